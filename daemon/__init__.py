@@ -1,0 +1,1 @@
+"""The onboard service: when to expose, what is stored, who may watch and ask."""

@@ -1,0 +1,246 @@
+"""What a device is to this program, and what it yields.
+
+The public contract of `drivers`: record types, life cycle and the protocols head, trigger,
+thermometer and navigator. How a device is reached is in the room of its family.
+
+Times: `mono_ns` is CLOCK_MONOTONIC of the host at arrival, `gps_ns` counts nanoseconds since the
+GPS epoch (1980-01-06T00:00:00), `device_ns` is the device's own clock. All are `int`.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+
+class DeviceError(Exception):
+    """A device that cannot do what was asked; the message names device, finding and cure."""
+
+
+class LifeCycle(enum.Enum):
+    """The states of a device, and no others.
+
+    CREATED: configured, nothing touched yet. BOUND: its address answered and its settings are
+    written. ACTIVE: it delivers. INACTIVE: closed for good, or lost and waiting to be found again.
+    """
+
+    CREATED = "created"
+    BOUND = "bound"
+    ACTIVE = "active"
+    INACTIVE = "inactive"
+
+
+class FrameStatus(enum.Enum):
+    """Whether a frame's pixels can be used."""
+
+    COMPLETE = "complete"
+    INCOMPLETE = "incomplete"
+    """Packets are missing for good: the pixels have holes."""
+    CORRUPT = "corrupt"
+    """Size or format differ from what was configured."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One sensor's pixels of one exposure, lying in slot `slot` of the head's memory.
+
+    `device_ns` is the start of exposure on the head's clock (chunk data); `device_clock_ns` and
+    `device_clock_mono_ns` are the last latch of that clock and the host time it belongs to, with
+    `latch_sigma_ns` from the round trip. `counter` counts the frames the head exposed since its
+    acquisition started, sent or not. `settings` are the head's own words: exposure time, gain...
+    """
+
+    head: str
+    slot: int
+    status: FrameStatus
+    frame_id: int
+    counter: int | None
+    width_px: int
+    height_px: int
+    pixel_format: str
+    device_ns: int | None
+    device_clock_ns: int | None
+    device_clock_mono_ns: int | None
+    latch_sigma_ns: int | None
+    mono_ns: int
+    exposure_time_us: float | None
+    temperature_c: float | None
+    settings: Mapping[str, float | int | str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class EventMark:
+    """The receiver's time of one strobe, rising edge.
+
+    `count` is the receiver's own count of edges (`count_bits` wide, it wraps). `time_valid` is the
+    receiver's word that `gps_ns` can be trusted.
+    """
+
+    receiver: str
+    channel: int
+    gps_ns: int
+    accuracy_ns: int
+    count: int
+    count_bits: int
+    time_valid: bool
+    mono_ns: int
+
+
+@dataclass(frozen=True)
+class NavSample:
+    """Position, velocity and, where the receiver knows it, attitude at one GPS instant.
+
+    Geographic coordinates in WGS 84, height above the ellipsoid; velocity north, east, down.
+    `fix` is the receiver's word: "none", "2d", "3d", "time", "dead-reckoning".
+    """
+
+    receiver: str
+    gps_ns: int
+    mono_ns: int
+    fix: str
+    satellites: int
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+    horizontal_sigma_m: float
+    vertical_sigma_m: float
+    velocity_ned_mps: tuple[float, float, float]
+    speed_sigma_mps: float
+    roll_rad: float | None
+    pitch_rad: float | None
+    heading_rad: float | None
+    leap_seconds: int | None
+    time_valid: bool
+
+
+@dataclass(frozen=True)
+class TemperatureSample:
+    """One reading of one probe; `value_c` is None where the probe is open."""
+
+    probe: str
+    value_c: float | None
+    mono_ns: int
+
+
+@dataclass(frozen=True)
+class TriggerPulse:
+    """A pulse that was given.
+
+    `mono_ns` is the host's estimate of the moment the delays count from, `sigma_ns` its half
+    width; `count` is the unit's own count since power-on.
+    """
+
+    sequence: int
+    mono_ns: int
+    sigma_ns: int
+    count: int
+
+
+@dataclass(frozen=True)
+class RawBytes:
+    """Bytes as they came from a device, for the flight log."""
+
+    device: str
+    mono_ns: int
+    data: bytes
+
+
+@dataclass(frozen=True)
+class DeviceEvent:
+    """A change of state or a fault of a device.
+
+    `name` is a stable kebab-case word ("opened", "lost", "timeout", "checksum", "held-by-another");
+    `sentence` is for the operator and ends with what to do.
+    """
+
+    device: str
+    name: str
+    is_fault: bool
+    sentence: str
+    mono_ns: int
+
+
+Record = Frame | EventMark | NavSample | TemperatureSample | RawBytes | DeviceEvent
+Sink = Callable[[Record], None]
+"""Where a device puts what it yields. Called from the device's own thread; returns quickly."""
+
+
+class FrameMemory(Protocol):
+    """Slots of pixel memory that outlive the driver; one ring per head."""
+
+    @property
+    def slot_count(self) -> int: ...
+
+    @property
+    def slot_nbytes(self) -> int: ...
+
+    def address(self, slot: int) -> int:
+        """Address of a slot in this process."""
+
+
+class Device(Protocol):
+    """What every device has."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def state(self) -> LifeCycle: ...
+
+    def bind(self) -> Mapping[str, str]:
+        """Reach the device, write its settings, and say what was found (model, serial, ...).
+
+        Raises:
+            DeviceError: it does not answer or refuses a setting; the sentence names the cure.
+        """
+
+    def run(self, sink: Sink) -> None:
+        """Deliver until `close` is called, from a thread of the caller's.
+
+        Never raises for what a device does: it is found again with back-off, and says so through
+        `DeviceEvent`.
+        """
+
+    def close(self) -> None:
+        """Stop `run` within two seconds and let go of the device. May be called twice."""
+
+    def statistics(self) -> Mapping[str, int]:
+        """Counters since creation, by stable name."""
+
+
+class Head(Device, Protocol):
+    """A camera head: frames land in the memory it was created with."""
+
+    def recycle(self, slot: int) -> None:
+        """Hand a slot back; from any thread."""
+
+    def trigger(self) -> None:
+        """Software trigger; from any thread. DeviceError where the head waits for a line."""
+
+
+class Thermometer(Device, Protocol):
+    """Yields `TemperatureSample`."""
+
+
+class Navigator(Device, Protocol):
+    """Yields `NavSample` and `EventMark`."""
+
+
+class Trigger(Protocol):
+    """Who fires. Not a stream of records: it is asked, and answers."""
+
+    @property
+    def name(self) -> str: ...
+
+    def bind(self) -> Mapping[str, str]:
+        """Reach the unit and say what was found. DeviceError as for a device."""
+
+    def program(self, delays_ns: Mapping[str, int]) -> None:
+        """Set the delay of every output, by cone, from the moment of firing."""
+
+    def fire(self, sequence: int) -> TriggerPulse:
+        """Give one pulse. DeviceError where none was given or nobody knows."""
+
+    def close(self) -> None: ...
