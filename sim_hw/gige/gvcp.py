@@ -1,0 +1,94 @@
+"""GVCP on the wire: commands in, acknowledgements out (GigE Vision 2.0, section 13 to 18).
+
+Only bytes and their meaning; who may do what is in `control`.
+"""
+
+from __future__ import annotations
+
+import enum
+import struct
+from dataclasses import dataclass
+
+PORT = 3956
+KEY = 0x42
+HEADER_LENGTH = 8
+PACKET_MAX = 576
+"""No GVCP packet is longer, IP and UDP headers included; ours never exceed it."""
+READ_MAX = 536
+ACK_REQUIRED = 0x01
+
+_HEADER = struct.Struct(">BBHHH")
+_ACK_HEADER = struct.Struct(">HHHH")
+
+
+class Status(enum.IntEnum):
+    SUCCESS = 0x0000
+    PACKET_RESEND = 0x0100
+    NOT_IMPLEMENTED = 0x8001
+    INVALID_PARAMETER = 0x8002
+    INVALID_ADDRESS = 0x8003
+    WRITE_PROTECT = 0x8004
+    BAD_ALIGNMENT = 0x8005
+    ACCESS_DENIED = 0x8006
+    BUSY = 0x8007
+    PACKET_UNAVAILABLE = 0x800C
+    INVALID_HEADER = 0x800E
+
+
+class Code(enum.IntEnum):
+    """Commands; the acknowledgement of one is its code plus one."""
+
+    DISCOVERY = 0x0002
+    FORCEIP = 0x0004
+    PACKETRESEND = 0x0040
+    READREG = 0x0080
+    WRITEREG = 0x0082
+    READMEM = 0x0084
+    WRITEMEM = 0x0086
+
+
+@dataclass(frozen=True)
+class Command:
+    code: int
+    flags: int
+    request_id: int
+    body: bytes
+
+    @property
+    def wants_acknowledgement(self) -> bool:
+        return bool(self.flags & ACK_REQUIRED)
+
+
+@dataclass(frozen=True)
+class ResendRequest:
+    """Packets `first` to `last` of a block, both included."""
+
+    block_id: int
+    first: int
+    last: int
+
+
+def parse_command(packet: bytes) -> Command | None:
+    """The command in a datagram; None for anything that is not one."""
+    if len(packet) < HEADER_LENGTH:
+        return None
+    key, flags, code, length, request_id = _HEADER.unpack_from(packet)
+    if key != KEY or request_id == 0 or length != len(packet) - HEADER_LENGTH:
+        return None
+    return Command(code, flags, request_id, packet[HEADER_LENGTH:])
+
+
+def acknowledgement(command: Command, body: bytes = b"", status: Status = Status.SUCCESS) -> bytes:
+    """The answer to a command."""
+    return _ACK_HEADER.pack(status, command.code + 1, len(body), command.request_id) + body
+
+
+def parse_resend(body: bytes) -> ResendRequest | None:
+    """The request in a PACKETRESEND command with 16-bit block ids; None where it makes no sense."""
+    if len(body) < 12:
+        return None
+    _channel, block_id, first, last = struct.unpack_from(">HHII", body)
+    first, last = first & 0xFF_FFFF, last & 0xFF_FFFF
+    if block_id == 0 or last < first:
+        return None
+    return ResendRequest(block_id, first, last)

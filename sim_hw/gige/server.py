@@ -1,0 +1,118 @@
+"""The UDP sockets of a head's control channel and the thread that answers on them."""
+
+from __future__ import annotations
+
+import ipaddress
+import selectors
+import socket
+import threading
+import time
+from collections import Counter
+
+from sim_hw.gige.control import ControlChannel
+from sim_hw.gige.gvcp import PORT
+
+BROADCAST_ADDRESS = "255.255.255.255"
+
+_HEARTBEAT_CHECK_S = 0.25
+_RECEIVE_BYTES = 2048
+
+
+class ControlServer:
+    """Serves one control channel on (address, 3956), and discovery by broadcast beside it."""
+
+    def __init__(self, address: str, channel: ControlChannel) -> None:
+        self._address = address
+        self._channel = channel
+        self._sockets: list[socket.socket] = []
+        self._wake: tuple[socket.socket, socket.socket] | None = None
+        self._thread: threading.Thread | None = None
+        self._deaf_until_ns = 0
+        self.counts: Counter[str] = Counter()
+
+    def start(self) -> None:
+        """Bind and answer.
+
+        Raises:
+            OSError: the address is not this host's, or somebody else answers there.
+        """
+        try:
+            self._bind()
+        except OSError as error:
+            self._close_sockets()
+            raise OSError(
+                error.errno,
+                f"{self._address}:{PORT} cannot be used ({error.strerror}); stop the other head"
+                " there or choose another address",
+            ) from error
+        self._wake = socket.socketpair()
+        self._thread = threading.Thread(
+            target=self._serve, name=f"gvcp-{self._address}", daemon=True
+        )
+        self._thread.start()
+
+    def close(self) -> None:
+        if self._wake is not None:
+            self._wake[1].send(b"\0")
+            if self._thread is not None:
+                self._thread.join(timeout=5.0)
+            for end in self._wake:
+                end.close()
+            self._wake = None
+        self._close_sockets()
+
+    def be_deaf(self, until_mono_ns: int) -> None:
+        """Hear nothing until then, as a device that restarts."""
+        self._deaf_until_ns = until_mono_ns
+
+    def _bind(self) -> None:
+        control = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._sockets.append(control)
+        control.bind((self._address, PORT))
+        if ipaddress.IPv4Address(self._address).is_loopback:
+            discovery = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            self._sockets.append(discovery)
+            discovery.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            discovery.bind((BROADCAST_ADDRESS, PORT))
+        for opened in self._sockets:
+            opened.setblocking(False)
+
+    def _close_sockets(self) -> None:
+        for opened in self._sockets:
+            opened.close()
+        self._sockets.clear()
+
+    def _serve(self) -> None:
+        assert self._wake is not None
+        woken = self._wake[0]
+        with selectors.DefaultSelector() as selector:
+            for readable in (*self._sockets, woken):
+                selector.register(readable, selectors.EVENT_READ)
+            while True:
+                ready = [key.fileobj for key, _ in selector.select(_HEARTBEAT_CHECK_S)]
+                if woken in ready:
+                    return
+                for readable in self._sockets:
+                    if readable in ready:
+                        self._receive(readable)
+                self._channel.expire(time.monotonic_ns())
+
+    def _receive(self, readable: socket.socket) -> None:
+        try:
+            packet, peer = readable.recvfrom(_RECEIVE_BYTES)
+        except OSError:
+            self.counts["receive_errors"] += 1
+            return
+        now_ns = time.monotonic_ns()
+        control = self._sockets[0]
+        # An emulated head never answers a broadcast from outside this machine.
+        is_foreign = readable is not control and not ipaddress.IPv4Address(peer[0]).is_loopback
+        if now_ns < self._deaf_until_ns or is_foreign:
+            return
+        answer = self._channel.answer(packet, (peer[0], peer[1]), now_ns)
+        if answer is None:
+            return
+        try:
+            control.sendto(answer, peer)
+        except OSError:
+            self.counts["send_errors"] += 1

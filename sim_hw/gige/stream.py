@@ -1,0 +1,202 @@
+"""The stream channel of a head: sends frames at the paced rate and packets again on request.
+
+One thread per head, asleep between bursts; a frame is sent whole before the next one.
+"""
+
+from __future__ import annotations
+
+import queue
+import socket
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim_hw.gige.faults import WireFaults
+from sim_hw.gige.gvcp import ResendRequest
+from sim_hw.gige.gvsp import (
+    UDP_OVERHEAD,
+    Batch,
+    Destination,
+    FramePackets,
+    send,
+    unavailable_packet,
+)
+from sim_hw.gige.pacing import Pacing, TokenBucket
+
+KEPT_FRAMES = 2
+"""Frames whose packets can be asked for again: the one on its way and the one before."""
+
+FRAMES_WAITING_MAX = 2
+SEND_BUFFER_BYTES = 4 << 20
+
+_UNAVAILABLE_ANSWERS_MAX = 16
+_POLL_S = 0.2
+_IP_MTU_DISCOVER = 10
+_IP_PMTUDISC_DONT, _IP_PMTUDISC_DO = 0, 2
+
+
+@dataclass
+class _Outgoing:
+    frame: FramePackets
+    is_wanted: Callable[[], bool]
+    sent_packets: int = 0
+
+
+class StreamChannel:
+    """The GVSP socket of a head and the thread behind it."""
+
+    def __init__(self, address: str, pacing: Pacing, faults: WireFaults, seed: int) -> None:
+        self._address = address
+        self._pacing = pacing
+        self._loss = faults.packet_loss
+        self._random = np.random.default_rng(seed)
+        self._waiting: queue.Queue[_Outgoing] = queue.Queue(FRAMES_WAITING_MAX)
+        self._kept: deque[_Outgoing] = deque(maxlen=KEPT_FRAMES)
+        self._bucket = TokenBucket(pacing, time.monotonic_ns())
+        self._stop = threading.Event()
+        self._lock = threading.Lock()
+        self._socket: socket.socket | None = None
+        self._thread: threading.Thread | None = None
+        self.counts: Counter[str] = Counter()
+
+    def start(self) -> int:
+        """Open the socket and start sending. Returns the source port."""
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
+        self._socket.bind((self._address, 0))
+        self._thread = threading.Thread(target=self._run, name=f"gvsp-{self._address}", daemon=True)
+        self._thread.start()
+        return int(self._socket.getsockname()[1])
+
+    def close(self) -> None:
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join(timeout=5.0)
+        if self._socket is not None:
+            self._socket.close()
+
+    def put(self, frame: FramePackets, is_wanted: Callable[[], bool]) -> bool:
+        """Queue a frame; waits while two are queued. False where it is not wanted any more.
+
+        `is_wanted` is asked again and again while the frame is being sent.
+        """
+        while is_wanted() and not self._stop.is_set():
+            try:
+                self._waiting.put(_Outgoing(frame, is_wanted), timeout=_POLL_S)
+            except queue.Full:
+                continue
+            return True
+        return False
+
+    def resend(self, request: ResendRequest) -> None:
+        """Send packets again at once; what they take is saved from the frame on its way."""
+        with self._lock:
+            outgoing = next((o for o in self._kept if o.frame.block_id == request.block_id), None)
+        if outgoing is None:
+            self._answer_unavailable(request)
+            return
+        frame = outgoing.frame
+        # What was not sent yet comes by itself.
+        last = min(request.last, outgoing.sent_packets - 1)
+        packets = np.arange(request.first, last + 1, dtype=np.intp)
+        fits = np.searchsorted(np.cumsum(frame.sizes[packets]), self._pacing.burst_bytes, "right")
+        packets = packets[: max(int(fits), 1)]
+        kept = packets[self._random.random(len(packets)) >= self._loss]
+        self.counts["packets_lost_by_fault"] += len(packets) - len(kept)
+        if len(kept):
+            self.counts["packets_resent"] += self._send(frame.resent(kept))
+            self._bucket.spend(int(frame.sizes[kept].sum()))
+
+    def fire_test_packet(self, destination: Destination, *, may_fragment: bool) -> None:
+        """Send one packet of the size asked for, so that the receiver learns whether it passes."""
+        if self._socket is None:
+            return
+        self._socket.setsockopt(
+            socket.IPPROTO_IP,
+            _IP_MTU_DISCOVER,
+            _IP_PMTUDISC_DONT if may_fragment else _IP_PMTUDISC_DO,
+        )
+        try:
+            self._socket.sendto(
+                bytes(destination.packet_size - UDP_OVERHEAD),
+                (destination.address, destination.port),
+            )
+        except OSError:
+            self.counts["send_errors"] += 1
+
+    def forget(self) -> None:
+        """Let go of the frames kept for resending."""
+        with self._lock:
+            self._kept.clear()
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            try:
+                outgoing = self._waiting.get(timeout=_POLL_S)
+            except queue.Empty:
+                continue
+            with self._lock:
+                self._kept.append(outgoing)
+            whole = self._transmit(outgoing)
+            self.counts["frames_sent" if whole else "frames_aborted"] += 1
+
+    def _transmit(self, outgoing: _Outgoing) -> bool:
+        frame = outgoing.frame
+        ends = np.cumsum(frame.sizes)
+        total = int(ends[-1])
+        delay_ns = frame.destination.packet_delay_ns
+        limit = frame.destination.packet_size * 1e9 / delay_ns if delay_ns else float("inf")
+        rate = min(limit, self._pacing.rate_bytes_per_s)
+        done = 0
+        while done < total:
+            if self._stop.is_set() or not outgoing.is_wanted():
+                return False
+            available = self._bucket.available(time.monotonic_ns(), limit)
+            # Half a burst at a time: few wake-ups, and room left to catch up after a late one.
+            enough = min(self._pacing.burst_bytes / 2, total - done)
+            if available < enough:
+                self._stop.wait((enough - available) / rate)
+                continue
+            first = outgoing.sent_packets
+            fits = int(np.searchsorted(ends, done + available, "right"))
+            last = min(max(fits, first + 1), frame.count) - 1
+            self._send_first_time(frame, first, last)
+            self._bucket.spend(int(ends[last]) - done)
+            done = int(ends[last])
+            outgoing.sent_packets = last + 1
+        return True
+
+    def _send_first_time(self, frame: FramePackets, first: int, last: int) -> None:
+        if not self._loss:
+            self.counts["packets_sent"] += self._send(frame.batch(first, last))
+            return
+        packets = np.arange(first, last + 1, dtype=np.intp)
+        kept = packets[self._random.random(len(packets)) >= self._loss]
+        self.counts["packets_lost_by_fault"] += len(packets) - len(kept)
+        if len(kept):
+            self.counts["packets_sent"] += self._send(frame.only(kept))
+
+    def _send(self, batch: Batch) -> int:
+        if self._socket is None:
+            return 0
+        taken, refused = send(self._socket.fileno(), batch)
+        self.counts["send_errors"] += refused
+        return taken
+
+    def _answer_unavailable(self, request: ResendRequest) -> None:
+        with self._lock:
+            newest = self._kept[-1] if self._kept else None
+        self.counts["resends_unavailable"] += 1
+        if newest is None or self._socket is None:
+            return
+        to = (newest.frame.destination.address, newest.frame.destination.port)
+        last = min(request.last, request.first + _UNAVAILABLE_ANSWERS_MAX - 1)
+        for packet in range(request.first, last + 1):
+            try:
+                self._socket.sendto(unavailable_packet(request.block_id, packet), to)
+            except OSError:
+                self.counts["send_errors"] += 1
