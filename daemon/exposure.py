@@ -90,7 +90,7 @@ class NavigationRecord:
 
 
 @dataclass(frozen=True)
-class StoredExposure:
+class Capture:
     """What is known when the pixels become durable: enough to seal the exposure after a crash.
 
     Written as `capture.json` beside the frames. `trigger_mono_ns` counts on the CLOCK_MONOTONIC
@@ -173,9 +173,9 @@ def exposure_bytes(exposure: Exposure) -> bytes:
     return canonical_bytes(to_json(exposure))
 
 
-def stored_bytes(stored: StoredExposure) -> bytes:
+def capture_bytes(capture: Capture) -> bytes:
     """The exact content of `capture.json`."""
-    return canonical_bytes(_shared_json(stored, "capture"))
+    return canonical_bytes(_shared_json(capture, "capture"))
 
 
 def from_json(content: Mapping[str, Any], file: str = "exposure.json") -> Exposure:
@@ -206,15 +206,15 @@ def from_json(content: Mapping[str, Any], file: str = "exposure.json") -> Exposu
     return exposure
 
 
-def stored_from_json(content: Mapping[str, Any], file: str = "capture.json") -> StoredExposure:
-    """Read what `stored_bytes` wrote. RecordError as for `from_json`."""
+def capture_from_json(content: Mapping[str, Any], file: str = "capture.json") -> Capture:
+    """Read what `capture_bytes` wrote. RecordError as for `from_json`."""
     problems: list[str] = []
     fields = Fields(content, "", file, problems)
-    stored = StoredExposure(**_shared_from(fields, "capture"))
+    capture = Capture(**_shared_from(fields, "capture"))
     fields.refuse_unknown()
     if problems:
         raise RecordError(problems)
-    return stored
+    return capture
 
 
 def navigation_to_json(navigation: NavigationRecord) -> dict[str, Any]:
@@ -264,7 +264,7 @@ def frame_to_json(frame: FrameRecord) -> dict[str, Any]:
     }
 
 
-def _shared_json(record: Exposure | StoredExposure, kind: str) -> dict[str, Any]:
+def _shared_json(record: Exposure | Capture, kind: str) -> dict[str, Any]:
     return {
         "format": EXPOSURE_FORMAT,
         "kind": kind,

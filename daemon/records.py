@@ -287,7 +287,9 @@ def _plain(value: Any, path: str, problems: list[str]) -> Any:
         return float(value)
     if isinstance(value, Mapping):
         odd = (key for key in value if not isinstance(key, str))
-        problems.extend(f"{path or 'the record'} has the key {key!r}; a key is a text" for key in odd)
+        problems.extend(
+            f"{path or 'the record'} has the key {key!r}; a key is a text" for key in odd
+        )
         return {
             str(key): _plain(item, f"{path}.{key}" if path else str(key), problems)
             for key, item in value.items()

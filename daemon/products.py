@@ -1,0 +1,170 @@
+"""Level-2 on disk: a finished exposure's images, geometry and quality report, in one folder.
+
+The folder appears whole, in place of an earlier one. What goes into it is made by `processing`;
+this runs in a worker, the only place where the quick look is encoded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon import durable
+from daemon.errors import DaemonError
+from daemon.level0 import tiff_parts
+from daemon.mission import Mission
+from daemon.records import canonical_bytes, plain_name
+
+REPLACED_SUFFIX = ".replaced"
+"""Ends the name of an earlier result while a newer one takes its place."""
+
+BAND_ORDER = ("red", "green", "blue", "nir")
+QUICKLOOK_QUALITY = 85
+
+
+class ProductError(DaemonError, ValueError):
+    """Products that cannot be written as they are; disk faults come as OSError instead."""
+
+
+@dataclass(frozen=True)
+class Level2Record:
+    """What was written: file name to size in bytes, and the verdict of quality.json."""
+
+    number: int
+    files: Mapping[str, int]
+    verdict: str | None
+
+
+def write_level2(
+    mission: Mission,
+    number: int,
+    *,
+    pan: NDArray[np.uint16] | None,
+    colour: Mapping[str, NDArray[np.uint16]],
+    quicklook: NDArray[np.uint8] | None,
+    report_json: Mapping[str, Any],
+    geometry: Mapping[str, Mapping[str, NDArray[Any]]] | None = None,
+    residuals_svg: str | None = None,
+) -> Level2Record:
+    """Write the products of an exposure; they are durable on return.
+
+    Args:
+        mission: where to.
+        number: the exposure.
+        pan: stitched image, shape (height, width); None for a rig or an exposure without one.
+        colour: by band, all of one shape; written in the order red, green, blue, nir.
+        quicklook: shape (height, width) or (height, width, 3) in the order red, green, blue.
+        report_json: content of quality.json.
+        geometry: by method ("free", "fixed", "fixed-no-tdm"), arrays by name.
+        residuals_svg: a drawing of the residual vectors.
+
+    Raises:
+        ProductError: arrays of wrong type or shape, or an unknown band.
+        RecordError: a report that JSON cannot hold.
+        OSError: the disk refused; an earlier result is still there.
+    """
+    final = mission.level2(number)
+    durable.make_directories(final.parent)
+    part = final.with_name(final.name + durable.PART_SUFFIX)
+    durable.remove_tree(part)
+    contents: dict[str, list[bytes | memoryview]] = {}
+    if pan is not None:
+        contents["pan.tif"] = tiff_parts([pan], {"bands": ["pan"], "exposure": number})
+    if colour:
+        bands = _ordered(colour)
+        about = {"bands": bands, "exposure": number}
+        contents["rgbn.tif"] = tiff_parts([colour[band] for band in bands], about)
+    if quicklook is not None:
+        contents["quicklook.jpg"] = [_jpeg(quicklook)]
+    for method, arrays in (geometry or {}).items():
+        contents[_geometry_name(method)] = [_npz(arrays)]
+    if residuals_svg is not None:
+        contents["residuals.svg"] = [residuals_svg.encode("utf-8")]
+    contents["quality.json"] = [canonical_bytes(report_json)]
+    part.mkdir()
+    try:
+        files = {
+            name: durable.create_file(part / name, parts, mode=0o644)
+            for name, parts in contents.items()
+        }
+        _take_the_place_of(part, final)
+    except OSError:
+        durable.remove_tree(part)
+        raise
+    verdict = report_json.get("verdict")
+    return Level2Record(number, files, verdict if isinstance(verdict, str) else None)
+
+
+def recover_level2(mission: Mission) -> list[str]:
+    """Clear what an interrupted `write_level2` left; sentences say what was done."""
+    if not mission.level2_root.is_dir():
+        return []
+    done = []
+    for entry in sorted(mission.level2_root.iterdir()):
+        if entry.name.endswith(durable.PART_SUFFIX):
+            durable.remove_tree(entry)
+            done.append(f"L2/{entry.name}: unfinished products removed; process them again")
+        elif entry.name.endswith(REPLACED_SUFFIX):
+            final = entry.with_name(entry.name.removesuffix(REPLACED_SUFFIX))
+            if final.exists():
+                durable.remove_tree(entry)
+            else:
+                entry.rename(final)
+                done.append(f"L2/{final.name}: earlier products put back in their place")
+    if done:
+        durable.sync_directory(mission.level2_root)
+    return done
+
+
+def _take_the_place_of(part: Path, final: Path) -> None:
+    replaced = final.with_name(final.name + REPLACED_SUFFIX)
+    durable.remove_tree(replaced)
+    if final.exists():
+        durable.sync_directory(part)
+        final.rename(replaced)
+    durable.rename_directory(part, final)
+    durable.remove_tree(replaced)
+
+
+def _ordered(colour: Mapping[str, NDArray[np.uint16]]) -> list[str]:
+    unknown = [band for band in colour if band not in BAND_ORDER]
+    if unknown:
+        raise ProductError(f"band {unknown[0]!r}; a colour band is one of {', '.join(BAND_ORDER)}")
+    return [band for band in BAND_ORDER if band in colour]
+
+
+def _geometry_name(method: str) -> str:
+    if not plain_name(method):
+        raise ProductError(f"method {method!r} cannot name a file")
+    return "geometry.npz" if method == "free" else f"geometry-{method}.npz"
+
+
+def _npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
+    for name, array in arrays.items():
+        if array.dtype.hasobject:
+            raise ProductError(f"geometry array {name!r} holds objects; numbers are needed")
+    buffer = BytesIO()
+    np.savez(buffer, **{name: arrays[name] for name in sorted(arrays)})  # type: ignore[arg-type]
+    return buffer.getvalue()
+
+
+def _jpeg(quicklook: NDArray[np.uint8]) -> bytes:
+    import cv2
+
+    shape_fits = quicklook.ndim == 2 or (quicklook.ndim == 3 and quicklook.shape[2] == 3)
+    if quicklook.dtype != np.uint8 or not shape_fits:
+        raise ProductError(
+            f"quick look is {quicklook.dtype} of shape {quicklook.shape}; "
+            "uint8 of shape (height, width) or (height, width, 3) is needed"
+        )
+    image = quicklook if quicklook.ndim == 2 else np.ascontiguousarray(quicklook[:, :, ::-1])
+    is_encoded, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUICKLOOK_QUALITY])
+    if not is_encoded:
+        raise ProductError(f"quick look of shape {quicklook.shape} cannot be encoded")
+    return bytes(data)

@@ -1,0 +1,333 @@
+"""On start: index, records, logs and disk are brought together, and it is told what was done.
+
+Whatever was called stored is kept; whole folders that were only not renamed yet are kept too; what
+is stored but unsealed is sealed from the flight log. Running it twice changes nothing more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from daemon import durable, products
+from daemon.catalog import Catalog, CatalogError
+from daemon.chain import ChainReport, Link, follow_chain
+from daemon.exposure import Capture, Exposure
+from daemon.flight_log import logs_of, read
+from daemon.level0_folder import (
+    EXPOSURE_FILE,
+    SealedRecord,
+    hash_file,
+    read_capture,
+    read_sealed,
+)
+from daemon.log_records import LoggedRecord, LoggedTrigger, record_of
+from daemon.mission import DISCARDED, Mission, exposure_name
+from daemon.records import RecordError
+from daemon.store import Level0Writer
+from processing.rig import RigError, load_rig
+
+CONTEXT_NS = 60_000_000_000
+"""Records of the log this long before and after a trigger belong to what seals its exposure."""
+
+Complete = Callable[[Capture, Sequence[LoggedRecord]], Exposure]
+"""Makes the final record of a stored exposure from what was logged around it."""
+
+
+@dataclass(frozen=True)
+class RecoveryReport:
+    """What recovery found and did. `problems` are what it could not put right.
+
+    `exposures` are all sealed records by number, for the ledger; `next_number` is the one to go on
+    with, beyond every trigger that was ever given.
+    """
+
+    done: tuple[str, ...]
+    problems: tuple[str, ...]
+    sealed: tuple[int, ...]
+    lost: tuple[int, ...]
+    next_number: int
+    exposures: tuple[Exposure, ...]
+    log_bytes_cut: int
+
+
+def recover(mission: Mission, complete: Complete, *, software: str = "") -> RecoveryReport:
+    """Bring a mission in order; to be run before anything else writes into it.
+
+    Args:
+        mission: it must be held by the caller (`Mission.held`).
+        complete: pure; called once for each exposure to be sealed, in order of number.
+        software: goes into the record of an exposure of which nothing but its trigger is known.
+
+    Raises:
+        OSError: the disk refused; recovery may be run again.
+    """
+    return _Recovery(mission, complete, software).run()
+
+
+@dataclass
+class _Log:
+    """What the flight logs hold of the exposures that need it."""
+
+    triggers: dict[int, tuple[str, LoggedTrigger]] = field(default_factory=dict)
+    cut_nbytes: int = 0
+
+
+class _Recovery:
+    def __init__(self, mission: Mission, complete: Complete, software: str) -> None:
+        self.mission = mission
+        self.complete = complete
+        self.software = software
+        self.done: list[str] = []
+        self.problems: list[str] = []
+
+    def run(self) -> RecoveryReport:
+        self._parts()
+        self.done += products.recover_level2(self.mission)
+        sealed, captures = self._read_folders()
+        chain = self._chain(sealed)
+        catalog = self._index(sealed, captures, chain)
+        try:
+            log = self._triggers()
+            newly, lost = self._seal(catalog, captures, sealed, log)
+            for sentence in self.done:
+                catalog.add_event(
+                    "recovery", "done", sentence, is_fault=False, mono_ns=0, boot_id=""
+                )
+            for sentence in self.problems:
+                catalog.add_event(
+                    "recovery", "problem", sentence, is_fault=True, mono_ns=0, boot_id=""
+                )
+        finally:
+            catalog.close()
+        next_number = max([self.mission.next_number(), *(number + 1 for number in log.triggers)])
+        return RecoveryReport(
+            done=tuple(self.done),
+            problems=tuple(self.problems),
+            sealed=tuple(newly),
+            lost=tuple(lost),
+            next_number=next_number,
+            exposures=tuple(sealed[number].exposure for number in sorted(sealed)),
+            log_bytes_cut=log.cut_nbytes,
+        )
+
+    def _parts(self) -> None:
+        """Folders without their final name: whole ones get it, the rest is set aside."""
+        for part in sorted(self.mission.level0_root.glob(f"*{durable.PART_SUFFIX}")):
+            final = part.with_name(part.name.removesuffix(durable.PART_SUFFIX))
+            if not final.exists() and _is_whole(part):
+                durable.rename_directory(part, final)
+                self.done.append(f"exposure {final.name}: was whole but unnamed; kept as stored")
+            else:
+                self._set_aside(part, final.name)
+        for number in self.mission.numbers():
+            unfinished = self.mission.level0(number) / f".{EXPOSURE_FILE}{durable.PART_SUFFIX}"
+            if unfinished.exists():
+                unfinished.unlink()
+                durable.sync_directory(unfinished.parent)
+                self.done.append(f"exposure {number}: a record written half was removed")
+
+    def _set_aside(self, part: Path, name: str) -> None:
+        aside = self.mission.level0_root / DISCARDED
+        durable.make_directories(aside)
+        repetition = 1
+        while (target := aside / f"{name}-{repetition}").exists():
+            repetition += 1
+        part.rename(target)
+        durable.sync_directory(aside)
+        durable.sync_directory(part.parent)
+        self.done.append(
+            f"exposure {name}: was being written and never called stored; "
+            f"what there is lies in L0/{DISCARDED}/{target.name}"
+        )
+
+    def _read_folders(self) -> tuple[dict[int, SealedRecord], dict[int, Capture]]:
+        sealed: dict[int, SealedRecord] = {}
+        captures: dict[int, Capture] = {}
+        for number in self.mission.numbers():
+            folder = self.mission.level0(number)
+            try:
+                record = read_sealed(folder)
+                capture = read_capture(folder)
+            except RecordError as error:
+                self.problems += error.problems
+                continue
+            if record is not None:
+                sealed[number] = record
+            if capture is not None:
+                captures[number] = capture
+            if record is None and capture is None:
+                self.problems.append(
+                    f"exposure {number}: its folder has no record; it is left as it is"
+                )
+        return sealed, captures
+
+    def _chain(self, sealed: Mapping[int, SealedRecord]) -> ChainReport:
+        links = [Link(n, r.sha256, r.exposure.previous_sha256) for n, r in sealed.items()]
+        chain = follow_chain(links, self.mission.genesis_sha256())
+        self.problems += chain.problems
+        return chain
+
+    def _index(
+        self,
+        sealed: Mapping[int, SealedRecord],
+        captures: Mapping[int, Capture],
+        chain: ChainReport,
+    ) -> Catalog:
+        """The index, made to say what the folders say."""
+        catalog = self._open_index()
+        rows = {row.number: row for row in catalog.exposures()}
+        for number in sorted(set(rows) - set(self.mission.numbers())):
+            self.problems.append(
+                f"exposure {number}: the index calls it stored but its folder is gone; "
+                "it was removed by others"
+            )
+            catalog.remove(number)
+        self.problems += [
+            f"exposure {number}: was sealed but its record is gone; it is sealed anew"
+            for number in sorted(set(captures) - set(sealed))
+            if number in rows and rows[number].is_sealed
+        ]
+        for number in sorted(set(captures) - set(rows)):
+            catalog.add_stored(captures[number])
+            self.done.append(f"exposure {number}: has its folder; taken into the index")
+        for link in chain.order:
+            row = rows.get(link.number)
+            if row is not None and row.is_sealed and row.record_sha256 == link.sha256:
+                continue
+            if row is not None and row.is_sealed:
+                self.problems.append(f"exposure {link.number}: its record was altered since sealed")
+            catalog.add_sealed(sealed[link.number].exposure, link.sha256)
+            self.done.append(f"exposure {link.number}: is sealed; noted in the index")
+        return catalog
+
+    def _open_index(self) -> Catalog:
+        path = self.mission.catalog_path
+        if not path.exists() and self.mission.numbers():
+            self.done.append("the index was missing; built again from the records")
+        try:
+            return Catalog.open(path)
+        except CatalogError as error:
+            aside = path.with_name(f"{path.name}.damaged")
+            repetition = 1
+            while aside.exists():
+                repetition += 1
+                aside = path.with_name(f"{path.name}.damaged-{repetition}")
+            path.rename(aside)
+            for ending in ("-wal", "-shm"):
+                path.with_name(path.name + ending).unlink(missing_ok=True)
+            durable.sync_directory(path.parent)
+            self.done.append(f"the index was unusable ({error}); kept as {aside.name}, built again")
+            return Catalog.open(path)
+
+    def _triggers(self) -> _Log:
+        log = _Log()
+        for path in logs_of(self.mission.log_dir):
+            reader = read(path)
+            for message in reader:
+                if message.topic == "trigger":
+                    record = record_of(message)
+                    if isinstance(record, LoggedTrigger):
+                        log.triggers[record.number] = (reader.boot_id, record)
+            if reader.cut_nbytes:
+                log.cut_nbytes += reader.cut_nbytes
+                self.done.append(
+                    f"log/{path.name}: ends in the middle of a message; "
+                    f"{reader.cut_nbytes} bytes cannot be read"
+                )
+            if reader.bad_checkpoints:
+                self.problems.append(f"log/{path.name}: was damaged on the disk; read with care")
+        return log
+
+    def _seal(
+        self,
+        catalog: Catalog,
+        captures: Mapping[int, Capture],
+        sealed: dict[int, SealedRecord],
+        log: _Log,
+    ) -> tuple[list[int], list[int]]:
+        """Seal what is stored but unsealed, and what was triggered and left nothing."""
+        waiting = {n: c for n, c in captures.items() if n not in sealed}
+        folders = set(self.mission.numbers())
+        lost = [number for number in sorted(log.triggers) if number not in folders]
+        for number in lost:
+            waiting[number] = self._capture_of_lost(*log.triggers[number])
+        if not waiting:
+            return [], []
+        records = _logged_around(self.mission.log_dir, waiting)
+        writer = Level0Writer(self.mission, catalog=catalog)
+        newly = []
+        try:
+            for number in sorted(waiting):
+                try:
+                    exposure = self.complete(waiting[number], records[number])
+                except RecordError as error:
+                    self.problems += [f"exposure {number}: not sealed: {p}" for p in error.problems]
+                    continue
+                writer.seal(exposure)
+                record = read_sealed(self.mission.level0(number))
+                if record is not None:
+                    sealed[number] = record
+                newly.append(number)
+                how = (
+                    "was triggered but never stored; recorded as lost"
+                    if number in lost
+                    else f"was stored but not sealed; sealed from the log ({exposure.mark_source})"
+                )
+                self.done.append(f"exposure {number}: {how}")
+        finally:
+            writer.close()
+        return newly, [number for number in lost if number in newly]
+
+    def _capture_of_lost(self, boot_id: str, trigger: LoggedTrigger) -> Capture:
+        cause = "the service ended before its frame was stored"
+        try:
+            sensors = [sensor.name for sensor in load_rig(self.mission.rig_path).sensors]
+        except RigError:
+            sensors = []
+        return Capture(
+            number=trigger.number,
+            trigger_sequence=trigger.pulse.sequence,
+            trigger_mono_ns=trigger.pulse.mono_ns,
+            trigger_sigma_ns=trigger.pulse.sigma_ns,
+            boot_id=boot_id,
+            missing=tuple((sensor, cause) for sensor in sensors),
+            software=self.software,
+        )
+
+
+def _is_whole(part: Path) -> bool:
+    """Whether every frame named in a part folder's record is there and hashes to what it says."""
+    try:
+        capture = read_capture(part)
+    except RecordError:
+        return False
+    if capture is None or exposure_name(capture.number) + durable.PART_SUFFIX != part.name:
+        return False
+    for frame in capture.frames:
+        try:
+            if hash_file(part / frame.file) != frame.sha256:
+                return False
+        except OSError:
+            return False
+    return True
+
+
+def _logged_around(log_dir: Path, waiting: Mapping[int, Capture]) -> dict[int, list[LoggedRecord]]:
+    """By exposure, what was logged around its trigger on the same boot, in order."""
+    found: dict[int, list[LoggedRecord]] = {number: [] for number in waiting}
+    for path in logs_of(log_dir):
+        reader = read(path)
+        for message in reader:
+            near = [
+                number
+                for number, capture in waiting.items()
+                if capture.boot_id == reader.boot_id
+                and abs(capture.trigger_mono_ns - message.mono_ns) <= CONTEXT_NS
+            ]
+            record = record_of(message) if near else None
+            if record is not None:
+                for number in near:
+                    found[number].append(record)
+    return found
