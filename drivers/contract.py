@@ -167,8 +167,16 @@ Sink = Callable[[Record], None]
 """Where a device puts what it yields. Called from the device's own thread; returns quickly."""
 
 
+CHUNK_ALLOWANCE_NBYTES = 4096
+"""What a head may write behind the pixels of a frame: time, exposure time, counter."""
+
+
 class FrameMemory(Protocol):
-    """Slots of pixel memory that outlive the driver; one ring per head."""
+    """Slots of pixel memory that outlive the driver; one ring per head.
+
+    A slot has room for the pixels and CHUNK_ALLOWANCE_NBYTES behind them; its address is a
+    multiple of 8.
+    """
 
     @property
     def slot_count(self) -> int: ...

@@ -1,0 +1,374 @@
+"""One opened GenICam head: its settings written, its clock, temperature and trigger.
+
+Frames are in `drivers.aravis.stream`; finding, losing and finding again in `drivers.aravis.head`.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from drivers.aravis.library import aravis, aravis_error
+from drivers.aravis.settings import AravisSettings
+from drivers.contract import DeviceError
+
+LATCH_TRIES: Final = 3
+NS_PER_S: Final = 1_000_000_000
+CHUNKS: Final = ("Timestamp", "ExposureTime", "CounterValue")
+
+
+@dataclass(frozen=True)
+class Latch:
+    """The head's clock and the host time it belongs to."""
+
+    device_clock_ns: int
+    mono_ns: int
+    sigma_ns: int
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """What a frame has to look like."""
+
+    width_px: int
+    height_px: int
+    pixel_format: str
+    pixel_format_code: int
+    payload_nbytes: int
+
+
+class HeldByAnotherError(DeviceError):
+    """Another program controls the head."""
+
+
+class AravisCamera:
+    """An opened head, configured and under our control.
+
+    Not for several threads at once: the caller holds a lock around every call.
+
+    Raises:
+        HeldByAnotherError: another program has control.
+        DeviceError: it does not answer or refuses settings; all refusals in one message.
+    """
+
+    def __init__(self, head: str, settings: AravisSettings) -> None:
+        self._who = f"{head} at {settings.address}"
+        library, failed = aravis(), aravis_error()
+        try:
+            self._camera: Any = library.Camera.new(settings.address)
+        except failed as error:
+            raise DeviceError(
+                f"{self._who}: the head cannot be opened ({_said(error)}); check power, cable and "
+                "address"
+            ) from None
+        device = self._camera.get_device()
+        self.control_lost = threading.Event()
+        self.chunk_parser: Any = None
+        if self._camera.is_gv_device():
+            if not device.is_controller():
+                raise HeldByAnotherError(
+                    f"{self._who}: another program controls the head; end that program"
+                )
+            device.connect("control-lost", _setter(self.control_lost))
+        self.identity = self._identity(settings)
+        refusals = self._configure(settings)
+        if refusals:
+            raise DeviceError("\n".join(f"{self._who}: {refusal}" for refusal in refusals))
+        self._tick_hz = self._read_tick_frequency()
+        self._latch_features = self._find_latch()
+        self._has_temperature = self._has("DeviceTemperature")
+        self.exposure_time_us = float(self._camera.get_exposure_time())
+        self.frame_settings = self._frame_settings()
+
+    @property
+    def raw(self) -> Any:
+        """The Aravis camera, for the stream."""
+        return self._camera
+
+    def start(self) -> None:
+        self._camera.start_acquisition()
+
+    def stop(self) -> None:
+        """Stop acquiring; a head that is gone says nothing, and that is all right here."""
+        failed = aravis_error()
+        try:
+            self._camera.stop_acquisition()
+        except failed:
+            self.control_lost.set()
+
+    def release(self) -> None:
+        """Let go of the head: the last reference gives control back."""
+        self._camera = self.chunk_parser = None
+
+    def software_trigger(self) -> None:
+        """Raises what Aravis raises."""
+        self._camera.software_trigger()
+
+    def latch(self) -> Latch | None:
+        """Read the head's clock; the best of three tries. None where the head cannot."""
+        if self._latch_features is None:
+            return None
+        command, value, is_ns = self._latch_features
+        best: Latch | None = None
+        for _ in range(LATCH_TRIES):
+            before_ns = time.monotonic_ns()
+            self._camera.execute_command(command)
+            after_ns = time.monotonic_ns()
+            ticks = self._camera.get_integer(value)
+            sigma_ns = (after_ns - before_ns + 1) // 2
+            if best is None or sigma_ns < best.sigma_ns:
+                clock_ns = ticks if is_ns else self.ns_from_ticks(ticks)
+                best = Latch(clock_ns, before_ns + sigma_ns, sigma_ns)
+        return best
+
+    def temperature_c(self) -> float | None:
+        """DeviceTemperature; None where the head has none."""
+        return float(self._camera.get_float("DeviceTemperature")) if self._has_temperature else None
+
+    def sign_of_life(self) -> None:
+        """Read something that is not cached; raises what Aravis raises."""
+        self._camera.get_exposure_time()
+
+    def ns_from_ticks(self, ticks: int) -> int:
+        """Device clock in ns; exact also for a tick frequency that is no power of ten."""
+        return ticks * NS_PER_S // self._tick_hz
+
+    # Reading and writing features
+
+    def _has(self, feature: str) -> bool:
+        failed = aravis_error()
+        try:
+            return bool(self._camera.is_feature_available(feature))
+        except failed:
+            return False
+
+    def _identity(self, settings: AravisSettings) -> dict[str, str]:
+        camera, failed = self._camera, aravis_error()
+        identity = {"address": settings.address}
+        questions: Mapping[str, Callable[[], object]] = {
+            "vendor": camera.get_vendor_name,
+            "model": camera.get_model_name,
+            "serial": camera.get_device_serial_number,
+            "version": lambda: camera.get_string("DeviceVersion"),
+        }
+        for key, ask in questions.items():
+            try:
+                identity[key] = str(ask() or "")
+            except failed:
+                identity[key] = ""
+        if settings.serial and identity["serial"] != settings.serial:
+            raise DeviceError(
+                f"{self._who}: serial number is {identity['serial']!r} where {settings.serial!r} "
+                "is configured; another head is connected here, or serial is wrong"
+            )
+        return identity
+
+    def _configure(self, settings: AravisSettings) -> list[str]:
+        """Write every setting; what was refused, one sentence each."""
+        library, failed = aravis(), aravis_error()
+        camera = self._camera
+        refusals: list[str] = []
+
+        def write(key: str, value: object, action: Callable[[], object], cure: str) -> None:
+            try:
+                action()
+            except failed as error:
+                refusals.append(f"{key} = {value!r} is refused ({_said(error)}); {cure}")
+
+        # A head that a killed controller left running would refuse the rest.
+        write("acquisition", "stop", camera.stop_acquisition, "switch the head off and on")
+        self._write_format(settings, write, refusals)
+        self._write_exposure(settings, write, refusals)
+        write(
+            "acquisition",
+            "continuous",
+            lambda: camera.set_acquisition_mode(library.AcquisitionMode.CONTINUOUS),
+            "the head is unsuitable",
+        )
+        source = "Software" if settings.trigger_source == "software" else settings.trigger_line
+        try:
+            sources = camera.dup_available_trigger_sources()
+        except failed:
+            sources = []
+        write(
+            "trigger_source" if source == "Software" else "trigger_line",
+            source,
+            lambda: camera.set_trigger(source),
+            "the head has " + (", ".join(sources) or "no trigger"),
+        )
+        if camera.is_gv_device():
+            self._write_packets(settings, write)
+        if refusals:
+            return refusals
+        if settings.chunks and self._switch_on_chunks():
+            self.chunk_parser = camera.create_chunk_parser()
+        _, _, width, height = (int(n) for n in _region(camera))
+        self.geometry = Geometry(
+            width_px=width,
+            height_px=height,
+            pixel_format=str(camera.get_pixel_format_as_string()),
+            pixel_format_code=int(camera.get_pixel_format()),
+            payload_nbytes=int(camera.get_payload()),
+        )
+        return refusals
+
+    def _write_format(
+        self, settings: AravisSettings, write: Callable[..., None], refusals: list[str]
+    ) -> None:
+        camera, failed = self._camera, aravis_error()
+        try:
+            formats = list(camera.dup_available_pixel_formats_as_strings())
+        except failed:
+            formats = []
+        if formats and settings.pixel_format not in formats:
+            refusals.append(
+                f"pixel_format is {settings.pixel_format!r}; the head has {', '.join(formats)}"
+            )
+        else:
+            write(
+                "pixel_format",
+                settings.pixel_format,
+                lambda: camera.set_pixel_format_from_string(settings.pixel_format),
+                "choose one that the head has",
+            )
+        if settings.width_px:
+            width, height = settings.width_px, settings.height_px
+            if tuple(_region(camera))[2:] != (width, height):
+                write(
+                    "width_px, height_px",
+                    (width, height),
+                    lambda: camera.set_region(0, 0, width, height),
+                    "give the size of the sensor",
+                )
+                if not refusals and tuple(_region(camera))[2:] != (width, height):
+                    found = " x ".join(str(n) for n in tuple(_region(camera))[2:])
+                    refusals.append(
+                        f"width_px x height_px is {width} x {height}; the head gives {found}"
+                    )
+
+    def _write_exposure(
+        self, settings: AravisSettings, write: Callable[..., None], refusals: list[str]
+    ) -> None:
+        camera, failed = self._camera, aravis_error()
+        try:
+            low_us, high_us = camera.get_exposure_time_bounds()
+        except failed:
+            low_us, high_us = 0.0, float("inf")
+        if not low_us <= settings.exposure_time_us <= high_us:
+            refusals.append(
+                f"exposure_time_us is {settings.exposure_time_us:g}; the head takes {low_us:g} to "
+                f"{high_us:g}"
+            )
+        else:
+            write(
+                "exposure_time_us",
+                settings.exposure_time_us,
+                lambda: camera.set_exposure_time(settings.exposure_time_us),
+                "the head cannot set its exposure time",
+            )
+        if self._has("Gain"):
+            write(
+                "gain_db",
+                settings.gain_db,
+                lambda: camera.set_float("Gain", settings.gain_db),
+                "choose a gain within the head's bounds",
+            )
+        elif settings.gain_db != 0:
+            refusals.append(
+                f"gain_db is {settings.gain_db:g}; the head has no feature Gain in dB, set 0"
+            )
+        if self._has("TdiShifts"):
+            write(
+                "tdi_shifts",
+                settings.tdi_shifts,
+                lambda: camera.set_integer("TdiShifts", settings.tdi_shifts),
+                "choose a number within the head's bounds",
+            )
+        elif settings.tdi_shifts != 0:
+            refusals.append(
+                f"tdi_shifts is {settings.tdi_shifts}; the head has no feature TdiShifts, set 0"
+            )
+
+    def _write_packets(self, settings: AravisSettings, write: Callable[..., None]) -> None:
+        library, camera = aravis(), self._camera
+
+        def set_size() -> None:
+            size = settings.packet_size
+            if size == 0:
+                size = min(int(camera.gv_auto_packet_size()), settings.packet_size_limit)
+            camera.gv_set_packet_size(size)
+
+        write("packet_size", settings.packet_size, set_size, "give 0, or what the network carries")
+        # It is settled; Aravis would otherwise try again when the stream is made.
+        camera.gv_set_packet_size_adjustment(library.GvPacketSizeAdjustment.NEVER)
+        options = library.GvStreamOption
+        camera.gv_set_stream_options(
+            options.NONE if settings.packet_socket else options.PACKET_SOCKET_DISABLED
+        )
+
+    def _switch_on_chunks(self) -> bool:
+        camera, failed = self._camera, aravis_error()
+        try:
+            if not camera.are_chunks_available():
+                return False
+            camera.set_chunk_mode(True)
+            if self._has("ChunkSelector"):
+                offered = camera.dup_available_enumerations_as_strings("ChunkSelector")
+                for chunk in CHUNKS:
+                    if chunk in offered:
+                        camera.set_chunk_state(chunk, True)
+        except failed:
+            return False
+        return True
+
+    def _read_tick_frequency(self) -> int:
+        if not self._camera.is_gv_device():
+            return NS_PER_S
+        return int(self._camera.get_device().get_timestamp_tick_frequency()) or NS_PER_S
+
+    def _find_latch(self) -> tuple[str, str, bool] | None:
+        """Command and value of the clock, and whether the value is in ns already (SFNC 2)."""
+        for command, value, is_ns in (
+            ("TimestampLatch", "TimestampLatchValue", True),
+            ("GevTimestampControlLatch", "GevTimestampValue", False),
+        ):
+            if self._has(command) and self._has(value):
+                return command, value, is_ns
+        return None
+
+    def _frame_settings(self) -> Mapping[str, float | int | str]:
+        camera = self._camera
+        found: dict[str, float | int | str] = {
+            "ExposureTime": self.exposure_time_us,
+            "PixelFormat": self.geometry.pixel_format,
+        }
+        if self._has("Gain"):
+            found["Gain"] = float(camera.get_float("Gain"))
+        elif self._has("GainRaw"):
+            found["GainRaw"] = int(camera.get_integer("GainRaw"))
+        if self._has("TdiShifts"):
+            found["TdiShifts"] = int(camera.get_integer("TdiShifts"))
+        if camera.is_gv_device():
+            found["GevSCPSPacketSize"] = int(camera.gv_get_packet_size())
+        return found
+
+
+def _region(camera: Any) -> tuple[int, int, int, int]:
+    region = camera.get_region()
+    return tuple(region)
+
+
+def _setter(event: threading.Event) -> Callable[..., None]:
+    """A signal handler that holds the event and nothing else: no cycle with the device."""
+
+    def lost(*_: object) -> None:
+        event.set()
+
+    return lost
+
+
+def _said(error: Exception) -> str:
+    return str(getattr(error, "message", error))

@@ -1,0 +1,442 @@
+"""A GenICam head through Aravis: found, run, lost, and found again.
+
+Features are in `drivers.aravis.camera`, frames in `drivers.aravis.stream`.
+"""
+
+from __future__ import annotations
+
+import gc
+import threading
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Final
+
+from drivers.aravis.camera import AravisCamera, HeldByAnotherError, Latch
+from drivers.aravis.gvcp import control_privilege, is_ip_address
+from drivers.aravis.library import aravis_error
+from drivers.aravis.settings import AravisSettings
+from drivers.aravis.stream import FrameStream, ReceivedFrame
+from drivers.clock import BackOff, Clock, HostClock
+from drivers.contract import (
+    DeviceError,
+    Frame,
+    FrameMemory,
+    FrameStatus,
+    LifeCycle,
+    Sink,
+)
+from drivers.telling import Teller
+
+POP_STEP_S: Final = 0.1
+PROBE_TIMEOUT_S: Final = 0.2
+PROBE_TRIES: Final = 3
+SUSPICION_S: Final = 2.0
+"""A head that answers nothing for so long is lost; a pause of a second heals by itself."""
+HELD_POLL_S: Final = 0.25
+TRIGGER_TIMEOUT_S: Final = 1.0
+CLOSE_TIMEOUT_S: Final = 2.0
+NOT_FRAMES: Final = ("aborted", "cleared", "filling", "unknown")
+"""Buffers that come back empty when a stream ends."""
+
+
+class HeadLostError(Exception):
+    """The head is gone; internal."""
+
+
+@dataclass
+class _Session:
+    """An opened head, from finding to losing it."""
+
+    camera: AravisCamera
+    stream: FrameStream
+    latch: Latch | None = None
+    temperature_c: float | None = None
+    suspected_ns: int | None = None
+    is_lost: bool = False
+
+
+class AravisHead(AravisSettings):
+    """A GigE Vision or USB3 Vision head whose frames land in memory of the caller's.
+
+    Yields a Frame for every exposure of which at least a packet came: COMPLETE, INCOMPLETE where
+    packets are missing for good, CORRUPT where its size or format is not the configured one. A
+    frame that comes while all slots are taken is lost in Aravis and counted as an underrun.
+
+    One thread at a time calls `bind` and `run`; `recycle`, `trigger`, `close` and `statistics` are
+    for any thread.
+
+    Source: GenICam SFNC 2.7; GigE Vision 2.0. Quirks: docs/drivers/aravis.md.
+    """
+
+    kind: ClassVar = "head"
+
+    def __init__(
+        self,
+        name: str,
+        settings: Mapping[str, object],
+        *,
+        memory: FrameMemory,
+        clock: Clock | None = None,
+    ) -> None:
+        super().__init__(name, settings)
+        self._memory = memory
+        self._clock: Clock = clock or HostClock()
+        self._teller = Teller(name, self._clock)
+        self._state = LifeCycle.CREATED
+        self._closing = threading.Event()
+        self._ended = threading.Event()
+        self._ended.set()
+        self._control = threading.Lock()
+        self._slots = threading.Lock()
+        self._session: _Session | None = None
+        self._lent_out: set[int] = set()
+        self._counters: Counter[str] = Counter(
+            frames=0, frames_incomplete=0, frames_corrupt=0, underruns=0, opened=0, latches=0
+        )
+        self._of_stream: Counter[str] = Counter()
+
+    @property
+    def state(self) -> LifeCycle:
+        return self._state
+
+    def bind(self, sink: Sink | None = None) -> Mapping[str, str]:
+        """Open the head and write its settings; what was found. See `drivers.contract.Device`.
+
+        A hold by a dead controller is waited out; `sink` is told so.
+        """
+        self._teller.sink = sink
+        try:
+            session = self._session or self._open()
+        finally:
+            self._teller.sink = None
+        self._state = LifeCycle.BOUND
+        geometry = session.camera.geometry
+        return {
+            **session.camera.identity,
+            "frame": f"{geometry.width_px} x {geometry.height_px} {geometry.pixel_format}",
+            "packet_size": str(session.camera.frame_settings.get("GevSCPSPacketSize", "")),
+            "chunks": "yes" if session.camera.chunk_parser is not None else "no",
+            "clock": "no" if session.latch is None else f"+-{session.latch.sigma_ns / 1e3:.0f} us",
+            "temperature": ""
+            if session.temperature_c is None
+            else f"{session.temperature_c:.1f} degC",
+        }
+
+    def run(self, sink: Sink) -> None:
+        """Deliver until closed. See `drivers.contract.Device`."""
+        if self._closing.is_set():
+            return
+        self._ended.clear()
+        self._teller.sink = sink
+        pause = BackOff()
+        reachable = True
+        try:
+            while not self._closing.is_set():
+                try:
+                    session = self._session or self._open()
+                except DeviceError as error:
+                    self._state = LifeCycle.INACTIVE
+                    if reachable and not self._closing.is_set():
+                        reachable = False
+                        held = isinstance(error, HeldByAnotherError)
+                        self._teller.tell(
+                            "held-by-another" if held else "lost",
+                            f"{error}. It is tried again by itself.",
+                            fault=True,
+                        )
+                    self._clock.wait(self._closing, pause.next_s())
+                    continue
+                reachable = True
+                self._teller.tell(
+                    "opened", f"The head {self.name} is open at {self.address}; nothing to do."
+                )
+                frames = self._counters["frames"]
+                self._serve(session, sink)
+                if self._counters["frames"] > frames:
+                    pause.reset()
+                self._clock.wait(self._closing, pause.next_s())
+        finally:
+            self._let_go()
+            self._teller.sink = None
+            self._state = LifeCycle.INACTIVE
+            self._ended.set()
+
+    def close(self) -> None:
+        """End `run` within two seconds and let go of the head; may be called twice."""
+        self._closing.set()
+        if self._ended.wait(CLOSE_TIMEOUT_S):
+            self._let_go()
+        self._state = LifeCycle.INACTIVE
+
+    def recycle(self, slot: int) -> None:
+        """Hand a slot back; from any thread. ValueError for a slot that was not handed out."""
+        with self._slots:
+            if slot not in self._lent_out:
+                raise ValueError(f"{self.name}: slot {slot} was not handed out; recycle it once")
+            self._lent_out.discard(slot)
+            if self._session is not None:
+                self._session.stream.lend(slot)
+
+    def trigger(self) -> None:
+        """Software trigger; from any thread. See `drivers.contract.Head`."""
+        if self.trigger_source != "software":
+            raise DeviceError(
+                f"{self.name}: the head waits for its line {self.trigger_line}; set "
+                'trigger_source = "software" to trigger it from here'
+            )
+        if not self._control.acquire(timeout=TRIGGER_TIMEOUT_S):
+            raise DeviceError(f"{self.name}: the head was busy for {TRIGGER_TIMEOUT_S:g} s; wait")
+        try:
+            session = self._session
+            if session is None or self._state is not LifeCycle.ACTIVE:
+                raise DeviceError(f"{self.name}: the head is not running; wait for it to be opened")
+            session.camera.software_trigger()
+        except aravis_error() as error:
+            raise DeviceError(
+                f"{self.name}: the software trigger was refused ({error}); see whether the head "
+                "is lost"
+            ) from None
+        finally:
+            self._control.release()
+
+    def statistics(self) -> Mapping[str, int]:
+        """Frames by status and reason, underruns, packets missing and resent, openings."""
+        found = self._counters + self._of_stream
+        names = self._counters.keys() | self._of_stream.keys()
+        return {name: found[name] for name in sorted(names)}
+
+    # Finding
+
+    def _open(self) -> _Session:
+        """Open the head, waiting out whoever holds it. DeviceError where that is in vain."""
+        deadline_ns = self._clock.mono_ns() + round(self.held_limit_s * 1e9)
+        told = False
+        while not self._closing.is_set():
+            if not self._is_held():
+                try:
+                    return self._open_now()
+                except HeldByAnotherError:
+                    pass
+            if not told:
+                told = True
+                self._teller.tell(
+                    "held-by-another",
+                    f"The head {self.name} at {self.address} is still held by another controller. "
+                    f"If that one is dead the head lets go by itself; it is waited for up to "
+                    f"{self.held_limit_s:g} s.",
+                )
+            if self._clock.mono_ns() > deadline_ns:
+                raise HeldByAnotherError(
+                    f"{self.name} at {self.address}: another program has held the head for "
+                    f"{self.held_limit_s:g} s, so it is alive; end that program"
+                )
+            self._clock.wait(self._closing, HELD_POLL_S)
+        raise DeviceError(f"{self.name}: closed while it was being opened; nothing to do")
+
+    def _is_held(self) -> bool:
+        if not is_ip_address(self.address):
+            return False
+        for attempt in range(PROBE_TRIES):
+            privilege = control_privilege(
+                self.address, timeout_s=PROBE_TIMEOUT_S, request_id=attempt + 1
+            )
+            if privilege is not None:
+                return privilege != 0
+            if self._closing.is_set():
+                break
+        raise DeviceError(
+            f"{self.name}: nothing answers at {self.address}; check the head's power, cable and "
+            "address"
+        )
+
+    def _open_now(self) -> _Session:
+        camera = None
+        with self._control:
+            try:
+                camera = AravisCamera(self.name, self)
+                with self._slots:
+                    free = [s for s in range(self._memory.slot_count) if s not in self._lent_out]
+                    session = _Session(camera, FrameStream(camera, self, self._memory, free))
+                    self._session = session
+                session.latch = camera.latch()
+                session.temperature_c = camera.temperature_c()
+            except HeldByAnotherError:
+                raise
+            except DeviceError as error:
+                message = str(error)
+            except aravis_error() as error:
+                message = (
+                    f"{self.name} at {self.address}: {error}; check the head's power and cable"
+                )
+            else:
+                self._counters["opened"] += 1
+                return session
+        self._let_go()
+        if camera is not None:
+            camera.release()
+        gc.collect()
+        raise DeviceError(message)
+
+    # Running
+
+    def _serve(self, session: _Session, sink: Sink) -> None:
+        """Deliver until closing or loss, then drop everything that belongs to this opening."""
+        reason = ""
+        try:
+            with self._control:
+                session.camera.start()
+            self._state = LifeCycle.ACTIVE
+            self._deliver(session, sink)
+        except (HeadLostError, aravis_error()) as error:
+            reason = str(getattr(error, "message", error))
+        if reason:
+            self._state = LifeCycle.INACTIVE
+            session.is_lost = True
+            self._teller.tell(
+                "lost",
+                f"The head {self.name} at {self.address} was lost ({reason}). Check its power and "
+                "cable; it is opened again by itself.",
+                fault=True,
+            )
+        elif is_ip_address(self.address):
+            alive = control_privilege(self.address, timeout_s=PROBE_TIMEOUT_S)
+            session.is_lost = alive is None
+        self._let_go()
+
+    def _deliver(self, session: _Session, sink: Sink) -> None:
+        next_check_ns = self._clock.mono_ns()
+        while not self._closing.is_set():
+            received = session.stream.pop(POP_STEP_S)
+            if received is not None:
+                self._hand_over(session, received, sink)
+            self._count(session)
+            if session.camera.control_lost.is_set():
+                raise HeadLostError("it no longer takes our heartbeat")
+            if self._clock.mono_ns() >= next_check_ns:
+                healthy = self._check(session)
+                pause_s = self.latch_interval_s if healthy else 0.0
+                next_check_ns = self._clock.mono_ns() + round(pause_s * 1e9)
+
+    def _hand_over(self, session: _Session, received: ReceivedFrame, sink: Sink) -> None:
+        now_ns = self._clock.mono_ns()
+        status = _status(session.camera, received)
+        reason = received.reason.replace("-", "_")
+        if status is None:
+            self._counters[f"buffers_{reason}"] += 1
+            session.stream.lend(received.slot)
+            return
+        if status is FrameStatus.COMPLETE:
+            self._counters["frames"] += 1
+        else:
+            self._counters[f"frames_{status.value}"] += 1
+            self._counters[f"{status.value}_{reason}"] += 1
+        with self._slots:
+            self._lent_out.add(received.slot)
+        sink(self._frame(session, received, status, now_ns))
+
+    def _frame(
+        self, session: _Session, received: ReceivedFrame, status: FrameStatus, now_ns: int
+    ) -> Frame:
+        camera, latch = session.camera, session.latch
+        geometry = camera.geometry
+        if received.chunk_timestamp is not None:
+            device_ns: int | None = camera.ns_from_ticks(received.chunk_timestamp)
+        else:
+            device_ns = received.leader_ns or None
+        exposure_us = received.chunk_exposure_us
+        return Frame(
+            head=self.name,
+            slot=received.slot,
+            status=status,
+            frame_id=received.frame_id,
+            counter=received.chunk_counter,
+            width_px=geometry.width_px if received.width_px is None else received.width_px,
+            height_px=geometry.height_px if received.height_px is None else received.height_px,
+            pixel_format=geometry.pixel_format
+            if received.pixel_format_code in (None, geometry.pixel_format_code)
+            else f"0x{received.pixel_format_code:08x}",
+            device_ns=device_ns,
+            device_clock_ns=None if latch is None else latch.device_clock_ns,
+            device_clock_mono_ns=None if latch is None else latch.mono_ns,
+            latch_sigma_ns=None if latch is None else latch.sigma_ns,
+            mono_ns=now_ns,
+            exposure_time_us=camera.exposure_time_us if exposure_us is None else exposure_us,
+            temperature_c=session.temperature_c,
+            settings=camera.frame_settings,
+        )
+
+    def _check(self, session: _Session) -> bool:
+        """Read clock and temperature; False while the head does not answer.
+
+        Raises:
+            HeadLostError: it has not answered for two seconds, or no longer knows us.
+        """
+        if is_ip_address(self.address):
+            privilege = control_privilege(self.address, timeout_s=PROBE_TIMEOUT_S)
+            now_ns = self._clock.mono_ns()
+            if privilege is None:
+                if session.suspected_ns is None:
+                    session.suspected_ns = now_ns
+                if now_ns - session.suspected_ns > SUSPICION_S * 1e9:
+                    raise HeadLostError(f"it has not answered for {SUSPICION_S:g} s")
+                return False
+            session.suspected_ns = None
+            if privilege == 0:
+                raise HeadLostError("it has been restarted")
+        with self._control:
+            session.latch = session.camera.latch()
+            session.temperature_c = session.camera.temperature_c()
+            if session.latch is None and session.temperature_c is None:
+                session.camera.sign_of_life()
+        self._counters["latches"] += session.latch is not None
+        return True
+
+    def _count(self, session: _Session) -> None:
+        before = self._of_stream["underruns"]
+        self._of_stream = session.stream.counted()
+        if self._of_stream["underruns"] > before:
+            self._teller.complain(
+                "underrun",
+                f"The head {self.name} lost a frame because all {self._memory.slot_count} slots "
+                "are taken. Storage is too slow for this rate; lengthen the interval.",
+            )
+
+    # Letting go
+
+    def _let_go(self) -> None:
+        with self._slots:
+            session, self._session = self._session, None
+        if session is None:
+            return
+        self._counters.update(self._of_stream)
+        self._of_stream = Counter()
+        if session.is_lost and self._closing.is_set():
+            # Aravis asks a dead head three times to let go, 2.5 s each; closing does not wait.
+            threading.Thread(
+                target=self._dismantle, args=(session,), name=f"{self.name}-let-go", daemon=True
+            ).start()
+        else:
+            self._dismantle(session)
+
+    def _dismantle(self, session: _Session) -> None:
+        with self._control:
+            if not session.is_lost:
+                session.camera.stop()
+            session.stream.drop()
+            session.camera.release()
+            gc.collect()
+
+
+def _status(camera: AravisCamera, received: ReceivedFrame) -> FrameStatus | None:
+    """What a returned buffer is worth; None where it holds no frame at all."""
+    if received.reason in NOT_FRAMES:
+        return None
+    if received.reason == "size-mismatch":
+        return FrameStatus.CORRUPT
+    if received.reason != "success":
+        return FrameStatus.INCOMPLETE
+    geometry = camera.geometry
+    found = (received.width_px, received.height_px, received.pixel_format_code)
+    configured = (geometry.width_px, geometry.height_px, geometry.pixel_format_code)
+    return FrameStatus.COMPLETE if found == configured else FrameStatus.CORRUPT

@@ -1,0 +1,38 @@
+"""The Aravis library itself: loaded when it is first needed, and its quirks in one place."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+from drivers.contract import DeviceError
+
+
+@functools.cache
+def aravis() -> Any:
+    """The Aravis namespace of PyGObject.
+
+    Raises:
+        DeviceError: it is not installed; the sentence says what to install.
+    """
+    try:
+        import gi
+
+        gi.require_version("Aravis", "0.8")
+        from gi.repository import Aravis
+    except (ImportError, ValueError) as error:
+        raise DeviceError(
+            f"Aravis cannot be loaded ({error}); install Debian's gir1.2-aravis-0.8 and this "
+            "package's extra aravis"
+        ) from error
+    return Aravis
+
+
+@functools.cache
+def aravis_error() -> type[Exception]:
+    """What a call into Aravis raises."""
+    aravis()
+    from gi.repository import GLib
+
+    error: type[Exception] = GLib.Error
+    return error

@@ -1,0 +1,172 @@
+"""Frames of one head, received into memory of our own.
+
+Slots and Aravis' buffers are paired here; when a stream is made and dropped is decided in
+`drivers.aravis.head`.
+"""
+
+from __future__ import annotations
+
+import gc
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from drivers.aravis.camera import AravisCamera
+from drivers.aravis.library import aravis, aravis_error
+from drivers.aravis.settings import AravisSettings
+from drivers.contract import DeviceError, FrameMemory
+
+INFOS: Final = {
+    "n_underruns": "underruns",
+    "n_resend_requests": "resend_requests",
+    "n_resent_packets": "resent_packets",
+    "n_missing_packets": "missing_packets",
+    "n_missing_frames": "missing_frames",
+    "n_received_packets": "received_packets",
+    "n_ignored_packets": "ignored_packets",
+    "n_error_packets": "error_packets",
+    "n_transferred_bytes": "bytes",
+}
+"""What Aravis counts, and what it is called here."""
+
+
+@dataclass(frozen=True)
+class ReceivedFrame:
+    """A buffer that Aravis has given back, and the slot its pixels lie in.
+
+    `reason` is Aravis' word for its status; the figures are None where no leader came.
+    """
+
+    slot: int
+    reason: str
+    frame_id: int
+    leader_ns: int
+    width_px: int | None
+    height_px: int | None
+    pixel_format_code: int | None
+    chunk_timestamp: int | None
+    chunk_exposure_us: float | None
+    chunk_counter: int | None
+
+
+class FrameStream:
+    """The stream of an opened head into `memory`.
+
+    `free` slots are lent to Aravis at once, others by `lend`. Aravis writes into a slot from
+    `lend` until `pop` gives it back; the buffers are kept alive here for as long.
+
+    Raises:
+        DeviceError: the slots are too small, or the stream cannot be made.
+    """
+
+    def __init__(
+        self,
+        camera: AravisCamera,
+        settings: AravisSettings,
+        memory: FrameMemory,
+        free: Iterable[int],
+    ) -> None:
+        library = aravis()
+        nbytes = camera.geometry.payload_nbytes
+        if memory.slot_nbytes < nbytes:
+            raise DeviceError(
+                f"{settings.name} at {settings.address}: a frame has {nbytes} bytes, its slot "
+                f"{memory.slot_nbytes}; give slots of the sensor's size plus "
+                "CHUNK_ALLOWANCE_NBYTES, and check width_px, height_px and pixel_format"
+            )
+        self._parser = camera.chunk_parser
+        self._counted: Counter[str] = Counter()
+        self._buffers = {
+            slot: library.Buffer.new(nbytes, memory.address(slot))
+            for slot in range(memory.slot_count)
+        }
+        self._slots = {hash(buffer): slot for slot, buffer in self._buffers.items()}
+        self._stream: Any = camera.raw.create_stream(None, None)
+        if self._stream is None:
+            raise DeviceError(
+                f"{settings.name} at {settings.address}: the stream cannot be made; check that no "
+                "other program holds the head"
+            )
+        if camera.raw.is_gv_device():
+            self._tune(settings)
+        for slot in free:
+            self.lend(slot)
+
+    def lend(self, slot: int) -> None:
+        """Let Aravis fill this slot next; from any thread."""
+        self._stream.push_buffer(self._buffers[slot])
+
+    def pop(self, timeout_s: float) -> ReceivedFrame | None:
+        """Wait for a frame, at most so long. The slot is the caller's until `lend`."""
+        buffer = self._stream.timeout_pop_buffer(round(timeout_s * 1e6))
+        if buffer is None:
+            return None
+        reason = str(buffer.get_status().value_nick)
+        # Aravis complains on stderr when asked for the size of a frame that it gave up.
+        whole = reason == "success"
+        parser = self._parser if whole and buffer.has_chunks() else None
+        return ReceivedFrame(
+            slot=self._slots[hash(buffer)],
+            reason=reason,
+            frame_id=int(buffer.get_frame_id()),
+            leader_ns=int(buffer.get_timestamp()),
+            width_px=int(buffer.get_image_width()) if whole else None,
+            height_px=int(buffer.get_image_height()) if whole else None,
+            pixel_format_code=int(buffer.get_image_pixel_format()) if whole else None,
+            chunk_timestamp=_chunk(parser, "get_integer_value", buffer, "ChunkTimestamp"),
+            chunk_exposure_us=_chunk(parser, "get_float_value", buffer, "ChunkExposureTime"),
+            chunk_counter=_chunk(parser, "get_integer_value", buffer, "ChunkCounterValue"),
+        )
+
+    def counted(self) -> Counter[str]:
+        """What Aravis has counted of this stream."""
+        found: Counter[str] = Counter()
+        for theirs, ours in INFOS.items():
+            found[ours] = int(self._stream.get_info_uint64_by_name(theirs))
+        return found
+
+    def drop(self) -> None:
+        """End the stream. When this returns Aravis writes into no slot any more."""
+        weak = self._stream.weak_ref()
+        self._stream = None
+        gc.collect()
+        # The last reference stops the stream's thread. Were one left somewhere, memory that is
+        # handed out anew would be written into: stop the thread by hand then.
+        left = weak()
+        if left is not None:
+            left.stop_thread(False)
+        self._parser = None
+        self._buffers.clear()
+        self._slots.clear()
+
+    def _tune(self, settings: AravisSettings) -> None:
+        library, stream = aravis(), self._stream
+        stream.set_property("socket-buffer", library.GvStreamSocketBuffer.FIXED)
+        stream.set_property(
+            "socket-buffer-size", min(settings.socket_buffer_bytes, receive_buffer_limit())
+        )
+        stream.set_property("packet-resend", library.GvStreamPacketResend.ALWAYS)
+        stream.set_property("packet-request-ratio", 1.0)
+        stream.set_property("packet-timeout", round(settings.packet_timeout_ms * 1e3))
+        stream.set_property("frame-retention", round(settings.frame_retention_ms * 1e3))
+
+
+def receive_buffer_limit() -> int:
+    """The largest socket buffer the kernel grants, net.core.rmem_max in bytes."""
+    try:
+        return int(Path("/proc/sys/net/core/rmem_max").read_text(encoding="ascii"))
+    except (OSError, ValueError):
+        return 212_992
+
+
+def _chunk(parser: Any, method: str, buffer: Any, name: str) -> Any:
+    """A chunk's value; None where the head does not send this one."""
+    if parser is None:
+        return None
+    failed = aravis_error()
+    try:
+        return getattr(parser, method)(buffer, name)
+    except failed:
+        return None

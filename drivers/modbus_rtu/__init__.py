@@ -1,0 +1,1 @@
+"""Thermometers on a Modbus RTU line: the frames of the protocol, and the device."""

@@ -1,0 +1,329 @@
+"""Base of devices on a serial line: opening, reconnecting, counting, and noticing silence.
+
+What the bytes mean is in the driver of each device, which says it in `step` and `identify`.
+"""
+
+from __future__ import annotations
+
+import errno
+import termios
+import threading
+from abc import abstractmethod
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Final, Protocol
+
+import serial
+
+from drivers.clock import BackOff, Clock, HostClock
+from drivers.contract import (
+    DeviceError,
+    EventMark,
+    LifeCycle,
+    NavSample,
+    RawBytes,
+    Sink,
+    TemperatureSample,
+)
+from drivers.settings import Configured, Setting
+from drivers.telling import Teller
+
+READ_STEP_S: Final = 0.2
+"""Longest wait for bytes before the driver looks up again."""
+WRITE_TIMEOUT_S: Final = 1.0
+
+Sample = NavSample | EventMark | TemperatureSample
+
+
+class Port(Protocol):
+    """What is used of `serial.Serial`."""
+
+    timeout: Any
+
+    @property
+    def in_waiting(self) -> int: ...
+
+    def read(self, size: int = ...) -> bytes: ...
+
+    def write(self, data: bytes, /) -> int | None: ...
+
+    def close(self) -> None: ...
+
+
+class LineLostError(Exception):
+    """The port went away below us; internal to the serial drivers."""
+
+
+class SerialLine:
+    """One open port. Every byte read is counted and handed to the flight log."""
+
+    def __init__(self, port: Port, received: Callable[[bytes], None]) -> None:
+        self._port = port
+        self._received = received
+
+    def read(self, timeout_s: float) -> bytes:
+        """What has come, waiting for the first byte at most so long; may be empty.
+
+        Raises:
+            LineLostError: the port is gone.
+        """
+        try:
+            self._port.timeout = timeout_s
+            data = bytes(self._port.read(1))
+            waiting = self._port.in_waiting if data else 0
+            if waiting:
+                data += bytes(self._port.read(waiting))
+        except (serial.SerialException, OSError, termios.error, TypeError) as error:
+            raise LineLostError(_reason(error)) from error
+        if data:
+            self._received(data)
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Send; LineLostError where the port is gone or takes nothing for a second."""
+        try:
+            self._port.write(data)
+        except (serial.SerialException, OSError, termios.error, TypeError) as error:
+            raise LineLostError(_reason(error)) from error
+
+    def close(self) -> None:
+        # A port that is already gone may refuse even this; there is nothing left to let go of.
+        try:
+            self._port.close()
+        except (serial.SerialException, OSError, termios.error):
+            return
+
+
+PortOpener = Callable[[str, int, str], Port]
+
+
+def open_serial_port(path: str, baudrate: int, parity: str) -> Port:
+    """Open a port for ourselves alone, 8 data bits, one stop bit.
+
+    Raises:
+        DeviceError: it cannot be opened; the sentence says why and what to do.
+    """
+    try:
+        return serial.Serial(
+            path,
+            baudrate=baudrate,
+            parity=parity,
+            timeout=READ_STEP_S,
+            write_timeout=WRITE_TIMEOUT_S,
+            exclusive=True,
+        )
+    except (serial.SerialException, OSError, termios.error, ValueError) as error:
+        number = getattr(error, "errno", None) or (error.args[0] if error.args else None)
+        if number == errno.EINVAL and parity != "N":
+            cure = f'parity {parity} is refused, as a pseudo-terminal does; set parity = "N" there'
+        elif number == errno.ENOENT:
+            cure = "there is no such port; check the cable and the port's name"
+        elif number in (errno.EACCES, errno.EPERM):
+            cure = "permission denied; add the service's user to the group dialout"
+        elif "lock" in str(error):
+            cure = "another program holds it; end that program"
+        else:
+            cure = f"{_reason(error)}; check the cable, the port's name and its settings"
+        raise DeviceError(f"port {path} cannot be opened: {cure}") from error
+
+
+def _reason(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+class SerialDevice(Configured):
+    """A device on a serial line, run by one thread of the caller's.
+
+    A driver declares its settings and says in `step` how it listens or asks; `heard` is to be
+    called for every message that was understood. No byte from the line raises out of `run`.
+    """
+
+    port = Setting("", required=True, says="serial port, such as /dev/ttyUSB0")
+    silence_s = Setting(
+        5.0, minimum=0.5, maximum=3600, says="without a message for so long the device is silent"
+    )
+
+    what: str = "device"
+    """What it is, for the operator's sentences."""
+
+    def __init__(
+        self,
+        name: str,
+        settings: Mapping[str, object],
+        *,
+        clock: Clock | None = None,
+        open_port: PortOpener = open_serial_port,
+    ) -> None:
+        super().__init__(name, settings)
+        self.clock: Clock = clock or HostClock()
+        self._open_port = open_port
+        self._closing = threading.Event()
+        self._ended = threading.Event()
+        self._ended.set()
+        self._lock = threading.Lock()
+        self._state = LifeCycle.CREATED
+        self._line: SerialLine | None = None
+        self.teller = Teller(name, self.clock)
+        self._heard_ns = 0
+        self._silent = False
+        self.counters: Counter[str] = Counter(
+            bytes=0, messages=0, bad_messages=0, bad_bytes=0, timeouts=0, opened=0, silences=0
+        )
+
+    # What a driver says
+
+    @abstractmethod
+    def line_settings(self) -> tuple[int, str]:
+        """Baud rate and parity."""
+
+    @abstractmethod
+    def identify(self, line: SerialLine) -> Mapping[str, str]:
+        """Ask who is there; DeviceError with the cure where nobody fitting answers."""
+
+    @abstractmethod
+    def step(self, line: SerialLine) -> Iterable[Sample]:
+        """One turn of listening or asking, a second at most; what was understood."""
+
+    def connected(self) -> None:
+        """A port was opened: what was half received on the one before is of no use."""
+
+    def heard(self, *, messages: int = 1) -> None:
+        """So many messages were understood just now."""
+        if messages <= 0:
+            return
+        self.counters["messages"] += messages
+        self._heard_ns = self.clock.mono_ns()
+        if self._silent:
+            self._silent = False
+            self.teller.tell(
+                "recovered", f"The {self.what} {self.name} speaks again; nothing to do."
+            )
+
+    # The contract
+
+    @property
+    def state(self) -> LifeCycle:
+        return self._state
+
+    def bind(self) -> Mapping[str, str]:
+        """Open the port and ask who is there. See `drivers.contract.Device`."""
+        if self._line is None:
+            self._line = self._open()
+        try:
+            found = {"port": self.port, **self.identify(self._line)}
+        except LineLostError as error:
+            self._drop()
+            raise DeviceError(
+                f"{self.name}: port {self.port} was lost: {error}; check the cable"
+            ) from error
+        except DeviceError:
+            self._drop()
+            raise
+        self._state = LifeCycle.BOUND
+        return found
+
+    def run(self, sink: Sink) -> None:
+        """Deliver until closed. See `drivers.contract.Device`."""
+        if self._closing.is_set():
+            return
+        self._ended.clear()
+        self.teller.sink = sink
+        pause = BackOff()
+        reachable = True
+        try:
+            while not self._closing.is_set():
+                try:
+                    line = self._line or self._open()
+                except DeviceError as error:
+                    self._state = LifeCycle.INACTIVE
+                    if reachable:
+                        reachable = False
+                        self.teller.tell(
+                            "lost", f"{error}. It is tried again by itself.", fault=True
+                        )
+                    self.clock.wait(self._closing, pause.next_s())
+                    continue
+                self._line = line
+                if not (reachable and self._silent):
+                    self.teller.tell(
+                        "opened", f"The {self.what} {self.name} is open at {self.port}."
+                    )
+                reachable = True
+                said = self.counters["messages"]
+                reachable = self._serve(line)
+                if self.counters["messages"] > said:
+                    pause.reset()
+                self._drop()
+                self.clock.wait(self._closing, pause.next_s())
+        finally:
+            self._drop()
+            self.teller.sink = None
+            self._state = LifeCycle.INACTIVE
+            self._ended.set()
+
+    def close(self) -> None:
+        """End `run` within two seconds and close the port; may be called twice."""
+        self._closing.set()
+        if self._ended.wait(2.0):
+            self._drop()
+        self._state = LifeCycle.INACTIVE
+
+    def statistics(self) -> Mapping[str, int]:
+        """Counters of bytes, messages, openings and silences, and the driver's own."""
+        return dict(self.counters)
+
+    # How it is done
+
+    def _open(self) -> SerialLine:
+        baudrate, parity = self.line_settings()
+        try:
+            port = self._open_port(self.port, baudrate, parity)
+        except DeviceError as error:
+            raise DeviceError(f"{self.name}: {error}") from error
+        self.counters["opened"] += 1
+        self.connected()
+        return SerialLine(port, self._received)
+
+    def _received(self, data: bytes) -> None:
+        self.counters["bytes"] += len(data)
+        if self.teller.sink is not None:
+            self.teller.sink(RawBytes(self.name, self.clock.mono_ns(), data))
+
+    def _serve(self, line: SerialLine) -> bool:
+        """Listen until closing, loss (False), or a whole silence (True: worth opening anew)."""
+        self._state = LifeCycle.ACTIVE
+        self._heard_ns = self.clock.mono_ns()
+        silence_ns = round(self.silence_s * 1e9)
+        while not self._closing.is_set():
+            try:
+                for sample in self.step(line):
+                    if self.teller.sink is not None:
+                        self.teller.sink(sample)
+            except LineLostError as error:
+                self._state = LifeCycle.INACTIVE
+                self.teller.tell(
+                    "lost",
+                    f"The {self.what} {self.name} at {self.port} was lost ({error}). Check cable "
+                    "and power; it is opened again by itself.",
+                    fault=True,
+                )
+                return False
+            if self.clock.mono_ns() - self._heard_ns >= silence_ns:
+                if not self._silent:
+                    self._silent = True
+                    self.counters["silences"] += 1
+                    self.teller.tell(
+                        "silent",
+                        f"The {self.what} {self.name} at {self.port} has said nothing "
+                        f"understandable for {self.silence_s:g} s. Check its power, wiring and "
+                        "baud rate; the port is opened anew by itself.",
+                        fault=True,
+                    )
+                return True
+        return True
+
+    def _drop(self) -> None:
+        with self._lock:
+            line, self._line = self._line, None
+        if line is not None:
+            line.close()

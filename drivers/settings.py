@@ -1,0 +1,221 @@
+"""Settings of a driver, declared in its class: what they are, what they may be, and what they mean.
+
+A configuration section is a mapping of plain values; here it is checked key by key, all mistakes at
+once. What a driver does with its settings is in the driver.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final, Generic, TypeVar, overload
+
+from drivers.contract import DeviceError
+
+T = TypeVar("T")
+
+
+class SettingsError(DeviceError):
+    """Settings that cannot be used; `problems` holds one sentence for each mistake."""
+
+    def __init__(self, name: str, problems: Sequence[str]) -> None:
+        self.problems = tuple(problems)
+        super().__init__("\n".join(f"{name}: {problem}" for problem in problems))
+
+
+class Setting(Generic[T]):
+    """One setting of a driver class; read from an instance it is the configured value.
+
+    The type follows from the default: bool, int, float (a whole number is accepted), str, or a
+    tuple of str. `required` settings have to be given; their default only tells the type.
+    `minimum` and `maximum` are inclusive and, for a tuple, bound its length.
+
+    Example:
+        >>> class Lamp(Configured):
+        ...     brightness = Setting(50, minimum=0, maximum=100, says="brightness in percent")
+        >>> Lamp("nose", {"brightness": 20}).brightness
+        20
+        >>> Lamp.problems({"brightness": 300})
+        ['brightness is 300; at most 100 (brightness in percent)']
+    """
+
+    def __init__(
+        self,
+        default: T,
+        *,
+        choices: tuple[T, ...] = (),
+        minimum: float | None = None,
+        maximum: float | None = None,
+        required: bool = False,
+        says: str,
+    ) -> None:
+        self.default: Final = default
+        self.choices: Final = choices
+        self.minimum: Final = minimum
+        self.maximum: Final = maximum
+        self.required: Final = required
+        self.says: Final = says
+        self.name = ""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    @overload
+    def __get__(self, instance: None, owner: type) -> Setting[T]: ...
+
+    @overload
+    def __get__(self, instance: Configured, owner: type) -> T: ...
+
+    def __get__(self, instance: Configured | None, owner: type) -> Setting[T] | T:
+        if instance is None:
+            return self
+        value: T = instance.configured[self.name]
+        return value
+
+    @property
+    def type_name(self) -> str:
+        """The type in words, for documentation and error sentences."""
+        return _TYPES[type(self.default)][0]
+
+    def convert(self, value: object) -> T:
+        """The value as this setting's type.
+
+        Raises:
+            ValueError: with what would be right.
+        """
+        words, convert = _TYPES[type(self.default)]
+        try:
+            converted: T = convert(value)
+        except TypeError as error:
+            raise ValueError(f"{words} is needed") from error
+        if self.choices and converted not in self.choices:
+            raise ValueError("one of " + ", ".join(repr(choice) for choice in self.choices))
+        if isinstance(converted, tuple):
+            size, unit = float(len(converted)), " names"
+        elif isinstance(converted, int | float) and not isinstance(converted, bool):
+            size, unit = float(converted), ""
+        else:
+            if self.required and converted == "":
+                raise ValueError("a text that is not empty")
+            return converted
+        if self.minimum is not None and size < self.minimum:
+            raise ValueError(f"at least {self.minimum:g}{unit}")
+        if self.maximum is not None and size > self.maximum:
+            raise ValueError(f"at most {self.maximum:g}{unit}")
+        return converted
+
+
+class Configured:
+    """Base of every driver: a name, and the settings its class declares.
+
+    Raises:
+        SettingsError: on creation, with one sentence per mistake.
+    """
+
+    def __init__(self, name: str, settings: Mapping[str, object]) -> None:
+        problems = self.problems(settings)
+        if problems:
+            raise SettingsError(name, problems)
+        self._name = name
+        self.configured: Mapping[str, Any] = self._values(settings)
+
+    @property
+    def name(self) -> str:
+        return self._name
+
+    @classmethod
+    def settings(cls) -> tuple[Setting[Any], ...]:
+        """The declared settings, those of the base classes first."""
+        found: dict[str, Setting[Any]] = {}
+        for owner in reversed(cls.__mro__):
+            found.update({k: v for k, v in vars(owner).items() if isinstance(v, Setting)})
+        return tuple(found.values())
+
+    @classmethod
+    def problems(cls, settings: Mapping[str, object]) -> list[str]:
+        """What is wrong with a configuration section; empty where nothing is.
+
+        Each sentence has the key, the value found, and what would be right.
+        """
+        declared = {setting.name: setting for setting in cls.settings()}
+        problems = []
+        for key, value in settings.items():
+            if key not in declared:
+                problems.append(f"{key} is {value!r}; {_unknown(key, tuple(declared))}")
+                continue
+            setting = declared[key]
+            try:
+                setting.convert(value)
+            except ValueError as error:
+                problems.append(f"{key} is {value!r}; {error} ({setting.says})")
+        problems.extend(
+            f"{setting.name} is missing; {setting.type_name} is needed ({setting.says})"
+            for setting in declared.values()
+            if setting.required and setting.name not in settings
+        )
+        if not problems:
+            problems.extend(cls.contradictions(cls._values(settings)))
+        return problems
+
+    @classmethod
+    def contradictions(cls, values: Mapping[str, Any]) -> list[str]:
+        """Mistakes that lie between settings, each right by itself; for a driver to override."""
+        return []
+
+    @classmethod
+    def _values(cls, settings: Mapping[str, object]) -> dict[str, Any]:
+        return {
+            setting.name: setting.convert(settings[setting.name])
+            if setting.name in settings
+            else setting.default
+            for setting in cls.settings()
+        }
+
+
+def _unknown(key: str, known: Sequence[str]) -> str:
+    close = difflib.get_close_matches(key, known, n=1)
+    if close:
+        return f"there is no such setting, {close[0]} is meant?"
+    return "there is no such setting; there are " + ", ".join(known)
+
+
+def _bool(value: object) -> bool:
+    if not isinstance(value, bool):
+        raise TypeError
+    return value
+
+
+def _int(value: object) -> int:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise TypeError
+    return value
+
+
+def _float(value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise TypeError
+    return float(value)
+
+
+def _str(value: object) -> str:
+    if not isinstance(value, str):
+        raise TypeError
+    return value
+
+
+def _names(value: object) -> tuple[str, ...]:
+    if not isinstance(value, list | tuple):
+        raise TypeError
+    if not all(isinstance(item, str) and item for item in value):
+        raise TypeError
+    return tuple(value)
+
+
+_TYPES: Final[Mapping[type, tuple[str, Callable[[object], Any]]]] = {
+    bool: ("true or false", _bool),
+    int: ("a whole number", _int),
+    float: ("a finite number", _float),
+    str: ("a text", _str),
+    tuple: ("a list of names", _names),
+}

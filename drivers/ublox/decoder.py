@@ -1,0 +1,275 @@
+"""UBX messages into records: bytes in, NavSample and EventMark out, no I/O and no clock.
+
+Framing is in `drivers.ublox.framing`, the arithmetic of time in `drivers.ublox.gps_time`; parsing
+of a single message is pyubx2's.
+
+Source: u-blox M8 receiver description UBX-13003221, sections 32.17 (NAV), 32.19 (TIM), HNR.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+from pyubx2 import UBXMessageError, UBXParseError, UBXReader, UBXStreamError, UBXTypeError
+
+from drivers.contract import EventMark, NavSample
+from drivers.ublox.framing import UbxFramer
+from drivers.ublox.gps_time import (
+    SECOND_NS,
+    WEEK_NS,
+    UtcFields,
+    gps_from_utc,
+    gps_near,
+    utc_ns,
+)
+
+LENGTHS: Final = {
+    (0x01, 0x05): 32,  # NAV-ATT
+    (0x01, 0x07): 92,  # NAV-PVT, protocol 15 and later
+    (0x01, 0x20): 16,  # NAV-TIMEGPS
+    (0x01, 0x26): 24,  # NAV-TIMELS
+    (0x01, 0x61): 4,  # NAV-EOE
+    (0x0D, 0x03): 28,  # TIM-TM2
+    (0x28, 0x01): 32,  # HNR-ATT
+}
+FIXES: Final = {0: "none", 1: "dead-reckoning", 2: "2d", 3: "3d", 4: "3d", 5: "time"}
+TIME_BASE_RECEIVER: Final = 0
+TIME_BASE_UTC: Final = 2
+LEAP_SOURCES_UNKNOWN: Final = (0, 255)
+"""Of NAV-TIMELS: 0 is the firmware's default, 255 unknown."""
+FAR_NS: Final = 3600 * SECOND_NS
+"""A mark further from the last navigation epoch has a wrong week or a restarted clock."""
+RECENT_NS: Final = 10 * SECOND_NS
+ATTITUDES_KEPT: Final = 64
+
+Nav = NavSample | EventMark
+
+
+class UbxDecoder:
+    """Decodes what a u-blox receiver sends.
+
+    NAV-PVT becomes a NavSample; NAV-ATT or HNR-ATT of the same iTOW gives its attitude. TIM-TM2
+    with its new-rising-edge flag becomes an EventMark. NAV-TIMEGPS and NAV-TIMELS give week and
+    leap seconds. Everything else is framed and left alone. Nothing that is fed raises.
+    """
+
+    def __init__(self, receiver: str) -> None:
+        self.receiver = receiver
+        self.counters: Counter[str] = Counter(
+            bad_messages=0, samples=0, marks=0, marks_without_rising_edge=0, marks_far=0
+        )
+        self.seen: Counter[str] = Counter()
+        """Messages understood, by identity."""
+        self._framer = UbxFramer(LENGTHS)
+        self._leap: int | None = None
+        self._leap_is_default = False
+        self._gps_ns: int | None = None
+        self._timegps_ns: int | None = None
+        self._attitudes: deque[tuple[int, tuple[float, float, float]]] = deque(
+            maxlen=ATTITUDES_KEPT
+        )
+        self._attitude_follows = False
+        self._without_attitude: int | None = None
+        self._held: tuple[Any, int] | None = None
+        self._handlers: Mapping[str, Callable[[Any, int], list[Nav]]] = {
+            "NAV-PVT": self._on_pvt,
+            "NAV-ATT": self._on_attitude,
+            "HNR-ATT": self._on_attitude,
+            "NAV-TIMEGPS": self._on_timegps,
+            "NAV-TIMELS": self._on_timels,
+            "NAV-EOE": self._on_end_of_epoch,
+            "TIM-TM2": self._on_mark,
+        }
+
+    @property
+    def leap_seconds(self) -> int | None:
+        """GPS - UTC as received from a satellite; None before that, whatever the firmware says."""
+        return self._leap
+
+    @property
+    def frames(self) -> int:
+        """Valid UBX frames so far, of any kind."""
+        return self._framer.frames
+
+    @property
+    def bad_messages(self) -> int:
+        """Frames whose checksum, length or content was wrong."""
+        return self._framer.bad_frames + self.counters["bad_messages"]
+
+    @property
+    def bad_bytes(self) -> int:
+        """Bytes that belong to no message and are no text."""
+        return self._framer.bad_bytes
+
+    @property
+    def other_bytes(self) -> int:
+        """Bytes of text: NMEA and the like."""
+        return self._framer.other_bytes
+
+    def reset(self) -> None:
+        """The line was opened anew: forget what was half received."""
+        self._framer.reset()
+        self._held = None
+        self._attitudes.clear()
+
+    def feed(self, data: bytes, mono_ns: int) -> list[Nav]:
+        """Records that became whole with these bytes, stamped with their arrival."""
+        records: list[Nav] = []
+        for frame in self._framer.feed(data):
+            if (frame[2], frame[3]) not in LENGTHS:
+                continue
+            try:
+                message = UBXReader.parse(frame)
+                identity = str(message.identity)
+                made = self._handlers[identity](message, mono_ns)
+            except (
+                UBXMessageError,
+                UBXParseError,
+                UBXStreamError,
+                UBXTypeError,
+                AttributeError,
+                ValueError,
+                KeyError,
+            ):
+                self.counters["bad_messages"] += 1
+                continue
+            self.seen[identity] += 1
+            records.extend(made)
+        return records
+
+    # Navigation
+
+    def _on_pvt(self, message: Any, mono_ns: int) -> list[Nav]:
+        released = self._release()
+        if self._attitude_follows and self._attitude_at(message.iTOW) is None:
+            self._held = (message, mono_ns)
+            return released
+        return [*released, self._sample(message, mono_ns)]
+
+    def _on_attitude(self, message: Any, _mono_ns: int) -> list[Nav]:
+        itow = int(message.iTOW)
+        degrees = (message.roll, message.pitch, message.heading)
+        roll, pitch, heading = (math.radians(angle) for angle in degrees)
+        self._attitudes.append((itow, (roll, pitch, heading)))
+        # A receiver whose attitude comes after the position of the same epoch is waited for from
+        # now on; one that sends it before, or none, costs no delay.
+        if itow == self._without_attitude:
+            self._attitude_follows = True
+        if self._held is not None and self._held[0].iTOW == itow:
+            return self._release()
+        return []
+
+    def _on_end_of_epoch(self, message: Any, _mono_ns: int) -> list[Nav]:
+        if self._held is not None and self._held[0].iTOW == message.iTOW:
+            return self._release()
+        return []
+
+    def _release(self) -> list[Nav]:
+        if self._held is None:
+            return []
+        (message, mono_ns), self._held = self._held, None
+        return [self._sample(message, mono_ns)]
+
+    def _attitude_at(self, itow: int) -> tuple[float, float, float] | None:
+        return next((angles for at, angles in self._attitudes if at == itow), None)
+
+    def _sample(self, message: Any, mono_ns: int) -> NavSample:
+        gps_ns, time_valid = self._gps_of(message)
+        attitude = self._attitude_at(message.iTOW)
+        self._without_attitude = message.iTOW if attitude is None else None
+        roll, pitch, heading = attitude or (None, None, None)
+        usable = bool(message.gnssFixOk) and not message.invalidLlh
+        self.counters["samples"] += 1
+        return NavSample(
+            receiver=self.receiver,
+            gps_ns=gps_ns,
+            mono_ns=mono_ns,
+            fix=FIXES.get(message.fixType, "none") if usable else "none",
+            satellites=int(message.numSV),
+            latitude_deg=float(message.lat),
+            longitude_deg=float(message.lon),
+            height_m=message.height * 1e-3,
+            horizontal_sigma_m=message.hAcc * 1e-3,
+            vertical_sigma_m=message.vAcc * 1e-3,
+            velocity_ned_mps=(message.velN * 1e-3, message.velE * 1e-3, message.velD * 1e-3),
+            speed_sigma_mps=message.sAcc * 1e-3,
+            roll_rad=roll,
+            pitch_rad=pitch,
+            heading_rad=heading,
+            leap_seconds=self._leap,
+            time_valid=time_valid,
+        )
+
+    def _gps_of(self, message: Any) -> tuple[int, bool]:
+        """GPS time of a NAV-PVT, and whether it can be trusted."""
+        fields = UtcFields(
+            year=message.year,
+            month=message.month,
+            day=message.day,
+            hour=message.hour,
+            minute=message.min,
+            second=message.second,
+            nano=message.nano,
+        )
+        utc = utc_ns(fields)
+        both = None if utc is None else gps_from_utc(utc, message.iTOW)
+        if both is not None and message.validDate and message.validTime and message.fullyResolved:
+            gps_ns, leap = both
+            if not self._leap_is_default:
+                self._leap = leap
+            self._gps_ns = gps_ns
+            return gps_ns, True
+        if self._timegps_ns is not None:
+            # UTC is not resolved yet, but NAV-TIMEGPS has just said week and time of week.
+            gps_ns = gps_near(message.iTOW, self._timegps_ns)
+            return gps_ns, abs(gps_ns - self._timegps_ns) < RECENT_NS
+        return (both[0] if both else message.iTOW * 1_000_000), False
+
+    # Time
+
+    def _on_timegps(self, message: Any, _mono_ns: int) -> list[Nav]:
+        if message.towValid and message.weekValid:
+            gps_ns = message.week * WEEK_NS + message.iTOW * 1_000_000 + message.fTOW
+            self._gps_ns = self._timegps_ns = gps_ns
+        else:
+            self._timegps_ns = None
+        if message.leapSValid and not self._leap_is_default:
+            self._leap = int(message.leapS)
+        return []
+
+    def _on_timels(self, message: Any, _mono_ns: int) -> list[Nav]:
+        self._leap_is_default = message.srcOfCurrLs in LEAP_SOURCES_UNKNOWN
+        known = message.validCurrLs and not self._leap_is_default
+        self._leap = int(message.currLs) if known else None
+        return []
+
+    # Marks
+
+    def _on_mark(self, message: Any, mono_ns: int) -> list[Nav]:
+        if not message.newRisingEdge:
+            self.counters["marks_without_rising_edge"] += 1
+            return []
+        gps_ns = message.wnR * WEEK_NS + message.towMsR * 1_000_000 + message.towSubMsR
+        valid = bool(message.time) and message.timeBase != TIME_BASE_RECEIVER
+        if message.timeBase == TIME_BASE_UTC:
+            valid = valid and self._leap is not None
+            gps_ns += (self._leap or 0) * SECOND_NS
+        if valid and self._gps_ns is not None and abs(gps_ns - self._gps_ns) > FAR_NS:
+            self.counters["marks_far"] += 1
+            valid = False
+        self.counters["marks"] += 1
+        return [
+            EventMark(
+                receiver=self.receiver,
+                channel=int(message.ch),
+                gps_ns=gps_ns,
+                accuracy_ns=int(message.accEst),
+                count=int(message.count),
+                count_bits=16,
+                time_valid=valid,
+                mono_ns=mono_ns,
+            )
+        ]
