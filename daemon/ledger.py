@@ -8,12 +8,14 @@ it; `imbalances` compares them. What an exposure may become is in `daemon.transi
     received (marks)      = the same
 
 *Pending* is what arrived and is not attributed yet; at the end of a flight it is zero and the
-equation is the design's. Triggers settled without naming a head as missing are its used frames,
-give or take the exposures still open.
+equation is the design's. The third check binds frames to triggers: exposures that are complete or
+degraded and do not name a head as missing are that head's used frames, give or take the exposures
+that are open or lost.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
@@ -28,7 +30,7 @@ PENDING = "pending"
 MARK = "mark"
 """The name under which a missing event mark stands among the causes of an exposure."""
 
-Causes = Iterable[tuple[str, str]]
+Causes = Mapping[str, str] | Iterable[tuple[str, str]]
 
 _SETTLING = {
     State.COMPLETE: Step.SETTLE_COMPLETE,
@@ -75,15 +77,30 @@ class LedgerSheet:
     def is_balanced(self) -> bool:
         return not self.imbalances
 
-    def to_json(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, Any]:
         """The sheet as an object of JSON types."""
-        return {**asdict(self), "balanced": self.is_balanced}
+        return {
+            "triggers": {
+                "triggers": self.triggers,
+                "open": self.open,
+                "complete": self.complete,
+                "degraded": self.degraded,
+                "lost": self.lost,
+                "stored": self.stored,
+                "sealed": self.sealed,
+            },
+            "heads": [asdict(head) for head in self.heads],
+            "frames": asdict(self.frames),
+            "marks": asdict(self.marks),
+            "imbalances": list(self.imbalances),
+            "balanced": self.is_balanced,
+        }
 
 
 @dataclass
 class _Entry:
     standing: Standing = field(default_factory=Standing)
-    causes: dict[str, str] = field(default_factory=dict)
+    missing: frozenset[str] = frozenset()
 
 
 class _Account:
@@ -94,7 +111,6 @@ class _Account:
         self.received = 0
         self.pending = 0
         self.became = dict.fromkeys(CAUSES, 0)
-        self.missing = 0
 
     def enter(self, cause: str) -> None:
         if cause == PENDING:
@@ -110,57 +126,59 @@ class _Account:
             self.received += 1
             self.became[cause] += 1
 
-    def receipts(self) -> Receipts:
+    def receipts(self, missing: int) -> Receipts:
         return Receipts(
             self.name,
             received=self.received,
             **self.became,
             pending=self.pending,
-            missing=self.missing,
+            missing=missing,
         )
 
 
 class Ledger:
-    """Counts for one mission. `heads` are named by the sensor they carry."""
+    """Counts for one mission.
 
-    def __init__(self, heads: Sequence[str]) -> None:
+    Heads are named by the sensor they carry; the sheet lists those given here first, others as
+    they turn up.
+    """
+
+    def __init__(self, heads: Sequence[str] = ()) -> None:
         self._entries: dict[int, _Entry] = {}
         self._heads = {head: _Account(head) for head in heads}
         self._marks = _Account("marks")
         self._triggers = 0
         self._in_state = dict.fromkeys(State, 0)
         self._in_storage = dict.fromkeys(Storage, 0)
-        self._settled_with = dict.fromkeys(heads, 0)
+        self._missing: Counter[str] = Counter()
 
     @classmethod
     def resume(
         cls,
-        heads: Sequence[str],
         exposures: Iterable[Exposure],
+        *,
+        heads: Sequence[str] = (),
         sheet: Mapping[str, Any] | None = None,
     ) -> Ledger:
         """Continue a flight from its sealed records.
 
         Frames and marks that became no part of an exposure are in no record: they come from the
-        last sheet that was logged, where one is given (its JSON form; what cannot be read in it
+        last sheet that was kept, where one is given (its JSON form; what cannot be read in it
         counts as zero). What was pending when the service ended was never durable and is not
         carried on.
         """
         ledger = cls(heads)
         for exposure in exposures:
             ledger.trigger(exposure.number)
-            causes = dict(exposure.missing)
             for frame in exposure.frames:
                 ledger.frame(frame.sensor, "used")
-            for head in heads:
-                if exposure.frame(head) is None:
-                    causes.setdefault(head, "not in the record")
             if exposure.mark_source == "event-mark":
                 ledger.mark("used")
-            state = exposure.state
-            if state == "complete" and causes:
-                state = "degraded"
-            ledger.settle(exposure.number, state, causes.items())
+            causes = dict(exposure.missing)
+            if exposure.state != "complete" and not causes:
+                causes = {"exposure": f"recorded as {exposure.state}"}
+            state = "degraded" if exposure.state == "complete" and causes else exposure.state
+            ledger.settle(exposure.number, state, causes)
             if state != "lost":
                 ledger.stored(exposure.number)
             ledger.sealed(exposure.number)
@@ -195,9 +213,13 @@ class Ledger:
             number: the exposure.
             state: "complete", "degraded" or "lost".
             causes: what it lacks and why: heads whose frame is not part of it, "mark", or what
-                else went wrong. None for a complete one, at least one for the others.
+                else went wrong. None for a complete one, at least one for the others. A head that
+                sent a duplicate beside its good frame lacks nothing and is not named.
         """
-        wanted = State(state)
+        try:
+            wanted = State(state)
+        except ValueError:
+            wanted = State.OPEN
         named = dict(causes)
         if wanted not in _SETTLING:
             raise LedgerError(f"exposure {number}: settled means complete, degraded or lost")
@@ -206,12 +228,10 @@ class Ledger:
         if wanted is not State.COMPLETE and not named:
             raise LedgerError(f"exposure {number}: is {wanted.value}; say what it lacks and why")
         entry = self._entry(number)
-        was_settled = entry.standing.state is not State.OPEN
         self._step(number, _SETTLING[wanted])
-        if was_settled:
-            self._count_heads(entry.causes, -1)
-        entry.causes = named
-        self._count_heads(named, 1)
+        self._missing.subtract(entry.missing)
+        entry.missing = frozenset() if wanted is State.LOST else frozenset(named)
+        self._missing.update(entry.missing)
 
     def stored(self, number: int) -> None:
         """Its pixels are durable."""
@@ -242,17 +262,18 @@ class Ledger:
             delivered: by head, frames its driver says it delivered; compared where given.
         """
         found = self._trigger_imbalances()
-        open_ = self._in_state[State.OPEN]
         for account in (*self._heads.values(), self._marks):
             total = account.pending + sum(account.became.values())
             if account.received != total:
                 found.append(f"{account.name}: {account.received} received, {total} accounted for")
+        whole = self._in_state[State.COMPLETE] + self._in_state[State.DEGRADED]
+        undecided = self._in_state[State.OPEN] + self._in_state[State.LOST]
         for head, account in self._heads.items():
-            settled, used = self._settled_with[head], account.became["used"]
-            if not settled <= used <= settled + open_:
+            with_it, used = whole - self._missing[head], account.became["used"]
+            if not with_it <= used <= with_it + undecided:
                 found.append(
-                    f"{head}: {used} frames used, but {settled} settled exposures have one "
-                    f"and {open_} are open"
+                    f"{head}: {used} frames used, but {with_it} exposures have one "
+                    f"and {undecided} are open or lost"
                 )
         used = self._marks.became["used"]
         if used > self._triggers:
@@ -265,7 +286,7 @@ class Ledger:
 
     def sheet(self) -> LedgerSheet:
         """The balance sheet as of now."""
-        heads = tuple(account.receipts() for account in self._heads.values())
+        heads = tuple(a.receipts(self._missing[head]) for head, a in self._heads.items())
         sums = {
             item.name: sum(getattr(receipts, item.name) for receipts in heads)
             for item in fields(Receipts)
@@ -281,7 +302,7 @@ class Ledger:
             sealed=self._in_storage[Storage.SEALED],
             heads=heads,
             frames=Receipts("frames", **sums),
-            marks=self._marks.receipts(),
+            marks=self._marks.receipts(self._missing[MARK]),
             imbalances=tuple(self.imbalances()),
         )
 
@@ -313,24 +334,15 @@ class Ledger:
         self._in_storage[before.storage] -= 1
         self._in_storage[entry.standing.storage] += 1
 
-    def _count_heads(self, causes: Mapping[str, str], sign: int) -> None:
-        for head in self._heads:
-            if head in causes:
-                self._heads[head].missing += sign
-            else:
-                self._settled_with[head] += sign
-        if MARK in causes:
-            self._marks.missing += sign
-
     def _carry_on(self, sheet: Mapping[str, Any]) -> None:
         lines = sheet.get("heads")
         by_name = {
-            line.get("name"): line
+            line["name"]: line
             for line in (lines if isinstance(lines, list | tuple) else [])
-            if isinstance(line, Mapping)
+            if isinstance(line, Mapping) and isinstance(line.get("name"), str)
         }
         marks = sheet.get("marks")
-        accounts = [(account, by_name.get(head)) for head, account in self._heads.items()]
+        accounts = [(self._account(head), line) for head, line in by_name.items()]
         for account, line in [*accounts, (self._marks, marks)]:
             for cause in CAUSES[1:]:
                 count = line.get(cause) if isinstance(line, Mapping) else None
@@ -339,10 +351,7 @@ class Ledger:
                     account.became[cause] += count
 
     def _account(self, head: str) -> _Account:
-        account = self._heads.get(head)
-        if account is None:
-            raise LedgerError(f"no head {head!r} in the ledger; it has {', '.join(self._heads)}")
-        return account
+        return self._heads.setdefault(head, _Account(head))
 
     def _entry(self, number: int) -> _Entry:
         entry = self._entries.get(number)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from daemon.records import EXACT_INTEGER_LIMIT, Fields, RecordError, canonical_bytes, parse_record
@@ -36,10 +36,16 @@ class Message:
 
 @dataclass(frozen=True)
 class LoggedTrigger:
-    """A pulse that was given, and the exposure it was given for."""
+    """A pulse that was given, and the exposure it was given for.
+
+    `delays_ns` by cone lead from the pulse to the start of exposure, `strobe_delay_ns` to the
+    strobe that the receiver stamps.
+    """
 
     number: int
     pulse: TriggerPulse
+    delays_ns: Mapping[str, int] = field(default_factory=dict)
+    strobe_delay_ns: int = 0
 
 
 LoggedRecord = Frame | EventMark | NavSample | TemperatureSample | DeviceEvent | LoggedTrigger
@@ -114,6 +120,8 @@ def _trigger_json(record: LoggedTrigger) -> dict[str, Any]:
         "mono_ns": str(record.pulse.mono_ns),
         "sigma_ns": record.pulse.sigma_ns,
         "count": record.pulse.count,
+        "delays_ns": dict(record.delays_ns),
+        "strobe_delay_ns": record.strobe_delay_ns,
     }
 
 
@@ -177,7 +185,11 @@ def _trigger(fields: Fields) -> LoggedTrigger:
         sigma_ns=fields.integer("sigma_ns"),
         count=fields.integer("count"),
     )
-    return LoggedTrigger(fields.integer("number", minimum=1), pulse)
+    delays_ns = {
+        cone: value for cone, value in fields.scalars("delays_ns").items() if isinstance(value, int)
+    }
+    strobe_ns = fields.integer("strobe_delay_ns", 0)
+    return LoggedTrigger(fields.integer("number", minimum=1), pulse, delays_ns, strobe_ns)
 
 
 def _frame(fields: Fields) -> Frame:

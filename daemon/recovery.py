@@ -39,8 +39,9 @@ Complete = Callable[[Capture, Sequence[LoggedRecord]], Exposure]
 class RecoveryReport:
     """What recovery found and did. `problems` are what it could not put right.
 
-    `exposures` are all sealed records by number, for the ledger; `next_number` is the one to go on
-    with, beyond every trigger that was ever given.
+    `sealed` and `lost` are the numbers it sealed just now; `settled` are all sealed records by
+    number, for the ledger; `next_number` is the one to go on with, beyond every trigger that was
+    ever given.
     """
 
     done: tuple[str, ...]
@@ -48,8 +49,13 @@ class RecoveryReport:
     sealed: tuple[int, ...]
     lost: tuple[int, ...]
     next_number: int
-    exposures: tuple[Exposure, ...]
+    settled: tuple[Exposure, ...]
     log_bytes_cut: int
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """All there is to tell the crew, what went wrong first."""
+        return (*self.problems, *self.done)
 
 
 def recover(mission: Mission, complete: Complete, *, software: str = "") -> RecoveryReport:
@@ -108,7 +114,7 @@ class _Recovery:
             sealed=tuple(newly),
             lost=tuple(lost),
             next_number=next_number,
-            exposures=tuple(sealed[number].exposure for number in sorted(sealed)),
+            settled=tuple(sealed[number].exposure for number in sorted(sealed)),
             log_bytes_cut=log.cut_nbytes,
         )
 

@@ -1,0 +1,49 @@
+"""The command `syntopic`: one file a subcommand, each a thin skin over the daemon.
+
+Figures are printed as tables for people and, with --json, as one object for programs. Heavy parts
+are imported inside the commands that need them, so that the service stays light.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import NoReturn
+
+import typer
+from rich.console import Console
+
+from daemon.cli import check, demo, kernels, process, rigs, run, sim, verify
+from daemon.configuration import ConfigurationError
+from processing.rig import RigError
+
+app = typer.Typer(
+    name="syntopic",
+    help="Onboard software of an aerial camera made of several heads.",
+    epilog="Begin with: syntopic demo",
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.command(name="demo", help=demo.HELP)(demo.demo)
+app.command(name="run", help=run.HELP)(run.run)
+app.command(name="check", help=check.HELP)(check.check)
+app.command(name="process", help=process.HELP)(process.process)
+app.command(name="verify", help=verify.HELP)(verify.verify)
+app.command(name="sim", help=sim.HELP)(sim.sim)
+app.command(name="kernels", help=kernels.HELP)(kernels.kernels)
+app.add_typer(rigs.app, name="rigs")
+
+
+def main() -> NoReturn:
+    """Entry point: mistakes of the user end in sentences, not in a traceback."""
+    try:
+        app()
+    except (ConfigurationError, RigError) as error:
+        console = Console(stderr=True, soft_wrap=True)
+        count = len(error.problems)
+        console.print(f"[bold red]Refused[/]: {count} mistake{'s' if count > 1 else ''}")
+        for problem in error.problems:
+            console.print(f"  {problem}", markup=False, highlight=False)
+        sys.exit(2)
+    sys.exit(0)

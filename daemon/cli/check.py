@@ -1,0 +1,114 @@
+"""`syntopic check`: is everything in place for a flight, and if not, what helps?"""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.tree import Tree
+
+HELP = """Validate a configuration, open every device, and print what is well and what is not.
+
+The exit status is 0 when all is well, 1 when a device is not, 2 when the configuration is refused.
+
+Example: `syntopic check flights/sim/service.toml`
+"""
+BIND_TIMEOUT_S = 25.0
+
+
+def check(
+    config: Annotated[Path, typer.Argument(help="Service configuration (TOML).")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    from daemon.configuration import load
+
+    configuration, rig = load(config)
+    console = Console(stderr=as_json)
+    with console.status("opening devices"):
+        findings = _open_all(configuration, rig)
+    well = all(finding["ok"] for finding in findings)
+    if as_json:
+        typer.echo(json.dumps({"rig": rig.name, "ok": well, "devices": findings}))
+    else:
+        _print_tree(console, config, rig.name, findings)
+        if well:
+            console.print(f"All well. Next: [bold]syntopic run {config}[/]")
+        else:
+            console.print("[bold red]Not ready[/]; see the cures above.")
+    raise typer.Exit(0 if well else 1)
+
+
+def _open_all(configuration: Any, rig: Any) -> list[dict[str, Any]]:
+    """Bind every device at once, each in its own thread and each with a time-out."""
+    from daemon.capture import open_device
+    from daemon.devices import device_specs, frame_nbytes
+    from daemon.memory import FrameRing
+
+    findings: list[dict[str, Any]] = []
+    threads: list[tuple[threading.Thread, dict[str, Any]]] = []
+    heads: dict[str, Any] = {}
+    for spec in device_specs(configuration):
+        finding = {"kind": spec.kind, "name": spec.name, "driver": spec.driver, "ok": False}
+        memory = None
+        if spec.kind == "head":
+            memory = FrameRing.create(spec.name, 2, frame_nbytes(rig, spec.name))
+        device = open_device(spec, memory=memory, heads=heads)
+        if spec.kind == "head":
+            heads[spec.name] = device
+            finding["calibrated_serial"] = rig.sensor(spec.name).serial
+        findings.append(finding)
+        thread = threading.Thread(target=_bind, args=(device, finding), daemon=True)
+        threads.append((thread, finding))
+        thread.start()
+    deadline = time.monotonic() + BIND_TIMEOUT_S
+    for thread, finding in threads:
+        thread.join(max(0.0, deadline - time.monotonic()))
+        if thread.is_alive():
+            finding["problem"] = (
+                f"no answer within {BIND_TIMEOUT_S:g} s while opening it; check cable and power"
+            )
+    return findings
+
+
+def _bind(device: Any, finding: dict[str, Any]) -> None:
+    from drivers.contract import DeviceError
+
+    try:
+        finding["found"] = dict(device.bind())
+    except DeviceError as error:
+        finding["problem"] = str(error)
+        return
+    finally:
+        device.close()
+    calibrated = finding.get("calibrated_serial", "")
+    serial = finding["found"].get("serial", "")
+    if calibrated and serial and calibrated != serial:
+        finding["problem"] = (
+            f"serial number {serial}, but the calibration is of {calibrated}; connect that head "
+            f"or use this one's calibration"
+        )
+        return
+    finding["ok"] = True
+
+
+def _print_tree(
+    console: Console, config: Path, rig_name: str, findings: list[dict[str, Any]]
+) -> None:
+    tree = Tree(f"[bold]{config}[/] for {rig_name}: valid")
+    for kind in dict.fromkeys(finding["kind"] for finding in findings):
+        branch = tree.add(kind)
+        for finding in findings:
+            if finding["kind"] != kind:
+                continue
+            label = f"{finding['name']} ({finding['driver']})"
+            if finding["ok"]:
+                told = ", ".join(f"{k} {v}" for k, v in finding.get("found", {}).items())
+                branch.add(f"[green]ok[/] {label}: {told}")
+            else:
+                branch.add(f"[red]not ok[/] {label}: {finding.get('problem', 'no answer')}")
+    console.print(tree)

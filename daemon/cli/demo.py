@@ -1,0 +1,276 @@
+"""`syntopic demo`: the main job, end to end, with everything emulated.
+
+Emulator, service and judge are separate processes, as they are in life; this file starts them and
+shows what they say.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from daemon.cli.sim import Emulator, EmulatorError, service_toml, simulator_arguments
+
+HELP = """Fly the first flight: an emulated rig is captured, stitched and judged.
+
+A line of exposures is flown 12 K above the calibration temperature, with one sensor of the master
+cone displaced. The stitched images are then compared with the emulator's truth, and with what the
+older, fixed method would have given.
+
+Examples: `syntopic demo`, `syntopic demo --json`
+"""
+EVENT_TIMEOUT_S = 180.0
+
+
+class DemoError(RuntimeError):
+    """The demonstration cannot go on; the sentence says where to look."""
+
+
+def demo(
+    rig: Annotated[str, typer.Option(help="A rig.")] = "ultracam-x-mini",
+    exposures: Annotated[int, typer.Option(help="How many exposures to fly.", min=1)] = 12,
+    dc: Annotated[float, typer.Option(help="Temperature above calibration, K.")] = 12.0,
+    displace: Annotated[
+        str, typer.Option(help="The displaced sensor and its displacement in px; '' for none.")
+    ] = "SU02=1.0,-0.6",
+    seed: Annotated[int, typer.Option(help="Everything random follows from it.")] = 1,
+    out: Annotated[Path, typer.Option(help="Where flights are kept.")] = Path("flights"),
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    console = Console(stderr=as_json)
+    folder = out / f"demo-{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
+    arguments = simulator_arguments(
+        rig, folder / "sim", seed=seed, dc=dc, displace=[displace] if displace else []
+    )
+    arguments += ["--scene-cache", str(out / "scenes")]
+    console.print(f"[bold]Emulating {rig}[/] at dC = {dc:+g} K, displaced: {displace or 'none'}")
+    try:
+        emulator = Emulator(arguments)
+        try:
+            mission, ledger = _fly(console, emulator, folder, exposures)
+        finally:
+            emulator.end()
+        result = _judge(console, mission, Path(emulator.ready["truth"]), ledger)
+    except (DemoError, EmulatorError) as error:
+        console.print(f"[bold red]{error}[/]")
+        raise typer.Exit(1) from error
+    if as_json:
+        typer.echo(json.dumps(result))
+    else:
+        _print_result(console, result, ledger)
+    raise typer.Exit(0 if result["lost"] == 0 and result["ledger_balanced"] else 1)
+
+
+def _fly(
+    console: Console, emulator: Emulator, folder: Path, exposures: int
+) -> tuple[Path, Mapping[str, Any]]:
+    """Run the service until the line is flown.
+
+    Returns:
+        The mission folder, and the ledger's sheet.
+    """
+    config = folder / "service.toml"
+    config.write_text(
+        service_toml(
+            emulator.ready, root="missions", count=exposures, baselines=True, end_when_done=True
+        )
+    )
+    log = (folder / "service.log").open("w")
+    service = subprocess.Popen(
+        [sys.executable, "-m", "daemon", "run", str(config), "--json-lines"],
+        stdout=subprocess.PIPE,
+        stderr=log,
+        text=True,
+    )
+    console.print("Service: loading kernels, opening devices")
+    rows: dict[int, dict[str, Any]] = {}
+    mission: Path | None = None
+    ledger: Mapping[str, Any] | None = None
+    try:
+        with Live(_table(rows, exposures), console=console, refresh_per_second=4) as live:
+            for event in _events(service):
+                name = event["event"]
+                if name == "mission":
+                    mission = Path(event["path"])
+                elif name == "ended":
+                    ledger = event["ledger"]
+                elif name == "fault" or event.get("fault"):
+                    live.console.print(f"[yellow]{event['sentence']}[/]")
+                elif "number" in event:
+                    rows.setdefault(event["number"], {})[name] = event
+                live.update(_table(rows, exposures))
+        status = service.wait(30)
+    finally:
+        if service.poll() is None:
+            service.kill()
+        log.close()
+    if mission is None or ledger is None or status != 0:
+        raise DemoError(f"the service ended with status {status}; see {folder / 'service.log'}")
+    return mission, ledger
+
+
+def _events(service: subprocess.Popen[str]) -> Iterator[dict[str, Any]]:
+    """What the service says, line by line, until it ends."""
+    assert service.stdout is not None
+    for line in service.stdout:
+        yield json.loads(line)
+
+
+def _table(rows: Mapping[int, Mapping[str, Any]], exposures: int) -> Table:
+    table = Table(title=f"Line 1, {exposures} exposures", title_justify="left")
+    for heading in (
+        "exposure",
+        "GPS time",
+        "sigma ns",
+        "frames",
+        "dC K",
+        "tie points",
+        "sigma0 px",
+        "um",
+        "displaced",
+        "verdict",
+    ):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for number, told in sorted(rows.items()):
+        table.add_row(str(number), *_cells(told))
+    return table
+
+
+def _cells(told: Mapping[str, Any]) -> list[str]:
+    if "lost" in told:
+        return ["", "", "0", "", "", "", "", "", "[red]lost[/]"]
+    sealed = told.get("sealed")
+    if sealed is None:
+        return ["", "", "", "", "", "", "", "", "stored" if "stored" in told else "triggered"]
+    cells = [_gps_text(sealed["mark_gps_ns"]), str(sealed["mark_sigma_ns"]), str(sealed["frames"])]
+    if "processed" not in told:
+        return [*cells, "", "", "", "", "", "sealed"]
+    report = told["processed"]["report"]
+    figures = report["figures"]
+    colour = {"good": "green", "usable": "yellow", "refly": "red"}[report["verdict"]]
+    return [
+        *cells,
+        _number(figures.get("dc_k"), "+.1f"),
+        f"{figures.get('tie_points_pp', 0)} + {figures.get('tie_points_pc', 0)}",
+        _number(figures.get("sigma0_px"), ".3f"),
+        _number(figures.get("sigma0_um"), ".2f"),
+        str(figures.get("displaced_sensor") or "-"),
+        f"[{colour}]{report['verdict']}[/]",
+    ]
+
+
+def _number(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)
+
+
+def _gps_text(gps_ns: str | None) -> str:
+    """Week and second of week, the way the field writes GPS time."""
+    if gps_ns is None:
+        return "-"
+    seconds, nanoseconds = divmod(int(gps_ns), 1_000_000_000)
+    week, second = divmod(seconds, 604_800)
+    return f"{week}:{second}.{nanoseconds // 1000:06d}"
+
+
+def _judge(
+    console: Console, mission: Path, truth: Path, ledger: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Hold the products against the emulator's truth, and write the report."""
+    from daemon.report import write_report
+
+    started = time.monotonic()
+    with console.status("comparing the stitched images with the truth"):
+        judged = subprocess.run(
+            [
+                *(sys.executable, "-m", "sim_hw.judge"),
+                *("--mission", str(mission), "--truth", str(truth)),
+            ],
+            capture_output=True,
+            text=True,
+            timeout=EVENT_TIMEOUT_S,
+            check=False,
+        )
+    if judged.returncode != 0:
+        raise DemoError(f"the judge failed: {judged.stderr.strip()[-500:]}")
+    geometry = json.loads(judged.stdout)
+    reports = [
+        json.loads(path.read_text()) for path in sorted((mission / "L2").glob("*/quality.json"))
+    ]
+    named = [report["figures"].get("displaced_sensor") for report in reports]
+    free = geometry["methods"].get("free", {})
+    return {
+        "exposures": ledger["triggers"],
+        "complete": ledger["complete"],
+        "degraded": ledger["degraded"],
+        "lost": ledger["lost"],
+        "ledger_balanced": ledger["balanced"],
+        "rms_px": free.get("inner_rms_px"),
+        "max_px": free.get("inner_max_px"),
+        "rms_px_absolute": free.get("absolute_rms_px"),
+        "max_px_absolute": free.get("absolute_max_px"),
+        "rms_px_fixed": geometry["methods"].get("fixed", {}).get("inner_rms_px"),
+        "rms_px_no_tdm": geometry["methods"].get("fixed-no-tdm", {}).get("inner_rms_px"),
+        "displaced_sensor": named[0] if named and len(set(named)) == 1 else None,
+        "displaced_sensors": named,
+        "time_sigma_ns": max((_time_sigma(mission)), default=None),
+        "time_error_ns": geometry.get("time_error_ns"),
+        "verdicts": [report["verdict"] for report in reports],
+        "mission": str(mission),
+        "report": str(write_report(mission, ledger=ledger, geometry=geometry)),
+        "judged_s": round(time.monotonic() - started, 2),
+    }
+
+
+def _time_sigma(mission: Path) -> Iterator[int]:
+    for path in (mission / "L0").glob("*/exposure.json"):
+        sigma_ns = json.loads(path.read_text()).get("mark_sigma_ns")
+        if sigma_ns is not None:
+            yield sigma_ns
+
+
+def _print_result(console: Console, result: Mapping[str, Any], ledger: Mapping[str, Any]) -> None:
+    sheet = Table(title="Ledger", title_justify="left")
+    for heading in ("", "triggers", "complete", "degraded", "lost", "open"):
+        sheet.add_column(heading, justify="right")
+    sheet.add_row(
+        "exposures",
+        *(str(ledger[key]) for key in ("triggers", "complete", "degraded", "lost", "open")),
+    )
+    console.print(sheet)
+    received = Table()
+    for heading in ("", "received", "used", "late", "duplicate", "corrupt", "spurious"):
+        received.add_column(heading, justify="right")
+    for name in ("frames", "marks"):
+        received.add_row(name, *(str(ledger[name][h.header]) for h in received.columns[1:]))
+    console.print(received)
+    console.print("balanced" if result["ledger_balanced"] else "[bold red]does not balance[/]")
+    geometry = Table(title="Geometry against truth (PAN pixels)", title_justify="left")
+    for heading in ("method", "RMS", "worst"):
+        geometry.add_column(heading, justify="right")
+    geometry.add_row("free mosaic, inner", *_pair(result["rms_px"], result["max_px"]))
+    geometry.add_row(
+        "free mosaic, absolute", *_pair(result["rms_px_absolute"], result["max_px_absolute"])
+    )
+    geometry.add_row("fixed method with TDM, inner", *_pair(result["rms_px_fixed"], None))
+    geometry.add_row("fixed method without TDM, inner", *_pair(result["rms_px_no_tdm"], None))
+    console.print(geometry)
+    console.print(f"Displaced sensor found: [bold]{result['displaced_sensor'] or 'none'}[/]")
+    console.print(f"Event marks: sigma {result['time_sigma_ns']} ns")
+    console.print(f"Mission  {result['mission']}", soft_wrap=True)
+    console.print(f"Report   {result['report']}", soft_wrap=True)
+    console.print(f"Next: syntopic verify {result['mission']}", soft_wrap=True)
+
+
+def _pair(rms: float | None, worst: float | None) -> tuple[str, str]:
+    return (_number(rms, ".4f"), _number(worst, ".3f"))

@@ -1,0 +1,126 @@
+"""`syntopic process`: Level-0 to Level-2 again, after landing or from exposures of others."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+import tomllib
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from daemon.configuration import ConfigurationError, PlanSection, ProcessingSection
+from daemon.mission import Mission
+
+HELP = """Process the exposures of a mission folder again, Level-0 to Level-2.
+
+The folder may be a flight's, or written by hand as docs/formats.md tells. Level-0 stays as it is;
+products are replaced.
+
+Examples: `syntopic process MISSION`, `syntopic process MISSION --only 3 --method fixed`
+"""
+
+
+def process(
+    mission: Annotated[Path, typer.Argument(help="Mission folder.")],
+    only: Annotated[
+        list[int] | None, typer.Option(help="An exposure's number; repeatable.")
+    ] = None,
+    method: Annotated[str, typer.Option(help="free or fixed.")] = "free",
+    interpolation: Annotated[str, typer.Option(help="bilinear, cubic or lanczos.")] = "cubic",
+    radiometry: Annotated[
+        Path | None, typer.Option(help="Folder of radiometric calibrations.")
+    ] = None,
+    baselines: Annotated[
+        bool, typer.Option(help="Also solve the fixed method, with and without TDM.")
+    ] = False,
+    threads: Annotated[int, typer.Option(help="Cores to use.")] = 2,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
+    from daemon import store
+    from daemon.messages import WorkerSettings
+    from daemon.worker import make_pipeline, process_exposure
+    from processing.rig import load_rig
+
+    if method not in ("free", "fixed") or interpolation not in ("bilinear", "cubic", "lanczos"):
+        raise ConfigurationError(
+            ["--method is free or fixed, --interpolation is bilinear, cubic or lanczos"]
+        )
+    folder = Mission.open(mission)
+    rig = load_rig(folder.rig_path)
+    plan, radiometry = _as_flown(folder, radiometry)
+    settings = WorkerSettings(
+        rig=str(folder.rig_path),
+        radiometry=radiometry,
+        mission=folder.path,
+        plan=plan,
+        processing=ProcessingSection.model_validate(
+            {
+                "method": method,
+                "interpolation": interpolation,
+                "baselines": baselines,
+                "threads": threads,
+            }
+        ),
+    )
+    console = Console(stderr=True)
+    pipeline = make_pipeline(rig, settings)
+    reports = []
+    with Progress(console=console, transient=True) as progress:
+        task = progress.add_task("compiling kernels", total=None)
+        pipeline.warm_up()
+        numbers = only or folder.numbers()
+        progress.update(task, description="processing", total=len(numbers))
+        for number in numbers:
+            started = time.monotonic()
+            frames, exposure = store.load_level0(folder.level0(number), rig)
+            report = process_exposure(pipeline, rig, folder, plan, exposure, frames)
+            report["duration_s"] = round(time.monotonic() - started, 3)
+            reports.append(report)
+            progress.advance(task)
+    if as_json:
+        typer.echo(json.dumps({"mission": str(folder.path), "exposures": reports}))
+        return
+    table = Table(title=f"Level-2 of {folder.id}", title_justify="left")
+    for heading in ("exposure", "tie points", "sigma0 px", "sigma0 um", "verdict", "s"):
+        table.add_column(heading, justify="right")
+    for report in reports:
+        figures = report["figures"]
+        table.add_row(
+            str(report["exposure"]),
+            f"{figures.get('tie_points_pp', 0)} + {figures.get('tie_points_pc', 0)}",
+            f"{figures.get('sigma0_px') or 0:.3f}",
+            f"{figures.get('sigma0_um') or 0:.2f}",
+            report["verdict"],
+            f"{report['duration_s']:.1f}",
+        )
+    Console().print(table)
+    Console().print(f"Products are in [bold]{folder.level2_root}[/]")
+
+
+def _as_flown(folder: Mission, radiometry: Path | None) -> tuple[PlanSection, Path | None]:
+    """Plan and radiometry of the configuration that was flown, where the mission has one.
+
+    Only these two are read: devices that were there in the air need not be here.
+    """
+    if not folder.service_path.exists():
+        return PlanSection.model_validate({}), radiometry
+    flown = tomllib.loads(folder.service_path.read_text(encoding="utf-8"))
+    plan = PlanSection.model_validate(flown.get("plan", {}))
+    told = flown.get("mission", {}).get("radiometry")
+    if radiometry is None and told is not None:
+        radiometry = Path(told)
+        if not radiometry.is_dir():
+            raise ConfigurationError(
+                [
+                    f"{folder.service_path}: mission.radiometry is {told!r}, and that folder is "
+                    f"not here; give --radiometry FOLDER"
+                ]
+            )
+    return plan, radiometry

@@ -1,0 +1,151 @@
+"""`syntopic rigs`: which cameras are known, and what follows from their files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from processing.rig import Rig, find_rig, load_rig, shipped_rigs
+
+app = typer.Typer(
+    help="""List the rigs that come with Syntopic, or show what a rig file means.
+
+Examples: `syntopic rigs`, `syntopic rigs show ultracam-x`
+""",
+    rich_markup_mode="markdown",
+)
+
+
+@app.callback(invoke_without_command=True)
+def rigs(
+    context: typer.Context,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    if context.invoked_subcommand is not None:
+        return
+    loaded = [load_rig(path) for path in shipped_rigs().values()]
+    if as_json:
+        typer.echo(json.dumps({"rigs": [_row(rig) for rig in loaded]}))
+        return
+    table = Table(title="Rigs", title_justify="left")
+    for heading in ("name", "camera", "image", "sensors", "cones", "timing", "interval"):
+        table.add_column(heading)
+    for rig in loaded:
+        image = rig.virtual_image
+        table.add_row(
+            rig.name,
+            rig.title,
+            f"{image.width_px} x {image.height_px}" if image else "none",
+            str(len(rig.sensors)),
+            str(len(rig.cones)),
+            rig.timing,
+            f"{rig.frame_interval_s:g} s",
+        )
+    console = Console()
+    console.print(table)
+    console.print("Next: [bold]syntopic rigs show NAME[/]")
+
+
+@app.command()
+def show(
+    name: Annotated[str, typer.Argument(help="Name of a shipped rig, or a rig file.")],
+    drawing: Annotated[
+        Path | None, typer.Option(help="Where to draw the focal planes (SVG).")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Print topology, overlaps and the counts of the adjustment, and draw the focal planes."""
+    from processing import drawing as draw
+    from processing import topology
+
+    rig = find_rig(name)
+    counts = topology.counts(rig)
+    overlaps = topology.overlaps(rig)
+    pitch_mm = rig.virtual_image.pitch_mm if rig.virtual_image else rig.sensors[0].pitch_mm
+    path = drawing or Path(f"{rig.name}.svg")
+    path.write_text(draw.focal_planes_svg(rig), encoding="utf-8")
+    if as_json:
+        typer.echo(
+            json.dumps(
+                _row(rig)
+                | {
+                    "parameters": counts.parameters,
+                    "constraints": counts.constraints,
+                    "independent": counts.parameters - counts.constraints,
+                    "layers": [
+                        {
+                            "cone": layer.cone,
+                            "sensors": layer.sensors,
+                            "parameters": layer.parameters,
+                            "constraints": layer.constraints,
+                        }
+                        for layer in counts.cones
+                    ],
+                    "overlaps": [
+                        {
+                            "sensors": [overlap.sensor_a, overlap.sensor_b],
+                            "width_px": round(overlap.rectangle.width_mm / pitch_mm, 1),
+                            "height_px": round(overlap.rectangle.height_mm / pitch_mm, 1),
+                        }
+                        for overlap in overlaps
+                    ],
+                    "drawing": str(path),
+                }
+            )
+        )
+        return
+    console = Console()
+    console.print(f"[bold]{rig.name}[/]  {rig.title}; {rig.timing}")
+    cones = Table(title="Cones", title_justify="left")
+    for heading in ("cone", "bands", "f mm", "forward mm", "right mm", "sensors"):
+        cones.add_column(heading)
+    cones.add_column("parameters", justify="right")
+    cones.add_column("constraints", justify="right")
+    layers = {layer.cone: layer for layer in counts.cones}
+    for cone in rig.cones:
+        layer = layers.get(cone.name)
+        cones.add_row(
+            cone.name + (" (master)" if cone.name == rig.master_cone else ""),
+            ", ".join(cone.bands),
+            f"{cone.lens.f_mm:.3f}",
+            f"{cone.position_mm[0]:g}",
+            f"{cone.position_mm[1]:g}",
+            ", ".join(sensor.name for sensor in cone.sensors),
+            str(layer.parameters) if layer else "registered",
+            str(layer.constraints) if layer else "",
+        )
+    console.print(cones)
+    strips = Table(title=f"Overlaps ({len(overlaps)})", title_justify="left")
+    for heading in ("sensors", "width px", "height px"):
+        strips.add_column(heading)
+    for overlap in overlaps:
+        strips.add_row(
+            f"{overlap.sensor_a} - {overlap.sensor_b}",
+            f"{overlap.rectangle.width_mm / pitch_mm:.0f}",
+            f"{overlap.rectangle.height_mm / pitch_mm:.0f}",
+        )
+    console.print(strips)
+    console.print(
+        f"Adjustment: {counts.parameters} parameters, {counts.constraints} constraints, "
+        f"{counts.parameters - counts.constraints} independent unknowns"
+    )
+    console.print(f"Focal planes drawn in [bold]{path}[/]")
+
+
+def _row(rig: Rig) -> dict[str, object]:
+    image = rig.virtual_image
+    return {
+        "name": rig.name,
+        "title": rig.title,
+        "timing": rig.timing,
+        "width_px": image.width_px if image else None,
+        "height_px": image.height_px if image else None,
+        "sensors": len(rig.sensors),
+        "cones": len(rig.cones),
+        "frame_interval_s": rig.frame_interval_s,
+    }

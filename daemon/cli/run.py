@@ -1,0 +1,53 @@
+"""`syntopic run`: the onboard service."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+HELP = """Run the onboard service with a configuration, until SIGTERM or until the plan is flown.
+
+A service that was killed continues the same flight. Events are printed one a line, for people, or
+with --json-lines as one JSON object each, for programs.
+
+Examples: `syntopic run service.toml`, `syntopic run service.toml --json-lines`
+"""
+
+
+def run(
+    config: Annotated[Path, typer.Argument(help="Service configuration (TOML).")],
+    json_lines: Annotated[
+        bool, typer.Option("--json-lines", help="One JSON object an event.")
+    ] = False,
+) -> None:
+    from daemon.configuration import load
+    from daemon.service import Service
+
+    configuration, rig = load(config)
+    show = _print_json if json_lines else _print_line
+    status = asyncio.run(Service(configuration, rig, config, show).run())
+    raise typer.Exit(status)
+
+
+def _print_json(event: Mapping[str, Any]) -> None:
+    sys.stdout.write(json.dumps(event) + "\n")
+    sys.stdout.flush()
+
+
+def _print_line(event: Mapping[str, Any]) -> None:
+    """One fact a line, key=value; what is long (reports, ledgers) is in the mission folder."""
+    told = [
+        f"{key}={value}"
+        for key, value in event.items()
+        if key not in ("event", "mono_ns", "report", "ledger") and value not in (None, [], {})
+    ]
+    if "report" in event:
+        told.append(f"verdict={event['report'].get('verdict')}")
+    sys.stdout.write(f"{event['event']} {' '.join(told)}\n")
+    sys.stdout.flush()

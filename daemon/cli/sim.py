@@ -1,0 +1,202 @@
+"""`syntopic sim`: the emulated devices alone, for any program to connect to.
+
+The emulator always runs in processes of its own; this file only starts it and reads what it says.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from processing.rig import find_rig
+
+HELP = """Run the emulated devices of a rig until Ctrl-C.
+
+Prints their addresses and writes a fitting service configuration, for our daemon in another
+terminal or for any other GigE Vision, u-blox or Modbus program.
+
+Example: `syntopic sim ultracam-x-mini --out flights/sim` and then
+`syntopic run flights/sim/service.toml`
+"""
+
+
+class EmulatorError(RuntimeError):
+    """The emulator did not come up; the message is what it said last."""
+
+
+class Emulator:
+    """A running emulator process and what it said when it was ready."""
+
+    def __init__(self, arguments: Sequence[str]) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "sim_hw", *arguments],
+            stdout=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        assert self.process.stdout is not None
+        self.ready: dict[str, Any] = {}
+        for line in self.process.stdout:
+            message = json.loads(line)
+            if message.get("event") == "ready":
+                self.ready = message
+                return
+        raise EmulatorError(f"the emulator ended with status {self.process.wait(10)}; see above")
+
+    def end(self) -> None:
+        """Close all devices."""
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGTERM)
+            try:
+                self.process.wait(10)
+            except subprocess.TimeoutExpired:
+                os.killpg(self.process.pid, signal.SIGKILL)
+                self.process.wait(10)
+
+
+def sim(
+    rig: Annotated[str, typer.Argument(help="Name of a shipped rig, or a rig file.")],
+    out: Annotated[Path, typer.Option(help="Folder for calibration, truth and scene.")] = Path(
+        "flights/sim"
+    ),
+    seed: Annotated[int, typer.Option(help="Everything random follows from it.")] = 1,
+    dc: Annotated[float, typer.Option(help="Temperature above calibration, K.")] = 0.0,
+    displace: Annotated[
+        list[str] | None, typer.Option(help="Move a sensor: SU02=1.0,-0.6 (px); repeatable.")
+    ] = None,
+    packet_loss: Annotated[float, typer.Option(help="Share of image packets lost.")] = 0.0,
+    first_address: Annotated[str, typer.Option(help="Address of the first head.")] = "127.0.0.2",
+    scene: Annotated[Path | None, typer.Option(help="A GeoTIFF to fly over instead.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    arguments = simulator_arguments(
+        rig, out, seed=seed, dc=dc, displace=displace or [], packet_loss=packet_loss
+    )
+    arguments += ["--first-address", first_address]
+    arguments += ["--scene", str(scene)] if scene else []
+    console = Console(stderr=True)
+    try:
+        emulator = Emulator(arguments)
+    except EmulatorError as error:
+        console.print(f"[red]{error}[/]")
+        raise typer.Exit(1) from error
+    path = out / "service.toml"
+    path.write_text(service_toml(emulator.ready, root="missions"))
+    if as_json:
+        typer.echo(json.dumps(emulator.ready | {"configuration": str(path)}))
+    else:
+        _print_addresses(emulator.ready, path)
+    try:
+        emulator.process.wait()
+    except KeyboardInterrupt:
+        emulator.end()
+
+
+def simulator_arguments(
+    rig: str,
+    out: Path,
+    *,
+    seed: int,
+    dc: float,
+    displace: Sequence[str],
+    packet_loss: float = 0.0,
+) -> list[str]:
+    """The emulator's command line."""
+    out.mkdir(parents=True, exist_ok=True)
+    arguments = [rig, "--out", str(out), "--seed", str(seed), "--dc", str(dc)]
+    for item in displace:
+        arguments += ["--displace", item]
+    return [*arguments, "--packet-loss", str(packet_loss)] if packet_loss else arguments
+
+
+def service_toml(
+    ready: Mapping[str, Any],
+    *,
+    root: str,
+    count: int | None = None,
+    baselines: bool = False,
+    end_when_done: bool = False,
+) -> str:
+    """A service configuration that fits the emulated devices."""
+    plan = ready["plan"]
+    rig = find_rig(ready["rig_file"])
+    probes = ready["probes"]
+    lines = [
+        "# Written by `syntopic sim` for the devices it emulates.",
+        "[mission]",
+        f"root = {_quoted(root)}",
+        f"rig = {_quoted(str(Path(ready['rig_file']).resolve()))}",
+        f"radiometry = {_quoted(str(Path(ready['calibration']).resolve() / 'radiometry'))}",
+        "simulated = true",
+        f"end_when_done = {str(end_when_done).lower()}",
+        "",
+        "[plan]",
+        'line = "1"',
+        f"ground_height_m = {plan['ground_height_m']}",
+        f"height_above_ground_m = {plan['height_above_ground_m']}",
+        f"ground_speed_mps = {plan['ground_speed_mps']}",
+        "",
+        "[trigger]",
+        'driver = "pulse-bus"',
+        f"address = {_quoted(ready['pulse_bus'])}",
+        'mode = "distance"',
+        f"distance_m = {plan['distance_m']}",
+        *([f"count = {count}"] if count else []),
+        "",
+        "[processing]",
+        f"baselines = {str(baselines).lower()}",
+        "",
+        "[[thermometer]]",
+        'name = "probes"',
+        'driver = "modbus-rtu"',
+        f"port = {_quoted(probes['port'])}",
+        f"baudrate = {probes['baudrate']}",
+        'parity = "N"  # a pseudo terminal knows no parity',
+        f"unit = {probes['unit']}",
+        f"first_register = {probes['first_register']}",
+        f"channels = {json.dumps(probes['channels'])}",
+        "",
+        "[[navigator]]",
+        'name = "gnss"',
+        'driver = "ublox"',
+        f"port = {_quoted(ready['receiver']['port'])}",
+        f"baudrate = {ready['receiver']['baudrate']}",
+    ]
+    for sensor, head in ready["heads"].items():
+        lines += [
+            "",
+            "[[head]]",
+            f"sensor = {_quoted(sensor)}",
+            'driver = "aravis"',
+            f"address = {_quoted(head['address'])}",
+            'trigger = "line"',
+            f"exposure_time_us = {float(plan['exposure_time_us'][rig.cone_of(sensor).name])}",
+            f"tdi_shifts = {plan['tdi_shifts'][rig.cone_of(sensor).name]}",
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _quoted(text: str) -> str:
+    return json.dumps(text)
+
+
+def _print_addresses(ready: Mapping[str, Any], path: Path) -> None:
+    console = Console()
+    console.print(f"[bold]{ready['rig']}[/] is up: {len(ready['heads'])} GigE Vision heads")
+    addresses = "  ".join(f"{name} {head['address']}" for name, head in ready["heads"].items())
+    console.print(f"  heads     {addresses}")
+    console.print(f"  trigger   pulse bus at {ready['pulse_bus']}")
+    console.print(f"  receiver  u-blox at {ready['receiver']['port']}")
+    console.print(f"  probes    Modbus RTU at {ready['probes']['port']}")
+    console.print(f"  truth     {ready['truth']}")
+    console.print(f"Next, in another terminal: [bold]syntopic check {path}[/], then run it.")
+    console.print("Ctrl-C ends the emulator.")

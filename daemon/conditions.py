@@ -1,0 +1,51 @@
+"""From the record of an exposure to what the pipeline wants to know about it."""
+
+from __future__ import annotations
+
+import math
+
+from daemon.configuration import PlanSection
+from daemon.exposure import Exposure
+from processing.pipeline import Conditions
+from processing.quality import Flag
+from processing.rig import Rig
+
+
+def conditions_of(exposure: Exposure, rig: Rig, plan: PlanSection, flags: Flag) -> Conditions:
+    """The conditions of an exposure; what the record does not know comes from the plan.
+
+    `flags` are added to those the record holds.
+    """
+    navigation = exposure.navigation
+    speed_mps = plan.ground_speed_mps
+    height_m = plan.height_above_ground_m
+    crab_rad = None
+    if navigation is not None:
+        north, east, _ = navigation.velocity_ned_mps
+        speed_mps = math.hypot(north, east)
+        height_m = navigation.height_m - plan.ground_height_m
+        if navigation.heading_rad is not None and speed_mps > 1.0:
+            drift = math.atan2(east, north) - navigation.heading_rad
+            crab_rad = math.remainder(drift, 2 * math.pi)
+    exposure_time_s = {}
+    tdi_shifts = {}
+    for frame in exposure.frames:
+        cone = rig.cone_of(frame.sensor).name
+        if frame.exposure_time_us is not None:
+            exposure_time_s[cone] = frame.exposure_time_us * 1e-6
+        tdi_shifts[cone] = int(frame.settings.get("TdiShifts", 0))
+    return Conditions(
+        temperatures_c={t.probe: t.value_c for t in exposure.temperatures},
+        temperature_age_s={t.probe: t.age_ns * 1e-9 for t in exposure.temperatures},
+        exposure_time_s=exposure_time_s,
+        tdi_shifts=tdi_shifts,
+        ground_speed_mps=speed_mps,
+        height_above_ground_m=height_m,
+        roll_rad=navigation.roll_rad if navigation else None,
+        pitch_rad=navigation.pitch_rad if navigation else None,
+        angular_rate_rad_per_s=None,
+        crab_rad=crab_rad,
+        time_sigma_ns=exposure.mark_sigma_ns,
+        capture_flags=Flag(exposure.flags) | flags,
+        simulated=exposure.simulated,
+    )

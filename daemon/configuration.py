@@ -1,0 +1,256 @@
+"""What the service is told to do: one TOML file, refused with all its mistakes at once.
+
+Settings of a device are the business of its driver; here they are only checked through
+`drivers.registry`.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from drivers import registry
+from processing.rig import Rig, RigError, find_rig
+
+CONFIGURATION_MAX_BYTES = 1_000_000
+
+
+class ConfigurationError(ValueError):
+    """A configuration that cannot be used; `problems` holds one sentence for each mistake."""
+
+    def __init__(self, problems: Sequence[str]) -> None:
+        self.problems = tuple(problems)
+        super().__init__("\n".join(problems))
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class MissionSection(_Section):
+    """Where flights are kept and which camera flies."""
+
+    root: Path
+    rig: str
+    radiometry: Path | None = None
+    simulated: bool = False
+    end_when_done: bool = False
+
+
+class PlanSection(_Section):
+    """What the flight was planned to be; navigation replaces it as soon as it speaks."""
+
+    line: str = ""
+    ground_height_m: float = 0.0
+    height_above_ground_m: float = Field(1000.0, gt=0)
+    ground_speed_mps: float = Field(60.0, gt=0)
+
+
+class TriggerSection(BaseModel):
+    """When to expose, and who fires. Further keys are settings of the trigger's driver."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+    driver: str
+    mode: Literal["interval", "distance"] = "interval"
+    interval_s: float = Field(2.0, gt=0)
+    distance_m: float | None = Field(None, gt=0)
+    count: int | None = Field(None, gt=0)
+
+    @model_validator(mode="after")
+    def _distance_is_given(self) -> TriggerSection:
+        if self.mode == "distance" and self.distance_m is None:
+            raise ValueError("mode 'distance' needs distance_m, the way between two exposures in m")
+        return self
+
+
+class DeviceSection(BaseModel):
+    """One device: its driver, and whatever that driver wants to know."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+    driver: str
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        return dict(self.model_extra or {})
+
+
+class HeadSection(DeviceSection):
+    """The head that carries a sensor of the rig."""
+
+    sensor: str
+
+
+class NamedSection(DeviceSection):
+    """A thermometer or a navigator."""
+
+    name: str
+
+
+class ProcessingSection(_Section):
+    """How exposures become images."""
+
+    method: Literal["free", "fixed"] = "free"
+    interpolation: Literal["bilinear", "cubic", "lanczos"] = "cubic"
+    baselines: bool = False
+    threads: int = Field(2, ge=1, le=256)
+
+
+class LimitsSection(_Section):
+    """How long is waited for what, and how deep the memory is."""
+
+    frame_timeout_s: float = Field(8.0, gt=0)
+    mark_timeout_s: float = Field(3.0, gt=0)
+    ready_timeout_s: float = Field(60.0, gt=0)
+    temperature_stale_s: float = Field(10.0, gt=0)
+    exposures_in_memory: int = Field(3, ge=2, le=16)
+    disk_reserve_bytes: int = Field(500_000_000, ge=0)
+
+
+class Configuration(_Section):
+    """The whole file."""
+
+    mission: MissionSection
+    plan: PlanSection = PlanSection()  # type: ignore[call-arg]
+    trigger: TriggerSection
+    head: tuple[HeadSection, ...] = Field(min_length=1)
+    thermometer: tuple[NamedSection, ...] = ()
+    navigator: tuple[NamedSection, ...] = ()
+    processing: ProcessingSection = ProcessingSection()  # type: ignore[call-arg]
+    limits: LimitsSection = LimitsSection()  # type: ignore[call-arg]
+
+
+def load(path: Path) -> tuple[Configuration, Rig]:
+    """Read a service configuration and the rig it names.
+
+    Relative paths in the file count from the file's folder.
+
+    Raises:
+        ConfigurationError: with a sentence per mistake: file, key, value, and what is right.
+    """
+    try:
+        if path.stat().st_size > CONFIGURATION_MAX_BYTES:
+            raise ConfigurationError([f"{path.name}: too large for a configuration"])
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        reason = error.strerror or type(error).__name__
+        raise ConfigurationError(
+            [f"{path}: cannot be read ({reason}); give the path of a service.toml"]
+        ) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigurationError([f"{path.name}: not valid TOML: {error}"]) from error
+    return from_mapping(content, path)
+
+
+def from_mapping(content: Mapping[str, Any], path: Path) -> tuple[Configuration, Rig]:
+    """Validate parsed TOML; `path` names the file in the sentences and anchors relative paths."""
+    file = path.name
+    problems = _device_problems(content, file)
+    rig: Rig | None = None
+    rig_name = _dig(content, "mission", "rig")
+    if isinstance(rig_name, str):
+        try:
+            rig = find_rig(_rig_path(rig_name, path))
+        except RigError as error:
+            problems += [f"{file}: mission.rig: {problem}" for problem in error.problems]
+    configuration: Configuration | None = None
+    try:
+        configuration = Configuration.model_validate(content)
+    except ValidationError as error:
+        problems += [_sentence(file, detail) for detail in error.errors()]
+    if rig is not None:
+        problems += _rig_problems(content, rig, file)
+    if problems or configuration is None or rig is None:
+        raise ConfigurationError(problems)
+    return _anchored(configuration, path.parent.resolve()), rig
+
+
+def _rig_path(name: str, path: Path) -> str:
+    beside = path.parent / name
+    return str(beside) if name.endswith(".toml") and beside.exists() else name
+
+
+def _anchored(configuration: Configuration, folder: Path) -> Configuration:
+    mission = configuration.mission
+    radiometry = None if mission.radiometry is None else folder / mission.radiometry
+    anchored = mission.model_copy(
+        update={
+            "root": folder / mission.root,
+            "radiometry": radiometry,
+            "rig": _rig_path(mission.rig, folder / "service.toml"),
+        }
+    )
+    return configuration.model_copy(update={"mission": anchored})
+
+
+def _dig(content: Mapping[str, Any], *keys: str) -> Any:
+    value: Any = content
+    for key in keys:
+        value = value.get(key) if isinstance(value, Mapping) else None
+    return value
+
+
+def _sentence(file: str, detail: Any) -> str:
+    key = _key(detail["loc"])
+    message = str(detail["msg"]).removeprefix("Value error, ")
+    kind = detail["type"]
+    if kind == "missing":
+        return f"{file}: {key} is missing; {message.lower()}"
+    if kind == "extra_forbidden":
+        return f"{file}: {key} is not a key of this section; check the spelling"
+    shown = repr(detail["input"])
+    shown = shown if len(shown) <= 60 else shown[:57] + "..."
+    return f"{file}: {key} is {shown}; {message[0].lower()}{message[1:]}"
+
+
+def _key(location: Sequence[int | str]) -> str:
+    key = ""
+    for part in location:
+        key += f"[{part}]" if isinstance(part, int) else f".{part}" if key else part
+    return key
+
+
+def _device_problems(content: Mapping[str, Any], file: str) -> list[str]:
+    """What the drivers say of the settings meant for them."""
+    own_keys = {
+        "head": {"driver", "sensor"},
+        "thermometer": {"driver", "name"},
+        "navigator": {"driver", "name"},
+        "trigger": set(TriggerSection.model_fields),
+    }
+    problems: list[str] = []
+    for kind, own in own_keys.items():
+        sections = content.get(kind)
+        listed = sections if isinstance(sections, list) else [sections]
+        for index, section in enumerate(listed):
+            if not isinstance(section, Mapping) or not isinstance(section.get("driver"), str):
+                continue
+            key = kind if kind == "trigger" else f"{kind}[{index}]"
+            settings = {name: value for name, value in section.items() if name not in own}
+            found = registry.problems(kind, section["driver"], settings)
+            problems += [f"{file}: {key}.{problem}" for problem in found]
+    return problems
+
+
+def _rig_problems(content: Mapping[str, Any], rig: Rig, file: str) -> list[str]:
+    """Whether the heads and the sensors of the rig belong together."""
+    heads = content.get("head")
+    given = [
+        head["sensor"]
+        for head in (heads if isinstance(heads, list) else [])
+        if isinstance(head, Mapping) and isinstance(head.get("sensor"), str)
+    ]
+    known = {sensor.name for sensor in rig.sensors}
+    problems = []
+    for index, name in enumerate(given):
+        if name not in known:
+            listed = ", ".join(sorted(known))
+            problems.append(f"{file}: head[{index}].sensor is {name!r}; {rig.name} has {listed}")
+        elif name in given[:index]:
+            problems.append(f"{file}: head[{index}].sensor is {name!r} for the second time")
+    return problems

@@ -1,0 +1,398 @@
+"""The open exposures of a flight, from the pulse to the sealed record.
+
+Pure bookkeeping on instants handed in: frames, marks, navigation and temperatures come in; what is
+due to be stored, sealed or given up comes out. Processes and disk are the business of
+`daemon.service`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+
+from daemon.clock import HostClock
+from daemon.configuration import LimitsSection
+from daemon.exposure import (
+    Capture,
+    Exposure,
+    FrameRecord,
+    NavigationRecord,
+    RecordState,
+    TemperatureRecord,
+    TimeSource,
+)
+from daemon.ledger import Ledger
+from daemon.matching import Cause, Matcher, Pulse
+from daemon.navigation import Track
+from drivers.contract import EventMark, Frame, NavSample, TemperatureSample
+from processing.quality import Flag
+from processing.rig import Rig
+
+NS = 1_000_000_000
+NO_FLAG = Flag(0)
+SYNTOPIC_DELAY_SIGMA_NS = 1_000
+"""How well a trigger unit keeps its delays."""
+
+
+@dataclass(frozen=True)
+class Identity:
+    """What every record of a flight repeats."""
+
+    boot_id: str
+    line_id: str
+    calibration_id: str
+    calibration_sha256: str
+    configuration_sha256: str
+    software: str
+    simulated: bool
+
+
+@dataclass(frozen=True)
+class Instant:
+    """The instant of the strobe: GPS time, its sigma, and where it came from."""
+
+    gps_ns: int | None
+    sigma_ns: int | None
+    source: TimeSource
+    count: int | None
+
+
+@dataclass(frozen=True)
+class ToStore:
+    """An exposure whose frames are all here, or will not come: to be made durable."""
+
+    capture: Capture
+    slots: Mapping[str, int]
+
+
+@dataclass
+class _Open:
+    number: int
+    ordered_mono_ns: int
+    pulse: Pulse | None = None
+    frames: dict[str, Frame] = field(default_factory=dict)
+    flags: Flag = NO_FLAG
+    causes: dict[str, str] = field(default_factory=dict)
+    mark: EventMark | None = None
+    handed_to_disk: Capture | None = None
+    stored: Capture | None = None
+    lost: str = ""
+
+
+class Flight:
+    """Exposures between trigger and seal.
+
+    Every method that takes an instant takes `mono_ns`. Slots of frames that are not used are
+    collected in `idle_slots`, to be handed back to the heads.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        serial_of_head: Mapping[str, str],
+        identity: Identity,
+        limits: LimitsSection,
+        ledger: Ledger,
+        first_number: int,
+    ) -> None:
+        self.rig = rig
+        self.identity = identity
+        self.limits = limits
+        self.ledger = ledger
+        self.clock = HostClock()
+        self.track = Track()
+        self.temperatures: dict[str, TemperatureSample] = {}
+        self.idle_slots: list[tuple[str, int]] = []
+        self.serial_of_head = serial_of_head
+        self._cone_of_head = {head: rig.cone_of(head) for head in serial_of_head}
+        self._matcher = Matcher({h: c.name for h, c in self._cone_of_head.items()}, self.clock)
+        self._open: dict[int, _Open] = {}
+        self._next_number = first_number
+
+    @property
+    def open_numbers(self) -> tuple[int, ...]:
+        """Exposures that are not sealed or given up yet."""
+        return tuple(self._open)
+
+    def order(self, mono_ns: int) -> int:
+        """A trigger is being ordered: its exposure is open from now on. Returns its number."""
+        number = self._next_number
+        self._next_number += 1
+        self._open[number] = _Open(number, mono_ns)
+        self.ledger.trigger(number)
+        self._matcher.forget_before(number - 64)
+        return number
+
+    def fired(self, pulse: Pulse) -> None:
+        """The pulse was given."""
+        self._open[pulse.number].pulse = pulse
+        self._matcher.pulse(pulse)
+
+    def frame(self, frame: Frame) -> Cause:
+        """A frame arrived. Its slot is kept only where the frame is used."""
+        match = self._matcher.frame(frame)
+        cause = match.cause
+        exposure = None if match.number is None else self._open.get(match.number)
+        if cause is Cause.USED and (exposure is None or exposure.handed_to_disk is not None):
+            cause = Cause.LATE
+        self.ledger.frame(frame.head, cause.value)
+        if exposure is not None:
+            if cause is Cause.USED:
+                exposure.frames[frame.head] = frame
+                return cause
+            exposure.flags |= _FRAME_FLAGS[cause]
+            exposure.causes[frame.head] = cause.value
+        self.idle_slots.append((frame.head, frame.slot))
+        return cause
+
+    def mark(self, mark: EventMark) -> Cause:
+        """An event mark arrived."""
+        match = self._matcher.mark(mark)
+        cause = match.cause
+        exposure = None if match.number is None else self._open.get(match.number)
+        if cause is Cause.USED:
+            if exposure is None:
+                cause = Cause.LATE
+            else:
+                exposure.mark = mark
+        if match.is_ambiguous:
+            for waiting in self._open.values():
+                if waiting.mark is None:
+                    waiting.flags |= Flag.MARK_AMBIGUOUS
+        self.ledger.mark(cause.value)
+        return cause
+
+    def navigation(self, sample: NavSample) -> None:
+        """A position arrived."""
+        if sample.time_valid:
+            self.track.add(sample)
+            self.clock.message_arrived(sample.gps_ns, sample.mono_ns)
+
+    def temperature(self, sample: TemperatureSample) -> None:
+        """A probe was read."""
+        self.temperatures[sample.probe] = sample
+
+    def due_to_store(self, mono_ns: int) -> list[ToStore]:
+        """Exposures whose frames are complete, or whose time is up; each is returned once."""
+        due = []
+        for exposure in self._open.values():
+            if exposure.handed_to_disk is not None or exposure.lost or not exposure.frames:
+                continue
+            waited_ns = mono_ns - exposure.ordered_mono_ns
+            is_complete = len(exposure.frames) == len(self.serial_of_head)
+            if is_complete or waited_ns > self.limits.frame_timeout_s * NS:
+                exposure.handed_to_disk = self._capture(exposure)
+                slots = {head: frame.slot for head, frame in exposure.frames.items()}
+                due.append(ToStore(exposure.handed_to_disk, slots))
+        return due
+
+    def due_to_give_up(self, mono_ns: int) -> list[tuple[int, str]]:
+        """Exposures of which nothing came in time: now lost, with the cause; returned once."""
+        lost = []
+        for exposure in self._open.values():
+            waited_ns = mono_ns - exposure.ordered_mono_ns
+            if exposure.frames or exposure.lost or waited_ns <= self.limits.frame_timeout_s * NS:
+                continue
+            cause = "no pulse was given" if exposure.pulse is None else "no head sent a frame"
+            lost.append((exposure.number, cause))
+            self._lose(exposure, cause)
+        return lost
+
+    def not_fired(self, number: int, sentence: str) -> None:
+        """The trigger unit gave no pulse, or nobody knows: the exposure is lost."""
+        exposure = self._open.get(number)
+        if exposure is not None and not exposure.frames:
+            self._lose(exposure, sentence)
+
+    def stored(self, number: int, frames: tuple[FrameRecord, ...]) -> None:
+        """The disk has the pixels."""
+        exposure = self._open[number]
+        assert exposure.handed_to_disk is not None
+        exposure.stored = replace(exposure.handed_to_disk, frames=frames)
+        self.ledger.stored(number)
+
+    def not_stored(self, number: int, sentence: str) -> None:
+        """The disk refused the pixels: the exposure is lost."""
+        exposure = self._open[number]
+        if exposure.stored is None:
+            self._lose(exposure, sentence)
+
+    def due_to_seal(self, mono_ns: int) -> Exposure | None:
+        """The oldest open exposure, once it is stored or lost and its mark and navigation final."""
+        if not self._open:
+            return None
+        exposure = next(iter(self._open.values()))
+        if exposure.lost:
+            return self._seal(exposure, self._capture(exposure), state="lost")
+        if exposure.stored is None:
+            return None
+        waited_ns = mono_ns - exposure.ordered_mono_ns
+        is_patient = waited_ns <= self.limits.mark_timeout_s * NS
+        has_navigation = exposure.mark is not None and self.track.reaches(exposure.mark.gps_ns)
+        if is_patient and not has_navigation:
+            return None
+        return self._seal(exposure, exposure.stored)
+
+    def sealed(self, number: int, state: RecordState) -> None:
+        """The record is on disk: the exposure is closed."""
+        self._settle(number, state)
+        self.ledger.sealed(number)
+
+    def not_sealed(self, number: int, state: RecordState) -> None:
+        """The disk will not have the record: closed here, and sealed by recovery one day."""
+        self._settle(number, state)
+
+    def _settle(self, number: int, state: RecordState) -> None:
+        exposure = self._open.pop(number)
+        causes = {
+            head: exposure.causes.get(head, "no frame came")
+            for head in self.serial_of_head
+            if head not in exposure.frames
+        }
+        if exposure.lost:
+            causes["exposure"] = exposure.lost
+        self.ledger.settle(number, state, causes.items())
+
+    def _lose(self, exposure: _Open, cause: str) -> None:
+        exposure.lost = cause
+        self.idle_slots += [(head, frame.slot) for head, frame in exposure.frames.items()]
+
+    def _capture(self, exposure: _Open) -> Capture:
+        usable = {} if exposure.lost else _in_order(exposure.frames, self.serial_of_head)
+        missing = [
+            (head, exposure.lost or exposure.causes.get(head, "no frame came"))
+            for head in self.serial_of_head
+            if head not in usable
+        ]
+        flags = exposure.flags | (Flag.FRAME_MISSING if missing else NO_FLAG)
+        return Capture(
+            number=exposure.number,
+            trigger_sequence=exposure.number,
+            trigger_mono_ns=exposure.pulse.mono_ns if exposure.pulse else exposure.ordered_mono_ns,
+            trigger_sigma_ns=exposure.pulse.sigma_ns if exposure.pulse else 0,
+            boot_id=self.identity.boot_id,
+            frames=tuple(self._frame_record(frame) for frame in usable.values()),
+            missing=tuple(missing),
+            line_id=self.identity.line_id,
+            calibration_id=self.identity.calibration_id,
+            calibration_sha256=self.identity.calibration_sha256,
+            configuration_sha256=self.identity.configuration_sha256,
+            software=self.identity.software,
+            simulated=self.identity.simulated,
+            flags=int(flags),
+        )
+
+    def _frame_record(self, frame: Frame) -> FrameRecord:
+        return FrameRecord(
+            sensor=frame.head,
+            head_serial=self.serial_of_head[frame.head],
+            file="",
+            sha256="",
+            width_px=frame.width_px,
+            height_px=frame.height_px,
+            pixel_format=frame.pixel_format,
+            device_ns=frame.device_ns,
+            counter=frame.counter,
+            exposure_time_us=frame.exposure_time_us,
+            temperature_c=frame.temperature_c,
+            mono_ns=frame.mono_ns,
+            settings=dict(frame.settings),
+        )
+
+    def _seal(
+        self, exposure: _Open, stored: Capture, *, state: RecordState | None = None
+    ) -> Exposure:
+        record = compose(
+            self.rig,
+            stored,
+            exposure.pulse,
+            instant_of(exposure.mark, exposure.pulse, self.clock),
+            self.track,
+            self.temperatures,
+            exposure.flags,
+        )
+        return record if state is None else replace(record, state=state)
+
+
+def instant_of(mark: EventMark | None, pulse: Pulse | None, clock: HostClock) -> Instant:
+    """The instant of the strobe: the receiver's mark, else from the pulse through the clock."""
+    if mark is not None:
+        return Instant(mark.gps_ns, mark.accuracy_ns, "event-mark", mark.count)
+    estimate = None if pulse is None else clock.gps_at(pulse.mono_ns + pulse.strobe_delay_ns)
+    if pulse is None or estimate is None:
+        return Instant(None, None, "none", None)
+    source: TimeSource = "host" if estimate.is_coarse else "interpolated"
+    return Instant(estimate.gps_ns, estimate.sigma_ns + pulse.sigma_ns, source, None)
+
+
+def compose(
+    rig: Rig,
+    stored: Capture,
+    pulse: Pulse | None,
+    instant: Instant,
+    track: Track,
+    temperatures: Mapping[str, TemperatureSample],
+    flags: Flag,
+) -> Exposure:
+    """The final record of a stored exposure; its place in the chain is given when it is written."""
+    flags |= Flag(stored.flags)
+    if instant.source != "event-mark":
+        flags |= Flag.MARK_MISSING
+    navigation: NavigationRecord | None = None
+    if instant.gps_ns is not None:
+        navigation = track.at(instant.gps_ns)
+    if navigation is None:
+        flags |= Flag.GNSS
+    return Exposure(
+        number=stored.number,
+        trigger_sequence=stored.trigger_sequence,
+        trigger_mono_ns=stored.trigger_mono_ns,
+        trigger_sigma_ns=stored.trigger_sigma_ns,
+        boot_id=stored.boot_id,
+        mark_gps_ns=instant.gps_ns,
+        mark_sigma_ns=instant.sigma_ns,
+        mark_source=instant.source,
+        mark_count=instant.count,
+        frames=tuple(_timed(rig, frame, pulse, instant) for frame in stored.frames),
+        missing=stored.missing,
+        temperatures=tuple(
+            TemperatureRecord(s.probe, s.value_c, stored.trigger_mono_ns - s.mono_ns)
+            for s in temperatures.values()
+        ),
+        navigation=navigation,
+        line_id=stored.line_id,
+        calibration_id=stored.calibration_id,
+        calibration_sha256=stored.calibration_sha256,
+        configuration_sha256=stored.configuration_sha256,
+        software=stored.software,
+        simulated=stored.simulated,
+        state="lost" if not stored.frames else "degraded" if stored.missing else "complete",
+        flags=int(flags),
+    )
+
+
+def _timed(rig: Rig, frame: FrameRecord, pulse: Pulse | None, instant: Instant) -> FrameRecord:
+    """A frame's mid-exposure: the strobe, the pulses' delays, half the exposure, the head's own."""
+    if instant.gps_ns is None or instant.sigma_ns is None or pulse is None:
+        return frame
+    cone = rig.cone_of(frame.sensor)
+    half_ns = round((frame.exposure_time_us or 0.0) * 500)
+    offset_ns = pulse.delays_ns[cone.name] + half_ns - pulse.strobe_delay_ns
+    return replace(
+        frame,
+        mid_exposure_gps_ns=instant.gps_ns + offset_ns + cone.mark_to_mid_exposure_ns,
+        time_sigma_ns=instant.sigma_ns + SYNTOPIC_DELAY_SIGMA_NS,
+        time_source=instant.source,
+    )
+
+
+def _in_order(frames: Mapping[str, Frame], heads: Iterable[str]) -> dict[str, Frame]:
+    return {head: frames[head] for head in heads if head in frames}
+
+
+_FRAME_FLAGS = {
+    Cause.LATE: Flag.FRAME_LATE,
+    Cause.DUPLICATE: Flag.FRAME_DUPLICATE,
+    Cause.CORRUPT: Flag.FRAME_CORRUPT,
+    Cause.SPURIOUS: NO_FLAG,
+}

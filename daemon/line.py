@@ -1,0 +1,114 @@
+"""A flight line: wait until the camera is ready, then order exposures as they fall due."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import shutil
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from daemon.configuration import Configuration
+from daemon.devices import exposure_times_ns, frame_nbytes
+from daemon.flight import Flight
+from daemon.triggering import DistanceTrigger, IntervalTrigger, pulse_delays_ns
+from drivers.contract import NavSample
+from processing.rig import Rig
+
+NS = 1_000_000_000
+LOOK_AHEAD_S = 0.05
+"""How often a due time is predicted anew; the last bit is slept through exactly."""
+DISK_RETRY_S = 1.0
+LEVEL2_SHARE = 2
+"""Products take about as much room as frames; one more share for the log and the index."""
+
+
+@dataclass(frozen=True)
+class Order:
+    """An exposure that is ordered: what capture is told, and what matching needs."""
+
+    number: int
+    mono_ns: int
+    delays_ns: Mapping[str, int]
+    strobe_delay_ns: int
+
+
+class Line:
+    """Orders exposures of a flight until the planned number is reached."""
+
+    def __init__(
+        self, configuration: Configuration, rig: Rig, flight: Flight, mission: Path, flown: int
+    ) -> None:
+        self._configuration = configuration
+        self._rig = rig
+        self._flight = flight
+        self._mission = mission
+        self._ordered = flown
+        self._last_ns: int | None = None
+        self._exposure_ns = exposure_times_ns(configuration, rig)
+        self._policy = _policy(configuration, rig)
+
+    @property
+    def is_flown(self) -> bool:
+        """Whether the planned number of exposures was ordered."""
+        count = self._configuration.trigger.count
+        return count is not None and self._ordered >= count
+
+    async def fly(self, fire: Callable[[Order], None], disk_full: Callable[[str], None]) -> None:
+        """Order exposures as they fall due, until the line is flown."""
+        while not self.is_flown:
+            now_ns = time.monotonic_ns()
+            nav = self._flight.track.last
+            due_ns = self._policy.due(now_ns, self._last_ns, nav)
+            if due_ns is None or due_ns > now_ns:
+                left_s = LOOK_AHEAD_S if due_ns is None else (due_ns - now_ns) / NS
+                await asyncio.sleep(min(LOOK_AHEAD_S, left_s))
+            elif (left := exposures_left(self._configuration, self._rig, self._mission)) > 0:
+                fire(self._order(now_ns, nav))
+            else:
+                disk_full(f"room for {left} exposures: no more are made; free {self._mission}")
+                await asyncio.sleep(DISK_RETRY_S)
+
+    def absent(self, active: Callable[[str], bool], *, has_trigger: bool) -> list[str]:
+        """What is not there yet, in words."""
+        configuration, flight = self._configuration, self._flight
+        absent = [f"head {h.sensor}" for h in configuration.head if not active(h.sensor)]
+        if not has_trigger:
+            absent.append("trigger")
+        if configuration.navigator and flight.track.last is None:
+            absent.append("time and position")
+        if configuration.thermometer:
+            missing = [p for p in self._rig.probes if p not in flight.temperatures]
+            absent += [f"temperature of {probe}" for probe in missing]
+        return absent
+
+    def _order(self, now_ns: int, nav: NavSample | None) -> Order:
+        speed_mps = self._configuration.plan.ground_speed_mps
+        if nav is not None:
+            flown_mps = math.hypot(*nav.velocity_ned_mps[:2])
+            speed_mps = flown_mps if flown_mps > 1.0 else speed_mps
+        delays_ns = pulse_delays_ns(self._rig, speed_mps, self._exposure_ns)
+        reference = self._rig.reference_cone
+        strobe_ns = delays_ns[reference] + self._exposure_ns[reference] // 2
+        number = self._flight.order(now_ns)
+        self._ordered += 1
+        self._last_ns = now_ns
+        self._policy.fired(now_ns, nav)
+        return Order(number, now_ns, delays_ns, strobe_ns)
+
+
+def exposures_left(configuration: Configuration, rig: Rig, mission: Path) -> int:
+    """How many more exposures the disk holds, with their products and the reserve kept free."""
+    exposure_nbytes = sum(frame_nbytes(rig, head.sensor) for head in configuration.head)
+    free_nbytes = shutil.disk_usage(mission).free - configuration.limits.disk_reserve_bytes
+    return max(0, free_nbytes // ((1 + LEVEL2_SHARE) * exposure_nbytes))
+
+
+def _policy(configuration: Configuration, rig: Rig) -> IntervalTrigger | DistanceTrigger:
+    trigger = configuration.trigger
+    least_ns = round(rig.frame_interval_s * NS)
+    if trigger.mode == "distance" and trigger.distance_m is not None:
+        return DistanceTrigger(trigger.distance_m, least_ns)
+    return IntervalTrigger(max(round(trigger.interval_s * NS), least_ns))

@@ -1,0 +1,107 @@
+"""Child processes of the service: spawned, never forked, and dead when the service is.
+
+A child is a function "module:name" that gets a `Link` and its own arguments. It is named, not
+imported, so that what a child needs is never loaded into the service.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import importlib
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Mapping
+from multiprocessing.connection import Connection
+from typing import Any
+
+PR_SET_PDEATHSIG = 1  # linux/prctl.h
+_SPAWN = multiprocessing.get_context("spawn")
+
+
+class Link:
+    """The child's end of the line to the service; `send` may be called from any thread."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        self._lock = threading.Lock()
+
+    def send(self, message: object) -> None:
+        with self._lock:
+            self._connection.send(message)
+
+    def receive(self, timeout_s: float) -> object | None:
+        """The next message, or None when none came in time. EOFError: the service is gone."""
+        return self._connection.recv() if self._connection.poll(timeout_s) else None
+
+
+class Child:
+    """The service's end: the process, and the connection to it."""
+
+    def __init__(
+        self,
+        name: str,
+        target: str,
+        arguments: tuple[Any, ...],
+        environment: Mapping[str, str],
+    ) -> None:
+        self.name = name
+        self.connection, theirs = _SPAWN.Pipe(duplex=True)
+        self.process = _SPAWN.Process(
+            target=_child_main,
+            args=(theirs, os.getpid(), target, arguments),
+            name=f"syntopic-{name}",
+            daemon=True,
+        )
+        # Numerical libraries read their thread counts when they are first imported, which in a
+        # spawned child is before any line of ours runs: the environment is the only way in.
+        before = {key: os.environ.get(key) for key in environment}
+        os.environ.update(environment)
+        try:
+            self.process.start()
+        finally:
+            for key, value in before.items():
+                if value is None:
+                    del os.environ[key]
+                else:
+                    os.environ[key] = value
+        theirs.close()
+
+    def send(self, message: object) -> None:
+        """BrokenPipeError where the child is gone; the service notices by its sentinel."""
+        self.connection.send(message)
+
+    def end(self, timeout_s: float) -> None:
+        """Wait for the child to end by itself, then end it."""
+        self.process.join(timeout_s)
+        if self.process.is_alive():
+            self.process.kill()
+            self.process.join(timeout_s)
+        self.connection.close()
+
+
+def die_with_parent(parent_pid: int) -> None:
+    """Ask the kernel to kill this process when its parent dies, however it dies."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.prctl(PR_SET_PDEATHSIG, signal.SIGKILL) != 0:
+        raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG) failed")
+    if os.getppid() != parent_pid:  # the parent died before we could ask
+        os._exit(1)
+
+
+def _child_main(
+    connection: Connection,
+    parent_pid: int,
+    target: str,
+    arguments: tuple[Any, ...],
+) -> None:
+    die_with_parent(parent_pid)
+    # Ctrl-C reaches the whole process group; the service ends its children in order.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    module, _, function = target.partition(":")
+    try:
+        getattr(importlib.import_module(module), function)(Link(connection), *arguments)
+    except (EOFError, BrokenPipeError):
+        os._exit(1)  # the service is gone; nothing is left to be told

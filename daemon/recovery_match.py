@@ -1,0 +1,64 @@
+"""The record of an exposure that a crash left unsealed, made from the flight log.
+
+The same matching and the same composing as in flight, fed with what was logged around the trigger.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from daemon.clock import HostClock
+from daemon.exposure import Capture, Exposure
+from daemon.flight import Instant, compose, instant_of
+from daemon.log_records import LoggedRecord, LoggedTrigger
+from daemon.matching import Cause, Matcher, Pulse
+from daemon.navigation import Track
+from daemon.recovery import Complete
+from drivers.contract import EventMark, NavSample, TemperatureSample
+from processing.quality import Flag
+from processing.rig import Rig
+
+
+def seal_from_log(rig: Rig) -> Complete:
+    """What `daemon.recovery.recover` needs to seal exposures of this rig."""
+    cone_of_head = {sensor.name: cone.name for cone in rig.cones for sensor in cone.sensors}
+
+    def complete(capture: Capture, records: Sequence[LoggedRecord]) -> Exposure:
+        clock = HostClock()
+        matcher = Matcher(cone_of_head, clock)
+        track = Track()
+        temperatures: dict[str, TemperatureSample] = {}
+        pulse: Pulse | None = None
+        mark: EventMark | None = None
+        for record in records:
+            if isinstance(record, NavSample) and record.time_valid:
+                track.add(record)
+                clock.message_arrived(record.gps_ns, record.mono_ns)
+            elif isinstance(record, LoggedTrigger):
+                given = pulse_of(record)
+                matcher.pulse(given)
+                pulse = given if given.number == capture.number else pulse
+            elif isinstance(record, EventMark):
+                match = matcher.mark(record)
+                if match.cause is Cause.USED and match.number == capture.number:
+                    mark = record
+            elif isinstance(record, TemperatureSample):
+                known = temperatures.get(record.probe)
+                if known is None or record.mono_ns <= capture.trigger_mono_ns:
+                    temperatures[record.probe] = record
+        instant: Instant = instant_of(mark, pulse, clock)
+        return compose(rig, capture, pulse, instant, track, temperatures, Flag(0))
+
+    return complete
+
+
+def pulse_of(logged: LoggedTrigger) -> Pulse:
+    """The pulse as the matching needs it."""
+    return Pulse(
+        number=logged.number,
+        mono_ns=logged.pulse.mono_ns,
+        sigma_ns=logged.pulse.sigma_ns,
+        count=logged.pulse.count,
+        delays_ns=logged.delays_ns,
+        strobe_delay_ns=logged.strobe_delay_ns,
+    )

@@ -1,0 +1,495 @@
+"""The service: one asyncio loop that hears every process and keeps the deadlines.
+
+It decides nothing about matching (`daemon.flight`), when to expose (`daemon.line`), pixels
+(`daemon.worker`) or disk (`daemon.writer`), and imports none of what those need.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import signal
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from daemon import recovery
+from daemon.configuration import Configuration
+from daemon.devices import device_specs, frame_nbytes, serial_problem
+from daemon.exposure import Exposure
+from daemon.flight import Flight, Identity
+from daemon.ledger import Ledger
+from daemon.line import Line, Order
+from daemon.log_records import LoggedTrigger, message_of
+from daemon.matching import Cause, Pulse
+from daemon.memory import FrameRing
+from daemon.messages import (
+    Bound,
+    Fire,
+    Fired,
+    Log,
+    NotBound,
+    Pong,
+    Process,
+    Processed,
+    ProcessFailed,
+    Recycle,
+    Seal,
+    Sealed,
+    Store,
+    Stored,
+    WorkerReady,
+    WorkerSettings,
+    WriteFailed,
+)
+from daemon.mission import Mission
+from daemon.notify import Notifier
+from daemon.recovery_match import seal_from_log
+from daemon.supervisor import Supervisor
+from drivers.contract import (
+    DeviceEvent,
+    EventMark,
+    Frame,
+    NavSample,
+    RawBytes,
+    Record,
+    TemperatureSample,
+)
+from processing.rig import Rig, shipped_rigs
+
+TICK_S = 0.05
+PING_S = 1.0
+LANDING_TIMEOUT_S = 20.0
+END_OF_WAITING_S = 1e9
+
+Events = Callable[[Mapping[str, Any]], None]
+
+
+@dataclass
+class _Waiting:
+    """An exposure waiting for the worker; `slots` while its frames are still in memory."""
+
+    exposure: Exposure
+    slots: Mapping[str, int] | None
+
+
+class Service:
+    """One run of the onboard service over one mission.
+
+    Args:
+        configuration: what to do.
+        rig: the camera.
+        config_path: the file the configuration came from; its bytes go into the mission.
+        events: told of everything a person or a program may want to know, as plain JSON types.
+    """
+
+    def __init__(
+        self, configuration: Configuration, rig: Rig, config_path: Path, events: Events
+    ) -> None:
+        self.configuration = configuration
+        self.rig = rig
+        self.config_path = config_path
+        self.events = events
+        self.notifier = Notifier()
+        self.supervisor = Supervisor(self._hear, self._child_died)
+        self.failure: str | None = None
+        self.stopping = asyncio.Event()
+        self.changed = asyncio.Event()
+        self.active: set[str] = set()
+        self.has_trigger = False
+        self.is_worker_ready = False
+        self.is_worker_busy = False
+        self.waiting: deque[_Waiting] = deque()
+        self.in_memory: dict[int, Mapping[str, int]] = {}
+        self.sealing: Exposure | None = None
+        self.orders: dict[int, Order] = {}
+
+    async def run(self) -> int:
+        """Fly until told to stop, or until the planned exposures are done.
+
+        Returns:
+            The exit status: 0 after an orderly end, 1 after a fault that needs a person or a
+            restart.
+        """
+        loop = asyncio.get_running_loop()
+        for name in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(name, self.stopping.set)
+        mission = self._open_mission()
+        with mission.held():
+            self._start(mission)
+            tasks = [
+                loop.create_task(self._keep_deadlines()),
+                loop.create_task(self._watch_processes()),
+                loop.create_task(self._fly()),
+            ]
+            for task in tasks:
+                task.add_done_callback(self._task_ended)
+            await self.stopping.wait()
+            self.notifier.stopping("landing: sealing what is open")
+            await self._land(tasks)
+        if self.failure is None:
+            mission.close()
+        self._event("ended", failure=self.failure, ledger=self.flight.ledger.sheet().to_json())
+        return 0 if self.failure is None else 1
+
+    # Before the flight
+
+    def _open_mission(self) -> Mission:
+        root = self.configuration.mission.root
+        mission = Mission.current(root) if root.is_dir() else None
+        self.is_resumed = mission is not None
+        if mission is None:
+            rig_path = shipped_rigs().get(self.configuration.mission.rig)
+            mission = Mission.create(
+                root,
+                self.rig.name,
+                rig_toml=(rig_path or Path(self.configuration.mission.rig)).read_bytes(),
+                service_toml=self.config_path.read_bytes(),
+                started_utc=datetime.now(UTC),
+            )
+        return mission
+
+    def _start(self, mission: Mission) -> None:
+        report = recovery.recover(mission, seal_from_log(self.rig))
+        self._event(
+            "mission",
+            path=str(mission.path),
+            resumed=self.is_resumed,
+            recovery=[*report.done, *report.problems],
+            next_number=report.next_number,
+        )
+        self.flight = Flight(
+            self.rig,
+            {head.sensor: self.rig.sensor(head.sensor).serial for head in self.configuration.head},
+            self._identity(mission),
+            self.configuration.limits,
+            Ledger.resume([head.sensor for head in self.configuration.head], report.exposures),
+            report.next_number,
+        )
+        flown = len(report.exposures)
+        self.line = Line(self.configuration, self.rig, self.flight, mission.path, flown)
+        rings = tuple(
+            FrameRing.create(
+                head.sensor,
+                self.configuration.limits.exposures_in_memory,
+                frame_nbytes(self.rig, head.sensor),
+            )
+            for head in self.configuration.head
+        )
+        worker = WorkerSettings(
+            rig=str(mission.rig_path),
+            radiometry=self.configuration.mission.radiometry,
+            mission=mission.path,
+            plan=self.configuration.plan,
+            processing=self.configuration.processing,
+        )
+        one, many = _thread_counts(1), _thread_counts(self.configuration.processing.threads)
+        specs = device_specs(self.configuration)
+        self.supervisor.spawn("writer", "daemon.writer:main", (mission.path, rings), one)
+        self.supervisor.spawn("worker", "daemon.worker:main", (worker, rings), many)
+        self.supervisor.spawn("capture", "daemon.capture:main", (specs, rings), one)
+
+    def _identity(self, mission: Mission) -> Identity:
+        return Identity(
+            boot_id=Path("/proc/sys/kernel/random/boot_id").read_text().strip(),
+            line_id=self.configuration.plan.line,
+            calibration_id=self.rig.calibration_id,
+            calibration_sha256=_sha256(mission.rig_path),
+            configuration_sha256=_sha256(mission.service_path),
+            software=f"syntopic {version('syntopic')}",
+            simulated=self.configuration.mission.simulated,
+        )
+
+    # What the processes say
+
+    def _hear(self, message: object) -> None:
+        self._handlers[type(message)](self, message)
+        self.changed.set()
+
+    def _child_died(self, name: str) -> None:
+        if not self.stopping.is_set():
+            self._fail(f"process {name} died; started again, the service goes on in this flight")
+
+    def _on_frame(self, frame: Frame) -> None:
+        cause = self.flight.frame(frame)
+        if cause is not Cause.USED:
+            self._event("frame", head=frame.head, cause=cause.value)
+        self._log(frame)
+
+    def _on_mark(self, mark: EventMark) -> None:
+        cause = self.flight.mark(mark)
+        if cause is not Cause.USED:
+            self._event("mark", count=mark.count, cause=cause.value)
+        self._log(mark)
+
+    def _on_navigation(self, sample: NavSample) -> None:
+        self.flight.navigation(sample)
+        self._log(sample)
+
+    def _on_temperature(self, sample: TemperatureSample) -> None:
+        self.flight.temperature(sample)
+        self._log(sample)
+
+    def _on_raw(self, raw: RawBytes) -> None:
+        self._log(raw)
+
+    def _on_device_event(self, event: DeviceEvent) -> None:
+        self._log(event)
+        self._event(
+            "device",
+            device=event.device,
+            name=event.name,
+            fault=event.is_fault,
+            sentence=event.sentence,
+        )
+        if event.name in _DELIVERS:
+            self.active.add(event.device)
+        elif event.is_fault:
+            self.active.discard(event.device)
+
+    def _on_bound(self, bound: Bound) -> None:
+        self._event("bound", kind=bound.kind, device=bound.name, found=dict(bound.found))
+        if bound.kind == "trigger":
+            self.has_trigger = True
+        if bound.kind == "head":
+            problem = serial_problem(self.rig, bound.name, bound.found)
+            if problem is not None:
+                self._fail(problem)
+
+    def _on_not_bound(self, unbound: NotBound) -> None:
+        sentence = unbound.sentence
+        self._event("device", device=unbound.name, name="absent", fault=True, sentence=sentence)
+
+    def _on_fired(self, fired: Fired) -> None:
+        order = self.orders.pop(fired.sequence)
+        if fired.pulse is None:
+            self.flight.not_fired(fired.sequence, fired.sentence)
+            self._event("lost", number=fired.sequence, cause=fired.sentence)
+            return
+        pulse = Pulse(
+            number=fired.sequence,
+            mono_ns=fired.pulse.mono_ns,
+            sigma_ns=fired.pulse.sigma_ns,
+            count=fired.pulse.count,
+            delays_ns=order.delays_ns,
+            strobe_delay_ns=order.strobe_delay_ns,
+        )
+        self.flight.fired(pulse)
+        self._log(
+            LoggedTrigger(fired.sequence, fired.pulse, order.delays_ns, order.strobe_delay_ns)
+        )
+
+    def _on_stored(self, stored: Stored) -> None:
+        self.flight.stored(stored.number, stored.frames)
+        self._event("stored", number=stored.number, duration_s=round(stored.duration_s, 4))
+        if self.waiting or any(number < stored.number for number in self.in_memory):
+            # An older exposure is still being worked on: this one is read from disk later.
+            self._recycle(self.in_memory.pop(stored.number))
+
+    def _on_sealed(self, sealed: Sealed) -> None:
+        exposure, self.sealing = self.sealing, None
+        assert exposure is not None and exposure.number == sealed.number
+        self.flight.sealed(sealed.number, exposure.state)
+        if exposure.state == "lost":
+            return
+        self._event("sealed", **_summary(exposure))
+        self.waiting.append(_Waiting(exposure, self.in_memory.get(sealed.number)))
+        self._feed_worker()
+
+    def _on_write_failed(self, failed: WriteFailed) -> None:
+        self._event("not-written", number=failed.number, sentence=failed.sentence)
+        if self.sealing is not None and self.sealing.number == failed.number:
+            # Recovery seals it from the log when the service starts next.
+            self.flight.not_sealed(failed.number, self.sealing.state)
+            self.sealing = None
+        else:
+            self.in_memory.pop(failed.number, None)
+            self.flight.not_stored(failed.number, failed.sentence)
+
+    def _on_worker_ready(self, ready: WorkerReady) -> None:
+        self._event("kernels", warm_up_s=round(ready.warm_up_s, 2))
+        self.is_worker_ready = True
+        self._feed_worker()
+
+    def _on_processed(self, done: Processed) -> None:
+        seconds = round(done.duration_s, 3)
+        self._event("processed", number=done.number, report=dict(done.report), duration_s=seconds)
+        self._worker_is_free(done.number)
+
+    def _on_process_failed(self, failed: ProcessFailed) -> None:
+        self._event("not-processed", number=failed.number, sentence=failed.sentence)
+        self._worker_is_free(failed.number)
+
+    def _on_pong(self, pong: Pong) -> None:
+        if pong.statistics:
+            self.statistics = pong.statistics
+
+    _handlers: Mapping[type, Callable[[Service, Any], None]] = {
+        Frame: _on_frame,
+        EventMark: _on_mark,
+        NavSample: _on_navigation,
+        TemperatureSample: _on_temperature,
+        RawBytes: _on_raw,
+        DeviceEvent: _on_device_event,
+        Bound: _on_bound,
+        NotBound: _on_not_bound,
+        Fired: _on_fired,
+        Stored: _on_stored,
+        Sealed: _on_sealed,
+        WriteFailed: _on_write_failed,
+        WorkerReady: _on_worker_ready,
+        Processed: _on_processed,
+        ProcessFailed: _on_process_failed,
+        Pong: _on_pong,
+    }
+
+    def _worker_is_free(self, number: int) -> None:
+        self.is_worker_busy = False
+        if number in self.in_memory:
+            self._recycle(self.in_memory.pop(number))
+        self._feed_worker()
+
+    def _feed_worker(self) -> None:
+        if self.is_worker_ready and not self.is_worker_busy and self.waiting:
+            task = self.waiting.popleft()
+            self.is_worker_busy = True
+            self.supervisor.send("worker", Process(task.exposure, task.slots))
+
+    def _recycle(self, slots: Mapping[str, int]) -> None:
+        self.supervisor.send("capture", Recycle(slots))
+
+    # In flight
+
+    async def _keep_deadlines(self) -> None:
+        while True:
+            now_ns = time.monotonic_ns()
+            for due in self.flight.due_to_store(now_ns):
+                self.in_memory[due.capture.number] = due.slots
+                self.supervisor.send("writer", Store(due.capture, due.slots))
+            for number, cause in self.flight.due_to_give_up(now_ns):
+                self._event("lost", number=number, cause=cause)
+            for head, slot in self.flight.idle_slots:
+                self._recycle({head: slot})
+            self.flight.idle_slots.clear()
+            if self.sealing is None:
+                self.sealing = self.flight.due_to_seal(now_ns)
+                if self.sealing is not None:
+                    self.supervisor.send("writer", Seal(self.sealing))
+            await asyncio.sleep(TICK_S)
+
+    async def _watch_processes(self) -> None:
+        while True:
+            imbalances = self.flight.ledger.imbalances()
+            if imbalances:
+                self._fail(f"the ledger does not balance: {'; '.join(imbalances)}")
+            silent = self.supervisor.ping()
+            if silent:
+                self.notifier.status(f"no answer from {', '.join(silent)}")
+            else:
+                self.notifier.watchdog()
+                self.notifier.status(f"{len(self.flight.open_numbers)} exposures open")
+            await asyncio.sleep(PING_S)
+
+    async def _fly(self) -> None:
+        limit_s = self.configuration.limits.ready_timeout_s
+        await self._until(lambda: not self._absent(), limit_s)
+        # Devices may be missing and said to be; kernels may not: nothing compiles in flight.
+        await self._until(lambda: self.is_worker_ready, END_OF_WAITING_S)
+        absent = self._absent()
+        self._event("ready", absent=absent)
+        self.notifier.ready(f"flying without {', '.join(absent)}" if absent else "ready")
+        await self.line.fly(self._fire, self._disk_full)
+        await self._until(lambda: not self._is_unfinished(), END_OF_WAITING_S)
+        self._event("done")
+        if self.configuration.mission.end_when_done:
+            self.stopping.set()
+
+    def _absent(self) -> list[str]:
+        return self.line.absent(self.active.__contains__, has_trigger=self.has_trigger)
+
+    def _fire(self, order: Order) -> None:
+        self.orders[order.number] = order
+        self.supervisor.send("capture", Fire(order.number, order.delays_ns))
+        self._event("triggered", number=order.number)
+
+    def _disk_full(self, sentence: str) -> None:
+        self._event("disk", fault=True, sentence=sentence)
+
+    async def _until(self, is_so: Callable[[], bool], limit_s: float) -> bool:
+        """Wait for something that messages bring about; False when the time is over first."""
+        deadline = time.monotonic() + limit_s
+        while not is_so():
+            left_s = deadline - time.monotonic()
+            if left_s <= 0:
+                return False
+            self.changed.clear()
+            with suppress(TimeoutError):
+                await asyncio.wait_for(self.changed.wait(), min(left_s, PING_S))
+        return True
+
+    # After the flight
+
+    async def _land(self, tasks: list[asyncio.Task[None]]) -> None:
+        tasks[-1].cancel()  # no more exposures
+        if self.failure is None:
+            await self._until(lambda: not self._is_unfinished(), LANDING_TIMEOUT_S)
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        await self.supervisor.end(("capture", "worker", "writer"))
+
+    def _is_unfinished(self) -> bool:
+        in_work = self.sealing is not None or self.is_worker_busy
+        return in_work or bool(self.flight.open_numbers or self.waiting)
+
+    def _task_ended(self, task: asyncio.Task[None]) -> None:
+        error = None if task.cancelled() else task.exception()
+        if error is not None:
+            self._fail(f"the service itself failed: {type(error).__name__}: {error}")
+
+    # Telling
+
+    def _log(self, record: Record | LoggedTrigger) -> None:
+        self.supervisor.send("writer", Log(message_of(record)))
+
+    def _event(self, event: str, **content: Any) -> None:
+        self.events({"event": event, "mono_ns": str(time.monotonic_ns()), **content})
+
+    def _fail(self, sentence: str) -> None:
+        if self.failure is None:
+            self.failure = sentence
+            self._event("fault", sentence=sentence)
+        self.stopping.set()
+
+
+_DELIVERS = frozenset({"opened", "recovered", "active"})
+
+
+def _thread_counts(threads: int) -> dict[str, str]:
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+    return dict.fromkeys(names, str(threads))
+
+
+def _summary(exposure: Exposure) -> dict[str, Any]:
+    navigation = exposure.navigation
+    return {
+        "number": exposure.number,
+        "state": exposure.state,
+        "frames": len(exposure.frames),
+        "missing": [sensor for sensor, _ in exposure.missing],
+        "mark_gps_ns": None if exposure.mark_gps_ns is None else str(exposure.mark_gps_ns),
+        "mark_sigma_ns": exposure.mark_sigma_ns,
+        "mark_source": exposure.mark_source,
+        "temperatures_c": {t.probe: t.value_c for t in exposure.temperatures},
+        "height_m": navigation.height_m if navigation else None,
+    }
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()

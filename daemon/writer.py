@@ -1,0 +1,72 @@
+"""The writer process: Level-0 frames, records, catalog and flight log go to disk here.
+
+It answers *stored* only after the disk has the pixels, and never waits for anything but the disk.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+from daemon.errors import DaemonError
+from daemon.exposure import Exposure
+from daemon.flight_log import FlightLog
+from daemon.memory import FrameRing
+from daemon.messages import Log, Ping, Pong, Seal, Sealed, Stop, Store, Stored, WriteFailed
+from daemon.mission import Mission
+from daemon.processes import Link
+from daemon.store import Level0Writer
+
+LOG_SYNC_INTERVAL_S = 1.0
+"""The flight log is on disk at most this much later than it was handed over (and the writer's
+current frame, which may take as long as the disk does)."""
+
+
+def main(link: Link, mission_path: Path, rings: tuple[FrameRing, ...]) -> None:
+    """Write until told to stop."""
+    mission = Mission.open(mission_path)
+    memory = {ring.head: ring for ring in rings}
+    writer = Level0Writer(mission)
+    log = FlightLog.create(mission.log_dir)
+    synced = time.monotonic()
+    while not isinstance(order := link.receive(LOG_SYNC_INTERVAL_S), Stop):
+        if isinstance(order, Store):
+            link.send(_store(writer, memory, order))
+        elif isinstance(order, Seal):
+            link.send(_seal(writer, order.exposure))
+        elif isinstance(order, Log):
+            log.write(order.message)
+        elif isinstance(order, Ping):
+            link.send(Pong({}))
+        if time.monotonic() - synced >= LOG_SYNC_INTERVAL_S:
+            log.sync()
+            synced = time.monotonic()
+    log.close()
+    writer.close()
+
+
+def _store(
+    writer: Level0Writer, memory: Mapping[str, FrameRing], order: Store
+) -> Stored | WriteFailed:
+    started = time.monotonic()
+    pixels = {
+        frame.sensor: memory[frame.sensor].frame(
+            order.slots[frame.sensor], frame.height_px, frame.width_px
+        )
+        for frame in order.capture.frames
+    }
+    try:
+        frames = writer.write(order.capture, pixels)
+    except (OSError, DaemonError) as error:
+        sentence = f"exposure {order.capture.number} is not stored: {error}; look at the disk"
+        return WriteFailed(order.capture.number, sentence)
+    return Stored(order.capture.number, frames, time.monotonic() - started)
+
+
+def _seal(writer: Level0Writer, exposure: Exposure) -> Sealed | WriteFailed:
+    try:
+        return Sealed(exposure.number, writer.seal(exposure))
+    except (OSError, DaemonError) as error:
+        sentence = f"exposure {exposure.number} is not sealed: {error}; look at the disk"
+        return WriteFailed(exposure.number, sentence)
