@@ -1,0 +1,122 @@
+"""Least squares with linear constraints between the unknowns, and its statistics.
+
+Blocks of observations that touch few unknowns each are accumulated into dense normal equations;
+what an observation or an unknown means is the caller's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# Eigenvalues of a datum defect are not quite zero: residuals shrink a little with the scale.
+_RANK_TOLERANCE = 1e-7
+
+
+@dataclass(frozen=True)
+class Block:
+    """m observation equations design @ dp = misclosure + v that touch the unknowns `columns` (k).
+
+    `design` is (m, k), `misclosure` (m,) observed minus computed, `weight` (m,) 1 / sigma squared.
+    """
+
+    columns: NDArray[np.int64]
+    design: Array
+    misclosure: Array
+    weight: Array
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Corrections dp and what is known of them.
+
+    `cofactor` is the (u, u) inverse belonging to unit weight. `rank` is that of the normal matrix
+    without constraints, `constrained_rank` with them. `undetermined` holds as columns (u, d) the
+    directions that neither observations nor constraints fix well enough.
+    """
+
+    dp: Array
+    cofactor: Array
+    rank: int
+    constrained_rank: int
+    undetermined: Array
+
+
+def normal_equations(blocks: Sequence[Block], unknowns: int) -> tuple[Array, Array]:
+    """Normal matrix (u, u) and right-hand side (u,) of all blocks."""
+    normal = np.zeros((unknowns, unknowns))
+    right = np.zeros(unknowns)
+    for block in blocks:
+        weighted = block.design * block.weight[:, None]
+        normal[np.ix_(block.columns, block.columns)] += weighted.T @ block.design
+        right[block.columns] += weighted.T @ block.misclosure
+    return normal, right
+
+
+def solve(
+    normal: Array,
+    right: Array,
+    constraints: Array,
+    misclosure: Array,
+    *,
+    held_at: Array,
+    least_information: float,
+) -> Solution:
+    """Solve the normal equations, bordered with constraints @ dp = misclosure.
+
+    Unknowns must be scaled alike. Directions with less information (eigenvalue of the normal
+    matrix, constraints included) than `least_information` count as undetermined: these alone get a
+    pseudo-observation of that information that draws them to `held_at` (as a correction dp).
+
+    Args:
+        normal: (u, u).
+        right: (u,).
+        constraints: (c, u), linearly independent rows.
+        misclosure: (c,).
+        held_at: (u,).
+        least_information: in units of the normal matrix.
+
+    Raises:
+        ValueError: constraints that depend on each other.
+    """
+    unknowns, conditions = len(right), len(constraints)
+    rows = constraints / np.linalg.norm(constraints, axis=1, keepdims=True)
+    if conditions and np.linalg.matrix_rank(rows) < conditions:
+        raise ValueError("constraints depend on each other; give each condition once")
+    eigenvalues = np.linalg.eigvalsh(normal)
+    top = max(float(eigenvalues[-1]), np.finfo(float).tiny)
+    strength = max(top, least_information)
+    fixed_values, directions = np.linalg.eigh(normal + strength * (rows.T @ rows))
+    free = directions[:, fixed_values < least_information]
+    held = normal + least_information * (free @ free.T)
+    # Balanced against the border, so that the inversion stays well conditioned.
+    border = rows * np.sqrt(strength)
+    bordered = np.zeros((unknowns + conditions, unknowns + conditions))
+    bordered[:unknowns, :unknowns] = held
+    bordered[:unknowns, unknowns:] = border.T
+    bordered[unknowns:, :unknowns] = border
+    target = np.zeros(unknowns + conditions)
+    target[:unknowns] = right + least_information * (free @ (free.T @ held_at))
+    if conditions:
+        target[unknowns:] = misclosure / np.linalg.norm(constraints, axis=1) * np.sqrt(strength)
+    inverse = np.linalg.inv(bordered)
+    cofactor = inverse[:unknowns, :unknowns]
+    return Solution(
+        dp=(inverse @ target)[:unknowns],
+        cofactor=0.5 * (cofactor + cofactor.T),
+        rank=int(np.sum(eigenvalues > _RANK_TOLERANCE * top)),
+        constrained_rank=int(np.sum(fixed_values > _RANK_TOLERANCE * strength)),
+        undetermined=free,
+    )
+
+
+def redundancy_numbers(block: Block, cofactor: Array) -> Array:
+    """r_i = 1 - p_i a_i Q a_i' of each observation of a block, weightless ones too (r_i = 1)."""
+    q = cofactor[np.ix_(block.columns, block.columns)]
+    hat = np.einsum("ij,ij->i", block.design @ q, block.design) * block.weight
+    return np.asarray(np.clip(1.0 - hat, 0.0, 1.0))

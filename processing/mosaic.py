@@ -1,0 +1,529 @@
+"""Free image mosaicking: every sensor finds its place from tie points alone (DESIGN 5.4).
+
+The adjustment and its statistics live here; the unknowns are laid out in
+`processing.mosaic_model`, and whether the result agrees with the calibration is judged in
+`processing.validity`.
+
+Source: seeds/ultracam-calibration.txt, eq. 1-7, tables 1 and 2.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.adjustment import Block, Solution, normal_equations, redundancy_numbers, solve
+from processing.mosaic_model import MosaicModel, build_model, placement_at, vip_and_design
+from processing.placement import (
+    SensorPlacement,
+    corrected_mm_from_raw,
+    start_similarity,
+    vip_mm_from_raw,
+)
+from processing.rig import Rig
+from processing.tie_points import PAN_TO_COLOUR, PAN_TO_PAN, TiePoints
+from processing.topology import corners, mosaic_cones
+
+Array = NDArray[np.float64]
+
+_HUBER = 2.0
+_SPREAD_OF_MEDIAN = 1.4826
+_CLASSES = (PAN_TO_PAN, PAN_TO_COLOUR)
+
+
+@dataclass(frozen=True)
+class MosaicSettings:
+    """A-priori accuracy and the rules of the adjustment.
+
+    `sigma_pp_px`, `sigma_pc_px` are the a-priori standard deviations of one coordinate difference
+    of a typical P/P and P/C point, in PAN px; the ratio of the two is found again from the data.
+    `parallax_px` is what relief leaves in P/C points (DESIGN 5.4), for this exposure.
+    """
+
+    sigma_pp_px: float = 0.1
+    sigma_pc_px: float = 0.3
+    parallax_px: float = 0.0
+    outlier_limit: float = 4.0
+    max_iterations: int = 12
+    min_iterations: int = 3
+    converged_px: float = 1e-3
+    least_class_redundancy: float = 30.0
+    undetermined_px: float = 5.0
+
+
+@dataclass(frozen=True)
+class Mosaic:
+    """The outcome of an adjustment; placements in the virtual image and how good they are.
+
+    `values` (u,) are accumulated corrections against the start, `covariance` (u, u) theirs, a
+    posteriori, both in the unknowns' own units (see `MosaicModel`). `residuals_px` (n, 2) is place
+    of a minus place of b in the VIP after the adjustment, (x right, y up), for all tie points,
+    outliers included; `redundancy_numbers` (n, 2) likewise; `outliers` (n,) marks points not used.
+    `sigma0` has no unit; `sigma0_px` is that of one coordinate difference of a P/P pair.
+    `used` counts points per pair, `undetermined` names unknowns held at their start.
+    `pseudo_observations` is the number of directions held.
+    """
+
+    method: str
+    model: MosaicModel
+    start: Mapping[str, SensorPlacement]
+    placements: Mapping[str, SensorPlacement]
+    sigma0: float
+    sigma0_px: float
+    sigma0_um: float
+    sigma_pp_px: float
+    sigma_pc_px: float
+    redundancy: float
+    observations: int
+    values: Array
+    covariance: Array
+    residuals_px: Array
+    redundancy_numbers: Array
+    outliers: NDArray[np.bool_]
+    used: Mapping[tuple[str, str], int]
+    iterations: int
+    rank: int
+    constrained_rank: int
+    constraints: int
+    undetermined: tuple[str, ...]
+    pseudo_observations: int
+    datum_sensors: tuple[str, ...]
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        return self.model.names
+
+    def value(self, name: str) -> float:
+        """The correction of one unknown by name, such as `SU00.x` (mm)."""
+        return float(self.values[self.model.names.index(name)])
+
+    def sigma(self, name: str) -> float:
+        """The standard deviation of one unknown by name."""
+        i = self.model.names.index(name)
+        return math.sqrt(max(float(self.covariance[i, i]), 0.0))
+
+
+@dataclass(frozen=True)
+class Constraint:
+    """sum(coefficient * unknown) = 0 over named unknowns."""
+
+    coefficients: Mapping[str, float]
+
+
+@dataclass
+class _Group:
+    """The tie points of one pair of sensors, ready for linearisation."""
+
+    a: str
+    b: str
+    kind: int
+    rows: NDArray[np.int64]
+    corrected_a: Array
+    corrected_b: Array
+    sigma: Array
+    difference: Array = field(default_factory=lambda: np.empty((0, 2)))
+    redundancy: Array = field(default_factory=lambda: np.empty((0, 2)))
+    factor: Array = field(default_factory=lambda: np.empty(0))
+
+
+def free_mosaic(
+    rig: Rig,
+    placements: Mapping[str, SensorPlacement],
+    tie_points: TiePoints,
+    *,
+    settings: MosaicSettings | None = None,
+    excluded_datum_sensors: Sequence[str] = (),
+) -> Mosaic:
+    """Adjust all sensors of the PAN cones and the layer of the colour master.
+
+    Args:
+        rig: the camera.
+        placements: the start: calibration + TDM, layers by platform calibration.
+        tie_points: matched points.
+        settings: None takes the defaults.
+        excluded_datum_sensors: master sensors the datum (eq. 6) does not rest on.
+
+    Returns:
+        The mosaic. What tie points do not determine (missing frames, empty overlaps) stays at its
+        start and is named.
+
+    Source: seeds/ultracam-calibration.txt, eq. 1-7.
+    """
+    start = _starts(placements)
+    cones = mosaic_cones(rig)
+    free_sensors = [s.name for cone in cones if len(cone.sensors) >= 2 for s in cone.sensors]
+    free_layers = [cone.name for cone in cones if cone.name != rig.master_cone]
+    model = build_model(rig, start, free_sensors=free_sensors, free_layers=free_layers)
+    touched = _touched(tie_points)
+    datum = tuple(
+        s.name
+        for s in rig.cone(rig.master_cone).sensors
+        if s.name in model.sensors and s.name in touched and s.name not in excluded_datum_sensors
+    )
+    constraints = datum_constraints(start, datum)
+    for cone in cones:
+        present = [s.name for s in cone.sensors if s.name in touched]
+        if cone.name != rig.master_cone and len(cone.sensors) >= 2 and present:
+            constraints += layer_constraints(present)
+    return adjust_mosaic(
+        rig,
+        start,
+        tie_points,
+        model=model,
+        constraints=constraints,
+        settings=settings or MosaicSettings(),
+        method="free",
+        datum_sensors=datum,
+    )
+
+
+def datum_constraints(
+    start: Mapping[str, SensorPlacement], sensors: Sequence[str]
+) -> list[Constraint]:
+    """Eq. 6a, 6b, 6c over the given sensors of the master cone.
+
+    One sensor alone gives neither scale nor rotation by its place: its own are held instead. The
+    lever arms count from the sensors' mean, which with eq. 6a comes to the same.
+    """
+    if not sensors:
+        return []
+    if len(sensors) == 1:
+        return [Constraint({f"{sensors[0]}.{what}": 1.0}) for what in _SIMILARITY]
+    x = np.array([start[name].similarity.x_mm for name in sensors])
+    y = np.array([start[name].similarity.y_mm for name in sensors])
+    x, y = x - x.mean(), y - y.mean()
+    shift_x = {f"{name}.x": 1.0 for name in sensors}
+    shift_y = {f"{name}.y": 1.0 for name in sensors}
+    scale: dict[str, float] = {}
+    rotation: dict[str, float] = {}
+    for name, xc, yc in zip(sensors, x, y, strict=True):
+        scale |= {f"{name}.x": float(xc), f"{name}.y": float(yc)}
+        rotation |= {f"{name}.x": float(-yc), f"{name}.y": float(xc)}
+    return [Constraint(c) for c in (shift_x, shift_y, scale, rotation)]
+
+
+def layer_constraints(sensors: Sequence[str]) -> list[Constraint]:
+    """Eq. 6a, 7a, 7b over the sensors of one other cone: they separate S from P."""
+    return [Constraint({f"{name}.{what}": 1.0 for name in sensors}) for what in _SIMILARITY]
+
+
+_SIMILARITY = ("x", "y", "rotation", "scale")
+
+
+def adjust_mosaic(
+    rig: Rig,
+    start: Mapping[str, SensorPlacement],
+    tie_points: TiePoints,
+    *,
+    model: MosaicModel,
+    constraints: Sequence[Constraint],
+    settings: MosaicSettings,
+    method: str,
+    datum_sensors: tuple[str, ...],
+    kinds: Sequence[int] = _CLASSES,
+) -> Mosaic:
+    """Gauss-Newton with robust weights, variance components and data snooping.
+
+    Each round linearises, weighs (a soft weight while the model is still far off, then points whose
+    normalised residual exceeds `outlier_limit` are left out), solves, and estimates what the two
+    classes of points are worth, until corrections and outliers come to rest.
+    """
+    groups = _groups(rig, start, tie_points, settings, kinds)
+    for group in groups:
+        group.factor = _first_look(model, start, group)
+    matrix = np.zeros((len(constraints), len(model.names)))
+    for i, constraint in enumerate(constraints):
+        for name, coefficient in constraint.coefficients.items():
+            matrix[i, model.names.index(name)] = coefficient
+    scaled_matrix = matrix * model.units
+    values = np.zeros(len(model.names))
+    class_scale = dict.fromkeys(_CLASSES, 1.0)
+    solution: Solution | None = None
+    iterations = 0
+    for iterations in range(1, settings.max_iterations + 1):
+        blocks = [_block(model, start, g, values, class_scale[g.kind]) for g in groups]
+        normal, right = normal_equations(blocks, len(values))
+        solution = solve(
+            normal,
+            right,
+            scaled_matrix,
+            -scaled_matrix @ (values / model.units),
+            held_at=-values / model.units,
+            least_information=1.0 / settings.undetermined_px**2,
+        )
+        values = values + solution.dp * model.units
+        soft = iterations < settings.min_iterations - 1
+        changed = False
+        for group, block in zip(groups, blocks, strict=True):
+            v = (block.design @ solution.dp[block.columns] - block.misclosure).reshape(-1, 2)
+            weightless = dataclasses.replace(block, weight=_full_weight(group, class_scale))
+            group.difference = v
+            group.redundancy = redundancy_numbers(weightless, solution.cofactor).reshape(-1, 2)
+        class_scale, moved = _class_scales(groups, class_scale, settings)
+        for group, factor in zip(groups, _factors(groups, settings, soft=soft), strict=True):
+            changed = changed or bool(np.any((factor > 0.0) != (group.factor > 0.0)))
+            group.factor = factor
+        still = float(np.abs(solution.dp).max(initial=0.0)) < settings.converged_px
+        if iterations >= settings.min_iterations and still and not changed and not moved:
+            break
+    return _mosaic(
+        rig,
+        start,
+        tie_points,
+        model,
+        settings,
+        groups,
+        class_scale,
+        values,
+        solution,
+        iterations,
+        method=method,
+        constraints=len(constraints),
+        datum_sensors=datum_sensors,
+    )
+
+
+def _mosaic(
+    rig: Rig,
+    start: Mapping[str, SensorPlacement],
+    tie_points: TiePoints,
+    model: MosaicModel,
+    settings: MosaicSettings,
+    groups: Sequence[_Group],
+    class_scale: Mapping[int, float],
+    values: Array,
+    solution: Solution | None,
+    iterations: int,
+    *,
+    method: str,
+    constraints: int,
+    datum_sensors: tuple[str, ...],
+) -> Mosaic:
+    unknowns = len(model.names)
+    n = len(tie_points)
+    residuals, redundancy = np.full((n, 2), np.nan), np.full((n, 2), np.nan)
+    outliers = np.ones(n, dtype=np.bool_)
+    squares, used_points = 0.0, 0
+    used = dict.fromkeys(tie_points.pairs, 0)
+    for group in groups:
+        good = group.factor > 0.0
+        residuals[group.rows] = group.difference
+        redundancy[group.rows] = group.redundancy
+        outliers[group.rows] = ~good
+        used[(group.a, group.b)] = int(good.sum())
+        used_points += int(good.sum())
+        sigma = group.sigma[good] * class_scale[group.kind]
+        squares += float(np.sum((group.difference[good] / sigma[:, None]) ** 2))
+    undetermined = np.empty((unknowns, 0)) if solution is None else solution.undetermined
+    held = undetermined.shape[1]
+    freedom = 2 * used_points - unknowns + constraints + held
+    sigma0 = math.sqrt(squares / freedom) if freedom > 0 else 1.0
+    cofactor = np.zeros((unknowns, unknowns)) if solution is None else solution.cofactor
+    ratio = class_scale[PAN_TO_COLOUR] / class_scale[PAN_TO_PAN]
+    pitch_um = model.pitch_mm * 1e3
+    sigma0_px = sigma0 * settings.sigma_pp_px * class_scale[PAN_TO_PAN]
+    return Mosaic(
+        method=method,
+        model=model,
+        start=start,
+        placements={name: placement_at(model, p, values) for name, p in start.items()},
+        sigma0=sigma0,
+        sigma0_px=sigma0_px,
+        sigma0_um=sigma0_px * pitch_um,
+        sigma_pp_px=sigma0_px,
+        sigma_pc_px=sigma0 * settings.sigma_pc_px * ratio * class_scale[PAN_TO_PAN],
+        redundancy=float(freedom),
+        observations=2 * used_points,
+        values=values,
+        covariance=cofactor * np.outer(model.units, model.units) * sigma0**2,
+        residuals_px=residuals,
+        redundancy_numbers=redundancy,
+        outliers=outliers,
+        used=used,
+        iterations=iterations,
+        rank=0 if solution is None else solution.rank,
+        constrained_rank=0 if solution is None else solution.constrained_rank,
+        constraints=constraints,
+        undetermined=_named(model, undetermined),
+        pseudo_observations=held,
+        datum_sensors=datum_sensors,
+    )
+
+
+def _starts(placements: Mapping[str, SensorPlacement]) -> dict[str, SensorPlacement]:
+    """Placements with S at calibration + TDM, the reference of datum and validity."""
+    return {
+        name: dataclasses.replace(p, similarity=start_similarity(p))
+        for name, p in placements.items()
+    }
+
+
+def _touched(tie_points: TiePoints) -> set[str]:
+    seen = set(np.unique(tie_points.sensor_a)) | set(np.unique(tie_points.sensor_b))
+    return {tie_points.names[i] for i in seen}
+
+
+def _groups(
+    rig: Rig,
+    start: Mapping[str, SensorPlacement],
+    tie_points: TiePoints,
+    settings: MosaicSettings,
+    kinds: Sequence[int],
+) -> list[_Group]:
+    typical = {}
+    for kind in _CLASSES:
+        sigmas = tie_points.sigma_px[tie_points.kind == kind]
+        typical[kind] = float(np.median(sigmas)) if len(sigmas) else 1.0
+    apriori = {
+        PAN_TO_PAN: settings.sigma_pp_px,
+        PAN_TO_COLOUR: math.hypot(settings.sigma_pc_px, settings.parallax_px),
+    }
+    shared = corners(rig)
+    groups = []
+    for number, (a, b) in enumerate(tie_points.pairs):
+        rows = np.flatnonzero(tie_points.overlap == number)
+        if not len(rows):
+            continue
+        kind = int(tie_points.kind[rows[0]])
+        if kind not in kinds:
+            continue
+        relative = tie_points.sigma_px[rows] / typical[kind]
+        if kind == PAN_TO_COLOUR:
+            # Parallax is not smaller where the match is sharper.
+            share = settings.sigma_pc_px * relative
+            sigma = np.hypot(share, settings.parallax_px)
+        else:
+            sigma = apriori[kind] * relative
+            xy = vip_mm_from_raw(start[a], tie_points.raw_a[rows])
+            for corner in shared:
+                # m differences of n images hold the information of n - 1.
+                meeting = sum(
+                    p[0] in corner.sensors and p[1] in corner.sensors for p in tie_points.pairs
+                )
+                inside = corner.rectangle.contains(xy)
+                sigma[inside] *= math.sqrt(max(1.0, meeting / (len(corner.sensors) - 1)))
+        groups.append(
+            _Group(
+                a=a,
+                b=b,
+                kind=kind,
+                rows=rows,
+                corrected_a=corrected_mm_from_raw(start[a], tie_points.raw_a[rows]),
+                corrected_b=corrected_mm_from_raw(start[b], tie_points.raw_b[rows]),
+                sigma=np.maximum(sigma, 1e-6),
+            )
+        )
+    return groups
+
+
+def _first_look(model: MosaicModel, start: Mapping[str, SensorPlacement], group: _Group) -> Array:
+    """Weight factors before any adjustment: points far from their pair's median are left out."""
+    zero = np.zeros(len(model.names))
+    a = vip_and_design(model, start[group.a], group.corrected_a, zero)[0]
+    b = vip_and_design(model, start[group.b], group.corrected_b, zero)[0]
+    off = a - b
+    off = np.abs(off - np.median(off, axis=0))
+    spread = np.maximum(_SPREAD_OF_MEDIAN * np.median(off, axis=0), 0.2)
+    group.difference = a - b
+    group.redundancy = np.ones((len(a), 2))
+    return np.asarray((off < 6.0 * spread).all(axis=1), dtype=np.float64)
+
+
+def _full_weight(group: _Group, class_scale: Mapping[int, float]) -> Array:
+    return np.repeat(1.0 / (group.sigma * class_scale[group.kind]) ** 2, 2)
+
+
+def _block(
+    model: MosaicModel,
+    start: Mapping[str, SensorPlacement],
+    group: _Group,
+    values: Array,
+    scale: float,
+) -> Block:
+    a, columns_a, design_a = vip_and_design(model, start[group.a], group.corrected_a, values)
+    b, columns_b, design_b = vip_and_design(model, start[group.b], group.corrected_b, values)
+    columns = np.concatenate([columns_a, columns_b])
+    design = np.concatenate([design_a, -design_b], axis=2).reshape(2 * len(a), len(columns))
+    return Block(
+        columns=columns,
+        design=design * model.units[columns],
+        misclosure=(b - a).reshape(-1),
+        weight=np.repeat(group.factor / (group.sigma * scale) ** 2, 2),
+    )
+
+
+def _class_scales(
+    groups: Sequence[_Group], before: Mapping[int, float], settings: MosaicSettings
+) -> tuple[dict[int, float], bool]:
+    """Variance components: P/P and P/C sigmas that make both classes fit their residuals.
+
+    P/P keeps its a-priori sigma (unit weight); only the ratio is estimated. Returns the factors on
+    the a-priori sigmas and whether they moved by more than two percent.
+    """
+    variance = {}
+    for kind in _CLASSES:
+        squares = redundancy = 0.0
+        for group in groups:
+            if group.kind == kind:
+                w = group.factor[:, None]
+                squares += float(np.sum(w * (group.difference / group.sigma[:, None]) ** 2))
+                redundancy += float(np.sum((w > 0.0) * group.redundancy))
+        if redundancy < settings.least_class_redundancy or squares <= 0.0:
+            return dict(before), False
+        variance[kind] = squares / redundancy
+    ratio = math.sqrt(variance[PAN_TO_COLOUR] / variance[PAN_TO_PAN])
+    after = {PAN_TO_PAN: 1.0, PAN_TO_COLOUR: ratio}
+    return after, abs(ratio / before[PAN_TO_COLOUR] - 1.0) > 0.02
+
+
+def _factors(groups: Sequence[_Group], settings: MosaicSettings, *, soft: bool) -> list[Array]:
+    """Weight factors of each group from normalised residuals, the larger of both coordinates.
+
+    Soft: Huber about the group's median, for rounds in which the model does not fit yet. Else zero
+    beyond the limit (data snooping, w-test against the robust spread of the class), one within.
+    """
+    normalised = []
+    for group in groups:
+        unit = group.sigma[:, None] * np.sqrt(np.maximum(group.redundancy, 1e-3))
+        middle = np.median(group.difference, axis=0) if soft else 0.0
+        normalised.append(np.abs(group.difference - middle) / unit)
+    spread = {}
+    for kind in _CLASSES:
+        every = [n.ravel() for n, g in zip(normalised, groups, strict=True) if g.kind == kind]
+        if every:
+            spread[kind] = max(_SPREAD_OF_MEDIAN * float(np.median(np.concatenate(every))), 1e-9)
+    factors = []
+    for w, group in zip(normalised, groups, strict=True):
+        largest = w.max(axis=1) / spread[group.kind]
+        if soft:
+            factors.append(np.minimum(1.0, _HUBER / np.maximum(largest, 1e-12)))
+        else:
+            factors.append((largest <= settings.outlier_limit).astype(np.float64))
+    return factors
+
+
+def _named(model: MosaicModel, undetermined: Array) -> tuple[str, ...]:
+    if not undetermined.shape[1]:
+        return ()
+    share = np.sqrt(np.sum(undetermined**2, axis=1))
+    limit = min(0.3, float(share.max()))
+    return tuple(name for name, s in zip(model.names, share, strict=True) if s >= limit)
+
+
+def vip_precision_px(mosaic: Mosaic, sensor: str, colrow: Array) -> Array:
+    """Standard deviation of where raw pixels (n, 2) fall, (n, 2) px, by the tie points alone.
+
+    It holds in the mosaic's datum; calibration and TDM are not part of it.
+    """
+    start = mosaic.start[sensor]
+    _, columns, design = vip_and_design(
+        mosaic.model, start, corrected_mm_from_raw(start, colrow), mosaic.values
+    )
+    q = mosaic.covariance[np.ix_(columns, columns)]
+    variance = np.einsum("nai,ij,naj->na", design, q, design)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))

@@ -1,0 +1,172 @@
+"""The model of a mosaic: which S and P are free, and how VIP points depend on them (eq. 1, 2).
+
+The unknowns are accumulated corrections against the start (calibration + TDM), never increments;
+their adjustment is in `processing.mosaic`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.placement import SensorPlacement
+from processing.projective import apply_projective, projective_jacobian
+from processing.rig import Rig
+from processing.similarity import Similarity, apply_similarity
+
+Array = NDArray[np.float64]
+
+SIMILARITY_NAMES = ("x", "y", "rotation", "scale")
+LAYER_NAMES = ("p11", "p12", "p13", "p21", "p22", "p23", "p31", "p32")
+
+
+@dataclass(frozen=True)
+class MosaicModel:
+    """Free similarities and layers of a rig, and the place of their unknowns.
+
+    Unknowns of a sensor: x, y (mm), rotation (rad), scale (1): S = (x0 + x, y0 + y, r0 + rotation,
+    s0 (1 + scale)), turned and scaled about the sensor's centre. Unknowns of a layer: p11 .. p32
+    (1) of P = N^-1 (I + p) N P0, N dividing by `half_size_mm`.
+
+    `units` is the size of each unknown that moves the farthest image point by about one pixel.
+    """
+
+    names: tuple[str, ...]
+    sensors: Mapping[str, int]
+    layers: Mapping[str, int]
+    units: Array
+    half_size_mm: float
+    pitch_mm: float
+
+
+def build_model(
+    rig: Rig,
+    placements: Mapping[str, SensorPlacement],
+    *,
+    free_sensors: Sequence[str],
+    free_layers: Sequence[str],
+) -> MosaicModel:
+    """Lay out the unknowns: those of each free sensor, then those of each free layer.
+
+    Raises:
+        ValueError: the rig has no virtual image.
+    """
+    image = rig.virtual_image
+    if image is None:
+        raise ValueError(f"rig {rig.name} has no [virtual_image]; nothing can be stitched")
+    pitch = image.pitch_mm
+    half_size = max(image.width_px, image.height_px) / 2.0 * pitch
+    names: list[str] = []
+    units: list[float] = []
+    sensors, layers = {}, {}
+    for name in free_sensors:
+        sensor = placements[name].sensor
+        reach = np.hypot(sensor.width_px, sensor.height_px) / 2.0 * sensor.pitch_mm
+        sensors[name] = len(names)
+        names += [f"{name}.{what}" for what in SIMILARITY_NAMES]
+        units += [pitch, pitch, pitch / reach, pitch / reach]
+    for name in free_layers:
+        layers[name] = len(names)
+        names += [f"{name}.{what}" for what in LAYER_NAMES]
+        units += [pitch / half_size] * 8
+    return MosaicModel(tuple(names), sensors, layers, np.array(units), half_size, pitch)
+
+
+def placement_at(model: MosaicModel, start: SensorPlacement, values: Array) -> SensorPlacement:
+    """The placement of a sensor with the unknowns at `values` (u,)."""
+    return dataclasses.replace(
+        start,
+        similarity=_similarity(model, start, values),
+        layer=_layer_correction(model, start, values) @ start.layer,
+    )
+
+
+def vip_and_design(
+    model: MosaicModel, start: SensorPlacement, corrected_mm: Array, values: Array
+) -> tuple[Array, NDArray[np.int64], Array]:
+    """VIP points of a sensor and their derivatives.
+
+    Args:
+        model: the unknowns.
+        start: the sensor's placement at calibration + TDM.
+        corrected_mm: u' (n, 2).
+        values: the unknowns (u,).
+
+    Returns:
+        Points (n, 2) in px of the virtual image, unscaled columns (k,) of the unknowns touched, and
+        derivatives (n, 2, k), px.
+
+    Source: seeds/ultracam-calibration.txt, eq. 1 and 2.
+    """
+    n = len(corrected_mm)
+    similarity = _similarity(model, start, values)
+    layer_mm = apply_similarity(similarity, corrected_mm)
+    start_mm = apply_projective(start.layer, layer_mm)
+    first_sensor = model.sensors.get(start.sensor.name)
+    first_layer = model.layers.get(start.cone.name)
+    columns = np.concatenate(
+        [
+            np.arange(first, first + size, dtype=np.int64)
+            for first, size in ((first_sensor, 4), (first_layer, 8))
+            if first is not None
+        ]
+        or [np.empty(0, dtype=np.int64)]
+    )
+    design = np.zeros((n, 2, len(columns)))
+    size = model.half_size_mm
+    if first_layer is None:
+        vip_mm = start_mm
+        jacobian = projective_jacobian(start.layer, layer_mm)
+    else:
+        scaled = start_mm / size
+        correction = _scaled_correction(values[first_layer : first_layer + 8])
+        moved = apply_projective(correction, scaled)
+        vip_mm = moved * size
+        w = correction[2, 0] * scaled[:, 0] + correction[2, 1] * scaled[:, 1] + 1.0
+        d = design[:, :, len(columns) - 8 :]
+        for axis in (0, 1):
+            d[:, axis, 3 * axis] = size * scaled[:, 0] / w
+            d[:, axis, 3 * axis + 1] = size * scaled[:, 1] / w
+            d[:, axis, 3 * axis + 2] = size / w
+            d[:, axis, 6] = -size * moved[:, axis] * scaled[:, 0] / w
+            d[:, axis, 7] = -size * moved[:, axis] * scaled[:, 1] / w
+        jacobian = projective_jacobian(correction, scaled) @ projective_jacobian(
+            start.layer, layer_mm
+        )
+    if first_sensor is not None:
+        arm = layer_mm - np.array([similarity.x_mm, similarity.y_mm])
+        turned = np.stack([-arm[:, 1], arm[:, 0]], axis=1)
+        # arm = s0 (1 + scale) R u', so its derivative by scale is arm / (1 + scale).
+        stretched = arm / (1.0 + values[first_sensor + 3])
+        design[:, :, 0:2] = jacobian
+        design[:, :, 2] = np.einsum("nij,nj->ni", jacobian, turned)
+        design[:, :, 3] = np.einsum("nij,nj->ni", jacobian, stretched)
+    return vip_mm / model.pitch_mm, columns, design / model.pitch_mm
+
+
+def _similarity(model: MosaicModel, start: SensorPlacement, values: Array) -> Similarity:
+    first = model.sensors.get(start.sensor.name)
+    s = start.similarity
+    if first is None:
+        return s
+    x, y, rotation, scale = (float(v) for v in values[first : first + 4])
+    return Similarity(s.x_mm + x, s.y_mm + y, s.rotation_rad + rotation, s.scale * (1.0 + scale))
+
+
+def _layer_correction(model: MosaicModel, start: SensorPlacement, values: Array) -> Array:
+    first = model.layers.get(start.cone.name)
+    if first is None:
+        return np.eye(3)
+    shrink = np.diag([1.0 / model.half_size_mm, 1.0 / model.half_size_mm, 1.0])
+    grow = np.diag([model.half_size_mm, model.half_size_mm, 1.0])
+    return np.asarray(grow @ _scaled_correction(values[first : first + 8]) @ shrink)
+
+
+def _scaled_correction(p: Array) -> Array:
+    return np.array(
+        [[1.0 + p[0], p[1], p[2]], [p[3], 1.0 + p[4], p[5]], [p[6], p[7], 1.0]], dtype=np.float64
+    )
