@@ -7,8 +7,10 @@ is stored but unsealed is sealed from the flight log. Running it twice changes n
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from daemon import durable, products
 from daemon.catalog import Catalog, CatalogError
@@ -24,12 +26,14 @@ from daemon.level0_folder import (
 )
 from daemon.log_records import LoggedRecord, LoggedTrigger, record_of
 from daemon.mission import DISCARDED, Mission, exposure_name
-from daemon.records import RecordError
+from daemon.records import RecordError, parse_record
 from daemon.store import Level0Writer
 from processing.rig import RigError, load_rig
 
 CONTEXT_NS = 60_000_000_000
 """Records of the log this long before and after a trigger belong to what seals its exposure."""
+
+LEDGER_TOPIC = "ledger"
 
 Complete = Callable[[Capture, Sequence[LoggedRecord]], Exposure]
 """Makes the final record of a stored exposure from what was logged around it."""
@@ -40,8 +44,8 @@ class RecoveryReport:
     """What recovery found and did. `problems` are what it could not put right.
 
     `sealed` and `lost` are the numbers it sealed just now; `settled` are all sealed records by
-    number, for the ledger; `next_number` is the one to go on with, beyond every trigger that was
-    ever given.
+    number, for the ledger, and `ledger_sheet` the last one that was logged under the topic
+    "ledger"; `next_number` is the one to go on with, beyond every trigger that was ever given.
     """
 
     done: tuple[str, ...]
@@ -50,6 +54,7 @@ class RecoveryReport:
     lost: tuple[int, ...]
     next_number: int
     settled: tuple[Exposure, ...]
+    ledger_sheet: Mapping[str, Any] | None
     log_bytes_cut: int
 
     @property
@@ -77,6 +82,7 @@ class _Log:
     """What the flight logs hold of the exposures that need it."""
 
     triggers: dict[int, tuple[str, LoggedTrigger]] = field(default_factory=dict)
+    sheet: Mapping[str, Any] | None = None
     cut_nbytes: int = 0
 
 
@@ -115,6 +121,7 @@ class _Recovery:
             lost=tuple(lost),
             next_number=next_number,
             settled=tuple(sealed[number].exposure for number in sorted(sealed)),
+            ledger_sheet=log.sheet,
             log_bytes_cut=log.cut_nbytes,
         )
 
@@ -236,6 +243,9 @@ class _Recovery:
                     record = record_of(message)
                     if isinstance(record, LoggedTrigger):
                         log.triggers[record.number] = (reader.boot_id, record)
+                elif message.topic == LEDGER_TOPIC:
+                    with suppress(RecordError):
+                        log.sheet = parse_record(message.payload, message.topic)
             if reader.cut_nbytes:
                 log.cut_nbytes += reader.cut_nbytes
                 self.done.append(
