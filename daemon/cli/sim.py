@@ -130,6 +130,7 @@ def service_toml(
     plan = ready["plan"]
     rig = find_rig(ready["rig_file"])
     probes = ready["probes"]
+    host, _, port = ready["pulse_bus"].rpartition(":")
     lines = [
         "# Written by `syntopic sim` for the devices it emulates.",
         "[mission]",
@@ -147,7 +148,8 @@ def service_toml(
         "",
         "[trigger]",
         'driver = "pulse-bus"',
-        f"address = {_quoted(ready['pulse_bus'])}",
+        f"host = {_quoted(host)}",
+        f"port = {port}",
         'mode = "distance"',
         f"distance_m = {plan['distance_m']}",
         *([f"count = {count}"] if count else []),
@@ -178,7 +180,7 @@ def service_toml(
             f"sensor = {_quoted(sensor)}",
             'driver = "aravis"',
             f"address = {_quoted(head['address'])}",
-            'trigger = "line"',
+            'trigger_source = "line"',
             f"exposure_time_us = {float(plan['exposure_time_us'][rig.cone_of(sensor).name])}",
             f"tdi_shifts = {plan['tdi_shifts'][rig.cone_of(sensor).name]}",
         ]

@@ -1,0 +1,94 @@
+"""A bad configuration is refused with all its mistakes at once; a good one means what it says."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daemon.configuration import ConfigurationError, from_mapping, load
+
+GOOD: dict[str, Any] = {
+    "mission": {"root": "missions", "rig": "ultracam-x-mini"},
+    "trigger": {"driver": "pulse-bus", "port": 5310, "interval_s": 2.0},
+    "head": [{"sensor": "SU00", "driver": "aravis", "address": "127.0.0.2"}],
+    "thermometer": [
+        {"name": "probes", "driver": "modbus-rtu", "port": "/dev/ttyS1", "channels": ["0"]}
+    ],
+    "navigator": [{"name": "gnss", "driver": "ublox", "port": "/dev/ttyS2"}],
+}
+FILE = Path("service.toml")
+
+
+def problems_of(content: dict[str, Any]) -> tuple[str, ...]:
+    with pytest.raises(ConfigurationError) as refused:
+        from_mapping(content, FILE)
+    return refused.value.problems
+
+
+def test_a_good_configuration_is_taken_with_paths_beside_the_file(tmp_path: Path) -> None:
+    configuration, rig = from_mapping(copy.deepcopy(GOOD), tmp_path / "service.toml")
+    assert rig.name == "ultracam-x-mini"
+    assert configuration.mission.root == tmp_path / "missions"
+    assert configuration.head[0].settings == {"address": "127.0.0.2"}
+    assert configuration.limits.exposures_in_memory == 3
+
+
+def test_five_mistakes_are_refused_with_five_sentences_that_name_file_and_key() -> None:
+    content = copy.deepcopy(GOOD)
+    content["trigger"]["interval_s"] = -2.0
+    content["head"][0]["sensor"] = "SU99"
+    content["navigator"][0]["driver"] = "ublocks"
+    content["thermometer"][0]["parity"] = "X"
+    content["processing"] = {"method": "freely"}
+    problems = problems_of(content)
+    assert len(problems) == 5, problems
+    for key in (
+        "trigger.interval_s",
+        "head[0].sensor",
+        "navigator[0].driver",
+        "thermometer[0].parity",
+        "processing.method",
+    ):
+        (sentence,) = [problem for problem in problems if key in problem]
+        assert sentence.startswith("service.toml: ")
+        assert "; " in sentence, "the cure stands behind the finding"
+
+
+def test_a_distance_trigger_without_a_distance_is_refused() -> None:
+    content = copy.deepcopy(GOOD)
+    content["trigger"]["mode"] = "distance"
+    (sentence,) = problems_of(content)
+    assert "distance_m" in sentence
+
+
+def test_a_misspelt_key_is_refused_by_its_name() -> None:
+    content = copy.deepcopy(GOOD)
+    content["mission"]["simulatd"] = True
+    (sentence,) = problems_of(content)
+    assert "mission.simulatd" in sentence
+
+
+def test_two_heads_for_one_sensor_are_refused() -> None:
+    content = copy.deepcopy(GOOD)
+    content["head"].append(dict(content["head"][0]))
+    (sentence,) = problems_of(content)
+    assert "head[1].sensor" in sentence
+
+
+def test_an_unknown_rig_is_refused_with_the_names_of_those_there_are() -> None:
+    content = copy.deepcopy(GOOD)
+    content["mission"]["rig"] = "ultracam-y"
+    (sentence,) = problems_of(content)
+    assert "ultracam-x-mini" in sentence
+
+
+def test_a_file_that_is_not_toml_or_not_there_is_refused_in_one_sentence(tmp_path: Path) -> None:
+    broken = tmp_path / "service.toml"
+    broken.write_text("[mission\n")
+    for path in (broken, tmp_path / "absent.toml"):
+        with pytest.raises(ConfigurationError) as refused:
+            load(path)
+        assert len(refused.value.problems) == 1
