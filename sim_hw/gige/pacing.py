@@ -19,6 +19,9 @@ LATENCY_S = 0.020
 BURST_PART = 0.25
 """Part of the buffer that may be filled at once, which is what a late sender does to catch up."""
 
+BURST_MAX_BYTES = 512 * 1024
+RATE_MAX_BYTES_PER_S = 60e6
+
 _NS_PER_S = 1_000_000_000
 
 
@@ -31,9 +34,11 @@ class Pacing:
     bytes of packets fit. What comes while the receiver sleeps must fit:
     burst + rate * latency <= rmem_max. Hence
 
-        burst = rmem_max / 4,    rate = (rmem_max - burst) / 20 ms
+        burst = min(rmem_max / 4, 512 KiB)
+        rate = min((rmem_max - burst) / 20 ms, 60 MB/s)
 
-    8 MB/s per head with 212,992 bytes, 157 MB/s with 4 MiB.
+    8 MB/s per head with 212,992 bytes, 60 MB/s with 4 MiB. The upper bounds keep thirteen heads
+    that fire together within what two cores can move from socket to socket.
     """
 
     rate_bytes_per_s: float
@@ -42,8 +47,9 @@ class Pacing:
     @classmethod
     def for_receive_buffer(cls, buffer_bytes: int) -> Pacing:
         """Pacing for receivers whose sockets ask for that many bytes (SO_RCVBUF)."""
-        burst = int(buffer_bytes * BURST_PART)
-        return cls((buffer_bytes - burst) / LATENCY_S, burst)
+        burst = min(int(buffer_bytes * BURST_PART), BURST_MAX_BYTES)
+        rate = (buffer_bytes - burst) / LATENCY_S
+        return cls(min(rate, RATE_MAX_BYTES_PER_S), burst)
 
     @classmethod
     def for_this_host(cls) -> Pacing:

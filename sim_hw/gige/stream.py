@@ -33,6 +33,9 @@ KEPT_FRAMES = 2
 FRAMES_WAITING_MAX = 2
 SEND_BUFFER_BYTES = 4 << 20
 
+FIRST_LEADER_AHEAD_S = 0.005
+"""The first leader of a stream goes alone: a receiver may enlarge its socket only when it comes."""
+
 _UNAVAILABLE_ANSWERS_MAX = 16
 _POLL_S = 0.2
 _IP_MTU_DISCOVER = 10
@@ -44,6 +47,10 @@ class _Outgoing:
     frame: FramePackets
     is_wanted: Callable[[], bool]
     sent_packets: int = 0
+
+    @property
+    def opens_the_stream(self) -> bool:
+        return self.frame.block_id == 1
 
 
 class StreamChannel:
@@ -152,6 +159,10 @@ class StreamChannel:
         limit = frame.destination.packet_size * 1e9 / delay_ns if delay_ns else float("inf")
         rate = min(limit, self._pacing.rate_bytes_per_s)
         done = 0
+        if outgoing.opens_the_stream:
+            self._send_first_time(frame, 0, 0)
+            outgoing.sent_packets, done = 1, int(ends[0])
+            self._stop.wait(FIRST_LEADER_AHEAD_S)
         while done < total:
             if self._stop.is_set() or not outgoing.is_wanted():
                 return False
