@@ -25,8 +25,8 @@ def conditions_of(exposure: Exposure, rig: Rig, plan: PlanSection, flags: Flag) 
         speed_mps = math.hypot(north, east)
         height_m = navigation.height_m - plan.ground_height_m
         if navigation.heading_rad is not None and speed_mps > 1.0:
-            drift = math.atan2(east, north) - navigation.heading_rad
-            crab_rad = math.remainder(drift, 2 * math.pi)
+            crab = navigation.heading_rad - math.atan2(east, north)
+            crab_rad = math.remainder(crab, 2 * math.pi)
     exposure_time_s = {}
     tdi_shifts = {}
     for frame in exposure.frames:
