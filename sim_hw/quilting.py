@@ -1,0 +1,202 @@
+"""Image quilting: one large picture out of patches of a few photographs, at full sharpness.
+
+Patches are drawn without replacement from (source cell, one of eight orientations) and joined by
+minimum-error boundary cuts, after Efros and Freeman, Image Quilting for Texture Synthesis and
+Transfer, 2001; nothing is blended, so nothing is blurred. Radiometry of a scene is in `scene`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+Picture = NDArray[np.uint16]
+"""Shape (height, width, bands)."""
+
+PATCH_PX = 368
+OVERLAP_PX = 48
+THUMB = 16
+"""Candidates are compared on thumbnails reduced by this factor; it divides the two above."""
+CANDIDATES = 160
+KEEP_APART = 2
+"""A cell is not used again, in whatever orientation, within this many patches."""
+ORIENTATIONS = 8
+
+
+@dataclass(frozen=True)
+class Patch:
+    """Where a patch comes from: source picture, upper left corner of its cell, orientation 0-7."""
+
+    source: int
+    row: int
+    column: int
+    orientation: int
+
+    @property
+    def cell(self) -> tuple[int, int, int]:
+        return self.source, self.row, self.column
+
+
+@dataclass(frozen=True)
+class Quilt:
+    """A plan of patches, row by row. `reused` counts patches that had to be taken a second time."""
+
+    rows: tuple[tuple[Patch, ...], ...]
+    reused: int
+
+
+def oriented(picture: NDArray[np.generic], orientation: int) -> NDArray[np.generic]:
+    """One of the eight orientations of a square: quarter turns, then mirrored."""
+    turned = np.rot90(picture, orientation % 4)
+    return turned[:, ::-1] if orientation >= 4 else turned
+
+
+def patches_of(sources: Sequence[Picture]) -> list[Patch]:
+    """All patches that the sources hold: cells do not overlap."""
+    found = []
+    for index, source in enumerate(sources):
+        height, width = source.shape[:2]
+        if min(height, width) < PATCH_PX:
+            raise ValueError(
+                f"source picture {index} is {width} x {height} px; a patch needs {PATCH_PX} px"
+            )
+        for row in range(0, height - PATCH_PX + 1, PATCH_PX):
+            for column in range(0, width - PATCH_PX + 1, PATCH_PX):
+                found += [Patch(index, row, column, o) for o in range(ORIENTATIONS)]
+    return found
+
+
+def plan_quilt(
+    sources: Sequence[Picture], *, height_px: int, width_px: int, random: np.random.Generator
+) -> Quilt:
+    """Choose patches: each the best match to its neighbours of candidates drawn at random."""
+    step = PATCH_PX - OVERLAP_PX
+    rows = -(-(height_px - OVERLAP_PX) // step)
+    columns = -(-(width_px - OVERLAP_PX) // step)
+    patches = patches_of(sources)
+    edges = _edges(sources, patches)
+    free = np.ones(len(patches), dtype=bool)
+    cells = np.array([hash(p.cell) for p in patches])
+    chosen = np.full((rows, columns), -1)
+    reused = 0
+    for r in range(rows):
+        for c in range(columns):
+            if not free.any():
+                free[:] = True
+                reused += 1
+            elif reused:
+                reused += 1
+            near = chosen[
+                max(0, r - KEEP_APART) : r + 1, max(0, c - KEEP_APART) : c + KEEP_APART + 1
+            ]
+            allowed = free & ~np.isin(cells, cells[near[near >= 0]])
+            pool = np.flatnonzero(allowed if allowed.any() else free)
+            pool = random.permutation(pool)[:CANDIDATES]
+            cost = np.zeros(pool.size)
+            if c > 0:
+                cost += _mismatch(edges["left"][pool], edges["right"][chosen[r, c - 1]])
+            if r > 0:
+                cost += _mismatch(edges["top"][pool], edges["bottom"][chosen[r - 1, c]])
+            best = int(pool[np.argmin(cost)])
+            chosen[r, c] = best
+            free[best] = False
+    return Quilt(
+        rows=tuple(tuple(patches[i] for i in row) for row in chosen),
+        reused=reused,
+    )
+
+
+def sew(sources: Sequence[Picture], quilt: Quilt, *, height_px: int, width_px: int) -> Picture:
+    """Lay the patches of a plan out and cut them together, shape (height, width, bands)."""
+    step = PATCH_PX - OVERLAP_PX
+    rows, columns = len(quilt.rows), len(quilt.rows[0])
+    full = (rows * step + OVERLAP_PX, columns * step + OVERLAP_PX, sources[0].shape[2])
+    canvas = np.empty(full, dtype=np.uint16)
+    for r, row in enumerate(quilt.rows):
+        for c, patch in enumerate(row):
+            y, x = r * step, c * step
+            cell = sources[patch.source][
+                patch.row : patch.row + PATCH_PX, patch.column : patch.column + PATCH_PX
+            ]
+            new = np.ascontiguousarray(oriented(cell, patch.orientation))
+            place = canvas[y : y + PATCH_PX, x : x + PATCH_PX]
+            keep = np.zeros((PATCH_PX, PATCH_PX), dtype=bool)
+            if c > 0:
+                seam = least_error_cut(_difference(place[:, :OVERLAP_PX], new[:, :OVERLAP_PX]))
+                keep |= np.arange(PATCH_PX)[None, :] < seam[:, None]
+            if r > 0:
+                seam = least_error_cut(_difference(place[:OVERLAP_PX], new[:OVERLAP_PX]).T)
+                keep |= np.arange(PATCH_PX)[:, None] < seam[None, :]
+            np.copyto(new, place, where=keep[:, :, None])
+            place[...] = new
+    return canvas[:height_px, :width_px]
+
+
+def least_error_cut(error: NDArray[np.float32]) -> NDArray[np.int64]:
+    """The path down a strip (length, width) of least summed error: a column for every line."""
+    return np.asarray(_cut(np.ascontiguousarray(error)))
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _cut(error: NDArray[np.float32]) -> NDArray[np.int64]:
+    length, width = error.shape
+    total = error.astype(np.float64)
+    for i in range(1, length):
+        for j in range(width):
+            best = total[i - 1, j]
+            if j > 0 and total[i - 1, j - 1] < best:
+                best = total[i - 1, j - 1]
+            if j < width - 1 and total[i - 1, j + 1] < best:
+                best = total[i - 1, j + 1]
+            total[i, j] += best
+    path = np.empty(length, dtype=np.int64)
+    j = int(np.argmin(total[length - 1]))
+    path[length - 1] = j
+    for i in range(length - 2, -1, -1):
+        low = max(j - 1, 0)
+        high = min(j + 2, width)
+        j = low + int(np.argmin(total[i, low:high]))
+        path[i] = j
+    return path
+
+
+def _difference(a: Picture, b: Picture) -> NDArray[np.float32]:
+    """Squared difference of two overlaps as the eye sees it: of square roots of radiance."""
+    roots = [cv2.sqrt(np.ascontiguousarray(p).astype(np.float32)) for p in (a, b)]
+    difference = roots[0] - roots[1]
+    return np.asarray(np.einsum("ijk,ijk->ij", difference, difference), dtype=np.float32)
+
+
+def _edges(sources: Sequence[Picture], patches: Sequence[Patch]) -> dict[str, NDArray[np.float32]]:
+    """The four overlap strips of every patch on thumbnails, shape (patches, values)."""
+    size = PATCH_PX // THUMB
+    width = OVERLAP_PX // THUMB
+    strips: dict[str, list[NDArray[np.float32]]] = {
+        k: [] for k in ("left", "right", "top", "bottom")
+    }
+    cells: dict[tuple[int, int, int], NDArray[np.float32]] = {}
+    for patch in patches:
+        if patch.cell not in cells:
+            cell = sources[patch.source][
+                patch.row : patch.row + PATCH_PX, patch.column : patch.column + PATCH_PX
+            ]
+            small = cv2.resize(
+                np.ascontiguousarray(cell), (size, size), interpolation=cv2.INTER_AREA
+            )
+            cells[patch.cell] = np.sqrt(small.astype(np.float32))
+        thumb = np.asarray(oriented(cells[patch.cell], patch.orientation), dtype=np.float32)
+        strips["left"].append(thumb[:, :width].ravel())
+        strips["right"].append(thumb[:, size - width :].ravel())
+        strips["top"].append(thumb[:width].ravel())
+        strips["bottom"].append(thumb[size - width :].ravel())
+    return {side: np.stack(values) for side, values in strips.items()}
+
+
+def _mismatch(candidates: NDArray[np.float32], placed: NDArray[np.float32]) -> NDArray[np.float64]:
+    difference = candidates - placed
+    return np.asarray(np.einsum("ij,ij->i", difference, difference), dtype=np.float64)
