@@ -89,8 +89,8 @@ class Level0Writer:
             The frames with file name and hash.
 
         Raises:
-            OSError: the disk refused; nothing of the exposure is left, and nothing stored before
-                is touched.
+            OSError: the disk refused. Nothing of the exposure is left, unless it failed at the
+                very last syncs: then recovery finds it whole. Nothing stored before is touched.
             StoreError: this number is stored already, or frames and pixels do not fit.
         """
         _check(capture, pixels)
