@@ -1,0 +1,119 @@
+"""Overlaps and counts follow from the rig alone: tables 1 and 2 of the paper."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from processing.rig import Rig, find_rig
+from processing.topology import (
+    colour_coverage,
+    colour_ratio,
+    corners,
+    counts,
+    overlaps,
+)
+
+
+def side_by_side_rig() -> Rig:
+    """The topology of ultracam-l: two single-sensor PAN cones, left and right, and one green."""
+    mini = find_rig("ultracam-x-mini")
+    assert mini.virtual_image is not None
+    master, other, green = mini.cone("0"), mini.cone("1"), mini.cone("G")
+    half = (1248 - 128) / 2.0 * 7.2e-3
+    left = dataclasses.replace(master.sensors[0], name="SU00", x_mm=-half, y_mm=0.0)
+    right = dataclasses.replace(other.sensors[0], name="SU10", x_mm=half, y_mm=0.0)
+    return dataclasses.replace(
+        mini,
+        name="side-by-side",
+        cones=(
+            dataclasses.replace(master, sensors=(left,)),
+            dataclasses.replace(other, sensors=(right,)),
+            green,
+        ),
+        virtual_image=dataclasses.replace(mini.virtual_image, width_px=2368, height_px=832),
+    )
+
+
+def test_ultracam_x_has_twelve_strips_six_of_each_kind() -> None:
+    rig = find_rig("ultracam-x")
+    found = overlaps(rig)
+    assert len(found) == 12
+    pitch = 7.2e-3
+    upright = [o.rectangle for o in found if o.rectangle.height_mm > o.rectangle.width_mm]
+    flat = [o.rectangle for o in found if o.rectangle.height_mm < o.rectangle.width_mm]
+    assert (len(upright), len(flat)) == (6, 6)
+    # 273 x 3328 and 4992 x 282, to the few pixels by which the calibrated sensors are askew.
+    for r in upright:
+        assert r.width_mm / pitch == pytest.approx(273, abs=8)
+        assert r.height_mm / pitch == pytest.approx(3328, abs=10)
+    for r in flat:
+        assert r.width_mm / pitch == pytest.approx(4992, abs=10)
+        assert r.height_mm / pitch == pytest.approx(282, abs=8)
+    for o in found:
+        assert rig.cone_of(o.sensor_a).name != rig.cone_of(o.sensor_b).name
+
+
+def test_four_corners_are_seen_by_four_sensors_each() -> None:
+    found = corners(find_rig("ultracam-x"))
+    assert {c.sensors for c in found} == {
+        ("SU00", "SU10", "SU20", "SU30"),
+        ("SU01", "SU10", "SU21", "SU30"),
+        ("SU02", "SU11", "SU20", "SU30"),
+        ("SU03", "SU11", "SU21", "SU30"),
+    }
+    for corner in found:
+        assert corner.rectangle.width_mm / 7.2e-3 == pytest.approx(273, abs=8)
+
+
+@pytest.mark.parametrize("name", ["ultracam-x", "ultracam-x-mini"])
+def test_table_1_counts_64_parameters_12_constraints_52_unknowns(name: str) -> None:
+    found = counts(find_rig(name))
+    by_cone = {c.cone: (c.parameters, c.constraints, c.degrees_of_freedom) for c in found.cones}
+    assert by_cone == {
+        "0": (16, 4, 12),
+        "1": (16, 4, 12),
+        "2": (16, 4, 12),
+        "3": (8, 0, 8),
+        "G": (8, 0, 8),
+    }
+    assert (found.parameters, found.constraints, found.unknowns) == (64, 12, 52)
+
+
+def test_table_2_counts_no_parameter_for_a_master_of_one_sensor_and_16_in_all() -> None:
+    found = counts(side_by_side_rig())
+    assert {c.cone: c.parameters for c in found.cones} == {"0": 0, "1": 8, "G": 8}
+    assert (found.parameters, found.constraints) == (16, 0)
+
+
+def test_a_rig_of_two_single_sensors_has_one_strip_and_no_corner() -> None:
+    rig = side_by_side_rig()
+    (strip,) = overlaps(rig)
+    assert (strip.sensor_a, strip.sensor_b) == ("SU00", "SU10")
+    assert strip.rectangle.width_mm / 7.2e-3 == pytest.approx(128, abs=8)
+    assert corners(rig) == ()
+
+
+def test_green_sees_all_of_every_pan_sensor_at_a_third() -> None:
+    rig = find_rig("ultracam-x")
+    coverage = colour_coverage(rig)
+    assert list(coverage) == [s.name for cone in rig.pan_cones for s in cone.sensors]
+    assert all(r.width_mm / 7.2e-3 > 4985 for r in coverage.values())
+    assert colour_ratio(rig) == 3
+
+
+def test_a_rig_without_colour_master_has_neither_coverage_nor_ratio() -> None:
+    rig = dataclasses.replace(find_rig("ultracam-x-mini"), colour_master_cone=None)
+    assert colour_coverage(rig) == {}
+    assert colour_ratio(rig) is None
+    assert counts(rig).parameters == 56
+
+
+def test_a_ratio_that_is_not_whole_is_not_rounded() -> None:
+    rig = find_rig("ultracam-x-mini")
+    cones = tuple(
+        dataclasses.replace(c, lens=dataclasses.replace(c.lens, f_mm=21.0)) if c.name == "G" else c
+        for c in rig.cones
+    )
+    assert colour_ratio(dataclasses.replace(rig, cones=cones)) is None
