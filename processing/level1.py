@@ -339,6 +339,7 @@ def _interpolate_defects(level1, mask, places):  # type: ignore[no-untyped-def]
             if error < best:
                 best = error
                 share = distances[0] / (distances[0] + distances[1])
-                value = np.int64(values[0] + (values[1] - values[0]) * share + 0.5)
-                found = (np.int64(min(max(value, 2), 65534)) & 0xFFFE) | saturated
+                # Half of the word and its doubling leave the lowest bit to the saturation mark.
+                half = int(0.5 * (values[0] + (values[1] - values[0]) * share) + 0.5)
+                found = 2 * half + saturated
         level1[row, column] = found

@@ -26,7 +26,9 @@ _STEP_COST: Final = 0.15
 """A detour of one node must save this much disagreement (in units of noise): straight seams."""
 _EDGE_COST: Final = 3.0
 _UNUSABLE_COST: Final = 30.0
-_UNCOVERED_COST: Final = 1e5
+_UNCOVERED_COST: Final = 0.1
+"""Per node given to a part that does not cover it. Low, because such nodes are handed over after-
+wards: a stretch of them bends the seam, a ragged border of one node does not."""
 _NOISE_FLOOR_COUNTS: Final = 100.0
 
 

@@ -1,0 +1,72 @@
+"""Which compiled kernels there are, and compiling them before a flight: none compiles in the air.
+
+Kernels are cached on disk (numba; `NUMBA_CACHE_DIR` where the service says so), so that after the
+installation a start only loads them.
+"""
+
+from __future__ import annotations
+
+import importlib
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from numba.core.dispatcher import Dispatcher
+
+from processing.pipeline import Pipeline, Settings
+from processing.radiometry import RadiometricCalibration
+from processing.rig import Rig
+
+_ROOMS: Final = (
+    "processing.balance",
+    "processing.level1",
+    "processing.matching",
+    "processing.quicklook",
+    "processing.resampling",
+    "processing.seams",
+)
+
+
+@dataclass(frozen=True)
+class Compilation:
+    """What a warm-up did: variants by kernel, how many of them the cache did not hold, seconds."""
+
+    variants: Mapping[str, int]
+    compiled: int
+    seconds: float
+
+
+def kernels() -> dict[str, Any]:
+    """All compiled kernels by "module.function"."""
+    found = {}
+    for room in _ROOMS:
+        for name, value in vars(importlib.import_module(room)).items():
+            if isinstance(value, Dispatcher) and value.py_func.__module__ == room:
+                found[f"{room}.{name.lstrip('_')}"] = value
+    return dict(sorted(found.items()))
+
+
+def variants() -> dict[str, int]:
+    """How many variants (by argument types) of each kernel this process holds ready."""
+    return {name: len(kernel.signatures) for name, kernel in kernels().items()}
+
+
+def compile_for(
+    rig: Rig,
+    radiometry: Mapping[str, RadiometricCalibration] | None = None,
+    settings: Settings | None = None,
+) -> Compilation:
+    """Compile, or load from the cache, what this rig's pipeline will call.
+
+    Raises:
+        ValueError, CalibrationError: as `Pipeline`.
+    """
+    began = time.perf_counter()
+    before = _cache_misses()
+    Pipeline(rig, radiometry, settings).warm_up()
+    return Compilation(variants(), _cache_misses() - before, time.perf_counter() - began)
+
+
+def _cache_misses() -> int:
+    return sum(sum(kernel.stats.cache_misses.values()) for kernel in kernels().values())

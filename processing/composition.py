@@ -1,0 +1,240 @@
+"""Composing rasters from corrected frames: PAN of many sensors, colour of one sensor a band.
+
+Holds the buffers, which are allocated once and used again for every exposure. Where sensors lie is
+given by placements; what they are good for is not asked here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.balance import Balance, balance_gains, node_means
+from processing.level1 import exposed_rows
+from processing.placement import (
+    SensorPlacement,
+    vip_mm_from_raw,
+    vip_px_from_mm,
+)
+from processing.resampling import (
+    OUTSIDE,
+    WEIGHT_STEP_PX,
+    WEIGHT_UNIT,
+    Interpolation,
+    colour_raster,
+    fill_lattice,
+    interpolate_lattice,
+    lattice_shape,
+    pan_raster,
+    resample,
+    usable_area,
+)
+from processing.rig import Sensor, VirtualImage
+from processing.seams import seam_labels, seam_weights
+
+Array = NDArray[Any]
+
+PAN_CELL_PX: Final = 32
+COLOUR_CELL_PX: Final = 16
+"""Spacing of the lattices of inverse mapping; a short lens bends its pixels faster."""
+
+_NOWHERE: Final = (1.0, 0.0, 1.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Composition:
+    """The PAN image: `pan` (H, W) uint16, 0 no data; `source` (H, W) uint8 as in
+    `processing.resampling.resample`, an index into the composer's sensors."""
+
+    pan: Array
+    source: Array
+    balance: Balance
+
+
+class PanComposer:
+    """Level-1 frames of the PAN sensors and what is needed to make one image of them."""
+
+    def __init__(self, image: VirtualImage, sensors: Collection[Sensor]) -> None:
+        self.image = image
+        self.sensors = tuple(sensors)
+        self.names = tuple(sensor.name for sensor in self.sensors)
+        count = len(self.sensors)
+        raster = pan_raster(image)
+        rows, columns = lattice_shape(raster, PAN_CELL_PX)
+        per_cell = PAN_CELL_PX // WEIGHT_STEP_PX
+        nodes = ((rows - 1) * per_cell + 1, (columns - 1) * per_cell + 1)
+        self._frames = _stack(self.sensors)
+        self._lattices = np.full((count, rows, columns, 2), OUTSIDE)
+        self._spare = np.full((rows, columns, 2), OUTSIDE)
+        self._valid = np.tile(np.array(_NOWHERE), (count, 1))
+        self._means = np.zeros((count, *nodes), np.float32)
+        self._weights = np.zeros((count, *nodes), np.uint8)
+        self._pan = np.zeros((image.height_px, image.width_px), np.uint16)
+        self._source = np.zeros((image.height_px, image.width_px), np.uint8)
+
+    def frame(self, name: str) -> Array:
+        """Where the Level-1 frame of a sensor is to be written, (h, w) uint16."""
+        index = self.names.index(name)
+        sensor = self.sensors[index]
+        view: Array = self._frames[index, : sensor.height_px, : sensor.width_px]
+        return view
+
+    def compose(
+        self,
+        placements: Mapping[str, SensorPlacement],
+        present: Collection[str],
+        *,
+        feather_px: int,
+        interpolation: Interpolation,
+    ) -> Composition:
+        """Balance, seams and the one resampling, of the frames written before.
+
+        Args:
+            placements: by sensor name, adjusted.
+            present: sensors whose frames are there; the others leave holes.
+        """
+        raster = pan_raster(self.image)
+        for k, name in enumerate(self.names):
+            if name in present:
+                fill_lattice(self.image, raster, placements[name], PAN_CELL_PX, self._lattices[k])
+                self._valid[k] = _usable(placements[name])
+            else:
+                self._lattices[k] = OUTSIDE
+                self._valid[k] = _NOWHERE
+        node_means(self._frames, self._valid, self._lattices, PAN_CELL_PX, self._means)
+        balance = balance_gains(self.names, self._means)
+        gains = np.array([balance.gains[name] for name in self.names], np.float32)
+        labels = seam_labels(self._middles(placements), self._means, gains, feather_px)
+        seam_weights(labels, feather_px, self._weights)
+        resample(
+            self._frames,
+            self._valid,
+            self._lattices,
+            PAN_CELL_PX,
+            self._weights,
+            gains,
+            interpolation=interpolation,
+            out=self._pan,
+            source=self._source,
+        )
+        return Composition(self._pan, self._source, balance)
+
+    def geometry(self, placements: Mapping[str, SensorPlacement] | None = None) -> dict[str, Array]:
+        """Which raw pixel serves which VIP pixel, on every `WEIGHT_STEP_PX`-th VIP pixel.
+
+        For each sensor that contributes: `<sensor>.vip` (n, 2) VIP pixels, `<sensor>.raw` (n, 2)
+        raw pixels, `<sensor>.weight` (n,) above zero.
+
+        Args:
+            placements: None tells what the last image was made with. Others tell where the same
+                VIP pixels would be fetched if these placements were used instead.
+        """
+        result: dict[str, Array] = {}
+        for k, name in enumerate(self.names):
+            lattice = self._lattices[k]
+            used = lattice
+            i, j = np.nonzero(self._weights[k])
+            vip = np.stack([j, i], axis=1) * float(WEIGHT_STEP_PX)
+            inside = (vip[:, 0] < self.image.width_px) & (vip[:, 1] < self.image.height_px)
+            raw = interpolate_lattice(lattice, PAN_CELL_PX, vip)
+            first_c, last_c, first_r, last_r = self._valid[k]
+            with np.errstate(invalid="ignore"):
+                inside &= (raw[:, 0] >= first_c) & (raw[:, 0] <= last_c)
+                inside &= (raw[:, 1] >= first_r) & (raw[:, 1] <= last_r)
+            if not inside.any():
+                continue
+            vip, raw = vip[inside], raw[inside]
+            if placements is not None:
+                used = self._spare
+                fill_lattice(
+                    self.image, pan_raster(self.image), placements[name], PAN_CELL_PX, used
+                )
+                raw = interpolate_lattice(used, PAN_CELL_PX, vip)
+            known = np.isfinite(raw[:, 0])
+            weights = self._weights[k][i[inside], j[inside]] / np.float32(WEIGHT_UNIT)
+            result[f"{name}.vip"] = vip[known]
+            result[f"{name}.raw"] = raw[known]
+            result[f"{name}.weight"] = weights[known]
+        return result
+
+    def _middles(self, placements: Mapping[str, SensorPlacement]) -> Array:
+        middles = []
+        for sensor in self.sensors:
+            middle = np.array([[(sensor.width_px - 1) / 2.0, (sensor.height_px - 1) / 2.0]])
+            xy = vip_mm_from_raw(placements[sensor.name], middle)
+            middles.append(vip_px_from_mm(self.image, xy)[0])
+        return np.array(middles)
+
+
+class ColourComposer:
+    """Level-1 frames of the colour sensors and the rasters of their bands."""
+
+    def __init__(self, image: VirtualImage, sensors: Mapping[str, Sensor]) -> None:
+        """`sensors` by band."""
+        self.image = image
+        self.sensors = dict(sensors)
+        raster = colour_raster(image)
+        rows, columns = lattice_shape(raster, COLOUR_CELL_PX)
+        per_cell = COLOUR_CELL_PX // WEIGHT_STEP_PX
+        nodes = ((rows - 1) * per_cell + 1, (columns - 1) * per_cell + 1)
+        shape = (raster.height_px, raster.width_px)
+        self._frames = {band: _stack([sensor]) for band, sensor in self.sensors.items()}
+        self._lattice = np.full((1, rows, columns, 2), OUTSIDE)
+        self._weights = np.full((1, *nodes), WEIGHT_UNIT, np.uint8)
+        self._bands = {band: np.zeros(shape, np.uint16) for band in self.sensors}
+        self._source = np.zeros(shape, np.uint8)
+
+    def frame(self, band: str) -> Array:
+        """Where the Level-1 frame of a band is to be written, (h, w) uint16."""
+        view: Array = self._frames[band][0]
+        return view
+
+    def compose(
+        self,
+        band: str,
+        placement: SensorPlacement,
+        source_from_target_mm: Array | None,
+        *,
+        interpolation: Interpolation,
+    ) -> Array:
+        """Resample one band onto the colour raster, (h, w) uint16; see `fill_lattice`."""
+        raster = colour_raster(self.image)
+        fill_lattice(
+            self.image,
+            raster,
+            placement,
+            COLOUR_CELL_PX,
+            self._lattice[0],
+            source_from_target_mm=source_from_target_mm,
+        )
+        resample(
+            self._frames[band],
+            np.array([_usable(placement)]),
+            self._lattice,
+            COLOUR_CELL_PX,
+            self._weights,
+            np.ones(1, np.float32),
+            interpolation=interpolation,
+            out=self._bands[band],
+            source=self._source,
+        )
+        return self._bands[band]
+
+    def empty(self, band: str) -> Array:
+        """The raster of a band whose frame is missing: no data."""
+        self._bands[band][:] = 0
+        return self._bands[band]
+
+
+def _stack(sensors: Collection[Sensor]) -> Array:
+    height = max(sensor.height_px for sensor in sensors)
+    width = max(sensor.width_px for sensor in sensors)
+    return np.zeros((len(sensors), height, width), np.uint16)
+
+
+def _usable(placement: SensorPlacement) -> tuple[float, ...]:
+    return tuple(usable_area(placement, exposed_rows(placement.sensor, placement.tdi_shifts)))

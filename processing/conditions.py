@@ -1,0 +1,151 @@
+"""What is known about an exposure besides its pixels, and the figures that follow from it alone.
+
+Smear, parallax, ground sampling distance and dC are computed here; they become findings in
+`processing.quality`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from processing.quality import NO_FLAGS, Figure, Flag, Thresholds
+from processing.rig import Cone, Rig
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """The circumstances of one exposure; None or an absent key is "not known".
+
+    Angles and rates are of the body (x forward, y right, z down); `crab_rad` is the angle from the
+    track to the body's x axis. `capture_flags` is what capture found.
+    """
+
+    temperatures_c: Mapping[str, float | None] = field(default_factory=dict)
+    temperature_age_s: Mapping[str, float] = field(default_factory=dict)
+    exposure_time_s: Mapping[str, float] = field(default_factory=dict)
+    tdi_shifts: Mapping[str, int] = field(default_factory=dict)
+    ground_speed_mps: float | None = None
+    height_above_ground_m: float | None = None
+    roll_rad: float | None = None
+    pitch_rad: float | None = None
+    angular_rate_rad_per_s: tuple[float, float, float] | None = None
+    crab_rad: float | None = None
+    time_sigma_ns: float | None = None
+    capture_flags: Flag = NO_FLAGS
+    simulated: bool = False
+
+    @property
+    def flags(self) -> Flag:
+        """Capture's flags, with SIMULATED where the hardware is."""
+        return self.capture_flags | (Flag.SIMULATED if self.simulated else NO_FLAGS)
+
+
+@dataclass(frozen=True)
+class Temperatures:
+    """Temperatures that can be used, and the probes that gave none or an impossible one."""
+
+    usable_c: Mapping[str, float]
+    missing: tuple[str, ...]
+    out_of_range: tuple[str, ...]
+
+
+def usable_temperatures(rig: Rig, conditions: Conditions, thresholds: Thresholds) -> Temperatures:
+    """Sort the probes the rig asks for into usable, missing and out of range."""
+    usable, missing, out_of_range = {}, [], []
+    for probe in rig.probes:
+        value = conditions.temperatures_c.get(probe)
+        if value is None or not math.isfinite(value):
+            missing.append(probe)
+        elif thresholds.temperature_low_c <= value <= thresholds.temperature_high_c:
+            usable[probe] = value
+        else:
+            out_of_range.append(probe)
+    return Temperatures(usable, tuple(missing), tuple(out_of_range))
+
+
+def condition_figures(
+    rig: Rig, conditions: Conditions, temperatures: Temperatures
+) -> dict[str, Figure]:
+    """Figures that need no pixels, by the names of `processing.quality.FIGURES`."""
+    figures: dict[str, Figure] = {"gsd_m": ground_sampling_distance_m(rig, conditions)}
+    figures |= _dc(rig, temperatures)
+    smears = [_smear(rig, cone, conditions) for cone in rig.pan_cones]
+    for k, name in enumerate(("smear_along_px", "smear_across_px")):
+        figures[name] = max((s[k] for s in smears if s is not None), default=None)
+    ages = [conditions.temperature_age_s.get(probe) for probe in temperatures.usable_c]
+    figures["temperature_age_s"] = max((age for age in ages if age is not None), default=None)
+    figures["time_sigma_ns"] = conditions.time_sigma_ns
+    tilts = [abs(a) for a in (conditions.roll_rad, conditions.pitch_rad) if a is not None]
+    figures["tilt_deg"] = math.degrees(max(tilts)) if tilts else None
+    crab = conditions.crab_rad
+    figures["crab_deg"] = None if crab is None else abs(math.degrees(crab))
+    figures["tdi_shifts"] = conditions.tdi_shifts.get(rig.reference_cone)
+    return figures
+
+
+def ground_sampling_distance_m(rig: Rig, conditions: Conditions) -> float | None:
+    """Ground covered by one pixel of the virtual image, at the foot of the camera."""
+    image, height = rig.virtual_image, conditions.height_above_ground_m
+    if image is None or height is None or height <= 0:
+        return None
+    return height * image.pitch_mm / image.f_mm
+
+
+def parallax_px(rig: Rig, conditions: Conditions, relief_fraction: float) -> float:
+    """What relief leaves between PAN and the colour master beside the flight axis, PAN pixels.
+
+    base * f * dh / h^2 for relief of `relief_fraction` of the height; zero where the height is not
+    known. Along the flight axis syntopic exposure removes it; crab turns some of it back.
+    """
+    image, height = rig.virtual_image, conditions.height_above_ground_m
+    if image is None or height is None or height <= 0 or rig.colour_master_cone is None:
+        return 0.0
+    master, colour = rig.cone(rig.master_cone), rig.cone(rig.colour_master_cone)
+    along = colour.position_mm[0] - master.position_mm[0]
+    across = colour.position_mm[1] - master.position_mm[1]
+    if rig.timing == "syntopic":
+        along *= math.sin(conditions.crab_rad or 0.0)
+    base_mm = math.hypot(along, across)
+    return base_mm * image.f_mm * relief_fraction / (height * 1e3) / image.pitch_mm
+
+
+def _dc(rig: Rig, temperatures: Temperatures) -> dict[str, Figure]:
+    figures: dict[str, Figure] = {}
+    pan = []
+    for cone in rig.cones:
+        known = temperatures.usable_c.get(cone.probe)
+        dc = None if known is None else known - cone.calibration_c
+        figures[f"dc_k_{cone.name}"] = dc
+        if dc is not None and cone.role == "pan":
+            pan.append(dc)
+    figures["dc_k"] = sum(pan) / len(pan) if pan else None
+    return figures
+
+
+def _smear(rig: Rig, cone: Cone, conditions: Conditions) -> tuple[float, float] | None:
+    """Motion in pixels along and across track that the cone's TDI leaves (DESIGN 5.11).
+
+    Rotation adds to translation by absolute value: the worst place of the image counts.
+    """
+    time_s = conditions.exposure_time_s.get(cone.name)
+    gsd_m = ground_sampling_distance_m(rig, conditions)
+    image = rig.virtual_image
+    if time_s is None or image is None:
+        return None
+    along = across = 0.0
+    known = False
+    if gsd_m is not None and conditions.ground_speed_mps is not None:
+        known = True
+        moved_px = conditions.ground_speed_mps * time_s / gsd_m
+        crab = conditions.crab_rad or 0.0
+        along = abs(moved_px * math.cos(crab) - conditions.tdi_shifts.get(cone.name, 0))
+        across = abs(moved_px * math.sin(crab))
+    if conditions.angular_rate_rad_per_s is not None:
+        known = True
+        roll, pitch, yaw = (abs(rate) * time_s for rate in conditions.angular_rate_rad_per_s)
+        f_px = image.f_mm / image.pitch_mm
+        along += pitch * f_px + yaw * image.width_px / 2.0
+        across += roll * f_px + yaw * image.height_px / 2.0
+    return (along, across) if known else None

@@ -1,0 +1,356 @@
+"""One exposure through the whole chain: Level-0 frames in, the virtual image and its verdict out.
+
+The order of the steps is decided here; each step's mathematics has a room of its own. Nothing here
+reads a file or waits for anything.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.colour import BandRegistration, nominal_registration, register_band
+from processing.composition import ColourComposer, PanComposer
+from processing.conditions import (
+    Conditions,
+    Temperatures,
+    condition_figures,
+    parallax_px,
+    usable_temperatures,
+)
+from processing.figures import frame_figures, stitching_figures
+from processing.fixed_method import fixed_mosaic
+from processing.level1 import (
+    FrameStatistics,
+    corrector_for,
+    exposed_rows,
+    level1_counts_per_dn,
+    level1_from_level0,
+)
+from processing.mosaic import Mosaic, MosaicSettings, free_mosaic
+from processing.placement import SensorPlacement, nominal_placements
+from processing.product import Method, Product, Settings
+from processing.quality import Figure, judge
+from processing.quicklook import quicklook
+from processing.radiometry import RadiometricCalibration
+from processing.rehearsal import rehearsal_frames
+from processing.resampling import Interpolation
+from processing.rig import Rig, Sensor
+from processing.tie_points import TiePoints, match_tie_points
+from processing.validity import Validity, judge_master, robust_datum
+
+__all__ = ["Conditions", "Interpolation", "Method", "Pipeline", "Product", "Settings"]
+
+Array = NDArray[Any]
+Placements = Mapping[str, SensorPlacement]
+
+
+class Pipeline:
+    """A rig, its radiometry and settings, and the buffers of one exposure.
+
+    One exposure at a time: the arrays of a `Product` are this object's buffers and hold until the
+    next call of `process`.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        radiometry: Mapping[str, RadiometricCalibration] | None = None,
+        settings: Settings | None = None,
+    ) -> None:
+        """Allocate all buffers and make the calibrations ready.
+
+        Args:
+            rig: the camera; it has a virtual image.
+            radiometry: by sensor name; a sensor without one is taken as neutral.
+            settings: None takes the defaults.
+
+        Raises:
+            ValueError: the rig has no virtual image or no PAN sensor.
+            CalibrationError: a radiometric calibration that does not fit its sensor.
+        """
+        if rig.virtual_image is None or not rig.pan_cones:
+            raise ValueError(f"rig {rig.name} has no virtual image of PAN sensors to compose")
+        self.rig = rig
+        self.settings = settings or Settings()
+        pan = [sensor for cone in rig.pan_cones for sensor in cone.sensors]
+        self._bands = _single_bands(rig)
+        self._pan = PanComposer(rig.virtual_image, pan)
+        self._colour = ColourComposer(rig.virtual_image, self._bands)
+        known = radiometry or {}
+        self._correctors = {
+            sensor.name: corrector_for(sensor, known.get(sensor.name))
+            for sensor in (*pan, *self._bands.values())
+        }
+        self._green = next(
+            (
+                band
+                for band, sensor in self._bands.items()
+                if rig.cone_of(sensor.name).name == rig.colour_master_cone
+            ),
+            None,
+        )
+
+    def warm_up(self) -> None:
+        """Compile every kernel a flight will need, from the cache where there is one.
+
+        A rehearsal exposure goes through all steps, twice where the steps can see the pixels in
+        read-only memory.
+        """
+        frames = rehearsal_frames(self.rig)
+        conditions = Conditions(
+            temperatures_c=dict.fromkeys(self.rig.probes, 20.0),
+            exposure_time_s={cone.name: 0.005 for cone in self.rig.cones},
+            tdi_shifts={cone.name: 1 for cone in self.rig.cones},
+        )
+        settings = self.settings
+        try:
+            self.settings = replace(settings, baselines=True, geometry=True)
+            self.process(frames, conditions)
+            for frame in frames.values():
+                frame.flags.writeable = False
+            self.settings = settings
+            self.process(frames, conditions)
+        finally:
+            self.settings = settings
+
+    def process(self, frames: Mapping[str, Array], conditions: Conditions) -> Product:
+        """Make the virtual image of one exposure and judge it.
+
+        Args:
+            frames: Level-0 frames by sensor name, (h, w) uint16, DN. A missing one leaves a hole.
+            conditions: what else is known of the exposure.
+
+        Returns:
+            The product; its pixel arrays hold until the next call.
+
+        Raises:
+            ValueError: a frame of the wrong shape or type; none at all of the PAN sensors is none.
+        """
+        numba.set_num_threads(
+            max(1, min(self.settings.threads, int(numba.config.NUMBA_NUM_THREADS)))
+        )
+        rig, settings, clock = self.rig, self.settings, _Stopwatch()
+        temperatures = usable_temperatures(rig, conditions, settings.thresholds)
+        start = nominal_placements(
+            rig, temperatures.usable_c, conditions.tdi_shifts, use_drift=settings.use_drift
+        )
+        with clock.stage("radiometry"):
+            level1, statistics = self._correct(frames, conditions, temperatures)
+        with clock.stage("tie_points"):
+            tie_points = match_tie_points(rig, start, level1, settings=settings.tie_points)
+        with clock.stage("mosaic"):
+            equal, mosaic, validity = self._stitch(start, tie_points, temperatures, conditions)
+        with clock.stage("composition"):
+            image = self._pan.compose(
+                mosaic.placements,
+                level1,
+                feather_px=settings.feather_px,
+                interpolation=settings.interpolation,
+            )
+        with clock.stage("colour"):
+            registrations, colour = self._register(mosaic, level1)
+        with clock.stage("baselines"):
+            baselines = self._baselines(start, tie_points, temperatures, conditions)
+        with clock.stage("geometry"):
+            geometry = self._geometry(mosaic, baselines) if settings.geometry else {}
+        with clock.stage("quicklook"):
+            picture = quicklook(image.pan, colour)
+        with clock.stage("quality"):
+            figures = condition_figures(rig, conditions, temperatures)
+            figures |= self._frame_figures(level1, statistics, start)
+            figures |= stitching_figures(
+                rig, tie_points, mosaic, validity, image.balance, registrations
+            )
+            figures |= self._whole_figures(image.source, frames, conditions)
+            report = judge(
+                figures,
+                capture_flags=conditions.flags,
+                missing_sensors=self._missing(frames),
+                missing_probes=temperatures.missing,
+                probes_out_of_range=temperatures.out_of_range,
+                nominal_bands=[
+                    r.band for r in registrations if not r.registered and r.sensor in level1
+                ],
+                thresholds=settings.thresholds,
+            )
+        return Product(
+            sensors=self._pan.names,
+            pan=image.pan,
+            valid=image.source,
+            colour=colour,
+            counts_per_dn=level1_counts_per_dn(self._pan.sensors[0].bits),
+            quicklook=picture,
+            start=start,
+            tie_points=tie_points,
+            mosaic=mosaic,
+            equal_datum=equal,
+            validity=validity,
+            balance=image.balance,
+            bands=registrations,
+            baselines=baselines,
+            geometry=geometry,
+            report=report,
+            timings_s=clock.seconds,
+        )
+
+    def _correct(
+        self, frames: Mapping[str, Array], conditions: Conditions, temperatures: Temperatures
+    ) -> tuple[dict[str, Array], dict[str, FrameStatistics]]:
+        """Level-1 frames by sensor, in this object's buffers, and what the pass saw."""
+        places = {name: self._pan.frame(name) for name in self._pan.names}
+        places |= {sensor.name: self._colour.frame(band) for band, sensor in self._bands.items()}
+        level1, statistics = {}, {}
+        for name, out in places.items():
+            if name not in frames:
+                continue
+            corrector = self._correctors[name]
+            cone = self.rig.cone_of(name).name
+            statistics[name] = level1_from_level0(
+                corrector,
+                np.ascontiguousarray(frames[name]),
+                temperature_c=temperatures.usable_c.get(corrector.sensor.probe),
+                exposure_time_s=conditions.exposure_time_s.get(cone, 0.0),
+                tdi_shifts=conditions.tdi_shifts.get(cone, 0),
+                out=out,
+            )
+            level1[name] = out
+        return level1, statistics
+
+    def _stitch(
+        self,
+        start: Placements,
+        tie_points: TiePoints,
+        temperatures: Temperatures,
+        conditions: Conditions,
+    ) -> tuple[Mosaic, Mosaic, Validity | None]:
+        """The mosaic over all master sensors, the one the image is made with, and the judgement."""
+        settings = self._mosaic_settings(conditions)
+        if self.settings.method == "fixed":
+            mosaic = fixed_mosaic(self.rig, start, tie_points, settings=settings)
+            return mosaic, mosaic, None
+        mosaic = free_mosaic(self.rig, start, tie_points, settings=settings)
+        known = temperatures.usable_c if self.settings.use_drift else {}
+        validity = judge_master(self.rig, mosaic, known)
+        robust = robust_datum(self.rig, start, tie_points, mosaic, validity, settings=settings)
+        return mosaic, robust, validity
+
+    def _register(
+        self, mosaic: Mosaic, level1: Mapping[str, Array]
+    ) -> tuple[tuple[BandRegistration, ...], dict[str, Array]]:
+        """Green as the adjustment placed it, the other bands by their tie points with green."""
+        registrations, rasters = [], {}
+        green = None if self._green is None else self._bands[self._green].name
+        for band, sensor in self._bands.items():
+            if sensor.name not in level1:
+                rasters[band] = self._colour.empty(band)
+                continue
+            placement = mosaic.placements[sensor.name]
+            homography = None
+            if sensor.name != green:
+                found = nominal_registration(band, sensor.name)
+                if green is not None and green in level1:
+                    found = register_band(
+                        band,
+                        mosaic.placements[green],
+                        placement,
+                        level1[green],
+                        level1[sensor.name],
+                        settings=self.settings.colour,
+                    )
+                registrations.append(found)
+                homography = found.band_from_green if found.registered else None
+            rasters[band] = self._colour.compose(
+                band, placement, homography, interpolation=self.settings.interpolation
+            )
+        return tuple(registrations), rasters
+
+    def _baselines(
+        self,
+        start: Placements,
+        tie_points: TiePoints,
+        temperatures: Temperatures,
+        conditions: Conditions,
+    ) -> dict[str, Mosaic]:
+        """The fixed method with and without TDM, from the same tie points."""
+        if not self.settings.baselines:
+            return {}
+        settings = self._mosaic_settings(conditions)
+        with_tdm = nominal_placements(self.rig, temperatures.usable_c, conditions.tdi_shifts)
+        without = nominal_placements(
+            self.rig, temperatures.usable_c, conditions.tdi_shifts, use_drift=False
+        )
+        return {
+            "fixed": fixed_mosaic(self.rig, with_tdm, tie_points, settings=settings),
+            "fixed-no-tdm": fixed_mosaic(self.rig, without, tie_points, settings=settings),
+        }
+
+    def _geometry(
+        self, mosaic: Mosaic, baselines: Mapping[str, Mosaic]
+    ) -> dict[str, dict[str, Array]]:
+        geometry = {mosaic.method: self._pan.geometry()}
+        for name, baseline in baselines.items():
+            geometry[name] = self._pan.geometry(baseline.placements)
+        return geometry
+
+    def _frame_figures(
+        self,
+        level1: Mapping[str, Array],
+        statistics: Mapping[str, FrameStatistics],
+        start: Placements,
+    ) -> dict[str, Figure]:
+        present = [sensor for sensor in self._pan.sensors if sensor.name in level1]
+        return frame_figures(
+            present,
+            [level1[s.name] for s in present],
+            [exposed_rows(s, start[s.name].tdi_shifts) for s in present],
+            [statistics[s.name] for s in present],
+        )
+
+    def _whole_figures(
+        self, source: Array, frames: Mapping[str, Array], conditions: Conditions
+    ) -> dict[str, Figure]:
+        return {
+            "valid_fraction": float(np.count_nonzero(source)) / source.size,
+            "missing_sensors": ", ".join(self._missing(frames)) or None,
+            "parallax_px": parallax_px(self.rig, conditions, self.settings.relief_fraction),
+        }
+
+    def _missing(self, frames: Mapping[str, Array]) -> Sequence[str]:
+        return [sensor.name for sensor in self.rig.sensors if sensor.name not in frames]
+
+    def _mosaic_settings(self, conditions: Conditions) -> MosaicSettings:
+        parallax = parallax_px(self.rig, conditions, self.settings.relief_fraction)
+        return replace(self.settings.mosaic, parallax_px=parallax)
+
+
+class _Stopwatch:
+    """Seconds by stage."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = time.perf_counter() - began
+
+
+def _single_bands(rig: Rig) -> dict[str, Sensor]:
+    """Colour sensors that hold one band each, by band; green first, for the others go to it."""
+    bands = {
+        cone.bands[0]: cone.sensors[0]
+        for cone in rig.colour_cones
+        if len(cone.bands) == 1 and len(cone.sensors) == 1
+    }
+    return dict(sorted(bands.items(), key=lambda item: item[0] != "green"))

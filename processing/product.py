@@ -1,0 +1,82 @@
+"""What one exposure becomes, and how it is wished: the pipeline's settings and its result."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from numpy.typing import NDArray
+
+from processing.balance import Balance
+from processing.colour import BandRegistration, ColourSettings
+from processing.mosaic import Mosaic, MosaicSettings
+from processing.quality import QualityReport, Thresholds
+from processing.resampling import Interpolation
+from processing.tie_points import TiePoints, TiePointSettings
+from processing.validity import Validity
+
+Array = NDArray[Any]
+Method = Literal["free", "fixed"]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How exposures are processed.
+
+    `baselines` solves the fixed method with and without TDM from the same tie points as well, for
+    comparison: their geometry only, nothing is resampled. `relief_fraction` is the terrain's height
+    difference over the height above ground, for the weight of P/C points. `geometry` asks for the
+    table of raw pixels behind the image.
+    """
+
+    method: Method = "free"
+    use_drift: bool = True
+    interpolation: Interpolation = "cubic"
+    feather_px: int = 16
+    baselines: bool = False
+    geometry: bool = True
+    relief_fraction: float = 0.01
+    threads: int = 2
+    thresholds: Thresholds = field(default_factory=Thresholds)
+    tie_points: TiePointSettings = field(default_factory=TiePointSettings)
+    mosaic: MosaicSettings = field(default_factory=MosaicSettings)
+    colour: ColourSettings = field(default_factory=ColourSettings)
+
+
+@dataclass(frozen=True)
+class Product:
+    """Level-2 of one exposure and all that is known about it.
+
+    The pixel arrays belong to the pipeline and hold until its next `process`.
+
+    `pan` (H, W) uint16 is linear signal, `counts_per_dn` counts to the DN (8 for 12 bits), 0 no
+    data. `valid` (H, W) uint8 is 0 without data, else 1 + the index into `sensors` of the sensor
+    that contributes most; its highest bit marks saturation. `colour` holds the bands by name, (h, w)
+    uint16 on the raster of `processing.resampling.colour_raster`. `quicklook` is (h, w, 3) uint8.
+
+    `geometry` is keyed by method ("free", "fixed", "fixed-no-tdm"), then `<sensor>.vip` (n, 2),
+    `<sensor>.raw` (n, 2), `<sensor>.weight` (n,): which raw pixel serves which VIP pixel.
+    `timings_s` are seconds by stage, in order.
+
+    `mosaic` is what the image was made with; `equal_datum` the mosaic whose datum rests on all
+    master sensors alike, which is the same unless one was found displaced.
+    """
+
+    sensors: tuple[str, ...]
+    pan: Array
+    valid: Array
+    colour: Mapping[str, Array]
+    counts_per_dn: float
+    quicklook: Array
+    start: Mapping[str, Any]
+    tie_points: TiePoints
+    mosaic: Mosaic
+    equal_datum: Mosaic
+    validity: Validity | None
+    balance: Balance
+    bands: tuple[BandRegistration, ...]
+    baselines: Mapping[str, Mosaic]
+    geometry: Mapping[str, Mapping[str, Array]]
+    report: QualityReport
+    timings_s: Mapping[str, float]

@@ -1,0 +1,59 @@
+"""Frames of no flight: a texture every sensor sees, so that each step can be exercised beforehand.
+
+Only for compiling and warming up; nothing is measured with them.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.placement import nominal_placements, vip_mm_from_raw, vip_px_from_mm
+from processing.rig import Rig
+
+Array = NDArray[Any]
+
+_TILE_PX: Final = 256
+_SEED: Final = 20
+
+
+def rehearsal_frames(rig: Rig) -> dict[str, Array]:
+    """Level-0 frames by sensor, (h, w) uint16, good to a pixel: enough for matching to succeed."""
+    image = rig.virtual_image
+    if image is None:
+        return {}
+    tile = _tile()
+    placements = nominal_placements(rig, {}, {})
+    frames = {}
+    for sensor in rig.sensors:
+        ends = np.array([[0.0, 0.0], [sensor.width_px - 1.0, sensor.height_px - 1.0]])
+        px = vip_px_from_mm(image, vip_mm_from_raw(placements[sensor.name], ends))
+        columns = np.linspace(px[0, 0], px[1, 0], sensor.width_px)
+        rows = np.linspace(px[0, 1], px[1, 1], sensor.height_px)
+        signal = _periodic(tile, rows, columns) * (sensor.full_scale_dn - sensor.black_dn)
+        frames[sensor.name] = (sensor.black_dn + signal).astype(np.uint16)
+    return frames
+
+
+def _tile() -> Array:
+    """Periodic noise between 0.2 and 0.8, smooth over two pixels of the colour raster."""
+    noise = np.random.default_rng(_SEED).standard_normal((_TILE_PX, _TILE_PX))
+    f = np.hypot(np.fft.fftfreq(_TILE_PX)[:, None], np.fft.fftfreq(_TILE_PX)[None, :])
+    smooth = np.fft.ifft2(np.fft.fft2(noise) * np.exp(-((f / 0.08) ** 2))).real
+    low, high = smooth.min(), smooth.max()
+    tile: Array = (0.2 + 0.6 * (smooth - low) / (high - low)).astype(np.float32)
+    return tile
+
+
+def _periodic(tile: Array, rows: Array, columns: Array) -> Array:
+    """The tile's value at every row and column, linear, repeated without end."""
+    r, c = np.floor(rows).astype(np.intp), np.floor(columns).astype(np.intp)
+    fr = (rows - r).astype(np.float32)[:, None]
+    fc = (columns - c).astype(np.float32)[None, :]
+    r0, r1, c0, c1 = r % _TILE_PX, (r + 1) % _TILE_PX, c % _TILE_PX, (c + 1) % _TILE_PX
+    upper = tile[np.ix_(r0, c0)] * (1 - fc) + tile[np.ix_(r0, c1)] * fc
+    lower = tile[np.ix_(r1, c0)] * (1 - fc) + tile[np.ix_(r1, c1)] * fc
+    value: Array = upper * (1 - fr) + lower * fr
+    return value
