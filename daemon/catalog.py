@@ -207,10 +207,6 @@ class Catalog:
                 self._rollback()
                 raise
 
-    def remove(self, number: int) -> None:
-        """Forget an exposure whose folder is gone."""
-        self._write("DELETE FROM exposures WHERE number = ?", (number,))
-
     def add_products(self, number: int, files: Mapping[str, int], verdict: str | None) -> None:
         """Note the products of an exposure, name to size in bytes, in place of earlier ones."""
         with self._lock:

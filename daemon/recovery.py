@@ -101,6 +101,7 @@ class _Recovery:
         chain = self._chain(sealed)
         catalog = self._index(sealed, captures, chain)
         try:
+            indexed = [row.number for row in catalog.exposures()]
             log = self._triggers()
             newly, lost = self._seal(catalog, captures, sealed, log)
             for sentence in self.done:
@@ -113,7 +114,7 @@ class _Recovery:
                 )
         finally:
             catalog.close()
-        next_number = max([self.mission.next_number(), *(number + 1 for number in log.triggers)])
+        next_number = 1 + max([self.mission.next_number() - 1, *log.triggers, *indexed])
         return RecoveryReport(
             done=tuple(self.done),
             problems=tuple(self.problems),
@@ -192,11 +193,11 @@ class _Recovery:
         catalog = self._open_index()
         rows = {row.number: row for row in catalog.exposures()}
         for number in sorted(set(rows) - set(self.mission.numbers())):
+            # The row stays: it is the last witness.
             self.problems.append(
                 f"exposure {number}: the index calls it stored but its folder is gone; "
                 "it was removed by others"
             )
-            catalog.remove(number)
         self.problems += [
             f"exposure {number}: was sealed but its record is gone; it is sealed anew"
             for number in sorted(set(captures) - set(sealed))
@@ -207,10 +208,12 @@ class _Recovery:
             self.done.append(f"exposure {number}: has its folder; taken into the index")
         for link in chain.order:
             row = rows.get(link.number)
-            if row is not None and row.is_sealed and row.record_sha256 == link.sha256:
-                continue
             if row is not None and row.is_sealed:
-                self.problems.append(f"exposure {link.number}: its record was altered since sealed")
+                if row.record_sha256 != link.sha256:
+                    self.problems.append(
+                        f"exposure {link.number}: its record was altered since it was sealed"
+                    )
+                continue
             catalog.add_sealed(sealed[link.number].exposure, link.sha256)
             self.done.append(f"exposure {link.number}: is sealed; noted in the index")
         return catalog
