@@ -257,6 +257,10 @@ class Catalog:
             self._read("SELECT DISTINCT number, verdict FROM products WHERE verdict IS NOT NULL")
         )
 
+    def processed_numbers(self) -> set[int]:
+        """Exposures whose products the index knows."""
+        return {number for (number,) in self._read("SELECT DISTINCT number FROM products")}
+
     def last_record_sha256(self) -> str:
         """Hash of the record sealed last, empty where none is."""
         rows = self._read(

@@ -19,7 +19,7 @@ from daemon import durable
 from daemon.errors import DaemonError
 from daemon.level0 import tiff_parts
 from daemon.mission import Mission
-from daemon.records import canonical_bytes, plain_name
+from daemon.records import RecordError, canonical_bytes, parse_record, plain_name
 
 REPLACED_SUFFIX = ".replaced"
 """Ends the name of an earlier result while a newer one takes its place."""
@@ -99,6 +99,16 @@ def write_level2(
         raise
     verdict = report_json.get("verdict")
     return Level2Record(number, files, verdict if isinstance(verdict, str) else None)
+
+
+def verdict_of(folder: Path) -> str | None:
+    """The verdict in a product folder's quality.json, None where it cannot be read."""
+    try:
+        content = parse_record((folder / "quality.json").read_bytes(), "quality.json")
+    except (OSError, RecordError):
+        return None
+    verdict = content.get("verdict")
+    return verdict if isinstance(verdict, str) else None
 
 
 def recover_level2(mission: Mission) -> list[str]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -102,6 +102,7 @@ class _Recovery:
         catalog = self._index(sealed, captures, chain)
         try:
             indexed = [row.number for row in catalog.exposures()]
+            self._index_products(catalog)
             log = self._triggers()
             newly, lost = self._seal(catalog, captures, sealed, log)
             for sentence in self.done:
@@ -218,6 +219,16 @@ class _Recovery:
             self.done.append(f"exposure {link.number}: is sealed; noted in the index")
         return catalog
 
+    def _index_products(self, catalog: Catalog) -> None:
+        """Products the index does not know, as after the index was lost."""
+        known = catalog.processed_numbers()
+        for number in self.mission.numbers():
+            folder = self.mission.level2(number)
+            if number in known or not folder.is_dir():
+                continue
+            files = {entry.name: entry.stat().st_size for entry in folder.iterdir()}
+            catalog.add_products(number, files, products.verdict_of(folder))
+
     def _open_index(self) -> Catalog:
         path = self.mission.catalog_path
         if not path.exists() and self.mission.numbers():
@@ -284,6 +295,8 @@ class _Recovery:
                 except RecordError as error:
                     self.problems += [f"exposure {number}: not sealed: {p}" for p in error.problems]
                     continue
+                if not exposure.frames:
+                    exposure = replace(exposure, state="lost")
                 writer.seal(exposure)
                 record = read_sealed(self.mission.level0(number))
                 if record is not None:

@@ -62,7 +62,7 @@ class Level0Writer:
     """
 
     def __init__(
-        self, mission: Mission, *, catalog: Catalog | None = None, threads: int = 2
+        self, mission: Mission, *, catalog: Catalog | None = None, threads: int = 3
     ) -> None:
         self._mission = mission
         self._catalog = catalog or Catalog.open(mission.catalog_path)

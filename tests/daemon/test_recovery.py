@@ -180,6 +180,8 @@ def test_a_lost_index_is_built_again_from_the_records(mission, loss):
     store_unsealed(mission, 4)
     path = mission.catalog_path
     before = Catalog.read(path).exposures()[:3]
+    mission.level2(2).mkdir()
+    (mission.level2(2) / "quality.json").write_bytes(b'{"verdict":"usable"}\n')
     path.unlink()
     if loss != "missing":
         path.write_bytes(b"" if loss == "empty" else b"not a database" * 500)
@@ -188,6 +190,7 @@ def test_a_lost_index_is_built_again_from_the_records(mission, loss):
     rows = Catalog.read(path).exposures()
     assert rows[:3] == before
     assert Catalog.read(path).last_record_sha256() == read_sealed(mission.level0(4)).sha256
+    assert Catalog.read(path).verdicts() == {2: "usable"}
     assert path.with_name("mission.db.damaged").exists() == (loss == "garbage")
     assert_in_order(mission)
 
