@@ -1,7 +1,7 @@
 """What a sensor sees: rays through the true camera onto the ground, and the light that comes back.
 
-The mapping is reckoned exactly on a coarse grid and interpolated; the scene is sampled with six by
-six taps at unrounded positions. What the electronics make of the light is in `electronics`.
+The mapping is reckoned exactly on a coarse grid and interpolated; the scene is a spline, read
+with six by six taps at unrounded positions. What a sensor makes of the light is in `electronics`.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.rig import Cone, Sensor
-from sim_hw import camera
+from sim_hw import camera, spline
 from sim_hw.flight import Flight, Pose
-from sim_hw.scene import COLOURS, UNIT, Scene
+from sim_hw.scene import COLOURS, Scene
 from sim_hw.world import END_MARGIN, World
 
 Array = NDArray[np.float64]
@@ -26,8 +26,9 @@ Map = NDArray[np.float32]
 
 GRID_PX = 8
 """Spacing of the exact mapping; between its points it is interpolated, to below 1e-3 px."""
-TAPS = 6
-PHASES = 1024
+PHASES = spline.PHASES
+UNIT = np.float32(spline.STORED_UNIT)
+ZERO = np.float32(spline.STORED_ZERO)
 SMEAR_STEPS = 33
 
 
@@ -187,21 +188,12 @@ def sample_scene(scene: Scene, band: str, grid: Array, size: tuple[int, int]) ->
         np.ascontiguousarray(grid[..., 0] / step),
         np.ascontiguousarray(grid[..., 1] / step),
         _TABLE,
-        np.float32(1.0 / UNIT),
         out,
     )
     return out
 
 
-def _lanczos_table() -> Map:
-    """Weights of six taps at -2..3 for fractions 0..1, each row summing to one."""
-    fraction = np.arange(PHASES + 1)[:, None] / PHASES
-    x = np.arange(-2, 4)[None, :] - fraction
-    weights = np.sinc(x) * np.sinc(x / (TAPS / 2))
-    return np.asarray(weights / weights.sum(axis=1, keepdims=True), dtype=np.float32)
-
-
-_TABLE = _lanczos_table()
+_TABLE = spline.weight_table()
 
 
 @numba.njit(inline="always")  # type: ignore[untyped-decorator]
@@ -212,9 +204,7 @@ def _mirrored(index: int, length: int) -> int:
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)  # type: ignore[untyped-decorator]
-def _sample(
-    band: NDArray[np.uint16], grid_x: Array, grid_y: Array, table: Map, scale: np.float32, out: Map
-) -> None:
+def _sample(band: NDArray[np.uint16], grid_x: Array, grid_y: Array, table: Map, out: Map) -> None:
     height, width = out.shape
     rows, columns = band.shape
     wx = np.empty(6, dtype=np.float32)
@@ -257,7 +247,7 @@ def _sample(
                         for n in range(6):
                             line += wx[n] * np.float32(band[row, _mirrored(cx - 2 + n, columns)])
                         total += wy[m] * line
-                out[i, j] = max(total * scale, np.float32(0.0))
+                out[i, j] = max((total - ZERO) / UNIT, np.float32(0.0))
 
 
 def render_ideal(

@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_hw import quilting
+from sim_hw import quilting, spline
 from sim_hw.seeding import random_stream
 
 Band = NDArray[np.uint16]
@@ -32,7 +32,7 @@ COLOURS = ("red", "green", "blue", "nir")
 PAN_MIX = {"red": 0.30, "green": 0.35, "blue": 0.20, "nir": 0.15}
 """Share of each band in the panchromatic signal: a silicon CCD behind a 450-850 nm filter."""
 UNIT = 48000
-"""The stored value of radiance 1, which is white: 99.5 % of a band lie below."""
+"""Radiance 1 in a source picture, which is white: 99.5 % of a band lie below."""
 WHITE_PERCENTILE = 99.5
 FORMAT = 1
 BLOCK_ROWS = 1024
@@ -81,7 +81,7 @@ class SceneSettings:
 
 @dataclass(frozen=True)
 class Scene:
-    """Bands by name ("pan", "red", ...), each (rows, columns) of uint16 with `UNIT` for radiance 1.
+    """Bands by name ("pan", "red", ...), each the coefficients of a spline, (rows, columns).
 
     `step` is the distance of a band's samples: 1 for PAN, `COLOUR_STEP` for colour.
     """
@@ -134,6 +134,7 @@ def _build(settings: SceneSettings, folder: Path) -> None:
             json.dumps({**asdict(settings), "patches": patches, "reused_patches": reused})
         )
         if not folder.exists():
+            work.chmod(0o755)
             work.rename(folder)
     finally:
         shutil.rmtree(work, ignore_errors=True)
@@ -188,20 +189,20 @@ def _store_bands(canvas: quilting.Picture, settings: SceneSettings, folder: Path
     colours = [_new_band(folder / f"{name}.npy", *small) for name in COLOURS]
     sigma_pan = settings.psf_px
     sigma_colour = settings.psf_px * settings.colour_ratio
-    halo = COLOUR_STEP * int(np.ceil(5 * sigma_colour))
+    halo = COLOUR_STEP * (spline.REACH + int(np.ceil(2 * sigma_colour)))
     mix = np.array([[PAN_MIX[name] for name in COLOURS]], dtype=np.float32)
     for start in range(0, height, BLOCK_ROWS):
         stop = min(start + BLOCK_ROWS, height)
         low, high = max(0, start - halo), min(height, stop + halo)
-        block = canvas[low:high].astype(np.float32)
-        inside = slice(start - low, stop - low)
-        grey = _blurred(cv2.transform(block, mix), sigma_pan)
-        pan[start:stop] = _rounded(grey[inside])
-        soft = _blurred(block, sigma_colour)[inside][::COLOUR_STEP, ::COLOUR_STEP]
+        block = canvas[low:high].astype(np.float32) / np.float32(UNIT)
+        grey = spline.coefficients(cv2.transform(block, mix), sigma_pan)
+        pan[start:stop] = spline.stored(grey[start - low : stop - low])
+        soft = _blurred(block, sigma_colour)[::COLOUR_STEP, ::COLOUR_STEP]
+        skip, place = (start - low) // COLOUR_STEP, start // COLOUR_STEP
+        rows = -(-(stop - start) // COLOUR_STEP)
         for i, band in enumerate(colours):
-            band[start // COLOUR_STEP : start // COLOUR_STEP + soft.shape[0]] = _rounded(
-                soft[..., i]
-            )
+            smooth = spline.coefficients(np.ascontiguousarray(soft[..., i]))
+            band[place : place + rows] = spline.stored(smooth[skip : skip + rows])
     for band in (pan, *colours):
         band.flush()
 
@@ -217,10 +218,6 @@ def _blurred(picture: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
         return picture
     size = 2 * int(np.ceil(4 * sigma)) + 1
     return np.asarray(cv2.GaussianBlur(picture, (size, size), sigma), dtype=np.float32)
-
-
-def _rounded(picture: NDArray[np.float32]) -> Band:
-    return np.asarray(np.clip(picture + 0.5, 0, 65535), dtype=np.uint16)
 
 
 def read_geotiff(path: Path, settings: SceneSettings) -> quilting.Picture:

@@ -1,0 +1,101 @@
+"""`python -m sim_hw RIG --out DIR`: run an emulated rig until it is told to end.
+
+One JSON line on stdout says that everything answers; progress and complaints go to stderr.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from processing.rig import RigError, load_rig, shipped_rigs
+from sim_hw.simulator import SimulatorSettings, simulate
+from sim_hw.world import WorldSettings
+from sim_hw.world_clock import WorldClock
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    line = argparse.ArgumentParser(prog="python -m sim_hw", description=__doc__)
+    add = line.add_argument
+    add("rig", help="name of a shipped rig, or a rig file")
+    add("--out", type=Path, required=True, help="folder for calibration, truth and scene")
+    add("--seed", type=int, default=1, help="everything random follows from it")
+    add("--dc", type=float, default=0.0, help="temperature above calibration, K")
+    add(
+        "--displace",
+        type=displacement,
+        action="append",
+        default=[],
+        metavar="SENSOR=X,Y",
+        help="move a sensor right and up in its layer, pixels; may be repeated",
+    )
+    add("--height", type=float, help="flying height above mean ground, m")
+    add("--speed", type=float, help="ground speed, m/s")
+    add("--heading", type=float, default=0.0, help="track of the first line, degrees")
+    add("--exposures", type=int, default=13, help="exposures of a line; sizes the scene")
+    add("--packet-loss", type=float, default=0.0, help="share of image packets lost")
+    add("--first-address", default="127.0.0.2", help="loopback address of the first head")
+    add("--scene", help="a GeoTIFF to fly over instead of the shipped photographs")
+    add("--scene-cache", type=Path, help="folder where built scenes are kept (default: OUT/scenes)")
+    add("--processes", type=int, default=2, help="worker processes that render")
+    return line
+
+
+def displacement(text: str) -> tuple[str, tuple[float, float]]:
+    """Read SENSOR=X,Y."""
+    name, _, numbers = text.partition("=")
+    try:
+        x, y = (float(number) for number in numbers.split(","))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r}; write it as SU02=1.0,-0.6") from error
+    return name, (x, y)
+
+
+def rig_file(name_or_path: str) -> Path:
+    """The file of a rig; RigError lists the shipped ones where there is none."""
+    path = shipped_rigs().get(name_or_path, Path(name_or_path))
+    if not path.is_file():
+        known = ", ".join(shipped_rigs())
+        raise RigError([f"rig {name_or_path!r} is neither a file nor one of: {known}"])
+    load_rig(path)
+    return path
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    given = parser().parse_args(arguments)
+    if given.processes < 1 or given.exposures < 1:
+        print("sim_hw: processes and exposures are at least 1", file=sys.stderr)
+        return 2
+    try:
+        path = rig_file(given.rig)
+    except RigError as error:
+        print(f"sim_hw: {error}", file=sys.stderr)
+        return 2
+    clock = WorldClock.starting_now()
+    world = WorldSettings(
+        rig_file=str(path.resolve()),
+        seed=given.seed,
+        epoch_gps_ns=clock.gps_ns_at_start,
+        dc_k=given.dc,
+        displaced_px=dict(given.displace),
+        height_m=given.height,
+        ground_speed_mps=given.speed,
+        heading_deg=given.heading,
+        exposures=given.exposures,
+        scene_file=given.scene,
+    )
+    settings = SimulatorSettings(
+        out=given.out,
+        scene_cache=given.scene_cache or given.out / "scenes",
+        first_address=given.first_address,
+        packet_loss=given.packet_loss,
+        processes=given.processes,
+    )
+    return simulate(settings, world, clock)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,260 @@
+"""One worker process of the emulator: some heads of the rig, rendering what they see.
+
+Pulses come in and reports go out through one pipe; everything else a worker needs follows from the
+settings of the world. The main process is in `simulator`.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from multiprocessing.sharedctypes import Synchronized
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.rig import Cone, Sensor
+from sim_hw import laboratory
+from sim_hw.electronics import Electronics, true_sensor
+from sim_hw.flight import Flight
+from sim_hw.gige.faults import WireFaults
+from sim_hw.gige.head import NO_PULSE, ExposureRequest, FrameSize, GigeHead, HeadIdentity
+from sim_hw.rendering import Look, light_on_sensor
+from sim_hw.scene import Scene, open_scene
+from sim_hw.seeding import random_stream
+from sim_hw.truth import Taken
+from sim_hw.world import World, WorldSettings
+from sim_hw.world_clock import DeviceClock, WorldClock
+
+VENDOR = "Syntopic emulator"
+WARM_UP = Look(mid_gps_ns=0, exposure_time_us=4000.0, tdi_shifts=1)
+PR_SET_PDEATHSIG = 1
+POLL_S = 0.5
+HEAD_TEMPERATURE_SIGMA_C = 0.1
+
+
+@dataclass(frozen=True)
+class HeadPlan:
+    """One head of this process: which sensor, and where it answers."""
+
+    sensor: str
+    address: str
+    packet_loss: float
+
+
+@dataclass(frozen=True)
+class WorkerPlan:
+    """What one worker process is to do."""
+
+    settings: WorldSettings
+    clock: WorldClock
+    scene_cache: Path
+    calibration: Path
+    heads: tuple[HeadPlan, ...]
+
+
+@dataclass(frozen=True)
+class Pulse:
+    """Told to a worker: a pulse of the bus, with the start of exposure of every sensor."""
+
+    count: int
+    start_mono_ns: dict[str, int]
+
+
+@dataclass(frozen=True)
+class Said:
+    """Told by a worker: that its heads answer, or why they cannot."""
+
+    event: Literal["ready", "failed"]
+    sentence: str = ""
+
+
+class FirstLine:
+    """Where the first line begins, in metres flown; shared by all processes, set once.
+
+    Nobody has seen the ground before the first exposure, so the line and its scene are laid where
+    the first exposure finds the aircraft.
+    """
+
+    def __init__(self, flight: Flight, shared: Synchronized[float]) -> None:
+        self._plain = flight
+        self._begun: Flight | None = None
+        self._shared = shared
+
+    def begin(self, gps_ns: int) -> None:
+        """Begin the line here, if it has not begun."""
+        with self._shared.get_lock():
+            if math.isnan(self._shared.value):
+                self._shared.value = self._plain.distance_flown_m(gps_ns)
+
+    @property
+    def flight(self) -> Flight:
+        """The flight as it is known now."""
+        if self._begun is not None:
+            return self._begun
+        begins_m = self._shared.value
+        if math.isnan(begins_m):
+            return self._plain
+        self._begun = self._plain.beginning_first_line_at(begins_m)
+        return self._begun
+
+
+class RenderedHead:
+    """A sensor of the world behind a GigE Vision head."""
+
+    def __init__(
+        self,
+        world: World,
+        scene: Scene,
+        line: FirstLine,
+        clock: WorldClock,
+        plan: HeadPlan,
+        report: Callable[[Taken], None],
+    ) -> None:
+        self._world = world
+        self._scene = scene
+        self._line = line
+        self._clock = clock
+        self._report = report
+        self.sensor: Sensor = world.rig.sensor(plan.sensor)
+        self.cone: Cone = world.rig.cone_of(plan.sensor)
+        seed = world.settings.seed
+        self.truth = true_sensor(
+            self.cone, self.sensor, seed, field_radius_mm=world.field_radius_mm(self.cone)
+        )
+        self._electronics = Electronics(
+            self.sensor, self.truth, world.electrons_per_radiance_s(self.cone)
+        )
+        random = random_stream(seed, "head", plan.sensor)
+        self._temperature_error_c = float(random.normal(0, HEAD_TEMPERATURE_SIGMA_C))
+        self.head = GigeHead(
+            HeadIdentity(
+                address=plan.address,
+                serial=self.sensor.serial or f"{world.rig.name}-{plan.sensor}",
+                model=world.rig.title[:31],
+                vendor=VENDOR,
+                user_id=plan.sensor,
+            ),
+            FrameSize(self.sensor.width_px, self.sensor.height_px),
+            expose=self.expose,
+            temperature_c=self.temperature_c,
+            clock=DeviceClock(
+                offset_ns=int(random.integers(0, 10**12)), drift_ppm=float(random.normal(0, 10))
+            ),
+            faults=WireFaults(packet_loss=plan.packet_loss),
+        )
+
+    def temperature_c(self, mono_ns: int) -> float:
+        """What the head's own thermometer says."""
+        true_c = self._world.temperature_c(self.sensor.probe, self._clock.gps_ns(mono_ns))
+        return true_c + self._temperature_error_c
+
+    def expose(self, request: ExposureRequest) -> NDArray[np.uint16]:
+        """Take a frame; on a pulse of the bus, report it for the truth and for the strobe."""
+        half_ns = round(request.exposure_time_us * 500)
+        look = Look(
+            mid_gps_ns=self._clock.gps_ns(request.start_mono_ns) + half_ns,
+            exposure_time_us=request.exposure_time_us,
+            tdi_shifts=request.tdi_shifts,
+        )
+        self._line.begin(look.mid_gps_ns)
+        if request.pulse_count != NO_PULSE:
+            self._report(Taken(self.sensor.name, request.pulse_count, look))
+        return self.frame(look, gain_db=request.gain_db, number=request.start_mono_ns)
+
+    def frame(self, look: Look, *, gain_db: float, number: int) -> NDArray[np.uint16]:
+        """Render a frame; `number` chooses its noise."""
+        world = self._world
+        light = light_on_sensor(world, self._scene, self._line.flight, self.cone, self.sensor, look)
+        return self._electronics.frame(
+            light,
+            exposure_time_us=look.exposure_time_us,
+            tdi_shifts=look.tdi_shifts,
+            gain_db=gain_db,
+            temperature_c=world.temperature_c(self.sensor.probe, look.mid_gps_ns),
+            random=random_stream(world.settings.seed, "noise", self.sensor.name, number),
+        )
+
+
+def run(plan: WorkerPlan, pipe: Connection, first_line_m: Synchronized[float]) -> None:
+    """Body of a worker process: until the pipe closes, or a signal comes."""
+    ending = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: ending.set())
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
+    cv2.setNumThreads(1)
+    sending = threading.Lock()
+
+    def say(message: Said | Taken) -> None:
+        with sending:
+            pipe.send(message)
+
+    try:
+        heads = _open(plan, first_line_m, say)
+    except (OSError, ValueError) as error:
+        say(Said("failed", f"{type(error).__name__}: {error}"))
+        return
+    try:
+        say(Said("ready"))
+        _serve(pipe, heads, ending)
+    finally:
+        for head in heads:
+            head.head.close()
+
+
+def _open(
+    plan: WorkerPlan, first_line_m: Synchronized[float], say: Callable[[Taken], None]
+) -> Sequence[RenderedHead]:
+    world = World(plan.settings)
+    scene = open_scene(world.scene_settings, plan.scene_cache)
+    line = FirstLine(world.flight, first_line_m)
+    heads = [RenderedHead(world, scene, line, plan.clock, head, say) for head in plan.heads]
+    for head in heads:
+        radiometry = laboratory.measure(head.sensor, head.truth, plan.settings.seed)
+        laboratory.write_radiometry(plan.calibration, head.sensor, radiometry)
+    # Kernels are compiled, or read from their cache, before anyone waits for a frame.
+    heads[0].frame(WARM_UP, gain_db=0.0, number=0)
+    started: list[RenderedHead] = []
+    try:
+        for head in heads:
+            head.head.start()
+            started.append(head)
+    except OSError:
+        for head in started:
+            head.head.close()
+        raise
+    return heads
+
+
+def _serve(pipe: Connection, heads: Sequence[RenderedHead], ending: threading.Event) -> None:
+    while not ending.is_set():
+        try:
+            if not pipe.poll(POLL_S):
+                continue
+            pulse = pipe.recv()
+        except (EOFError, OSError):
+            return
+        if not isinstance(pulse, Pulse):
+            return
+        for head in heads:
+            start_ns = pulse.start_mono_ns.get(head.sensor.name)
+            if start_ns is not None:
+                head.head.line(start_ns, pulse.count)
+
+
+def end_with_parent() -> None:
+    """Have the kernel send SIGTERM when the parent dies; it may have died before we could ask."""
+    ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+    parent = multiprocessing.parent_process()
+    if parent is not None and os.getppid() != parent.pid:
+        os.kill(os.getpid(), signal.SIGTERM)
