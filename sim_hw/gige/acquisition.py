@@ -91,7 +91,7 @@ class Acquisition:
         self._temperature_c = temperature_c
         self._clock = clock
         self._faults = faults
-        self._pending: queue.Queue[_Pending] = queue.Queue(PENDING_EXPOSURES_MAX)
+        self._pending: queue.Queue[_Pending | None] = queue.Queue()
         self._lock = threading.Lock()
         self._acquiring = False
         self._acquisition = 0
@@ -115,6 +115,7 @@ class Acquisition:
 
     def close(self) -> None:
         self._stop.set()
+        self._wake_up()
         if self._thread is not None:
             self._thread.join(timeout=5.0)
 
@@ -134,6 +135,7 @@ class Acquisition:
                 ),
             }.get(mode)
             self._acquiring = True
+        self._wake_up()
 
     def end(self) -> None:
         """AcquisitionStop: the frame on its way is finished, waiting exposures are not taken."""
@@ -207,7 +209,10 @@ class Acquisition:
         with self._lock:
             if not self._acquiring:
                 return
-            if start_mono_ns < self._busy_until_ns or self._pending.full():
+            if (
+                start_mono_ns < self._busy_until_ns
+                or self._pending.qsize() >= PENDING_EXPOSURES_MAX
+            ):
                 self.counts["overtriggered"] += 1
                 return
             self._counter += 1
@@ -230,10 +235,17 @@ class Acquisition:
                 self._acquiring = self._frames_left > 0
             self._pending.put_nowait(pending)
 
+    def _wake_up(self) -> None:
+        """Let the exposing thread look at what has changed."""
+        self._pending.put_nowait(None)
+
     def _drop_pending(self) -> None:
-        while not self._pending.empty():
-            self._pending.get_nowait()
-            self.counts["exposures_cancelled"] += 1
+        while True:
+            try:
+                dropped = self._pending.get_nowait()
+            except queue.Empty:
+                return
+            self.counts["exposures_cancelled"] += dropped is not None
 
     def _run(self) -> None:
         while not self._stop.is_set():
@@ -242,7 +254,8 @@ class Acquisition:
                 pending = self._pending.get(timeout=self._patience_s())
             except queue.Empty:
                 continue
-            self._take(pending)
+            if pending is not None:
+                self._take(pending)
 
     def _is_free_running(self) -> bool:
         return self._acquiring and not self._registers.integer("TriggerMode")
@@ -257,7 +270,8 @@ class Acquisition:
         now_ns = time.monotonic_ns()
         if self._is_free_running() and now_ns >= self._next_free_run_ns:
             period_ns = round(_NS_PER_S / self._registers.number("AcquisitionFrameRate"))
-            self._next_free_run_ns = max(self._next_free_run_ns + period_ns, now_ns)
+            due_ns = self._next_free_run_ns + period_ns
+            self._next_free_run_ns = due_ns if due_ns > now_ns else now_ns + period_ns
             self._start_exposure(max(now_ns, self._busy_until_ns), NO_PULSE)
 
     def _take(self, pending: _Pending) -> None:

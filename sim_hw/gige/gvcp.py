@@ -73,7 +73,10 @@ def parse_command(packet: bytes) -> Command | None:
     if len(packet) < HEADER_LENGTH:
         return None
     key, flags, code, length, request_id = _HEADER.unpack_from(packet)
-    if key != KEY or request_id == 0 or length != len(packet) - HEADER_LENGTH:
+    is_command = code % 2 == 0  # an odd code is an acknowledgement
+    if key != KEY or not is_command or request_id == 0:
+        return None
+    if length != len(packet) - HEADER_LENGTH:
         return None
     return Command(code, flags, request_id, packet[HEADER_LENGTH:])
 

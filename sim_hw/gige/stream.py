@@ -5,6 +5,7 @@ One thread per head, asleep between bursts; a frame is sent whole before the nex
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import socket
 import threading
@@ -61,7 +62,7 @@ class StreamChannel:
         self._pacing = pacing
         self._loss = faults.packet_loss
         self._random = np.random.default_rng(seed)
-        self._waiting: queue.Queue[_Outgoing] = queue.Queue(FRAMES_WAITING_MAX)
+        self._waiting: queue.Queue[_Outgoing | None] = queue.Queue(FRAMES_WAITING_MAX)
         self._kept: deque[_Outgoing] = deque(maxlen=KEPT_FRAMES)
         self._bucket = TokenBucket(pacing, time.monotonic_ns())
         self._stop = threading.Event()
@@ -81,6 +82,8 @@ class StreamChannel:
 
     def close(self) -> None:
         self._stop.set()
+        with contextlib.suppress(queue.Full):
+            self._waiting.put_nowait(None)  # wakes the thread up
         if self._thread is not None:
             self._thread.join(timeout=5.0)
         if self._socket is not None:
@@ -145,6 +148,8 @@ class StreamChannel:
             try:
                 outgoing = self._waiting.get(timeout=_POLL_S)
             except queue.Empty:
+                continue
+            if outgoing is None:
                 continue
             with self._lock:
                 self._kept.append(outgoing)
