@@ -47,7 +47,8 @@ class HeldByAnotherError(DeviceError):
 class AravisCamera:
     """An opened head, configured and under our control.
 
-    Not for several threads at once: the caller holds a lock around every call.
+    Not for several threads at once: the caller holds a lock around every call, and
+    `drivers.aravis.library.OPENING` while it is made and configured.
 
     Raises:
         HeldByAnotherError: another program has control.

@@ -13,8 +13,13 @@ from dataclasses import dataclass
 from typing import ClassVar, Final
 
 from drivers.aravis.camera import AravisCamera, HeldByAnotherError, Latch
-from drivers.aravis.gvcp import control_privilege, is_ip_address
-from drivers.aravis.library import aravis_error
+from drivers.aravis.gvcp import (
+    DEFAULT_HEARTBEAT_S,
+    control_privilege,
+    heartbeat_timeout_s,
+    is_ip_address,
+)
+from drivers.aravis.library import OPENING, aravis_error
 from drivers.aravis.settings import AravisSettings
 from drivers.aravis.stream import FrameStream, ReceivedFrame
 from drivers.clock import BackOff, Clock, HostClock
@@ -33,7 +38,7 @@ PROBE_TIMEOUT_S: Final = 0.2
 PROBE_TRIES: Final = 3
 SUSPICION_S: Final = 2.0
 """A head that answers nothing for so long is lost; a pause of a second heals by itself."""
-HELD_POLL_S: Final = 0.25
+HELD_MARGIN_S: Final = 0.1
 TRIGGER_TIMEOUT_S: Final = 1.0
 CLOSE_TIMEOUT_S: Final = 2.0
 NOT_FRAMES: Final = ("aborted", "cleared", "filling", "unknown")
@@ -211,13 +216,14 @@ class AravisHead(AravisSettings):
     def _open(self) -> _Session:
         """Open the head, waiting out whoever holds it. DeviceError where that is in vain."""
         deadline_ns = self._clock.mono_ns() + round(self.held_limit_s * 1e9)
+        held = self._is_held()
         told = False
         while not self._closing.is_set():
-            if not self._is_held():
+            if not held:
                 try:
                     return self._open_now()
                 except HeldByAnotherError:
-                    pass
+                    held = True
             if not told:
                 told = True
                 self._teller.tell(
@@ -231,16 +237,20 @@ class AravisHead(AravisSettings):
                     f"{self.name} at {self.address}: another program has held the head for "
                     f"{self.held_limit_s:g} s, so it is alive; end that program"
                 )
-            self._clock.wait(self._closing, HELD_POLL_S)
+            # In one go and without a question in between, which might count as a sign of life of
+            # the dead controller. Whether the head has let go only taking control can tell: some
+            # leave the register as it was.
+            left_s = (deadline_ns - self._clock.mono_ns()) * 1e-9
+            pause_s = self._heartbeat_s() + HELD_MARGIN_S
+            self._clock.wait(self._closing, max(0.0, min(pause_s, left_s)) + HELD_MARGIN_S)
+            held = False
         raise DeviceError(f"{self.name}: closed while it was being opened; nothing to do")
 
     def _is_held(self) -> bool:
         if not is_ip_address(self.address):
             return False
-        for attempt in range(PROBE_TRIES):
-            privilege = control_privilege(
-                self.address, timeout_s=PROBE_TIMEOUT_S, request_id=attempt + 1
-            )
+        for _ in range(PROBE_TRIES):
+            privilege = control_privilege(self.address, timeout_s=PROBE_TIMEOUT_S)
             if privilege is not None:
                 return privilege != 0
             if self._closing.is_set():
@@ -250,9 +260,14 @@ class AravisHead(AravisSettings):
             "address"
         )
 
+    def _heartbeat_s(self) -> float:
+        if not is_ip_address(self.address):
+            return DEFAULT_HEARTBEAT_S
+        return heartbeat_timeout_s(self.address, timeout_s=PROBE_TIMEOUT_S)
+
     def _open_now(self) -> _Session:
         camera = None
-        with self._control:
+        with OPENING, self._control:
             try:
                 camera = AravisCamera(self.name, self)
                 with self._slots:

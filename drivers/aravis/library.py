@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import functools
-from typing import Any
+import threading
+from typing import Any, Final
 
 from drivers.contract import DeviceError
+
+OPENING: Final = threading.Lock()
+"""Held while a head is opened and configured. Aravis 0.8.26 parses a head's description, and the
+nodes it adds of its own, with state of the whole process: two heads opened at once see features as
+missing or end in a segmentation fault."""
 
 
 @functools.cache

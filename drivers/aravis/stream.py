@@ -6,7 +6,11 @@ Slots and Aravis' buffers are paired here; when a stream is made and dropped is 
 
 from __future__ import annotations
 
+import contextlib
 import gc
+import os
+import socket
+import stat
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -19,7 +23,7 @@ from drivers.aravis.settings import AravisSettings
 from drivers.contract import DeviceError, FrameMemory
 
 INFOS: Final = {
-    "n_underruns": "underruns",
+    "n_underruns": "underrun_packets",
     "n_resend_requests": "resend_requests",
     "n_resent_packets": "resent_packets",
     "n_missing_packets": "missing_packets",
@@ -29,7 +33,9 @@ INFOS: Final = {
     "n_error_packets": "error_packets",
     "n_transferred_bytes": "bytes",
 }
-"""What Aravis counts, and what it is called here."""
+"""What Aravis counts, and what it is called here. Its underruns are packets, not frames."""
+GVSP_OVERHEAD_NBYTES: Final = 36
+"""IP, UDP and GVSP headers of a packet: what its size holds besides pixels."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +83,11 @@ class FrameStream:
                 "CHUNK_ALLOWANCE_NBYTES, and check width_px, height_px and pixel_format"
             )
         self._parser = camera.chunk_parser
-        self._counted: Counter[str] = Counter()
+        packet_size = int(camera.frame_settings.get("GevSCPSPacketSize", 0))
+        # Leader and trailer besides the payload; without packets (USB) every underrun is a frame.
+        self._packets_per_frame = (
+            2 + -(-nbytes // (packet_size - GVSP_OVERHEAD_NBYTES)) if packet_size else 1
+        )
         self._buffers = {
             slot: library.Buffer.new(nbytes, memory.address(slot))
             for slot in range(memory.slot_count)
@@ -121,10 +131,11 @@ class FrameStream:
         )
 
     def counted(self) -> Counter[str]:
-        """What Aravis has counted of this stream."""
+        """What Aravis has counted of this stream, and `underruns` in frames."""
         found: Counter[str] = Counter()
         for theirs, ours in INFOS.items():
             found[ours] = int(self._stream.get_info_uint64_by_name(theirs))
+        found["underruns"] = -(-found["underrun_packets"] // self._packets_per_frame)
         return found
 
     def drop(self) -> None:
@@ -143,10 +154,11 @@ class FrameStream:
 
     def _tune(self, settings: AravisSettings) -> None:
         library, stream = aravis(), self._stream
+        socket_nbytes = min(settings.socket_buffer_bytes, receive_buffer_limit())
         stream.set_property("socket-buffer", library.GvStreamSocketBuffer.FIXED)
-        stream.set_property(
-            "socket-buffer-size", min(settings.socket_buffer_bytes, receive_buffer_limit())
-        )
+        stream.set_property("socket-buffer-size", socket_nbytes)
+        # Aravis widens its socket only once a first frame has begun, and loses that one.
+        widen_receive_buffer(int(stream.get_port()), socket_nbytes)
         stream.set_property("packet-resend", library.GvStreamPacketResend.ALWAYS)
         stream.set_property("packet-request-ratio", 1.0)
         stream.set_property("packet-timeout", round(settings.packet_timeout_ms * 1e3))
@@ -159,6 +171,18 @@ def receive_buffer_limit() -> int:
         return int(Path("/proc/sys/net/core/rmem_max").read_text(encoding="ascii"))
     except (OSError, ValueError):
         return 212_992
+
+
+def widen_receive_buffer(port: int, nbytes: int) -> None:
+    """Set the receive buffer of this process's UDP socket that is bound to `port`."""
+    for entry in Path("/proc/self/fd").iterdir():
+        # Another thread may close a descriptor while this looks at it.
+        with contextlib.suppress(OSError, ValueError):
+            if not stat.S_ISSOCK(entry.stat().st_mode):
+                continue
+            with socket.socket(fileno=os.dup(int(entry.name))) as found:
+                if found.family == socket.AF_INET and found.getsockname()[1] == port:
+                    found.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, nbytes)
 
 
 def _chunk(parser: Any, method: str, buffer: Any, name: str) -> Any:

@@ -38,8 +38,8 @@ LENGTHS: Final = {
 FIXES: Final = {0: "none", 1: "dead-reckoning", 2: "2d", 3: "3d", 4: "3d", 5: "time"}
 TIME_BASE_RECEIVER: Final = 0
 TIME_BASE_UTC: Final = 2
-LEAP_SOURCES_UNKNOWN: Final = (0, 255)
-"""Of NAV-TIMELS: 0 is the firmware's default, 255 unknown."""
+LEAP_SOURCE_DEFAULT: Final = 0
+"""Of NAV-TIMELS: the firmware's own guess. 255, "unknown", is what an M8T says of received ones."""
 FAR_NS: Final = 3600 * SECOND_NS
 """A mark further from the last navigation epoch has a wrong week or a restarted clock."""
 RECENT_NS: Final = 10 * SECOND_NS
@@ -241,7 +241,7 @@ class UbxDecoder:
         return []
 
     def _on_timels(self, message: Any, _mono_ns: int) -> list[Nav]:
-        self._leap_is_default = message.srcOfCurrLs in LEAP_SOURCES_UNKNOWN
+        self._leap_is_default = message.srcOfCurrLs == LEAP_SOURCE_DEFAULT
         known = message.validCurrLs and not self._leap_is_default
         self._leap = int(message.currLs) if known else None
         return []

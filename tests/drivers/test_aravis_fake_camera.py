@@ -1,0 +1,151 @@
+"""The Aravis head against Aravis' own fake camera, which we did not write."""
+
+from __future__ import annotations
+
+import functools
+import json
+import shutil
+import socket
+import statistics
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytestmark = [
+    pytest.mark.peer,
+    pytest.mark.skipif(
+        shutil.which("arv-fake-gv-camera-0.8") is None,
+        reason="needs arv-fake-gv-camera-0.8 (Debian package aravis-tools)",
+    ),
+]
+
+REPOSITORY = Path(__file__).parents[2]
+
+
+@functools.cache
+def _namespace() -> tuple[str, ...]:
+    """How to start a program in a network of its own; skips where port 3956 is not to be had."""
+    pytest.importorskip("gi", reason="needs PyGObject (extra aravis) and gir1.2-aravis-0.8")
+    prefix = ("unshare", "--map-root-user", "--net")
+    if shutil.which("unshare") is not None:
+        tried = subprocess.run([*prefix, "true"], capture_output=True, timeout=10, check=False)
+        if tried.returncode == 0:
+            return prefix
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as port:
+        try:
+            port.bind(("127.0.0.1", 3956))
+        except OSError:
+            pytest.skip("needs UDP port 3956 of 127.0.0.1, or unshare (Debian package util-linux)")
+    return ()
+
+
+def _scenario(name: str) -> dict[str, Any]:
+    """Run a scenario of `aravis_scenarios`; what it found."""
+    done = subprocess.run(
+        [*_namespace(), sys.executable, "-m", "tests.drivers.aravis_scenarios", name],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+        cwd=REPOSITORY,
+    )
+    assert done.returncode == 0, done.stderr
+    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return found
+
+
+def test_frames_land_in_the_memory_we_gave_pixel_by_pixel() -> None:
+    told = _scenario("frames_land_in_our_memory")
+    assert told["statuses"] == ["complete"] * 8
+    assert told["slots"] == [0, 1, 2, 3, 0, 1, 2, 3], "slots are used in turn"
+    assert [b - a for a, b in zip(told["ids"], told["ids"][1:], strict=False)] == [1] * 7
+    assert told["is_diagonal_ramp"] == [True] * 8
+    assert told["next_is_shifted_by_one"] == [True] * 7
+    assert told["behind_the_pixels_untouched"]
+    assert told["size"] == [512, 512]
+    assert told["settings"]["ExposureTime"] == 2000.0
+    assert told["settings"]["PixelFormat"] == "Mono16"
+    assert told["settings"]["GevSCPSPacketSize"] >= 576
+    assert told["found"]["model"] == "Fake"
+    assert told["found"]["serial"] == "T1"
+    assert told["statistics"]["frames"] == 8
+    assert told["statistics"]["missing_packets"] == 0
+    assert (told["state"], told["thread_ended"]) == ("inactive", True)
+    # The fake camera exposes on a grid of 40 ms, so this bounds our share from above.
+    assert statistics.median(told["delays_ms"]) < 100
+
+
+def test_a_killed_head_is_noticed_within_five_seconds_and_opened_again() -> None:
+    told = _scenario("a_killed_head_is_found_again")
+    assert told["events"] == ["opened", "lost", "opened"]
+    assert told["faults"] == [False, True, False]
+    assert told["lost_after_s"] < 5
+    assert told["reopened_after_s"] < 12
+    assert told["frames"] == 4
+    assert told["opened"] == 2
+
+
+def test_a_head_that_restarts_at_once_is_noticed_too() -> None:
+    told = _scenario("a_quick_restart_is_noticed")
+    assert told["events"] == ["opened", "lost", "opened"]
+    assert told["back_after_s"] < 8
+    assert told["frames"] == 3
+
+
+def test_the_hold_of_a_dead_controller_is_waited_out_and_shown() -> None:
+    told = _scenario("a_dead_controllers_hold_is_waited_out")
+    assert told["controls"] == "True"
+    assert "another program has held the head for 1 s" in told["refused"]
+    assert told["told"] == ["held-by-another"]
+    assert told["waited_s"] < 8, "the fake camera lets go 3 s after the last heartbeat"
+    assert told["frames"] == 2
+
+
+def test_settings_that_the_head_refuses_come_all_at_once_and_let_it_go() -> None:
+    told = _scenario("refused_settings_come_together")
+    four, serial, line, small, absent = told["refusals"]
+    assert "pixel_format is 'Mono12p'; the head has" in four
+    assert "exposure_time_us is 5e+07; the head takes 10 to 1e+07" in four
+    assert "gain_db is 6; the head has no feature Gain in dB, set 0" in four
+    assert "tdi_shifts is 12; the head has no feature TdiShifts, set 0" in four
+    assert "serial number is 'T1' where 'T2' is configured" in serial
+    assert "trigger_line = 'Line7' is refused" in line
+    assert "a frame has 524288 bytes, its slot 1000" in small
+    assert "nothing answers at 127.0.0.1; check the head's power, cable" in absent
+    assert told["privilege_afterwards"] == 0
+
+
+def test_lost_packets_give_an_incomplete_frame_and_its_reason() -> None:
+    told = _scenario("lost_packets_make_incomplete_frames")
+    counted = told["statistics"]
+    assert told["statuses"].count("incomplete") == counted["frames_incomplete"] > 0
+    assert (
+        counted["incomplete_timeout"] + counted.get("incomplete_missing_packets", 0)
+        == (counted["frames_incomplete"])
+    )
+    assert counted["missing_packets"] > 0
+    assert counted["resend_requests"] > 0
+
+
+def test_frames_that_come_while_all_slots_are_taken_are_counted_and_told() -> None:
+    told = _scenario("taken_slots_lose_frames_at_the_stream")
+    assert told["underruns"] == 2
+    assert told["events"] == ["opened", "underrun"]
+    assert told["frames"] == 5, "three before, two after the slots were handed back"
+    assert "slot 0 was not handed out" in told["twice"]
+
+
+def test_closing_a_dead_head_takes_two_seconds_at_most() -> None:
+    told = _scenario("closing_a_dead_head_takes_two_seconds_at_most")
+    assert told["closed_s"] < 2.1
+    assert told["ended_s"] < 2.1
+    assert told["state"] == "inactive"
+
+
+def test_a_head_that_waits_for_its_line_refuses_a_software_trigger() -> None:
+    told = _scenario("a_head_that_waits_for_its_line_refuses_a_software_trigger")
+    assert 'set trigger_source = "software"' in told["refused"]
+    assert told["frames"] == 0

@@ -1,0 +1,140 @@
+"""The Modbus thermometer against pymodbus' server, over a pair of pseudo-terminals."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Iterator
+
+import pytest
+
+from drivers.contract import DeviceError, TemperatureSample
+from drivers.modbus_rtu.thermometer import ModbusThermometer
+from tests.drivers.lines import PtyLine
+from tests.drivers.stand_ins import Notebook
+
+pymodbus_server = pytest.importorskip("pymodbus.server", reason="needs pymodbus (group dev)")
+pymodbus_datastore = pytest.importorskip("pymodbus.datastore")
+pytestmark = pytest.mark.peer
+
+UNIT = 3
+REGISTERS = [215, 65484, 0x7FFF, 301]
+"""From register 10: 21.5 degC, -5.2 degC, open, 30.1 degC."""
+
+
+@pytest.fixture
+def line() -> Iterator[PtyLine]:
+    """A line with pymodbus' server at its far end."""
+    with PtyLine() as line:
+        loop = asyncio.new_event_loop()
+        listening = threading.Event()
+        thread = threading.Thread(target=_serve, args=(loop, line.far, listening))
+        thread.start()
+        assert listening.wait(10)
+        yield line
+        asyncio.run_coroutine_threadsafe(pymodbus_server.ServerAsyncStop(), loop).result(10)
+        thread.join(10)
+
+
+def _serve(loop: asyncio.AbstractEventLoop, port: str, listening: threading.Event) -> None:
+    async def serve() -> None:
+        block = pymodbus_datastore.ModbusSequentialDataBlock(11, REGISTERS)
+        device = pymodbus_datastore.ModbusDeviceContext(ir=block)
+        context = pymodbus_datastore.ModbusServerContext(devices={UNIT: device}, single=False)
+        loop.call_later(0.2, listening.set)
+        await pymodbus_server.StartAsyncSerialServer(context, port=port, baudrate=19200, parity="N")
+
+    asyncio.set_event_loop(loop)
+    loop.run_until_complete(serve())
+    loop.close()
+
+
+def _thermometer(line: PtyLine, **more: object) -> ModbusThermometer:
+    section: dict[str, object] = {
+        "port": line.near,
+        "parity": "N",
+        "unit": UNIT,
+        "first_register": 10,
+        "channels": ["0", "1", "2", "G"],
+        "interval_s": 0.1,
+        "answer_timeout_s": 0.3,
+        "silence_s": 0.6,
+        **more,
+    }
+    return ModbusThermometer("probes", section)
+
+
+def _run(thermometer: ModbusThermometer, enough: int) -> Notebook:
+    """Run until that many samples have come, ten seconds at most."""
+    notebook = Notebook()
+    done = threading.Event()
+
+    def stop(_: object) -> None:
+        if sum(isinstance(r, TemperatureSample) for r in notebook.records) >= enough:
+            done.set()
+
+    notebook.stop = stop
+    thread = threading.Thread(target=thermometer.run, args=(notebook,))
+    thread.start()
+    came = done.wait(10)
+    thermometer.close()
+    thread.join(5)
+    assert came, notebook.events
+    return notebook
+
+
+def test_pymodbus_registers_come_out_as_degrees(line: PtyLine) -> None:
+    thermometer = _thermometer(line)
+    found = thermometer.bind()
+    assert found["probe 0"] == "21.5 degC"
+    notebook = _run(thermometer, 8)
+    samples = [(r.probe, r.value_c) for r in notebook.records if isinstance(r, TemperatureSample)]
+    assert samples[:4] == [("0", 21.5), ("1", -5.2), ("2", None), ("G", 30.1)]
+    assert thermometer.statistics()["bad_bytes"] == 0
+
+
+def test_registers_that_pymodbus_does_not_have_are_an_exception_2(line: PtyLine) -> None:
+    thermometer = _thermometer(line, first_register=100)
+    with pytest.raises(DeviceError, match="exception 2"):
+        thermometer.bind()
+    thermometer.close()
+
+
+def test_a_unit_that_is_not_on_the_line_is_not_found(line: PtyLine) -> None:
+    thermometer = _thermometer(line, unit=9)
+    with pytest.raises(DeviceError, match=r"exception|gave no answer"):
+        thermometer.bind()
+    thermometer.close()
+
+
+def test_noise_on_the_line_loses_no_reading(line: PtyLine) -> None:
+    line.noise_to_near = b"\x03\x04\x00\xff\x03"
+    thermometer = _thermometer(line)
+    notebook = _run(thermometer, 8)
+    assert thermometer.statistics()["bad_bytes"] == 5
+    assert thermometer.statistics()["timeouts"] == 0
+    assert "checksum" not in notebook.event_names
+
+
+def test_a_cut_line_is_silent_and_recovers(line: PtyLine) -> None:
+    thermometer = _thermometer(line)
+    notebook = Notebook()
+    seen = {name: threading.Event() for name in ("opened", "silent", "recovered")}
+
+    def note(_: object) -> None:
+        for name in notebook.event_names:
+            if name in seen:
+                seen[name].set()
+
+    notebook.stop = note
+    thread = threading.Thread(target=thermometer.run, args=(notebook,))
+    thread.start()
+    try:
+        assert seen["opened"].wait(5)
+        line.is_cut = True
+        assert seen["silent"].wait(5)
+        line.is_cut = False
+        assert seen["recovered"].wait(10)
+    finally:
+        thermometer.close()
+        thread.join(5)

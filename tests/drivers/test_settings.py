@@ -1,0 +1,83 @@
+"""Declared settings: defaults, types, and mistakes told all at once."""
+
+from __future__ import annotations
+
+import pytest
+
+from drivers.contract import DeviceError
+from drivers.settings import Configured, Setting, SettingsError
+
+
+class Lamp(Configured):
+    """A device for these tests."""
+
+    brightness = Setting(50, minimum=0, maximum=100, says="brightness in percent")
+    colour = Setting("white", choices=("white", "red"), says="colour of the light")
+    warm_up_s = Setting(0.5, minimum=0, says="time until it is bright")
+    steady = Setting(True, says="whether it burns steadily")
+    sockets: Setting[tuple[str, ...]] = Setting(
+        (), required=True, minimum=1, says="names of the sockets"
+    )
+
+
+class NavigationLamp(Lamp):
+    """Inherits, and changes one default."""
+
+    colour = Setting("red", choices=("red",), says="colour prescribed")
+
+
+def test_a_setting_that_is_not_given_has_its_default() -> None:
+    lamp = Lamp("nose", {"sockets": ["a"]})
+    assert (lamp.brightness, lamp.colour, lamp.warm_up_s, lamp.steady) == (50, "white", 0.5, True)
+    assert lamp.sockets == ("a",)
+    assert lamp.name == "nose"
+
+
+def test_a_whole_number_will_do_where_a_float_is_meant() -> None:
+    lamp = Lamp("nose", {"sockets": ["a"], "warm_up_s": 2})
+    assert lamp.warm_up_s == 2.0
+    assert isinstance(lamp.warm_up_s, float)
+
+
+def test_the_class_lists_its_settings_with_type_default_choices_and_sentence() -> None:
+    listed = {s.name: (s.type_name, s.default, s.choices, s.says) for s in Lamp.settings()}
+    assert listed["colour"] == ("a text", "white", ("white", "red"), "colour of the light")
+    assert listed["brightness"] == ("a whole number", 50, (), "brightness in percent")
+    assert list(listed) == ["brightness", "colour", "warm_up_s", "steady", "sockets"]
+
+
+def test_a_subclass_may_declare_a_setting_anew() -> None:
+    assert NavigationLamp("left", {"sockets": ["a"]}).colour == "red"
+    assert len(NavigationLamp.problems({"sockets": ["a"], "colour": "white"})) == 1
+
+
+def test_five_mistakes_give_five_sentences_each_with_key_value_and_cure() -> None:
+    problems = Lamp.problems(
+        {"brightness": 300, "colour": "blue", "warm_up_s": "long", "steady": 1, "brigthness": 3}
+    )
+    assert problems == [
+        "brightness is 300; at most 100 (brightness in percent)",
+        "colour is 'blue'; one of 'white', 'red' (colour of the light)",
+        "warm_up_s is 'long'; a finite number is needed (time until it is bright)",
+        "steady is 1; true or false is needed (whether it burns steadily)",
+        "brigthness is 3; there is no such setting, brightness is meant?",
+        "sockets is missing; a list of names is needed (names of the sockets)",
+    ]
+
+
+def test_a_device_with_wrong_settings_is_not_created() -> None:
+    with pytest.raises(SettingsError) as caught:
+        Lamp("nose", {"brightness": True})
+    assert isinstance(caught.value, DeviceError)
+    assert len(caught.value.problems) == 2
+    assert str(caught.value).startswith("nose: brightness is True")
+
+
+@pytest.mark.parametrize("value", ["a", [], [""], [1], None, {"a": 1}])
+def test_a_list_of_names_holds_texts(value: object) -> None:
+    assert len(Lamp.problems({"sockets": value})) == 1
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), True, None, "1"])
+def test_a_number_is_finite_and_neither_truth_nor_text(value: object) -> None:
+    assert len(Lamp.problems({"sockets": ["a"], "warm_up_s": value})) == 1
