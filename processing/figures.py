@@ -6,7 +6,7 @@ is decided in `processing.quality`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -60,22 +60,29 @@ def stitching_figures(
     rig: Rig,
     tie_points: TiePoints,
     mosaic: Mosaic,
+    *,
     validity: Validity | None,
     balance: Balance,
     bands: Sequence[BandRegistration],
+    present: Collection[str],
 ) -> dict[str, Figure]:
-    """Tie points, adjustment, displaced sensor, balance and colour registration."""
+    """Tie points, adjustment, displaced sensor, balance and colour registration.
+
+    Overlaps of sensors that are not `present` do not count as poor in tie points.
+    """
+    told = mosaic.redundancy > 0
+    unknowns = dict.fromkeys(name.split(".")[0] for name in mosaic.undetermined)
     figures: dict[str, Figure] = {
         "method": mosaic.method,
-        "sigma0": mosaic.sigma0,
-        "sigma0_px": mosaic.sigma0_px,
-        "sigma0_um": mosaic.sigma0_um,
+        "sigma0": mosaic.sigma0 if told else None,
+        "sigma0_px": mosaic.sigma0_px if told else None,
+        "sigma0_um": mosaic.sigma0_um if told else None,
         "redundancy": mosaic.redundancy,
         "outliers": int(np.count_nonzero(mosaic.outliers)),
-        "undetermined": ", ".join(mosaic.undetermined) or None,
+        "undetermined": ", ".join(unknowns) or None,
         "balance_spread": balance.spread,
     }
-    figures |= _tie_point_counts(rig, tie_points, mosaic)
+    figures |= _tie_point_counts(rig, tie_points, mosaic, present)
     figures |= _displacement(validity)
     for band in bands:
         figures[f"{band.band}_points"] = band.points
@@ -83,9 +90,11 @@ def stitching_figures(
     return figures
 
 
-def _tie_point_counts(rig: Rig, tie_points: TiePoints, mosaic: Mosaic) -> dict[str, Figure]:
+def _tie_point_counts(
+    rig: Rig, tie_points: TiePoints, mosaic: Mosaic, present: Collection[str]
+) -> dict[str, Figure]:
     used = ~mosaic.outliers
-    pan = {s.name for cone in rig.pan_cones for s in cone.sensors}
+    pan = {s.name for cone in rig.pan_cones for s in cone.sensors if s.name in present}
     overlaps = {
         pair: count for pair, count in mosaic.used.items() if pair[0] in pan and pair[1] in pan
     }

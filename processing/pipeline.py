@@ -167,7 +167,13 @@ class Pipeline:
             figures = condition_figures(rig, conditions, temperatures)
             figures |= self._frame_figures(level1, statistics, start)
             figures |= stitching_figures(
-                rig, tie_points, mosaic, validity, image.balance, registrations
+                rig,
+                tie_points,
+                mosaic,
+                validity=validity,
+                balance=image.balance,
+                bands=registrations,
+                present=level1,
             )
             figures |= self._whole_figures(image.source, frames, conditions)
             report = judge(

@@ -94,8 +94,9 @@ class Thresholds:
     tie_points_pp_refly: int = 20
     sigma0_px: float = 0.3
     sigma0_refly_px: float = 1.0
-    underexposed_fraction: float = 0.06
-    """A bright part (95th percentile) below this share of full scale."""
+    bright_fraction: float = 0.06
+    """The 95th percentile of the signal as a share of full scale; below, the image is dark."""
+    bright_refly_fraction: float = 0.01
     saturated_fraction: float = 0.005
     saturated_refly_fraction: float = 0.05
     smear_px: float = 0.8
@@ -125,7 +126,7 @@ FIGURES: Final[Mapping[str, str]] = {
     "displacement_test": "test statistic over its critical value; above one is significant",
     "displaced_alternatives": "master sensors that explain the stitching nearly as well",
     "relative_displacements": "pairs of sensors of one cone found displaced against each other",
-    "undetermined": "unknowns the tie points did not determine, held at calibration and TDM",
+    "undetermined": "sensors and cones the tie points did not place, held at calibration and TDM",
     "smear_along_px": "motion during exposure along track that TDI left, worst PAN cone, pixels",
     "smear_across_px": "the same across track",
     "gsd_m": "ground sampling distance of the virtual image",
@@ -401,14 +402,17 @@ def _stitching(
 def _exposure(figures: Mapping[str, Figure], t: Thresholds) -> list[Finding]:
     findings = []
     bright = _number(figures, "bright_fraction")
-    if bright is not None and bright < t.underexposed_fraction:
+    if bright is not None and bright < t.bright_fraction:
+        black = bright < t.bright_refly_fraction
         findings.append(
             Finding(
                 Flag.UNDEREXPOSED,
-                Verdict.USABLE,
-                "The image is dark; lengthen the exposure or open the aperture.",
+                Verdict.REFLY if black else Verdict.USABLE,
+                "The image is black; check shutter, aperture and lens cover. Fly it again."
+                if black
+                else "The image is dark; lengthen the exposure or open the aperture.",
                 bright,
-                t.underexposed_fraction,
+                t.bright_refly_fraction if black else t.bright_fraction,
             )
         )
     findings += _above(
