@@ -67,6 +67,7 @@ class StreamChannel:
         self._bucket = TokenBucket(pacing, time.monotonic_ns())
         self._stop = threading.Event()
         self._lock = threading.Lock()
+        self._counting = threading.Lock()
         self._socket: socket.socket | None = None
         self._thread: threading.Thread | None = None
         self.counts: Counter[str] = Counter()
@@ -116,9 +117,9 @@ class StreamChannel:
         fits = np.searchsorted(np.cumsum(frame.sizes[packets]), self._pacing.burst_bytes, "right")
         packets = packets[: max(int(fits), 1)]
         kept = packets[self._random.random(len(packets)) >= self._loss]
-        self.counts["packets_lost_by_fault"] += len(packets) - len(kept)
+        self._count("packets_lost_by_fault", len(packets) - len(kept))
         if len(kept):
-            self.counts["packets_resent"] += self._send(frame.resent(kept))
+            self._count("packets_resent", self._send(frame.resent(kept)))
             self._bucket.spend(int(frame.sizes[kept].sum()))
 
     def fire_test_packet(self, destination: Destination, *, may_fragment: bool) -> None:
@@ -136,7 +137,7 @@ class StreamChannel:
                 (destination.address, destination.port),
             )
         except OSError:
-            self.counts["send_errors"] += 1
+            self._count("send_errors", 1)
 
     def forget(self) -> None:
         """Let go of the frames kept for resending."""
@@ -154,7 +155,7 @@ class StreamChannel:
             with self._lock:
                 self._kept.append(outgoing)
             whole = self._transmit(outgoing)
-            self.counts["frames_sent" if whole else "frames_aborted"] += 1
+            self._count("frames_sent" if whole else "frames_aborted", 1)
 
     def _transmit(self, outgoing: _Outgoing) -> bool:
         frame = outgoing.frame
@@ -188,25 +189,30 @@ class StreamChannel:
 
     def _send_first_time(self, frame: FramePackets, first: int, last: int) -> None:
         if not self._loss:
-            self.counts["packets_sent"] += self._send(frame.batch(first, last))
+            self._count("packets_sent", self._send(frame.batch(first, last)))
             return
         packets = np.arange(first, last + 1, dtype=np.intp)
         kept = packets[self._random.random(len(packets)) >= self._loss]
-        self.counts["packets_lost_by_fault"] += len(packets) - len(kept)
+        self._count("packets_lost_by_fault", len(packets) - len(kept))
         if len(kept):
-            self.counts["packets_sent"] += self._send(frame.only(kept))
+            self._count("packets_sent", self._send(frame.only(kept)))
 
     def _send(self, batch: Batch) -> int:
         if self._socket is None:
             return 0
         taken, refused = send(self._socket.fileno(), batch)
-        self.counts["send_errors"] += refused
+        self._count("send_errors", refused)
         return taken
+
+    def _count(self, name: str, number: int) -> None:
+        # First sending and resending are two threads, and += is not atomic.
+        with self._counting:
+            self.counts[name] += number
 
     def _answer_unavailable(self, request: ResendRequest) -> None:
         with self._lock:
             newest = self._kept[-1] if self._kept else None
-        self.counts["resends_unavailable"] += 1
+        self._count("resends_unavailable", 1)
         if newest is None or self._socket is None:
             return
         to = (newest.frame.destination.address, newest.frame.destination.port)
@@ -215,4 +221,4 @@ class StreamChannel:
             try:
                 self._socket.sendto(unavailable_packet(request.block_id, packet), to)
             except OSError:
-                self.counts["send_errors"] += 1
+                self._count("send_errors", 1)
