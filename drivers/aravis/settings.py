@@ -46,7 +46,7 @@ class AravisSettings(Configured):
     )
     chunks = Setting(True, says="let the head write time, exposure and counter behind the pixels")
     latch_interval_s = Setting(
-        2.0, minimum=0.5, maximum=4, says="time between readings of the head's clock and health"
+        2.0, minimum=0.5, maximum=2.5, says="time between readings of the head's clock and health"
     )
     held_limit_s = Setting(
         15.0, minimum=1, maximum=120, says="how long a dead controller's hold is waited out"

@@ -1,0 +1,50 @@
+"""The pages in docs/drivers name every setting with the default the driver really has."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from drivers import registry
+from drivers.settings import Setting
+
+DOCUMENTATION = Path(__file__).parents[2] / "docs" / "drivers"
+PAGES = [
+    ("head", "aravis", "aravis.md"),
+    ("thermometer", "modbus-rtu", "modbus-rtu.md"),
+    ("navigator", "ublox", "ublox.md"),
+    ("trigger", "pulse-bus", "pulse-bus.md"),
+    ("trigger", "software", "pulse-bus.md"),
+]
+
+
+def row(setting: Setting[object]) -> str:
+    """A line of a page's table of settings."""
+    if setting.required:
+        default = "required"
+    elif isinstance(setting.default, bool):
+        default = str(setting.default).lower()
+    elif isinstance(setting.default, str):
+        default = f'"{setting.default}"'
+    else:
+        default = f"{setting.default}"
+    allowed = ", ".join(f'"{choice}"' for choice in setting.choices)
+    if setting.minimum is not None:
+        allowed = f"{setting.minimum:g} to " + (
+            "any" if setting.maximum is None else f"{setting.maximum:g}"
+        )
+    return f"| `{setting.name}` | {setting.type_name} | {default} | {allowed} | {setting.says} |"
+
+
+@pytest.mark.parametrize(("kind", "driver", "page"), PAGES)
+def test_the_page_lists_every_setting_as_the_driver_declares_it(
+    kind: str, driver: str, page: str
+) -> None:
+    lines = (DOCUMENTATION / page).read_text(encoding="utf-8").splitlines()
+    missing = [
+        row(setting)
+        for setting in registry.driver_for(kind, driver).settings()
+        if row(setting) not in lines
+    ]
+    assert missing == []
