@@ -40,6 +40,8 @@ VENDOR = "Syntopic emulator"
 WARM_UP = Look(mid_gps_ns=0, exposure_time_us=4000.0, tdi_shifts=1)
 PR_SET_PDEATHSIG = 1
 POLL_S = 0.5
+STRAIGHT_ON_M = 1e7
+"""A first line so far ahead that the aircraft does not turn for two days."""
 HEAD_TEMPERATURE_SIGMA_C = 0.1
 
 
@@ -83,11 +85,11 @@ class FirstLine:
     """Where the first line begins, in metres flown; shared by all processes, set once.
 
     Nobody has seen the ground before the first exposure, so the line and its scene are laid where
-    the first exposure finds the aircraft.
+    the first exposure finds the aircraft. Until then it flies straight on.
     """
 
     def __init__(self, flight: Flight, shared: Synchronized[float]) -> None:
-        self._plain = flight
+        self._waiting = flight.beginning_first_line_at(STRAIGHT_ON_M)
         self._begun: Flight | None = None
         self._shared = shared
 
@@ -95,7 +97,7 @@ class FirstLine:
         """Begin the line here, if it has not begun."""
         with self._shared.get_lock():
             if math.isnan(self._shared.value):
-                self._shared.value = self._plain.distance_flown_m(gps_ns)
+                self._shared.value = self._waiting.distance_flown_m(gps_ns)
 
     @property
     def flight(self) -> Flight:
@@ -104,8 +106,8 @@ class FirstLine:
             return self._begun
         begins_m = self._shared.value
         if math.isnan(begins_m):
-            return self._plain
-        self._begun = self._plain.beginning_first_line_at(begins_m)
+            return self._waiting
+        self._begun = self._waiting.beginning_first_line_at(begins_m)
         return self._begun
 
 

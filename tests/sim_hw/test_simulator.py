@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import socket
@@ -11,6 +12,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,6 +25,7 @@ from pyubx2 import UBXReader
 
 from sim_hw.electronics import Electronics, true_sensor
 from sim_hw.gige import features as at
+from sim_hw.head_process import FirstLine
 from sim_hw.rendering import Look, light_on_sensor
 from sim_hw.scene import open_scene
 from sim_hw.simulator import SimulatorError, head_addresses
@@ -282,3 +285,21 @@ def test_heads_count_up_from_the_first_address(tmp_path: Path) -> None:
     assert addresses["SU30"] == "127.0.2.2"
     with pytest.raises(SimulatorError, match="loopback"):
         head_addresses(world, "192.168.1.1")
+
+
+def test_before_the_first_exposure_it_flies_straight_on_however_long_that_takes() -> None:
+    from processing.rig import shipped_rigs
+
+    rig_file = str(shipped_rigs()["ultracam-x-mini"])
+    world = World(WorldSettings(rig_file=rig_file, seed=1, epoch_gps_ns=EPOCH, exposures=2))
+    line = FirstLine(world.flight, get_context("spawn").Value("d", math.nan))
+    late = EPOCH + 1_000_000_000_000
+    before = line.flight.pose(late)
+    assert before.position_enu_m[1] == pytest.approx(55_000, abs=10)
+    line.begin(late)
+    begun = line.flight.pose(late)
+    assert begun.position_enu_m == pytest.approx(before.position_enu_m, abs=1e-6)
+    assert begun.enu_from_body == pytest.approx(before.enu_from_body, abs=1e-12)
+    # Two exposures long, the line ends after 383 m: 7 s later the turn has begun.
+    turning = line.flight.pose(late + 15_000_000_000)
+    assert abs(turning.roll_rad) > math.radians(10)
