@@ -5,11 +5,11 @@ Compiled kernels over many points; which points, in which frames, and what the p
 is no data or saturated, for float32 frames one that is not finite.
 
 Why it is unbiased: both patches are carried half of the shift towards each other, so what noise
-does to the gradients cancels; and the interpolation kernel (8 taps, a sinc low-passed at 0.35
-cycles per pixel under a Kaiser window) has a phase error below 0.0005 px up to 0.4 cycles per pixel
-and passes the same noise power at every sub-pixel phase (to 0.6 %), so noise prefers no phase.
-Bilinear interpolation passes four times as much noise at phase 0 as at phase 1/2, both axes taken
-together, and draws matches towards the half pixel.
+does to the gradients cancels; and the interpolation kernel (8 taps, a sinc low-passed at 0.3
+cycles per pixel under a Kaiser window that ends at zero) has a phase error below 0.0004 px up to
+0.35 cycles per pixel and passes the same noise power at every sub-pixel phase (to 0.2 %), so noise
+prefers no phase. Bilinear interpolation passes half the noise power at phase 1/2, per axis, and
+draws matches there.
 """
 
 from __future__ import annotations
@@ -26,18 +26,19 @@ MARGIN_PX: Final = 4
 """Pixels a patch needs around its window: four taps and the largest half shift."""
 
 _TAPS: Final = 8
-_CUTOFF: Final = 0.35
-_KAISER_BETA: Final = 6.0
+_CUTOFF: Final = 0.30
+_KAISER_BETA: Final = 8.0
 _PHASES: Final = 1024
 _STEPS: Final = 8
-_CONVERGED_PX: Final = 0.001
+_CONVERGED_PX: Final = 0.004
 _LARGEST_SHIFT_PX: Final = 1.2
 _BLOCK: Final = 32
 
 
 def _kernel(x: Array) -> Array:
-    taper = np.i0(_KAISER_BETA * np.sqrt(np.maximum(0.0, 1.0 - (x / 4.0) ** 2)))
-    value: Array = np.sinc(2.0 * _CUTOFF * x) * taper * (np.abs(x) < 4.0)
+    # Less its value at the ends: a step there would be a spike of the slope at whole pixels.
+    taper = np.i0(_KAISER_BETA * np.sqrt(np.maximum(0.0, 1.0 - (x / 4.0) ** 2))) - 1.0
+    value: Array = np.sinc(2.0 * _CUTOFF * x) * taper
     return value
 
 
@@ -180,41 +181,71 @@ def _all_finite(patch: Array) -> bool:
 
 
 @njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
-def _correlate(a: Array, b: Array, half: int, margin: int, reach: Array, surface: Array) -> None:
-    """Normalised cross correlation of a's window with b at all offsets; NaN-free, -2 where unset.
+def _correlate(
+    a: Array,
+    b: Array,
+    half: int,
+    margin: int,
+    reach: Array,
+    scratch: tuple[Array, Array, Array, Array],
+    surface: Array,
+) -> None:
+    """Normalised cross correlation of a's window with b at all offsets; -2 where not tried.
 
     `reach` holds the first and last column offset and the first and last row offset to be tried.
     """
+    template, products, sums, squares = scratch
     side = 2 * half + 1
-    n = np.float32(side * side)
-    search = (surface.shape[0] - 1) // 2
+    n = side * side
+    width = surface.shape[1]
+    search = (width - 1) // 2
     mean = np.float32(0.0)
     for r in range(side):
         for c in range(side):
             mean += a[r + margin, c + margin]
-    mean /= n
-    energy = np.float32(0.0)
+    mean /= np.float32(n)
+    energy = 0.0
     for r in range(side):
         for c in range(side):
             value = a[r + margin, c + margin] - mean
+            template[r, c] = value
             energy += value * value
     surface[:] = np.float32(-2.0)
+    sums[:] = 0.0
+    squares[:] = 0.0
+    first = margin + search + reach[2]
+    for r in range(first, first + side):
+        for j in range(width + side - 1):
+            value = float(b[r, margin + j])
+            sums[j] += value
+            squares[j] += value * value
     for dr in range(reach[2], reach[3] + 1):
-        for dc in range(reach[0], reach[1] + 1):
-            top, left = margin + search + dr, margin + search + dc
-            s = np.float32(0.0)
-            ss = np.float32(0.0)
-            sa = np.float32(0.0)
-            for r in range(side):
-                for c in range(side):
-                    value = b[top + r, left + c]
-                    s += value
-                    ss += value * value
-                    sa += value * (a[r + margin, c + margin] - mean)
-            spread = ss - s * s / n
-            product = spread * energy
-            if product > np.float32(1e-6):
-                surface[search + dr, search + dc] = sa / np.sqrt(product)
+        top = margin + search + dr
+        products[:] = np.float32(0.0)
+        for r in range(side):
+            for c in range(side):
+                weight = template[r, c]
+                for k in range(width):
+                    products[k] += weight * b[top + r, margin + c + k]
+        total = square = 0.0
+        for j in range(side - 1):
+            total += sums[j]
+            square += squares[j]
+        for k in range(width):
+            total += sums[k + side - 1]
+            square += squares[k + side - 1]
+            if reach[0] <= k - search <= reach[1]:
+                spread = (square - total * total / n) * energy
+                if spread > 1e-6:
+                    surface[search + dr, k] = products[k] / np.sqrt(spread)
+            total -= sums[k]
+            square -= squares[k]
+        if dr < reach[3]:
+            for j in range(width + side - 1):
+                leaving = float(b[top, margin + j])
+                coming = float(b[top + side, margin + j])
+                sums[j] += coming - leaving
+                squares[j] += coming * coming - leaving * leaving
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -518,7 +549,14 @@ def match_patches(
     for block in prange(blocks):
         a = np.empty((size_a, size_a), np.float32)
         b = np.zeros((size_b, size_b), np.float32)
-        surface = np.empty((2 * search + 1, 2 * search + 1), np.float32)
+        width = 2 * search + 1
+        surface = np.empty((width, width), np.float32)
+        correlation = (
+            np.empty((side, side), np.float32),
+            np.empty(width, np.float32),
+            np.empty(width + side - 1),
+            np.empty(width + side - 1),
+        )
         rows = (
             np.empty((side + 7, side), np.float32),
             np.empty((side + 7, side), np.float32),
@@ -564,7 +602,7 @@ def match_patches(
             first_col, first_row = col_b - room + reach[0], row_b - room + reach[2]
             if not _load(frame_b, first_col, first_row, 1, words, part) or not _all_finite(part):
                 continue
-            _correlate(a, b, half_window, margin, reach, surface)
+            _correlate(a, b, half_window, margin, reach, correlation, surface)
             if not _peak(surface, reach, peak):
                 continue
             moved_col = moved_row = 0

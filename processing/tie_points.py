@@ -34,7 +34,8 @@ class TiePointSettings:
     """How many points are sought, how, and what a match must reach.
 
     Window and search of P/C are in pixels of the colour master, of P/P in PAN pixels; so are the
-    largest sigmas. Where an area is too small for the wished number, windows are not let overlap.
+    sigmas. `floor_sigma_px` is what noise does not tell: rotation within the patch, interpolation.
+    Where an area is too small for the wished number, windows are not let overlap.
     """
 
     points_per_overlap: int = 850
@@ -45,6 +46,7 @@ class TiePointSettings:
     search_pc_px: int = 3
     min_correlation: float = 0.6
     min_peak_margin: float = 0.05
+    floor_sigma_px: float = 0.002
     max_sigma_pp_px: float = 0.3
     max_sigma_pc_px: float = 0.2
 
@@ -152,7 +154,7 @@ def match_tie_points(
         columns = np.empty((len(found), 10))
         columns[:, 0], columns[:, 1] = index[a], index[b]
         columns[:, 2:6] = found[:, :4]
-        columns[:, 6] = found[:, 4] * step
+        columns[:, 6] = np.hypot(found[:, 4], settings.floor_sigma_px) * step
         columns[:, 7] = found[:, 5]
         columns[:, 8], columns[:, 9] = search.kind, number
         rows.append(columns)
