@@ -1,0 +1,89 @@
+"""Figures of the circumstances, against numbers worked out by hand."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from processing.conditions import (
+    Conditions,
+    condition_figures,
+    parallax_px,
+    usable_temperatures,
+)
+from processing.quality import Figure, Flag, Thresholds
+from processing.rig import Rig, find_rig
+
+
+@pytest.fixture
+def rig() -> Rig:
+    return find_rig("ultracam-x-mini")
+
+
+def figures(rig: Rig, conditions: Conditions) -> dict[str, Figure]:
+    return condition_figures(rig, conditions, usable_temperatures(rig, conditions, Thresholds()))
+
+
+def test_ground_sampling_distance_is_height_by_pitch_over_focal_length(rig: Rig) -> None:
+    found = figures(rig, Conditions(height_above_ground_m=1000.0))["gsd_m"]
+    assert found == pytest.approx(1000 * 7.2e-6 / 0.1005)
+
+
+def test_tdi_takes_its_shifts_off_the_smear_along_track(rig: Rig) -> None:
+    gsd = 1000 * 7.2e-6 / 0.1005
+    conditions = Conditions(
+        height_above_ground_m=1000.0,
+        ground_speed_mps=70.0,
+        exposure_time_s={cone.name: 0.008 for cone in rig.cones},
+        tdi_shifts={cone.name: 8 for cone in rig.pan_cones},
+        crab_rad=math.radians(3.0),
+    )
+    found = figures(rig, conditions)
+    moved = 70 * 0.008 / gsd
+    assert found["smear_along_px"] == pytest.approx(abs(moved * math.cos(math.radians(3)) - 8))
+    assert found["smear_across_px"] == pytest.approx(moved * math.sin(math.radians(3)))
+    assert found["crab_deg"] == pytest.approx(3.0)
+
+
+def test_angular_rates_smear_by_focal_length_over_pitch(rig: Rig) -> None:
+    conditions = Conditions(
+        exposure_time_s={cone.name: 0.01 for cone in rig.cones},
+        angular_rate_rad_per_s=(0.02, -0.01, 0.0),
+    )
+    found = figures(rig, conditions)
+    assert found["smear_across_px"] == pytest.approx(0.02 * 0.01 * 100.5 / 0.0072)
+    assert found["smear_along_px"] == pytest.approx(0.01 * 0.01 * 100.5 / 0.0072)
+
+
+def test_unknown_motion_gives_no_figure_instead_of_a_good_one(rig: Rig) -> None:
+    found = figures(rig, Conditions())
+    assert found["smear_along_px"] is None and found["smear_across_px"] is None
+    assert found["tilt_deg"] is None and found["dc_k"] is None
+
+
+def test_parallax_of_the_green_cone_over_relief(rig: Rig) -> None:
+    # 100 mm of base, 500 m of height, 50 m of relief: 0.28 px.
+    conditions = Conditions(height_above_ground_m=500.0)
+    assert parallax_px(rig, conditions, 0.1) == pytest.approx(0.28, abs=0.005)
+    assert parallax_px(rig, Conditions(), 0.1) == 0.0
+
+
+def test_temperatures_are_sorted_into_usable_missing_and_impossible(rig: Rig) -> None:
+    readings = {"0": 31.0, "1": None, "2": math.nan, "3": 250.0, "R": 20.0, "G": 21.5}
+    found = usable_temperatures(rig, Conditions(temperatures_c=readings), Thresholds())
+    assert dict(found.usable_c) == {"0": 31.0, "R": 20.0, "G": 21.5}
+    assert found.missing == ("1", "2", "B", "N") and found.out_of_range == ("3",)
+
+
+def test_dc_is_told_per_cone_and_as_the_mean_of_the_pan_cones(rig: Rig) -> None:
+    readings = {"0": 32.0, "1": 31.0, "2": 33.0, "3": 32.0, "G": 50.0}
+    found = figures(rig, Conditions(temperatures_c=readings, temperature_age_s={"0": 2, "G": 5}))
+    assert found["dc_k_1"] == pytest.approx(11.0) and found["dc_k_R"] is None
+    assert found["dc_k"] == pytest.approx(12.0)
+    assert found["temperature_age_s"] == 5
+
+
+def test_simulated_hardware_raises_its_flag() -> None:
+    conditions = Conditions(capture_flags=Flag.MARK_MISSING, simulated=True)
+    assert conditions.flags == Flag.MARK_MISSING | Flag.SIMULATED
