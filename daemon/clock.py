@@ -6,6 +6,7 @@ is an exact pair. Between marks the model coasts, and its sigma grows.
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections import deque
 from dataclasses import dataclass
@@ -13,8 +14,10 @@ from dataclasses import dataclass
 COARSE_SIGMA_NS = 350_000_000
 ARRIVAL_MIN_NS = 10_000_000
 ARRIVAL_MAX_NS = 700_000_000
-COAST_SIGMA_PPM = 1.0
-"""How far a host's crystal may wander off the fitted rate while no mark comes."""
+DRIFT_SIGMA = 20e-6
+"""Standard deviation of a host clock's rate against GPS before anything is known of it."""
+HUBER = 2.0
+ROBUST_ITERATIONS = 5
 
 
 @dataclass(frozen=True)
@@ -58,29 +61,40 @@ class HostClock:
         return GpsEstimate(mono_ns - self._least_lateness_ns + centre, COARSE_SIGMA_NS, True)
 
     def _from_pairs(self, mono_ns: int) -> GpsEstimate:
-        origin = self._pairs[-1][0]
-        offsets = [gps - mono for mono, gps, _ in self._pairs]
-        base = offsets[-1]
-        x = [float(mono - origin) for mono, _, _ in self._pairs]
-        y = [float(offset - base) for offset in offsets]
-        slope = _theil_slope(x, y)
-        intercept = statistics.median(b - slope * a for a, b in zip(x, y, strict=True))
-        away = float(mono_ns - origin)
-        residuals = [abs(b - slope * a - intercept) for a, b in zip(x, y, strict=True)]
-        pair_sigma = statistics.median(sigma for _, _, sigma in self._pairs)
+        origin_mono_ns, origin_gps_ns, _ = self._pairs[-1]
+        x = [float(mono - origin_mono_ns) for mono, _, _ in self._pairs]
+        y = [float(gps - origin_gps_ns) - a for (_, gps, _), a in zip(self._pairs, x, strict=True)]
+        sigma = [float(s) for _, _, s in self._pairs]
+        away = float(mono_ns - origin_mono_ns)
+        offset, drift, variance = _fit(x, y, sigma, away)
+        gps_ns = origin_gps_ns + (mono_ns - origin_mono_ns) + round(offset + drift * away)
+        return GpsEstimate(gps_ns, round(math.sqrt(variance)), False)
+
+
+def _fit(
+    x: list[float], y: list[float], sigma: list[float], away: float
+) -> tuple[float, float, float]:
+    """Offset and drift by weighted least squares, and the variance of the line at `away`.
+
+    The drift has a prior, zero within what crystals do: two uncertain pairs close together must
+    not turn the clock. Pairs far off the line lose their weight (Huber), and a spread wider than
+    the stated sigmas widens the result.
+    """
+    weights = [1.0 / s**2 for s in sigma]
+    offset = drift = 0.0
+    q00 = q01 = q11 = 0.0
+    scale = 1.0
+    for _ in range(ROBUST_ITERATIONS):
+        n00 = sum(weights)
+        n01 = sum(w * a for w, a in zip(weights, x, strict=True))
+        n11 = sum(w * a * a for w, a in zip(weights, x, strict=True)) + DRIFT_SIGMA**-2
+        l0 = sum(w * b for w, b in zip(weights, y, strict=True))
+        l1 = sum(w * a * b for w, a, b in zip(weights, x, y, strict=True))
+        determinant = n00 * n11 - n01 * n01
+        q00, q01, q11 = n11 / determinant, -n01 / determinant, n00 / determinant
+        offset, drift = q00 * l0 + q01 * l1, q01 * l0 + q11 * l1
+        off = [abs(b - offset - drift * a) / s for a, b, s in zip(x, y, sigma, strict=True)]
+        weights = [min(1.0, HUBER / max(r, 1e-9)) / s**2 for r, s in zip(off, sigma, strict=True)]
         # 1.4826: from the median absolute deviation to a standard deviation.
-        spread = 1.4826 * statistics.median(residuals) if len(residuals) > 2 else 0.0
-        sigma = max(pair_sigma, spread) / min(len(x), 4) ** 0.5
-        sigma += COAST_SIGMA_PPM * 1e-6 * abs(away)
-        return GpsEstimate(mono_ns + base + round(intercept + slope * away), round(sigma), False)
-
-
-def _theil_slope(x: list[float], y: list[float]) -> float:
-    """Median of pairwise slopes: a single bad pair does not turn the clock."""
-    slopes = [
-        (y[j] - y[i]) / (x[j] - x[i])
-        for i in range(len(x))
-        for j in range(i + 1, len(x))
-        if x[j] != x[i]
-    ]
-    return statistics.median(slopes) if len(x) >= 3 and slopes else 0.0
+        scale = max(1.0, 1.4826 * statistics.median(off)) if len(off) > 2 else 1.0
+    return offset, drift, scale**2 * (q00 + 2 * away * q01 + away * away * q11)

@@ -18,12 +18,12 @@ from daemon.exposure import (
     FrameRecord,
     NavigationRecord,
     RecordState,
-    TemperatureRecord,
     TimeSource,
 )
 from daemon.ledger import Ledger
 from daemon.matching import Cause, Matcher, Pulse
 from daemon.navigation import Track
+from daemon.temperatures import Temperatures
 from drivers.contract import EventMark, Frame, NavSample, TemperatureSample
 from processing.quality import Flag
 from processing.rig import Rig
@@ -101,7 +101,7 @@ class Flight:
         self.ledger = ledger
         self.clock = HostClock()
         self.track = Track()
-        self.temperatures: dict[str, TemperatureSample] = {}
+        self.temperatures = Temperatures()
         self.idle_slots: list[tuple[str, int]] = []
         self.serial_of_head = serial_of_head
         self._cone_of_head = {head: rig.cone_of(head) for head in serial_of_head}
@@ -170,7 +170,7 @@ class Flight:
 
     def temperature(self, sample: TemperatureSample) -> None:
         """A probe was read."""
-        self.temperatures[sample.probe] = sample
+        self.temperatures.add(sample)
 
     def due_to_store(self, mono_ns: int) -> list[ToStore]:
         """Exposures whose frames are complete, or whose time is up; each is returned once."""
@@ -251,7 +251,7 @@ class Flight:
         }
         if exposure.lost:
             causes["exposure"] = exposure.lost
-        self.ledger.settle(number, state, causes.items())
+        self.ledger.settle(number, state, causes)
 
     def _lose(self, exposure: _Open, cause: str) -> None:
         exposure.lost = cause
@@ -331,7 +331,7 @@ def compose(
     pulse: Pulse | None,
     instant: Instant,
     track: Track,
-    temperatures: Mapping[str, TemperatureSample],
+    temperatures: Temperatures,
     flags: Flag,
 ) -> Exposure:
     """The final record of a stored exposure; its place in the chain is given when it is written."""
@@ -355,10 +355,7 @@ def compose(
         mark_count=instant.count,
         frames=tuple(_timed(rig, frame, pulse, instant) for frame in stored.frames),
         missing=stored.missing,
-        temperatures=tuple(
-            TemperatureRecord(s.probe, s.value_c, stored.trigger_mono_ns - s.mono_ns)
-            for s in temperatures.values()
-        ),
+        temperatures=temperatures.at(stored.trigger_mono_ns),
         navigation=navigation,
         line_id=stored.line_id,
         calibration_id=stored.calibration_id,

@@ -17,6 +17,10 @@ FRAME_WINDOW_NS = 20_000_000
 """How far a frame's start may lie from its pulse: trigger latency of a head, clock drift between
 two latches (100 ppm over a minute is 6 ms)."""
 MARK_WINDOW_NS = 2_000_000
+COUNT_WINDOW_NS = 500_000_000
+"""Within this a count decides which pulse a mark is of, where time does not."""
+SIGMAS = 5
+COARSE_SIGMAS = 2
 ARRIVAL_LIMIT_NS = 20_000_000_000
 """A frame without a time of its own belongs to a pulse at most this much earlier."""
 
@@ -98,17 +102,17 @@ class Matcher:
         """The exposure an event mark belongs to; a used one teaches the host's clock."""
         if not mark.time_valid:
             return Match(None, Cause.CORRUPT)
-        candidates, is_coarse = self._pulses_near(mark)
-        offset = self._counter_offset.get(mark.receiver)
         modulus = 1 << mark.count_bits
-        if is_coarse and offset is not None and candidates:
-            # A count decides only while time cannot.
-            counted = [p for p in candidates if (mark.count - p.count - offset) % modulus == 0]
-            candidates = counted or candidates
-        if not candidates:
-            return Match(None, Cause.SPURIOUS)
+        candidates = self._pulses_near(mark)
+        offset = self._counter_offset.get(mark.receiver)
+        if len(candidates) != 1 and offset is not None:
+            # Time does not decide: the count may, among pulses that time does not exclude.
+            near = candidates or self._pulses_near(mark, window_ns=COUNT_WINDOW_NS)
+            candidates = [p for p in near if (mark.count - p.count - offset) % modulus == 0]
         if len(candidates) > 1:
             return Match(None, Cause.SPURIOUS, is_ambiguous=True)
+        if not candidates:
+            return Match(None, Cause.SPURIOUS)
         pulse = candidates[0]
         if pulse.number in self._marks:
             return Match(pulse.number, Cause.DUPLICATE)
@@ -140,20 +144,19 @@ class Matcher:
         ]
         return waiting[0] if len(waiting) == 1 else None
 
-    def _pulses_near(self, mark: EventMark) -> tuple[list[Pulse], bool]:
+    def _pulses_near(self, mark: EventMark, *, window_ns: int = 0) -> list[Pulse]:
+        """Pulses whose strobe may be this mark; `window_ns` 0 takes what the clock is good for."""
         near = []
-        is_coarse = True
         for pulse in self._pulses.values():
             expected = self._clock.gps_at(pulse.mono_ns + pulse.strobe_delay_ns)
             if expected is None:
                 continue
-            is_coarse = expected.is_coarse
-            window_ns = 2 * expected.sigma_ns
-            if not is_coarse:
-                window_ns = 5 * (expected.sigma_ns + pulse.sigma_ns) + MARK_WINDOW_NS
-            if abs(mark.gps_ns - expected.gps_ns) <= window_ns:
+            within_ns = window_ns or MARK_WINDOW_NS + SIGMAS * (expected.sigma_ns + pulse.sigma_ns)
+            if expected.is_coarse and not window_ns:
+                within_ns = COARSE_SIGMAS * expected.sigma_ns
+            if abs(mark.gps_ns - expected.gps_ns) <= within_ns:
                 near.append(pulse)
-        return near, is_coarse
+        return near
 
 
 def start_of_exposure_mono_ns(frame: Frame) -> int | None:

@@ -14,6 +14,7 @@ from daemon.log_records import LoggedRecord, LoggedTrigger
 from daemon.matching import Cause, Matcher, Pulse
 from daemon.navigation import Track
 from daemon.recovery import Complete
+from daemon.temperatures import Temperatures
 from drivers.contract import EventMark, NavSample, TemperatureSample
 from processing.quality import Flag
 from processing.rig import Rig
@@ -27,7 +28,7 @@ def seal_from_log(rig: Rig) -> Complete:
         clock = HostClock()
         matcher = Matcher(cone_of_head, clock)
         track = Track()
-        temperatures: dict[str, TemperatureSample] = {}
+        temperatures = Temperatures()
         pulse: Pulse | None = None
         mark: EventMark | None = None
         for record in records:
@@ -43,9 +44,7 @@ def seal_from_log(rig: Rig) -> Complete:
                 if match.cause is Cause.USED and match.number == capture.number:
                     mark = record
             elif isinstance(record, TemperatureSample):
-                known = temperatures.get(record.probe)
-                if known is None or record.mono_ns <= capture.trigger_mono_ns:
-                    temperatures[record.probe] = record
+                temperatures.add(record)
         instant: Instant = instant_of(mark, pulse, clock)
         return compose(rig, capture, pulse, instant, track, temperatures, Flag(0))
 

@@ -10,6 +10,7 @@ import asyncio
 import hashlib
 import signal
 import time
+import traceback
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -26,7 +27,7 @@ from daemon.exposure import Exposure
 from daemon.flight import Flight, Identity
 from daemon.ledger import Ledger
 from daemon.line import Line, Order
-from daemon.log_records import LoggedTrigger, message_of
+from daemon.log_records import LoggedTrigger, Message, message_of
 from daemon.matching import Cause, Pulse
 from daemon.memory import FrameRing
 from daemon.messages import (
@@ -50,6 +51,7 @@ from daemon.messages import (
 )
 from daemon.mission import Mission
 from daemon.notify import Notifier
+from daemon.records import canonical_bytes
 from daemon.recovery_match import seal_from_log
 from daemon.supervisor import Supervisor
 from drivers.contract import (
@@ -118,6 +120,7 @@ class Service:
             restart.
         """
         loop = asyncio.get_running_loop()
+        loop.set_exception_handler(lambda _, context: self._broke(context))
         for name in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(name, self.stopping.set)
         mission = self._open_mission()
@@ -135,7 +138,7 @@ class Service:
             await self._land(tasks)
         if self.failure is None:
             mission.close()
-        self._event("ended", failure=self.failure, ledger=self.flight.ledger.sheet().to_json())
+        self._event("ended", failure=self.failure, ledger=self.flight.ledger.sheet().as_json())
         return 0 if self.failure is None else 1
 
     # Before the flight
@@ -161,7 +164,7 @@ class Service:
             "mission",
             path=str(mission.path),
             resumed=self.is_resumed,
-            recovery=[*report.done, *report.problems],
+            recovery=list(report.sentences),
             next_number=report.next_number,
         )
         self.flight = Flight(
@@ -169,10 +172,14 @@ class Service:
             {head.sensor: self.rig.sensor(head.sensor).serial for head in self.configuration.head},
             self._identity(mission),
             self.configuration.limits,
-            Ledger.resume([head.sensor for head in self.configuration.head], report.exposures),
+            Ledger.resume(
+                report.settled,
+                heads=[head.sensor for head in self.configuration.head],
+                sheet=report.ledger_sheet,
+            ),
             report.next_number,
         )
-        flown = len(report.exposures)
+        flown = len(report.settled)
         self.line = Line(self.configuration, self.rig, self.flight, mission.path, flown)
         rings = tuple(
             FrameRing.create(
@@ -296,6 +303,9 @@ class Service:
         exposure, self.sealing = self.sealing, None
         assert exposure is not None and exposure.number == sealed.number
         self.flight.sealed(sealed.number, exposure.state)
+        sheet = canonical_bytes(self.flight.ledger.sheet().as_json())
+        message = Message(recovery.LEDGER_TOPIC, time.monotonic_ns(), sheet)
+        self.supervisor.send("writer", Log(message))
         if exposure.state == "lost":
             return
         self._event("sealed", **_summary(exposure))
@@ -451,7 +461,15 @@ class Service:
     def _task_ended(self, task: asyncio.Task[None]) -> None:
         error = None if task.cancelled() else task.exception()
         if error is not None:
-            self._fail(f"the service itself failed: {type(error).__name__}: {error}")
+            self._broke({"exception": error})
+
+    def _broke(self, context: Mapping[str, Any]) -> None:
+        """A fault of our own: end with its trace, and be started again into the same flight."""
+        error = context.get("exception")
+        if isinstance(error, BaseException):
+            traceback.print_exception(error)
+        told = f"{type(error).__name__}: {error}" if error else context.get("message")
+        self._fail(f"the service itself failed ({told}); it is started again; report this")
 
     # Telling
 

@@ -99,7 +99,7 @@ def process_exposure(
         quicklook=product.quicklook,
         report_json=report,
         geometry=product.geometry,
-        residuals_svg=residuals_svg(product.mosaic),
+        residuals_svg=residuals_svg(rig, product.tie_points, product.mosaic, product.validity),
     )
     return report
 

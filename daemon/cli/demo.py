@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich import box
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
@@ -128,23 +129,33 @@ def _events(service: subprocess.Popen[str]) -> Iterator[dict[str, Any]]:
 
 
 def _table(rows: Mapping[int, Mapping[str, Any]], exposures: int) -> Table:
-    table = Table(title=f"Line 1, {exposures} exposures", title_justify="left")
-    for heading in (
-        "exposure",
-        "GPS time",
-        "sigma ns",
-        "frames",
-        "dC K",
-        "tie points",
-        "sigma0 px",
-        "um",
-        "displaced",
-        "verdict",
-    ):
+    """The live table; it fits a terminal of 80 columns."""
+    table = Table(
+        title=f"Line 1, {exposures} exposures",
+        title_justify="left",
+        box=box.SIMPLE,
+        pad_edge=False,
+        padding=(0, 1),
+    )
+    for heading in _HEADINGS:
         table.add_column(heading, justify="right", no_wrap=True)
     for number, told in sorted(rows.items()):
         table.add_row(str(number), *_cells(told))
     return table
+
+
+_HEADINGS = (
+    "no",
+    "GPS time",
+    "±ns",
+    "frames",
+    "dC",
+    "tie points",
+    "s0 px",
+    "um",
+    "moved",
+    "verdict",
+)
 
 
 def _cells(told: Mapping[str, Any]) -> list[str]:
@@ -162,7 +173,7 @@ def _cells(told: Mapping[str, Any]) -> list[str]:
     return [
         *cells,
         _number(figures.get("dc_k"), "+.1f"),
-        f"{figures.get('tie_points_pp', 0)} + {figures.get('tie_points_pc', 0)}",
+        f"{figures.get('tie_points_pp', 0)}+{figures.get('tie_points_pc', 0)}",
         _number(figures.get("sigma0_px"), ".3f"),
         _number(figures.get("sigma0_um"), ".2f"),
         str(figures.get("displaced_sensor") or "-"),
@@ -175,12 +186,11 @@ def _number(value: float | None, form: str) -> str:
 
 
 def _gps_text(gps_ns: str | None) -> str:
-    """Week and second of week, the way the field writes GPS time."""
+    """Second of the GPS week; the week is in the record."""
     if gps_ns is None:
         return "-"
     seconds, nanoseconds = divmod(int(gps_ns), 1_000_000_000)
-    week, second = divmod(seconds, 604_800)
-    return f"{week}:{second}.{nanoseconds // 1000:06d}"
+    return f"{seconds % 604_800}.{nanoseconds // 100_000:04d}"
 
 
 def _judge(
@@ -208,12 +218,13 @@ def _judge(
         json.loads(path.read_text()) for path in sorted((mission / "L2").glob("*/quality.json"))
     ]
     named = [report["figures"].get("displaced_sensor") for report in reports]
+    counts = ledger["triggers"]
     free = geometry["methods"].get("free", {})
     return {
-        "exposures": ledger["triggers"],
-        "complete": ledger["complete"],
-        "degraded": ledger["degraded"],
-        "lost": ledger["lost"],
+        "exposures": counts["triggers"],
+        "complete": counts["complete"],
+        "degraded": counts["degraded"],
+        "lost": counts["lost"],
         "ledger_balanced": ledger["balanced"],
         "rms_px": free.get("inner_rms_px"),
         "max_px": free.get("inner_max_px"),
@@ -240,12 +251,16 @@ def _time_sigma(mission: Path) -> Iterator[int]:
 
 
 def _print_result(console: Console, result: Mapping[str, Any], ledger: Mapping[str, Any]) -> None:
+    counts = ledger["triggers"]
     sheet = Table(title="Ledger", title_justify="left")
     for heading in ("", "triggers", "complete", "degraded", "lost", "open"):
         sheet.add_column(heading, justify="right")
     sheet.add_row(
         "exposures",
-        *(str(ledger[key]) for key in ("triggers", "complete", "degraded", "lost", "open")),
+        *(
+            str(ledger["triggers"][key])
+            for key in ("triggers", "complete", "degraded", "lost", "open")
+        ),
     )
     console.print(sheet)
     received = Table()

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
-import time
+from typing import Annotated
 
 import typer
 
+from processing.rig import find_rig
+
 HELP = """Compile the pipeline's kernels into the cache, so that nothing compiles in flight.
 
-Example: `syntopic kernels`
+Examples: `syntopic kernels`, `syntopic kernels ultracam-x`
 """
 
 
-def kernels() -> None:
+def kernels(
+    rig: Annotated[
+        str, typer.Argument(help="Name of a shipped rig, or a rig file.")
+    ] = "ultracam-x-mini",
+) -> None:
     from processing import compiled
 
-    started = time.monotonic()
-    count = compiled.warm_up()
-    typer.echo(f"{count} kernels ready after {time.monotonic() - started:.1f} s")
+    done = compiled.compile_for(find_rig(rig))
+    typer.echo(
+        f"{sum(done.variants.values())} kernels ready for {rig}, {done.compiled} of them compiled "
+        f"just now, {done.seconds:.1f} s"
+    )

@@ -51,6 +51,17 @@ def test_one_wrong_pair_does_not_turn_the_clock() -> None:
     assert abs(estimate.gps_ns - 18_000_000_000 - OFFSET_NS) < 1_000_000
 
 
+def test_an_uncertain_first_pulse_does_not_turn_the_clock() -> None:
+    clock = HostClock()
+    clock.mark_matched(OFFSET_NS + 23_800_000, 0, 23_800_000)
+    clock.mark_matched(3_500_000_000 + OFFSET_NS, 3_500_000_000, 45_000)
+    clock.mark_matched(7_000_000_000 + OFFSET_NS - 1_100_000, 7_000_000_000, 1_200_000)
+    estimate = clock.gps_at(10_500_000_000)
+    assert estimate is not None
+    assert abs(estimate.gps_ns - 10_500_000_000 - OFFSET_NS) < 3 * estimate.sigma_ns
+    assert estimate.sigma_ns < 500_000
+
+
 def test_coasting_makes_the_time_less_certain() -> None:
     clock = HostClock()
     clock.mark_matched(OFFSET_NS, 0, 10_000)

@@ -130,7 +130,23 @@ def test_a_repeated_mark_is_a_duplicate_and_an_untrusted_one_corrupt() -> None:
 def test_a_mark_of_no_pulse_is_spurious() -> None:
     matching = matcher(range(1, 4))
     matching.mark(mark(1))
-    assert matching.mark(mark(2, gps_ns=mark(2).gps_ns + NS // 2)).cause is Cause.SPURIOUS
+    assert matching.mark(mark(2, gps_ns=mark(2).gps_ns + NS)).cause is Cause.SPURIOUS
+
+
+def test_where_the_clock_is_off_the_count_finds_the_pulse_and_mends_the_clock() -> None:
+    matching = matcher(range(1, 6))
+    matching.mark(mark(1))
+    shifted = 50_000_000
+    for number in (2, 3, 4, 5):
+        late = mark(number)
+        assert matching.mark(replace(late, gps_ns=late.gps_ns + shifted)).number == number
+
+
+def test_a_mark_that_neither_time_nor_count_explains_stays_unmatched() -> None:
+    matching = matcher(range(1, 4))
+    matching.mark(mark(1))
+    odd = mark(2, count=7, gps_ns=mark(2).gps_ns + NS // 4)
+    assert matching.mark(odd).cause is Cause.SPURIOUS
 
 
 def test_a_first_mark_that_fits_two_pulses_stays_unmatched() -> None:
