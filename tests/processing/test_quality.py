@@ -155,37 +155,12 @@ def test_json_has_no_nan_and_names_its_flags() -> None:
 
 
 def test_bits_keep_their_places_for_ever() -> None:
-    names = ["FRAME_MISSING", "FRAME_LATE", "FRAME_DUPLICATE", "FRAME_CORRUPT", "MARK_MISSING",
-        "MARK_AMBIGUOUS", "TIME_SIGMA", "TEMPERATURE_MISSING", "TEMPERATURE_STALE",
-        "TEMPERATURE_RANGE", "DC_DISAGREEMENT", "TIE_POINTS", "SIGMA0", "DISPLACED_SENSOR",
-        "CALIBRATION_EXPIRED", "UNDEREXPOSED", "OVEREXPOSED", "BLUR", "TILT", "DRIFT", "OVERLAP",
-        "GNSS", "DISK_LOW", "PROCESSING_BEHIND", "SIMULATED", "NOT_PROCESSED"]
-        "FRAME_MISSING",
-        "FRAME_LATE",
-        "FRAME_DUPLICATE",
-        "FRAME_CORRUPT",
-        "MARK_MISSING",
-        "MARK_AMBIGUOUS",
-        "TIME_SIGMA",
-        "TEMPERATURE_MISSING",
-        "TEMPERATURE_STALE",
-        "TEMPERATURE_RANGE",
-        "DC_DISAGREEMENT",
-        "TIE_POINTS",
-        "SIGMA0",
-        "DISPLACED_SENSOR",
-        "CALIBRATION_EXPIRED",
-        "UNDEREXPOSED",
-        "OVEREXPOSED",
-        "BLUR",
-        "TILT",
-        "DRIFT",
-        "OVERLAP",
-        "GNSS",
-        "DISK_LOW",
-        "PROCESSING_BEHIND",
-        "SIMULATED",
-        "NOT_PROCESSED",
+    names = [
+        *("FRAME_MISSING", "FRAME_LATE", "FRAME_DUPLICATE", "FRAME_CORRUPT", "MARK_MISSING"),
+        *("MARK_AMBIGUOUS", "TIME_SIGMA", "TEMPERATURE_MISSING", "TEMPERATURE_STALE"),
+        *("TEMPERATURE_RANGE", "DC_DISAGREEMENT", "TIE_POINTS", "SIGMA0", "DISPLACED_SENSOR"),
+        *("CALIBRATION_EXPIRED", "UNDEREXPOSED", "OVEREXPOSED", "BLUR", "TILT", "DRIFT"),
+        *("OVERLAP", "GNSS", "DISK_LOW", "PROCESSING_BEHIND", "SIMULATED", "NOT_PROCESSED"),
     ]
     assert {name: int(Flag[name]) for name in names} == {
         name: 1 << bit for bit, name in enumerate(names)
