@@ -48,8 +48,8 @@ class FrameStatistics:
 class Corrector:
     """A calibration made ready for the pass: maps as 16-bit fixed point, scalars where it is flat.
 
-    `bias`, `dark` and `response` (one over gain) are None together, where the calibration is the
-    same for all pixels. `defects_by_shifts` keeps the defect map as spread by so many TDI shifts.
+    `bias` and `dark` count in units above their least value, `response` is one over gain; they are
+    None together, where the calibration is the same for all pixels. `defects_by_shifts` keeps the defect map as spread by so many TDI shifts.
     """
 
     sensor: Sensor
@@ -58,6 +58,8 @@ class Corrector:
     response: Array | None
     bias_unit_dn: float
     dark_unit_dn_per_s: float
+    least_bias_dn: float
+    least_dark_dn_per_s: float
     flat_gain: float
     doubling_k: float
     reference_c: float
@@ -80,18 +82,17 @@ def corrector_for(sensor: Sensor, calibration: RadiometricCalibration | None) ->
     check_radiometry(f"radiometry of {sensor.name}", calibration, sensor=sensor)
     maps = (calibration.bias_dn, calibration.dark_dn_per_s, calibration.gain)
     flat = all(float(np.min(m)) == float(np.max(m)) for m in maps)
-    bias_unit = float(np.max(calibration.bias_dn))
-    dark_unit = float(np.max(calibration.dark_dn_per_s))
-    if not flat:
-        bias_unit = max(bias_unit, 1e-6) / 65535.0
-        dark_unit = max(dark_unit, 1e-6) / 65535.0
+    least_bias, bias_unit = _range(calibration.bias_dn)
+    least_dark, dark_unit = _range(calibration.dark_dn_per_s)
     return Corrector(
         sensor=sensor,
-        bias=None if flat else _fixed_point(calibration.bias_dn, bias_unit),
-        dark=None if flat else _fixed_point(calibration.dark_dn_per_s, dark_unit),
+        bias=None if flat else _fixed_point(calibration.bias_dn - least_bias, bias_unit),
+        dark=None if flat else _fixed_point(calibration.dark_dn_per_s - least_dark, dark_unit),
         response=None if flat else _fixed_point(1.0 / calibration.gain, 1.0 / _RESPONSE_UNIT),
         bias_unit_dn=bias_unit,
         dark_unit_dn_per_s=dark_unit,
+        least_bias_dn=least_bias,
+        least_dark_dn_per_s=least_dark,
         flat_gain=float(calibration.gain.flat[0]),
         doubling_k=calibration.doubling_k,
         reference_c=calibration.reference_c,
@@ -132,14 +133,14 @@ def level1_from_level0(
     shifts = min(max(int(tdi_shifts), 0), sensor.height_px)
     warmth = 0.0 if temperature_c is None else temperature_c - corrector.reference_c
     dark_time_s = exposure_time_s * 2.0 ** min(max(warmth / corrector.doubling_k, -30.0), 30.0)
-    dark_dn = corrector.dark_unit_dn_per_s * dark_time_s
+    offset_dn = corrector.least_bias_dn + corrector.least_dark_dn_per_s * dark_time_s
     counts = level1_counts_per_dn(sensor.bits)
     bands = (sensor.height_px + _BAND_ROWS - 1) // _BAND_ROWS
     sums = np.zeros((bands, 2), np.float64)
     if corrector.bias is None or corrector.dark is None or corrector.response is None:
         _flat_pass(
             raw,
-            np.float32(corrector.bias_unit_dn + dark_dn),
+            np.float32(offset_dn),
             np.float32(0.5 * counts * corrector.flat_gain),
             shifts,
             sensor.tdi_row_sign,
@@ -154,7 +155,8 @@ def level1_from_level0(
             corrector.dark,
             corrector.response,
             np.float32(corrector.bias_unit_dn),
-            np.float32(dark_dn / (shifts + 1)),
+            np.float32(corrector.dark_unit_dn_per_s * dark_time_s / (shifts + 1)),
+            np.float32(offset_dn),
             np.float32(0.5 * counts * _RESPONSE_UNIT * (shifts + 1)),
             shifts,
             sensor.tdi_row_sign,
@@ -185,6 +187,12 @@ def exposed_rows(sensor: Sensor, tdi_shifts: int) -> tuple[int, int]:
 def _fixed_point(values: Array, unit: float) -> Array:
     words: Array = np.clip(np.rint(np.asarray(values) / np.float32(unit)), 0, 65535)
     return np.ascontiguousarray(words.astype(np.uint16))
+
+
+def _range(values: Array) -> tuple[float, float]:
+    """Least value, and the unit that carries the rest in 16 bits."""
+    least, most = float(np.min(values)), float(np.max(values))
+    return least, max(most - least, 1e-6) / 65535.0
 
 
 def _spread(defect: Array, shifts: int, sign: int) -> tuple[Array, Array]:
@@ -228,7 +236,19 @@ def _flat_pass(raw, offset, factor, shifts, sign, full_scale, out, sums):  # typ
 
 @njit(cache=True, parallel=True, fastmath=True, nogil=True)
 def _map_pass(  # type: ignore[no-untyped-def]
-    raw, bias, dark, response, bias_unit, dark_unit, factor, shifts, sign, full_scale, out, sums
+    raw,
+    bias,
+    dark,
+    response,
+    bias_unit,
+    dark_unit,
+    base,
+    factor,
+    shifts,
+    sign,
+    full_scale,
+    out,
+    sums,
 ):
     """The pass with maps; running sums along the column give the means over the pixels visited."""
     height, width = raw.shape
@@ -258,7 +278,7 @@ def _map_pass(  # type: ignore[no-untyped-def]
                 row_saturated = np.int32(0)
                 for k in range(width):
                     dn = np.int32(source[k])
-                    offset = np.float32(bias_row[k]) * bias_unit
+                    offset = base + np.float32(bias_row[k]) * bias_unit
                     offset += np.float32(dark_sum[k]) * dark_unit
                     signal = (np.float32(dn) - offset) * (factor / np.float32(response_sum[k]))
                     half = np.int32(signal + np.float32(0.5))

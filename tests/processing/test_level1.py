@@ -35,7 +35,7 @@ def calibration() -> RadiometricCalibration:
     rng = np.random.default_rng(3)
     return RadiometricCalibration(
         bias_dn=(64 + rng.normal(0, 2, SHAPE)).astype(np.float32),
-        dark_dn_per_s=rng.uniform(50, 400, SHAPE).astype(np.float32),
+        dark_dn_per_s=rng.uniform(-30, 400, SHAPE).astype(np.float32),
         doubling_k=6.5,
         reference_c=20.0,
         gain=(1 + rng.normal(0, 0.02, SHAPE)).astype(np.float32),
