@@ -49,7 +49,8 @@ class Corrector:
     """A calibration made ready for the pass: maps as 16-bit fixed point, scalars where it is flat.
 
     `bias` and `dark` count in units above their least value, `response` is one over gain; they are
-    None together, where the calibration is the same for all pixels. `defects_by_shifts` keeps the defect map as spread by so many TDI shifts.
+    None together, where the calibration is the same for all pixels. `defects_by_shifts` keeps the
+    defect map as spread by so many TDI shifts.
     """
 
     sensor: Sensor
