@@ -9,7 +9,7 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from daemon.memory import FrameRing
@@ -40,6 +40,7 @@ class _Capture:
         self.link = link
         self.devices: dict[str, tuple[DeviceSpec, Device]] = {}
         self.heads: dict[str, Head] = {}
+        self.heads_of_output: dict[str, list[Head]] = {}
         self.orders: queue.SimpleQueue[Fire | None] = queue.SimpleQueue()
         trigger_spec: DeviceSpec | None = None
         for spec in specs:
@@ -50,6 +51,7 @@ class _Capture:
             self.devices[spec.name] = (spec, device)
             if spec.kind == "head":
                 self.heads[spec.name] = device
+                self.heads_of_output.setdefault(spec.output, []).append(device)
         self.trigger_spec = trigger_spec
 
     def run(self) -> None:
@@ -82,7 +84,9 @@ class _Capture:
 
     def _deliver(self, spec: DeviceSpec, device: Device) -> None:
         try:
-            self.link.send(Bound(spec.kind, spec.name, dict(device.bind())))
+            # A head that a dead controller still holds is waited out here, and says so.
+            found = self.heads[spec.name].bind(self._sink) if spec.kind == "head" else device.bind()
+            self.link.send(Bound(spec.kind, spec.name, dict(found)))
         except DeviceError as error:
             self.link.send(NotBound(spec.kind, spec.name, str(error)))
         device.run(self._sink)
@@ -95,7 +99,7 @@ class _Capture:
         if self.trigger_spec is None:
             return
         spec = self.trigger_spec
-        trigger = open_device(spec, heads=self.heads)
+        trigger = open_device(spec, heads=self.heads_of_output)
         programmed: Mapping[str, int] = {}
         try:
             self.link.send(Bound("trigger", spec.name, dict(trigger.bind())))
@@ -118,11 +122,14 @@ class _Capture:
 
 
 def open_device(
-    spec: DeviceSpec, *, memory: FrameMemory | None = None, heads: Mapping[str, Head] | None = None
+    spec: DeviceSpec,
+    *,
+    memory: FrameMemory | None = None,
+    heads: Mapping[str, Sequence[Head]] | None = None,
 ) -> Any:
     """A device of `spec`, created and not yet touched.
 
-    A head needs its `memory`, a software trigger the `heads` it is to fire.
+    A head needs its `memory`, a software trigger the `heads` of every output.
     """
     driver: Any = registry.driver_for(spec.kind, spec.driver)
     if spec.kind == "head":

@@ -6,16 +6,17 @@ from collections.abc import Mapping
 
 from daemon.configuration import Configuration
 from daemon.messages import DeviceSpec
+from drivers.contract import CHUNK_ALLOWANCE_NBYTES
 from processing.rig import Rig
 
-CHUNK_DATA_MAX_BYTES = 4096
-"""Room behind the pixels for what a GigE Vision head appends to a frame."""
 
-
-def device_specs(configuration: Configuration) -> tuple[DeviceSpec, ...]:
+def device_specs(configuration: Configuration, rig: Rig) -> tuple[DeviceSpec, ...]:
     """Every device; the trigger last, since it may fire the heads."""
     trigger = configuration.trigger
-    heads = [DeviceSpec("head", h.driver, h.sensor, h.settings) for h in configuration.head]
+    heads = [
+        DeviceSpec("head", h.driver, h.sensor, h.settings, output=rig.cone_of(h.sensor).name)
+        for h in configuration.head
+    ]
     thermometers = [
         DeviceSpec("thermometer", t.driver, t.name, t.settings) for t in configuration.thermometer
     ]
@@ -29,7 +30,7 @@ def device_specs(configuration: Configuration) -> tuple[DeviceSpec, ...]:
 def frame_nbytes(rig: Rig, sensor_name: str) -> int:
     """Bytes of a sensor's frame in memory, 16 bit, with room for chunk data."""
     sensor = rig.sensor(sensor_name)
-    return sensor.width_px * sensor.height_px * 2 + CHUNK_DATA_MAX_BYTES
+    return sensor.width_px * sensor.height_px * 2 + CHUNK_ALLOWANCE_NBYTES
 
 
 def serial_problem(rig: Rig, head: str, found: Mapping[str, str]) -> str | None:

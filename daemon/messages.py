@@ -44,12 +44,16 @@ class Pong:
 
 @dataclass(frozen=True)
 class DeviceSpec:
-    """A device to be opened: its kind, driver, name, and the settings of that driver."""
+    """A device to be opened: its kind, driver, name, and the settings of that driver.
+
+    `output` is the trigger's output that a head is wired to, its cone.
+    """
 
     kind: str
     driver: str
     name: str
     settings: Mapping[str, Any]
+    output: str = ""
 
 
 @dataclass(frozen=True)

@@ -197,7 +197,7 @@ class Service:
             processing=self.configuration.processing,
         )
         one, many = _thread_counts(1), _thread_counts(self.configuration.processing.threads)
-        specs = device_specs(self.configuration)
+        specs = device_specs(self.configuration, self.rig)
         self.supervisor.spawn("writer", "daemon.writer:main", (mission.path, rings), one)
         self.supervisor.spawn("worker", "daemon.worker:main", (worker, rings), many)
         self.supervisor.spawn("capture", "daemon.capture:main", (specs, rings), one)

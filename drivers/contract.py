@@ -221,6 +221,9 @@ class Device(Protocol):
 class Head(Device, Protocol):
     """A camera head: frames land in the memory it was created with."""
 
+    def bind(self, sink: Sink | None = None) -> Mapping[str, str]:
+        """As for a device; `sink` hears at once that another controller is waited out."""
+
     def recycle(self, slot: int) -> None:
         """Hand a slot back; from any thread."""
 

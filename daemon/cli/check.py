@@ -46,21 +46,20 @@ def check(
 def _open_all(configuration: Any, rig: Any) -> list[dict[str, Any]]:
     """Bind every device at once, each in its own thread and each with a time-out."""
     from daemon.capture import open_device
-    from daemon.devices import device_specs, frame_nbytes
+    from daemon.devices import device_specs, frame_nbytes, serial_problem
     from daemon.memory import FrameRing
 
     findings: list[dict[str, Any]] = []
     threads: list[tuple[threading.Thread, dict[str, Any]]] = []
-    heads: dict[str, Any] = {}
-    for spec in device_specs(configuration):
+    heads: dict[str, list[Any]] = {}
+    for spec in device_specs(configuration, rig):
         finding = {"kind": spec.kind, "name": spec.name, "driver": spec.driver, "ok": False}
         memory = None
         if spec.kind == "head":
             memory = FrameRing.create(spec.name, 2, frame_nbytes(rig, spec.name))
         device = open_device(spec, memory=memory, heads=heads)
         if spec.kind == "head":
-            heads[spec.name] = device
-            finding["calibrated_serial"] = rig.sensor(spec.name).serial
+            heads.setdefault(spec.output, []).append(device)
         findings.append(finding)
         thread = threading.Thread(target=_bind, args=(device, finding), daemon=True)
         threads.append((thread, finding))
@@ -72,6 +71,11 @@ def _open_all(configuration: Any, rig: Any) -> list[dict[str, Any]]:
             finding["problem"] = (
                 f"no answer within {BIND_TIMEOUT_S:g} s while opening it; check cable and power"
             )
+    for finding in findings:
+        if finding["kind"] == "head" and finding["ok"]:
+            problem = serial_problem(rig, finding["name"], finding["found"])
+            if problem is not None:
+                finding |= {"ok": False, "problem": problem}
     return findings
 
 
@@ -85,14 +89,6 @@ def _bind(device: Any, finding: dict[str, Any]) -> None:
         return
     finally:
         device.close()
-    calibrated = finding.get("calibrated_serial", "")
-    serial = finding["found"].get("serial", "")
-    if calibrated and serial and calibrated != serial:
-        finding["problem"] = (
-            f"serial number {serial}, but the calibration is of {calibrated}; connect that head "
-            f"or use this one's calibration"
-        )
-        return
     finding["ok"] = True
 
 

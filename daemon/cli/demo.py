@@ -257,10 +257,7 @@ def _print_result(console: Console, result: Mapping[str, Any], ledger: Mapping[s
         sheet.add_column(heading, justify="right")
     sheet.add_row(
         "exposures",
-        *(
-            str(ledger["triggers"][key])
-            for key in ("triggers", "complete", "degraded", "lost", "open")
-        ),
+        *(str(counts[key]) for key in ("triggers", "complete", "degraded", "lost", "open")),
     )
     console.print(sheet)
     received = Table()
