@@ -463,7 +463,7 @@ def _class_scales(
     """Variance components: P/P and P/C sigmas that make both classes fit their residuals.
 
     P/P keeps its a-priori sigma (unit weight); only the ratio is estimated. Returns the factors on
-    the a-priori sigmas and whether they moved by more than two percent.
+    the a-priori sigmas and whether their ratio moved by more than two per mille.
     """
     variance = {}
     for kind in _CLASSES:
@@ -478,7 +478,7 @@ def _class_scales(
         variance[kind] = squares / redundancy
     ratio = math.sqrt(variance[PAN_TO_COLOUR] / variance[PAN_TO_PAN])
     after = {PAN_TO_PAN: 1.0, PAN_TO_COLOUR: ratio}
-    return after, abs(ratio / before[PAN_TO_COLOUR] - 1.0) > 0.02
+    return after, abs(ratio / before[PAN_TO_COLOUR] - 1.0) > 0.002
 
 
 def _factors(groups: Sequence[_Group], settings: MosaicSettings, *, soft: bool) -> list[Array]:
