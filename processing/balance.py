@@ -90,7 +90,8 @@ def balance_gains(names: Sequence[str], means: Array) -> Balance:
         # 1.2533: the median's standard deviation against the mean's, for normal errors.
         sigma = 1.2533 * max(spread, 1e-4) / np.sqrt(count)
         pairs.append(PairBalance(names[a], names[b], median, float(sigma), count))
-    return Balance(dict(zip(names, np.exp(_log_gains(names, pairs)), strict=True)), tuple(pairs))
+    gains = np.exp(_log_gains(names, pairs)).tolist()
+    return Balance(dict(zip(names, gains, strict=True)), tuple(pairs))
 
 
 def _log_gains(names: Sequence[str], pairs: Sequence[PairBalance]) -> Array:

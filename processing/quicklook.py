@@ -56,8 +56,10 @@ def _hue(picture: Array, grey: Array, seen: Array, bands: list[Array]) -> None:
     if not lit.any():
         picture[:] = light[:, :, None]
         return
-    # White balance by the median of the scene.
-    balanced = [band / max(float(np.median(band[lit][::7])), 1.0) for band in bands]
+    # White is what is bright: roofs and roads are greyer than the mean of a forest.
+    balanced = [
+        band / max(float(np.percentile(band[lit][::7], _HIGH_PERCENT)), 1.0) for band in bands
+    ]
     mean = (balanced[0] + balanced[1] + balanced[2]) / 3.0
     for k in range(3):
         ratio = np.ones_like(grey)

@@ -22,8 +22,9 @@ def test_colour_gives_the_hue_and_pan_the_brightness() -> None:
     rng = np.random.default_rng(1)
     pan = rng.integers(5000, 15000, (600, 1200)).astype(np.uint16)
     bands = {band: np.full((200, 400), 6000, np.uint16) for band in ("red", "green", "blue")}
-    bands["red"][:, 300:] = 12000
-    bands["blue"][:, 300:] = 3000
+    bands["red"][:, 300:] = 5000
+    bands["green"][:, 300:] = 3000
+    bands["blue"][:, 300:] = 1500
     picture = quicklook(pan, bands).astype(int)
     grey, red = picture[:, :850], picture[:, 950:]
     assert np.all(np.ptp(grey, axis=2) <= 2)
