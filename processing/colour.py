@@ -70,6 +70,7 @@ def register_band(
     green_frame: Array,
     band_frame: Array,
     *,
+    positions: Array,
     settings: ColourSettings,
 ) -> BandRegistration:
     """Find where a band lies against green.
@@ -78,8 +79,9 @@ def register_band(
         green: adjusted placement of the green sensor.
         other: placement of the band's sensor by calibration and TDM.
         green_frame, band_frame: Level-1 frames, (h, w) uint16.
+        positions: where to match, from `green_positions`; the same for all bands.
     """
-    raw_green, raw_band, sigma = _match(green, other, green_frame, band_frame, settings)
+    raw_green, raw_band, sigma = _match(green, other, green_frame, band_frame, positions, settings)
     if len(sigma) < settings.min_points:
         return nominal_registration(band, other.sensor.name)
     source = vip_mm_from_raw(green, raw_green)
@@ -94,6 +96,14 @@ def register_band(
         rms / unit_mm,
         registered=used >= settings.min_points,
     )
+
+
+def green_positions(green: SensorPlacement, green_frame: Array, settings: ColourSettings) -> Array:
+    """Feature-rich pixels of the green frame on an even grid, (n, 2) int64 (column, row)."""
+    cells = _grid(green, _room(settings), settings)
+    best = select_features(green_frame, cells, settings.window_px // 2, 2, True)
+    positions: Array = best[best[:, 2] > 0.0, :2].astype(np.int64)
+    return positions
 
 
 def fit_projective(source: Array, target: Array, sigma: Array) -> tuple[Array, float, int]:
@@ -159,13 +169,10 @@ def _match(
     other: SensorPlacement,
     green_frame: Array,
     band_frame: Array,
+    at_green: Array,
     settings: ColourSettings,
 ) -> tuple[Array, Array, Array]:
-    half = settings.window_px // 2
-    room = half + MARGIN_PX + 2
-    cells = _grid(green, room, settings)
-    best = select_features(green_frame, cells, half, 2, True)
-    at_green = best[best[:, 2] > 0.0, :2].astype(np.int64)
+    room = _room(settings)
     predicted = raw_from_vip_mm(other, vip_mm_from_raw(green, at_green.astype(np.float64)))
     first, last = exposed_rows(other.sensor, other.tdi_shifts)
     limits = np.array([0, other.sensor.width_px - 1, first, last], dtype=np.int64)
@@ -183,7 +190,7 @@ def _match(
         np.rint(predicted[inside]).astype(np.int64),
         limits,
         1,
-        half,
+        settings.window_px // 2,
         settings.search_px,
         True,
         INTERPOLATION,
@@ -195,6 +202,11 @@ def _match(
         & (found[:, 6] >= settings.min_peak_margin)
     ]
     return found[:, 0:2], found[:, 2:4], np.maximum(found[:, 4], 0.005)
+
+
+def _room(settings: ColourSettings) -> int:
+    """Pixels a window needs between its centre and the frame's border."""
+    return settings.window_px // 2 + MARGIN_PX + 2
 
 
 def _grid(green: SensorPlacement, room: int, settings: ColourSettings) -> Array:

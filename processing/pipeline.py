@@ -16,7 +16,12 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.colour import BandRegistration, nominal_registration, register_band
+from processing.colour import (
+    BandRegistration,
+    green_positions,
+    nominal_registration,
+    register_band,
+)
 from processing.composition import ColourComposer, PanComposer
 from processing.conditions import (
     Conditions,
@@ -254,6 +259,10 @@ class Pipeline:
         """Green as the adjustment placed it, the other bands by their tie points with green."""
         registrations, rasters = [], {}
         green = None if self._green is None else self._bands[self._green].name
+        wished = self.settings.colour
+        positions = None
+        if green is not None and green in level1:
+            positions = green_positions(mosaic.placements[green], level1[green], wished)
         for band, sensor in self._bands.items():
             if sensor.name not in level1:
                 rasters[band] = self._colour.empty(band)
@@ -262,14 +271,15 @@ class Pipeline:
             homography = None
             if sensor.name != green:
                 found = nominal_registration(band, sensor.name)
-                if green is not None and green in level1:
+                if green is not None and positions is not None:
                     found = register_band(
                         band,
                         mosaic.placements[green],
                         placement,
                         level1[green],
                         level1[sensor.name],
-                        settings=self.settings.colour,
+                        positions=positions,
+                        settings=wished,
                     )
                 registrations.append(found)
                 homography = found.band_from_green if found.registered else None

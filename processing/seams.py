@@ -157,7 +157,8 @@ def _path_cost(a: Array, b: Array, in_a: Array, in_b: Array, margin: int) -> Arr
     cost = np.where(both, np.abs(a - b) / noise, 0.0)
     cost[both & ((a == np.float32(UNUSABLE)) | (b == np.float32(UNUSABLE)))] = _UNUSABLE_COST
     # Near the border of the overlap, and beyond it, there is no room to fade.
-    cost[both.any(axis=1)[:, None] & ~_eroded(both, margin)] += _EDGE_COST
+    shared: Array = np.any(both, axis=1)
+    cost[shared[:, None] & ~_eroded(both, margin)] += _EDGE_COST
     # A position that gives nodes to a part that does not cover them costs every such node.
     wrong_for_a = np.cumsum(in_b & ~in_a, axis=1)
     wrong_for_b = np.cumsum((in_a & ~in_b)[:, ::-1], axis=1)[:, ::-1]

@@ -5,7 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from processing.colour import ColourSettings, fit_projective, nominal_registration, register_band
+from processing.colour import (
+    ColourSettings,
+    fit_projective,
+    green_positions,
+    nominal_registration,
+    register_band,
+)
 from processing.level1 import corrector_for, level1_from_level0
 from processing.placement import nominal_placements, raw_from_vip_mm, vip_mm_from_raw
 from processing.projective import apply_projective
@@ -59,7 +65,13 @@ def test_a_displaced_colour_head_is_brought_back_onto_green(
             out=level1[name],
         )
     found = register_band(
-        band, start["G"], start[sensor], level1["G"], level1[sensor], settings=ColourSettings()
+        band,
+        start["G"],
+        start[sensor],
+        level1["G"],
+        level1[sensor],
+        positions=green_positions(start["G"], level1["G"], ColourSettings()),
+        settings=ColourSettings(),
     )
     assert found.registered and found.points > 400
     x, y = np.meshgrid(np.arange(40.0, 1210, 90), np.arange(40.0, 790, 90))
@@ -79,7 +91,13 @@ def test_a_band_without_texture_lies_as_calibrated_and_says_so() -> None:
     rng = np.random.default_rng(1)
     noise = {n: (rng.integers(2000, 2100, (832, 1248)) * 2).astype(np.uint16) for n in "GB"}
     found = register_band(
-        "blue", start["G"], start["B"], noise["G"], noise["B"], settings=ColourSettings()
+        "blue",
+        start["G"],
+        start["B"],
+        noise["G"],
+        noise["B"],
+        positions=green_positions(start["G"], noise["G"], ColourSettings()),
+        settings=ColourSettings(),
     )
     assert not found.registered
     assert np.array_equal(found.band_from_green, nominal_registration("b", "B").band_from_green)
