@@ -1,0 +1,144 @@
+"""The main job, end to end on real wire protocols: flown, captured, stitched, judged."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+
+from sim_hw.rendering import render_ideal
+from sim_hw.scene import open_scene
+from sim_hw.truth import world_of
+from tests.system.flown import Flown, syntopic
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(400)]
+
+WINDOW_PX = 128
+
+
+def test_twelve_of_twelve_exposures_are_complete_and_the_ledger_balances(flown: Flown) -> None:
+    said = flown.said
+    assert (said["exposures"], said["complete"], said["degraded"], said["lost"]) == (12, 12, 0, 0)
+    assert said["ledger_balanced"] is True
+    assert len(said["verdicts"]) == 12
+    assert set(said["verdicts"]) <= {"good", "usable"}
+
+
+def test_the_stitched_images_are_where_the_truth_says(flown: Flown) -> None:
+    said = flown.said
+    assert said["rms_px"] < 0.1
+    assert said["rms_px_absolute"] < 0.15
+    assert said["rms_px_no_tdm"] > 3 * said["rms_px"]
+    assert said["rms_px_fixed"] > said["rms_px"]
+
+
+def test_the_displaced_sensor_is_named_in_every_exposure(flown: Flown) -> None:
+    assert flown.said["displaced_sensor"] == "SU02"
+    assert flown.said["displaced_sensors"] == ["SU02"] * 12
+
+
+def test_every_exposure_has_the_receivers_time_and_no_other(flown: Flown) -> None:
+    assert flown.said["time_error_ns"] == 0
+    assert flown.said["time_sigma_ns"] < 1000
+    for path in (flown.mission / "L0").glob("*/exposure.json"):
+        record = json.loads(path.read_text())
+        assert record["mark_source"] == "event-mark"
+        assert all(frame["time_source"] == "event-mark" for frame in record["frames"])
+
+
+def test_every_frame_has_its_own_syntopic_instant_close_to_the_truth(flown: Flown) -> None:
+    record = json.loads((flown.mission / "L0/000004/exposure.json").read_text())
+    truth = np.load(flown.truth / "000004.npz")
+    for frame in record["frames"]:
+        true_ns = int(truth[f"{frame['sensor']}.mid_gps_ns"])
+        assert abs(int(frame["mid_exposure_gps_ns"]) - true_ns) < 2_000, frame["sensor"]
+
+
+def test_the_virtual_image_shows_what_an_ideal_camera_would_see(flown: Flown) -> None:
+    """Image against image: the truth is rendered, and both are correlated in windows."""
+    number = 6
+    pan = tifffile.imread(flown.mission / f"L2/{number:06d}/pan.tif").astype(np.float32)
+    truth = np.load(flown.truth / f"{number:06d}.npz")
+    world = world_of(flown.truth)
+    scene = open_scene(world.scene_settings, flown.scenes)
+    flight = world.flight.beginning_first_line_at(float(truth["first_line_at_m"]))
+    ideal = render_ideal(world, scene, flight, int(truth["master_mid_gps_ns"]))
+    window = cv2.createHanningWindow((WINDOW_PX, WINDOW_PX), cv2.CV_32F)
+    shifts = []
+    height, width = pan.shape
+    for row in range(60, height - WINDOW_PX - 60, 250):
+        for column in range(60, width - WINDOW_PX - 60, 250):
+            part = (slice(row, row + WINDOW_PX), slice(column, column + WINDOW_PX))
+            shift, response = cv2.phaseCorrelate(
+                np.ascontiguousarray(ideal[part]), np.ascontiguousarray(pan[part]), window
+            )
+            if response > 0.3:
+                shifts.append(shift)
+    measured = np.array(shifts)
+    assert len(measured) > 50
+    assert np.abs(np.median(measured, axis=0)).max() < 0.05
+    assert np.sqrt(np.mean(np.median(np.abs(measured), axis=0) ** 2)) < 0.1
+
+
+def test_the_mission_verifies_and_a_flipped_bit_is_found(flown: Flown, tmp_path: Path) -> None:
+    whole = syntopic("verify", str(flown.mission), "--json")
+    assert whole.returncode == 0, whole.stdout
+    assert json.loads(whole.stdout)["frames"] == 156
+    copy = tmp_path / flown.mission.name
+    shutil.copytree(flown.mission, copy, ignore=shutil.ignore_patterns("L2"))
+    frame = copy / "L0/000003/SU11.tif"
+    frame.chmod(0o644)
+    content = bytearray(frame.read_bytes())
+    content[100_000] ^= 4
+    frame.write_bytes(content)
+    altered = syntopic("verify", str(copy), "--json")
+    assert altered.returncode == 1
+    (problem,) = json.loads(altered.stdout)["problems"]
+    assert "SU11" in problem
+
+
+def test_processing_again_gives_the_same_image_and_the_same_figures(
+    flown: Flown, tmp_path: Path
+) -> None:
+    copy = tmp_path / flown.mission.name
+    ignored = shutil.ignore_patterns("L2", "00000[!5]*", "00001*")
+    shutil.copytree(flown.mission, copy, ignore=ignored)
+    (copy / "L2").mkdir()
+    again = syntopic("process", str(copy), "--only", "5", "--json")
+    assert again.returncode == 0, again.stderr[-2000:]
+    (report,) = json.loads(again.stdout)["exposures"]
+    flown_report = json.loads((flown.mission / "L2/000005/quality.json").read_text())
+    assert report["figures"] == flown_report["figures"]
+    np.testing.assert_array_equal(
+        tifffile.imread(copy / "L2/000005/pan.tif"),
+        tifffile.imread(flown.mission / "L2/000005/pan.tif"),
+    )
+
+
+def test_an_exposure_written_by_hand_is_processed(flown: Flown, tmp_path: Path) -> None:
+    """Only TIFFs that tifffile wrote and a rig file: no record, no log, no index."""
+    folder = tmp_path / "by-hand"
+    (folder / "L0/000001").mkdir(parents=True)
+    shutil.copy(flown.mission / "rig.toml", folder / "rig.toml")
+    for path in (flown.mission / "L0/000002").glob("*.tif"):
+        tifffile.imwrite(folder / "L0/000001" / path.name, tifffile.imread(path))
+    service = (flown.mission / "service.toml").read_text()
+    radiometry = next(line for line in service.splitlines() if line.startswith("radiometry"))
+    done = syntopic(*("process", str(folder), "--radiometry", radiometry.split('"')[1], "--json"))
+    assert done.returncode == 0, done.stderr[-2000:]
+    (report,) = json.loads(done.stdout)["exposures"]
+    assert report["figures"]["tie_points_pp"] > 1000
+    assert "TEMPERATURE_MISSING" in report["flags"]
+    assert tifffile.imread(folder / "L2/000001/pan.tif").shape == (2226, 3480)
+
+
+def test_the_report_needs_nothing_beside_it_and_names_the_sensor(flown: Flown) -> None:
+    html = Path(flown.said["report"]).read_text()
+    assert "Simulated flight" in html
+    assert "Displaced sensor: SU02" in html
+    assert 'src="http' not in html and 'href="http' not in html

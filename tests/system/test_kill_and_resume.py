@@ -1,0 +1,143 @@
+"""kill -9 in the middle of a flight: what was reported stored is there, and the flight goes on."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daemon.cli.sim import Emulator, service_toml, simulator_arguments
+from tests.system.flown import ROOT, syntopic
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(400)]
+
+WAIT_S = 120.0
+CHILDREN_DIE_WITHIN_S = 3.0
+
+
+@pytest.fixture(scope="module")
+def emulator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Emulator, Path]]:
+    folder = tmp_path_factory.mktemp("kill")
+    arguments = simulator_arguments("ultracam-x-mini", folder / "sim", seed=3, dc=0, displace=[])
+    started = Emulator([*arguments, "--first-address", "127.0.7.2", "--exposures", "8"])
+    yield started, folder
+    started.end()
+
+
+def start(config: Path) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "daemon", "run", str(config), "--json-lines"],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+
+
+def heard(service: subprocess.Popen[str]) -> Iterator[dict[str, Any]]:
+    assert service.stdout is not None
+    deadline = time.monotonic() + WAIT_S
+    for line in service.stdout:
+        assert time.monotonic() < deadline, "the flight takes too long"
+        yield json.loads(line)
+
+
+def children(pid: int) -> list[int]:
+    listed = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    return [int(child) for child in listed]
+
+
+def is_running(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def test_a_killed_service_goes_on_in_the_same_flight(emulator: tuple[Emulator, Path]) -> None:
+    devices, folder = emulator
+    config = folder / "service.toml"
+    config.write_text(service_toml(devices.ready, root="missions", count=6, end_when_done=True))
+    first = start(config)
+    stored: set[int] = set()
+    mission = ""
+    for event in heard(first):
+        if event["event"] == "mission":
+            mission = event["path"]
+        if event["event"] == "stored":
+            stored.add(event["number"])
+        if len(stored) == 3:
+            break
+    loaded = Path(f"/proc/{first.pid}/maps").read_text()
+    assert "numba" not in loaded and "cv2" not in loaded and "aravis" not in loaded
+    family = children(first.pid)
+    assert len(family) >= 3
+    first.send_signal(signal.SIGKILL)
+    first.wait(10)
+    deadline = time.monotonic() + CHILDREN_DIE_WITHIN_S
+    while any(is_running(pid) for pid in family):
+        assert time.monotonic() < deadline, "a process outlived the service"
+        time.sleep(0.02)
+
+    for number in stored:
+        frames = list(Path(mission, "L0", f"{number:06d}").glob("*.tif"))
+        assert len(frames) == 13, f"exposure {number} was reported stored"
+
+    second = start(config)
+    events = list(heard(second))
+    assert second.wait(30) == 0
+    (told,) = [event for event in events if event["event"] == "mission"]
+    assert told["path"] == mission and told["resumed"]
+    held = [event for event in events if event.get("name") == "held-by-another"]
+    assert held, "the heads hold the dead controller's privilege, and that is said"
+    (ended,) = [event for event in events if event["event"] == "ended"]
+    counts = ended["ledger"]["triggers"]
+    assert counts["triggers"] == 6
+    assert counts["complete"] + counts["degraded"] + counts["lost"] == 6
+    assert ended["ledger"]["balanced"], ended["ledger"]["imbalances"]
+    states = {}
+    for path in Path(mission, "L0").glob("*/exposure.json"):
+        record = json.loads(path.read_text())
+        states[record["number"]] = record["state"]
+    assert sorted(states) == list(range(1, 7)), "every trigger ends in exactly one record"
+    assert all(states[number] == "complete" for number in stored)
+    verified = syntopic("verify", mission, "--json")
+    assert verified.returncode == 0, verified.stdout
+    assert (Path(mission) / "mission.db").exists()
+
+
+def test_after_an_orderly_end_a_new_mission_begins(emulator: tuple[Emulator, Path]) -> None:
+    devices, folder = emulator
+    config = folder / "service.toml"
+    before = {path.name for path in (folder / "missions").iterdir()}
+    config.write_text(service_toml(devices.ready, root="missions", count=1, end_when_done=True))
+    service = start(config)
+    events = list(heard(service))
+    assert service.wait(30) == 0
+    (told,) = [event for event in events if event["event"] == "mission"]
+    assert not told["resumed"] and Path(told["path"]).name not in before
+
+
+def test_check_prints_a_tree_of_what_is_well_and_the_cure_of_what_is_not(
+    emulator: tuple[Emulator, Path],
+) -> None:
+    devices, folder = emulator
+    config = folder / "check.toml"
+    text = service_toml(devices.ready, root="missions")
+    config.write_text(text)
+    well = syntopic("check", str(config), "--json")
+    said = json.loads(well.stdout)
+    assert well.returncode == 0, said
+    assert said["ok"] and len(said["devices"]) == 16
+    config.write_text(text.replace("127.0.7.5", "127.0.7.99"))
+    ill = syntopic("check", str(config), "--json")
+    said = json.loads(ill.stdout)
+    assert ill.returncode == 1
+    (head,) = [device for device in said["devices"] if not device["ok"]]
+    assert "127.0.7.99" in head["problem"] and "check" in head["problem"]
