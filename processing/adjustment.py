@@ -20,9 +20,11 @@ _RANK_TOLERANCE = 1e-7
 
 @dataclass(frozen=True)
 class Block:
-    """m observation equations design @ dp = misclosure + v that touch the unknowns `columns` (k).
+    """m observation equations dp @ design = misclosure + v that touch the unknowns `columns` (k).
 
-    `design` is (m, k), `misclosure` (m,) observed minus computed, `weight` (m,) 1 / sigma squared.
+    `design` is (k, m), a row of derivatives for each unknown (the usual matrix transposed, so that
+    rows lie together in memory); `misclosure` (m,) observed minus computed; `weight` (m,)
+    1 / sigma squared.
     """
 
     columns: NDArray[np.int64]
@@ -52,9 +54,9 @@ def normal_equations(blocks: Sequence[Block], unknowns: int) -> tuple[Array, Arr
     normal = np.zeros((unknowns, unknowns))
     right = np.zeros(unknowns)
     for block in blocks:
-        weighted = block.design * block.weight[:, None]
-        normal[np.ix_(block.columns, block.columns)] += weighted.T @ block.design
-        right[block.columns] += weighted.T @ block.misclosure
+        weighted = block.design * block.weight
+        normal[np.ix_(block.columns, block.columns)] += weighted @ block.design.T
+        right[block.columns] += weighted @ block.misclosure
     return normal, right
 
 
@@ -118,5 +120,5 @@ def solve(
 def redundancy_numbers(block: Block, cofactor: Array) -> Array:
     """r_i = 1 - p_i a_i Q a_i' of each observation of a block, weightless ones too (r_i = 1)."""
     q = cofactor[np.ix_(block.columns, block.columns)]
-    hat = np.einsum("ij,ij->i", block.design @ q, block.design) * block.weight
+    hat = np.einsum("ij,ij->j", q @ block.design, block.design) * block.weight
     return np.asarray(np.clip(1.0 - hat, 0.0, 1.0))

@@ -260,10 +260,10 @@ def adjust_mosaic(
         soft = iterations < settings.min_iterations - 1
         changed = False
         for group, block in zip(groups, blocks, strict=True):
-            v = (block.design @ solution.dp[block.columns] - block.misclosure).reshape(-1, 2)
+            v = (solution.dp[block.columns] @ block.design - block.misclosure).reshape(2, -1).T
             weightless = dataclasses.replace(block, weight=_full_weight(group, class_scale))
             group.difference = v
-            group.redundancy = redundancy_numbers(weightless, solution.cofactor).reshape(-1, 2)
+            group.redundancy = redundancy_numbers(weightless, solution.cofactor).reshape(2, -1).T
         class_scale, moved = _class_scales(groups, class_scale, settings)
         for group, factor in zip(groups, _factors(groups, settings, soft=soft), strict=True):
             changed = changed or bool(np.any((factor > 0.0) != (group.factor > 0.0)))
@@ -435,7 +435,7 @@ def _first_look(model: MosaicModel, start: Mapping[str, SensorPlacement], group:
 
 
 def _full_weight(group: _Group, class_scale: Mapping[int, float]) -> Array:
-    return np.repeat(1.0 / (group.sigma * class_scale[group.kind]) ** 2, 2)
+    return np.tile(1.0 / (group.sigma * class_scale[group.kind]) ** 2, 2)
 
 
 def _block(
@@ -448,12 +448,16 @@ def _block(
     a, columns_a, design_a = vip_and_design(model, start[group.a], group.corrected_a, values)
     b, columns_b, design_b = vip_and_design(model, start[group.b], group.corrected_b, values)
     columns = np.concatenate([columns_a, columns_b])
-    design = np.concatenate([design_a, -design_b], axis=2).reshape(2 * len(a), len(columns))
+    design = np.empty((len(columns), 2 * len(a)))
+    k = len(columns_a)
+    units = model.units[columns][:, None]
+    np.multiply(design_a.reshape(k, 2 * len(a)), units[:k], out=design[:k])
+    np.multiply(design_b.reshape(len(columns_b), 2 * len(b)), -units[k:], out=design[k:])
     return Block(
         columns=columns,
-        design=design * model.units[columns],
-        misclosure=(b - a).reshape(-1),
-        weight=np.repeat(group.factor / (group.sigma * scale) ** 2, 2),
+        design=design,
+        misclosure=(b - a).T.reshape(-1),
+        weight=np.tile(group.factor / (group.sigma * scale) ** 2, 2),
     )
 
 
@@ -525,5 +529,5 @@ def vip_precision_px(mosaic: Mosaic, sensor: str, colrow: Array) -> Array:
         mosaic.model, start, corrected_mm_from_raw(start, colrow), mosaic.values
     )
     q = mosaic.covariance[np.ix_(columns, columns)]
-    variance = np.einsum("nai,ij,naj->na", design, q, design)
+    variance = np.einsum("ian,ij,jan->na", design, q, design)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))

@@ -97,8 +97,8 @@ def vip_and_design(
         values: the unknowns (u,).
 
     Returns:
-        Points (n, 2) in px of the virtual image, unscaled columns (k,) of the unknowns touched, and
-        derivatives (n, 2, k), px.
+        Points (n, 2) in px of the virtual image, the indices (k,) of the unknowns touched, and the
+        points' derivatives by these, (k, 2, n), px per unknown's own unit.
 
     Source: seeds/ultracam-calibration.txt, eq. 1 and 2.
     """
@@ -116,36 +116,38 @@ def vip_and_design(
         ]
         or [np.empty(0, dtype=np.int64)]
     )
-    design = np.zeros((n, 2, len(columns)))
+    design = np.zeros((len(columns), 2, n))
     size = model.half_size_mm
-    if first_layer is None:
-        vip_mm = start_mm
-        jacobian = projective_jacobian(start.layer, layer_mm)
-    else:
-        scaled = start_mm / size
+    jacobian = projective_jacobian(start.layer, layer_mm)
+    vip_mm = start_mm
+    if first_layer is not None:
+        x, y = start_mm[:, 0] / size, start_mm[:, 1] / size
+        scaled = np.stack([x, y], axis=1)
         correction = _scaled_correction(values[first_layer : first_layer + 8])
         moved = apply_projective(correction, scaled)
         vip_mm = moved * size
-        w = correction[2, 0] * scaled[:, 0] + correction[2, 1] * scaled[:, 1] + 1.0
-        d = design[:, :, len(columns) - 8 :]
+        by_w = size / (correction[2, 0] * x + correction[2, 1] * y + 1.0)
+        d = design[len(columns) - 8 :]
         for axis in (0, 1):
-            d[:, axis, 3 * axis] = size * scaled[:, 0] / w
-            d[:, axis, 3 * axis + 1] = size * scaled[:, 1] / w
-            d[:, axis, 3 * axis + 2] = size / w
-            d[:, axis, 6] = -size * moved[:, axis] * scaled[:, 0] / w
-            d[:, axis, 7] = -size * moved[:, axis] * scaled[:, 1] / w
-        jacobian = projective_jacobian(correction, scaled) @ projective_jacobian(
-            start.layer, layer_mm
-        )
+            np.multiply(x, by_w, out=d[3 * axis, axis])
+            np.multiply(y, by_w, out=d[3 * axis + 1, axis])
+            d[3 * axis + 2, axis] = by_w
+            np.multiply(d[3 * axis, axis], -moved[:, axis], out=d[6, axis])
+            np.multiply(d[3 * axis + 1, axis], -moved[:, axis], out=d[7, axis])
+        jacobian = projective_jacobian(correction, scaled) @ jacobian
     if first_sensor is not None:
-        arm = layer_mm - np.array([similarity.x_mm, similarity.y_mm])
-        turned = np.stack([-arm[:, 1], arm[:, 0]], axis=1)
+        arm_x = layer_mm[:, 0] - similarity.x_mm
+        arm_y = layer_mm[:, 1] - similarity.y_mm
         # arm = s0 (1 + scale) R u', so its derivative by scale is arm / (1 + scale).
-        stretched = arm / (1.0 + values[first_sensor + 3])
-        design[:, :, 0:2] = jacobian
-        design[:, :, 2] = np.einsum("nij,nj->ni", jacobian, turned)
-        design[:, :, 3] = np.einsum("nij,nj->ni", jacobian, stretched)
-    return vip_mm / model.pitch_mm, columns, design / model.pitch_mm
+        stretch = 1.0 / (1.0 + values[first_sensor + 3])
+        for axis in (0, 1):
+            by_x, by_y = jacobian[:, axis, 0], jacobian[:, axis, 1]
+            design[0, axis] = by_x
+            design[1, axis] = by_y
+            design[2, axis] = by_y * arm_x - by_x * arm_y
+            design[3, axis] = (by_x * arm_x + by_y * arm_y) * stretch
+    design /= model.pitch_mm
+    return vip_mm / model.pitch_mm, columns, design
 
 
 def _similarity(model: MosaicModel, start: SensorPlacement, values: Array) -> Similarity:

@@ -258,7 +258,9 @@ def _prior(
     found = [rig.sensor(name) for name in sensors]
     covariance = np.zeros((2 * len(found), 2 * len(found)))
     for i, sensor in enumerate(found):
-        tdm = sensor.drift.sigma_um_per_k * sensor_dc(sensor, temperatures_c)
+        dc = sensor_dc(sensor, temperatures_c)
+        unknown = 0.0 if sensor.probe in temperatures_c else settings.unknown_sigma_k
+        tdm = sensor.drift.sigma_um_per_k * math.hypot(dc, unknown)
         variance = sensor.position_sigma_um**2 + tdm**2
         covariance[2 * i, 2 * i] = covariance[2 * i + 1, 2 * i + 1] = variance
     for probe in dict.fromkeys(sensor.probe for sensor in found):

