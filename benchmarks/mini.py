@@ -1,0 +1,166 @@
+"""`python -m benchmarks.mini`: the pipeline and the writer on an emulated mini exposure.
+
+Flies three exposures to have real frames, then times the pipeline beside a plain copy of the bytes it
+reads and writes, and the Level-0 writer beside a plain write + fsync of the same bytes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.machine import interleaved, machine
+from daemon.conditions import conditions_of
+from daemon.configuration import PlanSection
+from daemon.exposure import Capture, FrameRecord
+from daemon.mission import Mission
+from daemon.store import Level0Writer, load_level0
+from processing.pipeline import Pipeline, Settings
+from processing.quality import Flag
+from processing.radiometry import load_radiometry
+from processing.rig import load_rig
+
+Frames = Mapping[str, NDArray[np.uint16]]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.mini", description=__doc__)
+    parser.add_argument("--runs", type=int, default=7)
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="syntopic-bench-") as folder:
+        mission, radiometry = _fly(Path(folder))
+        result = {
+            "machine": machine(),
+            "rig": "ultracam-x-mini",
+            "pipeline": _time_pipeline(mission, radiometry, options.runs),
+            "writer": _time_writer(Path(folder), mission, options.runs),
+        }
+    if options.json:
+        print(json.dumps(result))
+    else:
+        _print(result)
+
+
+def _fly(folder: Path) -> tuple[Mission, Path]:
+    said = subprocess.run(
+        [
+            *(sys.executable, "-m", "daemon", "demo", "--json", "--exposures", "3"),
+            *("--out", str(folder)),
+        ],
+        stdout=subprocess.PIPE,
+        check=True,
+        timeout=300,
+    )
+    mission = Path(json.loads(said.stdout)["mission"])
+    return Mission.open(mission), mission.parents[1] / "sim" / "calibration" / "radiometry"
+
+
+def _time_pipeline(mission: Mission, radiometry: Path, runs: int) -> dict[str, Any]:
+    rig = load_rig(mission.rig_path)
+    calibrations = {s.name: load_radiometry(radiometry / f"{s.name}.npz") for s in rig.sensors}
+    pipeline = Pipeline(rig, calibrations, Settings(geometry=False))
+    pipeline.warm_up()
+    frames, exposure = load_level0(mission.level0(2), rig)
+    plan = PlanSection(ground_height_m=395.0, height_above_ground_m=3000.0)
+    conditions = conditions_of(exposure, rig, plan, Flag(0))
+    stages: dict[str, list[float]] = {}
+    product = pipeline.process(frames, conditions)
+    written = [product.pan, *product.colour.values()]
+    sources = [*frames.values(), *written]
+    copies = [np.empty_like(array) for array in sources]
+
+    def process() -> None:
+        done = pipeline.process(frames, conditions)
+        for stage, seconds in done.timings_s.items():
+            stages.setdefault(stage, []).append(seconds)
+
+    def copy() -> None:
+        for target, source in zip(copies, sources, strict=True):
+            np.copyto(target, source)
+
+    timed = interleaved(runs, process=process, copy=copy)
+    pixels = sum(frame.size for frame in frames.values())
+    seconds = timed["process"]["median_s"]
+    return {
+        **timed,
+        "stages_median_s": {stage: float(np.median(s)) for stage, s in stages.items()},
+        "megapixels_per_s": pixels / 1e6 / seconds,
+        "ratio_to_copy": seconds / timed["copy"]["median_s"],
+        "realtime_factor": rig.frame_interval_s / seconds,
+    }
+
+
+def _time_writer(folder: Path, mission: Mission, runs: int) -> dict[str, Any]:
+    rig = load_rig(mission.rig_path)
+    frames, exposure = load_level0(mission.level0(2), rig)
+    target = Mission.create(
+        folder / "writer",
+        rig.name,
+        rig_toml=mission.rig_path.read_bytes(),
+        service_toml=b"",
+        started_utc=datetime.now(UTC),
+    )
+    writer = Level0Writer(target)
+    numbers = iter(range(1, 10_000))
+    records: tuple[FrameRecord, ...] = tuple(
+        replace(f, file="", sha256="") for f in exposure.frames
+    )
+
+    def store() -> None:
+        writer.write(Capture(number=next(numbers), frames=records), frames)
+
+    def plain() -> None:
+        path = folder / "plain"
+        with path.open("wb", buffering=0) as file:
+            for frame in frames.values():
+                file.write(np.ascontiguousarray(frame).data)
+            os.fsync(file.fileno())
+        path.unlink()
+
+    timed = interleaved(runs, store=store, plain=plain)
+    writer.close()
+    ratio = timed["plain"]["median_s"] / timed["store"]["median_s"]
+    return {**timed, "ratio_of_plain_speed": ratio}
+
+
+def _print(result: Mapping[str, Any]) -> None:
+    console = Console()
+    m = result["machine"]
+    console.print(
+        f"{m['date']}  {m['processor']}, {m['cores']} cores, {m['memory_gib']} GiB, "
+        f"Python {m['python']}"
+    )
+    table = Table(title=f"Pipeline, {result['rig']}", title_justify="left")
+    for heading in ("stage", "median ms"):
+        table.add_column(heading, justify="right")
+    pipeline = result["pipeline"]
+    for stage, seconds in pipeline["stages_median_s"].items():
+        table.add_row(stage, f"{seconds * 1e3:.1f}")
+    table.add_row("all", f"{pipeline['process']['median_s'] * 1e3:.1f}")
+    console.print(table)
+    console.print(
+        f"{pipeline['megapixels_per_s']:.1f} Mpx/s, {pipeline['ratio_to_copy']:.0f} times a plain "
+        f"copy, realtime_factor {pipeline['realtime_factor']:.2f}"
+    )
+    console.print(
+        f"writer: {result['writer']['ratio_of_plain_speed']:.2f} of the speed of write + fsync"
+    )
+
+
+if __name__ == "__main__":
+    main()
