@@ -17,7 +17,8 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from processing.resampling import OUTSIDE, WEIGHT_STEP_PX
+from processing.lattice import OUTSIDE
+from processing.resampling import WEIGHT_STEP_PX
 
 Array = NDArray[Any]
 

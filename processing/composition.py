@@ -14,25 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.balance import Balance, balance_gains, node_means
+from processing.lattice import (
+    OUTSIDE,
+    colour_raster,
+    fill_lattice,
+    interpolate_lattice,
+    lattice_shape,
+    pan_raster,
+)
 from processing.level1 import exposed_rows
 from processing.placement import (
     SensorPlacement,
     vip_mm_from_raw,
     vip_px_from_mm,
 )
-from processing.resampling import (
-    OUTSIDE,
-    WEIGHT_STEP_PX,
-    WEIGHT_UNIT,
-    Interpolation,
-    colour_raster,
-    fill_lattice,
-    interpolate_lattice,
-    lattice_shape,
-    pan_raster,
-    resample,
-    usable_area,
-)
+from processing.resampling import WEIGHT_STEP_PX, WEIGHT_UNIT, Interpolation, resample, usable_area
 from processing.rig import Sensor, VirtualImage
 from processing.seams import seam_labels, seam_weights
 

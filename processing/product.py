@@ -53,7 +53,7 @@ class Product:
     `pan` (H, W) uint16 is linear signal, `counts_per_dn` counts to the DN (8 for 12 bits), 0 no
     data. `valid` (H, W) uint8 is 0 without data, else 1 + the index into `sensors` of the sensor
     that contributes most; its highest bit marks saturation. `colour` holds the bands by name,
-    (h, w) uint16 on the raster of `processing.resampling.colour_raster`. `quicklook` is (h, w, 3)
+    (h, w) uint16 on the raster of `processing.lattice.colour_raster`. `quicklook` is (h, w, 3)
     uint8.
 
     `geometry` is keyed by method ("free", "fixed", "fixed-no-tdm"), then `<sensor>.vip` (n, 2),

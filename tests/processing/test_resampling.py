@@ -7,19 +7,16 @@ import pytest
 from numpy.typing import NDArray
 
 from processing.composition import COLOUR_CELL_PX, PAN_CELL_PX
-from processing.placement import nominal_placements, raw_from_vip_mm, vip_mm_from_px
-from processing.resampling import (
+from processing.lattice import (
     OUTSIDE,
-    SATURATED_SOURCE,
-    WEIGHT_UNIT,
-    Interpolation,
     colour_raster,
     fill_lattice,
     interpolate_lattice,
     lattice_shape,
     pan_raster,
-    resample,
 )
+from processing.placement import nominal_placements, raw_from_vip_mm, vip_mm_from_px
+from processing.resampling import SATURATED_SOURCE, WEIGHT_UNIT, Interpolation, resample
 from processing.rig import find_rig
 
 CELL = 16
