@@ -46,8 +46,8 @@ class PlanSection(_Section):
 
     line: str = ""
     ground_height_m: float = 0.0
-    height_above_ground_m: float = Field(1000.0, gt=0)
-    ground_speed_mps: float = Field(60.0, gt=0)
+    height_above_ground_m: float = Field(default=1000.0, gt=0)
+    ground_speed_mps: float = Field(default=60.0, gt=0)
 
 
 class TriggerSection(BaseModel):
@@ -57,9 +57,9 @@ class TriggerSection(BaseModel):
 
     driver: str
     mode: Literal["interval", "distance"] = "interval"
-    interval_s: float = Field(2.0, gt=0)
-    distance_m: float | None = Field(None, gt=0)
-    count: int | None = Field(None, gt=0)
+    interval_s: float = Field(default=2.0, gt=0)
+    distance_m: float | None = Field(default=None, gt=0)
+    count: int | None = Field(default=None, gt=0)
 
     @model_validator(mode="after")
     def _distance_is_given(self) -> TriggerSection:
@@ -98,31 +98,31 @@ class ProcessingSection(_Section):
     method: Literal["free", "fixed"] = "free"
     interpolation: Literal["bilinear", "cubic", "lanczos"] = "cubic"
     baselines: bool = False
-    threads: int = Field(2, ge=1, le=256)
+    threads: int = Field(default=2, ge=1, le=256)
 
 
 class LimitsSection(_Section):
     """How long is waited for what, and how deep the memory is."""
 
-    frame_timeout_s: float = Field(8.0, gt=0)
-    mark_timeout_s: float = Field(3.0, gt=0)
-    ready_timeout_s: float = Field(60.0, gt=0)
-    temperature_stale_s: float = Field(10.0, gt=0)
-    exposures_in_memory: int = Field(3, ge=2, le=16)
-    disk_reserve_bytes: int = Field(500_000_000, ge=0)
+    frame_timeout_s: float = Field(default=8.0, gt=0)
+    mark_timeout_s: float = Field(default=3.0, gt=0)
+    ready_timeout_s: float = Field(default=60.0, gt=0)
+    temperature_stale_s: float = Field(default=10.0, gt=0)
+    exposures_in_memory: int = Field(default=3, ge=2, le=16)
+    disk_reserve_bytes: int = Field(default=500_000_000, ge=0)
 
 
 class Configuration(_Section):
     """The whole file."""
 
     mission: MissionSection
-    plan: PlanSection = PlanSection()  # type: ignore[call-arg]
+    plan: PlanSection = PlanSection()
     trigger: TriggerSection
     head: tuple[HeadSection, ...] = Field(min_length=1)
     thermometer: tuple[NamedSection, ...] = ()
     navigator: tuple[NamedSection, ...] = ()
-    processing: ProcessingSection = ProcessingSection()  # type: ignore[call-arg]
-    limits: LimitsSection = LimitsSection()  # type: ignore[call-arg]
+    processing: ProcessingSection = ProcessingSection()
+    limits: LimitsSection = LimitsSection()
 
 
 def load(path: Path) -> tuple[Configuration, Rig]:

@@ -5,8 +5,8 @@ in `processing.topology`; where a sensor's pixels fall in the virtual image is i
 `processing.placement`.
 
 Units and signs: image plane in mm, x right, y up, origin at the calibrated principal point,
-nominal flight direction +y. Body axes x forward, y right, z down. Angles omega, phi, kappa in radians with
-R = Rx(omega) Ry(phi) Rz(kappa), camera to object.
+nominal flight direction +y. Body axes x forward, y right, z down. Angles omega, phi, kappa in
+radians with R = Rx(omega) Ry(phi) Rz(kappa), camera to object.
 """
 
 from __future__ import annotations

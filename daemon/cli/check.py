@@ -53,7 +53,12 @@ def _open_all(configuration: Any, rig: Any) -> list[dict[str, Any]]:
     threads: list[tuple[threading.Thread, dict[str, Any]]] = []
     heads: dict[str, list[Any]] = {}
     for spec in device_specs(configuration, rig):
-        finding = {"kind": spec.kind, "name": spec.name, "driver": spec.driver, "ok": False}
+        finding: dict[str, Any] = {
+            "kind": spec.kind,
+            "name": spec.name,
+            "driver": spec.driver,
+            "ok": False,
+        }
         memory = None
         if spec.kind == "head":
             memory = FrameRing.create(spec.name, 2, frame_nbytes(rig, spec.name))
