@@ -16,6 +16,7 @@ from numba.core.dispatcher import Dispatcher
 
 from processing.pipeline import Pipeline, Settings
 from processing.radiometry import RadiometricCalibration
+from processing.rehearsal import rehearsal_radiometry
 from processing.rig import Rig
 
 _ROOMS: Final = (
@@ -59,11 +60,16 @@ def compile_for(
 ) -> Compilation:
     """Compile, or load from the cache, what this rig's pipeline will call.
 
+    Without radiometry, as at installation, what a calibrated sensor needs is compiled as well.
+
     Raises:
         ValueError, CalibrationError: as `Pipeline`.
     """
     began = time.perf_counter()
     before = _cache_misses()
+    if radiometry is None:
+        first = rig.pan_cones[0].sensors[0] if rig.pan_cones else None
+        radiometry = {first.name: rehearsal_radiometry(first)} if first else {}
     Pipeline(rig, radiometry, settings).warm_up()
     return Compilation(variants(), _cache_misses() - before, time.perf_counter() - began)
 

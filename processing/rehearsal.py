@@ -5,13 +5,15 @@ Only for compiling and warming up; nothing is measured with them.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from processing.placement import nominal_placements, vip_mm_from_raw, vip_px_from_mm
-from processing.rig import Rig
+from processing.radiometry import RadiometricCalibration, neutral_radiometry
+from processing.rig import Rig, Sensor
 
 Array = NDArray[Any]
 
@@ -35,6 +37,16 @@ def rehearsal_frames(rig: Rig) -> dict[str, Array]:
         signal = _periodic(tile, rows, columns) * (sensor.full_scale_dn - sensor.black_dn)
         frames[sensor.name] = (sensor.black_dn + signal).astype(np.uint16)
     return frames
+
+
+def rehearsal_radiometry(sensor: Sensor) -> RadiometricCalibration:
+    """A calibration with maps and a defect, for a sensor of no flight."""
+    shape = (sensor.height_px, sensor.width_px)
+    gain = np.ones(shape, np.float32)
+    gain[0] = 1.01
+    defect = np.zeros(shape, np.uint8)
+    defect[shape[0] // 2, shape[1] // 2] = 1
+    return replace(neutral_radiometry(sensor), gain=gain, defect=defect)
 
 
 def _tile() -> Array:

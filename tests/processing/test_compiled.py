@@ -1,0 +1,26 @@
+"""Compiling beforehand: after it every kernel of the pipeline is ready."""
+
+from __future__ import annotations
+
+from processing.compiled import compile_for, kernels
+from processing.rig import find_rig
+
+
+def test_installation_leaves_every_kernel_that_is_called_from_python_ready() -> None:
+    done = compile_for(find_rig("ultracam-x-mini"))
+    assert set(done.variants) == set(kernels())
+    called = {
+        "level1.flat_pass",
+        "level1.map_pass",
+        "level1.interpolate_defects",
+        "matching.select_features",
+        "matching.match_patches",
+        "balance.node_means",
+        "seams.cheapest_path",
+        "seams.feather",
+        "resampling.resample",
+        "quicklook.block_means",
+    }
+    ready = {name.removeprefix("processing.") for name, count in done.variants.items() if count}
+    assert ready >= called
+    assert compile_for(find_rig("ultracam-x-mini")).compiled == 0
