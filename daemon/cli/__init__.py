@@ -21,6 +21,7 @@ app = typer.Typer(
     help="Onboard software of an aerial camera made of several heads.",
     epilog="Begin with: syntopic demo",
     no_args_is_help=True,
+    add_completion=False,
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},

@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich import box
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
 from daemon.cli.sim import Emulator, EmulatorError, service_toml, simulator_arguments
+from daemon.cli.tables import light_table
 
 HELP = """Fly the first flight: an emulated rig is captured, stitched and judged.
 
@@ -130,15 +130,7 @@ def _events(service: subprocess.Popen[str]) -> Iterator[dict[str, Any]]:
 
 def _table(rows: Mapping[int, Mapping[str, Any]], exposures: int) -> Table:
     """The live table; it fits a terminal of 80 columns."""
-    table = Table(
-        title=f"Line 1, {exposures} exposures",
-        title_justify="left",
-        box=box.SIMPLE,
-        pad_edge=False,
-        padding=(0, 1),
-    )
-    for heading in _HEADINGS:
-        table.add_column(heading, justify="right", no_wrap=True)
+    table = light_table(f"Line 1, {exposures} exposures", (), _HEADINGS)
     for number, told in sorted(rows.items()):
         table.add_row(str(number), *_cells(told))
     return table
@@ -252,24 +244,19 @@ def _time_sigma(mission: Path) -> Iterator[int]:
 
 def _print_result(console: Console, result: Mapping[str, Any], ledger: Mapping[str, Any]) -> None:
     counts = ledger["triggers"]
-    sheet = Table(title="Ledger", title_justify="left")
-    for heading in ("", "triggers", "complete", "degraded", "lost", "open"):
-        sheet.add_column(heading, justify="right")
+    sheet = light_table("Ledger", ("",), ("triggers", "complete", "degraded", "lost", "open"))
     sheet.add_row(
         "exposures",
         *(str(counts[key]) for key in ("triggers", "complete", "degraded", "lost", "open")),
     )
     console.print(sheet)
-    received = Table()
-    for heading in ("", "received", "used", "late", "duplicate", "corrupt", "spurious"):
-        received.add_column(heading, justify="right")
+    causes = ("received", "used", "late", "duplicate", "corrupt", "spurious")
+    received = light_table("", ("",), causes)
     for name in ("frames", "marks"):
-        received.add_row(name, *(str(ledger[name][h.header]) for h in received.columns[1:]))
+        received.add_row(name, *(str(ledger[name][cause]) for cause in causes))
     console.print(received)
     console.print("balanced" if result["ledger_balanced"] else "[bold red]does not balance[/]")
-    geometry = Table(title="Geometry against truth (PAN pixels)", title_justify="left")
-    for heading in ("method", "RMS", "worst"):
-        geometry.add_column(heading, justify="right")
+    geometry = light_table("Geometry against truth, PAN pixels", ("method",), ("RMS", "worst"))
     geometry.add_row("free mosaic, inner", *_pair(result["rms_px"], result["max_px"]))
     geometry.add_row(
         "free mosaic, absolute", *_pair(result["rms_px_absolute"], result["max_px_absolute"])

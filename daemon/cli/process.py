@@ -12,8 +12,8 @@ from typing import Annotated
 import typer
 from rich.console import Console
 from rich.progress import Progress
-from rich.table import Table
 
+from daemon.cli.tables import light_table
 from daemon.configuration import ConfigurationError, PlanSection, ProcessingSection
 from daemon.mission import Mission
 
@@ -87,9 +87,11 @@ def process(
     if as_json:
         typer.echo(json.dumps({"mission": str(folder.path), "exposures": reports}))
         return
-    table = Table(title=f"Level-2 of {folder.id}", title_justify="left")
-    for heading in ("exposure", "tie points", "sigma0 px", "sigma0 um", "verdict", "s"):
-        table.add_column(heading, justify="right")
+    table = light_table(
+        f"Level-2 of {folder.id}",
+        (),
+        ("exposure", "tie points", "sigma0 px", "sigma0 um", "verdict", "s"),
+    )
     for report in reports:
         figures = report["figures"]
         table.add_row(

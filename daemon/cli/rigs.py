@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
+from daemon.cli.tables import light_table
 from processing.rig import Rig, find_rig, load_rig, shipped_rigs
 
 app = typer.Typer(
@@ -32,19 +32,17 @@ def rigs(
     if as_json:
         typer.echo(json.dumps({"rigs": [_row(rig) for rig in loaded]}))
         return
-    table = Table(title="Rigs", title_justify="left")
-    for heading in ("name", "camera", "image", "sensors", "cones", "timing", "interval"):
-        table.add_column(heading)
+    figures = ("image px", "sensors", "cones", "interval s")
+    table = light_table("Rigs", ("name", "timing"), figures)
     for rig in loaded:
         image = rig.virtual_image
         table.add_row(
             rig.name,
-            rig.title,
+            rig.timing,
             f"{image.width_px} x {image.height_px}" if image else "none",
             str(len(rig.sensors)),
             str(len(rig.cones)),
-            rig.timing,
-            f"{rig.frame_interval_s:g} s",
+            f"{rig.frame_interval_s:g}",
         )
     console = Console()
     console.print(table)
@@ -101,28 +99,23 @@ def show(
         return
     console = Console()
     console.print(f"[bold]{rig.name}[/]  {rig.title}; {rig.timing}")
-    cones = Table(title="Cones", title_justify="left")
-    for heading in ("cone", "bands", "f mm", "forward mm", "right mm", "sensors"):
-        cones.add_column(heading)
-    cones.add_column("parameters", justify="right")
-    cones.add_column("constraints", justify="right")
+    figures = ("f mm", "forward mm", "right mm", "param.", "constr.")
+    cones = light_table("Cones", ("cone", "bands", "sensors"), figures)
     layers = {layer.cone: layer for layer in counts.cones}
     for cone in rig.cones:
         layer = layers.get(cone.name)
         cones.add_row(
-            cone.name + (" (master)" if cone.name == rig.master_cone else ""),
+            cone.name + (" master" if cone.name == rig.master_cone else ""),
             ", ".join(cone.bands),
+            " ".join(sensor.name for sensor in cone.sensors),
             f"{cone.lens.f_mm:.3f}",
             f"{cone.position_mm[0]:g}",
             f"{cone.position_mm[1]:g}",
-            ", ".join(sensor.name for sensor in cone.sensors),
-            str(layer.parameters) if layer else "registered",
-            str(layer.constraints) if layer else "",
+            str(layer.parameters) if layer else "-",
+            str(layer.constraints) if layer else "-",
         )
     console.print(cones)
-    strips = Table(title=f"Overlaps ({len(overlaps)})", title_justify="left")
-    for heading in ("sensors", "width px", "height px"):
-        strips.add_column(heading)
+    strips = light_table(f"Overlaps ({len(overlaps)})", ("sensors",), ("width px", "height px"))
     for overlap in overlaps:
         strips.add_row(
             f"{overlap.sensor_a} - {overlap.sensor_b}",
@@ -132,7 +125,8 @@ def show(
     console.print(strips)
     console.print(
         f"Adjustment: {counts.parameters} parameters, {counts.constraints} constraints, "
-        f"{counts.parameters - counts.constraints} independent unknowns"
+        f"{counts.parameters - counts.constraints} independent unknowns (a cone with - is "
+        f"registered to green)"
     )
     console.print(f"Focal planes drawn in [bold]{path}[/]")
 

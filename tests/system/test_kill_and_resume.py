@@ -94,6 +94,7 @@ def test_a_killed_service_goes_on_in_the_same_flight(emulator: tuple[Emulator, P
     assert second.wait(30) == 0
     (told,) = [event for event in events if event["event"] == "mission"]
     assert told["path"] == mission and told["resumed"]
+    assert any("sealed from the log (event-mark)" in done for done in told["recovery"])
     held = [event for event in events if event.get("name") == "held-by-another"]
     assert held, "the heads hold the dead controller's privilege, and that is said"
     (ended,) = [event for event in events if event["event"] == "ended"]
