@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sqlite3
 import threading
+import time
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -20,6 +21,8 @@ from daemon.exposure import Capture, Exposure, FrameRecord
 SCHEMA_VERSION = 1
 BUSY_TIMEOUT_S = 10.0
 """How long a writer waits while another process commits."""
+
+BUSY_RETRY_S = 0.01
 
 _SCHEMA = """
 CREATE TABLE exposures (
@@ -73,6 +76,10 @@ class CatalogError(DaemonError):
     """An index that cannot be used; the sentence says what to do."""
 
 
+class CatalogBusyError(DaemonError):
+    """An index that is well but held by another process; nothing is to be repaired."""
+
+
 @dataclass(frozen=True)
 class Row:
     """What the index knows of an exposure. `state` is "stored" until it is sealed."""
@@ -103,6 +110,7 @@ class Catalog:
 
         Raises:
             CatalogError: damaged, or of another schema version.
+            CatalogBusyError: another process holds it and does not let go.
         """
         try:
             connection = sqlite3.connect(
@@ -111,12 +119,16 @@ class Catalog:
         except sqlite3.Error as error:
             raise CatalogError(f"{path}: cannot be opened ({error})") from error
         try:
-            connection.execute("PRAGMA journal_mode = WAL")
+            _enter_wal(connection)
             connection.execute("PRAGMA synchronous = FULL")
             connection.execute("PRAGMA foreign_keys = ON")
             _prepare(connection, path)
         except sqlite3.Error as error:
             connection.close()
+            if _is_busy(error):
+                raise CatalogBusyError(
+                    f"{path}: held by another process for {BUSY_TIMEOUT_S:g} s; end that process"
+                ) from error
             raise CatalogError(_damaged(path, error)) from error
         except CatalogError:
             connection.close()
@@ -320,6 +332,26 @@ def _prepare(connection: sqlite3.Connection, path: Path) -> None:
         _create(connection)
     else:
         raise CatalogError(_wrong_version(path, version))
+
+
+def _enter_wal(connection: sqlite3.Connection) -> None:
+    """Switch to WAL. SQLite answers at once, without its busy time-out, when two do so together."""
+    deadline = time.monotonic() + BUSY_TIMEOUT_S
+    while True:
+        try:
+            connection.execute("PRAGMA journal_mode = WAL")
+        except sqlite3.OperationalError as error:
+            if not _is_busy(error) or time.monotonic() > deadline:
+                raise
+            time.sleep(BUSY_RETRY_S)
+        else:
+            return
+
+
+def _is_busy(error: sqlite3.Error) -> bool:
+    # The low byte is the primary result code; the others say more about it.
+    code = getattr(error, "sqlite_errorcode", 0) & 0xFF
+    return code in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED)
 
 
 def _create(connection: sqlite3.Connection) -> None:

@@ -126,6 +126,15 @@ class Log:
     message: Message
 
 
+@dataclass(frozen=True)
+class NoteProducts:
+    """Note in the index that an exposure has products: file name to size in bytes."""
+
+    number: int
+    files: Mapping[str, int]
+    verdict: str | None
+
+
 # From the writer
 
 
@@ -192,6 +201,7 @@ class Processed:
 
     number: int
     report: Mapping[str, Any]
+    files: Mapping[str, int]
     duration_s: float
 
 

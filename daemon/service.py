@@ -7,7 +7,6 @@ It decides nothing about matching (`daemon.flight`), when to expose (`daemon.lin
 from __future__ import annotations
 
 import asyncio
-import hashlib
 import signal
 import time
 import traceback
@@ -15,27 +14,26 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from daemon import recovery
 from daemon.configuration import Configuration
-from daemon.devices import device_specs, frame_nbytes, serial_problem
+from daemon.departure import identity, open_mission, processes
+from daemon.devices import serial_problem
 from daemon.exposure import Exposure
-from daemon.flight import Flight, Identity
+from daemon.flight import Flight
 from daemon.ledger import Ledger
 from daemon.line import Line, Order
 from daemon.log_records import LoggedTrigger, Message, message_of
 from daemon.matching import Cause, Pulse
-from daemon.memory import FrameRing
 from daemon.messages import (
     Bound,
     Fire,
     Fired,
     Log,
     NotBound,
+    NoteProducts,
     Pong,
     Process,
     Processed,
@@ -46,7 +44,6 @@ from daemon.messages import (
     Store,
     Stored,
     WorkerReady,
-    WorkerSettings,
     WriteFailed,
 )
 from daemon.mission import Mission
@@ -63,7 +60,7 @@ from drivers.contract import (
     Record,
     TemperatureSample,
 )
-from processing.rig import Rig, shipped_rigs
+from processing.rig import Rig
 
 TICK_S = 0.05
 PING_S = 1.0
@@ -123,7 +120,7 @@ class Service:
         loop.set_exception_handler(lambda _, context: self._broke(context))
         for name in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(name, self.stopping.set)
-        mission = self._open_mission()
+        mission, self.is_resumed = open_mission(self.configuration, self.rig, self.config_path)
         with mission.held():
             self._start(mission)
             tasks = [
@@ -143,21 +140,6 @@ class Service:
 
     # Before the flight
 
-    def _open_mission(self) -> Mission:
-        root = self.configuration.mission.root
-        mission = Mission.current(root) if root.is_dir() else None
-        self.is_resumed = mission is not None
-        if mission is None:
-            rig_path = shipped_rigs().get(self.configuration.mission.rig)
-            mission = Mission.create(
-                root,
-                self.rig.name,
-                rig_toml=(rig_path or Path(self.configuration.mission.rig)).read_bytes(),
-                service_toml=self.config_path.read_bytes(),
-                started_utc=datetime.now(UTC),
-            )
-        return mission
-
     def _start(self, mission: Mission) -> None:
         report = recovery.recover(mission, seal_from_log(self.rig))
         self._event(
@@ -167,51 +149,19 @@ class Service:
             recovery=list(report.sentences),
             next_number=report.next_number,
         )
+        heads = [head.sensor for head in self.configuration.head]
         self.flight = Flight(
             self.rig,
-            {head.sensor: self.rig.sensor(head.sensor).serial for head in self.configuration.head},
-            self._identity(mission),
+            {head: self.rig.sensor(head).serial for head in heads},
+            identity(self.configuration, self.rig, mission),
             self.configuration.limits,
-            Ledger.resume(
-                report.settled,
-                heads=[head.sensor for head in self.configuration.head],
-                sheet=report.ledger_sheet,
-            ),
+            Ledger.resume(report.settled, heads=heads, sheet=report.ledger_sheet),
             report.next_number,
         )
         flown = len(report.settled)
         self.line = Line(self.configuration, self.rig, self.flight, mission.path, flown)
-        rings = tuple(
-            FrameRing.create(
-                head.sensor,
-                self.configuration.limits.exposures_in_memory,
-                frame_nbytes(self.rig, head.sensor),
-            )
-            for head in self.configuration.head
-        )
-        worker = WorkerSettings(
-            rig=str(mission.rig_path),
-            radiometry=self.configuration.mission.radiometry,
-            mission=mission.path,
-            plan=self.configuration.plan,
-            processing=self.configuration.processing,
-        )
-        one, many = _thread_counts(1), _thread_counts(self.configuration.processing.threads)
-        specs = device_specs(self.configuration, self.rig)
-        self.supervisor.spawn("writer", "daemon.writer:main", (mission.path, rings), one)
-        self.supervisor.spawn("worker", "daemon.worker:main", (worker, rings), many)
-        self.supervisor.spawn("capture", "daemon.capture:main", (specs, rings), one)
-
-    def _identity(self, mission: Mission) -> Identity:
-        return Identity(
-            boot_id=Path("/proc/sys/kernel/random/boot_id").read_text().strip(),
-            line_id=self.configuration.plan.line,
-            calibration_id=self.rig.calibration_id,
-            calibration_sha256=_sha256(mission.rig_path),
-            configuration_sha256=_sha256(mission.service_path),
-            software=f"syntopic {version('syntopic')}",
-            simulated=self.configuration.mission.simulated,
-        )
+        for process in processes(self.configuration, self.rig, mission):
+            self.supervisor.spawn(*process)
 
     # What the processes say
 
@@ -330,6 +280,8 @@ class Service:
     def _on_processed(self, done: Processed) -> None:
         seconds = round(done.duration_s, 3)
         self._event("processed", number=done.number, report=dict(done.report), duration_s=seconds)
+        verdict = done.report.get("verdict")
+        self.supervisor.send("writer", NoteProducts(done.number, done.files, verdict))
         self._worker_is_free(done.number)
 
     def _on_process_failed(self, failed: ProcessFailed) -> None:
@@ -489,11 +441,6 @@ class Service:
 _DELIVERS = frozenset({"opened", "recovered", "active"})
 
 
-def _thread_counts(threads: int) -> dict[str, str]:
-    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
-    return dict.fromkeys(names, str(threads))
-
-
 def _summary(exposure: Exposure) -> dict[str, Any]:
     navigation = exposure.navigation
     return {
@@ -507,7 +454,3 @@ def _summary(exposure: Exposure) -> dict[str, Any]:
         "temperatures_c": {t.probe: t.value_c for t in exposure.temperatures},
         "height_m": navigation.height_m if navigation else None,
     }
-
-
-def _sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()

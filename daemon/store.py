@@ -156,6 +156,10 @@ class Level0Writer:
         self._commit(lambda: self._catalog.add_sealed(final, sha256), exposure.number)
         return sha256
 
+    def note_products(self, number: int, files: Mapping[str, int], verdict: str | None) -> None:
+        """Note in the index that an exposure was processed. OSError: the disk refused."""
+        self._commit(lambda: self._catalog.add_products(number, files, verdict), number)
+
     def close(self) -> None:
         """Let go of threads and index; may be called twice."""
         self._pool.shutdown()

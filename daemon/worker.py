@@ -81,17 +81,17 @@ def process_exposure(
     exposure: Exposure,
     frames: Mapping[str, NDArray[np.uint16]],
     flags: Flag = Flag(0),  # noqa: B008 - an immutable value
-) -> dict[str, Any]:
+) -> tuple[dict[str, Any], Mapping[str, int]]:
     """Run the pipeline on one exposure and write its Level-2 folder.
 
     Returns:
-        The content of quality.json.
+        The content of quality.json, and the files written with their sizes in bytes.
     """
     product = pipeline.process(frames, conditions_of(exposure, rig, plan, flags))
     report = as_json(product.report)
     report["exposure"] = exposure.number
     report["timings_s"] = {stage: round(s, 4) for stage, s in product.timings_s.items()}
-    products.write_level2(
+    written = products.write_level2(
         mission,
         exposure.number,
         pan=product.pan,
@@ -101,7 +101,7 @@ def process_exposure(
         geometry=product.geometry,
         residuals_svg=residuals_svg(rig, product.tie_points, product.mosaic, product.validity),
     )
-    return report
+    return report, written.files
 
 
 def _process(
@@ -126,11 +126,11 @@ def _process(
                 )
                 for frame in exposure.frames
             }
-        report = process_exposure(pipeline, rig, mission, plan, exposure, frames, flags)
+        report, files = process_exposure(pipeline, rig, mission, plan, exposure, frames, flags)
     except (OSError, ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
         sentence = (
             f"exposure {exposure.number} was stored but not processed: {error}; "
             f"run syntopic process {mission.path} after landing"
         )
         return ProcessFailed(exposure.number, sentence)
-    return Processed(exposure.number, report, time.monotonic() - started)
+    return Processed(exposure.number, report, files, time.monotonic() - started)

@@ -7,13 +7,25 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 from daemon.errors import DaemonError
 from daemon.exposure import Exposure
 from daemon.flight_log import FlightLog
 from daemon.memory import FrameRing
-from daemon.messages import Log, Ping, Pong, Seal, Sealed, Stop, Store, Stored, WriteFailed
+from daemon.messages import (
+    Log,
+    NoteProducts,
+    Ping,
+    Pong,
+    Seal,
+    Sealed,
+    Stop,
+    Store,
+    Stored,
+    WriteFailed,
+)
 from daemon.mission import Mission
 from daemon.processes import Link
 from daemon.store import Level0Writer
@@ -35,6 +47,10 @@ def main(link: Link, mission_path: Path, rings: tuple[FrameRing, ...]) -> None:
             link.send(_store(writer, memory, order))
         elif isinstance(order, Seal):
             link.send(_seal(writer, order.exposure))
+        elif isinstance(order, NoteProducts):
+            # A refusal costs nothing: recovery finds the products when the service starts next.
+            with suppress(OSError, DaemonError):
+                writer.note_products(order.number, order.files, order.verdict)
         elif isinstance(order, Log):
             log.write(order.message)
         elif isinstance(order, Ping):

@@ -14,6 +14,7 @@ from rich.console import Console
 
 from daemon.cli import check, demo, kernels, process, rigs, run, sim, verify
 from daemon.configuration import ConfigurationError
+from daemon.errors import DaemonError
 from processing.rig import RigError
 
 app = typer.Typer(
@@ -47,4 +48,7 @@ def main() -> NoReturn:
         for problem in error.problems:
             console.print(f"  {problem}", markup=False, highlight=False)
         sys.exit(2)
+    except DaemonError as error:
+        Console(stderr=True, soft_wrap=True).print(str(error), style="red", markup=False)
+        sys.exit(1)
     sys.exit(0)

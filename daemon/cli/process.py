@@ -80,7 +80,7 @@ def process(
         for number in numbers:
             started = time.monotonic()
             frames, exposure = store.load_level0(folder.level0(number), rig)
-            report = process_exposure(pipeline, rig, folder, plan, exposure, frames)
+            report, _ = process_exposure(pipeline, rig, folder, plan, exposure, frames)
             report["duration_s"] = round(time.monotonic() - started, 3)
             reports.append(report)
             progress.advance(task)

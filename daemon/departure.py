@@ -1,0 +1,98 @@
+"""Before a flight: its mission folder, what its records repeat, and its processes.
+
+Nothing here waits or decides; `daemon.service` starts what is laid out.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from daemon.configuration import Configuration
+from daemon.devices import device_specs, frame_nbytes
+from daemon.flight import Identity
+from daemon.memory import FrameRing
+from daemon.messages import WorkerSettings
+from daemon.mission import Mission
+from processing.rig import Rig, shipped_rigs
+
+
+class ProcessPlan(NamedTuple):
+    """A process of the service, as `Supervisor.spawn` takes it."""
+
+    name: str
+    target: str
+    arguments: tuple[Any, ...]
+    environment: Mapping[str, str]
+
+
+def open_mission(configuration: Configuration, rig: Rig, config_path: Path) -> tuple[Mission, bool]:
+    """The mission that was being flown, else a new one; and whether it goes on.
+
+    Raises:
+        MissionError: the marker of the mission being flown is damaged.
+        OSError: the disk refused.
+    """
+    root = configuration.mission.root
+    current = Mission.current(root) if root.is_dir() else None
+    if current is not None:
+        return current, True
+    rig_path = shipped_rigs().get(configuration.mission.rig, Path(configuration.mission.rig))
+    created = Mission.create(
+        root,
+        rig.name,
+        rig_toml=rig_path.read_bytes(),
+        service_toml=config_path.read_bytes(),
+        started_utc=datetime.now(UTC),
+    )
+    return created, False
+
+
+def identity(configuration: Configuration, rig: Rig, mission: Mission) -> Identity:
+    """What every record of this flight repeats."""
+    return Identity(
+        boot_id=Path("/proc/sys/kernel/random/boot_id").read_text().strip(),
+        line_id=configuration.plan.line,
+        calibration_id=rig.calibration_id,
+        calibration_sha256=_sha256(mission.rig_path),
+        configuration_sha256=_sha256(mission.service_path),
+        software=f"syntopic {version('syntopic')}",
+        simulated=configuration.mission.simulated,
+    )
+
+
+def processes(configuration: Configuration, rig: Rig, mission: Mission) -> tuple[ProcessPlan, ...]:
+    """Writer, worker and capture, over one set of frame memory."""
+    rings = tuple(
+        FrameRing.create(
+            head.sensor, configuration.limits.exposures_in_memory, frame_nbytes(rig, head.sensor)
+        )
+        for head in configuration.head
+    )
+    worker = WorkerSettings(
+        rig=str(mission.rig_path),
+        radiometry=configuration.mission.radiometry,
+        mission=mission.path,
+        plan=configuration.plan,
+        processing=configuration.processing,
+    )
+    one, many = _thread_counts(1), _thread_counts(configuration.processing.threads)
+    specs = device_specs(configuration, rig)
+    return (
+        ProcessPlan("writer", "daemon.writer:main", (mission.path, rings), one),
+        ProcessPlan("worker", "daemon.worker:main", (worker, rings), many),
+        ProcessPlan("capture", "daemon.capture:main", (specs, rings), one),
+    )
+
+
+def _thread_counts(threads: int) -> dict[str, str]:
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+    return dict.fromkeys(names, str(threads))
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
