@@ -133,8 +133,8 @@ def _focal_plane(rig: Rig, cone: Cone, x: float, y: float, cell: float, reach: f
     marks += " colour master" if cone.name == rig.colour_master_cone else ""
     parts = [
         _text(x, y + 9, f"cone {cone.name}{marks}", 12, weight="bold"),
-        _text(x + cell, y + 9, f"f {cone.lens.f_mm:.1f} mm", 10, _FAINT, anchor="end"),
         _rect(x, y + 16, cell, cell, fill="#f6f8fa", stroke="#d5dce3"),
+        _text(x + cell - 6, y + 28, f"f {cone.lens.f_mm:.1f} mm", 10, _FAINT, anchor="end"),
         _line(cx, y + 16, cx, y + 16 + cell, "#d5dce3"),
         _line(x, cy, x + cell, cy, "#d5dce3"),
         _text(cx + 4, y + 28, "\u25b2", 9, _FAINT),

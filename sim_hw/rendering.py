@@ -95,7 +95,10 @@ def grid_axis(length_px: int, spacing_px: int) -> Array:
 def light_on_sensor(
     world: World, scene: Scene, flight: Flight, cone: Cone, sensor: Sensor, look: Look
 ) -> Map:
-    """Radiance on the pixels of a raw frame, shape (height, width), forward motion included."""
+    """Radiance on the pixels of a raw frame, shape (height, width), forward motion included.
+
+    Behind a colour filter array each pixel has the light of its own filter's band.
+    """
     # The grid reaches past the last pixel, so that every cell of it is a full one.
     columns = np.arange(-(-sensor.width_px // GRID_PX) + 1, dtype=np.float64) * GRID_PX
     rows = np.arange(-(-sensor.height_px // GRID_PX) + 1, dtype=np.float64) * GRID_PX
@@ -104,14 +107,37 @@ def light_on_sensor(
     ground = ground_points(world, cone, sensor, c, r, look, pose)
     positions = scene_positions(world, scene, flight, ground)
     size = (sensor.height_px, sensor.width_px)
+    smear = residual_smear_px(world, flight, cone, sensor, look)
+    if sensor.colour_filter_array != "none":
+        return _through_filters(scene, sensor, positions, smear)
     total: Map | None = None
     for band, share in _mix_of(cone, scene):
         light = sample_scene(scene, band, positions, size)
         total = light * np.float32(share) if total is None else total + light * np.float32(share)
     if total is None:
         raise ValueError(f"cone {cone.name} has no band that the scene knows")
-    smear = residual_smear_px(world, flight, cone, sensor, look)
     return smeared(total, smear)
+
+
+FILTERS = {"R": "red", "G": "green", "B": "blue"}
+
+
+def filter_of(colour_filter_array: str, *, column: int, row: int) -> str:
+    """The band that a pixel sees; the array's four letters are (0, 0), (1, 0), (0, 1), (1, 1)."""
+    return FILTERS[colour_filter_array[2 * (row % 2) + column % 2]]
+
+
+def _through_filters(
+    scene: Scene, sensor: Sensor, positions: Array, smear_px: tuple[float, float]
+) -> Map:
+    mosaic = np.empty((sensor.height_px, sensor.width_px), dtype=np.float32)
+    for band in FILTERS.values():
+        light = smeared(sample_scene(scene, band, positions, mosaic.shape), smear_px)
+        for row in (0, 1):
+            for column in (0, 1):
+                if filter_of(sensor.colour_filter_array, column=column, row=row) == band:
+                    mosaic[row::2, column::2] = light[row::2, column::2]
+    return mosaic
 
 
 def _mix_of(cone: Cone, scene: Scene) -> Sequence[tuple[str, float]]:

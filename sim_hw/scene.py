@@ -37,7 +37,8 @@ WHITE_PERCENTILE = 99.5
 FORMAT = 1
 BLOCK_ROWS = 1024
 COLOUR_STEP = 2
-"""Colour bands are kept at every second sample: fine enough for pixels of three."""
+"""Colour bands are kept at every second sample where colour pixels have three or more."""
+WIDE_COLOUR_RATIO = 3
 TONE_EXPONENT = 1.8
 """Radiance from stored level: less than the 2.2 of a display, for cameras deepen their shadows."""
 SOURCE_REDUCTION = 0.75
@@ -67,6 +68,11 @@ class SceneSettings:
     file: str | None = None
 
     @property
+    def colour_step(self) -> int:
+        """Samples between those kept of the colour bands; finer detail than this is blurred."""
+        return COLOUR_STEP if self.colour_ratio >= WIDE_COLOUR_RATIO else 1
+
+    @property
     def key(self) -> str:
         """Name of the scene in a cache."""
         facts: dict[str, object] = {"format": FORMAT, **asdict(self)}
@@ -83,7 +89,7 @@ class SceneSettings:
 class Scene:
     """Bands by name ("pan", "red", ...), each the coefficients of a spline, (rows, columns).
 
-    `step` is the distance of a band's samples: 1 for PAN, `COLOUR_STEP` for colour.
+    `step` is the distance of a band's samples: 1 for PAN, `SceneSettings.colour_step` for colour.
     """
 
     settings: SceneSettings
@@ -92,7 +98,7 @@ class Scene:
     reused_patches: int
 
     def step(self, band: str) -> int:
-        return 1 if band == "pan" else COLOUR_STEP
+        return 1 if band == "pan" else self.settings.colour_step
 
 
 def open_scene(settings: SceneSettings, cache: Path) -> Scene:
@@ -185,11 +191,12 @@ def _store_bands(canvas: quilting.Picture, settings: SceneSettings, folder: Path
     """Write the bands as the lens delivers them, block by block."""
     height, width = canvas.shape[:2]
     pan = _new_band(folder / "pan.npy", height, width)
-    small = (-(-height // COLOUR_STEP), -(-width // COLOUR_STEP))
+    step = settings.colour_step
+    small = (-(-height // step), -(-width // step))
     colours = [_new_band(folder / f"{name}.npy", *small) for name in COLOURS]
     sigma_pan = settings.psf_px
     sigma_colour = settings.psf_px * settings.colour_ratio
-    halo = COLOUR_STEP * (spline.REACH + int(np.ceil(2 * sigma_colour)))
+    halo = step * (spline.REACH + int(np.ceil(2 * sigma_colour)))
     mix = np.array([[PAN_MIX[name] for name in COLOURS]], dtype=np.float32)
     for start in range(0, height, BLOCK_ROWS):
         stop = min(start + BLOCK_ROWS, height)
@@ -197,9 +204,9 @@ def _store_bands(canvas: quilting.Picture, settings: SceneSettings, folder: Path
         block = canvas[low:high].astype(np.float32) / np.float32(UNIT)
         grey = spline.coefficients(cv2.transform(block, mix), sigma_pan)
         pan[start:stop] = spline.stored(grey[start - low : stop - low])
-        soft = _blurred(block, sigma_colour)[::COLOUR_STEP, ::COLOUR_STEP]
-        skip, place = (start - low) // COLOUR_STEP, start // COLOUR_STEP
-        rows = -(-(stop - start) // COLOUR_STEP)
+        soft = _blurred(block, sigma_colour)[::step, ::step]
+        skip, place = (start - low) // step, start // step
+        rows = -(-(stop - start) // step)
         for i, band in enumerate(colours):
             smooth = spline.coefficients(np.ascontiguousarray(soft[..., i]))
             band[place : place + rows] = spline.stored(smooth[skip : skip + rows])

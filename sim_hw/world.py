@@ -20,6 +20,8 @@ FORWARD_OVERLAP = 0.6
 SIDE_OVERLAP = 0.3
 TDI_EXPOSURE_S = 0.005
 """Exposures are planned near this; exactly a whole number of TDI shifts long."""
+FILTERED_SMEAR_PX = 0.5
+"""Heads behind a colour filter array have no TDI; they expose for at most so much motion."""
 SIDE_MARGIN = 0.11
 """Share of the image width that the scene is wider on either side: tremor, crab and wander."""
 END_MARGIN = 0.16
@@ -142,7 +144,7 @@ class World:
 
 
 def survey_plan(rig: Rig, settings: WorldSettings) -> SurveyPlan:
-    """Plan 60 % forward overlap and exposures of a whole number of TDI shifts."""
+    """Plan 60 % forward overlap and exposures of whole TDI shifts (none for Bayer heads)."""
     image = rig.virtual_image
     if image is None:
         raise ValueError(f"rig {rig.name} has no virtual image; it cannot be flown here")
@@ -154,8 +156,14 @@ def survey_plan(rig: Rig, settings: WorldSettings) -> SurveyPlan:
     for cone in rig.cones:
         sensor = cone.sensors[0]
         cone_gsd = sensor.pitch_um * 1e-3 * height / cone.lens.f_mm
-        shifts[cone.name] = max(1, round(TDI_EXPOSURE_S * speed / cone_gsd))
-        times[cone.name] = round(shifts[cone.name] * cone_gsd / speed * 1e6, 1)
+        if sensor.colour_filter_array != "none":
+            # Shifted charge would gather light of other filters: exposed shortly instead.
+            shifts[cone.name] = 0
+            seconds = min(TDI_EXPOSURE_S, FILTERED_SMEAR_PX * cone_gsd / speed)
+        else:
+            shifts[cone.name] = max(1, round(TDI_EXPOSURE_S * speed / cone_gsd))
+            seconds = shifts[cone.name] * cone_gsd / speed
+        times[cone.name] = round(seconds * 1e6, 1)
     return SurveyPlan(
         distance_m=round((1 - FORWARD_OVERLAP) * image.height_px * gsd, 3),
         height_above_ground_m=height,
