@@ -10,6 +10,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from processing.drift import lagged_probe, lagged_sensors
+from processing.probe_health import bridge_by_others
 from processing.quality import NO_FLAGS, Figure, Flag, Thresholds
 from processing.rig import Cone, Rig
 
@@ -44,11 +46,21 @@ class Conditions:
 
 @dataclass(frozen=True)
 class Temperatures:
-    """Temperatures that can be used, and the probes that gave none or an impossible one."""
+    """Temperatures that can be used, and the probes that gave none or an impossible one.
+
+    `usable_c` are as read, lagged ones of sensors among them; `bridged_c` stand in for probes
+    without, taken from the others.
+    """
 
     usable_c: Mapping[str, float]
     missing: tuple[str, ...]
     out_of_range: tuple[str, ...]
+    bridged_c: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def placing_c(self) -> dict[str, float]:
+        """What sensors are placed with: as read where it can be used, else bridged."""
+        return {**self.bridged_c, **self.usable_c}
 
 
 def usable_temperatures(rig: Rig, conditions: Conditions, thresholds: Thresholds) -> Temperatures:
@@ -62,7 +74,12 @@ def usable_temperatures(rig: Rig, conditions: Conditions, thresholds: Thresholds
             usable[probe] = value
         else:
             out_of_range.append(probe)
-    return Temperatures(usable, tuple(missing), tuple(out_of_range))
+    bridged = bridge_by_others(rig, usable)
+    for sensor in lagged_sensors(rig):
+        lagged = conditions.temperatures_c.get(lagged_probe(sensor))
+        if sensor.probe in usable and lagged is not None and math.isfinite(lagged):
+            usable[lagged_probe(sensor)] = lagged
+    return Temperatures(usable, tuple(missing), tuple(out_of_range), bridged)
 
 
 def condition_figures(

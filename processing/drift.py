@@ -1,14 +1,15 @@
 """TDM, the temperature dependent model: a sensor's place and a cone's principal distance at dC.
 
 dC is the temperature at exposure minus the temperature at calibration, measured by the sensor's or
-the cone's own probe. A time lag of a probe is the caller's to filter: temperatures come in as they
-hold.
+the cone's own probe. A sensor that follows its probe with a lag has a temperature of its own under
+the name `lagged_probe` gives it; `lag_step` is the filter it is made with.
 
 Source: DESIGN 5.3; seeds/ultracam-calibration.txt, "temperature dependant model".
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 from processing.rig import Cone, Rig, Sensor
@@ -16,8 +17,44 @@ from processing.similarity import Similarity
 
 
 def sensor_dc(sensor: Sensor, temperatures_c: Mapping[str, float]) -> float:
-    """dC of a sensor, K; zero where its probe has no temperature."""
-    return temperatures_c.get(sensor.probe, sensor.calibration_c) - sensor.calibration_c
+    """dC of a sensor, K; zero where its probe has no temperature.
+
+    Its lagged temperature counts where the rig asks for one and it is there.
+    """
+    known = temperatures_c.get(sensor.probe, sensor.calibration_c)
+    if sensor.drift.lag_s > 0.0:
+        known = temperatures_c.get(lagged_probe(sensor), known)
+    return known - sensor.calibration_c
+
+
+def lagged_probe(sensor: Sensor) -> str:
+    """The name under which a sensor's lagged temperature goes, beside those of the probes."""
+    return f"{sensor.probe}/{sensor.name}"
+
+
+def lagged_sensors(rig: Rig) -> tuple[Sensor, ...]:
+    """The sensors that follow their probes with a lag."""
+    return tuple(sensor for sensor in rig.sensors if sensor.drift.lag_s > 0.0)
+
+
+def lag_step(lagged_c: float, before_c: float, now_c: float, step_s: float, lag_s: float) -> float:
+    """One step of a first-order lag: dy/dt = (x - y) / lag.
+
+    Exact for a probe that went straight from `before_c` to `now_c`, whatever the step.
+
+    Args:
+        lagged_c: y at the beginning of the step.
+        before_c: x there.
+        now_c: x at its end.
+        step_s: its length; below or at zero changes nothing.
+        lag_s: time constant; zero follows at once.
+    """
+    if lag_s <= 0.0:
+        return now_c
+    if step_s <= 0.0:
+        return lagged_c
+    behind_c = (now_c - before_c) / step_s * lag_s
+    return now_c - behind_c + (lagged_c - before_c + behind_c) * math.exp(-step_s / lag_s)
 
 
 def cone_dc(cone: Cone, temperatures_c: Mapping[str, float]) -> float:

@@ -30,7 +30,13 @@ from processing.conditions import (
     parallax_px,
     usable_temperatures,
 )
-from processing.figures import frame_figures, stitching_figures
+from processing.estimated_dc import EstimatedDc, estimate_dc
+from processing.figures import (
+    estimated_dc_figures,
+    frame_figures,
+    precision_figures,
+    stitching_figures,
+)
 from processing.fixed_method import fixed_mosaic
 from processing.level1 import (
     FrameStatistics,
@@ -145,7 +151,7 @@ class Pipeline:
         rig, settings, clock = self.rig, self.settings, _Stopwatch()
         temperatures = usable_temperatures(rig, conditions, settings.thresholds)
         start = nominal_placements(
-            rig, temperatures.usable_c, conditions.tdi_shifts, use_drift=settings.use_drift
+            rig, temperatures.placing_c, conditions.tdi_shifts, use_drift=settings.use_drift
         )
         with clock.stage("radiometry"):
             level1, statistics = self._correct(frames, conditions, temperatures)
@@ -153,6 +159,7 @@ class Pipeline:
             tie_points = match_tie_points(rig, start, level1, settings=settings.tie_points)
         with clock.stage("mosaic"):
             equal, mosaic, validity = self._stitch(start, tie_points, temperatures, conditions)
+            estimated = self._estimate_dc(mosaic, validity, temperatures)
         with clock.stage("composition"):
             image = self._pan.compose(
                 mosaic.placements,
@@ -180,6 +187,8 @@ class Pipeline:
                 bands=registrations,
                 present=level1,
             )
+            figures |= estimated_dc_figures(estimated)
+            figures |= precision_figures(rig, mosaic, level1)
             figures |= self._whole_figures(image.source, frames, conditions)
             report = judge(
                 figures,
@@ -204,6 +213,8 @@ class Pipeline:
             mosaic=mosaic,
             equal_datum=equal,
             validity=validity,
+            estimated_dc=estimated,
+            temperatures=temperatures,
             balance=image.balance,
             bands=registrations,
             baselines=baselines,
@@ -227,7 +238,7 @@ class Pipeline:
             statistics[name] = level1_from_level0(
                 corrector,
                 np.ascontiguousarray(frames[name]),
-                temperature_c=temperatures.usable_c.get(corrector.sensor.probe),
+                temperature_c=temperatures.placing_c.get(corrector.sensor.probe),
                 exposure_time_s=conditions.exposure_time_s.get(cone, 0.0),
                 tdi_shifts=conditions.tdi_shifts.get(cone, 0),
                 out=out,
@@ -252,6 +263,20 @@ class Pipeline:
         validity = judge_master(self.rig, mosaic, known)
         robust = robust_datum(self.rig, start, tie_points, mosaic, validity, settings=settings)
         return mosaic, robust, validity
+
+    def _estimate_dc(
+        self, mosaic: Mosaic, validity: Validity | None, temperatures: Temperatures
+    ) -> tuple[EstimatedDc, ...]:
+        if validity is None:
+            return ()
+        displaced = () if validity.displaced is None else (validity.displaced.sensor,)
+        return estimate_dc(
+            self.rig,
+            mosaic,
+            temperatures.placing_c if self.settings.use_drift else {},
+            measured=temperatures.usable_c,
+            displaced=displaced,
+        )
 
     def _register(
         self, mosaic: Mosaic, level1: Mapping[str, Array]
@@ -299,9 +324,9 @@ class Pipeline:
         if not self.settings.baselines:
             return {}
         settings = self._mosaic_settings(conditions)
-        with_tdm = nominal_placements(self.rig, temperatures.usable_c, conditions.tdi_shifts)
+        with_tdm = nominal_placements(self.rig, temperatures.placing_c, conditions.tdi_shifts)
         without = nominal_placements(
-            self.rig, temperatures.usable_c, conditions.tdi_shifts, use_drift=False
+            self.rig, temperatures.placing_c, conditions.tdi_shifts, use_drift=False
         )
         return {
             "fixed": fixed_mosaic(self.rig, with_tdm, tie_points, settings=settings),

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from processing.balance import Balance
 from processing.colour import BandRegistration, ColourSettings
+from processing.conditions import Temperatures
+from processing.estimated_dc import EstimatedDc
 from processing.mosaic import Mosaic, MosaicSettings
 from processing.quality import QualityReport, Thresholds
 from processing.resampling import Interpolation
@@ -61,7 +63,8 @@ class Product:
     `timings_s` are seconds by stage, in order.
 
     `mosaic` is what the image was made with; `equal_datum` the mosaic whose datum rests on all
-    master sensors alike, which is the same unless one was found displaced.
+    master sensors alike, which is the same unless one was found displaced. `estimated_dc` is dC by
+    stitching, cone by cone (none with the fixed method), `temperatures` what the placing used.
     """
 
     sensors: tuple[str, ...]
@@ -75,6 +78,8 @@ class Product:
     mosaic: Mosaic
     equal_datum: Mosaic
     validity: Validity | None
+    estimated_dc: tuple[EstimatedDc, ...]
+    temperatures: Temperatures
     balance: Balance
     bands: tuple[BandRegistration, ...]
     baselines: Mapping[str, Mosaic]

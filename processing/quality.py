@@ -119,6 +119,12 @@ FIGURES: Final[Mapping[str, str]] = {
     "tie_points_min_overlap": "tie points in the poorest overlap",
     "tie_points_min_overlap_name": "which overlap that is",
     "dc_k": "temperature at exposure less that at calibration, mean of the PAN cones, K",
+    "dc_estimated_k": "the same as the stitching sees it, cones of two or more CCDs, K",
+    "dc_estimated_sigma_k": "standard deviation of that; null where it cannot be determined",
+    "dc_disagreement": "cones whose probes and stitching disagree, comma separated",
+    "stitched_sigma_px": "standard deviation of a stitched point, RMS over PAN sensors, pixels",
+    "stitched_sigma_worst_px": "the same of the worst PAN sensor",
+    "stitched_sigma_worst_sensor": "which sensor that is",
     "displaced_sensor": "name of the one master sensor found displaced",
     "displacement_x_px": "its displacement against calibration and TDM, PAN pixels, x right",
     "displacement_y_px": "the same, y up",
@@ -319,8 +325,8 @@ def _time_and_temperature(
             Finding(
                 Flag.TEMPERATURE_MISSING,
                 Verdict.USABLE,
-                f"No temperature of probe {', '.join(missing_probes)}: its sensors are placed as "
-                "at calibration; check the probe.",
+                f"No temperature of probe {', '.join(missing_probes)}: the other probes stand in, "
+                "calibration where there are none; check the probe.",
                 float(len(missing_probes)),
                 0.0,
             )
@@ -332,6 +338,17 @@ def _time_and_temperature(
         (t.temperature_age_s, math.inf),
         "Temperatures are old; check the probe module and its line.",
     )
+    disagreeing = figures.get("dc_disagreement")
+    if disagreeing:
+        findings.append(
+            Finding(
+                Flag.DC_DISAGREEMENT,
+                Verdict.USABLE,
+                f"Probe and stitching disagree on the temperature of cone {disagreeing}: a stuck "
+                "probe, a moved sensor or an old calibration; check the probe after landing.",
+                _number(figures, "dc_estimated_k"),
+            )
+        )
     if probes_out_of_range:
         findings.append(
             Finding(
