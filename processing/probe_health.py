@@ -166,20 +166,37 @@ def _own_state(samples: Sequence[ProbeSample], at_s: float, settings: ProbeSetti
 
 
 def _believed(samples: Sequence[ProbeSample], settings: ProbeSettings) -> list[ProbeSample]:
-    """Readings that can follow each other; what jumps away is left out until it comes back."""
+    """Readings that can follow each other; what jumps away is left out until it comes back.
+
+    What is possible counts from reading to reading: a probe that stays away is not believed for
+    staying long.
+    """
     kept: list[ProbeSample] = []
+    before_s = -math.inf
     for sample in samples:
         value = sample.value_c
         if value is None or not settings.low_c <= value <= settings.high_c:
             continue
         if kept:
-            before = kept[-1]
-            possible = settings.fastest_k_per_s * (sample.time_s - before.time_s)
-            assert before.value_c is not None
-            if abs(value - before.value_c) > max(settings.jump_k, possible):
+            last = kept[-1].value_c
+            assert last is not None
+            possible = settings.fastest_k_per_s * (sample.time_s - before_s)
+            before_s = sample.time_s
+            if abs(value - last) > max(settings.jump_k, possible):
                 continue
+        before_s = sample.time_s
         kept.append(sample)
     return kept
+
+
+def _before_it_stood_still(
+    samples: Sequence[ProbeSample], settings: ProbeSettings
+) -> list[ProbeSample]:
+    values = [s.value_c for s in samples if s.value_c is not None]
+    k = len(samples)
+    while k and abs(values[k - 1] - values[-1]) <= settings.stuck_k:
+        k -= 1
+    return list(samples[:k])
 
 
 def _is_stuck(
@@ -219,9 +236,9 @@ def _bridge(
     known = [k for k in now if k is not None]
     if known:
         good = _believed(past[probe], settings)
-        # A stuck probe was last good before the others moved away from it.
-        until_s = at_s - settings.stuck_s if state is ProbeState.STUCK else at_s
-        good = [s for s in good if s.time_s <= until_s][-60:]
+        if state is ProbeState.STUCK:
+            good = _before_it_stood_still(good, settings)
+        good = good[-60:]
         distances = []
         for sample in good:
             others = [_above(past[p], sample.time_s, calibration_c[p]) for p in trusted]
