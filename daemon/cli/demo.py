@@ -20,7 +20,13 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from daemon.cli.sim import Emulator, EmulatorError, service_toml, simulator_arguments
+from daemon.cli.sim import (
+    Emulator,
+    EmulatorError,
+    free_first_address,
+    service_toml,
+    simulator_arguments,
+)
 from daemon.cli.tables import light_table
 
 HELP = """Fly the first flight: an emulated rig is captured, stitched and judged.
@@ -54,7 +60,8 @@ def demo(
     arguments = simulator_arguments(
         rig, folder / "sim", seed=seed, dc=dc, displace=[displace] if displace else []
     )
-    arguments += ["--scene-cache", str(out / "scenes")]
+    arguments += ["--scene-cache", str(out / "scenes"), "--exposures", str(exposures + 1)]
+    arguments += ["--first-address", free_first_address()]
     console.print(f"[bold]Emulating {rig}[/] at dC = {dc:+g} K, displaced: {displace or 'none'}")
     try:
         emulator = Emulator(arguments)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -27,6 +28,9 @@ terminal or for any other GigE Vision, u-blox or Modbus program.
 Example: `syntopic sim ultracam-x-mini --out flights/sim` and then
 `syntopic run flights/sim/service.toml`
 """
+
+
+GVCP_PORT = 3956
 
 
 class EmulatorError(RuntimeError):
@@ -74,14 +78,16 @@ def sim(
         list[str] | None, typer.Option(help="Move a sensor: SU02=1.0,-0.6 (px); repeatable.")
     ] = None,
     packet_loss: Annotated[float, typer.Option(help="Share of image packets lost.")] = 0.0,
-    first_address: Annotated[str, typer.Option(help="Address of the first head.")] = "127.0.0.2",
+    first_address: Annotated[
+        str, typer.Option(help="Address of the first head; a free one by default.")
+    ] = "",
     scene: Annotated[Path | None, typer.Option(help="A GeoTIFF to fly over instead.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     arguments = simulator_arguments(
         rig, out, seed=seed, dc=dc, displace=displace or [], packet_loss=packet_loss
     )
-    arguments += ["--first-address", first_address]
+    arguments += ["--first-address", first_address or free_first_address()]
     arguments += ["--scene", str(scene)] if scene else []
     console = Console(stderr=True)
     try:
@@ -116,6 +122,19 @@ def simulator_arguments(
     for item in displace:
         arguments += ["--displace", item]
     return [*arguments, "--packet-loss", str(packet_loss)] if packet_loss else arguments
+
+
+def free_first_address() -> str:
+    """The first loopback block 127.0.k.2 on which no emulated rig answers yet."""
+    for block in range(256):
+        address = f"127.0.{block}.2"
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.bind((address, GVCP_PORT))
+            except OSError:
+                continue
+            return address
+    raise EmulatorError("256 emulated rigs are running here already; end one of them")
 
 
 def service_toml(
