@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -142,3 +143,30 @@ def test_check_prints_a_tree_of_what_is_well_and_the_cure_of_what_is_not(
     assert ill.returncode == 1
     (head,) = [device for device in said["devices"] if not device["ok"]]
     assert "127.0.7.99" in head["problem"] and "check" in head["problem"]
+
+
+def test_a_process_that_dies_ends_the_service_with_a_sentence_and_the_flight_stays_open(
+    emulator: tuple[Emulator, Path],
+) -> None:
+    devices, folder = emulator
+    config = folder / "service.toml"
+    config.write_text(service_toml(devices.ready, root="other-missions"))
+    service = start(config)
+    faults = []
+    mission = ""
+    for event in heard(service):
+        if event["event"] == "mission":
+            mission = event["path"]
+        elif event["event"] == "kernels":
+            (worker,) = [
+                pid
+                for pid in children(service.pid)
+                if "llvmlite" in Path(f"/proc/{pid}/maps").read_text()
+            ]
+            os.kill(worker, signal.SIGKILL)
+        elif event["event"] == "fault":
+            faults.append(event["sentence"])
+    assert service.wait(30) == 1
+    assert len(faults) == 1 and "worker" in faults[0]
+    marker = json.loads((folder / "other-missions" / "current-mission.json").read_text())
+    assert marker["mission"] == Path(mission).name

@@ -1,0 +1,83 @@
+"""A line is flown as planned, waits for what is missing, and stops for a full disk."""
+
+from __future__ import annotations
+
+import asyncio
+import copy
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from daemon.configuration import from_mapping
+from daemon.flight import Flight
+from daemon.ledger import Ledger
+from daemon.line import Line, Order, exposures_left
+from tests.daemon.test_configuration import GOOD
+from tests.daemon.test_flight import IDENTITY, LIMITS, nav
+
+
+def make_line(tmp_path: Path, *, count: int, flown: int = 0, reserve: int = 0) -> Line:
+    content = copy.deepcopy(GOOD)
+    content["trigger"] |= {"count": count, "interval_s": 0.01}
+    content["limits"] = {"disk_reserve_bytes": reserve}
+    configuration, rig = from_mapping(content, tmp_path / "service.toml")
+    flight = Flight(rig, {"SU00": ""}, IDENTITY, LIMITS, Ledger(heads=["SU00"]), flown + 1)
+    flight.navigation(nav(0.0))
+    return Line(configuration, rig, flight, tmp_path, flown)
+
+
+def fly(line: Line) -> tuple[list[Order], list[str]]:
+    orders: list[Order] = []
+    complaints: list[str] = []
+
+    def complain(sentence: str) -> None:
+        complaints.append(sentence)
+        raise TimeoutError
+
+    async def run() -> None:
+        async with asyncio.timeout(20):
+            await line.fly(orders.append, complain)
+
+    try:
+        asyncio.run(run())
+    except TimeoutError:
+        assert complaints
+    return orders, complaints
+
+
+def test_the_planned_number_is_flown_no_faster_than_the_camera_can(tmp_path: Path) -> None:
+    orders, _ = fly(make_line(tmp_path, count=2))
+    assert [order.number for order in orders] == [1, 2]
+    assert orders[1].mono_ns - orders[0].mono_ns >= 1_350_000_000
+    assert orders[0].delays_ns["1"] < orders[0].delays_ns["0"]
+
+
+def test_a_resumed_line_flies_only_what_is_left(tmp_path: Path) -> None:
+    orders, _ = fly(make_line(tmp_path, count=3, flown=2))
+    assert [order.number for order in orders] == [3]
+
+
+def test_a_full_disk_orders_nothing_and_says_what_to_do(tmp_path: Path) -> None:
+    orders, complaints = fly(make_line(tmp_path, count=2, reserve=1 << 60))
+    assert not orders
+    assert "free" in complaints[0]
+
+
+def test_what_is_absent_is_said_in_words(tmp_path: Path) -> None:
+    absent = make_line(tmp_path, count=1).absent(lambda _: False, has_trigger=False)
+    assert absent[:2] == ["head SU00", "trigger"]
+    assert "temperature of 0" in absent
+    assert "time and position" not in absent
+
+
+@pytest.mark.parametrize("free", [10_000_000_000, 400_000_000])
+def test_exposures_left_keep_the_reserve_and_room_for_products(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, free: int
+) -> None:
+    configuration, rig = from_mapping(copy.deepcopy(GOOD), tmp_path / "service.toml")
+    usage = SimpleNamespace(free=free)
+    monkeypatch.setattr("daemon.line.shutil.disk_usage", lambda _: usage)
+    per_exposure = 3 * (1248 * 832 * 2 + 4096)
+    expected = max(0, (free - 500_000_000) // per_exposure)
+    assert exposures_left(configuration, rig, tmp_path) == expected
