@@ -16,7 +16,7 @@ from processing.balance import Balance
 from processing.colour import BandRegistration
 from processing.estimated_dc import EstimatedDc, combined_dc
 from processing.level1 import FrameStatistics
-from processing.mosaic import Mosaic, vip_precision_px
+from processing.mosaic import Mosaic
 from processing.quality import Figure
 from processing.rig import Rig, Sensor
 from processing.sharpness import bright_level, sharpness
@@ -98,32 +98,6 @@ def estimated_dc_figures(estimates: Sequence[EstimatedDc]) -> dict[str, Figure]:
         "dc_estimated_k": None if combined is None else combined[0],
         "dc_estimated_sigma_k": None if combined is None else combined[1],
         "dc_disagreement": ", ".join(e.cone for e in estimates if e.disagrees) or None,
-    }
-
-
-def precision_figures(rig: Rig, mosaic: Mosaic, present: Collection[str]) -> dict[str, Figure]:
-    """How well the adjustment knows where points of the PAN sensors lie in the virtual image.
-
-    From the covariance of the adjustment, at centre and corners of every sensor that is there; what
-    tie points do not determine counts with the accuracy it is held with.
-    """
-    worst: dict[str, float] = {}
-    squares = []
-    for cone in rig.pan_cones:
-        for sensor in cone.sensors:
-            if sensor.name in present:
-                right, low = sensor.width_px - 1.0, sensor.height_px - 1.0
-                points = [(right / 2, low / 2), (0, 0), (right, 0), (0, low), (right, low)]
-                sigma = vip_precision_px(mosaic, sensor.name, np.array(points, np.float64))
-                squares.append(float(np.mean(sigma**2)))
-                worst[sensor.name] = float(np.sqrt(squares[-1]))
-    if not squares:
-        return {}
-    name = max(worst, key=lambda n: worst[n])
-    return {
-        "stitched_sigma_px": float(np.sqrt(np.mean(squares))),
-        "stitched_sigma_worst_px": worst[name],
-        "stitched_sigma_worst_sensor": name,
     }
 
 

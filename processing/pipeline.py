@@ -31,12 +31,7 @@ from processing.conditions import (
     usable_temperatures,
 )
 from processing.estimated_dc import EstimatedDc, estimate_dc
-from processing.figures import (
-    estimated_dc_figures,
-    frame_figures,
-    precision_figures,
-    stitching_figures,
-)
+from processing.figures import estimated_dc_figures, frame_figures, stitching_figures
 from processing.fixed_method import fixed_mosaic
 from processing.level1 import (
     FrameStatistics,
@@ -47,6 +42,7 @@ from processing.level1 import (
 )
 from processing.mosaic import Mosaic, MosaicSettings, free_mosaic
 from processing.placement import SensorPlacement, nominal_placements
+from processing.precision import precision_figures
 from processing.product import Method, Product, Settings
 from processing.quality import Figure, judge
 from processing.quicklook import quicklook
@@ -188,7 +184,7 @@ class Pipeline:
                 present=level1,
             )
             figures |= estimated_dc_figures(estimated)
-            figures |= precision_figures(rig, mosaic, level1)
+            figures |= precision_figures(rig, mosaic, level1, temperatures.usable_c)
             figures |= self._whole_figures(image.source, frames, conditions)
             report = judge(
                 figures,
