@@ -6,7 +6,7 @@ this runs in a worker, the only place where the quick look is encoded.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -70,10 +70,7 @@ def write_level2(
         OSError: the disk refused; an earlier result is still there.
     """
     final = mission.level2(number)
-    durable.make_directories(final.parent)
-    part = final.with_name(final.name + durable.PART_SUFFIX)
-    durable.remove_tree(part)
-    contents: dict[str, list[bytes | memoryview]] = {}
+    contents: dict[str, Sequence[bytes | memoryview]] = {}
     if pan is not None:
         contents["pan.tif"] = tiff_parts([pan], {"bands": ["pan"], "exposure": number})
     if colour:
@@ -81,24 +78,46 @@ def write_level2(
         about = {"bands": bands, "exposure": number}
         contents["rgbn.tif"] = tiff_parts([colour[band] for band in bands], about)
     if quicklook is not None:
-        contents["quicklook.jpg"] = [_jpeg(quicklook)]
+        contents["quicklook.jpg"] = [jpeg_bytes(quicklook)]
     for method, arrays in (geometry or {}).items():
         contents[_geometry_name(method)] = [_npz(arrays)]
     if residuals_svg is not None:
         contents["residuals.svg"] = [residuals_svg.encode("utf-8")]
     contents["quality.json"] = [canonical_bytes(report_json)]
+    files = write_folder(final, contents)
+    verdict = report_json.get("verdict")
+    return Level2Record(number, files, verdict if isinstance(verdict, str) else None)
+
+
+def write_folder(
+    final: Path, contents: Mapping[str, Sequence[bytes | memoryview]]
+) -> dict[str, int]:
+    """Write a product folder whole, in place of an earlier one; it is durable on return.
+
+    Args:
+        final: the folder; the one above it is made where it is missing.
+        contents: bytes by file name.
+
+    Returns:
+        Sizes in bytes by file name.
+
+    Raises:
+        OSError: the disk refused; an earlier folder is still there.
+    """
+    durable.make_directories(final.parent)
+    part = final.with_name(final.name + durable.PART_SUFFIX)
+    durable.remove_tree(part)
     part.mkdir()
     try:
         files = {
             name: durable.create_file(part / name, parts, mode=0o644)
             for name, parts in contents.items()
         }
-        _take_the_place_of(part, final)
+        take_the_place_of(part, final)
     except OSError:
         durable.remove_tree(part)
         raise
-    verdict = report_json.get("verdict")
-    return Level2Record(number, files, verdict if isinstance(verdict, str) else None)
+    return files
 
 
 def verdict_of(folder: Path) -> str | None:
@@ -132,7 +151,8 @@ def recover_level2(mission: Mission) -> list[str]:
     return done
 
 
-def _take_the_place_of(part: Path, final: Path) -> None:
+def take_the_place_of(part: Path, final: Path) -> None:
+    """Give a finished folder, whose files are durable, its name in place of an earlier one."""
     replaced = final.with_name(final.name + REPLACED_SUFFIX)
     durable.remove_tree(replaced)
     if final.exists():
@@ -164,7 +184,12 @@ def _npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
     return buffer.getvalue()
 
 
-def _jpeg(quicklook: NDArray[np.uint8]) -> bytes:
+def jpeg_bytes(quicklook: NDArray[np.uint8]) -> bytes:
+    """A quick look, (height, width) or (height, width, 3) in the order red, green, blue, as JPEG.
+
+    Raises:
+        ProductError: another type or shape.
+    """
     import cv2
 
     shape_fits = quicklook.ndim == 2 or (quicklook.ndim == 3 and quicklook.shape[2] == 3)

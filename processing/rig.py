@@ -23,7 +23,8 @@ Role = Literal["pan", "colour"]
 
 RIG_FORMAT = 1
 RIG_FILE_MAX_BYTES = 1_000_000
-BANDS = ("pan", "red", "green", "blue", "nir")
+BANDS = ("pan", "red", "green", "blue", "nir", "red_edge")
+JUSTIFICATIONS = ("right", "left")
 COLOUR_FILTER_ARRAYS = ("none", "RGGB", "BGGR", "GRBG", "GBRG")
 
 
@@ -53,7 +54,8 @@ class Sensor:
 
     `x_mm`, `y_mm` place the centre of the pixel array, `rotation_rad` turns it counter-clockwise,
     `scale` is near one. The place holds at `calibration_c`. `position_sigma_um` is the standard
-    deviation of each calibrated coordinate.
+    deviation of each calibrated coordinate. A left-justified sensor keeps its DN in the highest
+    bits of a 16-bit word: word = DN * `words_per_dn`.
     """
 
     name: str
@@ -75,6 +77,7 @@ class Sensor:
     read_noise_e: float
     colour_filter_array: str
     tdi_row_sign: int
+    justified: str = "right"
 
     @property
     def pitch_mm(self) -> float:
@@ -83,6 +86,11 @@ class Sensor:
     @property
     def full_scale_dn(self) -> int:
         return (1 << self.bits) - 1
+
+    @property
+    def words_per_dn(self) -> int:
+        """What one DN adds to a stored word: 1, or 2^(16 - bits) where DN are left-justified."""
+        return 1 << (16 - self.bits) if self.justified == "left" else 1
 
 
 @dataclass(frozen=True)
@@ -201,9 +209,9 @@ class Rig:
 
     @property
     def probes(self) -> tuple[str, ...]:
-        """Names of the temperature probes the rig asks for, without repetition."""
+        """Names of the temperature probes the rig asks for, without repetition; "" is none."""
         named = [c.probe for c in self.cones] + [s.probe for s in self.sensors]
-        return tuple(dict.fromkeys(named))
+        return tuple(dict.fromkeys(name for name in named if name))
 
 
 def shipped_rigs() -> dict[str, Path]:
@@ -374,6 +382,7 @@ def _sensor(table: _Table, probe: str, calibration_c: float) -> Sensor:
         read_noise_e=table.number("read_noise_e", 0.0),
         colour_filter_array=table.choice("colour_filter_array", COLOUR_FILTER_ARRAYS, "none"),
         tdi_row_sign=sign,
+        justified=table.choice("justified", JUSTIFICATIONS, "right"),
     )
     drift.refuse_unknown()
     table.refuse_unknown()
@@ -395,6 +404,12 @@ def _check_names(rig: Rig, file: str, problems: list[str]) -> None:
         f"{file}: cone {cone.name!r} has no sensor; give it [[cone.sensor]]"
         for cone in rig.cones
         if not cone.sensors
+    )
+    problems.extend(
+        f"{file}: sensor {sensor.name!r} is left-justified; a rig with [virtual_image] has "
+        f"right-justified words"
+        for sensor in rig.sensors
+        if rig.virtual_image is not None and sensor.justified == "left"
     )
 
 

@@ -13,14 +13,15 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
+from daemon.cli import bands
 from daemon.cli.tables import light_table
 from daemon.configuration import ConfigurationError, PlanSection, ProcessingSection
 from daemon.mission import Mission
 
 HELP = """Process the exposures of a mission folder again, Level-0 to Level-2.
 
-The folder may be a flight's, or written by hand as docs/formats.md tells. Level-0 stays as it is;
-products are replaced.
+The folder may be a flight's, imported, or written by hand as docs/formats.md tells. Level-0 stays
+as it is; products are replaced. A rig without a virtual image gives one raster per band.
 
 Examples: `syntopic process MISSION`, `syntopic process MISSION --only 3 --method fixed`
 """
@@ -55,6 +56,9 @@ def process(
     folder = Mission.open(mission)
     rig = load_rig(folder.rig_path)
     plan, radiometry = _as_flown(folder, radiometry)
+    if rig.virtual_image is None:
+        bands.process(folder, rig, plan, radiometry=radiometry, only=only or [], as_json=as_json)
+        return
     settings = WorkerSettings(
         rig=str(folder.rig_path),
         radiometry=radiometry,

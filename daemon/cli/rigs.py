@@ -63,7 +63,7 @@ def show(
 
     rig = find_rig(name)
     counts = topology.counts(rig)
-    overlaps = topology.overlaps(rig)
+    overlaps = topology.overlaps(rig) if rig.virtual_image else ()
     pitch_mm = rig.virtual_image.pitch_mm if rig.virtual_image else rig.sensors[0].pitch_mm
     path = drawing or Path(f"{rig.name}.svg")
     path.write_text(draw.focal_planes_svg(rig), encoding="utf-8")

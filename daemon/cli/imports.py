@@ -1,0 +1,62 @@
+"""`syntopic import`: images of other cameras become a mission folder."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import Progress
+
+app = typer.Typer(
+    help="""Bring in exposures of other cameras as a mission folder for `syntopic process`.
+
+Example: `syntopic import rededge 0000SET --out field-7`
+""",
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+)
+
+
+@app.callback()
+def imports() -> None:
+    """Bring in exposures of other cameras."""
+
+
+@app.command()
+def rededge(
+    folder: Annotated[Path, typer.Argument(help="Folder with IMG_0000_1.tif ..., searched below.")],
+    out: Annotated[Path, typer.Option(help="Mission folder to be written.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Import MicaSense RedEdge images; lens and radiance calibration come from their tags."""
+    from daemon.importers.rededge import import_rededge
+
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("importing", total=None)
+        imported = import_rededge(
+            folder,
+            out,
+            progress=lambda done, total: progress.update(task, completed=done, total=total),
+        )
+    if as_json:
+        content = {
+            "mission": str(imported.mission.path),
+            "exposures": imported.exposures,
+            "frames": imported.frames,
+            "lens_fit_px": dict(imported.lens_fit_px),
+            "missing": list(imported.missing),
+        }
+        typer.echo(json.dumps(content))
+        return
+    console = Console()
+    worst = max(imported.lens_fit_px.values(), default=0.0)
+    console.print(
+        f"{imported.exposures} exposures, {imported.frames} frames in [bold]{out}[/]; lens "
+        f"distortion carried over within {worst:.3f} px"
+    )
+    for sentence in imported.missing:
+        console.print(sentence, markup=False, style="yellow")
+    console.print(f"Next: [bold]syntopic process {out}[/]")

@@ -1,0 +1,67 @@
+"""Writing a rig as a rig file: what `processing.rig` reads back is the same rig.
+
+For importers, which put the calibration of one camera into the file of its kind.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields
+from typing import Any
+
+from processing.rig import RIG_FORMAT, Cone, Rig, Sensor
+
+
+def rig_toml(rig: Rig, *, remark: str = "") -> bytes:
+    """The rig as TOML; `remark` becomes the comment at the top."""
+    lines = [f"# {line}".rstrip() for line in remark.splitlines()]
+    lines += _pairs(
+        {
+            "format": RIG_FORMAT,
+            "name": rig.name,
+            "title": rig.title,
+            "timing": rig.timing,
+            "frame_interval_s": rig.frame_interval_s,
+            "master_cone": rig.master_cone,
+            "colour_master_cone": rig.colour_master_cone or "",
+            "reference_cone": rig.reference_cone,
+        }
+    )
+    lines += ["", "[calibration]"]
+    lines += _pairs({"id": rig.calibration_id, "date": rig.calibration_date})
+    if rig.virtual_image is not None:
+        lines += ["", "[virtual_image]", *_pairs(_values(rig.virtual_image))]
+    for cone in rig.cones:
+        lines += ["", "[[cone]]", *_cone(cone)]
+    return ("\n".join(lines) + "\n").encode("utf-8")
+
+
+def _cone(cone: Cone) -> list[str]:
+    values = _values(cone, without=("lens", "sensors"))
+    lines = [*_pairs(values), "", "[cone.lens]", *_pairs(_values(cone.lens))]
+    for sensor in cone.sensors:
+        lines += ["", "[[cone.sensor]]", *_sensor(sensor)]
+    return lines
+
+
+def _sensor(sensor: Sensor) -> list[str]:
+    lines = _pairs(_values(sensor, without=("drift",)))
+    return [*lines, "", "[cone.sensor.drift]", *_pairs(_values(sensor.drift))]
+
+
+def _values(record: Any, without: tuple[str, ...] = ()) -> dict[str, Any]:
+    names = [field.name for field in fields(record) if field.name not in without]
+    return {name: getattr(record, name) for name in names}
+
+
+def _pairs(values: dict[str, Any]) -> list[str]:
+    return [f"{key} = {_word(value)}" for key, value in values.items()]
+
+
+def _word(value: Any) -> str:
+    if isinstance(value, tuple):
+        return f"[{', '.join(_word(item) for item in value)}]"
+    if isinstance(value, str):
+        # A JSON string in ASCII is a TOML basic string, but for DEL, which no name holds.
+        return json.dumps(value)
+    return repr(value)
