@@ -1,7 +1,7 @@
-"""Registering the other colours to green by projective transformations (DESIGN 5.7).
+"""Which head sees which colours, and registering them to green (DESIGN 5.7).
 
-Green itself is placed by the adjustment of the mosaic; the pixels are fetched in
-`processing.resampling`.
+Heads are registered by projective transformations; green itself is placed by the adjustment of the
+mosaic, and the pixels are fetched in `processing.resampling`.
 
 Source: seeds/dmc-calibration.txt, 6.1; seeds/ultracam-calibration.txt, steps 5 and 6.
 """
@@ -14,10 +14,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.demosaic import BAYER_BANDS, is_bayer
 from processing.level1 import exposed_rows
 from processing.matching import INTERPOLATION, MARGIN_PX, match_patches, select_features
 from processing.placement import SensorPlacement, raw_from_vip_mm, vip_mm_from_raw
 from processing.projective import apply_projective
+from processing.rig import Rig, Sensor
 
 Array = NDArray[Any]
 
@@ -42,8 +44,47 @@ class ColourSettings:
 
 
 @dataclass(frozen=True)
+class ColourHead:
+    """One colour sensor and the bands it gives; all of them share its geometry.
+
+    `leading` is the band the head is matched by: green of a Bayer head, else its only one.
+    """
+
+    sensor: Sensor
+    bands: tuple[str, ...]
+    leading: str
+
+
+def colour_heads(rig: Rig) -> tuple[ColourHead, ...]:
+    """The colour heads of a rig, the colour master's first.
+
+    A cone of one band has it on its only sensor; a cone of several has them behind the colour
+    filter array of its only sensor. Of two heads that see the same band the first gives it.
+    """
+    heads: list[ColourHead] = []
+    given: set[str] = set()
+    cones = sorted(rig.colour_cones, key=lambda cone: cone.name != rig.colour_master_cone)
+    for cone in cones:
+        sensor = cone.sensors[0]
+        if len(cone.sensors) > 1:
+            continue
+        if is_bayer(sensor):
+            seen = [band for band in cone.bands if band in BAYER_BANDS]
+            leading = "green"
+        elif len(cone.bands) == 1:
+            seen, leading = list(cone.bands), cone.bands[0]
+        else:
+            continue
+        bands = tuple(band for band in seen if band not in given)
+        given.update(bands)
+        if bands:
+            heads.append(ColourHead(sensor, bands, leading))
+    return tuple(heads)
+
+
+@dataclass(frozen=True)
 class BandRegistration:
-    """One band against green.
+    """One head, by its leading band, against green.
 
     `band_from_green` (3, 3) carries a VIP point in mm to where the band's own placement has it.
     Where too few points were found it is the identity: the band lies as calibrated, and

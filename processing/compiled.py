@@ -12,8 +12,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
+import numpy as np
 from numba.core.dispatcher import Dispatcher
 
+from processing.demosaic import demosaic
 from processing.pipeline import Pipeline, Settings
 from processing.radiometry import RadiometricCalibration
 from processing.rehearsal import rehearsal_radiometry
@@ -21,6 +23,7 @@ from processing.rig import Rig
 
 _ROOMS: Final = (
     "processing.balance",
+    "processing.demosaic",
     "processing.level1",
     "processing.matching",
     "processing.quicklook",
@@ -60,7 +63,8 @@ def compile_for(
 ) -> Compilation:
     """Compile, or load from the cache, what this rig's pipeline will call.
 
-    Without radiometry, as at installation, what a calibrated sensor needs is compiled as well.
+    Without radiometry, as at installation, what a calibrated sensor needs is compiled as well; so
+    is what a Bayer head needs, whether this rig has one or not.
 
     Raises:
         ValueError, CalibrationError: as `Pipeline`.
@@ -70,6 +74,7 @@ def compile_for(
     if radiometry is None:
         first = rig.pan_cones[0].sensors[0] if rig.pan_cones else None
         radiometry = {first.name: rehearsal_radiometry(first)} if first else {}
+    demosaic(np.zeros((8, 8), np.uint16), "RGGB", out=np.zeros((3, 8, 8), np.uint16))
     Pipeline(rig, radiometry, settings).warm_up()
     return Compilation(variants(), _cache_misses() - before, time.perf_counter() - began)
 

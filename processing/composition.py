@@ -1,4 +1,4 @@
-"""Composing rasters from corrected frames: PAN of many sensors, colour of one sensor a band.
+"""Composing rasters from corrected frames: PAN of many sensors, colour of one sensor each band.
 
 Holds the buffers, which are allocated once and used again for every exposure. Where sensors lie is
 given by placements; what they are good for is not asked here.
@@ -6,7 +6,7 @@ given by placements; what they are good for is not asked here.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.balance import Balance, balance_gains, node_means
+from processing.colour import ColourHead
+from processing.demosaic import BAYER_BANDS, demosaic, is_bayer
 from processing.lattice import (
     OUTSIDE,
     colour_raster,
@@ -169,25 +171,47 @@ class PanComposer:
 class ColourComposer:
     """Level-1 frames of the colour sensors and the rasters of their bands."""
 
-    def __init__(self, image: VirtualImage, sensors: Mapping[str, Sensor]) -> None:
-        """`sensors` by band."""
+    def __init__(self, image: VirtualImage, heads: Sequence[ColourHead]) -> None:
         self.image = image
-        self.sensors = dict(sensors)
+        self.heads = tuple(heads)
         raster = colour_raster(image)
         rows, columns = lattice_shape(raster, COLOUR_CELL_PX)
         per_cell = COLOUR_CELL_PX // WEIGHT_STEP_PX
         nodes = ((rows - 1) * per_cell + 1, (columns - 1) * per_cell + 1)
         shape = (raster.height_px, raster.width_px)
-        self._frames = {band: _stack([sensor]) for band, sensor in self.sensors.items()}
+        self._raw: dict[str, Array] = {}
+        self._planes: dict[str, Array] = {}
+        self._frames: dict[str, Array] = {}
+        for head in self.heads:
+            one = _stack([head.sensor])
+            name = head.sensor.name
+            self._raw[name] = one[0]
+            self._planes[name] = one
+            if is_bayer(head.sensor):
+                self._planes[name] = _stack([head.sensor] * len(BAYER_BANDS))
+            for band in head.bands:
+                k = BAYER_BANDS.index(band) if is_bayer(head.sensor) else 0
+                self._frames[band] = self._planes[name][k : k + 1]
         self._lattice = np.full((1, rows, columns, 2), OUTSIDE)
         self._weights = np.full((1, *nodes), WEIGHT_UNIT, np.uint8)
-        self._bands = {band: np.zeros(shape, np.uint16) for band in self.sensors}
+        self._bands = {band: np.zeros(shape, np.uint16) for band in self._frames}
         self._source = np.zeros(shape, np.uint8)
 
-    def frame(self, band: str) -> Array:
-        """Where the Level-1 frame of a band is to be written, (h, w) uint16."""
-        view: Array = self._frames[band][0]
-        return view
+    def frame(self, head: ColourHead) -> Array:
+        """Where the Level-1 frame of a head is to be written, (h, w) uint16."""
+        return self._raw[head.sensor.name]
+
+    def leading(self, head: ColourHead) -> Array:
+        """The frame of the band that a head is matched by, once its own frame is written.
+
+        Of a Bayer head all bands are made here.
+        """
+        planes = self._planes[head.sensor.name]
+        if not is_bayer(head.sensor):
+            return self._raw[head.sensor.name]
+        demosaic(self._raw[head.sensor.name], head.sensor.colour_filter_array, out=planes)
+        leading: Array = planes[BAYER_BANDS.index(head.leading)]
+        return leading
 
     def compose(
         self,

@@ -171,7 +171,7 @@ def level1_from_level0(
                 corrector.defect, shifts, sensor.tdi_row_sign
             )
         mask, places = corrector.defects_by_shifts[shifts]
-        _interpolate_defects(out, mask, places)
+        _interpolate_defects(out, mask, places, 1 if sensor.colour_filter_array == "none" else 2)
     exposed = max((sensor.height_px - shifts) * sensor.width_px, 1)
     total, saturated = sums.sum(axis=0)
     return FrameStatistics(float(total) / counts / exposed, float(saturated) / exposed)
@@ -307,8 +307,10 @@ def _map_pass(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True, nogil=True)
-def _interpolate_defects(level1, mask, places):  # type: ignore[no-untyped-def]
+def _interpolate_defects(level1, mask, places, period):  # type: ignore[no-untyped-def]
     """Fill each defect from the nearest good pixels on both sides, along the least gradient.
+
+    Pixels `period` apart in row or column are of one colour; no others are compared.
 
     The gradient of a direction is the mean of what the pixels of a 5 x 5 neighbourhood differ from
     their neighbour in that direction, good ones only: many chords, so that noise does not choose.
@@ -321,12 +323,12 @@ def _interpolate_defects(level1, mask, places):  # type: ignore[no-untyped-def]
         best = 1e30
         found = 0
         for direction in range(4):
-            step_row = np.int64(0) if direction == 0 else np.int64(1)
-            step_column = np.int64(1)
+            step_row = np.int64(0) if direction == 0 else np.int64(period)
+            step_column = np.int64(period)
             if direction == 1:
                 step_column = np.int64(0)
             elif direction == 3:
-                step_column = np.int64(-1)
+                step_column = np.int64(-period)
             values = np.zeros(2)
             distances = np.zeros(2)
             saturated = 0

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from processing.colour import (
     BandRegistration,
+    colour_heads,
     green_positions,
     nominal_registration,
     register_band,
@@ -31,7 +32,11 @@ from processing.conditions import (
     usable_temperatures,
 )
 from processing.estimated_dc import EstimatedDc, estimate_dc
-from processing.figures import estimated_dc_figures, frame_figures, stitching_figures
+from processing.figures import (
+    estimated_dc_figures,
+    frame_figures,
+    stitching_figures,
+)
 from processing.fixed_method import fixed_mosaic
 from processing.level1 import (
     FrameStatistics,
@@ -49,7 +54,7 @@ from processing.quicklook import quicklook
 from processing.radiometry import RadiometricCalibration
 from processing.rehearsal import rehearsal_frames
 from processing.resampling import Interpolation
-from processing.rig import Rig, Sensor
+from processing.rig import Rig
 from processing.tie_points import TiePoints, match_tie_points
 from processing.validity import Validity, judge_master, robust_datum
 
@@ -88,19 +93,19 @@ class Pipeline:
         self.rig = rig
         self.settings = settings or Settings()
         pan = [sensor for cone in rig.pan_cones for sensor in cone.sensors]
-        self._bands = _single_bands(rig)
+        self._heads = colour_heads(rig)
         self._pan = PanComposer(rig.virtual_image, pan)
-        self._colour = ColourComposer(rig.virtual_image, self._bands)
+        self._colour = ColourComposer(rig.virtual_image, self._heads)
         known = radiometry or {}
         self._correctors = {
             sensor.name: corrector_for(sensor, known.get(sensor.name))
-            for sensor in (*pan, *self._bands.values())
+            for sensor in (*pan, *(head.sensor for head in self._heads))
         }
         self._green = next(
             (
-                band
-                for band, sensor in self._bands.items()
-                if rig.cone_of(sensor.name).name == rig.colour_master_cone
+                head
+                for head in self._heads
+                if rig.cone_of(head.sensor.name).name == rig.colour_master_cone
             ),
             None,
         )
@@ -224,7 +229,8 @@ class Pipeline:
     ) -> tuple[dict[str, Array], dict[str, FrameStatistics]]:
         """Level-1 frames by sensor, in this object's buffers, and what the pass saw."""
         places = {name: self._pan.frame(name) for name in self._pan.names}
-        places |= {sensor.name: self._colour.frame(band) for band, sensor in self._bands.items()}
+        heads = {head.sensor.name: head for head in self._heads}
+        places |= {name: self._colour.frame(head) for name, head in heads.items()}
         level1, statistics = {}, {}
         for name, out in places.items():
             if name not in frames:
@@ -239,7 +245,7 @@ class Pipeline:
                 tdi_shifts=conditions.tdi_shifts.get(cone, 0),
                 out=out,
             )
-            level1[name] = out
+            level1[name] = self._colour.leading(heads[name]) if name in heads else out
         return level1, statistics
 
     def _stitch(
@@ -278,35 +284,38 @@ class Pipeline:
         self, mosaic: Mosaic, level1: Mapping[str, Array]
     ) -> tuple[tuple[BandRegistration, ...], dict[str, Array]]:
         """Green as the adjustment placed it, the other bands by their tie points with green."""
-        registrations, rasters = [], {}
-        green = None if self._green is None else self._bands[self._green].name
+        registrations = []
+        rasters: dict[str, Array] = {}
+        green = None if self._green is None else self._green.sensor.name
         wished = self.settings.colour
         positions = None
         if green is not None and green in level1:
             positions = green_positions(mosaic.placements[green], level1[green], wished)
-        for band, sensor in self._bands.items():
-            if sensor.name not in level1:
-                rasters[band] = self._colour.empty(band)
+        for head in self._heads:
+            name, leading = head.sensor.name, head.leading
+            if name not in level1:
+                rasters |= {band: self._colour.empty(band) for band in head.bands}
                 continue
-            placement = mosaic.placements[sensor.name]
+            placement = mosaic.placements[name]
             homography = None
-            if sensor.name != green:
-                found = nominal_registration(band, sensor.name)
+            if name != green:
+                found = nominal_registration(leading, name)
                 if green is not None and positions is not None:
                     found = register_band(
-                        band,
+                        leading,
                         mosaic.placements[green],
                         placement,
                         level1[green],
-                        level1[sensor.name],
+                        level1[name],
                         positions=positions,
                         settings=wished,
                     )
                 registrations.append(found)
                 homography = found.band_from_green if found.registered else None
-            rasters[band] = self._colour.compose(
-                band, placement, homography, interpolation=self.settings.interpolation
-            )
+            for band in head.bands:
+                rasters[band] = self._colour.compose(
+                    band, placement, homography, interpolation=self.settings.interpolation
+                )
         return tuple(registrations), rasters
 
     def _baselines(
@@ -381,13 +390,3 @@ class _Stopwatch:
             yield
         finally:
             self.seconds[name] = time.perf_counter() - began
-
-
-def _single_bands(rig: Rig) -> dict[str, Sensor]:
-    """Colour sensors that hold one band each, by band; green first, for the others go to it."""
-    bands = {
-        cone.bands[0]: cone.sensors[0]
-        for cone in rig.colour_cones
-        if len(cone.bands) == 1 and len(cone.sensors) == 1
-    }
-    return dict(sorted(bands.items(), key=lambda item: item[0] != "green"))

@@ -132,9 +132,11 @@ def test_overlaps_are_those_of_the_cameras(name: str, across: int, along: int | 
     assert (len(widths), len(heights)) == ((1, 0) if along is None else (6, 6))
 
 
-def test_every_shipped_virtual_image_is_covered_by_its_sensors() -> None:
+def test_the_virtual_image_of_every_ultracam_is_covered_by_its_sensors() -> None:
     for path in shipped_rigs().values():
         rig = load_rig(path)
+        if not rig.name.startswith("ultracam"):
+            continue
         image = rig.virtual_image
         assert image is not None
         placements = nominal_placements(rig, {}, {})
