@@ -12,7 +12,7 @@ from typing import NoReturn
 import typer
 from rich.console import Console
 
-from daemon.cli import check, demo, imports, kernels, process, rigs, run, sim, verify
+from daemon.cli import check, demo, export, imports, kernels, process, rigs, run, sim, verify
 from daemon.configuration import ConfigurationError
 from daemon.errors import DaemonError
 from processing.rig import RigError
@@ -36,6 +36,7 @@ app.command(name="sim", help=sim.HELP)(sim.sim)
 app.command(name="kernels", help=kernels.HELP)(kernels.kernels)
 app.add_typer(rigs.app, name="rigs")
 app.add_typer(imports.app, name="import")
+app.add_typer(export.app, name="export")
 
 
 def main() -> NoReturn:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import tifffile
 from numpy.typing import NDArray
+from pyubx2 import UBXReader
 
 from sim_hw.rendering import render_ideal
 from sim_hw.scene import open_scene
@@ -140,6 +141,17 @@ def test_an_exposure_written_by_hand_is_processed(flown: Flown, tmp_path: Path) 
     assert report["figures"]["tie_points_pp"] > 1000
     assert "TEMPERATURE_MISSING" in report["flags"]
     assert tifffile.imread(folder / "L2/000001/pan.tif").shape == (2226, 3480)
+
+
+def test_the_receivers_bytes_come_out_whole_for_other_programs(flown: Flown) -> None:
+    done = syntopic("export", "raw", str(flown.mission), "--json")
+    assert done.returncode == 0, done.stderr
+    said = json.loads(done.stdout)
+    with (Path(said["folder"]) / "gnss.ubx").open("rb") as stream:
+        kinds = [message.identity for _, message in UBXReader(stream, protfilter=2)]
+    assert kinds.count("TIM-TM2") == 12
+    assert kinds.count("NAV-PVT") > 100
+    assert said["events"] == 12
 
 
 def test_the_report_needs_nothing_beside_it_and_names_the_sensor(flown: Flown) -> None:
