@@ -83,7 +83,8 @@ class Flight:
     """Exposures between trigger and seal.
 
     Every method that takes an instant takes `mono_ns`. Slots of frames that are not used are
-    collected in `idle_slots`, to be handed back to the heads.
+    collected in `idle_slots`, to be handed back to the heads. Heads in `absent_heads` are known to
+    be lost; their frames are not waited for.
     """
 
     def __init__(
@@ -103,6 +104,7 @@ class Flight:
         self.track = Track()
         self.temperatures = Temperatures()
         self.idle_slots: list[tuple[str, int]] = []
+        self.absent_heads: set[str] = set()
         self.serial_of_head = serial_of_head
         self._cone_of_head = {head: rig.cone_of(head) for head in serial_of_head}
         self._matcher = Matcher({h: c.name for h, c in self._cone_of_head.items()}, self.clock)
@@ -179,12 +181,28 @@ class Flight:
             if exposure.handed_to_disk is not None or exposure.lost or not exposure.frames:
                 continue
             waited_ns = mono_ns - exposure.ordered_mono_ns
-            is_complete = len(exposure.frames) == len(self.serial_of_head)
-            if is_complete or waited_ns > self.limits.frame_timeout_s * NS:
+            is_late = waited_ns > self.limits.frame_timeout_s * NS
+            if is_late or self._is_complete(exposure) or self._is_overtaken(exposure):
                 exposure.handed_to_disk = self._capture(exposure)
                 slots = {head: frame.slot for head, frame in exposure.frames.items()}
                 due.append(ToStore(exposure.handed_to_disk, slots))
         return due
+
+    def _is_complete(self, exposure: _Open) -> bool:
+        """Whether every head that can send its frame has done so."""
+        return exposure.frames.keys() >= self.serial_of_head.keys() - self.absent_heads
+
+    def _is_overtaken(self, exposure: _Open) -> bool:
+        """Whether an exposure so much newer has as many frames that its slots are needed now.
+
+        A silent head must not starve the others of memory: heads deliver in order, and one that is
+        as many exposures behind as there are slots is not waited for.
+        """
+        first = exposure.number + self.limits.exposures_in_memory - 1
+        return any(
+            other.number >= first and exposure.frames.keys() <= other.frames.keys()
+            for other in self._open.values()
+        )
 
     def due_to_give_up(self, mono_ns: int) -> list[tuple[int, str]]:
         """Exposures of which nothing came in time: now lost, with the cause; returned once."""

@@ -207,8 +207,11 @@ class Service:
         )
         if event.name in _DELIVERS:
             self.active.add(event.device)
+            self.flight.absent_heads.discard(event.device)
         elif event.is_fault:
             self.active.discard(event.device)
+            if event.name == _LOST:
+                self.flight.absent_heads.add(event.device)
 
     def _on_bound(self, bound: Bound) -> None:
         self._event("bound", kind=bound.kind, device=bound.name, found=dict(bound.found))
@@ -221,6 +224,8 @@ class Service:
 
     def _on_not_bound(self, unbound: NotBound) -> None:
         sentence = unbound.sentence
+        if unbound.kind == "head":
+            self.flight.absent_heads.add(unbound.name)
         self._event("device", device=unbound.name, name="absent", fault=True, sentence=sentence)
 
     def _on_fired(self, fired: Fired) -> None:
@@ -438,7 +443,8 @@ class Service:
         self.stopping.set()
 
 
-_DELIVERS = frozenset({"opened", "recovered", "active"})
+_DELIVERS = frozenset({"opened", "recovered"})
+_LOST = "lost"
 
 
 def _summary(exposure: Exposure) -> dict[str, Any]:

@@ -159,6 +159,24 @@ def test_a_missing_frame_is_waited_for_and_then_the_exposure_is_degraded() -> No
     assert (sheet.degraded, sheet.frames.late) == (1, 1) and sheet.is_balanced
 
 
+def test_a_head_that_is_known_to_be_lost_is_not_waited_for() -> None:
+    flying = flight()
+    flying.absent_heads.add("G")
+    fly_one(flying, 1, 0.0, HEADS[:2])
+    (due,) = flying.due_to_store(NS)
+    assert due.capture.missing == (("G", "no frame came"),)
+
+
+def test_a_silent_head_does_not_starve_the_others_of_memory() -> None:
+    flying = flight()
+    for number in (1, 2):
+        fly_one(flying, number, 1.35 * number, HEADS[:2])
+    assert not flying.due_to_store(4 * NS), "two of three slots are taken: there is time"
+    fly_one(flying, 3, 4.05, HEADS[:2])
+    (due,) = flying.due_to_store(5 * NS)
+    assert due.capture.number == 1
+
+
 def test_a_lost_mark_is_interpolated_through_the_clock_and_says_so() -> None:
     flying = flight()
     for number in (1, 2):

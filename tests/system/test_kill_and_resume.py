@@ -170,3 +170,28 @@ def test_a_process_that_dies_ends_the_service_with_a_sentence_and_the_flight_sta
     assert len(faults) == 1 and "worker" in faults[0]
     marker = json.loads((folder / "other-missions" / "current-mission.json").read_text())
     assert marker["mission"] == Path(mission).name
+
+
+def test_a_head_that_is_not_there_degrades_the_exposures_and_nothing_else(
+    emulator: tuple[Emulator, Path],
+) -> None:
+    devices, folder = emulator
+    config = folder / "service.toml"
+    text = service_toml(devices.ready, root="degraded", count=2, end_when_done=True)
+    address = devices.ready["heads"]["SU11"]["address"]
+    text = text.replace(f'"{address}"', '"127.0.7.99"') + "\n[limits]\nready_timeout_s = 4.0\n"
+    config.write_text(text)
+    service = start(config)
+    events = list(heard(service))
+    assert service.wait(30) == 0
+    (ready,) = [event for event in events if event["event"] == "ready"]
+    assert ready["absent"] == ["head SU11"]
+    sealed = [event for event in events if event["event"] == "sealed"]
+    assert [(event["state"], event["missing"]) for event in sealed] == [("degraded", ["SU11"])] * 2
+    for event in events:
+        if event["event"] == "processed":
+            report = event["report"]
+            assert "FRAME_MISSING" in report["flags"] and report["verdict"] != "good"
+            assert 0.85 < report["figures"]["valid_fraction"] < 0.95
+    (ended,) = [event for event in events if event["event"] == "ended"]
+    assert ended["ledger"]["balanced"] and ended["ledger"]["triggers"]["degraded"] == 2
