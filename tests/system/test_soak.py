@@ -12,7 +12,7 @@ import pytest
 
 from daemon.cli.sim import Emulator, free_first_address, service_toml, simulator_arguments
 from tests.system.flown import syntopic
-from tests.system.test_kill_and_resume import heard, start
+from tests.system.test_faults_in_flight import heard, start
 
 pytestmark = [pytest.mark.soak, pytest.mark.timeout(7200)]
 

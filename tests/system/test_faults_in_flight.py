@@ -1,4 +1,4 @@
-"""kill -9 in the middle of a flight: what was reported stored is there, and the flight goes on."""
+"""Faults in the middle of a flight: kill -9, a dead process, an absent head, an early landing."""
 
 from __future__ import annotations
 
@@ -195,3 +195,26 @@ def test_a_head_that_is_not_there_degrades_the_exposures_and_nothing_else(
             assert 0.85 < report["figures"]["valid_fraction"] < 0.95
     (ended,) = [event for event in events if event["event"] == "ended"]
     assert ended["ledger"]["balanced"] and ended["ledger"]["triggers"]["degraded"] == 2
+
+
+def test_sigterm_lands_in_good_order(emulator: tuple[Emulator, Path]) -> None:
+    devices, folder = emulator
+    config = folder / "service.toml"
+    config.write_text(service_toml(devices.ready, root="landed"))
+    service = start(config)
+    mission = ""
+    ended: dict[str, Any] = {}
+    for event in heard(service):
+        if event["event"] == "mission":
+            mission = event["path"]
+        elif event["event"] == "triggered" and event["number"] == 2:
+            service.send_signal(signal.SIGTERM)
+        elif event["event"] == "ended":
+            ended = event
+    assert service.wait(30) == 0
+    counts = ended["ledger"]["triggers"]
+    assert ended["failure"] is None and counts["open"] == 0
+    assert counts["triggers"] == counts["complete"] >= 2
+    records = list(Path(mission, "L0").glob("*/exposure.json"))
+    assert len(records) == counts["triggers"], "what was open is sealed"
+    assert not (folder / "landed" / "current-mission.json").exists(), "the flight is over"
