@@ -28,14 +28,15 @@ from daemon.cli.sim import (
     simulator_arguments,
 )
 from daemon.cli.tables import light_table
+from processing.rig import Rig, RigError, find_rig
 
 HELP = """Fly the first flight: an emulated rig is captured, stitched and judged.
 
 A line of exposures is flown 12 K above the calibration temperature, with one sensor of the master
-cone displaced. The stitched images are then compared with the emulator's truth, and with what the
-older, fixed method would have given.
+cone displaced where it has several. The stitched images are then compared with the emulator's
+truth, and with what the older, fixed method would have given.
 
-Examples: `syntopic demo`, `syntopic demo --json`
+Examples: `syntopic demo`, `syntopic demo --rig ultracam-l-mini`, `syntopic demo --json`
 """
 EVENT_TIMEOUT_S = 180.0
 
@@ -49,14 +50,23 @@ def demo(
     exposures: Annotated[int, typer.Option(help="How many exposures to fly.", min=1)] = 12,
     dc: Annotated[float, typer.Option(help="Temperature above calibration, K.")] = 12.0,
     displace: Annotated[
-        str, typer.Option(help="The displaced sensor and its displacement in px; '' for none.")
-    ] = "SU02=1.0,-0.6",
+        str | None,
+        typer.Option(
+            help="The displaced sensor and its displacement in px; '' for none. By default "
+            "SU02=1.0,-0.6, or none where a rig's master cone has too few sensors to name one."
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Everything random follows from it.")] = 1,
     out: Annotated[Path, typer.Option(help="Where flights are kept.")] = Path("flights"),
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     console = Console(stderr=as_json)
     folder = out / f"demo-{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
+    try:
+        displace = _displacement(find_rig(rig)) if displace is None else displace
+    except RigError as error:
+        console.print(f"[bold red]{error}[/]")
+        raise typer.Exit(1) from error
     arguments = simulator_arguments(
         rig, folder / "sim", seed=seed, dc=dc, displace=[displace] if displace else []
     )
@@ -78,6 +88,12 @@ def demo(
     else:
         _print_result(console, result, ledger)
     raise typer.Exit(0 if result["lost"] == 0 and result["ledger_balanced"] else 1)
+
+
+def _displacement(rig: Rig) -> str:
+    """The third sensor of the master cone, by a pixel; nothing where no sensor could be named."""
+    master = rig.cone(rig.master_cone).sensors
+    return f"{master[2].name}=1.0,-0.6" if len(master) >= 3 else ""
 
 
 def _fly(
