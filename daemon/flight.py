@@ -25,6 +25,7 @@ from daemon.matching import Cause, Matcher, Pulse
 from daemon.navigation import Track
 from daemon.temperatures import Temperatures
 from drivers.contract import EventMark, Frame, NavSample, TemperatureSample
+from processing.drift import lagged_sensors
 from processing.quality import Flag
 from processing.rig import Rig
 
@@ -102,7 +103,7 @@ class Flight:
         self.ledger = ledger
         self.clock = HostClock()
         self.track = Track()
-        self.temperatures = Temperatures()
+        self.temperatures = Temperatures(lagged_sensors(rig))
         self.idle_slots: list[tuple[str, int]] = []
         self.absent_heads: set[str] = set()
         self.serial_of_head = serial_of_head

@@ -51,6 +51,7 @@ def write_level2(
     report_json: Mapping[str, Any],
     geometry: Mapping[str, Mapping[str, NDArray[Any]]] | None = None,
     residuals_svg: str | None = None,
+    mosaic_json: Mapping[str, Any] | None = None,
 ) -> Level2Record:
     """Write the products of an exposure; they are durable on return.
 
@@ -63,6 +64,7 @@ def write_level2(
         report_json: content of quality.json.
         geometry: by method ("free", "fixed", "fixed-no-tdm"), arrays by name.
         residuals_svg: a drawing of the residual vectors.
+        mosaic_json: content of mosaic.json, what the stitching says about the sensors' places.
 
     Raises:
         ProductError: arrays of wrong type or shape, or an unknown band.
@@ -83,6 +85,8 @@ def write_level2(
         contents[_geometry_name(method)] = [_npz(arrays)]
     if residuals_svg is not None:
         contents["residuals.svg"] = [residuals_svg.encode("utf-8")]
+    if mosaic_json is not None:
+        contents["mosaic.json"] = [canonical_bytes(mosaic_json)]
     contents["quality.json"] = [canonical_bytes(report_json)]
     files = write_folder(final, contents)
     verdict = report_json.get("verdict")

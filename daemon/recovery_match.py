@@ -16,6 +16,7 @@ from daemon.navigation import Track
 from daemon.recovery import Complete
 from daemon.temperatures import Temperatures
 from drivers.contract import EventMark, NavSample, TemperatureSample
+from processing.drift import lagged_sensors
 from processing.quality import Flag
 from processing.rig import Rig
 
@@ -28,7 +29,7 @@ def seal_from_log(rig: Rig) -> Complete:
         clock = HostClock()
         matcher = Matcher(cone_of_head, clock)
         track = Track()
-        temperatures = Temperatures()
+        temperatures = Temperatures(lagged_sensors(rig))
         pulse: Pulse | None = None
         mark: EventMark | None = None
         for record in records:

@@ -35,6 +35,7 @@ from processing.pipeline import Pipeline, Settings
 from processing.quality import Flag, as_json
 from processing.radiometry import RadiometricCalibration, load_radiometry
 from processing.rig import Rig, find_rig
+from processing.stitch_record import stitch_record, stitch_record_json
 
 
 def main(link: Link, settings: WorkerSettings, rings: tuple[FrameRing, ...]) -> None:
@@ -90,6 +91,12 @@ def process_exposure(
     product = pipeline.process(frames, conditions_of(exposure, rig, plan, flags))
     report = as_json(product.report)
     report["exposure"] = exposure.number
+    told = product.temperatures
+    stitching = None
+    if product.mosaic.method == "free":
+        stitching = stitch_record_json(
+            stitch_record(rig, product.mosaic, told.placing_c, told.usable_c, product.estimated_dc)
+        )
     report["timings_s"] = {stage: round(s, 4) for stage, s in product.timings_s.items()}
     written = products.write_level2(
         mission,
@@ -100,6 +107,7 @@ def process_exposure(
         report_json=report,
         geometry=product.geometry,
         residuals_svg=residuals_svg(rig, product.tie_points, product.mosaic, product.validity),
+        mosaic_json=stitching,
     )
     return report, written.files
 

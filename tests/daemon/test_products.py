@@ -38,6 +38,7 @@ def _write(mission, **changes):
     content = {
         "pan": PAN, "colour": COLOUR, "quicklook": quicklook, "report_json": REPORT,
         "geometry": GEOMETRY, "residuals_svg": "<svg/>",
+        "mosaic_json": {"format": 1},
     }  # fmt: skip
     return write_level2(mission, 7, **{**content, **changes})
 
@@ -48,7 +49,7 @@ def test_every_product_is_read_by_others(mission):
     folder = mission.level2(7)
     assert set(record.files) == {p.name for p in folder.iterdir()} == {
         "pan.tif", "rgbn.tif", "quicklook.jpg", "quality.json", "geometry.npz",
-        "geometry-fixed-no-tdm.npz", "residuals.svg",
+        "geometry-fixed-no-tdm.npz", "residuals.svg", "mosaic.json",
     }  # fmt: skip
     assert all((folder / name).stat().st_size == size for name, size in record.files.items())
     assert record.verdict == "good"
@@ -70,7 +71,10 @@ def test_the_same_products_are_the_same_bytes(mission):
 
 
 def test_an_exposure_without_pan_or_colour_has_its_report_all_the_same(mission):
-    record = _write(mission, pan=None, colour={}, quicklook=None, geometry=None, residuals_svg=None)
+    record = _write(
+        mission, pan=None, colour={}, quicklook=None, geometry=None, residuals_svg=None,
+        mosaic_json=None,
+    )  # fmt: skip
     assert set(record.files) == {"quality.json"}
 
 
