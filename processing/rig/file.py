@@ -1,0 +1,216 @@
+"""Rig files: read, validated with all mistakes at once, and found by name."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from processing.rig.model import Cone, Drift, Lens, Rig, Sensor, VirtualImage
+from processing.rig.table import RigError, Table
+
+RIG_FORMAT = 1
+RIG_FILE_MAX_BYTES = 1_000_000
+BANDS = ("pan", "red", "green", "blue", "nir", "red_edge")
+JUSTIFICATIONS = ("right", "left")
+COLOUR_FILTER_ARRAYS = ("none", "RGGB", "BGGR", "GRBG", "GBRG")
+
+
+def shipped_rigs() -> dict[str, Path]:
+    """Rig files that come with the package, by name."""
+    return {path.stem: path for path in sorted((Path(__file__).parents[1] / "rigs").glob("*.toml"))}
+
+
+def find_rig(name_or_path: str) -> Rig:
+    """Load a shipped rig by its name, or any rig file by its path.
+
+    Raises:
+        RigError: no such rig, or a file with mistakes (all of them listed).
+    """
+    shipped = shipped_rigs()
+    if name_or_path in shipped:
+        return load_rig(shipped[name_or_path])
+    path = Path(name_or_path)
+    if path.suffix == ".toml" or path.exists():
+        return load_rig(path)
+    known = ", ".join(shipped)
+    raise RigError([f"rig {name_or_path!r} is neither a file nor one of: {known}"])
+
+
+def load_rig(path: Path) -> Rig:
+    """Read and validate a rig file.
+
+    Raises:
+        RigError: with one sentence per mistake: file, key, value, and what would be right.
+    """
+    try:
+        if path.stat().st_size > RIG_FILE_MAX_BYTES:
+            raise RigError([f"{path.name}: larger than {RIG_FILE_MAX_BYTES} bytes; not a rig file"])
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        reason = error.strerror or type(error).__name__
+        raise RigError([f"{path}: cannot be read ({reason}); give a readable file"]) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise RigError([f"{path.name}: not valid TOML ({error})"]) from error
+    return rig_from_mapping(content, path.name)
+
+
+def rig_from_mapping(content: Mapping[str, Any], file: str) -> Rig:
+    """Build a rig from parsed TOML; `file` names it in the error sentences."""
+    problems: list[str] = []
+    top = Table(content, "", file, problems)
+    if top.integer("format", RIG_FORMAT) != RIG_FORMAT:
+        top.complain("format", f"this version reads format {RIG_FORMAT}")
+    defaults = top.table("defaults", optional=True)
+    calibration = top.table("calibration")
+    image = top.table("virtual_image", optional=True)
+    rig = Rig(
+        name=top.text("name"),
+        title=top.text("title", ""),
+        timing="synchronous"
+        if top.choice("timing", ("syntopic", "synchronous")) == "synchronous"
+        else "syntopic",
+        frame_interval_s=top.number("frame_interval_s", positive=True),
+        master_cone=top.text("master_cone"),
+        colour_master_cone=top.text("colour_master_cone", "") or None,
+        reference_cone=top.text("reference_cone"),
+        calibration_id=calibration.text("id"),
+        calibration_date=calibration.text("date"),
+        virtual_image=_virtual_image(image) if image.content else None,
+        cones=tuple(_cone(cone, defaults) for cone in top.tables("cone")),
+    )
+    for table in (defaults, calibration, image, top):
+        table.refuse_unknown()
+    _check_names(rig, file, problems)
+    if problems:
+        raise RigError(problems)
+    return rig
+
+
+def _virtual_image(table: Table) -> VirtualImage:
+    return VirtualImage(
+        width_px=table.integer("width_px", positive=True),
+        height_px=table.integer("height_px", positive=True),
+        pitch_um=table.number("pitch_um", positive=True),
+        f_mm=table.number("f_mm", positive=True),
+        colour_ratio=table.integer("colour_ratio", 1, positive=True),
+    )
+
+
+def _cone(table: Table, defaults: Table) -> Cone:
+    probe = table.text("probe")
+    calibration_c = table.number("calibration_c")
+    bands = table.texts("bands")
+    for band in bands:
+        if band not in BANDS:
+            table.complain("bands", f"a band is one of {', '.join(BANDS)}")
+    lens_defaults = defaults.table("lens", optional=True)
+    sensor_defaults = defaults.table("sensor", optional=True)
+    lens = table.table("lens").over(lens_defaults)
+    sensors = [s.over(sensor_defaults) for s in table.tables("sensor")]
+    cone = Cone(
+        name=table.text("name"),
+        role="pan" if table.choice("role", ("pan", "colour")) == "pan" else "colour",
+        bands=bands,
+        position_mm=table.triple("position_mm"),
+        rotation_rad=table.triple("rotation_rad"),
+        probe=probe,
+        calibration_c=calibration_c,
+        mark_to_mid_exposure_ns=table.integer("mark_to_mid_exposure_ns", 0),
+        lens=_lens(lens),
+        sensors=tuple(_sensor(sensor, probe, calibration_c) for sensor in sensors),
+    )
+    table.refuse_unknown()
+    return cone
+
+
+def _lens(table: Table) -> Lens:
+    direction = table.text("direction", "ideal_from_measured")
+    if direction != "ideal_from_measured":
+        table.complain("direction", "a lens correction here is ideal_from_measured")
+    number = table.number
+    lens = Lens(
+        f_mm=number("f_mm", positive=True),
+        f_ppm_per_k=number("f_ppm_per_k", 0.0),
+        f_number=number("f_number", 5.6, positive=True),
+        serial=table.text("serial", ""),
+        dx0_mm=number("dx0_mm", 0.0),
+        dy0_mm=number("dy0_mm", 0.0),
+        df_mm=number("df_mm", 0.0),
+        k1=number("k1", 0.0),
+        k2=number("k2", 0.0),
+        k3=number("k3", 0.0),
+        p1=number("p1", 0.0),
+        p2=number("p2", 0.0),
+        b1=number("b1", 0.0),
+        b2=number("b2", 0.0),
+    )
+    table.refuse_unknown()
+    return lens
+
+
+def _sensor(table: Table, probe: str, calibration_c: float) -> Sensor:
+    drift = table.table("drift", optional=True)
+    sign = table.integer("tdi_row_sign", 1)
+    if sign not in (-1, 1):
+        table.complain("tdi_row_sign", "it is 1 (charge moves to higher rows) or -1")
+    bits = table.integer("bits", 12, positive=True)
+    if bits > 16:
+        table.complain("bits", "a pixel has at most 16 bits")
+    sensor = Sensor(
+        name=table.text("name"),
+        serial=table.text("serial", ""),
+        width_px=table.integer("width_px", positive=True),
+        height_px=table.integer("height_px", positive=True),
+        pitch_um=table.number("pitch_um", positive=True, says="a pixel pitch is positive"),
+        x_mm=table.number("x_mm"),
+        y_mm=table.number("y_mm"),
+        rotation_rad=table.number("rotation_rad", 0.0),
+        scale=table.number("scale", 1.0, positive=True),
+        position_sigma_um=table.number("position_sigma_um", 0.0),
+        calibration_c=table.number("calibration_c", calibration_c),
+        probe=table.text("probe", probe),
+        drift=Drift(
+            x_um_per_k=drift.number("x_um_per_k", 0.0),
+            y_um_per_k=drift.number("y_um_per_k", 0.0),
+            rotation_urad_per_k=drift.number("rotation_urad_per_k", 0.0),
+            scale_ppm_per_k=drift.number("scale_ppm_per_k", 0.0),
+            sigma_um_per_k=drift.number("sigma_um_per_k", 0.0),
+            lag_s=drift.number("lag_s", 0.0),
+        ),
+        bits=bits,
+        black_dn=table.number("black_dn", 0.0),
+        electrons_per_dn=table.number("electrons_per_dn", 1.0, positive=True),
+        read_noise_e=table.number("read_noise_e", 0.0),
+        colour_filter_array=table.choice("colour_filter_array", COLOUR_FILTER_ARRAYS, "none"),
+        tdi_row_sign=sign,
+        justified=table.choice("justified", JUSTIFICATIONS, "right"),
+    )
+    drift.refuse_unknown()
+    table.refuse_unknown()
+    return sensor
+
+
+def _check_names(rig: Rig, file: str, problems: list[str]) -> None:
+    cones = [cone.name for cone in rig.cones]
+    sensors = [sensor.name for sensor in rig.sensors]
+    for kind, names in (("cone", cones), ("sensor", sensors)):
+        twice = dict.fromkeys(name for name in names if names.count(name) > 1)
+        problems.extend(f"{file}: {kind} name {n!r} is used twice; names are unique" for n in twice)
+    for key in ("master_cone", "colour_master_cone", "reference_cone"):
+        name = getattr(rig, key)
+        if name is not None and name not in cones:
+            listed = ", ".join(cones) or "none"
+            problems.append(f"{file}: {key} is {name!r}; it names a cone of this rig: {listed}")
+    problems.extend(
+        f"{file}: cone {cone.name!r} has no sensor; give it [[cone.sensor]]"
+        for cone in rig.cones
+        if not cone.sensors
+    )
+    problems.extend(
+        f"{file}: sensor {sensor.name!r} is left-justified; a rig with [virtual_image] has "
+        f"right-justified words"
+        for sensor in rig.sensors
+        if rig.virtual_image is not None and sensor.justified == "left"
+    )

@@ -1,0 +1,193 @@
+"""The rig: what a camera of several heads is made of.
+
+Units and signs: image plane in mm, x right, y up, origin at the calibrated principal point,
+nominal flight direction +y. Body axes x forward, y right, z down. Angles omega, phi, kappa in
+radians with R = Rx(omega) Ry(phi) Rz(kappa), camera to object. How a file becomes a rig is in
+`processing.rig.file`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Timing = Literal["syntopic", "synchronous"]
+Role = Literal["pan", "colour"]
+
+
+@dataclass(frozen=True)
+class Drift:
+    """What one kelvin of dC does to a sensor's place in its cone (DESIGN 5.3)."""
+
+    x_um_per_k: float = 0.0
+    y_um_per_k: float = 0.0
+    rotation_urad_per_k: float = 0.0
+    scale_ppm_per_k: float = 0.0
+    sigma_um_per_k: float = 0.0
+    lag_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """One CCD: its pixels, its calibrated place in the layer of its cone, and its drift.
+
+    `x_mm`, `y_mm` place the centre of the pixel array, `rotation_rad` turns it counter-clockwise,
+    `scale` is near one. The place holds at `calibration_c`. `position_sigma_um` is the standard
+    deviation of each calibrated coordinate. A left-justified sensor keeps its DN in the highest
+    bits of a 16-bit word: word = DN * `words_per_dn`.
+    """
+
+    name: str
+    serial: str
+    width_px: int
+    height_px: int
+    pitch_um: float
+    x_mm: float
+    y_mm: float
+    rotation_rad: float
+    scale: float
+    position_sigma_um: float
+    calibration_c: float
+    probe: str
+    drift: Drift
+    bits: int
+    black_dn: float
+    electrons_per_dn: float
+    read_noise_e: float
+    colour_filter_array: str
+    tdi_row_sign: int
+    justified: str = "right"
+
+    @property
+    def pitch_mm(self) -> float:
+        return self.pitch_um * 1e-3
+
+    @property
+    def full_scale_dn(self) -> int:
+        return (1 << self.bits) - 1
+
+    @property
+    def words_per_dn(self) -> int:
+        """What one DN adds to a stored word: 1, or 2^(16 - bits) where DN are left-justified."""
+        return 1 << (16 - self.bits) if self.justified == "left" else 1
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Principal distance and the Australis ten, eq. 5.1 of seeds/dmc-calibration.txt.
+
+    The correction carries *measured* image coordinates to *ideal* ones: ideal = measured + delta.
+    `f_ppm_per_k` is the drift of the principal distance against dC of the cone's probe.
+    """
+
+    f_mm: float
+    f_ppm_per_k: float
+    f_number: float
+    serial: str
+    dx0_mm: float
+    dy0_mm: float
+    df_mm: float
+    k1: float
+    k2: float
+    k3: float
+    p1: float
+    p2: float
+    b1: float
+    b2: float
+
+
+@dataclass(frozen=True)
+class Cone:
+    """One lens with one focal plane.
+
+    `position_mm` is the projection centre in the body frame; `rotation_rad` is (omega, phi, kappa)
+    of master_from_cone, the platform calibration.
+    """
+
+    name: str
+    role: Role
+    bands: tuple[str, ...]
+    position_mm: tuple[float, float, float]
+    rotation_rad: tuple[float, float, float]
+    probe: str
+    calibration_c: float
+    mark_to_mid_exposure_ns: int
+    lens: Lens
+    sensors: tuple[Sensor, ...]
+
+
+@dataclass(frozen=True)
+class VirtualImage:
+    """The stitched image: a central perspective of `f_mm` on a raster centred on the axis."""
+
+    width_px: int
+    height_px: int
+    pitch_um: float
+    f_mm: float
+    colour_ratio: int
+
+    @property
+    def pitch_mm(self) -> float:
+        return self.pitch_um * 1e-3
+
+    @property
+    def colour_width_px(self) -> int:
+        return self.width_px // self.colour_ratio
+
+    @property
+    def colour_height_px(self) -> int:
+        return self.height_px // self.colour_ratio
+
+
+@dataclass(frozen=True)
+class Rig:
+    """A camera of several heads, as its file tells it."""
+
+    name: str
+    title: str
+    timing: Timing
+    frame_interval_s: float
+    master_cone: str
+    colour_master_cone: str | None
+    reference_cone: str
+    calibration_id: str
+    calibration_date: str
+    virtual_image: VirtualImage | None
+    cones: tuple[Cone, ...]
+
+    def cone(self, name: str) -> Cone:
+        """The cone of that name; KeyError names those there are."""
+        for cone in self.cones:
+            if cone.name == name:
+                return cone
+        raise KeyError(f"no cone {name!r}; the rig has {', '.join(c.name for c in self.cones)}")
+
+    def cone_of(self, sensor_name: str) -> Cone:
+        """The cone that carries a sensor."""
+        for cone in self.cones:
+            if any(sensor.name == sensor_name for sensor in cone.sensors):
+                return cone
+        raise KeyError(f"no sensor {sensor_name!r} in rig {self.name}")
+
+    def sensor(self, name: str) -> Sensor:
+        """The sensor of that name."""
+        return next(s for s in self.cone_of(name).sensors if s.name == name)
+
+    @property
+    def sensors(self) -> tuple[Sensor, ...]:
+        """All sensors in file order."""
+        return tuple(sensor for cone in self.cones for sensor in cone.sensors)
+
+    @property
+    def pan_cones(self) -> tuple[Cone, ...]:
+        return tuple(cone for cone in self.cones if cone.role == "pan")
+
+    @property
+    def colour_cones(self) -> tuple[Cone, ...]:
+        return tuple(cone for cone in self.cones if cone.role == "colour")
+
+    @property
+    def probes(self) -> tuple[str, ...]:
+        """Names of the temperature probes the rig asks for, without repetition; "" is none."""
+        named = [c.probe for c in self.cones] + [s.probe for s in self.sensors]
+        return tuple(dict.fromkeys(name for name in named if name))

@@ -1,0 +1,137 @@
+"""A table of a rig file that answers typed questions and remembers every mistake.
+
+What the questions are is in `processing.rig.file`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+
+class RigError(ValueError):
+    """A rig file that cannot be used; `problems` holds one sentence for each mistake found."""
+
+    def __init__(self, problems: Sequence[str]) -> None:
+        self.problems = tuple(problems)
+        super().__init__("\n".join(problems))
+
+
+class Table:
+    """A TOML table that answers typed questions and notes every mistake with its full key."""
+
+    def __init__(
+        self, content: Mapping[str, Any], path: str, file: str, problems: list[str]
+    ) -> None:
+        self.content = content
+        self.path = path
+        self.file = file
+        self.problems = problems
+        self.asked: set[str] = set()
+
+    def complain(self, key: str, cure: str) -> None:
+        found = f"is {self.content[key]!r}" if key in self.content else "is missing"
+        self.problems.append(f"{self.file}: {self._key(key)} {found}; {cure}")
+
+    def number(
+        self, key: str, default: float | None = None, *, positive: bool = False, says: str = ""
+    ) -> float:
+        value = self._get(key, default, "a number is needed")
+        if value is None:
+            return 1.0
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, int | float)
+            or not math.isfinite(value)
+        ):
+            self.complain(key, "a finite number is needed")
+            return 1.0
+        if positive and value <= 0:
+            self.complain(key, says or "it is positive")
+            return 1.0
+        return float(value)
+
+    def integer(self, key: str, default: int | None = None, *, positive: bool = False) -> int:
+        value = self._get(key, default, "a whole number is needed")
+        if value is None:
+            return 1
+        if isinstance(value, bool) or not isinstance(value, int):
+            self.complain(key, "a whole number is needed")
+            return 1
+        if positive and value <= 0:
+            self.complain(key, "it is positive")
+            return 1
+        return value
+
+    def text(self, key: str, default: str | None = None) -> str:
+        value = self._get(key, default, "a text is needed")
+        if value is not None and not isinstance(value, str):
+            self.complain(key, "a text is needed")
+            return ""
+        return value or ""
+
+    def choice(self, key: str, allowed: Sequence[str], default: str | None = None) -> str:
+        value = self._get(key, default, f"it is one of {', '.join(allowed)}")
+        if value is not None and value not in allowed:
+            self.complain(key, f"it is one of {', '.join(allowed)}")
+        return value if isinstance(value, str) and value in allowed else allowed[0]
+
+    def texts(self, key: str) -> tuple[str, ...]:
+        value = self._get(key, None, "a list of texts is needed")
+        if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
+            if value is not None:
+                self.complain(key, "a list of texts is needed")
+            return ()
+        return tuple(value)
+
+    def triple(self, key: str) -> tuple[float, float, float]:
+        value = self._get(key, None, "three numbers are needed")
+        good = (
+            isinstance(value, list)
+            and len(value) == 3
+            and all(isinstance(v, int | float) and math.isfinite(v) for v in value)
+        )
+        if not good:
+            if value is not None:
+                self.complain(key, "three numbers are needed")
+            return (0.0, 0.0, 0.0)
+        return (float(value[0]), float(value[1]), float(value[2]))
+
+    def table(self, key: str, *, optional: bool = False) -> Table:
+        value = self._get(key, {} if optional else None, f"a table [{self._key(key)}] is needed")
+        if value is not None and not isinstance(value, dict):
+            self.complain(key, "a table is needed")
+        content = value if isinstance(value, dict) else {}
+        return Table(content, self._key(key), self.file, self.problems)
+
+    def tables(self, key: str) -> Iterator[Table]:
+        value = self._get(key, None, f"at least one [[{self._key(key)}]] is needed")
+        if value is not None and not (
+            isinstance(value, list) and all(isinstance(v, dict) for v in value)
+        ):
+            self.complain(key, f"a list of tables [[{self._key(key)}]] is needed")
+            value = None
+        for index, content in enumerate(value or ()):
+            yield Table(content, f"{self._key(key)}[{index}]", self.file, self.problems)
+
+    def over(self, defaults: Table) -> Table:
+        """This table with another's values where it has none of its own."""
+        defaults.asked.update(defaults.content)
+        return Table({**defaults.content, **self.content}, self.path, self.file, self.problems)
+
+    def refuse_unknown(self) -> None:
+        for key in self.content:
+            if key not in self.asked:
+                self.complain(key, "no such key; check the spelling")
+
+    def _get(self, key: str, default: Any, cure: str) -> Any:
+        self.asked.add(key)
+        if key not in self.content:
+            if default is None:
+                self.complain(key, cure)
+            return default
+        return self.content[key]
+
+    def _key(self, key: str) -> str:
+        return f"{self.path}.{key}" if self.path else key

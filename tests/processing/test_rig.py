@@ -1,0 +1,96 @@
+"""Rig files are taken as they say, or refused with every mistake named at once."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from processing.rig import RigError, find_rig, load_rig, rig_from_mapping, shipped_rigs
+
+
+def content(name: str = "ultracam-x-mini") -> dict[str, Any]:
+    return tomllib.loads(shipped_rigs()[name].read_text())
+
+
+def problems_of(changed: dict[str, Any]) -> tuple[str, ...]:
+    with pytest.raises(RigError) as refused:
+        rig_from_mapping(changed, "camera.toml")
+    return refused.value.problems
+
+
+@pytest.mark.parametrize("name", sorted(shipped_rigs()))
+def test_every_shipped_rig_loads_and_is_called_what_its_file_is(name: str) -> None:
+    rig = find_rig(name)
+    assert rig.name == name
+    assert rig.sensors and rig.cone(rig.master_cone) and rig.cone(rig.reference_cone)
+
+
+def test_ultracam_x_is_thirteen_sensors_in_eight_cones_over_one_virtual_image() -> None:
+    rig = find_rig("ultracam-x")
+    assert [len(cone.sensors) for cone in rig.pan_cones] == [4, 2, 2, 1]
+    assert len(rig.colour_cones) == 4
+    image = rig.virtual_image
+    assert image is not None
+    assert (image.width_px, image.height_px) == (3 * 4992 - 2 * 273, 3 * 3328 - 2 * 282)
+    forward = [cone.position_mm[0] for cone in rig.pan_cones]
+    assert sorted(forward) == [-120.0, -40.0, 40.0, 120.0]
+
+
+def test_the_mini_drifts_by_as_many_pixels_as_the_full_rig() -> None:
+    full, mini = find_rig("ultracam-x"), find_rig("ultracam-x-mini")
+    for name in ("SU00", "SU01", "SU02", "SU03"):
+        drift_full, drift_mini = full.sensor(name).drift, mini.sensor(name).drift
+        assert drift_mini.x_um_per_k == pytest.approx(drift_full.x_um_per_k, abs=0.2)
+        assert drift_mini.y_um_per_k == pytest.approx(drift_full.y_um_per_k, abs=0.2)
+
+
+def test_all_mistakes_are_named_at_once_with_file_key_value_and_cure() -> None:
+    changed = content()
+    changed["cone"][1]["sensor"][0]["pitch_um"] = -7.2
+    changed["timing"] = "sometimes"
+    changed["cone"][0]["lens"]["f_mm"] = "long"
+    changed["colour_master_cone"] = "Q"
+    del changed["calibration"]["date"]
+    changed["cone"][2]["sensor"][1]["pitch"] = 7.2
+    problems = problems_of(changed)
+    assert len(problems) == 6, problems
+    assert "camera.toml: cone[1].sensor[0].pitch_um is -7.2; a pixel pitch is positive" in problems
+    for key in (
+        "timing is 'sometimes'",
+        "cone[0].lens.f_mm is 'long'",
+        "colour_master_cone is 'Q'",
+        "calibration.date is missing",
+        "cone[2].sensor[1].pitch is 7.2; no such key",
+    ):
+        assert any(key in problem for problem in problems), key
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), True, [1.0], "7"])
+def test_a_number_that_is_none_is_refused(value: object) -> None:
+    changed = content()
+    changed["cone"][0]["sensor"][0]["x_mm"] = value
+    (problem,) = problems_of(changed)
+    assert "cone[0].sensor[0].x_mm" in problem
+
+
+def test_two_sensors_of_one_name_are_refused() -> None:
+    changed = content()
+    changed["cone"][0]["sensor"][1]["name"] = "SU00"
+    (problem,) = problems_of(changed)
+    assert "SU00" in problem and "unique" in problem
+
+
+def test_what_is_no_rig_file_is_refused_in_one_sentence(tmp_path: Path) -> None:
+    broken = tmp_path / "camera.toml"
+    broken.write_bytes(b"\xff\xfe[cone")
+    huge = tmp_path / "huge.toml"
+    huge.write_bytes(b"#" * 1_100_000)
+    for path in (broken, huge, tmp_path / "absent.toml"):
+        with pytest.raises(RigError) as refused:
+            load_rig(path)
+        assert len(refused.value.problems) == 1
+    with pytest.raises(RigError, match="ultracam-x-mini"):
+        find_rig("ultracam-y")
