@@ -12,7 +12,20 @@ from typing import NoReturn
 import typer
 from rich.console import Console
 
-from daemon.cli import check, demo, export, imports, kernels, process, rigs, run, sim, verify
+from daemon.cli import (
+    calibrate,
+    check,
+    demo,
+    develop,
+    export,
+    imports,
+    kernels,
+    process,
+    rigs,
+    run,
+    sim,
+    verify,
+)
 from daemon.configuration import ConfigurationError
 from daemon.errors import DaemonError
 from processing.rig import RigError
@@ -31,12 +44,14 @@ app.command(name="demo", help=demo.HELP)(demo.demo)
 app.command(name="run", help=run.HELP)(run.run)
 app.command(name="check", help=check.HELP)(check.check)
 app.command(name="process", help=process.HELP)(process.process)
+app.command(name="develop", help=develop.HELP)(develop.develop)
 app.command(name="verify", help=verify.HELP)(verify.verify)
 app.command(name="sim", help=sim.HELP)(sim.sim)
 app.command(name="kernels", help=kernels.HELP)(kernels.kernels)
 app.add_typer(rigs.app, name="rigs")
 app.add_typer(imports.app, name="import")
 app.add_typer(export.app, name="export")
+app.add_typer(calibrate.app, name="calibrate")
 
 
 def main() -> NoReturn:

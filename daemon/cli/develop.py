@@ -1,0 +1,95 @@
+"""`syntopic develop`: Level-3 after landing, pansharpened and in one tone."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import Progress
+
+from daemon.cli.tables import light_table
+from daemon.configuration import ConfigurationError
+from daemon.mission import Mission
+
+HELP = """Make Level-3 of a mission after landing: pansharpened RGB and CIR in 16 and 8 bits.
+
+One tone curve serves all exposures that have Level-2, so that neighbouring images match; it is made
+anew from all of them each time.
+
+Examples: `syntopic develop MISSION`, `syntopic develop MISSION --only 3 --image cir --bits 8`
+"""
+
+
+def develop(
+    mission: Annotated[Path, typer.Argument(help="Mission folder.")],
+    only: Annotated[
+        list[int] | None, typer.Option(help="An exposure's number; repeatable.")
+    ] = None,
+    image: Annotated[list[str] | None, typer.Option(help="rgb or cir; repeatable.")] = None,
+    bits: Annotated[list[int] | None, typer.Option(help="16 or 8; repeatable.")] = None,
+    threads: Annotated[int, typer.Option(help="Cores to use.", min=1)] = 2,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    import cv2
+
+    from daemon import level3
+    from processing.rig import load_rig
+
+    images, depths = image or list(level3.IMAGES), bits or list(level3.DEPTHS)
+    if set(images) - set(level3.IMAGES) or set(depths) - set(level3.DEPTHS):
+        raise ConfigurationError(["--image is rgb or cir, --bits is 16 or 8"])
+    cv2.setNumThreads(threads)
+    folder = Mission.open(mission)
+    rig = load_rig(folder.rig_path)
+    rows = []
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("histograms", total=None)
+        tones = level3.mission_tones(
+            folder, rig, lambda _, done, total: progress.update(task, completed=done, total=total)
+        )
+        numbers = only or sorted(tones.scales)
+        progress.update(task, description="developing", total=len(numbers), completed=0)
+        for number in numbers:
+            if number not in tones.scales:
+                raise level3.Level3Error(
+                    f"exposure {number}: has no colour at Level-2; run syntopic process first"
+                )
+            started = time.monotonic()
+            done = level3.develop(
+                folder, rig, number, tones, images=images, depths=depths, threads=threads
+            )
+            rows.append((done, time.monotonic() - started))
+            progress.advance(task)
+    if as_json:
+        content = {
+            "mission": str(folder.path),
+            "tone_curve_sha256": tones.sha256,
+            "exponent": tones.curve.exponent,
+            "exposures": [
+                {
+                    "exposure": done.number,
+                    "files": dict(done.files),
+                    "left_out": list(done.left_out),
+                    "duration_s": round(seconds, 3),
+                }
+                for done, seconds in rows
+            ],
+        }
+        typer.echo(json.dumps(content))
+        return
+    table = light_table("Level-3", (), ("exposure", "files", "MB", "s"))
+    for done, seconds in rows:
+        nbytes = sum(done.files.values())
+        table.add_row(
+            str(done.number), str(len(done.files)), f"{nbytes / 1e6:.1f}", f"{seconds:.1f}"
+        )
+    console = Console()
+    console.print(table)
+    for done, _ in rows:
+        for sentence in done.left_out:
+            console.print(f"Exposure {done.number}: {sentence}", style="yellow", markup=False)
+    console.print(f"Images are in [bold]{level3.level3_root(folder)}[/]")
