@@ -68,8 +68,8 @@ class LearnedSensor:
     """Corrections to a sensor's calibration, and their standard deviations, by quantity.
 
     `rates` per kelvin: um, um, urad, ppm; `offsets` the same at the calibration temperature.
-    `effect_px` is what the rates' correction moves the sensor's farthest pixel at the largest dC
-    flown.
+    `effect_px` is what the rates' correction moves the sensor's farthest pixel at `largest_dc_k`,
+    the largest dC flown.
     """
 
     cone: str
@@ -78,6 +78,7 @@ class LearnedSensor:
     offset_sigmas: Mapping[str, float]
     rates: Mapping[str, float]
     rate_sigmas: Mapping[str, float]
+    largest_dc_k: float
     effect_px: float
 
 
@@ -365,15 +366,23 @@ def _sensors(cone: Cone, normal: Normal, solution: Array, covariance: Array) -> 
         half_mm = math.hypot(s.width_px, s.height_px) / 2.0 * s.pitch_mm
         x, y, rotation, scale = np.abs(rates[part])
         moved_um = math.hypot(x, y) + (rotation + scale) * half_mm * 1e-3
-        named = [
-            dict(zip(_QUANTITIES, (float(v) for v in values[part]), strict=True))
-            for values in (offsets, offset_sigmas, rates, rate_sigmas)
-        ]
-        effect_px = moved_um * largest / s.pitch_um
         result.append(
-            LearnedSensor(cone.name, s.name, named[0], named[1], named[2], named[3], effect_px)
+            LearnedSensor(
+                cone=cone.name,
+                sensor=s.name,
+                offsets=_by_quantity(offsets[part]),
+                offset_sigmas=_by_quantity(offset_sigmas[part]),
+                rates=_by_quantity(rates[part]),
+                rate_sigmas=_by_quantity(rate_sigmas[part]),
+                largest_dc_k=largest,
+                effect_px=moved_um * largest / s.pitch_um,
+            )
         )
     return result
+
+
+def _by_quantity(values: Array) -> dict[str, float]:
+    return dict(zip(_QUANTITIES, (float(v) for v in values), strict=True))
 
 
 def _far_px(rig: Rig, cone: Cone) -> float:

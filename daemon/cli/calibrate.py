@@ -1,0 +1,148 @@
+"""`syntopic calibrate`: calibrations from what was flown, proposed and never put in place."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+
+from daemon.cli.tables import light_table
+
+if TYPE_CHECKING:
+    from daemon.thermal_calibration import Gathered
+    from processing.thermal_learning import Learned, Observability
+    from processing.thermal_proposal import Change
+
+app = typer.Typer(
+    help="Calibrations from flown missions.", no_args_is_help=True, rich_markup_mode="markdown"
+)
+
+THERMAL_HELP = """Learn the temperature-dependent model from flown missions.
+
+The missions were flown with one rig file at dC that spread over at least 5 K. What their stitching
+says becomes a new, dated rig file; it counts only when a person configures it. No file is ever
+overwritten.
+
+Examples: `syntopic calibrate thermal MISSION...`, `syntopic calibrate thermal A B --out rig.toml`
+"""
+
+
+@app.callback()
+def calibrate() -> None:
+    """Calibrations from flown missions."""
+
+
+@app.command(name="thermal", help=THERMAL_HELP)
+def thermal(
+    missions: Annotated[list[Path], typer.Argument(help="Mission folders with Level-2.")],
+    out: Annotated[
+        Path | None, typer.Option(help="The new rig file; by default named by rig and date.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    from daemon.thermal_calibration import gather, write_rig
+    from processing.thermal_learning import learned, observability
+    from processing.thermal_proposal import proposed_rig
+
+    gathered = gather(missions)
+    rig = gathered.rig
+    found = learned(rig, gathered.state)
+    today = f"{datetime.now(UTC):%Y-%m-%d}"
+    calibration_id = f"{rig.calibration_id}-thermal-{today}"
+    proposal, changes = proposed_rig(rig, found, calibration_id=calibration_id, date=today)
+    written: Path | None = None
+    if changes:
+        written = out or Path(f"{rig.name}-thermal-{today}.toml")
+        remark = (
+            f"{rig.name}, proposed by `syntopic calibrate thermal` on {today} from "
+            f"{gathered.exposures} exposures,\nin place of calibration {rig.calibration_id}. "
+            "It counts only where it is configured.\nPer-kelvin values and places of sensors "
+            "relative to each other are learned; what is common to\nthe sensors of a cone is as "
+            "it was."
+        )
+        write_rig(proposal, written, remark=remark)
+    seen = observability(rig)
+    if as_json:
+        typer.echo(json.dumps(_json(gathered, found, changes, seen, written)))
+    else:
+        _print(gathered, found, changes, seen, written)
+    raise typer.Exit(0 if changes else 1)
+
+
+def _json(
+    gathered: Gathered,
+    found: Learned,
+    changes: tuple[Change, ...],
+    seen: tuple[Observability, ...],
+    written: Path | None,
+) -> dict[str, Any]:
+    return {
+        "rig": gathered.rig.name,
+        "calibration_id": gathered.rig.calibration_id,
+        "exposures": gathered.exposures,
+        "passed_over": list(gathered.passed_over),
+        "dc_spread_k": dict(found.spread_k),
+        "not_learned": dict(found.reasons),
+        "variance_factors": dict(found.variance_factors),
+        "changes": [
+            {
+                "where": c.where,
+                "what": c.what,
+                "old": c.old,
+                "new": c.new,
+                "sigma": c.sigma,
+                "significance": c.significance,
+                "effect_px": c.effect_px,
+            }
+            for c in changes
+        ],
+        "observability": [{"what": o.what, "observable": o.observable, "why": o.why} for o in seen],
+        "written": None if written is None else str(written),
+    }
+
+
+def _print(
+    gathered: Gathered,
+    found: Learned,
+    changes: tuple[Change, ...],
+    seen: tuple[Observability, ...],
+    written: Path | None,
+) -> None:
+    console = Console()
+    console.print(
+        f"[bold]{gathered.rig.name}[/], calibration {gathered.rig.calibration_id}: "
+        f"{gathered.exposures} exposures"
+    )
+    for sentence in gathered.passed_over[:10]:
+        console.print(f"  passed over: {sentence}", markup=False, highlight=False)
+    if len(gathered.passed_over) > 10:
+        console.print(f"  and {len(gathered.passed_over) - 10} more")
+    for key, reason in found.reasons.items():
+        console.print(f"  {key}: nothing learned, {reason}", markup=False, highlight=False)
+    if changes:
+        table = light_table("Old and new", ("", "value"), ("old", "new", "sigma", "t", "px"))
+        for c in changes:
+            table.add_row(
+                c.where,
+                c.what,
+                f"{c.old:.7g}",
+                f"{c.new:.7g}",
+                f"{c.sigma:.2g}",
+                f"{c.significance:.1f}",
+                f"{c.effect_px:.3f}",
+            )
+        console.print(table)
+        console.print(
+            "px: what the change moves the sensor's farthest pixel by, at the largest dC flown"
+        )
+    for o in seen:
+        if not o.observable:
+            console.print(f"Not observable: {o.what}: {o.why}", markup=False, highlight=False)
+    if written is None:
+        console.print("[yellow]Nothing learned, nothing written[/]")
+    else:
+        console.print(f"Proposed calibration: [bold]{written}[/]", soft_wrap=True)
