@@ -48,6 +48,7 @@ def pan_only_mosaic(
     placements: Mapping[str, SensorPlacement],
     tie_points: TiePoints,
     *,
+    precorrected: bool = False,
     settings: MosaicSettings | None = None,
 ) -> Mosaic:
     """Stitch PAN layers onto the master's by similarities, from P/P tie points.
@@ -57,11 +58,12 @@ def pan_only_mosaic(
 
     Args:
         rig: the camera.
-        placements: calibration + TDM; the calibrated rotations of PAN cones are left out.
+        placements: calibration + TDM, layers by platform calibration.
         tie_points: matched points; those with the colour master are not looked at.
+        precorrected: keep the calibrated rotations of the PAN cones; the experiment did not.
         settings: None takes the defaults.
     """
-    start = without_precorrection(rig, placements)
+    start = dict(placements) if precorrected else without_precorrection(rig, placements)
     layers = [cone.name for cone in rig.pan_cones if cone.name != rig.master_cone]
     return adjust_mosaic(
         rig,

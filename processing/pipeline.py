@@ -46,6 +46,7 @@ from processing.level1 import (
     level1_from_level0,
 )
 from processing.mosaic import Mosaic, MosaicSettings, free_mosaic
+from processing.pan_only import pan_only_mosaic
 from processing.placement import SensorPlacement, nominal_placements
 from processing.precision import precision_figures
 from processing.product import Method, Product, Settings
@@ -259,6 +260,9 @@ class Pipeline:
         settings = self._mosaic_settings(conditions)
         if self.settings.method == "fixed":
             mosaic = fixed_mosaic(self.rig, start, tie_points, settings=settings)
+            return mosaic, mosaic, None
+        if self.settings.method == "pan-only":
+            mosaic = pan_only_mosaic(self.rig, start, tie_points, settings=settings)
             return mosaic, mosaic, None
         mosaic = free_mosaic(self.rig, start, tie_points, settings=settings)
         known = temperatures.usable_c if self.settings.use_drift else {}

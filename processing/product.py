@@ -19,12 +19,15 @@ from processing.tie_points import TiePoints, TiePointSettings
 from processing.validity import Validity
 
 Array = NDArray[Any]
-Method = Literal["free", "fixed"]
+Method = Literal["free", "fixed", "pan-only"]
 
 
 @dataclass(frozen=True)
 class Settings:
     """How exposures are processed.
+
+    `method` "fixed" is the earlier method, "pan-only" the experiment without the colour master:
+    both are there to be compared with, not to be flown.
 
     `baselines` solves the fixed method with and without TDM from the same tie points as well, for
     comparison: their geometry only, nothing is resampled. `relief_fraction` is the terrain's height

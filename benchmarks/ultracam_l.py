@@ -1,0 +1,435 @@
+"""`python -m benchmarks.ultracam_l`: two PAN cones stitched with and without the colour master.
+
+Repeats the experiment of the UltraCam L paper over an emulated line at full size and draws the
+systematic residuals as its fig. 10 does. Nothing is rendered: tie points are where the emulator's
+camera sees the same ground, plus noise of the size measured on rendered exposures.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.machine import machine
+from processing.conditions import Conditions, parallax_px
+from processing.fixed_method import fixed_mosaic
+from processing.mosaic import Mosaic, MosaicSettings, free_mosaic
+from processing.pan_only import pan_only_mosaic
+from processing.placement import (
+    SensorPlacement,
+    nominal_placements,
+    raw_from_vip_mm,
+    vip_mm_from_raw,
+    vip_px_from_mm,
+)
+from processing.rig import Rig, VirtualImage, shipped_rigs
+from processing.tie_points import PAN_TO_COLOUR, PAN_TO_PAN, TiePoints
+from processing.topology import Rectangle, colour_coverage, overlaps
+from sim_hw.flight import Flight
+from sim_hw.rendering import Look, ground_points
+from sim_hw.truth import true_vip
+from sim_hw.world import World, WorldSettings
+
+Array = NDArray[np.float64]
+Placements = Mapping[str, SensorPlacement]
+
+EPOCH_GPS_NS = 1_447_000_000_000_000_000
+SIGMA_PP_PX = 0.018
+SIGMA_PC_PX = 0.10
+"""Of one coordinate of a difference: what the adjustment finds on rendered ultracam-l-mini."""
+POINTS_PER_OVERLAP = 850
+POINTS_PER_SENSOR = 1900
+PROBE_SIGMA_C = 0.1
+GRID = (14, 19)
+"""Columns and rows of residuals on each half of the image."""
+METHODS = {
+    "experiment": "P/P only, 4 parameters, not pre-corrected",
+    "pre-corrected": "P/P only, 4 parameters, pre-corrected",
+    "fixed": "P/P only, 8 parameters, pre-corrected",
+    "regular": "P/P and P/C, 8 parameters, pre-corrected",
+}
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """One method over a line: errors (exposures, points, 2) px at `places` (points, 2) VIP px."""
+
+    places: Array
+    errors: Array
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.ultracam_l", description=__doc__)
+    parser.add_argument("--rig", default="ultracam-l")
+    parser.add_argument("--exposures", type=int, default=40)
+    parser.add_argument("--dc", type=float, default=12.0)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument(
+        "--rotation", type=float, default=None, help="turn cone 1 by this omega and phi, mrad"
+    )
+    parser.add_argument("--drawing", type=Path, default=None, help="where to draw fig. 10 (SVG)")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="syntopic-bench-") as folder:
+        rig_file = shipped_rigs()[options.rig]
+        if options.rotation is not None:
+            rig_file = _turned(rig_file, options.rotation * 1e-3, Path(folder))
+        world = World(
+            WorldSettings(
+                rig_file=str(rig_file),
+                seed=options.seed,
+                epoch_gps_ns=EPOCH_GPS_NS,
+                dc_k=options.dc,
+                exposures=options.exposures,
+            )
+        )
+    found = fly(world, options.exposures, options.seed)
+    pitch_um = world.image.pitch_um
+    figures = {name: figures_of(world.image, r) for name, r in found.items()}
+    if options.drawing is not None:
+        panels = [
+            (METHODS[n], systematic(world.image, found[n])) for n in ("experiment", "regular")
+        ]
+        options.drawing.write_text(
+            drawn(world.image, panels, f"{world.rig.name}, {options.exposures} exposures")
+        )
+    rotation = world.rig.pan_cones[1].rotation_rad
+    result: dict[str, Any] = {
+        "machine": machine(),
+        "rig": world.rig.name,
+        "exposures": options.exposures,
+        "cone_1_rotation_mrad": [round(v * 1e3, 3) for v in rotation],
+        "methods": figures,
+    }
+    if options.json:
+        print(json.dumps(result))
+        return
+    turned = " ".join(f"{v * 1e3:+.3f}" for v in rotation)
+    print(f"{world.rig.name}, {options.exposures} exposures, cone 1 turned by {turned} mrad")
+    print(f"{'':46}inner RMS  worst px   systematic RMS  worst um")
+    for name, f in figures.items():
+        print(
+            f"{METHODS[name]:46}{f['inner_rms_px']:9.4f}{f['inner_max_px']:10.3f}"
+            f"{f['systematic_rms_px'] * pitch_um:17.3f}{f['systematic_max_px'] * pitch_um:10.3f}"
+        )
+
+
+def _turned(rig_file: Path, angle_rad: float, folder: Path) -> Path:
+    """The rig with the second PAN cone turned by omega = phi = angle, calibrated and true alike."""
+    text = rig_file.read_text()
+    head, found, tail = text.partition('name = "1"')
+    tail = re.sub(
+        r"rotation_rad = \[.*?\]", f"rotation_rad = [{angle_rad}, {angle_rad}, 0.0]", tail, count=1
+    )
+    path = folder / rig_file.name
+    path.write_text(head + found + tail)
+    return path
+
+
+def fly(world: World, exposures: int, seed: int) -> dict[str, Residuals]:
+    """All methods over one line, from the same tie points."""
+    rig, plan = world.rig, world.plan
+    flight = world.flight.beginning_first_line_at(0.0)
+    period_ns = round(plan.distance_m / plan.ground_speed_mps * 1e9)
+    settings = MosaicSettings(parallax_px=parallax_px(rig, _conditions(world, {}), 0.01))
+    rng = np.random.default_rng(seed)
+    errors: dict[str, list[Array]] = {name: [] for name in METHODS}
+    raw = {name: _grid(world, rig, name) for name in _pan(rig)}
+    places = np.empty((0, 2))
+    for k in range(exposures):
+        looks = _looks(world, EPOCH_GPS_NS + 20_000_000_000 + k * period_ns)
+        probes = {
+            p: world.temperature_c(p, looks[rig.master_cone].mid_gps_ns)
+            + rng.normal(0, PROBE_SIGMA_C)
+            for p in rig.probes
+        }
+        start = nominal_placements(rig, probes, plan.tdi_shifts)
+        points = tie_points(world, flight, looks, start, rng)
+        mosaics = {
+            "experiment": pan_only_mosaic(rig, start, points, settings=settings),
+            "pre-corrected": pan_only_mosaic(
+                rig, start, points, precorrected=True, settings=settings
+            ),
+            "fixed": fixed_mosaic(rig, start, points, settings=settings),
+            "regular": free_mosaic(rig, start, points, settings=settings),
+        }
+        for name, mosaic in mosaics.items():
+            put, errors_here = _errors(world, flight, looks, mosaic, raw)
+            errors[name].append(errors_here)
+            if name == "regular" and not len(places):
+                places = put
+    return {name: Residuals(places, np.array(each)) for name, each in errors.items()}
+
+
+def _pan(rig: Rig) -> list[str]:
+    return [sensor.name for cone in rig.pan_cones for sensor in cone.sensors]
+
+
+def _conditions(world: World, probes: Mapping[str, float]) -> Conditions:
+    plan = world.plan
+    return Conditions(
+        temperatures_c=dict(probes),
+        exposure_time_s={name: t * 1e-6 for name, t in plan.exposure_time_us.items()},
+        tdi_shifts=plan.tdi_shifts,
+        ground_speed_mps=plan.ground_speed_mps,
+        height_above_ground_m=plan.height_above_ground_m,
+    )
+
+
+def _looks(world: World, reference_ns: int) -> dict[str, Look]:
+    """The exposure of every cone, each over the place of the reference cone."""
+    rig, plan = world.rig, world.plan
+    reference_mm = rig.cone(rig.reference_cone).position_mm[0]
+    return {
+        cone.name: Look(
+            reference_ns
+            - round((cone.position_mm[0] - reference_mm) * 1e-3 / plan.ground_speed_mps * 1e9),
+            plan.exposure_time_us[cone.name],
+            plan.tdi_shifts[cone.name],
+        )
+        for cone in rig.cones
+    }
+
+
+def _grid(world: World, rig: Rig, name: str) -> Array:
+    """Raw pixels of a sensor spread over its half of the virtual image."""
+    image = world.image
+    half = image.width_px * image.pitch_mm / 2.0
+    tall = image.height_px * image.pitch_mm / 2.0
+    left = rig.sensor(name).x_mm < 0.0
+    x = np.linspace(-half if left else 0.0, 0.0 if left else half, GRID[0] + 1)
+    y = np.linspace(-tall, tall, GRID[1] + 1)
+    xy = np.stack(np.meshgrid((x[1:] + x[:-1]) / 2, (y[1:] + y[:-1]) / 2), axis=-1).reshape(-1, 2)
+    return raw_from_vip_mm(nominal_placements(rig, {}, {})[name], xy)
+
+
+def tie_points(
+    world: World,
+    flight: Flight,
+    looks: Mapping[str, Look],
+    start: Placements,
+    rng: np.random.Generator,
+) -> TiePoints:
+    """Where two sensors truly see the same ground, relief and all, with the noise of matching."""
+    rig = world.rig
+    names = tuple(sensor.name for sensor in rig.sensors)
+    areas: list[tuple[str, str, Rectangle, int]] = [
+        (o.sensor_a, o.sensor_b, o.rectangle, PAN_TO_PAN) for o in overlaps(rig)
+    ]
+    assert rig.colour_master_cone is not None and rig.virtual_image is not None
+    green = rig.cone(rig.colour_master_cone).sensors[0].name
+    areas += [(n, green, r, PAN_TO_COLOUR) for n, r in colour_coverage(rig).items()]
+    rows = []
+    for number, (a, b, area, kind) in enumerate(areas):
+        count = POINTS_PER_OVERLAP if kind == PAN_TO_PAN else POINTS_PER_SENSOR
+        sigma = SIGMA_PP_PX if kind == PAN_TO_PAN else SIGMA_PC_PX
+        xy = np.stack(
+            [
+                rng.uniform(area.x_min_mm, area.x_max_mm, count),
+                rng.uniform(area.y_min_mm, area.y_max_mm, count),
+            ],
+            axis=1,
+        )
+        raw_a = raw_from_vip_mm(start[a], xy)
+        raw_b = _same_ground(world, flight, looks, (a, raw_a), (b, raw_from_vip_mm(start[b], xy)))
+        raw_a = raw_a + rng.normal(0.0, sigma, raw_a.shape)
+        rows.append(
+            np.column_stack(
+                [
+                    np.full(count, names.index(a)),
+                    np.full(count, names.index(b)),
+                    raw_a,
+                    raw_b,
+                    np.full(count, sigma),
+                    np.full(count, kind),
+                    np.full(count, number),
+                ]
+            )
+        )
+    table = np.concatenate(rows)
+    return TiePoints(
+        names=names,
+        pairs=tuple((a, b) for a, b, _, _ in areas),
+        sought=tuple(len(block) for block in rows),
+        sensor_a=table[:, 0].astype(np.int64),
+        sensor_b=table[:, 1].astype(np.int64),
+        raw_a=table[:, 2:4],
+        raw_b=table[:, 4:6],
+        sigma_px=table[:, 6],
+        correlation=np.ones(len(table)),
+        kind=table[:, 7].astype(np.int64),
+        overlap=table[:, 8].astype(np.int64),
+    )
+
+
+def _same_ground(
+    world: World,
+    flight: Flight,
+    looks: Mapping[str, Look],
+    seen: tuple[str, Array],
+    sought: tuple[str, Array],
+) -> Array:
+    """Raw pixels of the sought sensor that see the ground of the first's; Newton's method."""
+    target = _ground(world, flight, looks, *seen)
+    name, raw = sought[0], sought[1].copy()
+    for _ in range(4):
+        here = _ground(world, flight, looks, name, raw)
+        by_column = _ground(world, flight, looks, name, raw + np.array([1.0, 0.0])) - here
+        by_row = _ground(world, flight, looks, name, raw + np.array([0.0, 1.0])) - here
+        jacobian = np.stack([by_column, by_row], axis=2)
+        raw += np.linalg.solve(jacobian, (target - here)[:, :, None])[:, :, 0]
+    return raw
+
+
+def _ground(
+    world: World, flight: Flight, looks: Mapping[str, Look], name: str, raw: Array
+) -> Array:
+    """East and north, m, of what raw pixels see."""
+    cone = world.rig.cone_of(name)
+    look = looks[cone.name]
+    pose = flight.pose(look.mid_gps_ns)
+    ground = ground_points(world, cone, world.rig.sensor(name), raw[:, 0], raw[:, 1], look, pose)
+    return np.asarray(ground[:, :2])
+
+
+def _errors(
+    world: World,
+    flight: Flight,
+    looks: Mapping[str, Look],
+    mosaic: Mosaic,
+    raw: Mapping[str, Array],
+) -> tuple[Array, Array]:
+    """Places in VIP px and truth less place, (n, 2) each, of the grids of all PAN sensors."""
+    rig = world.rig
+    put, errors = [], []
+    for name, at in raw.items():
+        column, row = true_vip(
+            world,
+            flight,
+            name,
+            looks[rig.cone_of(name).name],
+            columns=at[:, 0],
+            rows=at[:, 1],
+            master_mid_gps_ns=looks[rig.master_cone].mid_gps_ns,
+        )
+        px = vip_px_from_mm(world.image, vip_mm_from_raw(mosaic.placements[name], at))
+        put.append(px)
+        errors.append(np.stack([column, row], axis=1) - px)
+    return np.concatenate(put), np.concatenate(errors)
+
+
+def figures_of(image: VirtualImage, found: Residuals) -> dict[str, float]:
+    """Inner errors of single exposures, and what bundle adjustment leaves of their mean."""
+    inner = np.array([_after(_similarity(image, found.places), e) for e in found.errors])
+    length = np.hypot(inner[..., 0], inner[..., 1])
+    mean = np.hypot(*systematic(image, found)[1].T)
+    return {
+        "inner_rms_px": float(np.sqrt(np.mean(length**2))),
+        "inner_max_px": float(length.max()),
+        "systematic_rms_px": float(np.sqrt(np.mean(mean**2))),
+        "systematic_max_px": float(mean.max()),
+    }
+
+
+def systematic(image: VirtualImage, found: Residuals) -> tuple[Array, Array]:
+    """Mean residuals of a line as a bundle adjustment would leave them.
+
+    Each image's orientation takes six parameters (shift, scale, rotation, two tilts), the block two
+    of radial distortion; the mean over the exposures is taken in between.
+    """
+    each = [_after(_orientation(image, found.places), e) for e in found.errors]
+    mean = np.mean(each, axis=0)
+    both = np.concatenate([_orientation(image, found.places), _radial(image, found.places)], axis=0)
+    return found.places, _after(both, mean)
+
+
+def _after(design: Array, errors: Array) -> Array:
+    """Errors (n, 2) less their best fit by a design (k, n, 2)."""
+    flat = design.reshape(len(design), -1).T
+    step, *_ = np.linalg.lstsq(flat, errors.ravel(), rcond=None)
+    return np.asarray((errors.ravel() - flat @ step).reshape(-1, 2))
+
+
+def _unit(image: VirtualImage, places: Array) -> tuple[Array, Array, float]:
+    """Image coordinates over the half diagonal, row down, and f likewise."""
+    half = np.hypot(image.width_px, image.height_px) / 2.0
+    x = (places[:, 0] - (image.width_px - 1) / 2.0) / half
+    y = (places[:, 1] - (image.height_px - 1) / 2.0) / half
+    return x, y, image.f_mm / image.pitch_mm / float(half)
+
+
+def _similarity(image: VirtualImage, places: Array) -> Array:
+    x, y, _ = _unit(image, places)
+    one, none = np.ones_like(x), np.zeros_like(x)
+    return np.array(
+        [np.stack(v, axis=1) for v in ((one, none), (none, one), (x, y), (-y, x))], np.float64
+    )
+
+
+def _orientation(image: VirtualImage, places: Array) -> Array:
+    x, y, f = _unit(image, places)
+    tilts = [np.stack([f + x * x / f, x * y / f], 1), np.stack([x * y / f, f + y * y / f], 1)]
+    return np.concatenate([_similarity(image, places), np.array(tilts)])
+
+
+def _radial(image: VirtualImage, places: Array) -> Array:
+    x, y, _ = _unit(image, places)
+    r2 = x * x + y * y
+    return np.array([np.stack([x * r2**k, y * r2**k], axis=1) for k in (1, 2)])
+
+
+def drawn(
+    image: VirtualImage, panels: Sequence[tuple[str, tuple[Array, Array]]], title: str
+) -> str:
+    """Residual vectors side by side in one scale, as an SVG."""
+    gap, wide = 30.0, 520.0
+    scale = wide / image.width_px
+    high = image.height_px * scale
+    longest = max(float(np.hypot(*errors.T).max()) for _, (_, errors) in panels)
+    enlarge = 26.0 / longest
+    bar_um = 1.0 if 7.2 * longest > 1.0 else 0.5
+    bar = bar_um / image.pitch_um * enlarge
+    width, height = 2 * wide + 3 * gap, high + 130
+    body = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:.0f} {height:.0f}" '
+        f'width="{width:.0f}" height="{height:.0f}" font-family="DejaVu Sans, sans-serif">'
+        '<rect width="100%" height="100%" fill="#ffffff"/>',
+        f'<text x="{gap}" y="30" font-size="17" font-weight="bold" fill="#1c2733">'
+        f"Remaining systematic image residuals: {title}</text>",
+    ]
+    for k, (name, (places, errors)) in enumerate(panels):
+        left, top = gap + k * (wide + gap), 72.0
+        rms_um = float(np.sqrt(np.mean(np.sum(errors**2, axis=1)))) * image.pitch_um
+        body.append(
+            f'<text x="{left}" y="58" font-size="12" fill="#1c2733">'
+            f"{name}: RMS {rms_um:.2f} um</text>"
+            f'<rect x="{left}" y="{top}" width="{wide}" height="{high:.1f}" fill="#f6f8fa" '
+            'stroke="#8796a5"/>'
+        )
+        for (c, r), (dx, dy) in zip(places, errors, strict=True):
+            x, y = left + (c + 0.5) * scale, top + (r + 0.5) * scale
+            body.append(
+                f'<line x1="{x:.1f}" y1="{y:.1f}" x2="{x + dx * enlarge:.1f}" '
+                f'y2="{y + dy * enlarge:.1f}" stroke="#b3361e" stroke-width="1.1"/>'
+                f'<circle cx="{x:.1f}" cy="{y:.1f}" r="1.1" fill="#1c2733"/>'
+            )
+    y = 72.0 + high + 28
+    body.append(
+        f'<line x1="{gap}" y1="{y}" x2="{gap + bar:.1f}" y2="{y}" stroke="#b3361e" '
+        f'stroke-width="2"/><text x="{gap + bar + 8:.1f}" y="{y + 4}" font-size="12" '
+        f'fill="#1c2733">{bar_um:g} um = {bar_um / image.pitch_um:.2f} px</text></svg>'
+    )
+    return "".join(body)
+
+
+if __name__ == "__main__":
+    main()
