@@ -23,7 +23,9 @@ from processing.rig import Rig
 
 _ROOMS: Final = (
     "processing.balance",
+    "processing.correlation",
     "processing.demosaic",
+    "processing.least_squares_matching",
     "processing.level1",
     "processing.matching",
     "processing.quicklook",

@@ -3,13 +3,6 @@
 Compiled kernels over many points; which points, in which frames, and what the positions mean is in
 `processing.tie_points`. A bad pixel makes its patch unusable: for uint16 frames a Level-1 word that
 is no data or saturated, for float32 frames one that is not finite.
-
-Why it is unbiased: both patches are carried half of the shift towards each other, so what noise
-does to the gradients cancels; and the interpolation kernel (8 taps, a sinc low-passed at 0.3
-cycles per pixel under a Kaiser window that ends at zero) has a phase error below 0.0004 px up to
-0.35 cycles per pixel and passes the same noise power at every sub-pixel phase (to 0.2 %), so noise
-prefers no phase. Bilinear interpolation passes half the noise power at phase 1/2, per axis, and
-draws matches there.
 """
 
 from __future__ import annotations
@@ -20,47 +13,22 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from processing.correlation import correlate, peak
+from processing.least_squares_matching import (
+    INTERPOLATION,
+    PATCH_SLACK,
+    refine,
+    refinement_scratch,
+)
+
+__all__ = ["INTERPOLATION", "MARGIN_PX", "match_patches", "select_features"]
+
 Array = NDArray[Any]
 
 MARGIN_PX: Final = 4
 """Pixels a patch needs around its window: four taps and the largest half shift."""
 
-_TAPS: Final = 8
-_CUTOFF: Final = 0.30
-_KAISER_BETA: Final = 8.0
-_PHASES: Final = 1024
-_STEPS: Final = 8
-_CONVERGED_PX: Final = 0.004
-_LARGEST_SHIFT_PX: Final = 1.2
 _BLOCK: Final = 32
-
-
-def _kernel(x: Array) -> Array:
-    # Less its value at the ends: a step there would be a spike of the slope at whole pixels.
-    taper = np.i0(_KAISER_BETA * np.sqrt(np.maximum(0.0, 1.0 - (x / 4.0) ** 2))) - 1.0
-    value: Array = np.sinc(2.0 * _CUTOFF * x) * taper
-    return value
-
-
-def _kernel_tables() -> tuple[Array, Array]:
-    """Weights and their derivatives at phases 0 .. 1, shape (phases + 1, taps), float32.
-
-    Row i weighs the pixels -3 .. 4 for a sample at i / phases right of pixel 0.
-    """
-    taps = np.arange(-3, 5)
-    phase = np.arange(_PHASES + 1) / _PHASES
-    step = 1e-4
-
-    def weights(at: Array) -> Array:
-        w = _kernel(taps[None, :] - at[:, None])
-        normalised: Array = w / w.sum(axis=1, keepdims=True)
-        return normalised
-
-    slope = (weights(phase + step) - weights(phase - step)) / (2.0 * step)
-    return weights(phase).astype(np.float32), slope.astype(np.float32)
-
-
-INTERPOLATION: Final = _kernel_tables()
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -158,15 +126,24 @@ def _load(frame: Array, col: int, row: int, ratio: int, words: bool, patch: Arra
     height, width = patch.shape
     share = np.float32(1.0 / (ratio * ratio))
     origin = np.float32(frame[row + ratio * (height // 2), col + ratio * (width // 2)])
+    line = np.empty(width * ratio, np.float32)
     for r in range(height):
+        line[:] = np.float32(0.0)
+        for i in range(ratio):
+            source = frame[row + r * ratio + i, col : col + width * ratio]
+            if words:
+                bad = np.int32(0)
+                for k in range(len(line)):
+                    word = np.int32(source[k])
+                    bad |= (word & 1) | np.int32(word == 0)
+                if bad:
+                    return False
+            for k in range(len(line)):
+                line[k] += np.float32(source[k]) - origin
         for c in range(width):
             total = np.float32(0.0)
-            for i in range(ratio):
-                for j in range(ratio):
-                    value = frame[row + r * ratio + i, col + c * ratio + j]
-                    if words and _unusable(value):
-                        return False
-                    total += np.float32(value) - origin
+            for j in range(ratio):
+                total += line[c * ratio + j]
             patch[r, c] = total * share
     return True
 
@@ -178,333 +155,6 @@ def _all_finite(patch: Array) -> bool:
         for c in range(patch.shape[1]):
             total += patch[r, c] * np.float32(0.0)
     return bool(total == 0.0)
-
-
-@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
-def _correlate(
-    a: Array,
-    b: Array,
-    half: int,
-    margin: int,
-    reach: Array,
-    scratch: tuple[Array, Array, Array, Array],
-    surface: Array,
-) -> None:
-    """Normalised cross correlation of a's window with b at all offsets; -2 where not tried.
-
-    `reach` holds the first and last column offset and the first and last row offset to be tried.
-    """
-    template, products, sums, squares = scratch
-    side = 2 * half + 1
-    n = side * side
-    width = surface.shape[1]
-    search = (width - 1) // 2
-    mean = np.float32(0.0)
-    for r in range(side):
-        for c in range(side):
-            mean += a[r + margin, c + margin]
-    mean /= np.float32(n)
-    energy = 0.0
-    for r in range(side):
-        for c in range(side):
-            value = a[r + margin, c + margin] - mean
-            template[r, c] = value
-            energy += value * value
-    surface[:] = np.float32(-2.0)
-    sums[:] = 0.0
-    squares[:] = 0.0
-    first = margin + search + reach[2]
-    for r in range(first, first + side):
-        for j in range(width + side - 1):
-            value = float(b[r, margin + j])
-            sums[j] += value
-            squares[j] += value * value
-    for dr in range(reach[2], reach[3] + 1):
-        top = margin + search + dr
-        products[:] = np.float32(0.0)
-        for r in range(side):
-            for c in range(side):
-                weight = template[r, c]
-                for k in range(width):
-                    products[k] += weight * b[top + r, margin + c + k]
-        total = square = 0.0
-        for j in range(side - 1):
-            total += sums[j]
-            square += squares[j]
-        for k in range(width):
-            total += sums[k + side - 1]
-            square += squares[k + side - 1]
-            if reach[0] <= k - search <= reach[1]:
-                spread = (square - total * total / n) * energy
-                if spread > 1e-6:
-                    surface[search + dr, k] = products[k] / np.sqrt(spread)
-            total -= sums[k]
-            square -= squares[k]
-        if dr < reach[3]:
-            for j in range(width + side - 1):
-                leaving = float(b[top, margin + j])
-                coming = float(b[top + side, margin + j])
-                sums[j] += coming - leaving
-                squares[j] += coming * coming - leaving * leaving
-
-
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _peak(surface: Array, reach: Array, found: Array) -> bool:
-    """Best offset, its sub-pixel part by parabola, its height and that of the next maximum.
-
-    False where the peak lies on the edge of what was searched.
-    """
-    search = (surface.shape[0] - 1) // 2
-    best, row, col = -2.0, 0, 0
-    for dr in range(reach[2], reach[3] + 1):
-        for dc in range(reach[0], reach[1] + 1):
-            if surface[search + dr, search + dc] > best:
-                best = surface[search + dr, search + dc]
-                row, col = dr, dc
-    if best <= 0.0 or row == reach[2] or row == reach[3] or col == reach[0] or col == reach[1]:
-        return False
-    second = -1.0
-    for dr in range(reach[2], reach[3] + 1):
-        for dc in range(reach[0], reach[1] + 1):
-            value = surface[search + dr, search + dc]
-            if value <= second or (abs(dr - row) <= 1 and abs(dc - col) <= 1):
-                continue
-            highest = True
-            for i in range(max(dr - 1, reach[2]), min(dr + 1, reach[3]) + 1):
-                for j in range(max(dc - 1, reach[0]), min(dc + 1, reach[1]) + 1):
-                    if surface[search + i, search + j] > value:
-                        highest = False
-            if highest:
-                second = value
-    r, c = search + row, search + col
-    found[0] = col
-    found[1] = row
-    found[2] = _vertex(surface[r, c - 1], surface[r, c], surface[r, c + 1])
-    found[3] = _vertex(surface[r - 1, c], surface[r, c], surface[r + 1, c])
-    found[4] = best
-    found[5] = second
-    return True
-
-
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _vertex(before: float, at: float, after: float) -> float:
-    curvature = before - 2.0 * at + after
-    if curvature >= 0.0:
-        return 0.0
-    return min(0.5, max(-0.5, 0.5 * (before - after) / curvature))
-
-
-@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
-def _tap_weights(table: Array, phase: float, out: Array) -> None:
-    at = phase * (table.shape[0] - 1)
-    i = min(int(at), table.shape[0] - 2)
-    f = np.float32(at - i)
-    for k in range(8):
-        out[k] = table[i, k] * (np.float32(1.0) - f) + table[i + 1, k] * f
-
-
-@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
-def _along_rows(source: Array, top: int, left: int, w: Array, out: Array) -> None:
-    w0, w1, w2, w3, w4, w5, w6, w7 = w[0], w[1], w[2], w[3], w[4], w[5], w[6], w[7]
-    for r in range(out.shape[0]):
-        for c in range(out.shape[1]):
-            j = left + c
-            i = top + r
-            out[r, c] = (
-                w0 * source[i, j]
-                + w1 * source[i, j + 1]
-                + w2 * source[i, j + 2]
-                + w3 * source[i, j + 3]
-                + w4 * source[i, j + 4]
-                + w5 * source[i, j + 5]
-                + w6 * source[i, j + 6]
-                + w7 * source[i, j + 7]
-            )
-
-
-@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
-def _along_columns(source: Array, w: Array, out: Array) -> None:
-    w0, w1, w2, w3, w4, w5, w6, w7 = w[0], w[1], w[2], w[3], w[4], w[5], w[6], w[7]
-    for r in range(out.shape[0]):
-        for c in range(out.shape[1]):
-            out[r, c] = (
-                w0 * source[r, c]
-                + w1 * source[r + 1, c]
-                + w2 * source[r + 2, c]
-                + w3 * source[r + 3, c]
-                + w4 * source[r + 4, c]
-                + w5 * source[r + 5, c]
-                + w6 * source[r + 6, c]
-                + w7 * source[r + 7, c]
-            )
-
-
-@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
-def _sample(
-    patch: Array,
-    top: int,
-    left: int,
-    dx: float,
-    dy: float,
-    tables: tuple[Array, Array],
-    rows: tuple[Array, Array],
-    w: Array,
-    value: Array,
-    slope_x: Array,
-    slope_y: Array,
-) -> tuple[float, float]:
-    """A window of `patch` (first pixel at top, left) moved by (dx, dy): values and both slopes.
-
-    Returns the noise power the interpolation passes, and that of its slopes' mean.
-    """
-    whole_x, whole_y = int(np.floor(dx)), int(np.floor(dy))
-    _tap_weights(tables[0], dx - whole_x, w[0])
-    _tap_weights(tables[1], dx - whole_x, w[1])
-    _tap_weights(tables[0], dy - whole_y, w[2])
-    _tap_weights(tables[1], dy - whole_y, w[3])
-    i, j = top + whole_y - 3, left + whole_x - 3
-    _along_rows(patch, i, j, w[0], rows[0])
-    _along_rows(patch, i, j, w[1], rows[1])
-    _along_columns(rows[0], w[2], value)
-    _along_columns(rows[1], w[2], slope_x)
-    _along_columns(rows[0], w[3], slope_y)
-    power_x = power_y = slope_power_x = slope_power_y = 0.0
-    for k in range(8):
-        power_x += w[0, k] * w[0, k]
-        slope_power_x += w[1, k] * w[1, k]
-        power_y += w[2, k] * w[2, k]
-        slope_power_y += w[3, k] * w[3, k]
-    return power_x * power_y, 0.5 * (slope_power_x * power_y + slope_power_y * power_x)
-
-
-@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
-def _centre(values: Array) -> float:
-    """Take the mean away; returns the sum of squares that is left."""
-    mean = 0.0
-    for r in range(values.shape[0]):
-        for c in range(values.shape[1]):
-            mean += values[r, c]
-    centre = np.float32(mean / values.size)
-    squares = 0.0
-    for r in range(values.shape[0]):
-        for c in range(values.shape[1]):
-            values[r, c] -= centre
-            squares += values[r, c] * values[r, c]
-    return squares
-
-
-@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
-def _dot(a: Array, b: Array) -> float:
-    total = 0.0
-    for r in range(a.shape[0]):
-        for c in range(a.shape[1]):
-            total += a[r, c] * b[r, c]
-    return total
-
-
-@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
-def _spread(jacobian: Array, w: Array, rows: Array, out: Array) -> None:
-    """How each raw pixel enters the window's sum of jacobian * sample: interpolation transposed."""
-    side = jacobian.shape[0]
-    rows[:] = np.float32(0.0)
-    out[:] = np.float32(0.0)
-    for k in range(8):
-        weight = w[2, k]
-        for r in range(side):
-            for c in range(side):
-                rows[r + k, c] += weight * jacobian[r, c]
-    for k in range(8):
-        weight = w[0, k]
-        for r in range(side + 7):
-            for c in range(side):
-                out[r, c + k] += weight * rows[r, c]
-
-
-@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
-def _refine(
-    a: Array,
-    b: Array,
-    offset: tuple[int, int],
-    shift: tuple[float, float],
-    half: int,
-    margin: int,
-    scratch: tuple[Any, ...],
-    found: Array,
-) -> bool:
-    """Least-squares matching of a translation with gain and offset, symmetric in both patches.
-
-    `found` receives shift x, shift y, sigma (px, root mean square of both axes), correlation.
-    False where it does not converge within the reach of the patches.
-    """
-    tables, rows, wa, wb, fa, ax, ay, fb, bx, by, lean, wide_x, wide_y = scratch
-    side = 2 * half + 1
-    dx, dy = shift
-    top_b, left_b = margin + offset[1], margin + offset[0]
-    for step in range(_STEPS):
-        power, slope_power = _sample(
-            a, margin, margin, -0.5 * dx, -0.5 * dy, tables, rows, wa, fa, ax, ay
-        )
-        _sample(b, top_b, left_b, 0.5 * dx, 0.5 * dy, tables, rows, wb, fb, bx, by)
-        energy_a, energy_b = _centre(fa), _centre(fb)
-        if energy_a <= 0.0 or energy_b <= 0.0:
-            return False
-        # Gain as the ratio of contrasts treats both images alike; least squares would not.
-        gain = np.float32(np.sqrt(energy_a / energy_b))
-        correlation = _dot(fa, fb) / np.sqrt(energy_a * energy_b)
-        for r in range(side):
-            for c in range(side):
-                scaled = gain * fb[r, c]
-                lean[r, c] = fa[r, c] + scaled
-                fa[r, c] -= scaled
-                ax[r, c] = np.float32(0.5) * (ax[r, c] + gain * bx[r, c])
-                ay[r, c] = np.float32(0.5) * (ay[r, c] + gain * by[r, c])
-        # Offset and gain leave the system: slopes lose their mean and their share of the signal.
-        _centre(ax)
-        _centre(ay)
-        signal = _dot(lean, lean)
-        share_x = np.float32(_dot(ax, lean) / signal)
-        share_y = np.float32(_dot(ay, lean) / signal)
-        for r in range(side):
-            for c in range(side):
-                ax[r, c] -= share_x * lean[r, c]
-                ay[r, c] -= share_y * lean[r, c]
-        nxx, nxy, nyy = _dot(ax, ax), _dot(ax, ay), _dot(ay, ay)
-        determinant = nxx * nyy - nxy * nxy
-        if determinant <= 1e-9 * nxx * nyy:
-            return False
-        hx, hy = _dot(ax, fa), _dot(ay, fa)
-        step_x = (nyy * hx - nxy * hy) / determinant
-        step_y = (nxx * hy - nxy * hx) / determinant
-        dx += step_x
-        dy += step_y
-        if abs(dx) > _LARGEST_SHIFT_PX or abs(dy) > _LARGEST_SHIFT_PX:
-            return False
-        if abs(step_x) < _CONVERGED_PX and abs(step_y) < _CONVERGED_PX:
-            break
-        if step == _STEPS - 1:
-            return False
-    squares = _dot(fa, fa) - (hx * step_x + hy * step_y)
-    # Neighbouring samples share raw pixels: the variance of the shift comes from the raw pixels.
-    # (Power of noise is the same in both patches, which lie at mirrored phases.)
-    variance = max(squares, 0.0) / (side * side * power - 4.0)
-    # Noise in the slopes looks like signal and must not be counted as such.
-    noise = 0.25 * variance * slope_power * side * side
-    nxx -= noise
-    nyy -= noise
-    determinant = nxx * nyy - nxy * nxy
-    if nxx <= 0.0 or nyy <= 0.0 or determinant <= 1e-3 * nxx * nyy:
-        return False
-    _spread(ax, wa, rows[0], wide_x)
-    _spread(ay, wa, rows[0], wide_y)
-    mxx, mxy, myy = _dot(wide_x, wide_x), _dot(wide_x, wide_y), _dot(wide_y, wide_y)
-    qxx, qxy, qyy = nyy / determinant, -nxy / determinant, nxx / determinant
-    var_x = qxx * qxx * mxx + 2.0 * qxx * qxy * mxy + qxy * qxy * myy
-    var_y = qxy * qxy * mxx + 2.0 * qxy * qyy * mxy + qyy * qyy * myy
-    found[0] = dx
-    found[1] = dy
-    found[2] = np.sqrt(0.5 * variance * (var_x + var_y))
-    found[3] = correlation
-    return True
 
 
 @njit(cache=True, parallel=True)  # type: ignore[untyped-decorator]
@@ -547,36 +197,15 @@ def match_patches(
     size_a, size_b = side + 2 * margin, side + 2 * margin + 2 * search
     blocks = (count + _BLOCK - 1) // _BLOCK
     for block in prange(blocks):
-        a = np.empty((size_a, size_a), np.float32)
-        b = np.zeros((size_b, size_b), np.float32)
+        flat_a = np.zeros(size_a * size_a + PATCH_SLACK, np.float32)
+        flat_b = np.zeros(size_b * size_b + PATCH_SLACK, np.float32)
+        a = flat_a[: size_a * size_a].reshape(size_a, size_a)
+        b = flat_b[: size_b * size_b].reshape(size_b, size_b)
         width = 2 * search + 1
         surface = np.empty((width, width), np.float32)
-        correlation = (
-            np.empty((side, side), np.float32),
-            np.empty(width, np.float32),
-            np.empty(width + side - 1),
-            np.empty(width + side - 1),
-        )
-        rows = (
-            np.empty((side + 7, side), np.float32),
-            np.empty((side + 7, side), np.float32),
-        )
-        scratch = (
-            tables,
-            rows,
-            np.empty((4, 8), np.float32),
-            np.empty((4, 8), np.float32),
-            np.empty((side, side), np.float32),
-            np.empty((side, side), np.float32),
-            np.empty((side, side), np.float32),
-            np.empty((side, side), np.float32),
-            np.empty((side, side), np.float32),
-            np.empty((side, side), np.float32),
-            np.empty((side, side), np.float32),
-            np.empty((side + 7, side + 7), np.float32),
-            np.empty((side + 7, side + 7), np.float32),
-        )
-        peak = np.empty(6)
+        correlation = (np.zeros(size_b * size_b, np.float32), np.empty(size_b), np.empty(size_b))
+        scratch = refinement_scratch(side)
+        best = np.empty(6)
         found = np.empty(4)
         reach = np.empty(4, np.int64)
         for i in range(block * _BLOCK, min((block + 1) * _BLOCK, count)):
@@ -602,15 +231,15 @@ def match_patches(
             first_col, first_row = col_b - room + reach[0], row_b - room + reach[2]
             if not _load(frame_b, first_col, first_row, 1, words, part) or not _all_finite(part):
                 continue
-            _correlate(a, b, half_window, margin, reach, correlation, surface)
-            if not _peak(surface, reach, peak):
+            correlate(a, b, half_window, margin, reach, correlation, surface)
+            if not peak(surface, reach, best):
                 continue
             moved_col = moved_row = 0
-            shift = (peak[2], peak[3])
+            shift = (best[2], best[3])
             if ratio > 1:
                 # Reduced pixels in phase with b's: what is finer than b's pixels folds over alike.
-                moved_col = -int(np.round(peak[2] * ratio))
-                moved_row = -int(np.round(peak[3] * ratio))
+                moved_col = -int(np.round(best[2] * ratio))
+                moved_row = -int(np.round(best[3] * ratio))
                 if moved_col != 0 or moved_row != 0:
                     col, row = col_a + moved_col, row_a + moved_row
                     if (
@@ -622,17 +251,27 @@ def match_patches(
                         continue
                     if not _load(frame_a, col, row, ratio, words, a) or not _all_finite(a):
                         continue
-                shift = (peak[2] + moved_col / ratio, peak[3] + moved_row / ratio)
-            offset = (search + int(peak[0]), search + int(peak[1]))
-            if not _refine(a, b, offset, shift, half_window, margin, scratch, found):
+                shift = (best[2] + moved_col / ratio, best[3] + moved_row / ratio)
+            offset = (search + int(best[0]), search + int(best[1]))
+            if not refine(
+                (flat_a, flat_b),
+                (size_a, size_b),
+                offset,
+                shift,
+                half_window,
+                margin,
+                tables,
+                scratch,
+                found,
+            ):
                 continue
             middle = (ratio - 1) / 2.0
             result[i, 0] = at_a[i, 0] + moved_col + middle - 0.5 * found[0] * ratio
             result[i, 1] = at_a[i, 1] + moved_row + middle - 0.5 * found[1] * ratio
-            result[i, 2] = col_b + peak[0] + 0.5 * found[0]
-            result[i, 3] = row_b + peak[1] + 0.5 * found[1]
+            result[i, 2] = col_b + best[0] + 0.5 * found[0]
+            result[i, 3] = row_b + best[1] + 0.5 * found[1]
             result[i, 4] = found[2]
             result[i, 5] = found[3]
-            result[i, 6] = peak[4] - peak[5]
+            result[i, 6] = best[4] - best[5]
             result[i, 7] = 1.0
     return result
