@@ -193,6 +193,8 @@ def _write(
         tile=(TILE_PX, TILE_PX),
         photometric="rgb",
         compression="adobe_deflate",
+        # The default level is 1 % smaller and takes two and a half times as long.
+        compressionargs={"level": 1},
         predictor=True,
         maxworkers=threads,
         description=canonical_bytes(about).decode("utf-8").strip(),

@@ -10,11 +10,14 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
+from typer.testing import CliRunner
 
-from daemon.bands import make_band_pipeline, process_bands
+from daemon.bands import make_band_pipeline
+from daemon.cli import app
 from daemon.conditions import conditions_of
 from daemon.configuration import PlanSection
 from daemon.importers.rededge import ImagesError, gps_ns_from_utc, import_rededge
+from daemon.mission import Mission
 from daemon.store import load_level0
 from processing.band_registration import band_placements, reference_image
 from processing.placement import vip_mm_from_raw, vip_px_from_mm
@@ -33,15 +36,20 @@ PUBLISHED = {
 @pytest.fixture(scope="module")
 def processed(tmp_path_factory):
     """The recorded camera, imported and processed: mission, rig, reports by exposure."""
-    mission = import_rededge(RECORDED, tmp_path_factory.mktemp("rededge") / "field").mission
-    rig = load_rig(mission.rig_path)
-    pipeline, radiance = make_band_pipeline(rig, mission, None)
-    reports = {}
-    for number in mission.numbers():
-        frames, exposure = load_level0(mission.level0(number), rig, check_hashes=True)
-        plan = PlanSection.model_validate({})
-        reports[number], _ = process_bands(pipeline, radiance, mission, plan, exposure, frames)
-    return mission, rig, reports
+    path = tmp_path_factory.mktemp("rededge") / "field"
+    told = _said(["import", "rededge", str(RECORDED), "--out", str(path), "--json"])
+    assert told["exposures"] == 2 and told["frames"] == 10 and told["missing"] == []
+    assert max(told["lens_fit_px"].values()) < 0.03
+    mission = Mission.open(path)
+    reports = _said(["process", str(path), "--json"])["exposures"]
+    return mission, load_rig(mission.rig_path), {r["exposure"]: r for r in reports}
+
+
+def _said(arguments):
+    """What the command says as JSON."""
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 0, done.output
+    return json.loads(done.stdout)
 
 
 @needs_recording
@@ -49,6 +57,7 @@ def test_the_mission_holds_the_camera_s_words_and_its_calibration(processed):
     mission, rig, _ = processed
     assert mission.numbers() == [1, 2]
     for number, image in ((1, "IMG_0000"), (2, "IMG_0001")):
+        load_level0(mission.level0(number), rig, check_hashes=True)
         for sensor, head in (("B", 1), ("G", 2), ("R", 3), ("N", 4), ("E", 5)):
             theirs = tifffile.imread(RECORDED / "0000SET" / "000" / f"{image}_{head}.tif")
             ours = tifffile.imread(mission.level0(number) / f"{sensor}.tif")

@@ -8,8 +8,11 @@ import tomllib
 import numpy as np
 import pytest
 import tifffile
+from typer.testing import CliRunner
 
 from daemon import level3
+from daemon.cli import app
+from daemon.configuration import ConfigurationError
 from daemon.level0 import read_description, tiff_parts
 from daemon.mission import Mission
 from daemon.rig_text import rig_toml
@@ -112,6 +115,17 @@ def test_wishes_are_followed_and_an_earlier_result_is_replaced(mission):
     developed(mission, numbers=(1,), images=("cir",), depths=(8,))
     assert [p.name for p in (mission.path / "L3" / "000001").iterdir()] == ["cir-8.tif"]
     assert sorted(p.name for p in (mission.path / "L3").iterdir()) == ["000001", "tone-curve.json"]
+
+
+def test_the_command_develops_the_whole_mission_and_refuses_unknown_wishes(mission):
+    done = CliRunner().invoke(app, ["develop", str(mission.path), "--bits", "8", "--json"])
+    assert done.exit_code == 0, done.output
+    told = json.loads(done.stdout)
+    assert [row["exposure"] for row in told["exposures"]] == [1, 2, 3]
+    assert all(set(row["files"]) == {"rgb-8.tif", "cir-8.tif"} for row in told["exposures"])
+    with pytest.raises(ConfigurationError, match="--image is rgb or cir"):
+        CliRunner().invoke(app, ["develop", str(mission.path), "--image", "x"],
+                           catch_exceptions=False)  # fmt: skip
 
 
 def test_a_missing_band_leaves_out_its_images_and_says_so(mission):
