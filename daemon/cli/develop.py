@@ -18,7 +18,7 @@ from daemon.mission import Mission
 HELP = """Make Level-3 of a mission after landing: pansharpened RGB and CIR in 16 and 8 bits.
 
 One tone curve serves all exposures that have Level-2, so that neighbouring images match; it is made
-anew from all of them each time.
+anew from all of them each time. An exposure's earlier images are replaced.
 
 Examples: `syntopic develop MISSION`, `syntopic develop MISSION --only 3 --image cir --bits 8`
 """
