@@ -18,7 +18,7 @@ from processing.pan_only import pan_only_mosaic
 from processing.pipeline import Conditions, Pipeline, Product, Settings
 from processing.placement import nominal_placements, vip_mm_from_raw, vip_px_from_mm
 from processing.projective import apply_projective
-from processing.quality import Verdict
+from processing.quality import Flag, Verdict
 from processing.rig import Rig, find_rig, shipped_rigs
 from sim_hw.electronics import Electronics, true_sensor
 from sim_hw.flight import Flight
@@ -38,6 +38,9 @@ EPOCH = 1_400_000_000_000_000_000
 class Flown:
     """A processed exposure beside the world it was taken of."""
 
+    pipeline: Pipeline
+    frames: Mapping[str, NDArray[np.uint16]]
+    conditions: Conditions
     product: Product
     world: World
     flight: Flight
@@ -95,20 +98,21 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
         )
         looks[sensor.name] = look
     noise = np.random.default_rng(1)
-    product = Pipeline(rig, None, Settings()).process(
-        frames,
-        Conditions(
-            temperatures_c={
-                probe: world.temperature_c(probe, reference_ns) + noise.normal(0, 0.1)
-                for probe in rig.probes
-            },
-            exposure_time_s={name: t * 1e-6 for name, t in plan.exposure_time_us.items()},
-            tdi_shifts=plan.tdi_shifts,
-            ground_speed_mps=plan.ground_speed_mps,
-            height_above_ground_m=plan.height_above_ground_m,
-        ),
+    conditions = Conditions(
+        temperatures_c={
+            probe: world.temperature_c(probe, reference_ns) + noise.normal(0, 0.1)
+            for probe in rig.probes
+        },
+        exposure_time_s={name: t * 1e-6 for name, t in plan.exposure_time_us.items()},
+        tdi_shifts=plan.tdi_shifts,
+        ground_speed_mps=plan.ground_speed_mps,
+        height_above_ground_m=plan.height_above_ground_m,
     )
-    return Flown(product, world, flight, looks)
+    pipeline = Pipeline(rig, None, Settings())
+    product = pipeline.process(frames, conditions)
+    colour = {name: band.copy() for name, band in product.colour.items()}
+    kept = replace(product, pan=product.pan.copy(), valid=product.valid.copy(), colour=colour)
+    return Flown(pipeline, frames, conditions, kept, world, flight, looks)
 
 
 def rms(vectors: Array) -> float:
@@ -123,16 +127,18 @@ def after_similarity(vip: Array, errors: Array) -> Array:
     return np.stack([left.real, left.imag], axis=1)
 
 
-def test_the_stitched_geometry_is_within_its_bars(flown: Flown) -> None:
-    geometry = flown.product.geometry["free"]
-    vip = np.concatenate([geometry[f"{name}.vip"] for name in ("SU00", "SU10")])
+def errors_of(flown: Flown, geometry: Mapping[str, Array]) -> tuple[Array, Array]:
+    """Absolute and inner errors of all VIP nodes, (n, 2) px."""
+    names = [name for name in ("SU00", "SU10") if f"{name}.vip" in geometry]
+    vip = np.concatenate([geometry[f"{name}.vip"] for name in names])
     errors = np.concatenate(
-        [
-            flown.errors_px(name, geometry[f"{name}.raw"], geometry[f"{name}.vip"])
-            for name in ("SU00", "SU10")
-        ]
+        [flown.errors_px(n, geometry[f"{n}.raw"], geometry[f"{n}.vip"]) for n in names]
     )
-    inner = after_similarity(vip, errors)
+    return errors, after_similarity(vip, errors)
+
+
+def test_the_stitched_geometry_is_within_its_bars(flown: Flown) -> None:
+    errors, inner = errors_of(flown, flown.product.geometry["free"])
     assert rms(inner) < 0.02 and np.hypot(*inner.T).max() < 0.06
     assert rms(errors) < 0.1 and np.hypot(*errors.T).max() < 0.3
 
@@ -228,3 +234,20 @@ def test_the_layer_of_the_experiment_is_a_similarity(full_size: Rig) -> None:
     assert layer[0, 0] == pytest.approx(layer[1, 1], abs=1e-9)
     assert layer[0, 1] == pytest.approx(-layer[1, 0], abs=1e-9)
     assert np.abs(layer[2, :2]).max() * f < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("missing", "bar", "pan"),
+    [("RGB", 0.05, 0.99), ("N", 0.02, 0.99), ("SU10", 0.01, 0.5), ("SU00", 0.05, 0.5)],
+)
+def test_a_missing_frame_leaves_an_image_of_what_is_there(
+    flown: Flown, missing: str, bar: float, pan: float
+) -> None:
+    frames = {name: frame for name, frame in flown.frames.items() if name != missing}
+    product = flown.pipeline.process(frames, flown.conditions)
+    errors, inner = errors_of(flown, product.geometry["free"])
+    assert rms(inner) < bar
+    assert (product.valid > 0).mean() == pytest.approx(pan, abs=0.06)
+    assert Flag.FRAME_MISSING in product.report.flags
+    stated = product.report.figures["stitched_sigma_px"]
+    assert isinstance(stated, float) and rms(errors) < np.sqrt(2.0) * stated
