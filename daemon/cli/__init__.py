@@ -13,6 +13,7 @@ import typer
 from rich.console import Console
 
 from daemon.cli import (
+    bench,
     calibrate,
     check,
     demo,
@@ -47,6 +48,7 @@ app.command(name="process", help=process.HELP)(process.process)
 app.command(name="develop", help=develop.HELP)(develop.develop)
 app.command(name="verify", help=verify.HELP)(verify.verify)
 app.command(name="sim", help=sim.HELP)(sim.sim)
+app.command(name="bench", help=bench.HELP)(bench.bench)
 app.command(name="kernels", help=kernels.HELP)(kernels.kernels)
 app.add_typer(rigs.app, name="rigs")
 app.add_typer(imports.app, name="import")

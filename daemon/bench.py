@@ -1,0 +1,253 @@
+"""Timing the pipeline on one exposure that lies on disk, beside a copy, the fixed method, peers.
+
+Everything is timed in turn in one run, so that a machine whose speed drifts is fair to all. The
+peers themselves are in `daemon.bench_peers`; the exposure is rendered by a separate process.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon import bench_peers, store
+from daemon.conditions import conditions_of
+from daemon.configuration import PlanSection
+from daemon.errors import DaemonError
+from daemon.mission import Mission
+from daemon.worker import process_exposure
+from processing.pipeline import Conditions, Pipeline, Product, Settings
+from processing.quality import Flag
+from processing.radiometry import load_radiometry
+from processing.rig import Rig, load_rig
+
+DC_K = 12.0
+DISPLACED_PX = (1.0, -0.6)
+RENDER_WITHIN_S = 1800.0
+JUDGE_WITHIN_S = 600.0
+
+
+class BenchError(DaemonError):
+    """What is to be timed cannot be had; the sentence says why."""
+
+
+def exposures_of(rig_name: str, rig: Rig, folder: Path) -> Path:
+    """The folder with one exposure of a rig, rendered first where it is not there.
+
+    dC is 12 K, one sensor of the master cone is displaced, radiometry is as a laboratory measures.
+    """
+    if (folder / "ready.json").exists():
+        return folder
+    command = [sys.executable, "-m", "sim_hw.exposures", rig_name, "--out", str(folder)]
+    command += ["--exposures", "1", "--dc", str(DC_K)]
+    master = rig.cone(rig.master_cone).sensors
+    if len(master) > 2:
+        command += ["--displace", f"{master[2].name}={DISPLACED_PX[0]},{DISPLACED_PX[1]}"]
+    _json_of(command, RENDER_WITHIN_S, "rendering the exposure", needs_json=False)
+    return folder
+
+
+def measure(folder: Path, *, runs: int, threads: int, peers: bool) -> dict[str, Any]:
+    """All figures of one rig as one JSON object; see docs of the command.
+
+    Args:
+        folder: from `exposures_of`.
+        runs: how often everything is timed.
+        threads: cores the pipeline may use.
+        peers: also cv2.remap and, where installed, nona + enblend.
+    """
+    mission = Mission.open(folder / "mission")
+    rig = load_rig(mission.rig_path)
+    radiometry = folder / "calibration" / "radiometry"
+    plan = _plan_of(mission)
+    pipeline = Pipeline(
+        rig,
+        {s.name: load_radiometry(radiometry / f"{s.name}.npz") for s in rig.sensors},
+        Settings(geometry=False, threads=threads),
+    )
+    pipeline.warm_up()
+    stored, exposure = store.load_level0(mission.level0(1), rig)
+    frames = {name: np.array(frame) for name, frame in stored.items()}
+    conditions = conditions_of(exposure, rig, plan, Flag(0))
+    product = pipeline.process(frames, conditions)
+    result = {
+        "rig": rig.name,
+        "machine": machine(),
+        "runs": runs,
+        "threads": threads,
+        **_timed(rig, pipeline, frames, conditions, product, runs),
+    }
+    if peers:
+        product = pipeline.process(frames, conditions)
+        result["peers"] = _peers(rig, product, frames, mission, result)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    result["peak_rss_mib"] = round(peak / 1024)
+    pipeline.settings = replace(pipeline.settings, geometry=True, baselines=True)
+    process_exposure(pipeline, rig, mission, plan, exposure, frames)
+    result |= _geometry(mission, folder / "truth")
+    return result
+
+
+def _timed(
+    rig: Rig,
+    pipeline: Pipeline,
+    frames: Mapping[str, NDArray[np.uint16]],
+    conditions: Conditions,
+    product: Product,
+    runs: int,
+) -> dict[str, Any]:
+    outputs = [product.pan, *product.colour.values()]
+    sources = [*frames.values(), *outputs]
+    copies = [np.zeros_like(array) for array in sources]
+    stages: dict[str, list[float]] = {}
+    cpu_s: list[float] = []
+    settings = pipeline.settings
+
+    with tempfile.TemporaryDirectory(prefix="syntopic-bench-") as scratch:
+
+        def free() -> None:
+            began = time.process_time()
+            done = pipeline.process(frames, conditions)
+            started = time.perf_counter()
+            _to_page_cache(done, Path(scratch))
+            stages.setdefault("writing", []).append(time.perf_counter() - started)
+            for stage, seconds in done.timings_s.items():
+                stages.setdefault(stage, []).append(seconds)
+            cpu_s.append(time.process_time() - began)
+
+        def fixed() -> None:
+            pipeline.settings = replace(settings, method="fixed")
+            _to_page_cache(pipeline.process(frames, conditions), Path(scratch))
+            pipeline.settings = settings
+
+        def copy() -> None:
+            for target, source in zip(copies, sources, strict=True):
+                np.copyto(target, source)
+
+        _to_page_cache(product, Path(scratch))
+        timed = interleaved(runs, pipeline=free, fixed_method=fixed, copy=copy)
+    pixels = sum(frame.size for frame in frames.values())
+    seconds = timed["pipeline"]["median_s"]
+    return {
+        **timed,
+        "cpu_s": {"median_s": statistics.median(cpu_s), "min_s": min(cpu_s), "max_s": max(cpu_s)},
+        "stages": {stage: spread(values) for stage, values in stages.items() if max(values) > 1e-5},
+        "megapixels_in": round(pixels / 1e6, 1),
+        "megapixels_per_s": pixels / 1e6 / seconds,
+        "ratio_to_copy": seconds / timed["copy"]["median_s"],
+        "frame_interval_s": rig.frame_interval_s,
+        "realtime_factor": rig.frame_interval_s / seconds,
+        "realtime_factor_best": rig.frame_interval_s / timed["pipeline"]["min_s"],
+        "tie_points": len(product.tie_points),
+    }
+
+
+def _peers(
+    rig: Rig,
+    product: Product,
+    frames: Mapping[str, NDArray[np.uint16]],
+    mission: Mission,
+    result: Mapping[str, Any],
+) -> dict[str, Any]:
+    pan = {name: frames[name] for name in product.sensors}
+    remap_s = bench_peers.remap_seconds(rig, product.mosaic.placements, pan)
+    found: dict[str, Any] = {
+        "remap_s": remap_s,
+        "resampling_ratio": result["stages"]["composition"]["median_s"] / remap_s,
+    }
+    missing = bench_peers.missing_programs()
+    if missing:
+        found["nona_enblend"] = {"skipped": missing}
+    else:
+        seconds = bench_peers.nona_enblend_seconds(rig, mission.level0(1))
+        ours = result["pipeline"]["median_s"]
+        found["nona_enblend"] = {**seconds, "ratio_to_pipeline": seconds["seconds"] / ours}
+    return found
+
+
+def _geometry(mission: Mission, truth: Path) -> dict[str, Any]:
+    """Errors against the truth, which only the judge's own process reads."""
+    command = [sys.executable, "-m", "sim_hw.judge", "--mission", str(mission.path)]
+    judged = _json_of([*command, "--truth", str(truth)], JUDGE_WITHIN_S, "judging the geometry")
+    methods = judged["methods"]
+    return {
+        "rms_px": methods["free"]["inner_rms_px"],
+        "max_px": methods["free"]["inner_max_px"],
+        "rms_px_absolute": methods["free"]["absolute_rms_px"],
+        "rms_px_fixed": methods["fixed"]["inner_rms_px"],
+        "max_px_fixed": methods["fixed"]["inner_max_px"],
+        "rms_px_no_tdm": methods["fixed-no-tdm"]["inner_rms_px"],
+    }
+
+
+def _to_page_cache(product: Product, folder: Path) -> None:
+    for name, image in (("pan", product.pan), *product.colour.items()):
+        with (folder / name).open("wb", buffering=0) as file:
+            left = image.reshape(-1).view(np.uint8).data
+            while left:
+                left = left[file.write(left) :]
+
+
+def _plan_of(mission: Mission) -> PlanSection:
+    import tomllib
+
+    flown = tomllib.loads(mission.service_path.read_text(encoding="utf-8"))
+    return PlanSection.model_validate(flown.get("plan", {}))
+
+
+def _json_of(
+    command: list[str], within_s: float, what: str, *, needs_json: bool = True
+) -> dict[str, Any]:
+    try:
+        said = subprocess.run(command, capture_output=True, check=True, timeout=within_s)
+    except subprocess.TimeoutExpired as error:
+        raise BenchError(f"{what} took longer than {within_s:.0f} s") from error
+    except subprocess.CalledProcessError as error:
+        last = error.stderr.decode(errors="replace").strip().splitlines()[-1:]
+        raise BenchError(f"{what} failed: {last[0] if last else error.returncode}") from error
+    return dict(json.loads(said.stdout)) if needs_json else {}
+
+
+def interleaved(runs: int, **tasks: Callable[[], object]) -> dict[str, dict[str, float]]:
+    """Time tasks in turn; for each task seconds: median, least, most."""
+    seconds: dict[str, list[float]] = {name: [] for name in tasks}
+    for _ in range(runs):
+        for name, task in tasks.items():
+            started = time.perf_counter()
+            task()
+            seconds[name].append(time.perf_counter() - started)
+    return {name: spread(values) for name, values in seconds.items()}
+
+
+def spread(seconds: list[float]) -> dict[str, float]:
+    """Median, least and most."""
+    return {"median_s": statistics.median(seconds), "min_s": min(seconds), "max_s": max(seconds)}
+
+
+def machine() -> dict[str, Any]:
+    """What a reader needs to weigh a figure; the load says whether the machine was idle."""
+    text = Path("/proc/cpuinfo").read_text()
+    models = [line.split(":", 1)[1].strip() for line in text.splitlines() if "model name" in line]
+    memory_kb = int(Path("/proc/meminfo").read_text().split()[1])
+    return {
+        "date": f"{datetime.now(UTC):%Y-%m-%d}",
+        "processor": models[0] if models else platform.processor(),
+        "cores": len(os.sched_getaffinity(0)),
+        "memory_gib": round(memory_kb / 2**20, 1),
+        "load": round(os.getloadavg()[0], 1),
+        "python": platform.python_version(),
+    }

@@ -1,0 +1,148 @@
+"""Peers of the pipeline: a bare cv2.remap with our maps, and nona + enblend on the same frames.
+
+Only timed here; nothing of what they make is used.
+"""
+
+from __future__ import annotations
+
+import math
+import shutil
+import subprocess
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.errors import DaemonError
+from processing.lattice import OUTSIDE, fill_lattice, lattice_shape, pan_raster
+from processing.placement import SensorPlacement
+from processing.rig import Rig
+
+CELL_PX = 32
+PEER_WITHIN_S = 1500.0
+PACKAGES = {"nona": "hugin-tools", "enblend": "enblend"}
+
+
+class PeerError(DaemonError):
+    """A peer program that did not do its work."""
+
+
+def missing_programs() -> str | None:
+    """A sentence that names the Debian packages of peers that are not installed; None: all are."""
+    absent = [f"{name} (Debian package {p})" for name, p in PACKAGES.items() if not _found(name)]
+    return f"not installed: {', '.join(absent)}" if absent else None
+
+
+def remap_seconds(
+    rig: Rig,
+    placements: Mapping[str, SensorPlacement],
+    frames: Mapping[str, NDArray[np.uint16]],
+) -> float:
+    """Seconds of cv2.remap, cubic, of all PAN frames, each over the box of the image it fills.
+
+    The maps are float32, made before and not timed; nothing is blended, masked or balanced.
+    """
+    import cv2
+
+    image = rig.virtual_image
+    if image is None:
+        raise PeerError(f"rig {rig.name} has no virtual image to remap to")
+    raster = pan_raster(image)
+    rows, columns = lattice_shape(raster, CELL_PX)
+    total = 0.0
+    for name, frame in frames.items():
+        lattice = np.empty((rows, columns, 2))
+        fill_lattice(image, raster, placements[name], CELL_PX, lattice)
+        height, width = frame.shape
+        c, r = lattice[..., 0], lattice[..., 1]
+        inside = (c >= 0) & (c <= width - 1) & (r >= 0) & (r <= height - 1)
+        i, j = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
+        box = lattice[i[0] : i[-1] + 1, j[0] : j[-1] + 1]
+        box = np.where(box == OUTSIDE, 0.0, box)
+        up, along = _between(box.shape[0]), _between(box.shape[1])
+        maps = [np.ascontiguousarray(up @ box[..., k] @ along.T, np.float32) for k in (0, 1)]
+        source = np.ascontiguousarray(frame)
+        target = np.zeros(maps[0].shape, np.uint16)
+        best = math.inf
+        for _ in range(2):
+            started = time.perf_counter()
+            cv2.remap(source, maps[0], maps[1], cv2.INTER_CUBIC, target, cv2.BORDER_CONSTANT)
+            best = min(best, time.perf_counter() - started)
+        total += best
+    return total
+
+
+def _between(nodes: int) -> NDArray[np.float32]:
+    """Linear interpolation from nodes to the pixels between them, (pixels, nodes)."""
+    at = np.arange((nodes - 1) * CELL_PX) / CELL_PX
+    node = at.astype(np.intp)
+    matrix = np.zeros((len(at), nodes), np.float32)
+    matrix[np.arange(len(at)), node] = 1.0 - (at - node)
+    matrix[np.arange(len(at)), node + 1] = at - node
+    return matrix
+
+
+def nona_enblend_seconds(rig: Rig, level0: Path) -> dict[str, Any]:
+    """Seconds of nona and enblend for the PAN image from Level-0, sensors placed as calibrated.
+
+    They know no temperature, no radiometry and no lens of ours; lens and shifts are given as a
+    rectilinear camera with shifted centres.
+    """
+    with tempfile.TemporaryDirectory(prefix="syntopic-peer-") as scratch:
+        project = Path(scratch) / "image.pto"
+        project.write_text(project_of(rig, level0), encoding="utf-8")
+        begun = time.perf_counter()
+        _run(["nona", "-o", str(Path(scratch) / "part"), str(project)])
+        middle = time.perf_counter()
+        parts = sorted(str(path) for path in Path(scratch).glob("part*.tif"))
+        _run(["enblend", "-o", str(Path(scratch) / "whole.tif"), *parts])
+        ended = time.perf_counter()
+    return {"seconds": ended - begun, "nona_s": middle - begun, "enblend_s": ended - middle}
+
+
+def project_of(rig: Rig, level0: Path) -> str:
+    """The project file of Hugin: each PAN frame a rectilinear image with a shifted centre."""
+    image = rig.virtual_image
+    if image is None:
+        raise PeerError(f"rig {rig.name} has no virtual image to stitch")
+    field = _degrees(image.width_px * image.pitch_mm, image.f_mm)
+    lines = [f'p f0 w{image.width_px} h{image.height_px} v{field} n"TIFF_m c:NONE"', "m i0"]
+    for cone in rig.pan_cones:
+        for sensor in cone.sensors:
+            width = sensor.width_px * sensor.pitch_mm
+            d, e = -sensor.x_mm / sensor.pitch_mm, sensor.y_mm / sensor.pitch_mm
+            path = (level0 / f"{sensor.name}.tif").resolve()
+            lines.append(
+                f"i w{sensor.width_px} h{sensor.height_px} f0 "
+                f"v{_degrees(width, cone.lens.f_mm)} r0 p0 y0 a0 b0 c0 d{d:.4f} e{e:.4f} "
+                f'Eev0 Er1 Eb1 Vm5 n"{path}"'
+            )
+    return "\n".join(lines) + "\n"
+
+
+def _degrees(width_mm: float, f_mm: float) -> float:
+    return math.degrees(2.0 * math.atan(width_mm / 2.0 / f_mm))
+
+
+def _found(program: str) -> bool:
+    return shutil.which(program) is not None
+
+
+def _run(command: list[str]) -> None:
+    try:
+        subprocess.run(
+            command,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            check=True,
+            timeout=PEER_WITHIN_S,
+        )
+    except subprocess.TimeoutExpired as error:
+        raise PeerError(f"{command[0]} took longer than {PEER_WITHIN_S:.0f} s") from error
+    except subprocess.CalledProcessError as error:
+        last = error.stdout.decode(errors="replace").strip().splitlines()[-1:]
+        raise PeerError(f"{command[0]} failed: {last[0] if last else error.returncode}") from error

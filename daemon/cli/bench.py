@@ -1,0 +1,97 @@
+"""`syntopic bench`: how fast and how right the pipeline is on a rig, beside its peers."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from daemon.cli.tables import light_table
+
+HELP = """Time the pipeline on one emulated exposure of a rig, beside its peers.
+
+The exposure (dC 12 K, one sensor displaced) is rendered once by a separate process and kept. Timed
+in turn: the pipeline from Level-0 in memory to Level-2 in the page cache, the fixed method, a copy
+of the same bytes; then a bare cv2.remap, and nona + enblend where they are installed (Debian
+packages hugin-tools, enblend). Geometry is judged against the truth.
+
+Examples: `syntopic bench ultracam-x-mini`, `syntopic bench ultracam-x --runs 5 --json`
+"""
+
+
+def bench(
+    rig: Annotated[str, typer.Argument(help="Name of a shipped rig, or a rig file.")],
+    runs: Annotated[int, typer.Option(min=1, help="How often everything is timed.")] = 5,
+    peers: Annotated[bool, typer.Option(help="Time cv2.remap and nona + enblend too.")] = True,
+    threads: Annotated[int, typer.Option(min=1, help="Cores the pipeline may use.")] = 2,
+    folder: Annotated[
+        Path | None, typer.Option(help="Where rendered exposures are kept (default: cache).")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    # Threads that spin while they wait take the cores from those that work.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
+    from daemon import bench as measuring
+    from processing.rig import find_rig
+
+    found = find_rig(rig)
+    told = Console(stderr=True)
+    with told.status(f"timing {found.name}"):
+        place = measuring.exposures_of(rig, found, folder or _kept(found.name))
+        result = measuring.measure(place, runs=runs, threads=threads, peers=peers)
+    if as_json:
+        typer.echo(json.dumps(result))
+    else:
+        _print(result)
+
+
+def _kept(rig_name: str) -> Path:
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return cache / "syntopic" / "bench" / rig_name
+
+
+def _print(result: dict[str, Any]) -> None:
+    console = Console()
+    m = result["machine"]
+    console.print(
+        f"{m['date']}  {m['processor']}, {m['cores']} cores, {m['memory_gib']} GiB, "
+        f"load {m['load']}"
+    )
+    table = light_table(f"Pipeline, {result['rig']}", ("stage",), ("median ms", "least", "most"))
+    rows = {**result["stages"], "all": result["pipeline"], "CPU of all": result["cpu_s"]}
+    rows |= {"fixed method": result["fixed_method"], "plain copy": result["copy"]}
+    for name, times in rows.items():
+        figures = (times["median_s"], times["min_s"], times["max_s"])
+        table.add_row(name, *(f"{s * 1e3:.0f}" for s in figures))
+    console.print(table)
+    console.print(
+        f"{result['megapixels_per_s']:.0f} Mpx/s, {result['ratio_to_copy']:.1f} times a copy, "
+        f"realtime_factor {result['realtime_factor']:.2f} (best run "
+        f"{result['realtime_factor_best']:.2f}), {result['tie_points']} tie points, "
+        f"{result['peak_rss_mib']} MiB"
+    )
+    console.print(
+        f"inner error {result['rms_px']:.4f} px RMS, {result['max_px']:.4f} px at most; fixed "
+        f"{result['rms_px_fixed']:.3f}, without TDM {result['rms_px_no_tdm']:.3f}"
+    )
+    peers = result.get("peers")
+    if peers is None:
+        console.print("peers: skipped by --no-peers")
+        return
+    console.print(
+        f"cv2.remap of the PAN frames {peers['remap_s'] * 1e3:.0f} ms; composition takes "
+        f"{peers['resampling_ratio']:.2f} times that"
+    )
+    stitched = peers["nona_enblend"]
+    if "skipped" in stitched:
+        console.print(f"nona + enblend: skipped, {stitched['skipped']}")
+    else:
+        console.print(
+            f"nona + enblend {stitched['seconds']:.1f} s, {stitched['ratio_to_pipeline']:.1f} "
+            "times the pipeline"
+        )

@@ -1,0 +1,57 @@
+"""`syntopic bench`: one object of figures, measured on an exposure rendered for it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daemon import bench_peers
+from processing.rig import find_rig
+
+
+@pytest.fixture(scope="module")
+def told(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    folder = tmp_path_factory.mktemp("bench")
+    command = [sys.executable, "-m", "daemon", "bench", "ultracam-x-mini", "--json", "--runs", "2"]
+    said = subprocess.run(
+        [*command, "--no-peers", "--folder", str(folder)],
+        stdout=subprocess.PIPE,
+        check=True,
+        timeout=240,
+    )
+    return dict(json.loads(said.stdout))
+
+
+def test_figures_of_all_stages_are_told_with_their_spread(told: dict[str, Any]) -> None:
+    stages = {"radiometry", "tie_points", "mosaic", "composition", "colour", "writing"}
+    assert stages <= set(told["stages"])
+    for times in (*told["stages"].values(), told["pipeline"], told["fixed_method"], told["copy"]):
+        assert 0.0 < times["min_s"] <= times["median_s"] <= times["max_s"]
+    assert told["realtime_factor"] == told["frame_interval_s"] / told["pipeline"]["median_s"]
+    assert "peers" not in told
+
+
+def test_what_is_timed_is_right_against_the_truth(told: dict[str, Any]) -> None:
+    assert told["rms_px"] < 0.05 and told["max_px"] < 0.15
+    assert told["rms_px_fixed"] > 3 * told["rms_px"]
+
+
+def test_a_peer_that_is_not_installed_is_named_with_its_package(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    said = bench_peers.missing_programs()
+    assert said is not None and "hugin-tools" in said and "enblend" in said
+
+
+def test_the_peers_project_has_every_pan_frame_once(tmp_path: Path) -> None:
+    rig = find_rig("ultracam-x-mini")
+    lines = bench_peers.project_of(rig, tmp_path).splitlines()
+    frames = [line.split('n"')[1].rstrip('"') for line in lines if line.startswith("i ")]
+    pan = [sensor.name for cone in rig.pan_cones for sensor in cone.sensors]
+    assert [Path(frame).stem for frame in frames] == pan
