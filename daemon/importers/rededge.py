@@ -179,6 +179,9 @@ def read_image(path: Path) -> tuple[RedEdgeImage, NDArray[np.uint16]]:
             if page.dtype != np.uint16 or len(page.shape) != 2:
                 raise ImagesError([f"{path.name}: is no plane of 16-bit words"])
             shape = (int(page.shape[0]), int(page.shape[1]))
+            # Uncompressed, as the camera writes: a file cannot ask for more memory than it has.
+            if page.compression != 1 or 2 * shape[0] * shape[1] > path.stat().st_size:
+                raise ImagesError([f"{path.name}: is compressed or ends early; give the original"])
             image = _image(path, tags, shape)
             words: NDArray[np.uint16] = np.ascontiguousarray(page.asarray())
     except (ImagesError, OSError):
@@ -198,10 +201,12 @@ def _image(path: Path, tags: Mapping[int, Any], shape: tuple[int, int]) -> RedEd
     for code, name in ((_XMP, "XMP"), (_EXIF, "EXIF"), (_BLACK_LEVEL, "BlackLevel")):
         if code not in tags:
             raise ImagesError([f"{path.name}: has no {name}; give images as the camera wrote"])
-    packet = tags[_XMP]
-    if len(packet) > 0 and isinstance(packet, str):
+    packet, exif = tags[_XMP], tags[_EXIF]
+    if isinstance(packet, str):
         packet = packet.encode("utf-8")
-    xmp, exif = read_xmp(bytes(packet), path.name), tags[_EXIF]
+    if not isinstance(packet, bytes) or not isinstance(exif, dict):
+        raise ImagesError([f"{path.name}: XMP or EXIF is of an unknown kind"])
+    xmp = read_xmp(packet, path.name)
     band = xmp.text("BandName").strip().lower()
     if band not in SENSOR_OF_BAND:
         known = ", ".join(SENSOR_OF_BAND)
@@ -214,6 +219,8 @@ def _image(path: Path, tags: Mapping[int, Any], shape: tuple[int, int]) -> RedEd
     if exif.get("FocalPlaneResolutionUnit") != 4 or not 10.0 < per_mm < 10_000.0:
         raise ImagesError([f"{path.name}: focal plane resolution is not in pixels per mm"])
     black = np.atleast_1d(tags[_BLACK_LEVEL]).astype(np.float64)
+    if not (black.size and black.min() >= 0.0 and black.max() < 65536.0):
+        raise ImagesError([f"{path.name}: BlackLevel is no word of 16 bits"])
     a1, a2, a3 = xmp.numbers("RadiometricCalibration", 3)
     centre = xmp.numbers("VignettingCenter", 2)
     time_s, gain = _ratio(exif["ExposureTime"]), float(exif["ISOSpeed"]) / 100.0
@@ -403,7 +410,7 @@ def _utc(exif: Mapping[str, Any]) -> datetime | None:
     return whole.replace(tzinfo=UTC) + timedelta(microseconds=sign * microseconds)
 
 
-def _place(gps: Mapping[str, Any]) -> dict[str, float]:
+def _place(gps: Any) -> dict[str, float]:
     """Position as the camera's receiver told it, without a standard deviation: not navigation."""
     try:
         latitude = _degrees(gps["GPSLatitude"]) * (-1 if gps["GPSLatitudeRef"] == "S" else 1)

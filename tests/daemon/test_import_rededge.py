@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import struct
 from datetime import UTC, datetime
 
 import cv2
@@ -16,7 +17,12 @@ from daemon.bands import make_band_pipeline
 from daemon.cli import app
 from daemon.conditions import conditions_of
 from daemon.configuration import PlanSection
-from daemon.importers.rededge import ImagesError, gps_ns_from_utc, import_rededge
+from daemon.importers.rededge import (
+    ImagesError,
+    gps_ns_from_utc,
+    import_rededge,
+    read_image,
+)
 from daemon.mission import Mission
 from daemon.store import load_level0
 from processing.band_registration import band_placements, reference_image
@@ -183,6 +189,28 @@ def test_a_damaged_image_is_told_by_name(tmp_path):
         import_rededge(folder, tmp_path / "out")
     assert len(refused.value.problems) == 2
     assert refused.value.problems[0].startswith("short.tif: ")
+
+
+@needs_recording
+def test_damaged_tags_end_in_a_sentence_or_in_an_image_and_never_otherwise(tmp_path):
+    """Single bytes of header and tags are changed, everything else stays."""
+    whole = (RECORDED / "0000SET" / "000" / "IMG_0000_1.tif").read_bytes()
+    (first,) = struct.unpack_from("<I", whole, 4)
+    rng = np.random.default_rng(11)
+    refused = 0
+    for _ in range(250):
+        damaged = bytearray(whole)
+        for at in rng.integers(first, len(whole), 3):
+            damaged[at] = rng.integers(0, 256)
+        damaged[rng.integers(first, first + 300)] ^= 1 << rng.integers(0, 8)
+        path = tmp_path / "a.tif"
+        path.write_bytes(damaged)
+        try:
+            read_image(path)
+        except ImagesError as error:
+            refused += 1
+            assert error.problems[0].startswith("a.tif: ")
+    assert refused > 50
 
 
 def test_images_without_what_the_calibration_needs_are_refused(tmp_path):
