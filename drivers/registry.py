@@ -19,7 +19,10 @@ _PLACES: Final[Mapping[str, Mapping[str, str]]] = {
         "pulse-bus": "drivers.trigger.pulse_bus:PulseBusTrigger",
         "software": "drivers.trigger.software:SoftwareTrigger",
     },
-    "thermometer": {"modbus-rtu": "drivers.modbus_rtu.thermometer:ModbusThermometer"},
+    "thermometer": {
+        "modbus-rtu": "drivers.modbus_rtu.thermometer:ModbusThermometer",
+        "ascii-line": "drivers.ascii_line.thermometer:AsciiLineThermometer",
+    },
     "navigator": {"ublox": "drivers.ublox.navigator:UbloxNavigator"},
 }
 

@@ -14,6 +14,7 @@ PAGES = [
     ("head", "aravis", "aravis.md"),
     ("thermometer", "modbus-rtu", "modbus-rtu.md"),
     ("navigator", "ublox", "ublox.md"),
+    ("thermometer", "ascii-line", "ascii-line.md"),
     ("trigger", "pulse-bus", "pulse-bus.md"),
     ("trigger", "software", "pulse-bus.md"),
 ]
