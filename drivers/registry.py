@@ -22,6 +22,7 @@ _PLACES: Final[Mapping[str, Mapping[str, str]]] = {
     "thermometer": {
         "modbus-rtu": "drivers.modbus_rtu.thermometer:ModbusThermometer",
         "ascii-line": "drivers.ascii_line.thermometer:AsciiLineThermometer",
+        "host": "drivers.host.thermometer:HostThermometer",
     },
     "navigator": {"ublox": "drivers.ublox.navigator:UbloxNavigator"},
 }

@@ -15,6 +15,7 @@ PAGES = [
     ("thermometer", "modbus-rtu", "modbus-rtu.md"),
     ("navigator", "ublox", "ublox.md"),
     ("thermometer", "ascii-line", "ascii-line.md"),
+    ("thermometer", "host", "host.md"),
     ("trigger", "pulse-bus", "pulse-bus.md"),
     ("trigger", "software", "pulse-bus.md"),
 ]

@@ -18,7 +18,7 @@ def test_there_are_the_drivers_of_the_first_flight() -> None:
     assert registry.kinds() == {
         "head": ("aravis",),
         "trigger": ("pulse-bus", "software"),
-        "thermometer": ("modbus-rtu", "ascii-line"),
+        "thermometer": ("modbus-rtu", "ascii-line", "host"),
         "navigator": ("ublox",),
     }
 

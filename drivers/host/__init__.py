@@ -1,0 +1,1 @@
+"""Temperatures the host itself measures."""

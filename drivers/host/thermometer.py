@@ -1,0 +1,170 @@
+"""The host's own temperature sensors as a thermometer.
+
+What they are and how one is read is in `drivers.host.sensors`.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar, Final
+
+from drivers.clock import Clock, HostClock
+from drivers.contract import DeviceError, LifeCycle, Sink, TemperatureSample
+from drivers.host.sensors import HostSensor, SensorGoneError, find_sensors
+from drivers.settings import Configured, Setting
+from drivers.telling import Teller
+
+SYSFS: Final = Path("/sys")
+CLOSE_TIMEOUT_S: Final = 2.0
+
+
+class HostThermometer(Configured):
+    """Sensors of the Linux host: hwmon chips (processor, disks, boards) and iio devices.
+
+    A sensor is named `chip/channel`, `chip/label`, or `chip@device/...` where chips of one name
+    are to be told apart; never by its number, which changes from boot to boot. A sensor whose
+    files vanish yields nothing until it is found again under its name; one that its chip calls
+    faulty yields samples with `value_c=None`.
+
+    Source: Linux Documentation/hwmon/sysfs-interface, ABI/testing/sysfs-bus-iio.
+    """
+
+    kind: ClassVar = "thermometer"
+
+    sensors: Setting[tuple[str, ...]] = Setting(
+        (), required=True, minimum=1, maximum=64, says="sensors as chip/channel or chip/label"
+    )
+    channels: Setting[tuple[str, ...]] = Setting(
+        (), required=True, minimum=1, maximum=64, says="names of the probes, one for each sensor"
+    )
+    interval_s = Setting(1.0, minimum=0.05, maximum=3600, says="time from reading to reading")
+
+    def __init__(
+        self,
+        name: str,
+        settings: Mapping[str, object],
+        *,
+        clock: Clock | None = None,
+        root: Path = SYSFS,
+    ) -> None:
+        super().__init__(name, settings)
+        self._clock: Clock = clock or HostClock()
+        self._root = root
+        self._teller = Teller(name, self._clock)
+        self._state = LifeCycle.CREATED
+        self._closing = threading.Event()
+        self._ended = threading.Event()
+        self._ended.set()
+        self._found: dict[str, HostSensor] = {}
+        self._lost: set[str] = set()
+        self._counters: Counter[str] = Counter(readings=0, failures=0, open_sensors=0, losses=0)
+
+    @classmethod
+    def contradictions(cls, values: Mapping[str, Any]) -> list[str]:
+        sensors, channels = values["sensors"], values["channels"]
+        found = []
+        if len(sensors) != len(channels):
+            found.append(f"channels has {len(channels)} names; sensors has {len(sensors)}")
+        for key in ("sensors", "channels"):
+            twice = sorted({name for name in values[key] if values[key].count(name) > 1})
+            if twice:
+                found.append(f"{key} names {', '.join(twice)} twice; once is enough")
+        wrong = [sensor for sensor in sensors if "/" not in sensor.strip("/")]
+        if wrong:
+            found.append(f"sensors names {', '.join(wrong)}; chip/channel, as coretemp/temp1")
+        return found
+
+    @property
+    def state(self) -> LifeCycle:
+        return self._state
+
+    def bind(self) -> Mapping[str, str]:
+        """Find and read every sensor. See `drivers.contract.Device`."""
+        found = {}
+        problems = []
+        known = find_sensors(self._root)
+        for probe, sensor in zip(self.channels, self.sensors, strict=True):
+            try:
+                self._found[probe] = self._find(sensor, known)
+                value_c = self._found[probe].read_c()
+            except SensorGoneError as error:
+                problems.append(f"{self.name}: {error}")
+                continue
+            found[f"probe {probe}"] = "open" if value_c is None else f"{value_c:.1f} degC"
+        if problems:
+            raise DeviceError("\n".join(problems))
+        self._state = LifeCycle.BOUND
+        return found
+
+    def run(self, sink: Sink) -> None:
+        """Deliver until closed. See `drivers.contract.Device`."""
+        if self._closing.is_set():
+            return
+        self._ended.clear()
+        self._teller.sink = sink
+        try:
+            self._state = LifeCycle.ACTIVE
+            self._teller.tell("opened", f"The host's sensors {self.name} are read; nothing to do.")
+            next_ns = self._clock.mono_ns()
+            while not self._closing.is_set():
+                self._read_all(sink)
+                now_ns = self._clock.mono_ns()
+                next_ns = max(next_ns + round(self.interval_s * 1e9), now_ns)
+                self._clock.wait(self._closing, (next_ns - now_ns) * 1e-9)
+        finally:
+            self._teller.sink = None
+            self._state = LifeCycle.INACTIVE
+            self._ended.set()
+
+    def close(self) -> None:
+        """End `run` within two seconds; may be called twice."""
+        self._closing.set()
+        self._ended.wait(CLOSE_TIMEOUT_S)
+        self._state = LifeCycle.INACTIVE
+
+    def statistics(self) -> Mapping[str, int]:
+        """readings, failures (a sensor that could not be read), open_sensors, losses."""
+        return dict(self._counters)
+
+    def _read_all(self, sink: Sink) -> None:
+        known: list[HostSensor] | None = None
+        for probe, sensor in zip(self.channels, self.sensors, strict=True):
+            try:
+                if probe not in self._found:
+                    known = find_sensors(self._root) if known is None else known
+                    self._found[probe] = self._find(sensor, known)
+                value_c = self._found[probe].read_c()
+            except SensorGoneError as error:
+                self._found.pop(probe, None)
+                self._counters["failures"] += 1
+                if probe not in self._lost:
+                    self._lost.add(probe)
+                    self._counters["losses"] += 1
+                    self._teller.tell(
+                        "lost",
+                        f"The sensor {sensor} of probe {probe} cannot be read ({error}). Check "
+                        "that its kernel module is loaded; it is looked for again by itself.",
+                        fault=True,
+                    )
+                continue
+            if probe in self._lost:
+                self._lost.discard(probe)
+                self._teller.tell(
+                    "recovered", f"The sensor {sensor} of probe {probe} is back; nothing to do."
+                )
+            self._counters["readings"] += 1
+            self._counters["open_sensors"] += value_c is None
+            sink(TemperatureSample(probe, value_c, self._clock.mono_ns()))
+
+    def _find(self, sensor: str, known: list[HostSensor]) -> HostSensor:
+        matches = [candidate for candidate in known if sensor in candidate.words]
+        if len(matches) == 1:
+            return matches[0]
+        if matches:
+            devices = ", ".join(candidate.words[-1] for candidate in matches)
+            raise SensorGoneError(f"sensor {sensor} is there {len(matches)} times: {devices}")
+        listed = ", ".join(candidate.words[0] for candidate in known[:20]) or "none at all"
+        raise SensorGoneError(f"sensor {sensor} is not there; the host has {listed}")
