@@ -49,7 +49,7 @@ SIGMA_PC_PX = 0.10
 POINTS_PER_OVERLAP = 850
 POINTS_PER_SENSOR = 1900
 PROBE_SIGMA_C = 0.1
-GRID = (14, 19)
+GRID = (11, 15)
 """Columns and rows of residuals on each half of the image."""
 METHODS = {
     "experiment": "P/P only, 4 parameters, not pre-corrected",
@@ -100,7 +100,7 @@ def main() -> None:
             (METHODS[n], systematic(world.image, found[n])) for n in ("experiment", "regular")
         ]
         options.drawing.write_text(
-            drawn(world.image, panels, f"{world.rig.name}, {options.exposures} exposures")
+            drawn(world.image, panels, f"{world.rig.name}, {options.exposures} exposures") + "\n"
         )
     rotation = world.rig.pan_cones[1].rotation_rad
     result: dict[str, Any] = {
@@ -391,14 +391,14 @@ def drawn(
     image: VirtualImage, panels: Sequence[tuple[str, tuple[Array, Array]]], title: str
 ) -> str:
     """Residual vectors side by side in one scale, as an SVG."""
-    gap, wide = 30.0, 520.0
+    gap, wide = 40.0, 510.0
     scale = wide / image.width_px
     high = image.height_px * scale
     longest = max(float(np.hypot(*errors.T).max()) for _, (_, errors) in panels)
-    enlarge = 26.0 / longest
+    enlarge = 22.0 / longest
     bar_um = 1.0 if 7.2 * longest > 1.0 else 0.5
     bar = bar_um / image.pitch_um * enlarge
-    width, height = 2 * wide + 3 * gap, high + 130
+    width, height = 2 * wide + 3 * gap, high + 125
     body = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:.0f} {height:.0f}" '
         f'width="{width:.0f}" height="{height:.0f}" font-family="DejaVu Sans, sans-serif">'
@@ -411,7 +411,7 @@ def drawn(
         rms_um = float(np.sqrt(np.mean(np.sum(errors**2, axis=1)))) * image.pitch_um
         body.append(
             f'<text x="{left}" y="58" font-size="12" fill="#1c2733">'
-            f"{name}: RMS {rms_um:.2f} um</text>"
+            f"{name}: RMS {rms_um:.3f} um</text>"
             f'<rect x="{left}" y="{top}" width="{wide}" height="{high:.1f}" fill="#f6f8fa" '
             'stroke="#8796a5"/>'
         )
