@@ -90,8 +90,10 @@ def processes(configuration: Configuration, rig: Rig, mission: Mission) -> tuple
 
 
 def _thread_counts(threads: int) -> dict[str, str]:
-    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
-    return dict.fromkeys(names, str(threads))
+    """Compiled kernels share the cores; small matrices do not, and nobody spins while waiting."""
+    names = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")
+    fixed = {"OPENBLAS_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
+    return dict.fromkeys(names, str(threads)) | fixed
 
 
 def _sha256(path: Path) -> str:

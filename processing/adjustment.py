@@ -6,7 +6,7 @@ what an observation or an unknown means is the caller's.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +16,8 @@ Array = NDArray[np.float64]
 
 # Eigenvalues of a datum defect are not quite zero: residuals shrink a little with the scale.
 _RANK_TOLERANCE = 1e-7
+
+_PART = 512
 
 
 @dataclass(frozen=True)
@@ -54,9 +56,12 @@ def normal_equations(blocks: Sequence[Block], unknowns: int) -> tuple[Array, Arr
     normal = np.zeros((unknowns, unknowns))
     right = np.zeros(unknowns)
     for block in blocks:
-        weighted = block.design * block.weight
-        normal[np.ix_(block.columns, block.columns)] += weighted @ block.design.T
-        right[block.columns] += weighted @ block.misclosure
+        at = np.ix_(block.columns, block.columns)
+        for part in _parts(block):
+            design = block.design[:, part]
+            weighted = design * block.weight[part]
+            normal[at] += weighted @ design.T
+            right[block.columns] += weighted @ block.misclosure[part]
     return normal, right
 
 
@@ -120,5 +125,16 @@ def solve(
 def redundancy_numbers(block: Block, cofactor: Array) -> Array:
     """r_i = 1 - p_i a_i Q a_i' of each observation of a block, weightless ones too (r_i = 1)."""
     q = cofactor[np.ix_(block.columns, block.columns)]
-    hat = np.einsum("ij,ij->j", q @ block.design, block.design) * block.weight
-    return np.asarray(np.clip(1.0 - hat, 0.0, 1.0))
+    numbers = np.empty(len(block.weight))
+    for part in _parts(block):
+        design = block.design[:, part]
+        numbers[part] = np.sum((q @ design) * design, axis=0)
+    numbers *= -block.weight
+    numbers += 1.0
+    return np.asarray(np.clip(numbers, 0.0, 1.0, out=numbers))
+
+
+def _parts(block: Block) -> Iterator[slice]:
+    """Observations so many at a time that their derivatives stay in the cache."""
+    for first in range(0, len(block.weight), _PART):
+        yield slice(first, first + _PART)

@@ -43,8 +43,6 @@ class MosaicSettings:
     `sigma_pp_px`, `sigma_pc_px` are the a-priori standard deviations of one coordinate difference
     of a typical P/P and P/C point, in PAN px; the ratio of the two is found again from the data.
     `parallax_px` is what relief leaves in P/C points (DESIGN 5.4), for this exposure.
-    A direction of the unknowns that tie points know worse than `undetermined_px` (at the farthest
-    point of the image) is held at its start, to so much: calibration and platform know it better.
     """
 
     sigma_pp_px: float = 0.1
@@ -55,7 +53,7 @@ class MosaicSettings:
     min_iterations: int = 3
     converged_px: float = 1e-3
     least_class_redundancy: float = 30.0
-    undetermined_px: float = 1.0
+    undetermined_px: float = 5.0
 
 
 @dataclass(frozen=True)
@@ -140,6 +138,7 @@ def free_mosaic(
     *,
     settings: MosaicSettings | None = None,
     excluded_datum_sensors: Sequence[str] = (),
+    begin: Mosaic | None = None,
 ) -> Mosaic:
     """Adjust all sensors of the PAN cones and the layer of the colour master.
 
@@ -149,6 +148,7 @@ def free_mosaic(
         tie_points: matched points.
         settings: None takes the defaults.
         excluded_datum_sensors: master sensors the datum (eq. 6) does not rest on.
+        begin: an adjustment of the same points in another datum, to go on from.
 
     Returns:
         The mosaic. What tie points do not determine (missing frames, empty overlaps) stays at its
@@ -181,6 +181,7 @@ def free_mosaic(
         settings=settings or MosaicSettings(),
         method="free",
         datum_sensors=datum,
+        begin=begin,
     )
 
 
@@ -228,23 +229,29 @@ def adjust_mosaic(
     method: str,
     datum_sensors: tuple[str, ...],
     kinds: Sequence[int] = _CLASSES,
+    begin: Mosaic | None = None,
 ) -> Mosaic:
     """Gauss-Newton with robust weights, variance components and data snooping.
 
     Each round linearises, weighs (a soft weight while the model is still far off, then points whose
     normalised residual exceeds `outlier_limit` are left out), solves, and estimates what the two
-    classes of points are worth, until corrections and outliers come to rest.
+    classes of points are worth, until corrections and outliers come to rest. From `begin` on, an
+    adjustment of the same points and unknowns, nothing needs a first look or soft weights.
     """
     groups = _groups(rig, start, tie_points, settings, kinds)
     for group in groups:
-        group.factor = _first_look(model, start, group)
+        if begin is None:
+            group.factor = _first_look(model, start, group)
+        else:
+            group.factor = (~begin.outliers[group.rows]).astype(np.float64)
     matrix = np.zeros((len(constraints), len(model.names)))
     for i, constraint in enumerate(constraints):
         for name, coefficient in constraint.coefficients.items():
             matrix[i, model.names.index(name)] = coefficient
     scaled_matrix = matrix * model.units
-    values = np.zeros(len(model.names))
-    class_scale = dict.fromkeys(_CLASSES, 1.0)
+    values = np.zeros(len(model.names)) if begin is None else begin.values.copy()
+    class_scale = dict.fromkeys(_CLASSES, 1.0) if begin is None else _scales_of(begin, settings)
+    least = settings.min_iterations if begin is None else 1
     solution: Solution | None = None
     iterations = 0
     for iterations in range(1, settings.max_iterations + 1):
@@ -259,7 +266,7 @@ def adjust_mosaic(
             least_information=1.0 / settings.undetermined_px**2,
         )
         values = values + solution.dp * model.units
-        soft = iterations < settings.min_iterations - 1
+        soft = iterations < least - 1
         changed = False
         for group, block in zip(groups, blocks, strict=True):
             v = (solution.dp[block.columns] @ block.design - block.misclosure).reshape(2, -1).T
@@ -271,7 +278,7 @@ def adjust_mosaic(
             changed = changed or bool(np.any((factor > 0.0) != (group.factor > 0.0)))
             group.factor = factor
         still = float(np.abs(solution.dp).max(initial=0.0)) < settings.converged_px
-        if iterations >= settings.min_iterations and still and not changed and not moved:
+        if iterations >= least and still and not changed and not moved:
             break
     return _mosaic(
         rig,
@@ -461,6 +468,13 @@ def _block(
         misclosure=(b - a).T.reshape(-1),
         weight=np.tile(group.factor / (group.sigma * scale) ** 2, 2),
     )
+
+
+def _scales_of(mosaic: Mosaic, settings: MosaicSettings) -> dict[int, float]:
+    """The factors on the a-priori sigmas that an adjustment ended with."""
+    pan = mosaic.sigma_pp_px / settings.sigma_pp_px
+    ratio = mosaic.sigma_pc_px / settings.sigma_pc_px / pan
+    return {PAN_TO_PAN: 1.0, PAN_TO_COLOUR: ratio}
 
 
 def _class_scales(

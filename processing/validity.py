@@ -218,6 +218,7 @@ def robust_datum(
         tie_points,
         settings=settings,
         excluded_datum_sensors=(validity.displaced.sensor,),
+        begin=mosaic,
     )
 
 

@@ -36,6 +36,7 @@ def bench(
     # Threads that spin while they wait take the cores from those that work.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from daemon import bench as measuring
     from processing.rig import find_rig
 
