@@ -44,8 +44,6 @@ def process(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     from daemon import store
     from daemon.messages import WorkerSettings
     from daemon.worker import make_pipeline, process_exposure
