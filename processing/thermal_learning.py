@@ -147,7 +147,9 @@ def add_exposure(rig: Rig, state: ThermalState, record: StitchRecord) -> Thermal
         cone = rig.cone(name)
         names = set(record.names)
         told = {s.name for s in (*cone.sensors, *master.sensors)} <= set(record.measured)
-        if f"{name}.{LAYER_SCALE}" in names and told and _is_there(master, names):
+        # A lone master sensor is fixed: it is the scale.
+        fixed = len(master.sensors) == 1 or _is_there(master, names)
+        if f"{name}.{LAYER_SCALE}" in names and told and fixed:
             scales[name] = _add_scale(normal, master, cone, record)
     return ThermalState(state.rig, state.calibration_id, places, scales)
 

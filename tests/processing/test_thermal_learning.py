@@ -248,3 +248,17 @@ def test_a_record_survives_its_file_and_a_broken_one_is_refused(
     for wrong in ({"format": 9}, {"values": [1.0]}, {"names": None}, {"dc_k": "no"}):
         with pytest.raises(StitchRecordError):
             stitch_record_from_json(content | wrong)
+
+
+def test_a_rig_of_single_sensors_teaches_its_principal_distances_and_no_places() -> None:
+    rig = find_rig("ultracam-l-mini")
+    true_rig = aged(rig)
+    result = learned(rig, gathered(rig, flight(rig, true_rig, (-12.0, -4.0, 4.0, 12.0))))
+    assert not result.sensors and len(result.scales) >= 1
+    master = rig.master_cone
+    for scale in result.scales:
+        off = [
+            true_rig.cone(c).lens.f_ppm_per_k - rig.cone(c).lens.f_ppm_per_k
+            for c in (scale.cone, master)
+        ]
+        assert abs(scale.f_ppm_per_k - (off[0] - off[1])) < 4.0 * scale.sigma_ppm_per_k
