@@ -24,7 +24,10 @@ _PLACES: Final[Mapping[str, Mapping[str, str]]] = {
         "ascii-line": "drivers.ascii_line.thermometer:AsciiLineThermometer",
         "host": "drivers.host.thermometer:HostThermometer",
     },
-    "navigator": {"ublox": "drivers.ublox.navigator:UbloxNavigator"},
+    "navigator": {
+        "ublox": "drivers.ublox.navigator:UbloxNavigator",
+        "gpsd": "drivers.gpsd.navigator:GpsdNavigator",
+    },
 }
 
 

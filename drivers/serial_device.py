@@ -26,6 +26,7 @@ from drivers.contract import (
     TemperatureSample,
 )
 from drivers.settings import Configured, Setting
+from drivers.tcp_port import SCHEME, open_tcp_port
 from drivers.telling import Teller
 
 READ_STEP_S: Final = 0.2
@@ -98,11 +99,13 @@ PortOpener = Callable[[str, int, str], Port]
 
 
 def open_serial_port(path: str, baudrate: int, parity: str) -> Port:
-    """Open a port for ourselves alone, 8 data bits, one stop bit.
+    """Open a port for ourselves alone, 8 data bits, one stop bit; or connect to tcp://host:port.
 
     Raises:
         DeviceError: it cannot be opened; the sentence says why and what to do.
     """
+    if path.startswith(SCHEME):
+        return open_tcp_port(path)
     try:
         return serial.Serial(
             path,

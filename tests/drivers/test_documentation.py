@@ -16,6 +16,7 @@ PAGES = [
     ("navigator", "ublox", "ublox.md"),
     ("thermometer", "ascii-line", "ascii-line.md"),
     ("thermometer", "host", "host.md"),
+    ("navigator", "gpsd", "gpsd.md"),
     ("trigger", "pulse-bus", "pulse-bus.md"),
     ("trigger", "software", "pulse-bus.md"),
 ]

@@ -1,0 +1,1 @@
+"""A gpsd as navigator."""

@@ -1,0 +1,326 @@
+"""The gpsd navigator: reports by the book, a hostile peer, and the real gpsd on recorded bytes."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import socket
+import subprocess
+import threading
+import tty
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.contract import DeviceError, NavSample
+from drivers.gpsd.navigator import GpsdNavigator
+from drivers.gpsd.reports import MAX_LINE, UNKNOWN_SIGMA_M, GpsdReports
+from drivers.ublox.decoder import UbxDecoder
+from drivers.ublox.gps_time import SECOND_NS, UtcFields, utc_ns
+from tests.drivers.stand_ins import Notebook
+
+EXCERPT = Path(__file__).parent / "data" / "ublox-neo-m8l-excerpt.ubx"
+TPV: dict[str, object] = {
+    "class": "TPV",
+    "device": "/dev/ttyACM0",
+    "mode": 3,
+    "time": "2024-01-30T15:31:58.250Z",
+    "leapseconds": 18,
+    "lat": 48.7409856,
+    "lon": 9.3117336,
+    "altHAE": 314.385,
+    "eph": 5.196,
+    "epv": 12.449,
+    "track": 90.0,
+    "speed": 60.0,
+    "climb": -1.5,
+    "eps": 0.28,
+}
+ATT: dict[str, object] = {
+    "class": "ATT",
+    "device": "/dev/ttyACM0",
+    "time": "2024-01-30T15:31:58.250Z",
+    "roll": -2.0,
+    "pitch": 3.0,
+    "heading": 180.0,
+}
+VERSION = {"class": "VERSION", "release": "3.22"}
+DEVICES = {"class": "DEVICES", "devices": [{"class": "DEVICE", "path": "/dev/ttyACM0"}]}
+
+
+def lines(*reports: Mapping[str, object]) -> bytes:
+    return b"".join(json.dumps(report).encode() + b"\r\n" for report in reports)
+
+
+def samples(*reports: dict[str, object]) -> list[NavSample]:
+    return GpsdReports("gnss").feed(lines(*reports), 7)
+
+
+def test_a_report_becomes_a_sample_in_gps_time() -> None:
+    (sample,) = samples({"class": "SKY", "nSat": 34, "uSat": 13}, ATT, TPV)
+    utc = utc_ns(UtcFields(2024, 1, 30, 15, 31, 58, 250_000_000))
+    assert utc is not None
+    assert sample.gps_ns == utc + 18 * SECOND_NS
+    assert (sample.time_valid, sample.leap_seconds, sample.fix) == (True, 18, "3d")
+    assert (sample.latitude_deg, sample.longitude_deg) == (48.7409856, 9.3117336)
+    assert (sample.height_m, sample.satellites, sample.mono_ns) == (314.385, 13, 7)
+    assert (sample.horizontal_sigma_m, sample.vertical_sigma_m) == (5.196, 12.449)
+    assert sample.velocity_ned_mps == pytest.approx((0.0, 60.0, 1.5), abs=1e-12)
+    attitude = (sample.roll_rad, sample.pitch_rad, sample.heading_rad)
+    assert attitude == pytest.approx((math.radians(-2), math.radians(3), math.pi))
+
+
+def test_an_attitude_of_another_instant_is_not_taken() -> None:
+    (sample,) = samples({**ATT, "time": "2024-01-30T15:31:58.150Z"}, TPV)
+    assert sample.roll_rad is sample.pitch_rad is sample.heading_rad is None
+
+
+def test_time_is_not_valid_until_gpsd_knows_the_leap_seconds() -> None:
+    before = {key: value for key, value in TPV.items() if key != "leapseconds"}
+    first, second, third = samples(before, TPV, before)
+    assert (first.time_valid, first.leap_seconds) == (False, None)
+    assert (second.time_valid, third.time_valid) == (True, True)
+    assert first.gps_ns == second.gps_ns
+
+
+@pytest.mark.parametrize(
+    ("change", "fix"),
+    [({"mode": 2}, "2d"), ({"status": 5}, "dead-reckoning"), ({"status": 3}, "3d")],
+)
+def test_the_fix_is_gpsds_word(change: dict[str, object], fix: str) -> None:
+    assert [sample.fix for sample in samples({**TPV, **change})] == [fix]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"mode": 1},
+        {"time": "yesterday"},
+        {"time": "2024-02-30T00:00:00Z"},
+        {"lat": "48"},
+        {"lat": 91},
+        {"lon": 10**400},
+        {"lon": True},
+        {"lat": float("nan")},
+        {"mode": None},
+    ],
+)
+def test_a_report_without_time_or_position_is_no_sample(change: dict[str, object]) -> None:
+    reports = GpsdReports("gnss")
+    assert reports.feed(lines({**TPV, **change}), 0) == []
+    assert reports.counters["reports_without_fix"] == 1
+
+
+def test_what_is_not_reported_is_told_as_unknown() -> None:
+    bare = {key: TPV[key] for key in ("class", "mode", "time", "lat", "lon")}
+    (sample,) = samples(bare)
+    assert sample.horizontal_sigma_m == sample.vertical_sigma_m == UNKNOWN_SIGMA_M
+    assert sample.speed_sigma_mps == 1000.0
+
+
+def test_only_the_device_asked_for_is_heard() -> None:
+    reports = GpsdReports("gnss", "/dev/ttyACM0")
+    found = reports.feed(lines({**TPV, "device": "/dev/ttyACM1"}, TPV), 0)
+    assert len(found) == 1
+    assert reports.counters["other_devices"] == 1
+
+
+def test_a_line_without_end_takes_no_memory_and_the_next_is_read() -> None:
+    reports = GpsdReports("gnss")
+    for _ in range(40):
+        assert reports.feed(b"[" * 50_000, 0) == []
+        assert len(reports._pending) <= MAX_LINE
+    assert len(reports.feed(b"\n" + lines(TPV), 0)) == 1
+    assert reports.bad_bytes == 2_000_000
+    assert reports.feed(b"[" * 60_000 + b"\n", 0) == [], "nested deeper than the interpreter goes"
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner),
+    max_leaves=5,
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    name=st.sampled_from(["TPV", "SKY", "ATT", "DEVICES", "VERSION", "ERROR", "PPS"]),
+    changes=st.dictionaries(
+        st.sampled_from([*TPV, *ATT, "satellites", "devices", "uSat", "message", "release"]), JSON
+    ),
+    noise=st.binary(max_size=60),
+)
+def test_whatever_a_report_holds_the_next_one_is_read(
+    name: str, changes: dict[str, object], noise: bytes
+) -> None:
+    reports = GpsdReports("gnss")
+    reports.feed(lines({**TPV, **ATT, **changes, "class": name}) + noise + b"\n", 0)
+    assert len(reports.feed(lines(TPV), 0)) == 1
+
+
+class StubGpsd:
+    """Serves a script to every connection, one after the other, and then closes it."""
+
+    def __init__(self, *scripts: bytes) -> None:
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self._listener.settimeout(10)
+        self.port = f"127.0.0.1:{self._listener.getsockname()[1]}"
+        self.asked: list[bytes] = []
+        self._scripts = scripts
+        self._hold = threading.Event()
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        for number, script in enumerate(self._scripts, 1):
+            try:
+                connection, _ = self._listener.accept()
+            except OSError:
+                return
+            with connection:
+                connection.settimeout(5)
+                connection.sendall(lines(VERSION, DEVICES))
+                self.asked.append(connection.recv(1000))
+                connection.sendall(script)
+                if number == len(self._scripts):
+                    self._hold.wait(10)
+
+    def close(self) -> None:
+        self._hold.set()
+        self._listener.close()
+        self._thread.join(5)
+
+
+def flown(navigator: GpsdNavigator, wanted: int) -> Notebook:
+    """Run until so many samples have come."""
+    notebook = Notebook()
+    done = threading.Event()
+
+    def watch(_: object) -> None:
+        if sum(isinstance(record, NavSample) for record in notebook.records) >= wanted:
+            done.set()
+
+    notebook.stop = watch
+    thread = threading.Thread(target=navigator.run, args=(notebook,))
+    thread.start()
+    try:
+        assert done.wait(20), notebook.events
+    finally:
+        navigator.close()
+        thread.join(5)
+    return notebook
+
+
+def test_a_gpsd_that_ends_is_found_again_and_asked_again() -> None:
+    stub = StubGpsd(lines(TPV), lines(TPV, TPV))
+    try:
+        navigator = GpsdNavigator("gnss", {"port": stub.port, "device": "/dev/ttyACM0"})
+        notebook = flown(navigator, 3)
+    finally:
+        stub.close()
+    assert notebook.event_names == ["opened", "lost", "opened"]
+    assert len(stub.asked) == 2
+    watch = json.loads(stub.asked[1].removeprefix(b"?WATCH=").rstrip(b";\n"))
+    assert watch == {"enable": True, "json": True, "pps": True, "device": "/dev/ttyACM0"}
+    assert navigator.statistics()["opened"] == 2
+
+
+@pytest.mark.parametrize(
+    ("script", "device", "cure"),
+    [
+        (lines({"class": "DEVICES", "devices": []}), "", "has no receiver; name its port"),
+        (b"", "/dev/ttyS9", "no receiver /dev/ttyS9; it has /dev/ttyACM0"),
+        (b"", "", "said nothing in 0.5 s"),
+    ],
+)
+def test_binding_says_what_is_wrong_with_the_gpsd(script: bytes, device: str, cure: str) -> None:
+    stub = StubGpsd(script)
+    try:
+        navigator = GpsdNavigator("gnss", {"port": stub.port, "device": device, "silence_s": 0.5})
+        with pytest.raises(DeviceError, match=cure):
+            navigator.bind()
+    finally:
+        stub.close()
+
+
+def test_binding_without_a_gpsd_names_the_address() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = f"127.0.0.1:{listener.getsockname()[1]}"
+    with pytest.raises(DeviceError, match=f"no gpsd answers at {port}"):
+        GpsdNavigator("gnss", {"port": port}).bind()
+
+
+@pytest.mark.parametrize("port", ["2947", "localhost:", "host:99999", ":2947", "host:x"])
+def test_an_address_that_is_none_is_refused(port: str) -> None:
+    assert GpsdNavigator.problems({"port": port}) == [
+        f"port is {port!r}; host:port, as 127.0.0.1:2947"
+    ]
+
+
+@pytest.fixture
+def real_gpsd() -> Iterator[tuple[str, int]]:
+    """The real gpsd on a pseudo-terminal; its address, and where the receiver's bytes go in."""
+    program = shutil.which("gpsd", path=f"{os.environ.get('PATH', '')}:/usr/sbin")
+    if program is None:
+        pytest.skip("gpsd is absent; install Debian's gpsd")
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = str(listener.getsockname()[1])
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    # gpsd gives up root before it opens the port.
+    Path(os.ttyname(slave)).chmod(0o666)
+    process = subprocess.Popen(
+        [program, "-N", "-n", "-b", "-S", port, os.ttyname(slave)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        yield f"127.0.0.1:{port}", master
+    finally:
+        process.terminate()
+        try:
+            process.wait(timeout=10)
+        finally:
+            os.close(master)
+            os.close(slave)
+
+
+@pytest.mark.peer
+def test_the_real_gpsd_says_what_our_own_decoder_reads(real_gpsd: tuple[str, int]) -> None:
+    address, receiver = real_gpsd
+    recorded = EXCERPT.read_bytes()
+    own = [r for r in UbxDecoder("m8l").feed(recorded, 0) if isinstance(r, NavSample)]
+    ended = threading.Event()
+
+    def play() -> None:
+        # Again and again, slowly enough for the terminal's buffer, until the test has enough.
+        while not ended.is_set():
+            for at in range(0, len(recorded), 500):
+                if ended.wait(0.01):
+                    return
+                os.write(receiver, recorded[at : at + 500])
+
+    player = threading.Thread(target=play)
+    player.start()
+    try:
+        navigator = GpsdNavigator("gnss", {"port": address})
+        notebook = flown(navigator, len(own) + 2)
+    finally:
+        ended.set()
+        player.join(5)
+    found = [r for r in notebook.records if isinstance(r, NavSample) and r.time_valid]
+    # gpsd writes milliseconds: the same epoch is the one within one of them.
+    pairs = [(f, o) for f in found for o in own if abs(f.gps_ns - o.gps_ns) < 1_000_000]
+    assert len(pairs) == len(found) >= len(own) - 1
+    assert navigator.reports.release
+    for gpsd, ours in pairs:
+        assert gpsd.leap_seconds == 18
+        assert gpsd.latitude_deg == pytest.approx(ours.latitude_deg, abs=1e-9)
+        assert gpsd.longitude_deg == pytest.approx(ours.longitude_deg, abs=1e-9)
+        assert gpsd.height_m == pytest.approx(ours.height_m, abs=6e-4)
+        assert gpsd.fix == ours.fix
