@@ -36,6 +36,7 @@ class UbloxNavigator(SerialDevice):
     kind: ClassVar = "navigator"
     what = "receiver"
 
+    port = Setting("", required=True, says="serial port such as /dev/ttyUSB0, or tcp://host:port")
     baudrate = Setting(115200, minimum=4800, maximum=4_000_000, says="speed of the line, bit/s")
     parity = Setting("N", choices=("N", "E", "O"), says="parity on the wire")
     silence_s = Setting(

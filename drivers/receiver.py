@@ -1,0 +1,143 @@
+"""What receivers have in common that send by themselves on a line: listening and saying who spoke.
+
+What the bytes mean is in the decoder of each protocol; opening, reconnecting and silence are in
+`drivers.serial_device`.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from typing import Protocol
+
+from drivers.clock import Clock
+from drivers.contract import DeviceError, EventMark, NavSample
+from drivers.serial_device import (
+    READ_STEP_S,
+    PortOpener,
+    SerialDevice,
+    SerialLine,
+    open_serial_port,
+)
+from drivers.settings import Setting
+
+Nav = NavSample | EventMark
+
+
+class Decoder(Protocol):
+    """Bytes in, records out. Nothing that is fed raises."""
+
+    counters: Counter[str]
+    seen: Counter[str]
+    """Messages understood, by name."""
+
+    @property
+    def frames(self) -> int:
+        """Undamaged messages of the protocol, of any kind."""
+
+    @property
+    def bad_messages(self) -> int:
+        """Messages whose checksum, length or content was wrong."""
+
+    @property
+    def bad_bytes(self) -> int:
+        """Bytes that belong to no message."""
+
+    @property
+    def leap_seconds(self) -> int | None: ...
+
+    def reset(self) -> None:
+        """The line was opened anew: forget what was half received."""
+
+    def feed(self, data: bytes, mono_ns: int) -> list[Nav]:
+        """Records that became whole with these bytes."""
+
+
+class ListeningNavigator(SerialDevice):
+    """A receiver that sends by itself; its configuration is left as it is."""
+
+    what = "receiver"
+    protocol: str = ""
+    """Name of what it speaks, for the operator's sentences."""
+    required: tuple[str, ...] = ()
+    """Any one of these messages is what `bind` waits for."""
+
+    port = Setting("", required=True, says="serial port such as /dev/ttyUSB0, or tcp://host:port")
+    baudrate = Setting(115200, minimum=4800, maximum=4_000_000, says="speed of the line, bit/s")
+    parity = Setting("N", choices=("N", "E", "O"), says="parity on the wire")
+    silence_s = Setting(
+        3.0, minimum=0.5, maximum=3600, says="without a message for so long the device is silent"
+    )
+
+    def __init__(
+        self,
+        name: str,
+        settings: Mapping[str, object],
+        *,
+        clock: Clock | None = None,
+        open_port: PortOpener = open_serial_port,
+    ) -> None:
+        super().__init__(name, settings, clock=clock, open_port=open_port)
+        self.decoder = self.new_decoder()
+
+    @abstractmethod
+    def new_decoder(self) -> Decoder:
+        """The decoder of this protocol, with this device's settings."""
+
+    def line_settings(self) -> tuple[int, str]:
+        return self.baudrate, self.parity
+
+    def identify(self, line: SerialLine) -> Mapping[str, str]:
+        """Listen until a required message comes, `silence_s` at most; what was heard."""
+        deadline_ns = self.clock.mono_ns() + round(self.silence_s * 1e9)
+        came = 0
+        while self.clock.mono_ns() < deadline_ns and not self._closing.is_set():
+            before = self.counters["bytes"]
+            for _ in self.step(line):
+                pass
+            came += self.counters["bytes"] - before
+            if any(self.decoder.seen[message] for message in self.required):
+                heard = ", ".join(sorted(self.decoder.seen))
+                leap = self.decoder.leap_seconds
+                return {"messages": heard, "leap_seconds": "unknown" if leap is None else str(leap)}
+        wanted = " or ".join(self.required)
+        if self.decoder.frames:
+            raise DeviceError(
+                f"{self.name}: the receiver at {self.port} speaks {self.protocol} but sent no "
+                f"{wanted} in {self.silence_s:g} s; switch it on for this port"
+            )
+        if came:
+            raise DeviceError(
+                f"{self.name}: what comes at {self.port} is no {self.protocol}; check that the "
+                f"receiver sends {self.protocol} here, and on a serial port that its speed is "
+                f"{self.baudrate} bit/s"
+            )
+        raise DeviceError(
+            f"{self.name}: nothing came at {self.port} in {self.silence_s:g} s; check power, cable "
+            "and the port's name"
+        )
+
+    def connected(self) -> None:
+        self.decoder.reset()
+
+    def step(self, line: SerialLine) -> Iterable[Nav]:
+        frames, bad = self.decoder.frames, self.decoder.bad_messages
+        records = self.decoder.feed(line.read(READ_STEP_S), self.clock.mono_ns())
+        self.heard(messages=self.decoder.frames - frames)
+        if self.decoder.bad_messages > bad:
+            self.teller.complain(
+                "checksum",
+                f"The receiver {self.name} at {self.port} sent damaged messages. Check the cable, "
+                "and whether the line can carry all that is switched on.",
+            )
+        return records
+
+    def statistics(self) -> Mapping[str, int]:
+        """Those of every serial device and those of the decoder."""
+        return {
+            **self.counters,
+            **self.decoder.counters,
+            "bad_messages": self.decoder.bad_messages,
+            "bad_bytes": self.decoder.bad_bytes,
+        }
