@@ -148,6 +148,8 @@ class SerialDevice(Configured):
 
     what: str = "device"
     """What it is, for the operator's sentences."""
+    silence_cure: str = "Check its power, wiring and baud rate"
+    """What the operator is to do about its silence."""
 
     def __init__(
         self,
@@ -318,8 +320,8 @@ class SerialDevice(Configured):
                     self.teller.tell(
                         "silent",
                         f"The {self.what} {self.name} at {self.port} has said nothing "
-                        f"understandable for {self.silence_s:g} s. Check its power, wiring and "
-                        "baud rate; the port is opened anew by itself.",
+                        f"understandable for {self.silence_s:g} s. {self.silence_cure}; the port "
+                        "is opened anew by itself.",
                         fault=True,
                     )
                 return True
