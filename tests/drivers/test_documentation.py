@@ -14,6 +14,7 @@ PAGES = [
     ("head", "aravis", "aravis.md"),
     ("thermometer", "modbus-rtu", "modbus-rtu.md"),
     ("navigator", "ublox", "ublox.md"),
+    ("navigator", "nmea", "nmea.md"),
     ("thermometer", "ascii-line", "ascii-line.md"),
     ("thermometer", "host", "host.md"),
     ("navigator", "gpsd", "gpsd.md"),
