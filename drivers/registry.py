@@ -14,7 +14,10 @@ from drivers.contract import DeviceError
 from drivers.settings import Configured
 
 _PLACES: Final[Mapping[str, Mapping[str, str]]] = {
-    "head": {"aravis": "drivers.aravis.head:AravisHead"},
+    "head": {
+        "aravis": "drivers.aravis.head:AravisHead",
+        "folder": "drivers.folder.head:FolderHead",
+    },
     "trigger": {
         "pulse-bus": "drivers.trigger.pulse_bus:PulseBusTrigger",
         "software": "drivers.trigger.software:SoftwareTrigger",

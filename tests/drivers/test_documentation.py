@@ -18,6 +18,7 @@ PAGES = [
     ("thermometer", "ascii-line", "ascii-line.md"),
     ("thermometer", "host", "host.md"),
     ("navigator", "gpsd", "gpsd.md"),
+    ("head", "folder", "folder.md"),
     ("trigger", "pulse-bus", "pulse-bus.md"),
     ("trigger", "software", "pulse-bus.md"),
 ]

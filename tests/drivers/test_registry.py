@@ -16,7 +16,7 @@ EVERY_DRIVER = [(kind, name) for kind, names in registry.kinds().items() for nam
 
 def test_there_are_the_drivers_of_the_first_flight() -> None:
     assert registry.kinds() == {
-        "head": ("aravis",),
+        "head": ("aravis", "folder"),
         "trigger": ("pulse-bus", "software"),
         "thermometer": ("modbus-rtu", "ascii-line", "host"),
         "navigator": ("ublox", "gpsd"),
@@ -35,7 +35,9 @@ def test_every_driver_knows_its_kind_and_explains_its_settings(kind: str, name: 
 
 
 def test_a_driver_that_does_not_exist_is_named_with_those_that_do() -> None:
-    assert registry.problems("head", "basler", {}) == ["driver is 'basler'; a head has aravis"]
+    assert registry.problems("head", "basler", {}) == [
+        "driver is 'basler'; a head has aravis, folder"
+    ]
     with pytest.raises(DeviceError, match="one of head, trigger, thermometer, navigator"):
         registry.driver_for("barometer", "any")
 
@@ -66,7 +68,7 @@ def test_validating_every_driver_loads_no_hardware_library() -> None:
         "from drivers import registry\n"
         "for kind, names in registry.kinds().items():\n"
         "    for name in names: registry.problems(kind, name, {})\n"
-        "print(sorted({'gi', 'numba', 'cv2', 'numpy'} & set(sys.modules)))\n"
+        "print(sorted({'gi', 'numba', 'cv2', 'numpy', 'tifffile'} & set(sys.modules)))\n"
     )
     answer = subprocess.run(
         [sys.executable, "-c", code],

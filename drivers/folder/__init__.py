@@ -1,0 +1,1 @@
+"""A folder of frames as a head."""
