@@ -43,6 +43,8 @@ class MosaicSettings:
     `sigma_pp_px`, `sigma_pc_px` are the a-priori standard deviations of one coordinate difference
     of a typical P/P and P/C point, in PAN px; the ratio of the two is found again from the data.
     `parallax_px` is what relief leaves in P/C points (DESIGN 5.4), for this exposure.
+    A direction of the unknowns that tie points know worse than `undetermined_px` (at the farthest
+    point of the image) is held at its start, to so much: calibration and platform know it better.
     """
 
     sigma_pp_px: float = 0.1
@@ -53,7 +55,7 @@ class MosaicSettings:
     min_iterations: int = 3
     converged_px: float = 1e-3
     least_class_redundancy: float = 30.0
-    undetermined_px: float = 5.0
+    undetermined_px: float = 1.0
 
 
 @dataclass(frozen=True)
