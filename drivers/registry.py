@@ -30,6 +30,8 @@ _PLACES: Final[Mapping[str, Mapping[str, str]]] = {
     "navigator": {
         "ublox": "drivers.ublox.navigator:UbloxNavigator",
         "gpsd": "drivers.gpsd.navigator:GpsdNavigator",
+        "nmea": "drivers.nmea.navigator:NmeaNavigator",
+        "nmea": "drivers.nmea.navigator:NmeaNavigator",
     },
 }
 
