@@ -31,7 +31,6 @@ _PLACES: Final[Mapping[str, Mapping[str, str]]] = {
         "ublox": "drivers.ublox.navigator:UbloxNavigator",
         "gpsd": "drivers.gpsd.navigator:GpsdNavigator",
         "nmea": "drivers.nmea.navigator:NmeaNavigator",
-        "nmea": "drivers.nmea.navigator:NmeaNavigator",
     },
 }
 
