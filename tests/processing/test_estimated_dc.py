@@ -134,3 +134,36 @@ def test_without_tie_points_there_is_no_estimate(rig: Rig) -> None:
     points = tie_points_of(made, rng, without=tuple(s.name for s in rig.sensors))
     mosaic = free_mosaic(rig, made.start, points)
     assert all(e.estimated_k is None for e in estimate_dc(rig, mosaic, {}))
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(1800)
+def test_a_thousand_healthy_exposures_raise_no_flag_and_no_stuck_probe_is_missed(rig: Rig) -> None:
+    """Calibration, coefficients and probes off by their sigmas; probe 1 then off by two limits."""
+    false, missed, errors = 0, 0, []
+    for k in range(1000):
+        rng = np.random.default_rng([77, k])
+
+        def off(sensor: Sensor, rng: np.random.Generator = rng) -> Sensor:
+            d = sensor.drift
+            x, y = rng.normal(0.0, d.sigma_um_per_k, 2)
+            drift = dataclasses.replace(d, x_um_per_k=d.x_um_per_k + x, y_um_per_k=d.y_um_per_k + y)
+            return dataclasses.replace(sensor, drift=drift)
+
+        true_rig, dc = with_sensors(rig, off), rng.uniform(-20.0, 20.0)
+        made = make_truth(
+            true_rig, rng, temperature_c=20.0 + dc, sensor_px=CALIBRATION_PX, layer_px=1.0
+        )
+        points = tie_points_of(made, rng, per_overlap=60, per_sensor=120)
+        read = {probe: 20.0 + dc + rng.normal(0.0, 0.1) for probe in rig.probes}
+        mosaic = free_mosaic(rig, nominal_placements(rig, read, {}), points)
+        found = estimate_dc(rig, mosaic, read)
+        false += any(e.disagrees for e in found)
+        errors += [((e.estimated_k or 0.0) - dc) / (e.sigma_k or 1.0) for e in found]
+        limit = max(4.5 * float(np.hypot(found[1].sigma_k or 0.0, 0.1)), 1.0)
+        stuck = read | {"1": read["1"] - 2.0 * limit}
+        mosaic = free_mosaic(rig, nominal_placements(rig, stuck, {}), points)
+        missed += not estimate_dc(rig, mosaic, stuck)[1].disagrees
+    assert false <= 1 and missed <= 10
+    assert 0.92 < np.mean(np.square(errors)) < 1.09
+    assert np.mean(np.abs(errors) < 3.0) > 0.99 and np.abs(errors).max() < 5.0
