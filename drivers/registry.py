@@ -31,6 +31,7 @@ _PLACES: Final[Mapping[str, Mapping[str, str]]] = {
         "ublox": "drivers.ublox.navigator:UbloxNavigator",
         "gpsd": "drivers.gpsd.navigator:GpsdNavigator",
         "nmea": "drivers.nmea.navigator:NmeaNavigator",
+        "novatel": "drivers.novatel.navigator:NovatelNavigator",
     },
 }
 

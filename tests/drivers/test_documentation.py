@@ -15,6 +15,7 @@ PAGES = [
     ("thermometer", "modbus-rtu", "modbus-rtu.md"),
     ("navigator", "ublox", "ublox.md"),
     ("navigator", "nmea", "nmea.md"),
+    ("navigator", "novatel", "novatel.md"),
     ("thermometer", "ascii-line", "ascii-line.md"),
     ("thermometer", "host", "host.md"),
     ("navigator", "gpsd", "gpsd.md"),

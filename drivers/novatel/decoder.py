@@ -1,0 +1,277 @@
+"""NovAtel logs into records: bytes in, NavSample and EventMark out, no I/O and no clock.
+
+Framing is in `drivers.novatel.framing`.
+
+Source: NovAtel OEM7 Commands and Logs Reference Manual, OM-20000169.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections import Counter
+from typing import Any, Final
+
+from drivers.contract import EventMark, NavSample
+from drivers.novatel.framing import Log, log_of, novatel_framer
+from drivers.receiver import Nav
+from drivers.ublox.gps_time import SECOND_NS, WEEK_NS
+
+NAMES: Final = {
+    42: "BESTPOS", 99: "BESTVEL", 101: "TIME", 507: "INSPVA", 508: "INSPVAS", 1465: "INSPVAX",
+    1130: "MARK1TIME", 616: "MARK2TIME", 1075: "MARK3TIME", 1076: "MARK4TIME",
+    1067: "MARK1PVA", 1068: "MARK2PVA", 1118: "MARK3PVA", 1119: "MARK4PVA",
+}  # fmt: skip
+_PVA: Final = struct.Struct("<I10dI")
+_MARKTIME: Final = struct.Struct("<I4dI")
+LAYOUTS: Final = {
+    "BESTPOS": struct.Struct("<II3df4x3f4x2fBB6x"),
+    "BESTVEL": struct.Struct("<II2f3d4x"),
+    "TIME": struct.Struct("<I3dIBBBBII"),
+    "INSPVAX": struct.Struct("<II3df6d9fIH"),
+}
+ASCII_FIELDS: Final = {
+    # Where the values of LAYOUTS stand among the words of a line.
+    "BESTPOS": (0, 1, 2, 3, 4, 5, 7, 8, 9, 11, 12, 13, 14),
+    "BESTVEL": (0, 1, 2, 3, 4, 5, 6),
+}
+INS_FIXES: Final = {
+    2: "dead-reckoning", 3: "3d", 6: "dead-reckoning", 7: "3d",
+    "INS_HIGH_VARIANCE": "dead-reckoning", "INS_SOLUTION_GOOD": "3d",
+    "INS_SOLUTION_FREE": "dead-reckoning", "INS_ALIGNMENT_COMPLETE": "3d",
+}  # fmt: skip
+COMPUTED: Final = (0, "SOL_COMPUTED")
+VALID: Final = (0, 1, "VALID")
+TIME_IS_GOOD_FROM: Final = 120
+"""Of the numbers of the time status: COARSESTEERING and all that are finer."""
+GOOD_WORDS: Final = frozenset(
+    ("COARSESTEERING", "FREEWHEELING", "FINEADJUSTING", "FINE", "FINEBACKUPSTEERING",
+     "FINESTEERING", "EXACT", "SATTIME")
+)  # fmt: skip
+FAR_NS: Final = 3600 * SECOND_NS
+SAME_NS: Final = 1000
+"""MARKxTIME and MARKxPVA of one edge lie closer; two edges never do."""
+UNKNOWN_SIGMA: Final = 100.0
+"""Metres, or metres per second: where no log with sigmas has come."""
+COUNT_BITS: Final = 32
+
+
+class NovatelDecoder:
+    """Decodes what a NovAtel receiver sends.
+
+    INSPVAX, INSPVA or INSPVAS become a NavSample; BESTPOS with BESTVEL does while no inertial
+    solution comes. MARKxTIME and MARKxPVA become one EventMark together. Nothing that is fed
+    raises.
+    """
+
+    def __init__(self, receiver: str, *, mark_accuracy_ns: int = 100) -> None:
+        self.receiver = receiver
+        self.counters: Counter[str] = Counter(
+            bad_logs=0, samples=0, marks=0, marks_duplicate=0, marks_far=0
+        )
+        self.seen: Counter[str] = Counter()
+        self._mark_accuracy_ns = mark_accuracy_ns
+        self._framer = novatel_framer()
+        self._leap: int | None = None
+        self._time_good = False
+        self._gps_ns: int | None = None
+        self._sample_ns = -1
+        self._inertial_ns: int | None = None
+        self._velocity: tuple[int, tuple[float, float, float]] | None = None
+        self._satellites = 0
+        self._sigmas = (UNKNOWN_SIGMA, UNKNOWN_SIGMA, UNKNOWN_SIGMA)
+        self._marks: dict[int, list[int]] = {}
+        self._counts: Counter[int] = Counter()
+
+    @property
+    def leap_seconds(self) -> int | None:
+        """GPS - UTC by a valid TIME log; None before one."""
+        return self._leap
+
+    @property
+    def frames(self) -> int:
+        """Logs with the right checksum so far, of any kind."""
+        return self._framer.frames
+
+    @property
+    def bad_messages(self) -> int:
+        """Logs whose checksum or content was wrong."""
+        return self._framer.bad_frames + self.counters["bad_logs"]
+
+    @property
+    def bad_bytes(self) -> int:
+        """Bytes that belong to no log."""
+        return self._framer.bad_bytes
+
+    def reset(self) -> None:
+        """The line was opened anew: forget what was half received."""
+        self._framer.reset()
+
+    def feed(self, data: bytes, mono_ns: int) -> list[Nav]:
+        """Records that became whole with these bytes, stamped with their arrival."""
+        records: list[Nav] = []
+        for frame in self._framer.feed(data):
+            try:
+                records.extend(self._on_log(log_of(frame), mono_ns))
+            except (ValueError, IndexError, OverflowError, struct.error):
+                self.counters["bad_logs"] += 1
+        return records
+
+    def _on_log(self, log: Log, mono_ns: int) -> list[Nav]:
+        name = NAMES.get(log.identity, "") if isinstance(log.identity, int) else log.identity
+        name = name.removesuffix("S") if name == "INSPVAS" else name
+        if name not in NAMES.values():
+            return []
+        if isinstance(log.time_status, int):
+            self._time_good = log.time_status >= TIME_IS_GOOD_FROM
+        elif log.time_status is not None:
+            self._time_good = log.time_status in GOOD_WORDS
+        values = _values(name, log.body)
+        if any(isinstance(value, float) and not math.isfinite(value) for value in values):
+            raise ValueError(f"{name} holds a number that is none")
+        made: list[Nav] = []
+        if name.startswith("MARK"):
+            made = self._on_mark(int(name[4]), values, is_pva=name.endswith("PVA"), mono_ns=mono_ns)
+        elif name == "TIME":
+            if values[10] in VALID[1:]:
+                self._leap = round(-values[3])
+        elif name == "BESTVEL":
+            if values[0] in COMPUTED:
+                speed, track, up = values[4:7]
+                course = math.radians(track)
+                ned = (speed * math.cos(course), speed * math.sin(course), -up)
+                self._velocity = (_header_ns(log), ned)
+        elif name == "BESTPOS":
+            made = self._on_bestpos(log, values, mono_ns)
+        elif name == "INSPVAX":
+            self._sigmas = (math.hypot(*values[12:14]), values[14], math.hypot(*values[15:18]))
+            height = values[4] + values[5]
+            inertial = (*values[2:4], height, *values[6:12], values[0])
+            made = self._on_inertial(_header_ns(log), inertial, mono_ns)
+        else:
+            made = self._on_inertial(_gps_ns(values[0], values[1]), values[2:], mono_ns)
+        self.seen[name] += 1
+        return made
+
+    # Navigation
+
+    def _on_inertial(self, gps_ns: int, values: tuple[Any, ...], mono_ns: int) -> list[Nav]:
+        latitude, longitude, height, north, east, up, roll, pitch, azimuth, status = values
+        fix = INS_FIXES.get(status, "none")
+        if fix != "none":
+            self._inertial_ns = gps_ns
+        if gps_ns == self._sample_ns:
+            return []
+        return self._sample(
+            gps_ns,
+            mono_ns,
+            fix=fix,
+            place=(latitude, longitude, height),
+            velocity=(north, east, -up),
+            attitude=(math.radians(roll), math.radians(pitch), math.radians(azimuth) % math.tau),
+        )
+
+    def _on_bestpos(self, log: Log, values: tuple[Any, ...], mono_ns: int) -> list[Nav]:
+        gps_ns = _header_ns(log)
+        self._satellites = int(values[12])
+        if self._inertial_ns is not None and abs(gps_ns - self._inertial_ns) < 10 * SECOND_NS:
+            return []
+        speed_sigma = self._sigmas[2]
+        self._sigmas = (math.hypot(values[6], values[7]), values[8], speed_sigma)
+        velocity = (0.0, 0.0, 0.0)
+        if self._velocity is not None and abs(gps_ns - self._velocity[0]) < SECOND_NS:
+            velocity = self._velocity[1]
+        return self._sample(
+            gps_ns,
+            mono_ns,
+            fix="3d" if values[0] in COMPUTED else "none",
+            place=(values[2], values[3], values[4] + values[5]),
+            velocity=velocity,
+            attitude=(None, None, None),
+        )
+
+    def _sample(
+        self,
+        gps_ns: int,
+        mono_ns: int,
+        *,
+        fix: str,
+        place: tuple[float, float, float],
+        velocity: tuple[float, float, float],
+        attitude: tuple[float | None, float | None, float | None],
+    ) -> list[Nav]:
+        valid = self._time_good and gps_ns >= WEEK_NS
+        if not (abs(place[0]) <= 90 and abs(place[1]) <= 360):
+            raise ValueError("a position that is none")
+        self._sample_ns = gps_ns
+        if valid:
+            self._gps_ns = gps_ns
+        self.counters["samples"] += 1
+        return [
+            NavSample(
+                self.receiver, gps_ns, mono_ns, fix, self._satellites, *place,
+                *self._sigmas[:2], velocity, self._sigmas[2], *attitude, self._leap, valid,
+            )
+        ]  # fmt: skip
+
+    # Marks
+
+    def _on_mark(
+        self, channel: int, values: tuple[Any, ...], *, is_pva: bool, mono_ns: int
+    ) -> list[Nav]:
+        gps_ns = _gps_ns(values[0], values[1])
+        valid = self._time_good and gps_ns >= WEEK_NS
+        accuracy_ns = self._mark_accuracy_ns
+        if not is_pva:
+            # GPS time = receiver time - clock offset; MARKxPVA has it applied already.
+            gps_ns -= round(values[2] * 1e9)
+            accuracy_ns = max(accuracy_ns, min(round(abs(values[3]) * 1e9), SECOND_NS))
+            valid = valid and values[5] in VALID
+        recent = self._marks.setdefault(channel, [])
+        if any(abs(gps_ns - at) <= SAME_NS for at in recent):
+            self.counters["marks_duplicate"] += 1
+            return []
+        recent.append(gps_ns)
+        del recent[:-16]
+        if valid and self._gps_ns is not None and abs(gps_ns - self._gps_ns) > FAR_NS:
+            self.counters["marks_far"] += 1
+            valid = False
+        self.counters["marks"] += 1
+        count = self._counts[channel] = (self._counts[channel] + 1) % (1 << COUNT_BITS)
+        return [
+            EventMark(
+                self.receiver, channel, gps_ns, accuracy_ns, count, COUNT_BITS, valid, mono_ns
+            )
+        ]
+
+
+def _values(name: str, body: bytes | list[str]) -> tuple[Any, ...]:
+    layout = LAYOUTS.get(name)
+    if layout is None:
+        layout = _MARKTIME if name.endswith("TIME") else _PVA
+    if isinstance(body, bytes):
+        return layout.unpack_from(body)
+    picked = ASCII_FIELDS.get(name)
+    return tuple(_word(text) for text in ([body[n] for n in picked] if picked else body))
+
+
+def _word(text: str) -> int | float | str:
+    """A number where the text is one, a word of an enumeration otherwise."""
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
+
+
+def _gps_ns(week: object, seconds: object) -> int:
+    if not isinstance(week, int) or not isinstance(seconds, int | float):
+        raise ValueError("week and seconds that are no numbers")
+    if not (0 <= week < 65_536 and 0 <= seconds <= 604_800):
+        raise ValueError("week or seconds out of range")
+    return week * WEEK_NS + round(seconds * 1e9)
+
+
+def _header_ns(log: Log) -> int:
+    return log.week * WEEK_NS + log.tow_ns

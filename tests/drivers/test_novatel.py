@@ -1,0 +1,168 @@
+"""NovAtel logs: inertial solutions and marks at GPS time, checked by NovAtel's own decoder."""
+
+from __future__ import annotations
+
+import math
+import struct
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from novatel_edie import oem
+
+from drivers.contract import EventMark, NavSample
+from drivers.novatel.decoder import NovatelDecoder
+from drivers.novatel.framing import crc32
+from drivers.receiver import Nav
+from drivers.ublox.gps_time import WEEK_NS
+
+NAV = Path(__file__).parents[3] / "shared" / "data" / "nav"
+EXCERPT = Path(__file__).parent / "data" / "novatel-ins2-excerpt.gps"
+FINESTEERING, UNKNOWN = 180, 20
+WEEK = 2445
+
+
+def log(identity: int, body: bytes, *, week: int = WEEK, ms: int = 0, status: int = 180) -> bytes:
+    head = struct.pack("<3sBHBBHHBBHiIHH", b"\xaa\x44\x12", 28, identity, 0, 32, len(body), 0, 0,
+                       status, week, ms, 0, 0, 16000)  # fmt: skip
+    return head + body + crc32(head + body).to_bytes(4, "little")
+
+
+def mark_time(seconds: float, offset: float = 0.0, *, week: int = WEEK) -> bytes:
+    return log(1130, struct.pack("<I4dI", week, seconds, offset, 3e-9, -18.0, 0))
+
+
+def pva(identity: int, seconds: float, *, week: int = WEEK, status: int = 3) -> bytes:
+    body = struct.pack("<I10dI", week, seconds, 47.5, 8.5, 1000.0, 60.0, 3.0, 1.0, 1.5, -2.0, 359.0,
+                       status)  # fmt: skip
+    return log(identity, body, week=week, ms=round(seconds * 1000))
+
+
+def decode(data: bytes, piece: int = 0) -> tuple[NovatelDecoder, list[Nav]]:
+    decoder = NovatelDecoder("span")
+    records: list[Nav] = []
+    for at in range(0, len(data), piece or len(data) or 1):
+        records += decoder.feed(data[at : at + (piece or len(data))], 77)
+    return decoder, records
+
+
+def marks(data: bytes) -> list[EventMark]:
+    return [r for r in decode(data)[1] if isinstance(r, EventMark)]
+
+
+def test_an_inertial_solution_comes_out_in_si_units() -> None:
+    (sample,) = decode(pva(507, 360_018.25))[1]
+    assert isinstance(sample, NavSample)
+    assert sample.gps_ns == WEEK * WEEK_NS + 360_018_250_000_000
+    assert sample.velocity_ned_mps == (60.0, 3.0, -1.0)
+    assert (sample.roll_rad, sample.heading_rad) == (math.radians(1.5), math.radians(359.0))
+    assert (sample.fix, sample.time_valid) == ("3d", True)
+
+
+def test_the_published_mark_line_is_that_of_novatels_decoder() -> None:
+    line = (
+        b"#MARK1PVAA,USB1,0,92.0,EXACT,1753,238273.050,00000000,0000,470;1753,238273.050000025,"
+        b"37.856359728,-122.494864165,110.390118713,16.041177523,-24.789919285,-1.752024973,"
+        b"-3.954175540,4.393638450,32.292000751,INS_SOLUTION_GOOD*016857cc\r\n"
+    )
+    parser = oem.Parser()
+    parser.write(line)
+    (theirs,) = list(parser)
+    (mark,) = marks(line)
+    assert mark.gps_ns == theirs.week * WEEK_NS + round(theirs.seconds * 1e9)
+    assert mark.gps_ns % WEEK_NS == 238_273_050_000_025
+    assert (mark.channel, mark.time_valid) == (1, True)
+
+
+def test_the_clock_offset_is_taken_off_a_mark_time_and_its_mark_pva_is_no_second_mark() -> None:
+    data = mark_time(100.5 + 2e-6, offset=2e-6) + pva(1067, 100.5) + mark_time(100.5, 0.0)
+    (mark,) = marks(data)
+    assert mark.gps_ns == WEEK * WEEK_NS + 100_500_000_000
+    parser = oem.Parser()
+    parser.write(data)
+    theirs = [m for m in parser if "MARK1TIME" in type(m).__name__]
+    assert [m.week for m in theirs] == [WEEK, WEEK]
+
+
+def test_a_late_mark_of_the_week_before_keeps_its_own_week() -> None:
+    data = pva(507, 0.5, week=WEEK + 1) + mark_time(604_799.75)
+    (mark,) = marks(data)
+    assert mark.gps_ns == (WEEK + 1) * WEEK_NS - 250_000_000
+    assert mark.time_valid
+
+
+def test_a_rolled_over_week_and_a_time_that_is_not_known_are_not_valid() -> None:
+    assert [m.time_valid for m in marks(pva(507, 9.0) + mark_time(9.0, week=WEEK - 1024))] == [
+        False
+    ]
+    body = struct.pack("<I4dI", WEEK, 9.0, 0.0, 0.0, -18.0, 0)
+    assert [m.time_valid for m in marks(log(1130, body, status=UNKNOWN))] == [False]
+
+
+def test_leap_seconds_come_from_a_valid_time_log_only() -> None:
+    def time(utc_status: int) -> bytes:
+        return log(
+            101, struct.pack("<I3dIBBBBII", 0, 0, 0, -18.0, 2026, 11, 21, 9, 0, 0, utc_status)
+        )
+
+    assert decode(time(0))[0].leap_seconds is None
+    assert decode(time(1))[0].leap_seconds == 18
+
+
+@settings(max_examples=200, deadline=None)
+@given(data=st.data())
+def test_damage_and_noise_raise_nothing_and_cost_no_later_message(data: st.DataObject) -> None:
+    stream = bytearray(b"".join(pva(507, n / 10) + mark_time(n / 10) for n in range(4)))
+    for _ in range(data.draw(st.integers(0, 8))):
+        stream[data.draw(st.integers(0, len(stream) - 1))] = data.draw(st.integers(0, 255))
+    said = bytes(stream) + data.draw(st.binary(max_size=200)) + mark_time(50.0) + mark_time(51.0)
+    whole, records = decode(said)
+    seconds = [r.gps_ns - WEEK * WEEK_NS for r in records]
+    assert seconds[-1:] == [51 * 10**9]
+    pieces, same = decode(said, data.draw(st.integers(1, 60)))
+    assert same == records
+    assert (pieces.frames, pieces.bad_bytes) == (whole.frames, whole.bad_bytes)
+
+
+@pytest.mark.parametrize("path", [EXCERPT, NAV / "novatel" / "ins2.gps"])
+def test_every_recorded_solution_is_that_of_novatels_decoder(path: Path) -> None:
+    if not path.exists():
+        pytest.skip("needs NovAtel's recording in ../shared/data/nav/novatel")
+    decoder, records = decode(path.read_bytes())
+    parser = oem.Parser()
+    parser.write(path.read_bytes())
+    theirs = [m for m in parser if type(m).__name__.startswith("INSPVAS")]
+    assert len(records) == len(theirs) > 0
+    assert decoder.bad_messages == 0
+    for sample, their in zip(records, theirs, strict=True):
+        assert isinstance(sample, NavSample)
+        assert sample.gps_ns == their.week * WEEK_NS + round(their.seconds * 1e9)
+        assert (sample.latitude_deg, sample.longitude_deg) == (their.latitude, their.longitude)
+        assert sample.height_m == their.height
+        assert sample.roll_rad == math.radians(their.roll)
+
+
+def test_a_stream_that_is_nothing_but_sync_errors_gives_nothing_and_is_not_kept() -> None:
+    path = NAV / "novatel" / "binary_sync_error.BIN"
+    if not path.exists():
+        pytest.skip("needs NovAtel's recording in ../shared/data/nav/novatel")
+    data = path.read_bytes()
+    decoder, records = decode(data, 500)
+    assert (records, decoder.frames, decoder.bad_bytes) == ([], 0, len(data))
+
+
+def test_without_an_inertial_solution_the_position_comes_from_bestpos() -> None:
+    position = struct.pack("<II3dfI3f4s2f8B", 0, 50, 47.5, 8.5, 952.5, 47.5, 61, 0.03, 0.04, 0.09,
+                           b"0001", 0.0, 0.0, 17, 16, 0, 0, 0, 0, 0, 0)  # fmt: skip
+    velocity = struct.pack("<II2f3df", 0, 8, 0.0, 0.0, 60.0, 90.0, 1.0, 0.0)
+    data = log(99, velocity, ms=5000) + log(42, position, ms=5000)
+    (sample,) = decode(data)[1]
+    assert isinstance(sample, NavSample)
+    assert (sample.latitude_deg, sample.height_m, sample.satellites) == (47.5, 1000.0, 16)
+    assert sample.velocity_ned_mps == pytest.approx((0.0, 60.0, -1.0))
+    assert sample.horizontal_sigma_m == pytest.approx(0.05)
+    parser = oem.Parser()
+    parser.write(data)
+    _, theirs = list(parser)
+    assert (theirs.latitude, theirs.num_soln_svs) == (47.5, 16)
