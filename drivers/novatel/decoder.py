@@ -113,7 +113,7 @@ class NovatelDecoder:
         for frame in self._framer.feed(data):
             try:
                 records.extend(self._on_log(log_of(frame), mono_ns))
-            except (ValueError, IndexError, OverflowError, struct.error):
+            except (ValueError, TypeError, IndexError, OverflowError, struct.error):
                 self.counters["bad_logs"] += 1
         return records
 

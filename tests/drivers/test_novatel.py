@@ -166,3 +166,12 @@ def test_without_an_inertial_solution_the_position_comes_from_bestpos() -> None:
     parser.write(data)
     _, theirs = list(parser)
     assert (theirs.latitude, theirs.num_soln_svs) == (47.5, 16)
+
+
+@pytest.mark.parametrize("name", ["TIME", "BESTPOS", "BESTVEL", "INSPVAX", "MARK1TIME", "INSPVA"])
+@pytest.mark.parametrize("body", ["a," * 30 + "a", "", "1e999," * 24 + "nan", "VALID," * 12 + "1"])
+def test_a_checked_line_of_nonsense_raises_nothing(name: str, body: str) -> None:
+    said = f"{name}A,COM1,0,1,FINESTEERING,2445,1.0,0,0,1;{body}".encode()
+    decoder, records = decode(b"#" + said + b"*%08x\r\n" % crc32(said))
+    assert decoder.frames == 1
+    assert records == []
