@@ -24,8 +24,9 @@ from processing.band_registration import (
     register_to_reference,
 )
 from processing.conditions import Conditions
+from processing.judgement import judge
 from processing.placement import SensorPlacement
-from processing.quality import Figure, QualityReport, Thresholds, judge
+from processing.quality import Figure, QualityReport, Thresholds
 from processing.radiance import RadianceCalibration, radiance_from_words, saturated_words
 from processing.rig import Rig, Sensor, VirtualImage
 

@@ -38,6 +38,7 @@ from processing.figures import (
     stitching_figures,
 )
 from processing.fixed_method import fixed_mosaic
+from processing.judgement import judge
 from processing.level1 import (
     FrameStatistics,
     corrector_for,
@@ -50,7 +51,7 @@ from processing.pan_only import pan_only_mosaic
 from processing.placement import SensorPlacement, nominal_placements
 from processing.precision import precision_figures
 from processing.product import Method, Product, Settings
-from processing.quality import Figure, judge
+from processing.quality import Figure
 from processing.quicklook import quicklook
 from processing.radiometry import RadiometricCalibration
 from processing.rehearsal import rehearsal_frames

@@ -7,14 +7,8 @@ import math
 
 import pytest
 
-from processing.quality import (
-    NO_FLAGS,
-    Flag,
-    Thresholds,
-    Verdict,
-    as_json,
-    judge,
-)
+from processing.judgement import judge
+from processing.quality import NO_FLAGS, Flag, Thresholds, Verdict, as_json
 
 GOOD = {
     "sigma0_px": 0.05,
