@@ -253,7 +253,7 @@ def test_killed_it_leaves_no_process_behind(tmp_path: Path, cache: Path) -> None
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["no-such-rig"], "one of: ultracam-x"),
+        (["no-such-rig"], "neither a file nor one of: "),
         (["ultracam-x-mini", "--displace", "SU99=1,1"], "displaced sensor 'SU99'"),
         (["ultracam-x-mini", "--displace", "SU02"], "write it as SU02=1.0,-0.6"),
         (["ultracam-x-mini", "--first-address", "10.0.0.1"], "not a loopback address"),

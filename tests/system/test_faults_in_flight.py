@@ -14,20 +14,23 @@ from typing import Any
 
 import pytest
 
-from daemon.cli.sim import Emulator, service_toml, simulator_arguments
+from daemon.cli.sim import Emulator, free_first_address, service_toml, simulator_arguments
 from tests.system.flown import ROOT, syntopic
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(400)]
 
 WAIT_S = 120.0
 CHILDREN_DIE_WITHIN_S = 3.0
+NOBODY = "127.99.99.99"
+"""An address at which no head answers."""
 
 
 @pytest.fixture(scope="module")
 def emulator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Emulator, Path]]:
     folder = tmp_path_factory.mktemp("kill")
     arguments = simulator_arguments("ultracam-x-mini", folder / "sim", seed=3, dc=0, displace=[])
-    started = Emulator([*arguments, "--first-address", "127.0.7.2", "--exposures", "8"])
+    address = free_first_address()
+    started = Emulator([*arguments, "--first-address", address, "--exposures", "8"])
     yield started, folder
     started.end()
 
@@ -137,12 +140,13 @@ def test_check_prints_a_tree_of_what_is_well_and_the_cure_of_what_is_not(
     said = json.loads(well.stdout)
     assert well.returncode == 0, said
     assert said["ok"] and len(said["devices"]) == 16
-    config.write_text(text.replace("127.0.7.5", "127.0.7.99"))
+    present = devices.ready["heads"]["SU03"]["address"]
+    config.write_text(text.replace(f'"{present}"', f'"{NOBODY}"'))
     ill = syntopic("check", str(config), "--json")
     said = json.loads(ill.stdout)
     assert ill.returncode == 1
     (head,) = [device for device in said["devices"] if not device["ok"]]
-    assert "127.0.7.99" in head["problem"] and "check" in head["problem"]
+    assert NOBODY in head["problem"] and "check" in head["problem"]
 
 
 def test_a_process_that_dies_ends_the_service_with_a_sentence_and_the_flight_stays_open(
@@ -179,7 +183,7 @@ def test_a_head_that_is_not_there_degrades_the_exposures_and_nothing_else(
     config = folder / "service.toml"
     text = service_toml(devices.ready, root="degraded", count=2, end_when_done=True)
     address = devices.ready["heads"]["SU11"]["address"]
-    text = text.replace(f'"{address}"', '"127.0.7.99"') + "\n[limits]\nready_timeout_s = 4.0\n"
+    text = text.replace(f'"{address}"', f'"{NOBODY}"') + "\n[limits]\nready_timeout_s = 4.0\n"
     config.write_text(text)
     service = start(config)
     events = list(heard(service))
