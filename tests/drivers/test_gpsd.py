@@ -313,7 +313,10 @@ def test_the_real_gpsd_says_what_our_own_decoder_reads(real_gpsd: tuple[str, int
     finally:
         ended.set()
         player.join(5)
-    found = [r for r in notebook.records if isinstance(r, NavSample) and r.time_valid]
+    samples = [r for r in notebook.records if isinstance(r, NavSample)]
+    found = [r for r in samples if r.time_valid]
+    if samples and all(r.leap_seconds is None for r in samples):
+        pytest.skip("this gpsd tells no leap seconds for the recording: its time is not trusted")
     # gpsd writes milliseconds: the same epoch is the one within one of them.
     pairs = [(f, o) for f in found for o in own if abs(f.gps_ns - o.gps_ns) < 1_000_000]
     assert len(pairs) == len(found) >= len(own) - 1
