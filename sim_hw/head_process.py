@@ -255,8 +255,12 @@ def _serve(pipe: Connection, heads: Sequence[RenderedHead], ending: threading.Ev
 
 
 def end_with_parent() -> None:
-    """Have the kernel send SIGTERM when the parent dies; it may have died before we could ask."""
-    ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+    """Have the kernel end this process when the parent dies; it may have died before we asked.
+
+    SIGKILL, since nobody is left for whom an orderly end would make a difference, and an orderly
+    end can hang.
+    """
+    ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     parent = multiprocessing.parent_process()
     if parent is not None and os.getppid() != parent.pid:
-        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), signal.SIGKILL)

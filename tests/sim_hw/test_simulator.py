@@ -34,7 +34,7 @@ from sim_hw.world import World, WorldSettings
 from tests.sim_hw.test_gige_head import Controller
 
 READY_WITHIN_S = 90.0
-ENDS_WITHIN_S = 15.0
+ENDS_WITHIN_S = 60.0
 WEEK_NS = 604_800_000_000_000
 EPOCH = 1_400_000_000_000_000_000
 
