@@ -9,7 +9,7 @@ import bisect
 import datetime
 from typing import Final
 
-from drivers.ublox.gps_time import GPS_EPOCH_DAY, SECOND_NS
+from drivers.gps_time import GPS_EPOCH_DAY, SECOND_NS
 
 SINCE: Final = (
     (1981, 7), (1982, 7), (1983, 7), (1985, 7), (1988, 1), (1990, 1), (1991, 1), (1992, 7),

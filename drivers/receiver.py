@@ -7,12 +7,11 @@ What the bytes mean is in the decoder of each protocol; opening, reconnecting an
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections import Counter
 from collections.abc import Iterable, Mapping
-from typing import Protocol
 
 from drivers.clock import Clock
-from drivers.contract import DeviceError, EventMark, NavSample
+from drivers.contract import DeviceError
+from drivers.message_decoder import MessageDecoder, Nav
 from drivers.serial_device import (
     READ_STEP_S,
     PortOpener,
@@ -21,37 +20,6 @@ from drivers.serial_device import (
     open_serial_port,
 )
 from drivers.settings import Setting
-
-Nav = NavSample | EventMark
-
-
-class Decoder(Protocol):
-    """Bytes in, records out. Nothing that is fed raises."""
-
-    counters: Counter[str]
-    seen: Counter[str]
-    """Messages understood, by name."""
-
-    @property
-    def frames(self) -> int:
-        """Undamaged messages of the protocol, of any kind."""
-
-    @property
-    def bad_messages(self) -> int:
-        """Messages whose checksum, length or content was wrong."""
-
-    @property
-    def bad_bytes(self) -> int:
-        """Bytes that belong to no message."""
-
-    @property
-    def leap_seconds(self) -> int | None: ...
-
-    def reset(self) -> None:
-        """The line was opened anew: forget what was half received."""
-
-    def feed(self, data: bytes, mono_ns: int) -> list[Nav]:
-        """Records that became whole with these bytes."""
 
 
 class ListeningNavigator(SerialDevice):
@@ -62,6 +30,8 @@ class ListeningNavigator(SerialDevice):
     """Name of what it speaks, for the operator's sentences."""
     required: tuple[str, ...] = ()
     """Any one of these messages is what `bind` waits for."""
+    switch_on: str = "switch it on for this port"
+    """What the operator is to do where none of them comes."""
 
     port = Setting("", required=True, says="serial port such as /dev/ttyUSB0, or tcp://host:port")
     baudrate = Setting(115200, minimum=4800, maximum=4_000_000, says="speed of the line, bit/s")
@@ -82,7 +52,7 @@ class ListeningNavigator(SerialDevice):
         self.decoder = self.new_decoder()
 
     @abstractmethod
-    def new_decoder(self) -> Decoder:
+    def new_decoder(self) -> MessageDecoder:
         """The decoder of this protocol, with this device's settings."""
 
     def line_settings(self) -> tuple[int, str]:
@@ -101,21 +71,23 @@ class ListeningNavigator(SerialDevice):
                 heard = ", ".join(sorted(self.decoder.seen))
                 leap = self.decoder.leap_seconds
                 return {"messages": heard, "leap_seconds": "unknown" if leap is None else str(leap)}
-        wanted = " or ".join(self.required)
         if self.decoder.frames:
             raise DeviceError(
                 f"{self.name}: the receiver at {self.port} speaks {self.protocol} but sent no "
-                f"{wanted} in {self.silence_s:g} s; switch it on for this port"
+                f"{' or '.join(self.required)} in {self.silence_s:g} s; {self.switch_on}"
             )
         if came:
-            raise DeviceError(
-                f"{self.name}: what comes at {self.port} is no {self.protocol}; check that the "
-                f"receiver sends {self.protocol} here, and on a serial port that its speed is "
-                f"{self.baudrate} bit/s"
-            )
+            raise DeviceError(f"{self.name}: {self.not_understood()}")
         raise DeviceError(
             f"{self.name}: nothing came at {self.port} in {self.silence_s:g} s; check power, cable "
             "and the port's name"
+        )
+
+    def not_understood(self) -> str:
+        """What the operator reads where bytes came and none of them made sense."""
+        return (
+            f"what comes at {self.port} is no {self.protocol}; check that the receiver sends "
+            f"{self.protocol} here, and on a serial port that its speed is {self.baudrate} bit/s"
         )
 
     def connected(self) -> None:

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from drivers.contract import NavSample
-from drivers.ublox.gps_time import MAX_LEAP_SECONDS, SECOND_NS, UtcFields, utc_ns
+from drivers.gps_time import MAX_LEAP_SECONDS, SECOND_NS, UtcFields, utc_ns
 
 MAX_LINE: Final = 65_536
 """gpsd's own longest report, SKY of all constellations, stays below 20 kB."""

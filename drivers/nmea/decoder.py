@@ -8,16 +8,16 @@ Source: NMEA 0183 as published in gpsd's "NMEA Revealed"; Trimble's $PTNL,EVT.
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
 from drivers.contract import EventMark, NavSample
+from drivers.gps_time import DAY_NS, RECENT_NS, SECOND_NS, WEEK_NS
 from drivers.leap_seconds import leap_seconds_at
+from drivers.message_decoder import MessageDecoder, Nav
 from drivers.message_framer import MessageFramer
 from drivers.nmea.sentences import (
-    DAY_NS,
     angle_deg,
     checksum_fits,
     day_number,
@@ -28,14 +28,9 @@ from drivers.nmea.sentences import (
     size_of,
     time_of_day_ns,
 )
-from drivers.receiver import Nav
-from drivers.ublox.gps_time import SECOND_NS, WEEK_NS
 
 KNOT_MPS: Final = 1852 / 3600
 KMH_MPS: Final = 1 / 3.6
-FAR_NS: Final = 3600 * SECOND_NS
-"""A mark further from navigation has a wrong week or a restarted clock."""
-RECENT_NS: Final = 10 * SECOND_NS
 FIXES: Final = {0: "none", 6: "dead-reckoning", 7: "none", 8: "none"}
 """By GGA quality; every other one is a fix of position and height."""
 COUNT_BITS: Final = 16
@@ -62,13 +57,16 @@ class _Epoch:
     told: bool = False
 
 
-class NmeaDecoder:
+class NmeaDecoder(MessageDecoder):
     """Decodes what an NMEA 0183 receiver sends.
 
     Sentences of one UTC time (RMC, GGA, GST, ZDA, and VTG and HDT that follow them) become one
     NavSample, as soon as all kinds of the epoch before have come or the next epoch begins.
     $PTNL,EVT becomes an EventMark. Nothing that is fed raises.
     """
+
+    unreadable = (ValueError, IndexError, OverflowError)
+    bad_counter = "bad_sentences"
 
     def __init__(
         self,
@@ -78,18 +76,15 @@ class NmeaDecoder:
         speed_sigma_mps: float = 0.5,
         mark_accuracy_ns: int = 1000,
     ) -> None:
-        self.receiver = receiver
-        self.counters: Counter[str] = Counter(
-            bad_sentences=0, samples=0, samples_without_date=0, marks=0, marks_far=0
+        super().__init__(
+            receiver,
+            MessageFramer(b"$", size_of, checksum_fits),
+            ("samples", "samples_without_date", "marks", "marks_far"),
         )
-        self.seen: Counter[str] = Counter()
         self._range_error_m = range_error_m
         self._speed_sigma_mps = speed_sigma_mps
         self._mark_accuracy_ns = mark_accuracy_ns
-        self._framer = MessageFramer(b"$", size_of, checksum_fits)
-        self._leap: int | None = None
         self._utc_ns: int | None = None
-        self._gps_ns: int | None = None
         self._epoch: _Epoch | None = None
         self._expected: frozenset[str] = frozenset()
         self._timed: Mapping[str, Callable[[_Epoch, list[str]], None]] = {
@@ -99,40 +94,12 @@ class NmeaDecoder:
             "ZDA": self._on_zda,
         }
 
-    @property
-    def leap_seconds(self) -> int | None:
-        """GPS - UTC in use; None before the first trusted date."""
-        return self._leap
-
-    @property
-    def frames(self) -> int:
-        """Sentences with the right checksum so far, of any kind."""
-        return self._framer.frames
-
-    @property
-    def bad_messages(self) -> int:
-        """Sentences whose checksum or content was wrong."""
-        return self._framer.bad_frames + self.counters["bad_sentences"]
-
-    @property
-    def bad_bytes(self) -> int:
-        """Bytes that belong to no sentence."""
-        return self._framer.bad_bytes
-
     def reset(self) -> None:
-        """The line was opened anew: forget what was half received."""
-        self._framer.reset()
+        super().reset()
         self._epoch = None
 
-    def feed(self, data: bytes, mono_ns: int) -> list[Nav]:
-        """Records that became whole with these bytes, stamped with their arrival."""
-        records: list[Nav] = []
-        for line in self._framer.feed(data):
-            try:
-                records.extend(self._on_sentence(fields_of(line), mono_ns))
-            except (ValueError, IndexError, OverflowError):
-                self.counters["bad_sentences"] += 1
-        return records
+    def on_message(self, message: bytes, mono_ns: int) -> list[Nav]:
+        return self._on_sentence(fields_of(message), mono_ns)
 
     def _on_sentence(self, fields: list[str], mono_ns: int) -> list[Nav]:
         if fields[0] == "PTNL":
@@ -291,8 +258,7 @@ class NmeaDecoder:
             # and week the sentence gives differs by receiver: navigation decides.
             near = self._gps_ns
             gps_ns = min((by_utc_day, by_gps_day), key=lambda at: abs(at - near))
-            valid = abs(gps_ns - near) <= FAR_NS
-            self.counters["marks_far"] += not valid
+            valid = self.near_navigation(gps_ns)
         elif by_utc_day != by_gps_day:
             valid = False
         self.counters["marks"] += 1

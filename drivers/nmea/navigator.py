@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from drivers.nmea.decoder import NmeaDecoder
-from drivers.receiver import Decoder, ListeningNavigator
+from drivers.receiver import ListeningNavigator
 from drivers.settings import Setting
 
 
@@ -35,7 +35,7 @@ class NmeaNavigator(ListeningNavigator):
         1000, minimum=1, maximum=1_000_000_000, says="accuracy of an event mark, by the data sheet"
     )
 
-    def new_decoder(self) -> Decoder:
+    def new_decoder(self) -> NmeaDecoder:
         return NmeaDecoder(
             self.name,
             range_error_m=self.range_error_m,

@@ -12,12 +12,11 @@ import math
 import re
 from typing import Final
 
+from drivers.gps_time import GPS_EPOCH_DAY, SECOND_NS
 from drivers.message_framer import line_size
-from drivers.ublox.gps_time import GPS_EPOCH_DAY, SECOND_NS
 
 MAX_LENGTH: Final = 256
 """The standard says 82; receivers of high precision send more."""
-DAY_NS: Final = 86_400 * SECOND_NS
 
 _NUMBER: Final = re.compile(r"-?[0-9]{1,15}(\.[0-9]{0,20})?")
 _TIME: Final = re.compile(r"([0-9]{2})([0-9]{2})([0-9]{2})(?:\.([0-9]{0,9}))?")

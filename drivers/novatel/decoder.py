@@ -13,9 +13,9 @@ from collections import Counter
 from typing import Any, Final
 
 from drivers.contract import EventMark, NavSample
+from drivers.gps_time import RECENT_NS, SECOND_NS, WEEK_NS
+from drivers.message_decoder import MessageDecoder, Nav
 from drivers.novatel.framing import Log, log_of, novatel_framer
-from drivers.receiver import Nav
-from drivers.ublox.gps_time import SECOND_NS, WEEK_NS
 
 NAMES: Final = {
     42: "BESTPOS", 99: "BESTVEL", 101: "TIME", 507: "INSPVA", 508: "INSPVAS", 1465: "INSPVAX",
@@ -48,7 +48,6 @@ GOOD_WORDS: Final = frozenset(
     ("COARSESTEERING", "FREEWHEELING", "FINEADJUSTING", "FINE", "FINEBACKUPSTEERING",
      "FINESTEERING", "EXACT", "SATTIME")
 )  # fmt: skip
-FAR_NS: Final = 3600 * SECOND_NS
 SAME_NS: Final = 1000
 """MARKxTIME and MARKxPVA of one edge lie closer; two edges never do."""
 UNKNOWN_SIGMA: Final = 100.0
@@ -56,7 +55,7 @@ UNKNOWN_SIGMA: Final = 100.0
 COUNT_BITS: Final = 32
 
 
-class NovatelDecoder:
+class NovatelDecoder(MessageDecoder):
     """Decodes what a NovAtel receiver sends.
 
     INSPVAX, INSPVA or INSPVAS become a NavSample; BESTPOS with BESTVEL does while no inertial
@@ -64,17 +63,15 @@ class NovatelDecoder:
     raises.
     """
 
+    unreadable = (ValueError, TypeError, IndexError, OverflowError, struct.error)
+    bad_counter = "bad_logs"
+
     def __init__(self, receiver: str, *, mark_accuracy_ns: int = 100) -> None:
-        self.receiver = receiver
-        self.counters: Counter[str] = Counter(
-            bad_logs=0, samples=0, marks=0, marks_duplicate=0, marks_far=0
+        super().__init__(
+            receiver, novatel_framer(), ("samples", "marks", "marks_duplicate", "marks_far")
         )
-        self.seen: Counter[str] = Counter()
         self._mark_accuracy_ns = mark_accuracy_ns
-        self._framer = novatel_framer()
-        self._leap: int | None = None
         self._time_good = False
-        self._gps_ns: int | None = None
         self._sample_ns = -1
         self._inertial_ns: int | None = None
         self._velocity: tuple[int, tuple[float, float, float]] | None = None
@@ -83,39 +80,8 @@ class NovatelDecoder:
         self._marks: dict[int, list[int]] = {}
         self._counts: Counter[int] = Counter()
 
-    @property
-    def leap_seconds(self) -> int | None:
-        """GPS - UTC by a valid TIME log; None before one."""
-        return self._leap
-
-    @property
-    def frames(self) -> int:
-        """Logs with the right checksum so far, of any kind."""
-        return self._framer.frames
-
-    @property
-    def bad_messages(self) -> int:
-        """Logs whose checksum or content was wrong."""
-        return self._framer.bad_frames + self.counters["bad_logs"]
-
-    @property
-    def bad_bytes(self) -> int:
-        """Bytes that belong to no log."""
-        return self._framer.bad_bytes
-
-    def reset(self) -> None:
-        """The line was opened anew: forget what was half received."""
-        self._framer.reset()
-
-    def feed(self, data: bytes, mono_ns: int) -> list[Nav]:
-        """Records that became whole with these bytes, stamped with their arrival."""
-        records: list[Nav] = []
-        for frame in self._framer.feed(data):
-            try:
-                records.extend(self._on_log(log_of(frame), mono_ns))
-            except (ValueError, TypeError, IndexError, OverflowError, struct.error):
-                self.counters["bad_logs"] += 1
-        return records
+    def on_message(self, message: bytes, mono_ns: int) -> list[Nav]:
+        return self._on_log(log_of(message), mono_ns)
 
     def _on_log(self, log: Log, mono_ns: int) -> list[Nav]:
         name = NAMES.get(log.identity, "") if isinstance(log.identity, int) else log.identity
@@ -174,7 +140,7 @@ class NovatelDecoder:
     def _on_bestpos(self, log: Log, values: tuple[Any, ...], mono_ns: int) -> list[Nav]:
         gps_ns = _header_ns(log)
         self._satellites = int(values[12])
-        if self._inertial_ns is not None and abs(gps_ns - self._inertial_ns) < 10 * SECOND_NS:
+        if self._inertial_ns is not None and abs(gps_ns - self._inertial_ns) < RECENT_NS:
             return []
         speed_sigma = self._sigmas[2]
         self._sigmas = (math.hypot(values[6], values[7]), values[8], speed_sigma)
@@ -233,9 +199,7 @@ class NovatelDecoder:
             return []
         recent.append(gps_ns)
         del recent[:-16]
-        if valid and self._gps_ns is not None and abs(gps_ns - self._gps_ns) > FAR_NS:
-            self.counters["marks_far"] += 1
-            valid = False
+        valid = valid and self.near_navigation(gps_ns)
         self.counters["marks"] += 1
         count = self._counts[channel] = (self._counts[channel] + 1) % (1 << COUNT_BITS)
         return [

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from drivers.novatel.decoder import NovatelDecoder
-from drivers.receiver import Decoder, ListeningNavigator
+from drivers.receiver import ListeningNavigator
 from drivers.settings import Setting
 
 
@@ -29,5 +29,5 @@ class NovatelNavigator(ListeningNavigator):
         100, minimum=1, maximum=1_000_000_000, says="accuracy of an event mark, by the data sheet"
     )
 
-    def new_decoder(self) -> Decoder:
+    def new_decoder(self) -> NovatelDecoder:
         return NovatelDecoder(self.name, mark_accuracy_ns=self.mark_accuracy_ns)

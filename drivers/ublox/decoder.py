@@ -1,6 +1,6 @@
 """UBX messages into records: bytes in, NavSample and EventMark out, no I/O and no clock.
 
-Framing is in `drivers.ublox.framing`, the arithmetic of time in `drivers.ublox.gps_time`; parsing
+Framing is in `drivers.ublox.framing`, the arithmetic of time in `drivers.gps_time`; parsing
 of a single message is pyubx2's.
 
 Source: u-blox M8 receiver description UBX-13003221, sections 32.17 (NAV), 32.19 (TIM), HNR.
@@ -9,15 +9,15 @@ Source: u-blox M8 receiver description UBX-13003221, sections 32.17 (NAV), 32.19
 from __future__ import annotations
 
 import math
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from pyubx2 import UBXMessageError, UBXParseError, UBXReader, UBXStreamError, UBXTypeError
 
 from drivers.contract import EventMark, NavSample
-from drivers.ublox.framing import UbxFramer
-from drivers.ublox.gps_time import (
+from drivers.gps_time import (
+    RECENT_NS,
     SECOND_NS,
     WEEK_NS,
     UtcFields,
@@ -25,6 +25,8 @@ from drivers.ublox.gps_time import (
     gps_near,
     utc_ns,
 )
+from drivers.message_decoder import MessageDecoder, Nav
+from drivers.ublox.framing import UbxFramer
 
 LENGTHS: Final = {
     (0x01, 0x05): 32,  # NAV-ATT
@@ -40,15 +42,10 @@ TIME_BASE_RECEIVER: Final = 0
 TIME_BASE_UTC: Final = 2
 LEAP_SOURCE_DEFAULT: Final = 0
 """Of NAV-TIMELS: the firmware's own guess. 255, "unknown", is what an M8T says of received ones."""
-FAR_NS: Final = 3600 * SECOND_NS
-"""A mark further from the last navigation epoch has a wrong week or a restarted clock."""
-RECENT_NS: Final = 10 * SECOND_NS
 ATTITUDES_KEPT: Final = 64
 
-Nav = NavSample | EventMark
 
-
-class UbxDecoder:
+class UbxDecoder(MessageDecoder):
     """Decodes what a u-blox receiver sends.
 
     NAV-PVT becomes a NavSample; NAV-ATT or HNR-ATT of the same iTOW gives its attitude. TIM-TM2
@@ -56,17 +53,22 @@ class UbxDecoder:
     leap seconds. Everything else is framed and left alone. Nothing that is fed raises.
     """
 
+    unreadable = (
+        UBXMessageError,
+        UBXParseError,
+        UBXStreamError,
+        UBXTypeError,
+        AttributeError,
+        ValueError,
+        KeyError,
+    )
+
     def __init__(self, receiver: str) -> None:
-        self.receiver = receiver
-        self.counters: Counter[str] = Counter(
-            bad_messages=0, samples=0, marks=0, marks_without_rising_edge=0, marks_far=0
+        self._ubx = UbxFramer(LENGTHS)
+        super().__init__(
+            receiver, self._ubx, ("samples", "marks", "marks_without_rising_edge", "marks_far")
         )
-        self.seen: Counter[str] = Counter()
-        """Messages understood, by identity."""
-        self._framer = UbxFramer(LENGTHS)
-        self._leap: int | None = None
         self._leap_is_default = False
-        self._gps_ns: int | None = None
         self._timegps_ns: int | None = None
         self._attitudes: deque[tuple[int, tuple[float, float, float]]] = deque(
             maxlen=ATTITUDES_KEPT
@@ -85,60 +87,23 @@ class UbxDecoder:
         }
 
     @property
-    def leap_seconds(self) -> int | None:
-        """GPS - UTC as received from a satellite; None before that, whatever the firmware says."""
-        return self._leap
-
-    @property
-    def frames(self) -> int:
-        """Valid UBX frames so far, of any kind."""
-        return self._framer.frames
-
-    @property
-    def bad_messages(self) -> int:
-        """Frames whose checksum, length or content was wrong."""
-        return self._framer.bad_frames + self.counters["bad_messages"]
-
-    @property
-    def bad_bytes(self) -> int:
-        """Bytes that belong to no message and are no text."""
-        return self._framer.bad_bytes
-
-    @property
     def other_bytes(self) -> int:
         """Bytes of text: NMEA and the like."""
-        return self._framer.other_bytes
+        return self._ubx.other_bytes
 
     def reset(self) -> None:
-        """The line was opened anew: forget what was half received."""
-        self._framer.reset()
+        super().reset()
         self._held = None
         self._attitudes.clear()
 
-    def feed(self, data: bytes, mono_ns: int) -> list[Nav]:
-        """Records that became whole with these bytes, stamped with their arrival."""
-        records: list[Nav] = []
-        for frame in self._framer.feed(data):
-            if (frame[2], frame[3]) not in LENGTHS:
-                continue
-            try:
-                message = UBXReader.parse(frame)
-                identity = str(message.identity)
-                made = self._handlers[identity](message, mono_ns)
-            except (
-                UBXMessageError,
-                UBXParseError,
-                UBXStreamError,
-                UBXTypeError,
-                AttributeError,
-                ValueError,
-                KeyError,
-            ):
-                self.counters["bad_messages"] += 1
-                continue
-            self.seen[identity] += 1
-            records.extend(made)
-        return records
+    def on_message(self, message: bytes, mono_ns: int) -> list[Nav]:
+        if (message[2], message[3]) not in LENGTHS:
+            return []
+        parsed = UBXReader.parse(message)
+        identity = str(parsed.identity)
+        made = self._handlers[identity](parsed, mono_ns)
+        self.seen[identity] += 1
+        return made
 
     # Navigation
 
@@ -257,9 +222,7 @@ class UbxDecoder:
         if message.timeBase == TIME_BASE_UTC:
             valid = valid and self._leap is not None
             gps_ns += (self._leap or 0) * SECOND_NS
-        if valid and self._gps_ns is not None and abs(gps_ns - self._gps_ns) > FAR_NS:
-            self.counters["marks_far"] += 1
-            valid = False
+        valid = valid and self.near_navigation(gps_ns)
         self.counters["marks"] += 1
         return [
             EventMark(

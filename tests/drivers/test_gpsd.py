@@ -18,10 +18,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.contract import DeviceError, NavSample
+from drivers.gps_time import SECOND_NS, UtcFields, utc_ns
 from drivers.gpsd.navigator import GpsdNavigator
 from drivers.gpsd.reports import MAX_LINE, UNKNOWN_SIGMA_M, GpsdReports
 from drivers.ublox.decoder import UbxDecoder
-from drivers.ublox.gps_time import SECOND_NS, UtcFields, utc_ns
 from tests.drivers.stand_ins import Notebook
 
 EXCERPT = Path(__file__).parent / "data" / "ublox-neo-m8l-excerpt.ubx"

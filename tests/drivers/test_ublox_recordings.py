@@ -11,8 +11,8 @@ import pytest
 from pyubx2 import ERR_IGNORE, UBX_PROTOCOL, UBXReader
 
 from drivers.contract import DeviceError, NavSample, RawBytes
+from drivers.gps_time import WEEK_NS
 from drivers.ublox.decoder import UbxDecoder
-from drivers.ublox.gps_time import WEEK_NS
 from drivers.ublox.navigator import UbloxNavigator
 from tests.drivers.lines import PtyLine
 from tests.drivers.stand_ins import Notebook

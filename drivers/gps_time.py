@@ -1,7 +1,7 @@
-"""GPS time out of what a u-blox receiver says, in whole nanoseconds.
+"""GPS time out of weeks, times of week, dates and leap seconds, in whole nanoseconds.
 
-Weeks, leap seconds, rounding and validity flags are weighed here; messages are taken apart in
-`drivers.ublox.decoder`.
+What every decoder of a receiver reckons with; messages are taken apart in the decoders. How many
+leap seconds there were at a date is in `drivers.leap_seconds`.
 """
 
 from __future__ import annotations
@@ -11,9 +11,13 @@ from dataclasses import dataclass
 from typing import Final
 
 SECOND_NS: Final = 1_000_000_000
-WEEK_NS: Final = 604_800 * SECOND_NS
+DAY_NS: Final = 86_400 * SECOND_NS
+WEEK_NS: Final = 7 * DAY_NS
 GPS_EPOCH_DAY: Final = datetime.date(1980, 1, 6).toordinal()
 MAX_LEAP_SECONDS: Final = 99
+FAR_NS: Final = 3600 * SECOND_NS
+"""A mark further from the last navigation epoch has a wrong week or a restarted clock."""
+RECENT_NS: Final = 10 * SECOND_NS
 ITOW_SLACK_NS: Final = 1_000_000
 """iTOW is rounded to milliseconds; what lies further from it is of another epoch."""
 
