@@ -20,6 +20,7 @@ from daemon.cli import (
     develop,
     export,
     imports,
+    install,
     kernels,
     process,
     rigs,
@@ -50,6 +51,8 @@ app.command(name="verify", help=verify.HELP)(verify.verify)
 app.command(name="sim", help=sim.HELP)(sim.sim)
 app.command(name="bench", help=bench.HELP)(bench.bench)
 app.command(name="kernels", help=kernels.HELP)(kernels.kernels)
+app.command(name="install", help=install.HELP)(install.install)
+app.command(name="uninstall", help=install.UNINSTALL_HELP)(install.uninstall)
 app.add_typer(rigs.app, name="rigs")
 app.add_typer(imports.app, name="import")
 app.add_typer(export.app, name="export")

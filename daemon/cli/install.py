@@ -1,0 +1,90 @@
+"""`syntopic install` and `syntopic uninstall`: the service as a part of the machine."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+
+if TYPE_CHECKING:
+    from daemon.installation import Done
+
+HELP = """Lay out the service: unit, user, folders, device rules, kernel settings, compiled kernels.
+
+Give the configuration it will fly with; it stays where it is and is validated first. Nothing edited
+by hand is overwritten. `--root` stages the files into an image instead.
+
+Examples: `sudo /opt/syntopic/bin/syntopic install`, `syntopic install --root image/`
+"""
+UNINSTALL_HELP = """Stop the service and remove what `syntopic install` laid out.
+
+Missions, the configuration, the user and files edited by hand stay.
+
+Example: `sudo /opt/syntopic/bin/syntopic uninstall`
+"""
+
+Root = Annotated[Path, typer.Option(help="Root of an image, instead of this machine.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+
+
+def install(
+    config: Annotated[Path, typer.Argument(help="Configuration the service will run with.")] = Path(
+        "/etc/syntopic/service.toml"
+    ),
+    root: Root = Path("/"),
+    replace: Annotated[bool, typer.Option(help="Also overwrite what was edited by hand.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    from daemon import installation
+    from daemon.configuration import load
+
+    command = Path(sys.argv[0]).absolute()
+    configuration = PurePosixPath(config.absolute())
+    rig, missions = None, None
+    if config.exists():
+        loaded, _ = load(config)
+        rig, missions = loaded.mission.rig, loaded.mission.root
+    console = Console(stderr=True)
+    done = installation.install(
+        installation.contents(command, configuration, missions),
+        installation.steps(command, rig),
+        root=root,
+        tell=lambda line: console.print(line, style="dim", highlight=False),
+        replace=replace,
+    )
+    next_line = (
+        "systemctl enable --now syntopic"
+        if config.exists()
+        else f"write {configuration} (syntopic sim RIG writes one to begin with), then "
+        "syntopic check it, then install again: its rig's kernels are compiled then"
+    )
+    _tell(done, as_json, "written", next_line)
+
+
+def uninstall(root: Root = Path("/"), as_json: AsJson = False) -> None:
+    from daemon import installation
+
+    console = Console(stderr=True)
+    done = installation.uninstall(
+        root=root, tell=lambda line: console.print(line, style="dim", highlight=False)
+    )
+    _tell(done, as_json, "removed", "missions are still in /var/lib/syntopic")
+
+
+def _tell(done: Done, as_json: bool, verb: str, next_line: str) -> None:
+    if as_json:
+        told = {verb: done.files, "kept": done.kept, "steps": done.steps, "next": next_line}
+        typer.echo(json.dumps(told))
+    else:
+        console = Console()
+        console.print(f"{len(done.files)} files {verb}")
+        for path in done.kept:
+            console.print(f"kept, edited by hand: {path}", style="yellow", highlight=False)
+        for purpose, outcome in done.steps.items():
+            console.print(f"{purpose}: {outcome}", highlight=False, soft_wrap=True)
+        console.print(f"Next: [bold]{next_line}[/]", highlight=False, soft_wrap=True)
+    raise typer.Exit(1 if done.failed else 0)
