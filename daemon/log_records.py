@@ -13,11 +13,13 @@ from typing import Any
 
 from daemon.records import EXACT_INTEGER_LIMIT, Fields, RecordError, canonical_bytes, parse_record
 from drivers.contract import (
+    ClockReading,
     DeviceEvent,
     EventMark,
     Frame,
     FrameStatus,
     NavSample,
+    PpsEdge,
     RawBytes,
     Record,
     TemperatureSample,
@@ -48,7 +50,16 @@ class LoggedTrigger:
     strobe_delay_ns: int = 0
 
 
-LoggedRecord = Frame | EventMark | NavSample | TemperatureSample | DeviceEvent | LoggedTrigger
+LoggedRecord = (
+    Frame
+    | EventMark
+    | NavSample
+    | TemperatureSample
+    | PpsEdge
+    | ClockReading
+    | DeviceEvent
+    | LoggedTrigger
+)
 
 
 def message_of(record: Record | LoggedTrigger) -> Message:
@@ -66,6 +77,20 @@ def message_of(record: Record | LoggedTrigger) -> Message:
     elif isinstance(record, TemperatureSample):
         topic = f"temperature/{record.probe}"
         content = {"probe": record.probe, "value_c": record.value_c}
+    elif isinstance(record, PpsEdge):
+        topic = f"pps/{record.source}"
+        content = {
+            "source": record.source,
+            "sequence": record.sequence,
+            "sigma_ns": record.sigma_ns,
+        }
+    elif isinstance(record, ClockReading):
+        topic = f"clock/{record.device}"
+        content = {
+            "device": record.device,
+            "device_ns": str(record.device_ns),
+            "half_width_ns": record.half_width_ns,
+        }
     else:
         topic = f"event/{record.device}"
         content = {
@@ -221,7 +246,7 @@ def _mark(fields: Fields) -> EventMark:
         gps_ns=_needed(fields, "gps_ns"),
         accuracy_ns=fields.integer("accuracy_ns"),
         count=fields.integer("count"),
-        count_bits=fields.integer("count_bits", minimum=1),
+        count_bits=fields.integer("count_bits"),
         time_valid=fields.flag("time_valid", default=False),
         mono_ns=_needed(fields, "mono_ns"),
     )
@@ -257,6 +282,24 @@ def _temperature(fields: Fields) -> TemperatureSample:
     )
 
 
+def _pps(fields: Fields) -> PpsEdge:
+    return PpsEdge(
+        source=fields.text("source"),
+        sequence=fields.integer("sequence"),
+        mono_ns=_needed(fields, "mono_ns"),
+        sigma_ns=fields.integer("sigma_ns"),
+    )
+
+
+def _clock(fields: Fields) -> ClockReading:
+    return ClockReading(
+        device=fields.text("device"),
+        device_ns=_needed(fields, "device_ns"),
+        mono_ns=_needed(fields, "mono_ns"),
+        half_width_ns=fields.integer("half_width_ns"),
+    )
+
+
 def _event(fields: Fields) -> DeviceEvent:
     return DeviceEvent(
         device=fields.text("device"),
@@ -273,6 +316,8 @@ _READERS: Mapping[str, Callable[[Fields], LoggedRecord]] = {
     "mark": _mark,
     "navigation": _navigation,
     "temperature": _temperature,
+    "pps": _pps,
+    "clock": _clock,
     "event": _event,
 }
 

@@ -74,8 +74,9 @@ class Frame:
 class EventMark:
     """The receiver's time of one strobe, rising edge.
 
-    `count` is the receiver's own count of edges (`count_bits` wide, it wraps). `time_valid` is the
-    receiver's word that `gps_ns` can be trusted.
+    `count` is the receiver's own count of edges (`count_bits` wide, it wraps); where `count_bits` is
+    0 the receiver does not count and `count` says nothing. `time_valid` is the receiver's word that
+    `gps_ns` can be trusted.
     """
 
     receiver: str
@@ -139,6 +140,35 @@ class TriggerPulse:
 
 
 @dataclass(frozen=True)
+class PpsEdge:
+    """The host's time of one edge of a pulse per second: a whole second of GPS time, which one is
+    not said.
+
+    `mono_ns` has the source's known latency taken off; `sigma_ns` is its standard deviation.
+    `sequence` is the source's own count of edges.
+    """
+
+    source: str
+    sequence: int
+    mono_ns: int
+    sigma_ns: int
+
+
+@dataclass(frozen=True)
+class ClockReading:
+    """A device's clock, asked for and answered: what it said, and the middle of the round trip.
+
+    `half_width_ns` is half of the round trip: the reading was made within `mono_ns` plus or minus
+    that, and most likely near the middle where the round trip was short.
+    """
+
+    device: str
+    device_ns: int
+    mono_ns: int
+    half_width_ns: int
+
+
+@dataclass(frozen=True)
 class RawBytes:
     """Bytes as they came from a device, for the flight log."""
 
@@ -162,7 +192,16 @@ class DeviceEvent:
     mono_ns: int
 
 
-Record = Frame | EventMark | NavSample | TemperatureSample | RawBytes | DeviceEvent
+Record = (
+    Frame
+    | EventMark
+    | NavSample
+    | TemperatureSample
+    | PpsEdge
+    | ClockReading
+    | RawBytes
+    | DeviceEvent
+)
 Sink = Callable[[Record], None]
 """Where a device puts what it yields. Called from the device's own thread; returns quickly."""
 
@@ -237,6 +276,10 @@ class Thermometer(Device, Protocol):
 
 class Navigator(Device, Protocol):
     """Yields `NavSample` and `EventMark`."""
+
+
+class PulsePerSecond(Device, Protocol):
+    """Yields `PpsEdge`."""
 
 
 class Trigger(Protocol):

@@ -16,11 +16,13 @@ from mcap.reader import make_reader
 from daemon.flight_log import FlightLog, logs_of, read
 from daemon.log_records import LoggedTrigger, Message, message_of, record_of
 from drivers.contract import (
+    ClockReading,
     DeviceEvent,
     EventMark,
     Frame,
     FrameStatus,
     NavSample,
+    PpsEdge,
     RawBytes,
     TemperatureSample,
     TriggerPulse,
@@ -34,6 +36,8 @@ RECORDS = [
     ),
     TemperatureSample("0", 31.25, 7),
     TemperatureSample("1", None, 8),
+    PpsEdge("receiver", 2**32 - 1, 10**15 + 1, 2_500),
+    ClockReading("autopilot", 2**61, 10**15 + 2, 300_000),
     DeviceEvent("SU00", "lost", True, "SU00 does not answer; look at its cable", 9),
     Frame(
         "SU00", 2, FrameStatus.INCOMPLETE, 2**60, 41, 1248, 832, "Mono12", 2**62, 2**62 + 5,
