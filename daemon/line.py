@@ -14,7 +14,6 @@ from daemon.configuration import Configuration
 from daemon.devices import exposure_times_ns, frame_nbytes
 from daemon.flight import Flight
 from daemon.triggering import DistanceTrigger, IntervalTrigger, pulse_delays_ns
-from drivers.contract import NavSample
 from processing.rig import Rig
 
 NS = 1_000_000_000
@@ -60,16 +59,20 @@ class Line:
         """Order exposures as they fall due, until the line is flown."""
         while not self.is_flown:
             now_ns = time.monotonic_ns()
-            nav = self._flight.track.last
-            due_ns = self._policy.due(now_ns, self._last_ns, nav)
-            if due_ns is None or due_ns > now_ns:
-                left_s = LOOK_AHEAD_S if due_ns is None else (due_ns - now_ns) / NS
-                await asyncio.sleep(min(LOOK_AHEAD_S, left_s))
+            wait_s = self.wait_s(now_ns)
+            if wait_s > 0:
+                await asyncio.sleep(wait_s)
             elif (left := exposures_left(self._configuration, self._rig, self._mission)) > 0:
-                fire(self._order(now_ns, nav))
+                fire(self.order(now_ns))
             else:
                 disk_full(f"room for {left} exposures: no more are made; free {self._mission}")
                 await asyncio.sleep(DISK_RETRY_S)
+
+    def wait_s(self, now_ns: int) -> float:
+        """How long to wait before asking again; 0 where an exposure is due."""
+        due_ns = self._policy.due(now_ns, self._last_ns, self._flight.track.last)
+        left_s = LOOK_AHEAD_S if due_ns is None else (due_ns - now_ns) / NS
+        return max(0.0, min(LOOK_AHEAD_S, left_s))
 
     def absent(self, active: Callable[[str], bool], *, has_trigger: bool) -> list[str]:
         """What is not there yet, in words."""
@@ -84,7 +87,9 @@ class Line:
             absent += [f"temperature of {probe}" for probe in missing]
         return absent
 
-    def _order(self, now_ns: int, nav: NavSample | None) -> Order:
+    def order(self, now_ns: int) -> Order:
+        """An exposure that is due: ordered now."""
+        nav = self._flight.track.last
         speed_mps = self._configuration.plan.ground_speed_mps
         if nav is not None:
             flown_mps = math.hypot(*nav.velocity_ned_mps[:2])
