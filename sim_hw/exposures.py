@@ -15,19 +15,19 @@ from typing import Any
 
 import tifffile
 
-from processing.rig import Cone, RigError
+from processing.rig import RigError
 from sim_hw import laboratory
 from sim_hw.__main__ import displacement, rig_file
 from sim_hw.electronics import Electronics, true_sensor
 from sim_hw.rendering import Look, light_on_sensor
 from sim_hw.scene import open_scene
 from sim_hw.seeding import random_stream
+from sim_hw.snapshots import PROBE_SIGMA_C, look_of
 from sim_hw.truth import Taken, TruthWriter
 from sim_hw.world import World, WorldSettings
 
 EPOCH_GPS_NS = 1_447_000_000_000_000_000
 FIRST_AFTER_S = 20
-PROBE_SIGMA_C = 0.1
 MARK_SIGMA_NS = 60
 
 
@@ -59,7 +59,7 @@ def write_exposures(world: World, out: Path, *, count: int, scenes: Path) -> Pat
             )
             head = Electronics(sensor, faults, world.electrons_per_radiance_s(cone))
             for k, mark_ns in enumerate(marks):
-                look = _look(world, cone, mark_ns)
+                look = look_of(world, cone, mark_ns)
                 frame = head.frame(
                     light_on_sensor(world, scene, flight, cone, sensor, look),
                     exposure_time_us=look.exposure_time_us,
@@ -78,19 +78,6 @@ def write_exposures(world: World, out: Path, *, count: int, scenes: Path) -> Pat
         path.write_text(json.dumps(_record(world, k + 1, mark_ns, looks[k]), indent=1))
     (out / "ready.json").write_text(json.dumps({"exposures": count}))
     return mission
-
-
-def _look(world: World, cone: Cone, mark_ns: int) -> Look:
-    """Syntopic: every cone looks when it is where the reference cone is at the mark."""
-    reference_mm = world.rig.cone(world.rig.reference_cone).position_mm[0]
-    ahead_m = (cone.position_mm[0] - reference_mm) * 1e-3
-    if world.rig.timing != "syntopic":
-        ahead_m = 0.0
-    return Look(
-        mid_gps_ns=mark_ns - round(ahead_m / world.plan.ground_speed_mps * 1e9),
-        exposure_time_us=world.plan.exposure_time_us[cone.name],
-        tdi_shifts=world.plan.tdi_shifts[cone.name],
-    )
 
 
 def _record(world: World, number: int, mark_ns: int, looks: dict[str, Look]) -> dict[str, Any]:

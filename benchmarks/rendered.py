@@ -1,0 +1,150 @@
+"""Exposures rendered by the emulator, made into images by the pipeline, and held against the truth.
+
+What the benchmarks of geometry, hard scenes and flags have in common. Rendering and judging are the
+emulator's and share no code with the pipeline.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.pipeline import Conditions, Pipeline, Product
+from processing.radiometry import RadiometricCalibration
+from processing.rig import shipped_rigs
+from sim_hw import snapshots
+from sim_hw.flight import Flight
+from sim_hw.judge import compare
+from sim_hw.scene import Scene, open_scene
+from sim_hw.snapshots import Heads, Snapshot
+from sim_hw.world import World, WorldSettings
+
+EPOCH_GPS_NS = 1_447_000_000_000_000_000
+FIRST_AFTER_S = 20.0
+MARK_SIGMA_NS = 60.0
+ATTITUDE_SIGMA_RAD = math.radians(0.02)
+RATE_STEP_NS = 1_000_000
+"""Angular rates are differences over twice this."""
+
+
+_CONE_ROTATION = re.compile(r"^rotation_rad = \[.*?\]", re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """One exposure as the emulator took it, and the flight it belongs to."""
+
+    world: World
+    flight: Flight
+    snapshot: Snapshot
+
+
+def world_settings(rig: str | Path, seed: int, **others: object) -> WorldSettings:
+    """Settings of a world with one exposure; `rig` is a shipped rig's name or a file."""
+    file = shipped_rigs()[rig] if isinstance(rig, str) else rig
+    plain = WorldSettings(rig_file=str(file), seed=seed, epoch_gps_ns=EPOCH_GPS_NS, exposures=1)
+    return replace(plain, **others)  # type: ignore[arg-type]
+
+
+def take(world: World, scenes: Path, *, place: int = 0, scene: Scene | None = None) -> Exposure:
+    """Take exposure number `place` of the first line.
+
+    Args:
+        world: the world; its scene is built in the folder `scenes` unless one is given.
+    """
+    scene = scene or open_scene(world.scene_settings, scenes)
+    first_ns = EPOCH_GPS_NS + round(FIRST_AFTER_S * 1e9)
+    flight = world.flight.beginning_first_line_at(world.flight.distance_flown_m(first_ns))
+    period_ns = round(world.plan.distance_m / world.plan.ground_speed_mps * 1e9)
+    return Exposure(
+        world, flight, snapshots.take(world, scene, flight, first_ns + place * period_ns)
+    )
+
+
+def radiometry_of(heads: Heads) -> dict[str, RadiometricCalibration]:
+    """What the laboratory measured, as the pipeline takes it."""
+    return {
+        name: RadiometricCalibration(**measured.arrays())
+        for name, measured in heads.radiometry.items()
+    }
+
+
+def conditions_of(exposure: Exposure, *, seed: int) -> Conditions:
+    """What the service would know: probes, plan, attitude, rates; with the instruments' noise."""
+    world, mark = exposure.world, exposure.snapshot.mark_gps_ns
+    noise = np.random.default_rng([seed, 7])
+    pose, speed = exposure.flight.pose(mark), world.plan.ground_speed_mps
+    before, after = (exposure.flight.pose(mark + s * RATE_STEP_NS) for s in (-1, 1))
+    track = math.atan2(pose.velocity_enu_mps[0], pose.velocity_enu_mps[1])
+    step_s = 2 * RATE_STEP_NS * 1e-9
+    return Conditions(
+        temperatures_c=snapshots.probe_readings(world, mark, seed=seed),
+        temperature_age_s=dict.fromkeys(world.rig.probes, float(noise.uniform(0.0, 2.0))),
+        exposure_time_s={name: us * 1e-6 for name, us in world.plan.exposure_time_us.items()},
+        tdi_shifts=world.plan.tdi_shifts,
+        ground_speed_mps=speed + float(noise.normal(0.0, 0.05)),
+        height_above_ground_m=world.plan.height_above_ground_m,
+        roll_rad=pose.roll_rad + float(noise.normal(0.0, ATTITUDE_SIGMA_RAD)),
+        pitch_rad=pose.pitch_rad + float(noise.normal(0.0, ATTITUDE_SIGMA_RAD)),
+        angular_rate_rad_per_s=(
+            (after.roll_rad - before.roll_rad) / step_s,
+            (after.pitch_rad - before.pitch_rad) / step_s,
+            _turned(after.heading_rad - before.heading_rad) / step_s,
+        ),
+        crab_rad=_turned(pose.heading_rad - track) + float(noise.normal(0.0, ATTITUDE_SIGMA_RAD)),
+        time_sigma_ns=MARK_SIGMA_NS,
+    )
+
+
+def process(
+    pipeline: Pipeline,
+    heads: Heads,
+    exposure: Exposure,
+    *,
+    seed: int,
+    conditions: Conditions | None = None,
+) -> Product:
+    """One exposure through the pipeline; noise of sensors and instruments follows from `seed`."""
+    frames = heads.frames(exposure.world, exposure.snapshot, seed=seed)
+    return pipeline.process(frames, conditions or conditions_of(exposure, seed=seed))
+
+
+def errors_of(
+    geometry: Mapping[str, NDArray[np.generic]], snapshot: Snapshot
+) -> dict[str, float | int]:
+    """The judge's figures for the PAN image of one exposure, PAN pixels."""
+    return compare(geometry, snapshot.truth)["methods"].figures
+
+
+def with_random_rotations(rig_file: Path, out: Path, *, seed: int, sigma_rad: float) -> Path:
+    """A rig file whose cones, but the master's, are turned otherwise: every angle drawn anew."""
+    random = np.random.default_rng([seed, 11])
+    text = rig_file.read_text(encoding="utf-8")
+    cones = text.split("\n[[cone]]\n")
+    master = re.search(r'^master_cone = "(.+?)"', cones[0], re.MULTILINE)
+    if master is None:
+        raise ValueError(f"{rig_file}: names no master_cone; give a stitched rig")
+    for k, cone in enumerate(cones[1:], start=1):
+        angles = random.normal(0.0, sigma_rad, 3)
+        if re.search(rf'^name = "{re.escape(master[1])}"', cone, re.MULTILINE):
+            continue
+        values = ", ".join(f"{angle:.7f}" for angle in angles)
+        cones[k] = re.sub(
+            r"^rotation_rad = \[.*?\]",
+            f"rotation_rad = [{values}]",
+            cone,
+            count=1,
+            flags=re.MULTILINE,
+        )
+    out.write_text("\n[[cone]]\n".join(cones), encoding="utf-8")
+    return out
+
+
+def _turned(angle_rad: float) -> float:
+    return (angle_rad + math.pi) % (2 * math.pi) - math.pi
