@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import math
 import struct
-import threading
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 
 from sim_hw.pseudo_terminal import PseudoTerminal
+from sim_hw.serving import DRAIN_S, Line, LineDevice
 
 OPEN_SENSOR = 0x7FFF
 READ_HOLDING_REGISTERS = 3
@@ -27,11 +26,9 @@ baud rate, and the scheduler may tear a request apart for longer than that."""
 _REQUEST_BYTES = 8
 _FRAME_MAX_BYTES = 256
 _REGISTERS_MAX = 125
-_POLL_S = 0.2
-_UNPLUGGED_POLL_S = 0.02
 
 
-class ModbusProbe:
+class ModbusProbe(LineDevice):
     """The module, from `start()` to `close()`; a host opens `port`.
 
     Register `first_register + i` is channel i in signed 0.1 degC, 0x7FFF where the channel says
@@ -44,48 +41,31 @@ class ModbusProbe:
         channels: Sequence[Callable[[], float | None]],
         unit: int = 1,
         first_register: int = 0,
+        line: Line | None = None,
     ) -> None:
         if not 1 <= unit <= 247:
             raise ValueError(f"unit is {unit}; a Modbus slave has an address from 1 to 247")
+        super().__init__("modbus-probe", line or PseudoTerminal())
         self._channels = tuple(channels)
         self._unit = unit
         self._first_register = first_register
-        self._terminal = PseudoTerminal()
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
-        self._counts: Counter[str] = Counter()
-
-    @property
-    def port(self) -> str:
-        """Path of the serial port a host opens."""
-        return self._terminal.port
-
-    def start(self) -> None:
-        self._thread = threading.Thread(target=self._run, name="modbus-probe", daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        """Stop and unplug. May be called twice."""
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join(timeout=5.0)
-        self._terminal.close()
+        self._frame = b""
 
     def statistics(self) -> Mapping[str, int]:
         """Counters since creation, by stable name."""
         names = ("requests", "exceptions", "damaged_frames", "other_slaves")
-        return {name: self._counts[name] for name in names}
+        return {name: self.counts[name] for name in names}
 
     def answer(self, frame: bytes) -> bytes | None:
         """The answer to one RTU frame; None where a slave keeps silent. Never raises."""
         if len(frame) < 4 or crc16(frame) != 0:
-            self._counts["damaged_frames"] += 1
+            self.counts["damaged_frames"] += 1
             return None
         unit, function = frame[0], frame[1]
         if unit != self._unit:
-            self._counts["other_slaves"] += 1
+            self.counts["other_slaves"] += 1
             return None
-        self._counts["requests"] += 1
+        self.counts["requests"] += 1
         if function not in (READ_HOLDING_REGISTERS, READ_INPUT_REGISTERS):
             return self._exception(function, ILLEGAL_FUNCTION)
         if len(frame) != _REQUEST_BYTES:
@@ -100,24 +80,22 @@ class ModbusProbe:
         return _framed(struct.pack(f">BBB{count}H", unit, function, 2 * count, *words))
 
     def _exception(self, function: int, code: int) -> bytes:
-        self._counts["exceptions"] += 1
+        self.counts["exceptions"] += 1
         return _framed(bytes((self._unit, (function | 0x80) & 0xFF, code)))
 
-    def _run(self) -> None:
-        frame = b""
-        while not self._stop.is_set():
-            received = self._terminal.read(timeout_s=SILENCE_S if frame else _POLL_S)
-            frame += received
-            is_whole = len(frame) == _REQUEST_BYTES and crc16(frame) == 0
-            if is_whole or (frame and not received):
-                answer = self.answer(frame)
-                frame = b""
-                if answer is not None:
-                    self._terminal.write(answer)
-            elif not received and not self._terminal.is_open_by_a_host:
-                self._stop.wait(_UNPLUGGED_POLL_S)
-            # A babbling line never falls silent; its bytes are not worth keeping.
-            frame = frame[: _FRAME_MAX_BYTES + 1]
+    def hear(self, data: bytes) -> bytes:
+        # A babbling line never falls silent; its bytes are not worth keeping.
+        self._frame = (self._frame + data)[: _FRAME_MAX_BYTES + 1]
+        if len(self._frame) == _REQUEST_BYTES and crc16(self._frame) == 0:
+            return self.pause()
+        self.patience_s = SILENCE_S
+        return b""
+
+    def pause(self) -> bytes:
+        """The line has fallen silent: what was received is a frame."""
+        frame, self._frame = self._frame, b""
+        self.patience_s = DRAIN_S
+        return (self.answer(frame) or b"") if frame else b""
 
 
 def crc16(data: bytes) -> int:

@@ -1,4 +1,4 @@
-"""Messages of a u-blox receiver as bytes: UBX frames and NMEA sentences.
+"""UBX messages of a u-blox receiver as bytes.
 
 Written from the interface descriptions of u-blox 8/M8 (UBX-13003221) and F9 HPS (UBX-19056845);
 when they are sent is in `ublox_receiver`.
@@ -6,54 +6,21 @@ when they are sent is in `ublox_receiver`.
 
 from __future__ import annotations
 
-import math
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 
-from sim_hw.world_clock import (
-    LEAP_SECONDS,
-    NS_PER_S,
-    NS_PER_WEEK,
-    gps_week_and_tow_ns,
-    unix_ns_from_gps_ns,
+from sim_hw.nmea_sentences import (
+    GEOID_UNDULATION_M,
+    course_deg,
+    longitude_deg,
+    speed_mps,
+    utc_fields,
 )
-
-GEOID_UNDULATION_M = 46.0
-"""Geoid above ellipsoid where the receiver says it is; one value, plausible for Central Europe."""
+from sim_hw.receiver import ReceiverAccuracy, ReceiverState
+from sim_hw.world_clock import NS_PER_WEEK, gps_week_and_tow_ns
 
 _NS_PER_MS = 1_000_000
-_NS_PER_CS = 10_000_000
-
-
-@dataclass(frozen=True)
-class ReceiverState:
-    """What the receiver says of itself at one instant.
-
-    Geographic coordinates in WGS 84, height above the ellipsoid, velocity north, east, down.
-    """
-
-    latitude_deg: float
-    longitude_deg: float
-    height_m: float
-    velocity_ned_mps: tuple[float, float, float]
-    roll_deg: float
-    pitch_deg: float
-    heading_deg: float
-
-
-@dataclass(frozen=True)
-class ReceiverAccuracy:
-    """What the receiver believes of its own standard deviations."""
-
-    horizontal_m: float = 0.02
-    vertical_m: float = 0.03
-    speed_mps: float = 0.03
-    roll_pitch_deg: float = 0.02
-    heading_deg: float = 0.05
-    time_ns: int = 20
-    mark_ns: int = 25
 
 
 @dataclass(frozen=True)
@@ -65,41 +32,6 @@ class Satellite:
     cno_dbhz: int
     elevation_deg: int
     azimuth_deg: int
-
-
-@dataclass(frozen=True)
-class UtcFields:
-    """UTC as u-blox splits it: rounded to 10 ms, and the signed rest in `nano`.
-
-    Source: interface description, "UTC representation": nano lies in -5,000,000 .. 994,999,999.
-    """
-
-    year: int
-    month: int
-    day: int
-    hour: int
-    minute: int
-    second: int
-    nano: int
-    centisecond: int
-
-
-def utc_fields(gps_ns: int, leap_seconds: int = LEAP_SECONDS) -> UtcFields:
-    """Split a GPS instant into UTC."""
-    unix_ns = unix_ns_from_gps_ns(gps_ns, leap_seconds)
-    rounded_cs = (unix_ns + _NS_PER_CS // 2) // _NS_PER_CS
-    second, centisecond = divmod(rounded_cs, 100)
-    utc = datetime.fromtimestamp(second, UTC)
-    return UtcFields(
-        utc.year,
-        utc.month,
-        utc.day,
-        utc.hour,
-        utc.minute,
-        utc.second,
-        unix_ns - second * NS_PER_S,
-        centisecond,
-    )
 
 
 def itow_ms(gps_ns: int) -> int:
@@ -116,14 +48,6 @@ def ubx(message_class: int, message_id: int, payload: bytes) -> bytes:
         a = (a + byte) & 0xFF
         b = (b + a) & 0xFF
     return b"\xb5\x62" + body + bytes((a, b))
-
-
-def nmea(sentence: str) -> bytes:
-    """An NMEA sentence with its checksum, from the text between `$` and `*`."""
-    checksum = 0
-    for byte in sentence.encode("ascii"):
-        checksum ^= byte
-    return f"${sentence}*{checksum:02X}\r\n".encode("ascii")
 
 
 def nav_pvt(
@@ -156,7 +80,7 @@ def nav_pvt(
         fix_ok_and_vehicle_heading,
         confirmed_date_and_time,
         satellites,
-        round(_longitude(state.longitude_deg) * 1e7),
+        round(longitude_deg(state.longitude_deg) * 1e7),
         round(state.latitude_deg * 1e7),
         _mm(state.height_m),
         _mm(state.height_m - GEOID_UNDULATION_M),
@@ -165,8 +89,8 @@ def nav_pvt(
         _mm(north),
         _mm(east),
         _mm(down),
-        _mm(math.hypot(north, east)),
-        round(math.degrees(math.atan2(east, north)) % 360.0 * 1e5),
+        _mm(speed_mps(state)),
+        round(course_deg(state) * 1e5),
         _mm(accuracy.speed_mps),
         round(accuracy.heading_deg * 1e5),
         120,  # pDOP 1.2
@@ -287,49 +211,5 @@ def tim_tm2(
     return ubx(0x0D, 0x03, payload)
 
 
-def gga(gps_ns: int, state: ReceiverState, satellites: int, leap_seconds: int) -> bytes:
-    """NMEA GGA: fix, position and height above the geoid."""
-    utc = utc_fields(gps_ns, leap_seconds)
-    return nmea(
-        f"GNGGA,{_clock(utc)},{_position(state)},1,{min(satellites, 12):02d},0.80,"
-        f"{state.height_m - GEOID_UNDULATION_M:.1f},M,{GEOID_UNDULATION_M:.1f},M,,"
-    )
-
-
-def rmc(gps_ns: int, state: ReceiverState, leap_seconds: int) -> bytes:
-    """NMEA RMC: position, speed over ground and date."""
-    utc = utc_fields(gps_ns, leap_seconds)
-    north, east, _ = state.velocity_ned_mps
-    knots = math.hypot(north, east) * 3600.0 / 1852.0
-    course = math.degrees(math.atan2(east, north)) % 360.0
-    return nmea(
-        f"GNRMC,{_clock(utc)},A,{_position(state)},{knots:.3f},{course:.2f},"
-        f"{utc.day:02d}{utc.month:02d}{utc.year % 100:02d},,,A"
-    )
-
-
 def _mm(metres: float) -> int:
     return round(metres * 1000.0)
-
-
-def _longitude(degrees: float) -> float:
-    return (degrees + 180.0) % 360.0 - 180.0
-
-
-def _clock(utc: UtcFields) -> str:
-    return f"{utc.hour:02d}{utc.minute:02d}{utc.second:02d}.{utc.centisecond:02d}"
-
-
-def _position(state: ReceiverState) -> str:
-    latitude, longitude = state.latitude_deg, _longitude(state.longitude_deg)
-    return (
-        f"{_degrees_minutes(latitude, 2)},{'N' if latitude >= 0 else 'S'},"
-        f"{_degrees_minutes(longitude, 3)},{'E' if longitude >= 0 else 'W'}"
-    )
-
-
-def _degrees_minutes(degrees: float, width: int) -> str:
-    # In units of the last digit first, so that 59.999996 minutes become a whole degree.
-    units = round(abs(degrees) * 60.0 * 1e5)
-    whole, rest = divmod(units, 60 * 100_000)
-    return f"{whole:0{width}d}{rest / 1e5:08.5f}"
