@@ -49,14 +49,22 @@ class Track:
         """Navigation at an instant; None where no sample is within two seconds."""
         before = next((s for s in reversed(self._samples) if s.gps_ns <= gps_ns), None)
         after = next((s for s in self._samples if s.gps_ns > gps_ns), None)
-        if before is not None and after is not None:
-            gap_ns = after.gps_ns - before.gps_ns
-            if gap_ns <= EXTRAPOLATION_LIMIT_NS:
-                return _interpolated(before, after, gps_ns)
-        nearest = before or after
-        if nearest is None or abs(nearest.gps_ns - gps_ns) > EXTRAPOLATION_LIMIT_NS:
-            return None
-        return _extrapolated(nearest, gps_ns)
+        return between(before, after, gps_ns)
+
+
+def between(
+    before: NavSample | None, after: NavSample | None, gps_ns: int
+) -> NavigationRecord | None:
+    """Navigation at an instant from the samples around it; None where none is within two seconds."""
+    if before is not None and after is not None:
+        gap_ns = after.gps_ns - before.gps_ns
+        if gap_ns <= EXTRAPOLATION_LIMIT_NS:
+            return _interpolated(before, after, gps_ns)
+    near = [sample for sample in (before, after) if sample is not None]
+    nearest = min(near, key=lambda sample: abs(sample.gps_ns - gps_ns), default=None)
+    if nearest is None or abs(nearest.gps_ns - gps_ns) > EXTRAPOLATION_LIMIT_NS:
+        return None
+    return _extrapolated(nearest, gps_ns)
 
 
 def metres_per_degree(latitude_deg: float, height_m: float) -> tuple[float, float]:
