@@ -55,7 +55,7 @@ class Track:
 def between(
     before: NavSample | None, after: NavSample | None, gps_ns: int
 ) -> NavigationRecord | None:
-    """Navigation at an instant from the samples around it; None where none is within two seconds."""
+    """Navigation at an instant from the samples around it; None if none is within two seconds."""
     if before is not None and after is not None:
         gap_ns = after.gps_ns - before.gps_ns
         if gap_ns <= EXTRAPOLATION_LIMIT_NS:
