@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 from daemon.flight_log import logs_of, read
 from daemon.mission import Mission
 
-NATIVE_ENDINGS = {"ublox": "ubx"}
+NATIVE_ENDINGS = {"ublox": "ubx", "novatel": "gps", "septentrio": "sbf", "nmea": "nmea"}
 """How post-processing software expects a receiver's recording to be called, by driver."""
 
 EVENT_COLUMNS = (

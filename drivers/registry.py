@@ -32,6 +32,7 @@ _PLACES: Final[Mapping[str, Mapping[str, str]]] = {
         "gpsd": "drivers.gpsd.navigator:GpsdNavigator",
         "nmea": "drivers.nmea.navigator:NmeaNavigator",
         "novatel": "drivers.novatel.navigator:NovatelNavigator",
+        "septentrio": "drivers.septentrio.navigator:SeptentrioNavigator",
     },
 }
 

@@ -2,7 +2,8 @@
 
 Taking a sentence apart is in `drivers.nmea.sentences`.
 
-Source: NMEA 0183 as published in gpsd's "NMEA Revealed"; Trimble's $PTNL,EVT.
+Source: NMEA 0183 as published in gpsd's "NMEA Revealed"; Trimble's $PTNL,EVT; $PASHR as inertial
+systems send it.
 """
 
 from __future__ import annotations
@@ -40,7 +41,8 @@ COUNT_BITS: Final = 16
 class _Epoch:
     """What has come for one UTC time of day."""
 
-    time: str
+    time: tuple[int, bool]
+    """Time of day in ns, and whether that is within a leap second."""
     mono_ns: int
     kinds: set[str] = field(default_factory=set)
     day: int | None = None
@@ -54,14 +56,16 @@ class _Epoch:
     speed_mps: float | None = None
     course_rad: float | None = None
     heading_rad: float | None = None
+    roll_rad: float | None = None
+    pitch_rad: float | None = None
     told: bool = False
 
 
 class NmeaDecoder(MessageDecoder):
     """Decodes what an NMEA 0183 receiver sends.
 
-    Sentences of one UTC time (RMC, GGA, GST, ZDA, and VTG and HDT that follow them) become one
-    NavSample, as soon as all kinds of the epoch before have come or the next epoch begins.
+    Sentences of one UTC time (RMC, GGA, GST, ZDA, PASHR, and VTG and HDT that follow them) become
+    one NavSample, as soon as all kinds of the epoch before have come or the next epoch begins.
     $PTNL,EVT becomes an EventMark. Nothing that is fed raises.
     """
 
@@ -92,6 +96,7 @@ class NmeaDecoder(MessageDecoder):
             "GGA": self._on_gga,
             "GST": self._on_gst,
             "ZDA": self._on_zda,
+            "PASHR": self._on_pashr,
         }
 
     def reset(self) -> None:
@@ -109,12 +114,13 @@ class NmeaDecoder(MessageDecoder):
             self.seen["PTNL,EVT"] += 1
             return [mark]
         kind = fields[0][2:]
-        if len(fields[0]) != 5 or fields[0].startswith("P"):
+        if fields[0] == "PASHR" and fields[1][:1].isdigit():
+            kind = "PASHR"
+        elif len(fields[0]) != 5 or fields[0].startswith("P"):
             return []
         made: list[Nav] = []
         if kind in self._timed:
-            time = fields[1]
-            time_of_day_ns(time)
+            time = time_of_day_ns(fields[1])
             if self._epoch is None or self._epoch.time != time:
                 made = self._close()
                 self._epoch = _Epoch(time, mono_ns)
@@ -177,6 +183,13 @@ class NmeaDecoder(MessageDecoder):
         if heading is not None:
             epoch.heading_rad = math.radians(heading)
 
+    def _on_pashr(self, epoch: _Epoch, fields: list[str]) -> None:
+        heading, roll, pitch = (number_or_none(fields[n].removeprefix("+")) for n in (2, 4, 5))
+        if heading is not None:
+            epoch.heading_rad = math.radians(heading)
+        epoch.roll_rad = None if roll is None else math.radians(roll)
+        epoch.pitch_rad = None if pitch is None else math.radians(pitch)
+
     # Epochs
 
     def _close(self) -> list[Nav]:
@@ -216,8 +229,8 @@ class NmeaDecoder(MessageDecoder):
                 vertical_sigma_m=vertical_m,
                 velocity_ned_mps=(speed * math.cos(course), speed * math.sin(course), 0.0),
                 speed_sigma_mps=self._speed_sigma_mps,
-                roll_rad=None,
-                pitch_rad=None,
+                roll_rad=epoch.roll_rad,
+                pitch_rad=epoch.pitch_rad,
                 heading_rad=epoch.heading_rad,
                 leap_seconds=self._leap,
                 time_valid=valid,
@@ -225,7 +238,7 @@ class NmeaDecoder(MessageDecoder):
         ]
 
     def _gps_of(self, epoch: _Epoch) -> tuple[int, bool] | None:
-        of_day, in_leap_second = time_of_day_ns(epoch.time)
+        of_day, in_leap_second = epoch.time
         valid = epoch.trusted
         if epoch.day is not None:
             utc = epoch.day * DAY_NS + of_day

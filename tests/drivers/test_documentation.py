@@ -16,6 +16,7 @@ PAGES = [
     ("navigator", "ublox", "ublox.md"),
     ("navigator", "nmea", "nmea.md"),
     ("navigator", "novatel", "novatel.md"),
+    ("navigator", "septentrio", "septentrio.md"),
     ("thermometer", "ascii-line", "ascii-line.md"),
     ("thermometer", "host", "host.md"),
     ("navigator", "gpsd", "gpsd.md"),

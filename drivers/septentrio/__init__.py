@@ -1,0 +1,1 @@
+"""Septentrio receivers: SBF blocks into records, and the device on a line."""
