@@ -10,6 +10,10 @@ cycles per pixel under a Kaiser window that ends at zero) has a phase error belo
 prefers no phase. Bilinear interpolation passes half the noise power at phase 1/2, per axis, and
 draws matches there.
 
+Why unequal sharpness does not matter: to first order it leaves a multiple of the image's Laplacian,
+which is even where slopes are odd. One unknown of its own takes it out of shift and residuals, so
+that what is left to tell the sigma is noise.
+
 Why windows are flat: loops over fifteen pixels do not vectorise, loops over two hundred do. A
 window lies in memory row by row in whole vectors (`window_stride`), zero where it is not used.
 """
@@ -43,25 +47,27 @@ def _kernel(x: Array) -> Array:
     return value
 
 
-def _kernel_tables() -> tuple[Array, Array]:
-    """Weights and their derivatives at phases 0 .. 1, shape (phases + 1, taps), float32.
+def _kernel_table() -> Array:
+    """Weights, their slopes and bends at phases 0 .. 1, shape (3, phases + 1, taps), float32.
 
     Row i weighs the pixels -3 .. 4 for a sample at i / phases right of pixel 0.
     """
     taps = np.arange(-3, 5)
     phase = np.arange(_PHASES + 1) / _PHASES
-    step = 1e-4
+    step = 1e-3
 
     def weights(at: Array) -> Array:
         w = _kernel(taps[None, :] - at[:, None])
         normalised: Array = w / w.sum(axis=1, keepdims=True)
         return normalised
 
-    slope = (weights(phase + step) - weights(phase - step)) / (2.0 * step)
-    return weights(phase).astype(np.float32), slope.astype(np.float32)
+    before, at, after = weights(phase - step), weights(phase), weights(phase + step)
+    slope, bend = (after - before) / (2.0 * step), (after - 2.0 * at + before) / step**2
+    return np.stack([at, slope, bend]).astype(np.float32)
 
 
-INTERPOLATION: Final = _kernel_tables()
+INTERPOLATION: Final = _kernel_table()
+"""The one table `refine` takes."""
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -72,24 +78,41 @@ def window_stride(side: int) -> int:
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def refinement_scratch(side: int) -> tuple[Array, Array, Array, Array, Array]:
-    """Memory for `refine`: rows (2, .), tap weights of a and of b, windows (7, .), wide (4, .)."""
+    """Memory for `refine`: rows (2, .), tap weights of a and of b, windows (8, .), wide (4, .)."""
     stride = window_stride(side)
     return (
         np.zeros((2, (side + 7) * stride), np.float32),
         np.empty((4, 8), np.float32),
         np.empty((4, 8), np.float32),
-        np.zeros((7, side * stride), np.float32),
+        np.zeros((8, side * stride), np.float32),
         np.zeros((4, (side + 14) * (stride + 8) + 8), np.float32),
     )
 
 
 @njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
-def _tap_weights(table: Array, phase: float, out: Array) -> None:
-    at = phase * (table.shape[0] - 1)
-    i = min(int(at), table.shape[0] - 2)
+def _tap_weights(table: Array, order: int, phase: float, out: Array) -> None:
+    """Weights of a derivative of that order, between the two nearest phases."""
+    at = phase * (table.shape[1] - 1)
+    i = min(int(at), table.shape[1] - 2)
     f = np.float32(at - i)
     for k in range(8):
-        out[k] = table[i, k] * (np.float32(1.0) - f) + table[i + 1, k] * f
+        out[k] = table[order, i, k] * (np.float32(1.0) - f) + table[order, i + 1, k] * f
+
+
+@njit(cache=True, fastmath=True, inline="always")  # type: ignore[untyped-decorator]
+def _row_taps(s: Array, w: tuple[Any, ...], o: Array, count: int) -> None:
+    w0, w1, w2, w3, w4, w5, w6, w7 = w
+    for c in range(count):
+        o[c] = (
+            w0 * s[c]
+            + w1 * s[c + 1]
+            + w2 * s[c + 2]
+            + w3 * s[c + 3]
+            + w4 * s[c + 4]
+            + w5 * s[c + 5]
+            + w6 * s[c + 6]
+            + w7 * s[c + 7]
+        )
 
 
 @njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
@@ -97,48 +120,18 @@ def _along_rows(
     source: Array, width: int, first: int, w: Array, out: Array, stride: int, rows: int
 ) -> None:
     """Eight taps along each of `rows` rows of a flat patch, the first tap at word `first`."""
-    w0, w1, w2, w3, w4, w5, w6, w7 = w[0], w[1], w[2], w[3], w[4], w[5], w[6], w[7]
+    taps = (w[0], w[1], w[2], w[3], w[4], w[5], w[6], w[7])
     for r in range(rows):
         start = first + r * width
         s = source[start : start + stride + 7]
         o = out[r * stride : (r + 1) * stride]
         # A count known to the compiler: two or three vectors and nothing left over.
         if stride == 16:
-            for c in range(16):
-                o[c] = (
-                    w0 * s[c]
-                    + w1 * s[c + 1]
-                    + w2 * s[c + 2]
-                    + w3 * s[c + 3]
-                    + w4 * s[c + 4]
-                    + w5 * s[c + 5]
-                    + w6 * s[c + 6]
-                    + w7 * s[c + 7]
-                )
+            _row_taps(s, taps, o, 16)
         elif stride == 24:
-            for c in range(24):
-                o[c] = (
-                    w0 * s[c]
-                    + w1 * s[c + 1]
-                    + w2 * s[c + 2]
-                    + w3 * s[c + 3]
-                    + w4 * s[c + 4]
-                    + w5 * s[c + 5]
-                    + w6 * s[c + 6]
-                    + w7 * s[c + 7]
-                )
+            _row_taps(s, taps, o, 24)
         else:
-            for c in range(stride):
-                o[c] = (
-                    w0 * s[c]
-                    + w1 * s[c + 1]
-                    + w2 * s[c + 2]
-                    + w3 * s[c + 3]
-                    + w4 * s[c + 4]
-                    + w5 * s[c + 5]
-                    + w6 * s[c + 6]
-                    + w7 * s[c + 7]
-                )
+            _row_taps(s, taps, o, stride)
 
 
 @njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
@@ -182,7 +175,7 @@ def _sample(
     corner: tuple[int, int],
     shift: tuple[float, float],
     side: int,
-    tables: tuple[Array, Array],
+    table: Array,
     rows: Array,
     w: Array,
     value: Array,
@@ -196,10 +189,10 @@ def _sample(
     dx, dy = shift
     stride = window_stride(side)
     whole_x, whole_y = int(np.floor(dx)), int(np.floor(dy))
-    _tap_weights(tables[0], dx - whole_x, w[0])
-    _tap_weights(tables[1], dx - whole_x, w[1])
-    _tap_weights(tables[0], dy - whole_y, w[2])
-    _tap_weights(tables[1], dy - whole_y, w[3])
+    _tap_weights(table, 0, dx - whole_x, w[0])
+    _tap_weights(table, 1, dx - whole_x, w[1])
+    _tap_weights(table, 0, dy - whole_y, w[2])
+    _tap_weights(table, 1, dy - whole_y, w[3])
     first = (corner[0] + whole_y - 3) * width + corner[1] + whole_x - 3
     _along_rows(patch, width, first, w[0], rows[0], stride, side + 7)
     _along_rows(patch, width, first, w[1], rows[1], stride, side + 7)
@@ -213,6 +206,37 @@ def _sample(
         power_y += w[2, k] * w[2, k]
         slope_power_y += w[3, k] * w[3, k]
     return power_x * power_y, 0.5 * (slope_power_x * power_y + slope_power_y * power_x)
+
+
+@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
+def _add_laplacian(
+    patch: Array,
+    width: int,
+    corner: tuple[int, int],
+    shift: tuple[float, float],
+    side: int,
+    table: Array,
+    rows: Array,
+    w: Array,
+    spare: Array,
+    factor: np.float32,
+    out: Array,
+) -> None:
+    """Add a factor times the Laplacian of the window that `_sample` took with weights `w`.
+
+    The weights of the slopes, w[1] and w[3], are overwritten.
+    """
+    dx, dy = shift
+    stride = window_stride(side)
+    whole_x, whole_y = int(np.floor(dx)), int(np.floor(dy))
+    _tap_weights(table, 2, dx - whole_x, w[1])
+    _tap_weights(table, 2, dy - whole_y, w[3])
+    first = (corner[0] + whole_y - 3) * width + corner[1] + whole_x - 3
+    for along_x in range(2):
+        _along_rows(patch, width, first, w[along_x], rows[0], stride, side + 7)
+        _along_columns(rows[0], w[3 - along_x], spare, side, stride)
+        for p in range(side * stride):
+            out[p] += factor * spare[p]
 
 
 @njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
@@ -234,6 +258,14 @@ def _dot(a: Array, b: Array) -> float:
     for p in range(a.shape[0]):
         total += a[p] * b[p]
     return float(total)
+
+
+@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
+def _take_away(values: Array, direction: Array, square: float) -> None:
+    """Leave what is orthogonal to a direction, whose sum of squares is given."""
+    share = np.float32(_dot(values, direction) / max(square, 1e-12))
+    for p in range(values.shape[0]):
+        values[p] -= share * direction[p]
 
 
 @njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
@@ -275,7 +307,8 @@ def refine(
     shift: tuple[float, float],
     half: int,
     margin: int,
-    tables: tuple[Array, Array],
+    pixels_a: int,
+    table: Array,
     scratch: tuple[Array, Array, Array, Array, Array],
     found: Array,
 ) -> bool:
@@ -287,7 +320,8 @@ def refine(
         offset: column and row of b's window against a's.
         shift: start value beyond the offset.
         half, margin: half of the window's side; pixels around a's window.
-        tables: `INTERPOLATION`.
+        pixels_a: raw pixels behind one of a's, against one of b's.
+        table: `INTERPOLATION`.
         scratch: from `refinement_scratch`.
         found: receives shift x, shift y, sigma (px, root mean square of both axes), correlation.
 
@@ -295,15 +329,9 @@ def refine(
         False where it does not converge within the reach of the patches.
     """
     rows, wa, wb, windows, wide = scratch
-    fa, ax, ay, fb, bx, by, lean = (
-        windows[0],
-        windows[1],
-        windows[2],
-        windows[3],
-        windows[4],
-        windows[5],
-        windows[6],
-    )
+    fa, ax, ay = windows[0], windows[1], windows[2]
+    fb, bx, by = windows[3], windows[4], windows[5]
+    lean, bent = windows[6], windows[7]
     side = 2 * half + 1
     stride = window_stride(side)
     size = side * stride
@@ -317,7 +345,7 @@ def refine(
             corner_a,
             (-0.5 * dx, -0.5 * dy),
             side,
-            tables,
+            table,
             rows,
             wa,
             fa,
@@ -330,7 +358,7 @@ def refine(
             corner_b,
             (0.5 * dx, 0.5 * dy),
             side,
-            tables,
+            table,
             rows,
             wb,
             fb,
@@ -353,11 +381,8 @@ def refine(
         _centre(ax, side, stride)
         _centre(ay, side, stride)
         signal = _dot(lean, lean)
-        share_x = np.float32(_dot(ax, lean) / signal)
-        share_y = np.float32(_dot(ay, lean) / signal)
-        for p in range(size):
-            ax[p] -= share_x * lean[p]
-            ay[p] -= share_y * lean[p]
+        _take_away(ax, lean, signal)
+        _take_away(ay, lean, signal)
         nxx, nxy, nyy = _dot(ax, ax), _dot(ax, ay), _dot(ay, ay)
         determinant = nxx * nyy - nxy * nxy
         if determinant <= 1e-9 * nxx * nyy:
@@ -365,18 +390,43 @@ def refine(
         hx, hy = _dot(ax, fa), _dot(ay, fa)
         step_x = (nyy * hx - nxy * hy) / determinant
         step_y = (nxx * hy - nxy * hx) / determinant
-        dx += step_x
-        dy += step_y
-        if abs(dx) > _LARGEST_SHIFT_PX or abs(dy) > _LARGEST_SHIFT_PX:
-            return False
         if abs(step_x) < _CONVERGED_PX and abs(step_y) < _CONVERGED_PX:
             break
         if step == _STEPS - 1:
             return False
+        dx += step_x
+        dy += step_y
+        if abs(dx) > _LARGEST_SHIFT_PX or abs(dy) > _LARGEST_SHIFT_PX:
+            return False
+    # The last step once more, with the difference in sharpness beside the shift. Noise is in the
+    # Laplacian too; weighed by what is behind a sample it agrees with neither image.
+    bent[:size] = np.float32(0.0)
+    back, forth = (-0.5 * dx, -0.5 * dy), (0.5 * dx, 0.5 * dy)
+    part_a = np.float32(pixels_a / (pixels_a + 1.0))
+    part_b = gain * (np.float32(1.0) - part_a)
+    _add_laplacian(patches[0], widths[0], corner_a, back, side, table, rows, wa, bx, part_a, bent)
+    _add_laplacian(patches[1], widths[1], corner_b, forth, side, table, rows, wb, bx, part_b, bent)
+    _centre(bent, side, stride)
+    _take_away(bent, lean, signal)
+    bend = _dot(bent, bent)
+    _take_away(ax, bent, bend)
+    _take_away(ay, bent, bend)
+    _take_away(fa, bent, bend)
+    nxx, nxy, nyy = _dot(ax, ax), _dot(ax, ay), _dot(ay, ay)
+    determinant = nxx * nyy - nxy * nxy
+    if determinant <= 1e-9 * nxx * nyy:
+        return False
+    hx, hy = _dot(ax, fa), _dot(ay, fa)
+    step_x = (nyy * hx - nxy * hy) / determinant
+    step_y = (nxx * hy - nxy * hx) / determinant
+    dx += step_x
+    dy += step_y
+    if abs(dx) > _LARGEST_SHIFT_PX or abs(dy) > _LARGEST_SHIFT_PX:
+        return False
     squares = _dot(fa, fa) - (hx * step_x + hy * step_y)
     # Neighbouring samples share raw pixels: the variance of the shift comes from the raw pixels.
     # (Power of noise is the same in both patches, which lie at mirrored phases.)
-    variance = max(squares, 0.0) / (side * side * power - 4.0)
+    variance = max(squares, 0.0) / (side * side * power - 5.0)
     # Noise in the slopes looks like signal and must not be counted as such.
     noise = 0.25 * variance * slope_power * side * side
     nxx -= noise

@@ -168,7 +168,7 @@ def match_patches(
     half_window: int,
     search: int,
     words: bool,
-    tables: tuple[Array, Array],
+    table: Array,
 ) -> Array:
     """Find windows of frame a, reduced by `ratio`, in frame b.
 
@@ -182,7 +182,7 @@ def match_patches(
         half_window: the window has 2 * half_window + 1 pixels of b.
         search: offsets tried around the prediction, px of b.
         words: the frames hold Level-1 words.
-        tables: `INTERPOLATION`.
+        table: `INTERPOLATION`.
 
     Returns:
         (n, 8) float64: column and row in a, column and row in b of the same ground, sigma of their
@@ -260,7 +260,8 @@ def match_patches(
                 shift,
                 half_window,
                 margin,
-                tables,
+                ratio * ratio,
+                table,
                 scratch,
                 found,
             ):
