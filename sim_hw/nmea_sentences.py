@@ -158,7 +158,7 @@ def course_deg(state: ReceiverState) -> float:
 
 def longitude_deg(degrees: float) -> float:
     """Within -180 to 180."""
-    return (degrees + 180.0) % 360.0 - 180.0
+    return degrees if -180.0 <= degrees < 180.0 else (degrees + 180.0) % 360.0 - 180.0
 
 
 def _clock(utc: UtcFields) -> str:

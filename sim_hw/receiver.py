@@ -102,6 +102,7 @@ class EmulatedReceiver(LineDevice):
         self._epoch_ns: int | None = None
         self._epoch_due_ns = 0
         self._event_latency_ns = 0
+        self._last_event_due_ns = 0
 
     @abstractmethod
     def epoch_bytes(self, epoch_gps_ns: int) -> bytes:
@@ -176,7 +177,7 @@ class EmulatedReceiver(LineDevice):
             with self._lock:
                 edge = self._edges.pop(0)
             self.counts["marks"] += edge.is_rising
-            self._event_latency_ns = 0
+            self._event_latency_ns, self._last_event_due_ns = 0, edge_due_ns
             return self.event_bytes(edge)
         assert self._epoch_ns is not None
         data = self.epoch_bytes(self._epoch_ns)
@@ -197,4 +198,5 @@ class EmulatedReceiver(LineDevice):
             first_ns = self._edges[0].gps_ns
         if not self._event_latency_ns:
             self._event_latency_ns = self.random.randrange(*EVENT_LATENCY_NS)
-        return self.clock.mono_ns(first_ns) + self._event_latency_ns
+        due_ns = self.clock.mono_ns(first_ns) + self._event_latency_ns
+        return max(due_ns, self._last_event_due_ns)

@@ -1,0 +1,164 @@
+"""Each receiver's driver on the emulated receiver, over a real pseudo-terminal and a real socket.
+
+The emulators are written from the makers' specifications and held against other programs in
+tests/sim_hw; here both ends meet.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+import pytest
+
+from drivers.contract import EventMark, NavSample
+from drivers.nmea.navigator import NmeaNavigator
+from drivers.novatel.navigator import NovatelNavigator
+from drivers.receiver import ListeningNavigator
+from drivers.septentrio.navigator import SeptentrioNavigator
+from drivers.ublox.navigator import UbloxNavigator
+from sim_hw.network_line import TcpLine
+from sim_hw.nmea_receiver import NmeaReceiver
+from sim_hw.novatel_receiver import NovatelReceiver
+from sim_hw.pseudo_terminal import PseudoTerminal
+from sim_hw.receiver import EmulatedReceiver, ReceiverState
+from sim_hw.septentrio_receiver import SeptentrioReceiver
+from sim_hw.ublox_receiver import UbloxReceiver
+from sim_hw.world_clock import WorldClock
+from tests.drivers.stand_ins import Notebook
+from tests.sim_hw.receiver_state import NS, STATE, WEEK_NS
+
+WITHIN_S = 30.0
+METRES_PER_DEGREE = 111_320.0
+HOUR_NS = 3600 * NS
+
+PAIRS = {
+    "ublox": (UbloxReceiver, UbloxNavigator),
+    "novatel": (NovatelReceiver, NovatelNavigator),
+    "septentrio": (SeptentrioReceiver, SeptentrioNavigator),
+    "nmea": (NmeaReceiver, NmeaNavigator),
+}
+MARKS_WITHIN_NS = {"ublox": 0, "novatel": 1, "septentrio": 1, "nmea": 500}
+"""The resolution of each protocol: NMEA tells microseconds."""
+PLACE_WITHIN_M = {"ublox": 0.02, "novatel": 1e-3, "septentrio": 1e-3, "nmea": 0.06}
+
+
+def flying(gps_ns: int) -> ReceiverState:
+    """North at 60 m/s, at 10 degrees at the full hour: so time shows in the place."""
+    elapsed_s = ((gps_ns + HOUR_NS // 2) % HOUR_NS - HOUR_NS // 2) / NS
+    return replace(
+        STATE,
+        latitude_deg=10.0 + elapsed_s * 60.0 / METRES_PER_DEGREE,
+        velocity_ned_mps=(60.0, 0.0, 0.0),
+    )
+
+
+def pair(kind: str, line: str, clock: WorldClock) -> tuple[EmulatedReceiver, ListeningNavigator]:
+    receiver_class, navigator_class = PAIRS[kind]
+    receiver: EmulatedReceiver = receiver_class(
+        clock, flying, rate_hz=10.0, line=PseudoTerminal() if line == "pty" else TcpLine()
+    )
+    return receiver, navigator_class("gnss", {"port": receiver.port})
+
+
+@contextmanager
+def running(navigator: ListeningNavigator, notebook: Notebook) -> Iterator[None]:
+    thread = threading.Thread(target=navigator.run, args=(notebook,))
+    thread.start()
+    try:
+        yield
+    finally:
+        navigator.close()
+        thread.join(5)
+    assert not thread.is_alive()
+
+
+@pytest.mark.parametrize(("kind", "line"), [*((k, "pty") for k in PAIRS), ("septentrio", "tcp")])
+def test_places_and_marks_of_the_emulated_receiver_come_out_right(kind: str, line: str) -> None:
+    # A week's end lies 1.1 s ahead, so the flight goes through it.
+    clock = WorldClock(2444 * WEEK_NS - 1_100_000_000, time.monotonic_ns())
+    receiver, navigator = pair(kind, line, clock)
+    notebook, enough = Notebook(), threading.Event()
+    receiver.start()
+    try:
+        found = navigator.bind()
+        first_ns = clock.gps_ns(time.monotonic_ns()) + 250_000_000
+        given = [first_ns + n * 150_000_001 for n in range(5)]
+        for at_ns in given:
+            receiver.mark(at_ns)
+
+        def watch(_: object) -> None:
+            told = [r for r in notebook.records if isinstance(r, EventMark)]
+            after = [r for r in notebook.records if isinstance(r, NavSample)]
+            if len(told) == 5 and after and after[-1].gps_ns > given[-1] + 200_000_000:
+                enough.set()
+
+        notebook.stop = watch
+        with running(navigator, notebook):
+            assert enough.wait(WITHIN_S), navigator.statistics()
+    finally:
+        receiver.close()
+    assert found["port"] == receiver.port
+    marks = [r for r in notebook.records if isinstance(r, EventMark)]
+    away_ns = [abs(m.gps_ns - at) for m, at in zip(marks, given, strict=True)]
+    assert max(away_ns) <= MARKS_WITHIN_NS[kind]
+    assert all(m.time_valid for m in marks)
+    samples = [r for r in notebook.records if isinstance(r, NavSample)]
+    timed = [s for s in samples if s.time_valid]
+    assert len(timed) >= 6
+    assert timed[-1].gps_ns >= 2444 * WEEK_NS
+    for sample in timed:
+        there = flying(sample.gps_ns)
+        away_m = (sample.latitude_deg - there.latitude_deg) * METRES_PER_DEGREE
+        assert abs(away_m) < PLACE_WITHIN_M[kind], "time and place belong together"
+        assert sample.height_m == pytest.approx(STATE.height_m, abs=0.06)
+        assert sample.velocity_ned_mps[0] == pytest.approx(60.0, abs=1e-2)
+        assert sample.fix == "3d"
+    leaning = [s for s in timed if s.roll_rad is not None]
+    assert len(leaning) >= len(timed) - 2
+    for sample in leaning:
+        assert sample.roll_rad == pytest.approx(math.radians(STATE.roll_deg), abs=2e-5)
+        assert sample.pitch_rad == pytest.approx(math.radians(STATE.pitch_deg), abs=2e-5)
+        assert sample.heading_rad == pytest.approx(math.radians(STATE.heading_deg), abs=2e-5)
+    assert samples[-1].leap_seconds == 18
+    statistics = navigator.statistics()
+    assert statistics["bad_messages"] == 0
+    assert statistics["marks"] == 5
+
+
+@pytest.mark.parametrize("kind", list(PAIRS))
+def test_a_receiver_behind_a_noisy_line_is_heard_and_its_damage_counted(kind: str) -> None:
+    clock = WorldClock.starting_now()
+    receiver, navigator = pair(kind, "pty", clock)
+    spoilt = iter(range(1_000_000))
+
+    def wire(data: bytes, _mono_ns: int) -> bytes:
+        """A bit of every third piece turns over."""
+        if not data or next(spoilt) % 3:
+            return data
+        at = len(data) // 2
+        return data[:at] + bytes((data[at] ^ 0x10,)) + data[at + 1 :]
+
+    receiver.wire = wire
+    notebook, enough = Notebook(), threading.Event()
+
+    def watch(_: object) -> None:
+        if sum(isinstance(r, NavSample) for r in notebook.records) >= 12:
+            enough.set()
+
+    notebook.stop = watch
+    receiver.start()
+    try:
+        with running(navigator, notebook):
+            assert enough.wait(WITHIN_S), navigator.statistics()
+    finally:
+        receiver.close()
+    assert navigator.statistics()["bad_messages"] >= 3
+    for sample in (r for r in notebook.records if isinstance(r, NavSample)):
+        if sample.time_valid:
+            there = flying(sample.gps_ns).latitude_deg
+            assert abs(sample.latitude_deg - there) * METRES_PER_DEGREE < PLACE_WITHIN_M[kind]
