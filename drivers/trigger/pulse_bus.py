@@ -8,9 +8,9 @@ from __future__ import annotations
 import contextlib
 import socket
 import threading
-from collections import Counter
-from collections.abc import Mapping
-from typing import ClassVar, Final
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from typing import ClassVar, Final, Protocol
 
 from drivers.clock import Clock, HostClock
 from drivers.contract import DeviceError, TriggerPulse
@@ -19,6 +19,33 @@ from drivers.settings import Configured, Setting
 PROTOCOL: Final = ("PULSEBUS", "1")
 MAX_DELAY_NS: Final = 1_000_000_000
 MAX_LINE: Final = 4096
+EARLIER_ANSWERS: Final = 32
+"""Answers that may still come twice, or after their time."""
+
+
+class Connection(Protocol):
+    """What is used of a `socket.socket`."""
+
+    def settimeout(self, value: float, /) -> None: ...
+
+    def sendall(self, data: bytes, /) -> None: ...
+
+    def recv(self, size: int, /) -> bytes: ...
+
+    def shutdown(self, how: int, /) -> None: ...
+
+    def close(self) -> None: ...
+
+
+Connect = Callable[[str, int, float], Connection]
+"""Connects to host and port within so many seconds; OSError where that fails."""
+
+
+def connect_tcp(host: str, port: int, timeout_s: float) -> Connection:
+    """A TCP connection that sends every line at once."""
+    connection = socket.create_connection((host, port), timeout=timeout_s)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    return connection
 
 
 class PulseBusTrigger(Configured):
@@ -38,18 +65,25 @@ class PulseBusTrigger(Configured):
     timeout_s = Setting(0.5, minimum=0.05, maximum=5, says="longest wait for an answer")
 
     def __init__(
-        self, name: str, settings: Mapping[str, object], *, clock: Clock | None = None
+        self,
+        name: str,
+        settings: Mapping[str, object],
+        *,
+        clock: Clock | None = None,
+        connect: Connect = connect_tcp,
     ) -> None:
         super().__init__(name, settings)
         self._clock: Clock = clock or HostClock()
+        self._connect_to = connect
         self._lock = threading.Lock()
-        self._socket: socket.socket | None = None
+        self._socket: Connection | None = None
         self._received = b""
         self._delays_ns: dict[str, int] = {}
+        self._earlier: deque[str] = deque(maxlen=EARLIER_ANSWERS)
         self._unit = ""
         self._outputs: tuple[str, ...] = ()
         self._closed = False
-        self._counters: Counter[str] = Counter(pulses=0, failures=0, opened=0)
+        self._counters: Counter[str] = Counter(pulses=0, failures=0, opened=0, stale_answers=0)
 
     def bind(self) -> Mapping[str, str]:
         """Connect; the unit's name, outputs and count. See `drivers.contract.Trigger`."""
@@ -125,7 +159,7 @@ class PulseBusTrigger(Configured):
             self._disconnect()
 
     def statistics(self) -> Mapping[str, int]:
-        """pulses, failures, opened."""
+        """pulses, failures, opened, stale_answers."""
         return dict(self._counters)
 
     # The connection; the lock is held
@@ -136,8 +170,7 @@ class PulseBusTrigger(Configured):
         if self._socket is not None:
             return
         try:
-            self._socket = socket.create_connection((self.host, self.port), timeout=self.timeout_s)
-            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._socket = self._connect_to(self.host, self.port, self.timeout_s)
         except OSError as error:
             self._disconnect()
             raise DeviceError(
@@ -178,7 +211,7 @@ class PulseBusTrigger(Configured):
             self._socket.sendall(command.encode("ascii") + b"\n")
         except OSError as error:
             raise self._lost(command, error.strerror or str(error)) from error
-        answer = self._line(command).split()
+        answer = self._answer(command)
         if answer[:1] == ["ERR"]:
             raise DeviceError(
                 f"{self.name}: the trigger unit refuses {command!r}: {' '.join(answer[1:])}; "
@@ -188,10 +221,24 @@ class PulseBusTrigger(Configured):
             raise self._lost(command, f"the answer {' '.join(answer)!r} makes no sense")
         return answer[1:]
 
-    def _line(self, asked: str) -> str:
+    def _answer(self, command: str) -> list[str]:
+        """The words of the next line that does not answer an earlier question once more."""
+        verb, *rest = command.split()
+        answered = " ".join(("FIRED" if verb == "FIRE" else f"OK {verb}", *rest))
+        deadline_ns = self._clock.mono_ns() + round(self.timeout_s * 1e9)
+        while True:
+            line = self._line(command, deadline_ns)
+            stale = next((a for a in self._earlier if (line + " ").startswith(a + " ")), None)
+            if stale is None or stale == answered:
+                self._earlier.append(answered)
+                return line.split()
+            self._counters["stale_answers"] += 1
+
+    def _line(self, asked: str, deadline_ns: int | None = None) -> str:
         """The next line, within the time-out as a whole."""
         assert self._socket is not None
-        deadline_ns = self._clock.mono_ns() + round(self.timeout_s * 1e9)
+        if deadline_ns is None:
+            deadline_ns = self._clock.mono_ns() + round(self.timeout_s * 1e9)
         while b"\n" not in self._received:
             left_s = (deadline_ns - self._clock.mono_ns()) * 1e-9
             if left_s <= 0:
@@ -221,6 +268,7 @@ class PulseBusTrigger(Configured):
     def _disconnect(self) -> None:
         unit, self._socket = self._socket, None
         self._received = b""
+        self._earlier.clear()
         if unit is not None:
             with contextlib.suppress(OSError):
                 unit.close()

@@ -197,3 +197,18 @@ def test_no_unit_at_all_is_said_at_once() -> None:
     trigger = PulseBusTrigger("bus", {"host": "127.88.40.1", "port": 9})
     with pytest.raises(DeviceError, match="check its power, cable, host and port"):
         trigger.bind()
+
+
+def test_an_answer_that_comes_twice_is_not_taken_for_that_of_the_next_pulse() -> None:
+    unit = Unit()
+    twice = unit.by_the_book
+    unit.answer = lambda line: f"{(said := twice(line))}\n{said}"
+    trigger = PulseBusTrigger("trigger", {"host": "127.88.40.1", "port": unit.port})
+    try:
+        trigger.program({"0": 5, "1": 7})
+        assert [trigger.fire(sequence).count for sequence in (1, 2, 3)] == [1, 2, 3]
+        assert trigger.statistics()["stale_answers"] >= 3
+        assert trigger.statistics()["failures"] == 0
+    finally:
+        trigger.close()
+        unit.close()

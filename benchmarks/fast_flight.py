@@ -1,0 +1,610 @@
+"""A flight on a fake clock: the service's real pieces against the emulated rig without wires.
+
+Line, trigger client, decoders, flight, matching, clock, track and ledger are the ones that fly.
+What stands in for processes and disks is here: reopening of lost devices, slots of memory, a disk
+that takes 150 ms. What is true only `sim_hw.clockwork` knows; here the two are compared.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import random
+import threading
+from collections import Counter, deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from daemon.configuration import Configuration, from_mapping
+from daemon.exposure import Capture, Exposure, NavigationRecord
+from daemon.flight import Flight, Identity
+from daemon.ledger import Ledger
+from daemon.line import Line, Order
+from daemon.matching import Pulse
+from drivers.clock import BackOff
+from drivers.contract import (
+    DeviceError,
+    EventMark,
+    Frame,
+    FrameStatus,
+    NavSample,
+    TemperatureSample,
+)
+from drivers.modbus_rtu.frames import find_reply
+from drivers.trigger.pulse_bus import PulseBusTrigger
+from drivers.ublox.decoder import UbxDecoder
+from processing.rig import Rig, find_rig
+from sim_hw.clockwork import EARTH_M_PER_DEG, ClockworkHead, ClockworkRig, SentFrame, Timeline
+from sim_hw.faults.plan import Planned
+from sim_hw.world_clock import NS_PER_S, NS_PER_WEEK, WorldClock
+
+EXPOSURE_NS = 4_000_000
+TICK_NS = 100_000_000
+LATCH_NS = 2 * NS_PER_S
+LATCH_SIGMA_NS = 80_000
+SUSPICION_NS = 2 * NS_PER_S
+"""A head that answers nothing for so long is lost; see `drivers.aravis.head`."""
+REOPENED_SERIAL_NS = 5 * NS_PER_S
+"""Longest pause before a lost serial port is tried again."""
+ANSWER_TIMEOUT_NS = NS_PER_S // 2
+DISK_NS = 150_000_000
+PROBE_C = 32.5
+NAV_TOLERANCE_M = 1.0
+SIGMAS = 6
+RECOVERY_NS = 3 * NS_PER_S
+"""After a fault of a whole device: a head's clock is read every 2 s, a mark comes within one."""
+FOREVER_NS = 60 * NS_PER_S
+"""An exposure that is open for so long hangs."""
+
+
+class FakeClock:
+    """The clock of the drivers: the timeline's."""
+
+    def __init__(self) -> None:
+        self.now_ns = 0
+
+    def mono_ns(self) -> int:
+        return self.now_ns
+
+    def wait(self, event: threading.Event, timeout_s: float) -> bool:
+        return event.is_set()
+
+
+@dataclass
+class Truth:
+    """What became of one pulse that was given."""
+
+    number: int
+    ordered_ns: int
+    frames: set[str] = field(default_factory=set)
+    """Heads whose frame of this pulse came whole and in time."""
+    mark_came: bool = False
+
+
+@dataclass
+class Score:
+    """How the records of a flight compare with the truth; counts of pairs unless said otherwise."""
+
+    exposures: int = 0
+    sealed: int = 0
+    frames_came: int = 0
+    frames_right: int = 0
+    frames_wrong: int = 0
+    marks_came: int = 0
+    marks_right: int = 0
+    marks_wrong: int = 0
+    pairs: int = 0
+    """Of one head and one exposure, whose frame and mark both came."""
+    pairs_matched: int = 0
+    untouched: int = 0
+    """Exposures of which everything came, and nothing was touched by a fault."""
+    untouched_matched: int = 0
+    navigation_wrong: int = 0
+    times_wrong: int = 0
+    """Times without a mark that are further off than six of their sigmas."""
+    hangs: int = 0
+    imbalances: int = 0
+    hits: int = 0
+    longest_open_s: float = 0.0
+    examples: list[str] = field(default_factory=list)
+
+    @property
+    def wrong(self) -> int:
+        """Wrong pairings of any kind."""
+        return self.frames_wrong + self.marks_wrong + self.navigation_wrong
+
+    def blame(self, sentence: str) -> None:
+        """Keep the first few examples of what went wrong."""
+        if len(self.examples) < 8:
+            self.examples.append(sentence)
+
+
+class _Wire:
+    """The trigger client's connection on the timeline: waiting moves the clock."""
+
+    def __init__(self, flight: FastFlight, host: str, port: int, timeout_s: float) -> None:
+        self._flight = flight
+        self._timeout_s = timeout_s
+        flight.inbox.clear()
+        if not flight.clockwork.trigger.is_connected(flight.clock.now_ns):
+            flight.advance(flight.clock.now_ns + round(timeout_s * NS_PER_S))
+            raise TimeoutError("timed out")
+        flight.clockwork.greet(flight.clock.now_ns)
+
+    def settimeout(self, value: float, /) -> None:
+        self._timeout_s = value
+
+    def sendall(self, data: bytes, /) -> None:
+        self._flight.clockwork.obey(data, self._flight.clock.now_ns)
+
+    def recv(self, size: int, /) -> bytes:
+        flight = self._flight
+        end_ns = flight.clock.now_ns + round(self._timeout_s * NS_PER_S)
+        flight.advance(end_ns, until=lambda: bool(flight.inbox))
+        if not flight.inbox:
+            raise TimeoutError("timed out")
+        return flight.inbox.popleft()
+
+    def shutdown(self, how: int, /) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
+@dataclass
+class _Session:
+    """What the driver of a head knows."""
+
+    is_open: bool = False
+    suspected_ns: int | None = None
+    next_try_ns: int = 0
+    latch: tuple[int, int] | None = None
+    latched_ns: int = 0
+    pause: BackOff = field(default_factory=BackOff)
+
+
+class FastFlight:
+    """One flight with its faults, from `fly` to its `Score`."""
+
+    def __init__(
+        self, rig_name: str, planned: Sequence[Planned], *, exposures: int, seed: int, mission: Path
+    ) -> None:
+        self.rig = find_rig(rig_name)
+        self.configuration = configuration(self.rig, exposures)
+        self.clock = FakeClock()
+        self.timeline = Timeline()
+        # A week ends an hour after the start: every long flight passes a rollover.
+        world = WorldClock(2400 * NS_PER_WEEK - 3600 * NS_PER_S, 1000 * NS_PER_S)
+        self.world = world
+        self.clock.now_ns = world.mono_ns_at_start
+        self.clockwork = ClockworkRig(
+            self.rig, self.timeline, self, planned, world=world, seed=seed, exposure_ns=EXPOSURE_NS
+        )
+        self.inbox: deque[bytes] = deque()
+        heads = [sensor.name for sensor in self.rig.sensors]
+        self.flight = Flight(
+            self.rig,
+            dict.fromkeys(heads, ""),
+            Identity("boot", "1", "calibration", "", "", "syntopic", simulated=True),
+            self.configuration.limits,
+            Ledger(heads),
+            first_number=1,
+        )
+        self.line = Line(self.configuration, self.rig, self.flight, mission, 0)
+        self.trigger = PulseBusTrigger(
+            "trigger",
+            {"port": 1},
+            clock=self.clock,
+            connect=lambda host, port, timeout_s: _Wire(self, host, port, timeout_s),
+        )
+        self._programmed: Mapping[str, int] = {}
+        self._decoder = UbxDecoder("receiver")
+        self._receiver_is_open = True
+        self._receiver_back_ns = 0
+        self._sessions = {head: _Session() for head in heads}
+        self._slots = {
+            head: list(range(self.configuration.limits.exposures_in_memory)) for head in heads
+        }
+        self._pixels: dict[tuple[str, int], int] = {}
+        """Which exposure's pixels lie in a slot: the truth, for the heads only."""
+        self._asked_ns: int | None = None
+        self._heard_of_probes = b""
+        self._next_probe_ns = 0
+        self._chance = random.Random(f"host-{seed}")
+        self._captures: dict[int, Capture] = {}
+        self._stored_pixels: dict[int, dict[str, int]] = {}
+        self._answered: set[int] = set()
+        self._ordered_ns: dict[int, int] = {}
+        self.truth: dict[int, Truth] = {}
+        self.records: list[Exposure] = []
+        self.open_s: list[float] = []
+        self.score = Score(exposures=exposures)
+        self.events: Counter[str] = Counter()
+
+    def fly(self) -> Score:
+        """Fly all exposures and compare the records with the truth."""
+        for head, session in self._sessions.items():
+            self._open_head(self.clockwork.heads[head], session)
+        self.advance(self.clock.now_ns + 2 * NS_PER_S)
+        while not self.line.is_flown:
+            wait_s = self.line.wait_s(self.clock.now_ns)
+            if wait_s > 0:
+                self.advance(self.clock.now_ns + round(wait_s * NS_PER_S))
+            else:
+                self._fire(self.line.order(self.clock.now_ns))
+        end_ns = self.clock.now_ns + FOREVER_NS
+        self.advance(end_ns, until=lambda: not self.flight.open_numbers)
+        self.score.hangs += len(self.flight.open_numbers)
+        self._compare()
+        return self.score
+
+    def advance(self, end_ns: int, until: Callable[[], bool] | None = None) -> None:
+        """Let time pass, tick by tick, until then or until something is so."""
+        while self.clock.now_ns < end_ns:
+            if until is not None and until():
+                return
+            next_ns = min(end_ns, self.clock.now_ns // TICK_NS * TICK_NS + TICK_NS)
+            self.timeline.run_until(next_ns, self._set_clock, until)
+            if until is not None and until():
+                return
+            self.clock.now_ns = next_ns
+            if next_ns % TICK_NS == 0:
+                self._tick(next_ns)
+
+    def _set_clock(self, now_ns: int) -> None:
+        self.clock.now_ns = now_ns
+
+    # What the devices say
+
+    def hear_answer(self, line: bytes, now_ns: int) -> None:
+        self.inbox.append(line)
+
+    def hear_receiver(self, data: bytes, now_ns: int) -> None:
+        if not self._receiver_is_open:
+            return
+        for record in self._decoder.feed(data, now_ns):
+            if isinstance(record, NavSample):
+                self.flight.navigation(record)
+            elif isinstance(record, EventMark):
+                told = self.clockwork.receiver.told.get(record.gps_ns)
+                exposure = None if told is None else self._truth(told.exposure)
+                if exposure is not None:
+                    waited_ns = now_ns - exposure.ordered_ns
+                    limit_ns = self.configuration.limits.mark_timeout_s * NS_PER_S
+                    exposure.mark_came |= waited_ns < limit_ns and record.time_valid
+                self.flight.mark(record)
+
+    def hear_probes(self, data: bytes, now_ns: int) -> None:
+        if self._asked_ns is None or now_ns - self._asked_ns > ANSWER_TIMEOUT_NS:
+            return
+        self._heard_of_probes += data
+        reply = find_reply(self._heard_of_probes, 1, len(self.rig.probes))
+        if reply is None or reply.exception is not None:
+            return
+        self._asked_ns = None
+        for probe, register in zip(self.rig.probes, reply.registers, strict=True):
+            value_c = None if register == 0x7FFF else register / 10
+            if value_c not in (None, PROBE_C):
+                self.score.blame(f"probe {probe} said {value_c}, it is {PROBE_C}")
+                self.score.imbalances += 1
+            self.flight.temperature(TemperatureSample(probe, value_c, now_ns))
+
+    def hear_frame(self, frame: SentFrame, now_ns: int) -> None:
+        session = self._sessions[frame.head]
+        head = self.clockwork.heads[frame.head]
+        if not session.is_open or not head.channel.is_connected(now_ns):
+            return
+        if not self._slots[frame.head]:
+            self.events["underruns"] += 1
+            return
+        slot = self._slots[frame.head].pop(0)
+        self._pixels[frame.head, slot] = frame.exposure
+        truth = self._truth(frame.exposure)
+        if truth is not None and frame.integrity == "whole":
+            limit_ns = self.configuration.limits.frame_timeout_s * NS_PER_S
+            if now_ns - truth.ordered_ns < limit_ns:
+                truth.frames.add(frame.head)
+        self.flight.frame(self._frame(frame, slot, session, now_ns))
+
+    def _frame(self, frame: SentFrame, slot: int, session: _Session, now_ns: int) -> Frame:
+        sensor = self.rig.sensor(frame.head)
+        status = {
+            "whole": FrameStatus.COMPLETE,
+            "half": FrameStatus.INCOMPLETE,
+            "corrupt": FrameStatus.CORRUPT,
+        }[frame.integrity]
+        whole = status is FrameStatus.COMPLETE
+        latch = session.latch
+        return Frame(
+            head=frame.head,
+            slot=slot,
+            status=status,
+            frame_id=frame.counter,
+            counter=frame.counter if whole else None,
+            width_px=sensor.width_px,
+            height_px=sensor.height_px,
+            pixel_format="Mono16",
+            device_ns=frame.device_ns if whole else None,
+            device_clock_ns=None if latch is None else latch[0],
+            device_clock_mono_ns=None if latch is None else latch[1],
+            latch_sigma_ns=None if latch is None else LATCH_SIGMA_NS,
+            mono_ns=now_ns,
+            exposure_time_us=EXPOSURE_NS / 1000,
+            temperature_c=None,
+        )
+
+    # What the service does
+
+    def _fire(self, order: Order) -> None:
+        """Order a pulse and tell the flight what came of it; see `daemon.capture`."""
+        self._ordered_ns[order.number] = order.mono_ns
+        try:
+            if order.delays_ns != self._programmed:
+                self.trigger.program(order.delays_ns)
+                self._programmed = order.delays_ns
+            pulse = self.trigger.fire(order.number)
+        except DeviceError as error:
+            self._programmed = {}
+            self.events["not fired"] += 1
+            self.flight.not_fired(order.number, str(error))
+        else:
+            self.flight.fired(
+                Pulse(
+                    number=order.number,
+                    mono_ns=pulse.mono_ns,
+                    sigma_ns=pulse.sigma_ns,
+                    count=pulse.count,
+                    delays_ns=order.delays_ns,
+                    strobe_delay_ns=order.strobe_delay_ns,
+                )
+            )
+            self._answered.add(order.number)
+
+    def _truth(self, exposure: int) -> Truth | None:
+        """The truth of a pulse that was given; None for a frame that no pulse asked for."""
+        if exposure not in self.truth and exposure in self.clockwork.pulses:
+            number = self.clockwork.pulses[exposure]
+            self.truth[exposure] = Truth(number, self._ordered_ns[number])
+        return self.truth.get(exposure)
+
+    def _tick(self, now_ns: int) -> None:
+        for name, session in self._sessions.items():
+            self._look_after(self.clockwork.heads[name], session, now_ns)
+        self._look_after_receiver(now_ns)
+        if now_ns >= self._next_probe_ns:
+            self._next_probe_ns = now_ns + NS_PER_S
+            self._asked_ns, self._heard_of_probes = now_ns, b""
+            self.clockwork.ask_probes([PROBE_C] * len(self.rig.probes), now_ns)
+        flight = self.flight
+        for due in flight.due_to_store(now_ns):
+            number, slots = due.capture.number, dict(due.slots)
+            self._captures[number] = due.capture
+            self._stored_pixels[number] = {h: self._pixels[h, s] for h, s in slots.items()}
+            self.timeline.at(now_ns + DISK_NS, functools.partial(self._stored, number, slots))
+        flight.due_to_give_up(now_ns)
+        for head, slot in flight.idle_slots:
+            self._slots[head].append(slot)
+        flight.idle_slots.clear()
+        exposure = flight.due_to_seal(now_ns)
+        if exposure is not None:
+            self._sealed(exposure, now_ns)
+
+    def _stored(self, number: int, slots: Mapping[str, int], now_ns: int) -> None:
+        frames = tuple(
+            replace(record, file=f"{record.sensor}.tif", sha256="0" * 64)
+            for record in self._captures.pop(number).frames
+        )
+        self.flight.stored(number, frames)
+        for head, slot in slots.items():
+            self._slots[head].append(slot)
+
+    def _sealed(self, exposure: Exposure, now_ns: int) -> None:
+        flight = self.flight
+        flight.sealed(exposure.number, exposure.state)
+        imbalances = flight.ledger.imbalances()
+        self.score.imbalances += len(imbalances)
+        for imbalance in imbalances:
+            self.score.blame(imbalance)
+        self.records.append(exposure)
+        self.open_s.append((now_ns - self._ordered_ns[exposure.number]) / NS_PER_S)
+
+    def _look_after(self, head: ClockworkHead, session: _Session, now_ns: int) -> None:
+        """What the driver of a head does between frames; see `drivers.aravis.head`."""
+        answers = head.answers(now_ns)
+        if not session.is_open:
+            if answers and now_ns >= session.next_try_ns:
+                self._open_head(head, session)
+            return
+        if not answers:
+            session.suspected_ns = session.suspected_ns or now_ns
+            if now_ns - session.suspected_ns > SUSPICION_NS:
+                self._lose_head(head, session, now_ns)
+            return
+        session.suspected_ns = None
+        if not head.is_acquiring:
+            self._lose_head(head, session, now_ns)
+        elif now_ns - session.latched_ns >= LATCH_NS:
+            self._latch(head, session, now_ns)
+
+    def _open_head(self, head: ClockworkHead, session: _Session) -> None:
+        if not head.answers(self.clock.now_ns):
+            return
+        head.begin()
+        session.is_open, session.suspected_ns = True, None
+        session.pause.reset()
+        self._latch(head, session, self.clock.now_ns)
+        self.flight.absent_heads.discard(head.name)
+        self.events["opened"] += 1
+
+    def _lose_head(self, head: ClockworkHead, session: _Session, now_ns: int) -> None:
+        session.is_open = False
+        session.next_try_ns = now_ns + round(session.pause.next_s() * NS_PER_S)
+        self.flight.absent_heads.add(head.name)
+        self.events["lost"] += 1
+
+    def _latch(self, head: ClockworkHead, session: _Session, now_ns: int) -> None:
+        error_ns = self._chance.randrange(-LATCH_SIGMA_NS, LATCH_SIGMA_NS)
+        session.latch = (head.clock_ns(now_ns), now_ns + error_ns)
+        session.latched_ns = now_ns
+
+    def _look_after_receiver(self, now_ns: int) -> None:
+        """A port that goes away is opened again; what was half received is forgotten."""
+        connected = self.clockwork.receiver.channel.is_connected(now_ns)
+        if self._receiver_is_open and not connected:
+            self._receiver_is_open = False
+        elif not self._receiver_is_open and connected:
+            self._receiver_back_ns = self._receiver_back_ns or now_ns + REOPENED_SERIAL_NS
+            if now_ns >= self._receiver_back_ns:
+                self._receiver_is_open, self._receiver_back_ns = True, 0
+                self._decoder.reset()
+
+    # The comparison
+
+    def _compare(self) -> None:
+        score = self.score
+        exposure_of = {number: exposure for exposure, number in self.clockwork.pulses.items()}
+        for exposure in exposure_of.values():
+            self._truth(exposure)
+        whole: dict[int, Exposure] = {}
+        marked: set[int] = set()
+        for record in self.records:
+            score.sealed += 1
+            exposure = exposure_of.get(record.number, 0)
+            whole[exposure] = record
+            self._compare_frames(record, exposure)
+            if self._compare_mark(record, exposure):
+                marked.add(exposure)
+            if exposure:
+                self._compare_navigation(record, exposure)
+        touched = self._touched()
+        heads = set(self._sessions)
+        for exposure, truth in self.truth.items():
+            pixels = self._stored_pixels.get(truth.number, {})
+            score.frames_came += len(truth.frames)
+            score.marks_came += truth.mark_came
+            matched = {h for h in truth.frames if pixels.get(h) == exposure and exposure in whole}
+            if truth.mark_came:
+                score.pairs += len(truth.frames)
+                score.pairs_matched += len(matched) if exposure in marked else 0
+            if truth.mark_came and truth.frames == heads and exposure not in touched:
+                score.untouched += 1
+                is_matched = matched == heads and exposure in marked
+                score.untouched_matched += is_matched
+                if not is_matched:
+                    score.blame(
+                        f"exposure {truth.number}: untouched, but {len(matched)} frames and "
+                        f"{'the' if exposure in marked else 'no'} mark"
+                    )
+        score.hits = sum(len(channel.hits) for channel in self.clockwork.channels.values())
+        score.longest_open_s = max(self.open_s, default=0.0)
+
+    def _compare_frames(self, record: Exposure, exposure: int) -> None:
+        pixels = self._stored_pixels.get(record.number, {})
+        for frame in record.frames:
+            if pixels.get(frame.sensor) == exposure:
+                self.score.frames_right += 1
+            else:
+                self.score.frames_wrong += 1
+                self.score.blame(
+                    f"exposure {record.number}: {frame.sensor} has the pixels of pulse "
+                    f"{pixels.get(frame.sensor)}, its pulse is {exposure}"
+                )
+
+    def _compare_mark(self, record: Exposure, exposure: int) -> bool:
+        """Whether the record has the mark of its own pulse."""
+        gps_ns, sigma_ns = record.mark_gps_ns, record.mark_sigma_ns
+        if gps_ns is None or sigma_ns is None:
+            return False
+        if record.mark_source == "event-mark":
+            told = self.clockwork.receiver.told.get(gps_ns)
+            if told is not None and told.exposure == exposure:
+                self.score.marks_right += 1
+                return True
+            self.score.marks_wrong += 1
+            self.score.blame(
+                f"exposure {record.number}: has the mark of pulse "
+                f"{None if told is None else told.exposure}, its pulse is {exposure}"
+            )
+            return False
+        if exposure:
+            error_ns = gps_ns - self.clockwork.true_strobe_gps_ns[exposure]
+            if abs(error_ns) > SIGMAS * sigma_ns and not self._receiver_clock_is_at_fault:
+                self.score.times_wrong += 1
+                self.score.blame(
+                    f"exposure {record.number}: {record.mark_source} time is off by "
+                    f"{error_ns / 1e6:.3f} ms, its sigma is {sigma_ns / 1e6:.3f} ms"
+                )
+        return False
+
+    @property
+    def _receiver_clock_is_at_fault(self) -> bool:
+        """Its time is then not the true one, and nobody on board can know."""
+        names = {hit.fault for hit in self.clockwork.receiver.channel.hits}
+        return bool(names & {"clock-step", "clock-drift", "wrong-week"})
+
+    def _compare_navigation(self, record: Exposure, exposure: int) -> None:
+        if record.navigation is None:
+            return
+        error_m = self._navigation_error_m(record.navigation, exposure)
+        # Two seconds without a position leave the turn out: 1.2 m on this track.
+        limit_m = NAV_TOLERANCE_M * (1.0 if record.navigation.method == "interpolated" else 3.0)
+        if record.mark_sigma_ns is not None:
+            limit_m += SIGMAS * record.mark_sigma_ns * 1e-9 * 65.0
+        if error_m > limit_m:
+            self.score.navigation_wrong += 1
+            self.score.blame(
+                f"exposure {record.number}: its position is {error_m:.1f} m off "
+                f"({record.navigation.method}, {record.mark_source})"
+            )
+
+    def _navigation_error_m(self, navigation: NavigationRecord, exposure: int) -> float:
+        gps_ns = self.clockwork.true_strobe_gps_ns[exposure]
+        state = self.clockwork.receiver.state(gps_ns)
+        north_m = (navigation.latitude_deg - state.latitude_deg) * EARTH_M_PER_DEG
+        east_m = (navigation.longitude_deg - state.longitude_deg) * EARTH_M_PER_DEG * 0.669
+        return math.hypot(north_m, east_m, navigation.height_m - state.height_m)
+
+    def _touched(self) -> set[int]:
+        """Exposures that a fault had to do with: named by it, or taken while it lasted."""
+        touched: set[int] = set()
+        spans: list[tuple[int, int]] = []
+        for channel in self.clockwork.channels.values():
+            for hit in channel.hits:
+                if hit.what.isdecimal():
+                    touched.add(int(hit.what))
+                else:
+                    spans.append((hit.at_ns - NS_PER_S, hit.at_ns + RECOVERY_NS))
+        if spans:
+            touched |= {
+                exposure
+                for exposure, truth in self.truth.items()
+                if any(begin <= truth.ordered_ns <= end for begin, end in spans)
+            }
+        return touched
+
+
+def configuration(rig: Rig, exposures: int) -> Configuration:
+    """A service configuration for this rig, flown by distance."""
+    content = {
+        "mission": {"root": "missions", "rig": rig.name, "simulated": True},
+        "trigger": {
+            "driver": "pulse-bus",
+            "port": 1,
+            "mode": "distance",
+            "distance_m": 85.0,
+            "count": exposures,
+        },
+        "navigator": [{"name": "receiver", "driver": "ublox", "port": "none"}],
+        "head": [
+            {
+                "sensor": sensor.name,
+                "driver": "aravis",
+                "address": "127.0.0.2",
+                "exposure_time_us": EXPOSURE_NS / 1000,
+            }
+            for sensor in rig.sensors
+        ],
+    }
+    return from_mapping(content, Path("service.toml"))[0]

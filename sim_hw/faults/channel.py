@@ -1,0 +1,290 @@
+"""What the faults of one device do to what it says: pure, on instants handed in.
+
+The same channel stands behind the sockets and pseudo-terminals of the wire emulators and behind
+the devices of the fake clock. What a message is, bytes or a frame, only `Damage` knows.
+"""
+
+from __future__ import annotations
+
+import random
+import threading
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
+
+from sim_hw.faults.plan import Planned
+from sim_hw.world_clock import NS_PER_S, NS_PER_WEEK
+
+T = TypeVar("T")
+
+FLOOD_PERIOD_NS = 100_000_000
+"""A flooding device says something unasked so often."""
+DUPLICATE_AFTER_NS = 1_000_000
+OVERTAKEN_AFTER_NS = 5_000_000
+NOTED_EVERY_NS = NS_PER_S // 2
+"""A fault that lasts is a hit so often."""
+
+
+class Damage(Protocol[T]):
+    """How a message is damaged."""
+
+    def corrupt(self, message: T, chance: random.Random) -> T:
+        """With wrong content: same length, other bits; or a frame of another size."""
+
+    def truncated(self, message: T, chance: random.Random) -> T:
+        """Broken off somewhere."""
+
+    def half(self, message: T) -> T:
+        """Its first half only."""
+
+
+class BytesDamage:
+    """Damage of what is said in bytes."""
+
+    def corrupt(self, message: bytes, chance: random.Random) -> bytes:
+        damaged = bytearray(message)
+        for _ in range(chance.randint(1, 8)):
+            if damaged:
+                damaged[chance.randrange(len(damaged))] ^= 1 << chance.randrange(8)
+        return bytes(damaged)
+
+    def truncated(self, message: bytes, chance: random.Random) -> bytes:
+        return message[: chance.randrange(max(len(message), 1))]
+
+    def half(self, message: bytes) -> bytes:
+        return message[: len(message) // 2]
+
+
+@dataclass(frozen=True)
+class Delivery(Generic[T]):
+    """A message that goes out at `at_ns`."""
+
+    at_ns: int
+    message: T
+
+
+@dataclass(frozen=True)
+class Hit:
+    """A fault did something: `what` is the message's own name, or "" where it hit the device."""
+
+    fault: str
+    at_ns: int
+    what: str = ""
+
+
+@dataclass
+class _Armed:
+    planned: Planned
+    begins_ns: int | None = None
+    is_spent: bool = False
+    was_on: bool = False
+
+    def is_on(self, now_ns: int) -> bool:
+        if self.begins_ns is None or now_ns < self.begins_ns or self.is_spent:
+            return False
+        duration_s = self.planned.duration_s
+        return duration_s is None or now_ns < self.begins_ns + round(duration_s * NS_PER_S)
+
+
+class Channel(Generic[T]):
+    """The way out of one device, with its faults.
+
+    Times are ns of whatever clock the caller keeps. `begin` sets time zero; `pulse` tells of a
+    pulse of the trigger unit, for faults that begin with one. From any thread.
+    """
+
+    def __init__(self, planned: Iterable[Planned], damage: Damage[T], *, seed: int | str) -> None:
+        self._armed = [_Armed(fault) for fault in planned]
+        self._damage = damage
+        self._chance = random.Random(f"faults-{seed}")
+        self._lock = threading.RLock()
+        self._last: dict[str, T] = {}
+        self._held: list[tuple[str, T]] = []
+        self._next_flood_ns = 0
+        self._noted_ns: dict[str, int] = {}
+        self.hits: list[Hit] = []
+
+    @property
+    def is_faultless(self) -> bool:
+        """Whether nothing is planned here."""
+        return not self._armed
+
+    def begin(self, now_ns: int) -> None:
+        """The devices are ready: seconds of the plan count from here."""
+        with self._lock:
+            for armed in self._armed:
+                if armed.planned.at_s is not None:
+                    armed.begins_ns = now_ns + round(armed.planned.at_s * NS_PER_S)
+
+    def pulse(self, count: int, now_ns: int) -> None:
+        """The trigger unit gives pulse `count`."""
+        with self._lock:
+            for armed in self._armed:
+                if armed.begins_ns is None and armed.planned.at_pulse == count:
+                    armed.begins_ns = now_ns
+
+    # What the device asks of its own state
+
+    def is_connected(self, now_ns: int) -> bool:
+        """Whether power and cable are as they should be."""
+        return not (
+            self._is_on("cable-pulled", now_ns, note=True)
+            or self._is_on("power-cycle", now_ns, note=True)
+        )
+
+    def is_silent(self, now_ns: int) -> bool:
+        """Whether the device says nothing, though it is there."""
+        return self._is_on("silent", now_ns, note=True)
+
+    def is_powered(self, now_ns: int) -> bool:
+        """Whether the power is on."""
+        return not self._is_on("power-cycle", now_ns)
+
+    def comes_back_from_power_off(self, now_ns: int) -> bool:
+        """True once after each power cycle: counts, clocks and settings are to be as new."""
+        return self._ended_once("power-cycle", now_ns)
+
+    def counter_restarts(self, now_ns: int) -> bool:
+        """True once for each counter-reset."""
+        with self._lock:
+            for armed in self._armed:
+                if armed.planned.name == "counter-reset" and armed.is_on(now_ns):
+                    armed.is_spent = True
+                    self._note("counter-reset", now_ns)
+                    return True
+        return False
+
+    def sensor_is_open(self, now_ns: int) -> bool:
+        """Whether the probes' wires are broken."""
+        return self._is_on("open-sensor", now_ns, note=True)
+
+    def clock_error_ns(self, now_ns: int) -> int:
+        """How far the device's clock is ahead of what it would be."""
+        error_ns = 0
+        with self._lock:
+            for armed in self._armed:
+                fault = armed.planned
+                if fault.kind.level != "clock" or armed.begins_ns is None:
+                    continue
+                is_on = armed.is_on(now_ns)
+                # A step is one at its beginning and at its end, a wrong week as long as it lasts.
+                if is_on != armed.was_on or (is_on and fault.name == "wrong-week"):
+                    armed.was_on = is_on
+                    self._note(fault.name, now_ns)
+                if not is_on:
+                    continue
+                if fault.name == "clock-step":
+                    error_ns += round(fault.amount * NS_PER_S)
+                elif fault.name == "wrong-week":
+                    error_ns += int(fault.amount) * NS_PER_WEEK
+                else:
+                    error_ns += round((now_ns - armed.begins_ns) * fault.amount * 1e-6)
+        return error_ns
+
+    def flood_is_due(self, now_ns: int) -> bool:
+        """Whether something nobody asked for is to be said now."""
+        if not self._is_on("flooding", now_ns, note=True) or now_ns < self._next_flood_ns:
+            return False
+        self._next_flood_ns = now_ns + FLOOD_PERIOD_NS
+        return self.is_connected(now_ns)
+
+    def noise(self, length: int) -> bytes:
+        """Bytes of a flood."""
+        return self._chance.randbytes(length)
+
+    # What becomes of a message
+
+    def send(
+        self, message: T, now_ns: int, *, topic: str = "", what: str = ""
+    ) -> list[Delivery[T]]:
+        """What goes out, and when, for a message that is said now.
+
+        `topic` is what kind of message it is, `what` its own name for `hits`.
+        """
+        with self._lock:
+            released = [
+                Delivery(now_ns + OVERTAKEN_AFTER_NS, m) for _, m in self._held if m is not message
+            ]
+            self._held.clear()
+            for name in ("cable-pulled", "power-cycle", "silent"):
+                if self._is_on(name, now_ns):
+                    self._note(name, now_ns, what)
+                    return []
+            return [*self._sent(message, now_ns, topic, what), *released]
+
+    def overdue(self, now_ns: int) -> list[Delivery[T]]:
+        """Reordered messages that nothing has followed; ask now and then."""
+        with self._lock:
+            due = [Delivery(now_ns, message) for _, message in self._held]
+            self._held.clear()
+            return due
+
+    def _sent(self, message: T, now_ns: int, topic: str, what: str) -> list[Delivery[T]]:
+        last = self._last.get(topic)
+        if self._take("stuck", now_ns, topic, what) is not None and last is not None:
+            message = last
+        elif self._take("older-frame", now_ns, topic, what) is not None and last is not None:
+            # What was sent last stays the older one for the time this lasts.
+            message = last
+        else:
+            self._last[topic] = message
+        if self._take("corrupt", now_ns, topic, what) is not None:
+            message = self._damage.corrupt(message, self._chance)
+        if self._take("truncated", now_ns, topic, what) is not None:
+            message = self._damage.truncated(message, self._chance)
+        if self._take("half-frame", now_ns, topic, what) is not None:
+            message = self._damage.half(message)
+        if self._take("lost", now_ns, topic, what) is not None:
+            return []
+        if self._take("reordered", now_ns, topic, what) is not None:
+            self._held.append((topic, message))
+            return []
+        late = self._take("late", now_ns, topic, what)
+        at_ns = now_ns + (round(late.amount * NS_PER_S) if late is not None else 0)
+        sent = [Delivery(at_ns, message)]
+        if self._take("duplicate", now_ns, topic, what) is not None:
+            sent.append(Delivery(at_ns + DUPLICATE_AFTER_NS, message))
+        return sent
+
+    def _take(self, name: str, now_ns: int, topic: str = "", what: str = "") -> Planned | None:
+        """A fault of that name that is on; one without a duration is spent by this."""
+        with self._lock:
+            for armed in self._armed:
+                fault = armed.planned
+                if fault.name != name or not armed.is_on(now_ns):
+                    continue
+                if fault.topic not in ("", topic):
+                    continue
+                armed.is_spent = fault.duration_s is None
+                self._note(name, now_ns, what)
+                return fault
+        return None
+
+    def _is_on(self, name: str, now_ns: int, *, note: bool = False) -> bool:
+        with self._lock:
+            on = any(a.planned.name == name and a.is_on(now_ns) for a in self._armed)
+            if on and note:
+                self._note(name, now_ns)
+            return on
+
+    def _ended_once(self, name: str, now_ns: int) -> bool:
+        with self._lock:
+            for armed in self._armed:
+                if armed.planned.name != name or armed.begins_ns is None or armed.is_spent:
+                    continue
+                if now_ns >= armed.begins_ns and not armed.is_on(now_ns):
+                    armed.is_spent = True
+                    return True
+        return False
+
+    def _note(self, name: str, now_ns: int, what: str = "") -> None:
+        """Keep a hit; what only lasts is kept once in a while."""
+        last_ns = self._noted_ns.get(name)
+        if what or last_ns is None or now_ns - last_ns >= NOTED_EVERY_NS:
+            self._noted_ns[name] = now_ns
+            self.hits.append(Hit(name, now_ns, what))
+
+
+def for_device(planned: Sequence[Planned], device: str) -> tuple[Planned, ...]:
+    """The faults of one device."""
+    return tuple(fault for fault in planned if fault.device == device)
