@@ -1,8 +1,8 @@
 """Free image mosaicking: every sensor finds its place from tie points alone (DESIGN 5.4).
 
 The adjustment and its statistics live here; the unknowns are laid out in
-`processing.mosaic_model`, and whether the result agrees with the calibration is judged in
-`processing.validity`.
+`processing.mosaic_model`, what observations weigh is in `processing.mosaic_weights`, and whether
+the result agrees with the calibration is judged in `processing.validity`.
 
 Source: seeds/ultracam-calibration.txt, eq. 1-7, tables 1 and 2.
 """
@@ -12,50 +12,41 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.adjustment import Block, Solution, normal_equations, redundancy_numbers, solve
+from processing.adjustment import Solution, normal_equations, redundancy_numbers, solve
 from processing.mosaic_model import MosaicModel, build_model, placement_at, vip_and_design
-from processing.placement import (
-    SensorPlacement,
-    corrected_mm_from_raw,
-    start_similarity,
-    vip_mm_from_raw,
+from processing.mosaic_weights import (
+    CLASSES,
+    Group,
+    MosaicSettings,
+    block_of,
+    class_scales,
+    first_look,
+    full_weight,
+    groups_of,
+    weight_factors,
 )
+from processing.placement import SensorPlacement, corrected_mm_from_raw, start_similarity
 from processing.rig import Rig
 from processing.tie_points import PAN_TO_COLOUR, PAN_TO_PAN, TiePoints
-from processing.topology import corners, mosaic_cones
+from processing.topology import mosaic_cones
+
+__all__ = [
+    "Constraint",
+    "Mosaic",
+    "MosaicSettings",
+    "adjust_mosaic",
+    "datum_constraints",
+    "free_mosaic",
+    "layer_constraints",
+    "vip_precision_px",
+]
 
 Array = NDArray[np.float64]
-
-_HUBER = 2.0
-_SPREAD_OF_MEDIAN = 1.4826
-_CLASSES = (PAN_TO_PAN, PAN_TO_COLOUR)
-
-
-@dataclass(frozen=True)
-class MosaicSettings:
-    """A-priori accuracy and the rules of the adjustment.
-
-    `sigma_pp_px`, `sigma_pc_px` are the a-priori standard deviations of one coordinate difference
-    of a typical P/P and P/C point, in PAN px; the ratio of the two is found again from the data.
-    `parallax_px` is what relief leaves in P/C points (DESIGN 5.4), for this exposure.
-    A direction of the unknowns that tie points know worse than `undetermined_px` (at the farthest
-    point of the image) is held at its start, to so much: calibration and platform know it better.
-    """
-
-    sigma_pp_px: float = 0.1
-    sigma_pc_px: float = 0.3
-    parallax_px: float = 0.0
-    outlier_limit: float = 4.0
-    max_iterations: int = 12
-    min_iterations: int = 3
-    converged_px: float = 1e-3
-    least_class_redundancy: float = 30.0
-    undetermined_px: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -68,7 +59,8 @@ class Mosaic:
     outliers included; `redundancy_numbers` (n, 2) likewise; `outliers` (n,) marks points not used.
     `sigma0` has no unit; `sigma0_px` is that of one coordinate difference of a P/P pair.
     `used` counts points per pair, `undetermined` names unknowns held at their start.
-    `pseudo_observations` is the number of directions held.
+    `pseudo_observations` is the number of directions held. `supported` says that calibration and
+    platform took part as observations (`processing.support`).
     """
 
     method: str
@@ -95,6 +87,7 @@ class Mosaic:
     undetermined: tuple[str, ...]
     pseudo_observations: int
     datum_sensors: tuple[str, ...]
+    supported: bool = False
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -117,22 +110,6 @@ class Constraint:
     coefficients: Mapping[str, float]
 
 
-@dataclass
-class _Group:
-    """The tie points of one pair of sensors, ready for linearisation."""
-
-    a: str
-    b: str
-    kind: int
-    rows: NDArray[np.int64]
-    corrected_a: Array
-    corrected_b: Array
-    sigma: Array
-    difference: Array = field(default_factory=lambda: np.empty((0, 2)))
-    redundancy: Array = field(default_factory=lambda: np.empty((0, 2)))
-    factor: Array = field(default_factory=lambda: np.empty(0))
-
-
 def free_mosaic(
     rig: Rig,
     placements: Mapping[str, SensorPlacement],
@@ -141,6 +118,7 @@ def free_mosaic(
     settings: MosaicSettings | None = None,
     excluded_datum_sensors: Sequence[str] = (),
     begin: Mosaic | None = None,
+    prior: Array | None = None,
 ) -> Mosaic:
     """Adjust all sensors of the PAN cones and the layer of the colour master.
 
@@ -151,6 +129,7 @@ def free_mosaic(
         settings: None takes the defaults.
         excluded_datum_sensors: master sensors the datum (eq. 6) does not rest on.
         begin: an adjustment of the same points in another datum, to go on from.
+        prior: what is known of the unknowns beside the points, see `adjust_mosaic`.
 
     Returns:
         The mosaic. What tie points do not determine (missing frames, empty overlaps) stays at its
@@ -184,6 +163,7 @@ def free_mosaic(
         method="free",
         datum_sensors=datum,
         begin=begin,
+        prior=prior,
     )
 
 
@@ -230,8 +210,9 @@ def adjust_mosaic(
     settings: MosaicSettings,
     method: str,
     datum_sensors: tuple[str, ...],
-    kinds: Sequence[int] = _CLASSES,
+    kinds: Sequence[int] = CLASSES,
     begin: Mosaic | None = None,
+    prior: Array | None = None,
 ) -> Mosaic:
     """Gauss-Newton with robust weights, variance components and data snooping.
 
@@ -239,11 +220,14 @@ def adjust_mosaic(
     normalised residual exceeds `outlier_limit` are left out), solves, and estimates what the two
     classes of points are worth, until corrections and outliers come to rest. From `begin` on, an
     adjustment of the same points and unknowns, nothing needs a first look or soft weights.
+
+    `prior` (u, u) is information that draws the unknowns to their start, in the inverse square of
+    `MosaicModel.units` and of a weight like that of the points.
     """
-    groups = _groups(rig, start, tie_points, settings, kinds)
+    groups = groups_of(rig, start, tie_points, settings, kinds)
     for group in groups:
         if begin is None:
-            group.factor = _first_look(model, start, group)
+            group.factor = first_look(model, start, group)
         else:
             group.factor = (~begin.outliers[group.rows]).astype(np.float64)
     matrix = np.zeros((len(constraints), len(model.names)))
@@ -252,13 +236,16 @@ def adjust_mosaic(
             matrix[i, model.names.index(name)] = coefficient
     scaled_matrix = matrix * model.units
     values = np.zeros(len(model.names)) if begin is None else begin.values.copy()
-    class_scale = dict.fromkeys(_CLASSES, 1.0) if begin is None else _scales_of(begin, settings)
+    class_scale = dict.fromkeys(CLASSES, 1.0) if begin is None else _scales_of(begin, settings)
     least = settings.min_iterations if begin is None else 1
     solution: Solution | None = None
     iterations = 0
     for iterations in range(1, settings.max_iterations + 1):
-        blocks = [_block(model, start, g, values, class_scale[g.kind]) for g in groups]
+        blocks = [block_of(model, start, g, values, class_scale[g.kind]) for g in groups]
         normal, right = normal_equations(blocks, len(values))
+        if prior is not None:
+            normal += prior
+            right -= prior @ (values / model.units)
         solution = solve(
             normal,
             right,
@@ -272,11 +259,11 @@ def adjust_mosaic(
         changed = False
         for group, block in zip(groups, blocks, strict=True):
             v = (solution.dp[block.columns] @ block.design - block.misclosure).reshape(2, -1).T
-            weightless = dataclasses.replace(block, weight=_full_weight(group, class_scale))
+            weightless = dataclasses.replace(block, weight=full_weight(group, class_scale))
             group.difference = v
             group.redundancy = redundancy_numbers(weightless, solution.cofactor).reshape(2, -1).T
-        class_scale, moved = _class_scales(groups, class_scale, settings)
-        for group, factor in zip(groups, _factors(groups, settings, soft=soft), strict=True):
+        class_scale, moved = class_scales(groups, class_scale, settings)
+        for group, factor in zip(groups, weight_factors(groups, settings, soft=soft), strict=True):
             changed = changed or bool(np.any((factor > 0.0) != (group.factor > 0.0)))
             group.factor = factor
         still = float(np.abs(solution.dp).max(initial=0.0)) < settings.converged_px
@@ -296,6 +283,7 @@ def adjust_mosaic(
         method=method,
         constraints=len(constraints),
         datum_sensors=datum_sensors,
+        supported=prior is not None,
     )
 
 
@@ -305,7 +293,7 @@ def _mosaic(
     tie_points: TiePoints,
     model: MosaicModel,
     settings: MosaicSettings,
-    groups: Sequence[_Group],
+    groups: Sequence[Group],
     class_scale: Mapping[int, float],
     values: Array,
     solution: Solution | None,
@@ -314,12 +302,13 @@ def _mosaic(
     method: str,
     constraints: int,
     datum_sensors: tuple[str, ...],
+    supported: bool,
 ) -> Mosaic:
     unknowns = len(model.names)
     n = len(tie_points)
     residuals, redundancy = np.full((n, 2), np.nan), np.full((n, 2), np.nan)
     outliers = np.ones(n, dtype=np.bool_)
-    squares, used_points = 0.0, 0
+    squares, used_points, free = 0.0, 0, 0.0
     used = dict.fromkeys(tie_points.pairs, 0)
     for group in groups:
         good = group.factor > 0.0
@@ -328,11 +317,13 @@ def _mosaic(
         outliers[group.rows] = ~good
         used[(group.a, group.b)] = int(good.sum())
         used_points += int(good.sum())
+        free += float(group.redundancy[good].sum())
         sigma = group.sigma[good] * class_scale[group.kind]
         squares += float(np.sum((group.difference[good] / sigma[:, None]) ** 2))
     undetermined = np.empty((unknowns, 0)) if solution is None else solution.undetermined
     held = undetermined.shape[1]
-    freedom = 2 * used_points - unknowns + constraints + held
+    # With a prior the unknowns take less from the points than one degree of freedom each.
+    freedom = free if supported else 2 * used_points - unknowns + constraints + held
     sigma0 = math.sqrt(squares / freedom) if freedom > 0 else 1.0
     cofactor = np.zeros((unknowns, unknowns)) if solution is None else solution.cofactor
     ratio = class_scale[PAN_TO_COLOUR] / class_scale[PAN_TO_PAN]
@@ -363,6 +354,7 @@ def _mosaic(
         undetermined=_named(model, undetermined),
         pseudo_observations=held,
         datum_sensors=datum_sensors,
+        supported=supported,
     )
 
 
@@ -379,154 +371,11 @@ def _touched(tie_points: TiePoints) -> set[str]:
     return {tie_points.names[i] for i in seen}
 
 
-def _groups(
-    rig: Rig,
-    start: Mapping[str, SensorPlacement],
-    tie_points: TiePoints,
-    settings: MosaicSettings,
-    kinds: Sequence[int],
-) -> list[_Group]:
-    typical = {}
-    for kind in _CLASSES:
-        sigmas = tie_points.sigma_px[tie_points.kind == kind]
-        typical[kind] = float(np.median(sigmas)) if len(sigmas) else 1.0
-    apriori = {
-        PAN_TO_PAN: settings.sigma_pp_px,
-        PAN_TO_COLOUR: math.hypot(settings.sigma_pc_px, settings.parallax_px),
-    }
-    shared = corners(rig)
-    groups = []
-    for number, (a, b) in enumerate(tie_points.pairs):
-        rows = np.flatnonzero(tie_points.overlap == number)
-        if not len(rows):
-            continue
-        kind = int(tie_points.kind[rows[0]])
-        if kind not in kinds:
-            continue
-        relative = tie_points.sigma_px[rows] / typical[kind]
-        if kind == PAN_TO_COLOUR:
-            # Parallax is not smaller where the match is sharper.
-            share = settings.sigma_pc_px * relative
-            sigma = np.hypot(share, settings.parallax_px)
-        else:
-            sigma = apriori[kind] * relative
-            xy = vip_mm_from_raw(start[a], tie_points.raw_a[rows])
-            for corner in shared:
-                # m differences of n images hold the information of n - 1.
-                meeting = sum(
-                    p[0] in corner.sensors and p[1] in corner.sensors for p in tie_points.pairs
-                )
-                inside = corner.rectangle.contains(xy)
-                sigma[inside] *= math.sqrt(max(1.0, meeting / (len(corner.sensors) - 1)))
-        groups.append(
-            _Group(
-                a=a,
-                b=b,
-                kind=kind,
-                rows=rows,
-                corrected_a=corrected_mm_from_raw(start[a], tie_points.raw_a[rows]),
-                corrected_b=corrected_mm_from_raw(start[b], tie_points.raw_b[rows]),
-                sigma=np.maximum(sigma, 1e-6),
-            )
-        )
-    return groups
-
-
-def _first_look(model: MosaicModel, start: Mapping[str, SensorPlacement], group: _Group) -> Array:
-    """Weight factors before any adjustment: points far from their pair's median are left out."""
-    zero = np.zeros(len(model.names))
-    a = vip_and_design(model, start[group.a], group.corrected_a, zero)[0]
-    b = vip_and_design(model, start[group.b], group.corrected_b, zero)[0]
-    off = a - b
-    off = np.abs(off - np.median(off, axis=0))
-    spread = np.maximum(_SPREAD_OF_MEDIAN * np.median(off, axis=0), 0.2)
-    group.difference = a - b
-    group.redundancy = np.ones((len(a), 2))
-    return np.asarray((off < 6.0 * spread).all(axis=1), dtype=np.float64)
-
-
-def _full_weight(group: _Group, class_scale: Mapping[int, float]) -> Array:
-    return np.tile(1.0 / (group.sigma * class_scale[group.kind]) ** 2, 2)
-
-
-def _block(
-    model: MosaicModel,
-    start: Mapping[str, SensorPlacement],
-    group: _Group,
-    values: Array,
-    scale: float,
-) -> Block:
-    a, columns_a, design_a = vip_and_design(model, start[group.a], group.corrected_a, values)
-    b, columns_b, design_b = vip_and_design(model, start[group.b], group.corrected_b, values)
-    columns = np.concatenate([columns_a, columns_b])
-    design = np.empty((len(columns), 2 * len(a)))
-    k = len(columns_a)
-    units = model.units[columns][:, None]
-    np.multiply(design_a.reshape(k, 2 * len(a)), units[:k], out=design[:k])
-    np.multiply(design_b.reshape(len(columns_b), 2 * len(b)), -units[k:], out=design[k:])
-    return Block(
-        columns=columns,
-        design=design,
-        misclosure=(b - a).T.reshape(-1),
-        weight=np.tile(group.factor / (group.sigma * scale) ** 2, 2),
-    )
-
-
 def _scales_of(mosaic: Mosaic, settings: MosaicSettings) -> dict[int, float]:
     """The factors on the a-priori sigmas that an adjustment ended with."""
     pan = mosaic.sigma_pp_px / settings.sigma_pp_px
     ratio = mosaic.sigma_pc_px / settings.sigma_pc_px / pan
     return {PAN_TO_PAN: 1.0, PAN_TO_COLOUR: ratio}
-
-
-def _class_scales(
-    groups: Sequence[_Group], before: Mapping[int, float], settings: MosaicSettings
-) -> tuple[dict[int, float], bool]:
-    """Variance components: P/P and P/C sigmas that make both classes fit their residuals.
-
-    P/P keeps its a-priori sigma (unit weight); only the ratio is estimated. Returns the factors on
-    the a-priori sigmas and whether their ratio moved by more than two per mille.
-    """
-    variance = {}
-    for kind in _CLASSES:
-        squares = redundancy = 0.0
-        for group in groups:
-            if group.kind == kind:
-                w = group.factor[:, None]
-                squares += float(np.sum(w * (group.difference / group.sigma[:, None]) ** 2))
-                redundancy += float(np.sum((w > 0.0) * group.redundancy))
-        if redundancy < settings.least_class_redundancy or squares <= 0.0:
-            return dict(before), False
-        variance[kind] = squares / redundancy
-    ratio = math.sqrt(variance[PAN_TO_COLOUR] / variance[PAN_TO_PAN])
-    after = {PAN_TO_PAN: 1.0, PAN_TO_COLOUR: ratio}
-    return after, abs(ratio / before[PAN_TO_COLOUR] - 1.0) > 0.002
-
-
-def _factors(groups: Sequence[_Group], settings: MosaicSettings, *, soft: bool) -> list[Array]:
-    """Weight factors of each group from normalised residuals, the larger of both coordinates.
-
-    Soft: Huber about the group's median, for rounds in which the model does not fit yet. Else zero
-    beyond the limit (data snooping, w-test against the robust spread of the class), one within.
-    """
-    normalised = []
-    for group in groups:
-        unit = group.sigma[:, None] * np.sqrt(np.maximum(group.redundancy, 1e-3))
-        middle = np.median(group.difference, axis=0) if soft else 0.0
-        normalised.append(np.abs(group.difference - middle) / unit)
-    spread = {}
-    for kind in _CLASSES:
-        every = [n.ravel() for n, g in zip(normalised, groups, strict=True) if g.kind == kind]
-        if every:
-            spread[kind] = max(_SPREAD_OF_MEDIAN * float(np.median(np.concatenate(every))), 1e-9)
-    factors = []
-    for w, group in zip(normalised, groups, strict=True):
-        largest = w.max(axis=1) / spread[group.kind]
-        if soft:
-            factors.append(np.minimum(1.0, _HUBER / np.maximum(largest, 1e-12)))
-        else:
-            factors.append((largest <= settings.outlier_limit).astype(np.float64))
-    return factors
 
 
 def _named(model: MosaicModel, undetermined: Array) -> tuple[str, ...]:
