@@ -1,0 +1,315 @@
+"""The adjustment: Gauss-Newton with step control, robust weights, data snooping, components.
+
+Pure and deterministic: a network in, an adjusted network with all its statistics out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.bundle.equations import BehindCameraError, Equations, equations
+from processing.bundle.iterations import Progress, Run, iterated, robust_weights
+from processing.bundle.network import Network, NetworkError, checked
+from processing.bundle.normal import Reduced, cofactor_matrix, point_normals
+from processing.bundle.rank import Defect, defects
+from processing.bundle.statistics import Group, groups_of, leverages, point_cofactors
+from processing.bundle.unknowns import Layout, State, layout_of, starting_state
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+_LEAST_POINT_INFORMATION: Final = 1e-10
+_MOST_ROUNDS: Final = 12
+_COMPONENT_SETTLED: Final = 0.02
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to adjust.
+
+    Attributes:
+        most_iterations: of each Gauss-Newton run.
+        robust: first with Huber weights on image points, so that blunders pull less.
+        reject_beyond: image points whose standardised residual (residual over its own a posteriori
+            standard deviation) exceeds this are left out, worst first; None: no data snooping.
+        variance_components: scale the sigmas of each kind of observation by what it shows.
+        minimum_norm: undetermined directions are no error; the shortest correction is taken.
+    """
+
+    most_iterations: int = 30
+    robust: bool = False
+    reject_beyond: float | None = None
+    variance_components: bool = False
+    minimum_norm: bool = False
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """An adjusted network.
+
+    Attributes:
+        network, layout, settings: what was adjusted.
+        state: adjusted values.
+        sigma0: a posteriori standard deviation of unit weight.
+        redundancy, observations, unknowns: counts; constraints count as observations.
+        iterations: weighted sum of squares before each iteration and at the end.
+        cofactor: (c, c) of the columns; times sigma0 squared it is the covariance.
+        point_cofactor: (points, 3, 3) m squared, zero for held coordinates, NaN for points
+            left out.
+        equations: the last rows; `residual` (m,) in sigmas of each row, `redundancy_number` (m,).
+        weight: (image points,) robust weight, zero for what was rejected.
+        rejected: (image points,) left out by data snooping.
+        left_out: (points,) object points that their rays do not fix.
+        factors: variance factor applied to each kind of observation.
+        groups: statistics of each kind of observation.
+        defects: what nothing determines (only with `minimum_norm`).
+    """
+
+    network: Network
+    layout: Layout
+    settings: Settings
+    state: State
+    sigma0: float
+    redundancy: int
+    observations: int
+    unknowns: int
+    iterations: tuple[float, ...]
+    cofactor: Array
+    point_cofactor: Array
+    equations: Equations
+    residual: Array
+    redundancy_number: Array
+    weight: Array
+    rejected: Flags
+    left_out: Flags
+    factors: Mapping[str, float]
+    groups: tuple[Group, ...]
+    defects: tuple[Defect, ...] = field(default=())
+
+    @property
+    def standardised(self) -> Array:
+        """Residuals over their own a posteriori standard deviations, (m,)."""
+        spread = self.sigma0 * np.sqrt(np.clip(self.redundancy_number, 1e-12, None))
+        return np.asarray(self.residual / np.where(spread > 0.0, spread, 1.0))
+
+
+def adjust(
+    network: Network, settings: Settings | None = None, *, progress: Progress | None = None
+) -> Adjustment:
+    """Adjust a network by least squares.
+
+    Args:
+        network: observations and starting values.
+        settings: see `Settings`.
+        progress: called with what is done, the iteration, and the weighted sum of squares.
+
+    Raises:
+        NetworkError: tables that do not fit, starting values far off, no convergence, or fewer
+            observations than unknowns.
+        DefectError: something cannot be determined; it is named.
+    """
+    checked(network)
+    settings = settings or Settings()
+    given = network
+    weight = np.ones(len(network.image_points.image))
+    rejected = np.zeros(len(weight), dtype=bool)
+    factors: dict[str, float] = {}
+    state = starting_state(network)
+    tell = progress or (lambda _what, _iteration, _value: None)
+    history: list[float] = []
+    robust = settings.robust
+    for round_ in range(_MOST_ROUNDS + 1):
+        left_out = _undetermined_points(network, state, weight)
+        layout = layout_of(network, left_out)
+        run = Run(
+            network,
+            layout,
+            state,
+            weight,
+            tell,
+            history,
+            most_iterations=settings.most_iterations,
+            minimum_norm=settings.minimum_norm,
+        )
+        if robust:
+            robust_weights(run)
+            outlying = run.weight < 0.25
+            rejected |= outlying
+            weight = np.where(rejected, 0.0, 1.0)
+            state, robust = run.state, False
+            continue
+        rows, reduced = iterated(run)
+        state = run.state
+        result = _figures(run, settings, given, rows, reduced, left_out, rejected, factors)
+        if round_ == _MOST_ROUNDS:
+            break
+        worst = _worst(result, settings.reject_beyond)
+        if worst.any():
+            rejected = rejected | worst
+            weight = np.where(rejected, 0.0, 1.0)
+            tell(f"{int(rejected.sum())} image points left out", round_ + 1, history[-1])
+            continue
+        if settings.variance_components and _unsettled(result):
+            factors = {g.name: g.factor for g in result.groups if _scalable(g)}
+            network = _rescaled(given, factors)
+            tell("variance components", round_ + 1, history[-1])
+            continue
+        break
+    return result
+
+
+def _undetermined_points(network: Network, state: State, weight: Array) -> Flags:
+    """Object points whose rays do not fix them: seen once, or from one projection centre only."""
+    nothing = np.zeros(len(network.points.names), dtype=bool)
+    layout = layout_of(network, nothing)
+    bare = replace(
+        layout,
+        **{
+            name: np.full_like(getattr(layout, name), -1)
+            for name in ("station", "attitude", "head_rotation", "head_offset", "interior")
+        },
+        terms=tuple(np.full_like(t, -1) for t in layout.terms),
+    )
+    try:
+        rows = equations(network, bare, state, weight)
+    except BehindCameraError:
+        return nothing
+    normals = point_normals(rows, layout)
+    values = np.linalg.eigvalsh(normals)
+    weak = ~(values[:, 0] > _LEAST_POINT_INFORMATION * np.maximum(values[:, 2], 1e-300))
+    free = ~layout.locked[layout.eliminated_points].all(axis=1)
+    nothing[layout.eliminated_points[weak & free]] = True
+    return nothing
+
+
+def _figures(
+    run: Run,
+    settings: Settings,
+    given: Network,
+    rows: Equations,
+    reduced: Reduced,
+    left_out: Flags,
+    rejected: Flags,
+    factors: Mapping[str, float],
+) -> Adjustment:
+    layout = run.layout
+    run.tell("covariances", len(run.history), run.history[-1])
+    cofactor = cofactor_matrix(reduced, layout.constraints, minimum_norm=run.minimum_norm)
+    found: tuple[Defect, ...] = ()
+    if run.minimum_norm:
+        found = defects(run.network, layout, run.state, reduced)
+    leverage = leverages(rows, reduced, cofactor)
+    free_points = layout.eliminated_points
+    held = layout.locked[free_points]
+    unknowns = layout.columns + int((~held).sum())
+    observations = len(rows.misclosure)
+    redundancy = observations - unknowns + len(layout.constraints) + len(found)
+    if redundancy < 0:
+        raise NetworkError(
+            [f"{observations} observations for {unknowns} unknowns: more are needed than that"]
+        )
+    # The corrections at convergence are negligible: misclosures are the residuals, sign reversed.
+    residual = -rows.misclosure
+    sigma0 = float(np.sqrt(residual @ residual / redundancy)) if redundancy > 0 else float("nan")
+    point_cofactor = np.full((len(layout.locked), 3, 3), np.nan)
+    own = point_cofactors(reduced, cofactor)
+    own = np.where(held[:, :, None] | held[:, None, :], 0.0, own)
+    point_cofactor[free_points] = own
+    for point in np.flatnonzero((layout.kept >= 0).any(axis=1) | _held_apart(layout)):
+        at = layout.kept[point]
+        there = at >= 0
+        point_cofactor[point] = 0.0
+        point_cofactor[point][np.ix_(there, there)] = cofactor[np.ix_(at[there], at[there])]
+    redundancy_number = 1.0 - leverage
+    return Adjustment(
+        network=given,
+        layout=layout,
+        settings=settings,
+        state=run.state,
+        sigma0=sigma0,
+        redundancy=redundancy,
+        observations=observations,
+        unknowns=unknowns,
+        iterations=tuple(run.history),
+        cofactor=cofactor,
+        point_cofactor=point_cofactor,
+        equations=rows,
+        residual=residual,
+        redundancy_number=redundancy_number,
+        weight=run.weight,
+        rejected=rejected,
+        left_out=left_out,
+        factors=dict(factors),
+        groups=groups_of(rows, residual, redundancy_number, factors),
+        defects=found,
+    )
+
+
+def _held_apart(layout: Layout) -> Flags:
+    """Fully held points that distances end at: neither eliminated nor with columns."""
+    return np.asarray(layout.locked.all(axis=1) & (layout.eliminated < 0))
+
+
+def _worst(result: Adjustment, limit: float | None) -> Flags:
+    """Image points to leave out next: beyond the limit and the largest of their image and point.
+
+    One blunder makes its neighbours look bad; taking only the largest of each image and each object
+    point at a time lets those come back.
+    """
+    table = result.network.image_points
+    worst = np.zeros(len(table.image), dtype=bool)
+    if limit is None or result.redundancy == 0:
+        return worst
+    rows = result.equations.group < 2
+    size = np.zeros(len(table.image))
+    testable = result.redundancy_number[rows] > 0.01
+    values = np.where(testable, np.abs(result.standardised[rows]), 0.0)
+    np.maximum.at(size, result.equations.source[rows], values)
+    of_image = np.zeros(len(result.network.images.names))
+    of_point = np.zeros(len(result.network.points.names))
+    np.maximum.at(of_image, table.image, size)
+    np.maximum.at(of_point, table.point, size)
+    return np.asarray(
+        (size > limit) & (size >= of_image[table.image]) & (size >= of_point[table.point])
+    )
+
+
+def _unsettled(result: Adjustment) -> bool:
+    """Whether a variance component still differs from what the sigmas hold."""
+    return any(
+        _scalable(g)
+        and abs(np.log(g.factor / result.factors.get(g.name, 1.0))) > _COMPONENT_SETTLED
+        for g in result.groups
+    )
+
+
+def _scalable(group: Group) -> bool:
+    """Enough redundancy for a variance component: known to about a third or better."""
+    return bool(np.isfinite(group.factor) and group.factor > 0.0 and group.redundancy >= 15.0)
+
+
+def _rescaled(network: Network, factors: Mapping[str, float]) -> Network:
+    """The network with each kind's sigmas multiplied by the root of its variance factor."""
+    root = {name: float(np.sqrt(value)) for name, value in factors.items()}
+
+    def of(name: str) -> float:
+        return root.get(name, 1.0)
+
+    table, points, gnss = network.image_points, network.points, network.gnss
+    plan_height = np.array([of("control plan"), of("control plan"), of("control height")])
+    gnss_scale = np.array([of("GNSS plan"), of("GNSS plan"), of("GNSS height")])
+    return replace(
+        network,
+        image_points=replace(
+            table, sigma_mm=table.sigma_mm * np.array([of("image x"), of("image y")])
+        ),
+        points=replace(points, sigma_m=points.sigma_m * plan_height),
+        gnss=replace(gnss, sigma_m=gnss.sigma_m * gnss_scale),
+        bearings=replace(network.bearings, sigma_rad=network.bearings.sigma_rad * of("attitude")),
+        distances=replace(network.distances, sigma_m=network.distances.sigma_m * of("distance")),
+    )

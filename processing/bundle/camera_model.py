@@ -1,0 +1,112 @@
+"""Interior orientation: measured image coordinates to ideal ones, and derivatives.
+
+Eq. 5.1 of seeds/dmc-calibration.txt in two readings (`Camera.model`), plus the additional terms.
+The correction is added to what was measured: ideal = measured + delta(measured).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.bundle.network import Camera
+from processing.bundle.terms import term_design
+
+Array = NDArray[np.float64]
+
+
+def principal_distance_mm(camera: Camera, interior: Array) -> float:
+    """What the collinearity equations project with.
+
+    Australis keeps f and carries df in the correction (+x df / f); the centred model projects with
+    f - df, which is the same to first order.
+    """
+    return camera.f_mm if camera.model == "australis" else camera.f_mm - float(interior[2])
+
+
+def ideal_mm(camera: Camera, interior: Array, terms: Array, xy_mm: Array) -> Array:
+    """Ideal image coordinates (n, 2) of measured ones (n, 2), mm about the principal point.
+
+    Args:
+        camera: model, principal point and principal distance.
+        interior: the ten, (10,).
+        terms: values of the additional parameters, (t,).
+        xy_mm: measured.
+    """
+    if camera.model == "australis":
+        x, y = xy_mm[:, 0] - camera.xp_mm, xy_mm[:, 1] - camera.yp_mm
+        ideal = np.stack([x, y], axis=1) + _ten(camera, x, y) @ interior
+    else:
+        x, y, _ = _centred(camera, interior, xy_mm)
+        delta = np.einsum("nik,k->ni", _ten(camera, x, y)[:, :, 3:8], interior[3:8])
+        ideal = np.stack([x, y], axis=1) + delta
+    for value, term in zip(terms, camera.terms, strict=True):
+        if value != 0.0:
+            ideal += value * term_design(term, _about_given(camera, xy_mm))
+    return ideal
+
+
+def interior_derivatives(camera: Camera, interior: Array, xy_mm: Array) -> Array:
+    """d(ideal) / d(the ten), (n, 2, 10); df of the centred model acts in the projection: zero."""
+    if camera.model == "australis":
+        return _ten(camera, xy_mm[:, 0] - camera.xp_mm, xy_mm[:, 1] - camera.yp_mm)
+    x, y, about = _centred(camera, interior, xy_mm)
+    result = _ten(camera, x, y)
+    by_place = np.eye(2) + _by_place(interior, x, y)
+    result[:, :, 0] = by_place[:, :, 0] * (1.0 + interior[8])
+    result[:, :, 1] = by_place[:, :, 0] * interior[9] + by_place[:, :, 1]
+    result[:, :, 2] = 0.0
+    result[:, :, 8] = by_place[:, :, 0] * about[:, 0, None]
+    result[:, :, 9] = by_place[:, :, 0] * about[:, 1, None]
+    return result
+
+
+def term_derivatives(camera: Camera, xy_mm: Array) -> Array:
+    """d(ideal) / d(additional parameters), (n, 2, t)."""
+    if not camera.terms:
+        return np.zeros((len(xy_mm), 2, 0))
+    place = _about_given(camera, xy_mm)
+    return np.stack([term_design(term, place) for term in camera.terms], axis=2)
+
+
+def _about_given(camera: Camera, xy_mm: Array) -> Array:
+    return np.asarray(xy_mm - np.array([camera.xp_mm, camera.yp_mm]))
+
+
+def _centred(camera: Camera, interior: Array, xy_mm: Array) -> tuple[Array, Array, Array]:
+    """Coordinates about the estimated principal point, after affinity and shear; and before."""
+    about = xy_mm - np.array([camera.xp_mm, camera.yp_mm]) + interior[:2]
+    return about[:, 0] * (1.0 + interior[8]) + about[:, 1] * interior[9], about[:, 1], about
+
+
+def _ten(camera: Camera, x: Array, y: Array) -> Array:
+    """The ten columns of eq. 5.1 at coordinates about the principal point, (n, 2, 10)."""
+    r2 = x * x + y * y
+    result = np.zeros((len(x), 2, 10))
+    result[:, 0, 0] = 1.0
+    result[:, 1, 1] = 1.0
+    for axis, own in ((0, x), (1, y)):
+        result[:, axis, 2] = own / camera.f_mm
+        result[:, axis, 3] = own * r2
+        result[:, axis, 4] = own * r2 * r2
+        result[:, axis, 5] = own * r2 * r2 * r2
+    result[:, 0, 6], result[:, 1, 6] = r2 + 2.0 * x * x, 2.0 * x * y
+    result[:, 0, 7], result[:, 1, 7] = 2.0 * x * y, r2 + 2.0 * y * y
+    result[:, 0, 8] = x
+    result[:, 0, 9] = y
+    return result
+
+
+def _by_place(interior: Array, x: Array, y: Array) -> Array:
+    """d(radial and decentring correction) / d(place), (n, 2, 2)."""
+    k1, k2, k3, p1, p2 = interior[3:8]
+    r2 = x * x + y * y
+    radial = r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3))
+    result = np.empty((len(x), 2, 2))
+    cross = x * y * slope + 2.0 * y * p1 + 2.0 * x * p2
+    result[:, 0, 0] = radial + x * x * slope + 6.0 * x * p1 + 2.0 * y * p2
+    result[:, 0, 1] = cross
+    result[:, 1, 0] = cross
+    result[:, 1, 1] = radial + y * y * slope + 2.0 * x * p1 + 6.0 * y * p2
+    return result

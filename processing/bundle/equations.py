@@ -1,0 +1,375 @@
+"""Observation equations of a network: misclosures and analytic derivatives, whitened.
+
+Every row is divided by its standard deviation, so that normal equations are plain products. Rows
+hold entries of columns (`reduced`) and of at most one eliminated object point (`point_part`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from processing.bundle.camera_model import (
+    ideal_mm,
+    interior_derivatives,
+    principal_distance_mm,
+    term_derivatives,
+)
+from processing.bundle.network import INTERIOR, Network
+from processing.bundle.rotations import logarithm, skew
+from processing.bundle.unknowns import Layout, State
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+
+class BehindCameraError(ValueError):
+    """Object points lie behind the camera that saw them: starting values are far off."""
+
+    def __init__(self, image_points: Indices) -> None:
+        self.image_points = image_points
+        super().__init__(f"{len(image_points)} image points see an object point behind the camera")
+
+
+@dataclass(frozen=True)
+class Equations:
+    """m whitened rows: misclosure + v = design @ corrections.
+
+    Attributes:
+        misclosure: (m,) observed less computed.
+        reduced: (m, columns), sparse.
+        point_part: (m, 3) derivatives by the eliminated point's coordinates, zero where held.
+        point: (m,) its position among the eliminated, -1 where there is none.
+        sigma: (m,) standard deviation a row was divided by (robust weights are not in it).
+        group: (m,) index into `groups`.
+        groups: kinds of observations.
+        source: (m,) row of the table the observation comes from (image points, ...).
+    """
+
+    misclosure: Array
+    reduced: sparse.csr_array
+    point_part: Array
+    point: Indices
+    sigma: Array
+    group: Indices
+    groups: tuple[str, ...]
+    source: Indices
+
+
+GROUPS = (
+    "image x",
+    "image y",
+    "control plan",
+    "control height",
+    "GNSS plan",
+    "GNSS height",
+    "attitude",
+    "distance",
+    "prior",
+)
+
+
+def equations(
+    network: Network, layout: Layout, state: State, weight: Array, *, derivatives: bool = True
+) -> Equations:
+    """All rows at the current state.
+
+    Args:
+        network: observations.
+        layout: columns.
+        state: current values.
+        weight: (image points,) factor on the weight of each image point; zero leaves it out.
+        derivatives: without them `reduced` and `point_part` are zero.
+
+    Raises:
+        BehindCameraError: an object point is not in front of a camera that saw it.
+    """
+    build = _Builder(layout, derivatives)
+    _image_rows(build, network, layout, state, weight)
+    _control_rows(build, network, layout, state)
+    _gnss_rows(build, network, layout, state)
+    _bearing_rows(build, network, layout, state)
+    _distance_rows(build, network, layout, state)
+    _prior_rows(build, network, layout, state)
+    return build.equations()
+
+
+class _Builder:
+    def __init__(self, layout: Layout, derivatives: bool) -> None:
+        self.layout = layout
+        self.derivatives = derivatives
+        self.count = 0
+        self._rows: list[Indices] = []
+        self._columns: list[Indices] = []
+        self._values: list[Array] = []
+        self._tables: list[tuple[Array, Array, Indices, Array, Indices, Indices]] = []
+
+    def add(
+        self,
+        misclosure: Array,
+        sigma: Array,
+        group: Indices,
+        source: Indices,
+        entries: list[tuple[Indices, Array]],
+        *,
+        point: Indices | None = None,
+        point_part: Array | None = None,
+        weight: Array | None = None,
+    ) -> None:
+        """Append rows (n,); entries are (columns (n, k), values (n, k))."""
+        n = len(misclosure)
+        factor = 1.0 / sigma if weight is None else np.sqrt(weight) / sigma
+        part = np.zeros((n, 3)) if point_part is None else point_part * factor[:, None]
+        who = np.full(n, -1, dtype=np.int64) if point is None else point
+        self._tables.append((misclosure * factor, sigma, group, part, who, source))
+        if self.derivatives:
+            rows = np.arange(self.count, self.count + n)
+            for columns, values in entries:
+                there = columns >= 0
+                self._rows.append(np.broadcast_to(rows[:, None], columns.shape)[there])
+                self._columns.append(columns[there])
+                self._values.append((values * factor[:, None])[there])
+        self.count += n
+
+    def equations(self) -> Equations:
+        joined = [np.concatenate(part) for part in zip(*self._tables, strict=True)]
+        shape = (self.count, self.layout.columns)
+        if self._rows:
+            where = (np.concatenate(self._rows), np.concatenate(self._columns))
+            reduced = sparse.coo_array((np.concatenate(self._values), where), shape=shape).tocsr()
+        else:
+            reduced = sparse.csr_array(shape)
+        misclosure, sigma, group, part, point, source = joined
+        return Equations(misclosure, reduced, part, point, sigma, group, GROUPS, source)
+
+
+def _image_rows(
+    build: _Builder, network: Network, layout: Layout, state: State, weight: Array
+) -> None:
+    measured, images = network.image_points, network.images
+    part = layout.eliminated[measured.point]
+    takes_part = (part >= 0) | (layout.kept[measured.point] >= 0).any(axis=1)
+    takes_part |= layout.locked[measured.point].all(axis=1)
+    for index, camera in enumerate(network.cameras):
+        rows = np.flatnonzero(
+            (images.camera[measured.image] == index) & (weight > 0.0) & takes_part
+        )
+        if not rows.size:
+            continue
+        image, point = measured.image[rows], measured.point[rows]
+        station, attitude, head = images.station[image], images.attitude[image], images.head[image]
+        object_from_rig = state.attitude[attitude]
+        scale = np.where(network.points.at_infinity[point], 0.0, 1.0)
+        ray = state.points[point] - scale[:, None] * state.station[station]
+        in_rig = np.einsum("nji,nj->ni", object_from_rig, ray)
+        rig_from_camera = np.broadcast_to(np.eye(3), (len(rows), 3, 3)).copy()
+        offset = np.zeros((len(rows), 3))
+        mounted = head >= 0
+        rig_from_camera[mounted] = state.head_rotation[head[mounted]]
+        offset[mounted] = state.head_offset[head[mounted]]
+        seen = np.einsum("nji,nj->ni", rig_from_camera, in_rig - scale[:, None] * offset)
+        if (seen[:, 2] >= 0.0).any():
+            raise BehindCameraError(rows[seen[:, 2] >= 0.0])
+        interior = state.interior[index]
+        c = principal_distance_mm(camera, interior)
+        projected = -c * seen[:, :2] / seen[:, 2:]
+        measured_mm = measured.xy_mm[rows]
+        misclosure = ideal_mm(camera, interior, state.terms[index], measured_mm) - projected
+        entries: list[tuple[Indices, Array]] = []
+        by_point = np.zeros((len(rows), 2, 3))
+        if build.derivatives:
+            by_seen = np.zeros((len(rows), 2, 3))
+            by_seen[:, 0, 0] = by_seen[:, 1, 1] = -c / seen[:, 2]
+            by_seen[:, :, 2] = -projected / seen[:, 2:]
+            by_rig = np.einsum("nij,nkj->nik", by_seen, rig_from_camera)
+            by_point = np.einsum("nij,nkj->nik", by_rig, object_from_rig)
+            by_interior = -interior_derivatives(camera, interior, measured_mm)
+            if camera.model == "centred":
+                by_interior[:, :, 2] = -projected / c
+            blocks = [
+                (layout.station[station], -by_point * scale[:, None, None]),
+                (layout.attitude[attitude], by_rig @ skew(in_rig)),
+                (np.broadcast_to(layout.interior[index], (len(rows), 10)), by_interior),
+                (layout.kept[point], by_point),
+            ]
+            if camera.terms:
+                columns = np.broadcast_to(layout.terms[index], (len(rows), len(camera.terms)))
+                by_term = -term_derivatives(camera, measured_mm)
+                blocks += _active(columns, by_term)
+            if mounted.any():
+                blocks += [
+                    (_where(layout.head_rotation, head), by_seen @ skew(seen)),
+                    (_where(layout.head_offset, head), -by_rig * scale[:, None, None]),
+                ]
+            entries = [(columns, values.reshape(len(rows), 2, -1)) for columns, values in blocks]
+        locked = layout.locked[point]
+        for axis in range(2):
+            build.add(
+                misclosure[:, axis],
+                measured.sigma_mm[rows, axis],
+                np.full(len(rows), axis),
+                rows,
+                [(columns, values[:, axis]) for columns, values in entries],
+                point=part[rows],
+                point_part=np.where(locked | (part[rows] < 0)[:, None], 0.0, by_point[:, axis]),
+                weight=weight[rows],
+            )
+
+
+def _active(columns: Indices, by_term: Array) -> list[tuple[Indices, Array]]:
+    """Terms act on parts of the image: columns of -1 where an entry is zero."""
+    active = (by_term != 0.0).any(axis=1)
+    return [(np.where(active, columns, -1), by_term)]
+
+
+def _where(table: Indices, index: Indices) -> Indices:
+    return np.where((index >= 0)[:, None], table[np.clip(index, 0, None)], -1)
+
+
+def _control_rows(build: _Builder, network: Network, layout: Layout, state: State) -> None:
+    sigma = network.points.sigma_m
+    part = layout.eliminated
+    for axis in range(3):
+        known = np.nan_to_num(sigma[:, axis]) > 0.0
+        rows = np.flatnonzero(known & ((part >= 0) | (layout.kept[:, axis] >= 0)))
+        if not rows.size:
+            continue
+        unit = np.zeros((len(rows), 3))
+        unit[part[rows] >= 0, axis] = 1.0
+        build.add(
+            network.points.xyz_m[rows, axis] - state.points[rows, axis],
+            sigma[rows, axis],
+            np.full(len(rows), 2 if axis < 2 else 3),
+            rows,
+            [(layout.kept[rows, axis][:, None], np.ones((len(rows), 1)))],
+            point=part[rows],
+            point_part=unit,
+        )
+
+
+def _gnss_rows(build: _Builder, network: Network, layout: Layout, state: State) -> None:
+    gnss = network.gnss
+    n = len(gnss.station)
+    if not n:
+        return
+    rows = np.arange(n)
+    lever = np.einsum("nij,nj->ni", state.attitude[gnss.attitude], gnss.lever_m)
+    since = _since_middle(network)
+    on_line = gnss.line >= 0
+    computed = state.station[gnss.station] + lever
+    if len(gnss.lines):
+        line = np.clip(gnss.line, 0, None)
+        bias = state.shift[line] + state.drift[line] * since[:, None]
+        computed = computed + np.where(on_line[:, None], bias, 0.0)
+    turned = -np.einsum("nij,njk->nik", state.attitude[gnss.attitude], skew(gnss.lever_m))
+    for axis in range(3):
+        entries = [
+            (layout.station[gnss.station, axis][:, None], np.ones((n, 1))),
+            (
+                np.where(
+                    (gnss.lever_m != 0.0).any(axis=1)[:, None], layout.attitude[gnss.attitude], -1
+                ),
+                turned[:, axis],
+            ),
+        ]
+        if len(gnss.lines):
+            shift = _where(layout.shift, gnss.line)[:, axis][:, None]
+            drift = _where(layout.drift, gnss.line)[:, axis][:, None]
+            entries += [(shift, np.ones((n, 1))), (drift, since[:, None])]
+        build.add(
+            gnss.position_m[:, axis] - computed[:, axis],
+            gnss.sigma_m[:, axis],
+            np.full(n, 4 if axis < 2 else 5),
+            rows,
+            entries,
+        )
+
+
+def _since_middle(network: Network) -> Array:
+    """Seconds since the mean time of each line's positions, so that shift and drift part."""
+    gnss = network.gnss
+    since = np.zeros(len(gnss.station))
+    for line in range(len(gnss.lines)):
+        rows = gnss.line == line
+        if rows.any():
+            since[rows] = gnss.time_s[rows] - gnss.time_s[rows].mean()
+    return since
+
+
+def _bearing_rows(build: _Builder, network: Network, layout: Layout, state: State) -> None:
+    bearings = network.bearings
+    n = len(bearings.attitude)
+    if not n:
+        return
+    own = state.attitude[bearings.attitude]
+    misclosure = logarithm(np.einsum("nji,njk->nik", own, bearings.rotation))
+    turning = _by_turning(misclosure)
+    for axis in range(3):
+        build.add(
+            misclosure[:, axis],
+            bearings.sigma_rad[:, axis],
+            np.full(n, 6),
+            np.arange(n),
+            [(layout.attitude[bearings.attitude], turning[:, axis])],
+        )
+
+
+def _by_turning(misclosure: Array) -> Array:
+    """-d(log(exp(-d) exp(m))) / dd at d = 0, (n, 3, 3): one but for half the misclosure m."""
+    k = skew(misclosure)
+    return np.asarray(np.eye(3) - 0.5 * k + np.einsum("nij,njk->nik", k, k) / 12.0)
+
+
+def _distance_rows(build: _Builder, network: Network, layout: Layout, state: State) -> None:
+    distances = network.distances
+    n = len(distances.point_a)
+    if not n:
+        return
+    apart = state.points[distances.point_b] - state.points[distances.point_a]
+    length = np.linalg.norm(apart, axis=1)
+    direction = apart / length[:, None]
+    build.add(
+        distances.distance_m - length,
+        distances.sigma_m,
+        np.full(n, 7),
+        np.arange(n),
+        [
+            (layout.kept[distances.point_b], direction),
+            (layout.kept[distances.point_a], -direction),
+        ],
+    )
+
+
+def _prior_rows(build: _Builder, network: Network, layout: Layout, state: State) -> None:
+    """Pseudo-observations of interior orientation, terms and heads."""
+    for index, camera in enumerate(network.cameras):
+        given = np.concatenate([camera.interior, [t.value for t in camera.terms]])
+        now = np.concatenate([state.interior[index], state.terms[index]])
+        at = np.concatenate([layout.interior[index], layout.terms[index]])
+        names = [*INTERIOR, *(t.name for t in camera.terms)]
+        sigma = np.array([camera.sigma.get(name, np.nan) for name in names])
+        rows = np.flatnonzero(np.isfinite(sigma) & (at >= 0))
+        _add_prior(build, (given - now)[rows], sigma[rows], at[rows][:, None], None)
+    for index, head in enumerate(network.heads):
+        if head.rotation_free and head.rotation_sigma_rad is not None:
+            turned = logarithm((state.head_rotation[index].T @ head.rotation)[None])
+            columns = np.tile(layout.head_rotation[index], (3, 1))
+            sigma = np.full(3, head.rotation_sigma_rad)
+            _add_prior(build, turned[0], sigma, columns, _by_turning(turned)[0])
+        if head.offset_free and head.offset_sigma_m is not None:
+            moved = head.offset_m - state.head_offset[index]
+            sigma = np.full(3, head.offset_sigma_m)
+            _add_prior(build, moved, sigma, layout.head_offset[index][:, None], None)
+
+
+def _add_prior(
+    build: _Builder, misclosure: Array, sigma: Array, columns: Indices, values: Array | None
+) -> None:
+    if not len(misclosure):
+        return
+    n = len(misclosure)
+    entry = np.ones((n, 1)) if values is None else values
+    build.add(misclosure, sigma, np.full(n, 8), columns[:, 0], [(columns, entry)])

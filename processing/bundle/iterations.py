@@ -1,0 +1,129 @@
+"""Gauss-Newton iterations of a network: steps that always lower the sum of squares, robust weights.
+
+Nothing is decided here about which observations take part; see `adjust`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.bundle.equations import BehindCameraError, Equations, equations
+from processing.bundle.network import Network, NetworkError
+from processing.bundle.normal import Reduced, SingularError, reduced_equations, solved
+from processing.bundle.rank import DefectError, defects
+from processing.bundle.unknowns import Layout, State, improved
+
+Array = NDArray[np.float64]
+Progress = Callable[[str, int, float], None]
+
+_CONVERGED: Final = 1e-14
+"""Promised decrease over the sum of squares: far below what any figure is printed to."""
+
+_SETTLED: Final = 1e-10
+"""Promised decrease, in squared a priori sigmas, that no figure would show."""
+
+_HUBER: Final = 2.0
+_MOST_HALVINGS: Final = 8
+
+
+@dataclass
+class Run:
+    """What changes while adjusting: state, weights, history."""
+
+    network: Network
+    layout: Layout
+    state: State
+    weight: Array
+    tell: Progress
+    history: list[float]
+    most_iterations: int
+    minimum_norm: bool
+
+    def rows(self, state: State, *, derivatives: bool = True) -> Equations:
+        return equations(self.network, self.layout, state, self.weight, derivatives=derivatives)
+
+
+def iterated(run: Run) -> tuple[Equations, Reduced]:
+    """Iterate to convergence; the rows and reduced equations at the solution come back."""
+    for iteration in range(run.most_iterations + 1):
+        rows = _front(run, run.state)
+        objective = float(rows.misclosure @ rows.misclosure)
+        run.history.append(objective)
+        run.tell("iteration", iteration, objective)
+        reduced = reduced_equations(rows, run.layout)
+        try:
+            step = solved(reduced, run.layout.constraints, minimum_norm=run.minimum_norm)
+        except SingularError as error:
+            raise DefectError(defects(run.network, run.layout, run.state, error.reduced)) from None
+        if step.promised <= max(_CONVERGED * objective, _SETTLED):
+            return rows, reduced
+        run.state = _stepped(run, step.dx, step.dpoints, objective, step.promised)
+    raise NetworkError(
+        [
+            f"no convergence after {run.most_iterations} iterations; starting values are "
+            "far off, or blunders too large: try robust weights"
+        ]
+    )
+
+
+def _front(run: Run, state: State) -> Equations:
+    try:
+        return run.rows(state)
+    except BehindCameraError as error:
+        table, names = run.network.image_points, run.network
+        first = int(error.image_points[0])
+        raise NetworkError(
+            [
+                f"{len(error.image_points)} image points see their object point behind the camera, "
+                f"first point {names.points.names[table.point[first]]} in image "
+                f"{names.images.names[table.image[first]]}: better starting values are needed"
+            ]
+        ) from None
+
+
+def _stepped(run: Run, dx: Array, dpoints: Array, objective: float, promised: float) -> State:
+    """The full step, or a half of it as often as needed for the sum of squares to fall."""
+    length = 1.0
+    for _ in range(_MOST_HALVINGS):
+        state = improved(run.state, run.layout, length * dx, length * dpoints)
+        try:
+            rows = run.rows(state, derivatives=False)
+            value = float(rows.misclosure @ rows.misclosure)
+            if value <= objective - 1e-4 * length * promised or promised < 1e-7 * objective:
+                return state
+        except BehindCameraError:
+            pass
+        length *= 0.5
+    return improved(run.state, run.layout, length * dx, length * dpoints)
+
+
+def robust_weights(run: Run) -> None:
+    """Huber weights on whole image points, renewed at every iteration."""
+    points = run.network.image_points
+    for iteration in range(run.most_iterations):
+        rows = _front(run, run.state)
+        objective = float(rows.misclosure @ rows.misclosure)
+        run.tell("robust iteration", iteration, objective)
+        reduced = reduced_equations(rows, run.layout)
+        try:
+            step = solved(reduced, run.layout.constraints, minimum_norm=run.minimum_norm)
+        except SingularError as error:
+            raise DefectError(defects(run.network, run.layout, run.state, error.reduced)) from None
+        run.state = _stepped(run, step.dx, step.dpoints, objective, step.promised)
+        before = run.weight
+        plain = replace(run, weight=np.where(run.weight > 0.0, 1.0, 0.0))
+        rows = plain.rows(run.state, derivatives=False)
+        size = np.zeros(len(points.image))
+        image_rows = rows.group < 2
+        np.add.at(size, rows.source[image_rows], rows.misclosure[image_rows] ** 2)
+        seen = size > 0.0
+        unit = 1.4826 * np.median(np.sqrt(size[seen] / 2.0)) / 0.8 if seen.any() else 1.0
+        size = np.sqrt(size / 2.0) / max(float(unit), 1e-12)
+        run.weight = np.where(before > 0.0, np.minimum(1.0, _HUBER / np.maximum(size, 1e-9)), 0.0)
+        if np.abs(run.weight - before).max() < 1e-2 and step.promised < 1e-6 * objective:
+            return

@@ -1,0 +1,121 @@
+"""Sets of additional parameters for stitched images, composed from a rig's arrangement.
+
+Four sets, each holding the one before it. For nine CCDs in four cones they have 0, 2, 23 and 61
+parameters, as the sets a photogrammetrist of these cameras knows; what the last two of those are
+made of is not public, and these are our own:
+
+- `none`;
+- `radial`: K1 and K2 of eq. 5.1;
+- `sensors`: with them P1 and P2 (lens elements off the axis), dx0, dy0 and df (interior
+  orientation; only where GNSS positions and two flying heights part it from the orientation of the
+  images), and two shifts of every CCD: 7 + 2 (n - 1);
+- `sensors-full`: with them rotation, scale, affinity and shear of every CCD and two perspective
+  terms of every cone but the master: 7 + 6 (n - 1) + 2 (c - 1).
+
+What all CCDs do alike cannot be told from the orientation and the lens: of each kind, the sum over
+the CCDs of the master cone is zero, as in the datum of the mosaic. So one is lost of each kind.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final, Literal
+
+from processing.bundle.network import Camera
+from processing.bundle.terms import Kind, Part, Term
+from processing.placement import nominal_placements
+from processing.rig import Rig
+from processing.topology import footprint
+
+SetName = Literal["none", "radial", "sensors", "sensors-full"]
+SETS: Final[tuple[SetName, ...]] = ("none", "radial", "sensors", "sensors-full")
+
+_RADIAL: Final = frozenset({"k1", "k2"})
+_DECENTRING: Final = frozenset({"p1", "p2"})
+INTERIOR_THREE: Final = frozenset({"dx0", "dy0", "df"})
+_OF_SENSOR: Final[tuple[Kind, ...]] = ("shift-x", "shift-y")
+_OF_SENSOR_FULL: Final[tuple[Kind, ...]] = (
+    "shift-x",
+    "shift-y",
+    "rotation",
+    "scale",
+    "affinity",
+    "shear",
+)
+_OF_CONE: Final[tuple[Kind, ...]] = ("perspective-x", "perspective-y")
+
+
+def parts_of(rig: Rig) -> tuple[Part, ...]:
+    """Which PAN CCD makes which part of the stitched image, from calibrated places.
+
+    Raises:
+        ValueError: a rig without a stitched image.
+    """
+    if rig.virtual_image is None:
+        raise ValueError(f"rig {rig.name} has no stitched image; calibrate its heads one by one")
+    placements = nominal_placements(rig, {}, {})
+    found = []
+    for cone in rig.pan_cones:
+        for sensor in cone.sensors:
+            r = footprint(placements[sensor.name])
+            found.append(
+                Part(sensor.name, cone.name, r.x_min_mm, r.y_min_mm, r.x_max_mm, r.y_max_mm)
+            )
+    return tuple(found)
+
+
+def self_calibrating(
+    camera: Camera,
+    name: SetName,
+    parts: tuple[Part, ...] = (),
+    *,
+    master_cone: str = "",
+    interior: bool = False,
+) -> Camera:
+    """The camera with a set of additional parameters to be estimated.
+
+    Args:
+        camera: whose interior orientation they improve.
+        name: the set.
+        parts: the CCDs of its image; needed for `sensors` and `sensors-full`.
+        master_cone: whose CCDs carry the datum.
+        interior: whether dx0, dy0 and df can be told from the images' orientation.
+
+    Raises:
+        ValueError: a set of CCDs for an image that is not made of several.
+    """
+    free = set(camera.free)
+    if name == "none":
+        return camera
+    free |= _RADIAL
+    if name == "radial":
+        return replace(camera, free=frozenset(free))
+    masters = [p.sensor for p in parts if p.cone == master_cone]
+    if not masters:
+        raise ValueError(
+            f"set {name} needs the CCDs of the image and its master cone; camera {camera.name} has "
+            f"{len(parts)} CCDs, none in cone {master_cone!r}"
+        )
+    free |= _DECENTRING
+    if interior:
+        free |= INTERIOR_THREE
+    terms: list[Term] = []
+    gauges: list[tuple[str, ...]] = []
+    for kind in _OF_SENSOR if name == "sensors" else _OF_SENSOR_FULL:
+        terms += [
+            Term(f"{kind} {part.sensor}", kind, (part.sensor,), parts)
+            for part in parts
+            if masters != [part.sensor]
+        ]
+        if len(masters) > 1:
+            gauges.append(tuple(f"{kind} {sensor}" for sensor in masters))
+    if name == "sensors-full":
+        for cone in dict.fromkeys(p.cone for p in parts if p.cone != master_cone):
+            sensors = tuple(p.sensor for p in parts if p.cone == cone)
+            terms += [Term(f"{kind} cone {cone}", kind, sensors, parts) for kind in _OF_CONE]
+    return replace(camera, free=frozenset(free), terms=tuple(terms), gauges=tuple(gauges))
+
+
+def parameter_count(camera: Camera) -> int:
+    """Independent parameters of a camera: what is estimated less its gauges."""
+    return len(camera.free) + len(camera.terms) - len(camera.gauges)

@@ -1,0 +1,116 @@
+"""Additional parameters of a stitched image: what one CCD or one cone may do to image coordinates.
+
+Each term is a correction of measured coordinates, linear in its parameter, that acts on a part of
+the image only. Which terms make up a set is in `self_calibration`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+Kind = Literal[
+    "shift-x", "shift-y", "rotation", "scale", "affinity", "shear", "perspective-x", "perspective-y"
+]
+
+UNITS: Final[Mapping[Kind, tuple[str, float]]] = {
+    "shift-x": ("um", 1e3),
+    "shift-y": ("um", 1e3),
+    "rotation": ("urad", 1e6),
+    "scale": ("ppm", 1e6),
+    "affinity": ("ppm", 1e6),
+    "shear": ("urad", 1e6),
+    "perspective-x": ("ppm/mm", 1e6),
+    "perspective-y": ("ppm/mm", 1e6),
+}
+"""What a parameter is printed in, and how many of it make one of the internal unit (mm, rad, 1)."""
+
+MEANING: Final[Mapping[Kind, str]] = {
+    "shift-x": "the CCD lies displaced to the right of where the stitching put it",
+    "shift-y": "the CCD lies displaced in flight direction from where the stitching put it",
+    "rotation": "the CCD is turned in the image plane about its centre",
+    "scale": "the CCD is larger or smaller than thought: its mount is warmer, or it lies deeper",
+    "affinity": "x and y of the CCD have different scales: it is tilted out of the focal plane, "
+    "seen off axis",
+    "shear": "the CCD's rows and columns are not square to each other: the same tilt, seen in the "
+    "other diagonal",
+    "perspective-x": "the cone's layer converges to the right: its pointing about the flight axis "
+    "was not wholly taken out",
+    "perspective-y": "the cone's layer converges in flight direction: its pointing about the cross "
+    "axis was not wholly taken out",
+}
+
+
+@dataclass(frozen=True)
+class Part:
+    """An upright rectangle of the image, mm about the principal point, that one CCD has made."""
+
+    sensor: str
+    cone: str
+    x_min_mm: float
+    y_min_mm: float
+    x_max_mm: float
+    y_max_mm: float
+
+    @property
+    def centre_mm(self) -> tuple[float, float]:
+        return ((self.x_min_mm + self.x_max_mm) / 2.0, (self.y_min_mm + self.y_max_mm) / 2.0)
+
+
+@dataclass(frozen=True)
+class Term:
+    """One additional parameter: `kind` on the CCDs `sensors` of an image made of `parts`.
+
+    Corrections are taken about the centre of each part. `name` is unique within a camera.
+    """
+
+    name: str
+    kind: Kind
+    sensors: tuple[str, ...]
+    parts: tuple[Part, ...]
+    value: float = 0.0
+
+
+def part_of(parts: Sequence[Part], xy_mm: Array) -> NDArray[np.int64]:
+    """The part that image points (n, 2) belong to, (n,): where they lie deepest inside.
+
+    In an overlap the border runs in its middle, as the seam does nominally.
+    """
+    depth = np.stack(
+        [
+            np.minimum(
+                np.minimum(xy_mm[:, 0] - p.x_min_mm, p.x_max_mm - xy_mm[:, 0]),
+                np.minimum(xy_mm[:, 1] - p.y_min_mm, p.y_max_mm - xy_mm[:, 1]),
+            )
+            for p in parts
+        ],
+        axis=1,
+    )
+    return np.asarray(np.argmax(depth, axis=1))
+
+
+def term_design(term: Term, xy_mm: Array) -> Array:
+    """Correction (n, 2), mm, that a parameter of one makes at image points (n, 2)."""
+    names = [part.sensor for part in term.parts]
+    own = part_of(term.parts, xy_mm)
+    chosen = np.isin(own, [names.index(s) for s in term.sensors])
+    centres = np.array([part.centre_mm for part in term.parts])
+    u, v = (xy_mm - centres[own]).T
+    one, none = np.ones_like(u), np.zeros_like(u)
+    x, y = {
+        "shift-x": (one, none),
+        "shift-y": (none, one),
+        "rotation": (-v, u),
+        "scale": (u, v),
+        "affinity": (u, -v),
+        "shear": (v, u),
+        "perspective-x": (u * u, u * v),
+        "perspective-y": (u * v, v * v),
+    }[term.kind]
+    return np.asarray(np.stack([x, y], axis=1) * chosen[:, None])

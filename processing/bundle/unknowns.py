@@ -1,0 +1,246 @@
+"""What is unknown in a network: names, columns, current values, and how corrections are applied.
+
+The unknowns of most object points are eliminated and have no column; those that distances tie to
+each other keep theirs. Everything held has column -1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.bundle.network import INTERIOR, Constraint, Network, NetworkError
+from processing.bundle.rotations import exponential
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+
+class Unknown(NamedTuple):
+    """One column: what kind of thing, which of them, which of its components."""
+
+    kind: str
+    owner: str
+    component: str
+
+    @property
+    def name(self) -> str:
+        return f"{self.kind} {self.owner} {self.component}"
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Columns of the unknowns; -1 is held.
+
+    Attributes:
+        station, attitude: (n, 3).
+        head_rotation, head_offset: (heads, 3).
+        interior: (cameras, 10).
+        terms: (t,) per camera.
+        shift, drift: (lines, 3).
+        kept: (points, 3), points with columns of their own.
+        eliminated: (points,) position among the eliminated points, -1 for kept and left-out ones.
+        locked: (points, 3) coordinates that are held.
+        unknowns: what each column is.
+        constraints: (c, columns) rows; corrections summed over all iterations obey them.
+    """
+
+    station: Indices
+    attitude: Indices
+    head_rotation: Indices
+    head_offset: Indices
+    interior: Indices
+    terms: tuple[Indices, ...]
+    shift: Indices
+    drift: Indices
+    kept: Indices
+    eliminated: Indices
+    locked: NDArray[np.bool_]
+    unknowns: tuple[Unknown, ...]
+    constraints: Array
+
+    @property
+    def columns(self) -> int:
+        return len(self.unknowns)
+
+    @property
+    def eliminated_points(self) -> Indices:
+        """Object points in the order of their elimination."""
+        return np.flatnonzero(self.eliminated >= 0)
+
+
+@dataclass(frozen=True)
+class State:
+    """Current values of everything that may be unknown; shapes as in the network."""
+
+    station: Array
+    attitude: Array
+    head_rotation: Array
+    head_offset: Array
+    interior: Array
+    terms: tuple[Array, ...]
+    shift: Array
+    drift: Array
+    points: Array
+
+
+def starting_state(network: Network) -> State:
+    """The values the network was given with."""
+    heads = network.heads
+    lines = len(network.gnss.lines)
+    return State(
+        station=network.stations.position_m.copy(),
+        attitude=network.attitudes.rotation.copy(),
+        head_rotation=np.array([h.rotation for h in heads]).reshape(-1, 3, 3),
+        head_offset=np.array([h.offset_m for h in heads]).reshape(-1, 3),
+        interior=np.array([c.interior for c in network.cameras], dtype=np.float64),
+        terms=tuple(np.array([t.value for t in c.terms]) for c in network.cameras),
+        shift=np.zeros((lines, 3)),
+        drift=np.zeros((lines, 3)),
+        points=network.points.xyz_m.copy(),
+    )
+
+
+def layout_of(network: Network, left_out: NDArray[np.bool_]) -> Layout:
+    """Give every unknown its column.
+
+    Args:
+        network: what is estimated and what is held.
+        left_out: (points,) object points that take no part.
+
+    Raises:
+        NetworkError: a constraint names what is not there.
+    """
+    columns: list[Unknown] = []
+
+    def take(free: bool, kind: str, owner: str, components: tuple[str, ...]) -> list[int]:
+        if not free:
+            return [-1] * len(components)
+        first = len(columns)
+        columns.extend(Unknown(kind, owner, component) for component in components)
+        return list(range(first, first + len(components)))
+
+    xyz = ("X", "Y", "Z")
+    used_stations, used_attitudes = _used(network)
+    station = [
+        take(not held and used, "station", name, xyz)
+        for name, held, used in zip(
+            network.stations.names, network.stations.fixed, used_stations, strict=True
+        )
+    ]
+    attitude = [
+        take(not held and used, "attitude", name, ("about x", "about y", "about z"))
+        for name, held, used in zip(
+            network.attitudes.names, network.attitudes.fixed, used_attitudes, strict=True
+        )
+    ]
+    head_rotation = [
+        take(h.rotation_free, "head rotation", h.name, ("about x", "about y", "about z"))
+        for h in network.heads
+    ]
+    head_offset = [take(h.offset_free, "head offset", h.name, xyz) for h in network.heads]
+    interior, terms = [], []
+    for camera in network.cameras:
+        interior.append(
+            [take(name in camera.free, "camera", camera.name, (name,))[0] for name in INTERIOR]
+        )
+        terms.append(
+            np.array(
+                [take(True, "camera", camera.name, (t.name,))[0] for t in camera.terms],
+                dtype=np.int64,
+            )
+        )
+    lines = network.gnss.lines
+    shift = [take(network.gnss.drift != "none", "GNSS shift", line, xyz) for line in lines]
+    drift = [take(network.gnss.drift == "linear", "GNSS drift", line, xyz) for line in lines]
+    locked = network.points.sigma_m == 0.0
+    kept = np.full((len(network.points.names), 3), -1, dtype=np.int64)
+    tied = np.union1d(network.distances.point_a, network.distances.point_b)
+    for point in tied:
+        for axis in range(3):
+            if not locked[point, axis]:
+                kept[point, axis] = len(columns)
+                columns.append(Unknown("point", network.points.names[point], xyz[axis]))
+    eliminated = np.full(len(locked), -1, dtype=np.int64)
+    free = ~left_out
+    free[tied] = False
+    eliminated[free] = np.arange(int(free.sum()))
+    return Layout(
+        station=_table(station, 3),
+        attitude=_table(attitude, 3),
+        head_rotation=_table(head_rotation, 3),
+        head_offset=_table(head_offset, 3),
+        interior=_table(interior, 10),
+        terms=tuple(terms),
+        shift=_table(shift, 3),
+        drift=_table(drift, 3),
+        kept=kept,
+        eliminated=eliminated,
+        locked=locked,
+        unknowns=tuple(columns),
+        constraints=_constraints(network, columns),
+    )
+
+
+def improved(state: State, layout: Layout, dx: Array, dpoints: Array) -> State:
+    """The state with corrections dx (columns,) and those of eliminated points (n, 3) applied."""
+
+    def part(columns: Indices) -> Array:
+        return (
+            np.where(columns >= 0, dx[np.clip(columns, 0, None)], 0.0)
+            if dx.size
+            else (np.zeros(columns.shape))
+        )
+
+    points = state.points + part(layout.kept)
+    points[layout.eliminated_points] += dpoints
+    return replace(
+        state,
+        station=state.station + part(layout.station),
+        attitude=state.attitude @ exponential(part(layout.attitude)),
+        head_rotation=state.head_rotation @ exponential(part(layout.head_rotation)),
+        head_offset=state.head_offset + part(layout.head_offset),
+        interior=state.interior + part(layout.interior),
+        terms=tuple(v + part(c) for v, c in zip(state.terms, layout.terms, strict=True)),
+        shift=state.shift + part(layout.shift),
+        drift=state.drift + part(layout.drift),
+        points=points,
+    )
+
+
+def _used(network: Network) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Stations and attitudes that some observation touches."""
+    seen = np.unique(network.image_points.image)
+    station = np.zeros(len(network.stations.names), dtype=bool)
+    attitude = np.zeros(len(network.attitudes.names), dtype=bool)
+    station[network.images.station[seen]] = True
+    attitude[network.images.attitude[seen]] = True
+    station[network.gnss.station] = True
+    attitude[network.bearings.attitude] = True
+    return station, attitude
+
+
+def _table(rows: list[list[int]], width: int) -> Indices:
+    return np.array(rows, dtype=np.int64).reshape(-1, width)
+
+
+def _constraints(network: Network, columns: list[Unknown]) -> Array:
+    at = {unknown.name: index for index, unknown in enumerate(columns)}
+    wanted = list(network.constraints)
+    for camera in network.cameras:
+        wanted += [
+            Constraint({f"camera {camera.name} {name}": 1.0 for name in gauge})
+            for gauge in camera.gauges
+        ]
+    rows = np.zeros((len(wanted), len(columns)))
+    for row, constraint in zip(rows, wanted, strict=True):
+        for name, coefficient in constraint.coefficients.items():
+            if name not in at:
+                raise NetworkError(
+                    [f"a constraint names {name!r}, which is not an unknown of this network"]
+                )
+            row[at[name]] = coefficient
+    return rows

@@ -1,0 +1,207 @@
+"""The adjustment against truth, against plain dense least squares, and against blunders."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from processing.bundle.adjust import Adjustment, Settings, adjust
+from processing.bundle.network import Camera, Constraint, Network, NetworkError
+from processing.bundle.rotations import logarithm
+from tests.processing.bundle.networks import Made, aerial, turned, with_everything
+
+
+def _dense(result: Adjustment) -> tuple[np.ndarray, np.ndarray]:
+    """The whole design matrix of the last rows: columns, then eliminated points."""
+    rows = result.equations
+    held = result.layout.locked[result.layout.eliminated_points].ravel()
+    points = np.zeros((len(rows.misclosure), len(held)))
+    for row, (who, part) in enumerate(zip(rows.point, rows.point_part, strict=True)):
+        if who >= 0:
+            points[row, 3 * who : 3 * who + 3] = part
+    return np.hstack([rows.reduced.toarray(), points[:, ~held]]), ~held
+
+
+def test_without_noise_the_truth_comes_back() -> None:
+    made = with_everything()
+    result = adjust(made.network)
+    assert np.abs(result.state.station - made.station).max() < 1e-5
+    assert np.abs(result.state.interior[0][:3] - made.interior[0][:3]).max() < 1e-6
+    assert result.state.terms[0][0] == pytest.approx(3e-5, abs=1e-9)
+    oblique = turned(0.5, 0.01, 0.02)
+    assert np.abs(logarithm((result.state.head_rotation[1].T @ oblique)[None])).max() < 1e-7
+
+
+def test_covariances_and_redundancy_numbers_are_those_of_the_whole_inverse() -> None:
+    made = with_everything()
+    result = adjust(made.network)
+    design, free = _dense(result)
+    scale = np.linalg.norm(design, axis=0)
+    inverse = np.linalg.inv((design / scale).T @ (design / scale)) / scale[:, None] / scale
+    c = result.layout.columns
+    size = np.sqrt(np.diag(inverse))
+    off = (result.cofactor - inverse[:c, :c]) / size[:c, None] / size[:c]
+    assert np.abs(off).max() < 1e-6
+    whole = np.zeros((len(free), len(free)))
+    whole[np.ix_(free, free)] = inverse[c:, c:]
+    for k, point in enumerate(result.layout.eliminated_points):
+        own = whole[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
+        assert np.abs(result.point_cofactor[point] - own).max() < 1e-6 * np.abs(own).max()
+    leverage = np.einsum("ij,jk,ik->i", design, inverse, design)
+    assert np.abs(result.redundancy_number - (1.0 - leverage)).max() < 1e-7
+    assert result.redundancy == len(design) - design.shape[1]
+    assert result.redundancy_number.sum() == pytest.approx(result.redundancy, abs=1e-6)
+
+
+def test_constraints_are_kept_and_their_cofactors_are_those_of_the_bordered_inverse() -> None:
+    made = aerial(sigma_mm=1e-3, seed=5, control_sigma_m=0.5)
+    names = [f"station {name} X" for name in made.network.stations.names]
+    network = replace(made.network, constraints=(Constraint(dict.fromkeys(names, 1.0)),))
+    result = adjust(network)
+    moved = result.state.station[:, 0] - network.stations.position_m[:, 0]
+    assert abs(moved.sum()) < 1e-9
+    design, _ = _dense(result)
+    size = design.shape[1]
+    border = np.zeros((size + 1, size + 1))
+    border[:size, :size] = design.T @ design
+    border[size, : result.layout.columns] = result.layout.constraints[0]
+    border[:, size] = border[size]
+    inverse = np.linalg.inv(border)[: result.layout.columns, : result.layout.columns]
+    assert np.allclose(result.cofactor, inverse, rtol=1e-5, atol=1e-12)
+    assert result.redundancy == len(design) - size + 1
+
+
+def _adjusted(seed: int) -> tuple[Made, Adjustment]:
+    made = aerial(seed=seed, sigma_mm=1e-3, gnss_sigma_m=0.05, points=40, lines=2, along=4)
+    return made, adjust(made.network)
+
+
+def test_uncertainty_is_honest() -> None:
+    squares, dimensions, errors = 0.0, 0, []
+    for seed in range(24):
+        made, result = _adjusted(seed)
+        columns = result.layout.station.ravel()
+        error = (result.state.station - made.station).ravel()
+        covariance = result.cofactor[np.ix_(columns, columns)]
+        squares += float(error @ np.linalg.solve(covariance, error))
+        dimensions += len(error)
+        for point in result.layout.eliminated_points:
+            own = result.point_cofactor[point]
+            off = result.state.points[point] - made.points[point]
+            errors.append(off / np.sqrt(np.diag(own)))
+    low, high = stats.chi2.ppf([0.0005, 0.9995], dimensions)
+    assert low < squares < high
+    normalised = np.abs(np.concatenate(errors))
+    assert (normalised < 3.0).mean() > 0.99
+    assert normalised.max() < 5.0
+
+
+def test_sigma0_and_components_find_wrong_sigmas() -> None:
+    made = aerial(seed=7, sigma_mm=2e-3, gnss_sigma_m=0.05, points=250, lines=3, along=8)
+    table, gnss = made.network.image_points, made.network.gnss
+    network = replace(
+        made.network,
+        image_points=replace(table, sigma_mm=table.sigma_mm / 2.0),
+        gnss=replace(gnss, sigma_m=gnss.sigma_m * 3.0),
+    )
+    result = adjust(network, Settings(variance_components=True))
+    assert result.factors["image x"] == pytest.approx(4.0, rel=0.15)
+    assert result.factors["image y"] == pytest.approx(4.0, rel=0.15)
+    assert result.factors["GNSS height"] == pytest.approx(1.0 / 9.0, rel=0.6)
+    assert "control height" not in result.factors, "a redundancy of two tells nothing"
+    assert result.sigma0 == pytest.approx(1.0, rel=0.02)
+
+
+def test_blunders_are_found_and_nothing_else() -> None:
+    made = aerial(seed=8, sigma_mm=1e-3, points=200, lines=3, along=6)
+    table = made.network.image_points
+    rays = np.bincount(table.point, minlength=200)
+    several = np.flatnonzero(rays[table.point] >= 5)
+    wrong = np.random.default_rng(1).choice(several, 25, replace=False)
+    xy = table.xy_mm.copy()
+    xy[wrong] += np.random.default_rng(2).normal(0, 1, (25, 2)) * 0.3 + 0.1
+    network = replace(made.network, image_points=replace(table, xy_mm=xy))
+    plain = adjust(network)
+    assert plain.sigma0 > 10.0
+    result = adjust(network, Settings(robust=True, reject_beyond=4.0))
+    assert set(wrong) <= set(np.flatnonzero(result.rejected))
+    assert int(result.rejected.sum()) <= 28
+    assert result.sigma0 == pytest.approx(1.0, abs=0.08)
+
+
+def test_a_point_seen_once_is_left_out_and_changes_nothing() -> None:
+    made = aerial(seed=9, sigma_mm=1e-3)
+    table = made.network.image_points
+    rays = np.bincount(table.point, minlength=60)
+    lonely = int(np.flatnonzero(rays[8:] >= 3)[0]) + 8
+    first = int(np.flatnonzero(table.point == lonely)[0])
+    keep = (table.point != lonely) | (np.arange(len(table.point)) == first)
+    network = replace(made.network, image_points=_only(table, keep))
+    without = replace(made.network, image_points=_only(table, table.point != lonely))
+    result, reference = adjust(network), adjust(without)
+    assert result.left_out[lonely]
+    assert np.isnan(result.point_cofactor[lonely]).all()
+    assert np.abs(result.state.station - reference.state.station).max() < 1e-9
+    assert result.redundancy == reference.redundancy
+
+
+def _only(table, keep):  # type: ignore[no-untyped-def]
+    return replace(
+        table,
+        image=table.image[keep],
+        point=table.point[keep],
+        xy_mm=table.xy_mm[keep],
+        sigma_mm=table.sigma_mm[keep],
+    )
+
+
+def test_shared_projection_centres_share_three_unknowns() -> None:
+    made = with_everything()
+    images = made.network.images
+    # Every image an attitude of its own, the projection centres of an exposure in one.
+    n = len(images.names)
+    heads = made.network.heads
+    own = np.array(
+        [made.attitude[images.attitude[k]] @ heads[images.head[k]].rotation for k in range(n)]
+    )
+    network = replace(
+        made.network,
+        attitudes=replace(
+            made.network.attitudes, names=images.names, rotation=own, fixed=np.zeros(n, bool)
+        ),
+        images=replace(images, attitude=np.arange(n), head=np.full(n, -1)),
+        heads=(),
+        gnss=replace(made.network.gnss, attitude=np.arange(0, n, 2)),
+        bearings=replace(made.network.bearings, attitude=np.arange(0, n, 2), rotation=own[0::2]),
+    )
+    result = adjust(network)
+    kinds = [u.kind for u in result.layout.unknowns]
+    assert kinds.count("station") == 3 * 12
+    seen = len(np.unique(np.concatenate([network.image_points.image, np.arange(0, n, 2)])))
+    assert kinds.count("attitude") == 3 * seen > 3 * 12
+
+
+def test_tables_that_do_not_fit_are_refused_with_all_their_mistakes() -> None:
+    network = aerial().network
+    broken = replace(
+        network,
+        cameras=(Camera("c", -70.0),),
+        images=replace(network.images, station=network.images.station + 1),
+        image_points=replace(network.image_points, sigma_mm=network.image_points.sigma_mm * 0.0),
+    )
+    with pytest.raises(NetworkError) as caught:
+        adjust(broken)
+    text = str(caught.value)
+    assert "station that is not there" in text
+    assert "f -70.0 mm" in text
+    assert "sigma that is not positive" in text
+
+
+def test_starting_values_far_off_end_in_a_sentence() -> None:
+    network: Network = aerial().network
+    below = network.stations.position_m - np.array([0.0, 0.0, 5000.0])
+    with pytest.raises(NetworkError, match="better starting values"):
+        adjust(replace(network, stations=replace(network.stations, position_m=below)))

@@ -1,0 +1,130 @@
+"""Analytic derivatives of every unknown against differences."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from processing.bundle.camera_model import ideal_mm
+from processing.bundle.equations import BehindCameraError, equations
+from processing.bundle.network import Camera
+from processing.bundle.rotations import (
+    angles_by_rotation_vector,
+    exponential,
+    logarithm,
+    omega_phi_kappa,
+)
+from processing.bundle.unknowns import improved, layout_of, starting_state
+from processing.lens import ideal_from_measured
+from processing.rig import find_rig
+from processing.rotation import rotation_matrix
+from tests.processing.bundle.networks import aerial, turned, with_everything
+
+
+def test_derivatives_of_every_unknown_agree_with_differences() -> None:
+    network = with_everything().network
+    layout = layout_of(network, np.zeros(len(network.points.names), dtype=bool))
+    state = starting_state(network)
+    random = np.random.default_rng(4)
+    state = replace(
+        state,
+        interior=random.normal(0, 1, (2, 10))
+        * np.array([0.02, 0.02, 0.05, 2e-6, 1e-9, 1e-13, 1e-6, 1e-6, 1e-5, 1e-5]),
+    )
+    weight = np.ones(len(network.image_points.image))
+    rows = equations(network, layout, state, weight)
+    design = rows.reduced.toarray()
+    points = len(layout.eliminated_points)
+    kinds = {unknown.kind for unknown in layout.unknowns}
+    assert kinds == {
+        "station", "attitude", "head rotation", "head offset", "camera",
+        "GNSS shift", "GNSS drift", "point",
+    }  # fmt: skip
+    none = np.zeros((points, 3))
+    for column in range(layout.columns):
+        size = float(np.abs(design[:, column]).max())
+        assert size > 0.0, layout.unknowns[column].name
+        dx = np.zeros(layout.columns)
+        dx[column] = 1.0 / size
+        up = equations(network, layout, improved(state, layout, dx, none), weight)
+        down = equations(network, layout, improved(state, layout, -dx, none), weight)
+        numeric = -(up.misclosure - down.misclosure) / (2.0 * dx[column])
+        error = np.abs(numeric - design[:, column]).max() / size
+        assert error < 1e-6, (layout.unknowns[column].name, error)
+    nothing = np.zeros(layout.columns)
+    for axis in range(3):
+        dp = np.zeros((points, 3))
+        dp[:, axis] = 1e-3
+        up = equations(network, layout, improved(state, layout, nothing, dp), weight)
+        down = equations(network, layout, improved(state, layout, nothing, -dp), weight)
+        own = rows.point >= 0
+        numeric = -(up.misclosure - down.misclosure)[own] / 2e-3
+        assert (
+            np.abs(numeric - rows.point_part[own, axis]).max()
+            < 1e-5 * np.abs(rows.point_part).max()
+        )
+
+
+def test_the_truth_leaves_no_misclosure() -> None:
+    made = with_everything()
+    network = made.network
+    state = replace(
+        starting_state(network),
+        station=made.station,
+        attitude=made.attitude,
+        points=made.points,
+        interior=made.interior,
+        terms=(np.array([3e-5]), np.zeros(0)),
+    )
+    layout = layout_of(network, np.zeros(len(network.points.names), dtype=bool))
+    rows = equations(network, layout, state, np.ones(len(network.image_points.image)))
+    image = rows.group < 2
+    assert np.abs(rows.misclosure[image] * rows.sigma[image]).max() < 1e-9
+
+
+def test_the_australis_model_is_the_lens_correction_of_the_pipeline() -> None:
+    lens = replace(
+        find_rig("ultracam-l").cones[0].lens,
+        dx0_mm=0.01,
+        dy0_mm=-0.02,
+        df_mm=0.03,
+        b1=1e-5,
+        b2=-3e-5,
+    )
+    interior = np.array(
+        [lens.dx0_mm, lens.dy0_mm, lens.df_mm, lens.k1, lens.k2, lens.k3, lens.p1, lens.p2,
+         lens.b1, lens.b2]
+    )  # fmt: skip
+    xy = np.random.default_rng(1).uniform(-30, 30, (50, 2))
+    ours = ideal_mm(Camera("c", lens.f_mm), interior, np.zeros(0), xy)
+    assert np.abs(ours - ideal_from_measured(lens, xy)).max() < 1e-12
+
+
+def test_angles_of_many_rotations_are_those_of_one() -> None:
+    angles = np.random.default_rng(2).uniform(-1.2, 1.2, (20, 3))
+    rotations = np.array([rotation_matrix(*a) for a in angles])
+    assert np.abs(omega_phi_kappa(rotations) - angles).max() < 1e-12
+    vectors = np.random.default_rng(3).uniform(-1.5, 1.5, (20, 3))
+    assert np.abs(logarithm(exponential(vectors)) - vectors).max() < 1e-12
+    step = 1e-6
+    for axis in range(3):
+        small = exponential(np.tile(np.eye(3)[axis] * step, (20, 1)))
+        there, back = rotations @ small, rotations @ np.swapaxes(small, 1, 2)
+        numeric = (omega_phi_kappa(there) - omega_phi_kappa(back)) / (2 * step)
+        assert np.abs(numeric - angles_by_rotation_vector(rotations)[:, :, axis]).max() < 1e-8
+
+
+def test_points_behind_a_camera_are_told_of() -> None:
+    network = aerial().network
+    upside_down = replace(
+        network.attitudes,
+        rotation=network.attitudes.rotation @ turned(np.pi, 0.0, 0.0),
+    )
+    network = replace(network, attitudes=upside_down)
+    layout = layout_of(network, np.zeros(len(network.points.names), dtype=bool))
+    with pytest.raises(BehindCameraError):
+        equations(
+            network, layout, starting_state(network), np.ones(len(network.image_points.image))
+        )
