@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.rig import Cone, Sensor
-from sim_hw import camera, spline
+from sim_hw import camera, spline, traffic
+from sim_hw.cloud import Cloud
 from sim_hw.flight import Flight, Pose
 from sim_hw.scene import COLOURS, Scene
 from sim_hw.world import END_MARGIN, World
@@ -108,15 +109,57 @@ def light_on_sensor(
     positions = scene_positions(world, scene, flight, ground)
     size = (sensor.height_px, sensor.width_px)
     smear = residual_smear_px(world, flight, cone, sensor, look)
+    if world.cars:
+        t_s = (look.mid_gps_ns - world.settings.epoch_gps_ns) * 1e-9
+        t_s -= flight.first_line_at_m / flight.plan.ground_speed_mps
+        bands = [band for band, _ in _mix_of(cone, scene)]
+        scene = traffic.scene_with(world.cars, scene, t_s, bands)
     if sensor.colour_filter_array != "none":
-        return _through_filters(scene, sensor, positions, smear)
+        total = _through_filters(scene, sensor, positions, smear)
+    else:
+        total = smeared(_mixed(cone, scene, positions, size), smear)
+    if world.cloud is not None:
+        _hide(total, world, world.cloud, flight, cone, sensor, (c, r), look)
+    return np.asarray(total * np.float32(world.ground.light), dtype=np.float32)
+
+
+def _mixed(cone: Cone, scene: Scene, positions: Array, size: tuple[int, int]) -> Map:
     total: Map | None = None
     for band, share in _mix_of(cone, scene):
         light = sample_scene(scene, band, positions, size)
         total = light * np.float32(share) if total is None else total + light * np.float32(share)
     if total is None:
         raise ValueError(f"cone {cone.name} has no band that the scene knows")
-    return smeared(total, smear)
+    return total
+
+
+def _hide(
+    light: Map,
+    world: World,
+    cloud: Cloud,
+    flight: Flight,
+    cone: Cone,
+    sensor: Sensor,
+    grid: tuple[Array, Array],
+    look: Look,
+) -> None:
+    """Put a cloud before the ground, seen from where the cone is at mid-exposure."""
+    columns, rows = grid
+    pose = flight.pose(look.mid_gps_ns)
+    at = content_rows(sensor, rows, look.tdi_shifts)
+    directions = sensor_directions(world, cone, sensor, columns, at, look.mid_gps_ns)
+    places = cloud.positions(
+        camera.projection_centre_m(cone, pose),
+        camera.world_directions(directions, pose),
+        heading=math.radians(flight.plan.heading_deg),
+        along_m=flight.first_line_at_m,
+    )
+    x, y = (np.ascontiguousarray(places[..., i]) for i in (0, 1))
+    opacity, white = np.empty_like(light), np.empty_like(light)
+    _sample(cloud.opacity, x, y, _TABLE, opacity)
+    _sample(cloud.radiance, x, y, _TABLE, white)
+    np.clip(opacity, 0.0, 1.0, out=opacity)
+    light += opacity * (white - light)
 
 
 FILTERS = {"R": "red", "G": "green", "B": "blue"}

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_hw import quilting, spline
+from sim_hw.grounds import GROUNDS
 from sim_hw.seeding import random_stream
 
 Band = NDArray[np.uint16]
@@ -56,7 +57,8 @@ class SceneSettings:
     """What makes a scene: equal settings give equal samples.
 
     `psf_px` is the standard deviation of lens and pixel aperture, in pixels of the head that
-    looks; `colour_ratio` is the size of a colour pixel in PAN pixels.
+    looks; `colour_ratio` is the size of a colour pixel in PAN pixels; `ground` is a name of
+    `grounds.GROUNDS`.
     """
 
     seed: int
@@ -66,6 +68,7 @@ class SceneSettings:
     colour_ratio: int
     psf_px: float = 0.55
     file: str | None = None
+    ground: str = "landscape"
 
     @property
     def colour_step(self) -> int:
@@ -77,9 +80,11 @@ class SceneSettings:
         """Name of the scene in a cache."""
         facts: dict[str, object] = {"format": FORMAT, **asdict(self)}
         if self.file is None:
-            # The shipped picture does not depend on what a sample is called in metres.
-            facts.pop("sample_m")
+            if self.ground == "landscape":
+                # The shipped picture does not depend on what a sample is called in metres.
+                del facts["ground"], facts["sample_m"]
         else:
+            del facts["ground"]
             status = Path(self.file).stat()
             facts["file_state"] = [status.st_size, status.st_mtime_ns]
         return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]
@@ -135,6 +140,8 @@ def _build(settings: SceneSettings, folder: Path) -> None:
             )
             canvas = quilting.sew(sources, quilt, **size)
             patches, reused = sum(len(row) for row in quilt.rows), quilt.reused
+            paint = GROUNDS[settings.ground].paint
+            canvas = paint(canvas, settings.sample_m, random_stream(settings.seed, "ground"))
         _store_bands(canvas, settings, work)
         (work / "scene.json").write_text(
             json.dumps({**asdict(settings), "patches": patches, "reused_patches": reused})

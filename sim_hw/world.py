@@ -14,7 +14,10 @@ from pathlib import Path
 
 from processing.rig import Cone, Rig, VirtualImage, load_rig
 from sim_hw import camera, scene, terrain
+from sim_hw.cloud import Cloud, cloud_over
 from sim_hw.flight import Flight, FlightPlan
+from sim_hw.grounds import GROUNDS, Ground
+from sim_hw.traffic import Car, cars_of
 
 FORWARD_OVERLAP = 0.6
 SIDE_OVERLAP = 0.3
@@ -35,7 +38,9 @@ WHITE_LEVEL = 0.8
 class WorldSettings:
     """All that makes a world. `displaced_px` moves sensors by (right, up) pixels in their layer.
 
-    `height_m` above mean ground and `ground_speed_mps` default to what suits the rig.
+    `height_m` above mean ground and `ground_speed_mps` default to what suits the rig. `ground` is a
+    name of `grounds.GROUNDS`; `cloud_over` names a sensor that a cloud hides the ground from, in
+    the first image of the line.
     """
 
     rig_file: str
@@ -49,6 +54,8 @@ class WorldSettings:
     exposures: int = 13
     relative_relief: float = 0.003
     scene_file: str | None = None
+    ground: str = "landscape"
+    cloud_over: str | None = None
 
 
 @dataclass(frozen=True)
@@ -79,6 +86,10 @@ class World:
             if name not in {s.name for s in self.rig.sensors}:
                 known = ", ".join(s.name for s in self.rig.sensors)
                 raise ValueError(f"displaced sensor {name!r} is not in the rig; it has {known}")
+        if settings.ground not in GROUNDS:
+            raise ValueError(
+                f"ground {settings.ground!r} is not known; give one of: {', '.join(GROUNDS)}"
+            )
         self.plan = survey_plan(self.rig, settings)
         self.flight = Flight(
             plan=_flight_plan(self.image, self.plan, settings),
@@ -133,6 +144,34 @@ class World:
             sample_m=plan.gsd_m,
             colour_ratio=image.colour_ratio,
             file=settings.scene_file,
+            ground=settings.ground,
+        )
+
+    @property
+    def ground(self) -> Ground:
+        """What kind of ground is flown over."""
+        return GROUNDS[self.settings.ground]
+
+    @cached_property
+    def cars(self) -> tuple[Car, ...]:
+        """What moves on the ground."""
+        return cars_of(self.scene_settings) if self.ground.moves else ()
+
+    @cached_property
+    def cloud(self) -> Cloud | None:
+        """The cloud over one sensor's part of the first image, where there is one."""
+        if self.settings.cloud_over is None:
+            return None
+        cone = self.rig.cone_of(self.settings.cloud_over)
+        sensor = self.rig.sensor(self.settings.cloud_over)
+        ground_m_per_mm = self.plan.height_above_ground_m / cone.lens.f_mm
+        size_mm = (sensor.width_px * sensor.pitch_mm, sensor.height_px * sensor.pitch_mm)
+        return cloud_over(
+            self.settings.seed,
+            place_m=(sensor.x_mm * ground_m_per_mm, sensor.y_mm * ground_m_per_mm),
+            size_m=(size_mm[0] * ground_m_per_mm, size_mm[1] * ground_m_per_mm),
+            flying_height_m=self.plan.height_above_ground_m,
+            gsd_m=self.plan.gsd_m,
         )
 
     @property
