@@ -23,6 +23,7 @@ from processing.rig import Rig
 
 _ROOMS: Final = (
     "processing.balance",
+    "processing.cells",
     "processing.correlation",
     "processing.demosaic",
     "processing.least_squares_matching",
@@ -31,6 +32,7 @@ _ROOMS: Final = (
     "processing.quicklook",
     "processing.resampling",
     "processing.seams",
+    "processing.taps",
 )
 
 
