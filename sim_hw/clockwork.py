@@ -20,7 +20,7 @@ from sim_hw.faults.catalogue import HEAD, RECEIVER, THERMOMETER, TRIGGER, Device
 from sim_hw.faults.channel import BytesDamage, Channel, for_device
 from sim_hw.faults.plan import Planned
 from sim_hw.modbus_probe import OPEN_SENSOR, READ_INPUT_REGISTERS, crc16
-from sim_hw.receiver import ReceiverAccuracy, ReceiverState
+from sim_hw.receiver import MARK, NAVIGATION, ReceiverAccuracy, ReceiverState
 from sim_hw.ublox_messages import (
     nav_att,
     nav_pvt,
@@ -34,8 +34,6 @@ RECEIVER_NAME = "receiver"
 PROBES_NAME = "probes"
 TRIGGER_NAME = "trigger"
 PROBE_UNIT = 1
-MARK = "mark"
-NAVIGATION = "navigation"
 
 NAV_PERIOD_NS = 200_000_000
 SERIAL_LATENCY_NS = (30_000_000, 80_000_000)

@@ -6,6 +6,7 @@ import errno
 import os
 import select
 import tty
+from pathlib import Path
 
 _READ_BYTES = 4096
 
@@ -17,18 +18,48 @@ class PseudoTerminal:
     lost, as on a cable that is plugged into nothing.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, link: Path | None = None) -> None:
+        """`link`: a name for the port that stays the same when the cable is pulled and back."""
+        self._link = link
+        self._device = -1
+        self.port = ""
+        self.plug_in()
+
+    def plug_in(self) -> None:
+        """Join it to the host; nothing where it is joined already."""
+        if self._device >= 0:
+            return
         self._device, host_end = os.openpty()
         try:
             tty.setraw(host_end)
-            self.port = os.ttyname(host_end)
+            port = os.ttyname(host_end)
         finally:
             # Only when our own descriptor of it is closed can we see whether a host is there.
             os.close(host_end)
         os.set_blocking(self._device, False)
+        if self._link is None:
+            self.port = port
+            return
+        self._link.parent.mkdir(parents=True, exist_ok=True)
+        new = self._link.with_name(f".{self._link.name}.{os.getpid()}")
+        new.unlink(missing_ok=True)
+        new.symlink_to(port)
+        new.replace(self._link)
+        self.port = str(self._link)
+
+    def unplug(self) -> None:
+        """Pull the cable: whoever has the port open loses it, and its name is gone."""
+        if self._device < 0:
+            return
+        os.close(self._device)
+        self._device = -1
+        if self._link is not None:
+            self._link.unlink(missing_ok=True)
 
     @property
     def is_open_by_a_host(self) -> bool:
+        if self._device < 0:
+            return False
         poll = select.poll()
         poll.register(self._device, 0)
         return not any(event & select.POLLHUP for _, event in poll.poll(0))
@@ -49,6 +80,8 @@ class PseudoTerminal:
 
     def read(self, timeout_s: float) -> bytes:
         """What the host has written, b"" where nothing came within the time-out."""
+        if self._device < 0:
+            return b""
         poll = select.poll()
         poll.register(self._device, select.POLLIN)
         events = poll.poll(round(timeout_s * 1000))
@@ -62,7 +95,5 @@ class PseudoTerminal:
             raise
 
     def close(self) -> None:
-        """Unplug. May be called twice."""
-        if self._device >= 0:
-            os.close(self._device)
-            self._device = -1
+        """Unplug for good. May be called twice."""
+        self.unplug()

@@ -5,6 +5,8 @@ It counts, delays and tells the rest of the world when each output pulses; it kn
 
 from __future__ import annotations
 
+import heapq
+import itertools
 import queue
 import selectors
 import socket
@@ -14,6 +16,8 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+from sim_hw.faults.channel import BytesDamage, Channel
+
 PROTOCOL_VERSION = 1
 DELAY_MAX_NS = 1_000_000_000
 SEQUENCE_MAX = 2**64 - 1
@@ -22,6 +26,8 @@ LINE_MAX_BYTES = 256
 
 _SEND_TIMEOUT_S = 0.5
 _POLL_S = 0.5
+_FAULT_POLL_S = 0.02
+"""How often a unit with faults looks after them."""
 _RECEIVE_BYTES = 4096
 
 
@@ -49,6 +55,7 @@ class PulseBus:
         outputs: Sequence[str],
         on_fire: Callable[[Firing], None],
         address: tuple[str, int] = ("127.0.0.1", 0),
+        faults: Channel[bytes] | None = None,
     ) -> None:
         for word in (name, *outputs):
             if not word.isascii() or not word.isprintable() or " " in word or not word:
@@ -67,6 +74,10 @@ class PulseBus:
         self._wake: tuple[socket.socket, socket.socket] | None = None
         self._threads: list[threading.Thread] = []
         self._counts: Counter[str] = Counter()
+        self._faults = faults or Channel[bytes]((), BytesDamage(), seed=name)
+        self._later: list[tuple[int, int, bytes]] = []
+        self._order = itertools.count()
+        self._was_connected = True
 
     @property
     def address(self) -> tuple[str, int]:
@@ -119,7 +130,13 @@ class PulseBus:
                 watched = self._owner
                 if watched is not None:
                     selector.register(watched, selectors.EVENT_READ)
-                ready = [key.fileobj for key, _ in selector.select(_POLL_S)]
+                ready = [key.fileobj for key, _ in selector.select(self._patience_s())]
+                if not self._is_reachable():
+                    if watched is not None:
+                        selector.unregister(watched)
+                    self._stop.wait(_FAULT_POLL_S)
+                    continue
+                self._send_what_is_due()
                 if watched is not None:
                     selector.unregister(watched)
                 # The owner's words first: one who hangs up makes room for the next.
@@ -127,6 +144,32 @@ class PulseBus:
                     self._read_owner(watched)
                 if self._listener in ready:
                     self._accept(self._listener)
+
+    def _patience_s(self) -> float:
+        return _POLL_S if self._faults.is_faultless else _FAULT_POLL_S
+
+    def _is_reachable(self) -> bool:
+        """Whether cable and power are there; what came meanwhile dies with its connection."""
+        now_ns = time.monotonic_ns()
+        if self._faults.comes_back_from_power_off(now_ns):
+            self._count = 0
+            self._delays_ns = dict.fromkeys(self._delays_ns, 0)
+        if not self._faults.is_connected(now_ns):
+            self._was_connected = False
+            return False
+        if not self._was_connected:
+            self._was_connected = True
+            self._drop_owner()
+        return True
+
+    def _send_what_is_due(self) -> None:
+        now_ns = time.monotonic_ns()
+        while self._later and self._later[0][0] <= now_ns:
+            data = heapq.heappop(self._later)[2]
+            if self._owner is not None:
+                self._send_bytes(self._owner, data)
+        if self._owner is not None and self._faults.flood_is_due(now_ns):
+            self._send_bytes(self._owner, b"FIRED 18446744073709551615 0\n")
 
     def _accept(self, listener: socket.socket) -> None:
         try:
@@ -143,7 +186,7 @@ class PulseBus:
         self._counts["connections"] += 1
         self._owner, self._owner_address, self._line = connection, f"{peer[0]}:{peer[1]}", b""
         greeting = ["PULSEBUS", str(PROTOCOL_VERSION), self._name, *self._delays_ns]
-        if not self._send(connection, " ".join(greeting)):
+        if not self._say(connection, " ".join(greeting)):
             self._drop_owner()
 
     def _read_owner(self, owner: socket.socket) -> None:
@@ -158,7 +201,7 @@ class PulseBus:
         *lines, self._line = (self._line + received).split(b"\n")
         for line in lines:
             answer, firing = self._obey(line, heard_mono_ns)
-            if not self._send(owner, answer):
+            if not self._say(owner, answer):
                 self._drop_owner()
             if firing is not None:
                 self._firings.put(firing)
@@ -178,6 +221,8 @@ class PulseBus:
                 sequence = _number(text, SEQUENCE_MAX)
                 if sequence is None:
                     return self._refuse("a sequence is an unsigned 64-bit number"), None
+                if self._faults.counter_restarts(heard_mono_ns):
+                    self._count = 0
                 self._count += 1
                 pulses = {
                     output: heard_mono_ns + delay for output, delay in self._delays_ns.items()
@@ -199,9 +244,24 @@ class PulseBus:
         self._counts["refused_lines"] += 1
         return f"ERR {sentence}"
 
+    def _say(self, owner: socket.socket, line: str) -> bool:
+        """Send a line to the owner, as far as the faults let it pass."""
+        data = line.encode("ascii", errors="replace") + b"\n"
+        now_ns = time.monotonic_ns()
+        for delivery in self._faults.send(data, now_ns):
+            if delivery.at_ns <= now_ns:
+                if not self._send_bytes(owner, delivery.message):
+                    return False
+            else:
+                heapq.heappush(self._later, (delivery.at_ns, next(self._order), delivery.message))
+        return True
+
     def _send(self, connection: socket.socket, line: str) -> bool:
+        return self._send_bytes(connection, line.encode("ascii", errors="replace") + b"\n")
+
+    def _send_bytes(self, connection: socket.socket, data: bytes) -> bool:
         try:
-            connection.sendall(line.encode("ascii", errors="replace") + b"\n")
+            connection.sendall(data)
         except OSError:
             return False
         return True
@@ -210,6 +270,7 @@ class PulseBus:
         if self._owner is not None:
             self._owner.close()
         self._owner, self._owner_address, self._line = None, "", b""
+        self._later.clear()
 
     def _deliver(self) -> None:
         while (firing := self._firings.get()) is not None:

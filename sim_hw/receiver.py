@@ -24,6 +24,12 @@ LATENCY_NS = (30_000_000, 80_000_000)
 EVENT_LATENCY_NS = (8_000_000, 30_000_000)
 """Likewise from an edge, where the receiver tells it at once."""
 CLOCK_DRIFT_PPM = 0.2
+MARK, NAVIGATION = "mark", "navigation"
+"""What a receiver says, as topics of faults."""
+BOOT_NS = 3 * NS_PER_S
+"""From power on to the first position."""
+STEP_NS = 2 * NS_PER_S
+"""An epoch so far from now was planned by a clock that has stepped since."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +109,8 @@ class EmulatedReceiver(LineDevice):
         self._epoch_due_ns = 0
         self._event_latency_ns = 0
         self._last_event_due_ns = 0
+        self._silent_until_ns = 0
+        self._topic = NAVIGATION
 
     @abstractmethod
     def epoch_bytes(self, epoch_gps_ns: int) -> bytes:
@@ -163,11 +171,29 @@ class EmulatedReceiver(LineDevice):
             **{name: self.counts[name] for name in ("epochs", "marks", "mark_messages")},
         }
 
+    # Faults
+
+    def parts(self, data: bytes) -> list[tuple[str, bytes]]:
+        return [(self._topic, data)]
+
+    def restart_count(self) -> None:
+        with self._lock:
+            self._edge_count = 0
+
+    def restart(self) -> None:
+        with self._lock:
+            self._edge_count = 0
+            self._edges.clear()
+        self._silent_until_ns = time.monotonic_ns() + BOOT_NS
+
     # Turns: epochs, and edges between them
 
     def due_mono_ns(self) -> int:
-        if self._epoch_ns is None:
-            self._plan_epoch(self.clock.gps_ns(time.monotonic_ns()))
+        now_ns = time.monotonic_ns()
+        has_stepped = abs(self._epoch_due_ns - now_ns) > STEP_NS + self._period_ns
+        if self._epoch_ns is None or has_stepped:
+            # The first epoch, or the receiver's clock is not what it was.
+            self._plan_epoch(self.clock.gps_ns(now_ns))
         edge_due_ns = self._edge_due_ns()
         return self._epoch_due_ns if edge_due_ns is None else min(edge_due_ns, self._epoch_due_ns)
 
@@ -178,12 +204,14 @@ class EmulatedReceiver(LineDevice):
                 edge = self._edges.pop(0)
             self.counts["marks"] += edge.is_rising
             self._event_latency_ns, self._last_event_due_ns = 0, edge_due_ns
+            self._topic = MARK
             return self.event_bytes(edge)
         assert self._epoch_ns is not None
+        self._topic = NAVIGATION
         data = self.epoch_bytes(self._epoch_ns)
         self.counts["epochs"] += 1
         self._plan_epoch(self._epoch_ns)
-        return data
+        return data if time.monotonic_ns() >= self._silent_until_ns else b""
 
     def _plan_epoch(self, after_gps_ns: int) -> None:
         self._epoch_ns = self.epoch_after(after_gps_ns)

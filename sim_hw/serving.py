@@ -79,6 +79,17 @@ class LineDevice:
         """Nothing was heard for `patience_s`: what it says to that."""
         return b""
 
+    def parts(self, data: bytes) -> list[tuple[str, bytes]]:
+        """What was said at once, in messages with their topics, for faults of some of them."""
+        return [("", data)]
+
+    def restart_count(self) -> None:
+        """What the device counts begins anew."""
+
+    def restart(self) -> None:
+        """The power came back: the device is as new."""
+        self.restart_count()
+
     # The loop
 
     @property

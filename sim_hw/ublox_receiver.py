@@ -11,6 +11,8 @@ from typing import Any, ClassVar
 from sim_hw.nmea_sentences import gga, rmc
 from sim_hw.receiver import (
     LATENCY_NS,
+    MARK,
+    NAVIGATION,
     STROBE_WIDTH_NS,
     EmulatedReceiver,
     ReceiverAccuracy,
@@ -30,6 +32,7 @@ from sim_hw.world_clock import WorldClock
 
 __all__ = ["LATENCY_NS", "STROBE_WIDTH_NS", "ReceiverAccuracy", "ReceiverState", "UbloxReceiver"]
 
+TIM_TM2 = b"\xb5\x62\x0d\x03"
 CLOCK_BIAS_MAX_NS = 500_000
 """The receiver steers its epochs to whole ms of GPS time and misses by up to half of one."""
 
@@ -102,6 +105,13 @@ class UbloxReceiver(EmulatedReceiver):
             )
         parts.append(self._mark_message(epoch_gps_ns))
         return b"".join(parts)
+
+    def parts(self, data: bytes) -> list[tuple[str, bytes]]:
+        """The mark is told last in its epoch."""
+        begin = data.find(TIM_TM2)
+        if begin < 0:
+            return super().parts(data)
+        return [(NAVIGATION, data[:begin]), (MARK, data[begin:])]
 
     def _mark_message(self, epoch_gps_ns: int) -> bytes:
         """TIM-TM2 for the edges since the last epoch: only the last of each kind is told."""
