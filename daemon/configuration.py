@@ -50,6 +50,17 @@ class PlanSection(_Section):
     ground_speed_mps: float = Field(default=60.0, gt=0)
 
 
+class MountSection(_Section):
+    """How the camera sits against what the receiver speaks of (docs/orientation.md).
+
+    `antenna_m` is the point whose position the receiver tells, in the body frame of the rig;
+    `boresight_deg` (roll, pitch, heading) turns the rig's body axes into the inertial unit's.
+    """
+
+    antenna_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    boresight_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
 class TriggerSection(BaseModel):
     """When to expose, and who fires. Further keys are settings of the trigger's driver."""
 
@@ -117,6 +128,7 @@ class Configuration(_Section):
 
     mission: MissionSection
     plan: PlanSection = PlanSection()
+    mount: MountSection = MountSection()
     trigger: TriggerSection
     head: tuple[HeadSection, ...] = Field(min_length=1)
     thermometer: tuple[NamedSection, ...] = ()

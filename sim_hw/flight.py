@@ -53,8 +53,9 @@ class FlightPlan:
 class Pose:
     """Position and attitude of the body at one instant.
 
-    `enu_from_body` is the rotation (3, 3); roll, pitch, heading are its angles, heading from north,
-    clockwise.
+    `enu_from_body` is the rotation (3, 3); roll, pitch, heading are its angles against the tangent
+    plane at the origin, heading from north, clockwise. `Flight.attitude_rad` is against the level
+    at the aircraft.
     """
 
     position_enu_m: Matrix
@@ -174,12 +175,26 @@ class Flight:
 
     def velocity_ned_mps(self, pose: Pose) -> tuple[float, float, float]:
         """Velocity north, east, down at the aircraft."""
-        # The vertical of the aircraft differs from that of the origin by 9 arc seconds per 280 m.
+        east, north, up = self._local_from_enu(pose) @ pose.velocity_enu_mps
+        return float(north), float(east), float(-up)
+
+    def attitude_rad(self, pose: Pose) -> tuple[float, float, float]:
+        """Roll, pitch and heading against the local level at the aircraft, as an IMU tells them."""
+        east, north, up = self._local_from_enu(pose) @ pose.enu_from_body
+        return (
+            math.atan2(-up[1], -up[2]),
+            math.asin(up[0]),
+            math.atan2(east[0], north[0]) % (2 * math.pi),
+        )
+
+    def _local_from_enu(self, pose: Pose) -> Matrix:
+        """East, north, up at the aircraft from those at the origin.
+
+        The two verticals differ by 9 arc seconds per 280 m.
+        """
         latitude, longitude, _ = self.geodetic(pose.position_enu_m)
         ecef = ecef_from_enu_rotation(self.plan.latitude_deg, self.plan.longitude_deg)
-        there = ecef_from_enu_rotation(latitude, longitude)
-        east, north, up = there.T @ (ecef @ pose.velocity_enu_mps)
-        return float(north), float(east), float(-up)
+        return np.asarray(ecef_from_enu_rotation(latitude, longitude).T @ ecef)
 
 
 def attitude_tremor(random: np.random.Generator, *, rms: float, rate_rms: float) -> Tremor:

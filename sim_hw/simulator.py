@@ -22,7 +22,12 @@ from pathlib import Path
 from typing import Any
 
 from sim_hw import laboratory, scene, world
+from sim_hw.clockwork import PROBES_NAME, RECEIVER_NAME, TRIGGER_NAME, devices_of
+from sim_hw.faults.channel import BytesDamage, Channel, for_device
+from sim_hw.faults.plan import read_plan
+from sim_hw.faults.wire import FaultyWire, FaultyWorldClock
 from sim_hw.head_process import (
+    Begin,
     FirstLine,
     HeadPlan,
     Pulse,
@@ -32,6 +37,7 @@ from sim_hw.head_process import (
     run,
 )
 from sim_hw.modbus_probe import ModbusProbe
+from sim_hw.pseudo_terminal import PseudoTerminal
 from sim_hw.pulse_bus import Firing, PulseBus
 from sim_hw.seeding import random_stream
 from sim_hw.truth import Taken, TruthWriter
@@ -64,6 +70,8 @@ class SimulatorSettings:
     first_address: str = "127.0.0.2"
     packet_loss: float = 0.0
     processes: int = 2
+    faults: tuple[str, ...] = ()
+    scenario: Path | None = None
 
 
 class Simulator:
@@ -93,13 +101,31 @@ class Simulator:
         rig = world_.rig
         self._strobe = rig.cone(rig.reference_cone).sensors[0].name
         self.addresses = head_addresses(world_, settings.first_address)
-        self._bus = PulseBus(rig.name, [c.name for c in rig.cones], self._on_fire)
-        self._receiver = UbloxReceiver(clock, self._receiver_state)
+        self.planned = read_plan(settings.faults, settings.scenario, devices_of(rig))
+        self._channels = {
+            name: Channel(
+                for_device(self.planned, name),
+                BytesDamage(),
+                seed=f"{world_.settings.seed}-{name}",
+                tell=lambda sentence, name=name: tell(f"{name}: {sentence}"),
+            )
+            for name in (TRIGGER_NAME, RECEIVER_NAME, PROBES_NAME)
+        }
+        self._bus = PulseBus(
+            rig.name,
+            [c.name for c in rig.cones],
+            self._on_fire,
+            faults=self._channels[TRIGGER_NAME],
+        )
+        self._receiver = self._faulty_receiver(settings.out / "ports" / RECEIVER_NAME)
+        line = PseudoTerminal(settings.out / "ports" / PROBES_NAME)
         self._probes = ModbusProbe(
             [self._probe_reading(probe) for probe in rig.probes],
             unit=PROBE_UNIT,
             first_register=PROBE_FIRST_REGISTER,
+            line=line,
         )
+        self._probes.wire = FaultyWire(self._probes, self._channels[PROBES_NAME], line)
 
     def start(self) -> None:
         """Build the scene, measure the calibration, and open every device.
@@ -124,6 +150,7 @@ class Simulator:
         self._probes.start()
         self._reports = threading.Thread(target=self._follow_reports, name="reports", daemon=True)
         self._reports.start()
+        self._begin_faults(time.monotonic_ns())
 
     def close(self) -> None:
         """Close every device and write what truth is still open."""
@@ -170,7 +197,30 @@ class Simulator:
             "truth": str((out / "truth").resolve()),
             "plan": asdict(self._world.plan),
             "mono_ns_at_line_start": self._clock.mono_ns_at_start,
+            "faults": [asdict(fault) for fault in self.planned],
         }
+
+    def _faulty_receiver(self, port: Path) -> UbloxReceiver:
+        """The receiver, whose clock is its own: times given to it and asked of it are the world's."""
+        channel = self._channels[RECEIVER_NAME]
+        line = PseudoTerminal(port)
+        clock = FaultyWorldClock(self._clock, channel)
+        self._receiver_clock = clock
+        receiver = UbloxReceiver(
+            clock,
+            lambda own_gps_ns: self._receiver_state(clock.world_gps_ns(own_gps_ns)),
+            line=line,
+        )
+        receiver.wire = FaultyWire(receiver, channel, line)
+        return receiver
+
+    def _begin_faults(self, mono_ns: int) -> None:
+        """Everything answers: the seconds of the faults count from now."""
+        for channel in self._channels.values():
+            channel.begin(mono_ns)
+        with self._sending:
+            for pipe in self._pipes:
+                pipe.send(Begin(mono_ns))
 
     def _start_workers(self) -> None:
         sensors = self._world.rig.sensors
@@ -182,7 +232,12 @@ class Simulator:
                 scene_cache=self._settings.scene_cache,
                 calibration=self._settings.out / "calibration",
                 heads=tuple(
-                    HeadPlan(s.name, self.addresses[s.name], self._settings.packet_loss)
+                    HeadPlan(
+                        s.name,
+                        self.addresses[s.name],
+                        self._settings.packet_loss,
+                        for_device(self.planned, s.name),
+                    )
                     for s in group
                 ),
             )
@@ -216,6 +271,8 @@ class Simulator:
         pulses = firing.pulses_mono_ns
         first_ns = pulses.get(self._world.rig.reference_cone, min(pulses.values()))
         self._line.begin(self._clock.gps_ns(first_ns))
+        for channel in self._channels.values():
+            channel.pulse(firing.count, first_ns)
         starts = {
             sensor.name: pulses[cone.name]
             for cone in self._world.rig.cones
@@ -250,29 +307,33 @@ class Simulator:
 
     def _taken(self, taken: Taken) -> None:
         if taken.sensor == self._strobe:
-            self._receiver.mark(taken.look.mid_gps_ns)
+            self._receiver.mark(self._receiver_clock.own_gps_ns(taken.look.mid_gps_ns))
         self._truth.add(taken, self._line.flight)
 
     def _receiver_state(self, gps_ns: int) -> ReceiverState:
         flight = self._line.flight
         pose = flight.pose(gps_ns)
         latitude, longitude, height = flight.geodetic(pose.position_enu_m)
+        roll, pitch, heading = flight.attitude_rad(pose)
         return ReceiverState(
             latitude_deg=latitude,
             longitude_deg=longitude,
             height_m=height,
             velocity_ned_mps=flight.velocity_ned_mps(pose),
-            roll_deg=math.degrees(pose.roll_rad),
-            pitch_deg=math.degrees(pose.pitch_rad),
-            heading_deg=math.degrees(pose.heading_rad),
+            roll_deg=math.degrees(roll),
+            pitch_deg=math.degrees(pitch),
+            heading_deg=math.degrees(heading),
         )
 
     def _probe_reading(self, probe: str) -> Callable[[], float | None]:
         random = random_stream(self._world.settings.seed, "probe", probe)
         offset_c = float(random.normal(0, PROBE_OFFSET_SIGMA_C))
 
-        def reading() -> float:
-            gps_ns = self._clock.gps_ns(time.monotonic_ns())
+        def reading() -> float | None:
+            now_ns = time.monotonic_ns()
+            if self._channels[PROBES_NAME].sensor_is_open(now_ns):
+                return None
+            gps_ns = self._clock.gps_ns(now_ns)
             noise_c = float(random.normal(0, PROBE_NOISE_SIGMA_C))
             return self._world.temperature_c(probe, gps_ns) + offset_c + noise_c
 
@@ -308,7 +369,8 @@ def simulate(settings: SimulatorSettings, world_settings: WorldSettings, clock: 
     try:
         simulator = Simulator(settings, World(world_settings), clock, tell)
     except (SimulatorError, ValueError) as error:
-        tell(str(error))
+        for sentence in str(error).splitlines():
+            tell(sentence)
         return 1
     describe(simulator, tell)
     try:

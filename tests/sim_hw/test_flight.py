@@ -111,3 +111,22 @@ def test_rays_end_on_the_relief() -> None:
     assert along[:, 0] == pytest.approx(along[:, 2], rel=1e-12)
     assert np.abs(ground[:, 2]).max() < 9.0
     assert ground[:, 2].std() > 1.0
+
+
+def test_an_inertial_unit_is_level_where_it_is_and_not_where_the_flight_began() -> None:
+    still = FlightPlan(
+        height_m=1000.0,
+        ground_speed_mps=60.0,
+        line_length_m=20_000.0,
+        line_spacing_m=500.0,
+        attitude_rms_deg=0.0,
+        rate_rms_dps=0.0,
+        wander_rms_m=0.0,
+    )
+    flown = Flight(still, seed=1, epoch_gps_ns=0)
+    pose = flown.pose(150 * 10**9)  # 9 km north of the origin
+    roll, pitch, heading = flown.attitude_rad(pose)
+    # The mount is level in the plane of the origin, so the nose is up against the level there.
+    assert pitch == pytest.approx(9000.0 / 6_376_000.0, rel=5e-3)
+    assert roll == pytest.approx(0.0, abs=5e-5)  # a little, by the crab
+    assert heading == pytest.approx(pose.heading_rad, abs=5e-5)

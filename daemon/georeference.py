@@ -1,0 +1,163 @@
+"""From WGS 84 to the coordinate system a customer asks for, by PROJ, and never by a guess.
+
+What PROJ can only do roughly, because a grid is not installed, is an error that names the grid.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from daemon.errors import DaemonError
+
+if TYPE_CHECKING:
+    import pyproj
+
+FROM_CRS = "EPSG:4979"
+STEP_DEG = 1e-3
+"""Half the length, about 110 m, of the piece of meridian whose direction is taken."""
+
+
+class GeoreferenceError(DaemonError):
+    """A coordinate system that cannot be served; the sentence says what is missing."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """A point in the target system: east, north and height in metres, and where true north is.
+
+    `azimuth_of_north_rad` is clockwise from grid north; `scale` is grid length over true length.
+    """
+
+    east_m: float
+    north_m: float
+    height_m: float
+    azimuth_of_north_rad: float
+    scale: float
+
+
+class Georeference:
+    """Transforms WGS 84 positions into one projected coordinate system.
+
+    Args:
+        crs: such as "EPSG:25833" (heights stay above the ellipsoid) or "EPSG:25833+7837".
+
+    Raises:
+        GeoreferenceError: no such system, not a projected one in metres, or a grid is missing.
+    """
+
+    def __init__(self, crs: str) -> None:
+        import_proj()
+        import pyproj
+        from pyproj.transformer import TransformerGroup
+
+        try:
+            self.crs = pyproj.CRS.from_user_input(crs)
+        except pyproj.exceptions.CRSError as error:
+            raise GeoreferenceError(
+                f"{crs} is no coordinate system PROJ knows; "
+                "write it as EPSG:25833 or EPSG:25833+7837"
+            ) from error
+        self.name = crs
+        _refuse_unfit(self.crs, crs)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what it warns of is the error below
+            group = TransformerGroup(FROM_CRS, self.crs, always_xy=True, allow_ballpark=False)
+        if not group.transformers or not group.best_available:
+            raise GeoreferenceError(_what_is_missing(crs, group.unavailable_operations))
+        self._transformer: pyproj.Transformer = group.transformers[0]
+        self.operation = str(self._transformer.description)
+        self.accuracy_m = float(self._transformer.accuracy)
+
+    @property
+    def height_system(self) -> str:
+        """What the heights count from, in words."""
+        vertical = [part for part in self.crs.sub_crs_list if part.is_vertical]
+        return str(vertical[0].name) if vertical else "ellipsoid of WGS 84"
+
+    def place(self, latitude_deg: float, longitude_deg: float, height_m: float) -> Place:
+        """Transform a position, height above the ellipsoid.
+
+        Raises:
+            GeoreferenceError: it lies outside the area of the system.
+        """
+        north_of, south_of = latitude_deg + STEP_DEG, latitude_deg - STEP_DEG
+        east, north, height = self._transform(longitude_deg, latitude_deg, height_m)
+        above = self._transform(longitude_deg, north_of, height_m)
+        below = self._transform(longitude_deg, south_of, height_m)
+        along = (above[0] - below[0], above[1] - below[1])
+        return Place(
+            east_m=east,
+            north_m=north,
+            height_m=height,
+            azimuth_of_north_rad=math.atan2(along[0], along[1]),
+            scale=math.hypot(*along) / _meridian_m(latitude_deg),
+        )
+
+    def _transform(
+        self, longitude_deg: float, latitude_deg: float, height_m: float
+    ) -> tuple[float, float, float]:
+        x, y, z = self._transformer.transform(longitude_deg, latitude_deg, height_m)
+        if not all(map(math.isfinite, (x, y, z))):
+            raise GeoreferenceError(
+                f"{latitude_deg:.6f} N {longitude_deg:.6f} E lies outside the area of {self.name}"
+            )
+        return float(x), float(y), float(z)
+
+
+def utm_of(latitude_deg: float, longitude_deg: float) -> str:
+    """The UTM zone of a place on WGS 84, as EPSG code."""
+    zone = min(int((longitude_deg + 180.0) % 360.0 // 6.0) + 1, 60)
+    return f"EPSG:{32600 + zone if latitude_deg >= 0 else 32700 + zone}"
+
+
+def import_proj() -> None:
+    """Whether PROJ is here.
+
+    Raises:
+        GeoreferenceError: pyproj is not installed.
+    """
+    try:
+        import pyproj  # noqa: F401
+    except ImportError as error:
+        raise GeoreferenceError(
+            "coordinate systems need pyproj; install the extra: pip install 'syntopic[geodesy]'"
+        ) from error
+
+
+def _refuse_unfit(crs: pyproj.CRS, name: str) -> None:
+    horizontal = crs.sub_crs_list[0] if crs.is_compound else crs
+    if not horizontal.is_projected:
+        raise GeoreferenceError(
+            f"{name} ({crs.name}) is not projected; omega, phi and kappa need a map grid, "
+            "such as a UTM zone"
+        )
+    units = {axis.unit_name for axis in crs.axis_info}
+    if units != {"metre"}:
+        raise GeoreferenceError(f"{name} ({crs.name}) counts in {', '.join(sorted(units))}, not m")
+
+
+def _what_is_missing(name: str, unavailable: Sequence[object]) -> str:
+    for operation in unavailable:
+        grids = [grid for grid in getattr(operation, "grids", []) if not grid.available]
+        if grids:
+            files = ", ".join(grid.short_name for grid in grids)
+            commands = "; ".join(f"pyproj sync --file {grid.short_name}" for grid in grids)
+            return (
+                f"{name}: PROJ lacks {files}, without which heights or positions would be wrong "
+                f"by metres. Fetch it where there is a network ({commands}), or leave the height "
+                "system out for ellipsoidal heights"
+            )
+    return f"{name}: PROJ knows no accurate way there from WGS 84 with ellipsoidal heights"
+
+
+def _meridian_m(latitude_deg: float) -> float:
+    """Length of the piece of meridian of `place` on the ellipsoid."""
+    import pyproj
+
+    ellipsoid = pyproj.Geod(ellps="WGS84")
+    _, _, length = ellipsoid.inv(0.0, latitude_deg - STEP_DEG, 0.0, latitude_deg + STEP_DEG)
+    return float(length)
