@@ -17,7 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.adjustment import Solution, normal_equations, redundancy_numbers, solve
+from processing.adjustment import Block, Solution, normal_equations, redundancy_numbers, solve
+from processing.mosaic_clusters import clustered_cofactor
 from processing.mosaic_model import MosaicModel, build_model, placement_at, vip_and_design
 from processing.mosaic_weights import (
     CLASSES,
@@ -54,7 +55,8 @@ class Mosaic:
     """The outcome of an adjustment; placements in the virtual image and how good they are.
 
     `values` (u,) are accumulated corrections against the start, `covariance` (u, u) theirs, a
-    posteriori, both in the unknowns' own units (see `MosaicModel`). `residuals_px` (n, 2) is place
+    posteriori, both in the unknowns' own units (see `MosaicModel`); neighbours that err alike are
+    counted for what they tell (`processing.mosaic_clusters`). `residuals_px` (n, 2) is place
     of a minus place of b in the VIP after the adjustment, (x right, y up), for all tie points,
     outliers included; `redundancy_numbers` (n, 2) likewise; `outliers` (n,) marks points not used.
     `sigma0` has no unit; `sigma0_px` is that of one coordinate difference of a P/P pair.
@@ -239,6 +241,7 @@ def adjust_mosaic(
     class_scale = dict.fromkeys(CLASSES, 1.0) if begin is None else _scales_of(begin, settings)
     least = settings.min_iterations if begin is None else 1
     solution: Solution | None = None
+    blocks: list[Block] = []
     iterations = 0
     for iterations in range(1, settings.max_iterations + 1):
         blocks = [block_of(model, start, g, values, class_scale[g.kind]) for g in groups]
@@ -276,6 +279,7 @@ def adjust_mosaic(
         model,
         settings,
         groups,
+        blocks,
         class_scale,
         values,
         solution,
@@ -294,6 +298,7 @@ def _mosaic(
     model: MosaicModel,
     settings: MosaicSettings,
     groups: Sequence[Group],
+    blocks: Sequence[Block],
     class_scale: Mapping[int, float],
     values: Array,
     solution: Solution | None,
@@ -325,7 +330,10 @@ def _mosaic(
     # With a prior the unknowns take less from the points than one degree of freedom each.
     freedom = free if supported else 2 * used_points - unknowns + constraints + held
     sigma0 = math.sqrt(squares / freedom) if freedom > 0 else 1.0
-    cofactor = np.zeros((unknowns, unknowns)) if solution is None else solution.cofactor
+    cofactor = np.zeros((unknowns, unknowns))
+    if solution is not None:
+        scales = np.array([class_scale[group.kind] for group in groups])
+        cofactor = clustered_cofactor(groups, blocks, solution.cofactor, scales, sigma0)
     ratio = class_scale[PAN_TO_COLOUR] / class_scale[PAN_TO_PAN]
     pitch_um = model.pitch_mm * 1e3
     sigma0_px = sigma0 * settings.sigma_pp_px * class_scale[PAN_TO_PAN]
