@@ -37,6 +37,14 @@ def parser() -> argparse.ArgumentParser:
     add("--heading", type=float, default=0.0, help="track of the first line, degrees")
     add("--exposures", type=int, default=13, help="exposures of a line; sizes the scene")
     add("--packet-loss", type=float, default=0.0, help="share of image packets lost")
+    add(
+        "--fault",
+        action="append",
+        default=[],
+        metavar="NAME@TIME[:DEVICE][,DURATION]",
+        help="plan a fault, see docs/faults.md; may be repeated",
+    )
+    add("--scenario", type=Path, help="a file with faults")
     add("--first-address", default="127.0.0.2", help="loopback address of the first head")
     add("--scene", help="a GeoTIFF to fly over instead of the shipped photographs")
     add("--scene-cache", type=Path, help="folder where built scenes are kept (default: OUT/scenes)")
@@ -93,6 +101,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         first_address=given.first_address,
         packet_loss=given.packet_loss,
         processes=given.processes,
+        faults=tuple(given.fault),
+        scenario=given.scenario,
     )
     return simulate(settings, world, clock)
 

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from processing.rig import Cone, Sensor
 from sim_hw import laboratory
 from sim_hw.electronics import Electronics, true_sensor
+from sim_hw.faults.plan import Planned
 from sim_hw.flight import Flight
 from sim_hw.gige.faults import WireFaults
 from sim_hw.gige.head import NO_PULSE, ExposureRequest, FrameSize, GigeHead, HeadIdentity
@@ -52,6 +53,7 @@ class HeadPlan:
     sensor: str
     address: str
     packet_loss: float
+    faults: tuple[Planned, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,13 @@ class Pulse:
 
     count: int
     start_mono_ns: dict[str, int]
+
+
+@dataclass(frozen=True)
+class Begin:
+    """Told to a worker: everything answers, and the seconds of the faults count from then."""
+
+    mono_ns: int
 
 
 @dataclass(frozen=True)
@@ -153,7 +162,7 @@ class RenderedHead:
             clock=DeviceClock(
                 offset_ns=int(random.integers(0, 10**12)), drift_ppm=float(random.normal(0, 10))
             ),
-            faults=WireFaults(packet_loss=plan.packet_loss),
+            faults=WireFaults(packet_loss=plan.packet_loss, planned=plan.faults),
         )
 
     def temperature_c(self, mono_ns: int) -> float:
@@ -246,6 +255,10 @@ def _serve(pipe: Connection, heads: Sequence[RenderedHead], ending: threading.Ev
             pulse = pipe.recv()
         except (EOFError, OSError):
             return
+        if isinstance(pulse, Begin):
+            for head in heads:
+                head.head.channel.begin(pulse.mono_ns)
+            continue
         if not isinstance(pulse, Pulse):
             return
         for head in heads:

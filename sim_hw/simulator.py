@@ -6,6 +6,7 @@ Composition only. What a device says on its wire is in the device's own file, wh
 
 from __future__ import annotations
 
+import functools
 import ipaddress
 import json
 import math
@@ -107,7 +108,7 @@ class Simulator:
                 for_device(self.planned, name),
                 BytesDamage(),
                 seed=f"{world_.settings.seed}-{name}",
-                tell=lambda sentence, name=name: tell(f"{name}: {sentence}"),
+                tell=functools.partial(_tell_of, tell, name),
             )
             for name in (TRIGGER_NAME, RECEIVER_NAME, PROBES_NAME)
         }
@@ -117,8 +118,8 @@ class Simulator:
             self._on_fire,
             faults=self._channels[TRIGGER_NAME],
         )
-        self._receiver = self._faulty_receiver(settings.out / "ports" / RECEIVER_NAME)
-        line = PseudoTerminal(settings.out / "ports" / PROBES_NAME)
+        self._receiver = self._faulty_receiver(settings.out.resolve() / "ports" / RECEIVER_NAME)
+        line = PseudoTerminal(settings.out.resolve() / "ports" / PROBES_NAME)
         self._probes = ModbusProbe(
             [self._probe_reading(probe) for probe in rig.probes],
             unit=PROBE_UNIT,
@@ -201,7 +202,7 @@ class Simulator:
         }
 
     def _faulty_receiver(self, port: Path) -> UbloxReceiver:
-        """The receiver, whose clock is its own: times given to it and asked of it are the world's."""
+        """The receiver, with a clock of its own: what goes in and out is in times of the world."""
         channel = self._channels[RECEIVER_NAME]
         line = PseudoTerminal(port)
         clock = FaultyWorldClock(self._clock, channel)
@@ -338,6 +339,10 @@ class Simulator:
             return self._world.temperature_c(probe, gps_ns) + offset_c + noise_c
 
         return reading
+
+
+def _tell_of(tell: Callable[[str], None], device: str, sentence: str) -> None:
+    tell(f"{device}: {sentence}")
 
 
 def head_addresses(world_: World, first_address: str) -> dict[str, str]:

@@ -25,7 +25,7 @@ HELP = """Run the emulated devices of a rig until Ctrl-C.
 Prints their addresses and writes a fitting service configuration, for our daemon in another
 terminal or for any other GigE Vision, u-blox or Modbus program.
 
-Example: `syntopic sim ultracam-x-mini --out flights/sim` and then
+Example: `syntopic sim ultracam-x-mini --out flights/sim --fault silent@60:receiver,8` and then
 `syntopic run flights/sim/service.toml`
 """
 
@@ -78,6 +78,11 @@ def sim(
         list[str] | None, typer.Option(help="Move a sensor: SU02=1.0,-0.6 (px); repeatable.")
     ] = None,
     packet_loss: Annotated[float, typer.Option(help="Share of image packets lost.")] = 0.0,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(help="NAME@TIME[:DEVICE][,DURATION], see docs/faults.md; repeatable."),
+    ] = None,
+    scenario: Annotated[Path | None, typer.Option(help="A file with faults.")] = None,
     first_address: Annotated[
         str, typer.Option(help="Address of the first head; a free one by default.")
     ] = "",
@@ -89,6 +94,9 @@ def sim(
     )
     arguments += ["--first-address", first_address or free_first_address()]
     arguments += ["--scene", str(scene)] if scene else []
+    for planned in fault or []:
+        arguments += ["--fault", planned]
+    arguments += ["--scenario", str(scenario)] if scenario else []
     console = Console(stderr=True)
     try:
         emulator = Emulator(arguments)
@@ -125,9 +133,14 @@ def simulator_arguments(
 
 
 def free_first_address() -> str:
-    """The first loopback block 127.0.k.2 on which no emulated rig answers yet."""
+    """The first loopback block 127.p.k.2 on which no emulated rig answers yet.
+
+    p is this process's own, so that rigs started at the same moment do not choose the same one, and
+    a service that still looks for the heads of an earlier flight does not find those of this.
+    """
+    own = 1 + os.getpid() % 250
     for block in range(256):
-        address = f"127.0.{block}.2"
+        address = f"127.{own}.{block}.2"
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             try:
                 probe.bind((address, GVCP_PORT))

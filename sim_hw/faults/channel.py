@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import random
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
+from sim_hw.faults.catalogue import CATALOGUE
 from sim_hw.faults.plan import Planned
 from sim_hw.world_clock import NS_PER_S, NS_PER_WEEK
 
@@ -21,6 +22,8 @@ FLOOD_PERIOD_NS = 100_000_000
 """A flooding device says something unasked so often."""
 DUPLICATE_AFTER_NS = 1_000_000
 OVERTAKEN_AFTER_NS = 5_000_000
+TOLD_AGAIN_NS = 5 * NS_PER_S
+"""A fault that hits again so much later is told again."""
 NOTED_EVERY_NS = NS_PER_S // 2
 """A fault that lasts is a hit so often."""
 
@@ -93,7 +96,14 @@ class Channel(Generic[T]):
     pulse of the trigger unit, for faults that begin with one. From any thread.
     """
 
-    def __init__(self, planned: Iterable[Planned], damage: Damage[T], *, seed: int | str) -> None:
+    def __init__(
+        self,
+        planned: Iterable[Planned],
+        damage: Damage[T],
+        *,
+        seed: int | str,
+        tell: Callable[[str], None] | None = None,
+    ) -> None:
         self._armed = [_Armed(fault) for fault in planned]
         self._damage = damage
         self._chance = random.Random(f"faults-{seed}")
@@ -101,6 +111,7 @@ class Channel(Generic[T]):
         self._last: dict[str, T] = {}
         self._held: list[tuple[str, T]] = []
         self._next_flood_ns = 0
+        self._tell = tell
         self._noted_ns: dict[str, int] = {}
         self.hits: list[Hit] = []
 
@@ -280,6 +291,8 @@ class Channel(Generic[T]):
     def _note(self, name: str, now_ns: int, what: str = "") -> None:
         """Keep a hit; what only lasts is kept once in a while."""
         last_ns = self._noted_ns.get(name)
+        if self._tell is not None and (last_ns is None or now_ns - last_ns >= TOLD_AGAIN_NS):
+            self._tell(f"fault {name}: {CATALOGUE[name].says}")
         if what or last_ns is None or now_ns - last_ns >= NOTED_EVERY_NS:
             self._noted_ns[name] = now_ns
             self.hits.append(Hit(name, now_ns, what))

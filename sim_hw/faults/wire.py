@@ -83,6 +83,14 @@ class FaultyWorldClock(WorldClock):
         """How far it is ahead of the world."""
         return self._channel.clock_error_ns(mono_ns)
 
+    def own_gps_ns(self, world_gps_ns: int) -> int:
+        """What it shows at a GPS time of the world."""
+        return world_gps_ns + self.error_ns(super().mono_ns(world_gps_ns))
+
+    def world_gps_ns(self, own_gps_ns: int) -> int:
+        """What time it really is, by the error it has now."""
+        return own_gps_ns - self.error_ns(time.monotonic_ns())
+
     def gps_ns(self, mono_ns: int) -> int:
         return super().gps_ns(mono_ns) + self.error_ns(mono_ns)
 

@@ -5,6 +5,8 @@ The sensor is behind `expose`; the way out is `stream`. One thread takes the exp
 
 from __future__ import annotations
 
+import heapq
+import itertools
 import queue
 import struct
 import threading
@@ -16,12 +18,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_hw.faults.channel import Channel
 from sim_hw.gige import features as at
-from sim_hw.gige.faults import WireFaults
+from sim_hw.gige.faults import HeadClock, TakenFrame, WireFaults
 from sim_hw.gige.gvsp import Destination, FrameHeader, FramePackets, chunk_data
 from sim_hw.gige.registers import FrameSize, RegisterMemory
 from sim_hw.gige.stream import StreamChannel
-from sim_hw.world_clock import DeviceClock
 
 NO_PULSE = 0
 """`pulse_count` of an exposure that no pulse of the bus started (software, free-running)."""
@@ -33,6 +35,8 @@ _IMAGE_CHUNK_BYTES = 8
 _MONO8_SHIFT = 4
 _BLOCK_ID_MAX = 65_535
 _POLL_S = 0.2
+_FAULT_POLL_S = 0.02
+"""How often a head with faults looks after them."""
 _NS_PER_US = 1_000
 _NS_PER_S = 1_000_000_000
 
@@ -81,8 +85,9 @@ class Acquisition:
         size: FrameSize,
         expose: Callable[[ExposureRequest], NDArray[np.uint16]],
         temperature_c: Callable[[int], float],
-        clock: DeviceClock,
+        clock: HeadClock,
         faults: WireFaults,
+        channel: Channel[TakenFrame],
     ) -> None:
         self._registers = registers
         self._stream = stream
@@ -91,6 +96,9 @@ class Acquisition:
         self._temperature_c = temperature_c
         self._clock = clock
         self._faults = faults
+        self._channel = channel
+        self._later: list[tuple[int, int, _Pending, TakenFrame]] = []
+        self._order = itertools.count()
         self._pending: queue.Queue[_Pending | None] = queue.Queue()
         self._lock = threading.Lock()
         self._acquiring = False
@@ -215,6 +223,8 @@ class Acquisition:
             ):
                 self.counts["overtriggered"] += 1
                 return
+            if self._channel.counter_restarts(start_mono_ns):
+                self._counter = 0
             self._counter += 1
             pending = _Pending(
                 acquisition=self._acquisition,
@@ -250,6 +260,7 @@ class Acquisition:
     def _run(self) -> None:
         while not self._stop.is_set():
             self._free_run()
+            self._send_what_is_due()
             try:
                 pending = self._pending.get(timeout=self._patience_s())
             except queue.Empty:
@@ -262,7 +273,7 @@ class Acquisition:
 
     def _patience_s(self) -> float:
         if not self._is_free_running():
-            return _POLL_S
+            return _POLL_S if self._channel.is_faultless else _FAULT_POLL_S
         until_next_s = (self._next_free_run_ns - time.monotonic_ns()) / _NS_PER_S
         return min(_POLL_S, max(until_next_s, 0.001))
 
@@ -274,14 +285,41 @@ class Acquisition:
             self._next_free_run_ns = due_ns if due_ns > now_ns else now_ns + period_ns
             self._start_exposure(max(now_ns, self._busy_until_ns), NO_PULSE)
 
+    def _send_what_is_due(self) -> None:
+        now_ns = time.monotonic_ns()
+        while self._later and self._later[0][0] <= now_ns:
+            _, _, pending, taken = heapq.heappop(self._later)
+            self._hand_over(pending, taken)
+        if self._acquiring and self._channel.flood_is_due(now_ns):
+            self._start_exposure(max(now_ns, self._busy_until_ns), NO_PULSE)
+
     def _take(self, pending: _Pending) -> None:
         request = pending.request
-        image = self._expose(request)
+        image, size = self._expose(request), self._size
+        if image.shape != (size.height_px, size.width_px) or image.dtype != np.uint16:
+            raise ValueError(
+                f"expose gave {image.dtype} of shape {image.shape};"
+                f" the sensor is uint16 of shape {(size.height_px, size.width_px)}"
+            )
         self.counts["frames_exposed"] += 1
         self._stop.wait(max(0.0, (pending.end_mono_ns - time.monotonic_ns()) / _NS_PER_S))
         if request.pulse_count != NO_PULSE and request.pulse_count in self._faults.drop_frame:
             self.counts["frames_dropped_by_fault"] += 1
             return
+        start_ns = self._clock.device_ns(request.start_mono_ns)
+        now_ns = time.monotonic_ns()
+        sent = self._channel.send(
+            TakenFrame(image, start_ns, request.counter), now_ns, what=str(request.pulse_count)
+        )
+        self.counts["frames_dropped_by_fault"] += not sent
+        for delivery in sent:
+            heapq.heappush(
+                self._later, (delivery.at_ns, next(self._order), pending, delivery.message)
+            )
+        self._send_what_is_due()
+
+    def _hand_over(self, pending: _Pending, taken: TakenFrame) -> None:
+        """To the stream, where somebody wants it."""
         destination = self.destination()
         with self._lock:
             if destination is None or pending.acquisition != self._acquisition:
@@ -289,35 +327,31 @@ class Acquisition:
                 return
             self._block_id = self._block_id % _BLOCK_ID_MAX + 1
             block_id, opened = self._block_id, self._opened
-        frame = self._frame(pending, image, block_id, destination)
+        frame = self._frame(pending, taken, block_id, destination)
         self._stream.put(
             frame,
+            taken.share,
             lambda: pending.acquisition == self._acquisition and opened == self._opened,
         )
 
     def _frame(
         self,
         pending: _Pending,
-        image: NDArray[np.uint16],
+        taken: TakenFrame,
         block_id: int,
         destination: Destination,
     ) -> FramePackets:
-        request, size = pending.request, self._size
-        if image.shape != (size.height_px, size.width_px) or image.dtype != np.uint16:
-            raise ValueError(
-                f"expose gave {image.dtype} of shape {image.shape};"
-                f" the sensor is uint16 of shape {(size.height_px, size.width_px)}"
-            )
+        request, image = pending.request, taken.image
         pixels: NDArray[np.uint8] | NDArray[np.uint16]
         if pending.pixel_format == at.PIXEL_FORMATS["Mono8"]:
             pixels = np.minimum(image >> _MONO8_SHIFT, 255).astype(np.uint8)
         else:
             pixels = np.ascontiguousarray(image, dtype="<u2")
-        start_ns = self._clock.device_ns(request.start_mono_ns)
+        start_ns = taken.start_ns
         values = {
             "Timestamp": struct.pack(">Q", start_ns & 0xFFFF_FFFF_FFFF_FFFF),
             "ExposureTime": struct.pack(">d", request.exposure_time_us),
-            "CounterValue": struct.pack(">Q", request.counter),
+            "CounterValue": struct.pack(">Q", taken.counter),
             "Temperature": struct.pack(">d", self._temperature_c(request.start_mono_ns)),
         }
         chunks = b""
@@ -326,6 +360,6 @@ class Acquisition:
                 pixels.nbytes, [(at.CHUNK_IDS[name], values[name]) for name in pending.chunks]
             )
         header = FrameHeader(
-            block_id, start_ns, pending.pixel_format, size.width_px, size.height_px
+            block_id, start_ns, pending.pixel_format, image.shape[1], image.shape[0]
         )
         return FramePackets(header, pixels, chunks, destination)

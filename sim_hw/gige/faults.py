@@ -1,8 +1,16 @@
-"""What can be wrong with a head's connection, by name and reproducible."""
+"""What can be wrong with a head and its connection, by name and reproducible."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import random
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_hw.faults.channel import Channel
+from sim_hw.faults.plan import Planned
+from sim_hw.world_clock import DeviceClock
 
 
 @dataclass(frozen=True)
@@ -11,10 +19,12 @@ class WireFaults:
 
     `packet_loss` is the probability that a stream packet never leaves, resent ones included.
     `drop_frame` holds the pulse counts whose frame is exposed and counted but never sent.
+    `planned` are faults of the library, for this head.
     """
 
     packet_loss: float = 0.0
     drop_frame: frozenset[int] = frozenset()
+    planned: tuple[Planned, ...] = ()
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.packet_loss <= 1.0:
@@ -22,3 +32,54 @@ class WireFaults:
 
 
 NO_FAULTS = WireFaults()
+
+
+@dataclass(frozen=True)
+class TakenFrame:
+    """A frame between exposure and stream. Of its packets the first `share` are sent.
+
+    `start_ns` is on the head's own clock: it belongs to the frame, whenever that is sent.
+    """
+
+    image: NDArray[np.uint16]
+    start_ns: int
+    counter: int
+    share: float = 1.0
+
+
+class TakenFrameDamage:
+    """Damage of a frame."""
+
+    def corrupt(self, message: TakenFrame, chance: random.Random) -> TakenFrame:
+        """Half of its rows, honestly announced: not the size that was configured."""
+        rows = message.image.shape[0] // 2
+        return replace(message, image=np.ascontiguousarray(message.image[:rows]))
+
+    def truncated(self, message: TakenFrame, chance: random.Random) -> TakenFrame:
+        return replace(message, share=chance.uniform(0.1, 0.9))
+
+    def half(self, message: TakenFrame) -> TakenFrame:
+        return replace(message, share=0.5)
+
+
+def channel_of(faults: WireFaults, serial: str) -> Channel[TakenFrame]:
+    """The way out of a head with this serial number."""
+    return Channel(faults.planned, TakenFrameDamage(), seed=serial)
+
+
+class HeadClock:
+    """A head's own clock, with the error of its clock faults; anew after a power cycle."""
+
+    def __init__(self, clock: DeviceClock, channel: Channel[TakenFrame]) -> None:
+        self._clock = clock
+        self._channel = channel
+
+    def device_ns(self, mono_ns: int) -> int:
+        """What the clock shows at a monotonic time."""
+        return self._clock.device_ns(mono_ns) + self._channel.clock_error_ns(mono_ns)
+
+    def restart(self, mono_ns: int) -> None:
+        """It begins at zero, as after power on."""
+        drift_ppm = self._clock.drift_ppm
+        gone_ns = DeviceClock(0, drift_ppm).device_ns(mono_ns)
+        self._clock = DeviceClock(-gone_ns, drift_ppm)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sim_hw.gige import features as at
 from sim_hw.gige.acquisition import NO_PULSE, Acquisition, ExposureRequest
 from sim_hw.gige.control import Actions, ControlChannel
-from sim_hw.gige.faults import NO_FAULTS, WireFaults
+from sim_hw.gige.faults import NO_FAULTS, HeadClock, WireFaults, channel_of
 from sim_hw.gige.pacing import Pacing
 from sim_hw.gige.registers import FrameSize, HeadIdentity, RegisterMemory
 from sim_hw.gige.server import ControlServer
@@ -88,16 +88,25 @@ class GigeHead:
     ) -> None:
         self.identity = identity
         self.size = size
-        self._clock = clock
+        self.channel = channel_of(faults, identity.serial)
+        self._clock = HeadClock(clock, self.channel)
         self._registers = RegisterMemory(identity, size)
         self._stream = StreamChannel(
             identity.address,
             packet_pacing or Pacing.for_this_host(),
             faults,
             seed=zlib.crc32(identity.serial.encode("utf-8")),
+            is_connected=lambda: self.channel.is_connected(time.monotonic_ns()),
         )
         self._acquisition = Acquisition(
-            self._registers, self._stream, size, expose, temperature_c, clock, faults
+            self._registers,
+            self._stream,
+            size,
+            expose,
+            temperature_c,
+            self._clock,
+            faults,
+            self.channel,
         )
         self._registers.provide(
             "DeviceTemperature", lambda: struct.pack(">d", temperature_c(time.monotonic_ns()))
@@ -114,7 +123,7 @@ class GigeHead:
                 is_acquiring=lambda: self._acquisition.is_acquiring,
             ),
         )
-        self._server = ControlServer(identity.address, self._control)
+        self._server = ControlServer(identity.address, self._control, self._is_hearing)
         self._stream_port = 0
         self._counts: Counter[str] = Counter()
 
@@ -144,7 +153,9 @@ class GigeHead:
 
         May be called somewhat before or after that moment, from any thread; never blocks.
         """
-        self._acquisition.line_pulse(start_mono_ns, pulse_count)
+        self.channel.pulse(pulse_count, start_mono_ns)
+        if self.channel.is_powered(start_mono_ns):
+            self._acquisition.line_pulse(start_mono_ns, pulse_count)
 
     def statistics(self) -> Mapping[str, int]:
         """Counters since creation, by stable name."""
@@ -153,6 +164,14 @@ class GigeHead:
             total.update(part.counts)
         total.update(self._counts)
         return {name: total[name] for name in STATISTICS}
+
+    def _is_hearing(self) -> bool:
+        """Whether a command reaches the head; asked every quarter of a second at the latest."""
+        now_ns = time.monotonic_ns()
+        if self.channel.comes_back_from_power_off(now_ns):
+            self._clock.restart(now_ns)
+            self._reset()
+        return self.channel.is_connected(now_ns) and not self.channel.is_silent(now_ns)
 
     def _written(self, address: int) -> None:
         """What the write of a register sets in motion."""

@@ -8,6 +8,7 @@ import socket
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable
 
 from sim_hw.gige.control import ControlChannel
 from sim_hw.gige.gvcp import PORT
@@ -21,7 +22,10 @@ _RECEIVE_BYTES = 2048
 class ControlServer:
     """Serves one control channel on (address, 3956), and discovery by broadcast beside it."""
 
-    def __init__(self, address: str, channel: ControlChannel) -> None:
+    def __init__(
+        self, address: str, channel: ControlChannel, is_hearing: Callable[[], bool] = lambda: True
+    ) -> None:
+        self._is_hearing = is_hearing
         self._address = address
         self._channel = channel
         self._sockets: list[socket.socket] = []
@@ -95,6 +99,7 @@ class ControlServer:
                 for readable in self._sockets:
                     if readable in ready:
                         self._receive(readable)
+                self._is_hearing()
                 self._channel.expire(time.monotonic_ns())
 
     def _receive(self, readable: socket.socket) -> None:
@@ -107,7 +112,7 @@ class ControlServer:
         control = self._sockets[0]
         # An emulated head never answers a broadcast from outside this machine.
         is_foreign = readable is not control and not ipaddress.IPv4Address(peer[0]).is_loopback
-        if now_ns < self._deaf_until_ns or is_foreign:
+        if now_ns < self._deaf_until_ns or is_foreign or not self._is_hearing():
             return
         answer = self._channel.answer(packet, (peer[0], peer[1]), now_ns)
         if answer is None:

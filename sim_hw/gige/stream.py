@@ -48,6 +48,12 @@ class _Outgoing:
     frame: FramePackets
     is_wanted: Callable[[], bool]
     sent_packets: int = 0
+    share: float = 1.0
+
+    @property
+    def packets(self) -> int:
+        """How many of its packets there are to be sent."""
+        return self.frame.count if self.share >= 1.0 else round(self.frame.count * self.share)
 
     @property
     def opens_the_stream(self) -> bool:
@@ -57,7 +63,15 @@ class _Outgoing:
 class StreamChannel:
     """The GVSP socket of a head and the thread behind it."""
 
-    def __init__(self, address: str, pacing: Pacing, faults: WireFaults, seed: int) -> None:
+    def __init__(
+        self,
+        address: str,
+        pacing: Pacing,
+        faults: WireFaults,
+        seed: int,
+        is_connected: Callable[[], bool] = lambda: True,
+    ) -> None:
+        self._is_connected = is_connected
         self._address = address
         self._pacing = pacing
         self._loss = faults.packet_loss
@@ -90,14 +104,15 @@ class StreamChannel:
         if self._socket is not None:
             self._socket.close()
 
-    def put(self, frame: FramePackets, is_wanted: Callable[[], bool]) -> bool:
+    def put(self, frame: FramePackets, share: float, is_wanted: Callable[[], bool]) -> bool:
         """Queue a frame; waits while two are queued. False where it is not wanted any more.
 
-        `is_wanted` is asked again and again while the frame is being sent.
+        Only the first `share` of its packets is sent, also on request. `is_wanted` is asked again
+        and again while the frame is being sent.
         """
         while is_wanted() and not self._stop.is_set():
             try:
-                self._waiting.put(_Outgoing(frame, is_wanted), timeout=_POLL_S)
+                self._waiting.put(_Outgoing(frame, is_wanted, share=share), timeout=_POLL_S)
             except queue.Full:
                 continue
             return True
@@ -159,7 +174,7 @@ class StreamChannel:
 
     def _transmit(self, outgoing: _Outgoing) -> bool:
         frame = outgoing.frame
-        ends = np.cumsum(frame.sizes)
+        ends = np.cumsum(frame.sizes)[: max(outgoing.packets, 1)]
         total = int(ends[-1])
         delay_ns = frame.destination.packet_delay_ns
         limit = frame.destination.packet_size * 1e9 / delay_ns if delay_ns else float("inf")
@@ -180,7 +195,7 @@ class StreamChannel:
                 continue
             first = outgoing.sent_packets
             fits = int(np.searchsorted(ends, done + available, "right"))
-            last = min(max(fits, first + 1), frame.count) - 1
+            last = min(max(fits, first + 1), len(ends)) - 1
             self._send_first_time(frame, first, last)
             self._bucket.spend(int(ends[last]) - done)
             done = int(ends[last])
@@ -198,7 +213,8 @@ class StreamChannel:
             self._count("packets_sent", self._send(frame.only(kept)))
 
     def _send(self, batch: Batch) -> int:
-        if self._socket is None:
+        if self._socket is None or not self._is_connected():
+            self._count("packets_lost_by_fault", len(batch))
             return 0
         taken, refused = send(self._socket.fileno(), batch)
         self._count("send_errors", refused)
@@ -213,7 +229,7 @@ class StreamChannel:
         with self._lock:
             newest = self._kept[-1] if self._kept else None
         self._count("resends_unavailable", 1)
-        if newest is None or self._socket is None:
+        if newest is None or self._socket is None or not self._is_connected():
             return
         to = (newest.frame.destination.address, newest.frame.destination.port)
         last = min(request.last, request.first + _UNAVAILABLE_ANSWERS_MAX - 1)
