@@ -18,7 +18,13 @@ from typing import Any, BinaryIO
 from daemon.flight_log import logs_of, read
 from daemon.mission import Mission
 
-NATIVE_ENDINGS = {"ublox": "ubx", "novatel": "gps", "septentrio": "sbf", "nmea": "nmea"}
+NATIVE_ENDINGS = {
+    "ublox": "ubx",
+    "novatel": "gps",
+    "septentrio": "sbf",
+    "nmea": "nmea",
+    "mavlink": "raw",
+}
 """How post-processing software expects a receiver's recording to be called, by driver."""
 
 EVENT_COLUMNS = (

@@ -39,7 +39,7 @@ class MessageDecoder:
     mean that one makes no sense, and in `bad_counter` how those are called in the statistics.
     """
 
-    unreadable: ClassVar[tuple[type[Exception], ...]] = (ValueError,)
+    unreadable: tuple[type[Exception], ...] = (ValueError,)
     bad_counter: ClassVar[str] = "bad_messages"
 
     def __init__(self, receiver: str, framer: Framer, counters: tuple[str, ...]) -> None:

@@ -33,6 +33,7 @@ _PLACES: Final[Mapping[str, Mapping[str, str]]] = {
         "nmea": "drivers.nmea.navigator:NmeaNavigator",
         "novatel": "drivers.novatel.navigator:NovatelNavigator",
         "septentrio": "drivers.septentrio.navigator:SeptentrioNavigator",
+        "mavlink": "drivers.mavlink.navigator:MavlinkNavigator",
     },
 }
 

@@ -28,6 +28,7 @@ from drivers.contract import (
 from drivers.settings import Configured, Setting
 from drivers.tcp_port import SCHEME, open_tcp_port
 from drivers.telling import Teller
+from drivers.udp_port import LISTEN_SCHEME, SPEAK_SCHEME, open_udp_port
 
 READ_STEP_S: Final = 0.2
 """Longest wait for bytes before the driver looks up again."""
@@ -99,13 +100,17 @@ PortOpener = Callable[[str, int, str], Port]
 
 
 def open_serial_port(path: str, baudrate: int, parity: str) -> Port:
-    """Open a port for ourselves alone, 8 data bits, one stop bit; or connect to tcp://host:port.
+    """Open a port for ourselves alone, 8 data bits, one stop bit; or a network address.
+
+    Addresses are tcp://host:port, udpin://host:port (listens) and udpout://host:port (speaks).
 
     Raises:
         DeviceError: it cannot be opened; the sentence says why and what to do.
     """
     if path.startswith(SCHEME):
         return open_tcp_port(path)
+    if path.startswith((LISTEN_SCHEME, SPEAK_SCHEME)):
+        return open_udp_port(path)
     try:
         return serial.Serial(
             path,

@@ -70,17 +70,13 @@ def open_tcp_port(address: str) -> TcpPort:
     Raises:
         DeviceError: the address is wrong or nobody answers there; the sentence names the cure.
     """
-    try:
-        parts = urlsplit(address)
-        host, number = parts.hostname, parts.port
-    except ValueError:
-        host, number = None, None
-    if not host or not number:
+    place = host_and_number(address)
+    if place is None:
         raise DeviceError(
             f"port {address} is no address; write tcp://host:port, such as tcp://10.0.0.5:3001"
         )
     try:
-        connection = socket.create_connection((host, number), timeout=CONNECT_TIMEOUT_S)
+        connection = socket.create_connection(place, timeout=CONNECT_TIMEOUT_S)
     except (OSError, UnicodeError) as error:
         raise DeviceError(
             f"port {address} cannot be opened: {error or type(error).__name__}; check that the "
@@ -88,3 +84,18 @@ def open_tcp_port(address: str) -> TcpPort:
         ) from error
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     return TcpPort(connection)
+
+
+def host_and_number(address: str) -> tuple[str, int] | None:
+    """Host and port number of "scheme://host:port"; None where it is none.
+
+    Example:
+        >>> host_and_number("tcp://10.0.0.5:3001")
+        ('10.0.0.5', 3001)
+    """
+    try:
+        parts = urlsplit(address)
+        host, number = parts.hostname, parts.port
+    except ValueError:
+        return None
+    return (host, number) if host and number else None

@@ -17,6 +17,7 @@ PAGES = [
     ("navigator", "nmea", "nmea.md"),
     ("navigator", "novatel", "novatel.md"),
     ("navigator", "septentrio", "septentrio.md"),
+    ("navigator", "mavlink", "mavlink.md"),
     ("thermometer", "ascii-line", "ascii-line.md"),
     ("thermometer", "host", "host.md"),
     ("navigator", "gpsd", "gpsd.md"),

@@ -19,7 +19,7 @@ def test_there_are_the_drivers_of_the_first_flight() -> None:
         "head": ("aravis", "folder"),
         "trigger": ("pulse-bus", "software"),
         "thermometer": ("modbus-rtu", "ascii-line", "host"),
-        "navigator": ("ublox", "gpsd", "nmea", "novatel", "septentrio"),
+        "navigator": ("ublox", "gpsd", "nmea", "novatel", "septentrio", "mavlink"),
     }
 
 

@@ -1,0 +1,223 @@
+"""An autopilot on MAVLink, on a serial line, UDP or TCP, and the port for other MAVLink traffic.
+
+What its bytes mean is in `drivers.mavlink.decoder`.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable, Mapping
+from typing import ClassVar, Final
+
+from drivers.clock import Clock
+from drivers.mavlink.decoder import MavlinkDecoder, Timesync
+from drivers.mavlink.library import dialect
+from drivers.message_decoder import Nav
+from drivers.receiver import ListeningNavigator
+from drivers.serial_device import LineLostError, PortOpener, SerialLine, open_serial_port
+from drivers.settings import Setting
+
+SECOND_NS: Final = 1_000_000_000
+COMPANION: Final = 191
+"""MAV_COMP_ID_ONBOARD_COMPUTER: who we are on the autopilot's bus."""
+ASK_AGAIN_NS: Final = 5 * SECOND_NS
+SET_MESSAGE_INTERVAL: Final = 511
+AUTOPILOTS: Final = {3: "ArduPilot", 12: "PX4"}
+
+TimesyncListener = Callable[[Timesync], None]
+
+
+class MavlinkNavigator(ListeningNavigator):
+    """An autopilot that speaks MAVLink 1 or 2.
+
+    Yields a NavSample for every GLOBAL_POSITION_INT and an EventMark for every CAMERA_TRIGGER. It
+    says by a heartbeat once a second that it is there, as an onboard computer, and asks for the
+    messages it needs that do not come. It commands nothing else.
+
+    Source: MAVLink common message set.
+    """
+
+    kind: ClassVar = "navigator"
+    what = "autopilot"
+    protocol = "MAVLink"
+    required = ("GLOBAL_POSITION_INT",)
+    switch_on = "switch it on for this port, or let this computer ask for it (request = true)"
+
+    port = Setting(
+        "",
+        required=True,
+        says="serial port, tcp://host:port, udpin://host:port (listens) or udpout://host:port",
+    )
+    system = Setting(
+        0, minimum=0, maximum=255, says="number of the autopilot; 0: the first that is heard"
+    )
+    request = Setting(True, says="ask the autopilot for messages that do not come")
+    position_hz = Setting(10.0, minimum=0.1, maximum=400, says="rate of GLOBAL_POSITION_INT")
+    attitude_hz = Setting(50.0, minimum=0.1, maximum=1000, says="rate of ATTITUDE_QUATERNION")
+    imu_hz = Setting(0.0, minimum=0, maximum=1000, says="rate of HIGHRES_IMU; 0: not asked for")
+    mark_accuracy_ns = Setting(
+        1_000_000, minimum=1, maximum=1_000_000_000, says="accuracy of CAMERA_TRIGGER's time"
+    )
+    undulation_m = Setting(
+        0.0,
+        minimum=-200,
+        maximum=200,
+        says="geoid above ellipsoid, m, for autopilots that tell no ellipsoidal height",
+    )
+
+    decoder: MavlinkDecoder
+
+    def __init__(
+        self,
+        name: str,
+        settings: Mapping[str, object],
+        *,
+        clock: Clock | None = None,
+        open_port: PortOpener = open_serial_port,
+    ) -> None:
+        super().__init__(name, settings, clock=clock, open_port=open_port)
+        self._writing = threading.Lock()
+        self._talking: SerialLine | None = None
+        self._sequence = 0
+        self._heartbeat_ns = 0
+        self._ask_ns = 0
+        self._seen_when_asked: dict[str, int] = {}
+        self._timesync_listener: TimesyncListener | None = None
+        self.counters.update(requests=0, refusals=0)
+
+    def new_decoder(self) -> MavlinkDecoder:
+        return MavlinkDecoder(
+            self.name,
+            system=self.system,
+            mark_accuracy_ns=self.mark_accuracy_ns,
+            undulation_m=self.undulation_m,
+        )
+
+    # The port for TIMESYNC
+
+    def listen_for_timesync(self, heard: TimesyncListener | None) -> None:
+        """Call `heard` with every TIMESYNC of the autopilot, from the thread that runs the device.
+
+        `heard` returns quickly; None ends it.
+        """
+        self._timesync_listener = heard
+
+    def send_timesync(self, *, tc1_ns: int, ts1_ns: int) -> bool:
+        """Send a TIMESYNC, from any thread; False where the line is not open or just lost.
+
+        A request has `tc1_ns` 0 and our own time in `ts1_ns`; an answer gives the asker's `ts1_ns`
+        back with our time in `tc1_ns`.
+        """
+        line = self._talking
+        if line is None or not self.decoder.system:
+            return False
+        message = dialect().MAVLink_timesync_message(tc1_ns, ts1_ns)
+        try:
+            self._say(line, message)
+        except LineLostError:
+            return False
+        return True
+
+    # The device
+
+    def identify(self, line: SerialLine) -> Mapping[str, str]:
+        found = super().identify(line)
+        number = self.decoder.autopilot
+        kind = "unknown" if number is None else AUTOPILOTS.get(number, f"kind {number}")
+        return {"autopilot": kind, "system": str(self.decoder.system), **found}
+
+    def connected(self) -> None:
+        super().connected()
+        self._heartbeat_ns = self._ask_ns = self.clock.mono_ns()
+        self._seen_when_asked = {}
+
+    def step(self, line: SerialLine) -> Iterable[Nav]:
+        self._talking = line
+        self._tend(line)
+        records = super().step(line)
+        while self.decoder.timesyncs:
+            timesync = self.decoder.timesyncs.popleft()
+            if self._timesync_listener is not None:
+                self._timesync_listener(timesync)
+        while self.decoder.refusals:
+            self._on_refusal(*self.decoder.refusals.popleft())
+        return records
+
+    def close(self) -> None:
+        self._talking = None
+        super().close()
+
+    def _tend(self, line: SerialLine) -> None:
+        """Heartbeat and requests, when they are due."""
+        now_ns = self.clock.mono_ns()
+        if now_ns >= self._heartbeat_ns:
+            self._heartbeat_ns = now_ns + SECOND_NS
+            here = dialect()
+            self._say(
+                line,
+                here.MAVLink_heartbeat_message(
+                    here.MAV_TYPE_ONBOARD_CONTROLLER,
+                    here.MAV_AUTOPILOT_INVALID,
+                    0,
+                    0,
+                    here.MAV_STATE_ACTIVE,
+                    3,
+                ),
+            )
+        if self.request and self.decoder.system and now_ns >= self._ask_ns:
+            self._ask_ns = now_ns + ASK_AGAIN_NS
+            self._ask_for_what_does_not_come(line)
+
+    def _ask_for_what_does_not_come(self, line: SerialLine) -> None:
+        wanted = {
+            "SYSTEM_TIME": 1.0,
+            "GPS_RAW_INT": 1.0,
+            "GLOBAL_POSITION_INT": self.position_hz,
+            "ATTITUDE_QUATERNION": self.attitude_hz,
+            "HIGHRES_IMU": self.imu_hz,
+        }
+        here = dialect()
+        for name, hertz in wanted.items():
+            seen = self.decoder.seen[name]
+            # Half of what is wanted is enough: a line that is full would not carry more.
+            enough = hertz * ASK_AGAIN_NS / SECOND_NS / 2
+            before = self._seen_when_asked.get(name)
+            self._seen_when_asked[name] = seen
+            if not hertz or (before is not None and seen - before >= enough):
+                continue
+            self.counters["requests"] += 1
+            self._say(
+                line,
+                here.MAVLink_command_long_message(
+                    self.decoder.system,
+                    self.decoder.component,
+                    SET_MESSAGE_INTERVAL,
+                    0,
+                    getattr(here, f"MAVLINK_MSG_ID_{name}"),
+                    1e6 / hertz,
+                    0,
+                    0,
+                    0,
+                    0,
+                    0,
+                ),
+            )
+
+    def _on_refusal(self, command: int, result: int) -> None:
+        if command != SET_MESSAGE_INTERVAL:
+            return
+        self.counters["refusals"] += 1
+        self.teller.complain(
+            "refused",
+            f"The autopilot {self.name} refuses to send a message it was asked for (result "
+            f"{result}). Switch GLOBAL_POSITION_INT, ATTITUDE_QUATERNION, GPS_RAW_INT and "
+            "SYSTEM_TIME on there for this port.",
+        )
+
+    def _say(self, line: SerialLine, message: object) -> None:
+        """Pack and send as a companion of the autopilot's own system."""
+        with self._writing:
+            packer = dialect().MAVLink(None, self.decoder.system or self.system or 1, COMPANION)
+            packer.seq = self._sequence
+            self._sequence = (self._sequence + 1) % 256
+            line.write(bytes(message.pack(packer)))  # type: ignore[attr-defined]
