@@ -143,7 +143,7 @@ class Catalog:
             CatalogError: not there, damaged, or of another schema version.
         """
         if not path.is_file():
-            raise CatalogError(f"{path}: no such index; syntopic verify rebuilds nothing, run does")
+            raise CatalogError(f"{path}: no such index; syntopic repair builds it again")
         address = path.resolve().as_uri()
         try:
             connection = sqlite3.connect(

@@ -1,12 +1,15 @@
-"""Is what a mission folder holds still what was stored: hashes, chain of records, index.
+"""Is what a mission folder holds still what was stored: hashes, chain of records, index, logs.
 
-Reads only. What it finds is told in sentences; putting things right is in `daemon.recovery`.
+Hashes several exposures at a time, and reads only. What it finds is told in sentences; putting
+things right is in `daemon.recovery`.
 """
 
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +24,7 @@ from daemon.level0_folder import (
     read_capture,
     read_sealed,
 )
+from daemon.log_seals import check_logs
 from daemon.mission import DISCARDED, Mission
 from daemon.records import RecordError
 
@@ -53,11 +57,13 @@ def verify(mission: Mission, progress: Progress = lambda done, total: None) -> V
     numbers = mission.numbers()
     total = sum(_folder_nbytes(mission.level0(number)) for number in numbers)
     done = 0
+    counting = threading.Lock()
 
     def step(count: int) -> None:
         nonlocal done
-        done += count
-        progress(done, max(total, done))
+        with counting:
+            done += count
+            progress(done, max(total, done))
 
     problems = _odd_entries(mission)
     sealed: dict[int, SealedRecord] = {}
@@ -71,9 +77,13 @@ def verify(mission: Mission, progress: Progress = lambda done, total: None) -> V
             continue
         if record is not None:
             sealed[number] = record
-        named = record.exposure.frames if record else capture.frames if capture else ()
-        frames[number] = named
-        problems += _check_folder(mission.level0(number), named, step)
+        frames[number] = record.exposure.frames if record else capture.frames if capture else ()
+    # Hashing lets go of the interpreter, so that threads are enough to use every core.
+    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+        folders = [mission.level0(number) for number in frames]
+        for found in pool.map(lambda f, n: _check_folder(f, n, step), folders, frames.values()):
+            problems += found
+    problems += check_logs(mission, step)
     genesis = mission.genesis_sha256()
     if genesis:
         links = [Link(n, r.sha256, r.exposure.previous_sha256) for n, r in sealed.items()]

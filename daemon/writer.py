@@ -13,6 +13,7 @@ from pathlib import Path
 from daemon.errors import DaemonError
 from daemon.exposure import Exposure
 from daemon.flight_log import FlightLog
+from daemon.log_seals import seal_logs
 from daemon.memory import FrameRing
 from daemon.messages import (
     Log,
@@ -40,6 +41,7 @@ def main(link: Link, mission_path: Path, rings: tuple[FrameRing, ...]) -> None:
     mission = Mission.open(mission_path)
     memory = {ring.head: ring for ring in rings}
     writer = Level0Writer(mission)
+    _seal_logs(mission)  # those of earlier runs; ours is not there yet
     log = FlightLog.create(mission.log_dir)
     synced = time.monotonic()
     while not isinstance(order := link.receive(LOG_SYNC_INTERVAL_S), Stop):
@@ -59,7 +61,14 @@ def main(link: Link, mission_path: Path, rings: tuple[FrameRing, ...]) -> None:
             log.sync()
             synced = time.monotonic()
     log.close()
+    _seal_logs(mission)
     writer.close()
+
+
+def _seal_logs(mission: Mission) -> None:
+    # A disk that refuses costs only that a later damage is not seen; the next start seals them.
+    with suppress(OSError):
+        seal_logs(mission)
 
 
 def _store(

@@ -13,6 +13,7 @@ import typer
 from rich.console import Console
 
 from daemon.cli import (
+    adjust,
     bench,
     calibrate,
     check,
@@ -23,9 +24,11 @@ from daemon.cli import (
     install,
     kernels,
     process,
+    repair,
     rigs,
     run,
     sim,
+    transfer,
     verify,
 )
 from daemon.configuration import ConfigurationError
@@ -48,6 +51,9 @@ app.command(name="check", help=check.HELP)(check.check)
 app.command(name="process", help=process.HELP)(process.process)
 app.command(name="develop", help=develop.HELP)(develop.develop)
 app.command(name="verify", help=verify.HELP)(verify.verify)
+app.command(name="repair", help=repair.HELP)(repair.repair)
+app.command(name="transfer", help=transfer.HELP)(transfer.transfer)
+app.command(name="adjust", help=adjust.HELP)(adjust.adjust)
 app.command(name="sim", help=sim.HELP)(sim.sim)
 app.command(name="bench", help=bench.HELP)(bench.bench)
 app.command(name="kernels", help=kernels.HELP)(kernels.kernels)
