@@ -34,6 +34,7 @@ def conditions_of(exposure: Exposure, rig: Rig, plan: PlanSection, flags: Flag) 
         if frame.exposure_time_us is not None:
             exposure_time_s[cone] = frame.exposure_time_us * 1e-6
         tdi_shifts[cone] = int(frame.settings.get("TdiShifts", 0))
+    sigmas_ns = [f.time_sigma_ns for f in exposure.frames if f.time_sigma_ns is not None]
     return Conditions(
         temperatures_c={t.probe: t.value_c for t in exposure.temperatures},
         temperature_age_s={t.probe: t.age_ns * 1e-9 for t in exposure.temperatures},
@@ -45,7 +46,8 @@ def conditions_of(exposure: Exposure, rig: Rig, plan: PlanSection, flags: Flag) 
         pitch_rad=navigation.pitch_rad if navigation else None,
         angular_rate_rad_per_s=None,
         crab_rad=crab_rad,
-        time_sigma_ns=exposure.mark_sigma_ns,
+        time_sigma_ns=max(sigmas_ns, default=exposure.mark_sigma_ns),
+        time_budget_ns=exposure.time_budget_ns,
         capture_flags=Flag(exposure.flags) | flags,
         simulated=exposure.simulated,
     )

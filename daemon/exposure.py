@@ -12,7 +12,7 @@ from typing import Any, Literal, cast, get_args
 
 from daemon.records import Fields, RecordError, canonical_bytes
 
-TimeSource = Literal["event-mark", "interpolated", "host", "none"]
+TimeSource = Literal["event-mark", "pps", "interpolated", "host", "none"]
 RecordState = Literal["complete", "degraded", "lost"]
 Missing = tuple[tuple[str, str], ...]
 """What an exposure lacks and why: (sensor, cause) pairs."""
@@ -118,8 +118,9 @@ class Exposure:
     """The sealed record of an exposure, `exposure.json`.
 
     `mark_gps_ns` is the instant of the rig's strobe, from the source `mark_source` says; `flags`
-    is the bit set of `processing.quality.Flag` as far as capture knows it. `previous_sha256` is
-    the hash of the record sealed before this one.
+    is the bit set of `processing.quality.Flag` as far as capture knows it. `time_budget_ns` are
+    the standard deviations that make up that of the least certain frame, by what they come from.
+    `previous_sha256` is the hash of the record sealed before this one.
     """
 
     number: int
@@ -131,6 +132,7 @@ class Exposure:
     mark_sigma_ns: int | None = None
     mark_source: TimeSource = "none"
     mark_count: int | None = None
+    time_budget_ns: Mapping[str, int] = field(default_factory=dict)
     frames: tuple[FrameRecord, ...] = ()
     missing: Missing = ()
     temperatures: tuple[TemperatureRecord, ...] = ()
@@ -158,6 +160,7 @@ def to_json(exposure: Exposure) -> dict[str, Any]:
         "mark_sigma_ns": exposure.mark_sigma_ns,
         "mark_source": exposure.mark_source,
         "mark_count": exposure.mark_count,
+        "time_budget_ns": dict(exposure.time_budget_ns),
         "temperatures": [
             {"probe": t.probe, "value_c": _float(t.value_c), "age_ns": t.age_ns}
             for t in exposure.temperatures
@@ -194,6 +197,7 @@ def from_json(content: Mapping[str, Any], file: str = "exposure.json") -> Exposu
         mark_sigma_ns=fields.integer_or_none("mark_sigma_ns"),
         mark_source=cast(TimeSource, fields.choice("mark_source", TIME_SOURCES, "none")),
         mark_count=fields.integer_or_none("mark_count"),
+        time_budget_ns=_budget(fields),
         temperatures=tuple(_temperature(item) for item in fields.objects("temperatures")),
         navigation=_navigation(navigation) if navigation else None,
         state=cast(RecordState, fields.choice("state", RECORD_STATES, "complete")),
@@ -378,6 +382,13 @@ def _navigation(fields: Fields) -> NavigationRecord:
     )
     fields.refuse_unknown()
     return record
+
+
+def _budget(fields: Fields) -> dict[str, int]:
+    found = fields.scalars("time_budget_ns")
+    if not all(isinstance(value, int) and value >= 0 for value in found.values()):
+        fields.complain("time_budget_ns", "whole nanoseconds, by what they come from, are needed")
+    return {name: value for name, value in found.items() if isinstance(value, int)}
 
 
 def _refuse_twice(names: list[str], key: str, fields: Fields) -> None:

@@ -7,10 +7,11 @@ due to be stored, sealed or given up comes out. Processes and disk are the busin
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
-from daemon.clock import HostClock
+from daemon.clock import ClockEvent, HostClock, Source
 from daemon.configuration import LimitsSection
 from daemon.exposure import (
     Capture,
@@ -24,15 +25,13 @@ from daemon.ledger import Ledger
 from daemon.matching import Cause, Matcher, Pulse
 from daemon.navigation import Track
 from daemon.temperatures import Temperatures
-from drivers.contract import EventMark, Frame, NavSample, TemperatureSample
+from drivers.contract import EventMark, Frame, NavSample, PpsEdge, TemperatureSample
 from processing.drift import lagged_sensors
 from processing.quality import Flag
 from processing.rig import Rig
 
 NS = 1_000_000_000
 NO_FLAG = Flag(0)
-SYNTOPIC_DELAY_SIGMA_NS = 1_000
-"""How well a trigger unit keeps its delays."""
 
 
 @dataclass(frozen=True)
@@ -50,12 +49,17 @@ class Identity:
 
 @dataclass(frozen=True)
 class Instant:
-    """The instant of the strobe: GPS time, its sigma, and where it came from."""
+    """The instant of the strobe: GPS time, its sigma, and where it came from.
+
+    `budget_ns` are the parts of the sigma, by what they come from.
+    """
 
     gps_ns: int | None
     sigma_ns: int | None
     source: TimeSource
     count: int | None
+    budget_ns: Mapping[str, int] = field(default_factory=dict)
+    in_holdover: bool = False
 
 
 @dataclass(frozen=True)
@@ -74,7 +78,6 @@ class _Open:
     frames: dict[str, Frame] = field(default_factory=dict)
     flags: Flag = NO_FLAG
     causes: dict[str, str] = field(default_factory=dict)
-    mark: EventMark | None = None
     handed_to_disk: Capture | None = None
     stored: Capture | None = None
     lost: str = ""
@@ -84,8 +87,9 @@ class Flight:
     """Exposures between trigger and seal.
 
     Every method that takes an instant takes `mono_ns`. Slots of frames that are not used are
-    collected in `idle_slots`, to be handed back to the heads. Heads in `absent_heads` are known to
-    be lost; their frames are not waited for.
+    collected in `idle_slots`, to be handed back to the heads; marks whose fate became final after
+    they had come, in `resolved_marks`. Heads in `absent_heads` are known to be lost; their frames
+    are not waited for.
     """
 
     def __init__(
@@ -105,6 +109,7 @@ class Flight:
         self.track = Track()
         self.temperatures = Temperatures(lagged_sensors(rig))
         self.idle_slots: list[tuple[str, int]] = []
+        self.resolved_marks: list[tuple[EventMark, Cause]] = []
         self.absent_heads: set[str] = set()
         self.serial_of_head = serial_of_head
         self._cone_of_head = {head: rig.cone_of(head) for head in serial_of_head}
@@ -149,27 +154,31 @@ class Flight:
         return cause
 
     def mark(self, mark: EventMark) -> Cause:
-        """An event mark arrived."""
-        match = self._matcher.mark(mark)
-        cause = match.cause
-        exposure = None if match.number is None else self._open.get(match.number)
-        if cause is Cause.USED:
-            if exposure is None:
-                cause = Cause.LATE
-            else:
-                exposure.mark = mark
-        if match.is_ambiguous:
-            for waiting in self._open.values():
-                if waiting.mark is None:
-                    waiting.flags |= Flag.MARK_AMBIGUOUS
-        self.ledger.mark(cause.value)
+        """An event mark arrived. USED and PENDING may change until its exposure is sealed."""
+        cause = self._matcher.mark(mark).cause
+        is_open = cause in (Cause.USED, Cause.PENDING)
+        self.ledger.mark(Cause.PENDING.value if is_open else cause.value)
         return cause
+
+    def pps(self, edge: PpsEdge) -> None:
+        """An edge of the pulse per second arrived."""
+        self.clock.pps_edge(edge.mono_ns, edge.sigma_ns)
+        self._matcher.marks.reconsider()
+
+    def clock_events(self, mono_ns: int) -> list[ClockEvent]:
+        """What is to be told of the clock since the last time of asking."""
+        return self.clock.events(mono_ns)
+
+    def land(self) -> None:
+        """No more marks will come: what is still held belongs nowhere."""
+        self._give_up_marks(2**63)
 
     def navigation(self, sample: NavSample) -> None:
         """A position arrived."""
         if sample.time_valid:
             self.track.add(sample)
             self.clock.message_arrived(sample.gps_ns, sample.mono_ns)
+            self._matcher.marks.reconsider()
 
     def temperature(self, sample: TemperatureSample) -> None:
         """A probe was read."""
@@ -238,6 +247,8 @@ class Flight:
 
     def due_to_seal(self, mono_ns: int) -> Exposure | None:
         """The oldest open exposure, once it is stored or lost and its mark and navigation final."""
+        patience_ns = round((self.limits.mark_timeout_s + self.limits.frame_timeout_s) * NS)
+        self._give_up_marks(mono_ns - patience_ns)
         if not self._open:
             return None
         exposure = next(iter(self._open.values()))
@@ -247,8 +258,10 @@ class Flight:
             return None
         waited_ns = mono_ns - exposure.ordered_mono_ns
         is_patient = waited_ns <= self.limits.mark_timeout_s * NS
-        has_navigation = exposure.mark is not None and self.track.reaches(exposure.mark.gps_ns)
-        if is_patient and not has_navigation:
+        mark = self._matcher.mark_of(exposure.number)
+        has_navigation = mark is not None and self.track.reaches(mark.gps_ns)
+        is_sure = self._matcher.marks.is_corroborated(exposure.number)
+        if is_patient and not (has_navigation and is_sure):
             return None
         return self._seal(exposure, exposure.stored)
 
@@ -270,7 +283,14 @@ class Flight:
         }
         if exposure.lost:
             causes["exposure"] = exposure.lost
+        if self._matcher.mark_of(number) is not None:
+            self.ledger.mark(Cause.USED.value)
         self.ledger.settle(number, state, causes)
+
+    def _give_up_marks(self, before_mono_ns: int) -> None:
+        for mark in self._matcher.marks.give_up(before_mono_ns):
+            self.ledger.mark(Cause.SPURIOUS.value)
+            self.resolved_marks.append((mark, Cause.SPURIOUS))
 
     def _lose(self, exposure: _Open, cause: str) -> None:
         exposure.lost = cause
@@ -321,11 +341,15 @@ class Flight:
     def _seal(
         self, exposure: _Open, stored: Capture, *, state: RecordState | None = None
     ) -> Exposure:
+        mark = self._matcher.mark_of(exposure.number)
+        if mark is None and self._matcher.marks.has_ambiguous(exposure.number):
+            exposure.flags |= Flag.MARK_AMBIGUOUS
+        self._matcher.marks.seal(exposure.number)
         record = compose(
             self.rig,
             stored,
             exposure.pulse,
-            instant_of(exposure.mark, exposure.pulse, self.clock),
+            instant_of(mark, exposure.pulse, self.clock),
             self.track,
             self.temperatures,
             exposure.flags,
@@ -336,12 +360,25 @@ class Flight:
 def instant_of(mark: EventMark | None, pulse: Pulse | None, clock: HostClock) -> Instant:
     """The instant of the strobe: the receiver's mark, else from the pulse through the clock."""
     if mark is not None:
-        return Instant(mark.gps_ns, mark.accuracy_ns, "event-mark", mark.count)
-    estimate = None if pulse is None else clock.gps_at(pulse.mono_ns + pulse.strobe_delay_ns)
-    if pulse is None or estimate is None:
+        budget = {"receiver": mark.accuracy_ns}
+        count = mark.count if mark.count_bits else None
+        return Instant(mark.gps_ns, mark.accuracy_ns, "event-mark", count, budget)
+    if pulse is None:
         return Instant(None, None, "none", None)
-    source: TimeSource = "host" if estimate.is_coarse else "interpolated"
-    return Instant(estimate.gps_ns, estimate.sigma_ns + pulse.sigma_ns, source, None)
+    strobe_ns = pulse.mono_ns + pulse.strobe_delay_ns
+    estimate = clock.pulse_at(strobe_ns, pulse.sigma_ns)
+    if estimate is None:
+        return Instant(None, None, "none", None)
+    clock_ns = min(clock.sigma_of(strobe_ns, estimate.source), estimate.sigma_ns)
+    trigger_ns = round(math.sqrt(estimate.sigma_ns**2 - clock_ns**2))
+    return Instant(
+        gps_ns=estimate.gps_ns,
+        sigma_ns=estimate.sigma_ns,
+        source=_SOURCES[estimate.source],
+        count=None,
+        budget_ns={"clock": clock_ns, "trigger": trigger_ns},
+        in_holdover=estimate.in_holdover,
+    )
 
 
 def compose(
@@ -357,6 +394,8 @@ def compose(
     flags |= Flag(stored.flags)
     if instant.source != "event-mark":
         flags |= Flag.MARK_MISSING
+    if instant.in_holdover:
+        flags |= Flag.TIME_HOLDOVER
     navigation: NavigationRecord | None = None
     if instant.gps_ns is not None:
         navigation = track.at(instant.gps_ns)
@@ -372,6 +411,7 @@ def compose(
         mark_sigma_ns=instant.sigma_ns,
         mark_source=instant.source,
         mark_count=instant.count,
+        time_budget_ns=_worst_budget(rig, stored.frames, pulse, instant),
         frames=tuple(_timed(rig, frame, pulse, instant) for frame in stored.frames),
         missing=stored.missing,
         temperatures=temperatures.at(stored.trigger_mono_ns),
@@ -397,15 +437,42 @@ def _timed(rig: Rig, frame: FrameRecord, pulse: Pulse | None, instant: Instant) 
     return replace(
         frame,
         mid_exposure_gps_ns=instant.gps_ns + offset_ns + cone.mark_to_mid_exposure_ns,
-        time_sigma_ns=instant.sigma_ns + SYNTOPIC_DELAY_SIGMA_NS,
+        time_sigma_ns=_combined(_budget_of(rig, frame, pulse, instant).values()),
         time_source=instant.source,
     )
+
+
+def _budget_of(rig: Rig, frame: FrameRecord, pulse: Pulse, instant: Instant) -> Mapping[str, int]:
+    """What a frame's time is unsure by, by what it comes from."""
+    cone = rig.cone_of(frame.sensor)
+    # The strobe is the reference cone's: its own pulse needs no delay to be trusted.
+    delay_ns = 0 if cone.name == rig.reference_cone else pulse.spread_ns
+    head_ns = cone.mark_to_mid_exposure_sigma_ns
+    return {**instant.budget_ns, "delay": delay_ns, "head": head_ns}
+
+
+def _worst_budget(
+    rig: Rig, frames: Iterable[FrameRecord], pulse: Pulse | None, instant: Instant
+) -> Mapping[str, int]:
+    if pulse is None or instant.gps_ns is None:
+        return {}
+    budgets = [_budget_of(rig, frame, pulse, instant) for frame in frames]
+    return max(budgets, key=lambda budget: _combined(budget.values()), default=instant.budget_ns)
+
+
+def _combined(sigmas_ns: Iterable[int]) -> int:
+    return math.ceil(math.hypot(*sigmas_ns))
 
 
 def _in_order(frames: Mapping[str, Frame], heads: Iterable[str]) -> dict[str, Frame]:
     return {head: frames[head] for head in heads if head in frames}
 
 
+_SOURCES: Mapping[Source, TimeSource] = {
+    "pps": "pps",
+    "marks": "interpolated",
+    "messages": "host",
+}
 _FRAME_FLAGS = {
     Cause.LATE: Flag.FRAME_LATE,
     Cause.DUPLICATE: Flag.FRAME_DUPLICATE,

@@ -145,6 +145,7 @@ def _trigger_json(record: LoggedTrigger) -> dict[str, Any]:
         "mono_ns": str(record.pulse.mono_ns),
         "sigma_ns": record.pulse.sigma_ns,
         "count": record.pulse.count,
+        "spread_ns": record.pulse.spread_ns,
         "delays_ns": dict(record.delays_ns),
         "strobe_delay_ns": record.strobe_delay_ns,
     }
@@ -209,6 +210,7 @@ def _trigger(fields: Fields) -> LoggedTrigger:
         mono_ns=_needed(fields, "mono_ns"),
         sigma_ns=fields.integer("sigma_ns"),
         count=fields.integer("count"),
+        spread_ns=fields.integer("spread_ns", 1_000),
     )
     delays_ns = {
         cone: value for cone, value in fields.scalars("delays_ns").items() if isinstance(value, int)

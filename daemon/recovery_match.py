@@ -9,13 +9,13 @@ from collections.abc import Sequence
 
 from daemon.clock import HostClock
 from daemon.exposure import Capture, Exposure
-from daemon.flight import Instant, compose, instant_of
+from daemon.flight import compose, instant_of
 from daemon.log_records import LoggedRecord, LoggedTrigger
-from daemon.matching import Cause, Matcher, Pulse
+from daemon.matching import Matcher, Pulse
 from daemon.navigation import Track
 from daemon.recovery import Complete
 from daemon.temperatures import Temperatures
-from drivers.contract import EventMark, NavSample, TemperatureSample
+from drivers.contract import EventMark, NavSample, PpsEdge, TemperatureSample
 from processing.drift import lagged_sensors
 from processing.quality import Flag
 from processing.rig import Rig
@@ -31,7 +31,6 @@ def seal_from_log(rig: Rig) -> Complete:
         track = Track()
         temperatures = Temperatures(lagged_sensors(rig))
         pulse: Pulse | None = None
-        mark: EventMark | None = None
         for record in records:
             if isinstance(record, NavSample) and record.time_valid:
                 track.add(record)
@@ -41,12 +40,12 @@ def seal_from_log(rig: Rig) -> Complete:
                 matcher.pulse(given)
                 pulse = given if given.number == capture.number else pulse
             elif isinstance(record, EventMark):
-                match = matcher.mark(record)
-                if match.cause is Cause.USED and match.number == capture.number:
-                    mark = record
+                matcher.mark(record)
+            elif isinstance(record, PpsEdge):
+                clock.pps_edge(record.mono_ns, record.sigma_ns)
             elif isinstance(record, TemperatureSample):
                 temperatures.add(record)
-        instant: Instant = instant_of(mark, pulse, clock)
+        instant = instant_of(matcher.mark_of(capture.number), pulse, clock)
         return compose(rig, capture, pulse, instant, track, temperatures, Flag(0))
 
     return complete
@@ -61,4 +60,5 @@ def pulse_of(logged: LoggedTrigger) -> Pulse:
         count=logged.pulse.count,
         delays_ns=logged.delays_ns,
         strobe_delay_ns=logged.strobe_delay_ns,
+        spread_ns=logged.pulse.spread_ns,
     )

@@ -52,10 +52,12 @@ from daemon.records import canonical_bytes
 from daemon.recovery_match import seal_from_log
 from daemon.supervisor import Supervisor
 from drivers.contract import (
+    ClockReading,
     DeviceEvent,
     EventMark,
     Frame,
     NavSample,
+    PpsEdge,
     RawBytes,
     Record,
     TemperatureSample,
@@ -133,6 +135,7 @@ class Service:
             await self.stopping.wait()
             self.notifier.stopping("landing: sealing what is open")
             await self._land(tasks)
+            self.flight.land()
         if self.failure is None:
             mission.close()
         self._event("ended", failure=self.failure, ledger=self.flight.ledger.sheet().as_json())
@@ -181,13 +184,20 @@ class Service:
 
     def _on_mark(self, mark: EventMark) -> None:
         cause = self.flight.mark(mark)
-        if cause is not Cause.USED:
+        if cause not in (Cause.USED, Cause.PENDING):
             self._event("mark", count=mark.count, cause=cause.value)
         self._log(mark)
 
     def _on_navigation(self, sample: NavSample) -> None:
         self.flight.navigation(sample)
         self._log(sample)
+
+    def _on_pps(self, edge: PpsEdge) -> None:
+        self.flight.pps(edge)
+        self._log(edge)
+
+    def _on_clock_reading(self, reading: ClockReading) -> None:
+        self._log(reading)
 
     def _on_temperature(self, sample: TemperatureSample) -> None:
         self.flight.temperature(sample)
@@ -241,6 +251,7 @@ class Service:
             count=fired.pulse.count,
             delays_ns=order.delays_ns,
             strobe_delay_ns=order.strobe_delay_ns,
+            spread_ns=fired.pulse.spread_ns,
         )
         self.flight.fired(pulse)
         self._log(
@@ -302,6 +313,8 @@ class Service:
         EventMark: _on_mark,
         NavSample: _on_navigation,
         TemperatureSample: _on_temperature,
+        PpsEdge: _on_pps,
+        ClockReading: _on_clock_reading,
         RawBytes: _on_raw,
         DeviceEvent: _on_device_event,
         Bound: _on_bound,
@@ -344,11 +357,27 @@ class Service:
             for head, slot in self.flight.idle_slots:
                 self._recycle({head: slot})
             self.flight.idle_slots.clear()
+            self._tell_of_time(now_ns)
             if self.sealing is None:
                 self.sealing = self.flight.due_to_seal(now_ns)
                 if self.sealing is not None:
                     self.supervisor.send("writer", Seal(self.sealing))
             await asyncio.sleep(TICK_S)
+
+    def _tell_of_time(self, now_ns: int) -> None:
+        for mark, cause in self.flight.resolved_marks:
+            self._event("mark", count=mark.count, cause=cause.value)
+        self.flight.resolved_marks.clear()
+        for told in self.flight.clock_events(now_ns):
+            event = DeviceEvent("clock", told.name, told.is_fault, told.sentence, now_ns)
+            self._log(event)
+            self._event(
+                "device",
+                device="clock",
+                name=told.name,
+                fault=told.is_fault,
+                sentence=told.sentence,
+            )
 
     async def _watch_processes(self) -> None:
         while True:

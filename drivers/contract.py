@@ -74,9 +74,9 @@ class Frame:
 class EventMark:
     """The receiver's time of one strobe, rising edge.
 
-    `count` is the receiver's own count of edges (`count_bits` wide, it wraps); where `count_bits` is
-    0 the receiver does not count and `count` says nothing. `time_valid` is the receiver's word that
-    `gps_ns` can be trusted.
+    `count` is the receiver's own count of edges (`count_bits` wide, it wraps); where `count_bits`
+    is 0 the receiver does not count and `count` says nothing. `time_valid` is the receiver's word
+    that `gps_ns` can be trusted.
     """
 
     receiver: str
@@ -130,13 +130,15 @@ class TriggerPulse:
     """A pulse that was given.
 
     `mono_ns` is the host's estimate of the moment the delays count from, `sigma_ns` its half
-    width; `count` is the unit's own count since power-on.
+    width; `count` is the unit's own count since power-on. `spread_ns` is how well the delays are
+    kept against each other, as a standard deviation.
     """
 
     sequence: int
     mono_ns: int
     sigma_ns: int
     count: int
+    spread_ns: int = 1_000
 
 
 @dataclass(frozen=True)

@@ -15,13 +15,16 @@ from processing.probe_health import bridge_by_others
 from processing.quality import NO_FLAGS, Figure, Flag, Thresholds
 from processing.rig import Cone, Rig
 
+TIME_PARTS = ("receiver", "clock", "trigger", "delay", "head")
+
 
 @dataclass(frozen=True)
 class Conditions:
     """The circumstances of one exposure; None or an absent key is "not known".
 
     Angles and rates are of the body (x forward, y right, z down); `crab_rad` is the angle from the
-    track to the body's x axis. `capture_flags` is what capture found.
+    track to the body's x axis. `time_budget_ns` are the parts of `time_sigma_ns`: receiver, clock,
+    trigger, delay, head. `capture_flags` is what capture found.
     """
 
     temperatures_c: Mapping[str, float | None] = field(default_factory=dict)
@@ -35,6 +38,7 @@ class Conditions:
     angular_rate_rad_per_s: tuple[float, float, float] | None = None
     crab_rad: float | None = None
     time_sigma_ns: float | None = None
+    time_budget_ns: Mapping[str, float] = field(default_factory=dict)
     capture_flags: Flag = NO_FLAGS
     simulated: bool = False
 
@@ -93,12 +97,22 @@ def condition_figures(
         figures[name] = max((s[k] for s in smears if s is not None), default=None)
     ages = [conditions.temperature_age_s.get(probe) for probe in temperatures.usable_c]
     figures["temperature_age_s"] = max((age for age in ages if age is not None), default=None)
-    figures["time_sigma_ns"] = conditions.time_sigma_ns
+    figures |= _time(conditions, figures["gsd_m"])
     tilts = [abs(a) for a in (conditions.roll_rad, conditions.pitch_rad) if a is not None]
     figures["tilt_deg"] = math.degrees(max(tilts)) if tilts else None
     crab = conditions.crab_rad
     figures["crab_deg"] = None if crab is None else abs(math.degrees(crab))
     figures["tdi_shifts"] = conditions.tdi_shifts.get(rig.reference_cone)
+    return figures
+
+
+def _time(conditions: Conditions, gsd_m: Figure) -> dict[str, Figure]:
+    sigma_ns, speed_mps = conditions.time_sigma_ns, conditions.ground_speed_mps
+    figures: dict[str, Figure] = {"time_sigma_ns": sigma_ns, "time_error_px": None}
+    if sigma_ns is not None and speed_mps is not None and isinstance(gsd_m, float):
+        figures["time_error_px"] = speed_mps * sigma_ns * 1e-9 / gsd_m
+    for part in TIME_PARTS:
+        figures[f"time_sigma_{part}_ns"] = conditions.time_budget_ns.get(part)
     return figures
 
 

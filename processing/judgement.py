@@ -42,6 +42,10 @@ _CAPTURE: Final[Mapping[Flag, tuple[Verdict, str]]] = {
         Verdict.USABLE,
         "Two event marks could belong to this exposure; check the strobe line for noise.",
     ),
+    Flag.TIME_HOLDOVER: (
+        Verdict.USABLE,
+        "The clock coasts without marks or pulse per second; check the cables of the receiver.",
+    ),
     Flag.DC_DISAGREEMENT: (
         Verdict.USABLE,
         "Probes and stitching disagree on the temperature; check the probes after landing.",
@@ -158,6 +162,14 @@ def _time_and_temperature(
         Flag.TIME_SIGMA,
         (t.time_sigma_ns, t.time_sigma_refly_ns),
         "The exposure's time is uncertain; check strobe cable and receiver.",
+    )
+    findings += _above(
+        figures,
+        "time_error_px",
+        Flag.TIME_SIGMA,
+        (t.time_error_px, t.time_error_refly_px),
+        "The exposure's time is too uncertain for this speed and GSD; the time budget says by what: "
+        "check strobe cable and receiver.",
     )
     if missing_probes:
         findings.append(

@@ -44,6 +44,7 @@ class Flag(enum.IntFlag):
     PROCESSING_BEHIND = 1 << 23
     SIMULATED = 1 << 24
     NOT_PROCESSED = 1 << 25
+    TIME_HOLDOVER = 1 << 26
 
 
 NO_FLAGS: Final = Flag(0)
@@ -87,6 +88,9 @@ class Thresholds:
 
     time_sigma_ns: float = 100_000.0
     time_sigma_refly_ns: float = 20_000_000.0
+    time_error_px: float = 0.1
+    """Way flown in one standard deviation of time, as a fraction of the GSD."""
+    time_error_refly_px: float = 10.0
     temperature_age_s: float = 30.0
     temperature_low_c: float = -40.0
     temperature_high_c: float = 70.0
@@ -143,7 +147,13 @@ FIGURES: Final[Mapping[str, str]] = {
     "bright_fraction": "95th percentile of PAN signal as a share of full scale",
     "balance_spread": "largest over smallest gain between PAN heads, less one",
     "sharpness": "share of the finest detail: 0.25 smooth, 1 without any correlation",
-    "time_sigma_ns": "standard deviation of the exposure's time",
+    "time_sigma_ns": "standard deviation of the time of the least certain frame",
+    "time_error_px": "way flown in that, speed x sigma, as a fraction of the GSD",
+    "time_sigma_receiver_ns": "part of it: the receiver's event mark",
+    "time_sigma_clock_ns": "part of it: the host's clock, where there is no mark",
+    "time_sigma_trigger_ns": "part of it: when the pulse was given, where there is no mark",
+    "time_sigma_delay_ns": "part of it: how well the trigger unit keeps its delays",
+    "time_sigma_head_ns": "part of it: from the head's trigger to its mid-exposure",
     "temperature_age_s": "age of the oldest temperature used",
     "valid_fraction": "share of virtual image pixels that hold data",
     "missing_sensors": "sensors without a frame, comma separated",

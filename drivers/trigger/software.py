@@ -103,7 +103,9 @@ class SoftwareTrigger(Configured):
         first_ns = min(before for before, _ in spans)
         last_ns = max(after for _, after in spans)
         sigma_ns = (last_ns - first_ns + 1) // 2
-        return TriggerPulse(sequence, first_ns + sigma_ns, sigma_ns, self._counters["pulses"])
+        # Each head fired at a moment of its own within that span.
+        count, spread_ns = self._counters["pulses"], round(sigma_ns / 3**0.5)
+        return TriggerPulse(sequence, first_ns + sigma_ns, sigma_ns, count, spread_ns)
 
     def close(self) -> None:
         """Let the threads end; may be called twice."""

@@ -118,6 +118,7 @@ def _cone(table: Table, defaults: Table) -> Cone:
         probe=probe,
         calibration_c=calibration_c,
         mark_to_mid_exposure_ns=table.integer("mark_to_mid_exposure_ns", 0),
+        mark_to_mid_exposure_sigma_ns=table.integer("mark_to_mid_exposure_sigma_ns", 1000),
         lens=_lens(lens),
         sensors=tuple(_sensor(sensor, probe, calibration_c) for sensor in sensors),
     )

@@ -112,6 +112,7 @@ class Cone:
     probe: str
     calibration_c: float
     mark_to_mid_exposure_ns: int
+    mark_to_mid_exposure_sigma_ns: int
     lens: Lens
     sensors: tuple[Sensor, ...]
 

@@ -53,9 +53,11 @@ def test_one_wrong_pair_does_not_turn_the_clock() -> None:
 
 def test_an_uncertain_first_pulse_does_not_turn_the_clock() -> None:
     clock = HostClock()
-    clock.mark_matched(OFFSET_NS + 23_800_000, 0, 23_800_000)
-    clock.mark_matched(3_500_000_000 + OFFSET_NS, 3_500_000_000, 45_000)
-    clock.mark_matched(7_000_000_000 + OFFSET_NS - 1_100_000, 7_000_000_000, 1_200_000)
+    readings = ((0, 23_800_000, 23_800_000), (7, 0, 45_000), (14, -1_100_000, 1_200_000))
+    for half_seconds, error_ns, half_width_ns in readings:
+        mono_ns = half_seconds * 500_000_000
+        clock.pulse_given(half_width_ns)
+        clock.mark_matched(mono_ns + OFFSET_NS + error_ns, mono_ns, half_width_ns)
     estimate = clock.gps_at(10_500_000_000)
     assert estimate is not None
     assert abs(estimate.gps_ns - 10_500_000_000 - OFFSET_NS) < 3 * estimate.sigma_ns

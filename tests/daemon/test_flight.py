@@ -18,6 +18,7 @@ from drivers.contract import (
     Frame,
     FrameStatus,
     NavSample,
+    PpsEdge,
     TemperatureSample,
     TriggerPulse,
 )
@@ -34,11 +35,15 @@ STROBE_NS = DELAYS_NS["0"] + 2_000_000
 IDENTITY = Identity("boot", "1", "calibration", "", "", "syntopic test", simulated=True)
 
 
-def flight() -> Flight:
+def flight(*, has_pps: bool = True) -> Flight:
     made = Flight(
         RIG, dict.fromkeys(HEADS, "serial"), IDENTITY, LIMITS, Ledger(heads=HEADS), first_number=1
     )
-    made.navigation(nav(-1.0))
+    for earlier in EARLIER:
+        if isinstance(earlier, NavSample):
+            made.navigation(earlier)
+        elif has_pps:
+            made.pps(earlier)
     for probe in RIG.probes:
         made.temperature(TemperatureSample(probe, 32.0, -NS // 2))
     return made
@@ -64,6 +69,13 @@ def nav(t_s: float) -> NavSample:
         leap_seconds=18,
         time_valid=True,
     )
+
+
+EARLIER = [
+    PpsEdge("gnss", 1, -2 * NS, 1_000),
+    *(nav(t_s) for t_s in (-1.4, -1.2, -1.0)),
+    PpsEdge("gnss", 2, -NS, 1_000),
+]
 
 
 def pulse(number: int, t_s: float) -> Pulse:
@@ -178,13 +190,13 @@ def test_a_silent_head_does_not_starve_the_others_of_memory() -> None:
 
 
 def test_a_lost_mark_is_interpolated_through_the_clock_and_says_so() -> None:
-    flying = flight()
+    flying = flight(has_pps=False)
     for number in (1, 2):
         given = fly_one(flying, number, 3.0 * number)
         flying.stored(number, stored_frames(flying, number, round(3.0 * number * NS) + NS))
         flying.mark(mark(given))
         flying.navigation(nav(3.0 * number + 0.2))
-        seal(flying, round(3.0 * number * NS) + NS)
+    assert seal(flying, 7 * NS).mark_source == seal(flying, 7 * NS).mark_source == "event-mark"
     given = fly_one(flying, 3, 9.0)
     flying.stored(3, stored_frames(flying, 3, 10 * NS))
     flying.navigation(nav(9.2))
@@ -195,6 +207,44 @@ def test_a_lost_mark_is_interpolated_through_the_clock_and_says_so() -> None:
     true_ns = GPS_NS + given.mono_ns + STROBE_NS
     assert abs(exposure.mark_gps_ns - true_ns) < 3 * exposure.mark_sigma_ns
     assert Flag(exposure.flags) & Flag.MARK_MISSING
+
+
+def test_with_a_pulse_per_second_a_lost_mark_is_timed_by_it_and_the_budget_says_by_what() -> None:
+    flying = flight()
+    given = fly_one(flying, 1, 0.0)
+    flying.stored(1, stored_frames(flying, 1, NS))
+    flying.navigation(nav(0.2))
+    exposure = seal(flying, 4 * NS)
+    assert exposure.mark_source == "pps"
+    assert exposure.mark_gps_ns is not None and exposure.mark_sigma_ns is not None
+    assert abs(exposure.mark_gps_ns - GPS_NS - given.strobe_delay_ns) < 2 * exposure.mark_sigma_ns
+    assert exposure.time_budget_ns.keys() == {"clock", "trigger", "delay", "head"}
+    worst_ns = max(frame.time_sigma_ns or 0 for frame in exposure.frames)
+    total_ns = sum(part**2 for part in exposure.time_budget_ns.values()) ** 0.5
+    assert worst_ns == pytest.approx(total_ns, abs=2)
+
+
+def test_the_first_mark_is_believed_when_a_second_one_agrees_and_revised_when_two_disagree() -> (
+    None
+):
+    flying = flight(has_pps=False)
+    given = [fly_one(flying, number, 2.0 * (number - 1)) for number in (1, 2, 3)]
+    noise = replace(mark(given[0]), gps_ns=mark(given[0]).gps_ns + 200_000_000, count=0)
+    assert flying.mark(noise) is Cause.USED, "nothing else is known yet"
+    (due, *_) = flying.due_to_store(NS)
+    flying.stored(1, due.capture.frames)
+    assert flying.due_to_seal(2 * NS) is None, "one mark alone is not believed at once"
+    assert flying.mark(mark(given[1])) is Cause.PENDING
+    flying.mark(mark(given[2]))
+    flying.navigation(nav(4.5))
+    exposure = seal(flying, 5 * NS)
+    assert exposure.mark_source == "interpolated", "what was taken for its mark was noise"
+    true_ns = GPS_NS + given[0].strobe_delay_ns
+    assert exposure.mark_gps_ns is not None and exposure.mark_sigma_ns is not None
+    assert abs(exposure.mark_gps_ns - true_ns) < 4 * exposure.mark_sigma_ns
+    flying.land()
+    sheet = flying.ledger.sheet()
+    assert sheet.is_balanced and sheet.marks.received == 3 and sheet.marks.spurious == 1
 
 
 def test_a_pulse_that_was_not_given_is_a_lost_exposure_with_a_record() -> None:
@@ -247,7 +297,7 @@ def test_recovery_makes_the_same_record_from_the_log_as_the_flight_did(*, has_ma
     (due,) = flying.due_to_store(NS)
     frames = tuple(replace(r, file=f"{r.sensor}.tif", sha256="0" * 64) for r in due.capture.frames)
     flying.stored(1, frames)
-    logged = [nav(-1.0), *(TemperatureSample(p, 32.0, -NS // 2) for p in RIG.probes)]
+    logged = [*EARLIER, *(TemperatureSample(p, 32.0, -NS // 2) for p in RIG.probes)]
     told = TriggerPulse(1, given.mono_ns, given.sigma_ns, given.count)
     records = [*logged, LoggedTrigger(1, told, DELAYS_NS, STROBE_NS)]
     if has_mark:

@@ -45,6 +45,8 @@ def test_what_is_not_known_is_not_judged() -> None:
     [
         ("time_sigma_ns", 2e5, Flag.TIME_SIGMA, Verdict.USABLE),
         ("time_sigma_ns", 1e8, Flag.TIME_SIGMA, Verdict.REFLY),
+        ("time_error_px", 0.11, Flag.TIME_SIGMA, Verdict.USABLE),
+        ("time_error_px", 11.0, Flag.TIME_SIGMA, Verdict.REFLY),
         ("temperature_age_s", 31.0, Flag.TEMPERATURE_STALE, Verdict.USABLE),
         ("tie_points_min_overlap", 11, Flag.TIE_POINTS, Verdict.USABLE),
         ("sigma0_px", 0.31, Flag.SIGMA0, Verdict.USABLE),
@@ -155,6 +157,7 @@ def test_bits_keep_their_places_for_ever() -> None:
         *("TEMPERATURE_RANGE", "DC_DISAGREEMENT", "TIE_POINTS", "SIGMA0", "DISPLACED_SENSOR"),
         *("CALIBRATION_EXPIRED", "UNDEREXPOSED", "OVEREXPOSED", "BLUR", "TILT", "DRIFT"),
         *("OVERLAP", "GNSS", "DISK_LOW", "PROCESSING_BEHIND", "SIMULATED", "NOT_PROCESSED"),
+        "TIME_HOLDOVER",
     ]
     assert {name: int(Flag[name]) for name in names} == {
         name: 1 << bit for bit, name in enumerate(names)

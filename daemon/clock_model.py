@@ -1,0 +1,310 @@
+"""One clock told by another: offset, rate and their uncertainty from pairs of readings.
+
+The clock that is asked is an oscillator whose rate wanders; how much it wanders, and how well the
+readings deserve the sigma they came with, is learned from the pairs themselves. Nothing here knows
+what the pairs were made of.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+MEMORY: Final = 40
+"""Pairs kept: the newest all, older ones ever thinner."""
+MEMORY_NS: Final = 1_800_000_000_000
+RATE_SIGMA: Final = 20_000.0
+"""Standard deviation of a crystal's rate before anything is known of it, ns per s (20 ppm)."""
+RATE_LIMIT: Final = 500_000.0
+"""No clock of a computer or camera is off by more, ns per s."""
+WANDER: Final[Array] = np.logspace(-1.5, 4.5, 10)
+"""Candidates for how fast the rate wanders, (ns/s)^2 per s: from 0.2 ppb (a good TCXO at constant
+temperature) to 180 ppb (a crystal in a draught) after one second, as the square root of time."""
+SCALES: Final[Array] = np.logspace(math.log10(0.35), math.log10(8.0), 7)
+"""Candidates for the factor by which sigmas of readings are too large or too small."""
+SCALE_SPREAD: Final = math.log(2.0)
+"""Stated sigmas are believed to a factor of two, before they are looked at."""
+OUTLIER: Final = 4.0
+"""A pair so many sigmas off the others loses weight, or is held back as it comes."""
+GATE_SHARE: Final = 6
+"""The fit that new pairs are held against is made anew after so large a share of new ones."""
+STEP_PAIRS: Final = 3
+"""So many pairs held back that agree with each other are no outliers: the clock has stepped."""
+ROUNDS: Final = 3
+
+
+@dataclass(frozen=True)
+class Pair:
+    """The same instant on the clock that is asked and on the one that is told, with its sigma.
+
+    `key` lets a pair be taken back.
+    """
+
+    from_ns: int
+    to_ns: int
+    sigma_ns: float
+    key: Hashable = None
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """An instant on the other clock.
+
+    `away_ns` is how far the nearest pair lies: beyond the last one the clock coasts.
+    """
+
+    to_ns: int
+    sigma_ns: float
+    away_ns: int
+
+
+class ClockModel:
+    """An oscillator against a reference, over the last half hour at most."""
+
+    def __init__(self, *, memory: int = MEMORY) -> None:
+        self._memory = memory
+        self._pairs: list[Pair] = []
+        self._held: list[Pair] = []
+        self._fit: _Fit | None = None
+        self._gate: _Fit | None = None
+        self._since_gate = 0
+        self.outliers = 0
+        self.steps = 0
+        self.last_step_ns = 0
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    @property
+    def last(self) -> Pair | None:
+        """The newest pair in use."""
+        return self._pairs[-1] if self._pairs else None
+
+    def add(self, pair: Pair) -> bool:
+        """Take a pair in; False where it is held back because it fits nothing.
+
+        Where several in succession are held back and agree, the clock has stepped: what was known
+        is dropped, and they are the new beginning.
+        """
+        if len(self._pairs) >= 2 and not self._fits(pair):
+            self._held.append(pair)
+            self.outliers += 1
+            if len(self._held) >= STEP_PAIRS and _agree(self._held[-STEP_PAIRS:]):
+                self._step()
+                return True
+            del self._held[:-STEP_PAIRS]
+            return False
+        self._held.clear()
+        self._insert(pair)
+        self._since_gate += 1
+        return True
+
+    def take_back(self, key: Hashable) -> None:
+        """Forget the pair of that key, if it is still there."""
+        kept = [pair for pair in self._pairs if pair.key != key]
+        if len(kept) < len(self._pairs):
+            self._pairs = kept
+            self._fit = self._gate = None
+        self._held = [pair for pair in self._held if pair.key != key]
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._pairs.clear()
+        self._held.clear()
+        self._fit = self._gate = None
+
+    def at(self, from_ns: int, *, reading_sigma_ns: float = 0.0) -> Estimate | None:
+        """The other clock at an instant; None before the first pair.
+
+        With `reading_sigma_ns` the instant itself was read like the pairs were, with that stated
+        sigma: what was learned of such sigmas is applied to it.
+        """
+        if not self._pairs:
+            return None
+        if self._fit is None:
+            self._fit = _Fit(self._pairs)
+        to_ns, sigma_ns = self._fit.at(from_ns, reading_sigma_ns)
+        away_ns = min(abs(pair.from_ns - from_ns) for pair in self._pairs)
+        return Estimate(to_ns, sigma_ns, away_ns)
+
+    def reading_scale(self) -> float:
+        """By which factor sigmas of readings were found too small."""
+        if not self._pairs:
+            return 1.0
+        if self._fit is None:
+            self._fit = _Fit(self._pairs)
+        return self._fit.reading_scale()
+
+    def _fits(self, pair: Pair) -> bool:
+        """Whether a pair may be one, by a fit that may be a few pairs old: it then coasts."""
+        if self._gate is None or self._since_gate > len(self._pairs) // GATE_SHARE:
+            self._gate = self._fit or _Fit(self._pairs)
+            self._since_gate = 0
+        to_ns, sigma_ns = self._gate.at(pair.from_ns, pair.sigma_ns)
+        return abs(pair.to_ns - to_ns) <= OUTLIER * 1.5 * max(sigma_ns, pair.sigma_ns)
+
+    def _step(self) -> None:
+        expected = self.at(self._held[-1].from_ns)
+        assert expected is not None
+        self.steps += 1
+        self.last_step_ns = self._held[-1].to_ns - expected.to_ns
+        self._pairs = sorted(self._held[-STEP_PAIRS:], key=lambda pair: pair.from_ns)
+        self._held.clear()
+        self._fit = self._gate = None
+
+    def _insert(self, pair: Pair) -> None:
+        pairs = self._pairs
+        position = len(pairs)
+        while position and pairs[position - 1].from_ns > pair.from_ns:
+            position -= 1
+        pairs.insert(position, pair)
+        newest_ns = pairs[-1].from_ns
+        while newest_ns - pairs[0].from_ns > MEMORY_NS:
+            del pairs[0]
+        if len(pairs) > self._memory:
+            del pairs[_most_dispensable(pairs)]
+        self._fit = None
+
+
+def _most_dispensable(pairs: list[Pair]) -> int:
+    """The inner pair whose gap, were it gone, would be smallest for its age."""
+    newest_ns = pairs[-1].from_ns
+    best, least = 1, math.inf
+    for index in range(1, len(pairs) - 1):
+        gap = pairs[index + 1].from_ns - pairs[index - 1].from_ns
+        ratio = gap / (newest_ns - pairs[index].from_ns + 1)
+        if ratio < least:
+            best, least = index, ratio
+    return best
+
+
+def _agree(pairs: list[Pair]) -> bool:
+    """Whether pairs lie on one line of a rate a clock can have."""
+    for before, after in pairwise(sorted(pairs, key=lambda pair: pair.from_ns)):
+        apart_s = (after.from_ns - before.from_ns) * 1e-9
+        moved = (after.to_ns - before.to_ns) - (after.from_ns - before.from_ns)
+        tolerance = 8.0 * (before.sigma_ns + after.sigma_ns) + RATE_SIGMA * 5 * apart_s
+        if abs(moved) > min(tolerance, 1e8):
+            return False
+    return True
+
+
+class _Fit:
+    """The posterior of one set of pairs.
+
+    Readings are z = offset + rate u + w(u) + noise, with w the twice integrated white noise of a
+    wandering rate. Rate and wander have priors, the offset has none. Wander and the scale of the
+    readings' sigmas are unknown: a grid of both is weighted by how well it explains the pairs, and
+    estimates are averaged over it (no single choice would be honest when pairs are few). One
+    eigen-decomposition serves the whole grid.
+    """
+
+    def __init__(self, pairs: list[Pair]) -> None:
+        last = pairs[-1]
+        self._from_ns, self._to_ns = last.from_ns, last.to_ns
+        self._u = np.array([(p.from_ns - last.from_ns) * 1e-9 for p in pairs])
+        z = [(p.to_ns - last.to_ns) - (p.from_ns - last.from_ns) for p in pairs]
+        self._z = np.array(z, dtype=np.float64)
+        stated = np.array([max(p.sigma_ns, 1.0) for p in pairs])
+        self._stated = stated
+        self._sigma = stated
+        self._start = float(self._u[0])
+        for _ in range(ROUNDS):
+            self._solve()
+            sigma = stated * self._growth()
+            if np.allclose(sigma, self._sigma, rtol=0.05):
+                break
+            self._sigma = sigma
+
+    def _solve(self) -> None:
+        n = len(self._u)
+        kernel = _wander_covariance(self._u - self._start, self._u - self._start)
+        whitened = kernel / np.outer(self._sigma, self._sigma)
+        values, vectors = np.linalg.eigh(whitened)
+        self._vectors = vectors
+        values = np.maximum(values, 0.0)
+        # Axes: wander, scale, pair.
+        spread = SCALES[None, :, None] ** 2 + WANDER[:, None, None] * values
+        self._inverse = 1.0 / spread
+        design = np.stack([np.ones(n), self._u], axis=1) / self._sigma[:, None]
+        h = vectors.T @ design
+        z = vectors.T @ (self._z / self._sigma)
+        normal = np.einsum("qsn,ni,nj->qsij", self._inverse, h, h)
+        normal[..., 1, 1] += RATE_SIGMA**-2
+        right = np.einsum("qsn,ni,n->qsi", self._inverse, h, z)
+        self._cofactor = np.linalg.inv(normal)
+        self._line = np.einsum("qsij,qsj->qsi", self._cofactor, right)
+        residual = z - np.einsum("qsi,ni->qsn", self._line, h)
+        square = np.einsum("qsn,n,qsn->qs", self._inverse, z, residual)
+        log_likelihood = -0.5 * (
+            square - np.log(self._inverse).sum(axis=2) + np.log(np.linalg.det(normal))
+        )
+        log_weight = log_likelihood - 0.5 * (np.log(SCALES) / SCALE_SPREAD) ** 2
+        weight = np.exp(log_weight - log_weight.max())
+        self._weight = weight / weight.sum()
+        self._h, self._residual = h, residual
+        self._weighted_residual = self._inverse * residual
+
+    def _growth(self) -> Array:
+        """By how much the stated sigma of each pair has to grow for it to be no outlier."""
+        if len(self._u) < 4:
+            return np.ones(len(self._u))
+        q, s = np.unravel_index(int(np.argmax(self._weight)), self._weight.shape)
+        inverse = self._inverse[q, s]
+        # What each pair is off from what the others say of it, and the variance of that.
+        whole = self._vectors @ (inverse * self._residual[q, s])
+        hat = self._vectors @ (inverse[:, None] * self._h)
+        precision = np.einsum("ij,j,ij->i", self._vectors, inverse, self._vectors)
+        precision -= np.einsum("ni,ij,nj->n", hat, self._cofactor[q, s], hat)
+        precision = np.maximum(precision, 1e-12)
+        off = np.abs(whole) / precision * self._sigma
+        variance = self._sigma**2 * (1.0 / precision - SCALES[s] ** 2)
+        variance = np.maximum(variance, 0.0) + (SCALES[s] * self._stated) ** 2
+        growth: Array = np.clip(off / (OUTLIER * 0.75 * np.sqrt(variance)), 1.0, 1e6)
+        return growth
+
+    def at(self, from_ns: int, reading_sigma_ns: float) -> tuple[int, float]:
+        u = (from_ns - self._from_ns) * 1e-9
+        # The kernel counts from the oldest pair; before it, everything is mirrored (the line is
+        # free, so that the origin does not matter).
+        at = np.array([u - self._start])
+        across = _wander_covariance(at, self._u - self._start)[0] / self._sigma
+        itself = float(_wander_covariance(at, at)[0, 0])
+        k = self._vectors.T @ across
+        covariance = WANDER[:, None, None] * k
+        g = np.array([1.0, u]) - np.einsum("qsn,qsn,ni->qsi", covariance, self._inverse, self._h)
+        mean = (
+            self._line[..., 0]
+            + self._line[..., 1] * u
+            + np.einsum("qsn,qsn->qs", covariance, self._weighted_residual)
+        )
+        variance = (
+            WANDER[:, None] * itself
+            - np.einsum("qsn,qsn,qsn->qs", covariance, self._inverse, covariance)
+            + np.einsum("qsi,qsij,qsj->qs", g, self._cofactor, g)
+        )
+        variance = np.maximum(variance, 0.0) + (SCALES[None, :] * reading_sigma_ns) ** 2
+        centre = float((self._weight * mean).sum())
+        total = float((self._weight * (variance + (mean - centre) ** 2)).sum())
+        to_ns = self._to_ns + (from_ns - self._from_ns) + round(centre)
+        return to_ns, math.sqrt(max(total, 0.25))
+
+    def reading_scale(self) -> float:
+        return float(math.sqrt((self._weight * SCALES[None, :] ** 2).sum()))
+
+
+def _wander_covariance(a: Array, b: Array) -> Array:
+    """Covariance of the twice integrated white noise that starts at rest at zero, both sides."""
+    x, y = np.abs(a)[:, None], np.abs(b)[None, :]
+    low, high = np.minimum(x, y), np.maximum(x, y)
+    same_side = np.sign(a)[:, None] * np.sign(b)[None, :] > 0
+    covariance: Array = np.where(same_side, low * low * (3 * high - low) / 6.0, 0.0)
+    return covariance
