@@ -168,7 +168,7 @@ def _time_and_temperature(
         "time_error_px",
         Flag.TIME_SIGMA,
         (t.time_error_px, t.time_error_refly_px),
-        "The exposure's time is too uncertain for this speed and GSD; the time budget says by what: "
+        "The exposure's time is too uncertain for this speed and GSD; the budget says by what: "
         "check strobe cable and receiver.",
     )
     if missing_probes:
