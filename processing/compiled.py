@@ -26,6 +26,7 @@ _ROOMS: Final = (
     "processing.cells",
     "processing.correlation",
     "processing.demosaic",
+    "processing.features",
     "processing.least_squares_matching",
     "processing.level1",
     "processing.matching",

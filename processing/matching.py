@@ -14,6 +14,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from processing.correlation import correlate, peak
+from processing.features import select_features
 from processing.least_squares_matching import (
     INTERPOLATION,
     PATCH_SLACK,
@@ -29,92 +30,6 @@ MARGIN_PX: Final = 4
 """Pixels a patch needs around its window: four taps and the largest half shift."""
 
 _BLOCK: Final = 32
-
-
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _unusable(word: Any) -> bool:
-    """A Level-1 word that is no data (0) or saturated (its lowest bit is set)."""
-    return bool(word == 0 or (np.int64(word) & 1) != 0)
-
-
-@njit(cache=True, parallel=True)  # type: ignore[untyped-decorator]
-def select_features(
-    frame: Array, cells: Array, half_window: int, stride: int, words: bool
-) -> Array:
-    """The most feature-rich position of each cell: the structure tensor's smaller eigenvalue peaks.
-
-    Args:
-        frame: (h, w), uint16 Level-1 words or float32.
-        cells: (n, 4) int64: first and last column, first and last row a window centre may take. The
-            window and one pixel around it must lie in the frame.
-        half_window: half of the window's side, px.
-        stride: candidates and gradients are looked at every so many pixels.
-        words: frame holds Level-1 words.
-
-    Returns:
-        (n, 3) float64: column, row, eigenvalue (mean squared gradient per pixel along the weaker
-        direction, halved step); eigenvalue -1 where bad pixels leave no candidate.
-    """
-    result = np.empty((len(cells), 3))
-    for i in prange(len(cells)):
-        first_col, last_col = cells[i, 0], cells[i, 1]
-        first_row, last_row = cells[i, 2], cells[i, 3]
-        # Integral images of the gradient products, on every stride-th pixel.
-        span_col = (last_col - first_col + 2 * half_window) // stride + 1
-        span_row = (last_row - first_row + 2 * half_window) // stride + 1
-        sums = np.zeros((span_row + 1, span_col + 1, 4))
-        for r in range(span_row):
-            row = first_row - half_window + r * stride
-            xx = xy = yy = bad = 0.0
-            for c in range(span_col):
-                col = first_col - half_window + c * stride
-                right, left = frame[row, col + 1], frame[row, col - 1]
-                down, up = frame[row + 1, col], frame[row - 1, col]
-                broken = words and (
-                    _unusable(right)
-                    or _unusable(left)
-                    or _unusable(down)
-                    or _unusable(up)
-                    or _unusable(frame[row, col])
-                )
-                dx = float(right) - float(left)
-                dy = float(down) - float(up)
-                if not (np.isfinite(dx) and np.isfinite(dy)):
-                    broken = True
-                if broken:
-                    bad += 1.0
-                else:
-                    xx += dx * dx
-                    xy += dx * dy
-                    yy += dy * dy
-                sums[r + 1, c + 1, 0] = sums[r, c + 1, 0] + xx
-                sums[r + 1, c + 1, 1] = sums[r, c + 1, 1] + xy
-                sums[r + 1, c + 1, 2] = sums[r, c + 1, 2] + yy
-                sums[r + 1, c + 1, 3] = sums[r, c + 1, 3] + bad
-        reach = 2 * half_window // stride
-        best, best_col, best_row = -1.0, first_col, first_row
-        for r in range(span_row - reach):
-            for c in range(span_col - reach):
-                s = (
-                    sums[r + reach + 1, c + reach + 1]
-                    - sums[r, c + reach + 1]
-                    - sums[r + reach + 1, c]
-                    + sums[r, c]
-                )
-                if s[3] > 0.0:
-                    continue
-                half_trace = 0.5 * (s[0] + s[2])
-                weaker = half_trace - np.sqrt(
-                    max(0.25 * (s[0] - s[2]) * (s[0] - s[2]) + s[1] * s[1], 0.0)
-                )
-                if weaker > best:
-                    best = weaker
-                    best_col = first_col + c * stride
-                    best_row = first_row + r * stride
-        result[i, 0] = best_col
-        result[i, 1] = best_row
-        result[i, 2] = best / ((reach + 1) * (reach + 1)) if best > 0.0 else best
-    return result
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -157,7 +72,7 @@ def _all_finite(patch: Array) -> bool:
     return bool(total == 0.0)
 
 
-@njit(cache=True, parallel=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, parallel=True, nogil=True)  # type: ignore[untyped-decorator]
 def match_patches(
     frame_a: Array,
     frame_b: Array,

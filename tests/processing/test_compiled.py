@@ -13,7 +13,7 @@ def test_installation_leaves_every_kernel_that_is_called_from_python_ready() -> 
         "level1.flat_pass",
         "level1.map_pass",
         "level1.interpolate_defects",
-        "matching.select_features",
+        "features.select_features",
         "matching.match_patches",
         "balance.node_means",
         "seams.cheapest_path",
