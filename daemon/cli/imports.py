@@ -60,3 +60,23 @@ def rededge(
     for sentence in imported.missing:
         console.print(sentence, markup=False, style="yellow")
     console.print(f"Next: [bold]syntopic process {out}[/]")
+
+
+@app.command()
+def dbat(
+    script: Annotated[Path, typer.Argument(help="Script (XML) of a camera calibration.")],
+    out: Annotated[Path, typer.Option(help="Folder for the adjustment project; must be new.")],
+) -> None:
+    """Import a camera calibration of the Damped Bundle Adjustment Toolbox for `syntopic adjust`."""
+    from daemon.adjusting.writing import write_project
+    from daemon.importers.dbat import import_dbat
+
+    imported = import_dbat(script)
+    write_project(out, imported.file, imported.network, imported.checks)
+    network = imported.network
+    console = Console()
+    console.print(
+        f"{len(network.images.names)} images, {len(network.points.names)} object points, "
+        f"{len(network.image_points.image)} image points in [bold]{out}[/]"
+    )
+    console.print(f"Next: [bold]syntopic adjust {out}[/]")

@@ -112,7 +112,11 @@ def _told(direction: Array, unknowns: Sequence[Unknown]) -> Defect:
             + (", ...)" if len(who) > 3 else ")")
         )
         shares.append((words[-1], value))
-    if len(words) == 1:
+    things = {(unknowns[c].kind, unknowns[c].owner) for c in np.flatnonzero(share > 1e-3)}
+    if len(words) > 1 and len(things) == 1 and next(iter(things))[0] != "camera":
+        kind, owner = next(iter(things))
+        sentence = f"{kind} {owner} cannot be determined: it has too few observations"
+    elif len(words) == 1:
         sentence = f"{words[0]} cannot be determined: no observation depends on it"
     else:
         sentence = (

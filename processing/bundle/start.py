@@ -5,9 +5,14 @@ Neither is an adjustment; both are good enough for one to converge.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from processing.bundle.camera_model import ideal_mm, principal_distance_mm
+from processing.bundle.network import Network, NetworkError
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -69,3 +74,112 @@ def intersected(
     good = (rays >= 2) & (values[:, 0] > 1e-9 * np.maximum(values[:, 2], 1e-300))
     result[good] = np.linalg.solve(normal[good], right[good][:, :, None])[:, :, 0]
     return result, rays
+
+
+def completed(network: Network) -> Network:
+    """Fill in what has no starting value (NaN): orientations by resection, points by intersection.
+
+    Images are oriented from four or more points whose coordinates are known or were intersected
+    before, points from two or more oriented images, in turn until nothing more is found. Lens
+    corrections are applied as far as the cameras' starting values hold them.
+
+    Raises:
+        NetworkError: images or points that this does not reach.
+    """
+    station, attitude = network.stations.position_m.copy(), network.attitudes.rotation.copy()
+    xyz = network.points.xyz_m.copy()
+    table, images = network.image_points, network.images
+    ideal = np.empty_like(table.xy_mm)
+    for index, camera in enumerate(network.cameras):
+        rows = images.camera[table.image] == index
+        terms = np.array([term.value for term in camera.terms])
+        ideal[rows] = ideal_mm(camera, camera.interior, terms, table.xy_mm[rows])
+    distance = np.array(
+        [principal_distance_mm(camera, camera.interior) for camera in network.cameras]
+    )
+    while True:
+        before = _open(station, attitude, xyz)
+        for image in range(len(images.names)):
+            s, a = images.station[image], images.attitude[image]
+            if np.isfinite(station[s]).all() and np.isfinite(attitude[a]).all():
+                continue
+            rows = np.flatnonzero(table.image == image)
+            rows = rows[np.isfinite(xyz[table.point[rows]]).all(axis=1)]
+            if len(rows) < 4 or network.points.at_infinity[table.point[rows]].any():
+                continue
+            place, turn = resected(
+                ideal[rows], xyz[table.point[rows]], distance[images.camera[image]]
+            )
+            if images.head[image] >= 0:
+                head = network.heads[images.head[image]]
+                turn = turn @ head.rotation.T
+                place = place - turn @ head.offset_m
+            if not np.isfinite(station[s]).all():
+                station[s] = place
+            if not np.isfinite(attitude[a]).all():
+                attitude[a] = turn
+        xyz = _intersect_open(network, ideal, distance, station, attitude, xyz)
+        left = _open(station, attitude, xyz)
+        if left == before or left == (0, 0, 0):
+            break
+    problems = _unreached(network, station, attitude)
+    if problems:
+        raise NetworkError(problems)
+    missing = np.asarray(np.isnan(xyz).any(axis=1))
+    # Points that no two images see take no part; any place does.
+    xyz[missing] = np.nanmean(xyz, axis=0) if not missing.all() else 0.0
+    return replace(
+        network,
+        stations=replace(network.stations, position_m=station),
+        attitudes=replace(network.attitudes, rotation=attitude),
+        points=replace(network.points, xyz_m=xyz),
+    )
+
+
+def _open(station: Array, attitude: Array, xyz: Array) -> tuple[int, int, int]:
+    return (
+        int(np.isnan(station).any(axis=1).sum()),
+        int(np.isnan(attitude).any(axis=(1, 2)).sum()),
+        int(np.isnan(xyz).any(axis=1).sum()),
+    )
+
+
+def _intersect_open(
+    network: Network, ideal: Array, distance: Array, station: Array, attitude: Array, xyz: Array
+) -> Array:
+    table, images = network.image_points, network.images
+    turn = attitude[images.attitude].copy()
+    place = station[images.station].copy()
+    for image in np.flatnonzero(images.head >= 0):
+        head = network.heads[images.head[image]]
+        place[image] = place[image] + turn[image] @ head.offset_m
+        turn[image] = turn[image] @ head.rotation
+    wanted = np.asarray(np.isnan(xyz).any(axis=1))
+    oriented = np.asarray(np.isfinite(turn).all(axis=(1, 2)) & np.isfinite(place).all(axis=1))
+    rows = np.flatnonzero(wanted[table.point] & oriented[table.image])
+    if not rows.size:
+        return xyz
+    of = table.image[rows]
+    ray = np.column_stack([ideal[rows], -distance[images.camera[of]]])
+    found, _ = intersected(
+        len(xyz), table.point[rows], place[of], np.einsum("nij,nj->ni", turn[of], ray)
+    )
+    return np.where(wanted[:, None], found, xyz)
+
+
+def _unreached(network: Network, station: Array, attitude: Array) -> list[str]:
+    used = np.unique(network.image_points.image)
+    images = network.images
+    lost = [
+        images.names[k]
+        for k in used
+        if not np.isfinite(station[images.station[k]]).all()
+        or not np.isfinite(attitude[images.attitude[k]]).all()
+    ]
+    if not lost:
+        return []
+    return [
+        f"{len(lost)} images have no orientation and see too few known points for one "
+        f"({', '.join(lost[:5])}{', ...' if len(lost) > 5 else ''}): give theirs, or four points "
+        "with coordinates in each"
+    ]

@@ -225,7 +225,7 @@ def with_everything(seed: int = 3) -> Made:
         ),
     )
     made = aerial(
-        seed=seed, cameras=cameras, heads=heads, lines=3, along=4, points=90, gnss_sigma_m=0.05,
+        seed=seed, cameras=cameras, heads=heads, lines=3, along=3, points=130, gnss_sigma_m=0.05,
         heights=(1000.0, 1400.0, 1000.0),
     )  # fmt: skip
     network = made.network

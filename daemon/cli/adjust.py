@@ -1,0 +1,111 @@
+"""`syntopic adjust`: bundle adjustment of a project of text files."""
+
+from __future__ import annotations
+
+import json
+import resource
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import Progress
+
+HELP = """Adjust a bundle: a project of text files, made by hand or by `syntopic import dbat`.
+
+Prints sigma0, redundancy, residuals by kind, interior orientation with standard deviations, and
+check points against their predicted accuracy. With --out the adjusted project, coordinates and
+residuals are written as tables. What cannot be determined is named. The format is told in
+docs/formats.md.
+
+Examples: `syntopic adjust project.toml`, `syntopic adjust project.toml --reject 4 --out adjusted`
+"""
+
+
+def adjust(
+    project: Annotated[Path, typer.Argument(help="project.toml, or the folder that holds it.")],
+    out: Annotated[Path | None, typer.Option(help="Folder for results; must be new.")] = None,
+    robust: Annotated[
+        bool | None, typer.Option("--robust/--no-robust", help="Begin with robust weights.")
+    ] = None,
+    reject: Annotated[
+        float | None, typer.Option(help="Leave out image points beyond this many sigmas.")
+    ] = None,
+    components: Annotated[
+        bool | None, typer.Option("--components/--no-components", help="Variance components.")
+    ] = None,
+    free_network: Annotated[
+        bool | None,
+        typer.Option("--free-network/--no-free-network", help="Undetermined is no error."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    from daemon.adjusting.project import read_project
+    from daemon.adjusting.tables import ProjectError
+    from daemon.adjusting.telling import print_report, report_of
+    from daemon.adjusting.writing import write_results
+    from processing.bundle.adjust import adjust as adjusted
+    from processing.bundle.network import NetworkError
+    from processing.bundle.rank import DefectError
+    from processing.bundle.start import completed
+
+    if out is not None and (out / "project.toml").exists():
+        raise ProjectError([f"{out} holds a project already; give another folder"])
+    path = project / "project.toml" if project.is_dir() else project
+    begun = time.perf_counter()
+    given = read_project(path)
+    settings = given.settings
+    if robust is not None:
+        settings = replace(settings, robust=robust)
+    if reject is not None:
+        settings = replace(settings, reject_beyond=reject)
+    if components is not None:
+        settings = replace(settings, variance_components=components)
+    if free_network is not None:
+        settings = replace(settings, minimum_norm=free_network)
+    problems: tuple[str, ...] = ()
+    try:
+        with Progress(console=Console(stderr=True), transient=True) as progress:
+            task = progress.add_task("starting values", total=None)
+
+            def show(what: str, number: int, squares: float) -> None:
+                progress.update(task, description=f"{what} {number}: {squares:.6g}")
+
+            result = adjusted(completed(given.network), settings, progress=show)
+    except NetworkError as error:
+        problems = error.problems
+    except DefectError as error:
+        problems = tuple(defect.sentence for defect in error.defects)
+    if problems:
+        if as_json:
+            typer.echo(json.dumps({"name": given.name, "problems": list(problems)}))
+        else:
+            console = Console(stderr=True, soft_wrap=True)
+            for problem in problems:
+                console.print(problem, style="red", markup=False, highlight=False)
+        raise typer.Exit(1)
+    report = report_of(
+        result,
+        given.checks,
+        name=given.name,
+        seconds=time.perf_counter() - begun,
+        peak_mib=_peak_mib(),
+    )
+    if out is not None:
+        write_results(out, given, result, report)
+    if as_json:
+        typer.echo(json.dumps(report))
+        return
+    console = Console()
+    print_report(console, report)
+    if out is not None:
+        console.print(f"Results: [bold]{out}[/]", soft_wrap=True)
+
+
+def _peak_mib() -> float:
+    """Largest resident memory of this process so far."""
+    per_mib = 1024.0 if sys.platform != "darwin" else 1024.0**2
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / per_mib
