@@ -5,7 +5,7 @@ Frames are in `drivers.aravis.stream`; finding, losing and finding again in `dri
 
 from __future__ import annotations
 
-import threading
+import contextlib
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -65,15 +65,11 @@ class AravisCamera:
                 f"{self._who}: the head cannot be opened ({_said(error)}); check power, cable and "
                 "address"
             ) from None
-        device = self._camera.get_device()
-        self.control_lost = threading.Event()
         self.chunk_parser: Any = None
-        if self._camera.is_gv_device():
-            if not device.is_controller():
-                raise HeldByAnotherError(
-                    f"{self._who}: another program controls the head; end that program"
-                )
-            device.connect("control-lost", _setter(self.control_lost))
+        if self._camera.is_gv_device() and not self._camera.get_device().is_controller():
+            raise HeldByAnotherError(
+                f"{self._who}: another program controls the head; end that program"
+            )
         self.identity = self._identity(settings)
         refusals = self._configure(settings)
         if refusals:
@@ -89,16 +85,24 @@ class AravisCamera:
         """The Aravis camera, for the stream."""
         return self._camera
 
+    @property
+    def has_lost_control(self) -> bool:
+        """Whether Aravis' heartbeat has found that the head no longer obeys us.
+
+        Asked for, and not heard of through the signal "control-lost": while that is told, the
+        heartbeat's thread holds a reference to the device. Were we to let go meanwhile, that
+        reference would be the last, and the thread would wait for its own end: GLib aborts then.
+        """
+        camera = self._camera
+        return bool(camera.is_gv_device() and not camera.get_device().is_controller())
+
     def start(self) -> None:
         self._camera.start_acquisition()
 
     def stop(self) -> None:
         """Stop acquiring; a head that is gone says nothing, and that is all right here."""
-        failed = aravis_error()
-        try:
+        with contextlib.suppress(aravis_error()):
             self._camera.stop_acquisition()
-        except failed:
-            self.control_lost.set()
 
     def release(self) -> None:
         """Let go of the head: the last reference gives control back."""
@@ -360,15 +364,6 @@ class AravisCamera:
 def _region(camera: Any) -> tuple[int, int, int, int]:
     region = camera.get_region()
     return tuple(region)
-
-
-def _setter(event: threading.Event) -> Callable[..., None]:
-    """A signal handler that holds the event and nothing else: no cycle with the device."""
-
-    def lost(*_: object) -> None:
-        event.set()
-
-    return lost
 
 
 def _said(error: Exception) -> str:

@@ -326,7 +326,7 @@ class AravisHead(AravisSettings):
             if received is not None:
                 self._hand_over(session, received, sink)
             self._count(session)
-            if session.camera.control_lost.is_set():
+            if session.camera.has_lost_control:
                 raise HeadLostError("it no longer takes our heartbeat")
             if self._clock.mono_ns() >= next_check_ns:
                 healthy = self._check(session)
