@@ -98,7 +98,7 @@ class HeadSection(DeviceSection):
 
 
 class NamedSection(DeviceSection):
-    """A thermometer or a navigator."""
+    """A thermometer, a navigator or a pulse per second."""
 
     name: str
 
@@ -133,6 +133,7 @@ class Configuration(_Section):
     head: tuple[HeadSection, ...] = Field(min_length=1)
     thermometer: tuple[NamedSection, ...] = ()
     navigator: tuple[NamedSection, ...] = ()
+    pps: tuple[NamedSection, ...] = Field(default=(), max_length=1)
     processing: ProcessingSection = ProcessingSection()
     limits: LimitsSection = LimitsSection()
 
@@ -233,6 +234,7 @@ def _device_problems(content: Mapping[str, Any], file: str) -> list[str]:
         "head": {"driver", "sensor"},
         "thermometer": {"driver", "name"},
         "navigator": {"driver", "name"},
+        "pps": {"driver", "name"},
         "trigger": set(TriggerSection.model_fields),
     }
     problems: list[str] = []

@@ -23,8 +23,9 @@ def device_specs(configuration: Configuration, rig: Rig) -> tuple[DeviceSpec, ..
     navigators = [
         DeviceSpec("navigator", n.driver, n.name, n.settings) for n in configuration.navigator
     ]
+    seconds = [DeviceSpec("pps", p.driver, p.name, p.settings) for p in configuration.pps]
     fires = DeviceSpec("trigger", trigger.driver, "trigger", dict(trigger.model_extra or {}))
-    return (*heads, *thermometers, *navigators, fires)
+    return (*heads, *thermometers, *navigators, *seconds, fires)
 
 
 def frame_nbytes(rig: Rig, sensor_name: str) -> int:

@@ -27,6 +27,9 @@ _PLACES: Final[Mapping[str, Mapping[str, str]]] = {
         "ascii-line": "drivers.ascii_line.thermometer:AsciiLineThermometer",
         "host": "drivers.host.thermometer:HostThermometer",
     },
+    "pps": {
+        "kernel": "drivers.pps.device:PpsDevice",
+    },
     "navigator": {
         "ublox": "drivers.ublox.navigator:UbloxNavigator",
         "gpsd": "drivers.gpsd.navigator:GpsdNavigator",

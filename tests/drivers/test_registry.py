@@ -19,6 +19,7 @@ def test_there_are_the_drivers_of_the_first_flight() -> None:
         "head": ("aravis", "folder"),
         "trigger": ("pulse-bus", "software"),
         "thermometer": ("modbus-rtu", "ascii-line", "host"),
+        "pps": ("kernel",),
         "navigator": ("ublox", "gpsd", "nmea", "novatel", "septentrio", "mavlink"),
     }
 

@@ -1,0 +1,1 @@
+"""Pulses per second through the kernel's PPS interface."""
