@@ -25,8 +25,11 @@ Array = NDArray[Any]
 NOT_COVERED: Final = -2.0
 UNUSABLE: Final = -1.0
 """Covered, but saturated or without data somewhere in the block."""
+ALONE: Final = -3.0
+"""Covered by this frame and no other: not measured, since there is nothing to compare it with."""
 
 _BLOCK_PX: Final = 8
+_COARSE: Final = 8
 _MIN_SAMPLES: Final = 30
 _MIN_SIGNAL: Final = 80.0
 """Level-1 counts (10 DN of 12 bits): below, the ratio of two means says little."""
@@ -58,15 +61,34 @@ class Balance:
 
 
 def node_means(frames: Array, valid: Array, lattices: Array, cell_px: int, out: Array) -> None:
-    """Mean Level-1 signal of 8 x 8 raw pixels around every weight node, by frame.
+    """Mean Level-1 signal of 8 x 8 raw pixels around every weight node that frames share.
 
     Args:
         frames, valid, lattices, cell_px: as in `processing.resampling.resample`.
         out: (n, rows, columns) float32 at every `WEIGHT_STEP_PX`-th target pixel; overwritten.
-            `NOT_COVERED` where the frame does not reach, `UNUSABLE` where the block holds
-            saturated pixels or holes.
+            `NOT_COVERED` where the frame does not reach, `ALONE` where only this one does,
+            `UNUSABLE` where the block holds saturated pixels or holes.
     """
     _node_means(frames, valid, lattices, cell_px, out)
+
+
+def covered_box(means: Array) -> tuple[slice, slice]:
+    """Rows and columns of nodes that hold all a frame covers, with a little around it.
+
+    A frame covers one coherent part of the image; every eighth node finds it.
+    """
+    rows, columns = means.shape
+    coarse = means[::_COARSE, ::_COARSE] != np.float32(NOT_COVERED)
+    i, j = np.flatnonzero(coarse.any(axis=1)), np.flatnonzero(coarse.any(axis=0))
+    if len(i) == 0:
+        covered = means != np.float32(NOT_COVERED)
+        if not covered.any():
+            return slice(0, 0), slice(0, 0)
+        return slice(0, rows), slice(0, columns)
+    return (
+        slice(max((i[0] - 1) * _COARSE, 0), min((i[-1] + 1) * _COARSE, rows)),
+        slice(max((j[0] - 1) * _COARSE, 0), min((j[-1] + 1) * _COARSE, columns)),
+    )
 
 
 def balance_gains(names: Sequence[str], means: Array) -> Balance:
@@ -80,12 +102,18 @@ def balance_gains(names: Sequence[str], means: Array) -> Balance:
         means: (n, rows, columns) from `node_means`.
     """
     pairs = []
+    boxes = [covered_box(one) for one in means]
     for a, b in itertools.combinations(range(len(names)), 2):
-        common = (means[a] > _MIN_SIGNAL) & (means[b] > _MIN_SIGNAL)
+        both = tuple(
+            slice(max(p.start, q.start), max(min(p.stop, q.stop), 0))
+            for p, q in zip(boxes[a], boxes[b], strict=True)
+        )
+        of_a, of_b = means[a][both], means[b][both]
+        common = (of_a > _MIN_SIGNAL) & (of_b > _MIN_SIGNAL)
         count = int(np.count_nonzero(common))
         if count < _MIN_SAMPLES:
             continue
-        ratios = np.log(means[a][common] / means[b][common])
+        ratios = np.log(of_a[common] / of_b[common])
         median = float(np.median(ratios))
         spread = 1.4826 * float(np.median(np.abs(ratios - median)))
         # 1.2533: the median's standard deviation against the mean's, for normal errors.
@@ -123,48 +151,61 @@ def _log_gains(names: Sequence[str], pairs: Sequence[PairBalance]) -> Array:
 def _node_means(frames, valid, lattices, cell, out):  # type: ignore[no-untyped-def]
     count, rows, columns = out.shape
     nodes = cell // WEIGHT_STEP_PX
+    cells = lattices.shape[2] - 1
     for i in prange(rows):
         li = min(i // nodes, lattices.shape[1] - 2)
-        fy = (i - li * nodes) / nodes
+        f = (i - li * nodes) / nodes
+        covering = np.zeros(columns, np.int64)
+        places = np.empty((count, columns, 2), np.int64)
+        for s in range(count):
+            line = out[s, i]
+            line[:] = NOT_COVERED
+            for lj in range(cells):
+                upper_left = lattices[s, li, lj]
+                upper_right = lattices[s, li, lj + 1]
+                lower_left = lattices[s, li + 1, lj]
+                lower_right = lattices[s, li + 1, lj + 1]
+                if (
+                    upper_left[0] == OUTSIDE
+                    or upper_right[0] == OUTSIDE
+                    or lower_left[0] == OUTSIDE
+                    or lower_right[0] == OUTSIDE
+                ):
+                    continue
+                c0 = upper_left[0] + f * (lower_left[0] - upper_left[0])
+                r0 = upper_left[1] + f * (lower_left[1] - upper_left[1])
+                dc = (upper_right[0] + f * (lower_right[0] - upper_right[0]) - c0) / nodes
+                dr = (upper_right[1] + f * (lower_right[1] - upper_right[1]) - r0) / nodes
+                # The last cell has the nodes at its right end, too.
+                for k in range(nodes + (1 if lj == cells - 1 else 0)):
+                    c = c0 + dc * k
+                    r = r0 + dr * k
+                    if valid[s, 0] <= c <= valid[s, 1] and valid[s, 2] <= r <= valid[s, 3]:
+                        j = lj * nodes + k
+                        line[j] = ALONE
+                        covering[j] += 1
+                        places[s, j, 0] = np.int64(np.floor(c + 0.5)) - _BLOCK_PX // 2
+                        places[s, j, 1] = np.int64(np.floor(r + 0.5)) - _BLOCK_PX // 2
         for s in range(count):
             for j in range(columns):
-                out[s, i, j] = NOT_COVERED
-                lj = min(j // nodes, lattices.shape[2] - 2)
-                fx = (j - lj * nodes) / nodes
-                if (
-                    lattices[s, li, lj, 0] == OUTSIDE
-                    or lattices[s, li, lj + 1, 0] == OUTSIDE
-                    or lattices[s, li + 1, lj, 0] == OUTSIDE
-                    or lattices[s, li + 1, lj + 1, 0] == OUTSIDE
-                ):
-                    continue
-                c = (1.0 - fy) * (
-                    (1.0 - fx) * lattices[s, li, lj, 0] + fx * lattices[s, li, lj + 1, 0]
-                ) + fy * (
-                    (1.0 - fx) * lattices[s, li + 1, lj, 0] + fx * lattices[s, li + 1, lj + 1, 0]
-                )
-                r = (1.0 - fy) * (
-                    (1.0 - fx) * lattices[s, li, lj, 1] + fx * lattices[s, li, lj + 1, 1]
-                ) + fy * (
-                    (1.0 - fx) * lattices[s, li + 1, lj, 1] + fx * lattices[s, li + 1, lj + 1, 1]
-                )
-                if not (valid[s, 0] <= c <= valid[s, 1] and valid[s, 2] <= r <= valid[s, 3]):
-                    continue
-                first_c = np.int64(np.floor(c + 0.5)) - _BLOCK_PX // 2
-                first_r = np.int64(np.floor(r + 0.5)) - _BLOCK_PX // 2
-                total = np.int64(0)
-                pixels = 0
-                marred = False
-                for y in range(
-                    max(first_r, np.int64(valid[s, 2])),
-                    min(first_r + _BLOCK_PX, np.int64(valid[s, 3]) + 1),
-                ):
-                    for x in range(
-                        max(first_c, np.int64(valid[s, 0])),
-                        min(first_c + _BLOCK_PX, np.int64(valid[s, 1]) + 1),
-                    ):
-                        word = frames[s, y, x]
-                        marred |= (word == 0) | ((word & 1) == 1)
-                        total += word
-                        pixels += 1
-                out[s, i, j] = UNUSABLE if marred or pixels == 0 else total / pixels
+                if covering[j] > 1 and out[s, i, j] == ALONE:
+                    out[s, i, j] = _block_mean(frames[s], valid[s], places[s, j])
+
+
+@njit(cache=True, nogil=True)
+def _block_mean(frame, valid, corner):  # type: ignore[no-untyped-def]
+    """Mean of a block within the usable area; `UNUSABLE` where a pixel is saturated or a hole."""
+    total = np.int64(0)
+    pixels = 0
+    marred = False
+    for y in range(
+        max(corner[1], np.int64(valid[2])), min(corner[1] + _BLOCK_PX, np.int64(valid[3]) + 1)
+    ):
+        for x in range(
+            max(corner[0], np.int64(valid[0])), min(corner[0] + _BLOCK_PX, np.int64(valid[1]) + 1)
+        ):
+            word = frame[y, x]
+            marred |= (word == 0) | ((word & 1) == 1)
+            total += word
+            pixels += 1
+    return UNUSABLE if marred or pixels == 0 else total / pixels

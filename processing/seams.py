@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from processing.balance import NOT_COVERED, UNUSABLE
+from processing.balance import NOT_COVERED, UNUSABLE, covered_box
 from processing.resampling import WEIGHT_STEP_PX, WEIGHT_UNIT
 
 Array = NDArray[Any]
@@ -34,10 +34,21 @@ _NOISE_FLOOR_COUNTS: Final = 100.0
 
 @dataclass(frozen=True)
 class _Part:
-    """Sensors already joined: who owns each node and the owner's signal there."""
+    """Sensors already joined, in the box of nodes from (row, column) on that holds them all: who
+    owns each node, and the owner's signal there."""
 
+    row: int
+    column: int
     labels: Array
     signal: Array
+
+    @property
+    def end_row(self) -> int:
+        return self.row + len(self.labels)
+
+    @property
+    def end_column(self) -> int:
+        return self.column + int(self.labels.shape[1])
 
 
 def seam_labels(centres: Array, means: Array, gains: Array, feather_px: int) -> Array:
@@ -67,11 +78,14 @@ def seam_labels(centres: Array, means: Array, gains: Array, feather_px: int) -> 
     whole = parts[0]
     for part in parts[1:]:
         whole = _join(whole, part, margin, upright=False)
-    labels = whole.labels
+    labels = np.zeros(means.shape[1:], np.int8)
+    box = (slice(whole.row, whole.end_row), slice(whole.column, whole.end_column))
+    labels[box] = whole.labels
     orphaned = whole.signal == np.float32(NOT_COVERED)
     if orphaned.any():
+        inner = labels[box]
         for index in range(len(means)):
-            labels[orphaned & (means[index] != np.float32(NOT_COVERED))] = index
+            inner[orphaned & (means[index][box] != np.float32(NOT_COVERED))] = index
     return labels
 
 
@@ -109,44 +123,87 @@ def seam_weights(labels: Array, feather_px: int, out: Array) -> None:
 
 
 def _part(means: Array, gains: Array, index: int) -> _Part:
-    signal = np.where(means[index] >= 0.0, means[index] * np.float32(gains[index]), means[index])
-    return _Part(np.full(signal.shape, index, np.int8), signal.astype(np.float32))
+    rows, columns = covered_box(means[index])
+    there = means[index][rows, columns]
+    signal = np.where(there >= 0.0, there * np.float32(gains[index]), there)
+    labels = np.full(signal.shape, index, np.int8)
+    return _Part(rows.start, columns.start, labels, signal.astype(np.float32))
 
 
 def _join(first: _Part, second: _Part, margin: int, *, upright: bool) -> _Part:
     """Join two parts, the second right of the first (`upright` seam) or below it."""
+    if not first.labels.size or not second.labels.size:
+        return first if first.labels.size else second
     if not upright:
         joined = _join(_transposed(first), _transposed(second), margin, upright=True)
         return _transposed(joined)
-    a, b = first.signal, second.signal
+    row, end_row = min(first.row, second.row), max(first.end_row, second.end_row)
+    column = min(first.column, second.column)
+    end_column = max(first.end_column, second.end_column)
+    low, high = _window(first, second, column, end_column)
+    a, b = (_signal_in(part, row, end_row, low, high) for part in (first, second))
     in_a, in_b = a != np.float32(NOT_COVERED), b != np.float32(NOT_COVERED)
-    low, high = _window(in_a, in_b)
-    window = slice(low, high)
-    cost = _path_cost(a[:, window], b[:, window], in_a[:, window], in_b[:, window], margin)
+    cost = _path_cost(a, b, in_a, in_b, margin)
     path = low + _cheapest_path(cost, np.float32(_STEP_COST))
-    left = np.arange(a.shape[1])[None, :] < path[:, None]
-    return _Part(
-        np.where(left, first.labels, second.labels),
-        np.where(left, a, b),
-    )
+    shape = (end_row - row, end_column - column)
+    labels, signal = np.zeros(shape, np.int8), np.full(shape, NOT_COVERED, np.float32)
+    for part, begin, end in ((first, column, low), (second, high, end_column)):
+        begin, end = max(begin, part.column), min(end, part.end_column)
+        if begin < end:
+            own = slice(begin - part.column, end - part.column)
+            target = (
+                slice(part.row - row, part.end_row - row),
+                slice(begin - column, end - column),
+            )
+            signal[target] = part.signal[:, own]
+            labels[target] = part.labels[:, own]
+    left = np.arange(low, high)[None, :] < path[:, None]
+    window = slice(low - column, high - column)
+    signal[:, window] = np.where(left, a, b)
+    of_a, of_b = (_labels_in(part, row, end_row, low, high) for part in (first, second))
+    labels[:, window] = np.where(left, of_a, of_b)
+    return _Part(row, column, labels, signal)
 
 
 def _transposed(part: _Part) -> _Part:
-    return _Part(np.ascontiguousarray(part.labels.T), np.ascontiguousarray(part.signal.T))
+    return _Part(
+        part.column,
+        part.row,
+        np.ascontiguousarray(part.labels.T),
+        np.ascontiguousarray(part.signal.T),
+    )
 
 
-def _window(in_a: Array, in_b: Array) -> tuple[int, int]:
+def _window(first: _Part, second: _Part, column: int, end_column: int) -> tuple[int, int]:
     """Columns between which the seam must run: from where b begins to where a ends."""
-    columns_a = np.flatnonzero(in_a.any(axis=0))
-    columns_b = np.flatnonzero(in_b.any(axis=0))
-    width = in_a.shape[1]
-    if len(columns_a) == 0 or len(columns_b) == 0:
-        whole = width if len(columns_a) else 0
-        return (width - 1, width) if whole else (0, 1)
+    columns_a = first.column + np.flatnonzero((first.signal != np.float32(NOT_COVERED)).any(axis=0))
+    columns_b = second.column + np.flatnonzero(
+        (second.signal != np.float32(NOT_COVERED)).any(axis=0)
+    )
     low, high = int(columns_b[0]), int(columns_a[-1]) + 1
     if low >= high:
         low, high = high - 1, low + 1
-    return max(low - 1, 0), min(high + 1, width)
+    return max(low - 1, column), min(high + 1, end_column)
+
+
+def _signal_in(part: _Part, row: int, end_row: int, low: int, high: int) -> Array:
+    """A part's signal in a window of nodes, `NOT_COVERED` beyond its box."""
+    return _laid_out(part, part.signal, (row, end_row, low, high), NOT_COVERED)
+
+
+def _labels_in(part: _Part, row: int, end_row: int, low: int, high: int) -> Array:
+    return _laid_out(part, part.labels, (row, end_row, low, high), int(part.labels.flat[0]))
+
+
+def _laid_out(part: _Part, values: Array, window: tuple[int, int, int, int], fill: float) -> Array:
+    row, end_row, low, high = window
+    out = np.full((end_row - row, high - low), fill, values.dtype)
+    begin, end = max(low, part.column), min(high, part.end_column)
+    if begin < end:
+        out[part.row - row : part.end_row - row, begin - low : end - low] = values[
+            :, begin - part.column : end - part.column
+        ]
+    return out
 
 
 def _path_cost(a: Array, b: Array, in_a: Array, in_b: Array, margin: int) -> Array:
