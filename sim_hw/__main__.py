@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from processing.rig import RigError, load_rig, shipped_rigs
+from sim_hw.receivers import PROBES, RECEIVERS
 from sim_hw.simulator import SimulatorSettings, simulate
 from sim_hw.world import WorldSettings
 from sim_hw.world_clock import WorldClock
@@ -45,6 +46,8 @@ def parser() -> argparse.ArgumentParser:
         help="plan a fault, see docs/faults.md; may be repeated",
     )
     add("--scenario", type=Path, help="a file with faults")
+    add("--receiver", choices=RECEIVERS, default="ublox", help="kind of the receiver")
+    add("--probe", choices=PROBES, default="modbus", help="kind of the thermometer")
     add("--first-address", default="127.0.0.2", help="loopback address of the first head")
     add("--scene", help="a GeoTIFF to fly over instead of the shipped photographs")
     add("--scene-cache", type=Path, help="folder where built scenes are kept (default: OUT/scenes)")
@@ -103,6 +106,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         processes=given.processes,
         faults=tuple(given.fault),
         scenario=given.scenario,
+        receiver=given.receiver,
+        probe=given.probe,
     )
     return simulate(settings, world, clock)
 

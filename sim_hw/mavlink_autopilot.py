@@ -14,10 +14,10 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from sim_hw.mavlink_messages import Listener, Received, by_number, message
+from sim_hw.mavlink_messages import Listener, Received, by_number, message, messages_in
 from sim_hw.nmea_sentences import GEOID_UNDULATION_M, course_deg, longitude_deg, speed_mps
 from sim_hw.pseudo_terminal import PseudoTerminal
-from sim_hw.receiver import ReceiverAccuracy, ReceiverState
+from sim_hw.receiver import BOOT_NS, MARK, NAVIGATION, ReceiverAccuracy, ReceiverState
 from sim_hw.serving import Line, LineDevice
 from sim_hw.world_clock import LEAP_SECONDS, NS_PER_S, DeviceClock, WorldClock, unix_ns_from_gps_ns
 
@@ -94,9 +94,7 @@ class MavlinkAutopilot(LineDevice):
             "TRIG_INTERFACE": 1.0,
             "SYS_AUTOSTART": 2100.0,
         }
-        self._period_ns = {
-            name: round(NS_PER_S / hertz) if hertz else 0 for name, hertz in DEFAULT_HZ.items()
-        }
+        self._period_ns = _default_periods()
         self._next_ns = dict.fromkeys(DEFAULT_HZ, clock.mono_ns_at_start)
         self._height_at_start_m: float | None = None
 
@@ -114,6 +112,32 @@ class MavlinkAutopilot(LineDevice):
     def boot_ns(self, gps_ns: int) -> int:
         """The autopilot's own clock at a GPS time."""
         return self._device_clock.device_ns(gps_ns - self._clock.gps_ns_at_start)
+
+    # Faults
+
+    def parts(self, data: bytes) -> list[tuple[str, bytes]]:
+        return [
+            (MARK if name == "CAMERA_TRIGGER" else NAVIGATION, said)
+            for name, said in messages_in(data)
+        ]
+
+    def restart_count(self) -> None:
+        with self._lock:
+            self._edge_count = 0
+
+    def restart(self) -> None:
+        """Its clock counts from the start, which is now; rates are those of its own."""
+        now_ns = time.monotonic_ns()
+        with self._lock:
+            self._edge_count = 0
+            self._edges.clear()
+        elapsed_ns = self._clock.gps_ns(now_ns) - self._clock.gps_ns_at_start
+        self._device_clock = DeviceClock(
+            self._device_clock.offset_ns - self._device_clock.device_ns(elapsed_ns),
+            self._device_clock.drift_ppm,
+        )
+        self._period_ns = _default_periods()
+        self._next_ns = dict.fromkeys(DEFAULT_HZ, now_ns + BOOT_NS)
 
     # What it says by itself
 
@@ -316,7 +340,7 @@ class MavlinkAutopilot(LineDevice):
         if number == SET_MESSAGE_INTERVAL:
             result = DENIED if name not in DEFAULT_HZ or not math.isfinite(second) else ACCEPTED
             if result == ACCEPTED:
-                default_ns = round(NS_PER_S / DEFAULT_HZ[name]) if DEFAULT_HZ[name] else 0
+                default_ns = _default_periods()[name]
                 period_ns = default_ns if second == 0 else 0 if second < 0 else round(second * 1e3)
                 self._set_period(name, period_ns, mono_ns)
         elif number == GET_MESSAGE_INTERVAL:
@@ -353,6 +377,10 @@ class MavlinkAutopilot(LineDevice):
     def _set_period(self, name: str, period_ns: int, mono_ns: int) -> None:
         self._period_ns[name] = max(period_ns, FASTEST_NS) if period_ns else 0
         self._next_ns[name] = mono_ns
+
+
+def _default_periods() -> dict[str, int]:
+    return {name: round(NS_PER_S / hertz) if hertz else 0 for name, hertz in DEFAULT_HZ.items()}
 
 
 Quaternion = tuple[float, float, float, float]

@@ -183,6 +183,17 @@ def message(name: str, sequence: int, system: int, component: int, **values: Any
     return bytes((MAGIC,)) + head + payload + struct.pack("<H", crc)
 
 
+def messages_in(data: bytes) -> list[tuple[str, bytes]]:
+    """Whole messages, one behind the other, as `message` makes them, each with its name."""
+    found = []
+    while data:
+        size = _HEADER_NBYTES + data[1] + _CRC_NBYTES
+        number = int.from_bytes(data[7:10], "little")
+        found.append((by_number()[number].name, data[:size]))
+        data = data[size:]
+    return found
+
+
 class Listener:
     """Takes messages of version 2 out of what a host writes; others and damage are skipped."""
 

@@ -22,7 +22,7 @@ from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Any
 
-from sim_hw import laboratory, scene, world
+from sim_hw import laboratory, receivers, scene, world
 from sim_hw.clockwork import PROBES_NAME, RECEIVER_NAME, TRIGGER_NAME, devices_of
 from sim_hw.faults.channel import BytesDamage, Channel, for_device
 from sim_hw.faults.plan import read_plan
@@ -37,22 +37,18 @@ from sim_hw.head_process import (
     end_with_parent,
     run,
 )
-from sim_hw.modbus_probe import ModbusProbe
-from sim_hw.pseudo_terminal import PseudoTerminal
 from sim_hw.pulse_bus import Firing, PulseBus
+from sim_hw.receiver import ReceiverState
+from sim_hw.receivers import Emulated
 from sim_hw.seeding import random_stream
 from sim_hw.truth import Taken, TruthWriter
-from sim_hw.ublox_receiver import ReceiverState, UbloxReceiver
 from sim_hw.world import World, WorldSettings
 from sim_hw.world_clock import WorldClock
 
 READY_WITHIN_S = 180.0
 WORKER_ENDS_WITHIN_S = 5.0
 REPORT_POLL_S = 0.5
-RECEIVER_BAUDRATE = 115200
-PROBE_BAUDRATE = 19200
-PROBE_UNIT = 1
-PROBE_FIRST_REGISTER = 0
+PROBE_DRIVERS = {"modbus": "modbus-rtu", "ascii": "ascii-line"}
 PROBE_OFFSET_SIGMA_C = 0.07
 PROBE_NOISE_SIGMA_C = 0.07
 """Together the 0.1 K that probes of this kind are good for."""
@@ -73,6 +69,8 @@ class SimulatorSettings:
     processes: int = 2
     faults: tuple[str, ...] = ()
     scenario: Path | None = None
+    receiver: str = "ublox"
+    probe: str = "modbus"
 
 
 class Simulator:
@@ -118,15 +116,14 @@ class Simulator:
             self._on_fire,
             faults=self._channels[TRIGGER_NAME],
         )
-        self._receiver = self._faulty_receiver(settings.out.resolve() / "ports" / RECEIVER_NAME)
-        line = PseudoTerminal(settings.out.resolve() / "ports" / PROBES_NAME)
-        self._probes = ModbusProbe(
-            [self._probe_reading(probe) for probe in rig.probes],
-            unit=PROBE_UNIT,
-            first_register=PROBE_FIRST_REGISTER,
-            line=line,
+        ports = settings.out.resolve() / "ports"
+        self._receiver = self._faulty_receiver(ports / RECEIVER_NAME)
+        self._probes = receivers.probes(
+            settings.probe,
+            {probe: self._probe_reading(probe) for probe in rig.probes},
+            ports / PROBES_NAME,
         )
-        self._probes.wire = FaultyWire(self._probes, self._channels[PROBES_NAME], line)
+        self._put_faults_on(self._probes, PROBES_NAME)
 
     def start(self) -> None:
         """Build the scene, measure the calibration, and open every device.
@@ -147,8 +144,8 @@ class Simulator:
         self._tell("heads: measuring their calibration and opening them")
         self._start_workers()
         self._bus.start()
-        self._receiver.start()
-        self._probes.start()
+        self._receiver.device.start()
+        self._probes.device.start()
         self._reports = threading.Thread(target=self._follow_reports, name="reports", daemon=True)
         self._reports.start()
         self._begin_faults(time.monotonic_ns())
@@ -166,8 +163,8 @@ class Simulator:
             if worker.is_alive():
                 worker.kill()
                 worker.join(WORKER_ENDS_WITHIN_S)
-        self._receiver.close()
-        self._probes.close()
+        self._receiver.device.close()
+        self._probes.device.close()
         self._truth.write_overdue(self._line.flight, wait_s=0.0)
 
     def ready_message(self) -> dict[str, Any]:
@@ -186,14 +183,8 @@ class Simulator:
                 for sensor in rig.sensors
             },
             "pulse_bus": f"{host}:{port}",
-            "receiver": {"port": str(self._receiver.port), "baudrate": RECEIVER_BAUDRATE},
-            "probes": {
-                "port": str(self._probes.port),
-                "baudrate": PROBE_BAUDRATE,
-                "unit": PROBE_UNIT,
-                "first_register": PROBE_FIRST_REGISTER,
-                "channels": list(rig.probes),
-            },
+            "receiver": {"driver": self._settings.receiver, **self._receiver.settings},
+            "probes": {"driver": PROBE_DRIVERS[self._settings.probe], **self._probes.settings},
             "calibration": str((out / "calibration").resolve()),
             "truth": str((out / "truth").resolve()),
             "plan": asdict(self._world.plan),
@@ -201,19 +192,22 @@ class Simulator:
             "faults": [asdict(fault) for fault in self.planned],
         }
 
-    def _faulty_receiver(self, port: Path) -> UbloxReceiver:
+    def _faulty_receiver(self, port: Path) -> Emulated:
         """The receiver, with a clock of its own: what goes in and out is in times of the world."""
-        channel = self._channels[RECEIVER_NAME]
-        line = PseudoTerminal(port)
-        clock = FaultyWorldClock(self._clock, channel)
+        clock = FaultyWorldClock(self._clock, self._channels[RECEIVER_NAME])
         self._receiver_clock = clock
-        receiver = UbloxReceiver(
+        receiver = receivers.receiver(
+            self._settings.receiver,
             clock,
             lambda own_gps_ns: self._receiver_state(clock.world_gps_ns(own_gps_ns)),
-            line=line,
+            port,
         )
-        receiver.wire = FaultyWire(receiver, channel, line)
+        self._put_faults_on(receiver, RECEIVER_NAME)
         return receiver
+
+    def _put_faults_on(self, emulated: Emulated, name: str) -> None:
+        device = emulated.device
+        device.wire = FaultyWire(device, self._channels[name], emulated.cable)
 
     def _begin_faults(self, mono_ns: int) -> None:
         """Everything answers: the seconds of the faults count from now."""
@@ -308,7 +302,7 @@ class Simulator:
 
     def _taken(self, taken: Taken) -> None:
         if taken.sensor == self._strobe:
-            self._receiver.mark(self._receiver_clock.own_gps_ns(taken.look.mid_gps_ns))
+            self._receiver.device.mark(self._receiver_clock.own_gps_ns(taken.look.mid_gps_ns))
         self._truth.add(taken, self._line.flight)
 
     def _receiver_state(self, gps_ns: int) -> ReceiverState:

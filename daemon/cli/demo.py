@@ -56,6 +56,9 @@ def demo(
             "SU02=1.0,-0.6, or none where a rig's master cone has too few sensors to name one."
         ),
     ] = None,
+    receiver: Annotated[
+        str, typer.Option(help="ublox, novatel, septentrio, nmea, or mavlink (an autopilot).")
+    ] = "ublox",
     seed: Annotated[int, typer.Option(help="Everything random follows from it.")] = 1,
     out: Annotated[Path, typer.Option(help="Where flights are kept.")] = Path("flights"),
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
@@ -71,7 +74,7 @@ def demo(
         rig, folder / "sim", seed=seed, dc=dc, displace=[displace] if displace else []
     )
     arguments += ["--scene-cache", str(out / "scenes"), "--exposures", str(exposures + 1)]
-    arguments += ["--first-address", free_first_address()]
+    arguments += ["--first-address", free_first_address(), "--receiver", receiver]
     console.print(f"[bold]Emulating {rig}[/] at dC = {dc:+g} K, displaced: {displace or 'none'}")
     try:
         emulator = Emulator(arguments)

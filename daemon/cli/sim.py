@@ -83,6 +83,10 @@ def sim(
         typer.Option(help="NAME@TIME[:DEVICE][,DURATION], see docs/faults.md; repeatable."),
     ] = None,
     scenario: Annotated[Path | None, typer.Option(help="A file with faults.")] = None,
+    receiver: Annotated[
+        str, typer.Option(help="ublox, novatel, septentrio, nmea, or mavlink (an autopilot).")
+    ] = "ublox",
+    probe: Annotated[str, typer.Option(help="Thermometer: modbus or ascii.")] = "modbus",
     first_address: Annotated[
         str, typer.Option(help="Address of the first head; a free one by default.")
     ] = "",
@@ -94,6 +98,7 @@ def sim(
     )
     arguments += ["--first-address", first_address or free_first_address()]
     arguments += ["--scene", str(scene)] if scene else []
+    arguments += ["--receiver", receiver, "--probe", probe]
     for planned in fault or []:
         arguments += ["--fault", planned]
     arguments += ["--scenario", str(scenario)] if scenario else []
@@ -188,22 +193,8 @@ def service_toml(
         "",
         "[processing]",
         f"baselines = {str(baselines).lower()}",
-        "",
-        "[[thermometer]]",
-        'name = "probes"',
-        'driver = "modbus-rtu"',
-        f"port = {_quoted(probes['port'])}",
-        f"baudrate = {probes['baudrate']}",
-        'parity = "N"  # a pseudo terminal knows no parity',
-        f"unit = {probes['unit']}",
-        f"first_register = {probes['first_register']}",
-        f"channels = {json.dumps(probes['channels'])}",
-        "",
-        "[[navigator]]",
-        'name = "gnss"',
-        'driver = "ublox"',
-        f"port = {_quoted(ready['receiver']['port'])}",
-        f"baudrate = {ready['receiver']['baudrate']}",
+        *_section("thermometer", "probes", probes),
+        *_section("navigator", "gnss", ready["receiver"]),
     ]
     for sensor, head in ready["heads"].items():
         lines += [
@@ -219,6 +210,15 @@ def service_toml(
     return "\n".join(lines) + "\n"
 
 
+def _section(kind: str, name: str, settings: Mapping[str, Any]) -> list[str]:
+    """A device's section: JSON's texts, numbers and lists of texts are TOML's."""
+    lines = ["", f"[[{kind}]]", f"name = {_quoted(name)}"]
+    lines += [f"{key} = {json.dumps(value)}" for key, value in settings.items()]
+    if settings["driver"] == "modbus-rtu":
+        lines.append('parity = "N"  # a pseudo terminal knows no parity')
+    return lines
+
+
 def _quoted(text: str) -> str:
     return json.dumps(text)
 
@@ -229,8 +229,8 @@ def _print_addresses(ready: Mapping[str, Any], path: Path) -> None:
     addresses = "  ".join(f"{name} {head['address']}" for name, head in ready["heads"].items())
     console.print(f"  heads     {addresses}")
     console.print(f"  trigger   pulse bus at {ready['pulse_bus']}")
-    console.print(f"  receiver  u-blox at {ready['receiver']['port']}")
-    console.print(f"  probes    Modbus RTU at {ready['probes']['port']}")
+    for title, device in (("receiver", ready["receiver"]), ("probes", ready["probes"])):
+        console.print(f"  {title:8}  {device['driver']} at {device['port']}")
     console.print(f"  truth     {ready['truth']}")
     console.print(f"Next, in another terminal: [bold]syntopic check {path}[/], then run it.")
     console.print("Ctrl-C ends the emulator.")

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import io
 import math
+import os
+import shutil
+import subprocess
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,6 +19,7 @@ from sim_hw.receiver import Edge, EmulatedReceiver
 from sim_hw.septentrio_receiver import SeptentrioReceiver
 from sim_hw.world_clock import WorldClock
 from tests.sim_hw.receiver_state import NS, START_GPS_NS, STATE, WEEK_NS, state_at
+from tests.sim_hw.test_ublox_receiver import free_port, gpsd_position
 
 Kind = Callable[..., EmulatedReceiver]
 # Near a week's end and a whole number of milliseconds past nothing.
@@ -193,3 +198,30 @@ def test_marks_come_at_once_and_epochs_in_their_order(kind: Kind) -> None:
     assert dues == sorted(dues)
     assert rising == 2
     assert receiver.statistics()["epochs"] == 6
+
+
+@pytest.mark.peer
+def test_gpsd_reports_the_position_of_the_nmea_receiver() -> None:
+    program = shutil.which("gpsd", path=f"{os.environ.get('PATH', '')}:/usr/sbin")
+    if program is None:
+        pytest.skip("gpsd is absent; install Debian's gpsd")
+    receiver = NmeaReceiver(WorldClock.starting_now(), state_at)
+    receiver.start()
+    # gpsd gives up root before it opens the port.
+    Path(receiver.port).chmod(0o666)
+    port = free_port()
+    gpsd = subprocess.Popen(
+        [program, "-N", "-n", "-b", "-S", str(port), receiver.port],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        report = gpsd_position(port, timeout_s=20.0)
+    finally:
+        gpsd.terminate()
+        gpsd.wait(timeout=10)
+        receiver.close()
+    assert report["lat"] == pytest.approx(STATE.latitude_deg, abs=2e-7)
+    assert report["lon"] == pytest.approx(STATE.longitude_deg, abs=2e-7)
+    assert report["altHAE"] == pytest.approx(STATE.height_m, abs=0.1)
+    assert report["speed"] == pytest.approx(62.466, abs=0.01)
