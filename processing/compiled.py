@@ -33,6 +33,7 @@ _ROOMS: Final = (
     "processing.quicklook",
     "processing.resampling",
     "processing.seams",
+    "processing.sharpness",
     "processing.taps",
 )
 
