@@ -4,7 +4,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: setup demo test check bench soak clean
+.PHONY: setup demo test test-v4l2 check bench soak clean
 
 setup: .venv/ready
 
@@ -17,6 +17,12 @@ demo: setup
 
 test: setup
 	$(BIN)/python -m pytest
+
+# The V4L2 heads against the real kernel, in a virtual machine; REQUIRED=--required where skipping is no
+# answer.
+test-v4l2: setup
+	sh bootstrap.sh --machine
+	$(BIN)/python -m tests.v4l2.machine $(REQUIRED)
 
 check: setup
 	$(BIN)/ruff check .

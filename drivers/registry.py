@@ -17,6 +17,7 @@ _PLACES: Final[Mapping[str, Mapping[str, str]]] = {
     "head": {
         "aravis": "drivers.aravis.head:AravisHead",
         "folder": "drivers.folder.head:FolderHead",
+        "v4l2": "drivers.v4l2.head:V4l2Head",
     },
     "trigger": {
         "pulse-bus": "drivers.trigger.pulse_bus:PulseBusTrigger",

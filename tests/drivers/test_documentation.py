@@ -22,6 +22,7 @@ PAGES = [
     ("thermometer", "host", "host.md"),
     ("navigator", "gpsd", "gpsd.md"),
     ("head", "folder", "folder.md"),
+    ("head", "v4l2", "v4l2.md"),
     ("pps", "kernel", "pps.md"),
     ("trigger", "pulse-bus", "pulse-bus.md"),
     ("trigger", "software", "pulse-bus.md"),
