@@ -1,7 +1,7 @@
 """GPS time on the host's monotonic clock, and how well it is known at every moment.
 
 Three witnesses: edges of a pulse per second (exact, but nameless), event marks of pulses the host
-gave (exact, named, as good as the pulse's host time), and navigation messages, which come 10 to
+gave (exact, named, as good as the pulse's host time), and navigation messages, which come up to
 700 ms late and only name the second. What a model of two clocks is stands in `daemon.clock_model`.
 """
 
@@ -16,7 +16,8 @@ from typing import Final, Literal
 
 from daemon.clock_model import ClockModel, Estimate, Pair
 
-ARRIVAL_MIN_NS: Final = 10_000_000
+ARRIVAL_MIN_NS: Final = 0
+"""An autopilot on the network tells its position within a millisecond, a serial line after 10."""
 ARRIVAL_MAX_NS: Final = 700_000_000
 COARSE_SIGMA_NS: Final = round((ARRIVAL_MAX_NS - ARRIVAL_MIN_NS) / math.sqrt(12))
 """Of an instant that lies anywhere between both."""
@@ -380,7 +381,7 @@ class HostClock:
             if edge is None:
                 return
             behind.append(gps_ns - edge.to_ns)
-        # The least late message counts: the name lies 10 to 700 ms beyond what it says.
+        # The least late message counts: the name lies up to 700 ms beyond what it says.
         second = math.ceil((max(behind) + ARRIVAL_MIN_NS) / SECOND_NS)
         if second * SECOND_NS <= max(behind) + ARRIVAL_MAX_NS:
             self._second = second
