@@ -129,7 +129,7 @@ class HeadDevice(Configured):
     def _opened_sentence(self) -> str:
         return f"The head {self.name} is open; nothing to do."
 
-    def _word_for(self, _error: DeviceError) -> str:
+    def _word_for(self, error: DeviceError) -> str:
         """The event that tells of a head that cannot be opened."""
         return "lost"
 

@@ -22,7 +22,7 @@ from drivers.aravis.gvcp import (
 from drivers.aravis.library import OPENING, aravis_error
 from drivers.aravis.settings import AravisSettings
 from drivers.aravis.stream import FrameStream, ReceivedFrame
-from drivers.clock import BackOff, Clock, HostClock
+from drivers.clock import Clock
 from drivers.contract import (
     DeviceError,
     Frame,
@@ -31,7 +31,7 @@ from drivers.contract import (
     LifeCycle,
     Sink,
 )
-from drivers.telling import Teller
+from drivers.head_device import HeadDevice
 
 POP_STEP_S: Final = 0.1
 PROBE_TIMEOUT_S: Final = 0.2
@@ -40,7 +40,6 @@ SUSPICION_S: Final = 2.0
 """A head that answers nothing for so long is lost; a pause of a second heals by itself."""
 HELD_MARGIN_S: Final = 0.1
 TRIGGER_TIMEOUT_S: Final = 1.0
-CLOSE_TIMEOUT_S: Final = 2.0
 NOT_FRAMES: Final = ("aborted", "cleared", "filling", "unknown")
 """Buffers that come back empty when a stream ends."""
 
@@ -61,20 +60,20 @@ class _Session:
     is_lost: bool = False
 
 
-class AravisHead(AravisSettings):
+class AravisHead(AravisSettings, HeadDevice):
     """A GigE Vision or USB3 Vision head whose frames land in memory of the caller's.
 
     Yields a Frame for every exposure of which at least a packet came: COMPLETE, INCOMPLETE where
     packets are missing for good, CORRUPT where its size or format is not the configured one. A
     frame that comes while all slots are taken is lost in Aravis and counted as an underrun.
 
-    One thread at a time calls `bind` and `run`; `recycle`, `trigger`, `close` and `statistics` are
-    for any thread.
-
     Source: GenICam SFNC 2.7; GigE Vision 2.0. Quirks: docs/drivers/aravis.md.
     """
 
     kind: ClassVar = "head"
+    counted: ClassVar = (
+        *("frames", "frames_incomplete", "frames_corrupt", "underruns", "opened", "latches"),
+    )
 
     def __init__(
         self,
@@ -84,26 +83,10 @@ class AravisHead(AravisSettings):
         memory: FrameMemory,
         clock: Clock | None = None,
     ) -> None:
-        super().__init__(name, settings)
-        self._memory = memory
-        self._clock: Clock = clock or HostClock()
-        self._teller = Teller(name, self._clock)
-        self._state = LifeCycle.CREATED
-        self._closing = threading.Event()
-        self._ended = threading.Event()
-        self._ended.set()
+        super().__init__(name, settings, memory=memory, clock=clock)
         self._control = threading.Lock()
-        self._slots = threading.Lock()
         self._session: _Session | None = None
-        self._lent_out: set[int] = set()
-        self._counters: Counter[str] = Counter(
-            frames=0, frames_incomplete=0, frames_corrupt=0, underruns=0, opened=0, latches=0
-        )
         self._of_stream: Counter[str] = Counter()
-
-    @property
-    def state(self) -> LifeCycle:
-        return self._state
 
     def bind(self, sink: Sink | None = None) -> Mapping[str, str]:
         """Open the head and write its settings; what was found. See `drivers.contract.Device`.
@@ -127,61 +110,6 @@ class AravisHead(AravisSettings):
             if session.temperature_c is None
             else f"{session.temperature_c:.1f} degC",
         }
-
-    def run(self, sink: Sink) -> None:
-        """Deliver until closed. See `drivers.contract.Device`."""
-        if self._closing.is_set():
-            return
-        self._ended.clear()
-        self._teller.sink = sink
-        pause = BackOff()
-        reachable = True
-        try:
-            while not self._closing.is_set():
-                try:
-                    session = self._session or self._open()
-                except DeviceError as error:
-                    self._state = LifeCycle.INACTIVE
-                    if reachable and not self._closing.is_set():
-                        reachable = False
-                        held = isinstance(error, HeldByAnotherError)
-                        self._teller.tell(
-                            "held-by-another" if held else "lost",
-                            f"{error}. It is tried again by itself.",
-                            fault=True,
-                        )
-                    self._clock.wait(self._closing, pause.next_s())
-                    continue
-                reachable = True
-                self._teller.tell(
-                    "opened", f"The head {self.name} is open at {self.address}; nothing to do."
-                )
-                frames = self._counters["frames"]
-                self._serve(session, sink)
-                if self._counters["frames"] > frames:
-                    pause.reset()
-                self._clock.wait(self._closing, pause.next_s())
-        finally:
-            self._let_go()
-            self._teller.sink = None
-            self._state = LifeCycle.INACTIVE
-            self._ended.set()
-
-    def close(self) -> None:
-        """End `run` within two seconds and let go of the head; may be called twice."""
-        self._closing.set()
-        if self._ended.wait(CLOSE_TIMEOUT_S):
-            self._let_go()
-        self._state = LifeCycle.INACTIVE
-
-    def recycle(self, slot: int) -> None:
-        """Hand a slot back; from any thread. ValueError for a slot that was not handed out."""
-        with self._slots:
-            if slot not in self._lent_out:
-                raise ValueError(f"{self.name}: slot {slot} was not handed out; recycle it once")
-            self._lent_out.discard(slot)
-            if self._session is not None:
-                self._session.stream.lend(slot)
 
     def trigger(self) -> None:
         """Software trigger; from any thread. See `drivers.contract.Head`."""
@@ -212,6 +140,16 @@ class AravisHead(AravisSettings):
         return {name: found[name] for name in sorted(names)}
 
     # Finding
+
+    def _reach(self) -> None:
+        if self._session is None:
+            self._open()
+
+    def _opened_sentence(self) -> str:
+        return f"The head {self.name} is open at {self.address}; nothing to do."
+
+    def _word_for(self, error: DeviceError) -> str:
+        return "held-by-another" if isinstance(error, HeldByAnotherError) else "lost"
 
     def _open(self) -> _Session:
         """Open the head, waiting out whoever holds it. DeviceError where that is in vain."""
@@ -295,8 +233,11 @@ class AravisHead(AravisSettings):
 
     # Running
 
-    def _serve(self, session: _Session, sink: Sink) -> None:
+    def _serve(self, sink: Sink) -> None:
         """Deliver until closing or loss, then drop everything that belongs to this opening."""
+        session = self._session
+        if session is None:
+            return
         reason = ""
         try:
             with self._control:
@@ -346,8 +287,7 @@ class AravisHead(AravisSettings):
         else:
             self._counters[f"frames_{status.value}"] += 1
             self._counters[f"{status.value}_{reason}"] += 1
-        with self._slots:
-            self._lent_out.add(received.slot)
+        self._lend_out(received.slot)
         sink(self._frame(session, received, status, now_ns))
 
     def _frame(
@@ -411,13 +351,13 @@ class AravisHead(AravisSettings):
         before = self._of_stream["underruns"]
         self._of_stream = session.stream.counted()
         if self._of_stream["underruns"] > before:
-            self._teller.complain(
-                "underrun",
-                f"The head {self.name} lost a frame because all {self._memory.slot_count} slots "
-                "are taken. Storage is too slow for this rate; lengthen the interval.",
-            )
+            self._complain_of_underrun()
 
     # Letting go
+
+    def _returned(self, slot: int) -> None:
+        if self._session is not None:
+            self._session.stream.lend(slot)
 
     def _let_go(self) -> None:
         with self._slots:

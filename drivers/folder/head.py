@@ -5,15 +5,12 @@ What a file holds is in `drivers.folder.frames`.
 
 from __future__ import annotations
 
-import ctypes
 import queue
-import threading
-from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
-from drivers.clock import Clock, HostClock
+from drivers.clock import Clock
 from drivers.contract import (
     DeviceError,
     Frame,
@@ -22,19 +19,19 @@ from drivers.contract import (
     LifeCycle,
     Sink,
 )
-from drivers.settings import Configured, Setting
-from drivers.telling import Teller
+from drivers.head_device import HeadDevice
+from drivers.pixels import words_at
+from drivers.settings import Setting
 
 if TYPE_CHECKING:
     from drivers.folder.frames import FrameFile
 
-CLOSE_TIMEOUT_S: Final = 2.0
 WAIT_STEP_S: Final = 0.1
 MAX_WAITING: Final = 16
 """So many triggers may wait while a file is read; a head in the air forgets them sooner."""
 
 
-class FolderHead(Configured):
+class FolderHead(HeadDevice):
     """Frames of a mission's Level-0, or of a folder of 16-bit TIFFs, as if a head had them.
 
     Each trigger (or interval) plays the next file: COMPLETE, or CORRUPT where its size is not that
@@ -43,13 +40,11 @@ class FolderHead(Configured):
     ours, `device_ns`, exposure time, temperature and settings are those of the capture; the
     recorded head's clock has no latch on this host, so `device_clock_ns` is None.
 
-    One thread at a time calls `bind` and `run`; `recycle`, `trigger`, `close` and `statistics` are
-    for any thread.
-
     Source: docs/formats.md, Level-0 frames.
     """
 
     kind: ClassVar = "head"
+    counted: ClassVar = ("frames", "frames_corrupt", "unreadable", "underruns", "opened", "rounds")
 
     folder = Setting("", required=True, says="folder of the frames, such as MISSION/L0")
     pattern = Setting("*/{head}.tif", says="files below it; {head} is the head's name, * any text")
@@ -67,25 +62,12 @@ class FolderHead(Configured):
         memory: FrameMemory,
         clock: Clock | None = None,
     ) -> None:
-        super().__init__(name, settings)
-        self._memory = memory
-        self._clock: Clock = clock or HostClock()
-        self._teller = Teller(name, self._clock)
-        self._state = LifeCycle.CREATED
-        self._closing = threading.Event()
-        self._ended = threading.Event()
-        self._ended.set()
+        super().__init__(name, settings, memory=memory, clock=clock)
         self._waiting: queue.Queue[int] = queue.Queue(MAX_WAITING)
-        self._slots = threading.Lock()
-        self._free = list(range(memory.slot_count))
-        self._lent_out: set[int] = set()
         self._files: list[Path] = []
         self._next_file = 0
         self._due = 0
         self._shape: tuple[int, int] | None = None
-        self._counters: Counter[str] = Counter(
-            frames=0, frames_corrupt=0, unreadable=0, underruns=0, rounds=0
-        )
 
     @classmethod
     def contradictions(cls, values: Mapping[str, Any]) -> list[str]:
@@ -97,10 +79,6 @@ class FolderHead(Configured):
         if any("**" in part and part != "**" for part in pattern.parts):
             return [f"pattern is {values['pattern']!r}; ** stands alone between slashes"]
         return []
-
-    @property
-    def state(self) -> LifeCycle:
-        return self._state
 
     def bind(self, sink: Sink | None = None) -> Mapping[str, str]:
         """Find the files and read the first. See `drivers.contract.Head`."""
@@ -135,53 +113,6 @@ class FolderHead(Configured):
             "frame": f"{self._shape[1]} x {self._shape[0]} {first.pixel_format}",
         }
 
-    def run(self, sink: Sink) -> None:
-        """Play until closed. See `drivers.contract.Device`."""
-        if self._closing.is_set():
-            return
-        self._ended.clear()
-        self._teller.sink = sink
-        try:
-            if not self._reach():
-                return
-            self._state = LifeCycle.ACTIVE
-            self._teller.tell(
-                "opened", f"The head {self.name} plays {len(self._files)} files of {self.folder}."
-            )
-            next_ns = self._clock.mono_ns() + round(self.interval_s * 1e9)
-            while not self._closing.is_set():
-                if self.trigger_source == "line":
-                    left_ns = next_ns - self._clock.mono_ns()
-                    if left_ns > 0:
-                        self._clock.wait(self._closing, left_ns * 1e-9)
-                        continue
-                    next_ns = max(next_ns + round(self.interval_s * 1e9), self._clock.mono_ns())
-                    self._expose(sink)
-                else:
-                    try:
-                        self._waiting.get(timeout=WAIT_STEP_S)
-                    except queue.Empty:
-                        continue
-                    self._expose(sink)
-        finally:
-            self._teller.sink = None
-            self._state = LifeCycle.INACTIVE
-            self._ended.set()
-
-    def close(self) -> None:
-        """End `run` within two seconds; may be called twice."""
-        self._closing.set()
-        self._ended.wait(CLOSE_TIMEOUT_S)
-        self._state = LifeCycle.INACTIVE
-
-    def recycle(self, slot: int) -> None:
-        """Hand a slot back; from any thread. ValueError for a slot that was not handed out."""
-        with self._slots:
-            if slot not in self._lent_out:
-                raise ValueError(f"{self.name}: slot {slot} was not handed out; recycle it once")
-            self._lent_out.discard(slot)
-            self._free.append(slot)
-
     def trigger(self) -> None:
         """Play the next file; from any thread. See `drivers.contract.Head`."""
         if self.trigger_source != "software":
@@ -203,23 +134,31 @@ class FolderHead(Configured):
                 f"{self.name}: {MAX_WAITING} triggers wait already; lengthen the interval"
             ) from None
 
-    def statistics(self) -> Mapping[str, int]:
-        """frames, frames_corrupt, unreadable files, underruns, rounds played to the end."""
-        return dict(self._counters)
+    def _reach(self) -> None:
+        if not (self._files and self._shape):
+            self.bind()
+        self._counters["opened"] += 1
 
-    def _reach(self) -> bool:
-        """Find the files, again and again until they are there; False where it was closed."""
-        told = False
-        while not (self._files and self._shape):
-            try:
-                self.bind()
-            except DeviceError as error:
-                if not told:
-                    told = True
-                    self._teller.tell("lost", f"{error}. It is tried again by itself.", fault=True)
-                if self._clock.wait(self._closing, 1.0) or self._closing.is_set():
-                    return False
-        return True
+    def _opened_sentence(self) -> str:
+        return f"The head {self.name} plays {len(self._files)} files of {self.folder}."
+
+    def _serve(self, sink: Sink) -> None:
+        self._state = LifeCycle.ACTIVE
+        next_ns = self._clock.mono_ns() + round(self.interval_s * 1e9)
+        while not self._closing.is_set():
+            if self.trigger_source == "line":
+                left_ns = next_ns - self._clock.mono_ns()
+                if left_ns > 0:
+                    self._clock.wait(self._closing, left_ns * 1e-9)
+                    continue
+                next_ns = max(next_ns + round(self.interval_s * 1e9), self._clock.mono_ns())
+                self._expose(sink)
+            else:
+                try:
+                    self._waiting.get(timeout=WAIT_STEP_S)
+                except queue.Empty:
+                    continue
+                self._expose(sink)
 
     def _is_played_out(self) -> bool:
         return self._next_file >= len(self._files) and not self.loop
@@ -234,21 +173,11 @@ class FolderHead(Configured):
         self._due += 1
         if self._next_file % len(self._files) == 0:
             self._counters["rounds"] += 1
-        with self._slots:
-            slot = self._free.pop(0) if self._free else None
-        if slot is None:
-            self._counters["underruns"] += 1
-            self._teller.complain(
-                "underrun",
-                f"The head {self.name} lost a frame because all {self._memory.slot_count} slots "
-                "are taken. Storage is too slow for this rate; lengthen the interval.",
-            )
-        else:
+        slot = self._free_slot()
+        if slot is not None:
             try:
                 file = read_frame(path, room_nbytes=self._memory.slot_nbytes)
             except FrameFileError as error:
-                with self._slots:
-                    self._free.append(slot)
                 self._counters["unreadable"] += 1
                 self._teller.complain(
                     "unreadable",
@@ -265,18 +194,15 @@ class FolderHead(Configured):
             )
 
     def _hand_over(self, file: FrameFile, slot: int, sink: Sink) -> None:
-        import numpy as np
-
-        pixels = np.ascontiguousarray(file.pixels, dtype=np.uint16)
-        ctypes.memmove(self._memory.address(slot), pixels.ctypes.data, pixels.nbytes)
-        height_px, width_px = pixels.shape
+        height_px, width_px = file.pixels.shape
+        words = words_at(self._memory.address(slot), file.pixels.size)
+        words.reshape(file.pixels.shape)[:] = file.pixels
         whole = (height_px, width_px) == self._shape
         self._counters["frames" if whole else "frames_corrupt"] += 1
         settings: dict[str, float | int | str] = {**file.settings, "file": str(file.path)}
         if file.counter is not None:
             settings["recorded_counter"] = file.counter
-        with self._slots:
-            self._lent_out.add(slot)
+        self._lend_out(slot)
         sink(
             Frame(
                 head=self.name,
