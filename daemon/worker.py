@@ -95,7 +95,7 @@ def process_exposure(
     stitching = None
     if product.mosaic.method == "free":
         stitching = stitch_record_json(
-            stitch_record(rig, product.mosaic, told.placing_c, told.usable_c, product.estimated_dc)
+            stitch_record(rig, product.free, told.placing_c, told.usable_c, product.estimated_dc)
         )
     report["timings_s"] = {stage: round(s, 4) for stage, s in product.timings_s.items()}
     written = products.write_level2(

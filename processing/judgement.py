@@ -233,6 +233,17 @@ def _stitching(
                 float(t.tie_points_per_overlap),
             )
         )
+    resting = figures.get("resting_on_calibration")
+    if resting:
+        findings.append(
+            Finding(
+                Flag.TIE_POINTS,
+                Verdict.USABLE,
+                f"Too little detail to place {resting}: calibration and temperature help to place "
+                "them. Look at the quick look; fly again if there should have been detail.",
+                _number(figures, "stitched_sigma_worst_px"),
+            )
+        )
     findings += [
         Finding(
             Flag.TIE_POINTS,

@@ -46,19 +46,19 @@ from processing.level1 import (
     level1_counts_per_dn,
     level1_from_level0,
 )
-from processing.mosaic import Mosaic, MosaicSettings, free_mosaic
-from processing.pan_only import pan_only_mosaic
+from processing.mosaic import Mosaic, MosaicSettings
 from processing.placement import SensorPlacement, nominal_placements
 from processing.precision import precision_figures
-from processing.product import Method, Product, Settings
+from processing.product import Product, Settings
 from processing.quality import Figure
 from processing.quicklook import quicklook
 from processing.radiometry import RadiometricCalibration
 from processing.rehearsal import rehearsal_frames
 from processing.resampling import Interpolation
 from processing.rig import Rig
+from processing.stitching import Method, stitch
 from processing.tie_points import TiePoints, match_tie_points
-from processing.validity import Validity, judge_master, robust_datum
+from processing.validity import Validity
 
 __all__ = ["Conditions", "Interpolation", "Method", "Pipeline", "Product", "Settings"]
 
@@ -161,8 +161,17 @@ class Pipeline:
         with clock.stage("tie_points"):
             tie_points = match_tie_points(rig, start, level1, settings=settings.tie_points)
         with clock.stage("mosaic"):
-            equal, mosaic, validity = self._stitch(start, tie_points, temperatures, conditions)
-            estimated = self._estimate_dc(mosaic, validity, temperatures)
+            stitched = stitch(
+                rig,
+                start,
+                tie_points,
+                present=level1,
+                temperatures_c=temperatures.usable_c if settings.use_drift else {},
+                method=settings.method,
+                settings=self._mosaic_settings(conditions),
+            )
+            tie_points, mosaic, validity = stitched.tie_points, stitched.image, stitched.validity
+            estimated = self._estimate_dc(stitched.free, validity, temperatures)
         with clock.stage("composition"):
             image = self._pan.compose(
                 mosaic.placements,
@@ -190,6 +199,7 @@ class Pipeline:
                 bands=registrations,
                 present=level1,
             )
+            figures["resting_on_calibration"] = ", ".join(stitched.weak) or None
             figures |= estimated_dc_figures(estimated)
             figures |= precision_figures(rig, mosaic, level1, temperatures.usable_c)
             figures |= self._whole_figures(image.source, frames, conditions)
@@ -214,7 +224,8 @@ class Pipeline:
             start=start,
             tie_points=tie_points,
             mosaic=mosaic,
-            equal_datum=equal,
+            equal_datum=stitched.equal,
+            free=stitched.free,
             validity=validity,
             estimated_dc=estimated,
             temperatures=temperatures,
@@ -249,27 +260,6 @@ class Pipeline:
             )
             level1[name] = self._colour.leading(heads[name]) if name in heads else out
         return level1, statistics
-
-    def _stitch(
-        self,
-        start: Placements,
-        tie_points: TiePoints,
-        temperatures: Temperatures,
-        conditions: Conditions,
-    ) -> tuple[Mosaic, Mosaic, Validity | None]:
-        """The mosaic over all master sensors, the one the image is made with, and the judgement."""
-        settings = self._mosaic_settings(conditions)
-        if self.settings.method == "fixed":
-            mosaic = fixed_mosaic(self.rig, start, tie_points, settings=settings)
-            return mosaic, mosaic, None
-        if self.settings.method == "pan-only":
-            mosaic = pan_only_mosaic(self.rig, start, tie_points, settings=settings)
-            return mosaic, mosaic, None
-        mosaic = free_mosaic(self.rig, start, tie_points, settings=settings)
-        known = temperatures.usable_c if self.settings.use_drift else {}
-        validity = judge_master(self.rig, mosaic, known)
-        robust = robust_datum(self.rig, start, tie_points, mosaic, validity, settings=settings)
-        return mosaic, robust, validity
 
     def _estimate_dc(
         self, mosaic: Mosaic, validity: Validity | None, temperatures: Temperatures

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 from numpy.typing import NDArray
 
@@ -15,11 +15,11 @@ from processing.estimated_dc import EstimatedDc
 from processing.mosaic import Mosaic, MosaicSettings
 from processing.quality import QualityReport, Thresholds
 from processing.resampling import Interpolation
+from processing.stitching import Method
 from processing.tie_points import TiePoints, TiePointSettings
 from processing.validity import Validity
 
 Array = NDArray[Any]
-Method = Literal["free", "fixed", "pan-only"]
 
 
 @dataclass(frozen=True)
@@ -65,8 +65,9 @@ class Product:
     `<sensor>.raw` (n, 2), `<sensor>.weight` (n,): which raw pixel serves which VIP pixel.
     `timings_s` are seconds by stage, in order.
 
-    `mosaic` is what the image was made with; `equal_datum` the mosaic whose datum rests on all
-    master sensors alike, which is the same unless one was found displaced. `estimated_dc` is dC by
+    `mosaic` is what the image was made with; `free` the same by tie points alone, which differs
+    where calibration had to support them; `equal_datum` that whose datum rests on all master
+    sensors alike, which is `free` unless one was found displaced. `estimated_dc` is dC by
     stitching, cone by cone (none with the fixed method), `temperatures` what the placing used.
     """
 
@@ -80,6 +81,7 @@ class Product:
     tie_points: TiePoints
     mosaic: Mosaic
     equal_datum: Mosaic
+    free: Mosaic
     validity: Validity | None
     estimated_dc: tuple[EstimatedDc, ...]
     temperatures: Temperatures

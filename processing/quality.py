@@ -137,6 +137,7 @@ FIGURES: Final[Mapping[str, str]] = {
     "displaced_alternatives": "master sensors that explain the stitching nearly as well",
     "relative_displacements": "pairs of sensors of one cone found displaced against each other",
     "undetermined": "sensors and cones the tie points did not place, held at calibration and TDM",
+    "resting_on_calibration": "PAN sensors that tie points place too poorly, supported",
     "smear_along_px": "motion during exposure along track that TDI left, worst PAN cone, pixels",
     "smear_across_px": "the same across track",
     "gsd_m": "ground sampling distance of the virtual image",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -75,6 +75,12 @@ class TiePoints:
 
     def __len__(self) -> int:
         return len(self.sigma_px)
+
+    def only(self, keep: NDArray[np.bool_]) -> TiePoints:
+        """The points whose rows `keep` (n,) marks; `pairs` and `sought` stay."""
+        columns = ("sensor_a", "sensor_b", "raw_a", "raw_b", "sigma_px", "correlation", "kind")
+        kept = {name: getattr(self, name)[keep] for name in (*columns, "overlap")}
+        return replace(self, **kept)
 
     def counts(self) -> dict[tuple[str, str], int]:
         """Points found per pair of sensors; pairs without any included."""

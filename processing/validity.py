@@ -26,6 +26,9 @@ from processing.tie_points import TiePoints
 
 Array = NDArray[np.float64]
 
+LEAST_PAN_POINTS = 24
+"""P/P points used below which a sensor's place is not the stitching's to tell."""
+
 Observability = Literal["named", "relative", "unobservable"]
 
 
@@ -101,6 +104,7 @@ class Validity:
     relative displacement is seen, or nothing (one sensor: the layer transformation absorbs it).
     `consistent` is the global test of the master sensors. `displaced` is the named sensor, with
     `alternatives` that fit nearly as well; `several` says that one sensor does not explain it all.
+    `unproven` is a sensor that would be named if more than P/C points and a few P/P said so.
     """
 
     observability: Mapping[str, Observability]
@@ -114,6 +118,7 @@ class Validity:
     alternatives: tuple[str, ...]
     several: bool
     relative: tuple[RelativeDisplacement, ...]
+    unproven: Displacement | None = None
 
     @property
     def consistent(self) -> bool:
@@ -173,13 +178,18 @@ def judge_master(
         hypotheses.sort(key=lambda h: -h.statistic)
         remainder = global_statistic - hypotheses[0].statistic
     displaced = hypotheses[0] if hypotheses and hypotheses[0].statistic > limit else None
+    unproven = None
+    if displaced and pan_points(rig, mosaic)[displaced.sensor] < LEAST_PAN_POINTS:
+        displaced, unproven = None, displaced
     fits = [
         h.sensor
         for h in hypotheses[1:]
         if hypotheses[0].statistic - h.statistic < 2.0 * math.log(settings.odds)
     ]
     several = bool(
-        displaced and freedom > 2 and remainder > chi2.ppf(1.0 - settings.family_alpha, freedom - 2)
+        (displaced or unproven)
+        and freedom > 2
+        and remainder > chi2.ppf(1.0 - settings.family_alpha, freedom - 2)
     )
     return Validity(
         observability=_observability(rig, mosaic),
@@ -190,10 +200,21 @@ def judge_master(
         hypotheses=tuple(hypotheses),
         limit=limit,
         displaced=displaced,
-        alternatives=tuple(fits) if displaced else (),
+        alternatives=tuple(fits) if displaced or unproven else (),
         several=several,
         relative=_relative(rig, mosaic, temperatures_c, settings),
+        unproven=unproven,
     )
+
+
+def pan_points(rig: Rig, mosaic: Mosaic) -> dict[str, int]:
+    """P/P points in use, by PAN sensor."""
+    counts = {s.name: 0 for cone in rig.pan_cones for s in cone.sensors}
+    for (a, b), used in mosaic.used.items():
+        if a in counts and b in counts:
+            counts[a] += used
+            counts[b] += used
+    return counts
 
 
 def robust_datum(
