@@ -112,7 +112,7 @@ def _told(direction: Array, unknowns: Sequence[Unknown]) -> Defect:
             + (", ...)" if len(who) > 3 else ")")
         )
         shares.append((words[-1], value))
-    things = {(unknowns[c].kind, unknowns[c].owner) for c in np.flatnonzero(share > 1e-3)}
+    things = {(u.kind, u.owner) for u, part in zip(unknowns, share, strict=True) if part > 1e-3}
     if len(words) > 1 and len(things) == 1 and next(iter(things))[0] != "camera":
         kind, owner = next(iter(things))
         sentence = f"{kind} {owner} cannot be determined: it has too few observations"

@@ -1,0 +1,112 @@
+"""A small block of the emulator's: accuracy against truth, and a pattern only one set can model."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.aerial_block import Judged, judged, network_of
+from processing.bundle.findings import parameters_of
+from processing.bundle.network import Camera
+from processing.bundle.self_calibration import SETS, parameter_count, parts_of, self_calibrating
+from processing.bundle.terms import part_of
+from processing.rig import find_rig
+from sim_hw.block import Block, Errors, flown, image_grid, left_after_orientation, small_plan
+
+
+@pytest.fixture(scope="module")
+def block() -> Block:
+    return flown(small_plan(), seed=1)
+
+
+@pytest.fixture(scope="module")
+def full(block) -> Judged:
+    return judged(block, "sensors-full")
+
+
+@pytest.mark.parametrize(
+    ("rig_name", "counts"),
+    [("ultracam-x", (0, 2, 23, 61)), ("ultracam-d", (0, 2, 23, 61)), ("ultracam-l", (0, 2, 9, 15))],
+)
+def test_the_sets_have_the_parameters_of_the_topology(rig_name, counts) -> None:
+    rig = find_rig(rig_name)
+    sensors = sum(len(cone.sensors) for cone in rig.pan_cones)
+    cones = len(rig.pan_cones)
+    camera = Camera("stitched", rig.virtual_image.f_mm)
+    found = tuple(
+        parameter_count(
+            self_calibrating(
+                camera, name, parts_of(rig), master_cone=rig.master_cone, interior=True
+            )
+        )
+        for name in SETS
+    )
+    assert found == counts
+    assert found[2] == 7 + 2 * (sensors - 1)
+    assert found[3] == 7 + 6 * (sensors - 1) + 2 * (cones - 1)
+
+
+def test_every_image_point_belongs_to_the_ccd_that_made_it() -> None:
+    rig = find_rig("ultracam-x")
+    parts = parts_of(rig)
+    for index, part in enumerate(parts):
+        assert list(part_of(parts, np.array([part.centre_mm]))) == [index]
+    image = rig.virtual_image
+    half = np.array([image.width_px, image.height_px]) * image.pitch_mm / 2.0
+    everywhere = np.random.default_rng(1).uniform(-half, half, (5000, 2))
+    share = np.bincount(part_of(parts, everywhere), minlength=9) / 5000
+    assert share.min() > 0.08, "nine CCDs of about a ninth each"
+
+
+def test_without_a_pattern_sigma0_is_the_noise_and_no_parameter_is_needed() -> None:
+    plan = replace(small_plan(), errors=Errors(pattern_mm=0.0))
+    found = judged(flown(plan, seed=2), "none")
+    assert found.figures["sigma0"] == pytest.approx(1.0, abs=0.03)
+    low, high = found.figures["check_squares_bounds"]
+    assert low < found.figures["check_squares"] < high
+
+
+def test_the_set_that_can_model_the_pattern_leaves_none_of_it(full) -> None:
+    assert full.figures["sigma0"] == pytest.approx(1.0, abs=0.05)
+    assert full.figures["left_rms_um"] < 0.3
+    significant = {p.name for p in parameters_of(full.result) if p.t > 5.0}
+    assert {"perspective-x cone 1", "perspective-y cone 1"} <= significant
+
+
+def test_the_pattern_shows_without_that_set(block, full) -> None:
+    radial = judged(block, "radial")
+    assert radial.figures["sigma0"] > 1.05
+    assert radial.figures["left_max_um"] > 1.5
+    assert radial.figures["residual_pattern_max_um"] > 2.0 * full.figures["residual_pattern_max_um"]
+    assert radial.result.redundancy > full.result.redundancy
+
+
+def test_check_points_err_as_predicted(full) -> None:
+    low, high = full.figures["check_squares_bounds"]
+    assert full.figures["checks"] == 20
+    assert low < full.figures["check_squares"] < high
+    assert full.figures["check_plan_px"] < 0.3
+    assert full.figures["check_rms_px"][2] < 0.36
+    predicted = np.array(full.checks.predicted_m)
+    assert (np.array(full.checks.rms_m) / predicted < 1.5).all()
+
+
+def test_gnss_shifts_and_drifts_of_every_strip_are_found(block, full) -> None:
+    network = network_of(block, "sensors-full")
+    result = full.result
+    truth = block.true_station + block.true_rotation @ np.array(block.plan.lever_m)
+    spread = result.sigma0 * np.sqrt(np.diag(result.cofactor))
+    for line in range(len(network.gnss.lines)):
+        rows = block.strip == line
+        mean = (block.antenna_m[rows] - truth[rows]).mean(axis=0)
+        own = spread[result.layout.shift[line]]
+        assert (np.abs(result.state.shift[line] - mean) < 4.0 * own).all()
+
+
+def test_the_planted_pattern_has_the_size_it_is_said_to_have(block) -> None:
+    frame = block.plan.frame
+    places = image_grid(frame, 24, 25)
+    left = left_after_orientation(frame, places, block.pattern.at(places))
+    assert np.hypot(*left.T).max() == pytest.approx(2e-3, rel=0.01)
