@@ -1,0 +1,249 @@
+"""`python -m benchmarks.flags`: false alarms of clean exposures, and misses where a fault is twice
+what its flag's threshold allows.
+
+Every exposure of `ultracam-x-mini` is rendered anew: another place of the scene, attitude, dC,
+errors of calibration and mounting, noise of sensors and instruments. Faults are put into the light,
+the true camera, the probes or the instruments, never into figures.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from benchmarks.machine import machine
+from benchmarks.rendered import (
+    Exposure,
+    conditions_of,
+    process,
+    radiometry_of,
+    take,
+    world_settings,
+)
+from processing.pipeline import Conditions, Pipeline, Product, Settings
+from processing.quality import NO_FLAGS, Flag, Thresholds
+from sim_hw.scene import open_scene
+from sim_hw.snapshots import Heads
+from sim_hw.world import World
+
+RIG = "ultracam-x-mini"
+PLACES = 6
+LARGEST_DC_K = 20.0
+THRESHOLDS = Thresholds()
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What is done to an exposure, and the flag it must raise.
+
+    `world` are settings of the world that differ, by seed; `light` and `conditions` change what
+    the sensors see and what the instruments say.
+    """
+
+    flag: Flag
+    says: str
+    world: Callable[[int], Mapping[str, object]] = lambda seed: {}
+    light: Callable[[Exposure], Exposure] = lambda exposure: exposure
+    conditions: Callable[[Conditions], Conditions] = lambda told: told
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.flags")
+    add = parser.add_argument
+    add("--clean", type=int, default=1000, help="clean exposures")
+    add("--faulty", type=int, default=100, help="exposures of each fault")
+    add("--fault", action="append", choices=sorted(FAULTS), help="only these; repeat")
+    add("--first-seed", type=int, default=0, help="go on from an earlier run")
+    add("--within-s", type=float, default=math.inf, help="stop after so long, and say how far")
+    add("--scene-cache", type=Path, help="folder where built scenes are kept")
+    add("--json", action="store_true", help="print one JSON object")
+    given = parser.parse_args()
+    until = time.monotonic() + given.within_s
+    with tempfile.TemporaryDirectory(prefix="syntopic-flags-") as folder:
+        camera = Camera(given.scene_cache or Path(folder))
+        seeds = range(given.first_seed, given.first_seed + given.clean)
+        clean = raised(camera, seeds, None, until)
+        faulty = {
+            name: raised(camera, range(50_000, 50_000 + given.faulty), FAULTS[name], until)
+            for name in given.fault or FAULTS
+        }
+    result = {
+        "machine": machine(),
+        "clean": clean,
+        "faults": {
+            name: found | {"missed": missed(FAULTS[name], found)} for name, found in faulty.items()
+        },
+    }
+    print(json.dumps(result) if given.json else table(result))
+
+
+class Camera:
+    """One emulated camera over one long scene; worlds differ by seed."""
+
+    def __init__(self, scenes: Path) -> None:
+        first = World(world_settings(RIG, 1, exposures=PLACES))
+        self.scene = open_scene(first.scene_settings, scenes)
+        self.heads = Heads(first, seed=1)
+        self.pipeline = Pipeline(first.rig, radiometry_of(self.heads), Settings(geometry=False))
+
+    def product(self, seed: int, fault: Fault | None) -> Product:
+        """One exposure, rendered and processed; all that is random follows from the seed."""
+        random = np.random.default_rng([seed, 3])
+        others: dict[str, object] = {"dc_k": float(random.uniform(-LARGEST_DC_K, LARGEST_DC_K))}
+        others |= fault.world(seed) if fault else {}
+        world = World(world_settings(RIG, seed, **others))
+        exposure = take(world, Path(), place=int(random.integers(0, PLACES)), scene=self.scene)
+        told = conditions_of(exposure, seed=seed)
+        if fault is not None:
+            exposure, told = fault.light(exposure), fault.conditions(told)
+        return process(self.pipeline, self.heads, exposure, seed=seed, conditions=told)
+
+
+def raised(
+    camera: Camera, seeds: Sequence[int], fault: Fault | None, until: float
+) -> dict[str, Any]:
+    """How many exposures raised each flag, and the seeds of those that did on their own accord."""
+    counts: Counter[str] = Counter()
+    alarms: list[tuple[int, str]] = []
+    done = 0
+    for seed in seeds:
+        if time.monotonic() > until:
+            break
+        flags = camera.product(seed, fault).report.flags
+        done += 1
+        for flag in flags:
+            counts[str(flag.name)] += 1
+        unexpected = flags & ~(fault.flag if fault else NO_FLAGS)
+        if unexpected:
+            alarms.append((seed, str(unexpected.name)))
+        if done % 10 == 0:
+            print(
+                fault.says if fault else "clean", done, dict(counts), alarms[-3:], file=sys.stderr
+            )
+            sys.stderr.flush()
+    return {"exposures": done, "raised": dict(counts), "others": alarms}
+
+
+def missed(fault: Fault, found: Mapping[str, Any]) -> int:
+    """Faulty exposures that did not raise the flag of their fault."""
+    return int(found["exposures"] - found["raised"].get(str(fault.flag.name), 0))
+
+
+def table(result: Mapping[str, Any]) -> str:
+    """Markdown: false alarms by flag, then misses by fault."""
+    clean = result["clean"]
+    lines = [
+        f"{clean['exposures']} clean exposures; flags raised: {clean['raised'] or 'none'}",
+        "",
+        "| fault | flag | exposures | missed |",
+        "|---|---|---|---|",
+    ]
+    for name, found in result["faults"].items():
+        fault = FAULTS[name]
+        lines.append(
+            f"| {fault.says} | `{fault.flag.name}` | {found['exposures']} | {found['missed']} |"
+        )
+    return "\n".join(lines)
+
+
+def _displaced(seed: int) -> Mapping[str, object]:
+    random = np.random.default_rng([seed, 5])
+    angle = float(random.uniform(0.0, 2 * math.pi))
+    name = str(random.choice(["SU00", "SU01", "SU02", "SU03"]))
+    return {"displaced_px": {name: (0.3 * math.cos(angle), 0.3 * math.sin(angle))}}
+
+
+def _lit(exposure: Exposure, factor: float) -> Exposure:
+    light = {
+        name: np.asarray(seen * np.float32(factor), np.float32)
+        for name, seen in exposure.snapshot.light.items()
+    }
+    return replace(exposure, snapshot=replace(exposure.snapshot, light=light))
+
+
+def _pan(exposure: Exposure) -> Iterator[tuple[str, Any]]:
+    for cone in exposure.world.rig.pan_cones:
+        for sensor in cone.sensors:
+            yield sensor.name, exposure.snapshot.light[sensor.name]
+
+
+def _dark(exposure: Exposure) -> Exposure:
+    """The 95th percentile of the signal at half of the threshold."""
+    light = np.concatenate([seen[::16, ::16].ravel() for _, seen in _pan(exposure)])
+    planned = 0.8 * float(np.percentile(light, 95.0))
+    return _lit(exposure, 0.5 * THRESHOLDS.bright_fraction / planned)
+
+
+def _burnt(exposure: Exposure) -> Exposure:
+    """Twice the threshold's share of the pixels at or above full scale, on the axis of the lens."""
+    light = np.concatenate([seen[::4, ::4].ravel() for _, seen in _pan(exposure)])
+    share = 100.0 * (1.0 - 2.0 * THRESHOLDS.saturated_fraction)
+    # A quarter of the light is lost towards the corners: what saturates there is brighter still.
+    return _lit(exposure, 1.3 / (0.8 * float(np.percentile(light, share))))
+
+
+def _defocused(exposure: Exposure) -> Exposure:
+    light = {
+        name: np.asarray(cv2.GaussianBlur(seen, (0, 0), 2.0), np.float32)
+        for name, seen in exposure.snapshot.light.items()
+    }
+    return replace(exposure, snapshot=replace(exposure.snapshot, light=light))
+
+
+def _clouded(exposure: Exposure) -> Exposure:
+    """Half an image without any detail: every overlap of one side."""
+    light = dict(exposure.snapshot.light)
+    for name in ("SU00", "SU02", "SU20"):
+        light[name] = np.full_like(light[name], 0.7)
+    return replace(exposure, snapshot=replace(exposure.snapshot, light=light))
+
+
+def _stuck(told: Conditions) -> Conditions:
+    """Probe 0 off by four kelvin: twice 4.5 standard deviations of a typical estimate."""
+    read = dict(told.temperatures_c)
+    read["0"] = (read["0"] or 0.0) + 4.0
+    return replace(told, temperatures_c=read)
+
+
+def _turning(told: Conditions) -> Conditions:
+    """A pitch rate that smears by twice the threshold during the exposure of PAN."""
+    time_s = told.exposure_time_s["0"]
+    rate = 2.0 * THRESHOLDS.smear_px / (time_s * 100.5 / 7.2e-3)
+    return replace(told, angular_rate_rad_per_s=(0.0, rate, 0.0))
+
+
+FAULTS: Mapping[str, Fault] = {
+    "displaced": Fault(Flag.DISPLACED_SENSOR, "a master sensor off by 0.3 px", world=_displaced),
+    "stuck-probe": Fault(Flag.DC_DISAGREEMENT, "a probe off by 4 K", conditions=_stuck),
+    "dark": Fault(Flag.UNDEREXPOSED, "half of the least brightness", light=_dark),
+    "burnt": Fault(Flag.OVEREXPOSED, "twice the saturated pixels", light=_burnt),
+    "defocused": Fault(Flag.BLUR, "defocused by 2 px", light=_defocused),
+    "turning": Fault(Flag.BLUR, "twice the smear", conditions=_turning),
+    "no-detail": Fault(Flag.TIE_POINTS, "three sensors see no detail", light=_clouded),
+    "tilted": Fault(
+        Flag.TILT,
+        "twice the tilt",
+        conditions=lambda told: replace(told, roll_rad=2 * THRESHOLDS.tilt_rad),
+    ),
+    "drifting": Fault(
+        Flag.DRIFT,
+        "twice the crab",
+        conditions=lambda told: replace(told, crab_rad=-2 * THRESHOLDS.crab_rad),
+    ),
+}
+
+
+if __name__ == "__main__":
+    main()
