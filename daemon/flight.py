@@ -398,7 +398,7 @@ def compose(
         flags |= Flag.TIME_HOLDOVER
     navigation: NavigationRecord | None = None
     if instant.gps_ns is not None:
-        navigation = track.at(instant.gps_ns)
+        navigation = track.at(instant.gps_ns, stored.trigger_mono_ns)
     if navigation is None:
         flags |= Flag.GNSS
     return Exposure(

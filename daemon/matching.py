@@ -27,6 +27,18 @@ ARRIVAL_LIMIT_NS: Final = 20_000_000_000
 USUAL_SLACK_NS: Final = 400_000_000
 """A frame that arrives so much off the usual is no witness of when it was exposed."""
 ARRIVALS_KEPT: Final = 16
+STARTS_TO_KNOW: Final = 5
+"""So many frames tell how far a head's starts usually lie from their pulses."""
+STARTS_KEPT: Final = 16
+USUAL_START_NS: Final = 1_000_000
+LATCH_DRIFT: Final = 1e-4
+"""How far from there a start may lie, beside what pulse, latch and time since the latch leave
+open."""
+STARTS_TO_RETHINK: Final = 3
+"""So many unusual starts in succession that agree are the new usual."""
+SPURIOUS_TO_DOUBT: Final = 3
+DOUBT_NS: Final = 1_500_000_000
+"""A head that sent so many frames nobody asked for within this time is not believed."""
 
 
 @dataclass
@@ -35,6 +47,37 @@ class _HeadRecord:
 
     offset: int | None = None
     arrivals_ns: deque[int] = field(default_factory=lambda: deque(maxlen=ARRIVALS_KEPT))
+    starts_ns: deque[int] = field(default_factory=lambda: deque(maxlen=STARTS_KEPT))
+    """How much later than by their pulses exposures began, by the head's clock."""
+    odd_starts_ns: deque[int] = field(default_factory=lambda: deque(maxlen=STARTS_TO_RETHINK))
+    spurious_ns: deque[int] = field(default_factory=lambda: deque(maxlen=SPURIOUS_TO_DOUBT))
+    """When exposures began that nobody asked for."""
+
+    def is_in_doubt(self, start_ns: int) -> bool:
+        """Whether so many frames came unasked for that one among them may be near by chance."""
+        full = len(self.spurious_ns) == SPURIOUS_TO_DOUBT
+        return full and abs(start_ns - self.spurious_ns[0]) < DOUBT_NS
+
+    def starts_as_usual(self, away_ns: int, unsure_ns: int) -> bool:
+        """Whether an exposure that began so much later than by its pulse is like those before.
+
+        What is usual is learned anew where unusual ones agree: a head that was given another delay
+        must not be disbelieved for ever.
+        """
+        if len(self.starts_ns) >= STARTS_TO_KNOW:
+            usual_ns = statistics.median(self.starts_ns)
+            # 1.4826: from the median absolute deviation to a standard deviation.
+            spread_ns = 6 * 1.4826 * statistics.median(abs(s - usual_ns) for s in self.starts_ns)
+            window_ns = max(USUAL_START_NS, spread_ns) + unsure_ns
+            if abs(away_ns - usual_ns) > window_ns:
+                self.odd_starts_ns.append(away_ns)
+                odd_ns = self.odd_starts_ns
+                if len(odd_ns) < STARTS_TO_RETHINK or max(odd_ns) - min(odd_ns) > window_ns:
+                    return False
+                self.starts_ns.clear()
+        self.odd_starts_ns.clear()
+        self.starts_ns.append(away_ns)
+        return True
 
     @property
     def usual_ns(self) -> int | None:
@@ -81,7 +124,12 @@ class Matcher:
         number, is_ambiguous = self._pulse_of(frame)
         if frame.status is not FrameStatus.COMPLETE:
             return Match(number, Cause.CORRUPT)
+        if number is not None and not self._is_like_the_others(frame, self._pulses[number]):
+            number, is_ambiguous = None, True
         if number is None:
+            start_ns = start_of_exposure_mono_ns(frame)
+            if start_ns is not None:
+                self._heads[frame.head].spurious_ns.append(start_ns)
             return Match(None, Cause.SPURIOUS, is_ambiguous)
         if (frame.head, number) in self._frames:
             return Match(number, Cause.DUPLICATE)
@@ -116,6 +164,20 @@ class Matcher:
             return None, True
         waiting = [p for p in possible if (frame.head, p.number) not in self._frames]
         return (waiting[0].number, False) if len(waiting) == 1 else (None, len(waiting) > 1)
+
+    def _is_like_the_others(self, frame: Frame, pulse: Pulse) -> bool:
+        """Whether a frame near a pulse began as its head's frames do, and not there by chance."""
+        start_ns = start_of_exposure_mono_ns(frame)
+        if start_ns is None or (frame.head, pulse.number) in self._frames:
+            return True
+        head = self._heads[frame.head]
+        if head.is_in_doubt(start_ns):
+            return False
+        since_latch_ns = abs((frame.device_ns or 0) - (frame.device_clock_ns or 0))
+        unsure_ns = (
+            pulse.sigma_ns + 3 * (frame.latch_sigma_ns or 0) + round(LATCH_DRIFT * since_latch_ns)
+        )
+        return head.starts_as_usual(start_ns - self._start_ns(frame, pulse), unsure_ns)
 
     def _start_ns(self, frame: Frame, pulse: Pulse) -> int:
         return pulse.mono_ns + pulse.delays_ns[self._cone_of_head[frame.head]]

@@ -20,13 +20,28 @@ WGS84_A_M = 6_378_137.0
 WGS84_E2 = 6.694379990141e-3
 EXTRAPOLATION_LIMIT_NS = 2_000_000_000
 MEMORY_NS = 120_000_000_000
+SAMPLES_TO_STEP_BACK = 3
+LATEST_ARRIVAL_NS = 700_000_000
+"""How long a sample may have been on its way."""
+CONTRADICTION_M = 1.0
+CONTRADICTION_MPS2 = 2.0
+CONTRADICTION_SIGMAS = 5
+"""How far two positions may disagree with the way between them, beside their sigmas."""
 
 
 class Track:
-    """The samples of one receiver over the last two minutes."""
+    """The samples of one receiver over the last two minutes.
+
+    A sample that is not newer than the last is dropped: it came late, or twice. Where the next ones
+    are no newer either, but follow each other, the receiver's time has stepped back; where the way
+    from one to the next is not what their velocities say, it has stepped, too. What was before
+    belongs to another time then.
+    """
 
     def __init__(self) -> None:
         self._samples: deque[NavSample] = deque()
+        self._before_step: deque[NavSample] = deque()
+        self._from_the_past: list[NavSample] = []
 
     @property
     def last(self) -> NavSample | None:
@@ -34,21 +49,47 @@ class Track:
         return self._samples[-1] if self._samples else None
 
     def add(self, sample: NavSample) -> None:
-        """Note a sample; one that is not newer than the last is dropped."""
+        """Note a sample."""
         if self._samples and sample.gps_ns <= self._samples[-1].gps_ns:
+            past = self._from_the_past
+            if past and sample.gps_ns <= past[-1].gps_ns:
+                past.clear()
+            past.append(sample)
+            if len(past) >= SAMPLES_TO_STEP_BACK:
+                self._before_step, self._samples = self._samples, deque(past)
+                past.clear()
             return
+        self._from_the_past.clear()
+        if self._samples and _contradict(self._samples[-1], sample):
+            before = self._before_step
+            is_outlier = len(self._samples) == 1 and before and not _contradict(before[-1], sample)
+            if is_outlier and sample.gps_ns > before[-1].gps_ns:
+                self._samples, self._before_step = before, deque()
+            else:
+                self._before_step, self._samples = self._samples, deque()
         self._samples.append(sample)
         while self._samples[-1].gps_ns - self._samples[0].gps_ns > MEMORY_NS:
             self._samples.popleft()
 
     def reaches(self, gps_ns: int) -> bool:
-        """Whether a sample at or after that instant is there."""
-        return bool(self._samples) and self._samples[-1].gps_ns >= gps_ns
+        """Whether a sample at or after that instant is there, and its time not in question."""
+        known = bool(self._samples) and not self._from_the_past
+        return known and self._samples[-1].gps_ns >= gps_ns
 
-    def at(self, gps_ns: int) -> NavigationRecord | None:
-        """Navigation at an instant; None where no sample is within two seconds."""
-        before = next((s for s in reversed(self._samples) if s.gps_ns <= gps_ns), None)
-        after = next((s for s in self._samples if s.gps_ns > gps_ns), None)
+    def at(self, gps_ns: int, mono_ns: int | None = None) -> NavigationRecord | None:
+        """Navigation at an instant; None where no sample is within two seconds.
+
+        `mono_ns` is about when that was on the host's clock: it tells which of two times is meant
+        where the receiver's has stepped back. Too close to the step there is no telling.
+        """
+        samples = self._samples
+        if self._before_step and samples and mono_ns is not None:
+            if mono_ns < self._before_step[-1].mono_ns - LATEST_ARRIVAL_NS:
+                samples = self._before_step
+            elif mono_ns < samples[0].mono_ns:
+                return None
+        before = next((s for s in reversed(samples) if s.gps_ns <= gps_ns), None)
+        after = next((s for s in samples if s.gps_ns > gps_ns), None)
         return between(before, after, gps_ns)
 
 
@@ -75,6 +116,31 @@ def metres_per_degree(latitude_deg: float, height_m: float) -> tuple[float, floa
     normal = WGS84_A_M / math.sqrt(w2) + height_m
     parallel = normal * math.cos(math.radians(latitude_deg))
     return math.radians(meridian), math.radians(parallel)
+
+
+def _contradict(a: NavSample, b: NavSample) -> bool:
+    """Whether the way over ground from one sample to the other is not what their velocities say.
+
+    After a longer gap there is no telling: that is False.
+    """
+    if b.gps_ns - a.gps_ns > EXTRAPOLATION_LIMIT_NS:
+        return False
+    span_s = (b.gps_ns - a.gps_ns) / NANOSECONDS
+    north_m, east_m = metres_per_degree(a.latitude_deg, a.height_m)
+    way = (
+        (b.latitude_deg - a.latitude_deg) * north_m,
+        (b.longitude_deg - a.longitude_deg) * east_m,
+    )
+    velocities = zip(a.velocity_ned_mps[:2], b.velocity_ned_mps[:2], strict=True)
+    flown = [(va + vb) / 2 * span_s for va, vb in velocities]
+    sigma_m = math.hypot(
+        a.horizontal_sigma_m,
+        b.horizontal_sigma_m,
+        a.speed_sigma_mps * span_s,
+        b.speed_sigma_mps * span_s,
+    )
+    allowed_m = CONTRADICTION_M + CONTRADICTION_MPS2 * span_s**2 + CONTRADICTION_SIGMAS * sigma_m
+    return math.dist(way, flown) > allowed_m
 
 
 def _interpolated(a: NavSample, b: NavSample, gps_ns: int) -> NavigationRecord:

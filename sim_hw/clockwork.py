@@ -132,7 +132,7 @@ class ClockworkHead:
         self._clock = DeviceClock(chance.randrange(10**12), chance.gauss(0.0, 10.0))
         self._counter = 0
         self._is_acquiring = False
-        self._flood_counted = 0
+        self._busy_until_ns = 0
 
     def answers(self, now_ns: int) -> bool:
         """Whether a question to the head is answered."""
@@ -155,10 +155,13 @@ class ClockworkHead:
         """The head's own clock."""
         return self._clock.device_ns(now_ns) + self.channel.clock_error_ns(now_ns)
 
-    def exposed(self, start_ns: int, exposure: int) -> SentFrame | None:
-        """The frame of a pulse; None where the head was off or not started."""
+    def exposed(self, start_ns: int, exposure: int, lasts_ns: int) -> SentFrame | None:
+        """The frame of a pulse; None where the head was off, not started, or exposing already."""
         if not self.channel.is_powered(start_ns) or not self._is_acquiring:
             return None
+        if start_ns < self._busy_until_ns:
+            return None
+        self._busy_until_ns = start_ns + lasts_ns
         if self.channel.counter_restarts(start_ns):
             self._counter = 0
         self._counter += 1
@@ -377,7 +380,7 @@ class ClockworkRig:
 
     def _expose(self, head: ClockworkHead, start_ns: int, exposure: int) -> None:
         def expose(at_ns: int) -> None:
-            frame = head.exposed(at_ns, exposure)
+            frame = head.exposed(at_ns, exposure, self._exposure_ns)
             if frame is not None:
                 self._timeline.at(
                     at_ns + self._exposure_ns, lambda end_ns: self._send(head, frame, end_ns)
@@ -403,7 +406,7 @@ class ClockworkRig:
     def _flood(self, now_ns: int) -> None:
         for head in self.heads.values():
             if head.channel.flood_is_due(now_ns):
-                unasked = head.exposed(now_ns, NOBODY)
+                unasked = head.exposed(now_ns, NOBODY, self._exposure_ns)
                 if unasked is not None:
                     self._send(head, unasked, now_ns)
         if self.receiver.channel.flood_is_due(now_ns):

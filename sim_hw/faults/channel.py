@@ -272,6 +272,8 @@ class Channel(Generic[T]):
         return None
 
     def _is_on(self, name: str, now_ns: int, *, note: bool = False) -> bool:
+        if not self._armed:
+            return False
         with self._lock:
             on = any(a.planned.name == name and a.is_on(now_ns) for a in self._armed)
             if on and note:

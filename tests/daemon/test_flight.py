@@ -56,7 +56,7 @@ def nav(t_s: float) -> NavSample:
         mono_ns=round(t_s * NS) + 60_000_000,
         fix="3d",
         satellites=12,
-        latitude_deg=48.0,
+        latitude_deg=48.0 + t_s * 55.0 / 111_200,
         longitude_deg=11.0,
         height_m=3395.0,
         horizontal_sigma_m=0.5,

@@ -184,3 +184,34 @@ def test_whatever_is_lost_or_reordered_nothing_is_paired_wrongly(
     for number in shuffled:
         assert matching.frame(frame(number)).number == number
         assert matching.mark(mark(number)).number == number
+
+
+def test_a_frame_nobody_asked_for_is_not_taken_for_that_of_a_pulse_nearby() -> None:
+    matching = matcher(range(1, 30))
+    for number in range(1, 8):
+        assert matching.frame(frame(number)).cause is Cause.USED
+    stray = frame(8, device_ns=frame(8).device_ns - 9_000_000)  # type: ignore[operator]
+    assert matching.frame(stray).cause is Cause.SPURIOUS
+    assert matching.frame(frame(8)).cause is Cause.USED
+
+
+def test_a_head_whose_delay_has_changed_is_believed_again_after_three_frames() -> None:
+    matching = matcher(range(1, 30))
+    for number in range(1, 8):
+        matching.frame(frame(number))
+    later = [
+        matching.frame(frame(n, device_ns=frame(n).device_ns + 9_000_000))  # type: ignore[operator]
+        for n in range(8, 14)
+    ]
+    assert [match.cause is Cause.USED for match in later] == [False, False, True, True, True, True]
+
+
+def test_none_of_the_frames_of_a_head_that_floods_is_believed_until_it_stops() -> None:
+    matching = matcher(range(1, 30))
+    for number in range(1, 8):
+        matching.frame(frame(number))
+    for tenth in (1, 2, 3):
+        device_ns = frame(8).device_ns - tenth * 100_000_000  # type: ignore[operator]
+        assert matching.frame(frame(8, device_ns=device_ns)).cause is Cause.SPURIOUS
+    assert matching.frame(frame(8)).is_ambiguous
+    assert matching.frame(frame(9)).cause is Cause.USED

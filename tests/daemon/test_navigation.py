@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -79,3 +80,48 @@ def test_a_sample_that_is_not_newer_is_dropped() -> None:
     track.add(sample(1.0))
     track.add(sample(0.5))
     assert track.last is not None and track.last.gps_ns == GPS_NS + NS
+
+
+def stepped(flown: NavSample, by_s: float) -> NavSample:
+    """The same place and host time, by a receiver clock that has stepped."""
+    return replace(flown, gps_ns=flown.gps_ns + round(by_s * NS))
+
+
+def test_between_two_times_of_one_receiver_there_is_no_position() -> None:
+    track = Track()
+    track.add(sample(0.0))
+    track.add(stepped(sample(0.6), -0.4))
+    track.add(stepped(sample(0.8), -0.4))
+    assert track.at(GPS_NS + 100_000_000, 500_000_000) is None
+    record = track.at(GPS_NS + 300_000_000, 700_000_000)
+    assert record is not None
+    north_m, _ = metres_per_degree(LATITUDE, HEIGHT)
+    flown_m = (record.latitude_deg - LATITUDE) * north_m
+    assert flown_m == pytest.approx(50.0 * 0.7 + 0.7**2, abs=0.01)
+
+
+def test_one_position_beside_the_track_is_passed_over() -> None:
+    track = Track()
+    for tenth in (0, 2, 4):
+        track.add(sample(tenth / 10))
+    track.add(replace(sample(0.6), latitude_deg=LATITUDE + 0.01))
+    track.add(sample(0.8))
+    record = track.at(GPS_NS + 600_000_000, 600_000_000)
+    assert record is not None
+    north_m, _ = metres_per_degree(LATITUDE, HEIGHT)
+    assert (record.latitude_deg - LATITUDE) * north_m == pytest.approx(30.0 + 0.36, abs=0.01)
+
+
+def test_a_receiver_whose_time_steps_back_is_followed_and_a_late_message_is_not() -> None:
+    track = Track()
+    for tenth in range(0, 50, 2):
+        track.add(sample(tenth / 10))
+    track.add(sample(3.0))
+    assert track.last == sample(4.8)
+    for tenth in range(50, 58, 2):
+        track.add(stepped(sample(tenth / 10), -3.0))
+    record = track.at(GPS_NS + round(2.1 * NS))
+    assert record is not None
+    north_m, _ = metres_per_degree(LATITUDE, HEIGHT)
+    flown_m = (record.latitude_deg - LATITUDE) * north_m
+    assert flown_m == pytest.approx(50.0 * 5.1 + 5.1**2, abs=0.01)
