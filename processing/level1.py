@@ -32,7 +32,10 @@ SATURATED_BIT: Final = 1
 _RESPONSE_UNIT: Final = 16384
 """Fixed-point word of a response of one. Integer running sums are exact, so the result does not
 depend on how many threads shared the rows."""
-_BAND_ROWS: Final = 32
+_BAND_ROWS: Final = 128
+_MATHEMATICS: Final = {"contract", "nnan", "ninf", "nsz"}
+"""No approximate reciprocals: compilers take them or not as loops happen to vectorise, and the same
+bytes must give the same pixels wherever the kernels were compiled."""
 _DEFECT_REACH_PX: Final = 8
 
 
@@ -206,10 +209,12 @@ def _spread(defect: Array, shifts: int, sign: int) -> tuple[Array, Array]:
     return mask, np.argwhere(mask).astype(np.int32)
 
 
-@njit(cache=True, parallel=True, fastmath=True, nogil=True)
+@njit(cache=True, parallel=True, fastmath=_MATHEMATICS, nogil=True)
 def _flat_pass(raw, offset, factor, shifts, sign, full_scale, out, sums):  # type: ignore[no-untyped-def]
     """The pass where one offset and one gain hold for all pixels."""
     height, width = raw.shape
+    # Sums and limits stay 32 bits wide, so that vectors hold eight pixels and not four.
+    ceiling = np.int32(full_scale)
     for band in prange(sums.shape[0]):
         total = np.int64(0)
         saturated = np.int64(0)
@@ -225,17 +230,17 @@ def _flat_pass(raw, offset, factor, shifts, sign, full_scale, out, sums):  # typ
                 dn = np.int32(source[k])
                 half = np.int32((np.float32(dn) - offset) * factor + np.float32(0.5))
                 half = min(max(half, np.int32(1)), np.int32(32767))
-                full = np.int32((dn >= full_scale) | (half >= 32767))
+                full = np.int32((dn >= ceiling) | (half >= 32767))
                 target[k] = np.uint16(2 * half + full)
-                row_total += half
-                row_saturated += full
+                row_total = np.int32(row_total + half)
+                row_saturated = np.int32(row_saturated + full)
             total += row_total
             saturated += row_saturated
         sums[band, 0] = 2.0 * total
         sums[band, 1] = saturated
 
 
-@njit(cache=True, parallel=True, fastmath=True, nogil=True)
+@njit(cache=True, parallel=True, fastmath=_MATHEMATICS, nogil=True)
 def _map_pass(  # type: ignore[no-untyped-def]
     raw,
     bias,
@@ -253,6 +258,7 @@ def _map_pass(  # type: ignore[no-untyped-def]
 ):
     """The pass with maps; running sums along the column give the means over the pixels visited."""
     height, width = raw.shape
+    ceiling = np.int32(full_scale)
     for band in prange(sums.shape[0]):
         first = band * _BAND_ROWS
         last = min(first + _BAND_ROWS, height)
@@ -284,26 +290,35 @@ def _map_pass(  # type: ignore[no-untyped-def]
                     signal = (np.float32(dn) - offset) * (factor / np.float32(response_sum[k]))
                     half = np.int32(signal + np.float32(0.5))
                     half = min(max(half, np.int32(1)), np.int32(32767))
-                    full = np.int32((dn >= full_scale) | (half >= 32767))
+                    full = np.int32((dn >= ceiling) | (half >= 32767))
                     target[k] = np.uint16(2 * half + full)
-                    row_total += half
-                    row_saturated += full
+                    row_total = np.int32(row_total + half)
+                    row_saturated = np.int32(row_saturated + full)
                 total += row_total
                 saturated += row_saturated
-            if low >= 0:
-                dark_row = dark[low]
-                response_row = response[low]
+            coming = low + shifts + 1
+            if row + 1 == last:
+                continue
+            if low >= 0 and coming < height:
+                _slide(dark_sum, dark[low], dark[coming])
+                _slide(response_sum, response[low], response[coming])
+            elif coming < height:
                 for k in range(width):
-                    dark_sum[k] -= np.int32(dark_row[k])
-                    response_sum[k] -= np.int32(response_row[k])
-            if low + shifts + 1 < height:
-                dark_row = dark[low + shifts + 1]
-                response_row = response[low + shifts + 1]
+                    dark_sum[k] += np.int32(dark[coming, k])
+                    response_sum[k] += np.int32(response[coming, k])
+            elif low >= 0:
                 for k in range(width):
-                    dark_sum[k] += np.int32(dark_row[k])
-                    response_sum[k] += np.int32(response_row[k])
+                    dark_sum[k] -= np.int32(dark[low, k])
+                    response_sum[k] -= np.int32(response[low, k])
         sums[band, 0] = 2.0 * total
         sums[band, 1] = saturated
+
+
+@njit(cache=True, nogil=True)
+def _slide(sums, leaving, coming):  # type: ignore[no-untyped-def]
+    """Move running sums on by one row."""
+    for k in range(len(sums)):
+        sums[k] += np.int32(coming[k]) - np.int32(leaving[k])
 
 
 @njit(cache=True, parallel=True, nogil=True)
@@ -329,8 +344,9 @@ def _interpolate_defects(level1, mask, places, period):  # type: ignore[no-untyp
                 step_column = np.int64(0)
             elif direction == 3:
                 step_column = np.int64(-period)
-            values = np.zeros(2)
-            distances = np.zeros(2)
+            # Two numbers each: an array would be asked of the heap for every defect.
+            before = after = 0.0
+            to_before = to_after = 0.0
             saturated = 0
             for side in range(2):
                 way = 2 * side - 1
@@ -340,13 +356,16 @@ def _interpolate_defects(level1, mask, places, period):  # type: ignore[no-untyp
                     if r < 0 or c < 0 or r >= height or c >= width:
                         break
                     if mask[r, c] == 0 and level1[r, c] != 0:
-                        values[side] = level1[r, c] & 0xFFFE
+                        value = np.float64(level1[r, c] & 0xFFFE)
                         saturated |= level1[r, c] & 1
-                        distances[side] = reach
+                        if side == 0:
+                            before, to_before = value, np.float64(reach)
+                        else:
+                            after, to_after = value, np.float64(reach)
                         break
-            if distances[0] == 0.0 or distances[1] == 0.0:
+            if to_before == 0.0 or to_after == 0.0:
                 continue
-            gradient = abs(values[1] - values[0]) / (distances[0] + distances[1])
+            gradient = abs(after - before) / (to_before + to_after)
             chords = 1
             for r in range(max(row - 2, 0), min(row + 3, height)):
                 for c in range(max(column - 2, 0), min(column + 3, width)):
@@ -358,11 +377,11 @@ def _interpolate_defects(level1, mask, places, period):  # type: ignore[no-untyp
                         continue
                     gradient += abs(np.float64(level1[r, c]) - np.float64(level1[r2, c2]))
                     chords += 1
-            error = gradient / chords * (distances[0] + distances[1])
+            error = gradient / chords * (to_before + to_after)
             if error < best:
                 best = error
-                share = distances[0] / (distances[0] + distances[1])
+                share = to_before / (to_before + to_after)
                 # Half of the word and its doubling leave the lowest bit to the saturation mark.
-                half = int(0.5 * (values[0] + (values[1] - values[0]) * share) + 0.5)
+                half = int(0.5 * (before + (after - before) * share) + 0.5)
                 found = 2 * half + saturated
         level1[row, column] = found

@@ -45,6 +45,7 @@ def resample(
     weights: Array,
     gains: Array,
     *,
+    offsets: Array | None = None,
     interpolation: Interpolation,
     out: Array,
     source: Array,
@@ -58,6 +59,7 @@ def resample(
         cell_px: lattice spacing, a multiple of `WEIGHT_STEP_PX`.
         weights: (n, rows, columns) uint8 at every `WEIGHT_STEP_PX`-th target pixel.
         gains: (n,) float32, applied to the signal.
+        offsets: (n,) float32, added after the gain; None adds nothing.
         out: (height, width) uint16; 0 is no data.
         source: (height, width) uint8: 0 no data, else 1 + index of the frame of greatest weight,
             with `SATURATED_SOURCE` set where one of the four nearest raw pixels was saturated.
@@ -74,6 +76,7 @@ def resample(
         cell_px,
         weights,
         gains,
+        np.zeros(len(gains), np.float32) if offsets is None else offsets,
         _CODES[interpolation],
         LANCZOS_TABLE,
         out,
@@ -109,7 +112,7 @@ def _weights_along(weights, y, x0, n, line):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, fastmath=True, nogil=True)
 def _add_share(  # type: ignore[no-untyped-def]
-    weights, y0, x0, rows, n, name, gain, values, flags, line, total, weight, best, mark
+    weights, y0, x0, rows, n, name, gain, offset, values, flags, line, total, weight, best, mark
 ):
     """Add one frame's weighted values of a cell."""
     zero = np.float32(0.0)
@@ -125,7 +128,7 @@ def _add_share(  # type: ignore[no-untyped-def]
             there = flag[k] < MISSING
             w = line[k] if there else zero
             v = value[k] if there else zero
-            sums[k] += w * gain * v
+            sums[k] += w * (gain * v + offset)
             whole[k] += w
             leads = w > highest[k]
             full = np.int32(flag[k] & 1) * np.int32(w > zero) * np.int32(SATURATED_SOURCE)
@@ -135,9 +138,9 @@ def _add_share(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def _finish_single(values, flags, gain, name, out, source, y0, x0, rows, n):  # type: ignore[no-untyped-def]
+def _finish_single(values, flags, gain, offset, name, out, source, y0, x0, rows, n):  # type: ignore[no-untyped-def]
     """Write a cell that one frame fills alone."""
-    half = np.float32(0.5)
+    rise = offset + np.float32(0.5)
     floor = np.float32(1.0)
     ceiling = np.float32(65535.0)
     for y in range(rows):
@@ -146,7 +149,7 @@ def _finish_single(values, flags, gain, name, out, source, y0, x0, rows, n):  # 
         for k in range(n):
             there = flags[y, k] < MISSING
             v = values[y, k] if there else floor
-            v = min(max(v * gain + half, floor), ceiling)
+            v = min(max(v * gain + rise, floor), ceiling)
             line[k] = np.uint16(np.int32(v)) if there else np.uint16(0)
             seen = name | np.uint8(np.uint8(flags[y, k] & 1) << np.uint8(7))
             whence[k] = seen if there else np.uint8(0)
@@ -174,9 +177,12 @@ def _serving(lattices, weights, band, column, nodes, chosen):  # type: ignore[no
     return found
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@njit(cache=True, fastmath={"contract", "nnan", "ninf", "nsz"}, nogil=True)
 def _finish_blend(total, weight, mark, out, source, y0, x0, rows, n):  # type: ignore[no-untyped-def]
-    """Write a cell that several frames share, or none fills."""
+    """Write a cell that several frames share, or none fills.
+
+    Divided exactly: an approximate reciprocal depends on how the loop was compiled.
+    """
     half = np.float32(0.5)
     floor = np.float32(1.0)
     ceiling = np.float32(65535.0)
@@ -201,6 +207,7 @@ def _mixed_cell(  # type: ignore[no-untyped-def]
     lattices,
     weights,
     gains,
+    offsets,
     band,
     column,
     cell,
@@ -245,7 +252,9 @@ def _mixed_cell(  # type: ignore[no-untyped-def]
             flags,
         )
         if found == 1:
-            _finish_single(values, flags, gains[s], np.uint8(s + 1), out, source, y0, x0, rows, n)
+            _finish_single(
+                values, flags, gains[s], offsets[s], np.uint8(s + 1), out, source, y0, x0, rows, n
+            )
         else:
             _add_share(
                 weights[s],
@@ -255,6 +264,7 @@ def _mixed_cell(  # type: ignore[no-untyped-def]
                 n,
                 np.int32(s + 1),
                 gains[s],
+                offsets[s],
                 values,
                 flags,
                 line,
@@ -269,7 +279,7 @@ def _mixed_cell(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, parallel=True, fastmath=True, nogil=True)
 def _resample(  # type: ignore[no-untyped-def]
-    frames, valid, lattices, cell, weights, gains, code, table, out, source
+    frames, valid, lattices, cell, weights, gains, offsets, code, table, out, source
 ):
     height, width = out.shape
     nodes = cell // WEIGHT_STEP_PX
@@ -303,6 +313,7 @@ def _resample(  # type: ignore[no-untyped-def]
                 lattices,
                 weights,
                 gains,
+                offsets,
                 band,
                 column,
                 cell,
@@ -340,6 +351,7 @@ def _resample(  # type: ignore[no-untyped-def]
                     first,
                     last,
                     gains[s],
+                    offsets[s],
                     lines,
                     out,
                     x0,
