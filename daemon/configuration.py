@@ -71,6 +71,7 @@ class TriggerSection(BaseModel):
     interval_s: float = Field(default=2.0, gt=0)
     distance_m: float | None = Field(default=None, gt=0)
     count: int | None = Field(default=None, gt=0)
+    start: Literal["at once", "on command"] = "at once"
 
     @model_validator(mode="after")
     def _distance_is_given(self) -> TriggerSection:
@@ -112,6 +113,30 @@ class ProcessingSection(_Section):
     threads: int = Field(default=2, ge=1, le=256)
 
 
+class WatchSection(_Section):
+    """Who may look in, and from where (docs/watching.md). Commands always need a token."""
+
+    host: str = "127.0.0.1"
+    port: int = Field(default=8470, ge=0, le=65535)
+    open: bool = True
+    tokens: Path | None = None
+    certificate: Path | None = None
+    key: Path | None = None
+    announce: bool = True
+
+    @model_validator(mode="after")
+    def _is_safe(self) -> WatchSection:
+        if (self.certificate is None) != (self.key is None):
+            raise ValueError("certificate and key belong together; give both or none")
+        leaves = not (self.host.startswith("127.") or self.host in ("::1", "localhost"))
+        if leaves and self.tokens is not None and self.certificate is None:
+            raise ValueError(
+                f"host {self.host} lies outside this machine, and tokens would travel in the "
+                "clear; give certificate and key, or no tokens (then nobody may command)"
+            )
+        return self
+
+
 class LimitsSection(_Section):
     """How long is waited for what, and how deep the memory is."""
 
@@ -136,6 +161,7 @@ class Configuration(_Section):
     pps: tuple[NamedSection, ...] = Field(default=(), max_length=1)
     processing: ProcessingSection = ProcessingSection()
     limits: LimitsSection = LimitsSection()
+    watch: WatchSection | None = None
 
 
 def load(path: Path) -> tuple[Configuration, Rig]:
@@ -198,7 +224,12 @@ def _anchored(configuration: Configuration, folder: Path) -> Configuration:
             "rig": _rig_path(mission.rig, folder / "service.toml"),
         }
     )
-    return configuration.model_copy(update={"mission": anchored})
+    watch = configuration.watch
+    if watch is not None:
+        files = {name: getattr(watch, name) for name in ("tokens", "certificate", "key")}
+        update = {name: folder / path for name, path in files.items() if path is not None}
+        watch = watch.model_copy(update=update)
+    return configuration.model_copy(update={"mission": anchored, "watch": watch})
 
 
 def _dig(content: Mapping[str, Any], *keys: str) -> Any:

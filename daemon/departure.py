@@ -89,6 +89,14 @@ def processes(configuration: Configuration, rig: Rig, mission: Mission) -> tuple
     )
 
 
+def watch_process(configuration: Configuration) -> ProcessPlan | None:
+    """The process that serves watchers, where the configuration wants one."""
+    if configuration.watch is None:
+        return None
+    one = _thread_counts(1)
+    return ProcessPlan("watch", "daemon.watch.process:main", (configuration.watch,), one)
+
+
 def _thread_counts(threads: int) -> dict[str, str]:
     """Compiled kernels share the cores; small matrices do not, and nobody spins while waiting."""
     names = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")

@@ -221,6 +221,15 @@ def capture_from_json(content: Mapping[str, Any], file: str = "capture.json") ->
     return capture
 
 
+def navigation_from_json(content: Mapping[str, Any]) -> NavigationRecord:
+    """Read what `navigation_to_json` wrote. RecordError as for `from_json`."""
+    problems: list[str] = []
+    navigation = _navigation(Fields(content, "", "navigation", problems))
+    if problems:
+        raise RecordError(problems)
+    return navigation
+
+
 def navigation_to_json(navigation: NavigationRecord) -> dict[str, Any]:
     """The navigation of an exposure as an object of JSON types."""
     return {

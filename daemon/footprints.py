@@ -13,12 +13,19 @@ from typing import Any
 
 import numpy as np
 
+from daemon.configuration import MountSection
+from daemon.exposure import NavigationRecord
 from daemon.mission import Mission
 from daemon.navigation import metres_per_degree
 from daemon.orientation import ExteriorOrientation
 from daemon.orientation_files import image_extent_mm
 from drivers.leap_seconds import leap_seconds_at
-from processing.orientation import on_level_ground
+from processing.orientation import (
+    BODY_FROM_CAMERA,
+    grid_from_camera,
+    level_from_body,
+    on_level_ground,
+)
 from processing.rig import Rig
 
 GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
@@ -55,6 +62,43 @@ def footprint(
         )
         for east, north, _ in ground
     ]
+
+
+def seen_from(
+    rig: Rig, mount: MountSection, navigation: NavigationRecord, ground_m: float
+) -> list[tuple[float, float]] | None:
+    """The corners (longitude, latitude) of the image taken there, before any georeferencing.
+
+    None without an attitude, and where the horizon is seen. The camera's own place on the aircraft
+    is left out: centimetres.
+    """
+    n = navigation
+    if n.roll_rad is None or n.pitch_rad is None or n.heading_rad is None:
+        return None
+    boresight = level_from_body(*(math.radians(angle) for angle in mount.boresight_deg))
+    eo = ExteriorOrientation(
+        exposure=0,
+        cone=rig.master_cone,
+        is_virtual=rig.virtual_image is not None,
+        gps_ns=n.gps_ns,
+        line_id="",
+        latitude_deg=n.latitude_deg,
+        longitude_deg=n.longitude_deg,
+        height_m=n.height_m,
+        centre_m=np.array([0.0, 0.0, n.height_m]),
+        rotation=grid_from_camera(
+            level_from_imu=level_from_body(n.roll_rad, n.pitch_rad, n.heading_rad),
+            imu_from_body=boresight,
+            body_from_camera=BODY_FROM_CAMERA,
+            azimuth_of_north_rad=0.0,
+        ),
+        azimuth_of_north_rad=0.0,
+        scale=1.0,
+        method=n.method,
+        horizontal_sigma_m=n.horizontal_sigma_m,
+        vertical_sigma_m=n.vertical_sigma_m,
+    )
+    return footprint(eo, rig, ground_m)
 
 
 def ground_sample_m(eo: ExteriorOrientation, rig: Rig, ground_m: float) -> float:

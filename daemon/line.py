@@ -48,6 +48,12 @@ class Line:
         self._last_ns: int | None = None
         self._exposure_ns = exposure_times_ns(configuration, rig)
         self._policy = _policy(configuration, rig)
+        self.runs = configuration.trigger.start == "at once"
+        self._asked_for = 0
+
+    def trigger_once(self) -> None:
+        """Order one exposure as soon as the camera can, whether the line runs or not."""
+        self._asked_for += 1
 
     @property
     def is_flown(self) -> bool:
@@ -59,10 +65,13 @@ class Line:
         """Order exposures as they fall due, until the line is flown."""
         while not self.is_flown:
             now_ns = time.monotonic_ns()
-            wait_s = self.wait_s(now_ns)
+            wait_s = self.wait_s(now_ns) if self.runs else LOOK_AHEAD_S
+            if self._asked_for:
+                wait_s = self._readiness_s(now_ns)
             if wait_s > 0:
                 await asyncio.sleep(wait_s)
             elif (left := exposures_left(self._configuration, self._rig, self._mission)) > 0:
+                self._asked_for = max(0, self._asked_for - 1)
                 fire(self.order(now_ns))
             else:
                 disk_full(f"room for {left} exposures: no more are made; free {self._mission}")
@@ -72,6 +81,13 @@ class Line:
         """How long to wait before asking again; 0 where an exposure is due."""
         due_ns = self._policy.due(now_ns, self._last_ns, self._flight.track.last)
         left_s = LOOK_AHEAD_S if due_ns is None else (due_ns - now_ns) / NS
+        return max(0.0, min(LOOK_AHEAD_S, left_s))
+
+    def _readiness_s(self, now_ns: int) -> float:
+        """How long until the camera can expose again."""
+        if self._last_ns is None:
+            return 0.0
+        left_s = self._rig.frame_interval_s - (now_ns - self._last_ns) / NS
         return max(0.0, min(LOOK_AHEAD_S, left_s))
 
     def absent(self, active: Callable[[str], bool], *, has_trigger: bool) -> list[str]:

@@ -39,6 +39,35 @@ class Pong:
     statistics: Mapping[str, Mapping[str, int]]
 
 
+# To and from watch
+
+
+@dataclass(frozen=True)
+class Told:
+    """Something happened: plain JSON types with a key "event"."""
+
+    event: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Command:
+    """Somebody wants something of the service; `by` is who, as the token says."""
+
+    number: int
+    name: str
+    arguments: Mapping[str, Any]
+    by: str
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What became of a command, in a sentence."""
+
+    number: int
+    done: bool
+    sentence: str
+
+
 # To capture
 
 

@@ -18,17 +18,19 @@ from pathlib import Path
 from typing import Any
 
 from daemon import recovery
+from daemon.commanding import audit_message, obey
 from daemon.configuration import Configuration
-from daemon.departure import identity, open_mission, processes
+from daemon.departure import identity, open_mission, processes, watch_process
 from daemon.devices import serial_problem
-from daemon.exposure import Exposure
+from daemon.exposure import Exposure, navigation_to_json
 from daemon.flight import Flight
 from daemon.ledger import Ledger
-from daemon.line import Line, Order
+from daemon.line import Line, Order, exposures_left
 from daemon.log_records import LoggedTrigger, Message, message_of
 from daemon.matching import Cause, Pulse
 from daemon.messages import (
     Bound,
+    Command,
     Fire,
     Fired,
     Log,
@@ -43,6 +45,7 @@ from daemon.messages import (
     Sealed,
     Store,
     Stored,
+    Told,
     WorkerReady,
     WriteFailed,
 )
@@ -51,6 +54,8 @@ from daemon.notify import Notifier
 from daemon.records import canonical_bytes
 from daemon.recovery_match import seal_from_log
 from daemon.supervisor import Supervisor
+from daemon.watching import NAME as WATCH
+from daemon.watching import Watching, status_event
 from drivers.contract import (
     ClockReading,
     DeviceEvent,
@@ -99,6 +104,8 @@ class Service:
         self.events = events
         self.notifier = Notifier()
         self.supervisor = Supervisor(self._hear, self._child_died)
+        self.watching = Watching(self.supervisor, watch_process(configuration))
+        self.is_ready = False
         self.failure: str | None = None
         self.stopping = asyncio.Event()
         self.changed = asyncio.Event()
@@ -139,15 +146,21 @@ class Service:
         if self.failure is None:
             mission.close()
         self._event("ended", failure=self.failure, ledger=self.flight.ledger.sheet().as_json())
+        await self.supervisor.end((WATCH,))
         return 0 if self.failure is None else 1
 
     # Before the flight
 
     def _start(self, mission: Mission) -> None:
+        self.mission = mission
+        self.watching.start()
         report = recovery.recover(mission, seal_from_log(self.rig))
         self._event(
             "mission",
+            id=mission.id,
             path=str(mission.path),
+            rig=self.rig.name,
+            simulated=self.configuration.mission.simulated,
             resumed=self.is_resumed,
             recovery=list(report.sentences),
             next_number=report.next_number,
@@ -173,7 +186,10 @@ class Service:
         self.changed.set()
 
     def _child_died(self, name: str) -> None:
-        if not self.stopping.is_set():
+        if name == WATCH:
+            if not self.stopping.is_set():
+                self.watching.died()
+        elif not self.stopping.is_set():
             self._fail(f"process {name} died; started again, the service goes on in this flight")
 
     def _on_frame(self, frame: Frame) -> None:
@@ -304,6 +320,23 @@ class Service:
         self._event("not-processed", number=failed.number, sentence=failed.sentence)
         self._worker_is_free(failed.number)
 
+    def _on_told(self, told: Told) -> None:
+        """What the watch process has to say of itself."""
+        self._event(**told.event)
+
+    def _on_command(self, command: Command) -> None:
+        answer = obey(command, self)
+        self.watching.answer(answer)
+        self.supervisor.send("writer", Log(audit_message(command, answer)))
+        self._event(
+            "command",
+            name=command.name,
+            by=command.by,
+            done=answer.done,
+            sentence=answer.sentence,
+            override=bool(command.arguments.get("override")),
+        )
+
     def _on_pong(self, pong: Pong) -> None:
         if pong.statistics:
             self.statistics = pong.statistics
@@ -327,6 +360,8 @@ class Service:
         Processed: _on_processed,
         ProcessFailed: _on_process_failed,
         Pong: _on_pong,
+        Told: _on_told,
+        Command: _on_command,
     }
 
     def _worker_is_free(self, number: int) -> None:
@@ -390,14 +425,16 @@ class Service:
             else:
                 self.notifier.watchdog()
                 self.notifier.status(f"{len(self.flight.open_numbers)} exposures open")
+            self.watching.tell(self._status())
             await asyncio.sleep(PING_S)
 
     async def _fly(self) -> None:
         limit_s = self.configuration.limits.ready_timeout_s
-        await self._until(lambda: not self._absent(), limit_s)
+        await self._until(lambda: not self.absent(), limit_s)
         # Devices may be missing and said to be; kernels may not: nothing compiles in flight.
         await self._until(lambda: self.is_worker_ready, END_OF_WAITING_S)
-        absent = self._absent()
+        absent = self.absent()
+        self.is_ready = True
         self._event("ready", absent=absent)
         self.notifier.ready(f"flying without {', '.join(absent)}" if absent else "ready")
         await self.line.fly(self._fire, self._disk_full)
@@ -406,8 +443,56 @@ class Service:
         if self.configuration.mission.end_when_done:
             self.stopping.set()
 
-    def _absent(self) -> list[str]:
+    # What may be commanded (`daemon.commanding`)
+
+    def absent(self) -> list[str]:
+        """What is not there yet, in words."""
         return self.line.absent(self.active.__contains__, has_trigger=self.has_trigger)
+
+    @property
+    def is_flown(self) -> bool:
+        return self.line.is_flown
+
+    @property
+    def runs(self) -> bool:
+        return self.line.runs
+
+    def start_line(self) -> None:
+        self.line.runs = True
+
+    def stop_line(self) -> None:
+        self.line.runs = False
+
+    def trigger_once(self) -> None:
+        self.line.trigger_once()
+
+    def land(self) -> None:
+        """End in good order: what is open is sealed first."""
+        self.stopping.set()
+
+    def _phase(self) -> str:
+        if self.failure is not None:
+            return "fault"
+        if not self.is_ready:
+            return "starting"
+        if self.line.is_flown:
+            return "landed"
+        if self.line.runs:
+            return "flying"
+        return "paused" if self.flight.ledger.sheet().triggers else "ready"
+
+    def _status(self) -> dict[str, Any]:
+        now_ns = time.monotonic_ns()
+        time_now = self.flight.clock.gps_at(now_ns)
+        return status_event(
+            phase=self._phase(),
+            ledger=self.flight.ledger.sheet().as_json(),
+            exposures_left=exposures_left(self.configuration, self.rig, self.mission.path),
+            position=self.flight.track.last,
+            temperatures_c={t.probe: t.value_c for t in self.flight.temperatures.at(now_ns)},
+            clock_sigma_ns=None if time_now is None else time_now.sigma_ns,
+            queue=len(self.waiting) + self.is_worker_busy,
+        )
 
     def _fire(self, order: Order) -> None:
         self.orders[order.number] = order
@@ -463,7 +548,9 @@ class Service:
         self.supervisor.send("writer", Log(message_of(record)))
 
     def _event(self, event: str, **content: Any) -> None:
-        self.events({"event": event, "mono_ns": str(time.monotonic_ns()), **content})
+        told = {"event": event, "mono_ns": str(time.monotonic_ns()), **content}
+        self.events(told)
+        self.watching.tell(told)
 
     def _fail(self, sentence: str) -> None:
         if self.failure is None:
@@ -488,4 +575,6 @@ def _summary(exposure: Exposure) -> dict[str, Any]:
         "mark_source": exposure.mark_source,
         "temperatures_c": {t.probe: t.value_c for t in exposure.temperatures},
         "height_m": navigation.height_m if navigation else None,
+        "navigation": navigation_to_json(navigation) if navigation else None,
+        "line": exposure.line_id,
     }

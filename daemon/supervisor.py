@@ -36,7 +36,10 @@ class Supervisor:
     def spawn(
         self, name: str, target: str, arguments: tuple[Any, ...], environment: Mapping[str, str]
     ) -> None:
-        """Start a child; `target` is "module:function"."""
+        """Start a child; `target` is "module:function". One of that name that died is cleared."""
+        dead = self._children.pop(name, None)
+        if dead is not None:
+            dead.end(0.0)
         child = Child(name, target, arguments, environment)
         self._children[name] = child
         self._answered[name] = time.monotonic()
@@ -49,16 +52,25 @@ class Supervisor:
         except OSError:
             self._lost(self._children[name])
 
+    def tell(self, name: str, message: object) -> bool:
+        """Tell a child something unless that would take time; False where it was dropped."""
+        child = self._children.get(name)
+        try:
+            return child is not None and child.tell(message)
+        except OSError:
+            return False  # its end is noticed by the loop
+
     def ping(self) -> list[str]:
-        """Ask every child for a sign of life.
+        """Ask every child that a flight depends on for a sign of life.
 
         Returns:
             The names of those that have been silent for too long.
         """
-        for name in self._children:
+        watched = [name for name in self._children if name in ANSWER_LIMIT_S]
+        for name in watched:
             self.send(name, Ping())
         now = time.monotonic()
-        return [name for name, at in self._answered.items() if now - at > ANSWER_LIMIT_S[name]]
+        return [name for name in watched if now - self._answered[name] > ANSWER_LIMIT_S[name]]
 
     async def end(self, names: tuple[str, ...]) -> None:
         """Tell children to stop, in this order, and see them off."""

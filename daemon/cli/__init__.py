@@ -23,11 +23,13 @@ from daemon.cli import (
     imports,
     install,
     kernels,
+    monitor,
     process,
     repair,
     rigs,
     run,
     sim,
+    token,
     transfer,
     verify,
 )
@@ -47,6 +49,7 @@ app = typer.Typer(
 )
 app.command(name="demo", help=demo.HELP)(demo.demo)
 app.command(name="run", help=run.HELP)(run.run)
+app.command(name="monitor", help=monitor.HELP)(monitor.monitor)
 app.command(name="check", help=check.HELP)(check.check)
 app.command(name="process", help=process.HELP)(process.process)
 app.command(name="develop", help=develop.HELP)(develop.develop)
@@ -64,6 +67,7 @@ app.add_typer(rigs.app, name="rigs")
 app.add_typer(imports.app, name="import")
 app.add_typer(export.app, name="export")
 app.add_typer(calibrate.app, name="calibrate")
+app.add_typer(token.app, name="token")
 
 
 def main() -> NoReturn:

@@ -110,7 +110,12 @@ def _fly(
     config = folder / "service.toml"
     config.write_text(
         service_toml(
-            emulator.ready, root="missions", count=exposures, baselines=True, end_when_done=True
+            emulator.ready,
+            root="missions",
+            count=exposures,
+            baselines=True,
+            end_when_done=True,
+            watch_port=0,
         )
     )
     log = (folder / "service.log").open("w")
@@ -130,6 +135,9 @@ def _fly(
                 name = event["event"]
                 if name == "mission":
                     mission = Path(event["path"])
+                elif name == "watching":
+                    address = f"http://{event['host']}:{event['port']}/"
+                    live.console.print(f"Watch it at [bold]{address}[/]")
                 elif name == "ended":
                     ledger = event["ledger"]
                 elif name == "fault" or event.get("fault"):

@@ -109,7 +109,7 @@ def sim(
         console.print(f"[red]{error}[/]")
         raise typer.Exit(1) from error
     path = out / "service.toml"
-    path.write_text(service_toml(emulator.ready, root="missions"))
+    path.write_text(service_toml(emulator.ready, root="missions", watch_port=8470))
     if as_json:
         typer.echo(json.dumps(emulator.ready | {"configuration": str(path)}))
     else:
@@ -162,8 +162,12 @@ def service_toml(
     count: int | None = None,
     baselines: bool = False,
     end_when_done: bool = False,
+    watch_port: int | None = None,
 ) -> str:
-    """A service configuration that fits the emulated devices."""
+    """A service configuration that fits the emulated devices.
+
+    Watchers are served on `watch_port`, 0 being any that is free; nobody where it is None.
+    """
     plan = ready["plan"]
     rig = find_rig(ready["rig_file"])
     probes = ready["probes"]
@@ -193,6 +197,11 @@ def service_toml(
         "",
         "[processing]",
         f"baselines = {str(baselines).lower()}",
+        *(
+            ["", "[watch]", f"port = {watch_port}", 'tokens = "tokens.toml"']
+            if watch_port is not None
+            else []
+        ),
         *_section("thermometer", "probes", probes),
         *_section("navigator", "gnss", ready["receiver"]),
     ]

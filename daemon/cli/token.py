@@ -1,0 +1,70 @@
+"""`syntopic token`: who may command the service over the network."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from daemon.cli.tables import light_table
+
+app = typer.Typer(
+    help="""Make and take back tokens for the API and the operator's page.
+
+Examples: `syntopic token add operator --role command`, `syntopic token list`
+""",
+    rich_markup_mode="markdown",
+    no_args_is_help=True,
+)
+TokenFile = Annotated[Path, typer.Option("--file", help="The file [watch] tokens names.")]
+DEFAULT_FILE = Path("/etc/syntopic/tokens.toml")
+
+
+@app.command()
+def add(
+    name: Annotated[str, typer.Argument(help="Who: a person or a program.")],
+    role: Annotated[str, typer.Option(help="watch or command.")] = "watch",
+    file: TokenFile = DEFAULT_FILE,
+) -> None:
+    """Make a token and show it once."""
+    from daemon.watch.tokens import ROLES, TokenError, add_token
+
+    chosen = next((known for known in ROLES if known == role), None)
+    if chosen is None:
+        raise TokenError(f"--role {role}: it is one of {', '.join(ROLES)}")
+    typer.echo(add_token(file, name, chosen))
+    Console(stderr=True, soft_wrap=True).print(
+        f"It is not shown again; {file} holds its hash. The service reads the file when it starts."
+    )
+
+
+@app.command()
+def remove(
+    name: Annotated[str, typer.Argument(help="Whose.")], file: TokenFile = DEFAULT_FILE
+) -> None:
+    """Take a token back."""
+    from daemon.watch.tokens import remove_token
+
+    remove_token(file, name)
+    typer.echo(f"{name} has no token any more; restart the service to make it so")
+
+
+@app.command(name="list")
+def list_(
+    file: TokenFile = DEFAULT_FILE,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Who has a token, and what it allows."""
+    from daemon.watch.tokens import read_tokens
+
+    holders = sorted(read_tokens(file).holders.values(), key=lambda holder: holder.name)
+    if as_json:
+        typer.echo(json.dumps({holder.name: holder.role for holder in holders}))
+        return
+    table = light_table(f"Tokens of {file}", ("name", "role"), ())
+    for holder in holders:
+        table.add_row(holder.name, holder.role)
+    Console().print(table)

@@ -1,0 +1,117 @@
+"""What a person may tell a flying service to do, and when it may not be done.
+
+Each command answers with a sentence, and each is written into the flight log with who gave it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Protocol
+
+from daemon.log_records import Message, loose_bytes
+from daemon.messages import Answer, Command
+
+AUDIT_TOPIC = "audit"
+
+
+class Commanded(Protocol):
+    """What commands act on."""
+
+    def absent(self) -> list[str]: ...
+    def start_line(self) -> None: ...
+    def stop_line(self) -> None: ...
+    def trigger_once(self) -> None: ...
+    def land(self) -> None: ...
+
+    @property
+    def is_ready(self) -> bool: ...
+    @property
+    def is_flown(self) -> bool: ...
+    @property
+    def runs(self) -> bool: ...
+
+
+def obey(command: Command, flight: Commanded) -> Answer:
+    """Do what is asked, or say why not."""
+    handler = _COMMANDS.get(command.name)
+    if handler is None:
+        return _no(command, f"there is no command {command.name}")
+    return handler(command, flight)
+
+
+def audit_message(command: Command, answer: Answer) -> Message:
+    """The command and its answer, for the flight log."""
+    content = {
+        "command": command.name,
+        "arguments": dict(command.arguments),
+        "by": command.by,
+        "done": answer.done,
+        "sentence": answer.sentence,
+    }
+    return Message(AUDIT_TOPIC, time.monotonic_ns(), loose_bytes(content))
+
+
+def _start(command: Command, flight: Commanded) -> Answer:
+    if flight.is_flown:
+        return _no(command, "the planned number of exposures is flown")
+    if flight.runs:
+        return _no(command, "the line runs already")
+    refusal = _not_armed(command, flight)
+    if refusal is not None:
+        return refusal
+    flight.start_line()
+    return _yes(command, "the line runs")
+
+
+def _stop(command: Command, flight: Commanded) -> Answer:
+    if not flight.runs:
+        return _no(command, "the line does not run")
+    flight.stop_line()
+    return _yes(command, "the line is stopped; what was triggered is finished")
+
+
+def _trigger(command: Command, flight: Commanded) -> Answer:
+    if flight.is_flown:
+        return _no(command, "the planned number of exposures is flown")
+    refusal = _not_armed(command, flight)
+    if refusal is not None:
+        return refusal
+    flight.trigger_once()
+    return _yes(command, "one exposure is made as soon as the camera can")
+
+
+def _land(command: Command, flight: Commanded) -> Answer:
+    flight.land()
+    return _yes(command, "no more exposures; what is open is sealed, then the service ends")
+
+
+def _acknowledge(command: Command, _flight: Commanded) -> Answer:
+    return _yes(command, f"noted that {command.by} has seen {command.arguments.get('fault')}")
+
+
+def _not_armed(command: Command, flight: Commanded) -> Answer | None:
+    """The refusal, where the camera is not ready to fly and nobody takes that upon them."""
+    if not flight.is_ready:
+        return _no(command, "the service is not ready: devices open and kernels load")
+    absent = flight.absent()
+    if absent and not command.arguments.get("override"):
+        return _no(command, f"missing: {', '.join(absent)}; override to fly without")
+    return None
+
+
+def _yes(command: Command, sentence: str) -> Answer:
+    return Answer(command.number, True, sentence)
+
+
+def _no(command: Command, sentence: str) -> Answer:
+    return Answer(command.number, False, sentence)
+
+
+_COMMANDS: Mapping[str, Callable[[Command, Commanded], Answer]] = {
+    "start": _start,
+    "stop": _stop,
+    "trigger": _trigger,
+    "land": _land,
+    "acknowledge": _acknowledge,
+}

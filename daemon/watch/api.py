@@ -1,0 +1,390 @@
+"""The API over HTTP and WebSocket: state for watchers, commands for those who hold a token.
+
+Errors are problem+json (RFC 9457). What an exposure looks like is read from the mission folder; the
+service is asked for nothing but commands.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import re
+import time
+from collections.abc import Awaitable, Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from fastapi import Depends, FastAPI, HTTPException, Query, Request, Response, WebSocket
+from fastapi import Path as PathParameter
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import FileResponse, JSONResponse, PlainTextResponse
+from fastapi.staticfiles import StaticFiles
+from pydantic import BaseModel, ConfigDict, Field
+from starlette.exceptions import HTTPException as StarletteHTTPException
+from starlette.websockets import WebSocketDisconnect
+
+from daemon.mission import exposure_name
+from daemon.watch.gate import Gate, NoAnswerError
+from daemon.watch.metrics import exposition
+from daemon.watch.state import EXPOSURES_KEPT, FlightState
+from daemon.watch.telemetry import LEAST_BYTES_PER_S, Subscription, packed
+from daemon.watch.tokens import Attempts, Holder, Role, Tokens
+
+PAGE = Path(__file__).parent / "page"
+PROBLEM_JSON = "application/problem+json"
+TELEMETRY_TICK_S = 0.2
+SEND_TIMEOUT_S = 5.0
+"""A watcher that does not take a record in this time is let go."""
+
+WATCHERS_MAX = 64
+IMAGES = {
+    "quicklook.jpg": "image/jpeg",
+    "residuals.svg": "image/svg+xml",
+    "quality.json": "application/json",
+}
+CONTENT_SECURITY_POLICY = (
+    "default-src 'self'; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'; "
+    "connect-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+)
+
+
+class Problem(BaseModel):
+    """An error, RFC 9457."""
+
+    type: str = "about:blank"
+    title: str
+    status: int
+    detail: str = ""
+
+
+class CommandBody(BaseModel):
+    """What a command may carry besides its name."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    fault: str | None = Field(default=None, max_length=200, description="which, for acknowledge")
+    override: bool = Field(default=False, description="start although something is missing")
+
+
+class Outcome(BaseModel):
+    """What became of a command."""
+
+    done: bool
+    sentence: str
+
+
+Number = Annotated[int, PathParameter(ge=1, lt=10**9, description="of the exposure")]
+CommandName = Literal["start", "stop", "trigger", "land", "acknowledge"]
+
+
+@dataclass(frozen=True)
+class WatchSettings:
+    """Who may look and who may command.
+
+    `is_open`: looking needs no token.
+    """
+
+    tokens: Tokens
+    is_open: bool = True
+
+
+def create_app(state: FlightState, gate: Gate, settings: WatchSettings) -> FastAPI:
+    """The application; it has no state of its own but who is connected."""
+    app = FastAPI(
+        title="Syntopic",
+        description="State, products and commands of an aerial camera in flight.",
+        version="1",
+        responses={"default": {"model": Problem, "description": "problem+json"}},
+        docs_url=None,
+        redoc_url=None,
+    )
+    app.middleware("http")(_harden)
+    app.add_exception_handler(StarletteHTTPException, _http_problem)
+    app.add_exception_handler(RequestValidationError, _validation_problem)
+    doors = _Doors(settings)
+    _add_state(app, state, doors)
+    _add_products(app, state, doors)
+    _add_commands(app, state, gate, doors)
+    _add_telemetry(app, state, doors)
+    _add_page(app)
+    return app
+
+
+class _Doors:
+    """Checks tokens; a door is a dependency of a route."""
+
+    def __init__(self, settings: WatchSettings) -> None:
+        self._settings = settings
+        self._attempts = Attempts()
+        self.watchers = 0
+
+    def watch(self, request: Request) -> Holder:
+        if self._settings.is_open:
+            return Holder("anybody", "watch")
+        return self.admit(_bearer(request), _address(request), "watch")
+
+    def command(self, request: Request) -> Holder:
+        return self.admit(_bearer(request), _address(request), "command")
+
+    def admit(self, token: str | None, address: str, role: Role) -> Holder:
+        """Who comes with this token.
+
+        Raises:
+            HTTPException: 401, 403, or 429 after too many wrong tokens.
+        """
+        now_s = time.monotonic()
+        if self._attempts.is_blocked(address, now_s):
+            raise HTTPException(429, "too many wrong tokens; wait a minute")
+        if token is None:
+            raise HTTPException(
+                401,
+                "a token is needed (syntopic token add NAME --role command makes one)",
+                {"WWW-Authenticate": "Bearer"},
+            )
+        holder = self._settings.tokens.holder_of(token)
+        if holder is None:
+            self._attempts.failed(address, now_s)
+            raise HTTPException(401, "this token is not known", {"WWW-Authenticate": "Bearer"})
+        if role == "command" and holder.role != "command":
+            raise HTTPException(403, f"{holder.name} may watch, not command")
+        return holder
+
+    def may_watch(self, token: str | None, address: str) -> bool:
+        if self._settings.is_open:
+            return True
+        try:
+            self.admit(token, address, "watch")
+        except HTTPException:
+            return False
+        return True
+
+
+def _add_state(app: FastAPI, state: FlightState, doors: _Doors) -> None:
+    watcher = Depends(doors.watch)
+
+    @app.get("/api/v1/state", dependencies=[watcher], tags=["state"])
+    async def whole_state() -> dict[str, Any]:
+        """Everything a watcher needs to begin with."""
+        return state.snapshot()
+
+    @app.get("/api/v1/brief", dependencies=[watcher], tags=["state"])
+    async def brief_state() -> dict[str, Any]:
+        """Phase, ledger, disk, clock, faults."""
+        return {"version": 1, **state.brief()}
+
+    @app.get("/api/v1/ledger", dependencies=[watcher], tags=["state"])
+    async def ledger() -> dict[str, Any]:
+        """The balance sheet of triggers, frames and marks."""
+        return dict(state.brief()["status"].get("ledger") or {})
+
+    @app.get("/api/v1/devices", dependencies=[watcher], tags=["state"])
+    async def devices() -> list[dict[str, Any]]:
+        """Every device, whether it delivers, and what helps if not."""
+        return state.changed("devices", 0)
+
+    @app.get("/api/v1/faults", dependencies=[watcher], tags=["state"])
+    async def faults() -> list[dict[str, Any]]:
+        """Faults that stand, or that passed and nobody has acknowledged."""
+        return state.faults()
+
+    @app.get("/api/v1/events", dependencies=[watcher], tags=["state"])
+    async def events(after: Annotated[int, Query(ge=0, lt=2**53)] = 0) -> list[dict[str, Any]]:
+        """What happened, oldest first, after a sequence number."""
+        return state.changed("events", after)
+
+    @app.get(
+        "/api/v1/configuration",
+        dependencies=[watcher],
+        tags=["state"],
+        response_class=PlainTextResponse,
+        responses={200: {"content": {"text/plain": {}}}},
+    )
+    async def configuration() -> PlainTextResponse:
+        """The configuration that is flown, TOML."""
+        if state.mission_path is None:
+            raise HTTPException(404, "no mission yet")
+        path = Path(state.mission_path) / "service.toml"
+        try:
+            return PlainTextResponse(path.read_text("utf-8"))
+        except OSError as error:
+            raise HTTPException(404, "the mission has no service.toml") from error
+
+    @app.get("/metrics", tags=["state"], dependencies=[watcher], response_class=PlainTextResponse)
+    async def metrics() -> Response:
+        """Prometheus exposition."""
+        return Response(exposition(state), media_type="text/plain; version=0.0.4")
+
+
+def _add_products(app: FastAPI, state: FlightState, doors: _Doors) -> None:
+    watcher = Depends(doors.watch)
+
+    @app.get("/api/v1/exposures", dependencies=[watcher], tags=["exposures"])
+    async def exposures(
+        after: Annotated[int, Query(ge=0, lt=10**9, description="number")] = 0,
+        limit: Annotated[int, Query(ge=1, le=EXPOSURES_KEPT)] = 100,
+    ) -> list[dict[str, Any]]:
+        """Exposures by number."""
+        return state.exposures(after, limit)
+
+    @app.get("/api/v1/exposures/{number}", dependencies=[watcher], tags=["exposures"])
+    async def exposure(number: Number) -> dict[str, Any]:
+        """One exposure: what came, when it was, how it was judged."""
+        found = state.exposure(number)
+        if found is None:
+            raise HTTPException(404, f"exposure {number} is not known")
+        return found
+
+    @app.get(
+        "/api/v1/exposures/{number}/{product}",
+        dependencies=[watcher],
+        tags=["exposures"],
+        response_class=FileResponse,
+        responses={200: {"content": {kind: {} for kind in IMAGES.values()}}},
+    )
+    async def product(
+        number: Number, product: Literal["quicklook.jpg", "residuals.svg", "quality.json"]
+    ) -> FileResponse:
+        """Quick look, residual vectors or quality report, as they are on disk."""
+        if state.mission_path is None:
+            raise HTTPException(404, "no mission yet")
+        path = Path(state.mission_path) / "L2" / exposure_name(number) / product
+        if not path.is_file():
+            raise HTTPException(404, f"exposure {number} has no {product} (yet)")
+        return FileResponse(path, media_type=IMAGES[product])
+
+
+def _add_commands(app: FastAPI, state: FlightState, gate: Gate, doors: _Doors) -> None:
+    somebody_who_may = Depends(doors.command)
+
+    @app.post("/api/v1/commands/{name}", tags=["commands"])
+    async def command(
+        name: CommandName, body: CommandBody | None = None, holder: Holder = somebody_who_may
+    ) -> Outcome:
+        """start or stop the line, trigger once, land, acknowledge a fault. Needs a token.
+
+        Every command is answered by the service and written into the flight log.
+        """
+        given = body or CommandBody()
+        if name == "acknowledge":
+            if given.fault is None:
+                raise HTTPException(422, "acknowledge needs the fault's id")
+            if not any(fault["id"] == given.fault for fault in state.faults()):
+                raise HTTPException(404, f"no fault {given.fault!r} is listed")
+        try:
+            answer = await gate.command(name, given.model_dump(exclude_none=True), holder.name)
+        except NoAnswerError as error:
+            raise HTTPException(504, str(error)) from error
+        if answer.done and name == "acknowledge" and given.fault is not None:
+            state.acknowledge(given.fault)
+        if not answer.done:
+            raise HTTPException(409, answer.sentence)
+        return Outcome(done=True, sentence=answer.sentence)
+
+
+def _add_telemetry(app: FastAPI, state: FlightState, doors: _Doors) -> None:
+    @app.websocket("/api/v1/telemetry")
+    async def telemetry(
+        socket: WebSocket,
+        form: Literal["json", "msgpack"] = "msgpack",
+        bytes_per_s: float = math.inf,
+    ) -> None:
+        """Records as in docs/telemetry.md, from the whole state on, until the watcher goes."""
+        address = socket.client.host if socket.client else ""
+        token = socket.query_params.get("token")
+        if not doors.may_watch(token, address):
+            await socket.close(1008, "a token is needed")
+            return
+        if doors.watchers >= WATCHERS_MAX:
+            await socket.close(1013, "too many watchers")
+            return
+        await socket.accept()
+        doors.watchers += 1
+        told = Subscription(max(bytes_per_s, LEAST_BYTES_PER_S))
+        gone = asyncio.ensure_future(_until_gone(socket))
+        try:
+            while not gone.done():
+                record = told.record(state, time.monotonic())
+                if record is not None:
+                    await asyncio.wait_for(_send(socket, record, form), SEND_TIMEOUT_S)
+                await asyncio.wait([gone], timeout=TELEMETRY_TICK_S)
+        except (TimeoutError, WebSocketDisconnect, RuntimeError):
+            pass  # it stalled or went; nothing is kept for it
+        finally:
+            gone.cancel()
+            doors.watchers -= 1
+            with suppress(RuntimeError):
+                await socket.close()
+
+
+async def _send(socket: WebSocket, record: Any, form: str) -> None:
+    if form == "msgpack":
+        await socket.send_bytes(packed(record))
+    else:
+        await socket.send_json(record)
+
+
+async def _until_gone(socket: WebSocket) -> None:
+    """Hear what the watcher says, which is nothing, until it goes."""
+    with suppress(WebSocketDisconnect, RuntimeError):
+        while True:
+            await socket.receive_text()
+
+
+def _add_page(app: FastAPI) -> None:
+    @app.get("/docs", include_in_schema=False)
+    async def docs() -> FileResponse:
+        return FileResponse(PAGE / "api.html")
+
+    app.mount("/", StaticFiles(directory=PAGE, html=True), name="page")
+
+
+async def _harden(
+    request: Request, call_next: Callable[[Request], Awaitable[Response]]
+) -> Response:
+    response = await call_next(request)
+    response.headers["Content-Security-Policy"] = CONTENT_SECURITY_POLICY
+    response.headers["X-Content-Type-Options"] = "nosniff"
+    response.headers["Referrer-Policy"] = "no-referrer"
+    response.headers["Cache-Control"] = "no-cache"
+    return response
+
+
+async def _http_problem(_request: Request, error: Exception) -> Response:
+    assert isinstance(error, StarletteHTTPException)
+    problem = Problem(
+        title=_title(error.status_code), status=error.status_code, detail=error.detail
+    )
+    headers = dict(error.headers or {})
+    return JSONResponse(problem.model_dump(), error.status_code, headers, PROBLEM_JSON)
+
+
+async def _validation_problem(_request: Request, error: Exception) -> Response:
+    assert isinstance(error, RequestValidationError)
+    sentences = [f"{'.'.join(map(str, e['loc'][1:]))}: {e['msg']}" for e in error.errors()]
+    problem = Problem(title=_title(422), status=422, detail="; ".join(sentences))
+    return JSONResponse(problem.model_dump(), 422, media_type=PROBLEM_JSON)
+
+
+def _title(status: int) -> str:
+    titles: Mapping[int, str] = {
+        401: "Not known here",
+        403: "Not allowed",
+        404: "Not found",
+        405: "No such method",
+        409: "Not possible now",
+        422: "Not understood",
+        429: "Too many attempts",
+        504: "No answer",
+    }
+    return titles.get(status, "Not done")
+
+
+def _bearer(request: Request) -> str | None:
+    found = re.fullmatch(r"[Bb]earer +(\S{1,200})", request.headers.get("Authorization", ""))
+    return found.group(1) if found else None
+
+
+def _address(request: Request) -> str:
+    return request.client.host if request.client else ""

@@ -1,0 +1,117 @@
+"""Figures for a monitoring system, in the conventions of Prometheus: base units, `_total`.
+
+Made anew from the state at each scrape; nothing is counted twice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily, Metric
+from prometheus_client.registry import Collector
+
+from daemon.watch.state import FlightState
+
+PHASES = ("starting", "ready", "flying", "paused", "landed", "fault")
+
+
+def exposition(state: FlightState) -> bytes:
+    """The text that `/metrics` answers."""
+    registry = CollectorRegistry()
+    registry.register(_Flight(state))
+    return generate_latest(registry)
+
+
+class _Flight(Collector):
+    def __init__(self, state: FlightState) -> None:
+        self._brief = state.brief()
+        self._devices = state.changed("devices", 0)
+        self._exposures = state.changed("exposures", 0)
+
+    def collect(self) -> Iterator[Metric]:
+        brief, status = self._brief, self._brief["status"]
+        yield InfoMetricFamily(
+            "syntopic",
+            "What runs.",
+            value={
+                "software": str(brief["software"]),
+                "mission": str(brief["mission"].get("id") or ""),
+                "rig": str(brief["mission"].get("rig") or ""),
+                "simulated": str(brief["simulated"]).lower(),
+            },
+        )
+        phase = GaugeMetricFamily("syntopic_phase", "1 for the phase it is in.", labels=["phase"])
+        for name in PHASES:
+            phase.add_metric([name], float(brief["phase"] == name))
+        yield phase
+        yield from self._ledger(status.get("ledger") or {})
+        verdicts = CounterMetricFamily(
+            "syntopic_exposure_verdicts", "Exposures judged, by verdict.", labels=["verdict"]
+        )
+        for verdict, count in brief["verdicts"].items():
+            verdicts.add_metric([verdict], count)
+        yield verdicts
+        ready = GaugeMetricFamily(
+            "syntopic_device_ready", "1 while a device delivers.", labels=["device", "kind"]
+        )
+        for device in self._devices:
+            labels = [device["name"], str(device["kind"] or "")]
+            ready.add_metric(labels, float(device["state"] == "ready"))
+        yield ready
+        standing = sum(fault["stands"] for fault in brief["faults"])
+        yield GaugeMetricFamily("syntopic_faults_standing", "Faults that stand.", value=standing)
+        yield from self._gauges(status)
+
+    def _ledger(self, ledger: Mapping[str, Any]) -> Iterator[Metric]:
+        triggers = ledger.get("triggers") or {}
+        exposures = CounterMetricFamily(
+            "syntopic_exposures", "Triggers by what became of them.", labels=["state"]
+        )
+        for name in ("complete", "degraded", "lost"):
+            exposures.add_metric([name], triggers.get(name, 0))
+        yield exposures
+        yield CounterMetricFamily(
+            "syntopic_triggers", "Triggers given.", value=triggers.get("triggers", 0)
+        )
+        for what in ("frames", "marks"):
+            received = CounterMetricFamily(
+                f"syntopic_{what}", f"Received {what}, by cause.", labels=["cause"]
+            )
+            for cause, count in (ledger.get(what) or {}).items():
+                if cause != "received":
+                    received.add_metric([cause], count)
+            yield received
+        balanced = float(bool(ledger.get("balanced", True)))
+        yield GaugeMetricFamily(
+            "syntopic_ledger_balanced", "1 while the ledger balances.", value=balanced
+        )
+
+    def _gauges(self, status: Mapping[str, Any]) -> Iterator[Metric]:
+        left = status.get("exposures_left")
+        if left is not None:
+            yield GaugeMetricFamily(
+                "syntopic_disk_exposures_left", "Exposures the disk still holds.", value=left
+            )
+        sigma_ns = status.get("clock_sigma_ns")
+        if sigma_ns is not None:
+            yield GaugeMetricFamily(
+                "syntopic_clock_sigma_seconds",
+                "Standard deviation of GPS time on the host's clock.",
+                value=sigma_ns * 1e-9,
+            )
+        temperatures = GaugeMetricFamily(
+            "syntopic_temperature_celsius", "Temperature of a probe.", labels=["probe"]
+        )
+        for probe, value in (status.get("temperatures_c") or {}).items():
+            if value is not None:
+                temperatures.add_metric([probe], value)
+        yield temperatures
+        processing = [told for told in self._exposures if told.get("duration_s") is not None]
+        if processing:
+            yield GaugeMetricFamily(
+                "syntopic_processing_last_seconds",
+                "Time the pipeline took for the last exposure.",
+                value=processing[-1]["duration_s"],
+            )

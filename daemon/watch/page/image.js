@@ -1,0 +1,146 @@
+// The quick look: zoom, pan, histogram, residual vectors in its place.
+
+import { flight } from "./state.js";
+
+const room = document.getElementById("image");
+const image = document.getElementById("quicklook");
+const nothing = document.getElementById("no-image");
+const canvas = document.getElementById("histogram");
+const which = document.getElementById("image-which");
+const about = document.getElementById("about-image");
+const residuals = document.getElementById("show-residuals");
+const view = { scale: 1, x: 0, y: 0 };
+let shown = null;
+
+function place() {
+  image.style.transform = `translate(${view.x}px, ${view.y}px) scale(${view.scale})`;
+}
+
+function fit() {
+  if (!image.naturalWidth) return;
+  view.scale = Math.min(room.clientWidth / image.naturalWidth, room.clientHeight / image.naturalHeight);
+  view.x = (room.clientWidth - image.naturalWidth * view.scale) / 2;
+  view.y = (room.clientHeight - image.naturalHeight * view.scale) / 2;
+  place();
+}
+
+function zoom(factor, x = room.clientWidth / 2, y = room.clientHeight / 2) {
+  const scale = Math.min(Math.max(view.scale * factor, 0.02), 32);
+  view.x = x - (x - view.x) * (scale / view.scale);
+  view.y = y - (y - view.y) * (scale / view.scale);
+  view.scale = scale;
+  place();
+}
+
+function histogram() {
+  const sample = document.createElement("canvas");
+  sample.width = Math.min(image.naturalWidth, 512);
+  sample.height = Math.max(1, Math.round(sample.width * image.naturalHeight / image.naturalWidth));
+  const pen = sample.getContext("2d", { willReadFrequently: true });
+  pen.drawImage(image, 0, 0, sample.width, sample.height);
+  const pixels = pen.getImageData(0, 0, sample.width, sample.height).data;
+  const counts = [0, 1, 2].map(() => new Float64Array(256));
+  for (let i = 0; i < pixels.length; i += 4) {
+    for (let band = 0; band < 3; band += 1) counts[band][pixels[i + band]] += 1;
+  }
+  const draw = canvas.getContext("2d");
+  draw.clearRect(0, 0, canvas.width, canvas.height);
+  const most = Math.max(...counts.flatMap((one) => [...one.slice(1, 255)]), 1);
+  ["#d33", "#2a2", "#35e"].forEach((colour, band) => {
+    draw.strokeStyle = colour;
+    draw.beginPath();
+    counts[band].forEach((count, value) => {
+      draw.lineTo(value * 2, canvas.height * (1 - Math.sqrt(Math.min(count / most, 1))));
+    });
+    draw.stroke();
+  });
+}
+
+function figures(one) {
+  about.replaceChildren();
+  const told = one.figures || {};
+  const lines = {
+    "tie points": told.tie_points_pp === undefined ? null : `${told.tie_points_pp} + ${told.tie_points_pc}`,
+    "σ0": told.sigma0_px == null ? null : `${told.sigma0_px.toFixed(3)} px`,
+    "accuracy": told.stitched_sigma_px == null ? null : `${told.stitched_sigma_px.toFixed(3)} px`,
+    "displaced": told.displaced_sensor,
+    "saturated": told.saturated_fraction == null ? null : `${(100 * told.saturated_fraction).toFixed(2)} %`,
+    "tilt": told.tilt_deg == null ? null : `${told.tilt_deg.toFixed(1)}°`,
+    "GSD": told.gsd_m == null ? null : `${(100 * told.gsd_m).toFixed(1)} cm`,
+    "pipeline": one.duration_s == null ? null : `${one.duration_s.toFixed(2)} s`,
+  };
+  for (const [name, value] of Object.entries(lines)) {
+    if (value == null) continue;
+    const line = document.createElement("div");
+    const term = document.createElement("dt");
+    const said = document.createElement("dd");
+    term.textContent = name;
+    said.textContent = value;
+    line.append(term, said);
+    about.append(line);
+  }
+}
+
+export function showImage(number) {
+  const one = flight.exposures.get(number);
+  if (!one) return;
+  figures(one);
+  which.textContent = `${number}`;
+  if (one.step !== "processed") return;
+  const name = residuals.getAttribute("aria-pressed") === "true" ? "residuals.svg" : "quicklook.jpg";
+  const address = `/api/v1/exposures/${number}/${name}`;
+  if (shown === address) return;
+  shown = address;
+  const refit = image.hidden || image.dataset.kind !== name;
+  image.onload = () => {
+    image.hidden = false;
+    nothing.hidden = true;
+    image.dataset.kind = name;
+    if (refit) fit();
+    if (name === "quicklook.jpg") histogram();
+  };
+  image.onerror = () => { image.hidden = true; nothing.hidden = false; shown = null; };
+  image.alt = `${name === "quicklook.jpg" ? "Quick look" : "Residual vectors"} of exposure ${number}, ` +
+    `verdict ${one.verdict}`;
+  image.src = address;
+}
+
+export function prepareImage(again) {
+  document.getElementById("zoom-in").addEventListener("click", () => zoom(1.5));
+  document.getElementById("zoom-out").addEventListener("click", () => zoom(1 / 1.5));
+  document.getElementById("zoom-fit").addEventListener("click", fit);
+  residuals.addEventListener("click", () => {
+    const pressed = residuals.getAttribute("aria-pressed") === "true";
+    residuals.setAttribute("aria-pressed", String(!pressed));
+    again();
+  });
+  room.addEventListener("wheel", (event) => {
+    event.preventDefault();
+    const box = room.getBoundingClientRect();
+    zoom(event.deltaY < 0 ? 1.2 : 1 / 1.2, event.clientX - box.left, event.clientY - box.top);
+  }, { passive: false });
+  room.addEventListener("keydown", (event) => {
+    const moves = { ArrowLeft: [40, 0], ArrowRight: [-40, 0], ArrowUp: [0, 40], ArrowDown: [0, -40] };
+    if (event.key in moves) {
+      view.x += moves[event.key][0];
+      view.y += moves[event.key][1];
+      place();
+    } else if (event.key === "+") zoom(1.5);
+    else if (event.key === "-") zoom(1 / 1.5);
+    else if (event.key === "0") fit();
+    else return;
+    event.preventDefault();
+  });
+  let held = null;
+  room.addEventListener("pointerdown", (event) => {
+    held = [event.clientX - view.x, event.clientY - view.y];
+    room.setPointerCapture(event.pointerId);
+  });
+  room.addEventListener("pointermove", (event) => {
+    if (!held) return;
+    view.x = event.clientX - held[0];
+    view.y = event.clientY - held[1];
+    place();
+  });
+  room.addEventListener("pointerup", () => { held = null; });
+}

@@ -1,0 +1,177 @@
+"""The watch process: hears the service, keeps the state, serves the page, the API and telemetry."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+from collections.abc import Mapping
+from contextlib import suppress
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import uvicorn
+
+from daemon.configuration import ConfigurationError, MountSection, WatchSection
+from daemon.errors import DaemonError
+from daemon.exposure import navigation_from_json
+from daemon.footprints import seen_from
+from daemon.messages import Answer, Ping, Pong, Stop, Told
+from daemon.mission import Mission
+from daemon.orientation import mount_of
+from daemon.processes import Link
+from daemon.records import RecordError
+from daemon.watch.api import WatchSettings, create_app
+from daemon.watch.discovery import Announcement
+from daemon.watch.gate import Gate
+from daemon.watch.state import FlightState
+from daemon.watch.tokens import TokenError, Tokens, read_tokens
+from processing.rig import Rig, RigError, load_rig
+
+BODY_MAX_BYTES = 64_000
+_log = logging.getLogger(__name__)
+
+
+def main(link: Link, settings: WatchSection) -> None:
+    """Serve watchers until told to stop."""
+    asyncio.run(_serve(link, settings))
+
+
+async def _serve(link: Link, settings: WatchSection) -> None:
+    ground = _Ground()
+    state = FlightState(f"syntopic {version('syntopic')}", ground.seen_from)
+    ground.state = state
+    gate = Gate(link.send)
+    app = create_app(state, gate, WatchSettings(_tokens(settings.tokens), settings.open))
+    server = uvicorn.Server(
+        uvicorn.Config(
+            app,
+            log_level="warning",
+            access_log=False,
+            lifespan="off",
+            ws="websockets-sansio",
+            ws_max_size=BODY_MAX_BYTES,
+            timeout_graceful_shutdown=1,
+            ssl_certfile=settings.certificate,
+            ssl_keyfile=settings.key,
+        )
+    )
+    server.install_signal_handlers = lambda: None  # type: ignore[attr-defined]
+    listening = _listen(settings.host, settings.port)
+    if listening is None:
+        link.send(
+            Told(
+                {
+                    "event": "device",
+                    "device": "watch",
+                    "name": "absent",
+                    "fault": True,
+                    "sentence": f"port {settings.port} of {settings.host} is taken; watching "
+                    "is not possible until another is configured ([watch] port)",
+                }
+            )
+        )
+    port = settings.port if listening is None else listening.getsockname()[1]
+    link.send(
+        Told(
+            {
+                "event": "watching",
+                "host": settings.host,
+                "port": port,
+                "tls": settings.certificate is not None,
+            }
+        )
+    )
+    ending = asyncio.Event()
+    announcement = Announcement(state, settings, port)
+    loop = asyncio.get_running_loop()
+    loop.add_reader(link.fileno(), _hear, link, state, gate, ending)
+    serving = (
+        asyncio.create_task(server.serve(sockets=[listening])) if listening is not None else None
+    )
+    try:
+        with suppress(OSError):
+            await announcement.begin()
+        await ending.wait()
+    finally:
+        loop.remove_reader(link.fileno())
+        server.should_exit = True
+        with suppress(OSError):
+            await announcement.end()
+        if serving is not None:
+            with suppress(TimeoutError):
+                await asyncio.wait_for(serving, 3.0)
+
+
+class _Ground:
+    """Footprints for the map, once it is known which rig flies and how it is mounted."""
+
+    def __init__(self) -> None:
+        self.state: FlightState | None = None
+        self._of: str | None = None
+        self._known: tuple[Rig, MountSection, float] | None = None
+
+    def seen_from(self, navigation: Mapping[str, Any]) -> list[list[float]] | None:
+        """Corners [latitude, longitude] of an exposure; None where they are not to be had."""
+        path = self.state.mission_path if self.state else None
+        if path is not None and path != self._of:
+            self._of = path
+            self._known = _rig_and_ground(Path(path))
+        if self._known is None:
+            return None
+        rig, mount, ground_m = self._known
+        try:
+            corners = seen_from(rig, mount, navigation_from_json(navigation), ground_m)
+        except RecordError:
+            return None
+        return (
+            None if corners is None else [[latitude, longitude] for longitude, latitude in corners]
+        )
+
+
+def _rig_and_ground(path: Path) -> tuple[Rig, MountSection, float] | None:
+    try:
+        mission = Mission.open(path)
+        mount, plan = mount_of(mission)
+        return load_rig(mission.rig_path), mount, plan.ground_height_m
+    except (OSError, DaemonError, ConfigurationError, RigError):
+        return None
+
+
+def _hear(link: Link, state: FlightState, gate: Gate, ending: asyncio.Event) -> None:
+    """Everything the service has said."""
+    try:
+        while (message := link.receive(0.0)) is not None:
+            if isinstance(message, Told):
+                state.apply(message.event)
+            elif isinstance(message, Answer):
+                gate.answered(message)
+            elif isinstance(message, Ping):
+                link.send(Pong({}))
+            elif isinstance(message, Stop):
+                ending.set()
+                return
+    except (EOFError, ConnectionError):
+        ending.set()
+
+
+def _listen(host: str, port: int) -> socket.socket | None:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    listening = socket.socket(family, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listening.bind((host, port))
+    except OSError:
+        listening.close()
+        return None
+    listening.listen(64)
+    return listening
+
+
+def _tokens(path: Path | None) -> Tokens:
+    try:
+        return read_tokens(path)
+    except TokenError as error:
+        _log.error("%s; nobody may command", error)
+        return Tokens({})

@@ -1,0 +1,307 @@
+"""What a watcher sees: the service's events, gathered into one state that is told whole or in part.
+
+Pure: events in, JSON types out. Events may be missing, since the line from the service drops what
+does not fit; the `status` event, once a second, says everything that must not stay wrong.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+EXPOSURES_KEPT = 2000
+"""In the snapshot; earlier ones are on disk, and `/exposures` tells them."""
+EVENTS_KEPT = 500
+HISTORY_KEPT = 7200
+FIGURES_TOLD = (
+    *("sigma0_px", "sigma0_um", "tie_points_pp", "tie_points_pc", "outliers", "dc_k"),
+    *("dc_estimated_k", "dc_estimated_sigma_k", "displaced_sensor", "gsd_m", "tilt_deg"),
+    *("crab_deg", "sharpness", "saturated_fraction", "mean_dn", "valid_fraction", "method"),
+    *("stitched_sigma_px", "missing_sensors", "smear_along_px", "smear_across_px"),
+)
+PARTS = ("exposures", "devices", "track", "history", "events")
+"""Parts of the state besides what is brief, in the order of their worth on a thin link."""
+
+VERDICT_RANK = {"good": 0, "usable": 1, "refly": 2}
+
+Json = dict[str, Any]
+
+
+class FlightState:
+    """The state of one flight, for watchers.
+
+    `sequence` grows with every event, so that a watcher knows whether it missed one.
+    """
+
+    def __init__(
+        self, software: str, footprint: Callable[[Mapping[str, Any]], Any] = lambda _: None
+    ) -> None:
+        """`footprint` gives the corners of what an exposure's navigation saw, where it can."""
+        self.sequence = 0
+        self._footprint = footprint
+        self._software = software
+        self._phase = "starting"
+        self._mission: Json = {}
+        self._status: Json = {}
+        self._devices: dict[str, Json] = {}
+        self._faults: dict[str, Json] = {}
+        self._exposures: dict[int, Json] = {}
+        self._temperatures: dict[int, Any] = {}
+        self._events: deque[Json] = deque(maxlen=EVENTS_KEPT)
+        self._history: deque[Json] = deque(maxlen=HISTORY_KEPT)
+        self._track: deque[Json] = deque(maxlen=HISTORY_KEPT)
+
+    def apply(self, event: Mapping[str, Any]) -> None:
+        """Take in one event of the service; one of an unknown kind is only listed."""
+        self.sequence += 1
+        kind = str(event.get("event", ""))
+        handler = _HANDLERS.get(kind)
+        if handler is not None:
+            handler(self, event)
+        if kind not in ("status", "processed"):
+            self._events.append({"sequence": self.sequence, **event})
+
+    def brief(self) -> Json:
+        """What everybody must know at all times; a few hundred bytes."""
+        last = next(reversed(self._exposures.values()), None)
+        return {
+            "sequence": self.sequence,
+            "software": self._software,
+            "phase": self._phase,
+            "mission": self._mission,
+            "simulated": bool(self._mission.get("simulated")),
+            "status": self._status,
+            "faults": self.faults(),
+            "last_number": None if last is None else last["number"],
+            "verdicts": self._verdict_counts(),
+        }
+
+    def changed(self, part: str, after: int) -> list[Json]:
+        """What of "exposures", "devices", "track", "history" or "events" is newer than a sequence.
+
+        Ordered by sequence, so that a watcher may be given the beginning now and the rest later.
+        """
+        items: Iterable[Json] = {
+            "exposures": self._exposures.values(),
+            "devices": self._devices.values(),
+            "track": self._track,
+            "history": self._history,
+            "events": self._events,
+        }[part]
+        newer = [item for item in items if item["sequence"] > after]
+        return sorted(newer, key=lambda item: item["sequence"])
+
+    def snapshot(self) -> Json:
+        """Everything, for somebody who has just come."""
+        return {"version": 1, **self.brief(), **{part: self.changed(part, 0) for part in PARTS}}
+
+    @property
+    def phase(self) -> str:
+        return self._phase
+
+    @property
+    def mission_path(self) -> str | None:
+        path = self._mission.get("path")
+        return path if isinstance(path, str) else None
+
+    def faults(self) -> list[Json]:
+        """Faults that stand, or stood and nobody has acknowledged; the newest first."""
+        return sorted(self._faults.values(), key=lambda fault: -fault["sequence"])
+
+    def exposures(self, after: int = 0, limit: int = EXPOSURES_KEPT) -> list[Json]:
+        found = [told for number, told in sorted(self._exposures.items()) if number > after]
+        return found[:limit]
+
+    def exposure(self, number: int) -> Json | None:
+        return self._exposures.get(number)
+
+    def acknowledge(self, fault: str) -> bool:
+        """A person has seen a fault. One that has passed leaves the list; one that stands stays."""
+        found = self._faults.get(fault)
+        if found is None:
+            return False
+        found["acknowledged"] = True
+        if not found["stands"]:
+            del self._faults[fault]
+        self.sequence += 1
+        return True
+
+    # What each event means
+
+    def _on_mission(self, event: Mapping[str, Any]) -> None:
+        self._mission = {
+            key: event.get(key) for key in ("id", "path", "resumed", "rig", "simulated", "recovery")
+        }
+        self._phase = "starting"
+
+    def _on_bound(self, event: Mapping[str, Any]) -> None:
+        device = self._device(str(event.get("device")))
+        device |= {"kind": event.get("kind"), "found": event.get("found", {})}
+        if device["state"] == "unknown":
+            # A trigger unit has nothing to open; other devices say when they deliver.
+            device["state"] = "ready" if event.get("kind") == "trigger" else "found"
+
+    def _on_device(self, event: Mapping[str, Any]) -> None:
+        name = str(event.get("device"))
+        device = self._device(name)
+        is_fault = bool(event.get("fault"))
+        device["sentence"] = event.get("sentence", "")
+        device["since_mono_ns"] = event.get("mono_ns")
+        key = f"device {name}"
+        if is_fault:
+            device["state"] = "absent" if event.get("name") == "absent" else "lost"
+            self._raise(key, str(event.get("sentence", "")), name)
+        elif event.get("name") in ("opened", "recovered"):
+            device["state"] = "ready"
+            self._pass(key)
+
+    def _on_fault(self, event: Mapping[str, Any]) -> None:
+        self._phase = "fault"
+        self._raise("service", str(event.get("sentence", "")), "service")
+
+    def _on_disk(self, event: Mapping[str, Any]) -> None:
+        self._raise("disk", str(event.get("sentence", "")), "disk")
+
+    def _on_ready(self, event: Mapping[str, Any]) -> None:
+        self._phase = "ready"
+        for absent in event.get("absent", []):
+            self._raise(f"absent {absent}", f"Flying without {absent}; look at it.", str(absent))
+
+    def _on_status(self, event: Mapping[str, Any]) -> None:
+        status = {key: value for key, value in event.items() if key != "event"}
+        self._status = status
+        phase = status.get("phase")
+        if isinstance(phase, str) and self._phase != "fault":
+            self._phase = phase
+        if status.get("exposures_left"):
+            self._pass("disk")
+        position = status.get("position")
+        if isinstance(position, Mapping):
+            at = [float(position["latitude_deg"]), float(position["longitude_deg"])]
+            if not self._track or self._track[-1]["at"] != at:
+                self._track.append({"sequence": self.sequence, "at": at})
+
+    def _on_triggered(self, event: Mapping[str, Any]) -> None:
+        self._exposure(event)["step"] = "triggered"
+
+    def _on_stored(self, event: Mapping[str, Any]) -> None:
+        self._exposure(event)["step"] = "stored"
+
+    def _on_sealed(self, event: Mapping[str, Any]) -> None:
+        told = self._exposure(event)
+        left_out = ("event", "mono_ns", "navigation", "temperatures_c")
+        told |= {key: value for key, value in event.items() if key not in left_out}
+        told["step"] = "sealed"
+        self._temperatures[told["number"]] = event.get("temperatures_c", {})
+        if event.get("navigation"):
+            told["footprint"] = self._footprint(event["navigation"])
+
+    def _on_processed(self, event: Mapping[str, Any]) -> None:
+        told = self._exposure(event)
+        report = event.get("report", {})
+        figures = report.get("figures", {})
+        told["step"] = "processed"
+        told["verdict"] = report.get("verdict")
+        told["flags"] = report.get("flags", [])
+        told["findings"] = [
+            {key: finding.get(key) for key in ("flag", "sentence", "verdict")}
+            for finding in report.get("findings", [])
+        ]
+        told["figures"] = {key: figures[key] for key in FIGURES_TOLD if key in figures}
+        told["duration_s"] = event.get("duration_s")
+        self._history.append(
+            {
+                "sequence": self.sequence,
+                "number": told["number"],
+                "sigma0_px": figures.get("sigma0_px"),
+                "dc_k": figures.get("dc_k"),
+                "dc_estimated_k": figures.get("dc_estimated_k"),
+                "time_sigma_ns": told.get("mark_sigma_ns"),
+                "temperatures_c": self._temperatures.pop(told["number"], {}),
+            }
+        )
+
+    def _on_not_processed(self, event: Mapping[str, Any]) -> None:
+        told = self._exposure(event)
+        told |= {"step": "not processed", "sentence": event.get("sentence")}
+
+    def _on_lost(self, event: Mapping[str, Any]) -> None:
+        told = self._exposure(event)
+        number, cause = told["number"], event.get("cause")
+        told |= {"step": "lost", "state": "lost", "sentence": cause}
+        self._raise(f"exposure {number}", f"Exposure {number}: {cause}", "exposures")
+
+    def _on_not_written(self, event: Mapping[str, Any]) -> None:
+        self._exposure(event)["step"] = "not written"
+        self._raise("disk", str(event.get("sentence", "")), "disk")
+
+    def _on_ended(self, event: Mapping[str, Any]) -> None:
+        self._phase = "landed" if event.get("failure") is None else "fault"
+        self._status = {**self._status, "ledger": event.get("ledger")}
+
+    # Bookkeeping
+
+    def _device(self, name: str) -> Json:
+        fresh: Json = {"name": name, "kind": None, "state": "unknown", "sentence": "", "found": {}}
+        device = self._devices.setdefault(name, fresh)
+        device["sequence"] = self.sequence
+        return device
+
+    def _exposure(self, event: Mapping[str, Any]) -> Json:
+        number = int(event["number"])
+        told = self._exposures.setdefault(number, {"number": number, "step": "triggered"})
+        told["sequence"] = self.sequence
+        while len(self._exposures) > EXPOSURES_KEPT:
+            del self._exposures[next(iter(self._exposures))]
+        return told
+
+    def _raise(self, key: str, sentence: str, device: str = "") -> None:
+        known = self._faults.get(key)
+        count = known["count"] + 1 if known else 1
+        self._faults[key] = {
+            "id": key,
+            "device": device,
+            "sentence": sentence,
+            "stands": True,
+            "acknowledged": False,
+            "count": count,
+            "sequence": self.sequence,
+        }
+
+    def _pass(self, key: str) -> None:
+        """A fault is over; it stays listed until a person has acknowledged it."""
+        found = self._faults.get(key)
+        if found is None:
+            return
+        if found["acknowledged"]:
+            del self._faults[key]
+        else:
+            found["stands"] = False
+
+    def _verdict_counts(self) -> dict[str, int]:
+        counts = dict.fromkeys(VERDICT_RANK, 0)
+        for told in self._exposures.values():
+            verdict = told.get("verdict")
+            if verdict in counts:
+                counts[verdict] += 1
+        return counts
+
+
+_HANDLERS: Mapping[str, Callable[[FlightState, Mapping[str, Any]], None]] = {
+    "mission": FlightState._on_mission,
+    "bound": FlightState._on_bound,
+    "device": FlightState._on_device,
+    "fault": FlightState._on_fault,
+    "disk": FlightState._on_disk,
+    "ready": FlightState._on_ready,
+    "status": FlightState._on_status,
+    "triggered": FlightState._on_triggered,
+    "stored": FlightState._on_stored,
+    "sealed": FlightState._on_sealed,
+    "processed": FlightState._on_processed,
+    "not-processed": FlightState._on_not_processed,
+    "not-written": FlightState._on_not_written,
+    "lost": FlightState._on_lost,
+    "ended": FlightState._on_ended,
+}

@@ -1,0 +1,89 @@
+"""Telling watchers under a byte budget: what matters first, the rest when there is room.
+
+Nothing is queued for anybody. A watcher has cursors into the state; each record holds what is brief
+and, as far as the budget goes, what changed behind each cursor. A slow link therefore costs
+freshness, never memory, and ends up with the same state. The schema is in docs/telemetry.md.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import msgpack
+
+from daemon.watch.state import PARTS, FlightState
+
+VERSION = 1
+LEAST_BYTES_PER_S = 1000
+"""Below this not even what is brief gets through once in a few seconds."""
+
+BURST_S = 2.0
+"""How much of unused budget is kept for a moment when more is to be said."""
+
+
+@dataclass
+class Subscription:
+    """One watcher: its budget and how far it has been told."""
+
+    bytes_per_s: float = math.inf
+    _cursors: dict[str, int] = field(default_factory=lambda: dict.fromkeys(PARTS, 0))
+    _told_sequence: int = -1
+    _told_s: float = -math.inf
+    _credit: float = 0.0
+    _earned_s: float | None = None
+
+    def record(self, state: FlightState, now_s: float, *, repeat_s: float = 1.0) -> Any:
+        """The next record, as msgpack or JSON types; None when nothing is to be said yet.
+
+        Args:
+            now_s: any clock that goes evenly.
+            repeat_s: what is brief is said again this often even if nothing changed.
+        """
+        self._earn(now_s)
+        if state.sequence == self._told_sequence and now_s - self._told_s < repeat_s:
+            return None
+        record: dict[str, Any] = {"version": VERSION, **state.brief()}
+        left = self._credit - packed_nbytes(record)
+        if left < 0 and not math.isinf(self.bytes_per_s):
+            return None
+        complete = True
+        for part in PARTS:
+            items, left, all_told = self._some_of(state, part, left)
+            if items:
+                record[part] = items
+            complete = complete and all_told
+        if not math.isinf(self.bytes_per_s):
+            self._credit = left
+        self._told_sequence = state.sequence if complete else -1
+        self._told_s = now_s
+        return record
+
+    def _earn(self, now_s: float) -> None:
+        most = self.bytes_per_s * BURST_S
+        passed_s = BURST_S if self._earned_s is None else now_s - self._earned_s
+        self._credit = min(self._credit + passed_s * self.bytes_per_s, most)
+        self._earned_s = now_s
+
+    def _some_of(self, state: FlightState, part: str, left: float) -> tuple[list[Any], float, bool]:
+        """Items of a part that fit, what is left of the budget, and whether all were told."""
+        told: list[Any] = []
+        for item in state.changed(part, self._cursors[part]):
+            nbytes = packed_nbytes(item)
+            if nbytes > left:
+                return told, left, False
+            left -= nbytes
+            told.append(item)
+            self._cursors[part] = item["sequence"]
+        return told, left, True
+
+
+def packed(record: Any) -> bytes:
+    """A record as msgpack."""
+    data: bytes = msgpack.packb(record, use_bin_type=True)
+    return data
+
+
+def packed_nbytes(item: Any) -> int:
+    return len(packed(item))

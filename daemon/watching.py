@@ -1,0 +1,98 @@
+"""The service's side of watching: what is told, and a watch process that may die without harm.
+
+Telling drops rather than waits. What watchers see and how commands come in is in `daemon.watch`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from daemon.departure import ProcessPlan
+from daemon.messages import Answer, Told
+from daemon.supervisor import Supervisor
+
+NAME = "watch"
+RESTART_S = 3.0
+"""How long after its death the process is started again."""
+
+
+class Watching:
+    """Tells the watch process, where there is one.
+
+    `dropped` counts events that did not fit into the line; the status of every second puts right
+    what they would have told.
+    """
+
+    def __init__(self, supervisor: Supervisor, plan: ProcessPlan | None) -> None:
+        self._supervisor = supervisor
+        self._plan = plan
+        self._first: Mapping[str, Any] | None = None
+        self.dropped = 0
+        self.restarts = 0
+
+    def start(self) -> None:
+        if self._plan is not None:
+            self._supervisor.spawn(*self._plan)
+            if self._first is not None:
+                self.tell(self._first)
+
+    def tell(self, event: Mapping[str, Any]) -> None:
+        """Tell of an event. What mission it is, is told again to a process started anew."""
+        if event.get("event") == "mission":
+            self._first = event
+        if self._plan is not None and not self._supervisor.tell(NAME, Told(event)):
+            self.dropped += 1
+
+    def answer(self, answer: Answer) -> None:
+        self._supervisor.tell(NAME, answer)
+
+    def died(self) -> None:
+        """Start it again after a while; the flight goes on."""
+        self.restarts += 1
+        asyncio.get_running_loop().call_later(RESTART_S, self.start)
+
+
+def status_event(
+    *,
+    phase: str,
+    ledger: Mapping[str, Any],
+    exposures_left: int,
+    position: Any,
+    temperatures_c: Mapping[str, float | None],
+    clock_sigma_ns: int | None,
+    queue: int,
+) -> dict[str, Any]:
+    """What a watcher must not have wrong for longer than a second, as plain JSON types.
+
+    Args:
+        position: a `NavSample`, or None before the first.
+        queue: exposures waiting for the pipeline.
+    """
+    now_ns = time.monotonic_ns()
+    where = None
+    if position is not None:
+        where = {
+            "receiver": position.receiver,
+            "latitude_deg": position.latitude_deg,
+            "longitude_deg": position.longitude_deg,
+            "height_m": position.height_m,
+            "velocity_ned_mps": list(position.velocity_ned_mps),
+            "heading_rad": position.heading_rad,
+            "fix": position.fix,
+            "satellites": position.satellites,
+            "age_s": round((now_ns - position.mono_ns) * 1e-9, 3),
+        }
+    return {
+        "event": "status",
+        "mono_ns": str(now_ns),
+        "phase": phase,
+        "ledger": {key: value for key, value in ledger.items() if key != "heads"},
+        "exposures_left": exposures_left,
+        "position": where,
+        "temperatures_c": dict(temperatures_c),
+        "clock_sigma_ns": clock_sigma_ns,
+        "queue": queue,
+    }
