@@ -1,7 +1,7 @@
-"""Balancing the PAN heads: one gain per sensor from what the overlaps show (DESIGN 5.1).
+"""Balancing the PAN heads from the histograms of their overlaps (DESIGN 5.1).
 
-Also samples the heads at common nodes of the virtual image, which the seams use too. Offsets are
-the dark calibration's and stay untouched.
+A gain for each sensor; an offset too where an overlap spans light and dark enough to tell it. Also
+samples the heads at common nodes of the virtual image, which the seams use too.
 
 Source: seeds/dmc-calibration.txt, 6.2.
 """
@@ -9,8 +9,8 @@ Source: seeds/dmc-calibration.txt, 6.2.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
@@ -33,25 +33,44 @@ _COARSE: Final = 8
 _MIN_SAMPLES: Final = 30
 _MIN_SIGNAL: Final = 80.0
 """Level-1 counts (10 DN of 12 bits): below, the ratio of two means says little."""
+_SPAN: Final = 4.0
+"""Light over dark from which on an overlap tells an offset from a gain (DESIGN 5.1)."""
+_LEVELS: Final = 12
+_UNLIKE: Final = 2e-4
+"""What parallax and reflection leave between two cones at one level, of its signal."""
+_GAIN_SIGMA: Final = 0.05
+_OFFSET_SIGMA: Final = 24.0
+_NO_OFFSET_SIGMA: Final = 1e-3
+"""Level-1 counts: black drifts by a few DN, and where nothing tells it is not drawn on."""
 
 
 @dataclass(frozen=True)
 class PairBalance:
-    """One overlap: median of log(a / b), its standard deviation, and the samples behind it."""
+    """One overlap: median of log(a / b), its standard deviation, and the samples behind it.
+
+    `span` is how many times brighter the overlap's light is than its dark (98th over 2nd
+    percentile).
+    """
 
     sensor_a: str
     sensor_b: str
     log_ratio: float
     sigma: float
     samples: int
+    span: float = 1.0
 
 
 @dataclass(frozen=True)
 class Balance:
-    """Gains by sensor (the mean of their logarithms is zero) and what every overlap said."""
+    """Gains by sensor (the mean of their logarithms is zero) and what every overlap said.
+
+    Balanced signal is gain * signal + offset; `offsets` are in Level-1 counts and zero where no
+    overlap of a sensor spans enough light and dark to tell them from its gain.
+    """
 
     gains: Mapping[str, float]
     pairs: tuple[PairBalance, ...]
+    offsets: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def spread(self) -> float:
@@ -92,16 +111,18 @@ def covered_box(means: Array) -> tuple[slice, slice]:
 
 
 def balance_gains(names: Sequence[str], means: Array) -> Balance:
-    """Gains that make the overlaps agree, by weighted least squares over all pairs.
+    """Gains, and offsets where they can be told, that make the overlaps agree.
 
-    Each overlap gives the median of its log ratios, which neither a car that moved between two
-    exposures nor a saturated roof can pull. A sensor without overlap keeps the mean gain.
+    First each overlap gives the median of its log ratios, which neither a car that moved between
+    two exposures nor a saturated roof can pull; gains follow by weighted least squares over all
+    pairs. Where the histogram of an overlap spans a factor of four, medians level by level tell
+    gain from offset, and both are adjusted once more. A sensor without overlap keeps the mean gain.
 
     Args:
         names: sensors in the order of `means`.
         means: (n, rows, columns) from `node_means`.
     """
-    pairs = []
+    pairs, samples = [], []
     boxes = [covered_box(one) for one in means]
     for a, b in itertools.combinations(range(len(names)), 2):
         both = tuple(
@@ -113,14 +134,87 @@ def balance_gains(names: Sequence[str], means: Array) -> Balance:
         count = int(np.count_nonzero(common))
         if count < _MIN_SAMPLES:
             continue
-        ratios = np.log(of_a[common] / of_b[common])
+        light_a, light_b = of_a[common], of_b[common]
+        ratios = np.log(light_a / light_b)
         median = float(np.median(ratios))
         spread = 1.4826 * float(np.median(np.abs(ratios - median)))
         # 1.2533: the median's standard deviation against the mean's, for normal errors.
         sigma = 1.2533 * max(spread, 1e-4) / np.sqrt(count)
-        pairs.append(PairBalance(names[a], names[b], median, float(sigma), count))
-    gains = np.exp(_log_gains(names, pairs)).tolist()
-    return Balance(dict(zip(names, gains, strict=True)), tuple(pairs))
+        low, high = np.percentile(light_a, (2.0, 98.0))
+        span = float(high / low)
+        pairs.append(PairBalance(names[a], names[b], median, float(sigma), count, span))
+        samples.append((a, b, light_a, light_b))
+    logs = _log_gains(names, pairs)
+    offsets = np.zeros(len(names))
+    wide = {k for pair, s in zip(pairs, samples, strict=True) for k in s[:2] if pair.span >= _SPAN}
+    if wide:
+        steps = [
+            step
+            for a, b, light_a, light_b in samples
+            for step in _levels(a, b, light_a * np.exp(logs[a]), light_b * np.exp(logs[b]))
+        ]
+        change, offsets = _gains_and_offsets(len(names), steps, wide)
+        logs = logs + change
+    gains = np.exp(logs).tolist()
+    return Balance(
+        dict(zip(names, gains, strict=True)),
+        tuple(pairs),
+        dict(zip(names, offsets.tolist(), strict=True)),
+    )
+
+
+@dataclass(frozen=True)
+class _Level:
+    """One level of an overlap's histogram: median difference a - b there, and its sigma."""
+
+    a: int
+    b: int
+    signal: float
+    difference: float
+    sigma: float
+
+
+def _levels(a: int, b: int, light_a: Array, light_b: Array) -> list[_Level]:
+    """The overlap cut into levels of equal numbers of samples, from dark to light."""
+    middle = 0.5 * (light_a + light_b)
+    difference = light_a - light_b
+    order = np.argsort(middle)
+    found = []
+    for part in np.array_split(order, min(_LEVELS, max(1, len(order) // _MIN_SAMPLES))):
+        off = difference[part]
+        median = float(np.median(off))
+        spread = 1.4826 * float(np.median(np.abs(off - median)))
+        signal = float(np.median(middle[part]))
+        sigma = 1.2533 * max(spread, 1.0) / np.sqrt(len(part))
+        found.append(_Level(a, b, signal, median, float(np.hypot(sigma, _UNLIKE * signal))))
+    return found
+
+
+def _gains_and_offsets(
+    count: int, levels: Sequence[_Level], free: Collection[int]
+) -> tuple[Array, Array]:
+    """Relative changes of gain, and offsets of the sensors `free` to have one, (count,) each.
+
+    What the overlaps do not tell stays near none: drift of black between heads is small.
+    """
+    rows, values = [], []
+    for level in levels:
+        row = np.zeros(2 * count)
+        row[level.a], row[level.b] = level.signal, -level.signal
+        row[count + level.a], row[count + level.b] = 1.0, -1.0
+        rows.append(row / level.sigma)
+        values.append(-level.difference / level.sigma)
+    for k in range(count):
+        gain, offset = np.zeros(2 * count), np.zeros(2 * count)
+        gain[k] = 1.0 / _GAIN_SIGMA
+        offset[count + k] = 1.0 / (_OFFSET_SIGMA if k in free else _NO_OFFSET_SIGMA)
+        rows += [gain, offset]
+        values += [0.0, 0.0]
+    common = np.zeros((2, 2 * count))
+    common[0, :count] = common[1, count:] = 1e6 / max(count, 1)
+    design = np.concatenate([np.array(rows), common])
+    solution, *_ = np.linalg.lstsq(design, np.array([*values, 0.0, 0.0]), rcond=None)
+    return np.asarray(solution[:count]), np.asarray(solution[count:])
 
 
 def _log_gains(names: Sequence[str], pairs: Sequence[PairBalance]) -> Array:

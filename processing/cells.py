@@ -270,9 +270,9 @@ def straight_taps(frame, valid, lattice, band, column, cell, code):  # type: ign
 
 @njit(cache=True, fastmath=True, nogil=True)
 def fetch_straight(  # type: ignore[no-untyped-def]
-    frame, lattice, band, column, cell, left, top, first, last, gain, lines, out, x0, n
+    frame, lattice, band, column, cell, left, top, first, last, gain, offset, lines, out, x0, n
 ):
-    """Rows first .. last - 1 of a cell of straight taps, times gain, rounded into `out`.
+    """Rows first .. last - 1 of a cell of straight taps, gain and offset applied, into `out`.
 
     Args:
         left, top: from `straight_taps`; the other arguments as in `fetch_cell`.
@@ -303,11 +303,11 @@ def fetch_straight(  # type: ignore[no-untyped-def]
         target = out[band * cell + y, x0 : x0 + n]
         step = np.float32(dc - 1.0)
         if n == 64:
-            cubic_words(lines[y - first], phase, step, gain, target, 64)
+            cubic_words(lines[y - first], phase, step, gain, offset, target, 64)
         elif n == 32:
-            cubic_words(lines[y - first], phase, step, gain, target, 32)
+            cubic_words(lines[y - first], phase, step, gain, offset, target, 32)
         else:
-            cubic_words(lines[y - first], phase, step, gain, target, n)
+            cubic_words(lines[y - first], phase, step, gain, offset, target, n)
 
 
 @njit(cache=True, nogil=True)

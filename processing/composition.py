@@ -107,6 +107,7 @@ class PanComposer:
         node_means(self._frames, self._valid, self._lattices, PAN_CELL_PX, self._means)
         balance = balance_gains(self.names, self._means)
         gains = np.array([balance.gains[name] for name in self.names], np.float32)
+        offsets = np.array([balance.offsets.get(name, 0.0) for name in self.names], np.float32)
         labels = seam_labels(self._middles(placements), self._means, gains, feather_px)
         seam_weights(labels, feather_px, self._weights)
         resample(
@@ -116,6 +117,7 @@ class PanComposer:
             PAN_CELL_PX,
             self._weights,
             gains,
+            offsets=offsets,
             interpolation=interpolation,
             out=self._pan,
             source=self._source,

@@ -81,9 +81,10 @@ def cubic_along(line, start, first, step, values, y, k0, n):  # type: ignore[no-
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def cubic_words(a, first, step, gain, out, n):  # type: ignore[no-untyped-def]
-    """As `cubic_along`, times gain and rounded to a word that is signal."""
+def cubic_words(a, first, step, gain, offset, out, n):  # type: ignore[no-untyped-def]
+    """As `cubic_along`, times gain plus offset, rounded to a word that is signal."""
     half = np.float32(0.5)
+    rise = offset + half
     one_half = np.float32(1.5)
     for k in range(n):
         x = first + step * np.float32(np.int32(k))
@@ -94,7 +95,7 @@ def cubic_words(a, first, step, gain, out, n):  # type: ignore[no-untyped-def]
         u2 = half * (x + x2) + one_half * (x2 - x3)
         u1 = np.float32(1.0) - u0 - u2 - u3
         v = u0 * a[k] + u1 * a[k + 1] + u2 * a[k + 2] + u3 * a[k + 3]
-        v = min(max(v * gain + half, np.float32(1.0)), np.float32(65535.0))
+        v = min(max(v * gain + rise, np.float32(1.0)), np.float32(65535.0))
         out[k] = np.uint16(np.int32(v))
 
 

@@ -56,6 +56,38 @@ def test_cars_and_burnt_roofs_do_not_pull_the_balance() -> None:
     assert all(abs(gain - 1) < 2e-3 for gain in balance.gains.values())
 
 
+def test_where_light_and_dark_lie_far_apart_gain_and_offset_are_told_from_each_other() -> None:
+    """Black has drifted by up to 2 DN (16 counts), and gains by a few per cent."""
+    gains = np.array([1.0, 1.03, 0.98, 1.01, 0.97, 1.02, 1.0, 0.99, 1.01])
+    black = np.array([0.0, 16.0, -12.0, 8.0, -16.0, 4.0, 10.0, -6.0, -4.0])
+    rng = np.random.default_rng(4)
+    rows, columns = np.indices((ROWS, COLUMNS))
+    ground = 6000 * np.exp(1.3 * np.sin(rows / 3.0) * np.cos(columns / 4.0))
+    means = np.full((9, ROWS, COLUMNS), NOT_COVERED, np.float32)
+    for k in range(9):
+        r, c = STARTS_R[k // 3], STARTS_C[k % 3]
+        seen = ground[r : r + HIGH, c : c + WIDE]
+        means[k, r : r + HIGH, c : c + WIDE] = (
+            seen / gains[k] + black[k] + rng.normal(0, 8, seen.shape)
+        )
+    balance = balance_gains(NAMES, means)
+    assert min(pair.span for pair in balance.pairs if pair.samples > 100) > 4.0
+    for level in (1500.0, 6000.0, 20000.0):
+        # What the heads make of the same light, against each other.
+        said = [
+            balance.gains[name] * (level / gains[k] + black[k]) + balance.offsets[name]
+            for k, name in enumerate(NAMES)
+        ]
+        assert max(said) / min(said) - 1 < 2e-3
+    assert np.mean(list(balance.offsets.values())) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_an_even_scene_tells_no_offset_from_a_gain() -> None:
+    balance = balance_gains(NAMES, node_means(np.linspace(0.9, 1.1, 9)))
+    assert max(pair.span for pair in balance.pairs) < 4.0
+    assert set(balance.offsets.values()) == {0.0}
+
+
 def test_a_sensor_without_overlap_keeps_the_mean_gain() -> None:
     means = node_means(np.array([1.0, 1.2, 1, 1, 1, 1, 1, 1, 1]))
     means[0] = NOT_COVERED

@@ -71,6 +71,7 @@ def fetch(
     interpolation: Interpolation = "cubic",
     shape: tuple[int, int] = (96, 128),
     gains: list[float] | None = None,
+    offsets: list[float] | None = None,
     weights: NDArray[np.uint8] | None = None,
 ) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
     """Resample with raw = (c0 + cx x + cy y, r0 + rx x + ry y) for each frame."""
@@ -92,6 +93,7 @@ def fetch(
         CELL,
         weights,
         np.array(gains or [1.0] * count, np.float32),
+        offsets=None if offsets is None else np.array(offsets, np.float32),
         interpolation=interpolation,
         out=out,
         source=source,
@@ -148,6 +150,18 @@ def test_gain_is_applied_once_and_rounding_is_to_the_nearest() -> None:
     frame = np.full((1, 130, 170), 10000, np.uint16)
     out, _ = fetch(frame, [(6.4, 1.0, 0.0, 7.6, 0.0, 1.0)], gains=[1.23456])
     assert np.all(out == 12346)
+
+
+def test_an_offset_is_added_after_the_gain_wherever_a_frame_serves() -> None:
+    frames = np.full((2, 130, 170), 10000, np.uint16)
+    matrices = [(6.4, 1.0, 0.0, 7.6, 0.0, 1.0), (8.4, 1.0, 0.0, 9.6, 0.0, 1.0)]
+    for interpolation in ("bilinear", "cubic", "lanczos"):
+        out, _ = fetch(
+            frames[:1], matrices[:1], gains=[1.2], offsets=[-25.4], interpolation=interpolation
+        )
+        assert np.all(out == 11975)
+    out, _ = fetch(frames, matrices, gains=[1.2, 1.0], offsets=[-25.0, 5.0])
+    assert np.all(out == 10990)
 
 
 def test_saturated_pixels_and_holes_reach_the_image_as_such() -> None:
