@@ -22,7 +22,8 @@ EXTRAPOLATION_LIMIT_NS = 2_000_000_000
 MEMORY_NS = 120_000_000_000
 SAMPLES_TO_STEP_BACK = 3
 LATEST_ARRIVAL_NS = 700_000_000
-"""How long a sample may have been on its way."""
+BEFORE_NS = 100_000_000
+"""How long a sample may have been on its way, and how well "about when" is meant."""
 CONTRADICTION_M = 1.0
 CONTRADICTION_MPS2 = 2.0
 CONTRADICTION_SIGMAS = 5
@@ -80,7 +81,8 @@ class Track:
         """Navigation at an instant; None where no sample is within two seconds.
 
         `mono_ns` is about when that was on the host's clock: it tells which of two times is meant
-        where the receiver's has stepped back. Too close to the step there is no telling.
+        where the receiver's has stepped. Samples whose way here would have taken longer than any
+        does, or less than nothing, are of another time. Close to a step there is no telling.
         """
         samples = self._samples
         if self._before_step and samples and mono_ns is not None:
@@ -88,8 +90,9 @@ class Track:
                 samples = self._before_step
             elif mono_ns < samples[0].mono_ns:
                 return None
-        before = next((s for s in reversed(samples) if s.gps_ns <= gps_ns), None)
-        after = next((s for s in samples if s.gps_ns > gps_ns), None)
+        timely = [s for s in samples if _is_timely(s, gps_ns, mono_ns)]
+        before = next((s for s in reversed(timely) if s.gps_ns <= gps_ns), None)
+        after = next((s for s in timely if s.gps_ns > gps_ns), None)
         return between(before, after, gps_ns)
 
 
@@ -116,6 +119,16 @@ def metres_per_degree(latitude_deg: float, height_m: float) -> tuple[float, floa
     normal = WGS84_A_M / math.sqrt(w2) + height_m
     parallel = normal * math.cos(math.radians(latitude_deg))
     return math.radians(meridian), math.radians(parallel)
+
+
+def _is_timely(sample: NavSample, gps_ns: int, mono_ns: int | None) -> bool:
+    """Whether a sample and an instant are of one time, by when they were on the host's clock."""
+    if abs(sample.gps_ns - gps_ns) > 2 * EXTRAPOLATION_LIMIT_NS:
+        return False
+    if mono_ns is None:
+        return True
+    way_ns = (sample.mono_ns - mono_ns) - (sample.gps_ns - gps_ns)
+    return -BEFORE_NS <= way_ns <= LATEST_ARRIVAL_NS + BEFORE_NS
 
 
 def _contradict(a: NavSample, b: NavSample) -> bool:
