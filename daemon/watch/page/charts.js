@@ -8,7 +8,7 @@ function axes(unit) {
   const ink = getComputedStyle(document.documentElement).getPropertyValue("--soft").trim();
   const grid = { stroke: "#8884", width: 1 };
   return [
-    { stroke: ink, grid, size: 26 },
+    { stroke: ink, grid, size: 26, incrs: [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000] },
     { stroke: ink, grid, size: 52, label: unit, labelSize: 14, labelGap: 0 },
   ];
 }

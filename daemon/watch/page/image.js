@@ -60,7 +60,7 @@ function figures(one) {
   about.replaceChildren();
   const told = one.figures || {};
   const lines = {
-    "tie points": told.tie_points_pp === undefined ? null : `${told.tie_points_pp} + ${told.tie_points_pc}`,
+    "tie points": told.tie_points_pp === undefined ? null : `${told.tie_points_pp} + ${told.tie_points_pc ?? 0}`,
     "σ0": told.sigma0_px == null ? null : `${told.sigma0_px.toFixed(3)} px`,
     "accuracy": told.stitched_sigma_px == null ? null : `${told.stitched_sigma_px.toFixed(3)} px`,
     "displaced": told.displaced_sensor,

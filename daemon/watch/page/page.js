@@ -123,7 +123,7 @@ function row(one) {
     [one.frames == null ? "" : `${one.frames}`],
     [duration(one.mark_sigma_ns) || ""],
     [figures.sigma0_px == null ? "" : figures.sigma0_px.toFixed(3)],
-    [figures.tie_points_pp === undefined ? "" : `${figures.tie_points_pp}+${figures.tie_points_pc}`],
+    [figures.tie_points_pp === undefined ? "" : `${figures.tie_points_pp}+${figures.tie_points_pc ?? 0}`],
     [figures.dc_k == null ? "" : figures.dc_k.toFixed(1)],
     [figures.displaced_sensor || ""],
   ];
@@ -156,17 +156,13 @@ onChange((record) => {
   drawHead();
   drawVerdict();
   drawFaults();
+  const last = lastJudged();
+  if (follows && last) chosen = last.number;
   if (record.devices) drawDevices();
   if (record.exposures || record.track) drawMap(select);
   if (record.exposures) drawRows();
   if (record.history || !document.querySelector("#chart-sigma0 .uplot")) drawCharts();
-  if (follows) {
-    const last = lastJudged();
-    if (last) {
-      chosen = last.number;
-      showImage(last.number);
-    }
-  } else if (chosen != null) showImage(chosen);
+  if (chosen != null) showImage(chosen);
 });
 
 by("follow").addEventListener("click", () => follow(!follows));
