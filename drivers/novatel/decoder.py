@@ -53,6 +53,8 @@ SAME_NS: Final = 1000
 UNKNOWN_SIGMA: Final = 100.0
 """Metres, or metres per second: where no log with sigmas has come."""
 COUNT_BITS: Final = 32
+NO_COUNT: Final = 0
+"""The logs have no count: ours, of what came, is no witness of what the receiver saw."""
 
 
 class NovatelDecoder(MessageDecoder):
@@ -203,9 +205,7 @@ class NovatelDecoder(MessageDecoder):
         self.counters["marks"] += 1
         count = self._counts[channel] = (self._counts[channel] + 1) % (1 << COUNT_BITS)
         return [
-            EventMark(
-                self.receiver, channel, gps_ns, accuracy_ns, count, COUNT_BITS, valid, mono_ns
-            )
+            EventMark(self.receiver, channel, gps_ns, accuracy_ns, count, NO_COUNT, valid, mono_ns)
         ]
 
 

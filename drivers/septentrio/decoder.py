@@ -31,6 +31,8 @@ RISING: Final = 0
 OSCILLATOR_NS_PER_S: Final = 100
 """By which a mark's accuracy worsens with the age of the last PVT: 0.1 ppm, a TCXO."""
 COUNT_BITS: Final = 32
+NO_COUNT: Final = 0
+"""The block has no count: ours, of what came, is no witness of what the receiver saw."""
 EPOCH_KINDS: Final = frozenset(
     ("PVTGeodetic", "PosCovGeodetic", "VelCovGeodetic", "DOP", "AttEuler")
 )
@@ -272,7 +274,7 @@ class SbfDecoder(MessageDecoder):
                 gps_ns=gps_ns,
                 accuracy_ns=self._mark_accuracy_ns + age_s * OSCILLATOR_NS_PER_S,
                 count=self._counts[channel] % (1 << COUNT_BITS),
-                count_bits=COUNT_BITS,
+                count_bits=NO_COUNT,
                 time_valid=valid,
                 mono_ns=mono_ns,
             )
