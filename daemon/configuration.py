@@ -110,7 +110,9 @@ class ProcessingSection(_Section):
     method: Literal["free", "fixed"] = "free"
     interpolation: Literal["bilinear", "cubic", "lanczos"] = "cubic"
     baselines: bool = False
+    geometry: bool = True
     threads: int = Field(default=2, ge=1, le=256)
+    exposures_in_work: int = Field(default=2, ge=1, le=16)
 
 
 class WatchSection(_Section):

@@ -225,6 +225,13 @@ class WorkerReady:
 
 
 @dataclass(frozen=True)
+class FramesRead:
+    """The frames of this exposure are no longer needed in memory; it is still in work."""
+
+    number: int
+
+
+@dataclass(frozen=True)
 class Processed:
     """Products are written; `report` is the content of quality.json."""
 

@@ -33,6 +33,7 @@ from daemon.messages import (
     Command,
     Fire,
     Fired,
+    FramesRead,
     Log,
     NotBound,
     NoteProducts,
@@ -112,7 +113,7 @@ class Service:
         self.active: set[str] = set()
         self.has_trigger = False
         self.is_worker_ready = False
-        self.is_worker_busy = False
+        self.in_work: set[int] = set()
         self.waiting: deque[_Waiting] = deque()
         self.in_memory: dict[int, Mapping[str, int]] = {}
         self.sealing: Exposure | None = None
@@ -309,6 +310,10 @@ class Service:
         self.is_worker_ready = True
         self._feed_worker()
 
+    def _on_frames_read(self, read: FramesRead) -> None:
+        if read.number in self.in_memory:
+            self._recycle(self.in_memory.pop(read.number))
+
     def _on_processed(self, done: Processed) -> None:
         seconds = round(done.duration_s, 3)
         self._event("processed", number=done.number, report=dict(done.report), duration_s=seconds)
@@ -357,6 +362,7 @@ class Service:
         Sealed: _on_sealed,
         WriteFailed: _on_write_failed,
         WorkerReady: _on_worker_ready,
+        FramesRead: _on_frames_read,
         Processed: _on_processed,
         ProcessFailed: _on_process_failed,
         Pong: _on_pong,
@@ -365,15 +371,16 @@ class Service:
     }
 
     def _worker_is_free(self, number: int) -> None:
-        self.is_worker_busy = False
+        self.in_work.discard(number)
         if number in self.in_memory:
             self._recycle(self.in_memory.pop(number))
         self._feed_worker()
 
     def _feed_worker(self) -> None:
-        if self.is_worker_ready and not self.is_worker_busy and self.waiting:
+        lanes = self.configuration.processing.exposures_in_work
+        while self.is_worker_ready and self.waiting and len(self.in_work) < lanes:
             task = self.waiting.popleft()
-            self.is_worker_busy = True
+            self.in_work.add(task.exposure.number)
             self.supervisor.send("worker", Process(task.exposure, task.slots))
 
     def _recycle(self, slots: Mapping[str, int]) -> None:
@@ -526,7 +533,7 @@ class Service:
         await self.supervisor.end(("capture", "worker", "writer"))
 
     def _is_unfinished(self) -> bool:
-        in_work = self.sealing is not None or self.is_worker_busy
+        in_work = self.sealing is not None or bool(self.in_work)
         return in_work or bool(self.flight.open_numbers or self.waiting)
 
     def _task_ended(self, task: asyncio.Task[None]) -> None:

@@ -1,13 +1,17 @@
 """The pipeline worker: Level-0 in, Level-2 products and a verdict out.
 
 It reads an exposure from shared memory while it is still there, else from disk; it never makes the
-capture wait.
+capture wait. A few exposures are in work at a time (`daemon.lanes`).
 """
 
 from __future__ import annotations
 
+import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,8 +21,10 @@ from daemon import products, store
 from daemon.conditions import conditions_of
 from daemon.configuration import PlanSection
 from daemon.exposure import Exposure
+from daemon.lanes import Lanes
 from daemon.memory import FrameRing
 from daemon.messages import (
+    FramesRead,
     Ping,
     Pong,
     Process,
@@ -37,21 +43,31 @@ from processing.radiometry import RadiometricCalibration, load_radiometry
 from processing.rig import Rig, find_rig
 from processing.stitch_record import stitch_record, stitch_record_json
 
+SWITCH_INTERVAL_S = 0.001
+"""How long one thread may hold the interpreter while another waits to enter a kernel."""
+
 
 def main(link: Link, settings: WorkerSettings, rings: tuple[FrameRing, ...]) -> None:
     """Process until told to stop."""
     started = time.monotonic()
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
     rig = find_rig(settings.rig)
     pipeline = make_pipeline(rig, settings)
     pipeline.warm_up()
-    memory = {ring.head: ring for ring in rings}
-    mission = Mission.open(settings.mission)
+    lanes = Lanes(pipeline, settings.processing.exposures_in_work)
+    desk = _Desk(link, rig, Mission.open(settings.mission), settings.plan, rings)
     link.send(WorkerReady(time.monotonic() - started))
+    in_work: set[Future[None]] = set()
     while not isinstance(order := link.receive(timeout_s=1.0), Stop):
         if isinstance(order, Ping):
             link.send(Pong({}))
         elif isinstance(order, Process):
-            link.send(_process(pipeline, rig, mission, settings.plan, memory, order))
+            in_work.add(lanes.submit(partial(desk.process, order)))
+        done = {future for future in in_work if future.done()}
+        in_work -= done
+        for future in done:
+            future.result()  # a fault of our own ends the process, and the service says so
+    lanes.end()
 
 
 def make_pipeline(rig: Rig, settings: WorkerSettings) -> Pipeline:
@@ -69,6 +85,7 @@ def make_pipeline(rig: Rig, settings: WorkerSettings) -> Pipeline:
             method=settings.processing.method,
             interpolation=settings.processing.interpolation,
             baselines=settings.processing.baselines,
+            geometry=settings.processing.geometry,
             threads=settings.processing.threads,
         ),
     )
@@ -82,13 +99,18 @@ def process_exposure(
     exposure: Exposure,
     frames: Mapping[str, NDArray[np.uint16]],
     flags: Flag = Flag(0),  # noqa: B008 - an immutable value
+    *,
+    frames_read: Callable[[], None] | None = None,
 ) -> tuple[dict[str, Any], Mapping[str, int]]:
     """Run the pipeline on one exposure and write its Level-2 folder.
+
+    `frames_read` is called once the pixels of `frames` are no longer needed.
 
     Returns:
         The content of quality.json, and the files written with their sizes in bytes.
     """
-    product = pipeline.process(frames, conditions_of(exposure, rig, plan, flags))
+    conditions = conditions_of(exposure, rig, plan, flags)
+    product = pipeline.process(frames, conditions, frames_read=frames_read)
     report = as_json(product.report)
     report["exposure"] = exposure.number
     told = product.temperatures
@@ -112,33 +134,54 @@ def process_exposure(
     return report, written.files
 
 
-def _process(
-    pipeline: Pipeline,
-    rig: Rig,
-    mission: Mission,
-    plan: PlanSection,
-    memory: Mapping[str, FrameRing],
-    order: Process,
-) -> Processed | ProcessFailed:
-    started = time.monotonic()
-    exposure = order.exposure
-    flags = Flag(0)
-    try:
-        if order.slots is None:
-            flags |= Flag.PROCESSING_BEHIND
-            frames = store.load_level0(mission.level0(exposure.number), rig)[0]
-        else:
-            frames = {
-                frame.sensor: memory[frame.sensor].frame(
-                    order.slots[frame.sensor], frame.height_px, frame.width_px
-                )
-                for frame in exposure.frames
-            }
-        report, files = process_exposure(pipeline, rig, mission, plan, exposure, frames, flags)
-    except (OSError, ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
-        sentence = (
-            f"exposure {exposure.number} was stored but not processed: {error}; "
-            f"run syntopic process {mission.path} after landing"
-        )
-        return ProcessFailed(exposure.number, sentence)
-    return Processed(exposure.number, report, files, time.monotonic() - started)
+@dataclass(frozen=True)
+class _Desk:
+    """What every exposure needs on its way through a lane."""
+
+    link: Link
+    rig: Rig
+    mission: Mission
+    plan: PlanSection
+    rings: tuple[FrameRing, ...]
+
+    def process(self, order: Process, pipeline: Pipeline) -> None:
+        """Process one exposure and say what became of it."""
+        started = time.monotonic()
+        exposure = order.exposure
+        flags = Flag(0)
+        try:
+            if order.slots is None:
+                flags |= Flag.PROCESSING_BEHIND
+                frames = store.load_level0(self.mission.level0(exposure.number), self.rig)[0]
+            else:
+                frames = self._frames_in_memory(exposure, order.slots)
+            report, files = process_exposure(
+                pipeline,
+                self.rig,
+                self.mission,
+                self.plan,
+                exposure,
+                frames,
+                flags,
+                frames_read=partial(self.link.send, FramesRead(exposure.number)),
+            )
+        except (OSError, ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
+            sentence = (
+                f"exposure {exposure.number} was stored but not processed: {error}; "
+                f"run syntopic process {self.mission.path} after landing"
+            )
+            self.link.send(ProcessFailed(exposure.number, sentence))
+            return
+        seconds = time.monotonic() - started
+        self.link.send(Processed(exposure.number, report, files, seconds))
+
+    def _frames_in_memory(
+        self, exposure: Exposure, slots: Mapping[str, int]
+    ) -> dict[str, NDArray[np.uint16]]:
+        memory = {ring.head: ring for ring in self.rings}
+        return {
+            frame.sensor: memory[frame.sensor].frame(
+                slots[frame.sensor], frame.height_px, frame.width_px
+            )
+            for frame in exposure.frames
+        }

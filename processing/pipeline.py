@@ -6,8 +6,9 @@ reads a file or waits for anything.
 
 from __future__ import annotations
 
+import copy
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -112,6 +113,16 @@ class Pipeline:
             None,
         )
 
+    def twin(self) -> Pipeline:
+        """A second pipeline with buffers of its own, for another exposure at the same time.
+
+        Calibrations, the larger part of the memory, are shared.
+        """
+        other = copy.copy(self)
+        other._pan = PanComposer(self._pan.image, self._pan.sensors)
+        other._colour = ColourComposer(self._colour.image, self._heads)
+        return other
+
     def warm_up(self) -> None:
         """Compile every kernel a flight will need, from the cache where there is one.
 
@@ -135,12 +146,19 @@ class Pipeline:
         finally:
             self.settings = settings
 
-    def process(self, frames: Mapping[str, Array], conditions: Conditions) -> Product:
+    def process(
+        self,
+        frames: Mapping[str, Array],
+        conditions: Conditions,
+        *,
+        frames_read: Callable[[], None] | None = None,
+    ) -> Product:
         """Make the virtual image of one exposure and judge it.
 
         Args:
             frames: Level-0 frames by sensor name, (h, w) uint16, DN. A missing one leaves a hole.
             conditions: what else is known of the exposure.
+            frames_read: called once the pixels of `frames` are no longer needed.
 
         Returns:
             The product; its pixel arrays hold until the next call.
@@ -158,6 +176,8 @@ class Pipeline:
         )
         with clock.stage("radiometry"):
             level1, statistics = self._correct(frames, conditions, temperatures)
+        if frames_read is not None:
+            frames_read()
         with clock.stage("tie_points"):
             tie_points = match_tie_points(rig, start, level1, settings=settings.tie_points)
         with clock.stage("mosaic"):
