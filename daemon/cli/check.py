@@ -12,19 +12,45 @@ import typer
 from rich.console import Console
 from rich.tree import Tree
 
+from daemon.cli.find import find as find_devices
+
 HELP = """Validate a configuration, open every device, and print what is well and what is not.
 
 The exit status is 0 when all is well, 1 when a device is not, 2 when the configuration is refused.
 
-Example: `syntopic check flights/sim/service.toml`
+With `--find`, find out what speaks at serial ports, tcp://host:port, udpin://host:port (those
+given, or all serial ports and the usual addresses): protocol, speed, and the configuration for it.
+
+Examples: `syntopic check flights/sim/service.toml`, `syntopic check --find`,
+`syntopic check --find /dev/ttyUSB0 tcp://10.0.0.5:3001`
 """
 BIND_TIMEOUT_S = 25.0
 
 
 def check(
-    config: Annotated[Path, typer.Argument(help="Service configuration (TOML).")],
+    targets: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="CONFIG | PORT...", help="Service configuration (TOML); with --find, ports."
+        ),
+    ] = None,
+    find: Annotated[
+        bool, typer.Option("--find", help="Find out what speaks at ports, and how fast.")
+    ] = False,
+    listen_only: Annotated[
+        bool, typer.Option("--listen-only", help="With --find, send nothing to any port.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
+    if find:
+        find_devices(targets or [], as_json=as_json, ask=not listen_only)
+    if targets is None or len(targets) != 1:
+        raise typer.BadParameter("give one service configuration, or --find and ports")
+    check_devices(Path(targets[0]), as_json=as_json)
+
+
+def check_devices(config: Path, *, as_json: bool) -> None:
+    """Open every device of a configuration and say what is well and what is not."""
     from daemon.configuration import load
 
     configuration, rig = load(config)

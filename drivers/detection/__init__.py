@@ -1,0 +1,1 @@
+"""Finding out what speaks at a port: which protocol, at which speed, and the settings it needs."""

@@ -1,0 +1,248 @@
+"""Finding devices: protocol and speed, over lines that garble what is heard at a wrong speed."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import socket
+import subprocess
+import time
+import tomllib
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from daemon.cli import app
+from daemon.cli.find import toml_sections
+from drivers import registry
+from drivers.ascii_line.pattern import LinePattern
+from drivers.detection.evidence import Evidence
+from drivers.detection.lines import lines_in
+from drivers.detection.search import Found, search
+from sim_hw.ascii_probe import AsciiProbe
+from sim_hw.mavlink_autopilot import MavlinkAutopilot
+from sim_hw.modbus_probe import ModbusProbe
+from sim_hw.network_line import TcpLine, UdpLine
+from sim_hw.nmea_receiver import NmeaReceiver
+from sim_hw.novatel_receiver import NovatelReceiver
+from sim_hw.septentrio_receiver import SeptentrioReceiver
+from sim_hw.serving import LineDevice
+from sim_hw.ublox_receiver import UbloxReceiver
+from sim_hw.world_clock import WorldClock
+from tests.drivers.uart_relay import UartRelay, sampled
+from tests.sim_hw.receiver_state import state_at
+from tests.system.flown import syntopic
+
+DEVICES: dict[str, tuple[Callable[[], LineDevice], str, int]] = {
+    # The u-blox sends NMEA beside its own: it is a u-blox all the same.
+    "ublox": (lambda: UbloxReceiver(_clock(), state_at, rate_hz=1.0), "ublox", 38_400),
+    "novatel": (lambda: NovatelReceiver(_clock(), state_at, rate_hz=1.0), "novatel", 230_400),
+    "septentrio": (lambda: SeptentrioReceiver(_clock(), state_at, rate_hz=1.0), "septentrio",
+                   115_200),
+    "nmea": (lambda: NmeaReceiver(_clock(), state_at, rate_hz=1.0), "nmea", 9_600),
+    "mavlink": (lambda: MavlinkAutopilot(_clock(), state_at), "mavlink", 57_600),
+    "ascii": (lambda: AsciiProbe([lambda: 21.5, lambda: None], ["T1={0} T2={1}"]), "ascii-line",
+              9_600),
+    "modbus": (lambda: ModbusProbe([lambda: 21.5], unit=2), "modbus-rtu", 19_200),
+}  # fmt: skip
+
+
+def _clock() -> WorldClock:
+    return WorldClock.starting_now()
+
+
+@contextmanager
+def running(*devices: LineDevice) -> Iterator[None]:
+    for device in devices:
+        device.start()
+    try:
+        yield
+    finally:
+        for device in devices:
+            device.close()
+
+
+def test_at_the_right_speed_a_line_carries_every_byte_and_at_a_wrong_one_garbage() -> None:
+    sentence = b"$GNRMC,100000.00,A,4808.22925,N*4D\r\n"
+    assert sampled(sentence, 9600, 9600) == sentence
+    # Known by heart from a line set twice too fast: "U" is 0xE6 or 0x66 and the like.
+    assert sentence not in sampled(sentence, 9600, 19_200)
+    assert len(sampled(sentence, 9600, 19_200)) > len(sentence)
+    assert len(sampled(sentence, 19_200, 9600)) < len(sentence)
+    # 2 % of error is what a real line carries.
+    assert sampled(sentence, 9600, 9600 + 190) == sentence
+
+
+def test_every_device_is_found_with_its_protocol_and_its_speed() -> None:
+    """All at once, each behind a line of its own speed; a wrong one gives what a UART gives."""
+    told: dict[str, list[str]] = {}
+    with ExitStack() as stack:
+        relays, devices = {}, {}
+        for kind, (make, _, baudrate) in DEVICES.items():
+            devices[kind] = make()
+            stack.enter_context(running(devices[kind]))
+            relays[kind] = stack.enter_context(UartRelay(devices[kind].port, baudrate))
+        found = search(
+            [relay.port for relay in relays.values()],
+            tell=lambda port, sentence: told.setdefault(port, []).append(sentence),
+        )
+        speeds = {kind: set(relay.speeds) for kind, relay in relays.items()}
+    assert speeds["nmea"] >= {115_200, 9_600}, "it was heard at a wrong speed, too"
+    by_kind = dict(zip(relays, found, strict=True))
+    for kind, (_, driver, baudrate) in DEVICES.items():
+        one = by_kind[kind]
+        assert one.speaker is not None, (kind, one.sentence, told[one.port])
+        assert (one.speaker.driver, one.baudrate) == (driver, baudrate)
+        assert told[one.port][0] == "listening at 115200"
+    sections = tomllib.loads(toml_sections(found))
+    assert [s["name"] for s in sections["navigator"]] == [
+        "gnss",
+        "gnss2",
+        "gnss3",
+        "gnss4",
+        "gnss5",
+    ]
+    for kind, written in sections.items():
+        for section in written:
+            own = {key: value for key, value in section.items() if key not in ("name", "driver")}
+            assert registry.problems(kind, section["driver"], own) == []
+    assert by_kind["modbus"].speaker.settings["unit"] == 2  # type: ignore[union-attr]
+    assert by_kind["ascii"].speaker.settings["channels"] == ["0", "1"]  # type: ignore[union-attr]
+
+
+def test_devices_on_the_network_are_found_without_a_speed() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        free = probe.getsockname()
+    receiver = SeptentrioReceiver(_clock(), state_at, line=TcpLine())
+    autopilot = MavlinkAutopilot(_clock(), state_at, line=UdpLine(free))
+    with socket.create_server(("127.0.0.1", 0)) as mute, running(receiver, autopilot):
+        silent = f"tcp://127.0.0.1:{mute.getsockname()[1]}"
+        found = search([receiver.port, autopilot.port, silent, "tcp://127.0.0.1:9"])
+    assert [one.speaker and one.speaker.driver for one in found] == [
+        "septentrio",
+        "mavlink",
+        None,
+        None,
+    ]
+    assert [one.baudrate for one in found] == [None] * 4
+    assert "nothing speaks there" in found[2].sentence
+    assert "cannot be opened" in found[3].sentence
+    section = tomllib.loads(toml_sections(found))["navigator"][0]
+    assert "baudrate" not in section
+
+
+def test_the_command_prints_what_to_paste_and_says_whether_anything_was_found() -> None:
+    receiver = UbloxReceiver(_clock(), state_at)
+    with running(receiver):
+        done = syntopic("check", "--find", receiver.port, "/dev/no-such-port", "--json")
+        shown = CliRunner().invoke(app, ["check", "--find", receiver.port])
+    assert done.returncode == 0, done.stderr
+    said = json.loads(done.stdout)
+    assert [port["found"] for port in said["ports"]] == [True, False]
+    assert said["ports"][0]["protocol"] == "UBX"
+    assert "NAV-PVT" in said["ports"][0]["heard"]
+    assert tomllib.loads(said["toml"]) == {"navigator": [{
+        "name": "gnss", "driver": "ublox", "port": receiver.port, "baudrate": 115_200,
+        "parity": "N",
+    }]}  # fmt: skip
+    assert "Next: paste this" in shown.stdout
+    assert 'driver = "ublox"' in shown.stdout
+    nothing = CliRunner().invoke(app, ["check", "--find", "/dev/no-such-port"])
+    assert nothing.exit_code == 1
+    assert "check the cable" in " ".join(nothing.stdout.split())
+    assert CliRunner().invoke(app, ["check"]).exit_code == 2
+
+
+def test_listening_only_sends_nothing() -> None:
+    master, slave = os.openpty()
+    port = os.ttyname(slave)
+    try:
+        (found,) = search([port], ask=False)
+        os.set_blocking(master, False)
+        with pytest.raises(BlockingIOError):
+            os.read(master, 1)
+    finally:
+        os.close(master)
+        os.close(slave)
+    assert found.speaker is None
+    assert "nothing speaks there; check power, cable and the port's name" in found.sentence
+
+
+def test_a_port_that_is_not_there_is_told_with_its_cure() -> None:
+    (found,) = search(["/dev/no-such-port"])
+    assert found.sentence == (
+        "cannot be opened: there is no such port; check the cable and the port's name"
+    )
+
+
+@pytest.mark.parametrize(("said", "pattern", "readings"), [
+    (b"21.5 22.5\r\n21.6 -3.0\r\n21.7 1\r\n", r"^(?P<t0>\S+) (?P<t1>\S+)$", 2),
+    (b"TEMP: 20.1 C\n" * 3, r"^TEMP:\s*(?P<t0>\S+) C$", 1),
+    (b"A=1,B=OPEN\r" * 3, r"^A=(?P<t0>\S+),B=(?P<t1>\S+)$", 2),
+    (b"CH1: 20.1\r\nCH2: 20.2\r\nCH3: 9\r\n", None, 1),
+])  # fmt: skip
+def test_a_pattern_is_proposed_where_lines_agree(
+    said: bytes, pattern: str | None, readings: int
+) -> None:
+    found = lines_in(said)
+    assert found is not None
+    assert (found.pattern, found.readings) == (pattern, readings)
+    if pattern is not None:
+        matched = LinePattern(pattern).search(found.example)
+        assert matched is not None and len(matched) == readings
+
+
+@pytest.mark.parametrize(
+    "said", [b"", b"hello\r\nworld\r\n", b"$GNTXT,1*00\r\n" * 3, bytes(range(256)) * 4]
+)
+def test_what_is_no_reading_is_no_instrument(said: bytes) -> None:
+    assert lines_in(said) is None
+
+
+@settings(max_examples=40, deadline=None)
+@given(data=st.binary(max_size=3000))
+def test_noise_is_nobody(data: bytes) -> None:
+    evidence = Evidence()
+    for at in range(0, len(data), 97):
+        evidence.feed(data[at : at + 97], at)
+    if not evidence.looks_like_text:
+        assert evidence.speaker() is None
+
+
+@pytest.mark.peer
+def test_a_gpsd_is_known_by_its_greeting() -> None:
+    program = shutil.which("gpsd", path=f"{os.environ.get('PATH', '')}:/usr/sbin")
+    if program is None:
+        pytest.skip("gpsd is absent; install Debian's gpsd")
+    receiver = UbloxReceiver(_clock(), state_at)
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        number = probe.getsockname()[1]
+    with running(receiver):
+        Path(receiver.port).chmod(0o666)
+        gpsd = subprocess.Popen([program, "-N", "-n", "-b", "-S", str(number), receiver.port],
+                                stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)  # fmt: skip
+        try:
+            (found,) = _until_open(f"tcp://127.0.0.1:{number}")
+        finally:
+            gpsd.terminate()
+            gpsd.wait(timeout=10)
+    assert found.speaker is not None
+    assert found.speaker.driver == "gpsd"
+    section: dict[str, Any] = tomllib.loads(toml_sections([found]))["navigator"][0]
+    assert section["port"] == f"127.0.0.1:{number}"
+
+
+def _until_open(address: str) -> list[Found]:
+    deadline = time.monotonic() + 20
+    while True:
+        found = search([address])
+        if found[0].speaker is not None or time.monotonic() > deadline:
+            return found
