@@ -129,11 +129,11 @@ def open_device(
 ) -> Any:
     """A device of `spec`, created and not yet touched.
 
-    A head needs its `memory`, a software trigger the `heads` of every output.
+    A head needs its `memory`, a trigger that fires them itself the `heads` of every output.
     """
     driver: Any = registry.driver_for(spec.kind, spec.driver)
     if spec.kind == "head":
         return driver(spec.name, spec.settings, memory=memory)
-    if spec.kind == "trigger" and spec.driver == "software":
+    if spec.kind == "trigger" and getattr(driver, "fires_heads", False):
         return driver(spec.name, spec.settings, heads=heads)
     return driver(spec.name, spec.settings)

@@ -137,7 +137,8 @@ def unpack(packing: Packing, source: NDArray[np.uint8], target: NDArray[np.uint1
     Args:
         packing: how `source` is packed.
         source: shape (packed_nbytes(packing, target.size),), contiguous.
-        target: shape (n,), contiguous; must not overlap `source`.
+        target: shape (n,), contiguous. It may overlap `source` where it begins before it and ends
+            no later.
 
     Raises:
         ValueError: the sizes do not fit each other.
@@ -175,6 +176,14 @@ def _unpack_groups(group: _Group, source: NDArray[np.uint8], target: NDArray[np.
         block[:nbytes] = source[first * group.nbytes :][:nbytes]
         numbers = np.ndarray((count,), number, block, strides=(group.nbytes,))
         spread[first : first + count] = group.spread(numbers)
+
+
+def bytes_at(address: int, count: int) -> NDArray[np.uint8]:
+    """So many bytes at an address."""
+    import numpy as np
+
+    memory: Any = (ctypes.c_uint8 * count).from_address(address)
+    return np.frombuffer(memory, np.uint8)
 
 
 def words_at(address: int, count: int) -> NDArray[np.uint16]:

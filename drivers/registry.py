@@ -22,6 +22,7 @@ _PLACES: Final[Mapping[str, Mapping[str, str]]] = {
     "trigger": {
         "pulse-bus": "drivers.trigger.pulse_bus:PulseBusTrigger",
         "software": "drivers.trigger.software:SoftwareTrigger",
+        "gige-action": "drivers.aravis.action_trigger:ActionTrigger",
     },
     "thermometer": {
         "modbus-rtu": "drivers.modbus_rtu.thermometer:ModbusThermometer",

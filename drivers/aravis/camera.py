@@ -6,18 +6,21 @@ Frames are in `drivers.aravis.stream`; finding, losing and finding again in `dri
 from __future__ import annotations
 
 import contextlib
+import functools
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
+from drivers.aravis.formats import packing_of, unsuitable
 from drivers.aravis.library import aravis, aravis_error
 from drivers.aravis.settings import AravisSettings
 from drivers.contract import DeviceError
+from drivers.pixels import Packing
 
 LATCH_TRIES: Final = 3
 NS_PER_S: Final = 1_000_000_000
-CHUNKS: Final = ("Timestamp", "ExposureTime", "CounterValue")
+CHUNKS: Final = ("Timestamp", "ExposureTime", "CounterValue", "Gain", "Temperature", "FrameID")
 
 
 @dataclass(frozen=True)
@@ -37,6 +40,7 @@ class Geometry:
     height_px: int
     pixel_format: str
     pixel_format_code: int
+    packing: Packing
     payload_nbytes: int
 
 
@@ -193,17 +197,23 @@ class AravisCamera:
             lambda: camera.set_acquisition_mode(library.AcquisitionMode.CONTINUOUS),
             "the head is unsuitable",
         )
-        source = "Software" if settings.trigger_source == "software" else settings.trigger_line
+        key, source = {
+            "software": ("trigger_source", "Software"),
+            "line": ("trigger_line", settings.trigger_line),
+            "action": ("trigger_action", settings.trigger_action),
+        }[settings.trigger_source]
         try:
             sources = camera.dup_available_trigger_sources()
         except failed:
             sources = []
         write(
-            "trigger_source" if source == "Software" else "trigger_line",
+            key,
             source,
             lambda: camera.set_trigger(source),
             "the head has " + (", ".join(sources) or "no trigger"),
         )
+        if settings.trigger_source == "action":
+            self._write_action(settings, write, refusals)
         if camera.is_gv_device():
             self._write_packets(settings, write)
         if refusals:
@@ -211,14 +221,47 @@ class AravisCamera:
         if settings.chunks and self._switch_on_chunks():
             self.chunk_parser = camera.create_chunk_parser()
         _, _, width, height = (int(n) for n in _region(camera))
+        packing = packing_of(str(camera.get_pixel_format_as_string()))
+        assert packing is not None, "the settings allow no other format"
         self.geometry = Geometry(
             width_px=width,
             height_px=height,
             pixel_format=str(camera.get_pixel_format_as_string()),
             pixel_format_code=int(camera.get_pixel_format()),
+            packing=packing,
             payload_nbytes=int(camera.get_payload()),
         )
-        return refusals
+        wrong = unsuitable(packing, width)
+        return [wrong] if wrong else []
+
+    def _write_action(
+        self, settings: AravisSettings, write: Callable[..., None], refusals: list[str]
+    ) -> None:
+        """Keys and mask of action commands; a head may have several signals to choose from."""
+        camera = self._camera
+        if not camera.is_gv_device():
+            refusals.append('trigger_source is "action"; only GigE Vision heads take actions')
+            return
+        number = "".join(c for c in settings.trigger_action if c.isdigit())
+        if self._has("ActionSelector") and number:
+            write(
+                "trigger_action",
+                settings.trigger_action,
+                lambda: camera.set_integer("ActionSelector", int(number)),
+                "choose an action signal the head has",
+            )
+        for key, feature in (
+            ("action_device_key", "ActionDeviceKey"),
+            ("action_group_key", "ActionGroupKey"),
+            ("action_group_mask", "ActionGroupMask"),
+        ):
+            value = getattr(settings, key)
+            write(
+                key,
+                value,
+                functools.partial(camera.set_integer, feature, value),
+                "the head takes no action commands",
+            )
 
     def _write_format(
         self, settings: AravisSettings, write: Callable[..., None], refusals: list[str]

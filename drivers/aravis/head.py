@@ -14,10 +14,14 @@ from typing import ClassVar, Final
 
 from drivers.aravis.camera import AravisCamera, HeldByAnotherError, Latch
 from drivers.aravis.gvcp import (
+    ACTION_LATE,
     DEFAULT_HEARTBEAT_S,
+    SUCCESS,
+    ActionKeys,
     control_privilege,
     heartbeat_timeout_s,
     is_ip_address,
+    send_action,
 )
 from drivers.aravis.library import OPENING, aravis_error
 from drivers.aravis.settings import AravisSettings
@@ -40,6 +44,8 @@ SUSPICION_S: Final = 2.0
 """A head that answers nothing for so long is lost; a pause of a second heals by itself."""
 HELD_MARGIN_S: Final = 0.1
 TRIGGER_TIMEOUT_S: Final = 1.0
+CLOCK_DRIFT: Final = 100e-6
+"""How far a head's clock may run from the host's between two latches, as a part of the time."""
 NOT_FRAMES: Final = ("aborted", "cleared", "filling", "unknown")
 """Buffers that come back empty when a stream ends."""
 
@@ -112,12 +118,15 @@ class AravisHead(AravisSettings, HeadDevice):
         }
 
     def trigger(self) -> None:
-        """Software trigger; from any thread. See `drivers.contract.Head`."""
-        if self.trigger_source != "software":
+        """Software trigger or action command; from any thread. See `drivers.contract.Head`."""
+        if self.trigger_source == "line":
             raise DeviceError(
                 f"{self.name}: the head waits for its line {self.trigger_line}; set "
                 'trigger_source = "software" to trigger it from here'
             )
+        if self.trigger_source == "action":
+            self.act(None)
+            return
         if not self._control.acquire(timeout=TRIGGER_TIMEOUT_S):
             raise DeviceError(f"{self.name}: the head was busy for {TRIGGER_TIMEOUT_S:g} s; wait")
         try:
@@ -138,6 +147,44 @@ class AravisHead(AravisSettings, HeadDevice):
         found = self._counters + self._of_stream
         names = self._counters.keys() | self._of_stream.keys()
         return {name: found[name] for name in sorted(names)}
+
+    def act(self, device_ns: int | None) -> None:
+        """Give this head an action command, at once or for a time of its clock; from any thread.
+
+        Raises:
+            DeviceError: it does not answer, is not meant, or the time is past.
+        """
+        if self.trigger_source != "action":
+            raise DeviceError(
+                f"{self.name}: the head waits for its {self.trigger_source}; set trigger_source = "
+                '"action" to give it action commands'
+            )
+        if self._state is not LifeCycle.ACTIVE:
+            raise DeviceError(f"{self.name}: the head is not running; wait for it to be opened")
+        keys = ActionKeys(self.action_device_key, self.action_group_key, self.action_group_mask)
+        status = send_action(self.address, keys, device_ns=device_ns, timeout_s=TRIGGER_TIMEOUT_S)
+        if status == ACTION_LATE:
+            self._counters["actions_late"] += 1
+            raise DeviceError(
+                f"{self.name}: the action command came after its time; lengthen lead_ms"
+            )
+        if status != SUCCESS:
+            said = "no answer" if status is None else f"status 0x{status:04x}"
+            raise DeviceError(
+                f"{self.name}: the action command was not taken ({said}); see whether the head is "
+                "lost or another program has changed its keys"
+            )
+        self._counters["actions"] += 1
+
+    def clock_at(self, mono_ns: int) -> tuple[int, int] | None:
+        """The head's clock at a host time near now, and its sigma; None while it is not known."""
+        session = self._session
+        latch = None if session is None else session.latch
+        if latch is None:
+            return None
+        away_ns = mono_ns - latch.mono_ns
+        drift_ns = round(abs(away_ns) * CLOCK_DRIFT)
+        return latch.device_clock_ns + away_ns, latch.sigma_ns + drift_ns
 
     # Finding
 
@@ -287,6 +334,8 @@ class AravisHead(AravisSettings, HeadDevice):
         else:
             self._counters[f"frames_{status.value}"] += 1
             self._counters[f"{status.value}_{reason}"] += 1
+        if status is not FrameStatus.CORRUPT:
+            session.stream.unpack(received.slot)
         self._lend_out(received.slot)
         sink(self._frame(session, received, status, now_ns))
 
@@ -304,7 +353,9 @@ class AravisHead(AravisSettings, HeadDevice):
             head=self.name,
             slot=received.slot,
             status=status,
-            frame_id=received.frame_id,
+            frame_id=received.frame_id
+            if received.chunk_frame_id is None
+            else received.chunk_frame_id,
             counter=received.chunk_counter,
             width_px=geometry.width_px if received.width_px is None else received.width_px,
             height_px=geometry.height_px if received.height_px is None else received.height_px,
@@ -317,8 +368,10 @@ class AravisHead(AravisSettings, HeadDevice):
             latch_sigma_ns=None if latch is None else latch.sigma_ns,
             mono_ns=now_ns,
             exposure_time_us=camera.exposure_time_us if exposure_us is None else exposure_us,
-            temperature_c=session.temperature_c,
-            settings=camera.frame_settings,
+            temperature_c=session.temperature_c
+            if received.chunk_temperature_c is None
+            else received.chunk_temperature_c,
+            settings=_as_exposed(camera.frame_settings, received),
         )
 
     def _check(self, session: _Session) -> bool:
@@ -381,6 +434,14 @@ class AravisHead(AravisSettings, HeadDevice):
             session.stream.drop()
             session.camera.release()
             gc.collect()
+
+
+def _as_exposed(
+    settings: Mapping[str, float | int | str], received: ReceivedFrame
+) -> Mapping[str, float | int | str]:
+    """The head's settings, with what it wrote behind the pixels of this frame."""
+    told = {"ExposureTime": received.chunk_exposure_us, "Gain": received.chunk_gain}
+    return {**settings, **{key: value for key, value in told.items() if value is not None}}
 
 
 def _status(camera: AravisCamera, received: ReceivedFrame) -> FrameStatus | None:

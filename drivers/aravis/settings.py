@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from drivers.aravis.formats import packing_of
 from drivers.settings import Configured, Setting
 
 
@@ -21,8 +22,20 @@ class AravisSettings(Configured):
     exposure_time_us = Setting(1000.0, minimum=1, maximum=60e6, says="exposure time, us")
     gain_db = Setting(0.0, minimum=-20, maximum=60, says="gain, dB")
     tdi_shifts = Setting(0, minimum=0, maximum=1000, says="TDI shifts; 0 for a head without TDI")
-    trigger_source = Setting("line", choices=("line", "software"), says="what starts an exposure")
+    trigger_source = Setting(
+        "line", choices=("line", "software", "action"), says="what starts an exposure"
+    )
     trigger_line = Setting("Line1", says="GenICam name of the head's trigger input")
+    trigger_action = Setting("Action1", says="GenICam name of the head's action signal")
+    action_device_key = Setting(
+        0x5359_4E54, minimum=0, maximum=0xFFFF_FFFF, says="device key of action commands"
+    )
+    action_group_key = Setting(
+        1, minimum=0, maximum=0xFFFF_FFFF, says="group key of action commands"
+    )
+    action_group_mask = Setting(
+        1, minimum=1, maximum=0xFFFF_FFFF, says="groups of action commands the head is in, bits"
+    )
     packet_size = Setting(
         0, minimum=0, maximum=65535, says="bytes of a stream packet; 0 tries what passes"
     )
@@ -59,6 +72,11 @@ class AravisSettings(Configured):
             found.append(
                 f"width_px is {values['width_px']} and height_px is {values['height_px']}; "
                 "give both or neither"
+            )
+        if packing_of(values["pixel_format"]) is None:
+            found.append(
+                f"pixel_format is {values['pixel_format']!r}; a GenICam name of 8 to 16 bits, "
+                "monochrome or Bayer, such as Mono12p or BayerRG12"
             )
         if 0 < values["packet_size"] < 576:
             found.append(f"packet_size is {values['packet_size']}; 0 or at least 576")

@@ -21,6 +21,7 @@ from drivers.aravis.camera import AravisCamera
 from drivers.aravis.library import aravis, aravis_error
 from drivers.aravis.settings import AravisSettings
 from drivers.contract import DeviceError, FrameMemory
+from drivers.pixels import Packing, bytes_at, packed_nbytes, unpack, words_at
 
 INFOS: Final = {
     "n_underruns": "underrun_packets",
@@ -34,6 +35,7 @@ INFOS: Final = {
     "n_transferred_bytes": "bytes",
 }
 """What Aravis counts, and what it is called here. Its underruns are packets, not frames."""
+ALIGNMENT: Final = 8
 GVSP_OVERHEAD_NBYTES: Final = 36
 """IP, UDP and GVSP headers of a packet: what its size holds besides pixels."""
 
@@ -55,6 +57,9 @@ class ReceivedFrame:
     chunk_timestamp: int | None
     chunk_exposure_us: float | None
     chunk_counter: int | None
+    chunk_gain: float | None
+    chunk_temperature_c: float | None
+    chunk_frame_id: int | None
 
 
 class FrameStream:
@@ -76,9 +81,13 @@ class FrameStream:
     ) -> None:
         library = aravis()
         nbytes = camera.geometry.payload_nbytes
-        if memory.slot_nbytes < nbytes:
+        geometry = camera.geometry
+        pixel_count = geometry.width_px * geometry.height_px
+        self._packing, self._pixel_count = geometry.packing, pixel_count
+        needed = max(nbytes, 2 * pixel_count)
+        if memory.slot_nbytes < needed:
             raise DeviceError(
-                f"{settings.name} at {settings.address}: a frame has {nbytes} bytes, its slot "
+                f"{settings.name} at {settings.address}: a frame has {needed} bytes, its slot "
                 f"{memory.slot_nbytes}; give slots of the sensor's size plus "
                 "CHUNK_ALLOWANCE_NBYTES, and check width_px, height_px and pixel_format"
             )
@@ -88,8 +97,14 @@ class FrameStream:
         self._packets_per_frame = (
             2 + -(-nbytes // (packet_size - GVSP_OVERHEAD_NBYTES)) if packet_size else 1
         )
+        # Packed pixels are received at the end of the slot: unpacked from there to its start they
+        # never overtake themselves, and no memory besides is needed.
+        self._offset = 0
+        if self._packing is not Packing.WORDS:
+            self._offset = (memory.slot_nbytes - nbytes) // ALIGNMENT * ALIGNMENT
+        self._memory = memory
         self._buffers = {
-            slot: library.Buffer.new(nbytes, memory.address(slot))
+            slot: library.Buffer.new(nbytes, memory.address(slot) + self._offset)
             for slot in range(memory.slot_count)
         }
         self._slots = {hash(buffer): slot for slot, buffer in self._buffers.items()}
@@ -128,7 +143,18 @@ class FrameStream:
             chunk_timestamp=_chunk(parser, "get_integer_value", buffer, "ChunkTimestamp"),
             chunk_exposure_us=_chunk(parser, "get_float_value", buffer, "ChunkExposureTime"),
             chunk_counter=_chunk(parser, "get_integer_value", buffer, "ChunkCounterValue"),
+            chunk_gain=_chunk(parser, "get_float_value", buffer, "ChunkGain"),
+            chunk_temperature_c=_chunk(parser, "get_float_value", buffer, "ChunkTemperature"),
+            chunk_frame_id=_chunk(parser, "get_integer_value", buffer, "ChunkFrameID"),
         )
+
+    def unpack(self, slot: int) -> None:
+        """Make 16-bit words, right-justified, of what was received into a slot; after `pop`."""
+        if self._packing is Packing.WORDS:
+            return
+        address = self._memory.address(slot)
+        packed = bytes_at(address + self._offset, packed_nbytes(self._packing, self._pixel_count))
+        unpack(self._packing, packed, words_at(address, self._pixel_count))
 
     def counted(self) -> Counter[str]:
         """What Aravis has counted of this stream, and `underruns` in frames."""

@@ -21,7 +21,9 @@ from numpy.typing import NDArray
 from sim_hw.faults.channel import Channel
 from sim_hw.gige import features as at
 from sim_hw.gige.faults import HeadClock, TakenFrame, WireFaults
+from sim_hw.gige.gvcp import Status
 from sim_hw.gige.gvsp import Destination, FrameHeader, FramePackets, chunk_data
+from sim_hw.gige.packing import wire_pixels
 from sim_hw.gige.registers import FrameSize, RegisterMemory
 from sim_hw.gige.stream import StreamChannel
 
@@ -32,7 +34,7 @@ PENDING_EXPOSURES_MAX = 16
 
 _CHUNK_BYTES = 16
 _IMAGE_CHUNK_BYTES = 8
-_MONO8_SHIFT = 4
+_FORMAT_NAMES = {code: name for name, code in at.PIXEL_FORMATS.items()}
 _BLOCK_ID_MAX = 65_535
 _POLL_S = 0.2
 _FAULT_POLL_S = 0.02
@@ -178,6 +180,22 @@ class Acquisition:
             self.counts["software_triggers_ignored"] += 1
             return
         self._start_exposure(time.monotonic_ns(), NO_PULSE)
+
+    def act(self, device_ns: int | None) -> Status:
+        """An action command: expose now, or when the head's clock shows `device_ns`.
+
+        One whose time has passed is taken at once, and says that it is late.
+        """
+        if not self._is_waiting_for("Action1"):
+            self.counts["actions_not_waited_for"] += 1
+            return Status.SUCCESS
+        now_ns = time.monotonic_ns()
+        start_ns = now_ns if device_ns is None else self._clock.mono_ns(device_ns)
+        if self._pending.qsize() >= PENDING_EXPOSURES_MAX:
+            self.counts["overtriggered"] += 1
+            return Status.OVERFLOW
+        self._start_exposure(max(start_ns, now_ns), NO_PULSE)
+        return Status.ACTION_LATE if start_ns < now_ns else Status.SUCCESS
 
     def payload_bytes(self) -> int:
         """PayloadSize: pixels and chunk data of one frame."""
@@ -342,17 +360,15 @@ class Acquisition:
         destination: Destination,
     ) -> FramePackets:
         request, image = pending.request, taken.image
-        pixels: NDArray[np.uint8] | NDArray[np.uint16]
-        if pending.pixel_format == at.PIXEL_FORMATS["Mono8"]:
-            pixels = np.minimum(image >> _MONO8_SHIFT, 255).astype(np.uint8)
-        else:
-            pixels = np.ascontiguousarray(image, dtype="<u2")
+        pixels = wire_pixels(image, _FORMAT_NAMES[pending.pixel_format])
         start_ns = taken.start_ns
         values = {
             "Timestamp": struct.pack(">Q", start_ns & 0xFFFF_FFFF_FFFF_FFFF),
             "ExposureTime": struct.pack(">d", request.exposure_time_us),
             "CounterValue": struct.pack(">Q", taken.counter),
             "Temperature": struct.pack(">d", self._temperature_c(request.start_mono_ns)),
+            "Gain": struct.pack(">d", request.gain_db),
+            "FrameID": struct.pack(">Q", block_id),
         }
         chunks = b""
         if pending.chunks:

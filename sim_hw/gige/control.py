@@ -19,6 +19,7 @@ from sim_hw.gige.gvcp import (
     ResendRequest,
     Status,
     acknowledgement,
+    parse_action,
     parse_command,
     parse_resend,
 )
@@ -41,6 +42,8 @@ class Actions:
 
     written: Callable[[int], None]
     resend: Callable[[ResendRequest], None]
+    act: Callable[[int | None], Status]
+    """An action command that meant this head: now, or when its clock shows so many ns."""
     control_lost: Callable[[], None]
     is_acquiring: Callable[[], bool]
 
@@ -129,6 +132,8 @@ class ControlChannel:
                 return self._read_memory(command, peer)
             case Code.WRITEMEM:
                 return self._write_memory(command, peer, now_ns)
+            case Code.ACTION:
+                return self._act(command)
             case Code.PACKETRESEND:
                 self._resend(command, peer)
                 return None
@@ -198,6 +203,24 @@ class ControlChannel:
         self._controller = peer
         self._last_heard_ns = now_ns
         self._registers.set_word(at.CONTROL_PRIVILEGE, asked & _PRIVILEGES)
+
+    def _act(self, command: Command) -> bytes | None:
+        """An action command, from whom ever; who is not meant says nothing."""
+        request = parse_action(command)
+        if request is None:
+            raise RegisterRefusedError(Status.INVALID_HEADER)
+        registers = self._registers
+        is_meant = (
+            self._controller is not None
+            and request.device_key == registers.word(at.ACTION_DEVICE_KEY)
+            and request.group_key == registers.word(at.ACTION_GROUP_KEY)
+            and request.group_mask & registers.word(at.ACTION_GROUP_MASK)
+        )
+        if not is_meant:
+            self.counts["actions_ignored"] += 1
+            return None
+        self.counts["actions"] += 1
+        return acknowledgement(command, status=self._actions.act(request.device_ns))
 
     def _must_be_let_read(self, peer: Peer) -> None:
         if self._controller in (None, peer):

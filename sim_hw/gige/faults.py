@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import time
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -77,6 +78,13 @@ class HeadClock:
     def device_ns(self, mono_ns: int) -> int:
         """What the clock shows at a monotonic time."""
         return self._clock.device_ns(mono_ns) + self._channel.clock_error_ns(mono_ns)
+
+    def mono_ns(self, device_ns: int) -> int:
+        """When, near now, the clock shows `device_ns`."""
+        found = time.monotonic_ns()
+        for _ in range(2):
+            found += device_ns - self.device_ns(found)
+        return found
 
     def restart(self, mono_ns: int) -> None:
         """It begins at zero, as after power on."""

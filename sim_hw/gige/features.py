@@ -34,6 +34,8 @@ XML_URL_LENGTH = 512
 INTERFACES = 0x0600
 MESSAGE_CHANNELS = 0x0900
 STREAM_CHANNELS = 0x0904
+ACTION_SIGNALS = 0x0908
+ACTION_DEVICE_KEY = 0x090C
 STREAM_CAPABILITY = 0x092C
 CONTROL_CAPABILITY = 0x0934
 HEARTBEAT_TIMEOUT = 0x0938
@@ -47,6 +49,8 @@ STREAM_PACKET_SIZE = 0x0D04
 STREAM_PACKET_DELAY = 0x0D08
 STREAM_DESTINATION = 0x0D18
 STREAM_SOURCE_PORT = 0x0D1C
+ACTION_GROUP_KEY = 0x9800
+ACTION_GROUP_MASK = 0x9804
 
 FIRE_TEST_PACKET = 1 << 31
 DO_NOT_FRAGMENT = 1 << 30
@@ -59,12 +63,28 @@ CONTROL_ACCESS = 1 << 1
 FEATURES_START = 0x1_0000
 XML_START = 0x2_0000
 
-PIXEL_FORMATS = {"Mono8": 0x0108_0001, "Mono12": 0x0110_0005, "Mono16": 0x0110_0007}
+PIXEL_FORMATS = {
+    "Mono8": 0x0108_0001,
+    "Mono10": 0x0110_0003,
+    "Mono10p": 0x010A_0046,
+    "Mono10Packed": 0x010C_0004,
+    "Mono12": 0x0110_0005,
+    "Mono12p": 0x010C_0047,
+    "Mono12Packed": 0x010C_0006,
+    "Mono16": 0x0110_0007,
+}
 """PFNC codes; the byte above the lower sixteen bits is the width of a pixel on the wire."""
 
 ACQUISITION_MODES = {"Continuous": 0, "SingleFrame": 1, "MultiFrame": 2}
-TRIGGER_SOURCES = {"Software": 0, "Line1": 1}
-CHUNKS = {"Timestamp": 0, "ExposureTime": 1, "CounterValue": 2, "Temperature": 3}
+TRIGGER_SOURCES = {"Software": 0, "Line1": 1, "Action1": 2}
+CHUNKS = {
+    "Timestamp": 0,
+    "ExposureTime": 1,
+    "CounterValue": 2,
+    "Temperature": 3,
+    "Gain": 4,
+    "FrameID": 5,
+}
 
 IMAGE_CHUNK_ID = 0x0001
 CHUNK_IDS = {
@@ -72,6 +92,8 @@ CHUNK_IDS = {
     "ExposureTime": 0x1002,
     "CounterValue": 0x1003,
     "Temperature": 0x1004,
+    "Gain": 0x1005,
+    "FrameID": 0x1006,
 }
 
 HEARTBEAT_TIMEOUT_MIN_MS = 500
@@ -161,6 +183,7 @@ def head_features(width_px: int, height_px: int) -> tuple[Feature, ...]:
     """The registers of a head with that many pixels, in the order a person reads them."""
     device, image, acquisition = "DeviceControl", "ImageFormatControl", "AcquisitionControl"
     analog, transport, chunk = "AnalogControl", "TransportLayerControl", "ChunkDataControl"
+    action = "ActionControl"
     return (
         StringFeature("DeviceVendorName", device, MANUFACTURER),
         StringFeature("DeviceModelName", device, MODEL),
@@ -211,6 +234,10 @@ def head_features(width_px: int, height_px: int) -> tuple[Feature, ...]:
         EnumerationFeature("TriggerSource", acquisition, 0x1_0220, entries=TRIGGER_SOURCES),
         EnumerationFeature("TriggerActivation", acquisition, 0x1_0224, entries={"RisingEdge": 0}),
         CommandFeature("TriggerSoftware", acquisition, 0x1_0228),
+        IntegerFeature("ActionDeviceKey", action, ACTION_DEVICE_KEY),
+        IntegerFeature("ActionSelector", action, 0x1_0600, minimum=1, maximum=1, default=1),
+        IntegerFeature("ActionGroupKey", action, ACTION_GROUP_KEY),
+        IntegerFeature("ActionGroupMask", action, ACTION_GROUP_MASK),
         EnumerationFeature("ExposureMode", acquisition, 0x1_022C, entries={"Timed": 0}),
         FloatFeature(
             "ExposureTime",
@@ -274,4 +301,6 @@ CHUNK_FEATURES = (
     ChunkFeature("ChunkExposureTime", "ExposureTime", is_float=True, unit="us"),
     ChunkFeature("ChunkCounterValue", "CounterValue"),
     ChunkFeature("ChunkTemperature", "Temperature", is_float=True, unit="C"),
+    ChunkFeature("ChunkGain", "Gain", is_float=True, unit="dB"),
+    ChunkFeature("ChunkFrameID", "FrameID"),
 )

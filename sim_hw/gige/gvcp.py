@@ -16,6 +16,8 @@ PACKET_MAX = 576
 """No GVCP packet is longer, IP and UDP headers included; ours never exceed it."""
 READ_MAX = 536
 ACK_REQUIRED = 0x01
+SCHEDULED = 0x80
+"""An action command that says when."""
 
 _HEADER = struct.Struct(">BBHHH")
 _ACK_HEADER = struct.Struct(">HHHH")
@@ -33,6 +35,8 @@ class Status(enum.IntEnum):
     BUSY = 0x8007
     PACKET_UNAVAILABLE = 0x800C
     INVALID_HEADER = 0x800E
+    OVERFLOW = 0x8015
+    ACTION_LATE = 0x8016
 
 
 class Code(enum.IntEnum):
@@ -45,6 +49,7 @@ class Code(enum.IntEnum):
     WRITEREG = 0x0082
     READMEM = 0x0084
     WRITEMEM = 0x0086
+    ACTION = 0x0100
 
 
 @dataclass(frozen=True)
@@ -66,6 +71,26 @@ class ResendRequest:
     block_id: int
     first: int
     last: int
+
+
+@dataclass(frozen=True)
+class ActionRequest:
+    """Who is meant by an action command, and when on the device's clock; None is at once."""
+
+    device_key: int
+    group_key: int
+    group_mask: int
+    device_ns: int | None
+
+
+def parse_action(command: Command) -> ActionRequest | None:
+    """The request in an ACTION command; None where it makes no sense."""
+    is_scheduled = bool(command.flags & SCHEDULED)
+    if len(command.body) != (20 if is_scheduled else 12):
+        return None
+    device_key, group_key, group_mask = struct.unpack_from(">III", command.body)
+    at_ns = struct.unpack_from(">Q", command.body, 12)[0] if is_scheduled else None
+    return ActionRequest(device_key, group_key, group_mask, at_ns)
 
 
 def parse_command(packet: bytes) -> Command | None:

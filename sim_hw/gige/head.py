@@ -61,6 +61,9 @@ STATISTICS = (
     "commands_repeated",
     "commands_unknown",
     "garbage_packets",
+    "actions",
+    "actions_ignored",
+    "actions_not_waited_for",
     "heartbeats_lost",
     "resets",
 )
@@ -71,9 +74,9 @@ class GigeHead:
     """One head at `identity.address`, port 3956, from `start()` to `close()`.
 
     `expose` is called in the head's own thread, one exposure after another; it returns the whole
-    sensor, uint16, shape (height, width), and must not change the array afterwards. Mono16 and
-    Mono12 send the values as they are, Mono8 drops the four lowest of twelve bits. `temperature_c`
-    gets a monotonic time in ns. `packet_pacing` defaults to what suits this host's rmem_max.
+    sensor, uint16, shape (height, width), and must not change the array afterwards; what the pixel
+    formats make of it is in `packing`. `temperature_c` gets a monotonic time in ns.
+    `packet_pacing` defaults to what suits this host's rmem_max.
     """
 
     def __init__(
@@ -119,6 +122,7 @@ class GigeHead:
             Actions(
                 written=self._written,
                 resend=self._stream.resend,
+                act=self._acquisition.act,
                 control_lost=self._control_lost,
                 is_acquiring=lambda: self._acquisition.is_acquiring,
             ),

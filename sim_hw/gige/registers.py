@@ -32,6 +32,7 @@ _BIG_ENDIAN_TRANSMITTER_UTF8 = 0x8000_0001
 _LINK_LOCAL_DHCP_PERSISTENT = 0x7
 _USER_NAME_AND_SERIAL = 0xC000_0000
 _RESEND_WRITEMEM_CONCATENATION = 0x7
+_ACTION_AND_SCHEDULED = 1 << 6 | 1 << 17
 
 
 class RegisterRefusedError(Exception):
@@ -165,7 +166,12 @@ class RegisterMemory:
         words = set(range(0, at.DISCOVERY_LENGTH, 4))
         words |= set(range(at.XML_URL, at.XML_URL + at.XML_URL_LENGTH, 4))
         words |= {at.INTERFACES, at.MESSAGE_CHANNELS, at.STREAM_CHANNELS, at.STREAM_CAPABILITY}
-        words |= {at.CONTROL_CAPABILITY, at.CONTROL_PRIVILEGE, at.STREAM_SOURCE_PORT}
+        words |= {
+            at.ACTION_SIGNALS,
+            at.CONTROL_CAPABILITY,
+            at.CONTROL_PRIVILEGE,
+            at.STREAM_SOURCE_PORT,
+        }
         for feature in self._features:
             words |= set(range(feature.address, feature.address + feature.length, 4))
         blocks: dict[int, int] = {}
@@ -207,7 +213,11 @@ class RegisterMemory:
             (at.SUBNET_MASK, 0xFF00_0000),
             (at.INTERFACES, 1),
             (at.STREAM_CHANNELS, 1),
-            (at.CONTROL_CAPABILITY, _USER_NAME_AND_SERIAL | _RESEND_WRITEMEM_CONCATENATION),
+            (at.ACTION_SIGNALS, 1),
+            (
+                at.CONTROL_CAPABILITY,
+                _USER_NAME_AND_SERIAL | _RESEND_WRITEMEM_CONCATENATION | _ACTION_AND_SCHEDULED,
+            ),
         ):
             self.set_word(address, value)
         for address, text, length in (

@@ -92,3 +92,15 @@ def test_a_file_that_is_not_toml_or_not_there_is_refused_in_one_sentence(tmp_pat
         with pytest.raises(ConfigurationError) as refused:
             load(path)
         assert len(refused.value.problems) == 1
+
+
+def test_tdi_on_a_bayer_head_is_refused_with_its_cure() -> None:
+    content = copy.deepcopy(GOOD)
+    content["mission"]["rig"] = "ultracam-l-mini"
+    content["head"] = [
+        {"sensor": "RGB", "driver": "aravis", "address": "127.0.0.2", "tdi_shifts": 12},
+        {"sensor": "SU00", "driver": "aravis", "address": "127.0.0.3", "tdi_shifts": 12},
+    ]
+    (sentence,) = problems_of(content)
+    assert sentence.startswith("service.toml: head[0].tdi_shifts is 12; RGB is a Bayer head (RGGB)")
+    assert sentence.endswith("set 0 and expose shorter")

@@ -26,6 +26,7 @@ PAGES = [
     ("pps", "kernel", "pps.md"),
     ("trigger", "pulse-bus", "pulse-bus.md"),
     ("trigger", "software", "pulse-bus.md"),
+    ("trigger", "gige-action", "aravis.md"),
 ]
 
 

@@ -17,7 +17,7 @@ EVERY_DRIVER = [(kind, name) for kind, names in registry.kinds().items() for nam
 def test_there_are_the_drivers_of_the_first_flight() -> None:
     assert registry.kinds() == {
         "head": ("aravis", "folder", "v4l2"),
-        "trigger": ("pulse-bus", "software"),
+        "trigger": ("pulse-bus", "software", "gige-action"),
         "thermometer": ("modbus-rtu", "ascii-line", "host"),
         "pps": ("kernel",),
         "navigator": ("ublox", "gpsd", "nmea", "novatel", "septentrio", "mavlink"),
@@ -39,7 +39,7 @@ def test_a_driver_that_does_not_exist_is_named_with_those_that_do() -> None:
     assert registry.problems("head", "basler", {}) == [
         "driver is 'basler'; a head has aravis, folder, v4l2"
     ]
-    with pytest.raises(DeviceError, match="one of head, trigger, thermometer, navigator"):
+    with pytest.raises(DeviceError, match="one of head, trigger, thermometer, pps, navigator"):
         registry.driver_for("barometer", "any")
 
 

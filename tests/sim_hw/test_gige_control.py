@@ -30,6 +30,7 @@ class Bench:
         self.resends: list[ResendRequest] = []
         self.control_lost = 0
         self.acquiring = False
+        self.actions: list[int | None] = []
         self.registers = RegisterMemory(
             HeadIdentity("127.77.0.1", "S-1", "Model", "Vendor", "SU00"), FrameSize(1248, 832)
         )
@@ -38,11 +39,16 @@ class Bench:
             Actions(
                 written=self.written.append,
                 resend=self.resends.append,
+                act=self._act,
                 control_lost=self._lost,
                 is_acquiring=lambda: self.acquiring,
             ),
         )
         self._request_id = 0
+
+    def _act(self, device_ns: int | None) -> Status:
+        self.actions.append(device_ns)
+        return Status.SUCCESS
 
     def _lost(self) -> None:
         self.control_lost += 1
@@ -313,3 +319,59 @@ def test_hostile_packets_never_raise_and_the_head_still_answers(
     later_ns = now_ns + (1 << 32) * MS + 1
     assert bench.ask(DISCOVERY, now_ns=later_ns)[0] == Status.SUCCESS
     assert bench.take_control(OTHER_HOST, now_ns=later_ns) == Status.SUCCESS
+
+
+ACTION, ACTION_CAPABILITY, SCHEDULED_CAPABILITY = 0x0100, 1 << 6, 1 << 17
+
+
+def bench_with_keys() -> Bench:
+    """A controlled head with device key 7, group key 8 and group mask 0b0110."""
+    bench = Bench()
+    bench.ask(WRITEREG, struct.pack(">II", at.CONTROL_PRIVILEGE, 2))
+    for address, value in ((0x090C, 7), (0x9800, 8), (0x9804, 0b0110)):
+        bench.ask(WRITEREG, struct.pack(">II", address, value))
+    return bench
+
+
+def test_a_head_says_that_it_takes_actions_scheduled_ones_too() -> None:
+    capability = Bench().read(0x0934)
+    assert capability & ACTION_CAPABILITY
+    assert capability & SCHEDULED_CAPABILITY
+    assert Bench().read(0x0908) == 1, "one action signal"
+
+
+def test_an_action_is_taken_from_whoever_knows_the_keys() -> None:
+    bench = bench_with_keys()
+    status, body = bench.ask(ACTION, struct.pack(">III", 7, 8, 0b0010), OTHER_HOST)
+    assert (status, body) == (Status.SUCCESS, b"")
+    assert bench.actions == [None]
+
+
+@pytest.mark.parametrize("keys", [(6, 8, 0b0010), (7, 9, 0b0010), (7, 8, 0b1001)])
+def test_an_action_that_means_others_is_passed_over_in_silence(keys: tuple[int, int, int]) -> None:
+    bench = bench_with_keys()
+    packet = bench.packet(ACTION, struct.pack(">III", *keys))
+    assert bench.channel.answer(packet, OTHER_HOST, 0) is None
+    assert bench.actions == []
+
+
+def test_a_head_without_a_controller_takes_no_action() -> None:
+    bench = Bench()
+    packet = bench.packet(ACTION, struct.pack(">III", 0, 0, 0xFFFF_FFFF))
+    assert bench.channel.answer(packet, OTHER_HOST, 0) is None
+
+
+def test_a_scheduled_action_says_when() -> None:
+    bench = bench_with_keys()
+    body = struct.pack(">IIIQ", 7, 8, 0xFFFF_FFFF, 123_456_789_012_345)
+    assert bench.channel.answer(bench.packet(ACTION, body, flags=0x81), HOST, 0) is not None
+    assert bench.actions == [123_456_789_012_345]
+    status, _ = bench.ask(ACTION, body)
+    assert status == Status.INVALID_HEADER, "a time, and no flag that announces it"
+
+
+def test_an_action_that_asks_for_no_answer_gets_none() -> None:
+    bench = bench_with_keys()
+    packet = bench.packet(ACTION, struct.pack(">III", 7, 8, 2), flags=0)
+    assert bench.channel.answer(packet, OTHER_HOST, 0) is None
+    assert bench.actions == [None]
