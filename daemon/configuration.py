@@ -300,4 +300,20 @@ def _rig_problems(content: Mapping[str, Any], rig: Rig, file: str) -> list[str]:
             problems.append(f"{file}: head[{index}].sensor is {name!r}; {rig.name} has {listed}")
         elif name in given[:index]:
             problems.append(f"{file}: head[{index}].sensor is {name!r} for the second time")
-    return problems
+    return problems + _tdi_problems(content, rig, file)
+
+
+def _tdi_problems(content: Mapping[str, Any], rig: Rig, file: str) -> list[str]:
+    """TDI moves charge from row to row, and on a Bayer head from colour to colour."""
+    heads = content.get("head")
+    bayer = {s.name: s for s in rig.sensors if s.colour_filter_array != "none"}
+    return [
+        f"{file}: head[{index}].tdi_shifts is {head['tdi_shifts']}; {head['sensor']} is a Bayer "
+        f"head ({bayer[head['sensor']].colour_filter_array}), where moving charge would mix "
+        "colours: set 0 and expose shorter"
+        for index, head in enumerate(heads if isinstance(heads, list) else [])
+        if isinstance(head, Mapping)
+        and head.get("sensor") in bayer
+        and isinstance(head.get("tdi_shifts"), int)
+        and head["tdi_shifts"] > 0
+    ]
