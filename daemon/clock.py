@@ -16,6 +16,7 @@ from typing import Final, Literal
 
 from daemon.clock_model import ClockModel, Estimate, Pair
 
+SECOND_NS: Final = 1_000_000_000
 ARRIVAL_MIN_NS: Final = 0
 """An autopilot on the network tells its position within a millisecond, a serial line after 10."""
 ARRIVAL_MAX_NS: Final = 700_000_000
@@ -28,8 +29,8 @@ TOO_LATE_NS: Final = 900_000_000
 """A message further from the clock than these was held up, or the receiver's time has stepped."""
 MESSAGES_FROM_THE_FUTURE: Final = 5
 """So many in succession cannot have been held up: the receiver's time has stepped."""
+LONG_GAP_NS: Final = 100 * SECOND_NS
 NAMING_TOLERANCE_NS: Final = 100_000_000
-SECOND_NS: Final = 1_000_000_000
 ROUND_TRIPS_KEPT: Final = 32
 RESIDUALS_KEPT: Final = 64
 BELIEF: Final = 4.0
@@ -144,7 +145,6 @@ class HostClock:
         self._marks = ClockModel()
         self._pps = ClockModel()
         self._pps_sigma_ns = 0.0
-        self._pps_epoch_ns: int | None = None
         self._second: int | None = None
         self._lateness = _Lateness()
         self.round_trips = RoundTrips()
@@ -170,16 +170,17 @@ class HostClock:
 
     def pps_edge(self, mono_ns: int, sigma_ns: int) -> None:
         """Note an edge of the pulse per second."""
-        if self._pps_epoch_ns is None:
-            self._pps_epoch_ns = mono_ns
         last = self._pps.last
         if last is None:
             count_ns = 0
         else:
-            expected = self._pps.at(mono_ns)
-            assert expected is not None
-            count_ns = round(expected.to_ns / SECOND_NS) * SECOND_NS
-            if count_ns == last.to_ns:
+            since_ns = mono_ns - last.from_ns
+            if since_ns > LONG_GAP_NS:
+                # Over so long a gap the clock's rate matters for which second this is.
+                expected = self._pps.at(mono_ns)
+                since_ns = since_ns if expected is None else expected.to_ns - last.to_ns
+            count_ns = last.to_ns + round(since_ns / SECOND_NS) * SECOND_NS
+            if count_ns <= last.to_ns:
                 return  # the same second again
         self._pps_sigma_ns = float(sigma_ns)
         self._pps.add(Pair(mono_ns, count_ns, float(max(sigma_ns, 1))))

@@ -30,15 +30,24 @@ WANDER: Final[Array] = np.logspace(-1.5, 4.5, 10)
 temperature) to 180 ppb (a crystal in a draught) after one second, as the square root of time."""
 SCALES: Final[Array] = np.logspace(math.log10(0.35), math.log10(8.0), 7)
 """Candidates for the factor by which sigmas of readings are too large or too small."""
+GRID_WANDER: Final[Array] = np.repeat(WANDER, len(SCALES))
+GRID_SCALE: Final[Array] = np.tile(SCALES, len(WANDER))
+NEGLIGIBLE: Final = 1e-3
+WANDER_DECADES: Final = 1.5
+"""Crystals usually wander by about 1 ppb after a second; one in three by six times more or less."""
 SCALE_SPREAD: Final = math.log(2.0)
 """Stated sigmas are believed to a factor of two, before they are looked at."""
 OUTLIER: Final = 4.0
 """A pair so many sigmas off the others loses weight, or is held back as it comes."""
-GATE_SHARE: Final = 6
+GATE_SHARE: Final = 4
 """The fit that new pairs are held against is made anew after so large a share of new ones."""
 STEP_PAIRS: Final = 3
 """So many pairs held back that agree with each other are no outliers: the clock has stepped."""
 ROUNDS: Final = 3
+GRID_PRIOR: Final[Array] = (
+    -0.5 * (np.log10(GRID_WANDER) / WANDER_DECADES) ** 2
+    - 0.5 * (np.log(GRID_SCALE) / SCALE_SPREAD) ** 2
+)
 
 
 @dataclass(frozen=True)
@@ -220,7 +229,7 @@ class _Fit:
         for _ in range(ROUNDS):
             self._solve()
             sigma = stated * self._growth()
-            if np.allclose(sigma, self._sigma, rtol=0.05):
+            if bool(np.all(np.abs(sigma - self._sigma) <= 0.05 * self._sigma)):
                 break
             self._sigma = sigma
 
@@ -231,43 +240,46 @@ class _Fit:
         values, vectors = np.linalg.eigh(whitened)
         self._vectors = vectors
         values = np.maximum(values, 0.0)
-        # Axes: wander, scale, pair.
-        spread = SCALES[None, :, None] ** 2 + WANDER[:, None, None] * values
-        self._inverse = 1.0 / spread
+        # Axes: point of the grid, pair.
+        spread = GRID_SCALE[:, None] ** 2 + GRID_WANDER[:, None] * values
+        inverse = 1.0 / spread
         design = np.stack([np.ones(n), self._u], axis=1) / self._sigma[:, None]
         h = vectors.T @ design
         z = vectors.T @ (self._z / self._sigma)
-        normal = np.einsum("qsn,ni,nj->qsij", self._inverse, h, h)
-        normal[..., 1, 1] += RATE_SIGMA**-2
-        right = np.einsum("qsn,ni,n->qsi", self._inverse, h, z)
-        self._cofactor = np.linalg.inv(normal)
-        self._line = np.einsum("qsij,qsj->qsi", self._cofactor, right)
-        residual = z - np.einsum("qsi,ni->qsn", self._line, h)
-        square = np.einsum("qsn,n,qsn->qs", self._inverse, z, residual)
-        log_likelihood = -0.5 * (
-            square - np.log(self._inverse).sum(axis=2) + np.log(np.linalg.det(normal))
-        )
-        log_weight = log_likelihood - 0.5 * (np.log(SCALES) / SCALE_SPREAD) ** 2
+        products = np.stack([h[:, 0] ** 2, h[:, 0] * h[:, 1], h[:, 1] ** 2], axis=1)
+        normal = (inverse @ products)[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
+        normal[:, 1, 1] += RATE_SIGMA**-2
+        right = inverse @ (h * z[:, None])
+        cofactor, determinant = _inverse_of_twos(normal)
+        line = np.einsum("gij,gj->gi", cofactor, right)
+        residual = z - line @ h.T
+        square = (inverse * residual) @ z
+        log_likelihood = -0.5 * (square - np.log(inverse).sum(axis=1) + np.log(determinant))
+        log_weight = log_likelihood + GRID_PRIOR
         weight = np.exp(log_weight - log_weight.max())
-        self._weight = weight / weight.sum()
-        self._h, self._residual = h, residual
-        self._weighted_residual = self._inverse * residual
+        # What explains the pairs a thousand times worse than the best is left out.
+        kept = weight > NEGLIGIBLE
+        self._weight = weight[kept] / weight[kept].sum()
+        self._wander, self._scale = GRID_WANDER[kept], GRID_SCALE[kept]
+        self._inverse, self._cofactor = inverse[kept], cofactor[kept]
+        self._line, self._residual, self._h = line[kept], residual[kept], h
+        self._weighted_residual = self._inverse * self._residual
 
     def _growth(self) -> Array:
         """By how much the stated sigma of each pair has to grow for it to be no outlier."""
         if len(self._u) < 4:
             return np.ones(len(self._u))
-        q, s = np.unravel_index(int(np.argmax(self._weight)), self._weight.shape)
-        inverse = self._inverse[q, s]
+        best = int(np.argmax(self._weight))
+        inverse, scale = self._inverse[best], self._scale[best]
         # What each pair is off from what the others say of it, and the variance of that.
-        whole = self._vectors @ (inverse * self._residual[q, s])
+        whole = self._vectors @ (inverse * self._residual[best])
         hat = self._vectors @ (inverse[:, None] * self._h)
         precision = np.einsum("ij,j,ij->i", self._vectors, inverse, self._vectors)
-        precision -= np.einsum("ni,ij,nj->n", hat, self._cofactor[q, s], hat)
+        precision -= np.einsum("ni,ij,nj->n", hat, self._cofactor[best], hat)
         precision = np.maximum(precision, 1e-12)
         off = np.abs(whole) / precision * self._sigma
-        variance = self._sigma**2 * (1.0 / precision - SCALES[s] ** 2)
-        variance = np.maximum(variance, 0.0) + (SCALES[s] * self._stated) ** 2
+        variance = self._sigma**2 * (1.0 / precision - scale**2)
+        variance = np.maximum(variance, 0.0) + (scale * self._stated) ** 2
         growth: Array = np.clip(off / (OUTLIER * 0.75 * np.sqrt(variance)), 1.0, 1e6)
         return growth
 
@@ -279,26 +291,31 @@ class _Fit:
         across = _wander_covariance(at, self._u - self._start)[0] / self._sigma
         itself = float(_wander_covariance(at, at)[0, 0])
         k = self._vectors.T @ across
-        covariance = WANDER[:, None, None] * k
-        g = np.array([1.0, u]) - np.einsum("qsn,qsn,ni->qsi", covariance, self._inverse, self._h)
-        mean = (
-            self._line[..., 0]
-            + self._line[..., 1] * u
-            + np.einsum("qsn,qsn->qs", covariance, self._weighted_residual)
-        )
+        covariance = self._wander[:, None] * k
+        weighted = covariance * self._inverse
+        g = np.array([1.0, u]) - weighted @ self._h
+        mean = self._line @ np.array([1.0, u]) + (covariance * self._weighted_residual).sum(axis=1)
         variance = (
-            WANDER[:, None] * itself
-            - np.einsum("qsn,qsn,qsn->qs", covariance, self._inverse, covariance)
-            + np.einsum("qsi,qsij,qsj->qs", g, self._cofactor, g)
+            self._wander * itself
+            - (weighted * covariance).sum(axis=1)
+            + np.einsum("gi,gij,gj->g", g, self._cofactor, g)
         )
-        variance = np.maximum(variance, 0.0) + (SCALES[None, :] * reading_sigma_ns) ** 2
-        centre = float((self._weight * mean).sum())
-        total = float((self._weight * (variance + (mean - centre) ** 2)).sum())
+        variance = np.maximum(variance, 0.0) + (self._scale * reading_sigma_ns) ** 2
+        centre = float(self._weight @ mean)
+        total = float(self._weight @ (variance + (mean - centre) ** 2))
         to_ns = self._to_ns + (from_ns - self._from_ns) + round(centre)
         return to_ns, math.sqrt(max(total, 0.25))
 
     def reading_scale(self) -> float:
-        return float(math.sqrt((self._weight * SCALES[None, :] ** 2).sum()))
+        return float(math.sqrt(self._weight @ self._scale**2))
+
+
+def _inverse_of_twos(matrices: Array) -> tuple[Array, Array]:
+    """Inverse and determinant of symmetric 2 x 2 matrices, shape (..., 2, 2)."""
+    a, b, d = matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 1]
+    determinant: Array = a * d - b * b
+    inverse = np.stack([d, -b, -b, a], axis=-1) / determinant[..., None]
+    return inverse.reshape(matrices.shape), determinant
 
 
 def _wander_covariance(a: Array, b: Array) -> Array:
