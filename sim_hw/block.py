@@ -173,7 +173,7 @@ def ultracam_l_plan() -> Plan:
                 f"cross {k + 1}", (x, (k - 1) * 1900.0), 90.0 if east else 270.0, 26, base, height
             )
         )
-    return Plan(tuple(strips), ULTRACAM_L, spacing_m=43.0, relief_m=40.0, control=24, checks=40)
+    return Plan(tuple(strips), ULTRACAM_L, spacing_m=41.5, relief_m=40.0, control=24, checks=40)
 
 
 def small_plan() -> Plan:

@@ -17,13 +17,14 @@ from processing.bundle.iterations import Progress, Run, iterated, robust_weights
 from processing.bundle.network import Network, NetworkError, checked
 from processing.bundle.normal import Reduced, cofactor_matrix, point_normals
 from processing.bundle.rank import Defect, defects
-from processing.bundle.statistics import Group, groups_of, leverages, point_cofactors
+from processing.bundle.statistics import Group, groups_of, spread_of
 from processing.bundle.unknowns import Layout, State, layout_of, starting_state
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 _LEAST_POINT_INFORMATION: Final = 1e-10
+_MOST_BEHIND: Final = 0.05
 _MOST_ROUNDS: Final = 12
 _COMPONENT_SETTLED: Final = 0.02
 
@@ -124,7 +125,7 @@ def adjust(
     history: list[float] = []
     robust = settings.robust
     for round_ in range(_MOST_ROUNDS + 1):
-        left_out = _undetermined_points(network, state, weight)
+        left_out = undetermined_points(network, state, weight)
         layout = layout_of(network, left_out)
         run = Run(
             network,
@@ -163,10 +164,39 @@ def adjust(
     return result
 
 
-def _undetermined_points(network: Network, state: State, weight: Array) -> Flags:
-    """Object points whose rays do not fix them: seen once, or from one projection centre only."""
-    nothing = np.zeros(len(network.points.names), dtype=bool)
-    layout = layout_of(network, nothing)
+def undetermined_points(network: Network, state: State, weight: Array | None = None) -> Flags:
+    """Object points whose rays do not fix them.
+
+    They are seen once or from one projection centre only; or they start behind a camera that sees
+    them, where a few do (rays that hardly converge) and not so many that the images are to blame.
+    """
+    found = np.zeros(len(network.points.names), dtype=bool)
+    if weight is None:
+        weight = np.ones(len(network.image_points.image))
+    try:
+        rows, layout = _bare_equations(network, found, state, weight)
+    except BehindCameraError as error:
+        behind = np.unique(network.image_points.point[error.image_points])
+        behind = behind[~(network.points.sigma_m[behind] == 0.0).all(axis=1)]
+        if len(behind) > max(1.0, _MOST_BEHIND * len(found)):
+            return found
+        found[behind] = True
+        try:
+            rows, layout = _bare_equations(network, found, state, weight)
+        except BehindCameraError:
+            return found
+    values = np.linalg.eigvalsh(point_normals(rows, layout))
+    weak = ~(values[:, 0] > _LEAST_POINT_INFORMATION * np.maximum(values[:, 2], 1e-300))
+    free = ~layout.locked[layout.eliminated_points].all(axis=1)
+    found[layout.eliminated_points[weak & free]] = True
+    return found
+
+
+def _bare_equations(
+    network: Network, left_out: Flags, state: State, weight: Array
+) -> tuple[Equations, Layout]:
+    """Rows with the derivatives of object points only."""
+    layout = layout_of(network, left_out)
     bare = replace(
         layout,
         **{
@@ -175,16 +205,7 @@ def _undetermined_points(network: Network, state: State, weight: Array) -> Flags
         },
         terms=tuple(np.full_like(t, -1) for t in layout.terms),
     )
-    try:
-        rows = equations(network, bare, state, weight)
-    except BehindCameraError:
-        return nothing
-    normals = point_normals(rows, layout)
-    values = np.linalg.eigvalsh(normals)
-    weak = ~(values[:, 0] > _LEAST_POINT_INFORMATION * np.maximum(values[:, 2], 1e-300))
-    free = ~layout.locked[layout.eliminated_points].all(axis=1)
-    nothing[layout.eliminated_points[weak & free]] = True
-    return nothing
+    return equations(network, bare, state, weight), layout
 
 
 def _figures(
@@ -203,7 +224,7 @@ def _figures(
     found: tuple[Defect, ...] = ()
     if run.minimum_norm:
         found = defects(run.network, layout, run.state, reduced)
-    leverage = leverages(rows, reduced, cofactor)
+    own, leverage = spread_of(rows, reduced, cofactor)
     free_points = layout.eliminated_points
     held = layout.locked[free_points]
     unknowns = layout.columns + int((~held).sum())
@@ -217,7 +238,6 @@ def _figures(
     residual = -rows.misclosure
     sigma0 = float(np.sqrt(residual @ residual / redundancy)) if redundancy > 0 else float("nan")
     point_cofactor = np.full((len(layout.locked), 3, 3), np.nan)
-    own = point_cofactors(reduced, cofactor)
     own = np.where(held[:, :, None] | held[:, None, :], 0.0, own)
     point_cofactor[free_points] = own
     for point in np.flatnonzero((layout.kept >= 0).any(axis=1) | _held_apart(layout)):

@@ -153,6 +153,7 @@ def _image_rows(
     part = layout.eliminated[measured.point]
     takes_part = (part >= 0) | (layout.kept[measured.point] >= 0).any(axis=1)
     takes_part |= layout.locked[measured.point].all(axis=1)
+    behind: list[Indices] = []
     for index, camera in enumerate(network.cameras):
         rows = np.flatnonzero(
             (images.camera[measured.image] == index) & (weight > 0.0) & takes_part
@@ -172,7 +173,8 @@ def _image_rows(
         offset[mounted] = state.head_offset[head[mounted]]
         seen = np.einsum("nji,nj->ni", rig_from_camera, in_rig - scale[:, None] * offset)
         if (seen[:, 2] >= 0.0).any():
-            raise BehindCameraError(rows[seen[:, 2] >= 0.0])
+            behind.append(rows[seen[:, 2] >= 0.0])
+            continue
         interior = state.interior[index]
         c = principal_distance_mm(camera, interior)
         projected = -c * seen[:, :2] / seen[:, 2:]
@@ -217,6 +219,8 @@ def _image_rows(
                 point_part=np.where(locked | (part[rows] < 0)[:, None], 0.0, by_point[:, axis]),
                 weight=weight[rows],
             )
+    if behind:
+        raise BehindCameraError(np.concatenate(behind))
 
 
 def _active(columns: Indices, by_term: Array) -> list[tuple[Indices, Array]]:

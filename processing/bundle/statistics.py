@@ -37,61 +37,77 @@ class Group:
     worst: float
 
 
-def point_cofactors(reduced: Reduced, cofactor: Array) -> Array:
-    """Cofactors (p, 3, 3) of the eliminated points, m squared; zero where a coordinate is held
-    is left to the caller."""
-    points = len(reduced.point_factor)
-    inner = np.broadcast_to(np.eye(3), (points, 3, 3)).copy()
-    for first, last, spread, coupling_s, coupling_d in _parts(reduced, cofactor):
-        n = last - first
-        wide = np.zeros((3 * n, cofactor.shape[0]))
-        wide[:, reduced.sparse_columns] = coupling_s.toarray()
-        wide[:, reduced.dense_columns] = coupling_d
-        inner[first:last] += np.einsum(
-            "pic,pjc->pij", spread.reshape(n, 3, -1), wide.reshape(n, 3, -1)
-        )
-    return np.asarray(
-        np.einsum("pij,pjk,plk->pil", reduced.point_factor, inner, reduced.point_factor)
-    )
+def spread_of(equations: Equations, reduced: Reduced, cofactor: Array) -> tuple[Array, Array]:
+    """Cofactors of the eliminated points, and how much of each observation's error stays.
 
+    Args:
+        equations: the rows.
+        reduced: what they were reduced to.
+        cofactor: (c, c) of the columns.
 
-def leverages(equations: Equations, reduced: Reduced, cofactor: Array) -> Array:
-    """How much of an observation's error stays in its adjusted value, (m,): 1 - redundancy number.
-
-    A row (a, b) of columns a and orthonormal point part b has a leverage of
-    b b' + (a - b W) Q (a - b W)', W being the point's coupling with the columns.
+    Returns:
+        (p, 3, 3) m squared, of held coordinates without meaning; and (m,) leverages, which are one
+        less the redundancy numbers. A row (a, b) of columns a and orthonormal point part b has the
+        leverage b b' + (a - b W) Q (a - b W)', W being the point's coupling with the columns.
     """
-    m = len(equations.misclosure)
-    result = np.einsum("mi,mi->m", reduced.point_rows, reduced.point_rows)
+    leverage = np.einsum("mi,mi->m", reduced.point_rows, reduced.point_rows)
+    leverage += _own_products(reduced, cofactor)
+    points = len(reduced.point_factor)
+    through = np.zeros((points, 3, 3))
     thin, dense = reduced.sparse_columns, reduced.dense_columns
-    step = max(1, _PART_BYTES // (8 * max(len(cofactor), 1)))
-    for first in range(0, m, step):
-        rows = slice(first, min(first + step, m))
-        own, own_dense = reduced.design_sparse[rows], reduced.design_dense[rows]
-        carried = own @ cofactor[thin] + own_dense @ cofactor[dense]
-        result[rows] += _row_products(own, carried[:, thin])
-        result[rows] += np.einsum("md,md->m", own_dense, carried[:, dense])
     order = np.argsort(equations.point, kind="stable")
-    begin = np.searchsorted(equations.point[order], np.arange(len(reduced.point_factor) + 1))
-    for low, high, spread, coupling_s, coupling_d in _parts(reduced, cofactor):
-        rows_of = order[begin[low] : begin[high]]
-        if not len(rows_of):
+    begin = np.searchsorted(equations.point[order], np.arange(points + 1))
+    for low, high, spread, coupling, coupling_dense in _parts(reduced, cofactor):
+        in_thin, in_dense = spread[:, thin], spread[:, dense]
+        for axis in range(3):
+            own = coupling[axis::3].tocsr()
+            for other in range(3):
+                through[low:high, other, axis] = _row_products(own, in_thin[other::3])
+        through[low:high] += np.einsum(
+            "pic,pjc->pij",
+            in_dense.reshape(high - low, 3, -1),
+            coupling_dense.reshape(high - low, 3, -1),
+        )
+        rows = order[begin[low] : begin[high]]
+        local = equations.point[rows] - low
+        b = reduced.point_rows[rows]
+        sparse_rows, dense_rows = reduced.design_sparse[rows], reduced.design_dense[rows]
+        mixed = np.zeros(len(rows))
+        for axis in range(3):
+            at = 3 * local + axis
+            mixed += b[:, axis] * _row_products(sparse_rows, in_thin, at)
+            mixed += b[:, axis] * np.einsum("md,md->m", dense_rows, in_dense[at])
+        back = np.einsum("mi,mij,mj->m", b, through[equations.point[rows]], b)
+        leverage[rows] += back - 2.0 * mixed
+    inner = through + np.eye(3)
+    factor = reduced.point_factor
+    cofactors = np.einsum("pij,pjk,plk->pil", factor, inner, factor)
+    return np.asarray(cofactors), np.asarray(np.clip(leverage, 0.0, 1.0))
+
+
+def _own_products(reduced: Reduced, cofactor: Array) -> Array:
+    """a Q a' of every row's columns a, (m,): rows with as many sparse entries go together."""
+    thin, dense = reduced.sparse_columns, reduced.dense_columns
+    rows, among_dense = reduced.design_sparse, cofactor[np.ix_(dense, dense)]
+    result = np.einsum("md,md->m", reduced.design_dense @ among_dense, reduced.design_dense)
+    entries = np.diff(rows.indptr)
+    for count in np.unique(entries):
+        if count == 0:
             continue
-        local = equations.point[rows_of] - low
-        b = reduced.point_rows[rows_of]
-        through = np.einsum("mi,mic->mc", b, spread.reshape(high - low, 3, -1)[local])
-        own, own_dense = reduced.design_sparse[rows_of], reduced.design_dense[rows_of]
-        mixed = _row_products(own, through[:, thin])
-        mixed += np.einsum("md,md->m", own_dense, through[:, dense])
-        wide_rows = (3 * local[:, None] + np.arange(3)).ravel()
-        pick = sparse.coo_array(
-            (b.ravel(), (np.repeat(np.arange(len(b)), 3), wide_rows)),
-            shape=(len(b), 3 * (high - low)),
-        ).tocsr()
-        back = _row_products((pick @ coupling_s).tocsr(), through[:, thin])
-        back += np.einsum("md,md->m", pick @ coupling_d, through[:, dense])
-        result[rows_of] += back - 2.0 * mixed
-    return np.asarray(np.clip(result, 0.0, 1.0))
+        of_count = np.flatnonzero(entries == count)
+        step = max(1, _PART_BYTES // (8 * int(count) * (int(count) + len(dense))))
+        for first in range(0, len(of_count), step):
+            own = of_count[first : first + step]
+            at = rows.indptr[own][:, None] + np.arange(count)
+            columns, values = thin[rows.indices[at]], rows.data[at]
+            between = cofactor[columns[:, :, None], columns[:, None, :]]
+            result[own] += np.einsum("mi,mij,mj->m", values, between, values)
+            if len(dense):
+                across = cofactor[columns[:, :, None], dense]
+                result[own] += 2.0 * np.einsum(
+                    "mi,mid,md->m", values, across, reduced.design_dense[own]
+                )
+    return np.asarray(result)
 
 
 def groups_of(
@@ -140,8 +156,11 @@ def _parts(
         yield low, high, coupling_s @ thin + coupling_d @ dense, coupling_s, coupling_d
 
 
-def _row_products(rows: sparse.csr_array, dense: Array) -> Array:
-    """Scalar products of sparse and dense rows alike, (m,)."""
-    at = np.repeat(np.arange(rows.shape[0]), np.diff(rows.indptr))
+def _row_products(
+    rows: sparse.csr_array, dense: Array, of: NDArray[np.int64] | None = None
+) -> Array:
+    """Scalar products of each sparse row with the dense row of its own number, or of `of`, (m,)."""
+    row = np.repeat(np.arange(rows.shape[0]), np.diff(rows.indptr))
+    at = row if of is None else of[row]
     products = np.asarray(rows.data * dense[at, rows.indices], dtype=np.float64)
-    return np.bincount(at, weights=products, minlength=rows.shape[0]).astype(np.float64)
+    return np.bincount(row, weights=products, minlength=rows.shape[0]).astype(np.float64)
