@@ -266,6 +266,9 @@ class Channel(Generic[T]):
                     continue
                 if fault.topic not in ("", topic):
                     continue
+                # A frame of an earlier pulse may be said when this one is given already.
+                if fault.at_pulse is not None and what.isdecimal() and int(what) < fault.at_pulse:
+                    continue
                 armed.is_spent = fault.duration_s is None
                 self._note(name, now_ns, what)
                 return fault
