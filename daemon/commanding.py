@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from typing import Protocol
+from typing import Protocol, TypeGuard
 
 from daemon.log_records import Message, loose_bytes
 from daemon.messages import Answer, Command
@@ -22,6 +22,8 @@ class Commanded(Protocol):
     def start_line(self) -> None: ...
     def stop_line(self) -> None: ...
     def trigger_once(self) -> None: ...
+    def trigger_each(self, interval_s: float, count: int) -> None: ...
+    def trigger_along(self, distance_m: float) -> None: ...
     def land(self) -> None: ...
 
     @property
@@ -81,6 +83,32 @@ def _trigger(command: Command, flight: Commanded) -> Answer:
     return _yes(command, "one exposure is made as soon as the camera can")
 
 
+def _interval(command: Command, flight: Commanded) -> Answer:
+    interval_s, count = command.arguments.get("interval_s"), command.arguments.get("count", 0)
+    if not _is_positive(interval_s) or not isinstance(count, int) or count < 0:
+        return _no(command, "interval needs interval_s above 0 and a count, 0 for no end")
+    if flight.is_flown:
+        return _no(command, "the planned number of exposures is flown")
+    refusal = _not_armed(command, flight)
+    if refusal is not None:
+        return refusal
+    flight.trigger_each(float(interval_s), count)
+    return _yes(command, f"an exposure every {interval_s:g} s, or as fast as the camera can")
+
+
+def _distance(command: Command, flight: Commanded) -> Answer:
+    distance_m = command.arguments.get("distance_m")
+    if not _is_positive(distance_m):
+        return _no(command, "distance needs distance_m above 0")
+    if flight.is_flown:
+        return _no(command, "the planned number of exposures is flown")
+    refusal = _not_armed(command, flight)
+    if refusal is not None:
+        return refusal
+    flight.trigger_along(float(distance_m))
+    return _yes(command, f"an exposure every {distance_m:g} m")
+
+
 def _land(command: Command, flight: Commanded) -> Answer:
     flight.land()
     return _yes(command, "no more exposures; what is open is sealed, then the service ends")
@@ -100,6 +128,10 @@ def _not_armed(command: Command, flight: Commanded) -> Answer | None:
     return None
 
 
+def _is_positive(value: object) -> TypeGuard[float]:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < 1e6
+
+
 def _yes(command: Command, sentence: str) -> Answer:
     return Answer(command.number, True, sentence)
 
@@ -112,6 +144,8 @@ _COMMANDS: Mapping[str, Callable[[Command, Commanded], Answer]] = {
     "start": _start,
     "stop": _stop,
     "trigger": _trigger,
+    "interval": _interval,
+    "distance": _distance,
     "land": _land,
     "acknowledge": _acknowledge,
 }

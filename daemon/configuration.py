@@ -115,6 +115,35 @@ class ProcessingSection(_Section):
     exposures_in_work: int = Field(default=2, ge=1, le=16)
 
 
+class MavlinkCameraSection(_Section):
+    """The rig as one camera of a vehicle (docs/mavlink-camera.md).
+
+    `connect` is "udpout:HOST:PORT", where a ground station or autopilot listens, or
+    "udpin:HOST:PORT". `commands` from others are obeyed when "signed" (with `signing_key`, a file
+    of 64 hexadecimal digits), from "any", or from "none".
+    """
+
+    connect: str = "udpout:127.0.0.1:14550"
+    system_id: int = Field(default=1, ge=1, le=255)
+    component_id: int = Field(default=100, ge=100, le=105)
+    commands: Literal["signed", "any", "none"] = "none"
+    signing_key: Path | None = None
+    feedback: bool = False
+
+    @model_validator(mode="after")
+    def _is_usable(self) -> MavlinkCameraSection:
+        scheme, _, rest = self.connect.partition(":")
+        host, _, port = rest.rpartition(":")
+        good_port = port.isdecimal() and 0 < int(port) < 65536
+        if scheme not in ("udpin", "udpout") or not host or not good_port:
+            raise ValueError(
+                f"connect is {self.connect!r}; write udpout:HOST:PORT or udpin:HOST:PORT"
+            )
+        if self.commands == "signed" and self.signing_key is None:
+            raise ValueError("commands are 'signed' and there is no signing_key; give its file")
+        return self
+
+
 class WatchSection(_Section):
     """Who may look in, and from where (docs/watching.md). Commands always need a token."""
 
@@ -125,6 +154,7 @@ class WatchSection(_Section):
     certificate: Path | None = None
     key: Path | None = None
     announce: bool = True
+    mavlink: MavlinkCameraSection | None = None
 
     @model_validator(mode="after")
     def _is_safe(self) -> WatchSection:
@@ -229,7 +259,12 @@ def _anchored(configuration: Configuration, folder: Path) -> Configuration:
     watch = configuration.watch
     if watch is not None:
         files = {name: getattr(watch, name) for name in ("tokens", "certificate", "key")}
-        update = {name: folder / path for name, path in files.items() if path is not None}
+        update: dict[str, Any] = {
+            name: folder / path for name, path in files.items() if path is not None
+        }
+        if watch.mavlink is not None and watch.mavlink.signing_key is not None:
+            key = {"signing_key": folder / watch.mavlink.signing_key}
+            update["mavlink"] = watch.mavlink.model_copy(update=key)
         watch = watch.model_copy(update=update)
     return configuration.model_copy(update={"mission": anchored, "watch": watch})
 

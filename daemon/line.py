@@ -50,10 +50,27 @@ class Line:
         self._policy = _policy(configuration, rig)
         self.runs = configuration.trigger.start == "at once"
         self._asked_for = 0
+        self._runs_until: int | None = None
 
     def trigger_once(self) -> None:
         """Order one exposure as soon as the camera can, whether the line runs or not."""
         self._asked_for += 1
+
+    def trigger_each(self, interval_s: float, count: int) -> None:
+        """Expose every so often from now on, `count` times or until stopped (0).
+
+        Never faster than the camera.
+        """
+        least_ns = round(self._rig.frame_interval_s * NS)
+        self._policy = IntervalTrigger(max(round(interval_s * NS), least_ns))
+        self._runs_until = self._ordered + count if count else None
+        self.runs = True
+
+    def trigger_along(self, distance_m: float) -> None:
+        """Expose every so many metres over ground from now on."""
+        self._policy = DistanceTrigger(distance_m, round(self._rig.frame_interval_s * NS))
+        self._runs_until = None
+        self.runs = True
 
     @property
     def is_flown(self) -> bool:
@@ -115,6 +132,8 @@ class Line:
         strobe_ns = delays_ns[reference] + self._exposure_ns[reference] // 2
         number = self._flight.order(now_ns)
         self._ordered += 1
+        if self._runs_until is not None and self._ordered >= self._runs_until:
+            self.runs, self._runs_until = False, None
         self._last_ns = now_ns
         self._policy.fired(now_ns, nav)
         return Order(number, now_ns, delays_ns, strobe_ns)

@@ -473,6 +473,12 @@ class Service:
     def trigger_once(self) -> None:
         self.line.trigger_once()
 
+    def trigger_each(self, interval_s: float, count: int) -> None:
+        self.line.trigger_each(interval_s, count)
+
+    def trigger_along(self, distance_m: float) -> None:
+        self.line.trigger_along(distance_m)
+
     def land(self) -> None:
         """End in good order: what is open is sealed first."""
         self.stopping.set()
@@ -498,7 +504,7 @@ class Service:
             position=self.flight.track.last,
             temperatures_c={t.probe: t.value_c for t in self.flight.temperatures.at(now_ns)},
             clock_sigma_ns=None if time_now is None else time_now.sigma_ns,
-            queue=len(self.waiting) + self.is_worker_busy,
+            queue=len(self.waiting) + len(self.in_work),
         )
 
     def _fire(self, order: Order) -> None:

@@ -149,12 +149,11 @@ class _Seen:
     def _table(self) -> Table:
         table = light_table("", ("exposure", "verdict"), ("frames", "s0 px", "dC", "tie points"))
         for _, one in sorted(self.exposures.items())[-ROWS:]:
-            figures, verdict = one.get("figures", {}), one.get("verdict")
+            figures, verdict = one.get("figures", {}), str(one.get("verdict") or "")
+            word = f"{MARKS.get(verdict, '')} {verdict or one['step']}"
             table.add_row(
                 str(one["number"]),
-                Text(
-                    f"{MARKS.get(str(verdict), '')} {verdict or one['step']}", COLOURS.get(str(verdict), "")
-                ),
+                Text(word, COLOURS.get(verdict, "")),
                 str(one.get("frames", "")),
                 _number(figures.get("sigma0_px"), ".3f"),
                 _number(figures.get("dc_k"), "+.1f"),

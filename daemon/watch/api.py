@@ -66,6 +66,9 @@ class CommandBody(BaseModel):
 
     fault: str | None = Field(default=None, max_length=200, description="which, for acknowledge")
     override: bool = Field(default=False, description="start although something is missing")
+    interval_s: float | None = Field(default=None, gt=0, le=3600, description="for interval")
+    count: int = Field(default=0, ge=0, le=10**6, description="for interval; 0: until stopped")
+    distance_m: float | None = Field(default=None, gt=0, le=10**5, description="for distance")
 
 
 class Outcome(BaseModel):
@@ -76,7 +79,7 @@ class Outcome(BaseModel):
 
 
 Number = Annotated[int, PathParameter(ge=1, lt=10**9, description="of the exposure")]
-CommandName = Literal["start", "stop", "trigger", "land", "acknowledge"]
+CommandName = Literal["start", "stop", "trigger", "interval", "distance", "land", "acknowledge"]
 
 
 @dataclass(frozen=True)

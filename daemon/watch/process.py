@@ -25,6 +25,7 @@ from daemon.records import RecordError
 from daemon.watch.api import WatchSettings, create_app
 from daemon.watch.discovery import Announcement
 from daemon.watch.gate import Gate
+from daemon.watch.mavlink_camera import MavlinkCamera
 from daemon.watch.state import FlightState
 from daemon.watch.tokens import TokenError, Tokens, read_tokens
 from processing.rig import Rig, RigError, load_rig
@@ -59,32 +60,19 @@ async def _serve(link: Link, settings: WatchSection) -> None:
     )
     server.install_signal_handlers = lambda: None  # type: ignore[attr-defined]
     listening = _listen(settings.host, settings.port)
+    port = settings.port if listening is None else int(listening.getsockname()[1])
     if listening is None:
-        link.send(
-            Told(
-                {
-                    "event": "device",
-                    "device": "watch",
-                    "name": "absent",
-                    "fault": True,
-                    "sentence": f"port {settings.port} of {settings.host} is taken; watching "
-                    "is not possible until another is configured ([watch] port)",
-                }
-            )
+        sentence = (
+            f"port {settings.port} of {settings.host} is taken; watching is not possible until "
+            "another is configured ([watch] port)"
         )
-    port = settings.port if listening is None else listening.getsockname()[1]
-    link.send(
-        Told(
-            {
-                "event": "watching",
-                "host": settings.host,
-                "port": port,
-                "tls": settings.certificate is not None,
-            }
-        )
-    )
+        link.send(Told(_absent("watch", sentence)))
+    else:
+        told = {"host": settings.host, "port": port, "tls": settings.certificate is not None}
+        link.send(Told({"event": "watching", **told}))
     ending = asyncio.Event()
     announcement = Announcement(state, settings, port)
+    camera = await _camera(settings, state, gate, ground, link)
     loop = asyncio.get_running_loop()
     loop.add_reader(link.fileno(), _hear, link, state, gate, ending)
     serving = (
@@ -97,11 +85,29 @@ async def _serve(link: Link, settings: WatchSection) -> None:
     finally:
         loop.remove_reader(link.fileno())
         server.should_exit = True
+        if camera is not None:
+            camera.end()
         with suppress(OSError):
             await announcement.end()
         if serving is not None:
             with suppress(TimeoutError):
                 await asyncio.wait_for(serving, 3.0)
+
+
+async def _camera(
+    settings: WatchSection, state: FlightState, gate: Gate, ground: _Ground, link: Link
+) -> MavlinkCamera | None:
+    """The rig as a camera of the vehicle, where that is wanted and possible."""
+    if settings.mavlink is None:
+        return None
+    try:
+        camera = MavlinkCamera(settings.mavlink, state, gate, lambda: ground.rig)
+        await camera.begin()
+    except (ImportError, OSError, ValueError) as error:
+        sentence = f"no MAVLink camera: {error}; look at [watch.mavlink]"
+        link.send(Told(_absent("mavlink camera", sentence)))
+        return None
+    return camera
 
 
 class _Ground:
@@ -112,15 +118,25 @@ class _Ground:
         self._of: str | None = None
         self._known: tuple[Rig, MountSection, float] | None = None
 
-    def seen_from(self, navigation: Mapping[str, Any]) -> list[list[float]] | None:
-        """Corners [latitude, longitude] of an exposure; None where they are not to be had."""
+    @property
+    def rig(self) -> Rig | None:
+        """The rig that flies, once that is known."""
+        known = self._look()
+        return None if known is None else known[0]
+
+    def _look(self) -> tuple[Rig, MountSection, float] | None:
         path = self.state.mission_path if self.state else None
         if path is not None and path != self._of:
             self._of = path
             self._known = _rig_and_ground(Path(path))
-        if self._known is None:
+        return self._known
+
+    def seen_from(self, navigation: Mapping[str, Any]) -> list[list[float]] | None:
+        """Corners [latitude, longitude] of an exposure; None where they are not to be had."""
+        known = self._look()
+        if known is None:
             return None
-        rig, mount, ground_m = self._known
+        rig, mount, ground_m = known
         try:
             corners = seen_from(rig, mount, navigation_from_json(navigation), ground_m)
         except RecordError:
@@ -154,6 +170,16 @@ def _hear(link: Link, state: FlightState, gate: Gate, ending: asyncio.Event) -> 
                 return
     except (EOFError, ConnectionError):
         ending.set()
+
+
+def _absent(device: str, sentence: str) -> dict[str, Any]:
+    return {
+        "event": "device",
+        "device": device,
+        "name": "absent",
+        "fault": True,
+        "sentence": sentence,
+    }
 
 
 def _listen(host: str, port: int) -> socket.socket | None:

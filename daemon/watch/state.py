@@ -23,6 +23,10 @@ FIGURES_TOLD = (
 PARTS = ("exposures", "devices", "track", "history", "events")
 """Parts of the state besides what is brief, in the order of their worth on a thin link."""
 
+PLACE_KEYS = (
+    *("latitude_deg", "longitude_deg", "height_m"),
+    *("roll_rad", "pitch_rad", "heading_rad", "leap_seconds"),
+)
 VERDICT_RANK = {"good": 0, "usable": 1, "refly": 2}
 
 Json = dict[str, Any]
@@ -196,6 +200,7 @@ class FlightState:
         self._temperatures[told["number"]] = event.get("temperatures_c", {})
         if event.get("navigation"):
             told["footprint"] = self._footprint(event["navigation"])
+            told["place"] = {key: event["navigation"].get(key) for key in PLACE_KEYS}
 
     def _on_processed(self, event: Mapping[str, Any]) -> None:
         told = self._exposure(event)

@@ -1,0 +1,504 @@
+"""The rig as one camera of a vehicle: MAVLink's camera protocol over UDP.
+
+Ground stations and autopilots see a camera that takes pictures, tells of each of them once, and
+again when asked. The index of a picture is the exposure's number less one, so that it is never used
+twice in a mission. Source: the MAVLink camera protocol v2; the dialect is pymavlink's.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+import os
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, cast
+
+from daemon.configuration import MavlinkCameraSection
+from daemon.watch.gate import Gate, NoAnswerError
+from daemon.watch.state import FlightState
+from drivers.leap_seconds import leap_seconds_at
+from processing.rig import Rig
+
+HEARTBEAT_S = 1.0
+TICK_S = 0.1
+PEER_FORGOTTEN_S = 60.0
+PEERS_MAX = 8
+GPS_EPOCH_UNIX_S = 315_964_800
+UNKNOWN_ANGLE = (1.0, 0.0, 0.0, 0.0)
+VENDOR, FIRMWARE = "Syntopic", 1 << 24
+NAME_BYTES = 32
+MODE_IMAGE = 0
+SIGNING_KEY_BYTES = 32
+_log = logging.getLogger(__name__)
+
+Address = tuple[str, int]
+
+
+class MavlinkCamera(asyncio.DatagramProtocol):
+    """A camera component.
+
+    `counts` are statistics by stable name: messages heard, bad bytes, commands refused.
+    """
+
+    def __init__(
+        self,
+        settings: MavlinkCameraSection,
+        state: FlightState,
+        gate: Gate,
+        rig: Callable[[], Rig | None],
+    ) -> None:
+        """`rig` is asked for the camera's figures; None until a mission has begun."""
+        self._settings = settings
+        self._state = state
+        self._gate = gate
+        self._rig = rig
+        self._dialect = _dialect()
+        self._mav = self._dialect.MAVLink(
+            None, srcSystem=settings.system_id, srcComponent=settings.component_id
+        )
+        self._mav.robust_parsing = True
+        self._sign()
+        self._boot_s = time.monotonic()
+        self._peers: dict[Address, float] = {}
+        self._fixed: tuple[Address, ...] = ()
+        self._told: set[int] = set()
+        self._told_mission: str | None = None
+        self._interval_s = 0.0
+        self._task: asyncio.Task[None] | None = None
+        self._commands: set[asyncio.Task[None]] = set()
+        self._transport: asyncio.DatagramTransport | None = None
+        self.counts: dict[str, int] = {}
+
+    async def begin(self) -> None:
+        """Open the socket and begin to be alive. OSError: the address is taken."""
+        scheme, _, rest = self._settings.connect.partition(":")
+        host, _, port = rest.rpartition(":")
+        address = (host, int(port))
+        loop = asyncio.get_running_loop()
+        if scheme == "udpin":
+            await loop.create_datagram_endpoint(lambda: self, local_addr=address)
+        else:
+            self._fixed = (address,)
+            local = "127.0.0.1" if host.startswith("127.") else "0.0.0.0"
+            await loop.create_datagram_endpoint(lambda: self, local_addr=(local, 0))
+        self._task = asyncio.create_task(self._live())
+
+    def end(self) -> None:
+        for task in (self._task, *self._commands):
+            if task is not None:
+                task.cancel()
+        if self._transport is not None:
+            self._transport.close()
+
+    # What comes in
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = cast(asyncio.DatagramTransport, transport)
+
+    def error_received(self, exc: Exception) -> None:
+        self._count("send_errors")
+
+    def datagram_received(self, data: bytes, addr: Address) -> None:
+        """Parse and answer; bad bytes are counted, never raised."""
+        try:
+            messages = self._mav.parse_buffer(bytearray(data)) or []
+        except (self._dialect.MAVError, ValueError, TypeError, IndexError):
+            self._count("bad_bytes")
+            return
+        for message in messages:
+            if message.get_type() == "BAD_DATA":
+                self._count("bad_bytes")
+                continue
+            self._count("messages")
+            self._remember(addr)
+            if message.get_type() == "COMMAND_LONG" and self._is_for_us(message):
+                self._command(message, addr)
+
+    def _is_for_us(self, message: Any) -> bool:
+        return message.target_system in (0, self._settings.system_id) and (
+            message.target_component in (0, self._settings.component_id)
+        )
+
+    def _remember(self, address: Address) -> None:
+        now_s = time.monotonic()
+        self._peers[address] = now_s
+        for old, seen_s in list(self._peers.items()):
+            if now_s - seen_s > PEER_FORGOTTEN_S:
+                del self._peers[old]
+        while len(self._peers) > PEERS_MAX:
+            del self._peers[min(self._peers, key=self._peers.__getitem__)]
+
+    # Commands
+
+    def _command(self, message: Any, address: Address) -> None:
+        number = int(message.command)
+        if number in _REQUESTS:
+            self._request(message, address, _REQUESTS[number])
+        elif number in _ACTIONS:
+            self._act(message, address, _ACTIONS[number])
+        else:
+            self._acknowledge(message, address, self._dialect.MAV_RESULT_UNSUPPORTED)
+
+    def _request(self, message: Any, address: Address, wanted: str | None) -> None:
+        """512 and its older siblings: tell one message again."""
+        if wanted is None:
+            wanted = _BY_IDENTITY.get(_whole(message.param1))
+        if wanted == "CAMERA_IMAGE_CAPTURED":
+            given = message.param1 if message.command == 2002 else message.param2
+            index = _whole(given)
+            one = None if index is None else self._state.exposure(index + 1)
+            if one is None or not self._is_taken(one):
+                self._acknowledge(message, address, self._dialect.MAV_RESULT_DENIED)
+                return
+            self._acknowledge(message, address, self._dialect.MAV_RESULT_ACCEPTED)
+            self._send(self._captured(one), address)
+            return
+        tell = {
+            "CAMERA_INFORMATION": self._information,
+            "CAMERA_SETTINGS": self._camera_settings,
+            "STORAGE_INFORMATION": self._storage,
+            "CAMERA_CAPTURE_STATUS": self._capture_status,
+        }.get(wanted or "")
+        if tell is None:
+            self._acknowledge(message, address, self._dialect.MAV_RESULT_UNSUPPORTED)
+            return
+        self._acknowledge(message, address, self._dialect.MAV_RESULT_ACCEPTED)
+        self._send(tell(), address)
+
+    def _act(self, message: Any, address: Address, action: str) -> None:
+        """What changes something: only from those the configuration lets."""
+        if not self._may_command(message):
+            self._count("commands_refused")
+            self._acknowledge(message, address, self._dialect.MAV_RESULT_DENIED)
+            return
+        if action == "mode":
+            is_image = _whole(message.param2) == MODE_IMAGE
+            result = "ACCEPTED" if is_image else "UNSUPPORTED"
+            self._acknowledge(message, address, getattr(self._dialect, f"MAV_RESULT_{result}"))
+            if is_image:
+                self._send(self._camera_settings(), address)
+            return
+        wish = _wish(action, message)
+        if wish is None:
+            self._acknowledge(message, address, self._dialect.MAV_RESULT_DENIED)
+            return
+        task = asyncio.create_task(self._ask_service(message, address, *wish))
+        self._commands.add(task)
+        task.add_done_callback(self._commands.discard)
+
+    async def _ask_service(
+        self, message: Any, address: Address, name: str, arguments: Mapping[str, Any]
+    ) -> None:
+        by = f"mavlink {message.get_srcSystem()}/{message.get_srcComponent()}"
+        try:
+            answer = await self._gate.command(name, arguments, by)
+            done = answer.done
+        except NoAnswerError:
+            done = False
+        result = "ACCEPTED" if done else "TEMPORARILY_REJECTED"
+        self._acknowledge(message, address, getattr(self._dialect, f"MAV_RESULT_{result}"))
+        if done:
+            self._interval_s = float(arguments.get("interval_s", 0.0))
+            self._send(self._capture_status(), address)
+
+    def _may_command(self, message: Any) -> bool:
+        if self._settings.commands == "signed":
+            return bool(message.get_signed())
+        return self._settings.commands == "any"
+
+    def _acknowledge(self, message: Any, address: Address, result: int) -> None:
+        self._send(
+            self._mav.command_ack_encode(
+                int(message.command),
+                result,
+                target_system=message.get_srcSystem(),
+                target_component=message.get_srcComponent(),
+            ),
+            address,
+        )
+
+    # What goes out by itself
+
+    async def _live(self) -> None:
+        beat_s = -math.inf
+        while True:
+            now_s = time.monotonic()
+            if now_s - beat_s >= HEARTBEAT_S:
+                beat_s = now_s
+                self._tell_all(self._heartbeat())
+            self._tell_captures()
+            await asyncio.sleep(TICK_S)
+
+    def _tell_captures(self) -> None:
+        mission = self._state.mission_path
+        if mission != self._told_mission:
+            self._told_mission = mission
+            self._told.clear()
+        for one in self._state.exposures():
+            if one["number"] in self._told or not self._is_taken(one):
+                continue
+            self._told.add(one["number"])
+            self._tell_all(self._captured(one))
+            if self._settings.feedback and one.get("state") != "lost":
+                self._tell_all(self._feedback(one))
+            self._tell_all(self._capture_status())
+
+    def _is_taken(self, one: Mapping[str, Any]) -> bool:
+        """Whether it is final when and where it was taken, or that it is lost."""
+        return one.get("state") == "lost" or "mark_gps_ns" in one
+
+    def _tell_all(self, message: Any) -> None:
+        for address in {*self._fixed, *self._peers}:
+            self._send(message, address)
+
+    def _send(self, message: Any, address: Address) -> None:
+        if self._transport is not None and not self._transport.is_closing():
+            self._transport.sendto(bytes(message.pack(self._mav)), address)
+
+    # Messages
+
+    def _boot_ms(self) -> int:
+        return round((time.monotonic() - self._boot_s) * 1000) & 0xFFFFFFFF
+
+    def _heartbeat(self) -> Any:
+        flying = self._state.phase in ("ready", "flying", "paused")
+        status = self._dialect.MAV_STATE_ACTIVE if flying else self._dialect.MAV_STATE_STANDBY
+        if self._state.phase == "fault":
+            status = self._dialect.MAV_STATE_CRITICAL
+        return self._mav.heartbeat_encode(
+            self._dialect.MAV_TYPE_CAMERA, self._dialect.MAV_AUTOPILOT_INVALID, 0, 0, status
+        )
+
+    def _information(self) -> Any:
+        rig = self._rig()
+        virtual = rig.virtual_image if rig is not None else None
+        width, height = (virtual.width_px, virtual.height_px) if virtual else (0, 0)
+        pitch_mm = virtual.pitch_mm if virtual else math.nan
+        flags = (
+            self._dialect.CAMERA_CAP_FLAGS_CAPTURE_IMAGE
+            | self._dialect.CAMERA_CAP_FLAGS_HAS_MODES
+            | self._dialect.CAMERA_CAP_FLAGS_HAS_IMAGE_SURVEY_MODE
+        )
+        return self._mav.camera_information_encode(
+            self._boot_ms(),
+            _name(VENDOR),
+            _name(rig.name if rig is not None else "waiting"),
+            FIRMWARE,
+            virtual.f_mm if virtual else math.nan,
+            width * pitch_mm,
+            height * pitch_mm,
+            min(width, 65535),
+            min(height, 65535),
+            0,
+            flags,
+            0,
+            b"",
+        )
+
+    def _camera_settings(self) -> Any:
+        return self._mav.camera_settings_encode(self._boot_ms(), MODE_IMAGE, math.nan, math.nan)
+
+    def _storage(self) -> Any:
+        total_mb, used_mb, free_mb = _disk_mb(self._state.mission_path)
+        return self._mav.storage_information_encode(
+            self._boot_ms(),
+            1,
+            1,
+            self._dialect.STORAGE_STATUS_READY,
+            total_mb,
+            used_mb,
+            free_mb,
+            math.nan,
+            math.nan,
+            self._dialect.STORAGE_TYPE_HD,
+            b"missions",
+        )
+
+    def _capture_status(self) -> Any:
+        runs = self._state.phase == "flying"
+        _, _, free_mb = _disk_mb(self._state.mission_path)
+        triggers = (self._state.brief()["status"].get("ledger") or {}).get("triggers", {})
+        return self._mav.camera_capture_status_encode(
+            self._boot_ms(),
+            3 if runs and self._interval_s else 2 if runs else 0,
+            0,
+            self._interval_s if runs else 0.0,
+            0,
+            free_mb,
+            int(triggers.get("triggers", 0)),
+        )
+
+    def _captured(self, one: Mapping[str, Any]) -> Any:
+        place = one.get("place") or {}
+        latitude, longitude = place.get("latitude_deg"), place.get("longitude_deg")
+        height_m = place.get("height_m") or 0.0
+        return self._mav.camera_image_captured_encode(
+            self._boot_ms(),
+            _utc_us(one.get("mark_gps_ns")),
+            0,
+            round((latitude or 0.0) * 1e7),
+            round((longitude or 0.0) * 1e7),
+            round(height_m * 1000),
+            0,
+            _quaternion(place),
+            one["number"] - 1,
+            0 if one.get("state") == "lost" else 1,
+            f"L0/{one['number']:06d}".encode(),
+        )
+
+    def _feedback(self, one: Mapping[str, Any]) -> Any:
+        place = one.get("place") or {}
+        angles = [math.degrees(place.get(f"{name}_rad") or 0.0) for name in _ANGLES]
+        virtual = rig.virtual_image if (rig := self._rig()) is not None else None
+        return self._mav.camera_feedback_encode(
+            _utc_us(one.get("mark_gps_ns")),
+            self._settings.system_id,
+            0,
+            (one["number"] - 1) & 0xFFFF,
+            round((place.get("latitude_deg") or 0.0) * 1e7),
+            round((place.get("longitude_deg") or 0.0) * 1e7),
+            place.get("height_m") or 0.0,
+            0.0,
+            *angles,
+            virtual.f_mm if virtual else 0.0,
+            0,
+            one["number"] & 0xFFFF,
+        )
+
+    def _sign(self) -> None:
+        path = self._settings.signing_key
+        if path is None:
+            return
+        try:
+            key = bytes.fromhex(path.read_text("ascii").strip())
+        except (OSError, ValueError) as error:
+            raise ValueError(f"{path}: no signing key ({error}); 64 hexadecimal digits") from error
+        if len(key) != SIGNING_KEY_BYTES:
+            raise ValueError(f"{path}: a signing key has 64 hexadecimal digits")
+        signing = self._mav.signing
+        signing.secret_key = key
+        signing.link_id = 0
+        signing.timestamp = round((time.time() - 1_420_070_400) * 1e5)
+        signing.sign_outgoing = True
+        # Whoever is not signed may look: requests change nothing. What acts is checked again.
+        signing.allow_unsigned_callback = lambda _mav, _identity: True
+
+    def _count(self, name: str) -> None:
+        self.counts[name] = self.counts.get(name, 0) + 1
+
+
+_ANGLES = ("roll", "pitch", "heading")
+_REQUESTS: Mapping[int, str | None] = {
+    512: None,
+    521: "CAMERA_INFORMATION",
+    522: "CAMERA_SETTINGS",
+    525: "STORAGE_INFORMATION",
+    527: "CAMERA_CAPTURE_STATUS",
+    2002: "CAMERA_IMAGE_CAPTURED",
+}
+_BY_IDENTITY: Mapping[int | None, str] = {
+    259: "CAMERA_INFORMATION",
+    260: "CAMERA_SETTINGS",
+    261: "STORAGE_INFORMATION",
+    262: "CAMERA_CAPTURE_STATUS",
+    263: "CAMERA_IMAGE_CAPTURED",
+}
+_ACTIONS: Mapping[int, str] = {
+    203: "once",
+    206: "distance",
+    214: "interval",
+    530: "mode",
+    2000: "capture",
+    2001: "stop",
+    2003: "control",
+}
+
+
+def _wish(action: str, message: Any) -> tuple[str, dict[str, Any]] | None:
+    """The service's command for a MAVLink one; None where its parameters make no sense."""
+    if action == "stop":
+        return "stop", {}
+    if action == "once":
+        return "trigger", {}
+    if action == "capture":
+        count = _whole(message.param3)
+        interval_s = _finite(message.param2)
+        if count is None or count < 0:
+            return None
+        if count == 1:
+            return "trigger", {}
+        if interval_s is None or interval_s <= 0:
+            return None
+        return "interval", {"interval_s": interval_s, "count": count}
+    if action == "distance":
+        distance_m = _finite(message.param1)
+        if distance_m is None or distance_m < 0:
+            return None
+        return ("distance", {"distance_m": distance_m}) if distance_m > 0 else ("stop", {})
+    if action == "interval":
+        interval_ms = _finite(message.param1)
+        if interval_ms is None or interval_ms == 0:
+            return None
+        if interval_ms < 0:
+            return "stop", {}
+        return "interval", {"interval_s": interval_ms / 1000, "count": 0}
+    enabled = _whole(message.param1)  # 2003 DO_TRIGGER_CONTROL
+    if enabled not in (0, 1):
+        return None
+    return ("start", {}) if enabled else ("stop", {})
+
+
+def _whole(value: float) -> int | None:
+    """A parameter as a whole number; None for what is none, such as NaN."""
+    return int(value) if math.isfinite(value) and abs(value) < 2**31 else None
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _name(text: str) -> list[int]:
+    return list(text.encode("ascii", "replace")[:NAME_BYTES].ljust(NAME_BYTES, b"\0"))
+
+
+def _utc_us(gps_ns: object) -> int:
+    """A GPS instant as microseconds of Unix time; 0 where it is not known."""
+    if not isinstance(gps_ns, str):
+        return 0
+    instant = int(gps_ns)
+    leap_s = leap_seconds_at(instant - leap_seconds_at(instant) * 1_000_000_000)
+    return (instant - leap_s * 1_000_000_000) // 1000 + GPS_EPOCH_UNIX_S * 1_000_000
+
+
+def _quaternion(place: Mapping[str, Any]) -> tuple[float, ...]:
+    """Camera attitude w, x, y, z against north, east, down."""
+    angles = [place.get(f"{name}_rad") for name in _ANGLES]
+    if any(angle is None for angle in angles):
+        return UNKNOWN_ANGLE
+    (cr, sr), (cp, sp), (ch, sh) = (
+        (math.cos(a / 2), math.sin(a / 2)) for a in angles if a is not None
+    )
+    return (
+        cr * cp * ch + sr * sp * sh,
+        sr * cp * ch - cr * sp * sh,
+        cr * sp * ch + sr * cp * sh,
+        cr * cp * sh - sr * sp * ch,
+    )
+
+
+def _disk_mb(path: str | None) -> tuple[float, float, float]:
+    """Total, used and available of the mission's disk, MiB."""
+    try:
+        status = os.statvfs(path or "/")
+    except OSError:
+        return 0.0, 0.0, 0.0
+    unit = status.f_frsize / 2**20
+    return status.f_blocks * unit, (status.f_blocks - status.f_bfree) * unit, status.f_bavail * unit
+
+
+def _dialect() -> Any:
+    from pymavlink.dialects.v20 import ardupilotmega
+
+    return ardupilotmega
