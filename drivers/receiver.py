@@ -33,7 +33,11 @@ class ListeningNavigator(SerialDevice):
     switch_on: str = "switch it on for this port"
     """What the operator is to do where none of them comes."""
 
-    port = Setting("", required=True, says="serial port such as /dev/ttyUSB0, or tcp://host:port")
+    port = Setting(
+        "",
+        required=True,
+        says="serial port such as /dev/ttyUSB0, tcp://host:port or udpin://host:port",
+    )
     baudrate = Setting(115200, minimum=4800, maximum=4_000_000, says="speed of the line, bit/s")
     parity = Setting("N", choices=("N", "E", "O"), says="parity on the wire")
     silence_s = Setting(

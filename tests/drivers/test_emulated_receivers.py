@@ -7,6 +7,7 @@ tests/sim_hw; here both ends meet.
 from __future__ import annotations
 
 import math
+import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -21,7 +22,7 @@ from drivers.novatel.navigator import NovatelNavigator
 from drivers.receiver import ListeningNavigator
 from drivers.septentrio.navigator import SeptentrioNavigator
 from drivers.ublox.navigator import UbloxNavigator
-from sim_hw.network_line import TcpLine
+from sim_hw.network_line import TcpLine, UdpLine
 from sim_hw.nmea_receiver import NmeaReceiver
 from sim_hw.novatel_receiver import NovatelReceiver
 from sim_hw.pseudo_terminal import PseudoTerminal
@@ -162,3 +163,19 @@ def test_a_receiver_behind_a_noisy_line_is_heard_and_its_damage_counted(kind: st
         if sample.time_valid:
             there = flying(sample.gps_ns).latitude_deg
             assert abs(sample.latitude_deg - there) * METRES_PER_DEGREE < PLACE_WITHIN_M[kind]
+
+
+def test_a_receiver_that_sends_datagrams_is_heard_like_one_on_a_line() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        here = probe.getsockname()
+    receiver = SeptentrioReceiver(WorldClock.starting_now(), flying, line=UdpLine(here))
+    navigator = SeptentrioNavigator("gnss", {"port": receiver.port})
+    receiver.start()
+    try:
+        found = navigator.bind()
+    finally:
+        navigator.close()
+        receiver.close()
+    assert found["port"] == "udpin://{}:{}".format(*here)
+    assert "PVTGeodetic" in found["messages"]
