@@ -76,7 +76,7 @@ class Judged:
 def network_of(block: Block, name: SetName) -> Network:
     """What an aerotriangulation is given of a block: measurements, control, navigation."""
     plan, n = block.plan, len(block.names)
-    rig = find_rig("ultracam-l")
+    rig = find_rig(plan.rig)
     camera = self_calibrating(
         Camera("stitched", plan.frame.f_mm, pixel_mm=plan.frame.pixel_mm),
         name,

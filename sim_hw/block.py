@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.rig import Rig
 from sim_hw.camera import rotation_opk
 from sim_hw.seeding import random_stream
 
@@ -78,6 +79,7 @@ class Plan:
     relief_m: float
     control: int
     checks: int
+    rig: str = "ultracam-l"
     speed_mps: float = 65.0
     lever_m: tuple[float, float, float] = (0.2, -0.3, 1.6)
     errors: Errors = field(default_factory=Errors)
@@ -105,6 +107,30 @@ class Pattern:
         moved[xy_mm[:, 0] <= 0.0] = 0.0
         r2 = np.sum(xy_mm**2, axis=1, keepdims=True)
         return np.asarray(moved + self.radial * r2 * xy_mm)
+
+
+@dataclass(frozen=True)
+class CcdPattern:
+    """Every CCD of a rig off on its own: shifts, and a small affine and perspective distortion.
+
+    `parts_mm` (n, 4) are x_min, y_min, x_max, y_max in the stitched image, nominally; `projective`
+    (n, 8) as in `Pattern`, about each part's centre.
+    """
+
+    parts_mm: Array
+    projective: Array
+
+    def at(self, xy_mm: Array) -> Array:
+        """Displacement (n, 2) mm of measured against ideal coordinates."""
+        low, high = self.parts_mm[:, :2], self.parts_mm[:, 2:]
+        inside = np.minimum(xy_mm[:, None] - low, high - xy_mm[:, None]).min(axis=2)
+        own = inside.argmax(axis=1)
+        u, v = (xy_mm - ((low + high) / 2.0)[own]).T
+        a, b, c, d, e, f, g, h = self.projective[own].T
+        w = 1.0 + g * u + h * v
+        return np.asarray(
+            np.stack([(u + a + c * u + d * v) / w - u, (v + b + e * u + f * v) / w - v], axis=1)
+        )
 
 
 @dataclass(frozen=True)
@@ -137,7 +163,7 @@ class Block:
     image: Indices
     point: Indices
     xy_mm: Array
-    pattern: Pattern
+    pattern: Pattern | CcdPattern
 
 
 ULTRACAM_L = Frame(9735 * 3.6e-3, 6588 * 3.6e-3, 70.0, 7.2e-3)
@@ -176,9 +202,11 @@ def ultracam_l_plan() -> Plan:
     return Plan(tuple(strips), ULTRACAM_L, spacing_m=41.5, relief_m=40.0, control=24, checks=40)
 
 
-def small_plan() -> Plan:
-    """Three lines of eight frames and a cross strip of six: for tests."""
-    height, base, apart = 972.2, 131.8, 584.0
+def small_plan(frame: Frame = ULTRACAM_L, rig: str = "ultracam-l") -> Plan:
+    """Three lines of eight frames and a cross strip of six, GSD 10 cm: for tests."""
+    height = 0.1 * frame.f_mm / frame.pixel_mm
+    scale = height / frame.f_mm
+    base, apart = 0.4 * frame.half_height_mm * scale, 1.2 * frame.half_width_mm * scale
     strips = [
         Strip(
             f"line {k + 1}",
@@ -191,14 +219,47 @@ def small_plan() -> Plan:
         for k in range(3)
     ]
     strips.append(Strip("cross 1", (-2.5 * base, 0.0), 90.0, 6, base, height))
-    return Plan(tuple(strips), ULTRACAM_L, spacing_m=75.0, relief_m=40.0, control=12, checks=20)
+    spacing = 0.077 * frame.half_width_mm * scale * 2.0
+    return Plan(tuple(strips), frame, spacing, relief_m=40.0, control=12, checks=20, rig=rig)
 
 
-def flown(plan: Plan, seed: int) -> Block:
-    """Fly a plan: one seed, one block."""
+def frame_of(rig: Rig) -> Frame:
+    """The stitched image of a rig."""
+    image = rig.virtual_image
+    if image is None:
+        raise ValueError(f"rig {rig.name} has no stitched image")
+    half = image.pitch_mm / 2.0
+    return Frame(image.width_px * half, image.height_px * half, image.f_mm, image.pitch_mm)
+
+
+def ccd_pattern(rig: Rig, seed: int, size_mm: float) -> CcdPattern:
+    """Every PAN CCD but the master cone's first off by `size_mm` or so at its edges."""
+    random = random_stream(seed, "ccd pattern")
+    parts, projective = [], []
+    for cone in rig.pan_cones:
+        perspective = random.normal(0.0, 1.0, 2) if cone.name != rig.master_cone else np.zeros(2)
+        for sensor in cone.sensors:
+            half = np.array([sensor.width_px, sensor.height_px]) * sensor.pitch_um * 0.5e-3
+            centre = np.array([sensor.x_mm, sensor.y_mm])
+            parts.append([*(centre - half), *(centre + half)])
+            own = random.normal(0.0, 1.0, 6) * [1.0, 1.0, *(4 * [1.0 / half[0]])]
+            projective.append(size_mm * 0.5 * np.array([*own, *(perspective / half[0] ** 2)]))
+    table = np.array(projective)
+    masters = [k for k, c in enumerate(_cones(rig)) if c == rig.master_cone]
+    # What the master cone's CCDs have in common nobody could tell from the orientation.
+    table[:, :6] -= table[masters, :6].mean(axis=0)
+    return CcdPattern(np.array(parts), table)
+
+
+def _cones(rig: Rig) -> list[str]:
+    return [cone.name for cone in rig.pan_cones for _ in cone.sensors]
+
+
+def flown(plan: Plan, seed: int, pattern: CcdPattern | None = None) -> Block:
+    """Fly a plan: one seed, one block; a pattern of one's own in place of the paper's."""
     station, rotation, strip, time, names = _exposures(plan, seed)
     points = _ground(plan, station, seed)
-    pattern = _pattern(plan, seed)
+    planted = pattern or _pattern(plan, seed)
     image, point, ideal = [], [], []
     for k in range(len(station)):
         seen = (points - station[k]) @ rotation[k]
@@ -235,8 +296,8 @@ def flown(plan: Plan, seed: int) -> Block:
         survey_m=surveyed + survey,
         image=np.concatenate(image),
         point=np.concatenate(point),
-        xy_mm=xy + pattern.at(xy) + noise,
-        pattern=pattern,
+        xy_mm=xy + planted.at(xy) + noise,
+        pattern=planted,
     )
 
 
