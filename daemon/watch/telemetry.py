@@ -19,6 +19,7 @@ VERSION = 1
 LEAST_BYTES_PER_S = 1000
 """Below this not even what is brief gets through once in a few seconds."""
 
+BRIEF_SHARE = 0.5
 BURST_S = 2.0
 """How much of unused budget is kept for a moment when more is to be said."""
 
@@ -31,6 +32,7 @@ class Subscription:
     _cursors: dict[str, int] = field(default_factory=lambda: dict.fromkeys(PARTS, 0))
     _told_sequence: int = -1
     _told_s: float = -math.inf
+    _told_faults: list[Any] = field(default_factory=list)
     _credit: float = 0.0
     _earned_s: float | None = None
 
@@ -45,8 +47,12 @@ class Subscription:
         if state.sequence == self._told_sequence and now_s - self._told_s < repeat_s:
             return None
         record: dict[str, Any] = {"version": VERSION, **state.brief()}
-        left = self._credit - packed_nbytes(record)
-        if left < 0 and not math.isinf(self.bytes_per_s):
+        nbytes = packed_nbytes(record)
+        left = self._credit - nbytes
+        # What is brief may have half of the budget; a new fault waits for nothing but credit.
+        pause_s = nbytes / (BRIEF_SHARE * self.bytes_per_s)
+        is_too_soon = now_s - self._told_s < pause_s and record["faults"] == self._told_faults
+        if left < 0 or is_too_soon:
             return None
         complete = True
         for part in PARTS:
@@ -54,14 +60,16 @@ class Subscription:
             if items:
                 record[part] = items
             complete = complete and all_told
-        if not math.isinf(self.bytes_per_s):
-            self._credit = left
+        self._credit = left
         self._told_sequence = state.sequence if complete else -1
-        self._told_s = now_s
+        self._told_s, self._told_faults = now_s, record["faults"]
         return record
 
     def _earn(self, now_s: float) -> None:
         most = self.bytes_per_s * BURST_S
+        if math.isinf(most):
+            self._credit = most
+            return
         passed_s = BURST_S if self._earned_s is None else now_s - self._earned_s
         self._credit = min(self._credit + passed_s * self.bytes_per_s, most)
         self._earned_s = now_s
