@@ -255,13 +255,24 @@ class Ledger:
             n for n, e in self._entries.items() if e.standing.storage is not Storage.SEALED
         )
 
-    def imbalances(self, delivered: Mapping[str, int] | None = None) -> list[str]:
+    def imbalances(
+        self, delivered: Mapping[str, int] | None = None, *, has_landed: bool = False
+    ) -> list[str]:
         """One sentence for everything that does not add up; empty when the books balance.
 
         Args:
             delivered: by head, frames its driver says it delivered; compared where given.
+            has_landed: nothing more will come, so that nothing may be open or pending any more.
         """
         found = self._trigger_imbalances()
+        if has_landed:
+            found += [
+                f"{account.name}: {account.pending} pending after landing"
+                for account in (*self._heads.values(), self._marks)
+                if account.pending
+            ]
+            if self._in_state[State.OPEN]:
+                found.append(f"{self._in_state[State.OPEN]} exposures are open after landing")
         for account in (*self._heads.values(), self._marks):
             total = account.pending + sum(account.became.values())
             if account.received != total:

@@ -13,6 +13,8 @@ from typing import Any
 
 import jinja2
 
+from processing.conditions import TIME_PARTS
+
 _GLYPHS = {"good": "●", "usable": "▲", "refly": "■", "lost": "✕"}
 
 
@@ -50,6 +52,7 @@ def write_report(
             _plot("Sigma of the exposure's time, ns", {"sigma": _time_sigma(exposures)}),
         ],
         glyphs=_GLYPHS,
+        time_parts=TIME_PARTS,
     )
     path = mission / "export" / "report.html"
     path.parent.mkdir(exist_ok=True)
@@ -71,6 +74,7 @@ def _exposure(folder: Path, mission: Path) -> dict[str, Any]:
         "figures": report.get("figures", {}),
         "findings": report.get("findings", []),
         "gps": _gps_text(record.get("mark_gps_ns")),
+        "worst_time_sigma_ns": _worst_time_sigma(record),
         "quicklook": _data_uri(quicklook, "image/jpeg"),
         "residuals": _data_uri(residuals, "image/svg+xml"),
     }
@@ -95,6 +99,11 @@ def _gps_text(gps_ns: str | None) -> str:
     seconds, nanoseconds = divmod(int(gps_ns), 1_000_000_000)
     week, second = divmod(seconds, 604_800)
     return f"week {week}, {second}.{nanoseconds:09d} s"
+
+
+def _worst_time_sigma(record: Mapping[str, Any]) -> int | None:
+    sigmas = [frame.get("time_sigma_ns") for frame in record.get("frames", [])]
+    return max((sigma for sigma in sigmas if sigma is not None), default=None)
 
 
 def _displaced(exposures: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

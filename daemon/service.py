@@ -107,6 +107,7 @@ class Service:
         self.supervisor = Supervisor(self._hear, self._child_died)
         self.watching = Watching(self.supervisor, watch_process(configuration))
         self.is_ready = False
+        self.hurry_ns = 0
         self.failure: str | None = None
         self.stopping = asyncio.Event()
         self.changed = asyncio.Event()
@@ -130,6 +131,7 @@ class Service:
         loop.set_exception_handler(lambda _, context: self._broke(context))
         for name in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(name, self.stopping.set)
+        loop.add_signal_handler(signal.SIGPWR, self._power_fails)
         mission, self.is_resumed = open_mission(self.configuration, self.rig, self.config_path)
         with mission.held():
             self._start(mission)
@@ -144,6 +146,9 @@ class Service:
             self.notifier.stopping("landing: sealing what is open")
             await self._land(tasks)
             self.flight.land()
+            left = self.flight.ledger.imbalances(has_landed=True)
+            if left:
+                self._event("ledger", fault=True, sentence=f"not settled: {'; '.join(left)}")
         if self.failure is None:
             mission.close()
         self._event("ended", failure=self.failure, ledger=self.flight.ledger.sheet().as_json())
@@ -390,7 +395,7 @@ class Service:
 
     async def _keep_deadlines(self) -> None:
         while True:
-            now_ns = time.monotonic_ns()
+            now_ns = time.monotonic_ns() + self.hurry_ns
             for due in self.flight.due_to_store(now_ns):
                 self.in_memory[due.capture.number] = due.slots
                 self.supervisor.send("writer", Store(due.capture, due.slots))
@@ -399,7 +404,7 @@ class Service:
             for head, slot in self.flight.idle_slots:
                 self._recycle({head: slot})
             self.flight.idle_slots.clear()
-            self._tell_of_time(now_ns)
+            self._tell_of_time(now_ns - self.hurry_ns)
             if self.sealing is None:
                 self.sealing = self.flight.due_to_seal(now_ns)
                 if self.sealing is not None:
@@ -531,12 +536,30 @@ class Service:
 
     async def _land(self, tasks: list[asyncio.Task[None]]) -> None:
         tasks[-1].cancel()  # no more exposures
-        if self.failure is None:
+        if self.hurry_ns:
+            limit_s = self.configuration.limits.power_fail_s
+            await self._until(lambda: not self._is_unsafe(), limit_s)
+        elif self.failure is None:
             await self._until(lambda: not self._is_unfinished(), LANDING_TIMEOUT_S)
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        await self.supervisor.end(("capture", "worker", "writer"))
+        # In a power failure the disk comes first, and nobody waits for an image.
+        order = ("capture", "worker", "writer")
+        await self.supervisor.end(order[::-1] if self.hurry_ns else order)
+
+    def _power_fails(self) -> None:
+        """The supply said that it will be gone in seconds: no time-out is waited for any more."""
+        limits = self.configuration.limits
+        self.hurry_ns = round((limits.frame_timeout_s + limits.mark_timeout_s + 1.0) * 1e9)
+        sentence = (
+            f"power fails; what is open is stored and sealed within {limits.power_fail_s:g} s"
+        )
+        self._event("power", fault=True, sentence=sentence)
+        self.stopping.set()
+
+    def _is_unsafe(self) -> bool:
+        return self.sealing is not None or bool(self.flight.open_numbers)
 
     def _is_unfinished(self) -> bool:
         in_work = self.sealing is not None or bool(self.in_work)

@@ -188,3 +188,20 @@ def test_a_flight_goes_on_with_its_records_and_its_last_sheet():
 def test_a_damaged_sheet_counts_as_nothing():
     sheet = {"heads": [{"name": 3, "late": 1}, 7, {"name": "SU00", "late": -1}], "marks": "many"}
     assert Ledger.resume([], sheet=sheet).sheet().frames.received == 0
+
+
+def test_after_landing_nothing_may_be_open_or_pending():
+    ledger = Ledger(["SU00"])
+    ledger.trigger(1)
+    ledger.frame("SU00", "pending")
+    ledger.mark("pending")
+    assert ledger.imbalances() == []
+    assert ledger.imbalances(has_landed=True) == [
+        "SU00: 1 pending after landing",
+        "marks: 1 pending after landing",
+        "1 exposures are open after landing",
+    ]
+    ledger.frame("SU00", "used")
+    ledger.mark("spurious")
+    ledger.settle(1, "complete")
+    assert ledger.imbalances(has_landed=True) == []
