@@ -1,7 +1,7 @@
 """The receivers' own bytes out of the flight log, for post-processing software.
 
-One file a receiver in its native format, exactly as the bytes came, and the event file: one row an
-exposure. Nothing is decoded here.
+One file a receiver in its native format, exactly as the bytes came, and the event files: one row an
+exposure, one row a frame. Nothing is decoded here.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import json
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,6 +38,14 @@ EVENT_COLUMNS = (
     "longitude_deg",
     "height_ellipsoid_m",
 )
+FRAME_COLUMNS = (
+    "exposure",
+    "sensor",
+    "gps_week",
+    "seconds_of_week",
+    "sigma_ns",
+    "source",
+)
 _WEEK_NS = 604_800_000_000_000
 
 
@@ -51,8 +59,9 @@ class RawExport:
 
 
 def export_raw(mission: Mission) -> RawExport:
-    """Write `export/raw/<receiver>.<ending>` and `export/raw/events.csv`, in place of earlier ones.
+    """Write `<receiver>.<ending>`, `events.csv` and `frames.csv` into `export/raw`.
 
+    They take the place of earlier ones.
     Bytes of several service runs of one flight follow each other in the order they were received.
 
     Raises:
@@ -73,12 +82,18 @@ def export_raw(mission: Mission) -> RawExport:
                 if kind == "raw" and device in files:
                     files[device].write(message.payload)
                     nbytes[f"{device}.{endings[device]}"] += len(message.payload)
-    rows = list(_events(mission))
-    with (folder / "events.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(EVENT_COLUMNS)
-        writer.writerows(rows)
+    records = list(_records(mission))
+    rows = [row for record in records for row in _event(record)]
+    _write(folder / "events.csv", EVENT_COLUMNS, rows)
+    _write(folder / "frames.csv", FRAME_COLUMNS, [f for record in records for f in _frames(record)])
     return RawExport(folder, nbytes, len(rows))
+
+
+def _write(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        writer.writerows(rows)
 
 
 def _receivers(mission: Mission) -> dict[str, str]:
@@ -92,25 +107,44 @@ def _receivers(mission: Mission) -> dict[str, str]:
     }
 
 
-def _events(mission: Mission) -> Iterator[tuple[Any, ...]]:
+def _records(mission: Mission) -> Iterator[dict[str, Any]]:
     for number in mission.numbers():
         path = mission.level0(number) / "exposure.json"
-        if not path.exists():
-            continue
-        record = json.loads(path.read_text(encoding="utf-8"))
-        if record.get("mark_gps_ns") is None:
-            continue
-        week, of_week_ns = divmod(int(record["mark_gps_ns"]), _WEEK_NS)
-        place = record.get("navigation") or {}
-        seconds, nanoseconds = divmod(of_week_ns, 1_000_000_000)
-        yield (
-            number,
-            week,
-            f"{seconds}.{nanoseconds:09d}",
-            record.get("mark_sigma_ns"),
-            record.get("mark_source"),
-            record.get("mark_count"),
-            place.get("latitude_deg"),
-            place.get("longitude_deg"),
-            place.get("height_m"),
-        )
+        if path.exists():
+            yield json.loads(path.read_text(encoding="utf-8"))
+
+
+def _event(record: Mapping[str, Any]) -> Iterator[tuple[Any, ...]]:
+    """The instant of the strobe, where it is known."""
+    if record.get("mark_gps_ns") is None:
+        return
+    place = record.get("navigation") or {}
+    yield (
+        record["number"],
+        *_week_and_seconds(record["mark_gps_ns"]),
+        record.get("mark_sigma_ns"),
+        record.get("mark_source"),
+        record.get("mark_count"),
+        place.get("latitude_deg"),
+        place.get("longitude_deg"),
+        place.get("height_m"),
+    )
+
+
+def _frames(record: Mapping[str, Any]) -> Iterator[tuple[Any, ...]]:
+    """The mid-exposure of every frame whose time is known."""
+    for frame in record.get("frames", []):
+        if frame.get("mid_exposure_gps_ns") is not None:
+            yield (
+                record["number"],
+                frame["sensor"],
+                *_week_and_seconds(frame["mid_exposure_gps_ns"]),
+                frame.get("time_sigma_ns"),
+                frame.get("time_source"),
+            )
+
+
+def _week_and_seconds(gps_ns: str) -> tuple[int, str]:
+    week, of_week_ns = divmod(int(gps_ns), _WEEK_NS)
+    seconds, nanoseconds = divmod(of_week_ns, 1_000_000_000)
+    return week, f"{seconds}.{nanoseconds:09d}"

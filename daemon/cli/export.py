@@ -52,7 +52,7 @@ def raw(
     console = Console()
     for name, nbytes in done.nbytes.items():
         console.print(f"{name}: {nbytes} bytes")
-    console.print(f"events.csv: {done.events} exposures")
+    console.print(f"events.csv: {done.events} exposures; frames.csv: every frame of theirs")
     console.print(f"They are in [bold]{done.folder}[/]", soft_wrap=True)
 
 

@@ -21,7 +21,9 @@ def test_bytes_come_out_as_they_came_in_over_two_runs_and_other_devices_stay_out
     (tmp_path / "L0/000007").mkdir()
     (tmp_path / "L0/000007/exposure.json").write_text(
         '{"number":7,"mark_gps_ns":"1479300424815345071","mark_sigma_ns":25,'
-        '"mark_source":"event-mark","mark_count":7,"navigation":null}'
+        '"mark_source":"event-mark","mark_count":7,"navigation":null,"frames":['
+        '{"sensor":"G","mid_exposure_gps_ns":"1479300424815345070","time_sigma_ns":1415,'
+        '"time_source":"event-mark"},{"sensor":"R","mid_exposure_gps_ns":null}]}'
     )
     for run in range(2):
         log = FlightLog.create(mission.log_dir)
@@ -36,3 +38,5 @@ def test_bytes_come_out_as_they_came_in_over_two_runs_and_other_devices_stay_out
     header, row = (done.folder / "events.csv").read_text().splitlines()
     assert header.startswith("exposure,gps_week,seconds_of_week")
     assert row.startswith("7,2445,564424.815345071,25,event-mark,7,")
+    frames = (done.folder / "frames.csv").read_text().splitlines()
+    assert frames[1:] == ["7,G,2445,564424.815345070,1415,event-mark"]
