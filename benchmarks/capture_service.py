@@ -1,0 +1,52 @@
+"""The onboard service without its worker: capture, ledger and Level-0 as they fly, no pipeline."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from daemon import service
+from daemon.configuration import load
+from daemon.departure import ProcessPlan, processes
+from daemon.mission import Mission
+
+
+class CaptureOnly(service.Service):
+    """Hands memory back as soon as an exposure is stored and sealed."""
+
+    def _start(self, mission: Mission) -> None:
+        super()._start(mission)
+        self.is_worker_ready = True
+        children = self.supervisor._children.items()
+        self._event("processes", pids={name: child.process.pid for name, child in children})
+
+    def _feed_worker(self) -> None:
+        while self.waiting:
+            number = self.waiting.popleft().exposure.number
+            if number in self.in_memory:
+                self._recycle(self.in_memory.pop(number))
+
+
+def _without_worker(*arguments: Any) -> tuple[ProcessPlan, ...]:
+    return tuple(plan for plan in processes(*arguments) if plan.name != "worker")
+
+
+def _say(event: Mapping[str, Any]) -> None:
+    sys.stdout.write(json.dumps(event) + "\n")
+    sys.stdout.flush()
+
+
+def main() -> None:
+    """`python -m benchmarks.capture_service service.toml`: events as JSON, one a line."""
+    vars(service)["processes"] = _without_worker
+    path = Path(sys.argv[1])
+    configuration, rig = load(path)
+    sys.exit(asyncio.run(CaptureOnly(configuration, rig, path, _say).run()))
+
+
+if __name__ == "__main__":
+    main()
