@@ -13,6 +13,7 @@ from typing import Any
 
 import jinja2
 
+from daemon.displacements import write_displacements
 from processing.conditions import TIME_PARTS
 
 _GLYPHS = {"good": "●", "usable": "▲", "refly": "■", "lost": "✕"}
@@ -44,6 +45,7 @@ def write_report(
         exposures=exposures,
         simulated=any(exposure["record"].get("simulated") for exposure in exposures),
         displaced=_displaced(exposures),
+        flight_says=write_displacements(mission)["sentences"],
         ledger=ledger,
         geometry=geometry,
         plots=[

@@ -140,6 +140,7 @@ def _displacement(validity: Validity | None) -> Mapping[str, Figure]:
         figures |= {
             "displaced_sensor": validity.displaced.sensor,
             "displaced_alternatives": ", ".join(validity.alternatives) or None,
+            "displaced_several": 1 if validity.several else None,
             "displacement_x_px": validity.displaced.dx_px,
             "displacement_y_px": validity.displaced.dy_px,
             "displacement_sigma_px": max(

@@ -266,15 +266,23 @@ def _stitching(
             _number(figures, "displacement_x_px") or 0.0,
             _number(figures, "displacement_y_px") or 0.0,
         )
-        findings.append(
-            Finding(
-                Flag.DISPLACED_SENSOR,
-                Verdict.USABLE,
-                f"Sensor {displaced} sits {size:.2f} px off its calibrated place; the image is "
-                "corrected for it. Go on, and have the camera calibrated.",
-                size,
-            )
+        sentence = (
+            f"Sensor {displaced} sits {size:.2f} px off its calibrated place; the image is "
+            "corrected for it. Go on, and have the camera calibrated."
         )
+        alternatives = figures.get("displaced_alternatives")
+        if figures.get("displaced_several"):
+            sentence = (
+                "More than one sensor of the master cone sits off its calibrated place, and which "
+                "ones cannot be told: the image fits together, but its place in the camera is "
+                "uncertain. Go on, and have the camera calibrated."
+            )
+        elif alternatives:
+            sentence = (
+                f"Sensor {displaced} sits {size:.2f} px off its calibrated place, unless it is "
+                f"{alternatives}; the image fits together. Go on, and have the camera calibrated."
+            )
+        findings.append(Finding(Flag.DISPLACED_SENSOR, Verdict.USABLE, sentence, size))
     return findings
 
 

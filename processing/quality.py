@@ -135,6 +135,7 @@ FIGURES: Final[Mapping[str, str]] = {
     "displacement_sigma_px": "standard deviation of a coordinate of it",
     "displacement_test": "test statistic over its critical value; above one is significant",
     "displaced_alternatives": "master sensors that explain the stitching nearly as well",
+    "displaced_several": "1 where one displaced sensor does not explain it all: several moved",
     "relative_displacements": "pairs of sensors of one cone found displaced against each other",
     "undetermined": "sensors and cones the tie points did not place, held at calibration and TDM",
     "resting_on_calibration": "PAN sensors that tie points place too poorly, supported",

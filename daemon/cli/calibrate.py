@@ -31,6 +31,15 @@ Examples: `syntopic calibrate thermal MISSION...`, `syntopic calibrate thermal A
 """
 
 
+VALIDITY_HELP = """Say whether a sensor moved during a flight, since when and how far.
+
+Takes the stitching of all exposures together (`mosaic.json` of Level-2) and so sees less than one
+exposure can: a few hundredths of a pixel. Writes `export/displacements.json` into the mission.
+
+Example: `syntopic calibrate validity MISSION`
+"""
+
+
 @app.callback()
 def calibrate() -> None:
     """Calibrations from flown missions."""
@@ -71,6 +80,26 @@ def thermal(
     else:
         _print(gathered, found, changes, seen, written)
     raise typer.Exit(0 if changes else 1)
+
+
+@app.command(name="validity", help=VALIDITY_HELP)
+def validity(
+    mission: Annotated[Path, typer.Argument(help="A mission folder with Level-2.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    from daemon.displacements import write_displacements
+    from daemon.mission import Mission
+
+    told = write_displacements(Mission.open(mission).path)
+    if as_json:
+        typer.echo(json.dumps(told))
+    else:
+        console = Console()
+        counted = ", ".join(f"{n} of cone {cone}" for cone, n in told["exposures"].items())
+        console.print(f"Exposures judged: {counted or 'none; process the mission first'}")
+        for sentence in told["unreadable"] + (told["sentences"] or ["No sensor is seen to move."]):
+            console.print(sentence)
+    raise typer.Exit(1 if told["steps"] else 0)
 
 
 def _json(

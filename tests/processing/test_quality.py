@@ -162,3 +162,19 @@ def test_bits_keep_their_places_for_ever() -> None:
     assert {name: int(Flag[name]) for name in names} == {
         name: 1 << bit for bit, name in enumerate(names)
     }
+
+
+def test_two_displaced_sensors_are_said_to_be_ambiguous() -> None:
+    moved = {"displaced_sensor": "SU01", "displacement_x_px": 0.6, "displacement_y_px": -0.8}
+    report = judge(GOOD | moved | {"displaced_several": 1})
+    assert report.flags == Flag.DISPLACED_SENSOR
+    assert "More than one sensor" in report.findings[0].sentence
+    assert "cannot be told" in report.findings[0].sentence
+    unsure = judge(GOOD | moved | {"displaced_alternatives": "SU00, SU03"})
+    assert "unless it is SU00, SU03" in unsure.findings[0].sentence
+
+
+def test_sensors_that_rest_on_calibration_are_told() -> None:
+    report = judge(GOOD | {"resting_on_calibration": "SU00, SU10"})
+    assert report.flags == Flag.TIE_POINTS and report.verdict is Verdict.USABLE
+    assert "Too little detail to place SU00, SU10" in report.findings[0].sentence

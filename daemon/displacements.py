@@ -1,0 +1,62 @@
+"""Since when a sensor has been displaced: the stitching records of a landed mission, together.
+
+Read from `mosaic.json` of every exposure and written to `export/displacements.json`; the
+mathematics is in `processing.flight_validity`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from daemon.durable import replace_file
+from daemon.records import canonical_bytes
+from processing.flight_validity import FlightValidity, judge_flight
+from processing.rig import load_rig
+from processing.stitch_record import StitchRecord, StitchRecordError, stitch_record_from_json
+
+RECORD_MAX_BYTES = 4_000_000
+
+
+def write_displacements(mission: Path) -> Mapping[str, Any]:
+    """Judge the flight and write `export/displacements.json`.
+
+    Returns:
+        The content of the file: `sentences`, one for each step; `steps`, see
+        `processing.flight_validity.Step`; `exposures` used and `left_out`, by cone; `unreadable`,
+        sentences about records that could not be read.
+    """
+    records, unreadable = _records(mission)
+    content = _content(judge_flight(load_rig(mission / "rig.toml"), records), unreadable)
+    folder = mission / "export"
+    folder.mkdir(exist_ok=True)
+    replace_file(folder / "displacements.json", canonical_bytes(content))
+    return content
+
+
+def _records(mission: Path) -> tuple[dict[int, StitchRecord], list[str]]:
+    records, unreadable = {}, []
+    for path in sorted(mission.glob("L2/[0-9]*/mosaic.json")):
+        try:
+            if path.stat().st_size > RECORD_MAX_BYTES:
+                raise StitchRecordError("mosaic.json is too large to be one")
+            records[int(path.parent.name)] = stitch_record_from_json(json.loads(path.read_bytes()))
+        except (OSError, ValueError, StitchRecordError) as error:
+            unreadable.append(f"{path.parent.name}: {error}")
+    return records, unreadable
+
+
+def _content(found: FlightValidity, unreadable: list[str]) -> dict[str, Any]:
+    return {
+        "sentences": [step.sentence for step in found.steps],
+        "steps": [
+            asdict(step) | {"length_px": step.length_px, "alternatives": list(step.alternatives)}
+            for step in found.steps
+        ],
+        "exposures": dict(found.exposures),
+        "left_out": {cone: list(numbers) for cone, numbers in found.left_out.items()},
+        "unreadable": unreadable,
+    }
