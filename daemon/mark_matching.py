@@ -20,7 +20,7 @@ from drivers.contract import EventMark
 WINDOW_NS: Final = 2_000_000
 """How far a mark may lie from its pulse beside what the clock is unsure of."""
 SIGMAS: Final = 5
-COARSE_WINDOW_NS: Final = 350_000_000
+COARSE_WINDOW_NS: Final = 355_000_000
 """Half of what messages leave open, and a little."""
 BEFORE_NS: Final = 5_000_000
 """No mark arrives before its strobe; so much is forgiven to the pulse's own host time."""
