@@ -10,14 +10,16 @@ import json
 import os
 import platform
 import resource
+import shutil
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +30,9 @@ from daemon import bench_peers, store
 from daemon.conditions import conditions_of
 from daemon.configuration import PlanSection
 from daemon.errors import DaemonError
+from daemon.lanes import Lanes
 from daemon.mission import Mission
-from daemon.worker import process_exposure
+from daemon.worker import SWITCH_INTERVAL_S, make_products, process_exposure
 from processing.pipeline import Conditions, Pipeline, Product, Settings
 from processing.quality import Flag
 from processing.radiometry import load_radiometry
@@ -61,7 +64,9 @@ def exposures_of(rig_name: str, rig: Rig, folder: Path) -> Path:
     return folder
 
 
-def measure(folder: Path, *, runs: int, threads: int, peers: bool) -> dict[str, Any]:
+def measure(
+    folder: Path, *, runs: int, threads: int, peers: bool, lanes: int = 2
+) -> dict[str, Any]:
     """All figures of one rig as one JSON object; see docs of the command.
 
     Args:
@@ -69,6 +74,7 @@ def measure(folder: Path, *, runs: int, threads: int, peers: bool) -> dict[str, 
         runs: how often everything is timed.
         threads: cores the pipeline may use.
         peers: also cv2.remap and, where installed, nona + enblend.
+        lanes: exposures in work at a time, as the service's `exposures_in_work`.
     """
     mission = Mission.open(folder / "mission")
     rig = load_rig(mission.rig_path)
@@ -80,6 +86,7 @@ def measure(folder: Path, *, runs: int, threads: int, peers: bool) -> dict[str, 
         Settings(geometry=False, threads=threads),
     )
     pipeline.warm_up()
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
     stored, exposure = store.load_level0(mission.level0(1), rig)
     frames = {name: np.array(frame) for name, frame in stored.items()}
     conditions = conditions_of(exposure, rig, plan, Flag(0))
@@ -91,6 +98,7 @@ def measure(folder: Path, *, runs: int, threads: int, peers: bool) -> dict[str, 
         "threads": threads,
         **_timed(rig, pipeline, frames, conditions, product, runs),
     }
+    result |= _side_by_side(rig, pipeline, frames, conditions, lanes=lanes, count=3 * runs)
     if peers:
         product = pipeline.process(frames, conditions)
         result["peers"] = _peers(rig, product, frames, mission, result)
@@ -121,24 +129,26 @@ def _timed(
 
         def free() -> None:
             began = time.process_time()
-            done = pipeline.process(frames, conditions)
+            report, contents = make_products(pipeline, 1, frames, conditions)
             started = time.perf_counter()
-            _to_page_cache(done, Path(scratch))
+            _to_page_cache(contents, Path(scratch))
             stages.setdefault("writing", []).append(time.perf_counter() - started)
-            for stage, seconds in done.timings_s.items():
+            for stage, seconds in report["timings_s"].items():
                 stages.setdefault(stage, []).append(seconds)
             cpu_s.append(time.process_time() - began)
 
         def fixed() -> None:
             pipeline.settings = replace(settings, method="fixed")
-            _to_page_cache(pipeline.process(frames, conditions), Path(scratch))
+            _to_page_cache(make_products(pipeline, 1, frames, conditions)[1], Path(scratch))
             pipeline.settings = settings
 
         def copy() -> None:
             for target, source in zip(copies, sources, strict=True):
                 np.copyto(target, source)
 
-        _to_page_cache(product, Path(scratch))
+        free()
+        stages.clear()
+        cpu_s.clear()
         timed = interleaved(runs, pipeline=free, fixed_method=fixed, copy=copy)
     pixels = sum(frame.size for frame in frames.values())
     seconds = timed["pipeline"]["median_s"]
@@ -150,9 +160,59 @@ def _timed(
         "megapixels_per_s": pixels / 1e6 / seconds,
         "ratio_to_copy": seconds / timed["copy"]["median_s"],
         "frame_interval_s": rig.frame_interval_s,
-        "realtime_factor": rig.frame_interval_s / seconds,
-        "realtime_factor_best": rig.frame_interval_s / timed["pipeline"]["min_s"],
+        "realtime_factor_alone": rig.frame_interval_s / seconds,
         "tie_points": len(product.tie_points),
+    }
+
+
+def _side_by_side(
+    rig: Rig,
+    pipeline: Pipeline,
+    frames: Mapping[str, NDArray[np.uint16]],
+    conditions: Conditions,
+    *,
+    lanes: int,
+    count: int,
+) -> dict[str, Any]:
+    """The pace with exposures in work side by side, as in the service, and each one's latency.
+
+    Timed from the end of the first exposures to the end of the last, all lanes full all the while.
+    Each file is written anew, and removed when as many others were written as there are lanes.
+    """
+    work = Lanes(pipeline, lanes)
+    ends: list[float] = []
+    latencies: list[float] = []
+    used: list[float] = []
+
+    with tempfile.TemporaryDirectory(prefix="syntopic-bench-") as scratch:
+
+        def one(number: int, lane: Pipeline) -> None:
+            started = time.perf_counter()
+            folder = Path(scratch) / str(number)
+            folder.mkdir()
+            _to_page_cache(make_products(lane, number, frames, conditions)[1], folder)
+            ended = time.perf_counter()
+            ends.append(ended)
+            used.append(time.process_time())
+            latencies.append(ended - started)
+            shutil.rmtree(Path(scratch) / str(number - lanes), ignore_errors=True)
+
+        # As many before, to fill the buffers of the others, and as many after, to keep lanes full.
+        tasks = [work.submit(partial(one, k)) for k in range(count + 2 * work.count)]
+        for task in tasks:
+            task.result()
+        work.end()
+    first, last = work.count - 1, work.count - 1 + count
+    seconds = (ends[last] - ends[first]) / count
+    return {
+        "realtime_factor": rig.frame_interval_s / seconds,
+        "side_by_side": {
+            "lanes": work.count,
+            "exposures": count,
+            "seconds_per_exposure": seconds,
+            "cpu_s_per_exposure": (used[last] - used[first]) / count,
+            "latency": spread(latencies[work.count : last + 1]),
+        },
     }
 
 
@@ -194,12 +254,14 @@ def _geometry(mission: Mission, truth: Path) -> dict[str, Any]:
     }
 
 
-def _to_page_cache(product: Product, folder: Path) -> None:
-    for name, image in (("pan", product.pan), *product.colour.items()):
+def _to_page_cache(contents: Mapping[str, Sequence[bytes | memoryview]], folder: Path) -> None:
+    """Write all files of an exposure as the service does, but for the sync."""
+    for name, parts in contents.items():
         with (folder / name).open("wb", buffering=0) as file:
-            left = image.reshape(-1).view(np.uint8).data
-            while left:
-                left = left[file.write(left) :]
+            for part in parts:
+                left = memoryview(part).cast("B")
+                while left:
+                    left = left[file.write(left) :]
 
 
 def _plan_of(mission: Mission) -> PlanSection:

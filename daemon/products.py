@@ -41,8 +41,7 @@ class Level2Record:
     verdict: str | None
 
 
-def write_level2(
-    mission: Mission,
+def level2_contents(
     number: int,
     *,
     pan: NDArray[np.uint16] | None,
@@ -52,11 +51,10 @@ def write_level2(
     geometry: Mapping[str, Mapping[str, NDArray[Any]]] | None = None,
     residuals_svg: str | None = None,
     mosaic_json: Mapping[str, Any] | None = None,
-) -> Level2Record:
-    """Write the products of an exposure; they are durable on return.
+) -> dict[str, Sequence[bytes | memoryview]]:
+    """The files of an exposure's products: parts by name. Pixels are not copied.
 
     Args:
-        mission: where to.
         number: the exposure.
         pan: stitched image, shape (height, width); None for a rig or an exposure without one.
         colour: by band, all of one shape; written in the order red, green, blue, nir.
@@ -69,9 +67,7 @@ def write_level2(
     Raises:
         ProductError: arrays of wrong type or shape, or an unknown band.
         RecordError: a report that JSON cannot hold.
-        OSError: the disk refused; an earlier result is still there.
     """
-    final = mission.level2(number)
     contents: dict[str, Sequence[bytes | memoryview]] = {}
     if pan is not None:
         contents["pan.tif"] = tiff_parts([pan], {"bands": ["pan"], "exposure": number})
@@ -88,7 +84,26 @@ def write_level2(
     if mosaic_json is not None:
         contents["mosaic.json"] = [canonical_bytes(mosaic_json)]
     contents["quality.json"] = [canonical_bytes(report_json)]
-    files = write_folder(final, contents)
+    return contents
+
+
+def write_level2(
+    mission: Mission, number: int, *, report_json: Mapping[str, Any], **products: Any
+) -> Level2Record:
+    """Write the products of an exposure; they are durable on return.
+
+    Args:
+        mission: where to.
+        number: the exposure.
+        report_json: content of quality.json.
+        products: as in `level2_contents`.
+
+    Raises:
+        ProductError, RecordError: as `level2_contents`.
+        OSError: the disk refused; an earlier result is still there.
+    """
+    contents = level2_contents(number, report_json=report_json, **products)
+    files = write_folder(mission.level2(number), contents)
     verdict = report_json.get("verdict")
     return Level2Record(number, files, verdict if isinstance(verdict, str) else None)
 

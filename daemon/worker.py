@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
@@ -37,7 +37,7 @@ from daemon.messages import (
 from daemon.mission import Mission
 from daemon.processes import Link
 from processing.drawing import residuals_svg
-from processing.pipeline import Pipeline, Settings
+from processing.pipeline import Conditions, Pipeline, Settings
 from processing.quality import Flag, as_json
 from processing.radiometry import RadiometricCalibration, load_radiometry
 from processing.rig import Rig, find_rig
@@ -104,25 +104,45 @@ def process_exposure(
 ) -> tuple[dict[str, Any], Mapping[str, int]]:
     """Run the pipeline on one exposure and write its Level-2 folder.
 
-    `frames_read` is called once the pixels of `frames` are no longer needed.
-
     Returns:
         The content of quality.json, and the files written with their sizes in bytes.
     """
     conditions = conditions_of(exposure, rig, plan, flags)
+    report, contents = make_products(
+        pipeline, exposure.number, frames, conditions, frames_read=frames_read
+    )
+    return report, products.write_folder(mission.level2(exposure.number), contents)
+
+
+def make_products(
+    pipeline: Pipeline,
+    number: int,
+    frames: Mapping[str, NDArray[np.uint16]],
+    conditions: Conditions,
+    *,
+    frames_read: Callable[[], None] | None = None,
+) -> tuple[dict[str, Any], Mapping[str, Sequence[bytes | memoryview]]]:
+    """Run the pipeline on one exposure.
+
+    `frames_read` is called once the pixels of `frames` are no longer needed.
+
+    Returns:
+        The content of quality.json, and the parts of every file by its name. Pixels among them
+        are the pipeline's buffers and hold until its next exposure.
+    """
+    rig = pipeline.rig
     product = pipeline.process(frames, conditions, frames_read=frames_read)
     report = as_json(product.report)
-    report["exposure"] = exposure.number
+    report["exposure"] = number
     told = product.temperatures
     stitching = None
     if product.mosaic.method == "free":
         stitching = stitch_record_json(
-            stitch_record(rig, product.free, told.placing_c, told.usable_c, product.estimated_dc)
+            stitch_record(rig, product.mosaic, told.placing_c, told.usable_c, product.estimated_dc)
         )
     report["timings_s"] = {stage: round(s, 4) for stage, s in product.timings_s.items()}
-    written = products.write_level2(
-        mission,
-        exposure.number,
+    contents = products.level2_contents(
+        number,
         pan=product.pan,
         colour=product.colour,
         quicklook=product.quicklook,
@@ -131,7 +151,7 @@ def process_exposure(
         residuals_svg=residuals_svg(rig, product.tie_points, product.mosaic, product.validity),
         mosaic_json=stitching,
     )
-    return report, written.files
+    return report, contents
 
 
 @dataclass(frozen=True)

@@ -32,8 +32,20 @@ def test_figures_of_all_stages_are_told_with_their_spread(told: dict[str, Any]) 
     assert stages <= set(told["stages"])
     for times in (*told["stages"].values(), told["pipeline"], told["fixed_method"], told["copy"]):
         assert 0.0 < times["min_s"] <= times["median_s"] <= times["max_s"]
-    assert told["realtime_factor"] == told["frame_interval_s"] / told["pipeline"]["median_s"]
+    assert told["realtime_factor_alone"] == told["frame_interval_s"] / told["pipeline"]["median_s"]
     assert "peers" not in told
+
+
+def test_the_pace_is_that_of_exposures_side_by_side_and_says_how_long_each_takes(
+    told: dict[str, Any],
+) -> None:
+    side = told["side_by_side"]
+    assert side["lanes"] == 2 and side["exposures"] == 6
+    pace = told["frame_interval_s"] / side["seconds_per_exposure"]
+    assert told["realtime_factor"] == pytest.approx(pace)
+    # What is overlapped takes longer than its share of the time, never less.
+    assert side["latency"]["median_s"] > side["seconds_per_exposure"]
+    assert side["cpu_s_per_exposure"] > 0.0
 
 
 def test_what_is_timed_is_right_against_the_truth(told: dict[str, Any]) -> None:
