@@ -80,7 +80,9 @@ def network_of(block: ObliqueBlock, heads: tuple[int, ...], *, own: bool) -> Net
     """
     n, k = len(block.station), len(heads)
     # Images at the border that hardly see the block are not used, as in the paper.
-    seen = np.bincount(block.image, minlength=5 * n)
+    places = np.unique(np.stack([block.point, block.image // 5]), axis=1)[0]
+    tied = np.bincount(places, minlength=len(block.points))[block.point] >= 2
+    seen = np.bincount(block.image[tied], minlength=5 * n)
     table = np.isin(block.image % 5, heads) & (seen[block.image] >= LEAST_POINTS)
     of_head = {h: i for i, h in enumerate(heads)}
     image_of = np.array(
