@@ -1,7 +1,8 @@
 """The stated accuracy of a stitched image: tie points, and the calibration its datum rests on.
 
-How the covariance comes about is in `processing.mosaic`; whether the calibration holds is judged in
-`processing.validity`.
+Three parts: the adjustment's covariance, which `processing.mosaic` makes; calibration and drift
+coefficients of the master sensors the datum rests on; and the temperature of the master cone, which
+a common expansion hides in. Whether the calibration holds is judged in `processing.validity`.
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ from numpy.typing import NDArray
 
 from processing.drift import sensor_dc
 from processing.mosaic import Mosaic, vip_precision_px
-from processing.placement import vip_mm_from_raw
+from processing.mosaic_model import vip_and_design
+from processing.placement import corrected_mm_from_raw, vip_mm_from_raw
 from processing.quality import Figure
 from processing.rig import Rig
 
@@ -60,38 +62,94 @@ def placed_sigma_px(
 ) -> Array:
     """Standard deviation (n, 2), px, of where raw pixels (n, 2) lie in the virtual image.
 
-    Three parts: the adjustment's covariance; calibration and drift coefficients of the master
-    sensors the datum rests on; and the temperature of the master cone, which a common expansion
-    hides in. What tie points do not determine counts with the a-priori accuracy it is held with.
+    What tie points do not determine counts with the a-priori accuracy it is held with.
     """
     tie_points = vip_precision_px(mosaic, sensor, colrow)
     held = {name.split(".")[0] for name in mosaic.undetermined}
-    if held & {sensor, rig.cone_of(sensor).name}:
+    if held & {sensor, rig.cone_of(sensor).name} and not mosaic.supported:
         tie_points = tie_points * max(1.0, 1.0 / max(mosaic.sigma0, 1e-6))
+    placed_mm = vip_mm_from_raw(mosaic.placements[sensor], colrow)
+    datum = _datum_design(placed_mm)
+    variance = np.sum((datum @ datum_covariance(rig, mosaic, measured_c)) * datum, axis=1)
+    return np.asarray(np.sqrt(tie_points**2 + variance.reshape(-1, 2)))
+
+
+def placed_covariance_px(
+    rig: Rig, mosaic: Mosaic, points: Mapping[str, Array], measured_c: Mapping[str, float]
+) -> tuple[Array, Array]:
+    """Covariance of where raw pixels of several sensors lie in the virtual image.
+
+    Args:
+        rig: the camera.
+        mosaic: what the image was made with.
+        points: raw pixels (n, 2) by sensor name.
+        measured_c: temperatures that were read, by probe name.
+
+    Returns:
+        The part of the tie points, and that of the datum (calibration, drift coefficients and
+        temperature of the master cone), each (2 n, 2 n), px squared: x and y (up) of the first
+        point, of the second, and so on, sensor by sensor.
+    """
+    model = mosaic.model
+    rows, datum = [], []
+    for name, colrow in points.items():
+        start = mosaic.start[name]
+        corrected = corrected_mm_from_raw(start, colrow)
+        _, columns, design = vip_and_design(model, start, corrected, mosaic.values)
+        row = np.zeros((2 * len(colrow), len(model.names)))
+        row[:, columns] = design.transpose(2, 1, 0).reshape(2 * len(colrow), len(columns))
+        rows.append(row)
+        datum.append(_datum_design(vip_mm_from_raw(mosaic.placements[name], colrow)))
+    jacobian, similarity = np.concatenate(rows), np.concatenate(datum)
+    return (
+        jacobian @ mosaic.covariance @ jacobian.T,
+        similarity @ datum_covariance(rig, mosaic, measured_c) @ similarity.T,
+    )
+
+
+def datum_covariance(rig: Rig, mosaic: Mosaic, measured_c: Mapping[str, float]) -> Array:
+    """Covariance (4, 4) of the datum: shift x, y (px), scale and rotation (px per mm).
+
+    The datum is the best similarity over the master sensors it rests on (eq. 6), so what their
+    places are off by, each on its own or all with their probe, carries over by that fit.
+    """
     master = rig.cone(rig.master_cone)
-    datum = [s for s in master.sensors if s.name in mosaic.datum_sensors] or list(master.sensors)
-    place_mm = np.array([[s.x_mm, s.y_mm] for s in datum])
-    middle_mm = place_mm.mean(axis=0)
-    arms_mm = place_mm - middle_mm
-    half_mm = datum[0].height_px / 2.0 * datum[0].pitch_mm
-    spread = max(float(np.sum(arms_mm**2)), half_mm**2)
-    variance_um = float(
-        np.mean(
-            [
-                s.position_sigma_um**2 + (s.drift.sigma_um_per_k * sensor_dc(s, measured_c)) ** 2
-                for s in datum
-            ]
-        )
+    sensors = [s for s in master.sensors if s.name in mosaic.datum_sensors] or list(master.sensors)
+    place_mm = np.array([[s.x_mm, s.y_mm] for s in sensors])
+    own_um2 = np.array(
+        [
+            s.position_sigma_um**2 + (s.drift.sigma_um_per_k * sensor_dc(s, measured_c)) ** 2
+            for s in sensors
+        ]
     )
-    from_middle_mm = vip_mm_from_raw(mosaic.placements[sensor], colrow) - middle_mm
-    distance = np.sum(from_middle_mm**2, axis=1, keepdims=True)
-    calibration_um = np.sqrt(variance_um * (1.0 / len(datum) + distance / spread))
-    moved = np.array([[s.drift.x_um_per_k, s.drift.y_um_per_k] for s in datum])
-    # um per mm of distance and kelvin, less what the principal distance takes back.
-    expansion = float(np.sum(arms_mm * moved)) / spread - master.lens.f_ppm_per_k * 1e-3
-    read = all(s.probe in measured_c for s in datum)
-    thermal_um = from_middle_mm * expansion * (PROBE_SIGMA_K if read else UNKNOWN_SIGMA_K)
-    pitch_um = mosaic.model.pitch_mm * 1e3
-    return np.asarray(
-        np.sqrt(tie_points**2 + (calibration_um / pitch_um) ** 2 + (thermal_um / pitch_um) ** 2)
-    )
+    design = _datum_design(place_mm)
+    if len(sensors) == 1:
+        # Its own scale and rotation are held: known as its place is, at half of its height.
+        half_mm = sensors[0].height_px / 2.0 * sensors[0].pitch_mm
+        design = np.concatenate([design, _datum_design(place_mm + np.array([[0.0, half_mm]]))])
+        own_um2 = np.repeat(own_um2, 2)
+    fit = np.linalg.inv(design.T @ design) @ design.T
+    covariance = fit @ (np.repeat(own_um2, 2)[:, None] * fit.T)
+    # um per kelvin; the principal distance takes part of an expansion back.
+    for probe in dict.fromkeys([s.probe for s in sensors] + [master.probe]):
+        moved = np.zeros((len(place_mm), 2))
+        for i, s in enumerate(sensors):
+            if s.probe == probe:
+                moved[i] = (s.drift.x_um_per_k, s.drift.y_um_per_k)
+        if master.probe == probe:
+            moved -= master.lens.f_ppm_per_k * 1e-3 * place_mm
+        if len(sensors) == 1:
+            moved = np.repeat(moved, 2, axis=0)
+        sigma_k = PROBE_SIGMA_K if probe in measured_c else UNKNOWN_SIGMA_K
+        common = fit @ moved.reshape(-1) * sigma_k
+        covariance += np.outer(common, common)
+    return np.asarray(covariance / (mosaic.model.pitch_mm * 1e3) ** 2)
+
+
+def _datum_design(xy_mm: Array) -> Array:
+    """How shift, scale and rotation move points: (2 n, 4), x and y of each in turn."""
+    design = np.zeros((2 * len(xy_mm), 4))
+    design[0::2, 0], design[1::2, 1] = 1.0, 1.0
+    design[0::2, 2], design[1::2, 2] = xy_mm[:, 0], xy_mm[:, 1]
+    design[0::2, 3], design[1::2, 3] = -xy_mm[:, 1], xy_mm[:, 0]
+    return design
