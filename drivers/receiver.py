@@ -11,10 +11,11 @@ from collections.abc import Iterable, Mapping
 
 from drivers.clock import Clock
 from drivers.contract import DeviceError
-from drivers.message_decoder import MessageDecoder, Nav
+from drivers.message_decoder import MessageDecoder
 from drivers.serial_device import (
     READ_STEP_S,
     PortOpener,
+    Sample,
     SerialDevice,
     SerialLine,
     open_serial_port,
@@ -97,7 +98,7 @@ class ListeningNavigator(SerialDevice):
     def connected(self) -> None:
         self.decoder.reset()
 
-    def step(self, line: SerialLine) -> Iterable[Nav]:
+    def step(self, line: SerialLine) -> Iterable[Sample]:
         frames, bad = self.decoder.frames, self.decoder.bad_messages
         records = self.decoder.feed(line.read(READ_STEP_S), self.clock.mono_ns())
         self.heard(messages=self.decoder.frames - frames)

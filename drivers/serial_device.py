@@ -17,6 +17,7 @@ import serial
 
 from drivers.clock import BackOff, Clock, HostClock
 from drivers.contract import (
+    ClockReading,
     DeviceError,
     EventMark,
     LifeCycle,
@@ -34,7 +35,7 @@ READ_STEP_S: Final = 0.2
 """Longest wait for bytes before the driver looks up again."""
 WRITE_TIMEOUT_S: Final = 1.0
 
-Sample = NavSample | EventMark | TemperatureSample
+Sample = NavSample | EventMark | TemperatureSample | ClockReading
 
 
 class Port(Protocol):

@@ -10,17 +10,25 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import ClassVar, Final
 
 from drivers.clock import Clock
+from drivers.contract import ClockReading
 from drivers.mavlink.decoder import MavlinkDecoder, Timesync
 from drivers.mavlink.library import dialect
-from drivers.message_decoder import Nav
 from drivers.receiver import ListeningNavigator
-from drivers.serial_device import LineLostError, PortOpener, SerialLine, open_serial_port
+from drivers.serial_device import (
+    LineLostError,
+    PortOpener,
+    Sample,
+    SerialLine,
+    open_serial_port,
+)
 from drivers.settings import Setting
 
 SECOND_NS: Final = 1_000_000_000
 COMPANION: Final = 191
 """MAV_COMP_ID_ONBOARD_COMPUTER: who we are on the autopilot's bus."""
 ASK_AGAIN_NS: Final = 5 * SECOND_NS
+ANSWER_WITHIN_NS: Final = SECOND_NS
+"""A later answer to TIMESYNC says little, and may be of an autopilot that has restarted."""
 SET_MESSAGE_INTERVAL: Final = 511
 AUTOPILOTS: Final = {3: "ArduPilot", 12: "PX4"}
 
@@ -30,9 +38,10 @@ TimesyncListener = Callable[[Timesync], None]
 class MavlinkNavigator(ListeningNavigator):
     """An autopilot that speaks MAVLink 1 or 2.
 
-    Yields a NavSample for every GLOBAL_POSITION_INT and an EventMark for every CAMERA_TRIGGER. It
-    says by a heartbeat once a second that it is there, as an onboard computer, and asks for the
-    messages it needs that do not come. It commands nothing else.
+    Yields a NavSample for every GLOBAL_POSITION_INT, an EventMark for every CAMERA_TRIGGER, and a
+    ClockReading for every TIMESYNC that it asked for and was answered. It says by a heartbeat once
+    a second that it is there, as an onboard computer, and asks for the messages it needs that do
+    not come. It commands nothing else.
 
     Source: MAVLink common message set.
     """
@@ -55,6 +64,9 @@ class MavlinkNavigator(ListeningNavigator):
     position_hz = Setting(10.0, minimum=0.1, maximum=400, says="rate of GLOBAL_POSITION_INT")
     attitude_hz = Setting(50.0, minimum=0.1, maximum=1000, says="rate of ATTITUDE_QUATERNION")
     imu_hz = Setting(0.0, minimum=0, maximum=1000, says="rate of HIGHRES_IMU; 0: not asked for")
+    timesync_hz = Setting(
+        1.0, minimum=0, maximum=20, says="how often its clock is asked for (TIMESYNC); 0: never"
+    )
     mark_accuracy_ns = Setting(
         1_000_000, minimum=1, maximum=1_000_000_000, says="accuracy of CAMERA_TRIGGER's time"
     )
@@ -82,8 +94,10 @@ class MavlinkNavigator(ListeningNavigator):
         self._heartbeat_ns = 0
         self._ask_ns = 0
         self._seen_when_asked: dict[str, int] = {}
+        self._timesync_ns = 0
+        self._asked_at_ns: set[int] = set()
         self._timesync_listener: TimesyncListener | None = None
-        self.counters.update(requests=0, refusals=0)
+        self.counters.update(requests=0, refusals=0, timesyncs=0)
 
     def new_decoder(self) -> MavlinkDecoder:
         return MavlinkDecoder(
@@ -128,27 +142,41 @@ class MavlinkNavigator(ListeningNavigator):
 
     def connected(self) -> None:
         super().connected()
-        self._heartbeat_ns = self._ask_ns = self.clock.mono_ns()
+        self._heartbeat_ns = self._ask_ns = self._timesync_ns = self.clock.mono_ns()
         self._seen_when_asked = {}
+        self._asked_at_ns = set()
 
-    def step(self, line: SerialLine) -> Iterable[Nav]:
+    def step(self, line: SerialLine) -> Iterable[Sample]:
         self._talking = line
         self._tend(line)
-        records = super().step(line)
+        samples = [*super().step(line)]
         while self.decoder.timesyncs:
             timesync = self.decoder.timesyncs.popleft()
+            samples += self._reading(timesync)
             if self._timesync_listener is not None:
                 self._timesync_listener(timesync)
         while self.decoder.refusals:
             self._on_refusal(*self.decoder.refusals.popleft())
-        return records
+        return samples
+
+    def _reading(self, timesync: Timesync) -> list[ClockReading]:
+        """The autopilot's clock, where this is the answer to what we asked; it is used once."""
+        round_trip_ns = timesync.mono_ns - timesync.ts1_ns
+        if timesync.tc1_ns <= 0 or timesync.ts1_ns not in self._asked_at_ns:
+            return []
+        self._asked_at_ns.discard(timesync.ts1_ns)
+        if not 0 <= round_trip_ns <= ANSWER_WITHIN_NS:
+            return []
+        self.counters["timesyncs"] += 1
+        half_ns = round_trip_ns // 2
+        return [ClockReading(self.name, timesync.tc1_ns, timesync.ts1_ns + half_ns, half_ns + 1)]
 
     def close(self) -> None:
         self._talking = None
         super().close()
 
     def _tend(self, line: SerialLine) -> None:
-        """Heartbeat and requests, when they are due."""
+        """Heartbeat, TIMESYNC and requests, when they are due."""
         now_ns = self.clock.mono_ns()
         if now_ns >= self._heartbeat_ns:
             self._heartbeat_ns = now_ns + SECOND_NS
@@ -164,6 +192,12 @@ class MavlinkNavigator(ListeningNavigator):
                     3,
                 ),
             )
+        if self.timesync_hz and self.decoder.system and now_ns >= self._timesync_ns:
+            self._timesync_ns = now_ns + round(SECOND_NS / self.timesync_hz)
+            self._asked_at_ns = {at for at in self._asked_at_ns if now_ns - at < ANSWER_WITHIN_NS}
+            asked_ns = self.clock.mono_ns()
+            self._asked_at_ns.add(asked_ns)
+            self._say(line, dialect().MAVLink_timesync_message(0, asked_ns))
         if self.request and self.decoder.system and now_ns >= self._ask_ns:
             self._ask_ns = now_ns + ASK_AGAIN_NS
             self._ask_for_what_does_not_come(line)

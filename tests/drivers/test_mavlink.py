@@ -19,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from drivers.contract import DeviceError, EventMark, NavSample
+from drivers.contract import ClockReading, DeviceError, EventMark, NavSample
 from drivers.gps_time import SECOND_NS, WEEK_NS
 from drivers.mavlink.boot_clock import GPS_EPOCH_UNIX_NS, BootClock
 from drivers.mavlink.decoder import MavlinkDecoder, Timesync, angles_of, between
@@ -353,9 +353,16 @@ def test_places_attitudes_and_triggers_of_the_emulated_autopilot_come_out_right(
 def test_the_port_for_timesync_measures_the_autopilots_clock() -> None:
     clock = WorldClock.starting_now()
     autopilot = MavlinkAutopilot(clock, flying, line=new_line("udp"), drift_ppm=0.0)
-    navigator = MavlinkNavigator("fc", {"port": autopilot.port})
+    navigator = MavlinkNavigator("fc", {"port": autopilot.port, "timesync_hz": 20})
     heard: list[Timesync] = []
-    answered = threading.Event()
+    answered, read = threading.Event(), threading.Event()
+    notebook, sent = Notebook(), list[int]()
+
+    def watch(_: object) -> None:
+        if sum(isinstance(r, ClockReading) for r in notebook.records) >= 5:
+            read.set()
+
+    notebook.stop = watch
 
     def listen(timesync: Timesync) -> None:
         heard.append(timesync)
@@ -366,13 +373,21 @@ def test_the_port_for_timesync_measures_the_autopilots_clock() -> None:
     autopilot.start()
     try:
         navigator.bind()
-        with running(navigator, Notebook()):
+        with running(navigator, notebook):
             for _ in range(5):
                 answered.clear()
-                assert navigator.send_timesync(tc1_ns=0, ts1_ns=time.monotonic_ns())
+                sent.append(time.monotonic_ns())
+                assert navigator.send_timesync(tc1_ns=0, ts1_ns=sent[-1])
                 assert answered.wait(WITHIN_S)
+            assert read.wait(WITHIN_S)
     finally:
         autopilot.close()
+    readings = [r for r in notebook.records if isinstance(r, ClockReading)]
+    for reading in readings:
+        there_ns = autopilot.boot_ns(clock.gps_ns(reading.mono_ns))
+        assert abs(reading.device_ns - there_ns) <= reading.half_width_ns
+        assert reading.device == "fc"
+    assert not {t.ts1_ns for t in heard} <= set(sent), "the driver asks by itself, too"
     best = min(heard, key=lambda t: t.mono_ns - t.ts1_ns)
     round_trip_ns = best.mono_ns - best.ts1_ns
     true_ns = autopilot.boot_ns(clock.gps_ns(best.ts1_ns + round_trip_ns // 2))
@@ -420,6 +435,7 @@ def test_it_says_that_it_is_there_and_asks_for_what_does_not_come() -> None:
     assert {(m.get_srcSystem(), m.get_srcComponent()) for m in said} == {(1, 191)}
     names = [m.get_type() for m in said]
     assert 13 <= names.count("HEARTBEAT") <= 16
+    assert 13 <= names.count("TIMESYNC") <= 16
     asked = [m for m in said if m.get_type() == "COMMAND_LONG"]
     assert {(m.command, m.target_system, m.target_component) for m in asked} == {(511, 1, 1)}
     assert {(m.param1, m.param2) for m in asked} == {
