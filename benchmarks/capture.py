@@ -311,7 +311,7 @@ def _judged(
         "problems": retention.problems[:20],
         "events": flown["events"][:20],
         "cpu_s": flown["cpu_s"],
-        "cpu_s_per_exposure": {k: s / max(complete, 1) for k, s in flown["cpu_s"].items()},
+        "cpu_s_per_exposure": {k: s / wanted for k, s in flown["cpu_s"].items()},
         "store_s": _spread(flown["store_s"]),
         "trigger_to_stored_s": _spread(flown["delay_s"]),
     }
