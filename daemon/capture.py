@@ -15,6 +15,7 @@ from typing import Any
 from daemon.memory import FrameRing
 from daemon.messages import Bound, DeviceSpec, Fire, Fired, NotBound, Ping, Pong, Recycle, Stop
 from daemon.processes import Link
+from daemon.timesync import TimesyncAsker, can_be_asked
 from drivers import registry
 from drivers.contract import (
     Device,
@@ -53,6 +54,11 @@ class _Capture:
                 self.heads[spec.name] = device
                 self.heads_of_output.setdefault(spec.output, []).append(device)
         self.trigger_spec = trigger_spec
+        self.askers = [
+            TimesyncAsker(device, self._sink)
+            for _, device in self.devices.values()
+            if can_be_asked(device)
+        ]
 
     def run(self) -> None:
         threads = [
@@ -60,6 +66,10 @@ class _Capture:
             for pair in self.devices.values()
         ]
         threads.append(threading.Thread(target=self._fire_orders, name="trigger", daemon=True))
+        threads += [
+            threading.Thread(target=asker.run, name="timesync", daemon=True)
+            for asker in self.askers
+        ]
         for thread in threads:
             thread.start()
         while not isinstance(order := self.link.receive(timeout_s=1.0), Stop):
@@ -72,6 +82,8 @@ class _Capture:
                 counted = {name: dict(d.statistics()) for name, (_, d) in self.devices.items()}
                 self.link.send(Pong(counted))
         self.orders.put(None)
+        for asker in self.askers:
+            asker.stop()
         closers = [
             threading.Thread(target=device.close, daemon=True)
             for _, device in self.devices.values()

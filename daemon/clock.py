@@ -32,6 +32,8 @@ MESSAGES_FROM_THE_FUTURE: Final = 5
 LONG_GAP_NS: Final = 100 * SECOND_NS
 NAMING_TOLERANCE_NS: Final = 100_000_000
 ROUND_TRIPS_KEPT: Final = 32
+UNUSUAL: Final = 1.7
+"""A round trip so many times the median is one that somebody was late in."""
 RESIDUALS_KEPT: Final = 64
 BELIEF: Final = 4.0
 """How many readings the stated sigma of a pulse's host time weighs against what is seen."""
@@ -71,7 +73,7 @@ class RoundTrips:
     """How well the middle of a round trip is the moment asked about, from recent round trips.
 
     What is usual is taken as jitter of a constant size, since nobody knows which way took longer;
-    what a round trip is longer than twice the usual counts in full.
+    what a round trip is longer than is still usual counts in full.
     """
 
     def __init__(self) -> None:
@@ -95,7 +97,7 @@ class RoundTrips:
     def sigma_ns(self, half_width_ns: int) -> float:
         """Standard deviation of the middle of a round trip of that half width."""
         usual = self.usual_ns or float(half_width_ns)
-        excess = max(0.0, half_width_ns - 2 * usual)
+        excess = max(0.0, half_width_ns - UNUSUAL * usual)
         return max(1.0, math.hypot(min(half_width_ns, usual) / math.sqrt(3), excess))
 
 

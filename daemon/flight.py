@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 
 from daemon.clock import ClockEvent, HostClock, Source
 from daemon.configuration import LimitsSection
+from daemon.device_clocks import DeviceClocks
 from daemon.exposure import (
     Capture,
     Exposure,
@@ -25,7 +26,14 @@ from daemon.ledger import Ledger
 from daemon.matching import Cause, Matcher, Pulse
 from daemon.navigation import Track
 from daemon.temperatures import Temperatures
-from drivers.contract import EventMark, Frame, NavSample, PpsEdge, TemperatureSample
+from drivers.contract import (
+    ClockReading,
+    EventMark,
+    Frame,
+    NavSample,
+    PpsEdge,
+    TemperatureSample,
+)
 from processing.drift import lagged_sensors
 from processing.quality import Flag
 from processing.rig import Rig
@@ -106,6 +114,8 @@ class Flight:
         self.limits = limits
         self.ledger = ledger
         self.clock = HostClock()
+        self.device_clocks = DeviceClocks()
+        self._steps_told: dict[str, int] = {}
         self.track = Track()
         self.temperatures = Temperatures(lagged_sensors(rig))
         self.idle_slots: list[tuple[str, int]] = []
@@ -138,6 +148,7 @@ class Flight:
 
     def frame(self, frame: Frame) -> Cause:
         """A frame arrived. Its slot is kept only where the frame is used."""
+        self._read_latch(frame)
         match = self._matcher.frame(frame)
         cause = match.cause
         exposure = None if match.number is None else self._open.get(match.number)
@@ -153,6 +164,12 @@ class Flight:
         self.idle_slots.append((frame.head, frame.slot))
         return cause
 
+    def _read_latch(self, frame: Frame) -> None:
+        at_ns, mono_ns = frame.device_clock_ns, frame.device_clock_mono_ns
+        if at_ns is not None and mono_ns is not None and frame.latch_sigma_ns is not None:
+            reading = ClockReading(frame.head, at_ns, mono_ns, frame.latch_sigma_ns)
+            self.device_clocks.read(reading)
+
     def mark(self, mark: EventMark) -> Cause:
         """An event mark arrived. USED and PENDING may change until its exposure is sealed."""
         cause = self._matcher.mark(mark).cause
@@ -165,9 +182,25 @@ class Flight:
         self.clock.pps_edge(edge.mono_ns, edge.sigma_ns)
         self._matcher.marks.reconsider()
 
+    def clock_reading(self, reading: ClockReading) -> None:
+        """A device's clock was read."""
+        self.device_clocks.read(reading)
+
     def clock_events(self, mono_ns: int) -> list[ClockEvent]:
-        """What is to be told of the clock since the last time of asking."""
-        return self.clock.events(mono_ns)
+        """What is to be told of the clocks since the last time of asking."""
+        told = self.clock.events(mono_ns)
+        for device, steps in self.device_clocks.steps().items():
+            if steps > self._steps_told.get(device, 0):
+                self._steps_told[device] = steps
+                told.append(
+                    ClockEvent(
+                        "device-clock-stepped",
+                        True,
+                        f"the clock of {device} stepped or started again; it is learned anew; "
+                        "check its power if it happens again",
+                    )
+                )
+        return told
 
     def land(self) -> None:
         """No more marks will come: what is still held belongs nowhere."""

@@ -219,6 +219,7 @@ class Service:
         self._log(edge)
 
     def _on_clock_reading(self, reading: ClockReading) -> None:
+        self.flight.clock_reading(reading)
         self._log(reading)
 
     def _on_temperature(self, sample: TemperatureSample) -> None:

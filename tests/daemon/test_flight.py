@@ -14,6 +14,7 @@ from daemon.log_records import LoggedTrigger, message_of, record_of
 from daemon.matching import Cause, Pulse
 from daemon.recovery_match import seal_from_log
 from drivers.contract import (
+    ClockReading,
     EventMark,
     Frame,
     FrameStatus,
@@ -310,3 +311,40 @@ def test_recovery_makes_the_same_record_from_the_log_as_the_flight_did(*, has_ma
         replace(due.capture, frames=frames), [r for r in read_back if r is not None]
     )
     assert recovered == seal(flying, 9 * NS)
+
+
+def test_a_head_whose_clock_starts_again_is_told_of_once() -> None:
+    flying = flight()
+    given = [fly_one(flying, number, 2.0 * number) for number in range(1, 8)]
+    flying.clock_events(14 * NS)
+    again = replace(
+        frame("G", given[-1]),
+        device_ns=5,
+        device_clock_ns=1,
+        device_clock_mono_ns=given[-1].mono_ns,
+    )
+    for earlier in range(1, 8):
+        mono_ns = 2 * NS * earlier
+        flying.clock_reading(ClockReading("G", 900 * NS + mono_ns, mono_ns, 40_000))
+    flying.frame(again)
+    (told,) = flying.clock_events(15 * NS)
+    assert told.name == "device-clock-stepped" and "G" in told.sentence and told.is_fault
+    assert flying.clock_events(16 * NS) == []
+
+
+def test_holdover_is_told_with_cause_and_cure_and_flagged_and_ends() -> None:
+    flying = flight()
+    given = fly_one(flying, 1, 20.0)
+    (told,) = flying.clock_events(21 * NS)
+    assert told.name == "pps-holdover" and told.is_fault
+    assert "check the PPS cable" in told.sentence
+    flying.stored(1, stored_frames(flying, 1, 21 * NS))
+    exposure = seal(flying, 24 * NS)
+    assert exposure.mark_source == "pps" and Flag(exposure.flags) & Flag.TIME_HOLDOVER
+    assert exposure.mark_gps_ns is not None and exposure.mark_sigma_ns is not None
+    true_ns = GPS_NS + given.mono_ns + STROBE_NS
+    assert abs(exposure.mark_gps_ns - true_ns) < 2 * exposure.mark_sigma_ns
+    assert exposure.mark_sigma_ns > 10_000, "twenty seconds after the second of two edges"
+    flying.pps(PpsEdge("gnss", 30, 25 * NS, 1_000))
+    (back,) = flying.clock_events(25 * NS)
+    assert back.name == "pps-holdover" and not back.is_fault

@@ -25,7 +25,9 @@ class Oscillator:
     crystal's sensitivity. After IEEE Std 1139 and what crystal data sheets give: 0.03 to 0.5 ppm/K.
     """
 
-    def __init__(self, chance: np.random.Generator, span_s: float) -> None:
+    def __init__(
+        self, chance: np.random.Generator, span_s: float, *, harshness: float = 1.0
+    ) -> None:
         n = math.ceil(span_s / STEP_S) + 2
         wander = 10 ** chance.uniform(-10.5, -8.8)
         sensitivity = 10 ** chance.uniform(-7.5, -6.3)
@@ -39,7 +41,9 @@ class Oscillator:
         case, _ = lfilter([1.0 - lag], [1.0, -lag], air, zi=[air[0] * lag])
         rate = chance.normal(0.0, 15e-6) + chance.normal(0.0, 1e-12) * np.arange(n) * STEP_S
         rate = rate + np.cumsum(chance.normal(0.0, wander * math.sqrt(STEP_S), n))
-        rate = rate + sensitivity * case + chance.normal(0.0, 1e-10 / math.sqrt(STEP_S), n)
+        rate = (
+            rate + harshness * sensitivity * case + chance.normal(0.0, 1e-10 / math.sqrt(STEP_S), n)
+        )
         self._phase_ns = np.concatenate([[0.0], np.cumsum(rate) * STEP_S * 1e9])
 
     def reads(self, true_s: float) -> float:
@@ -58,11 +62,16 @@ class Fired:
 
 
 class Host:
-    """A computer: interrupts that wait, processes that are scheduled late."""
+    """A computer: interrupts that wait, processes that are scheduled late.
 
-    def __init__(self, chance: np.random.Generator, span_s: float) -> None:
+    `harshness` multiplies what temperature does to its crystal.
+    """
+
+    def __init__(
+        self, chance: np.random.Generator, span_s: float, *, harshness: float = 1.0
+    ) -> None:
         self._chance = chance
-        self.clock = Oscillator(chance, span_s)
+        self.clock = Oscillator(chance, span_s, harshness=harshness)
         self._interrupt_ns = chance.uniform(1.0, 8.0) * US
         self._interrupt_jitter_ns = chance.uniform(0.3, 3.0) * US
         self._way_there_ns = 40 * US * math.exp(chance.normal(0.0, 0.35))
