@@ -108,6 +108,7 @@ def main() -> None:
     parser.add_argument("--interval", type=float, help="s; the rig's own by default")
     parser.add_argument("--root", type=Path, help="where Level-0 goes (default: a folder in /tmp)")
     parser.add_argument("--noise", action="store_true", help="frames of noise, nothing rendered")
+    parser.add_argument("--depth", type=int, default=3, help="exposures in memory")
     parser.add_argument("--packet-size", type=int, default=9000)
     parser.add_argument("--rate", type=float, default=40.0, help="MB/s of one head")
     parser.add_argument("--processes", type=int, default=2, help="of emulated heads")
@@ -162,7 +163,7 @@ def _run(options: argparse.Namespace, rig: Rig, folder: Path) -> dict[str, Any]:
     finally:
         emulator.kill()
     return _judged(
-        options, rig, flown, json.loads(counted), load_before, interval_s, exposure_nbytes
+        options, rig, folder, flown, json.loads(counted), load_before, interval_s, exposure_nbytes
     )
 
 
@@ -194,6 +195,7 @@ def _configuration(
         f"count = {options.exposures}",
         "[limits]",
         "mark_timeout_s = 0.1  # there is no receiver to wait for",
+        f"exposures_in_memory = {options.depth}",
     ]
     for sensor in rig.sensors:
         lines += [
@@ -263,6 +265,7 @@ def _fly(
 def _judged(
     options: argparse.Namespace,
     rig: Rig,
+    folder: Path,
     flown: Mapping[str, Any],
     counted: Mapping[str, Mapping[str, int]],
     load_before: float,
@@ -299,6 +302,8 @@ def _judged(
         "seconds": seconds,
         "mb_per_s": exposure_nbytes * complete / 1e6 / seconds if seconds else 0.0,
         "packet_size": options.packet_size,
+        "exposures_in_memory": options.depth,
+        "file_system": _file_system(folder),
         "nothing_lost": nothing_lost,
         "triggers": triggers,
         "frames_of_ledger": frames,
@@ -315,6 +320,14 @@ def _judged(
         "store_s": _spread(flown["store_s"]),
         "trigger_to_stored_s": _spread(flown["delay_s"]),
     }
+
+
+def _file_system(folder: Path) -> str:
+    """The kind of file system a folder lies on."""
+    found = subprocess.run(
+        ["stat", "-f", "-c", "%T", folder], capture_output=True, text=True, timeout=10, check=False
+    )
+    return found.stdout.strip()
 
 
 def _spread(seconds: list[float]) -> dict[str, float]:
@@ -336,7 +349,8 @@ def _print(result: Mapping[str, Any]) -> None:
     )
     console.print(
         f"{result['rig']}, {result['frames']} frames, {result['exposures']} exposures every "
-        f"{result['interval_s']} s: {result['mb_per_s']:.0f} MB/s over {result['seconds']:.0f} s"
+        f"{result['interval_s']} s: {result['mb_per_s']:.0f} MB/s over {result['seconds']:.0f} s, "
+        f"on {result['file_system']}, {result['exposures_in_memory']} exposures in memory"
     )
     table = Table(title="CPU", title_justify="left")
     for heading in ("process", "s", "s per exposure", "of a core"):
