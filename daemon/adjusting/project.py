@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from daemon.adjusting.project_file import CameraSection, HeadSection, ProjectFile, read_project_file
 from daemon.adjusting.tables import ProjectError, Table, read_table
 from processing.bundle.adjust import Settings
+from processing.bundle.bent_rays import Rays
 from processing.bundle.network import (
     INTERIOR,
     Attitudes,
@@ -102,6 +103,7 @@ def read_project(path: Path) -> Project:
         gnss=_gnss(folder, file, build),
         bearings=_bearings(folder, file, build),
         constraints=tuple(Constraint(dict(c.coefficients)) for c in file.constraint),
+        rays=Rays(file.adjust.earth_radius_m, file.adjust.refraction, file.adjust.ground_m),
     )
     problems += [p for table in build.tables for p in table.problems]
     if problems:

@@ -26,6 +26,9 @@ class AdjustSection(_Section):
     most_iterations: int = Field(default=30, ge=1, le=1000)
     image_sigma_um: float = Field(default=1.0, gt=0.0)
     gnss: Literal["none", "shift", "linear"] = "none"
+    earth_radius_m: float | None = Field(default=None, gt=1e6)
+    refraction: bool = False
+    ground_m: float = 0.0
 
 
 class FilesSection(_Section):

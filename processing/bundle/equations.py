@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from processing.bundle.bent_rays import bent
 from processing.bundle.camera_model import (
     ideal_mm,
     interior_derivatives,
@@ -165,6 +166,9 @@ def _image_rows(
         object_from_rig = state.attitude[attitude]
         scale = np.where(network.points.at_infinity[point], 0.0, 1.0)
         ray = state.points[point] - scale[:, None] * state.station[station]
+        straight = network.rays.straight
+        if not straight:
+            ray, ray_by_point, ray_by_station = bent(ray, state.station[station, 2], network.rays)
         in_rig = np.einsum("nji,nj->ni", object_from_rig, ray)
         rig_from_camera = np.broadcast_to(np.eye(3), (len(rows), 3, 3)).copy()
         offset = np.zeros((len(rows), 3))
@@ -188,11 +192,14 @@ def _image_rows(
             by_seen[:, :, 2] = -projected / seen[:, 2:]
             by_rig = np.einsum("nij,nkj->nik", by_seen, rig_from_camera)
             by_point = np.einsum("nij,nkj->nik", by_rig, object_from_rig)
+            by_station = -by_point * scale[:, None, None]
+            if not straight:
+                by_point, by_station = by_point @ ray_by_point, by_point @ ray_by_station
             by_interior = -interior_derivatives(camera, interior, measured_mm)
             if camera.model == "centred":
                 by_interior[:, :, 2] = -projected / c
             blocks = [
-                (layout.station[station], -by_point * scale[:, None, None]),
+                (layout.station[station], by_station),
                 (layout.attitude[attitude], by_rig @ skew(in_rig)),
                 (np.broadcast_to(layout.interior[index], (len(rows), 10)), by_interior),
                 (layout.kept[point], by_point),

@@ -18,6 +18,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.bundle.bent_rays import Rays
 from processing.bundle.terms import Term
 
 Array = NDArray[np.float64]
@@ -208,6 +209,7 @@ class Network:
     gnss: Gnss = field(default_factory=no_gnss)
     bearings: Bearings = field(default_factory=no_bearings)
     constraints: tuple[Constraint, ...] = ()
+    rays: Rays = field(default_factory=Rays)
 
     def problems(self) -> tuple[str, ...]:
         """One sentence for each mistake in shapes, indices and numbers; empty when it fits."""
@@ -276,6 +278,8 @@ def _problems(n: Network) -> list[str]:
         if len(set(names)) < len(names):
             twice = next(name for name in names if list(names).count(name) > 1)
             found.append(f"{what} {twice} is given twice")
+    if not n.rays.straight and n.points.at_infinity.any():
+        found.append("directions of a collimator have neither earth curvature nor refraction")
     return found
 
 
