@@ -545,9 +545,7 @@ class Service:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        # In a power failure the disk comes first, and nobody waits for an image.
-        order = ("capture", "worker", "writer")
-        await self.supervisor.end(order[::-1] if self.hurry_ns else order)
+        await self.supervisor.end(("capture", "worker", "writer"))
 
     def _power_fails(self) -> None:
         """The supply said that it will be gone in seconds: no time-out is waited for any more."""

@@ -46,11 +46,17 @@ class Supervisor:
         asyncio.get_running_loop().add_reader(child.connection.fileno(), self._receive, child)
 
     def send(self, name: str, message: object) -> None:
-        """Tell a child something. One that is gone is noticed by its silence, not here."""
+        """Tell a child something. One that is gone is noticed by its silence, not here.
+
+        One that was ended hears nothing any more: others may still talk while they are seen off.
+        """
+        child = self._children.get(name)
+        if child is None:
+            return
         try:
-            self._children[name].send(message)
+            child.send(message)
         except OSError:
-            self._lost(self._children[name])
+            self._lost(child)
 
     def tell(self, name: str, message: object) -> bool:
         """Tell a child something unless that would take time; False where it was dropped."""

@@ -167,6 +167,9 @@ class FlightState:
     def _on_disk(self, event: Mapping[str, Any]) -> None:
         self._raise("disk", str(event.get("sentence", "")), "disk")
 
+    def _on_power(self, event: Mapping[str, Any]) -> None:
+        self._raise("power", str(event.get("sentence", "")), "power")
+
     def _on_ready(self, event: Mapping[str, Any]) -> None:
         self._phase = "ready"
         for absent in event.get("absent", []):
@@ -299,6 +302,7 @@ _HANDLERS: Mapping[str, Callable[[FlightState, Mapping[str, Any]], None]] = {
     "device": FlightState._on_device,
     "fault": FlightState._on_fault,
     "disk": FlightState._on_disk,
+    "power": FlightState._on_power,
     "ready": FlightState._on_ready,
     "status": FlightState._on_status,
     "triggered": FlightState._on_triggered,

@@ -222,3 +222,37 @@ def test_sigterm_lands_in_good_order(emulator: tuple[Emulator, Path]) -> None:
     records = list(Path(mission, "L0").glob("*/exposure.json"))
     assert len(records) == counts["triggers"], "what was open is sealed"
     assert not (folder / "landed" / "current-mission.json").exists(), "the flight is over"
+
+
+def test_a_failing_supply_finds_everything_safe_within_the_stated_time(
+    emulator: tuple[Emulator, Path],
+) -> None:
+    devices, folder = emulator
+    config = folder / "power.toml"
+    config.write_text(service_toml(devices.ready, root="power", count=50, end_when_done=True))
+    service = start(config)
+    mission, stored, triggered = "", set(), set()
+    status: dict[str, Any] = {}
+    begun = 0.0
+    for event in heard(service):
+        if event["event"] == "mission":
+            mission = event["path"]
+        elif event["event"] == "triggered":
+            triggered.add(event["number"])
+            if len(triggered) == 3:
+                begun = time.monotonic()
+                service.send_signal(signal.SIGPWR)
+        elif event["event"] == "stored":
+            stored.add(event["number"])
+        elif event["event"] == "ended":
+            status = event
+    took_s = time.monotonic() - begun
+    assert service.wait(30) == 0
+    # 5 s for what is open, and what ending the processes takes on a busy machine.
+    assert took_s < 15.0, f"{took_s:.1f} s"
+    assert status["ledger"]["balanced"]
+    assert status["ledger"]["triggers"]["open"] == 0
+    assert {1, 2} <= stored
+    verified = syntopic("verify", mission, "--json")
+    assert verified.returncode == 0, verified.stdout
+    assert json.loads(verified.stdout)["exposures"] == len(stored)
