@@ -1,0 +1,148 @@
+"""Cables pulled and power lost: noticed in time, told in words, and healed without anybody's help.
+
+All kinds at once, each with its driver on an emulated receiver; the others are not disturbed.
+"""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from drivers import registry
+from drivers.contract import EventMark, NavSample
+from sim_hw.mavlink_autopilot import MavlinkAutopilot
+from sim_hw.network_line import UdpLine
+from sim_hw.nmea_receiver import NmeaReceiver
+from sim_hw.novatel_receiver import NovatelReceiver
+from sim_hw.pseudo_terminal import PseudoTerminal
+from sim_hw.receiver import EmulatedReceiver
+from sim_hw.septentrio_receiver import SeptentrioReceiver
+from sim_hw.ublox_receiver import UbloxReceiver
+from sim_hw.world_clock import WorldClock
+from tests.drivers.stand_ins import Notebook
+from tests.sim_hw.receiver_state import state_at
+
+WITHIN_S = 40.0
+SILENCE_S = 1.0
+KINDS: dict[str, type[EmulatedReceiver]] = {
+    "ublox": UbloxReceiver,
+    "novatel": NovatelReceiver,
+    "septentrio": SeptentrioReceiver,
+    "nmea": NmeaReceiver,
+}
+
+
+@dataclass
+class Pair:
+    """A receiver, its cable, its driver, and what the driver said."""
+
+    kind: str
+    receiver: Any
+    cable: PseudoTerminal | None
+    navigator: Any
+    notebook: Notebook
+
+    def samples(self) -> int:
+        return sum(isinstance(record, NavSample) for record in self.notebook.records)
+
+
+def wait_for(condition: Callable[[], bool], what: str) -> None:
+    deadline = time.monotonic() + WITHIN_S
+    while not condition():
+        assert time.monotonic() < deadline, f"waited {WITHIN_S:g} s for {what}"
+        time.sleep(0.02)
+
+
+@contextmanager
+def running(pairs: list[Pair]) -> Iterator[None]:
+    threads = [
+        threading.Thread(target=pair.navigator.run, args=(pair.notebook,), daemon=True)
+        for pair in pairs
+    ]
+    for pair, thread in zip(pairs, threads, strict=True):
+        pair.receiver.start()
+        thread.start()
+    try:
+        yield
+    finally:
+        for pair, thread in zip(pairs, threads, strict=True):
+            pair.navigator.close()
+            thread.join(5)
+            pair.receiver.close()
+    assert not any(thread.is_alive() for thread in threads)
+
+
+def on_cables(folder: Path) -> list[Pair]:
+    clock = WorldClock.starting_now()
+    pairs = []
+    for kind, made in KINDS.items():
+        cable = PseudoTerminal(folder / kind)
+        receiver = made(clock, state_at, rate_hz=10.0, line=cable)
+        settings = {"port": receiver.port, "silence_s": SILENCE_S}
+        navigator = registry.driver_for("navigator", kind)("gnss", settings)
+        pairs.append(Pair(kind, receiver, cable, navigator, Notebook()))
+    return pairs
+
+
+def test_a_pulled_cable_is_told_and_healed_for_every_kind(tmp_path: Path) -> None:
+    pairs = on_cables(tmp_path)
+    with running(pairs):
+        for pair in pairs:
+            wait_for(lambda pair=pair: pair.samples() >= 3, f"{pair.kind} to begin")  # type: ignore[misc]
+        for pair in pairs[:-1]:
+            assert pair.cable is not None
+            pair.cable.unplug()
+        for pair in pairs[:-1]:
+            wait_for(lambda pair=pair: "lost" in pair.notebook.event_names, f"{pair.kind} lost")  # type: ignore[misc]
+        before = [pair.samples() for pair in pairs]
+        for pair in pairs[:-1]:
+            assert pair.cable is not None
+            pair.cable.plug_in()
+        for pair, had in zip(pairs, before, strict=True):
+            wait_for(lambda pair=pair, had=had: pair.samples() >= had + 3, f"{pair.kind} back")  # type: ignore[misc]
+    for pair in pairs[:-1]:
+        assert pair.notebook.event_names[:3] == ["opened", "lost", "opened"]
+        lost = next(e for e in pair.notebook.events if e.name == "lost")
+        assert lost.is_fault and "by itself" in lost.sentence
+    assert pairs[-1].notebook.event_names == ["opened"], "the one nobody touched"
+
+
+@pytest.mark.parametrize("power_cycled", [False, True])
+def test_an_autopilot_that_falls_silent_or_restarts_is_heard_again_at_the_right_time(
+    power_cycled: bool,
+) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        here = probe.getsockname()
+    clock = WorldClock.starting_now()
+    autopilot = MavlinkAutopilot(clock, state_at, line=UdpLine(here))
+    navigator = registry.driver_for("navigator", "mavlink")(
+        "fc", {"port": autopilot.port, "silence_s": SILENCE_S}
+    )
+    pair = Pair("mavlink", autopilot, None, navigator, Notebook())
+    silent = threading.Event()
+    autopilot.wire = lambda data, _mono_ns: b"" if silent.is_set() else data
+    with running([pair]):
+        wait_for(lambda: pair.samples() >= 3, "the autopilot to begin")
+        silent.set()
+        if power_cycled:
+            autopilot.restart()
+        wait_for(lambda: "silent" in pair.notebook.event_names, "its silence to be told")
+        silent.clear()
+        wait_for(lambda: "recovered" in pair.notebook.event_names, "it to be heard again")
+        had = pair.samples()
+        wait_for(lambda: pair.samples() >= had + 12, "its navigation")
+        autopilot.mark(given_ns := clock.gps_ns(time.monotonic_ns()) + 50_000_000)
+        wait_for(lambda: any(isinstance(r, EventMark) for r in pair.notebook.records), "its mark")
+    mark = next(r for r in pair.notebook.records if isinstance(r, EventMark))
+    assert mark.time_valid
+    assert abs(mark.gps_ns - given_ns) < 1_500_000
+    assert navigator.statistics()["clock_steps"] == power_cycled  # type: ignore[attr-defined]
