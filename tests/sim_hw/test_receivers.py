@@ -13,6 +13,8 @@ from typing import Any
 
 import pytest
 
+from drivers.contract import EventMark
+from drivers.novatel.decoder import NovatelDecoder
 from sim_hw.nmea_receiver import NmeaReceiver
 from sim_hw.novatel_receiver import CLOCK_OFFSET_MAX_NS, NovatelReceiver
 from sim_hw.receiver import Edge, EmulatedReceiver
@@ -148,6 +150,30 @@ def test_novatels_own_decoder_reads_every_mark_twice_and_to_the_nanosecond() -> 
         assert abs(rx_ns - round(offset_ns) - at_ns) <= 1
         assert abs(pva.week * WEEK_NS + round(pva.seconds * 1e9) - at_ns) <= 1
         assert pva.height == STATE.height_m
+
+
+@pytest.mark.parametrize("mark_input", [2, 3, 4])
+def test_every_mark_input_of_the_novatel_has_logs_of_its_own(mark_input: int) -> None:
+    receiver = make(NovatelReceiver)
+    receiver.mark_input = mark_input
+    data = receiver.event_bytes(Edge(EDGES_NS[0], True, 1))
+    receiver.close()
+    assert [name for name, _ in oem(data)] == [f"MARK{mark_input}TIME", f"MARK{mark_input}PVA"]
+    (mark,) = NovatelDecoder("gnss").feed(data, 0)
+    assert isinstance(mark, EventMark)
+    assert (mark.channel, abs(mark.gps_ns - EDGES_NS[0]) <= 1) == (mark_input, True)
+
+
+def test_asked_for_both_edges_the_septentrio_tells_each_with_its_polarity() -> None:
+    receiver = make(SeptentrioReceiver)
+    receiver.tells_both_edges = True
+    edges = [Edge(EDGES_NS[0], True, 1), Edge(EDGES_NS[0] + 50_000, False, 1)]
+    data = b"".join(map(receiver.event_bytes, edges))
+    receiver.close()
+    reader = pytest.importorskip("pysbf2", reason="pysbf2 is absent; pip install it").SBFReader
+    events = [m for _, m in reader(io.BytesIO(data), quitonerror=2) if m.identity == "ExtEvent"]
+    assert [m.Polarity for m in events] == [0, 1]
+    assert events[1].Offset - events[0].Offset == pytest.approx(50e-6, abs=1e-9)
 
 
 def test_pynmeagps_reads_the_nmea_receivers_numbers_and_every_checksum() -> None:
