@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -52,19 +52,27 @@ def world_settings(rig: str | Path, seed: int, **others: object) -> WorldSetting
     return replace(plain, **others)  # type: ignore[arg-type]
 
 
-def take(world: World, scenes: Path, *, place: int = 0, scene: Scene | None = None) -> Exposure:
+def take(
+    world: World,
+    scenes: Path,
+    *,
+    place: int = 0,
+    scene: Scene | None = None,
+    without: Collection[str] = (),
+) -> Exposure:
     """Take exposure number `place` of the first line.
 
     Args:
         world: the world; its scene is built in the folder `scenes` unless one is given.
+        without: sensors that do not look.
     """
     scene = scene or open_scene(world.scene_settings, scenes)
     first_ns = EPOCH_GPS_NS + round(FIRST_AFTER_S * 1e9)
     flight = world.flight.beginning_first_line_at(world.flight.distance_flown_m(first_ns))
     period_ns = round(world.plan.distance_m / world.plan.ground_speed_mps * 1e9)
-    return Exposure(
-        world, flight, snapshots.take(world, scene, flight, first_ns + place * period_ns)
-    )
+    mark_ns = first_ns + place * period_ns
+    snapshot = snapshots.take(world, scene, flight, mark_ns, without=without)
+    return Exposure(world, flight, snapshot)
 
 
 def radiometry_of(heads: Heads) -> dict[str, RadiometricCalibration]:

@@ -286,7 +286,8 @@ class Pipeline:
     ) -> tuple[EstimatedDc, ...]:
         if validity is None:
             return ()
-        displaced = () if validity.displaced is None else (validity.displaced.sensor,)
+        moved = validity.displaced
+        displaced = () if moved is None else (moved.sensor, *validity.alternatives)
         return estimate_dc(
             self.rig,
             mosaic,

@@ -229,16 +229,20 @@ def robust_datum(
     """The mosaic in the datum of the master sensors that are still in place.
 
     Without a displaced sensor this is `mosaic` itself. The inner geometry is the same; what changes
-    is the datum, which a displaced sensor pulls by a quarter of its displacement.
+    is the datum, which a displaced sensor pulls by a quarter of its displacement. Where another
+    sensor may be the one that moved, the datum rests on neither, if two are left to carry it.
     """
     if validity.displaced is None:
         return mosaic
+    suspects = (validity.displaced.sensor, *validity.alternatives)
+    if len(set(mosaic.datum_sensors) - set(suspects)) < 2:
+        suspects = suspects[:1]
     return free_mosaic(
         rig,
         placements,
         tie_points,
         settings=settings,
-        excluded_datum_sensors=(validity.displaced.sensor,),
+        excluded_datum_sensors=suspects,
         begin=mosaic,
     )
 

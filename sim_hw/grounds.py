@@ -30,12 +30,17 @@ HEADROOM = 4.0
 
 @dataclass(frozen=True)
 class Ground:
-    """A kind of ground. `light` is the illumination against what the exposure was planned for."""
+    """A kind of ground.
+
+    `light` is the illumination against what the exposure was planned for; `moves` that there is
+    traffic; `over_land` that the painter changes a landscape and does not make all of the picture.
+    """
 
     says: str
     paint: Painter
     light: float = 1.0
     moves: bool = False
+    over_land: bool = False
 
 
 def _landscape(picture: Picture, sample_m: float, random: np.random.Generator) -> Picture:
@@ -171,19 +176,23 @@ def motorways_px(width_px: int) -> tuple[float, float]:
 
 
 GROUNDS: Mapping[str, Ground] = {
-    "landscape": Ground("fields, villages and woods from photographs", _landscape),
+    "landscape": Ground("fields, villages and woods from photographs", _landscape, over_land=True),
     "open-water": Ground("the sea in a breeze", _open_water),
     "calm-water": Ground("a lake without wind", _calm_water),
-    "coast": Ground("half land, half a lake without wind", _coast),
+    "coast": Ground("half land, half a lake without wind", _coast, over_land=True),
     "desert": Ground("dunes", _desert),
     "snow": Ground("fresh snow, exposed for", _snow),
     "snow-burnt": Ground("fresh snow, exposed as for fields", _snow, light=2.2),
     "night": Ground("night, street lamps", _night, light=HEADROOM),
-    "dusk": Ground("a landscape with a hundredth of the light", _landscape, light=0.01),
-    "haze": Ground("a landscape through 3 km visibility", _haze),
-    "roofs": Ground("mirroring roofs over a fifth of the ground", _roofs, light=HEADROOM),
+    "dusk": Ground(
+        "a landscape with a hundredth of the light", _landscape, light=0.01, over_land=True
+    ),
+    "haze": Ground("a landscape through 3 km visibility", _haze, over_land=True),
+    "roofs": Ground(
+        "mirroring roofs over a fifth of the ground", _roofs, light=HEADROOM, over_land=True
+    ),
     "rows": Ground("vineyards and solar parks", _rows),
-    "traffic": Ground("dense traffic along two overlaps", _motorways, moves=True),
+    "traffic": Ground("dense traffic along two overlaps", _motorways, moves=True, over_land=True),
 }
 """Every kind of ground by name."""
 

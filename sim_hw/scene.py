@@ -133,15 +133,12 @@ def _build(settings: SceneSettings, folder: Path) -> None:
         if settings.file is not None:
             canvas = read_geotiff(Path(settings.file), settings)
         else:
-            sources = [radiance(path) for path in shipped_pictures()]
-            size = {"height_px": settings.height_px, "width_px": settings.width_px}
-            quilt = quilting.plan_quilt(
-                sources, **size, random=random_stream(settings.seed, "quilt")
-            )
-            canvas = quilting.sew(sources, quilt, **size)
-            patches, reused = sum(len(row) for row in quilt.rows), quilt.reused
-            paint = GROUNDS[settings.ground].paint
-            canvas = paint(canvas, settings.sample_m, random_stream(settings.seed, "ground"))
+            ground = GROUNDS[settings.ground]
+            canvas = np.zeros((settings.height_px, settings.width_px, len(COLOURS)), np.uint16)
+            if ground.over_land:
+                canvas, patches, reused = _quilted(settings)
+            random = random_stream(settings.seed, "ground")
+            canvas = ground.paint(canvas, settings.sample_m, random)
         _store_bands(canvas, settings, work)
         (work / "scene.json").write_text(
             json.dumps({**asdict(settings), "patches": patches, "reused_patches": reused})
@@ -151,6 +148,14 @@ def _build(settings: SceneSettings, folder: Path) -> None:
             work.rename(folder)
     finally:
         shutil.rmtree(work, ignore_errors=True)
+
+
+def _quilted(settings: SceneSettings) -> tuple[quilting.Picture, int, int]:
+    """A landscape of the shipped photographs, its patches, and those used again."""
+    sources = [radiance(path) for path in shipped_pictures()]
+    size = {"height_px": settings.height_px, "width_px": settings.width_px}
+    quilt = quilting.plan_quilt(sources, **size, random=random_stream(settings.seed, "quilt"))
+    return quilting.sew(sources, quilt, **size), sum(map(len, quilt.rows)), quilt.reused
 
 
 def shipped_pictures() -> list[Path]:

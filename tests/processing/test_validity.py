@@ -145,12 +145,16 @@ def test_the_judgement_does_not_depend_on_the_datum() -> None:
 
 
 def test_a_small_displacement_that_two_sensors_explain_alike_is_said_to_be_ambiguous() -> None:
-    _, _, mosaic, temperatures = exposure(17, {"SU00": (0.2, 0.0)}, sigma_pp_px=0.05)
+    truth, points, mosaic, temperatures = exposure(17, {"SU00": (0.2, 0.0)}, sigma_pp_px=0.05)
     judged = judge_master(MINI, mosaic, temperatures)
     assert judged.displaced is not None
     assert judged.alternatives
     assert judged.displaced.sensor not in judged.alternatives
     assert len(judged.hypotheses) == 4
+    # Wrongly blamed it would spoil the datum, so the datum rests on neither.
+    doubted = {judged.displaced.sensor, *judged.alternatives}
+    repaired = robust_datum(MINI, truth.start, points, mosaic, judged)
+    assert len(doubted) == 2 and set(repaired.datum_sensors) == set(MASTER) - doubted
     _, _, clear, temperatures = exposure(14, {"SU00": (3.0, 0.0)})
     assert judge_master(MINI, clear, temperatures).alternatives == ()
 
