@@ -22,8 +22,10 @@ from scipy import stats
 from benchmarks.machine import machine
 from processing.bundle.adjust import Adjustment, Settings, adjust
 from processing.bundle.camera_model import ideal_mm
+from processing.bundle.drawing import Panel, pattern_svg
 from processing.bundle.findings import (
     Agreement,
+    Pattern,
     checked_against,
     parameters_of,
     systematic_residuals,
@@ -69,8 +71,7 @@ class Judged:
     result: Adjustment | None
     figures: dict[str, Any]
     checks: Agreement
-    left_mm: Array
-    places_mm: Array
+    pattern: Pattern
 
 
 def network_of(block: Block, name: SetName) -> Network:
@@ -174,7 +175,7 @@ def judged(block: Block, name: SetName) -> Judged:
         "residual_pattern_rms_um": float(np.sqrt(np.mean(np.sum(seen.mean_mm**2, axis=1)))) * 1e3,
         "residual_pattern_max_um": float(np.hypot(*seen.mean_mm.T).max()) * 1e3,
     }
-    return Judged(name, result, figures, checks, seen.mean_mm, seen.places_mm)
+    return Judged(name, result, figures, checks, seen)
 
 
 def main() -> None:
@@ -196,7 +197,7 @@ def main() -> None:
     if options.drawing is not None:
         shown = [j for j in found if j.name in ("radial", "sensors-full")] or found
         options.drawing.parent.mkdir(parents=True, exist_ok=True)
-        options.drawing.write_text(_drawn(block, shown) + "\n")
+        options.drawing.write_text(_drawn(block, shown))
     if options.json:
         content = {
             "machine": machine(),
@@ -231,46 +232,20 @@ def _print(j: Judged, *, first: bool) -> None:
 
 
 def _drawn(block: Block, panels: Sequence[Judged]) -> str:
-    """Mean image residuals on a grid, side by side in one scale, as fig. 10 of the paper."""
     frame = block.plan.frame
-    gap, wide = 40.0, 510.0
-    unit = wide / (2.0 * frame.half_width_mm)
-    high = 2.0 * frame.half_height_mm * unit
-    longest = max(float(np.hypot(*j.left_mm.T).max()) for j in panels)
-    enlarge = 26.0 / longest
-    bar_mm = 1e-3 if longest > 8e-4 else 2e-4
-    width = len(panels) * (wide + gap) + gap
-    body = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:.0f} {high + 125:.0f}" '
-        f'width="{width:.0f}" height="{high + 125:.0f}" font-family="DejaVu Sans, sans-serif">'
-        '<rect width="100%" height="100%" fill="#ffffff"/>'
-        f'<text x="{gap}" y="30" font-size="17" font-weight="bold" fill="#1c2733">'
-        f"Systematic image residuals after bundle adjustment, {len(block.names)} frames</text>"
-    ]
-    for k, j in enumerate(panels):
-        left, top = gap + k * (wide + gap), 72.0
-        body.append(
-            f'<text x="{left}" y="58" font-size="12" fill="#1c2733">{j.name}, '
-            f"{j.figures['parameters']} parameters: at most "
-            f"{j.figures['residual_pattern_max_um']:.2f} um</text>"
-            f'<rect x="{left}" y="{top}" width="{wide}" height="{high:.1f}" fill="#f6f8fa" '
-            'stroke="#8796a5"/>'
-        )
-        for (px, py), (dx, dy) in zip(j.places_mm, j.left_mm, strict=True):
-            x = left + (px + frame.half_width_mm) * unit
-            y = top + (frame.half_height_mm - py) * unit
-            body.append(
-                f'<line x1="{x:.1f}" y1="{y:.1f}" x2="{x + dx * enlarge:.1f}" '
-                f'y2="{y - dy * enlarge:.1f}" stroke="#b3361e" stroke-width="1.2"/>'
-                f'<circle cx="{x:.1f}" cy="{y:.1f}" r="1.2" fill="#1c2733"/>'
+    half = (frame.half_width_mm, frame.half_height_mm)
+    return pattern_svg(
+        [
+            Panel(
+                f"{j.name}, {j.figures['parameters']} parameters: at most "
+                f"{j.figures['residual_pattern_max_um']:.2f} um",
+                j.pattern,
+                half,
             )
-    y, bar = 72.0 + high + 28.0, bar_mm * enlarge
-    body.append(
-        f'<line x1="{gap}" y1="{y:.1f}" x2="{gap + bar:.1f}" y2="{y:.1f}" stroke="#b3361e" '
-        f'stroke-width="2"/><text x="{gap + bar + 8:.1f}" y="{y + 4:.1f}" font-size="12" '
-        f'fill="#1c2733">{bar_mm * 1e3:g} um</text></svg>'
+            for j in panels
+        ],
+        f"Systematic image residuals after bundle adjustment, {len(block.names)} frames",
     )
-    return "".join(body)
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.adjusting.page import report_page
 from daemon.adjusting.project import ANGLES, SIGMAS, XYZ, Checks, Project
 from daemon.adjusting.project_file import ProjectFile
 from daemon.adjusting.tables import ProjectError, write_table
@@ -137,6 +138,8 @@ def write_results(
         _residuals(result),
     )
     (folder / "report.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    page = report_page(result, project.checks, report)
+    (folder / "report.html").write_text(page, encoding="utf-8")
 
 
 def _residuals(result: Adjustment) -> Iterator[tuple[str | float, ...]]:

@@ -25,7 +25,9 @@ from daemon.adjusting.writing import write_project
 from daemon.cli import app
 from daemon.importers.dbat import import_dbat
 from processing.bundle.adjust import Adjustment, adjust
+from processing.bundle.bent_rays import Rays
 from processing.bundle.findings import exposures_of, parameters_of
+from processing.bundle.network import Bearings, Distances, Head
 from processing.bundle.start import completed
 from tests.processing.bundle.networks import aerial, turned
 
@@ -164,6 +166,9 @@ def test_the_command_imports_and_adjusts(tmp_path) -> None:
     assert len(result.iterations) <= 2
     assert result.sigma0 == pytest.approx(report["sigma0"], rel=1e-9)
     assert len((out / "residuals.csv").read_text().splitlines()) == 2074 + 2
+    page = (out / "report.html").read_text()
+    assert "<strong>sigma0 1.6148</strong>" in page
+    assert page.count("<svg") == 2, "residuals by camera, and the network from above"
     refused = runner.invoke(app, ["adjust", str(project), "--out", str(out)])
     assert refused.exit_code != 0
 
@@ -193,6 +198,47 @@ def test_a_project_survives_writing_and_reading(tmp_path) -> None:
     assert read.sigma0 == pytest.approx(plain.sigma0, rel=1e-9)
     assert read.redundancy == plain.redundancy
     assert [u.name for u in read.layout.unknowns] == [u.name for u in plain.layout.unknowns]
+
+
+def test_distances_attitudes_and_map_coordinates_survive_too(tmp_path) -> None:
+    made = aerial(sigma_mm=1e-3)
+    n = len(made.network.stations.names)
+    apart = float(np.linalg.norm(made.points[20] - made.points[30]))
+    network = replace(
+        made.network,
+        distances=Distances(np.array([20]), np.array([30]), np.array([apart]), np.array([0.01])),
+        bearings=Bearings(np.arange(n), made.attitude, np.full((n, 3), 2e-4)),
+        rays=Rays(6_371_000.0, refraction=True, ground_m=100.0),
+    )
+    file = ProjectFile(
+        format=1,
+        name="all",
+        camera=(CameraSection(name="c", f_mm=70.0),),
+        adjust=AdjustSection(earth_radius_m=6_371_000.0, refraction=True, ground_m=100.0),
+    )
+    write_project(tmp_path / "p", file, network, Checks((), np.zeros((0, 3)), np.zeros((0, 3))))
+    back = read_project(tmp_path / "p" / "project.toml")
+    assert back.network.rays == network.rays
+    plain, read = adjust(network), adjust(completed(back.network), back.settings)
+    assert read.sigma0 == pytest.approx(plain.sigma0, rel=1e-9)
+    assert {g.name: g.count for g in read.groups} == {g.name: g.count for g in plain.groups}
+    assert {"distance", "attitude"} <= {g.name for g in read.groups}
+
+
+def test_names_from_files_do_no_harm_in_the_report(tmp_path) -> None:
+    made = aerial(sigma_mm=1e-3, points=120)
+    evil = "<script>alert(1)</script>"
+    network = replace(made.network, cameras=(replace(made.network.cameras[0], name=evil),))
+    file = ProjectFile(format=1, name=evil, camera=(CameraSection(name=evil, f_mm=70.0),))
+    checks = Checks(("p50",), made.points[50:51], np.full((1, 3), 0.02))
+    write_project(tmp_path / "p", file, network, checks)
+    out = tmp_path / "out"
+    said = CliRunner().invoke(app, ["adjust", str(tmp_path / "p"), "--out", str(out)])
+    assert said.exit_code == 0, said.output
+    page = (out / "report.html").read_text()
+    assert "<script" not in page
+    assert "&lt;script&gt;" in page
+    assert "Check points: 1" in said.output
 
 
 def test_images_with_angles_of_their_own_share_a_projection_centre(tmp_path) -> None:
@@ -251,6 +297,4 @@ def test_what_cannot_be_determined_ends_the_command_with_its_name(tmp_path) -> N
 
 
 def _head(name="n", rotation=None):
-    from processing.bundle.network import Head
-
     return Head(name, np.eye(3) if rotation is None else rotation, np.zeros(3))
