@@ -184,46 +184,45 @@ def warmed(host: Host) -> HostClock:
 def drawing(
     after_s: Sequence[float], errors: NDArray[np.float64], sigmas: NDArray[np.float64]
 ) -> str:
-    """Errors of coasting clocks over time, with twice the stated sigma about them."""
-    wide, high, left, low = 720.0, 360.0, 60.0, 40.0
-    top_us = float(np.percentile(np.abs(errors[:, -1]), 99)) * 1e-3 * 1.1
+    """Errors of coasting clocks over time in units of the sigma that was stated with each."""
+    wide, high, left, low, reach = 720.0, 380.0, 46.0, 58.0, 4.0
 
     def x(seconds: float) -> float:
         return left + (wide - left - 20) * seconds / max(after_s)
 
-    def y(microseconds: float) -> float:
-        clipped = min(max(microseconds, -top_us), top_us)
-        return (high - low) / 2 + 10 - clipped / top_us * ((high - low) / 2 - 10)
+    def y(sigmas_off: float) -> float:
+        clipped = min(max(sigmas_off, -reach), reach)
+        return (high - low) / 2 + 10 - clipped / reach * ((high - low) / 2 - 10)
 
-    def path(values_us: NDArray[np.float64], colour: str, stroke: float, dash: str = "") -> str:
-        points = " ".join(f"{x(t):.1f},{y(v):.1f}" for t, v in zip(after_s, values_us, strict=True))
+    def path(values: NDArray[np.float64], colour: str, stroke: float, dash: str = "none") -> str:
+        points = " ".join(f"{x(t):.1f},{y(v):.1f}" for t, v in zip(after_s, values, strict=True))
         return (
             f'<polyline points="{points}" fill="none" stroke="{colour}" '
             f'stroke-width="{stroke}" stroke-dasharray="{dash}"/>'
         )
 
-    body = [path(errors[run] * 1e-3, "#9bb8d3", 0.6) for run in range(min(len(errors), 120))]
-    within = np.percentile(np.abs(errors), 95.45, axis=0) * 1e-3
-    stated = 2 * np.median(sigmas, axis=0) * 1e-3
-    for sign in (1, -1):
-        body.append(path(sign * stated, "#c0392b", 2.0))
-        body.append(path(sign * within, "#1b4f72", 2.0, "6 4"))
-    body += [
-        f'<text x="{left - 6}" y="{y(label) + 4:.1f}" text-anchor="end">{label:.0f}</text>'
+    relative = errors / sigmas
+    within = np.percentile(np.abs(relative), 95.45, axis=0)
+    body = [
+        f'<text x="{left - 6}" y="{y(label) + 4:.1f}" text-anchor="end">{label:+d}</text>'
         f'<line x1="{left}" x2="{wide - 20}" y1="{y(label):.1f}" y2="{y(label):.1f}" '
-        'stroke="#dddddd" stroke-width="0.7"/>'
-        for label in (-top_us, -top_us / 2, 0.0, top_us / 2, top_us)
+        f'stroke="{"#c0392b" if abs(label) == 2 else "#dddddd"}" stroke-width="1"/>'
+        for label in range(-4, 5)
     ]
-    body += [
-        f'<text x="{x(label):.1f}" y="{high - 22}" text-anchor="middle">{label}</text>'
-        for label in range(0, round(max(after_s)) + 1, 10)
-    ]
+    body += [path(relative[run], "#9bb8d3", 0.6) for run in range(min(len(errors), 120))]
+    body += [path(sign * within, "#1b4f72", 2.0, "6 4") for sign in (1, -1)]
+    for seconds, sigma_ns in zip(after_s, np.median(sigmas, axis=0), strict=True):
+        if seconds % 10 == 0:
+            body.append(
+                f'<text x="{x(seconds):.1f}" y="{high - 40}" text-anchor="middle">{seconds:.0f} s'
+                f'</text><text x="{x(seconds):.1f}" y="{high - 24}" text-anchor="middle" '
+                f'fill="#c0392b">{sigma_ns * 1e-3:.1f} us</text>'
+            )
     body.append(
-        f'<text x="{(wide + left) / 2}" y="{high - 6}" text-anchor="middle">seconds since the last '
-        'edge</text><text x="8" y="14">error, us</text>'
-        f'<text x="{wide - 24}" y="16" text-anchor="end" fill="#c0392b">two stated sigmas (median)'
-        f'</text><text x="{wide - 24}" y="30" text-anchor="end" fill="#1b4f72">95.45 % of '
-        f"{len(errors)} hosts (dashed); 120 of them drawn</text>"
+        f'<text x="{left}" y="{high - 40}">coasting</text>'
+        f'<text x="{left}" y="{high - 24}" fill="#c0392b">median sigma</text>'
+        f'<text x="{left}" y="{high - 8}">Error over stated sigma; dashed: 95.45 % of '
+        f"{len(errors)} hosts lie between, two sigmas if sigmas are true; 120 hosts drawn</text>"
     )
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide:.0f} {high:.0f}" '
@@ -238,13 +237,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--runs", type=int, default=1000, help="independent hosts")
     parser.add_argument("--harshness", type=float, default=1.0, help="what temperature does, times")
     given = parser.parse_args(arguments)
+    after_s = [1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0, 45.0, 50.0, 55.0, 60.0]
+    given.svg.write_text(drawing(after_s, *coasts(given.runs // 2, after_s)), encoding="utf-8")
     print(f"{machine()}; {given.runs} hosts, harshness {given.harshness:g}\n")
     print("| set | median error | median sigma | within 1 sigma | within 2 | within 3 | worst |")
     print("|---|---|---|---|---|---|---|")
     for name, errors in stamps(given.runs, harshness=given.harshness).items():
         print(row(name, errors))
-    after_s = [1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0, 45.0, 50.0, 55.0, 60.0]
-    given.svg.write_text(drawing(after_s, *coasts(given.runs // 2, after_s)), encoding="utf-8")
     return 0
 
 

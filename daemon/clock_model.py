@@ -33,8 +33,10 @@ SCALES: Final[Array] = np.logspace(math.log10(0.35), math.log10(8.0), 7)
 GRID_WANDER: Final[Array] = np.repeat(WANDER, len(SCALES))
 GRID_SCALE: Final[Array] = np.tile(SCALES, len(WANDER))
 NEGLIGIBLE: Final = 1e-3
+WANDER_USUAL: Final = 1.2
 WANDER_DECADES: Final = 1.5
-"""Crystals usually wander by about 1 ppb after a second; one in three by six times more or less."""
+"""Crystals in a case that warms and cools wander by about 4 ppb after a second (log10 of its square
+here), one in three by six times more or less."""
 SCALE_SPREAD: Final = math.log(2.0)
 """Stated sigmas are believed to a factor of two, before they are looked at."""
 OUTLIER: Final = 4.0
@@ -45,7 +47,7 @@ STEP_PAIRS: Final = 3
 """So many pairs held back that agree with each other are no outliers: the clock has stepped."""
 ROUNDS: Final = 3
 GRID_PRIOR: Final[Array] = (
-    -0.5 * (np.log10(GRID_WANDER) / WANDER_DECADES) ** 2
+    -0.5 * ((np.log10(GRID_WANDER) - WANDER_USUAL) / WANDER_DECADES) ** 2
     - 0.5 * (np.log(GRID_SCALE) / SCALE_SPREAD) ** 2
 )
 
