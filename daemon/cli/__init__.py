@@ -14,6 +14,7 @@ from rich.console import Console
 
 from daemon.cli import (
     adjust,
+    advise,
     bench,
     calibrate,
     check,
@@ -60,6 +61,7 @@ app.command(name="adjust", help=adjust.HELP)(adjust.adjust)
 app.command(name="sim", help=sim.HELP)(sim.sim)
 app.command(name="bench", help=bench.HELP)(bench.bench)
 app.command(name="kernels", help=kernels.HELP)(kernels.kernels)
+app.command(name="advise", help=advise.HELP)(advise.advise)
 app.command(name="orient", help=export.ORIENTATION_HELP)(export.orientation)
 app.command(name="install", help=install.HELP)(install.install)
 app.command(name="uninstall", help=install.UNINSTALL_HELP)(install.uninstall)

@@ -1,0 +1,190 @@
+"""Plans of others: GeoJSON, KML, QGroundControl's .plan. Hostile input: limited in every way.
+
+GeoJSON is ours as well: every LineString is a line, its `id` and `strip` are properties, and a
+member `specification` of the collection says what the project asks for (docs/plan.md).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+from daemon.errors import DaemonError
+from daemon.plan.model import Plan, PlannedLine, Point, Specification
+
+PLAN_MAX_BYTES = 20_000_000
+LINES_MAX = 20_000
+WAYPOINT, TRIGGER_DISTANCE = 16, 206
+
+
+class PlanError(DaemonError):
+    """A plan that cannot be used; the sentence names file, place and what would be right."""
+
+
+def read_plan(path: Path) -> Plan:
+    """Read a plan by the ending of its name: .geojson, .json, .kml, .plan.
+
+    Raises:
+        PlanError: too large, not of its kind, or without a line.
+    """
+    try:
+        if path.stat().st_size > PLAN_MAX_BYTES:
+            raise PlanError(f"{path.name}: larger than {PLAN_MAX_BYTES / 1e6:.0f} MB, no plan")
+        data = path.read_bytes()
+    except OSError as error:
+        raise PlanError(f"{path}: cannot be read ({error.strerror})") from error
+    readers = {".geojson": _geojson, ".json": _geojson, ".kml": _kml, ".plan": _qgroundcontrol}
+    reader = readers.get(path.suffix.lower())
+    if reader is None:
+        raise PlanError(f"{path.name}: a plan ends in {', '.join(readers)}")
+    try:
+        plan = reader(path.name, data)
+    except RecursionError as error:
+        raise PlanError(f"{path.name}: nested too deeply to be a plan") from error
+    if not plan.lines:
+        raise PlanError(
+            f"{path.name}: holds no line; a line is a LineString, or a survey's transect"
+        )
+    if len(plan.lines) > LINES_MAX:
+        raise PlanError(f"{path.name}: {len(plan.lines)} lines; {LINES_MAX} at most")
+    ids = [line.id for line in plan.lines]
+    twice = sorted({line_id for line_id in ids if ids.count(line_id) > 1})
+    if twice:
+        raise PlanError(f"{path.name}: several lines are called {', '.join(twice[:5])}")
+    return plan
+
+
+def _geojson(name: str, data: bytes) -> Plan:
+    content = _json(name, data)
+    if content.get("type") != "FeatureCollection" or not isinstance(content.get("features"), list):
+        raise PlanError(f"{name}: no FeatureCollection; a plan is one, with a LineString a line")
+    lines: list[PlannedLine] = []
+    for index, feature in enumerate(content["features"]):
+        where = f"{name}: features[{index}]"
+        geometry = feature.get("geometry") if isinstance(feature, dict) else None
+        if not isinstance(geometry, dict) or geometry.get("type") != "LineString":
+            continue
+        properties = feature.get("properties") or {}
+        coordinates = geometry.get("coordinates")
+        if not isinstance(coordinates, list) or len(coordinates) < 2:
+            raise PlanError(f"{where}: a LineString has two places at least")
+        points = [_point(where, pair, swapped=True) for pair in coordinates]
+        line_id = str(properties.get("id", feature.get("id", len(lines) + 1)))
+        lines += _straight(line_id, str(properties.get("strip", "")), points)
+    return Plan(name, tuple(lines), _specification(name, content.get("specification")))
+
+
+def _kml(name: str, data: bytes) -> Plan:
+    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
+        raise PlanError(f"{name}: declares a document type or entities, which no KML needs")
+    try:
+        root = ElementTree.fromstring(data)
+    except (ElementTree.ParseError, ValueError) as error:
+        raise PlanError(f"{name}: not XML ({error})") from error
+    lines: list[PlannedLine] = []
+    for placemark in root.iter():
+        if not placemark.tag.endswith("}Placemark") and placemark.tag != "Placemark":
+            continue
+        title = next((e.text for e in placemark if e.tag.endswith("name") and e.text), None)
+        for element in placemark.iter():
+            if not element.tag.endswith("LineString"):
+                continue
+            text = next((e.text for e in element if e.tag.endswith("coordinates")), "") or ""
+            where = f"{name}: {title or 'a Placemark'}"
+            points = [_point(where, triple.split(","), swapped=True) for triple in text.split()]
+            if len(points) < 2:
+                raise PlanError(f"{where}: a LineString has two places at least")
+            lines += _straight(title or str(len(lines) + 1), "", points)
+    return Plan(name, tuple(lines))
+
+
+def _qgroundcontrol(name: str, data: bytes) -> Plan:
+    content = _json(name, data)
+    mission = content.get("mission")
+    if content.get("fileType") != "Plan" or not isinstance(mission, dict):
+        raise PlanError(f"{name}: no QGroundControl plan (fileType, mission)")
+    lines = [
+        PlannedLine(str(index), start, end)
+        for index, (start, end) in enumerate(_legs(name, mission.get("items") or []), start=1)
+    ]
+    return Plan(name, tuple(lines))
+
+
+def _legs(name: str, items: Sequence[Any]) -> Iterator[tuple[Point, Point]]:
+    """Transects of surveys, and legs between waypoints while a trigger distance is set."""
+    triggers, before = False, None
+    for index, item in enumerate(items):
+        where = f"{name}: mission.items[{index}]"
+        if not isinstance(item, dict):
+            raise PlanError(f"{where}: no object")
+        transects = item.get("TransectStyleComplexItem")
+        if isinstance(transects, dict):
+            points = [_point(where, p) for p in transects.get("VisualTransectPoints") or []]
+            yield from zip(points[0::2], points[1::2], strict=False)
+            continue
+        parameters = item.get("params") or []
+        if item.get("command") == TRIGGER_DISTANCE and parameters:
+            triggers = isinstance(parameters[0], int | float) and parameters[0] > 0
+        elif item.get("command") == WAYPOINT and len(parameters) >= 6:
+            here = _point(where, parameters[4:6])
+            if triggers and before is not None:
+                yield before, here
+            before = here
+
+
+def _straight(line_id: str, strip: str, points: Sequence[Point]) -> list[PlannedLine]:
+    """A line for each straight piece; the pieces of a bent one are a, b, c of its strip."""
+    if len(points) == 2:
+        return [PlannedLine(line_id, points[0], points[1], strip)]
+    return [
+        PlannedLine(f"{line_id}.{i + 1}", points[i], points[i + 1], strip or line_id)
+        for i in range(len(points) - 1)
+    ]
+
+
+def _point(where: str, pair: Any, *, swapped: bool = False) -> Point:
+    """A place from [latitude, longitude], or the other way round where `swapped`."""
+    try:
+        first, second = float(pair[0]), float(pair[1])
+    except (TypeError, ValueError, IndexError, KeyError) as error:
+        raise PlanError(f"{where}: {str(pair)[:60]} is no place") from error
+    latitude, longitude = (second, first) if swapped else (first, second)
+    if not (abs(latitude) <= 90 and abs(longitude) <= 180 and math.isfinite(latitude + longitude)):
+        raise PlanError(f"{where}: {latitude} N {longitude} E is no place on earth")
+    return Point(latitude, longitude)
+
+
+def _specification(name: str, content: Any) -> Specification:
+    if content is None:
+        return Specification()
+    if not isinstance(content, Mapping):
+        raise PlanError(f"{name}: specification is no object")
+    limits = {
+        "forward_overlap": (0.0, 0.95),
+        "sidelap": (0.0, 0.95),
+        "tilt_deg": (0.0, 90.0),
+        "crab_deg": (0.0, 180.0),
+        "time_sigma_ns": (0.0, 1e12),
+    }
+    for key, value in content.items():
+        if key not in limits:
+            raise PlanError(f"{name}: specification.{key}: there is {', '.join(limits)}")
+        low, high = limits[key]
+        good = isinstance(value, int | float) and not isinstance(value, bool)
+        if not good or not low <= value <= high:
+            raise PlanError(f"{name}: specification.{key} is {value!r}; {low:g} to {high:g}")
+    return Specification(**{str(key): float(value) for key, value in content.items()})
+
+
+def _json(name: str, data: bytes) -> dict[str, Any]:
+    try:
+        content = json.loads(data.decode("utf-8-sig"))
+    except ValueError as error:
+        raise PlanError(f"{name}: not JSON ({error})") from error
+    if not isinstance(content, dict):
+        raise PlanError(f"{name}: holds no object")
+    return content
