@@ -7,7 +7,7 @@ import pytest
 from benchmarks.pairing import SMALL_RIG, Case, fly, many_case, shortcomings, single_cases
 
 pytestmark = pytest.mark.timeout(600)
-EACH = 40
+EACH = 30
 MANY = 500
 SINGLE = [
     pytest.param(case, id=f"{case.title} {case.device}")
