@@ -39,28 +39,65 @@ def _load(frame: Array, col: int, row: int, ratio: int, words: bool, patch: Arra
     The patch is left with a mean near zero, so that single precision suffices. False: bad pixels.
     """
     height, width = patch.shape
+    n = width * ratio
     share = np.float32(1.0 / (ratio * ratio))
-    origin = np.float32(frame[row + ratio * (height // 2), col + ratio * (width // 2)])
-    line = np.empty(width * ratio, np.float32)
+    origin = frame[row + ratio * (height // 2), col + ratio * (width // 2)]
+    line = np.empty(n, np.float32)
+    bad = np.int32(0)
     for r in range(height):
-        line[:] = np.float32(0.0)
-        for i in range(ratio):
-            source = frame[row + r * ratio + i, col : col + width * ratio]
-            if words:
-                bad = np.int32(0)
-                for k in range(len(line)):
-                    word = np.int32(source[k])
-                    bad |= (word & 1) | np.int32(word == 0)
-                if bad:
-                    return False
-            for k in range(len(line)):
-                line[k] += np.float32(source[k]) - origin
-        for c in range(width):
-            total = np.float32(0.0)
-            for j in range(ratio):
-                total += line[c * ratio + j]
-            patch[r, c] = total * share
+        first = row + r * ratio
+        if words and ratio == 1:
+            bad = _words_of_one(frame[first, col : col + n], np.int32(origin), patch[r])
+        elif words and ratio == 3:
+            bad = _words_of_three(
+                frame[first, col : col + n],
+                frame[first + 1, col : col + n],
+                frame[first + 2, col : col + n],
+                np.int32(3) * np.int32(origin),
+                line,
+            )
+            for c in range(width):
+                patch[r, c] = (line[3 * c] + line[3 * c + 1] + line[3 * c + 2]) * share
+        else:
+            line[:] = np.float32(0.0)
+            for i in range(ratio):
+                source = frame[first + i, col : col + n]
+                if words:
+                    for k in range(n):
+                        word = np.int32(source[k])
+                        bad |= (word & 1) | np.int32(word == 0)
+                for k in range(n):
+                    line[k] += np.float32(source[k]) - np.float32(origin)
+            for c in range(width):
+                total = np.float32(0.0)
+                for j in range(ratio):
+                    total += line[c * ratio + j]
+                patch[r, c] = total * share
+        if bad:
+            return False
     return True
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _words_of_one(source: Array, origin: Any, line: Array) -> Any:
+    """A row of words less the origin; not zero where one is bad."""
+    bad = np.int32(0)
+    for k in range(len(line)):
+        word = np.int32(source[k])
+        bad |= (word & np.int32(1)) | np.int32(word == 0)
+        line[k] = np.float32(np.int32(word - origin))
+    return bad
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _words_of_three(upper: Array, middle: Array, lower: Array, origin: Any, line: Array) -> Any:
+    """Sums of three rows of words less the origin; not zero where one is bad."""
+    bad = np.int32(0)
+    for k in range(len(line)):
+        a, b, c = np.int32(upper[k]), np.int32(middle[k]), np.int32(lower[k])
+        bad |= ((a | b | c) & np.int32(1)) | np.int32(min(min(a, b), c) == 0)
+        line[k] = np.float32(np.int32(a + b + c - origin))
+    return bad
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
