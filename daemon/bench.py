@@ -37,6 +37,7 @@ from processing.pipeline import Conditions, Pipeline, Product, Settings
 from processing.quality import Flag
 from processing.radiometry import load_radiometry
 from processing.rig import Rig, load_rig
+from processing.tie_points import TiePoints
 
 DC_K = 12.0
 DISPLACED_PX = (1.0, -0.6)
@@ -101,12 +102,16 @@ def measure(
     result |= _side_by_side(rig, pipeline, frames, conditions, lanes=lanes, count=3 * runs)
     if peers:
         product = pipeline.process(frames, conditions)
+        tie_points = product.tie_points
         result["peers"] = _peers(rig, product, frames, mission, result)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     result["peak_rss_mib"] = round(peak / 1024)
     pipeline.settings = replace(pipeline.settings, geometry=True, baselines=True)
     process_exposure(pipeline, rig, mission, plan, exposure, frames)
     result |= _geometry(mission, folder / "truth")
+    if peers and "skipped" not in result["peers"]["nona_enblend"]:
+        told = _peer_geometry(rig, mission, folder / "truth", tie_points)
+        result["peers"]["nona_enblend"] |= told
     return result
 
 
@@ -239,11 +244,40 @@ def _peers(
     return found
 
 
-def _geometry(mission: Mission, truth: Path) -> dict[str, Any]:
-    """Errors against the truth, which only the judge's own process reads."""
-    command = [sys.executable, "-m", "sim_hw.judge", "--mission", str(mission.path)]
+def _peer_geometry(
+    rig: Rig, mission: Mission, truth: Path, tie_points: TiePoints
+) -> dict[str, float]:
+    """Errors of nona against the same truth, at pixels our own table has.
+
+    With frames placed as calibrated, and placed by its own optimiser from our tie points.
+    """
+    result: dict[str, float] = {}
+    with np.load(mission.level2(1) / "geometry.npz") as content:
+        ours = {key: content[key] for key in content.files}
+    for suffix, given in (("", tie_points), ("_as_calibrated", None)):
+        with tempfile.TemporaryDirectory(prefix="syntopic-bench-") as scratch:
+            stitched = Path(scratch) / "L2" / "000001"
+            stitched.mkdir(parents=True)
+            (Path(scratch) / "L0").symlink_to(mission.level0(1).parent.resolve())
+            table = bench_peers.nona_geometry(rig, mission.level0(1), ours, given)
+            np.savez(stitched / "geometry.npz", **table)  # type: ignore[arg-type]
+            figures = _judged(Path(scratch), truth)["free"]
+        result |= {
+            f"rms_px{suffix}": figures["inner_rms_px"],
+            f"max_px{suffix}": figures["inner_max_px"],
+        }
+    return result
+
+
+def _judged(mission: Path, truth: Path) -> dict[str, dict[str, float]]:
+    """Figures by method against the truth, which only the judge's own process reads."""
+    command = [sys.executable, "-m", "sim_hw.judge", "--mission", str(mission)]
     judged = _json_of([*command, "--truth", str(truth)], JUDGE_WITHIN_S, "judging the geometry")
-    methods = judged["methods"]
+    return dict(judged["methods"])
+
+
+def _geometry(mission: Mission, truth: Path) -> dict[str, Any]:
+    methods = _judged(mission.path, truth)
     return {
         "rms_px": methods["free"]["inner_rms_px"],
         "max_px": methods["free"]["inner_max_px"],

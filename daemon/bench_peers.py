@@ -21,10 +21,19 @@ from daemon.errors import DaemonError
 from processing.lattice import OUTSIDE, fill_lattice, lattice_shape, pan_raster
 from processing.placement import SensorPlacement
 from processing.rig import Rig
+from processing.tie_points import PAN_TO_PAN, TiePoints
 
 CELL_PX = 32
 PEER_WITHIN_S = 1500.0
-PACKAGES = {"nona": "hugin-tools", "enblend": "enblend"}
+PACKAGES = {
+    "nona": "hugin-tools",
+    "pano_trafo": "hugin-tools",
+    "autooptimiser": "hugin-tools",
+    "enblend": "enblend",
+}
+CONTROL_POINTS = 100
+GEOMETRY_POINTS = 5000
+"""Points of each sensor whose place in the peer's panorama is looked up."""
 
 
 class PeerError(DaemonError):
@@ -104,6 +113,47 @@ def nona_enblend_seconds(rig: Rig, level0: Path) -> dict[str, Any]:
     return {"seconds": ended - begun, "nona_s": middle - begun, "enblend_s": ended - middle}
 
 
+def nona_geometry(
+    rig: Rig,
+    level0: Path,
+    geometry: Mapping[str, NDArray[Any]],
+    tie_points: TiePoints | None = None,
+) -> dict[str, NDArray[Any]]:
+    """Where nona fetches the pixels of the virtual image: a table as in geometry.npz.
+
+    Asked of pano_trafo, which is the same mapping, at points of our own table; which sensor serves
+    a pixel is taken from there too, so that the same pixels are compared.
+
+    Args:
+        geometry: `<sensor>.vip`, `<sensor>.raw`, `<sensor>.weight` of our pipeline.
+        tie_points: of the exposure; the peer's own optimiser (autooptimiser) then finds shift,
+            rotation and scale of every frame but the first from them. None: as calibrated.
+    """
+    table: dict[str, NDArray[Any]] = {}
+    with tempfile.TemporaryDirectory(prefix="syntopic-peer-") as scratch:
+        project = Path(scratch) / "image.pto"
+        text = project_of(rig, level0)
+        if tie_points is not None:
+            text += _control_points(rig, tie_points)
+        project.write_text(text, encoding="utf-8")
+        if tie_points is not None:
+            _run(["autooptimiser", "-n", "-o", str(project), str(project)])
+        names = [sensor.name for cone in rig.pan_cones for sensor in cone.sensors]
+        for number, name in enumerate(names):
+            if f"{name}.vip" not in geometry:
+                continue
+            step = max(len(geometry[f"{name}.vip"]) // GEOMETRY_POINTS, 1)
+            vip = geometry[f"{name}.vip"][::step]
+            asked = "".join(f"{column} {row}\n" for column, row in vip)
+            told = _run(["pano_trafo", "-r", str(project), str(number)], asked)
+            raw = np.array([line.split() for line in told.splitlines() if line.strip()], float)
+            if raw.shape != vip.shape:
+                raise PeerError(f"pano_trafo gave {len(raw)} of {len(vip)} points of {name}")
+            table |= {f"{name}.vip": vip, f"{name}.raw": raw}
+            table[f"{name}.weight"] = geometry[f"{name}.weight"][::step]
+    return table
+
+
 def project_of(rig: Rig, level0: Path) -> str:
     """The project file of Hugin: each PAN frame a rectilinear image with a shifted centre."""
     image = rig.virtual_image
@@ -124,6 +174,23 @@ def project_of(rig: Rig, level0: Path) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _control_points(rig: Rig, tie_points: TiePoints) -> str:
+    """Lines of the project: a hundred tie points of each PAN overlap, and what may be moved."""
+    names = [sensor.name for cone in rig.pan_cones for sensor in cone.sensors]
+    number = {tie_points.names.index(name): k for k, name in enumerate(names)}
+    lines = []
+    for overlap in range(len(tie_points.pairs)):
+        rows = np.flatnonzero((tie_points.overlap == overlap) & (tie_points.kind == PAN_TO_PAN))
+        for i in rows[:: max(len(rows) // CONTROL_POINTS, 1)]:
+            a, b = tie_points.raw_a[i], tie_points.raw_b[i]
+            lines.append(
+                f"c n{number[int(tie_points.sensor_a[i])]} N{number[int(tie_points.sensor_b[i])]} "
+                f"x{a[0]:.4f} y{a[1]:.4f} X{b[0]:.4f} Y{b[1]:.4f} t0"
+            )
+    lines += [f"v {what}{k}" for k in range(1, len(names)) for what in ("r", "d", "e", "v")]
+    return "\n".join(lines) + "\n"
+
+
 def _degrees(width_mm: float, f_mm: float) -> float:
     return math.degrees(2.0 * math.atan(width_mm / 2.0 / f_mm))
 
@@ -132,17 +199,21 @@ def _found(program: str) -> bool:
     return shutil.which(program) is not None
 
 
-def _run(command: list[str]) -> None:
+def _run(command: list[str], asked: str | None = None) -> str:
     try:
-        subprocess.run(
+        done = subprocess.run(
             command,
+            input=asked,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             check=True,
             timeout=PEER_WITHIN_S,
+            text=True,
+            errors="replace",
         )
     except subprocess.TimeoutExpired as error:
         raise PeerError(f"{command[0]} took longer than {PEER_WITHIN_S:.0f} s") from error
     except subprocess.CalledProcessError as error:
-        last = error.stdout.decode(errors="replace").strip().splitlines()[-1:]
+        last = error.stdout.strip().splitlines()[-1:]
         raise PeerError(f"{command[0]} failed: {last[0] if last else error.returncode}") from error
+    return done.stdout

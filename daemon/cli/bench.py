@@ -98,5 +98,7 @@ def _print(result: dict[str, Any]) -> None:
     else:
         console.print(
             f"nona + enblend {stitched['seconds']:.1f} s, {stitched['ratio_to_pipeline']:.1f} "
-            "times the pipeline"
+            f"times the pipeline; inner error {stitched['rms_px']:.3f} px RMS, "
+            f"{stitched['max_px']:.3f} px at most (as calibrated "
+            f"{stitched['rms_px_as_calibrated']:.2f} px RMS)"
         )

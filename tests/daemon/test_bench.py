@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from daemon import bench_peers
 from processing.rig import find_rig
@@ -59,6 +62,31 @@ def test_a_peer_that_is_not_installed_is_named_with_its_package(
     monkeypatch.setenv("PATH", str(tmp_path))
     said = bench_peers.missing_programs()
     assert said is not None and "hugin-tools" in said and "enblend" in said
+
+
+@pytest.mark.skipif(shutil.which("pano_trafo") is None, reason="Debian package hugin-tools")
+def test_the_peers_geometry_of_a_rig_as_calibrated_is_that_of_a_lens_without_distortion(
+    tmp_path: Path,
+) -> None:
+    rig = find_rig("ultracam-x-mini")
+    names = [sensor.name for cone in rig.pan_cones for sensor in cone.sensors]
+    image = rig.virtual_image
+    assert image is not None
+    ours: dict[str, NDArray[np.float64]] = {}
+    expected = {}
+    for name in names:
+        sensor = rig.sensor(name)
+        raw = np.array([[0.0, 0.0], [100.0, 200.0], [sensor.width_px - 1.0, 300.0]])
+        # The peer knows where each sensor lies, and nothing of rotation, lens and temperature.
+        x = (raw[:, 0] - (sensor.width_px - 1) / 2) + sensor.x_mm / sensor.pitch_mm
+        y = ((sensor.height_px - 1) / 2 - raw[:, 1]) + sensor.y_mm / sensor.pitch_mm
+        f = image.f_mm / rig.cone_of(name).lens.f_mm
+        vip = [x * f + (image.width_px - 1) / 2, (image.height_px - 1) / 2 - y * f]
+        ours |= {f"{name}.vip": np.stack(vip, axis=1), f"{name}.weight": np.ones(3)}
+        expected[name] = raw
+    table = bench_peers.nona_geometry(rig, tmp_path, ours)
+    for name in names:
+        assert np.abs(table[f"{name}.raw"] - expected[name]).max() < 0.02
 
 
 def test_the_peers_project_has_every_pan_frame_once(tmp_path: Path) -> None:
