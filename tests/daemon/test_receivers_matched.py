@@ -27,8 +27,8 @@ from sim_hw.ublox_receiver import UbloxReceiver
 from sim_hw.world_clock import WorldClock
 from tests.sim_hw.receiver_state import state_at
 
-PULSES = 5
-LOST = 3
+PULSES = 4
+LOST = 2
 """The strobe of this pulse never reaches the receiver."""
 INTERVAL_NS = 1_100_000_000
 STROBE_DELAY_NS = 4_000_000
@@ -106,7 +106,7 @@ def test_every_kind_of_receiver_has_its_marks_matched_to_their_own_pulses() -> N
         chain.thread.start()
         chain.receiver.start()
     # Two seconds of navigation first, so that the clock knows roughly where it is.
-    first_ns = time.monotonic_ns() + 2_500_000_000
+    first_ns = time.monotonic_ns() + 2_000_000_000
     flights = [threading.Thread(target=c.fly, args=(world, first_ns)) for c in chains]
     for flight in flights:
         flight.start()
