@@ -1,0 +1,275 @@
+"""`python -m benchmarks.displacement_power`: how small a moved master sensor is found and named.
+
+Thousands of outcomes of stitching with one master sensor moved a known way, and of healthy ones for
+false alarms, go through the pipeline's own judgement. What calibration, drift, probes and stitching
+are off by is drawn, the last from the covariance that `benchmarks.honest_uncertainty` holds; some
+are stitched in full as a control. Beside each figure stands what the best test could reach.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from benchmarks import honest_uncertainty
+from benchmarks.chart import Chart
+from benchmarks.machine import machine
+from benchmarks.stitching_trials import (
+    MatchingErrors,
+    drawn_trial,
+    matching_errors,
+    world_and_rig,
+)
+from processing.rig import Rig, find_rig
+from processing.validity import Validity, judge_master
+
+Array = NDArray[np.float64]
+
+LENGTHS_PX = (0.05, 0.10, 0.15, 0.20, 0.25, 0.30, 0.40, 0.50)
+DC_K = (0.0, 10.0, 20.0)
+FAMILY_ALPHA = 0.001
+PROBE_SIGMA_K = 0.1
+IDEAL_DRAWS = 40_000
+TEMPLATES = 8
+CONTROL = (0.15, 0.30)
+FIRST_SEED = 50_000
+
+
+@dataclass(frozen=True)
+class Power:
+    """Shares of `exposures` with one sensor moved by `length_px` at a dC.
+
+    `found`: some sensor was called displaced; `named`: the right one; `alone`: the right one, and
+    no other that fits nearly as well. `ideal_found` and `ideal_named` are those of the best test.
+    """
+
+    dc_k: float
+    length_px: float
+    exposures: int
+    found: float
+    named: float
+    alone: float
+    ideal_found: float
+    ideal_named: float
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.displacement_power")
+    parser.add_argument("--errors", type=Path, help="errors of matching; rendered where not given")
+    parser.add_argument("--rendered", type=int, default=8, help="exposures to render for them")
+    parser.add_argument("--exposures", type=int, default=1000, help="for each length and dC")
+    parser.add_argument("--healthy", type=int, default=10_000)
+    parser.add_argument("--stitched", type=int, default=60, help="for each length of the control")
+    parser.add_argument("--drawing", type=Path, help="where to draw the curves (SVG)")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    options = parser.parse_args()
+    if options.errors is None:
+        with tempfile.TemporaryDirectory(prefix="syntopic-power-") as folder:
+            errors = matching_errors(honest_uncertainty.render(options.rendered, Path(folder)))
+    else:
+        errors = MatchingErrors.load(options.errors)
+    outcomes = Outcomes(errors)
+    alarms = outcomes.false_alarms(options.healthy)
+    powers = [
+        outcomes.power(dc_k=dc_k, length_px=length, exposures=options.exposures)
+        for dc_k in DC_K
+        for length in LENGTHS_PX
+    ]
+    control = [stitched(errors, length_px=length, exposures=options.stitched) for length in CONTROL]
+    if options.drawing is not None:
+        options.drawing.write_text(drawing(powers), encoding="utf-8")
+    if options.json:
+        told = {"healthy": options.healthy, "alarms": alarms}
+        told |= {"power": [vars(p) for p in powers], "control": [vars(p) for p in control]}
+        print(json.dumps({"machine": machine(), **told}))
+        return
+    print(f"{honest_uncertainty.RIG}: {alarms} false alarms of {options.healthy} healthy\n")
+    print(
+        "| dC K | moved px | exposures | found | rightly named | named alone | best test: found "
+        "| named |"
+    )
+    print("|---|---|---|---|---|---|---|---|")
+    for p in [*powers, *control]:
+        print(
+            f"| {p.dc_k:g} | {p.length_px:.2f} | {p.exposures} | {p.found:.1%} | {p.named:.1%} "
+            f"| {p.alone:.1%} | {p.ideal_found:.1%} | {p.ideal_named:.1%} |"
+        )
+
+
+class Outcomes:
+    """What stitching may find of the master sensors, drawn; and what the judgement makes of it."""
+
+    def __init__(self, errors: MatchingErrors) -> None:
+        self.rig = find_rig(honest_uncertainty.RIG)
+        self._templates = []
+        for k in range(TEMPLATES):
+            world, rig = world_and_rig(honest_uncertainty.RIG, FIRST_SEED + k, dc_k=0.0)
+            mosaic = drawn_trial(world, rig, errors, seed=FIRST_SEED + k).equal
+            units = mosaic.model.units
+            values, directions = np.linalg.eigh(mosaic.covariance / np.outer(units, units))
+            root = directions * np.sqrt(np.maximum(values, 0.0))
+            self._templates.append((mosaic, units[:, None] * root))
+        self._random = np.random.default_rng(7)
+
+    def judge(self, dc_k: float, moved: str | None, shift_px: tuple[float, float]) -> Validity:
+        """One exposure: errors drawn from the sigmas of the rig file, and one sensor moved."""
+        random = self._random
+        mosaic, root = self._templates[int(random.integers(0, TEMPLATES))]
+        values = root @ random.standard_normal(root.shape[1])
+        probe_k = float(random.normal(0.0, PROBE_SIGMA_K))
+        pitch_mm = mosaic.model.pitch_mm
+        temperatures = {}
+        for sensor in self.rig.cone(self.rig.master_cone).sensors:
+            drift = sensor.drift
+            off_um = random.normal(0.0, sensor.position_sigma_um, 2)
+            off_um += random.normal(0.0, drift.sigma_um_per_k, 2) * dc_k
+            off_um -= np.array([drift.x_um_per_k, drift.y_um_per_k]) * probe_k
+            if sensor.name == moved:
+                off_um += np.array(shift_px) * pitch_mm * 1e3
+            first = mosaic.model.sensors[sensor.name]
+            values[first : first + 2] += off_um * 1e-3
+            temperatures[sensor.probe] = sensor.calibration_c + dc_k + probe_k
+        return judge_master(self.rig, replace(mosaic, values=values), temperatures)
+
+    def false_alarms(self, count: int) -> int:
+        """How many of `count` healthy exposures, dC within +-20 K, name a sensor."""
+        alarms = 0
+        for _ in range(count):
+            dc_k = float(self._random.uniform(-20.0, 20.0))
+            alarms += self.judge(dc_k, None, (0.0, 0.0)).displaced is not None
+        return alarms
+
+    def power(self, *, dc_k: float, length_px: float, exposures: int) -> Power:
+        """Move one of the master sensors, in turn, in a direction drawn anew each time."""
+        tally = _Tally()
+        masters = [s.name for s in self.rig.cone(self.rig.master_cone).sensors]
+        for k in range(exposures):
+            moved = masters[k % len(masters)]
+            angle = float(self._random.uniform(0.0, 2.0 * math.pi))
+            shift = (length_px * math.cos(angle), length_px * math.sin(angle))
+            tally.add(self.judge(dc_k, moved, shift), moved)
+        return tally.power(self.rig, dc_k, length_px)
+
+
+def stitched(errors: MatchingErrors, *, length_px: float, exposures: int) -> Power:
+    """The same at dC = 0 with tie points, adjustment and all, the emulator's camera being moved."""
+    rig = find_rig(honest_uncertainty.RIG)
+    masters = [s.name for s in rig.cone(rig.master_cone).sensors]
+    tally = _Tally()
+    for k in range(exposures):
+        seed = 2 * FIRST_SEED + k
+        angle = float(np.random.default_rng([seed, 2]).uniform(0.0, 2.0 * math.pi))
+        moved = masters[k % len(masters)]
+        shift = (length_px * math.cos(angle), length_px * math.sin(angle))
+        world, calibrated = world_and_rig(
+            honest_uncertainty.RIG, seed, dc_k=0.0, displaced_px={moved: shift}
+        )
+        tally.add(drawn_trial(world, calibrated, errors, seed=seed).validity, moved)
+    return tally.power(rig, 0.0, length_px)
+
+
+@dataclass
+class _Tally:
+    count: int = 0
+    found: int = 0
+    named: int = 0
+    alone: int = 0
+
+    def add(self, validity: Validity, moved: str) -> None:
+        self.count += 1
+        if validity.displaced is not None:
+            right = validity.displaced.sensor == moved
+            self.found += 1
+            self.named += right
+            self.alone += right and not validity.alternatives
+
+    def power(self, rig: Rig, dc_k: float, length_px: float) -> Power:
+        ideal_found, ideal_named = ideal(rig, dc_k=dc_k, length_px=length_px)
+        return Power(
+            dc_k,
+            length_px,
+            self.count,
+            self.found / self.count,
+            self.named / self.count,
+            self.alone / self.count,
+            ideal_found,
+            ideal_named,
+        )
+
+
+def ideal(rig: Rig, *, dc_k: float, length_px: float) -> tuple[float, float]:
+    """What the likelihood ratio over all master sensors reaches where stitching has no error.
+
+    Only the positions of the master sensors carry the displacement; shift, rotation and scale they
+    have in common are the datum's. What remains is off by calibration, drift coefficients and
+    probe, drawn here by their sigmas.
+    """
+    sensors = rig.cone(rig.master_cone).sensors
+    pitch_um = sensors[0].pitch_um
+    covariance = np.diag(
+        np.repeat(
+            [s.position_sigma_um**2 + (s.drift.sigma_um_per_k * dc_k) ** 2 for s in sensors], 2
+        )
+    )
+    per_kelvin = np.array([[s.drift.x_um_per_k, s.drift.y_um_per_k] for s in sensors]).reshape(-1)
+    covariance = (covariance + np.outer(per_kelvin, per_kelvin) * PROBE_SIGMA_K**2) / pitch_um**2
+    common = np.zeros((2 * len(sensors), 4))
+    for i, s in enumerate(sensors):
+        common[2 * i] = (1.0, 0.0, s.x_mm, -s.y_mm)
+        common[2 * i + 1] = (0.0, 1.0, s.y_mm, s.x_mm)
+    full, _, _ = np.linalg.svd(common)
+    contrasts = full[:, 4:].T
+    of_contrasts = contrasts @ covariance @ contrasts.T
+    weight = np.linalg.inv(of_contrasts)
+    random = np.random.default_rng(1)
+    moved = random.integers(0, len(sensors), IDEAL_DRAWS)
+    angle = random.uniform(0.0, 2.0 * math.pi, IDEAL_DRAWS)
+    y = random.standard_normal((IDEAL_DRAWS, len(weight))) @ np.linalg.cholesky(of_contrasts).T
+    shift = length_px * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    statistics = np.empty((len(sensors), IDEAL_DRAWS))
+    for i in range(len(sensors)):
+        mine = moved == i
+        y[mine] += shift[mine] @ contrasts[:, 2 * i : 2 * i + 2].T
+    for i in range(len(sensors)):
+        design = contrasts[:, 2 * i : 2 * i + 2]
+        pull = y @ weight @ design
+        statistics[i] = np.sum((pull @ np.linalg.inv(design.T @ weight @ design)) * pull, axis=1)
+    over = statistics.max(axis=0) > chi2.ppf(1.0 - FAMILY_ALPHA / len(sensors), 2)
+    right = statistics.argmax(axis=0) == moved
+    return float(over.mean()), float((over & right).mean())
+
+
+def drawing(powers: Sequence[Power]) -> str:
+    """Found (full) and rightly named (hollow) over the displacement, a colour for each dC."""
+    chart = Chart(
+        title=f"{honest_uncertainty.RIG}: one master sensor moved, {powers[0].exposures} a point",
+        x_label="displacement, px",
+        y_label="share of exposures",
+        x_range=(0.0, 0.5),
+        y_range=(0.0, 1.0),
+    )
+    for dc_k, colour in zip(DC_K, ("#2980b9", "#27ae60", "#c0392b"), strict=True):
+        some = [p for p in powers if p.dc_k == dc_k]
+        x = [p.length_px for p in some]
+        chart.line(x, [p.ideal_found for p in some], colour, dashed=True)
+        chart.line(x, [p.found for p in some], colour, label=f"found, dC {dc_k:g} K")
+        chart.dots(x, [p.found for p in some], colour)
+        chart.line(x, [p.named for p in some], colour, thin=True)
+        chart.dots(x, [p.named for p in some], colour, filled=False)
+    chart.note("filled: found; hollow: rightly named; dashed: found by the best test there is")
+    chart.level(0.8, "80 %")
+    chart.mark(0.15, "0.15 px")
+    return chart.svg()
+
+
+if __name__ == "__main__":
+    main()

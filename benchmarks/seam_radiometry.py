@@ -1,0 +1,351 @@
+"""`python -m benchmarks.seam_radiometry`: how far the heads disagree along the seams.
+
+Even light and real imagery go through the emulated electronics and back through the laboratory's
+calibration and the balance of the heads; then both sides of every seam are compared before they are
+faded into each other, in squares of 32 px along its whole length. Also told is how far interpolated
+defects are from the light that was there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks import rendered
+from benchmarks.machine import machine
+from processing.composition import PanComposer
+from processing.level1 import corrector_for, exposed_rows, level1_counts_per_dn, level1_from_level0
+from processing.pipeline import Conditions, Pipeline, Product, Settings
+from processing.radiometry import RadiometricCalibration
+from processing.rig import Cone, Sensor
+from sim_hw import laboratory
+from sim_hw.electronics import Electronics, SensorTruth, over_tdi_path, true_sensor
+from sim_hw.rendering import Look
+from sim_hw.scene import open_scene
+from sim_hw.seeding import random_stream
+from sim_hw.snapshots import Snapshot
+from sim_hw.world import World
+
+Map = NDArray[np.float32]
+Array = NDArray[np.float64]
+
+RIG = "ultracam-x-mini"
+SEED = 5
+STRIP_PX = 32
+LEVELS = (0.2, 0.5, 0.8)
+TEXTURE = 0.25
+"""How much of its own contrast an image keeps at one level, so that its lights do not burn out."""
+BRIGHTEST = 0.97
+GAIN_CHANGE = 0.01
+BLACK_CHANGE_DN = 2.0
+"""What heads may have changed by since the laboratory saw them (standard deviations)."""
+
+
+@dataclass(frozen=True)
+class Seams:
+    """|L - R| / mean of all strips of one scene, in per cent of the signal."""
+
+    scene: str
+    level: float
+    strips: int
+    rms: float
+    p99: float
+    largest: float
+    inside: float
+    noise: float
+
+
+@dataclass(frozen=True)
+class Defects:
+    """Interpolated pixels against the light, in standard deviations of a good pixel's noise."""
+
+    scene: str
+    pixels: int
+    rms: float
+    median: float
+    inside_1: float
+    good_rms: float
+    rms_of_contrast: float
+
+
+@dataclass(frozen=True)
+class Head:
+    """One sensor: what it is now, and what the laboratory found before."""
+
+    cone: Cone
+    sensor: Sensor
+    electronics: Electronics
+    truth: SensorTruth
+    calibration: RadiometricCalibration
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.seam_radiometry")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--scenes", type=Path, help="folder where built scenes are kept")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="syntopic-seams-") as folder:
+        seams, defects = measure(options.scenes or Path(folder))
+    if options.json:
+        told = {"seams": [asdict(s) for s in seams], "defects": [asdict(d) for d in defects]}
+        print(json.dumps({"machine": machine(), **told}))
+        return
+    print("| scene | level | strips | RMS % | 99 % below | largest % | within 0.2 % | noise % |")
+    print("|---|---|---|---|---|---|---|---|")
+    for s in seams:
+        print(
+            f"| {s.scene} | {s.level:.0%} | {s.strips} | {s.rms:.3f} | {s.p99:.3f} "
+            f"| {s.largest:.3f} | {s.inside:.1%} | {s.noise:.3f} |"
+        )
+    print("\n| defects of | pixels | RMS | median | within 1 | good pixels RMS | RMS of contrast |")
+    print("|---|---|---|---|---|---|---|")
+    for d in defects:
+        print(
+            f"| {d.scene} | {d.pixels} | {d.rms:.2f} | {d.median:.2f} | {d.inside_1:.1%} "
+            f"| {d.good_rms:.2f} | {d.rms_of_contrast:.2f} |"
+        )
+
+
+def measure(scenes: Path) -> tuple[list[Seams], list[Defects]]:
+    """All scenes at all levels, heads as calibrated and changed since."""
+    world = World(rendered.world_settings(RIG, SEED))
+    scene = open_scene(world.scene_settings, scenes)
+    exposure = rendered.take(world, scenes, scene=scene)
+    conditions = rendered.conditions_of(exposure, seed=SEED)
+    seams: list[Seams] = []
+    defects: list[Defects] = []
+    for changed in (False, True):
+        heads = heads_of(world, changed=changed)
+        calibrations = {name: head.calibration for name, head in heads.items()}
+        pipeline = Pipeline(world.rig, calibrations, Settings(geometry=False))
+        label = ", heads changed since calibration" if changed else ""
+        lights: dict[tuple[str, float], Mapping[str, Map]] = {
+            (f"{kind}{label}", level): light_of(world, heads, exposure.snapshot, kind, level)
+            for level in LEVELS
+            for kind in ("even light", "real imagery")
+        }
+        lights[f"real imagery, own contrast{label}", 0.0] = exposure.snapshot.light
+        for (name, level), light in lights.items():
+            frames = frames_of(world, heads, exposure.snapshot, light)
+            product = pipeline.process(frames, conditions)
+            seams.append(seams_of(world, heads, frames, conditions, product, name, level))
+            if not changed:
+                told = f"{name}, {level:.0%}" if level else name
+                defects.append(
+                    defects_of(world, heads, frames, exposure.snapshot, conditions, light, told)
+                )
+    return seams, defects
+
+
+def heads_of(world: World, *, changed: bool) -> dict[str, Head]:
+    """Measured by the laboratory; then, where `changed`, of another gain and black each."""
+    heads = {}
+    for cone in world.rig.cones:
+        for sensor in cone.sensors:
+            truth = true_sensor(cone, sensor, SEED, field_radius_mm=world.field_radius_mm(cone))
+            measured = laboratory.measure(sensor, truth, SEED)
+            if changed:
+                gain, black = random_stream(SEED, "change", sensor.name).normal(0.0, 1.0, 2)
+                truth = replace(
+                    truth,
+                    response=truth.response * np.float32(1.0 + GAIN_CHANGE * gain),
+                    bias_dn=truth.bias_dn + np.float32(BLACK_CHANGE_DN * black),
+                )
+            heads[sensor.name] = Head(
+                cone,
+                sensor,
+                Electronics(sensor, truth, world.electrons_per_radiance_s(cone)),
+                truth,
+                RadiometricCalibration(**measured.arrays()),
+            )
+    return heads
+
+
+def light_of(
+    world: World, heads: Mapping[str, Head], snapshot: Snapshot, kind: str, level: float
+) -> dict[str, Map]:
+    """Light on every sensor with a mean of `level` of full scale for an ideal pixel on the axis."""
+    mean = np.mean([float(np.mean(snapshot.light[name])) for name in heads])
+    light = {}
+    for name, head in heads.items():
+        look = snapshot.looks[name]
+        unit = float(
+            head.electronics.linear_dn(np.ones((1, 1), np.float32), look.exposure_time_us)[0, 0]
+        )
+        full = head.sensor.full_scale_dn / unit
+        seen = snapshot.light[name]
+        if kind == "even light":
+            light[name] = np.full(seen.shape, level * full, np.float32)
+            continue
+        contrast = np.float32(TEXTURE) * (seen / np.float32(mean) - np.float32(1.0))
+        wished = np.float32(level * full) * (np.float32(1.0) + contrast)
+        light[name] = np.clip(wished, 0.0, BRIGHTEST * full).astype(np.float32)
+    return light
+
+
+def frames_of(
+    world: World, heads: Mapping[str, Head], snapshot: Snapshot, light: Mapping[str, Map]
+) -> dict[str, NDArray[np.uint16]]:
+    frames = {}
+    for name, head in heads.items():
+        look = snapshot.looks[name]
+        frames[name] = head.electronics.frame(
+            light[name],
+            exposure_time_us=look.exposure_time_us,
+            tdi_shifts=look.tdi_shifts,
+            gain_db=0.0,
+            temperature_c=world.temperature_c(head.sensor.probe, look.mid_gps_ns),
+            random=random_stream(SEED, "noise", name),
+        )
+    return frames
+
+
+def level1_of(
+    head: Head, raw: NDArray[np.uint16], look: Look, conditions: Conditions, out: Any
+) -> None:
+    """The Level-1 words of a frame as the pipeline makes them."""
+    level1_from_level0(
+        corrector_for(head.sensor, head.calibration),
+        raw,
+        temperature_c=conditions.temperatures_c.get(head.sensor.probe),
+        exposure_time_s=look.exposure_time_us * 1e-6,
+        tdi_shifts=look.tdi_shifts,
+        out=out,
+    )
+
+
+def seams_of(
+    world: World,
+    heads: Mapping[str, Head],
+    frames: Mapping[str, NDArray[np.uint16]],
+    conditions: Conditions,
+    product: Product,
+    scene: str,
+    level: float,
+) -> Seams:
+    """Every sensor resampled alone, with the gain and offset of the balance, along all seams."""
+    owner = (product.valid & 0x7F).astype(np.int64)
+    sides = []
+    for name in product.sensors:
+        head = heads[name]
+        composer = PanComposer(world.image, [head.sensor])
+        cone = head.cone.name
+        look = Look(0, conditions.exposure_time_s[cone] * 1e6, conditions.tdi_shifts[cone])
+        level1_of(head, frames[name], look, conditions, composer.frame(name))
+        alone = composer.compose(
+            product.mosaic.placements, [name], feather_px=16, interpolation="cubic"
+        )
+        gain = product.balance.gains[name]
+        offset = product.balance.offsets.get(name, 0.0)
+        value = alone.pan.astype(np.float32) * np.float32(gain) + np.float32(offset)
+        sides.append(np.where(alone.pan > 0, value, np.float32(np.nan)))
+    found = []
+    for upright in (True, False):
+        whose = owner if upright else owner.T
+        images = sides if upright else [side.T for side in sides]
+        found += _strips(whose, images)
+    off = np.array([100.0 * abs(a - b) / (0.5 * (a + b)) for a, b in found])
+    signal = np.array([0.5 * (a + b) for a, b in found])
+    sensor = heads[product.sensors[0]].sensor
+    dn = signal / level1_counts_per_dn(sensor.bits)
+    electrons = np.maximum(dn, 1.0) * sensor.electrons_per_dn
+    noise = np.sqrt(electrons + sensor.read_noise_e**2) / electrons / STRIP_PX * np.sqrt(2.0)
+    return Seams(
+        scene=scene,
+        level=level,
+        strips=len(off),
+        rms=float(np.sqrt(np.mean(off**2))),
+        p99=float(np.percentile(off, 99.0)),
+        largest=float(off.max()),
+        inside=float(np.mean(off <= 0.2)),
+        noise=float(100.0 * np.sqrt(np.mean(noise**2))),
+    )
+
+
+def _strips(owner: NDArray[np.int64], images: Sequence[Map]) -> list[tuple[float, float]]:
+    """Means of both sides over squares of 32 px along all upright seams of an image."""
+    left, right = owner[:, :-1], owner[:, 1:]
+    rows, columns = np.nonzero((left != right) & (left > 0) & (right > 0))
+    pairs = np.stack([left[rows, columns], right[rows, columns]], axis=1)
+    half = STRIP_PX // 2
+    found = []
+    for a, b in np.unique(pairs, axis=0):
+        mine = (pairs[:, 0] == a) & (pairs[:, 1] == b)
+        for strip in np.unique(rows[mine] // STRIP_PX):
+            here = mine & (rows // STRIP_PX == strip)
+            if np.count_nonzero(here) < STRIP_PX:
+                continue
+            sums, pixels = np.zeros(2), 0
+            for row, column in zip(rows[here], columns[here], strict=True):
+                window = slice(max(column + 1 - half, 0), column + 1 + half)
+                one, other = images[a - 1][row, window], images[b - 1][row, window]
+                good = np.isfinite(one) & np.isfinite(other)
+                sums += (float(one[good].sum()), float(other[good].sum()))
+                pixels += int(good.sum())
+            if pixels >= STRIP_PX * STRIP_PX // 2:
+                found.append((sums[0] / pixels, sums[1] / pixels))
+    return found
+
+
+def defects_of(
+    world: World,
+    heads: Mapping[str, Head],
+    frames: Mapping[str, NDArray[np.uint16]],
+    snapshot: Snapshot,
+    conditions: Conditions,
+    light: Mapping[str, Map],
+    scene: str,
+) -> Defects:
+    """Interpolated pixels of all PAN sensors against the light that fell on them."""
+    off, spread, good = [], [], []
+    for cone in world.rig.pan_cones:
+        for sensor in cone.sensors:
+            head, look = heads[sensor.name], snapshot.looks[sensor.name]
+            out = np.zeros(frames[sensor.name].shape, np.uint16)
+            level1_of(head, frames[sensor.name], look, conditions, out)
+            ideal = head.electronics.linear_dn(light[sensor.name], look.exposure_time_us)
+            path = {"shifts": look.tdi_shifts, "row_sign": sensor.tdi_row_sign}
+            response = over_tdi_path(head.truth.response, **path)
+            electrons = ideal * response * sensor.electrons_per_dn + sensor.read_noise_e**2
+            sigma = np.sqrt(electrons) / sensor.electrons_per_dn / response
+            error = out / level1_counts_per_dn(sensor.bits) - ideal
+            whole = np.zeros(out.shape, np.bool_)
+            first, last = exposed_rows(sensor, look.tdi_shifts)
+            whole[first + 8 : last - 7, 8:-8] = True
+            whole &= (out > 0) & ((out & 1) == 0)
+            spoilt = over_tdi_path(head.truth.defect.astype(np.float32), **path) > 0
+            off.append((error / sigma)[whole & spoilt])
+            good.append((error / sigma)[whole & ~spoilt][::50])
+            mean = _box(ideal)
+            local = np.sqrt(np.maximum(_box(ideal * ideal) - mean * mean, 0.0) + sigma**2)
+            spread.append((error / local)[whole & spoilt])
+    z, contrast = np.concatenate(off), np.concatenate(spread)
+    return Defects(
+        scene=scene,
+        pixels=len(z),
+        rms=float(np.sqrt(np.mean(z**2))),
+        median=float(np.median(np.abs(z))),
+        inside_1=float(np.mean(np.abs(z) < 1.0)),
+        good_rms=float(np.sqrt(np.mean(np.concatenate(good) ** 2))),
+        rms_of_contrast=float(np.sqrt(np.mean(contrast**2))),
+    )
+
+
+def _box(values: Map) -> Map:
+    """Means over 7 x 7 pixels."""
+    padded = np.pad(values.astype(np.float64), ((4, 3), (4, 3)), mode="edge")
+    sums = padded.cumsum(axis=0).cumsum(axis=1)
+    box = sums[7:, 7:] - sums[:-7, 7:] - sums[7:, :-7] + sums[:-7, :-7]
+    return np.asarray(box / 49.0, np.float32)
+
+
+if __name__ == "__main__":
+    main()
