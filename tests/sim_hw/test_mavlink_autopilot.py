@@ -168,6 +168,21 @@ def test_messages_intervals_and_parameters_are_told_when_asked(
     assert asked(autopilot, dialect.MAVLink_param_request_list_message(2, 1)) == []
 
 
+def test_faults_can_tell_what_is_a_mark_and_what_is_navigation(autopilot: MavlinkAutopilot) -> None:
+    autopilot.mark(START_GPS_NS)
+    said = autopilot.said_until(NS)
+    parts = autopilot.parts(said)
+    assert b"".join(data for _, data in parts) == said
+    assert [topic for topic, _ in parts].count("mark") == 1
+    assert parts[0][0] == "mark"
+    autopilot.restart_count()
+    autopilot.mark(START_GPS_NS + 2 * NS)
+    (trigger,) = [
+        m for m in parsed(autopilot.said_until(3 * NS)) if m.get_type() == "CAMERA_TRIGGER"
+    ]
+    assert trigger.seq == 0
+
+
 @settings(max_examples=200, deadline=None)
 @given(noise=st.binary(max_size=120), piece=st.integers(1, 40))
 def test_what_a_host_writes_may_be_anything(noise: bytes, piece: int) -> None:

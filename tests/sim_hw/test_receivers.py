@@ -17,7 +17,7 @@ from drivers.contract import EventMark
 from drivers.novatel.decoder import NovatelDecoder
 from sim_hw.nmea_receiver import NmeaReceiver
 from sim_hw.novatel_receiver import CLOCK_OFFSET_MAX_NS, NovatelReceiver
-from sim_hw.receiver import Edge, EmulatedReceiver
+from sim_hw.receiver import MARK, NAVIGATION, Edge, EmulatedReceiver
 from sim_hw.septentrio_receiver import SeptentrioReceiver
 from sim_hw.world_clock import WorldClock
 from tests.sim_hw.receiver_state import NS, START_GPS_NS, STATE, WEEK_NS, state_at
@@ -224,6 +224,22 @@ def test_marks_come_at_once_and_epochs_in_their_order(kind: Kind) -> None:
     assert dues == sorted(dues)
     assert rising == 2
     assert receiver.statistics()["epochs"] == 6
+
+
+@pytest.mark.parametrize("kind", [SeptentrioReceiver, NovatelReceiver, NmeaReceiver])
+def test_faults_can_tell_what_is_a_mark_and_what_is_navigation(kind: Kind) -> None:
+    receiver = make(kind)
+    receiver.due_mono_ns()
+    receiver._plan_epoch(START_GPS_NS)
+    receiver.mark(START_GPS_NS + 1_000_000)
+    topics = []
+    for _ in range(3):
+        receiver.due_mono_ns()
+        ((topic, said),) = receiver.parts(receiver.speak())
+        topics.append((topic, bool(said)))
+    receiver.close()
+    assert topics[0] == (MARK, True)
+    assert (NAVIGATION, True) in topics[1:]
 
 
 @pytest.mark.peer
