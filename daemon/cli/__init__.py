@@ -27,6 +27,7 @@ from daemon.cli import (
     monitor,
     process,
     repair,
+    report,
     rigs,
     run,
     sim,
@@ -55,6 +56,7 @@ app.command(name="check", help=check.HELP)(check.check)
 app.command(name="process", help=process.HELP)(process.process)
 app.command(name="develop", help=develop.HELP)(develop.develop)
 app.command(name="verify", help=verify.HELP)(verify.verify)
+app.command(name="report", help=report.HELP)(report.report)
 app.command(name="repair", help=repair.HELP)(repair.repair)
 app.command(name="transfer", help=transfer.HELP)(transfer.transfer)
 app.command(name="adjust", help=adjust.HELP)(adjust.adjust)

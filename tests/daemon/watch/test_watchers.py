@@ -1,0 +1,94 @@
+"""Fifty watchers, ten of them stalled: the others are told everything, and memory stays."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from daemon.configuration import WatchSection
+from daemon.messages import Stop, Told
+from daemon.processes import Child
+from tests.daemon.watch import flown
+
+WATCHERS, STALLED, EXPOSURES = 50, 10, 60
+GROWTH_MAX_KB = 60_000
+
+
+@pytest.fixture
+def watch(tmp_path: Path) -> Iterator[tuple[Child, int]]:
+    (tmp_path / "L0").mkdir()
+    child = Child("watch", "daemon.watch.process:main", (WatchSection(port=0, announce=False),), {})
+    assert child.connection.poll(60)
+    port = child.connection.recv().event["port"]
+    yield child, port
+    child.send(Stop())
+    child.end(10.0)
+
+
+def resident_kb(pid: int) -> int:
+    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+        if line.startswith("VmRSS"):
+            return int(line.split()[1])
+    return 0
+
+
+async def follow(port: int, until: int) -> set[int]:
+    """Numbers of the exposures this watcher was told the verdict of."""
+    from websockets.asyncio.client import connect
+
+    seen: set[int] = set()
+    async with connect(f"ws://127.0.0.1:{port}/api/v1/telemetry?form=json", max_size=None) as link:
+        while len(seen) < until:
+            record = json.loads(await asyncio.wait_for(link.recv(), 90))
+            seen |= {one["number"] for one in record.get("exposures", []) if "verdict" in one}
+    return seen
+
+
+async def stall(port: int, release: asyncio.Event) -> None:
+    """Connect, and take nothing."""
+    _reader, writer = await asyncio.open_connection("127.0.0.1", port, limit=1024)
+    writer.write(
+        b"GET /api/v1/telemetry?form=json HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\n"
+        b"Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+        b"Sec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\n\r\n"
+    )
+    await release.wait()
+    writer.close()
+
+
+def test_stalled_watchers_cost_the_others_nothing(watch: tuple[Child, int]) -> None:
+    child, port = watch
+    assert child.tell(Told(flown.mission()))
+    before_kb = resident_kb(child.process.pid or 0)
+    dropped = 0
+
+    def fly() -> None:
+        nonlocal dropped
+        for number in range(1, EXPOSURES + 1):
+            for event in (*flown.exposure(number), flown.status(triggers=number)):
+                while not child.tell(Told(event)):
+                    dropped += 1
+                    time.sleep(0.02)
+            time.sleep(0.05)
+
+    async def look() -> list[set[int]]:
+        release = asyncio.Event()
+        stalled = [asyncio.create_task(stall(port, release)) for _ in range(STALLED)]
+        following = [follow(port, EXPOSURES) for _ in range(WATCHERS - STALLED)]
+        flying = threading.Thread(target=fly)
+        flying.start()
+        seen = await asyncio.gather(*following)
+        flying.join()
+        release.set()
+        await asyncio.gather(*stalled)
+        return seen
+
+    for seen in asyncio.run(look()):
+        assert seen == set(range(1, EXPOSURES + 1))
+    assert resident_kb(child.process.pid or 0) - before_kb < GROWTH_MAX_KB
