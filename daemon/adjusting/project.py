@@ -91,6 +91,10 @@ def read_project(path: Path) -> Project:
         ("x_mm", "y_mm", "column_px", "row_px", "sx_um", "sy_um"),
     )
     build = _Names(images, exposures, seen, points, problems)
+    told = [problem for t in build.tables for problem in t.problems]
+    if told:
+        # Names that are not unique fit no index: what else is wrong cannot be told yet.
+        raise ProjectError(told)
     network = Network(
         cameras=cameras,
         heads=heads,
@@ -129,8 +133,8 @@ class _Names:
         self.tables = [t for t in (images, exposures, seen, points) if t is not None]
         self.problems = problems
         self._images, self._exposures, self._seen, self._points = images, exposures, seen, points
-        self.image_names = images.text("image")
-        listed = exposures.text("exposure") if exposures is not None else []
+        self.image_names = images.names("image")
+        listed = exposures.names("exposure") if exposures is not None else []
         of_image = [
             given or name
             for given, name in zip(images.text("exposure"), self.image_names, strict=True)
@@ -145,7 +149,7 @@ class _Names:
         )
         self.attitude_names = [*needing, *(f"image {name}" for name in own)]
         roles = points.text("role", "tie") if points is not None else []
-        listed_points = points.text("point") if points is not None else []
+        listed_points = points.names("point") if points is not None else []
         self.point_names = list(dict.fromkeys([*listed_points, *seen.text("point")]))
         self._roles = roles
         self.exposure_at = {name: k for k, name in enumerate(self.exposure_names)}

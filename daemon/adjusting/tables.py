@@ -45,6 +45,18 @@ class Table:
         at = self.columns.index(column)
         return [row[at] or default for row in self.rows]
 
+    def names(self, column: str) -> list[str]:
+        """A column of names, none of them twice or empty."""
+        found = self.text(column)
+        seen: set[str] = set()
+        for name, line in zip(found, self.lines, strict=True):
+            if not name:
+                self.wrong(line, f"{column} is empty")
+            elif name in seen:
+                self.wrong(line, f"{column} {name!r} is given twice")
+            seen.add(name)
+        return found
+
     def numbers(self, column: str, default: float = math.nan) -> list[float]:
         """A column of numbers; an empty cell is `default`."""
         if column not in self.columns:

@@ -223,7 +223,7 @@ def _figures(
     cofactor = cofactor_matrix(reduced, layout.constraints, minimum_norm=run.minimum_norm)
     found: tuple[Defect, ...] = ()
     if run.minimum_norm:
-        found = defects(run.network, layout, run.state, reduced)
+        found = defects(run.network, layout, run.state, reduced, singular=False)
     own, leverage = spread_of(rows, reduced, cofactor)
     free_points = layout.eliminated_points
     held = layout.locked[free_points]

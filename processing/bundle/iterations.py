@@ -59,7 +59,9 @@ def iterated(run: Run) -> tuple[Equations, Reduced]:
         try:
             step = solved(reduced, run.layout.constraints, minimum_norm=run.minimum_norm)
         except SingularError as error:
-            raise DefectError(defects(run.network, run.layout, run.state, error.reduced)) from None
+            raise DefectError(
+                defects(run.network, run.layout, run.state, error.reduced, singular=True)
+            ) from None
         if step.promised <= max(_CONVERGED * objective, _SETTLED):
             return rows, reduced
         run.state = _stepped(run, step.dx, step.dpoints, objective, step.promised)
@@ -113,7 +115,9 @@ def robust_weights(run: Run) -> None:
         try:
             step = solved(reduced, run.layout.constraints, minimum_norm=run.minimum_norm)
         except SingularError as error:
-            raise DefectError(defects(run.network, run.layout, run.state, error.reduced)) from None
+            raise DefectError(
+                defects(run.network, run.layout, run.state, error.reduced, singular=True)
+            ) from None
         run.state = _stepped(run, step.dx, step.dpoints, objective, step.promised)
         before = run.weight
         plain = replace(run, weight=np.where(run.weight > 0.0, 1.0, 0.0))

@@ -24,7 +24,7 @@ MOST_COLUMNS = 15_000
 """Beyond this the reduced matrix takes more than 1.7 GiB."""
 
 _DENSE_FILL = 0.04
-_LEAST_PIVOT = 1e-11
+LEAST_INFORMATION = 1e-11
 """Of the reduced matrix over the diagonal it had before points were eliminated; a datum defect
 leaves 1e-14."""
 
@@ -220,7 +220,7 @@ def cofactor_matrix(reduced: Reduced, constraints: Array, *, minimum_norm: bool)
     matrix, rows = constrained_matrix(reduced, constraints)
     if minimum_norm:
         values, vectors = linalg.eigh(matrix)
-        known = values > _LEAST_PIVOT
+        known = values > LEAST_INFORMATION
         inverse = (vectors[:, known] / values[known]) @ vectors[:, known].T
     else:
         factor = _factor(matrix, reduced)
@@ -237,7 +237,7 @@ def cofactor_matrix(reduced: Reduced, constraints: Array, *, minimum_norm: bool)
 def _factor(matrix: Array, reduced: Reduced) -> Array:
     """Lower Cholesky factor, refused where a pivot says that a direction has no information."""
     factor, info = linalg.lapack.dpotrf(matrix, lower=1, clean=1)
-    if info != 0 or float(factor.diagonal().min(initial=1.0)) ** 2 < _LEAST_PIVOT:
+    if info != 0 or float(factor.diagonal().min(initial=1.0)) ** 2 < LEAST_INFORMATION:
         raise SingularError(reduced)
     return np.asarray(factor)
 
@@ -247,7 +247,7 @@ def _inverse_action(
 ) -> Callable[[Array], Array]:
     if minimum_norm:
         values, vectors = linalg.eigh(matrix)
-        known = values > _LEAST_PIVOT
+        known = values > LEAST_INFORMATION
         kept, weights = vectors[:, known], 1.0 / values[known]
         return lambda right: np.asarray(kept @ ((weights * (kept.T @ right).T).T))
     factor = _factor(matrix, reduced)

@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from processing.bundle.network import Network
-from processing.bundle.normal import Reduced, constrained_matrix
+from processing.bundle.normal import LEAST_INFORMATION, Reduced, constrained_matrix
 from processing.bundle.unknowns import Layout, State, Unknown
 
 Array = NDArray[np.float64]
 
-_NO_INFORMATION: Final = 1e-10
 _SAME: Final = 1e-4
 _TAKES_PART: Final = 0.02
 """Share of a direction (in units of each unknown's own information) that is worth naming."""
@@ -55,12 +54,22 @@ class DefectError(ValueError):
         super().__init__("; ".join(defect.sentence for defect in found))
 
 
-def defects(network: Network, layout: Layout, state: State, reduced: Reduced) -> tuple[Defect, ...]:
-    """Name every direction of the unknowns that has no information."""
+def defects(
+    network: Network, layout: Layout, state: State, reduced: Reduced, *, singular: bool
+) -> tuple[Defect, ...]:
+    """Name every direction of the unknowns that has no information.
+
+    Args:
+        network, layout, state: what was to be adjusted.
+        reduced: its reduced equations.
+        singular: they could not be solved, so that the weakest direction is at fault at least.
+    """
     matrix, _ = constrained_matrix(reduced, layout.constraints)
     values, vectors = linalg.eigh(matrix)
-    none = vectors[:, values < _NO_INFORMATION]
+    none = vectors[:, values < LEAST_INFORMATION]
     if not none.shape[1]:
+        if not singular:
+            return ()
         none = vectors[:, :1]
     found: list[Defect] = []
     named: list[Array] = []

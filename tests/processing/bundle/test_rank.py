@@ -41,6 +41,15 @@ def test_a_free_network_is_adjusted_with_the_shortest_correction() -> None:
     assert np.isfinite(made.points).all()
 
 
+def test_a_free_network_that_lacks_nothing_is_the_controlled_one() -> None:
+    network = aerial(sigma_mm=1e-3).network
+    plain, free = adjust(network), adjust(network, Settings(minimum_norm=True))
+    assert free.defects == ()
+    assert free.redundancy == plain.redundancy
+    assert np.abs(free.state.station - plain.state.station).max() < 1e-7
+    assert np.allclose(free.cofactor, plain.cofactor, rtol=1e-6, atol=1e-15)
+
+
 def test_one_height_control_point_too_few_leaves_one_tilt() -> None:
     made = aerial(control=0, lines=1, along=5)
     sigma = made.network.points.sigma_m.copy()
