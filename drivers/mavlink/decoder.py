@@ -72,6 +72,7 @@ class MavlinkDecoder(MessageDecoder):
         self.clock = BootClock()
         self.system = system
         """The autopilot's number; 0 until its first heartbeat."""
+        self._chosen = system
         self.component = 1
         self.autopilot: int | None = None
         self.timesyncs: deque[Timesync] = deque(maxlen=64)
@@ -107,11 +108,13 @@ class MavlinkDecoder(MessageDecoder):
         self._held = None
         self._sequence = None
         self._attitudes.clear()
+        # It may be another one that is there now; until a heartbeat says so, it is the same.
+        self.autopilot = None
 
     def on_message(self, message: bytes, mono_ns: int) -> list[Nav]:
         parsed = self._parser.parse(message)
         name: str = parsed.get_type()
-        if name == "HEARTBEAT" and self.system in (0, parsed.get_srcSystem()):
+        if name == "HEARTBEAT" and self._chosen in (0, parsed.get_srcSystem()):
             self._on_heartbeat(parsed)
         if parsed.get_srcSystem() != self.system or parsed.get_srcComponent() != self.component:
             self.counters["messages_of_others"] += 1
@@ -131,7 +134,7 @@ class MavlinkDecoder(MessageDecoder):
             return
         if self.autopilot is None:
             self.system, self.component = message.get_srcSystem(), message.get_srcComponent()
-        if message.get_srcComponent() == self.component:
+        if (message.get_srcSystem(), message.get_srcComponent()) == (self.system, self.component):
             self.autopilot = int(message.autopilot)
 
     # Navigation

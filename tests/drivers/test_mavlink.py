@@ -203,6 +203,16 @@ def test_others_on_the_bus_are_not_taken_for_the_autopilot() -> None:
     assert chosen.system == 2
 
 
+def test_after_the_line_was_opened_anew_another_autopilot_may_be_there() -> None:
+    bus, other = Bus(), Bus(system=7)
+    decoder, _ = decode(bus.heartbeat() + bus.system_time())
+    assert len(decoder.feed(other.heartbeat() + other.position() + bus.position(), 0)) == 1
+    decoder.reset()
+    assert len(decoder.feed(bus.position(), 0)) == 1, "until a heartbeat says otherwise"
+    assert len(decoder.feed(other.heartbeat() + other.position(), 0)) == 1
+    assert decoder.system == 7
+
+
 def test_lost_messages_are_counted_by_their_sequence() -> None:
     bus = Bus()
     said = bus.heartbeat() + bus.system_time()
