@@ -389,7 +389,7 @@ def _interpolate_defects(level1, mask, places, period):  # type: ignore[no-untyp
             error = gradient / chords * (to_before + to_after)
             if step_row != 0 and step_column != 0:
                 error *= _DIAGONAL
-            value = before + (after - before) * to_before / (to_before + to_after)
+            filled = before + (after - before) * to_before / (to_before + to_after)
             r, c = row - 2 * step_row, column - 2 * step_column
             r2, c2 = row + 2 * step_row, column + 2 * step_column
             if (
@@ -401,9 +401,9 @@ def _interpolate_defects(level1, mask, places, period):  # type: ignore[no-untyp
                 and not (mask[r, c] or mask[r2, c2] or level1[r, c] == 0 or level1[r2, c2] == 0)
             ):
                 outer = np.float64(level1[r, c] & 0xFFFE) + np.float64(level1[r2, c2] & 0xFFFE)
-                value = _NEAR_TAP * (before + after) + (0.5 - _NEAR_TAP) * outer
+                filled = _NEAR_TAP * (before + after) + (0.5 - _NEAR_TAP) * outer
             share = 1.0 / (error + _EVEN_COUNTS) ** 4
-            total += share * value
+            total += share * filled
             weights += share
             if error < best:
                 best = error
