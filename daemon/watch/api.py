@@ -99,7 +99,7 @@ def create_app(state: FlightState, gate: Gate, settings: WatchSettings) -> FastA
         title="Syntopic",
         description="State, products and commands of an aerial camera in flight.",
         version="1",
-        responses={"default": {"model": Problem, "description": "problem+json"}},
+        responses={"default": _documented_problem(), 422: _documented_problem()},
         docs_url=None,
         redoc_url=None,
     )
@@ -272,7 +272,7 @@ def _add_commands(app: FastAPI, state: FlightState, gate: Gate, doors: _Doors) -
         given = body or CommandBody()
         if name == "acknowledge":
             if given.fault is None:
-                raise HTTPException(422, "acknowledge needs the fault's id")
+                raise HTTPException(409, "acknowledge needs the fault's id")
             if not any(fault["id"] == given.fault for fault in state.faults()):
                 raise HTTPException(404, f"no fault {given.fault!r} is listed")
         try:
@@ -341,6 +341,11 @@ def _add_page(app: FastAPI) -> None:
         return FileResponse(PAGE / "api.html")
 
     app.mount("/", StaticFiles(directory=PAGE, html=True), name="page")
+
+
+def _documented_problem() -> dict[str, Any]:
+    schema = Problem.model_json_schema()
+    return {"description": "what is wrong", "content": {PROBLEM_JSON: {"schema": schema}}}
 
 
 async def _harden(

@@ -144,7 +144,7 @@ def test_a_fault_is_acknowledged(camera: Camera, client: TestClient) -> None:
     camera.state.apply(flown.recovered("SU02"))
     (fault,) = client.get("/api/v1/faults").json()
     send = {"headers": bearer(camera.operator)}
-    assert client.post("/api/v1/commands/acknowledge", **send).status_code == 422
+    assert client.post("/api/v1/commands/acknowledge", **send).status_code == 409
     unknown = client.post("/api/v1/commands/acknowledge", json={"fault": "x"}, **send)
     assert unknown.status_code == 404
     done = client.post("/api/v1/commands/acknowledge", json={"fault": fault["id"]}, **send)
