@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.tree import Tree
 
 from daemon.cli.find import find as find_devices
+from daemon.cli.find_heads import find_heads
 
 HELP = """Validate a configuration, open every device, and print what is well and what is not.
 
@@ -20,6 +21,7 @@ The exit status is 0 when all is well, 1 when a device is not, 2 when the config
 
 With `--find`, find out what speaks at serial ports, tcp://host:port, udpin://host:port (those
 given, or all serial ports and the usual addresses): protocol, speed, and the configuration for it.
+With `--find-heads`, which GigE Vision, USB3 Vision and V4L2 heads there are, and the same.
 
 Examples: `syntopic check flights/sim/service.toml`, `syntopic check --find`,
 `syntopic check --find /dev/ttyUSB0 tcp://10.0.0.5:3001`
@@ -37,6 +39,9 @@ def check(
     find: Annotated[
         bool, typer.Option("--find", help="Find out what speaks at ports, and how fast.")
     ] = False,
+    heads: Annotated[
+        bool, typer.Option("--find-heads", help="Find out which heads there are.")
+    ] = False,
     listen_only: Annotated[
         bool, typer.Option("--listen-only", help="With --find, send nothing to any port.")
     ] = False,
@@ -44,8 +49,12 @@ def check(
 ) -> None:
     if find:
         find_devices(targets or [], as_json=as_json, ask=not listen_only)
+    if heads:
+        find_heads(as_json=as_json)
     if targets is None or len(targets) != 1:
-        raise typer.BadParameter("give one service configuration, or --find and ports")
+        raise typer.BadParameter(
+            "give one service configuration, or --find and ports, or --find-heads"
+        )
     check_devices(Path(targets[0]), as_json=as_json)
 
 

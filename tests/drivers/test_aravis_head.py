@@ -191,6 +191,18 @@ def test_a_packed_frame_without_chunks_is_unpacked_alike() -> None:
     assert pair.frames[0].temperature_c == 36.5, "asked for, since the frame does not say"
 
 
+def test_heads_are_found_with_what_reaches_them() -> None:
+    from daemon.cli.find_heads import found_heads
+
+    with flying(2) as pairs:
+        found, _ = found_heads()
+        addresses = [pair.driver.address for pair in pairs]
+    ours = [head for head in found if head["settings"].get("address") in addresses]
+    assert [head["settings"]["serial"] for head in ours] == ["E-0", "E-1"]
+    assert {head["driver"] for head in ours} == {"aravis"}
+    assert {head["found"]["vendor"] for head in ours} == {"Peer"}
+
+
 def test_a_format_that_is_no_survey_frame_is_refused_by_the_settings() -> None:
     problems = AravisHead.problems({"address": "127.77.9.1", "pixel_format": "RGB8"})
     assert problems == [

@@ -91,6 +91,18 @@ def test_the_same_pixels_come_from_the_bus_name_as_from_the_path() -> None:
     assert head.told == ["opened"]
 
 
+def test_check_finds_the_head_and_says_what_to_write() -> None:
+    from daemon.cli.find_heads import v4l2_heads
+
+    (head,), problems = v4l2_heads()
+    assert problems == []
+    assert head["settings"] == {"device": "/dev/video0", "pixel_format": "Y16"}
+    assert head["found"]["model"] == "vivid"
+    settings = {**head["settings"], "pixel_format": "Y12", "width_px": 640, "height_px": 360}
+    with flight(**settings) as found:
+        found.wait_frames(1)
+
+
 def test_settings_that_the_head_refuses_come_all_at_once() -> None:
     with pytest.raises(DeviceError) as refused:
         flight(
