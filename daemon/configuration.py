@@ -154,7 +154,22 @@ class WatchSection(_Section):
     certificate: Path | None = None
     key: Path | None = None
     announce: bool = True
+    udp: tuple[str, ...] = Field(default=(), max_length=8)
+    udp_bytes_per_s: float = Field(default=4000.0, ge=1000)
     mavlink: MavlinkCameraSection | None = None
+
+    @property
+    def udp_addresses(self) -> dict[str, tuple[str, int]]:
+        """Where datagrams go, by the text in the configuration."""
+        return {text: (text.rpartition(":")[0], int(text.rpartition(":")[2])) for text in self.udp}
+
+    @model_validator(mode="after")
+    def _has_addresses(self) -> WatchSection:
+        for text in self.udp:
+            host, _, port = text.rpartition(":")
+            if not host or not port.isdecimal() or not 0 < int(port) < 65536:
+                raise ValueError(f"udp has {text!r}; write HOST:PORT")
+        return self
 
     @model_validator(mode="after")
     def _is_safe(self) -> WatchSection:

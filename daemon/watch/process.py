@@ -23,6 +23,7 @@ from daemon.orientation import mount_of
 from daemon.processes import Link
 from daemon.records import RecordError
 from daemon.watch.api import WatchSettings, create_app
+from daemon.watch.datagrams import send
 from daemon.watch.discovery import Announcement
 from daemon.watch.gate import Gate
 from daemon.watch.mavlink_camera import MavlinkCamera
@@ -72,6 +73,7 @@ async def _serve(link: Link, settings: WatchSection) -> None:
         link.send(Told({"event": "watching", **told}))
     ending = asyncio.Event()
     announcement = Announcement(state, settings, port)
+    saying = asyncio.create_task(send(state, settings.udp_addresses, settings.udp_bytes_per_s))
     camera = await _camera(settings, state, gate, ground, link)
     loop = asyncio.get_running_loop()
     loop.add_reader(link.fileno(), _hear, link, state, gate, ending)
@@ -85,6 +87,7 @@ async def _serve(link: Link, settings: WatchSection) -> None:
     finally:
         loop.remove_reader(link.fileno())
         server.should_exit = True
+        saying.cancel()
         if camera is not None:
             camera.end()
         with suppress(OSError):
