@@ -28,13 +28,15 @@ MODBUS_LINES: Final = tuple(
 )
 MODBUS_UNITS: Final = (1, 2, 3, 4)
 MODBUS_ANSWER_S: Final = 0.15
-SILENCE_S: Final = 1.4
-"""Receivers and instruments that speak by themselves do so once a second."""
+SILENCE_S: Final = 2.2
+"""Receivers and instruments that speak by themselves do so once a second; one may be missed."""
 NONSENSE_S: Final = 0.4
 NONSENSE_NBYTES: Final = 300
 """So much that makes no sense is the wrong speed."""
 LISTEN_S: Final = 3.2
 """For whom something made sense: the message that tells who it is comes once a second."""
+NONSENSE_AT_LAST_S: Final = 1.4
+"""Likewise whatever has come by then."""
 SETTLED_S: Final = 1.5
 """By then a receiver has said everything it says once a second."""
 STEP_S: Final = 0.1
@@ -157,7 +159,7 @@ class _Search:
                     return evidence
                 if evidence.nbytes and not evidence.has_messages:
                     has_enough = evidence.nbytes > NONSENSE_NBYTES and elapsed_s > NONSENSE_S
-                    if has_enough or elapsed_s > SILENCE_S:
+                    if has_enough or elapsed_s > NONSENSE_AT_LAST_S:
                         return evidence
                 evidence.feed(line.read(STEP_S), self._clock.mono_ns())
         finally:
