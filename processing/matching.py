@@ -171,7 +171,7 @@ def match_patches(
                 continue
             col_a = at_a[i, 0] - ratio * room
             row_a = at_a[i, 1] - ratio * room
-            if not _load(frame_a, col_a, row_a, ratio, words, a) or not _all_finite(a):
+            if not _load(frame_a, col_a, row_a, ratio, words, a) or not (words or _all_finite(a)):
                 continue
             # Only what lies in the frame is loaded; the rest of b is never looked at.
             rows_b = 2 * room + 1 + reach[3] - reach[2]
@@ -181,7 +181,9 @@ def match_patches(
                 search + reach[0] : search + reach[0] + cols_b,
             ]
             first_col, first_row = col_b - room + reach[0], row_b - room + reach[2]
-            if not _load(frame_b, first_col, first_row, 1, words, part) or not _all_finite(part):
+            if not _load(frame_b, first_col, first_row, 1, words, part) or not (
+                words or _all_finite(part)
+            ):
                 continue
             correlate(a, b, half_window, margin, reach, correlation, surface)
             if not peak(surface, reach, best):
@@ -201,7 +203,9 @@ def match_patches(
                         or row + ratio * size_a > frame_a.shape[0]
                     ):
                         continue
-                    if not _load(frame_a, col, row, ratio, words, a) or not _all_finite(a):
+                    if not _load(frame_a, col, row, ratio, words, a) or not (
+                        words or _all_finite(a)
+                    ):
                         continue
                 shift = (best[2] + moved_col / ratio, best[3] + moved_row / ratio)
             offset = (search + int(best[0]), search + int(best[1]))
