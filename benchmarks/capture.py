@@ -1,8 +1,8 @@
-"""`python -m benchmarks.capture`: capture alone at full size (DESIGN 9, b).
+"""`python -m benchmarks.capture`: capture at full size (DESIGN 9, b), or with the pipeline (c).
 
 Thirteen emulated GigE Vision heads send frames made beforehand; the service captures, matches,
-hashes, stores and syncs them as in flight, without its pipeline. What is verified is deleted, so
-that the disk stays small; the product never does that.
+hashes, stores and syncs them as in flight. `--pipeline` has it process them, too. What is verified
+is deleted, so that the disk stays small; the product never does that.
 """
 
 from __future__ import annotations
@@ -40,6 +40,8 @@ EXPOSURE_US = 4000.0
 TICK_HZ = os.sysconf("SC_CLK_TCK")
 READY_WITHIN_S = 300.0
 GRACE_S = 120.0
+PIPELINE_WITHIN_S = 40.0
+"""What an exposure may take in the pipeline before the run is given up."""
 
 
 class Retention:
@@ -108,6 +110,7 @@ def main() -> None:
     parser.add_argument("--interval", type=float, help="s; the rig's own by default")
     parser.add_argument("--root", type=Path, help="where Level-0 goes (default: a folder in /tmp)")
     parser.add_argument("--noise", action="store_true", help="frames of noise, nothing rendered")
+    parser.add_argument("--pipeline", action="store_true", help="process the exposures, too")
     parser.add_argument("--depth", type=int, default=3, help="exposures in memory")
     parser.add_argument("--packet-size", type=int, default=9000)
     parser.add_argument("--rate", type=float, default=40.0, help="MB/s of one head")
@@ -127,10 +130,12 @@ def main() -> None:
 
 def _run(options: argparse.Namespace, rig: Rig, folder: Path) -> dict[str, Any]:
     exposure_nbytes = sum(2 * s.width_px * s.height_px for s in rig.sensors)
-    _refuse_small_disk(folder, exposure_nbytes * KEPT_EXPOSURES)
+    # What the pipeline puts off waits on disk until it is done.
+    kept = KEPT_EXPOSURES + (options.exposures if options.pipeline else 0)
+    _refuse_small_disk(folder, exposure_nbytes * kept)
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "syntopic"
     ring = cache / "capture" / (f"{rig.name}-noise" if options.noise else rig.name)
-    frames = None
+    frames = place = None
     if not options.noise:
         place = bench.exposures_of(options.rig, rig, cache / "bench" / rig.name)
         frames = place / "mission" / "L0" / "000001"
@@ -156,7 +161,7 @@ def _run(options: argparse.Namespace, rig: Rig, folder: Path) -> dict[str, Any]:
         assert emulator.stdout is not None
         bus = json.loads(emulator.stdout.readline())
         config = folder / "service.toml"
-        config.write_text(_configuration(options, rig, addresses, bus, interval_s))
+        config.write_text(_configuration(options, rig, addresses, bus, interval_s, place))
         load_before = os.getloadavg()[0]
         flown = _fly(options, config, bus, interval_s)
         counted, _ = emulator.communicate(timeout=READY_WITHIN_S)
@@ -180,13 +185,19 @@ def _configuration(
     addresses: Mapping[str, str],
     bus: Mapping[str, Any],
     interval_s: float,
+    place: Path | None,
 ) -> str:
+    calibrated = options.pipeline and place is not None
+    radiometry = place / "calibration" / "radiometry" if calibrated and place else None
     lines = [
         "[mission]",
         'root = "missions"',
         f"rig = {json.dumps(options.rig)}",
         "simulated = true",
         "end_when_done = true",
+        *([f"radiometry = {json.dumps(str(radiometry))}"] if radiometry else []),
+        "[processing]",
+        "geometry = false",
         "[trigger]",
         'driver = "pulse-bus"',
         f"host = {json.dumps(bus['host'])}",
@@ -215,13 +226,19 @@ def _fly(
     """Run the service to its end, looking at what it stores; what it said."""
     processor, retention = Processor(), Retention(options.whole_every)
     flown: dict[str, Any] = {"events": [], "store_s": [], "delay_s": [], "ledger": {}}
+    flown |= {"processed": []}
     triggered_ns: dict[int, int] = {}
     service = subprocess.Popen(
-        [sys.executable, "-m", "benchmarks.capture_service", str(config)],
+        [
+            *(sys.executable, "-m", "benchmarks.capture_service", str(config)),
+            *(["--pipeline"] if options.pipeline else []),
+        ],
         stdout=subprocess.PIPE,
         text=True,
     )
     limit_s = READY_WITHIN_S + options.exposures * interval_s + GRACE_S
+    if options.pipeline:
+        limit_s += options.exposures * PIPELINE_WITHIN_S
     killer = threading.Timer(limit_s, service.kill)
     killer.start()
     level0 = config.parent
@@ -248,7 +265,14 @@ def _fly(
             elif name == "sealed":
                 processor.look()
                 flown["seconds"] = time.monotonic() - flown["started_s"]
+                if not options.pipeline:
+                    retention.take(level0 / f"{event['number']:06d}")
+            elif name in ("processed", "not-processed"):
+                processor.look()
+                flown["processed_seconds"] = time.monotonic() - flown["started_s"]
+                flown["processed"].append(_processed(event, now_ns, triggered_ns))
                 retention.take(level0 / f"{event['number']:06d}")
+                shutil.rmtree(level0.parent / "L2" / f"{event['number']:06d}", ignore_errors=True)
             elif name == "ended":
                 flown["ledger"] = event["ledger"]
             elif name in ("lost", "not-written", "fault") or event.get("fault"):
@@ -260,6 +284,36 @@ def _fly(
     flown["cpu_s"] = processor.seconds
     flown["retention"] = retention
     return flown
+
+
+def _processed(
+    event: Mapping[str, Any], now_ns: int, triggered_ns: Mapping[int, int]
+) -> dict[str, Any]:
+    """What became of one exposure in the pipeline."""
+    report = event.get("report")
+    return {
+        "done": report is not None,
+        "behind": report is not None and "PROCESSING_BEHIND" in report["flags"],
+        "pipeline_s": event.get("duration_s", 0.0),
+        "trigger_to_products_s": (now_ns - triggered_ns[event["number"]]) * 1e-9,
+    }
+
+
+def _of_pipeline(flown: Mapping[str, Any], interval_s: float) -> dict[str, Any]:
+    """Pace and latency of the pipeline beside the capture; empty where it did not run."""
+    all_of_them = flown["processed"]
+    done = [one for one in all_of_them if one["done"]]
+    if not done:
+        return {}
+    return {
+        "processed": len(done),
+        "not_processed": len(all_of_them) - len(done),
+        "behind": sum(one["behind"] for one in done),
+        "seconds": flown["processed_seconds"],
+        "realtime_factor": interval_s * len(done) / flown["processed_seconds"],
+        "pipeline_s": _spread([one["pipeline_s"] for one in done]),
+        "trigger_to_products_s": _spread([one["trigger_to_products_s"] for one in done]),
+    }
 
 
 def _judged(
@@ -319,6 +373,7 @@ def _judged(
         "cpu_s_per_exposure": {k: s / wanted for k, s in flown["cpu_s"].items()},
         "store_s": _spread(flown["store_s"]),
         "trigger_to_stored_s": _spread(flown["delay_s"]),
+        "pipeline": _of_pipeline(flown, interval_s),
     }
 
 
@@ -364,6 +419,14 @@ def _print(result: Mapping[str, Any]) -> None:
         if result[what]:
             spread = result[what]
             console.print(f"{what}: median {spread['median']:.2f}, at most {spread['max']:.2f}")
+    made = result["pipeline"]
+    if made:
+        console.print(
+            f"pipeline: {made['processed']} exposures in {made['seconds']:.0f} s, realtime_factor "
+            f"{made['realtime_factor']:.2f}, {made['behind']} put off as processing behind, "
+            f"{made['not_processed']} failed; {made['pipeline_s']['median']:.2f} s each, "
+            f"{made['trigger_to_products_s']['median']:.1f} s from trigger to products"
+        )
     console.print(
         f"ledger: {_counted(result['triggers'])}; frames: {_counted(result['frames_of_ledger'])}"
     )

@@ -1,4 +1,7 @@
-"""The onboard service without its worker: capture, ledger and Level-0 as they fly, no pipeline."""
+"""The onboard service for benchmarks: it tells its processes, and flies with or without a worker.
+
+Without, capture, ledger and Level-0 are as they fly, and there is no pipeline.
+"""
 
 from __future__ import annotations
 
@@ -15,14 +18,21 @@ from daemon.departure import ProcessPlan, processes
 from daemon.mission import Mission
 
 
-class CaptureOnly(service.Service):
+class Told(service.Service):
+    """The service as it flies; it tells the numbers of its processes."""
+
+    def _start(self, mission: Mission) -> None:
+        super()._start(mission)
+        children = self.supervisor._children.items()
+        self._event("processes", pids={name: child.process.pid for name, child in children})
+
+
+class CaptureOnly(Told):
     """Hands memory back as soon as an exposure is stored and sealed."""
 
     def _start(self, mission: Mission) -> None:
         super()._start(mission)
         self.is_worker_ready = True
-        children = self.supervisor._children.items()
-        self._event("processes", pids={name: child.process.pid for name, child in children})
 
     def _feed_worker(self) -> None:
         while self.waiting:
@@ -41,11 +51,14 @@ def _say(event: Mapping[str, Any]) -> None:
 
 
 def main() -> None:
-    """`python -m benchmarks.capture_service service.toml`: events as JSON, one a line."""
-    vars(service)["processes"] = _without_worker
+    """`python -m benchmarks.capture_service service.toml [--pipeline]`: events, one a line."""
     path = Path(sys.argv[1])
     configuration, rig = load(path)
-    sys.exit(asyncio.run(CaptureOnly(configuration, rig, path, _say).run()))
+    kind: type[Told] = Told
+    if "--pipeline" not in sys.argv[2:]:
+        vars(service)["processes"] = _without_worker
+        kind = CaptureOnly
+    sys.exit(asyncio.run(kind(configuration, rig, path, _say).run()))
 
 
 if __name__ == "__main__":
