@@ -87,7 +87,8 @@ class V4l2Camera:
         name = self._settings.temperature_control
         if not name:
             return None
-        return self.node.read(self.controls[name]) * self._settings.temperature_unit_c
+        value = self.node.read_all({name: self.controls[name]}).get(name)
+        return None if value is None else value * self._settings.temperature_unit_c
 
     def recorded(self) -> dict[str, float | int | str]:
         """Every control of picture and camera as it stands, and the pixel format."""

@@ -21,7 +21,7 @@ from drivers.contract import DeviceEvent, Frame, LifeCycle, Record
 from drivers.v4l2.head import V4l2Head
 
 GUEST = Path(os.environ.get("V4L2_GUEST", "/dev/v4l2-guest"))
-PATIENCE_S = 30.0
+PATIENCE_S = 60.0
 UNTOUCHED = 0xA5A5
 
 
