@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from processing.rig import RigError, load_rig, shipped_rigs
+from sim_hw.grounds import GROUNDS
 from sim_hw.receivers import PROBES, RECEIVERS
 from sim_hw.simulator import SimulatorSettings, simulate
 from sim_hw.world import WorldSettings
@@ -46,10 +47,12 @@ def parser() -> argparse.ArgumentParser:
         help="plan a fault, see docs/faults.md; may be repeated",
     )
     add("--scenario", type=Path, help="a file with faults")
+    add("--pps", action="store_true", help="a pulse per second as well")
     add("--receiver", choices=RECEIVERS, default="ublox", help="kind of the receiver")
     add("--probe", choices=PROBES, default="modbus", help="kind of the thermometer")
     add("--first-address", default="127.0.0.2", help="loopback address of the first head")
     add("--scene", help="a GeoTIFF to fly over instead of the shipped photographs")
+    add("--ground", choices=list(GROUNDS), default="landscape", help="what is flown over")
     add("--scene-cache", type=Path, help="folder where built scenes are kept (default: OUT/scenes)")
     add("--processes", type=int, default=2, help="worker processes that render")
     return line
@@ -97,6 +100,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         heading_deg=given.heading,
         exposures=given.exposures,
         scene_file=given.scene,
+        ground=given.ground,
     )
     settings = SimulatorSettings(
         out=given.out,
@@ -107,6 +111,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         faults=tuple(given.fault),
         scenario=given.scenario,
         receiver=given.receiver,
+        has_pps=given.pps,
         probe=given.probe,
     )
     return simulate(settings, world, clock)

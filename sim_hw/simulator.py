@@ -37,6 +37,7 @@ from sim_hw.head_process import (
     end_with_parent,
     run,
 )
+from sim_hw.pps_source import PpsSource
 from sim_hw.pulse_bus import Firing, PulseBus
 from sim_hw.receiver import ReceiverState
 from sim_hw.receivers import Emulated
@@ -71,6 +72,7 @@ class SimulatorSettings:
     scenario: Path | None = None
     receiver: str = "ublox"
     probe: str = "modbus"
+    has_pps: bool = False
 
 
 class Simulator:
@@ -124,6 +126,7 @@ class Simulator:
             ports / PROBES_NAME,
         )
         self._put_faults_on(self._probes, PROBES_NAME)
+        self._pps = PpsSource(clock, seed=world_.settings.seed) if settings.has_pps else None
 
     def start(self) -> None:
         """Build the scene, measure the calibration, and open every device.
@@ -146,6 +149,8 @@ class Simulator:
         self._bus.start()
         self._receiver.device.start()
         self._probes.device.start()
+        if self._pps is not None:
+            self._pps.start()
         self._reports = threading.Thread(target=self._follow_reports, name="reports", daemon=True)
         self._reports.start()
         self._begin_faults(time.monotonic_ns())
@@ -165,6 +170,8 @@ class Simulator:
                 worker.join(WORKER_ENDS_WITHIN_S)
         self._receiver.device.close()
         self._probes.device.close()
+        if self._pps is not None:
+            self._pps.close()
         self._truth.write_overdue(self._line.flight, wait_s=0.0)
 
     def ready_message(self) -> dict[str, Any]:
@@ -185,6 +192,7 @@ class Simulator:
             "pulse_bus": f"{host}:{port}",
             "receiver": {"driver": self._settings.receiver, **self._receiver.settings},
             "probes": {"driver": PROBE_DRIVERS[self._settings.probe], **self._probes.settings},
+            "pps": None if self._pps is None else {"driver": "kernel", "device": self._pps.device},
             "calibration": str((out / "calibration").resolve()),
             "truth": str((out / "truth").resolve()),
             "plan": asdict(self._world.plan),

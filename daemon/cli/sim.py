@@ -87,6 +87,7 @@ def sim(
         str, typer.Option(help="ublox, novatel, septentrio, nmea, or mavlink (an autopilot).")
     ] = "ublox",
     probe: Annotated[str, typer.Option(help="Thermometer: modbus or ascii.")] = "modbus",
+    pps: Annotated[bool, typer.Option("--pps", help="A pulse per second as well.")] = False,
     first_address: Annotated[
         str, typer.Option(help="Address of the first head; a free one by default.")
     ] = "",
@@ -98,7 +99,7 @@ def sim(
     )
     arguments += ["--first-address", first_address or free_first_address()]
     arguments += ["--scene", str(scene)] if scene else []
-    arguments += ["--receiver", receiver, "--probe", probe]
+    arguments += ["--receiver", receiver, "--probe", probe, *(["--pps"] if pps else [])]
     for planned in fault or []:
         arguments += ["--fault", planned]
     arguments += ["--scenario", str(scenario)] if scenario else []
@@ -204,6 +205,7 @@ def service_toml(
         ),
         *_section("thermometer", "probes", probes),
         *_section("navigator", "gnss", ready["receiver"]),
+        *(_section("pps", "pps", ready["pps"]) if ready.get("pps") else []),
     ]
     for sensor, head in ready["heads"].items():
         lines += [
