@@ -33,9 +33,9 @@ SCALES: Final[Array] = np.logspace(math.log10(0.35), math.log10(8.0), 7)
 GRID_WANDER: Final[Array] = np.repeat(WANDER, len(SCALES))
 GRID_SCALE: Final[Array] = np.tile(SCALES, len(WANDER))
 NEGLIGIBLE: Final = 1e-3
-WANDER_USUAL: Final = 1.2
+WANDER_USUAL: Final = 0.7
 WANDER_DECADES: Final = 1.5
-"""Crystals in a case that warms and cools wander by about 4 ppb after a second (log10 of its square
+"""Crystals in a case that warms and cools wander by about 2 ppb after a second (log10 of its square
 here), one in three by six times more or less."""
 SCALE_SPREAD: Final = math.log(2.0)
 """Stated sigmas are believed to a factor of two, before they are looked at."""
