@@ -149,3 +149,12 @@ def test_a_head_that_waits_for_its_line_refuses_a_software_trigger() -> None:
     told = _scenario("a_head_that_waits_for_its_line_refuses_a_software_trigger")
     assert 'set trigger_source = "software"' in told["refused"]
     assert told["frames"] == 0
+
+
+def test_the_packet_size_is_negotiated_down_to_what_the_network_carries() -> None:
+    if not _namespace():
+        pytest.skip("needs unshare and user namespaces: the loopback's own MTU is not touched")
+    told = _scenario("packets_fit_the_network")
+    assert told["statuses"] == ["complete", "complete"]
+    assert told["equal"] == [True, True]
+    assert all(1000 < size <= 1500 for size in told["packet_sizes"]), told["packet_sizes"]

@@ -162,6 +162,10 @@ def prepare() -> Path:
             # Another run was faster; what it made is the same.
             if not (image / "initrd.cpio").exists():
                 raise
+    for old in image.parent.iterdir():
+        # Of an older kernel or an older text of this file; 100 MB each.
+        if old != image and not old.name.startswith("making-"):
+            shutil.rmtree(old, ignore_errors=True)
     return image
 
 
