@@ -6,6 +6,7 @@ What makes sense is decided in `drivers.detection.evidence`.
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,6 +41,8 @@ NONSENSE_AT_LAST_S: Final = 1.4
 SETTLED_S: Final = 1.5
 """By then a receiver has said everything it says once a second."""
 STEP_S: Final = 0.1
+WITHIN_S: Final = 120.0
+"""Twice through all speeds takes 80 s; a driver of the kernel that hangs is not waited for."""
 USUAL_ADDRESSES: Final = ("udpin://0.0.0.0:14550", "tcp://127.0.0.1:2947")
 """Where autopilots send to, and where gpsd serves."""
 BY_ID: Final = Path("/dev/serial/by-id")
@@ -90,9 +93,11 @@ def search(
     threads = [threading.Thread(target=look, args=(port,), daemon=True) for port in names]
     for thread in threads:
         thread.start()
+    deadline = time.monotonic() + WITHIN_S
     for thread in threads:
-        thread.join()
-    return [found[port] for port in names if port in found]
+        thread.join(max(0.0, deadline - time.monotonic()))
+    stuck = f"did not answer within {WITHIN_S:g} s; unplug it, plug it in and try again"
+    return [found.get(port, Found(port, None, sentence=stuck)) for port in names]
 
 
 class _Search:
