@@ -23,8 +23,8 @@ import tifffile
 from numpy.typing import NDArray
 
 from processing.rig import find_rig
+from sim_hw.ending import end_with_parent
 from sim_hw.gige.head import ExposureRequest, FrameSize, GigeHead, HeadIdentity, Pacing
-from sim_hw.head_process import end_with_parent
 from sim_hw.pulse_bus import Firing, PulseBus
 from sim_hw.world_clock import DeviceClock
 

@@ -6,10 +6,7 @@ settings of the world. The main process is in `simulator`.
 
 from __future__ import annotations
 
-import ctypes
 import math
-import multiprocessing
-import os
 import signal
 import threading
 from collections.abc import Callable, Sequence
@@ -26,6 +23,7 @@ from numpy.typing import NDArray
 from processing.rig import Cone, Sensor
 from sim_hw import laboratory
 from sim_hw.electronics import Electronics, true_sensor
+from sim_hw.ending import end_with_parent
 from sim_hw.faults.plan import Planned
 from sim_hw.flight import Flight
 from sim_hw.gige.faults import WireFaults
@@ -39,7 +37,6 @@ from sim_hw.world_clock import DeviceClock, WorldClock
 
 VENDOR = "Syntopic emulator"
 WARM_UP = Look(mid_gps_ns=0, exposure_time_us=4000.0, tdi_shifts=1)
-PR_SET_PDEATHSIG = 1
 POLL_S = 0.5
 STRAIGHT_ON_M = 1e7
 """A first line so far ahead that the aircraft does not turn for two days."""
@@ -265,15 +262,3 @@ def _serve(pipe: Connection, heads: Sequence[RenderedHead], ending: threading.Ev
             start_ns = pulse.start_mono_ns.get(head.sensor.name)
             if start_ns is not None:
                 head.head.line(start_ns, pulse.count)
-
-
-def end_with_parent() -> None:
-    """Have the kernel end this process when the parent dies; it may have died before we asked.
-
-    SIGKILL, since nobody is left for whom an orderly end would make a difference, and an orderly
-    end can hang.
-    """
-    ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    parent = multiprocessing.parent_process()
-    if parent is not None and os.getppid() != parent.pid:
-        os.kill(os.getpid(), signal.SIGKILL)

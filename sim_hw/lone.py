@@ -17,27 +17,15 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
-from sim_hw.ascii_probe import AsciiProbe
+from sim_hw.ending import end_with_parent
 from sim_hw.faults.catalogue import HEAD, RECEIVER, THERMOMETER, TRIGGER, DeviceKind
 from sim_hw.faults.channel import BytesDamage, Channel
 from sim_hw.faults.plan import FaultPlanError, Planned, read_plan
 from sim_hw.faults.wire import FaultyWire, FaultyWorldClock
-from sim_hw.gige.head import ExposureRequest, FrameSize, GigeHead, HeadIdentity, WireFaults
-from sim_hw.head_process import end_with_parent
-from sim_hw.mavlink_autopilot import MavlinkAutopilot
-from sim_hw.modbus_probe import ModbusProbe
-from sim_hw.nmea_receiver import NmeaReceiver
-from sim_hw.novatel_receiver import NovatelReceiver
 from sim_hw.pseudo_terminal import PseudoTerminal
-from sim_hw.pulse_bus import PulseBus
 from sim_hw.receiver import ReceiverState
-from sim_hw.septentrio_receiver import SeptentrioReceiver
 from sim_hw.serving import LineDevice
-from sim_hw.ublox_receiver import UbloxReceiver
-from sim_hw.world_clock import NS_PER_S, DeviceClock, WorldClock
+from sim_hw.world_clock import NS_PER_S, WorldClock
 
 SPEED_MPS = 60.0
 METRES_PER_DEGREE = 111_200.0
@@ -108,17 +96,11 @@ def _make(
 ) -> tuple[_Device, Callable[[int], None], Callable[[], None]]:
     """The device, how its faults begin, and what a strobe does to it."""
     if kind == "head":
-        head = GigeHead(
-            HeadIdentity(at, f"lone-{at}", "lone head", "Syntopic emulator", "lone"),
-            FrameSize(WIDTH_PX, HEIGHT_PX),
-            _expose,
-            lambda _: 30.0,
-            DeviceClock(),
-            faults=WireFaults(planned=tuple(planned)),
-        )
-        return head, head.channel.begin, lambda: None
+        return _head(at, planned)
     channel = Channel(planned, BytesDamage(), seed=kind)
     if kind == "trigger":
+        from sim_hw.pulse_bus import PulseBus
+
         host, _, port = at.rpartition(":")
         bus = PulseBus("lone", OUTPUTS, lambda _: None, (host, int(port)), faults=channel)
         return bus, channel.begin, lambda: None
@@ -143,18 +125,35 @@ def _line_device(
     def state(own_gps_ns: int) -> ReceiverState:
         return _state(clock.world_gps_ns(own_gps_ns) - clock.gps_ns_at_start)
 
-    made: Mapping[str, Callable[[], LineDevice]] = {
-        "ublox": lambda: UbloxReceiver(clock, state, line=line),
-        "nmea": lambda: NmeaReceiver(clock, state, line=line),
-        "novatel": lambda: NovatelReceiver(clock, state, line=line),
-        "septentrio": lambda: SeptentrioReceiver(clock, state, line=line),
-        "mavlink": lambda: MavlinkAutopilot(clock, state, line=line),
-        "modbus": lambda: ModbusProbe([value_c, value_c], line=line),
-        "ascii": lambda: AsciiProbe(
-            [value_c, value_c], ["CH1 = {0}", "CH2 = {1}"], interval_s=0.5, line=line
-        ),
-    }
-    return made[kind]()
+    # Imported one by one: a device comes up as fast as it can, and needs no other.
+    if kind == "ublox":
+        from sim_hw.ublox_receiver import UbloxReceiver
+
+        return UbloxReceiver(clock, state, line=line)
+    if kind == "nmea":
+        from sim_hw.nmea_receiver import NmeaReceiver
+
+        return NmeaReceiver(clock, state, line=line)
+    if kind == "novatel":
+        from sim_hw.novatel_receiver import NovatelReceiver
+
+        return NovatelReceiver(clock, state, line=line)
+    if kind == "septentrio":
+        from sim_hw.septentrio_receiver import SeptentrioReceiver
+
+        return SeptentrioReceiver(clock, state, line=line)
+    if kind == "mavlink":
+        from sim_hw.mavlink_autopilot import MavlinkAutopilot
+
+        return MavlinkAutopilot(clock, state, line=line)
+    if kind == "modbus":
+        from sim_hw.modbus_probe import ModbusProbe
+
+        return ModbusProbe([value_c, value_c], line=line)
+    from sim_hw.ascii_probe import AsciiProbe
+
+    lines = ["CH1 = {0}", "CH2 = {1}"]
+    return AsciiProbe([value_c, value_c], lines, interval_s=0.5, line=line)
 
 
 def _state(since_start_ns: int) -> ReceiverState:
@@ -170,9 +169,28 @@ def _state(since_start_ns: int) -> ReceiverState:
     )
 
 
-def _expose(request: ExposureRequest) -> NDArray[np.uint16]:
-    pixels: NDArray[Any] = np.full((HEIGHT_PX, WIDTH_PX), request.counter % 4096, np.uint16)
-    return pixels
+def _head(
+    address: str, planned: Sequence[Planned]
+) -> tuple[_Device, Callable[[int], None], Callable[[], None]]:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from sim_hw.gige.head import ExposureRequest, FrameSize, GigeHead, HeadIdentity, WireFaults
+    from sim_hw.world_clock import DeviceClock
+
+    def expose(request: ExposureRequest) -> NDArray[np.uint16]:
+        pixels: NDArray[Any] = np.full((HEIGHT_PX, WIDTH_PX), request.counter % 4096, np.uint16)
+        return pixels
+
+    head = GigeHead(
+        HeadIdentity(address, f"lone-{address}", "lone head", "Syntopic emulator", "lone"),
+        FrameSize(WIDTH_PX, HEIGHT_PX),
+        expose,
+        lambda _: 30.0,
+        DeviceClock(),
+        faults=WireFaults(planned=tuple(planned)),
+    )
+    return head, head.channel.begin, lambda: None
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ from typing import Any
 
 from sim_hw import laboratory, receivers, scene, world
 from sim_hw.clockwork import PROBES_NAME, RECEIVER_NAME, TRIGGER_NAME, devices_of
+from sim_hw.ending import end_with_parent
 from sim_hw.faults.channel import BytesDamage, Channel, for_device
 from sim_hw.faults.plan import read_plan
 from sim_hw.faults.wire import FaultyWire, FaultyWorldClock
@@ -34,7 +35,6 @@ from sim_hw.head_process import (
     Pulse,
     Said,
     WorkerPlan,
-    end_with_parent,
     run,
 )
 from sim_hw.pps_source import PpsSource

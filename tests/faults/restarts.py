@@ -40,7 +40,7 @@ HEADS = ("head-1", "head-2")
 ADDRESSES = {"head-1": "127.62.3.2", "head-2": "127.62.3.3"}
 TRIGGER_AT = "127.62.3.9:4790"
 EXPOSE_EVERY_S = 0.5
-READY_WITHIN_S = 60.0
+READY_WITHIN_S = 180.0
 
 
 @dataclass(frozen=True)
