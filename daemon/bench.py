@@ -32,10 +32,10 @@ from daemon.configuration import PlanSection
 from daemon.errors import DaemonError
 from daemon.lanes import Lanes
 from daemon.mission import Mission
+from daemon.radiometry_folder import RadiometryFolder
 from daemon.worker import SWITCH_INTERVAL_S, make_products, process_exposure
 from processing.pipeline import Conditions, Pipeline, Product, Settings
 from processing.quality import Flag
-from processing.radiometry import load_radiometry
 from processing.rig import Rig, load_rig
 from processing.tie_points import TiePoints
 
@@ -83,7 +83,7 @@ def measure(
     plan = _plan_of(mission)
     pipeline = Pipeline(
         rig,
-        {s.name: load_radiometry(radiometry / f"{s.name}.npz") for s in rig.sensors},
+        RadiometryFolder(radiometry, rig),
         Settings(geometry=False, threads=threads),
     )
     pipeline.warm_up()

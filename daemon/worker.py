@@ -36,10 +36,10 @@ from daemon.messages import (
 )
 from daemon.mission import Mission
 from daemon.processes import Link
+from daemon.radiometry_folder import RadiometryFolder
 from processing.drawing import residuals_svg
 from processing.pipeline import Conditions, Pipeline, Settings
 from processing.quality import Flag, as_json
-from processing.radiometry import RadiometricCalibration, load_radiometry
 from processing.rig import Rig, find_rig
 from processing.stitch_record import stitch_record, stitch_record_json
 
@@ -72,12 +72,8 @@ def main(link: Link, settings: WorkerSettings, rings: tuple[FrameRing, ...]) -> 
 
 def make_pipeline(rig: Rig, settings: WorkerSettings) -> Pipeline:
     """The pipeline with the calibrations of its folder; sensors without one are taken as ideal."""
-    radiometry: dict[str, RadiometricCalibration] = {}
-    if settings.radiometry is not None:
-        for sensor in rig.sensors:
-            path = settings.radiometry / f"{sensor.name}.npz"
-            if path.exists():
-                radiometry[sensor.name] = load_radiometry(path)
+    folder = settings.radiometry
+    radiometry = None if folder is None else RadiometryFolder(folder, rig)
     return Pipeline(
         rig,
         radiometry,

@@ -1,0 +1,90 @@
+"""`python -m benchmarks.memory RIG`: what the pipeline holds in memory, exposure by exposure.
+
+The exposure of `syntopic bench` goes through two lanes, as in the service, again and again; the
+memory the process owns (PSS) is read after each. Nothing is written.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.machine import machine
+from daemon import bench, store
+from daemon.conditions import conditions_of
+from daemon.configuration import PlanSection
+from daemon.lanes import Lanes
+from daemon.mission import Mission
+from daemon.radiometry_folder import RadiometryFolder
+from processing.pipeline import Pipeline, Settings
+from processing.quality import Flag
+from processing.rig import find_rig, load_rig
+
+SETTLED_AFTER = 4
+"""Exposures until each lane has touched all of its buffers, twice."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.memory", description=__doc__)
+    parser.add_argument("rig", help="name of a shipped rig")
+    parser.add_argument("--exposures", type=int, default=200)
+    parser.add_argument("--lanes", type=int, default=2, help="exposures in work at a time")
+    options = parser.parse_args()
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "syntopic"
+    found = find_rig(options.rig)
+    folder = bench.exposures_of(options.rig, found, cache / "bench" / found.name)
+    seen = held_mib(folder, options.exposures, options.lanes)
+    settled = seen[min(SETTLED_AFTER, len(seen) - 1)]
+    told: dict[str, Any] = {
+        "machine": machine(),
+        "rig": found.name,
+        "exposures": options.exposures,
+        "lanes": options.lanes,
+        "settled_mib": round(settled, 1),
+        "last_mib": round(seen[-1], 1),
+        "most_mib": round(max(seen), 1),
+    }
+    print(json.dumps(told))
+
+
+def held_mib(folder: Path, exposures: int, lanes: int) -> list[float]:
+    """MiB of the process after every exposure, in the order they were done.
+
+    Args:
+        folder: from `daemon.bench.exposures_of`.
+    """
+    mission = Mission.open(folder / "mission")
+    rig = load_rig(mission.rig_path)
+    radiometry = folder / "calibration" / "radiometry"
+    pipeline = Pipeline(rig, RadiometryFolder(radiometry, rig), Settings(geometry=False))
+    stored, exposure = store.load_level0(mission.level0(1), rig)
+    frames = {name: np.array(frame) for name, frame in stored.items()}
+    conditions = conditions_of(exposure, rig, PlanSection(), Flag(0))
+    seen: list[float] = []
+
+    def one(lane: Pipeline) -> None:
+        lane.process(frames, conditions)
+        seen.append(pss_mib())
+
+    work = Lanes(pipeline, lanes)
+    for task in [work.submit(one) for _ in range(exposures)]:
+        task.result()
+    work.end()
+    return seen
+
+
+def pss_mib() -> float:
+    """Proportional set size of this process, MiB."""
+    for line in Path("/proc/self/smaps_rollup").read_text().splitlines():
+        if line.startswith("Pss:"):
+            return int(line.split()[1]) / 1024
+    raise OSError("no Pss in /proc/self/smaps_rollup")
+
+
+if __name__ == "__main__":
+    main()
