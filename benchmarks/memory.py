@@ -62,6 +62,7 @@ def held_mib(folder: Path, exposures: int, lanes: int) -> list[float]:
     rig = load_rig(mission.rig_path)
     radiometry = folder / "calibration" / "radiometry"
     pipeline = Pipeline(rig, RadiometryFolder(radiometry, rig), Settings(geometry=False))
+    pipeline.warm_up()
     stored, exposure = store.load_level0(mission.level0(1), rig)
     frames = {name: np.array(frame) for name, frame in stored.items()}
     conditions = conditions_of(exposure, rig, PlanSection(), Flag(0))
