@@ -1,0 +1,351 @@
+"""`python -m benchmarks.rendered_block`: what matching reaches in a strip of rendered frames.
+
+The emulator renders twenty overlapping exposures, the pipeline makes stitched images of them, tie
+points are matched between neighbours by correlation and least squares, and the strip is adjusted:
+the image residuals are those of matching and stitching, not of a random generator.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.machine import machine
+from benchmarks.rendered import process, radiometry_of, take, world_settings
+from processing.bundle.adjust import Settings, adjust
+from processing.bundle.findings import checked_against, image_residuals_mm
+from processing.bundle.network import (
+    Attitudes,
+    Bearings,
+    Camera,
+    Gnss,
+    ImagePoints,
+    Images,
+    Network,
+    Points,
+    Stations,
+)
+from processing.bundle.rotations import exponential
+from processing.bundle.self_calibration import SETS, SetName, parts_of, self_calibrating
+from processing.bundle.start import intersected
+from processing.matching import INTERPOLATION, match_patches, select_features
+from processing.pipeline import Pipeline
+from processing.pipeline import Settings as PipelineSettings
+from processing.rig import VirtualImage
+from sim_hw import camera
+from sim_hw.scene import open_scene
+from sim_hw.snapshots import Heads
+from sim_hw.world import World
+
+Array = NDArray[np.float64]
+
+CELLS = (26, 18)
+WINDOW_PX = 19
+SEARCH_PX = 14
+LEAST_CORRELATION = 0.9
+LEAST_PEAK_MARGIN = 0.1
+MOST_SIGMA_PX = 0.1
+GNSS_M = 0.05
+INERTIAL_RAD = 8e-5
+SURVEY_M = 0.02
+CONTROL = 12
+
+
+@dataclass(frozen=True)
+class Strip:
+    """Stitched images (H, W) float32, NaN without data; where the ideal camera truly stood."""
+
+    world: World
+    images: list[NDArray[np.float32]]
+    station: Array
+    rotation: Array
+
+
+@dataclass(frozen=True)
+class Matched:
+    """Image points: image, point, (n, 2) px; the point's own image and place, (p,) and (p, 2)."""
+
+    image: NDArray[np.int64]
+    point: NDArray[np.int64]
+    px: Array
+    home: NDArray[np.int64]
+    home_px: Array
+
+
+def rendered_strip(rig: str, frames: int, seed: int, scenes: Path) -> Strip:
+    """Fly, expose and stitch."""
+    world = World(world_settings(rig, seed, exposures=frames))
+    scene = open_scene(world.scene_settings, scenes)
+    heads = Heads(world, seed=seed)
+    pipeline = Pipeline(world.rig, radiometry_of(heads), PipelineSettings(geometry=False))
+    images, station, rotation = [], [], []
+    master = world.rig.cone(world.rig.master_cone)
+    for k in range(frames):
+        exposure = take(world, scenes, place=k, scene=scene)
+        pan = process(pipeline, heads, exposure, seed=seed * 1000 + k).pan
+        images.append(np.where(pan == 0, np.nan, pan).astype(np.float32))
+        pose = exposure.flight.pose(exposure.snapshot.mark_gps_ns)
+        station.append(camera.projection_centre_m(master, pose))
+        rotation.append(pose.enu_from_body @ camera.BODY_FROM_CAMERA)
+    return Strip(world, images, np.array(station), np.array(rotation))
+
+
+def matched(strip: Strip, start_station: Array, start_rotation: Array) -> Matched:
+    """Feature-rich places of every image, found in the next two by prediction and matching."""
+    image = strip.world.image
+    room = WINDOW_PX // 2 + SEARCH_PX + 8
+    columns = np.linspace(room, image.width_px - room, CELLS[0] + 1).astype(np.int64)
+    rows = np.linspace(room, image.height_px - room, CELLS[1] + 1).astype(np.int64)
+    cells = np.array(
+        [
+            (columns[c], columns[c + 1] - 1, rows[r], rows[r + 1] - 1)
+            for r in range(CELLS[1])
+            for c in range(CELLS[0])
+        ]
+    )
+    limits = np.array([0, image.width_px - 1, 0, image.height_px - 1], dtype=np.int64)
+    found_image: list[NDArray[np.int64]] = []
+    found_point: list[NDArray[np.int64]] = []
+    found_px: list[Array] = []
+    home: list[NDArray[np.int64]] = []
+    home_px: list[Array] = []
+    count = 0
+    for k in range(len(strip.images) - 1):
+        chosen = select_features(strip.images[k], cells, WINDOW_PX // 2, 2, False)
+        places = np.round(chosen[chosen[:, 2] > 0.0][:, :2]).astype(np.int64)
+        ground = _level(image, start_station[k], start_rotation[k], places.astype(np.float64))
+        seen = np.zeros(len(places), dtype=np.int64)
+        rays: list[tuple[NDArray[np.int64], int, Array]] = []
+        for j in range(k + 1, min(k + 3, len(strip.images))):
+            predicted = _pixels(image, start_station[j], start_rotation[j], ground)
+            inside = (
+                (predicted > room) & (predicted < [image.width_px - room, image.height_px - room])
+            ).all(axis=1)
+            sought = np.flatnonzero(inside)
+            if not len(sought):
+                continue
+            result = match_patches(
+                strip.images[k],
+                strip.images[j],
+                places[sought],
+                np.round(predicted[sought]).astype(np.int64),
+                limits,
+                1,
+                WINDOW_PX // 2,
+                SEARCH_PX,
+                False,
+                INTERPOLATION,
+            )
+            good = (
+                (result[:, 7] > 0.0)
+                & (result[:, 4] <= MOST_SIGMA_PX)
+                & (result[:, 5] >= LEAST_CORRELATION)
+                & (result[:, 6] >= LEAST_PEAK_MARGIN)
+            )
+            own = sought[good]
+            # Both places moved by a fraction of a pixel; what counts is where the chosen pixel is.
+            at = result[good, 2:4] - (result[good, :2] - places[own])
+            rays.append((own, j, at))
+            seen[own] += 1
+        used = np.flatnonzero(seen > 0)
+        number = np.full(len(places), -1, dtype=np.int64)
+        number[used] = count + np.arange(len(used))
+        count += len(used)
+        found_image.append(np.full(len(used), k))
+        found_point.append(number[used])
+        found_px.append(places[used].astype(np.float64))
+        home.append(np.full(len(used), k))
+        home_px.append(places[used].astype(np.float64))
+        for own, j, at in rays:
+            found_image.append(np.full(len(own), j))
+            found_point.append(number[own])
+            found_px.append(at)
+    return Matched(
+        np.concatenate(found_image).astype(np.int64),
+        np.concatenate(found_point).astype(np.int64),
+        np.concatenate(found_px),
+        np.concatenate(home).astype(np.int64),
+        np.concatenate(home_px),
+    )
+
+
+def navigated(strip: Strip, seed: int) -> tuple[Array, Array]:
+    """Projection centres and rotations as receiver and inertial unit have them."""
+    random = np.random.default_rng([seed, 3])
+    n = len(strip.station)
+    station = strip.station + random.normal(0.0, GNSS_M, (n, 3))
+    return station, strip.rotation @ exponential(random.normal(0.0, INERTIAL_RAD, (n, 3)))
+
+
+def judged(strip: Strip, seed: int, found: Matched, name: SetName) -> dict[str, Any]:
+    """Adjust with a set of additional parameters and hold against the truth."""
+    random = np.random.default_rng([seed, 4])
+    image, n = strip.world.image, len(strip.station)
+    rig = strip.world.rig
+    gnss, inertial = navigated(strip, seed)
+    truth = np.array(
+        [
+            strip.world.terrain.intersect(
+                strip.station[h], _directions(image, strip.rotation[h], px[None])[0]
+            )
+            for h, px in zip(found.home, found.home_px, strict=True)
+        ]
+    )
+    xy = _mm(image, found.px)
+    ray = np.column_stack([xy, np.full(len(xy), -image.f_mm)])
+    directions = np.einsum("nij,nj->ni", inertial[found.image], ray)
+    xyz, _ = intersected(len(truth), found.point, gnss[found.image], directions)
+    sigma = np.full((len(truth), 3), np.nan)
+    rays = np.bincount(found.point, minlength=len(truth))
+    several = np.flatnonzero(rays == 3)
+    control = several[np.linspace(0, len(several) - 1, CONTROL).astype(int)]
+    sigma[control] = SURVEY_M
+    xyz[control] = truth[control] + random.normal(0.0, SURVEY_M, (CONTROL, 3))
+    xyz = np.where(np.isfinite(xyz), xyz, truth)
+    names = tuple(f"e{k + 1}" for k in range(n))
+    index = np.arange(n)
+    network = Network(
+        cameras=(
+            self_calibrating(
+                Camera("stitched", image.f_mm, pixel_mm=image.pitch_mm),
+                name,
+                parts_of(rig),
+                master_cone=rig.master_cone,
+            ),
+        ),
+        stations=Stations(names, gnss, np.zeros(n, bool)),
+        attitudes=Attitudes(names, inertial, np.zeros(n, bool)),
+        images=Images(names, index, index, np.zeros(n, np.int64), np.full(n, -1)),
+        points=Points(
+            tuple(f"p{k}" for k in range(len(truth))), xyz, sigma, np.zeros(len(truth), bool)
+        ),
+        image_points=ImagePoints(found.image, found.point, xy, np.full(xy.shape, 0.7e-3)),
+        gnss=Gnss(
+            station=index,
+            attitude=index,
+            position_m=gnss,
+            sigma_m=np.full((n, 3), GNSS_M),
+            lever_m=np.zeros((n, 3)),
+            line=np.full(n, -1),
+            time_s=np.zeros(n),
+        ),
+        bearings=Bearings(index, inertial, np.full((n, 3), INERTIAL_RAD)),
+    )
+    begun = time.perf_counter()
+    result = adjust(network, Settings(robust=True, reject_beyond=4.0, variance_components=True))
+    adjusting_s = time.perf_counter() - begun
+    residual = image_residuals_mm(result)
+    good = np.isfinite(residual).all(axis=1)
+    rms_um = np.sqrt(np.mean(residual[good] ** 2, axis=0)) * 1e3
+    table = {g.name: g for g in result.groups}
+    checks = np.setdiff1d(np.flatnonzero(rays >= 3), control)
+    against = checked_against(
+        result,
+        [network.points.names[k] for k in checks],
+        truth[checks],
+        np.zeros((len(checks), 3)),
+    )
+    return {
+        "frames": n,
+        "pixels": [image.width_px, image.height_px],
+        "image_points": int(good.sum()),
+        "object_points": int((~result.left_out).sum()),
+        "rejected": int(result.rejected.sum()),
+        "adjusting_s": adjusting_s,
+        "residual_rms_um": [float(v) for v in rms_um],
+        "image_sigma_um": [
+            0.7 * float(np.sqrt(table[name].factor)) for name in ("image x", "image y")
+        ],
+        "image_sigma_px": [
+            0.7e-3 / image.pitch_mm * float(np.sqrt(table[name].factor))
+            for name in ("image x", "image y")
+        ],
+        "sigma0": result.sigma0,
+        "redundancy": result.redundancy,
+        "checks": len(against.names),
+        "check_rms_m": [float(v) for v in against.rms_m],
+        "check_predicted_m": [float(v) for v in against.predicted_m],
+        "check_squares": against.squares,
+    }
+
+
+def _mm(image: VirtualImage, px: Array) -> Array:
+    return np.stack(
+        [
+            (px[:, 0] - (image.width_px - 1) / 2.0) * image.pitch_mm,
+            ((image.height_px - 1) / 2.0 - px[:, 1]) * image.pitch_mm,
+        ],
+        axis=1,
+    )
+
+
+def _directions(image: VirtualImage, rotation: Array, px: Array) -> Array:
+    xy = _mm(image, px)
+    return np.asarray(np.column_stack([xy, np.full(len(xy), -image.f_mm)]) @ rotation.T)
+
+
+def _level(image: VirtualImage, station: Array, rotation: Array, px: Array) -> Array:
+    """Where rays of pixels meet level ground at height zero."""
+    rays = _directions(image, rotation, px)
+    return np.asarray(station - rays * (station[2] / rays[:, 2:]))
+
+
+def _pixels(image: VirtualImage, station: Array, rotation: Array, ground: Array) -> Array:
+    seen = (ground - station) @ rotation
+    xy = -image.f_mm * seen[:, :2] / seen[:, 2:]
+    return np.stack(
+        [
+            xy[:, 0] / image.pitch_mm + (image.width_px - 1) / 2.0,
+            (image.height_px - 1) / 2.0 - xy[:, 1] / image.pitch_mm,
+        ],
+        axis=1,
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.rendered_block", description=__doc__
+    )
+    parser.add_argument("--rig", default="ultracam-l-mini")
+    parser.add_argument("--frames", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--scenes", type=Path, default=None, help="folder where scenes are kept")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="syntopic-bench-") as folder:
+        strip = rendered_strip(
+            options.rig, options.frames, options.seed, options.scenes or Path(folder)
+        )
+        found = matched(strip, *navigated(strip, options.seed))
+        sets = {name: judged(strip, options.seed, found, name) for name in SETS}
+    if options.json:
+        print(json.dumps({"machine": machine(), "rig": options.rig, "sets": sets}))
+        return
+    f = sets["none"]
+    print(
+        f"{options.rig}, {f['frames']} rendered frames of {f['pixels'][0]} x {f['pixels'][1]}: "
+        f"{f['image_points']} image points, {f['object_points']} object points, {f['checks']} of "
+        "them with three rays held against the truth"
+    )
+    for name, f in sets.items():
+        rms = " ".join(f"{v * 100:.2f}" for v in f["check_rms_m"])
+        predicted = " ".join(f"{v * 100:.2f}" for v in f["check_predicted_m"])
+        print(
+            f"{name:13} residuals {f['residual_rms_um'][0]:.3f} {f['residual_rms_um'][1]:.3f} um, "
+            f"sigma of an image coordinate {f['image_sigma_um'][0]:.3f} "
+            f"{f['image_sigma_um'][1]:.3f} um = {f['image_sigma_px'][0]:.4f} "
+            f"{f['image_sigma_px'][1]:.4f} px, {f['rejected']} left out; against truth {rms} cm, "
+            f"predicted {predicted} cm, squares {f['check_squares']:.2f}; {f['adjusting_s']:.1f} s"
+        )
+
+
+if __name__ == "__main__":
+    main()
