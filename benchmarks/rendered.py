@@ -67,12 +67,17 @@ def take(
         without: sensors that do not look.
     """
     scene = scene or open_scene(world.scene_settings, scenes)
+    flight, mark_ns = flight_and_mark(world, place)
+    snapshot = snapshots.take(world, scene, flight, mark_ns, without=without)
+    return Exposure(world, flight, snapshot)
+
+
+def flight_and_mark(world: World, place: int) -> tuple[Flight, int]:
+    """The flight whose first line begins under the first exposure, and the strobe of another."""
     first_ns = EPOCH_GPS_NS + round(FIRST_AFTER_S * 1e9)
     flight = world.flight.beginning_first_line_at(world.flight.distance_flown_m(first_ns))
     period_ns = round(world.plan.distance_m / world.plan.ground_speed_mps * 1e9)
-    mark_ns = first_ns + place * period_ns
-    snapshot = snapshots.take(world, scene, flight, mark_ns, without=without)
-    return Exposure(world, flight, snapshot)
+    return flight, first_ns + place * period_ns
 
 
 def radiometry_of(heads: Heads) -> dict[str, RadiometricCalibration]:

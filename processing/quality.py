@@ -105,7 +105,7 @@ class Thresholds:
     saturated_refly_fraction: float = 0.05
     smear_px: float = 0.8
     smear_refly_px: float = 2.0
-    sharpness: float = 0.26
+    sharpness: float = 0.27
     tilt_rad: float = math.radians(5.0)
     crab_rad: float = math.radians(5.0)
     valid_refly_fraction: float = 0.75

@@ -19,6 +19,7 @@ from processing.rig import RigError
 from sim_hw import laboratory
 from sim_hw.__main__ import displacement, rig_file
 from sim_hw.electronics import Electronics, true_sensor
+from sim_hw.grounds import GROUNDS
 from sim_hw.rendering import Look, light_on_sensor
 from sim_hw.scene import open_scene
 from sim_hw.seeding import random_stream
@@ -137,6 +138,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         metavar="SENSOR=X,Y",
         help="move a sensor right and up in its layer, pixels; may be repeated",
     )
+    add("--ground", choices=list(GROUNDS), default="landscape", help="what is flown over")
+    add("--cloud-over", metavar="SENSOR", help="a sensor that a cloud hides the ground from")
     add("--scene-cache", type=Path, help="folder where built scenes are kept (default: OUT/scenes)")
     given = line.parse_args(arguments)
     try:
@@ -148,6 +151,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 dc_k=given.dc,
                 displaced_px=dict(given.displace),
                 exposures=given.exposures,
+                ground=given.ground,
+                cloud_over=given.cloud_over,
             )
         )
     except (RigError, ValueError) as error:
