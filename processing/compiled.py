@@ -30,6 +30,7 @@ _ROOMS: Final = (
     "processing.least_squares_matching",
     "processing.level1",
     "processing.matching",
+    "processing.patch_sampling",
     "processing.quicklook",
     "processing.resampling",
     "processing.seams",
