@@ -114,25 +114,39 @@ def main() -> None:
         )
 
 
-def measure(scenes: Path) -> tuple[list[Seams], list[Defects]]:
-    """All scenes at all levels, heads as calibrated and changed since."""
+def measure(
+    scenes: Path,
+    *,
+    levels: Sequence[float] = LEVELS,
+    changes: Sequence[bool] = (False, True),
+    own_contrast: bool = True,
+) -> tuple[list[Seams], list[Defects]]:
+    """Even light and real imagery at some levels, heads as calibrated and changed since.
+
+    Args:
+        scenes: folder where built scenes are kept.
+        levels: shares of full scale.
+        changes: whether the heads have changed since their calibration.
+        own_contrast: real imagery as it is, too.
+    """
     world = World(rendered.world_settings(RIG, SEED))
     scene = open_scene(world.scene_settings, scenes)
     exposure = rendered.take(world, scenes, scene=scene)
     conditions = rendered.conditions_of(exposure, seed=SEED)
     seams: list[Seams] = []
     defects: list[Defects] = []
-    for changed in (False, True):
+    for changed in changes:
         heads = heads_of(world, changed=changed)
         calibrations = {name: head.calibration for name, head in heads.items()}
         pipeline = Pipeline(world.rig, calibrations, Settings(geometry=False))
         label = ", heads changed since calibration" if changed else ""
         lights: dict[tuple[str, float], Mapping[str, Map]] = {
             (f"{kind}{label}", level): light_of(world, heads, exposure.snapshot, kind, level)
-            for level in LEVELS
+            for level in levels
             for kind in ("even light", "real imagery")
         }
-        lights[f"real imagery, own contrast{label}", 0.0] = exposure.snapshot.light
+        if own_contrast:
+            lights[f"real imagery, own contrast{label}", 0.0] = exposure.snapshot.light
         for (name, level), light in lights.items():
             frames = frames_of(world, heads, exposure.snapshot, light)
             product = pipeline.process(frames, conditions)

@@ -9,6 +9,8 @@ from benchmarks.stitching_trials import MatchingErrors
 from processing.rig import find_rig
 from tests.processing.test_honest_uncertainty import ERRORS
 
+pytestmark = pytest.mark.timeout(600)
+
 
 @pytest.fixture(scope="module")
 def outcomes() -> Outcomes:

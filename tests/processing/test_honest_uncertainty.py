@@ -15,6 +15,8 @@ ERRORS = Path(__file__).parent / "matching_errors.npz"
 """Of two rendered exposures: `python -m benchmarks.honest_uncertainty --keep-errors` writes it."""
 EXPOSURES = 16
 
+pytestmark = pytest.mark.timeout(600)
+
 Pairs = list[tuple[Trial, Trial]]
 Pools = dict[str, list[honest_uncertainty.Held]]
 
