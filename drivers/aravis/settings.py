@@ -55,7 +55,7 @@ class AravisSettings(Configured):
         20.0, minimum=1, maximum=1000, says="a packet so late is asked for again"
     )
     frame_retention_ms = Setting(
-        200.0, minimum=10, maximum=5000, says="without a packet for so long a frame is given up"
+        500.0, minimum=10, maximum=5000, says="without a packet for so long a frame is given up"
     )
     chunks = Setting(True, says="let the head write time, exposure and counter behind the pixels")
     latch_interval_s = Setting(
