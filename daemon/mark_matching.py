@@ -32,6 +32,9 @@ RATE_LIMIT: Final = 1e-3
 SAME_NS: Final = 1_000
 MARKS_TO_RETHINK: Final = 2
 DUPLICATES_KEPT: Final = 256
+HELD_AT_MOST: Final = 32
+"""A strobe line full of noise must not cost the service its time: the oldest are given up."""
+PAIRS_TO_RETHINK: Final = 100
 
 
 @dataclass(eq=False)
@@ -69,6 +72,7 @@ class MarkMatcher:
         self._pulses: dict[int, Pulse] = {}
         self._sealed: dict[int, bool] = {}
         self._held: list[_Held] = []
+        self._crowded_out: list[EventMark] = []
         self._given: dict[int, _Held] = {}
         self._corroborated: set[int] = set()
         self._channels: dict[tuple[str, int], _Channel] = {}
@@ -104,12 +108,21 @@ class MarkMatcher:
             del channel.seen[next(iter(channel.seen))]
         held = _Held(mark)
         self._held.append(held)
+        while len(self._held) > HELD_AT_MOST:
+            self._crowded_out.append(self._held.pop(0).mark)
         number = self._late_for(held)
         if number is not None:
             self._held.remove(held)
             already = number in self._given
             return Match(number, Cause.DUPLICATE if already else Cause.LATE)
-        self.reconsider()
+        pulse = None if self._is_coarse() else self._pulse_of(held)
+        if pulse is not None:
+            self._give(held, pulse)
+            self.reconsider()
+        elif self._is_coarse():
+            self.reconsider()
+        elif len(self._held) >= MARKS_TO_RETHINK:
+            self._rethink()
         if held.number is not None:
             return Match(held.number, Cause.USED)
         twin = self._belongs_to_a_marked(held)
@@ -154,9 +167,10 @@ class MarkMatcher:
 
     def give_up(self, before_mono_ns: int) -> list[EventMark]:
         """Marks that arrived before an instant and belong nowhere: final, and forgotten."""
-        spurious = [held for held in self._held if held.mark.mono_ns < before_mono_ns]
+        spurious = [held.mark for held in self._held if held.mark.mono_ns < before_mono_ns]
         self._held = [held for held in self._held if held.mark.mono_ns >= before_mono_ns]
-        return [held.mark for held in spurious]
+        crowded_out, self._crowded_out = self._crowded_out, []
+        return [*crowded_out, *spurious]
 
     # One mark
 
@@ -293,6 +307,8 @@ class MarkMatcher:
             and self._is_usual(held.mark, pulse)
             and not self._is_sealed(pulse)
         ]
+        if len(pairs) > PAIRS_TO_RETHINK:
+            return  # so much noise explains anything
         best: list[list[tuple[_Held, Pulse]]] = []
         for first, second in combinations(pairs, 2):
             if first[0] is second[0] or first[1] is second[1] or not _agree(first, second):

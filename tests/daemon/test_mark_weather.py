@@ -248,6 +248,23 @@ def test_a_second_that_messages_cannot_name_stays_unnamed_until_a_mark_says_it()
     assert abs(estimate.gps_ns - epoch_ns - 5 * NS) < 10_000
 
 
+def test_a_strobe_line_full_of_noise_pairs_nothing_wrongly_and_every_edge_is_accounted_for() -> (
+    None
+):
+    bench = Bench("novatel", ORDINARY_NS)
+    sent = []
+    for number in range(1, 9):
+        bench.pulse()
+        for k in range(60):
+            gps_ns = ORDINARY_NS + bench.strobes[number] + (k + 1) * 7_123_457
+            sent.append(EventMark("gnss", 1, gps_ns, 100, 0, 0, True, bench.strobes[number] + NS))
+            assert bench.matcher.mark(sent[-1]).cause is Cause.PENDING
+        bench.mark(number)
+    bench.assert_right(*range(1, 9))
+    given_up = bench.matcher.marks.give_up(10**15)
+    assert sorted(m.gps_ns for m in given_up) == sorted(m.gps_ns for m in sent)
+
+
 def test_a_count_that_is_not_there_is_never_believed() -> None:
     bench = Bench("novatel", ORDINARY_NS)
     for number in range(1, 5):
