@@ -17,7 +17,12 @@ from processing.quality import NO_FLAGS, Flag, Verdict
 SEED = 50_001
 pytestmark = pytest.mark.timeout(600)
 
-IN_THE_LIGHT = ("displaced", "stuck-probe", "dark", "burnt", "defocused", "no-detail")
+FAULTY = (
+    *("dark", "burnt", "defocused", "no-detail"),
+    # In a shorter run test_pipeline_emulated and test_degraded_mode raise these two.
+    pytest.param("displaced", marks=pytest.mark.soak),
+    pytest.param("stuck-probe", marks=pytest.mark.soak),
+)
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +35,7 @@ def test_a_clean_exposure_raises_nothing(camera: Camera) -> None:
     assert report.flags == NO_FLAGS and report.verdict is Verdict.GOOD
 
 
-@pytest.mark.parametrize("name", IN_THE_LIGHT)
+@pytest.mark.parametrize("name", FAULTY)
 def test_a_fault_raises_its_flag(camera: Camera, name: str) -> None:
     report = camera.product(SEED, FAULTS[name]).report
     assert report.flags & FAULTS[name].flag, report.figures
