@@ -216,6 +216,9 @@ def kill_process(device: Device) -> float:
     if device.process.stdout is not None:
         device.process.stdout.close()
     device.process = None
+    if device.kind not in ("head", "trigger"):
+        # The name of a port goes with the port; the kernel may give its number to another device.
+        Path(device.at).unlink(missing_ok=True)
     return killed_s
 
 

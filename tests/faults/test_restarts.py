@@ -36,6 +36,8 @@ def fly(folder: Path, lasts_s: float, seed: int) -> None:
         found = {device.name: figures(device) for device in made}
         for device in made:
             print(found[device.name].row(device), f"unnoticed {found[device.name].unnoticed}")
+            for sentence in found[device.name].disturbances:
+                print("   ", sentence)
         assert kills >= len(made), "every device was killed"
         for device in made:
             seen = found[device.name]
