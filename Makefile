@@ -6,10 +6,17 @@ BIN := .venv/bin
 
 .PHONY: setup demo test test-v4l2 check bench soak clean
 
-setup: .venv/ready
+setup: .venv/ready .venv/kernels
 
 .venv/ready: requirements.lock pyproject.toml bootstrap.sh
 	PYTHON=$(PYTHON) sh bootstrap.sh
+	touch $@
+
+# The compiler's cache looks at a kernel's own file only, not at those of the kernels it calls.
+.venv/kernels: .venv/ready $(wildcard processing/*.py processing/*/*.py)
+	rm -f processing/__pycache__/*.nbi processing/__pycache__/*.nbc
+	@echo "Compiling the pipeline's kernels, so that nothing compiles in flight"
+	$(BIN)/syntopic kernels
 	touch $@
 
 demo: setup

@@ -52,6 +52,4 @@ fi
 echo "Installing Python packages into .venv (a few minutes the first time)"
 .venv/bin/python -m pip install -q --disable-pip-version-check -r requirements.lock
 .venv/bin/python -m pip install -q --disable-pip-version-check --no-deps --no-build-isolation -e .
-echo "Compiling the pipeline's kernels, so that nothing compiles in flight"
-.venv/bin/syntopic kernels
 echo "Ready: .venv/bin/syntopic --help"
