@@ -51,7 +51,9 @@ class Stated:
     back_s: float
 
 
-SERIAL = Stated(noticed_s=3.0, back_s=5.0 + 3.0)
+SILENCE_S = 6.0
+"""A machine that runs the tests beside other programs may starve a device for seconds."""
+SERIAL = Stated(noticed_s=SILENCE_S, back_s=5.0 + 3.0)
 """`silence_s` of the receivers; the longest back-off and a second of listening."""
 HEAD = Stated(noticed_s=4.5, back_s=5.0 + 2.5 + 3.0)
 """Two seconds of suspicion beside a check every two; the longest back-off, and opening."""
@@ -151,7 +153,7 @@ def devices(folder: Path, kinds: Iterator[str] | None = None) -> list[Device]:
 
 def driver_of(device: Device) -> Any:
     """The driver that flies, on this device."""
-    port: dict[str, object] = {"port": device.at, "silence_s": 3.0}
+    port: dict[str, object] = {"port": device.at, "silence_s": SILENCE_S}
     sections: Mapping[str, tuple[str, str, dict[str, object]]] = {
         "modbus": (
             "thermometer",

@@ -38,6 +38,14 @@ def fly(folder: Path, lasts_s: float, seed: int) -> None:
             print(found[device.name].row(device), f"unnoticed {found[device.name].unnoticed}")
             for sentence in found[device.name].disturbances:
                 print("   ", sentence)
+        deadline = time.monotonic() + 30
+        while (threading.active_count(), descriptors()) != settled:
+            assert time.monotonic() < deadline, (
+                f"threads and descriptors {(threading.active_count(), descriptors())}, "
+                f"at first {settled}"
+            )
+            time.sleep(0.2)
+        print(f"{kills} kills, all back after {back_s:.1f} s, {settled} threads and descriptors")
         assert kills >= len(made), "every device was killed"
         for device in made:
             seen = found[device.name]
@@ -49,14 +57,6 @@ def fly(folder: Path, lasts_s: float, seed: int) -> None:
                 is_long = up - down > device.stated.noticed_s + MARGIN_S
                 told = [s for s, e in device.events if e.is_fault and down <= s <= up + MARGIN_S]
                 assert told or not is_long
-        deadline = time.monotonic() + 30
-        while (threading.active_count(), descriptors()) != settled:
-            assert time.monotonic() < deadline, (
-                f"threads and descriptors {(threading.active_count(), descriptors())}, "
-                f"at first {settled}"
-            )
-            time.sleep(0.2)
-        print(f"{kills} kills, all back after {back_s:.1f} s, {settled} threads and descriptors")
     deadline = time.monotonic() + 30
     while threading.active_count() > threads_before:
         assert time.monotonic() < deadline, threading.enumerate()
