@@ -15,23 +15,27 @@ from daemon.messages import Answer, Command
 AUDIT_TOPIC = "audit"
 
 
-class Commanded(Protocol):
-    """What commands act on."""
+class CommandedLine(Protocol):
+    """The line commands act on; `daemon.line.Line`."""
 
-    def absent(self) -> list[str]: ...
-    def start_line(self) -> None: ...
-    def stop_line(self) -> None: ...
+    runs: bool
+
+    @property
+    def is_flown(self) -> bool: ...
     def trigger_once(self) -> None: ...
     def trigger_each(self, interval_s: float, count: int) -> None: ...
     def trigger_along(self, distance_m: float) -> None: ...
-    def land(self) -> None: ...
+
+
+class Commanded(Protocol):
+    """The service commands act on."""
+
+    is_ready: bool
 
     @property
-    def is_ready(self) -> bool: ...
-    @property
-    def is_flown(self) -> bool: ...
-    @property
-    def runs(self) -> bool: ...
+    def line(self) -> CommandedLine: ...
+    def absent(self) -> list[str]: ...
+    def land(self) -> None: ...
 
 
 def obey(command: Command, flight: Commanded) -> Answer:
@@ -55,31 +59,27 @@ def audit_message(command: Command, answer: Answer) -> Message:
 
 
 def _start(command: Command, flight: Commanded) -> Answer:
-    if flight.is_flown:
-        return _no(command, "the planned number of exposures is flown")
-    if flight.runs:
+    if flight.line.runs and not flight.line.is_flown:
         return _no(command, "the line runs already")
     refusal = _not_armed(command, flight)
     if refusal is not None:
         return refusal
-    flight.start_line()
+    flight.line.runs = True
     return _yes(command, "the line runs")
 
 
 def _stop(command: Command, flight: Commanded) -> Answer:
-    if not flight.runs:
+    if not flight.line.runs:
         return _no(command, "the line does not run")
-    flight.stop_line()
+    flight.line.runs = False
     return _yes(command, "the line is stopped; what was triggered is finished")
 
 
 def _trigger(command: Command, flight: Commanded) -> Answer:
-    if flight.is_flown:
-        return _no(command, "the planned number of exposures is flown")
     refusal = _not_armed(command, flight)
     if refusal is not None:
         return refusal
-    flight.trigger_once()
+    flight.line.trigger_once()
     return _yes(command, "one exposure is made as soon as the camera can")
 
 
@@ -87,12 +87,10 @@ def _interval(command: Command, flight: Commanded) -> Answer:
     interval_s, count = command.arguments.get("interval_s"), command.arguments.get("count", 0)
     if not _is_positive(interval_s) or not isinstance(count, int) or count < 0:
         return _no(command, "interval needs interval_s above 0 and a count, 0 for no end")
-    if flight.is_flown:
-        return _no(command, "the planned number of exposures is flown")
     refusal = _not_armed(command, flight)
     if refusal is not None:
         return refusal
-    flight.trigger_each(float(interval_s), count)
+    flight.line.trigger_each(float(interval_s), count)
     return _yes(command, f"an exposure every {interval_s:g} s, or as fast as the camera can")
 
 
@@ -100,12 +98,10 @@ def _distance(command: Command, flight: Commanded) -> Answer:
     distance_m = command.arguments.get("distance_m")
     if not _is_positive(distance_m):
         return _no(command, "distance needs distance_m above 0")
-    if flight.is_flown:
-        return _no(command, "the planned number of exposures is flown")
     refusal = _not_armed(command, flight)
     if refusal is not None:
         return refusal
-    flight.trigger_along(float(distance_m))
+    flight.line.trigger_along(float(distance_m))
     return _yes(command, f"an exposure every {distance_m:g} m")
 
 
@@ -120,6 +116,8 @@ def _acknowledge(command: Command, _flight: Commanded) -> Answer:
 
 def _not_armed(command: Command, flight: Commanded) -> Answer | None:
     """The refusal, where the camera is not ready to fly and nobody takes that upon them."""
+    if flight.line.is_flown:
+        return _no(command, "the planned number of exposures is flown")
     if not flight.is_ready:
         return _no(command, "the service is not ready: devices open and kernels load")
     absent = flight.absent()

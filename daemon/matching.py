@@ -30,7 +30,7 @@ ARRIVALS_KEPT: Final = 16
 STARTS_TO_KNOW: Final = 5
 """So many frames tell how far a head's starts usually lie from their pulses."""
 STARTS_KEPT: Final = 16
-USUAL_START_NS: Final = 1_000_000
+USUAL_START_NS: Final = 500_000
 LATCH_DRIFT: Final = 1e-4
 """How far from there a start may lie, beside what pulse, latch and time since the latch leave
 open."""

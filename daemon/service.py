@@ -56,7 +56,7 @@ from daemon.records import canonical_bytes
 from daemon.recovery_match import seal_from_log
 from daemon.supervisor import Supervisor
 from daemon.watching import NAME as WATCH
-from daemon.watching import Watching, status_event
+from daemon.watching import Watching, phase_of, status_event
 from drivers.contract import (
     ClockReading,
     DeviceEvent,
@@ -462,54 +462,25 @@ class Service:
         """What is not there yet, in words."""
         return self.line.absent(self.active.__contains__, has_trigger=self.has_trigger)
 
-    @property
-    def is_flown(self) -> bool:
-        return self.line.is_flown
-
-    @property
-    def runs(self) -> bool:
-        return self.line.runs
-
-    def start_line(self) -> None:
-        self.line.runs = True
-
-    def stop_line(self) -> None:
-        self.line.runs = False
-
-    def trigger_once(self) -> None:
-        self.line.trigger_once()
-
-    def trigger_each(self, interval_s: float, count: int) -> None:
-        self.line.trigger_each(interval_s, count)
-
-    def trigger_along(self, distance_m: float) -> None:
-        self.line.trigger_along(distance_m)
-
     def land(self) -> None:
         """End in good order: what is open is sealed first."""
         self.stopping.set()
 
-    def _phase(self) -> str:
-        if self.failure is not None:
-            return "fault"
-        if not self.is_ready:
-            return "starting"
-        if self.line.is_flown:
-            return "landed"
-        if self.line.runs:
-            return "flying"
-        return "paused" if self.flight.ledger.sheet().triggers else "ready"
-
     def _status(self) -> dict[str, Any]:
         now_ns = time.monotonic_ns()
-        time_now = self.flight.clock.gps_at(now_ns)
+        sheet = self.flight.ledger.sheet()
         return status_event(
-            phase=self._phase(),
-            ledger=self.flight.ledger.sheet().as_json(),
+            phase=phase_of(
+                self.line,
+                failed=self.failure is not None,
+                ready=self.is_ready,
+                triggers=sheet.triggers,
+            ),
+            ledger=sheet.as_json(),
             exposures_left=exposures_left(self.configuration, self.rig, self.mission.path),
             position=self.flight.track.last,
             temperatures_c={t.probe: t.value_c for t in self.flight.temperatures.at(now_ns)},
-            clock_sigma_ns=None if time_now is None else time_now.sigma_ns,
+            time_now=self.flight.clock.gps_at(now_ns),
             queue=len(self.waiting) + len(self.in_work),
         )
 

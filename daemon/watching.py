@@ -10,9 +10,12 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
+from daemon.clock import GpsEstimate
 from daemon.departure import ProcessPlan
+from daemon.line import Line
 from daemon.messages import Answer, Told
 from daemon.supervisor import Supervisor
+from drivers.contract import NavSample
 
 NAME = "watch"
 RESTART_S = 3.0
@@ -55,20 +58,33 @@ class Watching:
         asyncio.get_running_loop().call_later(RESTART_S, self.start)
 
 
+def phase_of(line: Line, *, failed: bool, ready: bool, triggers: int) -> str:
+    """Where a flight stands: starting, ready, flying, paused, landed or fault."""
+    if failed:
+        return "fault"
+    if not ready:
+        return "starting"
+    if line.is_flown:
+        return "landed"
+    if line.runs:
+        return "flying"
+    return "paused" if triggers else "ready"
+
+
 def status_event(
     *,
     phase: str,
     ledger: Mapping[str, Any],
     exposures_left: int,
-    position: Any,
+    position: NavSample | None,
     temperatures_c: Mapping[str, float | None],
-    clock_sigma_ns: int | None,
+    time_now: GpsEstimate | None,
     queue: int,
 ) -> dict[str, Any]:
     """What a watcher must not have wrong for longer than a second, as plain JSON types.
 
     Args:
-        position: a `NavSample`, or None before the first.
+        time_now: GPS time at this moment, or None before anything told it.
         queue: exposures waiting for the pipeline.
     """
     now_ns = time.monotonic_ns()
@@ -93,6 +109,8 @@ def status_event(
         "exposures_left": exposures_left,
         "position": where,
         "temperatures_c": dict(temperatures_c),
-        "clock_sigma_ns": clock_sigma_ns,
+        "clock_sigma_ns": None if time_now is None else time_now.sigma_ns,
+        "clock_source": None if time_now is None else time_now.source,
+        "in_holdover": time_now is not None and time_now.in_holdover,
         "queue": queue,
     }

@@ -414,7 +414,13 @@ def gvcp_commands() -> Parser:
     nothing = mock.Mock()
     control = ControlChannel(
         registers,
-        Actions(written=nothing, resend=nothing, control_lost=nothing, is_acquiring=lambda: False),
+        Actions(
+            written=nothing,
+            resend=nothing,
+            act=nothing,
+            control_lost=nothing,
+            is_acquiring=lambda: False,
+        ),
     )
     answered = 0
 
