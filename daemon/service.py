@@ -107,6 +107,7 @@ class Service:
         self.supervisor = Supervisor(self._hear, self._child_died)
         self.watching = Watching(self.supervisor, watch_process(configuration))
         self.is_ready = False
+        self.is_power_failing = False
         self.hurry_ns = 0
         self.failure: str | None = None
         self.stopping = asyncio.Event()
@@ -508,7 +509,7 @@ class Service:
 
     async def _land(self, tasks: list[asyncio.Task[None]]) -> None:
         tasks[-1].cancel()  # no more exposures
-        if self.hurry_ns:
+        if self.is_power_failing:
             limit_s = self.configuration.limits.power_fail_s
             await self._until(lambda: not self._is_unsafe(), limit_s)
         elif self.failure is None:
@@ -519,14 +520,22 @@ class Service:
         await self.supervisor.end(("capture", "worker", "writer"))
 
     def _power_fails(self) -> None:
-        """The supply said that it will be gone in seconds: no time-out is waited for any more."""
+        """The supply said that it will be gone in seconds.
+
+        What is on its way has half of them to arrive; after that no time-out is waited for.
+        """
         limits = self.configuration.limits
-        self.hurry_ns = round((limits.frame_timeout_s + limits.mark_timeout_s + 1.0) * 1e9)
+        self.is_power_failing = True
+        asyncio.get_running_loop().call_later(limits.power_fail_s / 2, self._hurry)
         sentence = (
             f"power fails; what is open is stored and sealed within {limits.power_fail_s:g} s"
         )
         self._event("power", fault=True, sentence=sentence)
         self.stopping.set()
+
+    def _hurry(self) -> None:
+        limits = self.configuration.limits
+        self.hurry_ns = round((limits.frame_timeout_s + limits.mark_timeout_s + 1.0) * 1e9)
 
     def _is_unsafe(self) -> bool:
         return self.sealing is not None or bool(self.flight.open_numbers)

@@ -34,7 +34,9 @@ def test_figures_of_all_stages_are_told_with_their_spread(told: dict[str, Any]) 
     stages = {"radiometry", "tie_points", "mosaic", "composition", "colour", "writing"}
     assert stages <= set(told["stages"])
     for times in (*told["stages"].values(), told["pipeline"], told["fixed_method"], told["copy"]):
-        assert 0.0 < times["min_s"] <= times["median_s"] <= times["max_s"]
+        # A stage of a small rig may take less than the tenth of a millisecond that is told.
+        assert 0.0 <= times["min_s"] <= times["median_s"] <= times["max_s"]
+    assert told["pipeline"]["min_s"] > 0.0
     assert told["realtime_factor_alone"] == told["frame_interval_s"] / told["pipeline"]["median_s"]
     assert "peers" not in told
 

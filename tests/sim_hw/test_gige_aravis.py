@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from sim_hw.gige.features import CHUNKS
 from sim_hw.gige.head import (
     NO_PULSE,
     ExposureRequest,
@@ -225,11 +226,11 @@ def test_aravis_reads_the_clock_by_latch(aravis: Any, heads: Heads) -> None:
 def test_chunks_are_chosen_through_selector_and_enable(aravis: Any, heads: Heads) -> None:
     heads.open()
     camera = aravis.Camera.new(heads.heads[0].address)
-    with_all = SIZE.width_px * SIZE.height_px * 2 + 8 + 4 * 16
+    with_all = SIZE.width_px * SIZE.height_px * 2 + 8 + len(CHUNKS) * 16
     camera.set_chunk_mode(True)
     assert camera.get_payload() == with_all
     camera.set_chunks("Timestamp,CounterValue")
-    assert camera.get_payload() == with_all - 2 * 16
+    assert camera.get_payload() == with_all - (len(CHUNKS) - 2) * 16
 
 
 def run(*command: str) -> str:

@@ -363,7 +363,7 @@ def test_packets_are_sent_again_on_request_and_marked_so(bench: Bench) -> None:
         bench.host.receive_packet(again)
     assert again.resent == {5, 6, 7, 8, 9}
     assert all(again.data[number] == first.data[number] for number in range(5, 10))
-    assert bench.head.statistics()["packets_resent"] == 5
+    bench.wait_for("packets_resent", 5)
 
 
 def test_packets_of_a_frame_long_gone_are_said_to_be_unavailable(bench: Bench) -> None:
