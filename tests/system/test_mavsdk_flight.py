@@ -25,7 +25,9 @@ def test_photos_that_a_ground_station_asked_for_are_in_the_ledger(
     mavsdk = pytest.importorskip("mavsdk", reason="mavsdk is absent; pip install it")
     from mavsdk.plugins.camera import Camera
 
-    arguments = simulator_arguments("ultracam-x-mini", tmp_path / "sim", seed=1, dc=0.0, displace=[])
+    arguments = simulator_arguments(
+        "ultracam-x-mini", tmp_path / "sim", seed=1, dc=0.0, displace=[]
+    )
     arguments += ["--scene-cache", str(flown.scenes), "--exposures", str(PHOTOS + 1)]
     emulator = Emulator([*arguments, "--first-address", free_first_address()])
     port = free_port()

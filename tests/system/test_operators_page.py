@@ -145,7 +145,9 @@ def test_a_head_that_goes_is_seen_within_two_seconds_and_acknowledged(
 ) -> None:
     """The emulator is killed under a waiting service: every device is lost, and is told so."""
     chromium()
-    arguments = simulator_arguments("ultracam-x-mini", tmp_path / "sim", seed=1, dc=0.0, displace=[])
+    arguments = simulator_arguments(
+        "ultracam-x-mini", tmp_path / "sim", seed=1, dc=0.0, displace=[]
+    )
     arguments += ["--scene-cache", str(flown.scenes), "--exposures", "2"]
     emulator = Emulator([*arguments, "--first-address", free_first_address()])
     config = tmp_path / "service.toml"
