@@ -63,6 +63,7 @@ def fly(folder: Path, lasts_s: float, seed: int) -> None:
         time.sleep(0.2)
 
 
+@pytest.mark.soak
 def test_half_a_minute_of_kills(tmp_path: Path) -> None:
     fly(tmp_path, 30.0, seed=1)
 
