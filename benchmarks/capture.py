@@ -27,11 +27,11 @@ import tifffile
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.machine import machine
 from benchmarks.ring_heads import RING, build_ring, is_whole, number_of
 from daemon import bench
 from daemon.cli.sim import free_first_address
 from daemon.level0_folder import read_sealed
+from daemon.measuring import machine
 from processing.rig import Rig, find_rig
 
 KEPT_EXPOSURES = 6

@@ -19,7 +19,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from benchmarks.machine import machine
+from daemon.measuring import machine
 from processing.pipeline import Conditions, Pipeline, Product, Settings
 from processing.quality import Flag
 from processing.radiometry import load_radiometry

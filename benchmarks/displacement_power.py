@@ -22,13 +22,13 @@ from scipy.stats import chi2
 
 from benchmarks import honest_uncertainty
 from benchmarks.chart import Chart
-from benchmarks.machine import machine
 from benchmarks.stitching_trials import (
     MatchingErrors,
     drawn_trial,
     matching_errors,
     world_and_rig,
 )
+from daemon.measuring import machine
 from processing.rig import Rig, find_rig
 from processing.validity import Validity, judge_master
 

@@ -24,7 +24,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from benchmarks.machine import machine
 from benchmarks.rendered import (
     Exposure,
     conditions_of,
@@ -34,6 +33,7 @@ from benchmarks.rendered import (
     take,
     world_settings,
 )
+from daemon.measuring import machine
 from processing.pipeline import Conditions, Pipeline, Product, Settings
 from processing.quality import NO_FLAGS, Flag, Thresholds
 from sim_hw.rendering import residual_smear_px

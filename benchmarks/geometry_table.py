@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.machine import machine
 from benchmarks.rendered import (
     errors_of,
     process,
@@ -28,6 +27,7 @@ from benchmarks.rendered import (
     with_random_rotations,
     world_settings,
 )
+from daemon.measuring import machine
 from processing.pipeline import Pipeline, Settings
 from processing.rig import Rig, load_rig, shipped_rigs
 from sim_hw.scene import Scene, open_scene

@@ -17,8 +17,8 @@ from pathlib import Path
 
 import cv2
 
-from benchmarks.machine import machine
 from benchmarks.rendered import errors_of, process, radiometry_of, take, world_settings
+from daemon.measuring import machine
 from processing.pipeline import Pipeline, Product, Settings
 from processing.quality import NO_FLAGS, Flag
 from processing.rig import find_rig

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from benchmarks import rendered
-from benchmarks.machine import machine
 from benchmarks.stitching_trials import (
     MatchingErrors,
     Trial,
@@ -32,6 +31,7 @@ from benchmarks.stitching_trials import (
     true_px,
     world_and_rig,
 )
+from daemon.measuring import machine
 from processing.pipeline import Pipeline, Settings
 from processing.precision import datum_covariance, placed_covariance_px
 from sim_hw.scene import open_scene

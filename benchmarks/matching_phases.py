@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.chart import Chart
-from benchmarks.machine import machine
+from daemon.measuring import machine
 from processing.matching import INTERPOLATION, match_patches
 from processing.tie_points import TiePointSettings
 

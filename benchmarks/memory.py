@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.machine import machine
 from daemon import bench, store
 from daemon.conditions import conditions_of
 from daemon.configuration import PlanSection
 from daemon.lanes import Lanes
+from daemon.measuring import machine
 from daemon.mission import Mission
 from daemon.radiometry_folder import RadiometryFolder
 from processing.pipeline import Pipeline, Settings

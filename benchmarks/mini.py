@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.machine import interleaved, machine
 from daemon.conditions import conditions_of
 from daemon.configuration import PlanSection
 from daemon.exposure import Capture, FrameRecord
+from daemon.measuring import interleaved, machine
 from daemon.mission import Mission
 from daemon.store import Level0Writer, load_level0
 from processing.pipeline import Pipeline, Settings

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.machine import machine
 from benchmarks.rendered import process, radiometry_of, take, world_settings
+from daemon.measuring import machine
 from processing.bundle.adjust import Settings, adjust
 from processing.bundle.findings import checked_against, image_residuals_mm
 from processing.bundle.network import (

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks import rendered
-from benchmarks.machine import machine
+from daemon.measuring import machine
 from processing.composition import PanComposer
 from processing.level1 import corrector_for, exposed_rows, level1_counts_per_dn, level1_from_level0
 from processing.pipeline import Conditions, Pipeline, Product, Settings

@@ -20,12 +20,12 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.machine import machine
 from benchmarks.time_truth import Fired, Host, delay_error_ns, inside, receiver_stamp
 from daemon.clock import HostClock
 from daemon.exposure import Capture, FrameRecord
 from daemon.flight import compose, instant_of
 from daemon.matching import Pulse
+from daemon.measuring import machine
 from daemon.navigation import Track
 from daemon.temperatures import Temperatures
 from drivers.contract import EventMark

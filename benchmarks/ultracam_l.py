@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.machine import machine
+from daemon.measuring import machine
 from processing.conditions import Conditions, parallax_px
 from processing.fixed_method import fixed_mosaic
 from processing.mosaic import Mosaic, MosaicSettings, free_mosaic

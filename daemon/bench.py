@@ -7,8 +7,6 @@ peers themselves are in `daemon.bench_peers`; the exposure is rendered by a sepa
 from __future__ import annotations
 
 import json
-import os
-import platform
 import resource
 import shutil
 import statistics
@@ -16,9 +14,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,6 +28,7 @@ from daemon.conditions import conditions_of
 from daemon.configuration import PlanSection
 from daemon.errors import DaemonError
 from daemon.lanes import Lanes
+from daemon.measuring import interleaved, machine, spread
 from daemon.mission import Mission
 from daemon.radiometry_folder import RadiometryFolder
 from daemon.worker import SWITCH_INTERVAL_S, make_products, process_exposure
@@ -316,34 +314,3 @@ def _json_of(
         last = error.stderr.decode(errors="replace").strip().splitlines()[-1:]
         raise BenchError(f"{what} failed: {last[0] if last else error.returncode}") from error
     return dict(json.loads(said.stdout)) if needs_json else {}
-
-
-def interleaved(runs: int, **tasks: Callable[[], object]) -> dict[str, dict[str, float]]:
-    """Time tasks in turn; for each task seconds: median, least, most."""
-    seconds: dict[str, list[float]] = {name: [] for name in tasks}
-    for _ in range(runs):
-        for name, task in tasks.items():
-            started = time.perf_counter()
-            task()
-            seconds[name].append(time.perf_counter() - started)
-    return {name: spread(values) for name, values in seconds.items()}
-
-
-def spread(seconds: list[float]) -> dict[str, float]:
-    """Median, least and most."""
-    return {"median_s": statistics.median(seconds), "min_s": min(seconds), "max_s": max(seconds)}
-
-
-def machine() -> dict[str, Any]:
-    """What a reader needs to weigh a figure; the load says whether the machine was idle."""
-    text = Path("/proc/cpuinfo").read_text()
-    models = [line.split(":", 1)[1].strip() for line in text.splitlines() if "model name" in line]
-    memory_kb = int(Path("/proc/meminfo").read_text().split()[1])
-    return {
-        "date": f"{datetime.now(UTC):%Y-%m-%d}",
-        "processor": models[0] if models else platform.processor(),
-        "cores": len(os.sched_getaffinity(0)),
-        "memory_gib": round(memory_kb / 2**20, 1),
-        "load": round(os.getloadavg()[0], 1),
-        "python": platform.python_version(),
-    }

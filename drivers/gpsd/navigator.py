@@ -7,69 +7,28 @@ What its reports mean is in `drivers.gpsd.reports`; reconnecting and counting in
 from __future__ import annotations
 
 import json
-import socket
 from collections.abc import Iterable, Mapping
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar
 
 from drivers.clock import Clock
 from drivers.contract import DeviceError, NavSample
 from drivers.gpsd.reports import GpsdReports
 from drivers.serial_device import READ_STEP_S, PortOpener, SerialDevice, SerialLine
 from drivers.settings import Setting
-
-CONNECT_TIMEOUT_S: Final = 2.0
-WRITE_TIMEOUT_S: Final = 1.0
-READ_NBYTES: Final = 65_536
+from drivers.tcp_port import SCHEME, TcpPort, open_tcp_port
 
 
-class SocketPort:
-    """A TCP connection that reads like a serial port, a bounded piece at a time."""
-
-    def __init__(self, connection: socket.socket) -> None:
-        self.timeout: Any = READ_STEP_S
-        self._connection = connection
-        self._ready = b""
-
-    @property
-    def in_waiting(self) -> int:
-        return len(self._ready)
-
-    def read(self, size: int = 1) -> bytes:
-        """What has come, `size` bytes at most; OSError where the other end has closed."""
-        if not self._ready:
-            self._connection.settimeout(self.timeout)
-            try:
-                self._ready = self._connection.recv(READ_NBYTES)
-            except (TimeoutError, BlockingIOError):
-                return b""
-            if not self._ready:
-                raise OSError("the other end has closed the connection")
-        data, self._ready = self._ready[:size], self._ready[size:]
-        return data
-
-    def write(self, data: bytes, /) -> int:
-        self._connection.settimeout(WRITE_TIMEOUT_S)
-        self._connection.sendall(data)
-        return len(data)
-
-    def close(self) -> None:
-        self._connection.close()
-
-
-def open_socket(path: str, baudrate: int, parity: str) -> SocketPort:
+def open_gpsd(path: str, baudrate: int, parity: str) -> TcpPort:
     """Connect to host:port; a connection has neither speed nor parity.
 
     Raises:
         DeviceError: nobody listens there; the sentence says what to do.
     """
-    host, _, port = path.rpartition(":")
     try:
-        return SocketPort(
-            socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_TIMEOUT_S)
-        )
-    except OSError as error:
+        return open_tcp_port(SCHEME + path)
+    except DeviceError as error:
         raise DeviceError(
-            f"no gpsd answers at {path} ({error.strerror or error}); start it (Debian's gpsd), "
+            f"no gpsd answers at {path} ({error.__cause__ or error}); start it (Debian's gpsd), "
             "and check address and port"
         ) from error
 
@@ -97,7 +56,7 @@ class GpsdNavigator(SerialDevice):
         settings: Mapping[str, object],
         *,
         clock: Clock | None = None,
-        open_port: PortOpener = open_socket,
+        open_port: PortOpener = open_gpsd,
     ) -> None:
         super().__init__(name, settings, clock=clock, open_port=open_port)
         self.reports = GpsdReports(name, self.device)
