@@ -22,8 +22,10 @@ setup: .venv/ready .venv/kernels
 demo: setup
 	$(BIN)/syntopic demo
 
+# Whole flights run in real time and are given the machine to themselves.
 test: setup
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile --ignore=tests/system
+	$(BIN)/python -m pytest tests/system
 
 # The V4L2 heads against the real kernel, in a virtual machine; REQUIRED=--required where skipping is no
 # answer.

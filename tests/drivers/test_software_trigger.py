@@ -53,7 +53,7 @@ def test_delays_are_kept_and_taken_off_the_pulse() -> None:
     trigger.fire(1)
     pulse = trigger.fire(2)
     apart_ns = last.fired_ns[1] - first.fired_ns[1]
-    assert 49_000_000 < apart_ns < 50_000_000 + 2 * pulse.sigma_ns
+    assert abs(apart_ns - 50_000_000) < 1_000_000 + 2 * pulse.sigma_ns
     assert abs(last.fired_ns[1] - 50_000_000 - pulse.mono_ns) <= pulse.sigma_ns
     trigger.close()
 
