@@ -31,7 +31,7 @@ from daemon.lanes import Lanes
 from daemon.measuring import interleaved, machine, spread
 from daemon.mission import Mission
 from daemon.radiometry_folder import RadiometryFolder
-from daemon.worker import SWITCH_INTERVAL_S, make_products, process_exposure
+from daemon.worker import make_products, process_exposure, settle_threads
 from processing.pipeline import Conditions, Pipeline, Product, Settings
 from processing.quality import Flag
 from processing.rig import Rig, load_rig
@@ -75,6 +75,7 @@ def measure(
         peers: also cv2.remap and, where installed, nona + enblend.
         lanes: exposures in work at a time, as the service's `exposures_in_work`.
     """
+    settle_threads()
     mission = Mission.open(folder / "mission")
     rig = load_rig(mission.rig_path)
     radiometry = folder / "calibration" / "radiometry"
@@ -85,7 +86,6 @@ def measure(
         Settings(geometry=False, threads=threads),
     )
     pipeline.warm_up()
-    sys.setswitchinterval(SWITCH_INTERVAL_S)
     stored, exposure = store.load_level0(mission.level0(1), rig)
     frames = {name: np.array(frame) for name, frame in stored.items()}
     conditions = conditions_of(exposure, rig, plan, Flag(0))

@@ -6,6 +6,7 @@ capture wait. A few exposures are in work at a time (`daemon.lanes`).
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -50,7 +51,7 @@ SWITCH_INTERVAL_S = 0.001
 def main(link: Link, settings: WorkerSettings, rings: tuple[FrameRing, ...]) -> None:
     """Process until told to stop."""
     started = time.monotonic()
-    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    settle_threads()
     rig = find_rig(settings.rig)
     pipeline = make_pipeline(rig, settings)
     pipeline.warm_up()
@@ -68,6 +69,15 @@ def main(link: Link, settings: WorkerSettings, rings: tuple[FrameRing, ...]) -> 
         for future in done:
             future.result()  # a fault of our own ends the process, and the service says so
     lanes.end()
+
+
+def settle_threads() -> None:
+    """Let threads take turns, and sleep where they wait; call it before the first kernel runs.
+
+    OpenMP's threads spin by default, which takes the core from the exposure beside them.
+    """
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
 
 
 def make_pipeline(rig: Rig, settings: WorkerSettings) -> Pipeline:
