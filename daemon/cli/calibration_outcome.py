@@ -1,0 +1,66 @@
+"""How a calibration command ends: the folder written, verdicts and comparison told."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+from rich.console import Console
+
+from daemon.cli.tables import light_table
+
+if TYPE_CHECKING:
+    from daemon.calibration_report import CalibrationReport
+
+_MOST_ROWS = 40
+
+
+def hand_over(
+    report: CalibrationReport,
+    folder: Path,
+    *,
+    files: Mapping[str, bytes] | None = None,
+    as_json: bool,
+) -> None:
+    """Write the calibration as a new folder and tell it, as one JSON object or for a person."""
+    from daemon.calibration_report import calibration_json, write_calibration
+
+    write_calibration(folder, report, files)
+    if as_json:
+        typer.echo(json.dumps({**calibration_json(report), "written": str(folder)}))
+        return
+    console = Console()
+    console.print(f"[bold]{report.title}[/]", highlight=False)
+    for sentence in report.verdicts:
+        console.print(sentence, markup=False, highlight=False)
+    for sentence in report.warnings:
+        console.print(sentence, style="yellow", markup=False, highlight=False)
+    if report.changes:
+        significant = [c for c in report.changes if c.significant]
+        console.print(
+            f"Against {report.previous}: {len(significant)} of {len(report.changes)} changes are "
+            "significant",
+            highlight=False,
+        )
+        if significant:
+            columns = ("old", "new", "sigma", "unit", "t")
+            table = light_table("Significant changes", ("", "quantity"), columns)
+            for c in significant[:_MOST_ROWS]:
+                table.add_row(
+                    c.where,
+                    c.what,
+                    f"{c.old:.6g}",
+                    f"{c.new:.6g}",
+                    f"{c.sigma or 0.0:.2g}",
+                    c.unit,
+                    f"{c.t or 0.0:.1f}",
+                )
+            console.print(table)
+            if len(significant) > _MOST_ROWS:
+                console.print(f"and {len(significant) - _MOST_ROWS} more in the report")
+    console.print(
+        f"Calibration: [bold]{folder}[/], report {folder / 'report.html'}", soft_wrap=True
+    )
