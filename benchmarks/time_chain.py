@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from benchmarks.time_truth import Fired, Host, delay_error_ns, inside, receiver_stamp
 from daemon.clock import HostClock
+from daemon.composing import compose, instant_of
 from daemon.exposure import Capture, FrameRecord
-from daemon.flight import compose, instant_of
 from daemon.matching import Pulse
 from daemon.measuring import machine
 from daemon.navigation import Track

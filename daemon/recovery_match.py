@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from daemon.clock import HostClock
+from daemon.composing import compose, instant_of
 from daemon.exposure import Capture, Exposure
-from daemon.flight import compose, instant_of
 from daemon.log_records import LoggedRecord, LoggedTrigger
 from daemon.matching import Matcher, Pulse
 from daemon.navigation import Track

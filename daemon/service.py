@@ -10,10 +10,8 @@ import asyncio
 import signal
 import time
 import traceback
-from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,51 +20,36 @@ from daemon.commanding import audit_message, obey
 from daemon.configuration import Configuration
 from daemon.departure import identity, open_mission, processes, watch_process
 from daemon.devices import serial_problem
-from daemon.exposure import Exposure, navigation_to_json
+from daemon.exposure import Exposure
 from daemon.flight import Flight
+from daemon.hearing import Hearing
 from daemon.ledger import Ledger
 from daemon.line import Line, Order, exposures_left
 from daemon.log_records import LoggedTrigger, Message, message_of
-from daemon.matching import Cause, Pulse
 from daemon.messages import (
     Bound,
     Command,
     Fire,
-    Fired,
-    FramesRead,
     Log,
-    NotBound,
-    NoteProducts,
     Pong,
-    Process,
-    Processed,
-    ProcessFailed,
-    Recycle,
     Seal,
     Sealed,
     Store,
     Stored,
     Told,
-    WorkerReady,
     WriteFailed,
 )
 from daemon.mission import Mission
 from daemon.notify import Notifier
+from daemon.pipeline_queue import PipelineQueue
 from daemon.records import canonical_bytes
 from daemon.recovery_match import seal_from_log
 from daemon.supervisor import Supervisor
 from daemon.watching import NAME as WATCH
-from daemon.watching import Watching, phase_of, status_event
+from daemon.watching import Watching, phase_of, status_event, summary
 from drivers.contract import (
-    ClockReading,
     DeviceEvent,
-    EventMark,
-    Frame,
-    NavSample,
-    PpsEdge,
-    RawBytes,
     Record,
-    TemperatureSample,
 )
 from processing.rig import Rig
 
@@ -76,14 +59,6 @@ LANDING_TIMEOUT_S = 20.0
 END_OF_WAITING_S = 1e9
 
 Events = Callable[[Mapping[str, Any]], None]
-
-
-@dataclass
-class _Waiting:
-    """An exposure waiting for the worker; `slots` while its frames are still in memory."""
-
-    exposure: Exposure
-    slots: Mapping[str, int] | None
 
 
 class Service:
@@ -112,14 +87,7 @@ class Service:
         self.failure: str | None = None
         self.stopping = asyncio.Event()
         self.changed = asyncio.Event()
-        self.active: set[str] = set()
-        self.has_trigger = False
-        self.is_worker_ready = False
-        self.in_work: set[int] = set()
-        self.waiting: deque[_Waiting] = deque()
-        self.in_memory: dict[int, Mapping[str, int]] = {}
         self.sealing: Exposure | None = None
-        self.orders: dict[int, Order] = {}
 
     async def run(self) -> int:
         """Fly until told to stop, or until the planned exposures are done.
@@ -181,6 +149,9 @@ class Service:
             Ledger.resume(report.settled, heads=heads, sheet=report.ledger_sheet),
             report.next_number,
         )
+        self.hearing = Hearing(self.flight, self._log, self._event)
+        lanes = self.configuration.processing.exposures_in_work
+        self.pipeline = PipelineQueue(lanes, self.supervisor.send, self._event)
         flown = len(report.settled)
         self.line = Line(self.configuration, self.rig, self.flight, mission.path, flown)
         for process in processes(self.configuration, self.rig, mission):
@@ -189,7 +160,11 @@ class Service:
     # What the processes say
 
     def _hear(self, message: object) -> None:
-        self._handlers[type(message)](self, message)
+        handler = self._handlers.get(type(message))
+        if handler is not None:
+            handler(self, message)
+        elif not (self.hearing.hear(message) or self.pipeline.hear(message)):
+            raise TypeError(f"a process said {type(message).__name__}, which nobody expects")
         self.changed.set()
 
     def _child_died(self, name: str) -> None:
@@ -199,95 +174,10 @@ class Service:
         elif not self.stopping.is_set():
             self._fail(f"process {name} died; started again, the service goes on in this flight")
 
-    def _on_frame(self, frame: Frame) -> None:
-        cause = self.flight.frame(frame)
-        if cause is not Cause.USED:
-            self._event("frame", head=frame.head, cause=cause.value)
-        self._log(frame)
-
-    def _on_mark(self, mark: EventMark) -> None:
-        cause = self.flight.mark(mark)
-        if cause not in (Cause.USED, Cause.PENDING):
-            self._event("mark", count=mark.count, cause=cause.value)
-        self._log(mark)
-
-    def _on_navigation(self, sample: NavSample) -> None:
-        self.flight.navigation(sample)
-        self._log(sample)
-
-    def _on_pps(self, edge: PpsEdge) -> None:
-        self.flight.pps(edge)
-        self._log(edge)
-
-    def _on_clock_reading(self, reading: ClockReading) -> None:
-        self.flight.clock_reading(reading)
-        self._log(reading)
-
-    def _on_temperature(self, sample: TemperatureSample) -> None:
-        self.flight.temperature(sample)
-        self._log(sample)
-
-    def _on_raw(self, raw: RawBytes) -> None:
-        self._log(raw)
-
-    def _on_device_event(self, event: DeviceEvent) -> None:
-        self._log(event)
-        self._event(
-            "device",
-            device=event.device,
-            name=event.name,
-            fault=event.is_fault,
-            sentence=event.sentence,
-        )
-        if event.name in _DELIVERS:
-            self.active.add(event.device)
-            self.flight.absent_heads.discard(event.device)
-        elif event.is_fault:
-            self.active.discard(event.device)
-            if event.name == _LOST:
-                self.flight.absent_heads.add(event.device)
-
-    def _on_bound(self, bound: Bound) -> None:
-        self._event("bound", kind=bound.kind, device=bound.name, found=dict(bound.found))
-        if bound.kind == "trigger":
-            self.has_trigger = True
-        if bound.kind == "head":
-            problem = serial_problem(self.rig, bound.name, bound.found)
-            if problem is not None:
-                self._fail(problem)
-
-    def _on_not_bound(self, unbound: NotBound) -> None:
-        sentence = unbound.sentence
-        if unbound.kind == "head":
-            self.flight.absent_heads.add(unbound.name)
-        self._event("device", device=unbound.name, name="absent", fault=True, sentence=sentence)
-
-    def _on_fired(self, fired: Fired) -> None:
-        order = self.orders.pop(fired.sequence)
-        if fired.pulse is None:
-            self.flight.not_fired(fired.sequence, fired.sentence)
-            self._event("lost", number=fired.sequence, cause=fired.sentence)
-            return
-        pulse = Pulse(
-            number=fired.sequence,
-            mono_ns=fired.pulse.mono_ns,
-            sigma_ns=fired.pulse.sigma_ns,
-            count=fired.pulse.count,
-            delays_ns=order.delays_ns,
-            strobe_delay_ns=order.strobe_delay_ns,
-            spread_ns=fired.pulse.spread_ns,
-        )
-        self.flight.fired(pulse)
-        self._log(
-            LoggedTrigger(fired.sequence, fired.pulse, order.delays_ns, order.strobe_delay_ns)
-        )
-
     def _on_stored(self, stored: Stored) -> None:
         self.flight.stored(stored.number, stored.frames)
         self._event("stored", number=stored.number, duration_s=round(stored.duration_s, 4))
-        if self.waiting or any(number < stored.number for number in self.in_memory):
-            # An older exposure is still being worked on: this one is read from disk later.
-            self._recycle(self.in_memory.pop(stored.number))
+        self.pipeline.stored(stored.number)
 
     def _on_sealed(self, sealed: Sealed) -> None:
         exposure, self.sealing = self.sealing, None
@@ -298,9 +188,8 @@ class Service:
         self.supervisor.send("writer", Log(message))
         if exposure.state == "lost":
             return
-        self._event("sealed", **_summary(exposure))
-        self.waiting.append(_Waiting(exposure, self.in_memory.get(sealed.number)))
-        self._feed_worker()
+        self._event("sealed", **summary(exposure))
+        self.pipeline.sealed(exposure)
 
     def _on_write_failed(self, failed: WriteFailed) -> None:
         self._event("not-written", number=failed.number, sentence=failed.sentence)
@@ -309,28 +198,15 @@ class Service:
             self.flight.not_sealed(failed.number, self.sealing.state)
             self.sealing = None
         else:
-            self.in_memory.pop(failed.number, None)
+            self.pipeline.not_stored(failed.number)
             self.flight.not_stored(failed.number, failed.sentence)
 
-    def _on_worker_ready(self, ready: WorkerReady) -> None:
-        self._event("kernels", warm_up_s=round(ready.warm_up_s, 2))
-        self.is_worker_ready = True
-        self._feed_worker()
-
-    def _on_frames_read(self, read: FramesRead) -> None:
-        if read.number in self.in_memory:
-            self._recycle(self.in_memory.pop(read.number))
-
-    def _on_processed(self, done: Processed) -> None:
-        seconds = round(done.duration_s, 3)
-        self._event("processed", number=done.number, report=dict(done.report), duration_s=seconds)
-        verdict = done.report.get("verdict")
-        self.supervisor.send("writer", NoteProducts(done.number, done.files, verdict))
-        self._worker_is_free(done.number)
-
-    def _on_process_failed(self, failed: ProcessFailed) -> None:
-        self._event("not-processed", number=failed.number, sentence=failed.sentence)
-        self._worker_is_free(failed.number)
+    def _on_bound(self, bound: Bound) -> None:
+        self.hearing.hear(bound)
+        if bound.kind == "head":
+            problem = serial_problem(self.rig, bound.name, bound.found)
+            if problem is not None:
+                self._fail(problem)
 
     def _on_told(self, told: Told) -> None:
         """What the watch process has to say of itself."""
@@ -354,44 +230,14 @@ class Service:
             self.statistics = pong.statistics
 
     _handlers: Mapping[type, Callable[[Service, Any], None]] = {
-        Frame: _on_frame,
-        EventMark: _on_mark,
-        NavSample: _on_navigation,
-        TemperatureSample: _on_temperature,
-        PpsEdge: _on_pps,
-        ClockReading: _on_clock_reading,
-        RawBytes: _on_raw,
-        DeviceEvent: _on_device_event,
         Bound: _on_bound,
-        NotBound: _on_not_bound,
-        Fired: _on_fired,
         Stored: _on_stored,
         Sealed: _on_sealed,
         WriteFailed: _on_write_failed,
-        WorkerReady: _on_worker_ready,
-        FramesRead: _on_frames_read,
-        Processed: _on_processed,
-        ProcessFailed: _on_process_failed,
         Pong: _on_pong,
         Told: _on_told,
         Command: _on_command,
     }
-
-    def _worker_is_free(self, number: int) -> None:
-        self.in_work.discard(number)
-        if number in self.in_memory:
-            self._recycle(self.in_memory.pop(number))
-        self._feed_worker()
-
-    def _feed_worker(self) -> None:
-        lanes = self.configuration.processing.exposures_in_work
-        while self.is_worker_ready and self.waiting and len(self.in_work) < lanes:
-            task = self.waiting.popleft()
-            self.in_work.add(task.exposure.number)
-            self.supervisor.send("worker", Process(task.exposure, task.slots))
-
-    def _recycle(self, slots: Mapping[str, int]) -> None:
-        self.supervisor.send("capture", Recycle(slots))
 
     # In flight
 
@@ -399,12 +245,12 @@ class Service:
         while True:
             now_ns = time.monotonic_ns() + self.hurry_ns
             for due in self.flight.due_to_store(now_ns):
-                self.in_memory[due.capture.number] = due.slots
+                self.pipeline.keep(due.capture.number, due.slots)
                 self.supervisor.send("writer", Store(due.capture, due.slots))
             for number, cause in self.flight.due_to_give_up(now_ns):
                 self._event("lost", number=number, cause=cause)
             for head, slot in self.flight.idle_slots:
-                self._recycle({head: slot})
+                self.pipeline.recycle({head: slot})
             self.flight.idle_slots.clear()
             self._tell_of_time(now_ns - self.hurry_ns)
             if self.sealing is None:
@@ -446,7 +292,7 @@ class Service:
         limit_s = self.configuration.limits.ready_timeout_s
         await self._until(lambda: not self.absent(), limit_s)
         # Devices may be missing and said to be; kernels may not: nothing compiles in flight.
-        await self._until(lambda: self.is_worker_ready, END_OF_WAITING_S)
+        await self._until(lambda: self.pipeline.is_ready, END_OF_WAITING_S)
         absent = self.absent()
         self.is_ready = True
         self._event("ready", absent=absent)
@@ -461,7 +307,9 @@ class Service:
 
     def absent(self) -> list[str]:
         """What is not there yet, in words."""
-        return self.line.absent(self.active.__contains__, has_trigger=self.has_trigger)
+        return self.line.absent(
+            self.hearing.active.__contains__, has_trigger=self.hearing.has_trigger
+        )
 
     def land(self) -> None:
         """End in good order: what is open is sealed first."""
@@ -482,11 +330,11 @@ class Service:
             position=self.flight.track.last,
             temperatures_c={t.probe: t.value_c for t in self.flight.temperatures.at(now_ns)},
             time_now=self.flight.clock.gps_at(now_ns),
-            queue=len(self.waiting) + len(self.in_work),
+            queue=len(self.pipeline),
         )
 
     def _fire(self, order: Order) -> None:
-        self.orders[order.number] = order
+        self.hearing.orders[order.number] = order
         self.supervisor.send("capture", Fire(order.number, order.delays_ns))
         self._event("triggered", number=order.number)
 
@@ -541,8 +389,7 @@ class Service:
         return self.sealing is not None or bool(self.flight.open_numbers)
 
     def _is_unfinished(self) -> bool:
-        in_work = self.sealing is not None or bool(self.in_work)
-        return in_work or bool(self.flight.open_numbers or self.waiting)
+        return self._is_unsafe() or bool(self.pipeline)
 
     def _task_ended(self, task: asyncio.Task[None]) -> None:
         error = None if task.cancelled() else task.exception()
@@ -572,24 +419,3 @@ class Service:
             self.failure = sentence
             self._event("fault", sentence=sentence)
         self.stopping.set()
-
-
-_DELIVERS = frozenset({"opened", "recovered"})
-_LOST = "lost"
-
-
-def _summary(exposure: Exposure) -> dict[str, Any]:
-    navigation = exposure.navigation
-    return {
-        "number": exposure.number,
-        "state": exposure.state,
-        "frames": len(exposure.frames),
-        "missing": [sensor for sensor, _ in exposure.missing],
-        "mark_gps_ns": None if exposure.mark_gps_ns is None else str(exposure.mark_gps_ns),
-        "mark_sigma_ns": exposure.mark_sigma_ns,
-        "mark_source": exposure.mark_source,
-        "temperatures_c": {t.probe: t.value_c for t in exposure.temperatures},
-        "height_m": navigation.height_m if navigation else None,
-        "navigation": navigation_to_json(navigation) if navigation else None,
-        "line": exposure.line_id,
-    }

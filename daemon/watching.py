@@ -12,6 +12,7 @@ from typing import Any
 
 from daemon.clock import GpsEstimate
 from daemon.departure import ProcessPlan
+from daemon.exposure import Exposure, navigation_to_json
 from daemon.line import Line
 from daemon.messages import Answer, Told
 from daemon.supervisor import Supervisor
@@ -113,4 +114,23 @@ def status_event(
         "clock_source": None if time_now is None else time_now.source,
         "in_holdover": time_now is not None and time_now.in_holdover,
         "queue": queue,
+    }
+
+
+def summary(exposure: Exposure) -> dict[str, Any]:
+    """What is told of a sealed exposure, as plain JSON types."""
+    navigation = exposure.navigation
+    return {
+        "number": exposure.number,
+        "state": exposure.state,
+        "frames": len(exposure.frames),
+        "missing": [sensor for sensor, _ in exposure.missing],
+        "mark_gps_ns": None if exposure.mark_gps_ns is None else str(exposure.mark_gps_ns),
+        "mark_sigma_ns": exposure.mark_sigma_ns,
+        "mark_source": exposure.mark_source,
+        "temperatures_c": {t.probe: t.value_c for t in exposure.temperatures},
+        "height_m": navigation.height_m if navigation else None,
+        "navigation": navigation_to_json(navigation) if navigation else None,
+        "line": exposure.line_id,
+        "strip": exposure.strip_id,
     }

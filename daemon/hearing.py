@@ -1,0 +1,158 @@
+"""What the devices of a flight say: it goes into the flight and into the log, and news are told.
+
+What follows from it is decided elsewhere: `daemon.flight` matches, `daemon.line` orders.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+from daemon.flight import Flight
+from daemon.line import Order
+from daemon.log_records import LoggedTrigger
+from daemon.matching import Cause, Pulse
+from daemon.messages import Bound, Fired, NotBound
+from drivers.contract import (
+    ClockReading,
+    DeviceEvent,
+    EventMark,
+    Frame,
+    NavSample,
+    PpsEdge,
+    RawBytes,
+    Record,
+    TemperatureSample,
+)
+
+
+class Tell(Protocol):
+    """Says something to whoever watches: what kind of event it is, and its content."""
+
+    def __call__(self, event: str, **content: Any) -> None: ...
+
+
+class Hearing:
+    """Takes in what `daemon.capture` passes on.
+
+    `active` are the devices that deliver; `orders` the exposures whose pulse has no answer yet.
+
+    Args:
+        flight: what the records are matched in.
+        log: puts a record into the flight log.
+        tell: told of what is worth knowing.
+    """
+
+    def __init__(
+        self, flight: Flight, log: Callable[[Record | LoggedTrigger], None], tell: Tell
+    ) -> None:
+        self._flight = flight
+        self._log = log
+        self._tell = tell
+        self.active: set[str] = set()
+        self.has_trigger = False
+        self.orders: dict[int, Order] = {}
+
+    def hear(self, message: object) -> bool:
+        """Take in a message; False where it is not from a device."""
+        handler = _HANDLERS.get(type(message))
+        if handler is None:
+            return False
+        handler(self, message)
+        return True
+
+    def _on_frame(self, frame: Frame) -> None:
+        cause = self._flight.frame(frame)
+        if cause is not Cause.USED:
+            self._tell("frame", head=frame.head, cause=cause.value)
+        self._log(frame)
+
+    def _on_mark(self, mark: EventMark) -> None:
+        cause = self._flight.mark(mark)
+        if cause not in (Cause.USED, Cause.PENDING):
+            self._tell("mark", count=mark.count, cause=cause.value)
+        self._log(mark)
+
+    def _on_navigation(self, sample: NavSample) -> None:
+        self._flight.navigation(sample)
+        self._log(sample)
+
+    def _on_pps(self, edge: PpsEdge) -> None:
+        self._flight.pps(edge)
+        self._log(edge)
+
+    def _on_clock_reading(self, reading: ClockReading) -> None:
+        self._flight.clock_reading(reading)
+        self._log(reading)
+
+    def _on_temperature(self, sample: TemperatureSample) -> None:
+        self._flight.temperature(sample)
+        self._log(sample)
+
+    def _on_raw(self, raw: RawBytes) -> None:
+        self._log(raw)
+
+    def _on_device_event(self, event: DeviceEvent) -> None:
+        self._log(event)
+        self._tell(
+            "device",
+            device=event.device,
+            name=event.name,
+            fault=event.is_fault,
+            sentence=event.sentence,
+        )
+        if event.name in _DELIVERS:
+            self.active.add(event.device)
+            self._flight.absent_heads.discard(event.device)
+        elif event.is_fault:
+            self.active.discard(event.device)
+            if event.name == _LOST:
+                self._flight.absent_heads.add(event.device)
+
+    def _on_bound(self, bound: Bound) -> None:
+        self._tell("bound", kind=bound.kind, device=bound.name, found=dict(bound.found))
+        if bound.kind == "trigger":
+            self.has_trigger = True
+
+    def _on_not_bound(self, unbound: NotBound) -> None:
+        sentence = unbound.sentence
+        if unbound.kind == "head":
+            self._flight.absent_heads.add(unbound.name)
+        self._tell("device", device=unbound.name, name="absent", fault=True, sentence=sentence)
+
+    def _on_fired(self, fired: Fired) -> None:
+        order = self.orders.pop(fired.sequence)
+        if fired.pulse is None:
+            self._flight.not_fired(fired.sequence, fired.sentence)
+            self._tell("lost", number=fired.sequence, cause=fired.sentence)
+            return
+        pulse = Pulse(
+            number=fired.sequence,
+            mono_ns=fired.pulse.mono_ns,
+            sigma_ns=fired.pulse.sigma_ns,
+            count=fired.pulse.count,
+            delays_ns=order.delays_ns,
+            strobe_delay_ns=order.strobe_delay_ns,
+            spread_ns=fired.pulse.spread_ns,
+        )
+        self._flight.fired(pulse)
+        self._log(
+            LoggedTrigger(fired.sequence, fired.pulse, order.delays_ns, order.strobe_delay_ns)
+        )
+
+
+_DELIVERS = frozenset({"opened", "recovered"})
+_LOST = "lost"
+_HANDLERS: Mapping[type, Callable[[Hearing, Any], None]] = {
+    Frame: Hearing._on_frame,
+    EventMark: Hearing._on_mark,
+    NavSample: Hearing._on_navigation,
+    TemperatureSample: Hearing._on_temperature,
+    PpsEdge: Hearing._on_pps,
+    ClockReading: Hearing._on_clock_reading,
+    RawBytes: Hearing._on_raw,
+    DeviceEvent: Hearing._on_device_event,
+    Bound: Hearing._on_bound,
+    NotBound: Hearing._on_not_bound,
+    Fired: Hearing._on_fired,
+}
