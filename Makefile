@@ -27,11 +27,11 @@ test: setup
 	$(BIN)/python -m pytest -n 2 --dist loadfile --ignore=tests/system
 	$(BIN)/python -m pytest tests/system
 
-# The V4L2 heads against the real kernel, in a virtual machine; REQUIRED=--required where skipping is no
+# V4L2 heads and pulses per second against the real kernel, in a virtual machine; REQUIRED=--required where skipping is no
 # answer.
 test-v4l2: setup
 	sh bootstrap.sh --machine
-	$(BIN)/python -m tests.v4l2.machine $(REQUIRED)
+	$(BIN)/python -m tests.kernel.machine $(REQUIRED)
 
 check: setup
 	$(BIN)/ruff check .

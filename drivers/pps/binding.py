@@ -52,6 +52,7 @@ class KernelPps:
     """An open /dev/pps device. OSError as the kernel says it."""
 
     def __init__(self, path: str) -> None:
+        self._path = path
         self._fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
 
     def capabilities(self) -> int:
@@ -79,6 +80,13 @@ class KernelPps:
         except (TimeoutError, InterruptedError):
             return None
         return edges_of(bytes(data))
+
+    def is_there(self) -> bool:
+        """Whether the path still leads to this device; waiting for an edge does not tell."""
+        try:
+            return os.path.samestat(os.stat(self._path), os.fstat(self._fd))  # noqa: PTH116
+        except FileNotFoundError:
+            return False
 
     def close(self) -> None:
         fd, self._fd = self._fd, -1

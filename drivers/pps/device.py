@@ -5,6 +5,8 @@ Which second an edge begins is not known here, and GPS time is not either.
 
 from __future__ import annotations
 
+import errno
+import os
 import threading
 import time
 from collections import Counter
@@ -38,6 +40,8 @@ class Source(Protocol):
     def set_mode(self, mode: int) -> None: ...
 
     def fetch(self, timeout_s: float) -> Edges | None: ...
+
+    def is_there(self) -> bool: ...
 
     def close(self) -> None: ...
 
@@ -234,6 +238,8 @@ class PpsDevice(Configured):
                     "the PPS cable and the receiver's fix. The clock coasts.",
                     fault=True,
                 )
+            if is_silent and not source.is_there():
+                raise OSError(errno.ENODEV, os.strerror(errno.ENODEV))
 
     def _of(self, edges: Edges) -> tuple[int, int]:
         if self.edge == "assert":

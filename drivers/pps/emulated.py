@@ -56,5 +56,9 @@ class EmulatedPps:
             self._received = (self._received + piece)[-4096:]
         return None
 
+    def is_there(self) -> bool:
+        """Yes: `fetch` raises where the source hung up."""
+        return True
+
     def close(self) -> None:
         self._socket.close()

@@ -92,6 +92,9 @@ class Scripted:
             raise said
         return said
 
+    def is_there(self) -> bool:
+        return True
+
     def close(self) -> None:
         self.is_closed = True
 

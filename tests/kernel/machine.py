@@ -1,7 +1,8 @@
-"""`python -m tests.v4l2.machine`: the tests of this folder inside a virtual machine.
+"""`python -m tests.kernel.machine`: the tests of this folder inside a virtual machine.
 
-The machine runs Debian's own kernel, whose vivid driver emulates capture devices and their faults;
-build machines seldom have one of these. Its root file system is this host's, read-only.
+The machine runs Debian's own kernel, whose vivid driver emulates capture devices and their faults,
+and has a parallel port, which takes pulses per second; build machines seldom have these. Its root
+file system is this host's, read-only.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ PROGRAMS: Final = {
 """What is needed, and the Debian package that has it."""
 METAPACKAGE: Final = "linux-image-amd64"
 BOOT_MODULES: Final = ("virtio_pci", "9pnet_virtio", "9p")
-TESTED_MODULES: Final = ("vivid",)
+TESTED_MODULES: Final = ("vivid", "parport_pc", "pps_parport")
+"""The tests load and unload them as they need it."""
 MEMORY_MIB: Final = 1536
 LIMIT_S: Final = 600
 DOWNLOAD_LIMIT_S: Final = 900
@@ -54,7 +56,7 @@ class CannotRunError(Exception):
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m tests.v4l2.machine", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tests.kernel.machine", description=__doc__)
     parser.add_argument("--required", action="store_true", help="fail where it cannot run")
     parser.add_argument(
         "--kvm",
@@ -67,12 +69,12 @@ def main() -> None:
     try:
         image = prepare()
     except CannotRunError as error:
-        print(f"SKIPPED: the V4L2 tests need a virtual machine: {error}")
+        print(f"SKIPPED: the tests against the kernel need a virtual machine: {error}")
         sys.exit(1 if options.required else 0)
     # No plugins but the one that is needed: every file is read by an emulated processor.
     python = [str(REPOSITORY / ".venv/bin/python"), "-m", "pytest", "-p", "pytest_timeout"]
     python += ["-p", "no:cacheprovider", "--color=no"]
-    chosen = options.pytest or ["-v", "--durations=5", "tests/v4l2"]
+    chosen = options.pytest or ["-v", "--durations=5", "tests/kernel"]
     command = options.command or shlex.join([*python, *chosen])
     started = time.monotonic()
     status = run(image, command, with_kvm=options.kvm)
@@ -86,7 +88,7 @@ def run(image: Path, command: str, *, with_kvm: bool = False) -> int:
     `NO_STATUS` where the machine ended, or had to be ended, without telling one.
     """
     has_kvm = with_kvm and os.access("/dev/kvm", os.R_OK | os.W_OK)
-    with tempfile.TemporaryDirectory(prefix="v4l2-machine-") as name:
+    with tempfile.TemporaryDirectory(prefix="kernel-machine-") as name:
         out = Path(name)
         (out / "command.sh").write_text(_script(command), encoding="utf-8")
         qemu = [
@@ -98,6 +100,7 @@ def run(image: Path, command: str, *, with_kvm: bool = False) -> int:
             *("-append", KERNEL_WORDS),
             *("-virtfs", _share("/", "host") + ",readonly=on,multidevs=remap"),
             *("-virtfs", _share(name, "out")),
+            *("-chardev", "null,id=nobody", "-device", "isa-parallel,chardev=nobody"),
         ]
         try:
             subprocess.run(qemu, stdin=subprocess.DEVNULL, timeout=LIMIT_S, check=False)
@@ -115,12 +118,12 @@ def _share(path: str, tag: str) -> str:
 
 def _script(command: str) -> str:
     words = {
-        "HOME": "/dev/v4l2-guest/tmp",
-        "TMPDIR": "/dev/v4l2-guest/tmp",
+        "HOME": "/dev/kernel-guest/tmp",
+        "TMPDIR": "/dev/kernel-guest/tmp",
         "PATH": "/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin",
         "PYTHONDONTWRITEBYTECODE": "1",
         "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",
-        "V4L2_GUEST": "/dev/v4l2-guest",
+        "KERNEL_GUEST": "/dev/kernel-guest",
         "COLUMNS": "100",
     }
     exports = "".join(f"export {name}={value}\n" for name, value in words.items())
@@ -148,7 +151,7 @@ def prepare() -> Path:
     kernel = _kernel_package()
     said = hashlib.sha256(Path(__file__).read_bytes() + (HERE / "guest.sh").read_bytes())
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    image = cache / "syntopic" / "v4l2-machine" / f"{kernel}-{said.hexdigest()[:12]}"
+    image = cache / "syntopic" / "kernel-machine" / f"{kernel}-{said.hexdigest()[:12]}"
     if (image / "initrd.cpio").exists():
         return image
     image.parent.mkdir(parents=True, exist_ok=True)
@@ -234,7 +237,6 @@ def _build(place: Path, kernel: str) -> None:
         return list(found)
 
     boot, tested = needed(BOOT_MODULES), needed(TESTED_MODULES)
-    # All but vivid itself, which the tests load and unload as they need it.
     load = dict.fromkeys(_plain_name(m) for m in (*boot, *tested))
     for name in TESTED_MODULES:
         del load[f"{name}.ko"]

@@ -8,7 +8,7 @@ import pytest
 
 from drivers.contract import DeviceError
 from drivers.v4l2.discovery import capture_nodes
-from tests.v4l2 import vivid
+from tests.kernel import vivid
 
 SIZE = {"width_px": 640, "height_px": 360, "pixel_format": "SRGGB12"}
 END_OF_FRAME, START_OF_EXPOSURE = 0, 1

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from drivers.contract import DeviceError, FrameStatus
-from tests.v4l2 import vivid
+from tests.kernel import vivid
 
 SIZE = {"width_px": 320, "height_px": 180, "pixel_format": "Y12", "frame_interval_s": 0.02}
 """The smallest picture at its fastest: the processor is emulated."""

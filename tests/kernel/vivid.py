@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from drivers.contract import DeviceEvent, Frame, LifeCycle, Record
 from drivers.v4l2.head import V4l2Head
 
-GUEST = Path(os.environ.get("V4L2_GUEST", "/dev/v4l2-guest"))
+GUEST = Path(os.environ.get("KERNEL_GUEST", "/dev/kernel-guest"))
 PATIENCE_S = 60.0
 UNTOUCHED = 0xA5A5
 

@@ -10,7 +10,7 @@ import pytest
 
 from drivers.contract import FrameStatus
 from drivers.v4l2.formats import FORMATS
-from tests.v4l2 import vivid
+from tests.kernel import vivid
 
 SHAPE = (720, 1280)
 SENT = 8
