@@ -18,7 +18,7 @@ from typing import Any
 from daemon.errors import DaemonError
 from daemon.exposure import Capture, Exposure, FrameRecord
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 BUSY_TIMEOUT_S = 10.0
 """How long a writer waits while another process commits."""
 
@@ -39,6 +39,7 @@ CREATE TABLE exposures (
     longitude_deg REAL,
     height_m REAL,
     line_id TEXT NOT NULL,
+    strip_id TEXT NOT NULL,
     flags INTEGER NOT NULL,
     is_simulated INTEGER NOT NULL,
     record_sha256 TEXT,
@@ -284,7 +285,8 @@ class Catalog:
     def _insert(self, record: Capture | Exposure, state: str) -> None:
         self._connection.execute(
             "INSERT INTO exposures (number, state, is_sealed, trigger_sequence, trigger_mono_ns,"
-            " boot_id, line_id, flags, is_simulated) VALUES (?, ?, 0, ?, ?, ?, ?, ?, ?)"
+            " boot_id, line_id, strip_id, flags, is_simulated)"
+            " VALUES (?, ?, 0, ?, ?, ?, ?, ?, ?, ?)"
             " ON CONFLICT (number) DO UPDATE SET state = excluded.state, flags = excluded.flags",
             (
                 record.number,
@@ -293,6 +295,7 @@ class Catalog:
                 record.trigger_mono_ns,
                 record.boot_id,
                 record.line_id,
+                record.strip_id,
                 int(record.flags),
                 int(record.simulated),
             ),
@@ -369,4 +372,4 @@ def _damaged(path: Path, finding: object) -> str:
 
 
 def _wrong_version(path: Path, version: int) -> str:
-    return f"{path}: schema {version}; this version reads {SCHEMA_VERSION}"
+    return f"{path}: schema {version}; this version reads {SCHEMA_VERSION} (syntopic repair)"

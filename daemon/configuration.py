@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from daemon.plan.reading import PlanError, read_plan
 from drivers import registry
 from processing.rig import Rig, RigError, find_rig
 
@@ -42,9 +43,15 @@ class MissionSection(_Section):
 
 
 class PlanSection(_Section):
-    """What the flight was planned to be; navigation replaces it as soon as it speaks."""
+    """What the flight was planned to be; navigation replaces it as soon as it speaks.
+
+    `file` holds the lines (docs/plan.md); beside them by more than `corridor_m`, a quarter of the
+    image where it is not given, none is flown. `line` names the line where there is no file.
+    """
 
     line: str = ""
+    file: Path | None = None
+    corridor_m: float | None = Field(default=None, gt=0)
     ground_height_m: float = 0.0
     height_above_ground_m: float = Field(default=1000.0, gt=0)
     ground_speed_mps: float = Field(default=60.0, gt=0)
@@ -55,10 +62,12 @@ class MountSection(_Section):
 
     `antenna_m` is the point whose position the receiver tells, in the body frame of the rig;
     `boresight_deg` (roll, pitch, heading) turns the rig's body axes into the inertial unit's.
+    `time_offset_ms` is added to the instants of exposures before the trajectory is asked.
     """
 
     antenna_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     boresight_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    time_offset_ms: float = 0.0
 
 
 class TriggerSection(BaseModel):
@@ -67,7 +76,7 @@ class TriggerSection(BaseModel):
     model_config = ConfigDict(extra="allow", frozen=True)
 
     driver: str
-    mode: Literal["interval", "distance"] = "interval"
+    mode: Literal["interval", "distance", "plan"] = "interval"
     interval_s: float = Field(default=2.0, gt=0)
     distance_m: float | None = Field(default=None, gt=0)
     count: int | None = Field(default=None, gt=0)
@@ -211,6 +220,12 @@ class Configuration(_Section):
     limits: LimitsSection = LimitsSection()
     watch: WatchSection | None = None
 
+    @model_validator(mode="after")
+    def _has_a_plan_to_follow(self) -> Configuration:
+        if self.trigger.mode == "plan" and self.plan.file is None:
+            raise ValueError("trigger.mode is 'plan' and there is no plan.file; give the plan")
+        return self
+
 
 def load(path: Path) -> tuple[Configuration, Rig]:
     """Read a service configuration and the rig it names.
@@ -252,6 +267,12 @@ def from_mapping(content: Mapping[str, Any], path: Path) -> tuple[Configuration,
         problems += [_sentence(file, detail) for detail in error.errors()]
     if rig is not None:
         problems += _rig_problems(content, rig, file)
+    plan_file = _dig(content, "plan", "file")
+    if isinstance(plan_file, str):
+        try:
+            read_plan(path.parent / plan_file)
+        except PlanError as error:
+            problems.append(f"{file}: plan.file: {error}")
     if problems or configuration is None or rig is None:
         raise ConfigurationError(problems)
     return _anchored(configuration, path.parent.resolve()), rig
@@ -272,6 +293,9 @@ def _anchored(configuration: Configuration, folder: Path) -> Configuration:
             "rig": _rig_path(mission.rig, folder / "service.toml"),
         }
     )
+    plan = configuration.plan
+    if plan.file is not None:
+        plan = plan.model_copy(update={"file": folder / plan.file})
     watch = configuration.watch
     if watch is not None:
         files = {name: getattr(watch, name) for name in ("tokens", "certificate", "key")}
@@ -282,7 +306,7 @@ def _anchored(configuration: Configuration, folder: Path) -> Configuration:
             key = {"signing_key": folder / watch.mavlink.signing_key}
             update["mavlink"] = watch.mavlink.model_copy(update=key)
         watch = watch.model_copy(update=update)
-    return configuration.model_copy(update={"mission": anchored, "watch": watch})
+    return configuration.model_copy(update={"mission": anchored, "plan": plan, "watch": watch})
 
 
 def _dig(content: Mapping[str, Any], *keys: str) -> Any:

@@ -42,11 +42,13 @@ def open_mission(configuration: Configuration, rig: Rig, config_path: Path) -> t
     if current is not None:
         return current, True
     rig_path = shipped_rigs().get(configuration.mission.rig, Path(configuration.mission.rig))
+    plan_file = configuration.plan.file
     created = Mission.create(
         root,
         rig.name,
         rig_toml=rig_path.read_bytes(),
         service_toml=config_path.read_bytes(),
+        plan=None if plan_file is None else (plan_file.suffix.lower(), plan_file.read_bytes()),
         started_utc=datetime.now(UTC),
     )
     return created, False

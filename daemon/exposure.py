@@ -105,6 +105,7 @@ class Capture:
     frames: tuple[FrameRecord, ...] = ()
     missing: Missing = ()
     line_id: str = ""
+    strip_id: str = ""
     calibration_id: str = ""
     calibration_sha256: str = ""
     configuration_sha256: str = ""
@@ -138,6 +139,7 @@ class Exposure:
     temperatures: tuple[TemperatureRecord, ...] = ()
     navigation: NavigationRecord | None = None
     line_id: str = ""
+    strip_id: str = ""
     calibration_id: str = ""
     calibration_sha256: str = ""
     configuration_sha256: str = ""
@@ -289,6 +291,7 @@ def _shared_json(record: Exposure | Capture, kind: str) -> dict[str, Any]:
         "frames": [frame_to_json(frame) for frame in record.frames],
         "missing": [{"sensor": sensor, "cause": cause} for sensor, cause in record.missing],
         "line_id": record.line_id,
+        "strip_id": record.strip_id,
         "calibration_id": record.calibration_id,
         "calibration_sha256": record.calibration_sha256,
         "configuration_sha256": record.configuration_sha256,
@@ -314,6 +317,7 @@ def _shared_from(fields: Fields, kind: str) -> dict[str, Any]:
         "frames": frames,
         "missing": tuple(_missing(item) for item in fields.objects("missing")),
         "line_id": fields.text("line_id", ""),
+        "strip_id": fields.text("strip_id", ""),
         "calibration_id": fields.text("calibration_id", ""),
         "calibration_sha256": fields.sha256("calibration_sha256"),
         "configuration_sha256": fields.sha256("configuration_sha256"),

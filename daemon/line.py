@@ -13,10 +13,18 @@ from pathlib import Path
 from daemon.configuration import Configuration
 from daemon.devices import exposure_times_ns, frame_nbytes
 from daemon.flight import Flight
-from daemon.triggering import DistanceTrigger, IntervalTrigger, pulse_delays_ns
+from daemon.mission import Mission
+from daemon.plan.image_size import image_on_ground_m
+from daemon.plan.reading import read_plan
+from daemon.plan.steering import PlanTrigger
+from daemon.triggering import DistanceTrigger, IntervalTrigger, Policy, pulse_delays_ns
+from drivers.contract import NavSample
 from processing.rig import Rig
 
 NS = 1_000_000_000
+CORRIDOR_SHARE = 0.25
+"""How far beside a planned line it is still flown, as a share of the image's width."""
+
 LOOK_AHEAD_S = 0.05
 """How often a due time is predicted anew; the last bit is slept through exactly."""
 DISK_RETRY_S = 1.0
@@ -47,7 +55,10 @@ class Line:
         self._ordered = flown
         self._last_ns: int | None = None
         self._exposure_ns = exposure_times_ns(configuration, rig)
+        self._steering = _steering(configuration, rig, mission)
         self._policy = _policy(configuration, rig)
+        if configuration.trigger.mode == "plan" and self._steering is not None:
+            self._policy = self._steering
         self.runs = configuration.trigger.start == "at once"
         self._asked_for = 0
         self._runs_until: int | None = None
@@ -130,13 +141,22 @@ class Line:
         delays_ns = pulse_delays_ns(self._rig, speed_mps, self._exposure_ns)
         reference = self._rig.reference_cone
         strobe_ns = delays_ns[reference] + self._exposure_ns[reference] // 2
-        number = self._flight.order(now_ns)
+        number = self._order_on_line(now_ns, nav)
         self._ordered += 1
         if self._runs_until is not None and self._ordered >= self._runs_until:
             self.runs, self._runs_until = False, None
         self._last_ns = now_ns
         self._policy.fired(now_ns, nav)
         return Order(number, now_ns, delays_ns, strobe_ns)
+
+    def _order_on_line(self, now_ns: int, nav: NavSample | None) -> int:
+        """Open the exposure under the ids of the planned line it belongs to."""
+        if self._steering is None:
+            return self._flight.order(now_ns)
+        line = self._steering.line_of(now_ns, nav)
+        if line is None:
+            return self._flight.order(now_ns, "")
+        return self._flight.order(now_ns, line.id, line.strip or line.id)
 
 
 def exposures_left(configuration: Configuration, rig: Rig, mission: Path) -> int:
@@ -146,7 +166,23 @@ def exposures_left(configuration: Configuration, rig: Rig, mission: Path) -> int
     return max(0, free_nbytes // ((1 + LEVEL2_SHARE) * exposure_nbytes))
 
 
-def _policy(configuration: Configuration, rig: Rig) -> IntervalTrigger | DistanceTrigger:
+def _steering(configuration: Configuration, rig: Rig, mission: Path) -> PlanTrigger | None:
+    """The plan of the mission, where it has one."""
+    path = Mission(mission, mission.name).plan_path
+    if path is None:
+        return None
+    plan, section = read_plan(path), configuration.plan
+    along_m, across_m = image_on_ground_m(rig, section.height_above_ground_m)
+    by_overlap_m = along_m * (1.0 - plan.specification.forward_overlap)
+    return PlanTrigger(
+        plan,
+        distance_m=configuration.trigger.distance_m or by_overlap_m,
+        corridor_m=section.corridor_m or CORRIDOR_SHARE * across_m,
+        least_interval_ns=round(rig.frame_interval_s * NS),
+    )
+
+
+def _policy(configuration: Configuration, rig: Rig) -> Policy:
     trigger = configuration.trigger
     least_ns = round(rig.frame_interval_s * NS)
     if trigger.mode == "distance" and trigger.distance_m is not None:

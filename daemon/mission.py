@@ -47,13 +47,14 @@ class Mission:
         *,
         rig_toml: bytes,
         service_toml: bytes,
+        plan: tuple[str, bytes] | None = None,
         started_utc: datetime,
         started_gps_ns: int | None = None,
     ) -> Mission:
         """Create a mission and make it the one a restarted service continues.
 
         The folder appears whole or not at all. A second mission within the same second gets
-        `-2` behind its id.
+        `-2` behind its id. `plan` is how the name of the flight plan ends, and its content.
 
         Raises:
             MissionError: a rig name that is no file name, a time without a zone, or another
@@ -85,6 +86,8 @@ class Mission:
         durable.create_file(part / "mission.json", [canonical_bytes(content)])
         durable.create_file(part / "rig.toml", [rig_toml])
         durable.create_file(part / "service.toml", [service_toml], mode=0o440)
+        if plan is not None:
+            durable.create_file(part / f"plan{plan[0]}", [plan[1]])
         durable.rename_directory(part, root / mission_id)
         durable.replace_file(root / CURRENT_FILE, canonical_bytes({"mission": mission_id}))
         return cls(root / mission_id, mission_id)
@@ -133,6 +136,11 @@ class Mission:
     @property
     def level2_root(self) -> Path:
         return self.path / "L2"
+
+    @property
+    def plan_path(self) -> Path | None:
+        """The flight plan that was flown after, where there was one."""
+        return next(iter(sorted(self.path.glob("plan.*"))), None)
 
     @property
     def log_dir(self) -> Path:

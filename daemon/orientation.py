@@ -11,6 +11,7 @@ import statistics
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -50,6 +51,7 @@ class ExteriorOrientation:
     is_virtual: bool
     gps_ns: int
     line_id: str
+    strip_id: str
     latitude_deg: float
     longitude_deg: float
     height_m: float
@@ -100,6 +102,20 @@ def mount_of(mission: Mission) -> tuple[MountSection, PlanSection]:
         raise ConfigurationError([f"{mission.service_path}: {error}"]) from error
 
 
+def read_mount(path: Path) -> MountSection:
+    """The `[mount]` of a TOML file, such as `syntopic calibrate boresight` writes.
+
+    Raises:
+        ConfigurationError: no such file, or no such section in it.
+    """
+    try:
+        return MountSection.model_validate(tomllib.loads(path.read_text(encoding="utf-8"))["mount"])
+    except KeyError as error:
+        raise ConfigurationError([f"{path}: no [mount] in it"]) from error
+    except (OSError, ValueError) as error:
+        raise ConfigurationError([f"{path}: {error}"]) from error
+
+
 def exposures_of(mission: Mission) -> Iterator[Exposure]:
     """The sealed records of a mission, by number."""
     for number in mission.numbers():
@@ -127,7 +143,7 @@ def orient(
         if gps_ns is None:
             yield Unoriented(exposure.number, cone.name, "no instant")
             continue
-        there = trajectory.at(gps_ns)
+        there = trajectory.at(gps_ns + round(mount.time_offset_ms * 1e6))
         if there is None:
             yield Unoriented(exposure.number, cone.name, "no navigation")
             continue
@@ -164,6 +180,7 @@ def _oriented(
         is_virtual=is_master and rig.virtual_image is not None,
         gps_ns=there.gps_ns,
         line_id=exposure.line_id,
+        strip_id=exposure.strip_id,
         latitude_deg=latitude,
         longitude_deg=longitude,
         height_m=height,

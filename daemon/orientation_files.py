@@ -23,7 +23,8 @@ PATB_CONE_STEP = 100
 """A PAT-B photo number is that of the exposure times this, plus the cone's place in the rig."""
 
 CSV_COLUMNS = (
-    *("image", "exposure", "cone", "line", "gps_ns", "east_m", "north_m", "height_m"),
+    *("image", "exposure", "cone", "line", "strip", "gps_ns"),
+    *("east_m", "north_m", "height_m"),
     *("omega_deg", "phi_deg", "kappa_deg", "latitude_deg", "longitude_deg"),
     *("ellipsoidal_height_m", "grid_scale", "method", "horizontal_sigma_m", "vertical_sigma_m"),
 )
@@ -72,7 +73,7 @@ def csv_text(about: About, oriented: Sequence[ExteriorOrientation]) -> str:
         omega, phi, kappa = eo.omega_phi_kappa_deg
         writer.writerow(
             [
-                *(eo.name, eo.exposure, eo.cone, eo.line_id, eo.gps_ns),
+                *(eo.name, eo.exposure, eo.cone, eo.line_id, eo.strip_id, eo.gps_ns),
                 *(f"{value:.4f}" for value in eo.centre_m),
                 *(f"{angle:.7f}" for angle in (omega, phi, kappa)),
                 *(f"{eo.latitude_deg:.10f}", f"{eo.longitude_deg:.10f}", f"{eo.height_m:.4f}"),

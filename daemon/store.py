@@ -252,6 +252,7 @@ def _capture_of(exposure: Exposure) -> Capture:
         boot_id=exposure.boot_id,
         missing=exposure.missing,
         line_id=exposure.line_id,
+        strip_id=exposure.strip_id,
         calibration_id=exposure.calibration_id,
         calibration_sha256=exposure.calibration_sha256,
         configuration_sha256=exposure.configuration_sha256,

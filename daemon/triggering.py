@@ -7,12 +7,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Protocol
 
 from drivers.contract import NavSample
 from processing.rig import Rig
 
 NANOSECONDS = 1_000_000_000
 EARTH_RADIUS_M = 6_371_000.0
+
+
+class Policy(Protocol):
+    """When to expose; also `daemon.plan.steering.PlanTrigger`."""
+
+    def due(self, now_ns: int, last_fired_ns: int | None, nav: NavSample | None) -> int | None: ...
+    def fired(self, mono_ns: int, nav: NavSample | None) -> None: ...
 
 
 class IntervalTrigger:

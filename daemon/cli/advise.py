@@ -16,27 +16,33 @@ HELP = """Which segments of the plan must be flown again, from verdicts, overlap
 The plan is GeoJSON, KML or QGroundControl's .plan. The mission may still be flying. Written are a
 GeoJSON, a KML and a MAVLink mission of the segments. The exit status is 1 while there are any.
 
-Example: `syntopic advise MISSION --plan block.geojson`
+Examples: `syntopic advise MISSION`, `syntopic advise MISSION --plan block.geojson`
 """
 
 
 def advise(
     mission: Annotated[Path, typer.Argument(help="Mission folder.")],
-    plan: Annotated[Path, typer.Option(help="The plan.")],
+    plan: Annotated[
+        Path | None, typer.Option(help="The plan; that of the mission, where it has one.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     from daemon.mission import Mission
     from daemon.orientation import mount_of
     from daemon.plan import advisor, flown, writing
-    from daemon.plan.reading import read_plan
+    from daemon.plan.image_size import image_on_ground_m
+    from daemon.plan.reading import PlanError, read_plan
     from daemon.products import write_folder
     from processing.rig import load_rig
 
     folder = Mission.open(mission)
-    read = read_plan(plan)
+    path = plan or folder.plan_path
+    if path is None:
+        raise PlanError(f"{folder.path}: was flown without a plan; give --plan FILE")
+    read = read_plan(path)
     _, section = mount_of(folder)
     rig = load_rig(folder.rig_path)
-    along_m, across_m = flown.image_on_ground_m(rig, section.height_above_ground_m)
+    along_m, across_m = image_on_ground_m(rig, section.height_above_ground_m)
     taken = flown.taken_of(folder, read.specification)
     advice = advisor.advise(read, taken, image_along_m=along_m, image_across_m=across_m)
     base_m = along_m * (1.0 - read.specification.forward_overlap)

@@ -13,7 +13,7 @@ from daemon.mission import Mission
 from daemon.orientation import exposures_of, mount_of
 from daemon.plan.advisor import Taken
 from daemon.plan.model import Point, Specification
-from processing.rig import Rig, load_rig
+from processing.rig import load_rig
 
 
 def taken_of(mission: Mission, specification: Specification) -> list[Taken]:
@@ -35,20 +35,6 @@ def taken_of(mission: Mission, specification: Specification) -> list[Taken]:
         places = tuple(Point(latitude, longitude) for longitude, latitude in corners)
         found.append(Taken(exposure.number, places, why))
     return found
-
-
-def image_on_ground_m(rig: Rig, height_above_ground_m: float) -> tuple[float, float]:
-    """Along and across flight, of level ground, as planned: (along, across) metres."""
-    virtual = rig.virtual_image
-    if virtual is not None:
-        scale = height_above_ground_m / virtual.f_mm
-        return (
-            virtual.height_px * virtual.pitch_mm * scale,
-            virtual.width_px * virtual.pitch_mm * scale,
-        )
-    cone = rig.cone(rig.master_cone)
-    sensor, scale = cone.sensors[0], height_above_ground_m / cone.lens.f_mm
-    return sensor.height_px * sensor.pitch_mm * scale, sensor.width_px * sensor.pitch_mm * scale
 
 
 def _objections(

@@ -22,26 +22,37 @@ class Point(NamedTuple):
 
 @dataclass(frozen=True)
 class PlannedLine:
-    """A line to be flown from `start` to `end`; `strip` groups lines that continue each other."""
+    """A line to be flown from `start` to `end`; `strip` groups lines that continue each other.
+
+    Exposures are due every `distance_m` from the start on, or at the places `at_m` (metres from
+    the start, rising) where the plan names them; where it says neither, by the overlap.
+    """
 
     id: str
     start: Point
     end: Point
     strip: str = ""
+    distance_m: float | None = None
+    at_m: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
 class Specification:
     """What a project asks for.
 
-    Overlaps are shares of the image's extent along and across the line. An exposure whose verdict
-    is `refly`, or that is tilted or turned further than allowed, does not count.
+    Overlaps are shares of the image's extent along and across the line, as planned; the least that
+    is taken is `overlap_tolerance` below them. An exposure that breaks what is asked for has to be
+    flown again, and does not count for the advisor. `gsd_m` and `sun_deg` (elevation) are asked for
+    only where they are given.
     """
 
     forward_overlap: float = 0.6
     sidelap: float = 0.3
+    overlap_tolerance: float = 0.1
+    gsd_m: float | None = None
     tilt_deg: float = 5.0
     crab_deg: float = 10.0
+    sun_deg: float | None = None
     time_sigma_ns: float = 1e9
 
     @property

@@ -9,16 +9,19 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 from daemon.errors import DaemonError
-from daemon.plan.model import Plan, PlannedLine, Point, Specification
+from daemon.plan.model import Plan, Plane, PlannedLine, Point, Specification
 
 PLAN_MAX_BYTES = 20_000_000
 LINES_MAX = 20_000
-WAYPOINT, TRIGGER_DISTANCE = 16, 206
+WAYPOINT, DIGICAM_CONTROL, TRIGGER_DISTANCE, START_CAPTURE = 16, 203, 206, 2000
+BEND_RAD = math.radians(5.0)
+"""Exposures named one by one make a line as long as the way does not turn further."""
 
 
 class PlanError(DaemonError):
@@ -63,19 +66,54 @@ def _geojson(name: str, data: bytes) -> Plan:
     if content.get("type") != "FeatureCollection" or not isinstance(content.get("features"), list):
         raise PlanError(f"{name}: no FeatureCollection; a plan is one, with a LineString a line")
     lines: list[PlannedLine] = []
+    places: dict[str, list[Point]] = {}
     for index, feature in enumerate(content["features"]):
         where = f"{name}: features[{index}]"
         geometry = feature.get("geometry") if isinstance(feature, dict) else None
-        if not isinstance(geometry, dict) or geometry.get("type") != "LineString":
+        if not isinstance(geometry, dict):
             continue
         properties = feature.get("properties") or {}
         coordinates = geometry.get("coordinates")
+        if geometry.get("type") == "Point" and "line" in properties:
+            place = _point(where, coordinates, swapped=True)
+            places.setdefault(str(properties["line"]), []).append(place)
+        if geometry.get("type") != "LineString":
+            continue
         if not isinstance(coordinates, list) or len(coordinates) < 2:
             raise PlanError(f"{where}: a LineString has two places at least")
         points = [_point(where, pair, swapped=True) for pair in coordinates]
         line_id = str(properties.get("id", feature.get("id", len(lines) + 1)))
-        lines += _straight(line_id, str(properties.get("strip", "")), points)
+        distance_m = _distance(where, properties.get("distance_m"))
+        lines += _straight(line_id, str(properties.get("strip", "")), points, distance_m)
+    lines = [_exposed_at(line, places.pop(line.id, [])) for line in lines]
+    if places:
+        known = ", ".join(line.id for line in lines[:20])
+        raise PlanError(
+            f"{name}: exposures are planned on line {next(iter(places))!r}; there is {known}"
+        )
     return Plan(name, tuple(lines), _specification(name, content.get("specification")))
+
+
+def _exposed_at(line: PlannedLine, places: Sequence[Point]) -> PlannedLine:
+    """The line with exposures at places, in whatever order they are named."""
+    if not places:
+        return line
+    plane = Plane(line.start)
+    east, north = plane.flat(line.end)
+    length_m = math.hypot(east, north) or 1.0
+    at = sorted(
+        round((x * east + y * north) / length_m, 3) for x, y in (plane.flat(p) for p in places)
+    )
+    return replace(line, at_m=tuple(at))
+
+
+def _distance(where: str, value: Any) -> float | None:
+    if value is None:
+        return None
+    good = isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < 1e5
+    if not good:
+        raise PlanError(f"{where}: distance_m is {str(value)[:60]}; metres between two exposures")
+    return float(value)
 
 
 def _kml(name: str, data: bytes) -> Plan:
@@ -107,16 +145,20 @@ def _qgroundcontrol(name: str, data: bytes) -> Plan:
     mission = content.get("mission")
     if content.get("fileType") != "Plan" or not isinstance(mission, dict):
         raise PlanError(f"{name}: no QGroundControl plan (fileType, mission)")
+    items = mission.get("items") or []
     lines = [
-        PlannedLine(str(index), start, end)
-        for index, (start, end) in enumerate(_legs(name, mission.get("items") or []), start=1)
+        PlannedLine(str(index), start, end, distance_m=distance_m)
+        for index, (start, end, distance_m) in enumerate(_legs(name, items), start=1)
     ]
+    for run in _runs_of_photographs(name, items):
+        line = PlannedLine(str(len(lines) + 1), run[0], run[-1])
+        lines.append(_exposed_at(line, run))
     return Plan(name, tuple(lines))
 
 
-def _legs(name: str, items: Sequence[Any]) -> Iterator[tuple[Point, Point]]:
+def _legs(name: str, items: Sequence[Any]) -> Iterator[tuple[Point, Point, float | None]]:
     """Transects of surveys, and legs between waypoints while a trigger distance is set."""
-    triggers, before = False, None
+    distance_m, before = None, None
     for index, item in enumerate(items):
         where = f"{name}: mission.items[{index}]"
         if not isinstance(item, dict):
@@ -124,24 +166,65 @@ def _legs(name: str, items: Sequence[Any]) -> Iterator[tuple[Point, Point]]:
         transects = item.get("TransectStyleComplexItem")
         if isinstance(transects, dict):
             points = [_point(where, p) for p in transects.get("VisualTransectPoints") or []]
-            yield from zip(points[0::2], points[1::2], strict=False)
+            camera = transects.get("CameraCalc")
+            way = camera.get("AdjustedFootprintFrontal") if isinstance(camera, dict) else None
+            apart_m = _distance(where, way)
+            for start, end in zip(points[0::2], points[1::2], strict=False):
+                yield start, end, apart_m
             continue
-        parameters = item.get("params") or []
+        parameters = _parameters(item)
         if item.get("command") == TRIGGER_DISTANCE and parameters:
-            triggers = isinstance(parameters[0], int | float) and parameters[0] > 0
+            way = parameters[0]
+            is_on = isinstance(way, int | float) and not isinstance(way, bool) and way > 0
+            distance_m = _distance(where, way) if is_on else None
         elif item.get("command") == WAYPOINT and len(parameters) >= 6:
             here = _point(where, parameters[4:6])
-            if triggers and before is not None:
-                yield before, here
+            if distance_m is not None and before is not None:
+                yield before, here, distance_m
             before = here
 
 
-def _straight(line_id: str, strip: str, points: Sequence[Point]) -> list[PlannedLine]:
+def _runs_of_photographs(name: str, items: Sequence[Any]) -> Iterator[list[Point]]:
+    """Waypoints at which one photograph each is taken, as long as they lie in a row."""
+    run: list[Point] = []
+    here: Point | None = None
+    for index, item in enumerate(items):
+        parameters = _parameters(item)
+        if item.get("command") == WAYPOINT and len(parameters) >= 6:
+            here = _point(f"{name}: mission.items[{index}]", parameters[4:6])
+            continue
+        once = item.get("command") == START_CAPTURE and parameters[2:3] == [1]
+        if here is None or not (once or item.get("command") == DIGICAM_CONTROL):
+            continue
+        if len(run) >= 2 and _turns(run[-2], run[-1], here):
+            yield run
+            run = []
+        run.append(here)
+        here = None
+    if len(run) >= 2:
+        yield run
+
+
+def _parameters(item: Mapping[str, Any]) -> list[Any]:
+    parameters = item.get("params")
+    return parameters if isinstance(parameters, list) else []
+
+
+def _turns(first: Point, second: Point, third: Point) -> bool:
+    plane = Plane(second)
+    (x0, y0), (x1, y1) = plane.flat(first), plane.flat(third)
+    turn = math.atan2(y1, x1) - math.atan2(-y0, -x0)
+    return abs(math.remainder(turn, 2 * math.pi)) > BEND_RAD
+
+
+def _straight(
+    line_id: str, strip: str, points: Sequence[Point], distance_m: float | None = None
+) -> list[PlannedLine]:
     """A line for each straight piece; the pieces of a bent one are a, b, c of its strip."""
     if len(points) == 2:
-        return [PlannedLine(line_id, points[0], points[1], strip)]
+        return [PlannedLine(line_id, points[0], points[1], strip, distance_m)]
     return [
-        PlannedLine(f"{line_id}.{i + 1}", points[i], points[i + 1], strip or line_id)
+        PlannedLine(f"{line_id}.{i + 1}", points[i], points[i + 1], strip or line_id, distance_m)
         for i in range(len(points) - 1)
     ]
 
@@ -166,8 +249,11 @@ def _specification(name: str, content: Any) -> Specification:
     limits = {
         "forward_overlap": (0.0, 0.95),
         "sidelap": (0.0, 0.95),
+        "overlap_tolerance": (0.0, 0.95),
+        "gsd_m": (1e-4, 100.0),
         "tilt_deg": (0.0, 90.0),
         "crab_deg": (0.0, 180.0),
+        "sun_deg": (-90.0, 90.0),
         "time_sigma_ns": (0.0, 1e12),
     }
     for key, value in content.items():

@@ -104,3 +104,15 @@ def test_tdi_on_a_bayer_head_is_refused_with_its_cure() -> None:
     (sentence,) = problems_of(content)
     assert sentence.startswith("service.toml: head[0].tdi_shifts is 12; RGB is a Bayer head (RGGB)")
     assert sentence.endswith("set 0 and expose shorter")
+
+
+def test_a_plan_to_follow_has_to_be_there_and_readable(tmp_path: Path) -> None:
+    content = copy.deepcopy(GOOD)
+    content["trigger"] |= {"mode": "plan"}
+    assert any("there is no plan.file" in problem for problem in problems_of(content))
+    content["plan"] = {"file": "block.kml"}
+    for text, why in ((None, "cannot be read"), ("<kml/>", "holds no line")):
+        if text is not None:
+            (tmp_path / "block.kml").write_text(text)
+        with pytest.raises(ConfigurationError, match=rf"plan\.file: .*block\.kml: {why}"):
+            from_mapping(content, tmp_path / "service.toml")

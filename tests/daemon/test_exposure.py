@@ -90,6 +90,7 @@ exposures = st.builds(
     ).map(tuple),
     navigation=st.none() | navigations,
     line_id=texts,
+    strip_id=texts,
     calibration_id=texts,
     calibration_sha256=hashes,
     configuration_sha256=hashes,

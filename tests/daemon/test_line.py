@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import copy
+import json
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -62,6 +63,26 @@ def test_a_full_disk_orders_nothing_and_says_what_to_do(tmp_path: Path) -> None:
     orders, complaints = fly(make_line(tmp_path, count=2, reserve=1 << 60))
     assert not orders
     assert "free" in complaints[0]
+
+
+def test_exposures_carry_the_ids_of_the_planned_line_and_its_strip(tmp_path: Path) -> None:
+    """The position of the test moves along 11 degrees east; the plan's line is there, or not."""
+    here = {"type": "LineString", "coordinates": [[11.0, 47.9], [11.0, 48.1]]}
+    elsewhere = {"type": "LineString", "coordinates": [[12.0, 47.9], [12.0, 48.1]]}
+    for geometry, expected in ((here, ("A7", "S2")), (elsewhere, ("", ""))):
+        mission = tmp_path / str(geometry is here)
+        mission.mkdir()
+        feature = {
+            "type": "Feature",
+            "properties": {"id": "A7", "strip": "S2"},
+            "geometry": geometry,
+        }
+        plan = {"type": "FeatureCollection", "features": [feature]}
+        (mission / "plan.geojson").write_text(json.dumps(plan))
+        line = make_line(mission, count=1)
+        line.order(nav(0.0).mono_ns)
+        opened = line._flight._open[1]
+        assert (opened.line_id, opened.strip_id) == expected
 
 
 def test_what_is_absent_is_said_in_words(tmp_path: Path) -> None:

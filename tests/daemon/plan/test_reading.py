@@ -90,10 +90,58 @@ def test_qgroundcontrol_surveys_and_waypoints_with_a_trigger_distance(tmp_path: 
         (Point(47.2, 15.5), Point(47.1, 15.5)),
     ]
 
+    assert [line.distance_m for line in plan.lines] == [25.0, None, None]
+
+
+def test_geojson_may_say_where_to_expose(tmp_path: Path) -> None:
+    middle = {"type": "Point", "coordinates": [15.44, 47.07]}
+    plan = plan_of(
+        tmp_path,
+        "p.geojson",
+        collection(
+            feature([A, B], id="L1", distance_m=80),
+            feature([B, C], id="L2"),
+            {"type": "Feature", "properties": {"line": "L2"}, "geometry": {**middle}},
+            {
+                "type": "Feature",
+                "properties": {"line": "L2"},
+                "geometry": {"type": "Point", "coordinates": B},
+            },
+        ),
+    )
+    assert plan.line("L1").distance_m == 80.0
+    # The place west of the line is exposed where it is passed.
+    assert plan.line("L2").at_m == (0.0, 0.0)
+
+
+def test_qgroundcontrol_photographs_at_waypoints_are_lines_that_end_where_the_way_turns(
+    tmp_path: Path,
+) -> None:
+    def item(command: int, *parameters: object) -> dict[str, object]:
+        return {"type": "SimpleItem", "command": command, "params": list(parameters)}
+
+    def waypoint(latitude: float, longitude: float) -> dict[str, object]:
+        return item(16, 0, 0, 0, None, latitude, longitude, 100)
+
+    once = item(2000, 0, 0, 1, 0, 0, 0, 0)
+    items = [waypoint(46.99, 15.4)]
+    for latitude in (47.000, 47.001, 47.003):
+        items += [waypoint(latitude, 15.4), once]
+    for latitude in (47.003, 47.001):
+        items += [waypoint(latitude, 15.41), item(203, 0, 0, 0, 0, 1, 0, 0)]
+    data = json.dumps({"fileType": "Plan", "mission": {"items": items}}).encode()
+    lines = plan_of(tmp_path, "survey.plan", data).lines
+    assert [(line.start, line.end) for line in lines] == [
+        (Point(47.0, 15.4), Point(47.003, 15.4)),
+        (Point(47.003, 15.41), Point(47.001, 15.41)),
+    ]
+    assert lines[0].at_m == pytest.approx((0.0, 111.2, 333.5), abs=0.2)
+
 
 @pytest.mark.parametrize(
     ("name", "data", "sentence"),
     [
+        ("p.geojson", collection(feature([A, B], distance_m=-1)), "metres between two"),
         ("p.txt", b"", "ends in"),
         ("p.geojson", b"[]", "no object"),
         ("p.geojson", b"\xff", "not JSON"),

@@ -1,0 +1,138 @@
+"""A planned line is exposed where the plan says, whoever flies it, whichever way, however often."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from daemon.plan.model import Plan, Plane, PlannedLine, Point
+from daemon.plan.steering import PlanTrigger
+from drivers.contract import NavSample
+from tests.daemon.test_flight import nav as any_sample
+
+NS = 1_000_000_000
+ORIGIN = Point(48.0, 11.0)
+PLANE = Plane(ORIGIN)
+SPEED_MPS = 60.0
+Leg = tuple[tuple[float, float], tuple[float, float]]
+
+
+def line(name: str, east_m: float, length_m: float = 1000.0, **about: Any) -> PlannedLine:
+    """A line to the north, `east_m` beside the origin."""
+    start, end = PLANE.place(east_m, 0.0), PLANE.place(east_m, length_m)
+    return replace(PlannedLine(name, start, end), **about)
+
+
+def trigger(*lines: PlannedLine, interval_s: float = 1.0) -> PlanTrigger:
+    return PlanTrigger(
+        Plan("test", lines),
+        distance_m=100.0,
+        corridor_m=80.0,
+        least_interval_ns=round(interval_s * NS),
+    )
+
+
+def flown(steering: PlanTrigger, legs: list[Leg]) -> list[tuple[float, float, str]]:
+    """Fly straight legs (east, north) and give place and line of every exposure.
+
+    Positions come ten times a second; the clock goes on between two legs.
+    """
+    taken: list[tuple[float, float, str]] = []
+    now_s, last_ns = 0.0, None
+    for start, end in legs:
+        way = np.subtract(end, start)
+        length_m = float(np.hypot(*way))
+        north, east = SPEED_MPS * way[1] / length_m, SPEED_MPS * way[0] / length_m
+        for k in range(int(length_m / SPEED_MPS * 10)):
+            at_ns = round((now_s + k * 0.1) * NS)
+            here = np.add(start, way * (k * 0.1 * SPEED_MPS / length_m))
+            place = PLANE.place(*(float(value) for value in here))
+            sample: NavSample = replace(
+                any_sample(0.0),
+                mono_ns=at_ns,
+                latitude_deg=place.latitude_deg,
+                longitude_deg=place.longitude_deg,
+                velocity_ned_mps=(float(north), float(east), 0.0),
+            )
+            due_ns = steering.due(at_ns, last_ns, sample)
+            if due_ns is not None and due_ns < at_ns + NS // 10:
+                fired_ns = max(due_ns, at_ns)
+                found = steering.line_of(fired_ns, sample)
+                steering.fired(fired_ns, sample)
+                last_ns = fired_ns
+                on = here + np.array([east, north]) * (fired_ns - at_ns) * 1e-9
+                taken.append((float(on[0]), float(on[1]), found.id if found else ""))
+        now_s += length_m / SPEED_MPS + 30.0
+    return taken
+
+
+def norths(taken: list[tuple[float, float, str]]) -> list[float]:
+    return [round(north, 1) for _, north, _ in taken]
+
+
+def test_a_line_is_exposed_at_its_places_and_nowhere_else() -> None:
+    taken = flown(trigger(line("7", 0.0)), [((0, -700), (0, 1700))])
+    assert norths(taken) == [100.0 * k for k in range(11)]
+    assert {name for _, _, name in taken} == {"7"}
+
+
+def test_flown_the_other_way_the_places_are_the_same() -> None:
+    taken = flown(trigger(line("7", 0.0, 950.0)), [((0, 1700), (0, -700))])
+    assert norths(taken) == [100.0 * k for k in range(10, -1, -1)]
+
+
+def test_waypoints_are_exposed_as_they_are_named() -> None:
+    taken = flown(trigger(line("7", 0.0, at_m=(30.0, 250.0, 980.0))), [((0, -300), (0, 1500))])
+    assert norths(taken) == [30.0, 250.0, 980.0]
+
+
+def test_a_distance_of_the_line_goes_before_that_of_the_trigger() -> None:
+    taken = flown(trigger(line("7", 0.0, distance_m=250.0)), [((0, -300), (0, 1500))])
+    assert norths(taken) == [0.0, 250.0, 500.0, 750.0, 1000.0]
+
+
+def test_two_lines_are_told_apart_and_the_turn_is_not_exposed() -> None:
+    legs = [
+        ((0.0, -300.0), (0.0, 1500.0)),
+        ((0.0, 1500.0), (300.0, 1500.0)),
+        ((310.0, 1500.0), (310.0, -300.0)),
+    ]
+    taken = flown(trigger(line("a", 0.0), line("b", 300.0)), legs)
+    assert [name for _, _, name in taken] == ["a"] * 11 + ["b"] * 11
+
+
+def test_a_line_flown_again_is_exposed_again() -> None:
+    leg = ((0.0, -300.0), (0.0, 1500.0))
+    taken = flown(trigger(line("7", 0.0)), [leg, leg])
+    assert norths(taken) == [100.0 * k for k in range(11)] * 2
+
+
+def test_who_joins_in_the_middle_exposes_the_rest() -> None:
+    assert norths(flown(trigger(line("7", 0.0)), [((0, 451), (0, 1500))]))[0] == 500.0
+
+
+@pytest.mark.parametrize("leg", [((90, -300), (90, 1500)), ((-800, 300), (800, 700))])
+def test_beside_or_across_a_line_nothing_is_exposed(leg: Leg) -> None:
+    assert flown(trigger(line("7", 0.0)), [leg]) == []
+
+
+def test_the_camera_is_never_asked_for_more_than_it_can() -> None:
+    taken = norths(flown(trigger(line("7", 0.0), interval_s=2.0), [((0, -300), (0, 1500))]))
+    ways = np.diff(taken)
+    assert min(ways) >= 2.0 * SPEED_MPS - 0.2
+    # Places that were passed meanwhile by more than a quarter are left out, the others are late.
+    late_m = [north - 100.0 * math.floor(north / 100.0) for north in taken]
+    assert max(late_m) <= 25.0 + 0.2
+
+
+def test_without_position_or_without_motion_nothing_is_due() -> None:
+    steering = trigger(line("7", 0.0))
+    still = replace(any_sample(0.0), velocity_ned_mps=(0.1, 0.0, 0.0))
+    assert steering.due(0, None, None) is None
+    assert steering.due(0, None, still) is None
+    assert steering.due(0, None, replace(any_sample(0.0), fix="none")) is None
+    assert steering.line_of(0, None) is None
