@@ -21,7 +21,14 @@ from daemon.errors import DaemonError
 from daemon.exposure import Exposure
 from daemon.georeference import Georeference, utm_of
 from daemon.mission import Mission
-from daemon.orientation import ExteriorOrientation, Unoriented, exposures_of, mount_of, orient
+from daemon.orientation import (
+    ExteriorOrientation,
+    Unoriented,
+    exposures_of,
+    mount_of,
+    orient,
+    read_mount,
+)
 from daemon.orientation_files import (
     About,
     about_text,
@@ -31,7 +38,7 @@ from daemon.orientation_files import (
     patb_text,
 )
 from daemon.products import verdict_of, write_folder
-from daemon.records import plain_name
+from daemon.records import plain_name, sha256_hex
 from daemon.trajectory import flown, read_trajectory
 from processing.rig import Rig, load_rig
 
@@ -64,6 +71,7 @@ def export_orientation(
     crs: str | None = None,
     trajectory_file: Path | None = None,
     receiver: str | None = None,
+    mount_file: Path | None = None,
     progress: Callable[[int], None] = lambda _done: None,
 ) -> OrientationSet:
     """Orient all sealed exposures and write the set.
@@ -72,6 +80,7 @@ def export_orientation(
         crs: target system; by default the UTM zone of the first place, ellipsoidal heights.
         trajectory_file: a post-processed trajectory instead of the navigation of the flight.
         receiver: whose navigation, where the flight had several.
+        mount_file: TOML with a `[mount]` in place of the one that was flown.
         progress: told how many exposures are done.
 
     Raises:
@@ -80,6 +89,8 @@ def export_orientation(
     """
     rig = load_rig(mission.rig_path)
     mount, plan = mount_of(mission)
+    if mount_file is not None:
+        mount = read_mount(mount_file)
     exposures = list(exposures_of(mission))
     stamped = [e.mark_gps_ns for e in exposures if e.mark_gps_ns is not None]
     if not stamped:
@@ -108,8 +119,10 @@ def export_orientation(
             "orients nothing; give --trajectory with one that has it"
         )
     change_m, change_deg = None, None
-    if trajectory_file is not None:
-        change_m, change_deg = _change(mission, oriented, rig, mount, georeference, exposures)
+    if trajectory_file is not None or mount_file is not None:
+        change_m, change_deg = _change(
+            mission, oriented, rig, mount_of(mission)[0], georeference, exposures
+        )
     simulated = any(exposure.simulated for exposure in exposures)
     about = About(mission.id, rig, simulated, trajectory.name, mount, georeference)
     verdicts = {
@@ -133,6 +146,8 @@ def export_orientation(
     if rig.virtual_image is not None:
         texts["camera.json"] = json.dumps(certificate(rig), indent=1) + "\n"
     name = trajectory.name if plain_name(trajectory.name) else "post-processed"
+    if mount_file is not None:
+        name += f"-{sha256_hex(mount_file.read_bytes())[:8]}"
     folder = mission.export_dir / "orientation" / name
     write_folder(folder, {file: [text.encode("utf-8")] for file, text in texts.items()})
     return OrientationSet(

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
+from daemon.cli import calibrate_boresight
 from daemon.cli.tables import light_table
 
 if TYPE_CHECKING:
@@ -43,6 +44,9 @@ Example: `syntopic calibrate validity MISSION`
 @app.callback()
 def calibrate() -> None:
     """Calibrations from flown missions."""
+
+
+app.command(name="boresight", help=calibrate_boresight.HELP)(calibrate_boresight.boresight)
 
 
 @app.command(name="thermal", help=THERMAL_HELP)

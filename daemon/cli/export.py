@@ -17,7 +17,8 @@ ORIENTATION_HELP = """Exterior orientation of every cone of every exposure, at i
 From the navigation of the flight, or from a post-processed trajectory; each trajectory gets a
 folder of its own. Written are CSV, PAT-B, BINGO's angles, footprints (GeoJSON) and STAC items.
 
-Examples: `syntopic orient MISSION`, `syntopic orient MISSION --trajectory sbet.out`
+Examples: `syntopic orient MISSION`, `syntopic orient MISSION --trajectory sbet.out`,
+`syntopic orient MISSION --mount boresight-2026-11-21/mount.toml`
 """
 
 app = typer.Typer(
@@ -68,6 +69,9 @@ def orientation(
     receiver: Annotated[
         str | None, typer.Option(help="Whose navigation, where there were several.")
     ] = None,
+    mount: Annotated[
+        Path | None, typer.Option(help="TOML with the [mount] to use, of calibrate boresight.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     from daemon import orientation_export
@@ -81,6 +85,7 @@ def orientation(
             crs=crs,
             trajectory_file=trajectory,
             receiver=receiver,
+            mount_file=mount,
             progress=lambda count: progress.update(task, completed=count),
         )
     if as_json:

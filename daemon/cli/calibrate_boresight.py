@@ -1,0 +1,133 @@
+"""`syntopic calibrate boresight`: how the rig sits against inertial unit and antenna."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import Progress
+
+from daemon.cli.calibration_outcome import hand_over
+from daemon.cli.tables import light_table
+
+HELP = """Boresight, lever arm and time offset: inertial against controlled orientation.
+
+PROJECT is an adjustment project (docs/formats.md) with control; it is adjusted without its antenna
+positions and attitudes, and the result is compared with the trajectory: `inertial.csv` in the
+project, or a mission's (--mission, exposures named as their folders, --crs of the project). Fly
+two heights, opposite and crossing lines and two speeds; what the flight cannot part is named and
+stays as it was given. Writes a dated folder with mount.toml, report.html and calibration.json.
+
+Examples: `syntopic calibrate boresight project`,
+`syntopic calibrate boresight project --mission M --trajectory sbet.out --crs EPSG:25833`
+"""
+
+
+def boresight(
+    project: Annotated[Path, typer.Argument(help="project.toml, or the folder that holds it.")],
+    mission: Annotated[Path | None, typer.Option(help="Mission whose trajectory counts.")] = None,
+    trajectory: Annotated[
+        Path | None, typer.Option(help="Post-processed trajectory: SBET, or .csv.")
+    ] = None,
+    crs: Annotated[str | None, typer.Option(help="Coordinate system of the project.")] = None,
+    mount: Annotated[
+        Path | None, typer.Option(help="TOML with the [mount] so far; default: the mission's.")
+    ] = None,
+    hold: Annotated[
+        list[str] | None, typer.Option(help="boresight, lever, time or shift; repeatable.")
+    ] = None,
+    lever_sigma: Annotated[
+        float | None, typer.Option(help="The given lever arm was surveyed to this, m.", min=1e-6)
+    ] = None,
+    position_sigma: Annotated[
+        tuple[float, float, float], typer.Option(help="Of the trajectory, m: east north up.")
+    ] = (0.03, 0.03, 0.05),
+    attitude_sigma: Annotated[
+        tuple[float, float, float], typer.Option(help="Of the inertial unit, mdeg.")
+    ] = (3.0, 3.0, 7.0),
+    previous: Annotated[
+        Path | None, typer.Option(help="Folder of the calibration to compare with.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="The new folder; by default dated.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    from daemon import boresight_calibration as flight
+    from daemon.adjusting.project import read_project
+    from daemon.calibration_report import read_previous, serial_warnings
+    from daemon.configuration import MountSection
+    from daemon.mission import Mission
+    from daemon.orientation import mount_of, read_mount
+    from processing.bundle.adjust import adjust
+    from processing.bundle.network import NetworkError
+    from processing.bundle.rank import DefectError
+    from processing.bundle.start import completed
+    from processing.rig import load_rig
+
+    path = project / "project.toml" if project.is_dir() else project
+    given = read_project(path)
+    before = None if previous is None else read_previous(previous, kind="boresight")
+    sigma_m = np.array(position_sigma)
+    sigma_rad = np.radians(np.array(attitude_sigma) * 1e-3)
+    stations = given.network.stations.names
+    section, serials = MountSection(), {}
+    if mission is not None:
+        folder = Mission.open(mission)
+        if crs is None:
+            raise flight.BoresightError(
+                "--mission needs --crs, the coordinate system of the project, such as EPSG:25833"
+            )
+        section = mount_of(folder)[0]
+        serials = {s.name: s.serial for s in load_rig(folder.rig_path).sensors if s.serial}
+        exposures, inertial = flight.inertial_of_mission(
+            folder, stations, crs, trajectory, sigma_m, sigma_rad
+        )
+    else:
+        exposures, inertial = flight.inertial_table(
+            path.parent / "inertial.csv", stations, sigma_m, sigma_rad
+        )
+    if mount is not None:
+        section = read_mount(mount)
+    try:
+        with Progress(console=Console(stderr=True), transient=True) as progress:
+            task = progress.add_task("starting values", total=None)
+            adjusted = adjust(
+                completed(flight.control_only(given.network)),
+                given.settings,
+                progress=lambda what, number, value: progress.update(
+                    task, description=f"{what} {number}: {value:.6g}"
+                ),
+            )
+    except (NetworkError, DefectError) as error:
+        raise flight.BoresightError(
+            f"the images cannot be oriented by their control: {error}"
+        ) from error
+    done = flight.compared(
+        adjusted, exposures, inertial, section, held=tuple(hold or ()), lever_sigma_m=lever_sigma
+    )
+    today = f"{datetime.now(UTC):%Y-%m-%d}"
+    report = flight.report_of(
+        done,
+        given,
+        date=today,
+        serials=serials,
+        previous=before,
+        warnings=() if before is None else serial_warnings(before, serials),
+    )
+    if not as_json:
+        console = Console()
+        table = light_table("", ("", ""), ("value", "sigma", "unit"))
+        for q in report.quantities:
+            known = "not determined" if q.sigma is None else f"{q.sigma:.2g}"
+            table.add_row(q.where, q.what, f"{q.value:.6f}", known, q.unit)
+        console.print(table)
+        console.print(f"sigma0 {done.found.sigma0:.3f}, redundancy {done.found.redundancy}")
+    hand_over(
+        report,
+        out or Path(f"boresight-{today}"),
+        files={"mount.toml": flight.mount_toml(done, date=today, project=given.name)},
+        as_json=as_json,
+    )
