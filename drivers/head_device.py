@@ -1,34 +1,26 @@
-"""What every head has, whatever it is reached through: slots, reopening, counters and an end.
-
-How a head is opened, served and let go of is in the room of its family.
-"""
+"""What every head has, whatever it is reached through: frames in slots of the caller's memory."""
 
 from __future__ import annotations
 
 import threading
-from collections import Counter
 from collections.abc import Mapping
-from typing import ClassVar, Final
+from typing import ClassVar
 
-from drivers.clock import BackOff, Clock, HostClock
-from drivers.contract import DeviceError, FrameMemory, LifeCycle, Sink
-from drivers.settings import Configured
-from drivers.telling import Teller
-
-CLOSE_TIMEOUT_S: Final = 2.0
+from drivers.clock import Clock
+from drivers.contract import FrameMemory
+from drivers.device import DeviceDriver
 
 
-class HeadDevice(Configured):
-    """A head whose frames land in memory of the caller's: opened, served, lost and opened again.
+class HeadDevice(DeviceDriver):
+    """A head whose frames land in memory of the caller's.
 
-    A driver says how: `_reach` opens the head, `_serve` delivers until `_closing` is set or the
-    head is lost, `_let_go` drops what belongs to the opening. One thread at a time calls `bind`
-    and `run`; `recycle`, `trigger`, `close` and `statistics` are for any thread.
+    One thread at a time calls `bind` and `run`; `recycle`, `trigger`, `close` and `statistics` are
+    for any thread.
     """
 
     kind: ClassVar = "head"
     counted: ClassVar[tuple[str, ...]] = ("frames", "underruns", "opened")
-    """Counters that are told even while they are zero."""
+    delivered: ClassVar = "frames"
 
     def __init__(
         self,
@@ -38,65 +30,11 @@ class HeadDevice(Configured):
         memory: FrameMemory,
         clock: Clock | None = None,
     ) -> None:
-        super().__init__(name, settings)
+        super().__init__(name, settings, clock=clock)
         self._memory = memory
-        self._clock: Clock = clock or HostClock()
-        self._teller = Teller(name, self._clock)
-        self._state = LifeCycle.CREATED
-        self._closing = threading.Event()
-        self._ended = threading.Event()
-        self._ended.set()
         self._slots = threading.Lock()
         self._lent_out: set[int] = set()
         self._last_slot = -1
-        self._counters: Counter[str] = Counter(dict.fromkeys(self.counted, 0))
-
-    @property
-    def state(self) -> LifeCycle:
-        return self._state
-
-    def run(self, sink: Sink) -> None:
-        """Deliver until closed. See `drivers.contract.Device`."""
-        if self._closing.is_set():
-            return
-        self._ended.clear()
-        self._teller.sink = sink
-        pause = BackOff()
-        is_reachable = True
-        try:
-            while not self._closing.is_set():
-                try:
-                    self._reach()
-                except DeviceError as error:
-                    self._state = LifeCycle.INACTIVE
-                    if is_reachable and not self._closing.is_set():
-                        is_reachable = False
-                        self._teller.tell(
-                            self._word_for(error),
-                            f"{error}. It is tried again by itself.",
-                            fault=True,
-                        )
-                    self._clock.wait(self._closing, pause.next_s())
-                    continue
-                is_reachable = True
-                self._teller.tell("opened", self._opened_sentence())
-                frames = self._counters["frames"]
-                self._serve(sink)
-                if self._counters["frames"] > frames:
-                    pause.reset()
-                self._clock.wait(self._closing, pause.next_s())
-        finally:
-            self._let_go()
-            self._teller.sink = None
-            self._state = LifeCycle.INACTIVE
-            self._ended.set()
-
-    def close(self) -> None:
-        """End `run` within two seconds and let go of the head; may be called twice."""
-        self._closing.set()
-        if self._ended.wait(CLOSE_TIMEOUT_S):
-            self._let_go()
-        self._state = LifeCycle.INACTIVE
 
     def recycle(self, slot: int) -> None:
         """Hand a slot back; from any thread. ValueError for a slot that was not handed out."""
@@ -108,20 +46,9 @@ class HeadDevice(Configured):
 
     def statistics(self) -> Mapping[str, int]:
         """Counters since creation, by stable name; see the driver's page."""
-        return dict(sorted(self._counters.items()))
+        return dict(sorted(self.counters.items()))
 
     # For a driver to say
-
-    def _reach(self) -> None:
-        """Open the head where it is not open. DeviceError where it cannot be."""
-        raise NotImplementedError
-
-    def _serve(self, sink: Sink) -> None:
-        """Deliver until `_closing` is set or the head is lost; tells of a loss itself."""
-        raise NotImplementedError
-
-    def _let_go(self) -> None:
-        """Drop what belongs to this opening; called twice, too."""
 
     def _returned(self, slot: int) -> None:
         """A slot came back. Called with `_slots` held."""
@@ -129,9 +56,8 @@ class HeadDevice(Configured):
     def _opened_sentence(self) -> str:
         return f"The head {self.name} is open; nothing to do."
 
-    def _word_for(self, error: DeviceError) -> str:
-        """The event that tells of a head that cannot be opened."""
-        return "lost"
+    def _tell_opened(self) -> None:
+        self.teller.tell("opened", self._opened_sentence())
 
     # For a driver to use
 
@@ -149,12 +75,12 @@ class HeadDevice(Configured):
                 slot = min(free, key=lambda s: (s <= self._last_slot, s))
                 self._last_slot = slot
                 return slot
-        self._counters["underruns"] += 1
+        self.counters["underruns"] += 1
         self._complain_of_underrun()
         return None
 
     def _complain_of_underrun(self) -> None:
-        self._teller.complain(
+        self.teller.complain(
             "underrun",
             f"The head {self.name} lost a frame because all {self._memory.slot_count} slots "
             "are taken. Storage is too slow for this rate; lengthen the interval.",

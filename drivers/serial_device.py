@@ -9,13 +9,12 @@ import errno
 import termios
 import threading
 from abc import abstractmethod
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Final, Protocol
 
 import serial
 
-from drivers.clock import BackOff, Clock, HostClock
+from drivers.clock import Clock
 from drivers.contract import (
     ClockReading,
     DeviceError,
@@ -26,9 +25,9 @@ from drivers.contract import (
     Sink,
     TemperatureSample,
 )
-from drivers.settings import Configured, Setting
+from drivers.device import DeviceDriver
+from drivers.settings import Setting
 from drivers.tcp_port import SCHEME, open_tcp_port
-from drivers.telling import Teller
 from drivers.udp_port import LISTEN_SCHEME, SPEAK_SCHEME, open_udp_port
 
 READ_STEP_S: Final = 0.2
@@ -140,7 +139,7 @@ def _reason(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-class SerialDevice(Configured):
+class SerialDevice(DeviceDriver):
     """A device on a serial line, run by one thread of the caller's.
 
     A driver declares its settings and says in `step` how it listens or asks; `heard` is to be
@@ -152,6 +151,16 @@ class SerialDevice(Configured):
         5.0, minimum=0.5, maximum=3600, says="without a message for so long the device is silent"
     )
 
+    counted = (
+        "bytes",
+        "messages",
+        "bad_messages",
+        "bad_bytes",
+        "timeouts",
+        "opened",
+        "silences",
+    )
+    delivered = "messages"
     what: str = "device"
     """What it is, for the operator's sentences."""
     silence_cure: str = "Check its power, wiring and baud rate"
@@ -165,21 +174,12 @@ class SerialDevice(Configured):
         clock: Clock | None = None,
         open_port: PortOpener = open_serial_port,
     ) -> None:
-        super().__init__(name, settings)
-        self.clock: Clock = clock or HostClock()
+        super().__init__(name, settings, clock=clock)
         self._open_port = open_port
-        self._closing = threading.Event()
-        self._ended = threading.Event()
-        self._ended.set()
         self._lock = threading.Lock()
-        self._state = LifeCycle.CREATED
         self._line: SerialLine | None = None
-        self.teller = Teller(name, self.clock)
         self._heard_ns = 0
         self._silent = False
-        self.counters: Counter[str] = Counter(
-            bytes=0, messages=0, bad_messages=0, bad_bytes=0, timeouts=0, opened=0, silences=0
-        )
 
     # What a driver says
 
@@ -212,10 +212,6 @@ class SerialDevice(Configured):
 
     # The contract
 
-    @property
-    def state(self) -> LifeCycle:
-        return self._state
-
     def bind(self) -> Mapping[str, str]:
         """Open the port and ask who is there. See `drivers.contract.Device`."""
         if self._line is None:
@@ -223,67 +219,25 @@ class SerialDevice(Configured):
         try:
             found = {"port": self.port, **self.identify(self._line)}
         except LineLostError as error:
-            self._drop()
+            self._let_go()
             raise DeviceError(
                 f"{self.name}: port {self.port} was lost: {error}; check the cable"
             ) from error
         except DeviceError:
-            self._drop()
+            self._let_go()
             raise
         self._state = LifeCycle.BOUND
         return found
 
-    def run(self, sink: Sink) -> None:
-        """Deliver until closed. See `drivers.contract.Device`."""
-        if self._closing.is_set():
-            return
-        self._ended.clear()
-        self.teller.sink = sink
-        pause = BackOff()
-        reachable = True
-        try:
-            while not self._closing.is_set():
-                try:
-                    line = self._line or self._open()
-                except DeviceError as error:
-                    self._state = LifeCycle.INACTIVE
-                    if reachable:
-                        reachable = False
-                        self.teller.tell(
-                            "lost", f"{error}. It is tried again by itself.", fault=True
-                        )
-                    self.clock.wait(self._closing, pause.next_s())
-                    continue
-                self._line = line
-                if not (reachable and self._silent):
-                    self.teller.tell(
-                        "opened", f"The {self.what} {self.name} is open at {self.port}."
-                    )
-                reachable = True
-                said = self.counters["messages"]
-                reachable = self._serve(line)
-                if self.counters["messages"] > said:
-                    pause.reset()
-                self._drop()
-                self.clock.wait(self._closing, pause.next_s())
-        finally:
-            self._drop()
-            self.teller.sink = None
-            self._state = LifeCycle.INACTIVE
-            self._ended.set()
-
-    def close(self) -> None:
-        """End `run` within two seconds and close the port; may be called twice."""
-        self._closing.set()
-        if self._ended.wait(2.0):
-            self._drop()
-        self._state = LifeCycle.INACTIVE
-
-    def statistics(self) -> Mapping[str, int]:
-        """Counters of bytes, messages, openings and silences, and the driver's own."""
-        return dict(self.counters)
-
     # How it is done
+
+    def _reach(self) -> None:
+        self._line = self._line or self._open()
+
+    def _tell_opened(self) -> None:
+        # A silent line is opened anew again and again, which is not news.
+        if self._is_lost or not self._silent:
+            self.teller.tell("opened", f"The {self.what} {self.name} is open at {self.port}.")
 
     def _open(self) -> SerialLine:
         baudrate, parity = self.line_settings()
@@ -300,40 +254,41 @@ class SerialDevice(Configured):
         if self.teller.sink is not None:
             self.teller.sink(RawBytes(self.name, self.clock.mono_ns(), data))
 
-    def _serve(self, line: SerialLine) -> bool:
-        """Listen until closing, loss (False), or a whole silence (True: worth opening anew)."""
+    def _serve(self, sink: Sink) -> None:
+        """Listen until closing, loss, or a whole silence, after which it is worth opening anew."""
+        line = self._line
+        assert line is not None
         self._state = LifeCycle.ACTIVE
         self._heard_ns = self.clock.mono_ns()
         silence_ns = round(self.silence_s * 1e9)
         while not self._closing.is_set():
             try:
                 for sample in self.step(line):
-                    if self.teller.sink is not None:
-                        self.teller.sink(sample)
+                    sink(sample)
             except LineLostError as error:
                 self._state = LifeCycle.INACTIVE
-                self.teller.tell(
-                    "lost",
+                self._tell_lost(
                     f"The {self.what} {self.name} at {self.port} was lost ({error}). Check cable "
-                    "and power; it is opened again by itself.",
-                    fault=True,
+                    "and power; it is opened again by itself."
                 )
-                return False
+                return
             if self.clock.mono_ns() - self._heard_ns >= silence_ns:
-                if not self._silent:
-                    self._silent = True
-                    self.counters["silences"] += 1
-                    self.teller.tell(
-                        "silent",
-                        f"The {self.what} {self.name} at {self.port} has said nothing "
-                        f"understandable for {self.silence_s:g} s. {self.silence_cure}; the port "
-                        "is opened anew by itself.",
-                        fault=True,
-                    )
-                return True
-        return True
+                self._tell_silence()
+                return
 
-    def _drop(self) -> None:
+    def _tell_silence(self) -> None:
+        if self._silent:
+            return
+        self._silent = True
+        self.counters["silences"] += 1
+        self.teller.tell(
+            "silent",
+            f"The {self.what} {self.name} at {self.port} has said nothing understandable for "
+            f"{self.silence_s:g} s. {self.silence_cure}; the port is opened anew by itself.",
+            fault=True,
+        )
+
+    def _let_go(self) -> None:
         with self._lock:
             line, self._line = self._line, None
         if line is not None:

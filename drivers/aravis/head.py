@@ -99,11 +99,11 @@ class AravisHead(AravisSettings, HeadDevice):
 
         A hold by a dead controller is waited out; `sink` is told so.
         """
-        self._teller.sink = sink
+        self.teller.sink = sink
         try:
             session = self._session or self._open()
         finally:
-            self._teller.sink = None
+            self.teller.sink = None
         self._state = LifeCycle.BOUND
         geometry = session.camera.geometry
         return {
@@ -144,8 +144,8 @@ class AravisHead(AravisSettings, HeadDevice):
 
     def statistics(self) -> Mapping[str, int]:
         """Frames by status and reason, underruns, packets missing and resent, openings."""
-        found = self._counters + self._of_stream
-        names = self._counters.keys() | self._of_stream.keys()
+        found = self.counters + self._of_stream
+        names = self.counters.keys() | self._of_stream.keys()
         return {name: found[name] for name in sorted(names)}
 
     def act(self, device_ns: int | None) -> None:
@@ -164,7 +164,7 @@ class AravisHead(AravisSettings, HeadDevice):
         keys = ActionKeys(self.action_device_key, self.action_group_key, self.action_group_mask)
         status = send_action(self.address, keys, device_ns=device_ns, timeout_s=TRIGGER_TIMEOUT_S)
         if status == ACTION_LATE:
-            self._counters["actions_late"] += 1
+            self.counters["actions_late"] += 1
             raise DeviceError(
                 f"{self.name}: the action command came after its time; lengthen lead_ms"
             )
@@ -174,7 +174,7 @@ class AravisHead(AravisSettings, HeadDevice):
                 f"{self.name}: the action command was not taken ({said}); see whether the head is "
                 "lost or another program has changed its keys"
             )
-        self._counters["actions"] += 1
+        self.counters["actions"] += 1
 
     def clock_at(self, mono_ns: int) -> tuple[int, int] | None:
         """The head's clock at a host time near now, and its sigma; None while it is not known."""
@@ -200,7 +200,7 @@ class AravisHead(AravisSettings, HeadDevice):
 
     def _open(self) -> _Session:
         """Open the head, waiting out whoever holds it. DeviceError where that is in vain."""
-        deadline_ns = self._clock.mono_ns() + round(self.held_limit_s * 1e9)
+        deadline_ns = self.clock.mono_ns() + round(self.held_limit_s * 1e9)
         held = self._is_held()
         told = False
         while not self._closing.is_set():
@@ -211,13 +211,13 @@ class AravisHead(AravisSettings, HeadDevice):
                     held = True
             if not told:
                 told = True
-                self._teller.tell(
+                self.teller.tell(
                     "held-by-another",
                     f"The head {self.name} at {self.address} is still held by another controller. "
                     f"If that one is dead the head lets go by itself; it is waited for up to "
                     f"{self.held_limit_s:g} s.",
                 )
-            if self._clock.mono_ns() > deadline_ns:
+            if self.clock.mono_ns() > deadline_ns:
                 raise HeldByAnotherError(
                     f"{self.name} at {self.address}: another program has held the head for "
                     f"{self.held_limit_s:g} s, so it is alive; end that program"
@@ -225,9 +225,9 @@ class AravisHead(AravisSettings, HeadDevice):
             # In one go and without a question in between, which might count as a sign of life of
             # the dead controller. Whether the head has let go only taking control can tell: some
             # leave the register as it was.
-            left_s = (deadline_ns - self._clock.mono_ns()) * 1e-9
+            left_s = (deadline_ns - self.clock.mono_ns()) * 1e-9
             pause_s = self._heartbeat_s() + HELD_MARGIN_S
-            self._clock.wait(self._closing, max(0.0, min(pause_s, left_s)) + HELD_MARGIN_S)
+            self.clock.wait(self._closing, max(0.0, min(pause_s, left_s)) + HELD_MARGIN_S)
             held = False
         raise DeviceError(f"{self.name}: closed while it was being opened; nothing to do")
 
@@ -270,7 +270,7 @@ class AravisHead(AravisSettings, HeadDevice):
                     f"{self.name} at {self.address}: {error}; check the head's power and cable"
                 )
             else:
-                self._counters["opened"] += 1
+                self.counters["opened"] += 1
                 return session
         self._let_go()
         if camera is not None:
@@ -296,7 +296,7 @@ class AravisHead(AravisSettings, HeadDevice):
         if reason:
             self._state = LifeCycle.INACTIVE
             session.is_lost = True
-            self._teller.tell(
+            self.teller.tell(
                 "lost",
                 f"The head {self.name} at {self.address} was lost ({reason}). Check its power and "
                 "cable; it is opened again by itself.",
@@ -308,7 +308,7 @@ class AravisHead(AravisSettings, HeadDevice):
         self._let_go()
 
     def _deliver(self, session: _Session, sink: Sink) -> None:
-        next_check_ns = self._clock.mono_ns()
+        next_check_ns = self.clock.mono_ns()
         while not self._closing.is_set():
             received = session.stream.pop(POP_STEP_S)
             if received is not None:
@@ -316,24 +316,24 @@ class AravisHead(AravisSettings, HeadDevice):
             self._count(session)
             if session.camera.has_lost_control:
                 raise HeadLostError("it no longer takes our heartbeat")
-            if self._clock.mono_ns() >= next_check_ns:
+            if self.clock.mono_ns() >= next_check_ns:
                 healthy = self._check(session)
                 pause_s = self.latch_interval_s if healthy else 0.0
-                next_check_ns = self._clock.mono_ns() + round(pause_s * 1e9)
+                next_check_ns = self.clock.mono_ns() + round(pause_s * 1e9)
 
     def _hand_over(self, session: _Session, received: ReceivedFrame, sink: Sink) -> None:
-        now_ns = self._clock.mono_ns()
+        now_ns = self.clock.mono_ns()
         status = _status(session.camera, received)
         reason = received.reason.replace("-", "_")
         if status is None:
-            self._counters[f"buffers_{reason}"] += 1
+            self.counters[f"buffers_{reason}"] += 1
             session.stream.lend(received.slot)
             return
         if status is FrameStatus.COMPLETE:
-            self._counters["frames"] += 1
+            self.counters["frames"] += 1
         else:
-            self._counters[f"frames_{status.value}"] += 1
-            self._counters[f"{status.value}_{reason}"] += 1
+            self.counters[f"frames_{status.value}"] += 1
+            self.counters[f"{status.value}_{reason}"] += 1
         if status is not FrameStatus.CORRUPT:
             session.stream.unpack(received.slot)
         self._lend_out(received.slot)
@@ -382,7 +382,7 @@ class AravisHead(AravisSettings, HeadDevice):
         """
         if is_ip_address(self.address):
             privilege = control_privilege(self.address, timeout_s=PROBE_TIMEOUT_S)
-            now_ns = self._clock.mono_ns()
+            now_ns = self.clock.mono_ns()
             if privilege is None:
                 if session.suspected_ns is None:
                     session.suspected_ns = now_ns
@@ -397,7 +397,7 @@ class AravisHead(AravisSettings, HeadDevice):
             session.temperature_c = session.camera.temperature_c()
             if session.latch is None and session.temperature_c is None:
                 session.camera.sign_of_life()
-        self._counters["latches"] += session.latch is not None
+        self.counters["latches"] += session.latch is not None
         return True
 
     def _count(self, session: _Session) -> None:
@@ -417,7 +417,7 @@ class AravisHead(AravisSettings, HeadDevice):
             session, self._session = self._session, None
         if session is None:
             return
-        self._counters.update(self._of_stream)
+        self.counters.update(self._of_stream)
         self._of_stream = Counter()
         if session.is_lost and self._closing.is_set():
             # Aravis asks a dead head three times to let go, 2.5 s each; closing does not wait.

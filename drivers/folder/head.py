@@ -137,21 +137,21 @@ class FolderHead(HeadDevice):
     def _reach(self) -> None:
         if not (self._files and self._shape):
             self.bind()
-        self._counters["opened"] += 1
+        self.counters["opened"] += 1
 
     def _opened_sentence(self) -> str:
         return f"The head {self.name} plays {len(self._files)} files of {self.folder}."
 
     def _serve(self, sink: Sink) -> None:
         self._state = LifeCycle.ACTIVE
-        next_ns = self._clock.mono_ns() + round(self.interval_s * 1e9)
+        next_ns = self.clock.mono_ns() + round(self.interval_s * 1e9)
         while not self._closing.is_set():
             if self.trigger_source == "line":
-                left_ns = next_ns - self._clock.mono_ns()
+                left_ns = next_ns - self.clock.mono_ns()
                 if left_ns > 0:
-                    self._clock.wait(self._closing, left_ns * 1e-9)
+                    self.clock.wait(self._closing, left_ns * 1e-9)
                     continue
-                next_ns = max(next_ns + round(self.interval_s * 1e9), self._clock.mono_ns())
+                next_ns = max(next_ns + round(self.interval_s * 1e9), self.clock.mono_ns())
                 self._expose(sink)
             else:
                 try:
@@ -172,14 +172,14 @@ class FolderHead(HeadDevice):
         self._next_file += 1
         self._due += 1
         if self._next_file % len(self._files) == 0:
-            self._counters["rounds"] += 1
+            self.counters["rounds"] += 1
         slot = self._free_slot()
         if slot is not None:
             try:
                 file = read_frame(path, room_nbytes=self._memory.slot_nbytes)
             except FrameFileError as error:
-                self._counters["unreadable"] += 1
-                self._teller.complain(
+                self.counters["unreadable"] += 1
+                self.teller.complain(
                     "unreadable",
                     f"The head {self.name} has no frame of {path}: it {error}. Take the file out, "
                     "or restore it.",
@@ -187,7 +187,7 @@ class FolderHead(HeadDevice):
             else:
                 self._hand_over(file, slot, sink)
         if self._is_played_out():
-            self._teller.tell(
+            self.teller.tell(
                 "played-out",
                 f"The head {self.name} has played all {len(self._files)} files; set loop = true "
                 "to begin again.",
@@ -198,7 +198,7 @@ class FolderHead(HeadDevice):
         words = words_at(self._memory.address(slot), file.pixels.size)
         words.reshape(file.pixels.shape)[:] = file.pixels
         whole = (height_px, width_px) == self._shape
-        self._counters["frames" if whole else "frames_corrupt"] += 1
+        self.counters["frames" if whole else "frames_corrupt"] += 1
         settings: dict[str, float | int | str] = {**file.settings, "file": str(file.path)}
         if file.counter is not None:
             settings["recorded_counter"] = file.counter
@@ -217,7 +217,7 @@ class FolderHead(HeadDevice):
                 device_clock_ns=None,
                 device_clock_mono_ns=None,
                 latch_sigma_ns=None,
-                mono_ns=self._clock.mono_ns(),
+                mono_ns=self.clock.mono_ns(),
                 exposure_time_us=file.exposure_time_us,
                 temperature_c=file.temperature_c,
                 settings=settings,

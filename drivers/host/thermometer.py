@@ -5,23 +5,20 @@ What they are and how one is read is in `drivers.host.sensors`.
 
 from __future__ import annotations
 
-import threading
-from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
-from drivers.clock import Clock, HostClock
+from drivers.clock import Clock
 from drivers.contract import DeviceError, LifeCycle, Sink, TemperatureSample
+from drivers.device import DeviceDriver
 from drivers.host.sensors import HostSensor, SensorGoneError, find_sensors
-from drivers.settings import Configured, Setting
-from drivers.telling import Teller
+from drivers.settings import Setting
 
 SYSFS: Final = Path("/sys")
-CLOSE_TIMEOUT_S: Final = 2.0
 
 
-class HostThermometer(Configured):
+class HostThermometer(DeviceDriver):
     """Sensors of the Linux host: hwmon chips (processor, disks, boards) and iio devices.
 
     A sensor is named `chip/channel`, `chip/label`, or `chip@device/...` where chips of one name
@@ -33,6 +30,7 @@ class HostThermometer(Configured):
     """
 
     kind: ClassVar = "thermometer"
+    counted = ("readings", "failures", "open_sensors", "losses")
 
     sensors: Setting[tuple[str, ...]] = Setting(
         (), required=True, minimum=1, maximum=64, says="sensors as chip/channel or chip/label"
@@ -50,17 +48,10 @@ class HostThermometer(Configured):
         clock: Clock | None = None,
         root: Path = SYSFS,
     ) -> None:
-        super().__init__(name, settings)
-        self._clock: Clock = clock or HostClock()
+        super().__init__(name, settings, clock=clock)
         self._root = root
-        self._teller = Teller(name, self._clock)
-        self._state = LifeCycle.CREATED
-        self._closing = threading.Event()
-        self._ended = threading.Event()
-        self._ended.set()
         self._found: dict[str, HostSensor] = {}
         self._lost: set[str] = set()
-        self._counters: Counter[str] = Counter(readings=0, failures=0, open_sensors=0, losses=0)
 
     @classmethod
     def contradictions(cls, values: Mapping[str, Any]) -> list[str]:
@@ -76,10 +67,6 @@ class HostThermometer(Configured):
         if wrong:
             found.append(f"sensors names {', '.join(wrong)}; chip/channel, as coretemp/temp1")
         return found
-
-    @property
-    def state(self) -> LifeCycle:
-        return self._state
 
     def bind(self) -> Mapping[str, str]:
         """Find and read every sensor. See `drivers.contract.Device`."""
@@ -99,35 +86,20 @@ class HostThermometer(Configured):
         self._state = LifeCycle.BOUND
         return found
 
-    def run(self, sink: Sink) -> None:
-        """Deliver until closed. See `drivers.contract.Device`."""
-        if self._closing.is_set():
-            return
-        self._ended.clear()
-        self._teller.sink = sink
-        try:
-            self._state = LifeCycle.ACTIVE
-            self._teller.tell("opened", f"The host's sensors {self.name} are read; nothing to do.")
-            next_ns = self._clock.mono_ns()
-            while not self._closing.is_set():
-                self._read_all(sink)
-                now_ns = self._clock.mono_ns()
-                next_ns = max(next_ns + round(self.interval_s * 1e9), now_ns)
-                self._clock.wait(self._closing, (next_ns - now_ns) * 1e-9)
-        finally:
-            self._teller.sink = None
-            self._state = LifeCycle.INACTIVE
-            self._ended.set()
+    def _reach(self) -> None:
+        """Sysfs is always there; a sensor that is not is looked for at every reading."""
 
-    def close(self) -> None:
-        """End `run` within two seconds; may be called twice."""
-        self._closing.set()
-        self._ended.wait(CLOSE_TIMEOUT_S)
-        self._state = LifeCycle.INACTIVE
+    def _tell_opened(self) -> None:
+        self.teller.tell("opened", f"The host's sensors {self.name} are read; nothing to do.")
 
-    def statistics(self) -> Mapping[str, int]:
-        """readings, failures (a sensor that could not be read), open_sensors, losses."""
-        return dict(self._counters)
+    def _serve(self, sink: Sink) -> None:
+        self._state = LifeCycle.ACTIVE
+        next_ns = self.clock.mono_ns()
+        while not self._closing.is_set():
+            self._read_all(sink)
+            now_ns = self.clock.mono_ns()
+            next_ns = max(next_ns + round(self.interval_s * 1e9), now_ns)
+            self.clock.wait(self._closing, (next_ns - now_ns) * 1e-9)
 
     def _read_all(self, sink: Sink) -> None:
         known: list[HostSensor] | None = None
@@ -139,11 +111,11 @@ class HostThermometer(Configured):
                 value_c = self._found[probe].read_c()
             except SensorGoneError as error:
                 self._found.pop(probe, None)
-                self._counters["failures"] += 1
+                self.counters["failures"] += 1
                 if probe not in self._lost:
                     self._lost.add(probe)
-                    self._counters["losses"] += 1
-                    self._teller.tell(
+                    self.counters["losses"] += 1
+                    self.teller.tell(
                         "lost",
                         f"The sensor {sensor} of probe {probe} cannot be read ({error}). Check "
                         "that its kernel module is loaded; it is looked for again by itself.",
@@ -152,12 +124,12 @@ class HostThermometer(Configured):
                 continue
             if probe in self._lost:
                 self._lost.discard(probe)
-                self._teller.tell(
+                self.teller.tell(
                     "recovered", f"The sensor {sensor} of probe {probe} is back; nothing to do."
                 )
-            self._counters["readings"] += 1
-            self._counters["open_sensors"] += value_c is None
-            sink(TemperatureSample(probe, value_c, self._clock.mono_ns()))
+            self.counters["readings"] += 1
+            self.counters["open_sensors"] += value_c is None
+            sink(TemperatureSample(probe, value_c, self.clock.mono_ns()))
 
     def _find(self, sensor: str, known: list[HostSensor]) -> HostSensor:
         matches = [candidate for candidate in known if sensor in candidate.words]

@@ -7,19 +7,17 @@ from __future__ import annotations
 
 import errno
 import os
-import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import ClassVar, Final, Protocol
 
-from drivers.clock import BackOff, Clock, HostClock
+from drivers.clock import Clock
 from drivers.contract import DeviceError, LifeCycle, PpsEdge, Sink
+from drivers.device import DeviceDriver
 from drivers.pps.binding import CAN_WAIT, CAPTURE_ASSERT, CAPTURE_CLEAR, Edges, KernelPps
 from drivers.pps.emulated import SCHEME, EmulatedPps
-from drivers.settings import Configured, Setting
-from drivers.telling import Teller
+from drivers.settings import Setting
 
 WAIT_S: Final = 0.5
 """Longest wait in the kernel before the driver looks up again."""
@@ -65,7 +63,7 @@ def wall_clock() -> tuple[int, int]:
     return best[1], best[2]
 
 
-class PpsDevice(Configured):
+class PpsDevice(DeviceDriver):
     """Edges of one PPS source of the kernel.
 
     The kernel stamps edges with the wall clock. They are carried to the monotonic clock with the
@@ -76,6 +74,15 @@ class PpsDevice(Configured):
     """
 
     kind: ClassVar = "pps"
+    counted = (
+        "edges",
+        "edges_missed",
+        "edges_repeated",
+        "wall_clock_steps",
+        "opened",
+        "silences",
+    )
+    delivered = "edges"
 
     device = Setting(
         "", required=True, says="such as /dev/pps0; tcp://host:port is an emulated one"
@@ -103,34 +110,21 @@ class PpsDevice(Configured):
         opener: Callable[[str], Source] = open_source,
         wall: Callable[[], tuple[int, int]] = wall_clock,
     ) -> None:
-        super().__init__(name, settings)
-        self._clock: Clock = clock or HostClock()
+        super().__init__(name, settings, clock=clock)
         self._opener, self._wall = opener, wall
-        self._teller = Teller(name, self._clock)
-        self._closing = threading.Event()
-        self._ended = threading.Event()
-        self._ended.set()
-        self._state = LifeCycle.CREATED
         self._source: Source | None = None
         self._last_sequence: int | None = None
         self._last_wall: tuple[int, int] | None = None
-        self._counters: Counter[str] = Counter(
-            edges=0, edges_missed=0, edges_repeated=0, wall_clock_steps=0, opened=0, silences=0
-        )
-
-    @property
-    def state(self) -> LifeCycle:
-        return self._state
 
     def bind(self) -> Mapping[str, str]:
         """Open the source and wait for an edge. See `drivers.contract.Device`."""
         source = self._source = self._source or self._open()
-        deadline_ns = self._clock.mono_ns() + round(self.silence_s * 1e9)
-        while self._clock.mono_ns() < deadline_ns and not self._closing.is_set():
+        deadline_ns = self.clock.mono_ns() + round(self.silence_s * 1e9)
+        while self.clock.mono_ns() < deadline_ns and not self._closing.is_set():
             try:
                 edges = source.fetch(WAIT_S)
             except OSError as error:
-                self._drop()
+                self._let_go()
                 raise self._gone(error) from error
             if edges is not None and self._of(edges)[1]:
                 self._state = LifeCycle.BOUND
@@ -139,57 +133,11 @@ class PpsDevice(Configured):
                 if label.is_file():
                     found["source"] = label.read_text(encoding="utf-8").strip()
                 return found
-        self._drop()
+        self._let_go()
         raise DeviceError(
             f"{self.name}: no {self.edge} edge came at {self.device} in {self.silence_s:g} s: "
             "check the PPS cable, that the receiver has a fix and sends PPS, and the polarity"
         )
-
-    def run(self, sink: Sink) -> None:
-        """Deliver until closed. See `drivers.contract.Device`."""
-        if self._closing.is_set():
-            return
-        self._ended.clear()
-        self._teller.sink = sink
-        pause = BackOff()
-        was_lost = False
-        try:
-            while not self._closing.is_set():
-                try:
-                    source = self._source = self._source or self._open()
-                except DeviceError as error:
-                    if not was_lost:
-                        self._teller.tell(
-                            "lost", f"{error}. It is tried again by itself.", fault=True
-                        )
-                    was_lost = True
-                    self._clock.wait(self._closing, pause.next_s())
-                    continue
-                was_lost = False
-                self._state = LifeCycle.ACTIVE
-                self._teller.tell("opened", f"The pulse per second {self.name} is open.")
-                try:
-                    self._serve(source, sink, pause)
-                except OSError as error:
-                    was_lost = True
-                    sentence = f"{self._gone(error)}. It is tried again by itself."
-                    self._teller.tell("lost", sentence, fault=True)
-                self._drop()
-                self._clock.wait(self._closing, pause.next_s())
-        finally:
-            self._drop()
-            self._teller.sink = None
-            self._ended.set()
-
-    def close(self) -> None:
-        """End `run` within a second; may be called twice."""
-        self._closing.set()
-        if self._ended.wait(2.0):
-            self._drop()
-
-    def statistics(self) -> Mapping[str, int]:
-        """edges, edges_missed, edges_repeated, wall_clock_steps, opened, silences."""
-        return dict(self._counters)
 
     def edge_of(self, edges: Edges) -> PpsEdge | None:
         """An edge on the monotonic clock; None where it is no new one, or not to be trusted."""
@@ -198,41 +146,55 @@ class PpsDevice(Configured):
         if last is not None:
             slewed_ns = STEP_NS + round((mono_ns - last[0]) * SLEW)
             if abs(offset_ns - last[1]) > slewed_ns:
-                self._counters["wall_clock_steps"] += 1
+                self.counters["wall_clock_steps"] += 1
                 self._last_sequence = self._of(edges)[0]
                 return None
         sequence, real_ns = self._of(edges)
         previous, self._last_sequence = self._last_sequence, sequence
         if not real_ns or sequence == previous:
-            self._counters["edges_repeated"] += 1
+            self.counters["edges_repeated"] += 1
             return None
         if previous is not None and 1 < (jump := (sequence - previous) % 2**32) < 2**31:
-            self._counters["edges_missed"] += jump - 1
+            self.counters["edges_missed"] += jump - 1
         edge_ns = real_ns - offset_ns
         if not 0 <= mono_ns - edge_ns + STEP_NS < OLD_NS:
-            self._counters["edges_repeated"] += 1
+            self.counters["edges_repeated"] += 1
             return None
-        self._counters["edges"] += 1
+        self.counters["edges"] += 1
         return PpsEdge(self.name, sequence, edge_ns - self.latency_ns, self.sigma_ns)
 
-    def _serve(self, source: Source, sink: Sink, pause: BackOff) -> None:
+    def _reach(self) -> None:
+        self._source = self._source or self._open()
+
+    def _tell_opened(self) -> None:
+        self.teller.tell("opened", f"The pulse per second {self.name} is open.")
+
+    def _serve(self, sink: Sink) -> None:
+        self._state = LifeCycle.ACTIVE
+        try:
+            self._listen(sink)
+        except OSError as error:
+            self._tell_lost(f"{self._gone(error)}. It is tried again by itself.")
+
+    def _listen(self, sink: Sink) -> None:
+        source = self._source
+        assert source is not None
         silence_ns = round(self.silence_s * 1e9)
-        heard_ns, is_silent = self._clock.mono_ns(), False
+        heard_ns, is_silent = self.clock.mono_ns(), False
         self._last_wall = self._wall()
         while not self._closing.is_set():
             edges = source.fetch(WAIT_S)
             edge = None if edges is None else self.edge_of(edges)
             if edge is not None:
                 sink(edge)
-                pause.reset()
-                heard_ns = self._clock.mono_ns()
+                heard_ns = self.clock.mono_ns()
                 if is_silent:
                     is_silent = False
-                    self._teller.tell("recovered", f"The pulse per second {self.name} is back.")
-            elif not is_silent and self._clock.mono_ns() - heard_ns >= silence_ns:
+                    self.teller.tell("recovered", f"The pulse per second {self.name} is back.")
+            elif not is_silent and self.clock.mono_ns() - heard_ns >= silence_ns:
                 is_silent = True
-                self._counters["silences"] += 1
-                self._teller.tell(
+                self.counters["silences"] += 1
+                self.teller.tell(
                     "silent",
                     f"No edge of the pulse per second {self.name} for {self.silence_s:g} s; check "
                     "the PPS cable and the receiver's fix. The clock coasts.",
@@ -266,7 +228,7 @@ class PpsDevice(Configured):
         except (OSError, DeviceError) as error:
             source.close()
             raise error if isinstance(error, DeviceError) else self._gone(error) from error
-        self._counters["opened"] += 1
+        self.counters["opened"] += 1
         self._last_sequence = None
         return source
 
@@ -278,7 +240,7 @@ class PpsDevice(Configured):
             why = "permission denied; install the udev rules, which give it to the service's group"
         return DeviceError(f"{self.name}: pulse per second at {self.device}: {why}")
 
-    def _drop(self) -> None:
+    def _let_go(self) -> None:
         source, self._source = self._source, None
         if source is not None:
             source.close()

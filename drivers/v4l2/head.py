@@ -129,7 +129,7 @@ class V4l2Head(V4l2Settings, HeadDevice):
             camera.node.close()
             raise
         self._session = session
-        self._counters["opened"] += 1
+        self.counters["opened"] += 1
 
     def _check_size(self, camera: V4l2Camera) -> None:
         layout = camera.layout
@@ -170,7 +170,7 @@ class V4l2Head(V4l2Settings, HeadDevice):
             reason = _loss(error)
         if reason:
             self._state = LifeCycle.INACTIVE
-            self._teller.tell(
+            self.teller.tell(
                 "lost",
                 f"The head {self.name} at {self.device} was lost ({reason}). Check its power and "
                 "cable; it is opened again by itself.",
@@ -180,11 +180,11 @@ class V4l2Head(V4l2Settings, HeadDevice):
 
     def _deliver(self, session: _Session, sink: Sink) -> None:
         node = session.camera.node
-        started_ns = heard_ns = self._clock.mono_ns()
+        started_ns = heard_ns = self.clock.mono_ns()
         next_check_ns = started_ns + round(self.check_interval_s * 1e9)
         while not self._closing.is_set():
             found = node.wait(WAIT_STEP_S)
-            now_ns = self._clock.mono_ns()
+            now_ns = self.clock.mono_ns()
             if found & (select.POLLIN | select.POLLERR | select.POLLHUP):
                 filled = node.dequeue()
                 if filled is not None:
@@ -194,7 +194,7 @@ class V4l2Head(V4l2Settings, HeadDevice):
                     raise HeadLostError("the kernel ended its stream")
             self._queue_again(session)
             if self.silence_s and now_ns - heard_ns > self.silence_s * 1e9:
-                self._counters["silences"] += 1
+                self.counters["silences"] += 1
                 raise HeadLostError(f"no frame came for {self.silence_s:g} s")
             if now_ns >= next_check_ns:
                 node.sign_of_life()
@@ -205,11 +205,11 @@ class V4l2Head(V4l2Settings, HeadDevice):
     def _take(self, session: _Session, filled: Filled, sink: Sink) -> None:
         """A filled buffer: its pixels into a slot, the buffer back to the kernel."""
         counted = session.sequence.take(filled.sequence)
-        self._counters["sequence_repeated"] += counted.is_repeated
-        self._counters["sequence_restarts"] += counted.is_restart
+        self.counters["sequence_repeated"] += counted.is_repeated
+        self.counters["sequence_restarts"] += counted.is_restart
         if counted.missing:
-            self._counters["frames_missing"] += counted.missing
-            self._teller.complain(
+            self.counters["frames_missing"] += counted.missing
+            self.teller.complain(
                 "frames-missing",
                 f"The head {self.name} lost {counted.missing} frames before they reached memory. "
                 "See whether the computer is overloaded; the exposures are flagged.",
@@ -223,13 +223,13 @@ class V4l2Head(V4l2Settings, HeadDevice):
         if frame is None:
             return
         key = "frames" if frame.status is FrameStatus.COMPLETE else f"frames_{frame.status.value}"
-        self._counters[key] += 1
+        self.counters[key] += 1
         self._lend_out(frame.slot)
         sink(frame)
 
     def _frame(self, session: _Session, filled: Filled, counter: int, slot: int) -> Frame:
         camera, layout = session.camera, session.camera.layout
-        now_ns = self._clock.mono_ns()
+        now_ns = self.clock.mono_ns()
         exposure_us = camera.exposure_time_us(session.settings)
         return Frame(
             head=self.name,
@@ -287,7 +287,7 @@ class V4l2Head(V4l2Settings, HeadDevice):
         if stamp_ns is None:
             return None
         if not now_ns - STAMP_BEHIND_NS <= stamp_ns <= now_ns + STAMP_AHEAD_NS:
-            self._counters["stamps_implausible"] += 1
+            self.counters["stamps_implausible"] += 1
             return None
         if filled.is_start_of_exposure:
             return stamp_ns
@@ -301,7 +301,7 @@ class V4l2Head(V4l2Settings, HeadDevice):
             try:
                 session.camera.node.queue(index)
             except OSError as error:
-                self._counters["queue_failures"] += 1
+                self.counters["queue_failures"] += 1
                 if error.errno != errno.EINVAL or tries + 1 >= QUEUE_TRIES:
                     raise
                 session.not_queued[index] = tries + 1
@@ -320,7 +320,7 @@ class V4l2Head(V4l2Settings, HeadDevice):
             node.stream_off()
         except OSError:
             # A lost head refuses; its mappings have to go all the same, or it never comes back.
-            self._counters["stop_failures"] += 1
+            self.counters["stop_failures"] += 1
         node.close()
 
 
