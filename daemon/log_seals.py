@@ -43,6 +43,10 @@ def seal_logs(mission: Mission) -> list[str]:
     new = [path for path in logs_of(mission.log_dir) if path.name not in seals]
     if not new:
         return []
+    for path in new:
+        # A run that was killed leaves bytes that only the kernel has: a power cut after this would
+        # take them from under their seal.
+        durable.sync_file(path)
     seals |= {path.name: LogSeal(path.stat().st_size, hash_file(path)) for path in new}
     content = {
         "format": SEALS_FORMAT,

@@ -41,7 +41,8 @@ Complete = Callable[[Capture, Sequence[LoggedRecord]], Exposure]
 
 @dataclass(frozen=True)
 class RecoveryReport:
-    """What recovery found and did. `problems` are what it could not put right.
+    """What recovery found and did. `problems` are what it could not put right, `noticed` what needs
+    nothing to be done and is told at every start.
 
     `sealed` and `lost` are the numbers it sealed just now; `settled` are all sealed records by
     number, for the ledger, and `ledger_sheet` the last one that was logged under the topic
@@ -50,6 +51,7 @@ class RecoveryReport:
 
     done: tuple[str, ...]
     problems: tuple[str, ...]
+    noticed: tuple[str, ...]
     sealed: tuple[int, ...]
     lost: tuple[int, ...]
     next_number: int
@@ -60,7 +62,7 @@ class RecoveryReport:
     @property
     def sentences(self) -> tuple[str, ...]:
         """All there is to tell the crew, what went wrong first."""
-        return (*self.problems, *self.done)
+        return (*self.problems, *self.done, *self.noticed)
 
 
 def recover(mission: Mission, complete: Complete, *, software: str = "") -> RecoveryReport:
@@ -93,6 +95,7 @@ class _Recovery:
         self.software = software
         self.done: list[str] = []
         self.problems: list[str] = []
+        self.noticed: list[str] = []
 
     def run(self) -> RecoveryReport:
         self._parts()
@@ -105,20 +108,14 @@ class _Recovery:
             self._index_products(catalog)
             log = self._triggers()
             newly, lost = self._seal(catalog, captures, sealed, log)
-            for sentence in self.done:
-                catalog.add_event(
-                    "recovery", "done", sentence, is_fault=False, mono_ns=0, boot_id=""
-                )
-            for sentence in self.problems:
-                catalog.add_event(
-                    "recovery", "problem", sentence, is_fault=True, mono_ns=0, boot_id=""
-                )
+            self._note(catalog)
         finally:
             catalog.close()
         next_number = 1 + max([self.mission.next_number() - 1, *log.triggers, *indexed])
         return RecoveryReport(
             done=tuple(self.done),
             problems=tuple(self.problems),
+            noticed=tuple(self.noticed),
             sealed=tuple(newly),
             lost=tuple(lost),
             next_number=next_number,
@@ -126,6 +123,16 @@ class _Recovery:
             ledger_sheet=log.sheet,
             log_bytes_cut=log.cut_nbytes,
         )
+
+    def _note(self, catalog: Catalog) -> None:
+        """Into the index what the crew may want to read after landing; what stays, only once."""
+        known = {sentence for source, _, sentence in catalog.events() if source == "recovery"}
+        new = [("done", sentence) for sentence in self.done]
+        new += [("problem", sentence) for sentence in self.problems if sentence not in known]
+        new += [("noticed", sentence) for sentence in self.noticed if sentence not in known]
+        for name, sentence in new:
+            is_fault = name == "problem"
+            catalog.add_event("recovery", name, sentence, is_fault=is_fault, mono_ns=0, boot_id="")
 
     def _parts(self) -> None:
         """Folders without their final name: whole ones get it, the rest is set aside."""
@@ -262,7 +269,7 @@ class _Recovery:
                         log.sheet = parse_record(message.payload, message.topic)
             if reader.cut_nbytes:
                 log.cut_nbytes += reader.cut_nbytes
-                self.done.append(
+                self.noticed.append(
                     f"log/{path.name}: ends in the middle of a message; "
                     f"{reader.cut_nbytes} bytes cannot be read"
                 )

@@ -114,7 +114,7 @@ def test_a_torn_log_seals_with_what_it_still_has(mission):
     os.truncate(log.path, size - 20)
     report = recover(mission, complete_from_log)
     assert report.log_bytes_cut > 0
-    assert any("ends in the middle of a message" in sentence for sentence in report.done)
+    assert any("ends in the middle of a message" in sentence for sentence in report.noticed)
     assert read_sealed(mission.level0(2)).exposure.mark_gps_ns == mark_of(2).gps_ns
     log.close()
 

@@ -1,0 +1,176 @@
+"""The flight whose writes are recorded: `python -m tests.crash.flight ROOT ACKS EXPOSURES FORGETS`.
+
+The real writer process, recovery and products over a camera of tiny heads, in two lives: the first
+ends as by `kill -9` with an exposure stored and not sealed, the second begins with recovery and
+lands. Whatever is told to somebody goes as a line into ACKS at the moment it is told.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from daemon import durable, log_seals, writer
+from daemon.exposure import Exposure
+from daemon.level0_folder import read_sealed
+from daemon.log_records import LoggedTrigger, message_of
+from daemon.messages import Log, NoteProducts, Seal, Sealed, Stop, Store, Stored
+from daemon.mission import Mission
+from daemon.products import write_level2
+from daemon.recovery import recover
+from daemon.recovery_match import seal_from_log
+from drivers.contract import TriggerPulse
+from tests.daemon.small_camera import (
+    SENSORS,
+    capture_of,
+    final_record,
+    mark_of,
+    new_mission,
+    pixels_of,
+    small_rig,
+)
+
+NEVER_S = 1e9
+
+
+class Ring:
+    """Frames of one head as the writer finds them in shared memory; a slot is a number."""
+
+    def __init__(self, head: str) -> None:
+        self.head = head
+
+    def frame(self, slot: int, height_px: int, width_px: int) -> Any:
+        return pixels_of(slot)[self.head].reshape(height_px, width_px)
+
+
+class _Without:
+    """A module one of whose functions does nothing."""
+
+    def __init__(self, module: Any, name: str) -> None:
+        self._module, self._name = module, name
+
+    def __getattr__(self, name: str) -> Any:
+        return (lambda *_: None) if name == self._name else getattr(self._module, name)
+
+
+class Flown:
+    """Stands where the service stands: gives the orders, and tells on what is answered."""
+
+    def __init__(self, mission: Mission, acks: int, numbers: range, lands: bool) -> None:
+        self._mission = mission
+        self._acks = acks
+        self._answers: list[object] = []
+        self._orders = self._flight(numbers, lands)
+        self._logged = 0
+        self._told = 0
+
+    def send(self, message: object) -> None:
+        if isinstance(message, Stored):
+            tell(self._acks, f"stored {message.number}")
+        elif isinstance(message, Sealed):
+            tell(self._acks, f"sealed {message.number} {message.sha256}")
+        self._answers.append(message)
+
+    def receive(self, _timeout_s: float) -> object:
+        if self._told < self._logged and writer.LOG_SYNC_INTERVAL_S == 0.0:
+            tell(self._acks, f"logged {self._logged}")
+            self._told = self._logged
+        # Every now and then a second has passed.
+        order = next(self._orders)
+        is_logged = isinstance(order, Log)
+        self._logged += is_logged
+        writer.LOG_SYNC_INTERVAL_S = 0.0 if is_logged and self._logged % 3 == 0 else NEVER_S
+        return order
+
+    def _flight(self, numbers: range, lands: bool) -> Iterator[object]:
+        for number in numbers:
+            pulse = TriggerPulse(number, number * 10**9, 1000, number)
+            yield Log(message_of(LoggedTrigger(number, pulse, {"0": 0, "1": 0})))
+            yield Log(message_of(mark_of(number)))
+            if number % 4 == 0:  # nothing came of it
+                missing = tuple((sensor, "no frame came") for sensor in SENSORS)
+                record = Exposure(number=number, boot_id="", state="lost", missing=missing)
+                yield Seal(record)
+                continue
+            sensors = SENSORS if number % 2 else SENSORS[:2]
+            capture = capture_of(number, sensors)
+            yield Store(capture, dict.fromkeys(sensors, number))
+            stored = self._answers[-1]
+            assert isinstance(stored, Stored), stored
+            if not lands and number == numbers[-1]:
+                break
+            yield Seal(final_record(replace(capture, frames=stored.frames)))
+            yield from self._process(number)
+        if lands:
+            yield Stop()
+        os._exit(0)  # killed: nothing is closed
+
+    def _process(self, number: int) -> Iterator[object]:
+        """What a worker does beside it; the second exposure twice, as when it is done anew."""
+        for _ in range(2 if number == 2 else 1):
+            pan = np.full((4, 6), number, np.uint16)
+            done = write_level2(
+                self._mission,
+                number,
+                report_json={"verdict": "good"},
+                pan=pan,
+                colour={},
+                quicklook=None,
+            )
+            tell(self._acks, f"processed {number}")
+            yield NoteProducts(number, done.files, done.verdict)
+
+
+def tell(acks: int, line: str) -> None:
+    """Say something to the world: from now on it must hold."""
+    os.write(acks, line.encode() + b"\n")
+
+
+def forget(what: str) -> None:
+    """Leave a step out, so that a test can show that the missing step is found."""
+    if what == "folders":
+        durable.sync_directory = lambda path: None
+    elif what == "frames":
+        durable.os = _Without(os, "fsync")
+    elif what == "log":
+        log_seals.durable = _Without(durable, "sync_file")
+
+
+def main() -> None:
+    root, acks_path, count = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])
+    forget(sys.argv[4])
+    acks = os.open(acks_path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+    first = os.fork()
+    if not first:
+        mission = new_mission(root)
+        tell(acks, f"mission {mission.id}")
+        live(mission, acks, range(1, count + 1), lands=False)
+    os.waitpid(first, 0)
+    mission = Mission.current(root)
+    assert mission is not None
+    live(mission, acks, range(count + 1, 2 * count + 1), lands=True)
+
+
+def live(mission: Mission, acks: int, numbers: range, *, lands: bool) -> None:
+    """One life of the service: recovery, flight, and its end."""
+    with mission.held():
+        report = recover(mission, seal_from_log(small_rig()))
+        for exposure in report.settled:
+            sealed = read_sealed(mission.level0(exposure.number))
+            assert sealed is not None
+            tell(acks, f"sealed {exposure.number} {sealed.sha256}")
+        link: Any = Flown(mission, acks, numbers, lands)
+        rings: Any = tuple(Ring(sensor) for sensor in SENSORS)
+        writer.main(link, mission.path, rings)
+    tell(acks, "closing 0")
+    mission.close()
+
+
+if __name__ == "__main__":
+    main()
