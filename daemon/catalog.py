@@ -15,62 +15,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from daemon.catalog_schema import SCHEMA_VERSION, create, migrate
 from daemon.errors import DaemonError
 from daemon.exposure import Capture, Exposure, FrameRecord
 
-SCHEMA_VERSION = 2
 BUSY_TIMEOUT_S = 10.0
 """How long a writer waits while another process commits."""
 
 BUSY_RETRY_S = 0.01
-
-_SCHEMA = """
-CREATE TABLE exposures (
-    number INTEGER PRIMARY KEY,
-    state TEXT NOT NULL CHECK (state IN ('stored', 'complete', 'degraded', 'lost')),
-    is_sealed INTEGER NOT NULL CHECK (is_sealed IN (0, 1)),
-    trigger_sequence INTEGER NOT NULL,
-    trigger_mono_ns INTEGER NOT NULL,
-    boot_id TEXT NOT NULL,
-    mark_gps_ns INTEGER,
-    mark_sigma_ns INTEGER,
-    mark_source TEXT NOT NULL DEFAULT 'none',
-    latitude_deg REAL,
-    longitude_deg REAL,
-    height_m REAL,
-    line_id TEXT NOT NULL,
-    strip_id TEXT NOT NULL,
-    flags INTEGER NOT NULL,
-    is_simulated INTEGER NOT NULL,
-    record_sha256 TEXT,
-    previous_sha256 TEXT,
-    seal_order INTEGER UNIQUE
-) STRICT;
-CREATE TABLE frames (
-    number INTEGER NOT NULL REFERENCES exposures (number) ON DELETE CASCADE,
-    sensor TEXT NOT NULL,
-    file TEXT NOT NULL,
-    sha256 TEXT NOT NULL,
-    mid_exposure_gps_ns INTEGER,
-    PRIMARY KEY (number, sensor)
-) STRICT;
-CREATE TABLE products (
-    number INTEGER NOT NULL,
-    file TEXT NOT NULL,
-    nbytes INTEGER NOT NULL,
-    verdict TEXT,
-    PRIMARY KEY (number, file)
-) STRICT;
-CREATE TABLE events (
-    id INTEGER PRIMARY KEY,
-    boot_id TEXT NOT NULL,
-    mono_ns INTEGER NOT NULL,
-    source TEXT NOT NULL,
-    name TEXT NOT NULL,
-    is_fault INTEGER NOT NULL,
-    sentence TEXT NOT NULL
-) STRICT;
-"""
 
 
 class CatalogError(DaemonError):
@@ -109,8 +61,10 @@ class Catalog:
     def open(cls, path: Path) -> Catalog:
         """Open for writing; the file is created with an empty schema where it is not there.
 
+        One of an older schema is brought to this version's in one transaction.
+
         Raises:
-            CatalogError: damaged, or of another schema version.
+            CatalogError: damaged, or of a newer schema version.
             CatalogBusyError: another process holds it and does not let go.
         """
         try:
@@ -140,8 +94,10 @@ class Catalog:
     def read(cls, path: Path) -> Catalog:
         """Open for reading only, while another process writes or on a medium that is read-only.
 
+        One of an older schema is read through a copy in memory, and left as it is.
+
         Raises:
-            CatalogError: not there, damaged, or of another schema version.
+            CatalogError: not there, damaged, or of a newer schema version.
         """
         if not path.is_file():
             raise CatalogError(f"{path}: no such index; syntopic repair builds it again")
@@ -163,6 +119,9 @@ class Catalog:
                     f"{address}?immutable=1", uri=True, check_same_thread=False
                 )
                 version = connection.execute("PRAGMA user_version").fetchone()[0]
+            if 0 < version < SCHEMA_VERSION:
+                connection = _migrated_copy(connection)
+                version = SCHEMA_VERSION
         except sqlite3.Error as error:
             raise CatalogError(_damaged(path, error)) from error
         if version != SCHEMA_VERSION:
@@ -332,9 +291,20 @@ def _prepare(connection: sqlite3.Connection, path: Path) -> None:
         if verdict != "ok":
             raise CatalogError(_damaged(path, verdict))
     elif version == 0:
-        _create(connection)
+        create(connection)
+    elif version < SCHEMA_VERSION:
+        migrate(connection)
     else:
         raise CatalogError(_wrong_version(path, version))
+
+
+def _migrated_copy(old: sqlite3.Connection) -> sqlite3.Connection:
+    """The index in memory, in the schema of this version."""
+    copy = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
+    old.backup(copy)
+    old.close()
+    migrate(copy)
+    return copy
 
 
 def _enter_wal(connection: sqlite3.Connection) -> None:
@@ -357,19 +327,11 @@ def _is_busy(error: sqlite3.Error) -> bool:
     return code in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED)
 
 
-def _create(connection: sqlite3.Connection) -> None:
-    connection.execute("BEGIN IMMEDIATE")
-    # Another process may have been first while this one waited for the lock.
-    if connection.execute("PRAGMA user_version").fetchone()[0] == 0:
-        for statement in filter(str.strip, _SCHEMA.split(";")):
-            connection.execute(statement)
-        connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
-    connection.execute("COMMIT")
-
-
 def _damaged(path: Path, finding: object) -> str:
     return f"{path}: damaged ({finding}); recovery sets it aside and rebuilds it from the records"
 
 
 def _wrong_version(path: Path, version: int) -> str:
-    return f"{path}: schema {version}; this version reads {SCHEMA_VERSION} (syntopic repair)"
+    return (
+        f"{path}: schema {version}; this version reads {SCHEMA_VERSION} at most (syntopic repair)"
+    )
