@@ -6,15 +6,26 @@ import math
 
 from daemon.configuration import PlanSection
 from daemon.exposure import Exposure
+from daemon.plan.overlaps import Surroundings
+from drivers.leap_seconds import leap_seconds_at
 from processing.pipeline import Conditions
 from processing.quality import Flag
 from processing.rig import Rig
+from processing.sun import sun_elevation_rad
+
+GPS_EPOCH_UNIX_S = 315_964_800
 
 
-def conditions_of(exposure: Exposure, rig: Rig, plan: PlanSection, flags: Flag) -> Conditions:
+def conditions_of(
+    exposure: Exposure,
+    rig: Rig,
+    plan: PlanSection,
+    flags: Flag,
+    surroundings: Surroundings | None = None,
+) -> Conditions:
     """The conditions of an exposure; what the record does not know comes from the plan.
 
-    `flags` are added to those the record holds.
+    `flags` are added to those the record holds; `surroundings` are its overlaps, where known.
     """
     navigation = exposure.navigation
     speed_mps = plan.ground_speed_mps
@@ -48,6 +59,19 @@ def conditions_of(exposure: Exposure, rig: Rig, plan: PlanSection, flags: Flag) 
         crab_rad=crab_rad,
         time_sigma_ns=max(sigmas_ns, default=exposure.mark_sigma_ns),
         time_budget_ns=exposure.time_budget_ns,
+        forward_overlap=surroundings.forward_overlap if surroundings else None,
+        sidelap=surroundings.sidelap if surroundings else None,
+        sun_elevation_rad=_sun_elevation_rad(exposure),
         capture_flags=Flag(exposure.flags) | flags,
         simulated=exposure.simulated,
+    )
+
+
+def _sun_elevation_rad(exposure: Exposure) -> float | None:
+    gps_ns, place = exposure.mark_gps_ns, exposure.navigation
+    if gps_ns is None or place is None:
+        return None
+    unix_s = gps_ns * 1e-9 - leap_seconds_at(gps_ns) + GPS_EPOCH_UNIX_S
+    return sun_elevation_rad(
+        unix_s, math.radians(place.latitude_deg), math.radians(place.longitude_deg)
     )

@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -36,12 +37,16 @@ from daemon.messages import (
     WorkerSettings,
 )
 from daemon.mission import Mission
+from daemon.orientation import exposures_of, mount_of
+from daemon.plan.overlaps import Overlaps, Surroundings
+from daemon.plan.reading import read_plan
 from daemon.processes import Link
 from daemon.radiometry_folder import RadiometryFolder
 from processing.drawing import residuals_svg
 from processing.pipeline import Conditions, Pipeline, Settings
 from processing.quality import Flag, as_json
 from processing.rig import Rig, find_rig
+from processing.specification import Asked
 from processing.stitch_record import stitch_record, stitch_record_json
 
 SWITCH_INTERVAL_S = 0.001
@@ -56,14 +61,17 @@ def main(link: Link, settings: WorkerSettings, rings: tuple[FrameRing, ...]) -> 
     pipeline = make_pipeline(rig, settings)
     pipeline.warm_up()
     lanes = Lanes(pipeline, settings.processing.exposures_in_work)
-    desk = _Desk(link, rig, Mission.open(settings.mission), settings.plan, rings)
+    mission = Mission.open(settings.mission)
+    desk = _Desk(link, rig, mission, settings.plan, rings, overlaps_of(mission, rig))
     link.send(WorkerReady(time.monotonic() - started))
     in_work: set[Future[None]] = set()
     while not isinstance(order := link.receive(timeout_s=1.0), Stop):
         if isinstance(order, Ping):
             link.send(Pong({}))
         elif isinstance(order, Process):
-            in_work.add(lanes.submit(partial(desk.process, order)))
+            # Here and not in a lane: the overlaps of one exposure follow from those before it.
+            surroundings = desk.surroundings_of(order.exposure)
+            in_work.add(lanes.submit(partial(desk.process, order, surroundings)))
         done = {future for future in in_work if future.done()}
         in_work -= done
         for future in done:
@@ -93,8 +101,36 @@ def make_pipeline(rig: Rig, settings: WorkerSettings) -> Pipeline:
             baselines=settings.processing.baselines,
             geometry=settings.processing.geometry,
             threads=settings.processing.threads,
+            asked=asked_of(settings.mission),
         ),
     )
+
+
+def asked_of(mission: Path) -> Asked:
+    """What the mission's plan asks of every exposure; nothing where there is none."""
+    path = Mission(mission, mission.name).plan_path
+    if path is None:
+        return Asked()
+    wanted = read_plan(path).specification
+    return Asked(
+        forward_overlap=max(0.0, wanted.forward_overlap - wanted.overlap_tolerance),
+        sidelap=max(0.0, wanted.sidelap - wanted.overlap_tolerance),
+        gsd_m=wanted.gsd_m,
+        tilt_deg=wanted.tilt_deg,
+        crab_deg=wanted.crab_deg,
+        sun_deg=wanted.sun_deg,
+        time_sigma_ns=wanted.time_sigma_ns,
+    )
+
+
+def overlaps_of(mission: Mission, rig: Rig) -> Overlaps:
+    """The footprints of what has been flown of a mission after a plan."""
+    mount, plan = mount_of(mission)
+    overlaps = Overlaps(rig, mount, plan.ground_height_m)
+    if mission.plan_path is not None:
+        for exposure in exposures_of(mission):
+            overlaps.add(exposure)
+    return overlaps
 
 
 def process_exposure(
@@ -106,6 +142,7 @@ def process_exposure(
     frames: Mapping[str, NDArray[np.uint16]],
     flags: Flag = Flag(0),  # noqa: B008 - an immutable value
     *,
+    surroundings: Surroundings | None = None,
     frames_read: Callable[[], None] | None = None,
 ) -> tuple[dict[str, Any], Mapping[str, int]]:
     """Run the pipeline on one exposure and write its Level-2 folder.
@@ -113,7 +150,7 @@ def process_exposure(
     Returns:
         The content of quality.json, and the files written with their sizes in bytes.
     """
-    conditions = conditions_of(exposure, rig, plan, flags)
+    conditions = conditions_of(exposure, rig, plan, flags, surroundings)
     report, contents = make_products(
         pipeline, exposure.number, frames, conditions, frames_read=frames_read
     )
@@ -169,8 +206,14 @@ class _Desk:
     mission: Mission
     plan: PlanSection
     rings: tuple[FrameRing, ...]
+    overlaps: Overlaps
 
-    def process(self, order: Process, pipeline: Pipeline) -> None:
+    def surroundings_of(self, exposure: Exposure) -> Surroundings:
+        """The overlaps of an exposure; call it in the order they were made."""
+        self.overlaps.add(exposure)
+        return self.overlaps.of(exposure.number)
+
+    def process(self, order: Process, surroundings: Surroundings, pipeline: Pipeline) -> None:
         """Process one exposure and say what became of it."""
         started = time.monotonic()
         exposure = order.exposure
@@ -189,6 +232,7 @@ class _Desk:
                 exposure,
                 frames,
                 flags,
+                surroundings=surroundings,
                 frames_read=partial(self.link.send, FramesRead(exposure.number)),
             )
         except (OSError, ValueError, ArithmeticError, np.linalg.LinAlgError) as error:

@@ -24,7 +24,8 @@ class Conditions:
 
     Angles and rates are of the body (x forward, y right, z down); `crab_rad` is the angle from the
     track to the body's x axis. `time_budget_ns` are the parts of `time_sigma_ns`: receiver, clock,
-    trigger, delay, head. `capture_flags` is what capture found.
+    trigger, delay, head. Overlaps are with the image before it on the line and with the
+    neighbouring line. `capture_flags` is what capture found.
     """
 
     temperatures_c: Mapping[str, float | None] = field(default_factory=dict)
@@ -39,6 +40,9 @@ class Conditions:
     crab_rad: float | None = None
     time_sigma_ns: float | None = None
     time_budget_ns: Mapping[str, float] = field(default_factory=dict)
+    forward_overlap: float | None = None
+    sidelap: float | None = None
+    sun_elevation_rad: float | None = None
     capture_flags: Flag = NO_FLAGS
     simulated: bool = False
 
@@ -102,6 +106,10 @@ def condition_figures(
     figures["tilt_deg"] = math.degrees(max(tilts)) if tilts else None
     crab = conditions.crab_rad
     figures["crab_deg"] = None if crab is None else abs(math.degrees(crab))
+    figures["forward_overlap"] = conditions.forward_overlap
+    figures["sidelap"] = conditions.sidelap
+    sun = conditions.sun_elevation_rad
+    figures["sun_deg"] = None if sun is None else math.degrees(sun)
     figures["tdi_shifts"] = conditions.tdi_shifts.get(rig.reference_cone)
     return figures
 

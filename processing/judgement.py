@@ -20,6 +20,7 @@ from processing.quality import (
     Verdict,
     finite,
 )
+from processing.specification import Asked, asked_findings
 
 _CAPTURE: Final[Mapping[Flag, tuple[Verdict, str]]] = {
     Flag.FRAME_LATE: (
@@ -58,6 +59,14 @@ _CAPTURE: Final[Mapping[Flag, tuple[Verdict, str]]] = {
         Verdict.REFLY,
         "The overlap is below plan; fly this part of the line again.",
     ),
+    Flag.SUN: (
+        Verdict.USABLE,
+        "The sun stands low: long shadows; go on when it is higher if the project asks for it.",
+    ),
+    Flag.GSD: (
+        Verdict.USABLE,
+        "The ground sampling distance is coarser than planned; fly lower.",
+    ),
     Flag.GNSS: (
         Verdict.USABLE,
         "GNSS quality is poor; wait for a better fix before the next line if the plan allows.",
@@ -87,6 +96,7 @@ def judge(
     probes_out_of_range: Sequence[str] = (),
     nominal_bands: Sequence[str] = (),
     thresholds: Thresholds | None = None,
+    asked: Asked | None = None,
 ) -> QualityReport:
     """Findings and verdict of one exposure from its figures.
 
@@ -99,6 +109,7 @@ def judge(
         missing_probes: probes that gave no temperature.
         probes_out_of_range: probes whose temperature cannot be.
         nominal_bands: colours placed by calibration because too few tie points were found.
+        asked: what the project asks for, where it does.
     """
     t = thresholds or Thresholds()
     findings = [
@@ -109,6 +120,8 @@ def judge(
     findings += _stitching(figures, nominal_bands, t)
     findings += _exposure(figures, t)
     findings += _attitude(figures, t)
+    broken = list(asked_findings(figures, asked or Asked()))
+    findings = [f for f in findings if f.flag not in {b.flag for b in broken}] + broken
     order = list(Verdict)
     worst = max((order.index(finding.verdict) for finding in findings), default=0)
     flags = capture_flags

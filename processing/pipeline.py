@@ -233,6 +233,7 @@ class Pipeline:
                     r.band for r in registrations if not r.registered and r.sensor in level1
                 ],
                 thresholds=settings.thresholds,
+                asked=settings.asked,
             )
         return Product(
             sensors=self._pan.names,

@@ -15,6 +15,7 @@ from processing.estimated_dc import EstimatedDc
 from processing.mosaic import Mosaic, MosaicSettings
 from processing.quality import QualityReport, Thresholds
 from processing.resampling import Interpolation
+from processing.specification import Asked
 from processing.stitching import Method
 from processing.tie_points import TiePoints, TiePointSettings
 from processing.validity import Validity
@@ -44,6 +45,7 @@ class Settings:
     relief_fraction: float = 0.01
     threads: int = 2
     thresholds: Thresholds = field(default_factory=Thresholds)
+    asked: Asked = field(default_factory=Asked)
     tie_points: TiePointSettings = field(default_factory=TiePointSettings)
     mosaic: MosaicSettings = field(default_factory=MosaicSettings)
     colour: ColourSettings = field(default_factory=ColourSettings)

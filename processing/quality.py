@@ -45,6 +45,8 @@ class Flag(enum.IntFlag):
     SIMULATED = 1 << 24
     NOT_PROCESSED = 1 << 25
     TIME_HOLDOVER = 1 << 26
+    SUN = 1 << 27
+    GSD = 1 << 28
 
 
 NO_FLAGS: Final = Flag(0)
@@ -161,6 +163,9 @@ FIGURES: Final[Mapping[str, str]] = {
     "missing_sensors": "sensors without a frame, comma separated",
     "tilt_deg": "largest of roll and pitch",
     "crab_deg": "angle between the image's along axis and the track",
+    "forward_overlap": "share of the ground seen that the image before it on the line saw, too",
+    "sidelap": "share of it that images of the neighbouring line saw, the poorer side",
+    "sun_deg": "elevation of the sun",
     "tdi_shifts": "TDI shifts of the reference cone",
     "parallax_px": "parallax relief may leave between PAN and the colour master, PAN pixels",
     "green_rms_px": "residual of P/C tie points, colour pixels",

@@ -46,7 +46,7 @@ def process(
     os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
     from daemon import store
     from daemon.messages import WorkerSettings
-    from daemon.worker import make_pipeline, process_exposure
+    from daemon.worker import make_pipeline, overlaps_of, process_exposure
     from processing.rig import load_rig
 
     if method not in ("free", "fixed") or interpolation not in ("bilinear", "cubic", "lanczos"):
@@ -75,6 +75,7 @@ def process(
     )
     console = Console(stderr=True)
     pipeline = make_pipeline(rig, settings)
+    overlaps = overlaps_of(folder, rig)
     reports = []
     with Progress(console=console, transient=True) as progress:
         task = progress.add_task("compiling kernels", total=None)
@@ -84,7 +85,15 @@ def process(
         for number in numbers:
             started = time.monotonic()
             frames, exposure = store.load_level0(folder.level0(number), rig)
-            report, _ = process_exposure(pipeline, rig, folder, plan, exposure, frames)
+            report, _ = process_exposure(
+                pipeline,
+                rig,
+                folder,
+                plan,
+                exposure,
+                frames,
+                surroundings=overlaps.of(number),
+            )
             report["duration_s"] = round(time.monotonic() - started, 3)
             reports.append(report)
             progress.advance(task)

@@ -123,7 +123,7 @@ def _of_line(
     seen = np.zeros(points.shape[:2], dtype=np.int64)
     for one, corners in near:
         if not one.why_not:
-            seen += _inside(corners, points)
+            seen += inside(corners, points)
     stations = np.arange(0.0, length_m + base_m, base_m)
     planned = np.sum(np.abs(along[:, None] - stations) <= along_m / 2 - STEP_M, axis=1)
     needed = np.minimum(planned, specification.images_on_every_point)
@@ -137,7 +137,7 @@ def _of_line(
             {
                 f"exposure {one.number}: {one.why_not}"
                 for one, corners in near
-                if one.why_not and _inside(corners, points[first : last + 1]).any()
+                if one.why_not and inside(corners, points[first : last + 1]).any()
             }
         )
         segments.append(
@@ -181,7 +181,7 @@ def _touches(corners: Array, points: Array, margin_m: float) -> bool:
     return bool((corners.max(axis=0) >= low).all() and (corners.min(axis=0) <= high).all())
 
 
-def _inside(corners: Array, points: Array) -> NDArray[np.bool_]:
+def inside(corners: Array, points: Array) -> NDArray[np.bool_]:
     """Which points lie inside a convex polygon, edges included; shape of points less the last."""
     to_next = np.roll(corners, -1, axis=0) - corners
     area = float(np.sum(corners[:, 0] * np.roll(corners[:, 1], -1)))

@@ -44,7 +44,10 @@ def _objections(
         yield "lost"
     if quality.get("verdict") == "refly":
         grave = [f["flag"] for f in quality.get("findings", []) if f.get("verdict") == "refly"]
-        yield f"refly ({', '.join(dict.fromkeys(grave)) or 'quality'})"
+        # Coverage is counted here; an image beside a gap is as good as any other.
+        why = dict.fromkeys(flag for flag in grave if flag != "OVERLAP")
+        if why or not grave:
+            yield f"refly ({', '.join(why) or 'quality'})"
     figures = quality.get("figures", {})
     navigation = exposure.navigation
     tilt_deg = figures.get("tilt_deg")

@@ -10,6 +10,10 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+from daemon.latches import DELIVERS, IS_GONE, Latches
+from daemon.phases import Phase
+
+PHASES = frozenset(phase.value for phase in Phase)
 EXPOSURES_KEPT = 2000
 """In the snapshot; earlier ones are on disk, and `/exposures` tells them."""
 EVENTS_KEPT = 500
@@ -18,6 +22,7 @@ FIGURES_TOLD = (
     *("sigma0_px", "sigma0_um", "tie_points_pp", "tie_points_pc", "outliers", "dc_k"),
     *("dc_estimated_k", "dc_estimated_sigma_k", "displaced_sensor", "gsd_m", "tilt_deg"),
     *("crab_deg", "sharpness", "saturated_fraction", "mean_dn", "valid_fraction", "method"),
+    *("forward_overlap", "sidelap", "sun_deg", "time_sigma_ns", "bright_fraction"),
     *("stitched_sigma_px", "missing_sensors", "smear_along_px", "smear_across_px"),
 )
 PARTS = ("exposures", "devices", "track", "history", "events")
@@ -45,11 +50,11 @@ class FlightState:
         self.sequence = 0
         self._footprint = footprint
         self._software = software
-        self._phase = "starting"
+        self._phase = "idle"
         self._mission: Json = {}
         self._status: Json = {}
         self._devices: dict[str, Json] = {}
-        self._faults: dict[str, Json] = {}
+        self._latches = Latches()
         self._exposures: dict[int, Json] = {}
         self._temperatures: dict[int, Any] = {}
         self._events: deque[Json] = deque(maxlen=EVENTS_KEPT)
@@ -60,6 +65,7 @@ class FlightState:
         """Take in one event of the service; one of an unknown kind is only listed."""
         self.sequence += 1
         kind = str(event.get("event", ""))
+        self._latches.apply(event, sequence=self.sequence)
         handler = _HANDLERS.get(kind)
         if handler is not None:
             handler(self, event)
@@ -111,7 +117,7 @@ class FlightState:
 
     def faults(self) -> list[Json]:
         """Faults that stand, or stood and nobody has acknowledged; the newest first."""
-        return sorted(self._faults.values(), key=lambda fault: -fault["sequence"])
+        return self._latches.listed()
 
     def exposures(self, after: int = 0, limit: int = EXPOSURES_KEPT) -> list[Json]:
         found = [told for number, told in sorted(self._exposures.items()) if number > after]
@@ -122,14 +128,8 @@ class FlightState:
 
     def acknowledge(self, fault: str) -> bool:
         """A person has seen a fault. One that has passed leaves the list; one that stands stays."""
-        found = self._faults.get(fault)
-        if found is None:
-            return False
-        found["acknowledged"] = True
-        if not found["stands"]:
-            del self._faults[fault]
         self.sequence += 1
-        return True
+        return self._latches.acknowledge(fault)
 
     # What each event means
 
@@ -137,7 +137,7 @@ class FlightState:
         self._mission = {
             key: event.get(key) for key in ("id", "path", "resumed", "rig", "simulated", "recovery")
         }
-        self._phase = "starting"
+        self._phase = "idle"
 
     def _on_bound(self, event: Mapping[str, Any]) -> None:
         device = self._device(str(event.get("device")))
@@ -149,40 +149,27 @@ class FlightState:
     def _on_device(self, event: Mapping[str, Any]) -> None:
         name = str(event.get("device"))
         device = self._device(name)
-        is_fault = bool(event.get("fault"))
         device["sentence"] = event.get("sentence", "")
         device["since_mono_ns"] = event.get("mono_ns")
-        key = f"device {name}"
-        if is_fault:
+        if event.get("name") in IS_GONE:
             device["state"] = "absent" if event.get("name") == "absent" else "lost"
-            self._raise(key, str(event.get("sentence", "")), name)
-        elif event.get("name") in ("opened", "recovered"):
+        elif event.get("name") in DELIVERS:
             device["state"] = "ready"
-            self._pass(key)
 
     def _on_fault(self, event: Mapping[str, Any]) -> None:
         self._phase = "fault"
-        self._raise("service", str(event.get("sentence", "")), "service")
 
-    def _on_disk(self, event: Mapping[str, Any]) -> None:
-        self._raise("disk", str(event.get("sentence", "")), "disk")
-
-    def _on_power(self, event: Mapping[str, Any]) -> None:
-        self._raise("power", str(event.get("sentence", "")), "power")
-
-    def _on_ready(self, event: Mapping[str, Any]) -> None:
-        self._phase = "ready"
-        for absent in event.get("absent", []):
-            self._raise(f"absent {absent}", f"Flying without {absent}; look at it.", str(absent))
+    def _on_phase(self, event: Mapping[str, Any]) -> None:
+        phase = event.get("phase")
+        if phase in PHASES:
+            self._phase = str(phase)
 
     def _on_status(self, event: Mapping[str, Any]) -> None:
         status = {key: value for key, value in event.items() if key != "event"}
         self._status = status
         phase = status.get("phase")
-        if isinstance(phase, str) and self._phase != "fault":
-            self._phase = phase
-        if status.get("exposures_left"):
-            self._pass("disk")
+        if phase in PHASES and self._phase != "fault":
+            self._phase = str(phase)
         position = status.get("position")
         if isinstance(position, Mapping):
             at = [float(position["latitude_deg"]), float(position["longitude_deg"])]
@@ -236,13 +223,10 @@ class FlightState:
 
     def _on_lost(self, event: Mapping[str, Any]) -> None:
         told = self._exposure(event)
-        number, cause = told["number"], event.get("cause")
-        told |= {"step": "lost", "state": "lost", "sentence": cause}
-        self._raise(f"exposure {number}", f"Exposure {number}: {cause}", "exposures")
+        told |= {"step": "lost", "state": "lost", "sentence": event.get("cause")}
 
     def _on_not_written(self, event: Mapping[str, Any]) -> None:
         self._exposure(event)["step"] = "not written"
-        self._raise("disk", str(event.get("sentence", "")), "disk")
 
     def _on_ended(self, event: Mapping[str, Any]) -> None:
         self._phase = "landed" if event.get("failure") is None else "fault"
@@ -264,29 +248,6 @@ class FlightState:
             del self._exposures[next(iter(self._exposures))]
         return told
 
-    def _raise(self, key: str, sentence: str, device: str = "") -> None:
-        known = self._faults.get(key)
-        count = known["count"] + 1 if known else 1
-        self._faults[key] = {
-            "id": key,
-            "device": device,
-            "sentence": sentence,
-            "stands": True,
-            "acknowledged": False,
-            "count": count,
-            "sequence": self.sequence,
-        }
-
-    def _pass(self, key: str) -> None:
-        """A fault is over; it stays listed until a person has acknowledged it."""
-        found = self._faults.get(key)
-        if found is None:
-            return
-        if found["acknowledged"]:
-            del self._faults[key]
-        else:
-            found["stands"] = False
-
     def _verdict_counts(self) -> dict[str, int]:
         counts = dict.fromkeys(VERDICT_RANK, 0)
         for told in self._exposures.values():
@@ -301,9 +262,7 @@ _HANDLERS: Mapping[str, Callable[[FlightState, Mapping[str, Any]], None]] = {
     "bound": FlightState._on_bound,
     "device": FlightState._on_device,
     "fault": FlightState._on_fault,
-    "disk": FlightState._on_disk,
-    "power": FlightState._on_power,
-    "ready": FlightState._on_ready,
+    "phase": FlightState._on_phase,
     "status": FlightState._on_status,
     "triggered": FlightState._on_triggered,
     "stored": FlightState._on_stored,

@@ -1,0 +1,39 @@
+"""Where the sun stands, to some hundredths of a degree: enough for shadows and for a specification.
+
+Refraction and the observer's height are left out.
+"""
+
+from __future__ import annotations
+
+import math
+
+J2000_UNIX_S = 946_728_000.0
+"""2000-01-01T12:00:00 UTC."""
+
+DAY_S = 86_400.0
+
+
+def sun_elevation_rad(unix_s: float, latitude_rad: float, longitude_rad: float) -> float:
+    """Elevation of the sun's centre above the horizon.
+
+    Args:
+        unix_s: UTC, seconds since 1970.
+        latitude_rad, longitude_rad: of the place, east positive.
+
+    Source: The Astronomical Almanac, "low precision formulas for the Sun" (0.01 deg from 1950 to
+    2050), and Greenwich mean sidereal time of the IAU 1982 model to first order.
+    """
+    days = (unix_s - J2000_UNIX_S) / DAY_S
+    anomaly = math.radians(357.528 + 0.985_600_3 * days)
+    longitude = math.radians(280.460 + 0.985_647_4 * days) + math.radians(
+        1.915 * math.sin(anomaly) + 0.020 * math.sin(2 * anomaly)
+    )
+    obliquity = math.radians(23.439 - 0.000_000_4 * days)
+    ascension = math.atan2(math.cos(obliquity) * math.sin(longitude), math.cos(longitude))
+    declination = math.asin(math.sin(obliquity) * math.sin(longitude))
+    sidereal = math.radians(280.460_618_37 + 360.985_647_366_29 * days)
+    hour_angle = sidereal + longitude_rad - ascension
+    return math.asin(
+        math.sin(latitude_rad) * math.sin(declination)
+        + math.cos(latitude_rad) * math.cos(declination) * math.cos(hour_angle)
+    )
