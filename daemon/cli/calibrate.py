@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from daemon.cli import calibrate_boresight
+from daemon.cli import calibrate_boresight, calibrate_radiometric, calibrate_rig
 from daemon.cli.tables import light_table
 
 if TYPE_CHECKING:
@@ -46,7 +46,9 @@ def calibrate() -> None:
     """Calibrations from flown missions."""
 
 
+app.command(name="radiometric", help=calibrate_radiometric.HELP)(calibrate_radiometric.radiometric)
 app.command(name="boresight", help=calibrate_boresight.HELP)(calibrate_boresight.boresight)
+app.command(name="rig", help=calibrate_rig.HELP)(calibrate_rig.rig)
 
 
 @app.command(name="thermal", help=THERMAL_HELP)
