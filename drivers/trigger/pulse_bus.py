@@ -83,18 +83,22 @@ class PulseBusTrigger(Configured):
         self._unit = ""
         self._outputs: tuple[str, ...] = ()
         self._closed = False
-        self._counters: Counter[str] = Counter(pulses=0, failures=0, opened=0, stale_answers=0)
+        self._count: int | None = None
+        """The unit's, where it is known."""
+        self._counters: Counter[str] = Counter(
+            pulses=0, failures=0, answers_lost=0, opened=0, stale_answers=0
+        )
 
     def bind(self) -> Mapping[str, str]:
         """Connect; the unit's name, outputs and count. See `drivers.contract.Trigger`."""
         with self._lock:
             self._connect()
-            count = self._ask("STATUS", "STATUS")[0]
+            self._count = self._asked_count()
             return {
                 "unit": self._unit,
                 "address": f"{self.host}:{self.port}",
                 "outputs": " ".join(self._outputs),
-                "count": count,
+                "count": str(self._count),
             }
 
     def program(self, delays_ns: Mapping[str, int]) -> None:
@@ -118,35 +122,46 @@ class PulseBusTrigger(Configured):
             if wrong:
                 raise DeviceError("\n".join(f"{self.name}: {sentence}" for sentence in wrong))
             self._delays_ns.update(delays_ns)
-            self._send_delays()
+            try:
+                self._send_delays()
+            except DeviceError:
+                if self._socket is not None:
+                    raise
+                # The connection is lost; a new one begins with the delays, and twice does no harm.
+                self._connect()
 
     def fire(self, sequence: int) -> TriggerPulse:
         """Give one pulse.
 
-        The time is the middle of the round trip, its sigma half of it.
+        The time is the middle of the round trip, its sigma half of it. Where the answer is lost the
+        unit is connected anew and its count says whether it fired: then at some time between asking
+        and giving up, and sigma says so.
 
         Raises:
-            DeviceError: no unit, refused, or no answer in time; then nobody knows.
+            DeviceError: no unit, refused, or no answer in time and none of its count; then nobody
+                knows.
         """
         with self._lock:
+            before_ns: int | None = None
             try:
                 self._connect()
                 before_ns = self._clock.mono_ns()
                 echo, count = self._ask(f"FIRE {sequence}", "FIRED", words=2)
                 after_ns = self._clock.mono_ns()
+                if echo != str(sequence) or not count.isdecimal():
+                    raise self._lost(f"FIRE {sequence}", f"it answered for {echo}")
             except DeviceError:
                 self._counters["failures"] += 1
-                raise
-            if echo != str(sequence) or not count.isdecimal():
-                self._counters["failures"] += 1
-                self._disconnect()
-                raise DeviceError(
-                    f"{self.name}: asked for pulse {sequence}, answered for {echo}; the exposure "
-                    "is uncertain, the unit is connected anew"
-                )
+                after_ns = self._clock.mono_ns()
+                # A unit that refuses says so and stays connected.
+                if before_ns is None or self._socket is not None or not self._has_fired():
+                    raise
+                self._counters["answers_lost"] += 1
+                count = str(self._count)
+            self._count = int(count)
             self._counters["pulses"] += 1
         sigma_ns = (after_ns - before_ns + 1) // 2
-        return TriggerPulse(sequence, before_ns + sigma_ns, sigma_ns, int(count))
+        return TriggerPulse(sequence, before_ns + sigma_ns, sigma_ns, self._count)
 
     def close(self) -> None:
         """Disconnect; may be called twice. An answer that is being waited for is given up."""
@@ -159,10 +174,26 @@ class PulseBusTrigger(Configured):
             self._disconnect()
 
     def statistics(self) -> Mapping[str, int]:
-        """pulses, failures, opened, stale_answers."""
+        """pulses, failures, answers_lost (of pulses that were given), opened, stale_answers."""
         return dict(self._counters)
 
     # The connection; the lock is held
+
+    def _has_fired(self) -> bool:
+        """Whether the unit's count, asked anew, is one more than before."""
+        known, self._count = self._count, None
+        try:
+            self._connect()
+            self._count = self._asked_count()
+        except DeviceError:
+            return False
+        return known is not None and self._count == known + 1
+
+    def _asked_count(self) -> int:
+        count = self._ask("STATUS", "STATUS")[0]
+        if not count.isdecimal():
+            raise self._lost("STATUS", f"the count {count!r} makes no sense")
+        return int(count)
 
     def _connect(self) -> None:
         if self._closed:
