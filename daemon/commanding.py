@@ -6,9 +6,10 @@ Each command answers with a sentence, and each is written into the flight log wi
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol, TypeGuard
 
+from daemon.arming import Lack
 from daemon.log_records import Message, loose_bytes
 from daemon.messages import Answer, Command
 
@@ -34,7 +35,9 @@ class Commanded(Protocol):
 
     @property
     def line(self) -> CommandedLine: ...
-    def absent(self) -> list[str]: ...
+    def lacks(self) -> Sequence[Lack]: ...
+    def override(self, by: str, missing: Sequence[Lack]) -> None: ...
+    def acknowledge(self, fault: str) -> bool: ...
     def land(self) -> None: ...
 
 
@@ -110,8 +113,11 @@ def _land(command: Command, flight: Commanded) -> Answer:
     return _yes(command, "no more exposures; what is open is sealed, then the service ends")
 
 
-def _acknowledge(command: Command, _flight: Commanded) -> Answer:
-    return _yes(command, f"noted that {command.by} has seen {command.arguments.get('fault')}")
+def _acknowledge(command: Command, flight: Commanded) -> Answer:
+    fault = command.arguments.get("fault")
+    if not isinstance(fault, str) or not flight.acknowledge(fault):
+        return _no(command, f"no fault {fault!r} is listed")
+    return _yes(command, f"noted that {command.by} has seen {fault}")
 
 
 def _not_armed(command: Command, flight: Commanded) -> Answer | None:
@@ -120,9 +126,15 @@ def _not_armed(command: Command, flight: Commanded) -> Answer | None:
         return _no(command, "the planned number of exposures is flown")
     if not flight.is_ready:
         return _no(command, "the service is not ready: devices open and kernels load")
-    absent = flight.absent()
-    if absent and not command.arguments.get("override"):
-        return _no(command, f"missing: {', '.join(absent)}; override to fly without")
+    missing = flight.lacks()
+    firm = [lack for lack in missing if not lack.may_be_overridden]
+    if firm:
+        return _no(command, f"not armed: {'; '.join(map(str, firm))}")
+    if missing and not command.arguments.get("override"):
+        told = "; ".join(map(str, missing))
+        return _no(command, f"not armed: {told}; override to fly without")
+    if missing:
+        flight.override(command.by, missing)
     return None
 
 

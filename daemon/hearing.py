@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 from daemon.flight import Flight
+from daemon.latches import DELIVERS, IS_GONE
 from daemon.line import Order
 from daemon.log_records import LoggedTrigger
 from daemon.matching import Cause, Pulse
@@ -35,7 +36,8 @@ class Tell(Protocol):
 class Hearing:
     """Takes in what `daemon.capture` passes on.
 
-    `active` are the devices that deliver; `orders` the exposures whose pulse has no answer yet.
+    `active` are the devices that deliver, `serials` what heads said they are ("" for nothing), and
+    `orders` the exposures whose pulse has no answer yet.
 
     Args:
         flight: what the records are matched in.
@@ -51,6 +53,7 @@ class Hearing:
         self._tell = tell
         self.active: set[str] = set()
         self.has_trigger = False
+        self.serials: dict[str, str] = {}
         self.orders: dict[int, Order] = {}
 
     def hear(self, message: object) -> bool:
@@ -101,10 +104,10 @@ class Hearing:
             fault=event.is_fault,
             sentence=event.sentence,
         )
-        if event.name in _DELIVERS:
+        if event.name in DELIVERS:
             self.active.add(event.device)
             self._flight.absent_heads.discard(event.device)
-        elif event.is_fault:
+        elif event.name in IS_GONE:
             self.active.discard(event.device)
             if event.name == _LOST:
                 self._flight.absent_heads.add(event.device)
@@ -113,6 +116,8 @@ class Hearing:
         self._tell("bound", kind=bound.kind, device=bound.name, found=dict(bound.found))
         if bound.kind == "trigger":
             self.has_trigger = True
+        elif bound.kind == "head":
+            self.serials[bound.name] = bound.found.get("serial", "")
 
     def _on_not_bound(self, unbound: NotBound) -> None:
         sentence = unbound.sentence
@@ -141,7 +146,6 @@ class Hearing:
         )
 
 
-_DELIVERS = frozenset({"opened", "recovered"})
 _LOST = "lost"
 _HANDLERS: Mapping[type, Callable[[Hearing, Any], None]] = {
     Frame: Hearing._on_frame,

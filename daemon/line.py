@@ -84,6 +84,12 @@ class Line:
         self.runs = True
 
     @property
+    def wanted(self) -> int | None:
+        """Planned exposures that are not ordered yet; None where the plan has no number."""
+        count = self._configuration.trigger.count
+        return None if count is None else max(0, count - self._ordered)
+
+    @property
     def is_flown(self) -> bool:
         """Whether the planned number of exposures was ordered."""
         count = self._configuration.trigger.count
@@ -102,7 +108,7 @@ class Line:
                 self._asked_for = max(0, self._asked_for - 1)
                 fire(self.order(now_ns))
             else:
-                disk_full(f"room for {left} exposures: no more are made; free {self._mission}")
+                disk_full(f"the disk is full: no more exposures are made; free {self._mission}")
                 await asyncio.sleep(DISK_RETRY_S)
 
     def wait_s(self, now_ns: int) -> float:

@@ -10,12 +10,13 @@ import asyncio
 import signal
 import time
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from daemon import recovery
+from daemon.arming import Lack, note_override, override_message
 from daemon.commanding import audit_message, obey
 from daemon.configuration import Configuration
 from daemon.departure import identity, open_mission, processes, watch_process
@@ -23,6 +24,7 @@ from daemon.devices import serial_problem
 from daemon.exposure import Exposure
 from daemon.flight import Flight
 from daemon.hearing import Hearing
+from daemon.latches import Latch, Latches, previous_faults, read_unhandled, write_unhandled
 from daemon.ledger import Ledger
 from daemon.line import Line, Order, exposures_left
 from daemon.log_records import LoggedTrigger, Message, message_of
@@ -42,11 +44,12 @@ from daemon.messages import (
 from daemon.mission import Mission
 from daemon.notify import Notifier
 from daemon.pipeline_queue import PipelineQueue
+from daemon.preflight import AT_ONCE, Preflight
 from daemon.records import canonical_bytes
 from daemon.recovery_match import seal_from_log
 from daemon.supervisor import Supervisor
 from daemon.watching import NAME as WATCH
-from daemon.watching import Watching, phase_of, status_event, summary
+from daemon.watching import Watching, status_event, summary
 from drivers.contract import (
     DeviceEvent,
     Record,
@@ -80,6 +83,8 @@ class Service:
         self.events = events
         self.notifier = Notifier()
         self.supervisor = Supervisor(self._hear, self._child_died)
+        self.latches = Latches()
+        self.unhandled: tuple[Latch, ...] = ()
         self.watching = Watching(self.supervisor, watch_process(configuration))
         self.is_ready = False
         self.is_power_failing = False
@@ -114,6 +119,7 @@ class Service:
             await self.stopping.wait()
             self.notifier.stopping("landing: sealing what is open")
             await self._land(tasks)
+            await self._keep_unhandled()
             self.flight.land()
             left = self.flight.ledger.imbalances(has_landed=True)
             if left:
@@ -154,6 +160,10 @@ class Service:
         self.pipeline = PipelineQueue(lanes, self.supervisor.send, self._event)
         flown = len(report.settled)
         self.line = Line(self.configuration, self.rig, self.flight, mission.path, flown)
+        self.preflight = Preflight(
+            self.configuration, self.rig, self.flight, self.line, self.hearing, self.pipeline
+        )
+        self._tell_previous(mission)
         for process in processes(self.configuration, self.rig, mission):
             self.supervisor.spawn(*process)
 
@@ -166,6 +176,13 @@ class Service:
         elif not (self.hearing.hear(message) or self.pipeline.hear(message)):
             raise TypeError(f"a process said {type(message).__name__}, which nobody expects")
         self.changed.set()
+
+    def _tell_previous(self, mission: Mission) -> None:
+        """What an earlier start of the service left for a person to see."""
+        self.unhandled = read_unhandled(mission.root)
+        for event in previous_faults(self.unhandled):
+            self._event(**event)
+        self.watching.faults = lambda: previous_faults(self.latches.unhandled())
 
     def _child_died(self, name: str) -> None:
         if name == WATCH:
@@ -209,7 +226,7 @@ class Service:
                 self._fail(problem)
 
     def _on_told(self, told: Told) -> None:
-        """What the watch process has to say of itself."""
+        """What the watch process and the writer have to say of themselves."""
         self._event(**told.event)
 
     def _on_command(self, command: Command) -> None:
@@ -285,7 +302,9 @@ class Service:
             else:
                 self.notifier.watchdog()
                 self.notifier.status(f"{len(self.flight.open_numbers)} exposures open")
+            self._follow_phase()
             self.watching.tell(self._status())
+            await self._keep_unhandled()
             await asyncio.sleep(PING_S)
 
     async def _fly(self) -> None:
@@ -297,6 +316,9 @@ class Service:
         self.is_ready = True
         self._event("ready", absent=absent)
         self.notifier.ready(f"flying without {', '.join(absent)}" if absent else "ready")
+        if self.line.runs and (missing := self.lacks()):
+            self.override(AT_ONCE, missing)
+        self._follow_phase()
         await self.line.fly(self._fire, self._disk_full)
         await self._until(lambda: not self._is_unfinished(), END_OF_WAITING_S)
         self._event("done")
@@ -311,6 +333,26 @@ class Service:
             self.hearing.active.__contains__, has_trigger=self.hearing.has_trigger
         )
 
+    def lacks(self) -> Sequence[Lack]:
+        """What a flight needs, is missing, and nobody has accepted to fly without."""
+        return self.preflight.lacks(time.monotonic_ns(), self._exposures_left())
+
+    def override(self, by: str, missing: Sequence[Lack]) -> None:
+        """Somebody flies without; who, when and what is kept in the log and in the mission."""
+        self.preflight.accept(missing)
+        self.supervisor.send("writer", Log(override_message(by, missing)))
+        told = "; ".join(map(str, missing))
+        self._event("override", by=by, sentence=f"{by} flies all the same: {told}")
+        try:
+            note_override(self.mission.path, by, missing)
+        except OSError as error:
+            # The log has it too.
+            self._event("disk", fault=True, sentence=f"the override is not noted: {error}")
+
+    def acknowledge(self, fault: str) -> bool:
+        """A person has seen a fault."""
+        return self.latches.acknowledge(fault)
+
     def land(self) -> None:
         """End in good order: what is open is sealed first."""
         self.stopping.set()
@@ -319,19 +361,39 @@ class Service:
         now_ns = time.monotonic_ns()
         sheet = self.flight.ledger.sheet()
         return status_event(
-            phase=phase_of(
-                self.line,
-                failed=self.failure is not None,
-                ready=self.is_ready,
-                triggers=sheet.triggers,
-            ),
+            phase=self.preflight.phase,
             ledger=sheet.as_json(),
-            exposures_left=exposures_left(self.configuration, self.rig, self.mission.path),
+            exposures_left=self._exposures_left(),
             position=self.flight.track.last,
             temperatures_c={t.probe: t.value_c for t in self.flight.temperatures.at(now_ns)},
             time_now=self.flight.clock.gps_at(now_ns),
             queue=len(self.pipeline),
+            missing=list(map(str, self.lacks())),
         )
+
+    def _exposures_left(self) -> int:
+        return exposures_left(self.configuration, self.rig, self.mission.path)
+
+    def _follow_phase(self) -> None:
+        entered = self.preflight.follow(
+            time.monotonic_ns(),
+            self._exposures_left(),
+            is_prepared=self.is_ready,
+            has_landed=self.line.is_flown or self.stopping.is_set(),
+            has_failed=self.failure is not None,
+        )
+        for phase in entered:
+            self._event("phase", phase=phase.value)
+        if entered:
+            self.watching.tell(self._status())
+
+    async def _keep_unhandled(self) -> None:
+        """What nobody has acknowledged is there when the service starts next."""
+        if (unhandled := self.latches.unhandled()) != self.unhandled:
+            self.unhandled = unhandled
+            # A disk that refuses has told so itself.
+            with suppress(OSError):
+                await asyncio.to_thread(write_unhandled, self.mission.root, unhandled)
 
     def _fire(self, order: Order) -> None:
         self.hearing.orders[order.number] = order
@@ -411,6 +473,7 @@ class Service:
 
     def _event(self, event: str, **content: Any) -> None:
         told = {"event": event, "mono_ns": str(time.monotonic_ns()), **content}
+        self.latches.apply(told)
         self.events(told)
         self.watching.tell(told)
 

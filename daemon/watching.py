@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from daemon.clock import GpsEstimate
 from daemon.departure import ProcessPlan
 from daemon.exposure import Exposure, navigation_to_json
-from daemon.line import Line
 from daemon.messages import Answer, Told
 from daemon.supervisor import Supervisor
 from drivers.contract import NavSample
@@ -34,6 +33,8 @@ class Watching:
         self._supervisor = supervisor
         self._plan = plan
         self._first: Mapping[str, Any] | None = None
+        self.faults: Callable[[], Sequence[Mapping[str, Any]]] = tuple
+        """Events that tell a process started anew of the faults it has not heard of."""
         self.dropped = 0
         self.restarts = 0
 
@@ -42,6 +43,8 @@ class Watching:
             self._supervisor.spawn(*self._plan)
             if self._first is not None:
                 self.tell(self._first)
+            for event in self.faults():
+                self.tell(event)
 
     def tell(self, event: Mapping[str, Any]) -> None:
         """Tell of an event. What mission it is, is told again to a process started anew."""
@@ -59,19 +62,6 @@ class Watching:
         asyncio.get_running_loop().call_later(RESTART_S, self.start)
 
 
-def phase_of(line: Line, *, failed: bool, ready: bool, triggers: int) -> str:
-    """Where a flight stands: starting, ready, flying, paused, landed or fault."""
-    if failed:
-        return "fault"
-    if not ready:
-        return "starting"
-    if line.is_flown:
-        return "landed"
-    if line.runs:
-        return "flying"
-    return "paused" if triggers else "ready"
-
-
 def status_event(
     *,
     phase: str,
@@ -81,12 +71,14 @@ def status_event(
     temperatures_c: Mapping[str, float | None],
     time_now: GpsEstimate | None,
     queue: int,
+    missing: Sequence[str],
 ) -> dict[str, Any]:
     """What a watcher must not have wrong for longer than a second, as plain JSON types.
 
     Args:
         time_now: GPS time at this moment, or None before anything told it.
         queue: exposures waiting for the pipeline.
+        missing: what a flight needs and does not have, with its cure.
     """
     now_ns = time.monotonic_ns()
     where = None
@@ -114,6 +106,7 @@ def status_event(
         "clock_source": None if time_now is None else time_now.source,
         "in_holdover": time_now is not None and time_now.in_holdover,
         "queue": queue,
+        "missing": list(missing),
     }
 
 

@@ -20,6 +20,7 @@ from daemon.cli import (
     check,
     demo,
     develop,
+    explain,
     export,
     imports,
     install,
@@ -51,6 +52,7 @@ app = typer.Typer(
 )
 app.command(name="demo", help=demo.HELP)(demo.demo)
 app.command(name="run", help=run.HELP)(run.run)
+app.command(name="explain", help=explain.HELP)(explain.explain)
 app.command(name="monitor", help=monitor.HELP)(monitor.monitor)
 app.command(name="check", help=check.HELP)(check.check)
 app.command(name="process", help=process.HELP)(process.process)

@@ -263,7 +263,7 @@ class MavlinkCamera(asyncio.DatagramProtocol):
         return round((time.monotonic() - self._boot_s) * 1000) & 0xFFFFFFFF
 
     def _heartbeat(self) -> Any:
-        flying = self._state.phase in ("ready", "flying", "paused")
+        flying = self._state.phase in ("ready", "armed", "flying")
         status = self._dialect.MAV_STATE_ACTIVE if flying else self._dialect.MAV_STATE_STANDBY
         if self._state.phase == "fault":
             status = self._dialect.MAV_STATE_CRITICAL

@@ -12,9 +12,10 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily, Metric
 from prometheus_client.registry import Collector
 
+from daemon.phases import Phase
 from daemon.watch.state import FlightState
 
-PHASES = ("starting", "ready", "flying", "paused", "landed", "fault")
+PHASES = tuple(phase.value for phase in Phase)
 
 
 def exposition(state: FlightState) -> bytes:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import pytest
 
+from daemon.arming import Lack
 from daemon.commanding import audit_message, obey
 from daemon.messages import Command
 
@@ -32,14 +34,25 @@ class FakeLine:
 class FakeService:
     line: FakeLine = field(default_factory=FakeLine)
     is_ready: bool = True
-    missing: list[str] = field(default_factory=list)
+    missing: list[Lack] = field(default_factory=list)
     landed: bool = False
+    overrides: list[tuple[str, list[str]]] = field(default_factory=list)
+    faults: set[str] = field(default_factory=set)
 
-    def absent(self) -> list[str]:
+    def lacks(self) -> Sequence[Lack]:
         return self.missing
+
+    def override(self, by: str, missing: Sequence[Lack]) -> None:
+        self.overrides.append((by, [lack.name for lack in missing]))
+
+    def acknowledge(self, fault: str) -> bool:
+        return fault in self.faults
 
     def land(self) -> None:
         self.landed = True
+
+
+KERNELS = Lack("arming-kernels", "kernels are not loaded", "wait", may_be_overridden=False)
 
 
 def give(service: FakeService, name: str, **arguments: Any) -> tuple[bool, str]:
@@ -80,11 +93,14 @@ def test_a_camera_that_is_not_ready_is_not_armed_unless_somebody_takes_it_upon_t
     how = {"interval_s": 1.0, "distance_m": 10.0}
     done, sentence = give(FakeService(is_ready=False), name, **how)
     assert (done, "not ready" in sentence) == (False, True)
-    lacking = FakeService(missing=["head SU02", "trigger"])
+    head = Lack("arming-device", "no head SU02", "check its cable")
+    lacking = FakeService(missing=[head])
     done, sentence = give(lacking, name, **how)
     assert not done
-    assert "head SU02, trigger" in sentence
+    assert "no head SU02 (check its cable); override to fly without" in sentence
+    assert lacking.overrides == []
     assert give(lacking, name, override=True, **how)[0]
+    assert lacking.overrides == [("operator", ["arming-device"])]
     done, sentence = give(FakeService(line=FakeLine(is_flown=True)), name, **how)
     assert (done, "is flown" in sentence) == (False, True)
 
@@ -107,8 +123,20 @@ def test_what_makes_no_sense_is_refused(name: str, arguments: dict[str, Any]) ->
     assert service.line.done == []
 
 
+def test_nobody_can_take_upon_them_that_kernels_compile_in_flight() -> None:
+    service = FakeService(missing=[KERNELS])
+    done, sentence = give(service, "start", override=True)
+    assert (done, "override to fly" in sentence, service.overrides) == (False, False, [])
+
+
+def test_only_a_fault_that_is_listed_can_be_acknowledged() -> None:
+    service = FakeService(faults={"device SU02"})
+    assert give(service, "acknowledge", fault="device SU02")[0]
+    assert not give(service, "acknowledge", fault="device SU03")[0]
+
+
 def test_landing_is_never_refused() -> None:
-    service = FakeService(is_ready=False, missing=["everything"])
+    service = FakeService(is_ready=False, missing=[KERNELS])
     assert give(service, "land")[0]
     assert service.landed
 

@@ -101,7 +101,7 @@ def test_a_flight_is_flown_from_the_page(
         browser.wait_for("document.querySelector('#link')?.innerText === 'linked'", 60)
         assert browser.text("#simulated") == "SIMULATED"
         service.wait_for(lambda e: e["event"] == "ready", READY_WITHIN_S)
-        browser.wait_for("document.querySelector('#phase').innerText === 'ready'", 10)
+        browser.wait_for("document.querySelector('#phase').innerText === 'armed'", 10)
 
         refused = browser.evaluate(
             "fetch('/api/v1/commands/start', {method: 'POST'}).then((answer) => answer.status)"

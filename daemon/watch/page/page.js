@@ -7,7 +7,7 @@ import { prepareImage, showImage } from "./image.js";
 import { drawCharts, fitCharts } from "./charts.js";
 
 const MARKS = { good: "●", usable: "▲", refly: "■", lost: "✖" };
-const PHASE_CLASS = { flying: "good", ready: "good", paused: "caution", fault: "warning", starting: "caution" };
+const PHASE_CLASS = { flying: "good", armed: "good", ready: "caution", fault: "warning", idle: "caution" };
 const DEVICE_MARKS = { ready: "●", found: "○", unknown: "○", lost: "✖", absent: "✖" };
 const ROWS_SHOWN = 300;
 
@@ -47,6 +47,8 @@ function drawHead() {
   text("speed", velocity && `${Math.hypot(velocity[0], velocity[1]).toFixed(1)} m/s`);
   text("triggers", status.ledger?.triggers?.triggers);
   text("lost", status.ledger?.triggers?.lost);
+  const missing = brief.phase === "ready" || brief.phase === "armed" ? status.missing || [] : [];
+  by("missing").replaceChildren(...missing.map((one) => element("li", { textContent: `Missing: ${one}` })));
   const temperatures = Object.entries(status.temperatures_c || {});
   by("temperatures").replaceChildren(...temperatures.map(([probe, value]) => element("div", {},
     element("dt", { textContent: probe }),
@@ -88,7 +90,7 @@ function drawFaults() {
     return;
   }
   list.replaceChildren(...faults.map((fault) => {
-    const word = fault.stands ? "✖ WARNING" : "▲ PASSED";
+    const word = fault.stands ? "✖ WARNING" : fault.previous ? "▲ BEFORE THE RESTART" : "▲ PASSED";
     const repeated = fault.count > 1 ? ` (${fault.count} times)` : "";
     const item = element("li", { className: fault.stands ? "stands" : "passed" },
       element("span", {}, element("strong", { textContent: word + repeated }), fault.sentence));

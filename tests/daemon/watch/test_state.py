@@ -86,7 +86,7 @@ def test_the_status_puts_right_what_was_dropped() -> None:
     state = state_of(flown.mission())
     state.apply({"event": "disk", "fault": True, "sentence": "room for 0 exposures"})
     assert state.faults()[0]["stands"]
-    state.apply(flown.status("paused", triggers=5))
-    assert state.phase == "paused"
+    state.apply(flown.status("armed", triggers=5))
+    assert state.phase == "armed"
     assert state.brief()["status"]["ledger"]["triggers"]["triggers"] == 5
     assert not state.faults()[0]["stands"]

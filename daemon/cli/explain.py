@@ -1,0 +1,43 @@
+"""`syntopic explain`: what an event means, and what helps."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import asdict
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from daemon.cli.tables import light_table
+
+HELP = """Say what an event of the service means, what causes it and what helps.
+
+Without a name all are listed; NAME may be part of one.
+
+Examples: `syntopic explain lost`, `syntopic explain arming`, `syntopic explain --json`
+"""
+
+
+def explain(
+    name: Annotated[str, typer.Argument(help="An event, or part of its name.")] = "",
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object.")] = False,
+    markdown: Annotated[bool, typer.Option("--markdown", help="The page docs/events.md.")] = False,
+) -> None:
+    from daemon.event_table import TABLE, as_markdown, entry_of
+
+    if markdown:
+        sys.stdout.write(as_markdown())
+        return
+    exact = entry_of(name)
+    found = [exact] if exact else [entry for entry in TABLE if name in entry.name]
+    if as_json:
+        sys.stdout.write(json.dumps({"events": [asdict(entry) for entry in found]}) + "\n")
+    else:
+        table = light_table(f"{len(found)} events", ("event", "severity", "cause", "cure"), ())
+        for entry in found:
+            table.add_row(entry.name, entry.severity, entry.cause, entry.cure)
+        Console().print(table)
+    if not found:
+        raise typer.Exit(1)
