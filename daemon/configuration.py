@@ -203,6 +203,7 @@ class LimitsSection(_Section):
     navigation_stale_s: float = Field(default=5.0, gt=0)
     exposures_in_memory: int = Field(default=3, ge=2, le=16)
     disk_reserve_bytes: int = Field(default=500_000_000, ge=0)
+    disk_warn_exposures: int = Field(default=100, ge=0)
     power_fail_s: float = Field(default=5.0, gt=0, le=60)
 
 

@@ -82,7 +82,7 @@ class Flight:
     Every method that takes an instant takes `mono_ns`. Slots of frames that are not used are
     collected in `idle_slots`, to be handed back to the heads; marks whose fate became final after
     they had come, in `resolved_marks`. Heads in `absent_heads` are known to be lost; their frames
-    are not waited for.
+    are not waited for. While `disk_is_low` what is ordered is flagged so.
     """
 
     def __init__(
@@ -106,6 +106,7 @@ class Flight:
         self.idle_slots: list[tuple[str, int]] = []
         self.resolved_marks: list[tuple[EventMark, Cause]] = []
         self.absent_heads: set[str] = set()
+        self.disk_is_low = False
         self.serial_of_head = serial_of_head
         self._cone_of_head = {head: rig.cone_of(head) for head in serial_of_head}
         self._matcher = Matcher({h: c.name for h, c in self._cone_of_head.items()}, self.clock)
@@ -125,7 +126,8 @@ class Flight:
         number = self._next_number
         self._next_number += 1
         line = self.identity.line_id if line_id is None else line_id
-        self._open[number] = _Open(number, mono_ns, line_id=line, strip_id=strip_id)
+        flags = Flag.DISK_LOW if self.disk_is_low else NO_FLAG
+        self._open[number] = _Open(number, mono_ns, line_id=line, strip_id=strip_id, flags=flags)
         self.ledger.trigger(number)
         self._matcher.forget_before(number - 64)
         return number

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import shutil
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ from pathlib import Path
 
 from daemon.configuration import Configuration
 from daemon.devices import exposure_times_ns, frame_nbytes
+from daemon.disk_guard import DiskGuard
 from daemon.flight import Flight
 from daemon.mission import Mission
 from daemon.plan.image_size import image_on_ground_m
@@ -28,8 +28,6 @@ CORRIDOR_SHARE = 0.25
 LOOK_AHEAD_S = 0.05
 """How often a due time is predicted anew; the last bit is slept through exactly."""
 DISK_RETRY_S = 1.0
-LEVEL2_SHARE = 2
-"""Products take about as much room as frames; one more share for the log and the index."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +51,8 @@ class Line:
         self._flight = flight
         self._mission = mission
         self._ordered = flown
+        exposure_nbytes = sum(frame_nbytes(rig, head.sensor) for head in configuration.head)
+        self.guard = DiskGuard(configuration.limits, exposure_nbytes, mission)
         self._last_ns: int | None = None
         self._exposure_ns = exposure_times_ns(configuration, rig)
         self._steering = _steering(configuration, rig, mission)
@@ -104,7 +104,8 @@ class Line:
                 wait_s = self._readiness_s(now_ns)
             if wait_s > 0:
                 await asyncio.sleep(wait_s)
-            elif (left := exposures_left(self._configuration, self._rig, self._mission)) > 0:
+            elif not (room := self.guard.look()).is_full:
+                self._flight.disk_is_low = room.is_low
                 self._asked_for = max(0, self._asked_for - 1)
                 fire(self.order(now_ns))
             else:
@@ -152,6 +153,7 @@ class Line:
         if self._runs_until is not None and self._ordered >= self._runs_until:
             self.runs, self._runs_until = False, None
         self._last_ns = now_ns
+        self.guard.exposed(now_ns)
         self._policy.fired(now_ns, nav)
         return Order(number, now_ns, delays_ns, strobe_ns)
 
@@ -163,13 +165,6 @@ class Line:
         if line is None:
             return self._flight.order(now_ns, "")
         return self._flight.order(now_ns, line.id, line.strip or line.id)
-
-
-def exposures_left(configuration: Configuration, rig: Rig, mission: Path) -> int:
-    """How many more exposures the disk holds, with their products and the reserve kept free."""
-    exposure_nbytes = sum(frame_nbytes(rig, head.sensor) for head in configuration.head)
-    free_nbytes = shutil.disk_usage(mission).free - configuration.limits.disk_reserve_bytes
-    return max(0, free_nbytes // ((1 + LEVEL2_SHARE) * exposure_nbytes))
 
 
 def _steering(configuration: Configuration, rig: Rig, mission: Path) -> PlanTrigger | None:

@@ -186,10 +186,14 @@ class Sealed:
 
 @dataclass(frozen=True)
 class WriteFailed:
-    """The disk refused; the exposure is not stored or not sealed."""
+    """The disk refused; the exposure is not stored or not sealed.
+
+    `may_pass`: the demand was right and may be made again when the disk has come to itself.
+    """
 
     number: int
     sentence: str
+    may_pass: bool = False
 
 
 # To the worker

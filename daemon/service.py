@@ -26,7 +26,7 @@ from daemon.flight import Flight
 from daemon.hearing import Hearing
 from daemon.latches import Latch, Latches, previous_faults, read_unhandled, write_unhandled
 from daemon.ledger import Ledger
-from daemon.line import Line, Order, exposures_left
+from daemon.line import Line, Order
 from daemon.log_records import LoggedTrigger, Message, message_of
 from daemon.messages import (
     Bound,
@@ -58,6 +58,8 @@ from processing.rig import Rig
 
 TICK_S = 0.05
 PING_S = 1.0
+SEAL_RETRY_NS = 1_000_000_000
+"""A disk that refused a record is asked again so much later."""
 LANDING_TIMEOUT_S = 20.0
 END_OF_WAITING_S = 1e9
 
@@ -93,6 +95,7 @@ class Service:
         self.stopping = asyncio.Event()
         self.changed = asyncio.Event()
         self.sealing: Exposure | None = None
+        self.seal_again_ns = 0
 
     async def run(self) -> int:
         """Fly until told to stop, or until the planned exposures are done.
@@ -211,8 +214,11 @@ class Service:
     def _on_write_failed(self, failed: WriteFailed) -> None:
         self._event("not-written", number=failed.number, sentence=failed.sentence)
         if self.sealing is not None and self.sealing.number == failed.number:
-            # Recovery seals it from the log when the service starts next.
-            self.flight.not_sealed(failed.number, self.sealing.state)
+            if failed.may_pass:
+                self.seal_again_ns = time.monotonic_ns() + SEAL_RETRY_NS
+            else:
+                # Recovery seals it from the log when the service starts next.
+                self.flight.not_sealed(failed.number, self.sealing.state)
             self.sealing = None
         else:
             self.pipeline.not_stored(failed.number)
@@ -270,7 +276,7 @@ class Service:
                 self.pipeline.recycle({head: slot})
             self.flight.idle_slots.clear()
             self._tell_of_time(now_ns - self.hurry_ns)
-            if self.sealing is None:
+            if self.sealing is None and now_ns >= self.seal_again_ns:
                 self.sealing = self.flight.due_to_seal(now_ns)
                 if self.sealing is not None:
                     self.supervisor.send("writer", Seal(self.sealing))
@@ -303,6 +309,8 @@ class Service:
                 self.notifier.watchdog()
                 self.notifier.status(f"{len(self.flight.open_numbers)} exposures open")
             self._follow_phase()
+            if (warning := self.line.guard.warning()) is not None:
+                self._event("disk", fault=True, sentence=warning)
             self.watching.tell(self._status())
             await self._keep_unhandled()
             await asyncio.sleep(PING_S)
@@ -372,7 +380,7 @@ class Service:
         )
 
     def _exposures_left(self) -> int:
-        return exposures_left(self.configuration, self.rig, self.mission.path)
+        return self.line.guard.look().exposures
 
     def _follow_phase(self) -> None:
         entered = self.preflight.follow(

@@ -7,9 +7,9 @@ and the index has committed it (promise 1). Reading back is in `daemon.level0_fo
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import sqlite3
+from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
@@ -42,7 +42,6 @@ __all__ = [
     "Level0Writer",
     "StoreError",
     "VerifyReport",
-    "exposures_left",
     "hash_file",
     "load_level0",
     "read_capture",
@@ -69,6 +68,16 @@ class Level0Writer:
         self._owns_catalog = catalog is None
         self._pool = ThreadPoolExecutor(threads, thread_name_prefix="level0")
         self._head_sha256 = self._catalog.last_record_sha256() or mission.genesis_sha256()
+        self._unindexed: deque[Callable[[], None]] = deque()
+        self._undecided: int | None = None
+
+    @property
+    def unindexed(self) -> int:
+        """How many changes the index has refused so far; they are tried again with the next one.
+
+        The folders are durable all the same, and recovery takes them into the index.
+        """
+        return len(self._unindexed)
 
     @property
     def head_sha256(self) -> str:
@@ -89,8 +98,8 @@ class Level0Writer:
             The frames with file name and hash.
 
         Raises:
-            OSError: the disk refused. Nothing of the exposure is left, unless it failed at the
-                very last syncs: then recovery finds it whole. Nothing stored before is touched.
+            OSError: the disk refused. Nothing of the exposure is left, unless the disk refused to
+                take it away, too: then recovery sees to it. Nothing stored before is touched.
             StoreError: this number is stored already, or frames and pixels do not fit.
         """
         _check(capture, pixels)
@@ -108,9 +117,9 @@ class Level0Writer:
         except OSError:
             # A disk that refused to write may refuse to clear, too; recovery sees to the rest.
             with suppress(OSError):
-                durable.remove_tree(part)
+                _withdraw(part, final)
             raise
-        self._commit(lambda: self._catalog.add_stored(stored), capture.number)
+        self._commit(lambda: self._catalog.add_stored(stored))
         return frames
 
     def seal(self, exposure: Exposure) -> str:
@@ -134,6 +143,7 @@ class Level0Writer:
             if exposure.frames:
                 raise StoreError(f"exposure {exposure.number} was never stored; store it first")
             self.write(_capture_of(exposure), {})
+        self._decide()
         sealed = read_sealed(folder)
         if sealed is not None:
             same = replace(exposure, previous_sha256=sealed.exposure.previous_sha256)
@@ -150,15 +160,17 @@ class Level0Writer:
         self._check_frames(folder, exposure)
         final = replace(exposure, previous_sha256=self._head_sha256)
         data = exposure_bytes(final)
+        self._undecided = exposure.number
         durable.replace_file(folder / EXPOSURE_FILE, data, mode=0o444)
+        self._undecided = None
         sha256 = sha256_hex(data)
         self._head_sha256 = sha256
-        self._commit(lambda: self._catalog.add_sealed(final, sha256), exposure.number)
+        self._commit(lambda: self._catalog.add_sealed(final, sha256))
         return sha256
 
     def note_products(self, number: int, files: Mapping[str, int], verdict: str | None) -> None:
-        """Note in the index that an exposure was processed. OSError: the disk refused."""
-        self._commit(lambda: self._catalog.add_products(number, files, verdict), number)
+        """Note in the index that an exposure was processed."""
+        self._commit(lambda: self._catalog.add_products(number, files, verdict))
 
     def close(self) -> None:
         """Let go of threads and index; may be called twice."""
@@ -184,17 +196,36 @@ class Level0Writer:
                 f"exposure {exposure.number}: the record names other frames than were stored"
             )
 
-    def _commit(self, change: Callable[[], None], number: int) -> None:
-        try:
-            change()
-        except sqlite3.Error as error:
-            # The folder is durable; recovery takes it into the index.
-            raise OSError(errno.EIO, f"the index refused exposure {number}: {error}") from error
+    def _decide(self) -> None:
+        """Take back a record whose last sync failed: a power cut may leave it or not.
+
+        The next record must not be chained to a perhaps, and this one is written anew.
+
+        Raises:
+            OSError: the disk still refuses; nothing can be sealed.
+        """
+        if self._undecided is None:
+            return
+        folder = self._mission.level0(self._undecided)
+        (folder / EXPOSURE_FILE).unlink(missing_ok=True)
+        durable.sync_directory(folder)
+        self._undecided = None
+
+    def _commit(self, change: Callable[[], None]) -> None:
+        """Into the index, after what it refused earlier; the folder is durable already."""
+        self._unindexed.append(change)
+        with suppress(sqlite3.Error):
+            while self._unindexed:
+                self._unindexed[0]()
+                self._unindexed.popleft()
 
 
-def exposures_left(mission: Mission, exposure_nbytes: int, reserve_nbytes: int) -> int:
-    """How many exposures of a size the disk still takes above a reserve."""
-    return max(0, (durable.free_bytes(mission.path) - reserve_nbytes) // max(1, exposure_nbytes))
+def _withdraw(part: Path, final: Path) -> None:
+    """Take back what was not acknowledged: out of its final name first, then away."""
+    if final.exists():
+        final.rename(part)
+        durable.sync_directory(final.parent)
+    durable.remove_tree(part)
 
 
 def _write_frame(

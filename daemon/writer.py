@@ -25,6 +25,7 @@ from daemon.messages import (
     Stop,
     Store,
     Stored,
+    Told,
     WriteFailed,
 )
 from daemon.mission import Mission
@@ -44,6 +45,7 @@ def main(link: Link, mission_path: Path, rings: tuple[FrameRing, ...]) -> None:
     _seal_logs(mission)  # those of earlier runs; ours is not there yet
     log = FlightLog.create(mission.log_dir)
     synced = time.monotonic()
+    refused = 0
     while not isinstance(order := link.receive(LOG_SYNC_INTERVAL_S), Stop):
         if isinstance(order, Store):
             link.send(_store(writer, memory, order))
@@ -57,6 +59,9 @@ def main(link: Link, mission_path: Path, rings: tuple[FrameRing, ...]) -> None:
             log.write(order.message)
         elif isinstance(order, Ping):
             link.send(Pong({}))
+        if (behind := writer.unindexed) != refused:
+            refused = behind
+            link.send(_told_of_index(behind))
         if time.monotonic() - synced >= LOG_SYNC_INTERVAL_S:
             log.sync()
             synced = time.monotonic()
@@ -69,6 +74,16 @@ def _seal_logs(mission: Mission) -> None:
     # A disk that refuses costs only that a later damage is not seen; the next start seals them.
     with suppress(OSError):
         seal_logs(mission)
+
+
+def _told_of_index(behind: int) -> Told:
+    sentence = (
+        f"the index refused {behind} changes; what they tell of is safe, and they are tried again; "
+        "look at the disk"
+        if behind
+        else "the index has taken what it had refused"
+    )
+    return Told({"event": "index", "fault": behind > 0, "behind": behind, "sentence": sentence})
 
 
 def _store(
@@ -94,4 +109,4 @@ def _seal(writer: Level0Writer, exposure: Exposure) -> Sealed | WriteFailed:
         return Sealed(exposure.number, writer.seal(exposure))
     except (OSError, DaemonError) as error:
         sentence = f"exposure {exposure.number} is not sealed: {error}; look at the disk"
-        return WriteFailed(exposure.number, sentence)
+        return WriteFailed(exposure.number, sentence, may_pass=isinstance(error, OSError))

@@ -20,7 +20,7 @@ from daemon import durable, log_seals, writer
 from daemon.exposure import Exposure
 from daemon.level0_folder import read_sealed
 from daemon.log_records import LoggedTrigger, message_of
-from daemon.messages import Log, NoteProducts, Seal, Sealed, Stop, Store, Stored
+from daemon.messages import Log, NoteProducts, Seal, Sealed, Stop, Store, Stored, WriteFailed
 from daemon.mission import Mission
 from daemon.products import write_level2
 from daemon.recovery import recover
@@ -36,7 +36,11 @@ from tests.daemon.small_camera import (
     small_rig,
 )
 
+ILL = "disk"
+"""Flown on a disk that refuses now and then: what the log has lost is not told as logged."""
+
 NEVER_S = 1e9
+TIMES = 20
 
 
 class Ring:
@@ -62,8 +66,11 @@ class _Without:
 class Flown:
     """Stands where the service stands: gives the orders, and tells on what is answered."""
 
-    def __init__(self, mission: Mission, acks: int, numbers: range, lands: bool) -> None:
+    def __init__(
+        self, mission: Mission, acks: int, numbers: range, *, lands: bool, is_ill: bool
+    ) -> None:
         self._mission = mission
+        self._is_ill = is_ill
         self._acks = acks
         self._answers: list[object] = []
         self._orders = self._flight(numbers, lands)
@@ -78,7 +85,7 @@ class Flown:
         self._answers.append(message)
 
     def receive(self, _timeout_s: float) -> object:
-        if self._told < self._logged and writer.LOG_SYNC_INTERVAL_S == 0.0:
+        if not self._is_ill and self._told < self._logged and writer.LOG_SYNC_INTERVAL_S == 0.0:
             tell(self._acks, f"logged {self._logged}")
             self._told = self._logged
         # Every now and then a second has passed.
@@ -93,43 +100,64 @@ class Flown:
             pulse = TriggerPulse(number, number * 10**9, 1000, number)
             yield Log(message_of(LoggedTrigger(number, pulse, {"0": 0, "1": 0})))
             yield Log(message_of(mark_of(number)))
-            if number % 4 == 0:  # nothing came of it
-                missing = tuple((sensor, "no frame came") for sensor in SENSORS)
-                record = Exposure(number=number, boot_id="", state="lost", missing=missing)
-                yield Seal(record)
-                continue
             sensors = SENSORS if number % 2 else SENSORS[:2]
             capture = capture_of(number, sensors)
-            yield Store(capture, dict.fromkeys(sensors, number))
-            stored = self._answers[-1]
-            assert isinstance(stored, Stored), stored
+            stored: object = None
+            if number % 4:  # else nothing came of it
+                yield Store(capture, dict.fromkeys(sensors, number))
+                stored = self._last(Stored, WriteFailed)
+            if not isinstance(stored, Stored):
+                missing = tuple((sensor, "no frame came") for sensor in SENSORS)
+                lost = Exposure(number=number, boot_id="", state="lost", missing=missing)
+                yield from self._seal(lost)
+                continue
             if not lands and number == numbers[-1]:
                 break
-            yield Seal(final_record(replace(capture, frames=stored.frames)))
+            yield from self._seal(final_record(replace(capture, frames=stored.frames)))
             yield from self._process(number)
         if lands:
             yield Stop()
         os._exit(0)  # killed: nothing is closed
 
+    def _seal(self, record: Exposure) -> Iterator[object]:
+        """As the service does: a disk that refuses is asked again."""
+        for _ in range(TIMES):
+            yield Seal(record)
+            answer = self._last(Sealed, WriteFailed)
+            if isinstance(answer, Sealed):
+                return
+            assert isinstance(answer, WriteFailed) and answer.may_pass, answer
+        raise AssertionError(f"not sealed after {TIMES} times")
+
+    def _last(self, *kinds: type) -> object:
+        return next(a for a in reversed(self._answers) if isinstance(a, kinds))
+
     def _process(self, number: int) -> Iterator[object]:
         """What a worker does beside it; the second exposure twice, as when it is done anew."""
         for _ in range(2 if number == 2 else 1):
             pan = np.full((4, 6), number, np.uint16)
-            done = write_level2(
-                self._mission,
-                number,
-                report_json={"verdict": "good"},
-                pan=pan,
-                colour={},
-                quicklook=None,
-            )
+            try:
+                done = write_level2(
+                    self._mission,
+                    number,
+                    report_json={"verdict": "good"},
+                    pan=pan,
+                    colour={},
+                    quicklook=None,
+                )
+            except OSError:
+                assert self._is_ill
+                return
             tell(self._acks, f"processed {number}")
             yield NoteProducts(number, done.files, done.verdict)
 
 
 def tell(acks: int, line: str) -> None:
-    """Say something to the world: from now on it must hold."""
-    os.write(acks, line.encode() + b"\n")
+    """Say something to the world: from now on it must hold.
+
+    With a call that nothing else here makes, so that a test may let any of the others fail.
+    """
+    os.pwritev(acks, [line.encode() + b"\n"], os.fstat(acks).st_size)
 
 
 def forget(what: str) -> None:
@@ -146,30 +174,31 @@ def main() -> None:
     root, acks_path, count = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])
     forget(sys.argv[4])
     acks = os.open(acks_path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-    first = os.fork()
-    if not first:
-        mission = new_mission(root)
-        tell(acks, f"mission {mission.id}")
-        live(mission, acks, range(1, count + 1), lands=False)
-    os.waitpid(first, 0)
-    mission = Mission.current(root)
-    assert mission is not None
-    live(mission, acks, range(count + 1, 2 * count + 1), lands=True)
-
-
-def live(mission: Mission, acks: int, numbers: range, *, lands: bool) -> None:
-    """One life of the service: recovery, flight, and its end."""
-    with mission.held():
-        report = recover(mission, seal_from_log(small_rig()))
-        for exposure in report.settled:
-            sealed = read_sealed(mission.level0(exposure.number))
-            assert sealed is not None
-            tell(acks, f"sealed {exposure.number} {sealed.sha256}")
-        link: Any = Flown(mission, acks, numbers, lands)
-        rings: Any = tuple(Ring(sensor) for sensor in SENSORS)
-        writer.main(link, mission.path, rings)
+    is_ill = sys.argv[4] == ILL
+    mission = new_mission(root)
+    tell(acks, f"mission {mission.id}")
+    for numbers, lands in ((range(1, count + 1), False), (range(count + 1, 2 * count + 1), True)):
+        one = os.fork()
+        if not one:
+            with mission.held():
+                live(mission, acks, numbers, lands=lands, is_ill=is_ill)
+        _, status = os.waitpid(one, 0)
+        assert status == 0, "the flight did not go on"
     tell(acks, "closing 0")
     mission.close()
+
+
+def live(mission: Mission, acks: int, numbers: range, *, lands: bool, is_ill: bool) -> None:
+    """One life of the service: recovery and flight. It never returns."""
+    report = recover(mission, seal_from_log(small_rig()))
+    for exposure in report.settled:
+        sealed = read_sealed(mission.level0(exposure.number))
+        assert sealed is not None
+        tell(acks, f"sealed {exposure.number} {sealed.sha256}")
+    link: Any = Flown(mission, acks, numbers, lands=lands, is_ill=is_ill)
+    rings: Any = tuple(Ring(sensor) for sensor in SENSORS)
+    writer.main(link, mission.path, rings)
+    os._exit(0)
 
 
 if __name__ == "__main__":

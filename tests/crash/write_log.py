@@ -87,6 +87,25 @@ def record(command: Sequence[str], folder: Path, log: Path, *, cwd: Path) -> lis
     ]
 
 
+def run_ill(command: Sequence[str], faults: Sequence[str], trace: Path, *, cwd: Path) -> int:
+    """Run a program some of whose calls fail or wait; how many did.
+
+    Args:
+        command: ends by itself.
+        faults: as `strace -e inject=` takes them, such as "fsync:error=EIO:when=3+5"; calls are
+            counted in each thread for itself.
+        trace: the recorder's own file.
+        cwd: where the program runs.
+    """
+    assert STRACE is not None
+    calls = ",".join(fault.partition(":")[0] for fault in faults)
+    traced = [STRACE, "-f", "--seccomp-bpf", "-qq", "-o", str(trace), "-e", f"trace={calls}"]
+    for fault in faults:
+        traced += ["-e", f"inject={fault}"]
+    subprocess.run([*traced, *command], cwd=cwd, check=True, timeout=300)
+    return sum("INJECTED" in line or "DELAYED" in line for line in trace.open())
+
+
 _LINE = re.compile(r"(\d+)\.(\d{9}) (.*) <(\d+)\.(\d{9})>")
 _CALL = re.compile(r"(\w+)\((.*)\)\s+= (-?\d+)(?:<([^>]*)>)?.*")
 _FD = re.compile(r"(?:-?\d+|AT_FDCWD)<((?:\\x[0-9a-f]{2})*)>(?:\(deleted\))?")

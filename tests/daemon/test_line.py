@@ -6,14 +6,11 @@ import asyncio
 import copy
 import json
 from pathlib import Path
-from types import SimpleNamespace
-
-import pytest
 
 from daemon.configuration import from_mapping
 from daemon.flight import Flight
 from daemon.ledger import Ledger
-from daemon.line import Line, Order, exposures_left
+from daemon.line import Line, Order
 from tests.daemon.test_configuration import GOOD
 from tests.daemon.test_flight import IDENTITY, LIMITS, nav
 
@@ -90,15 +87,3 @@ def test_what_is_absent_is_said_in_words(tmp_path: Path) -> None:
     assert absent[:2] == ["head SU00", "trigger"]
     assert "temperature of 0" in absent
     assert "time and position" not in absent
-
-
-@pytest.mark.parametrize("free", [10_000_000_000, 400_000_000])
-def test_exposures_left_keep_the_reserve_and_room_for_products(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, free: int
-) -> None:
-    configuration, rig = from_mapping(copy.deepcopy(GOOD), tmp_path / "service.toml")
-    usage = SimpleNamespace(free=free)
-    monkeypatch.setattr("daemon.line.shutil.disk_usage", lambda _: usage)
-    per_exposure = 3 * (1248 * 832 * 2 + 4096)
-    expected = max(0, (free - 500_000_000) // per_exposure)
-    assert exposures_left(configuration, rig, tmp_path) == expected

@@ -19,7 +19,7 @@ from daemon.catalog import Catalog
 from daemon.exposure import Exposure
 from daemon.level0 import read_description
 from daemon.records import RecordError
-from daemon.store import Level0Writer, StoreError, exposures_left, load_level0, verify
+from daemon.store import Level0Writer, StoreError, load_level0, verify
 from tests.daemon.small_camera import (
     HEIGHT_PX,
     SENSORS,
@@ -249,12 +249,6 @@ def test_pixels_are_read_where_they_lie(writer):
         pixels = {sensor: mapped[i] for i, sensor in enumerate(SENSORS)}
         frames = writer.write(capture_of(3), pixels)
         assert all(len(frame.sha256) == 64 for frame in frames)
-
-
-def test_what_is_left_of_the_disk_is_told_in_exposures(mission):
-    free = durable.free_bytes(mission.path)
-    assert exposures_left(mission, free // 10, reserve_nbytes=0) in (9, 10, 11)
-    assert exposures_left(mission, 1000, reserve_nbytes=2 * free) == 0
 
 
 def test_verification_finds_an_altered_bit_a_missing_frame_and_an_extra_file(mission):
