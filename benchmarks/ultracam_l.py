@@ -148,7 +148,7 @@ def fly(world: World, exposures: int, seed: int) -> dict[str, Residuals]:
     for k in range(exposures):
         looks = _looks(world, EPOCH_GPS_NS + 20_000_000_000 + k * period_ns)
         probes = {
-            p: world.temperature_c(p, looks[rig.master_cone].mid_gps_ns)
+            p: world.temperature_c(p, looks[rig.cone(rig.master_cone).name].mid_gps_ns)
             + rng.normal(0, PROBE_SIGMA_C)
             for p in rig.probes
         }
@@ -319,7 +319,7 @@ def _errors(
             looks[rig.cone_of(name).name],
             columns=at[:, 0],
             rows=at[:, 1],
-            master_mid_gps_ns=looks[rig.master_cone].mid_gps_ns,
+            master_mid_gps_ns=looks[rig.cone(rig.master_cone).name].mid_gps_ns,
         )
         px = vip_px_from_mm(world.image, vip_mm_from_raw(mosaic.placements[name], at))
         put.append(px)

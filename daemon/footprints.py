@@ -46,7 +46,7 @@ def footprint(
     Args:
         ground_m: height of the ground above the ellipsoid.
     """
-    cone = rig.cone(eo.cone)
+    cone = rig.cone(rig.reference_cone if eo.is_virtual else eo.cone)
     left, bottom, right, top = image_extent_mm(rig, cone, is_virtual=eo.is_virtual)
     f_mm = rig.virtual_image.f_mm if eo.is_virtual and rig.virtual_image else cone.lens.f_mm
     image_mm = np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
@@ -78,7 +78,7 @@ def seen_from(
     boresight = level_from_body(*(math.radians(angle) for angle in mount.boresight_deg))
     eo = ExteriorOrientation(
         exposure=0,
-        cone=rig.master_cone,
+        cone=rig.image_cone_name,
         is_virtual=rig.virtual_image is not None,
         gps_ns=n.gps_ns,
         line_id="",
@@ -104,9 +104,10 @@ def seen_from(
 
 def ground_sample_m(eo: ExteriorOrientation, rig: Rig, ground_m: float) -> float:
     """Size of a pixel on level ground straight below, m."""
-    virtual, cone = rig.virtual_image, rig.cone(eo.cone)
+    virtual = rig.virtual_image
     if eo.is_virtual and virtual is not None:
         return (eo.height_m - ground_m) * virtual.pitch_mm / virtual.f_mm
+    cone = rig.cone(eo.cone)
     return (eo.height_m - ground_m) * cone.sensors[0].pitch_mm / cone.lens.f_mm
 
 

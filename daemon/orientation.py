@@ -6,6 +6,7 @@ is looked at. Angles are the business of `processing.orientation`, places of `da
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import statistics
 import tomllib
@@ -132,13 +133,12 @@ def orient(
     trajectory: Trajectory,
     georeference: Georeference,
 ) -> Iterator[ExteriorOrientation | Unoriented]:
-    """Orient every cone of an exposure, the master cone first.
+    """Orient every cone of an exposure, the one the image belongs to first.
 
     Raises:
         GeoreferenceError: outside the area of the coordinate system.
     """
-    first = [rig.cone(rig.master_cone)]
-    for cone in [*first, *(cone for cone in rig.cones if cone.name != rig.master_cone)]:
+    for cone in [_image_cone(rig), *(c for c in rig.cones if c.name != rig.master_cone)]:
         gps_ns = _mid_exposure(exposure, cone)
         if gps_ns is None:
             yield Unoriented(exposure.number, cone.name, "no instant")
@@ -173,7 +173,7 @@ def _oriented(
     longitude = there.longitude_deg + float(east_m) / per_longitude
     height = there.height_m - float(down_m)
     place = georeference.place(latitude, longitude, height)
-    is_master = cone.name == rig.master_cone
+    is_master = cone.name == rig.image_cone_name
     return ExteriorOrientation(
         exposure=exposure.number,
         cone=cone.name,
@@ -196,6 +196,18 @@ def _oriented(
         method=there.method,
         horizontal_sigma_m=there.horizontal_sigma_m,
         vertical_sigma_m=there.vertical_sigma_m,
+    )
+
+
+def _image_cone(rig: Rig) -> Cone:
+    """The master cone; of converging heads one that stands and looks as the virtual camera."""
+    if rig.master_cone is not None:
+        return rig.cone(rig.master_cone)
+    return dataclasses.replace(
+        rig.cone(rig.reference_cone),
+        name=rig.image_cone_name,
+        position_mm=rig.image_position_mm,
+        rotation_rad=(0.0, 0.0, 0.0),
     )
 
 

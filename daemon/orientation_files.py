@@ -16,7 +16,7 @@ from daemon.configuration import MountSection
 from daemon.georeference import Georeference
 from daemon.orientation import ExteriorOrientation, Unoriented
 from processing.orientation import phi_omega_kappa
-from processing.rig import Cone, Rig
+from processing.rig import VIRTUAL_CAMERA, Cone, Rig
 
 GON_PER_RAD = 200.0 / math.pi
 PATB_CONE_STEP = 100
@@ -136,7 +136,8 @@ def about_text(
 
 def patb_number(rig: Rig, eo: ExteriorOrientation) -> int:
     """The number PAT-B knows an image by."""
-    return eo.exposure * PATB_CONE_STEP + [cone.name for cone in rig.cones].index(eo.cone)
+    names = [*(cone.name for cone in rig.cones), VIRTUAL_CAMERA]
+    return eo.exposure * PATB_CONE_STEP + names.index(eo.cone)
 
 
 def image_extent_mm(rig: Rig, cone: Cone, *, is_virtual: bool) -> tuple[float, float, float, float]:

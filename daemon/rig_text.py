@@ -22,7 +22,7 @@ def rig_toml(rig: Rig, *, remark: str = "") -> bytes:
             "title": rig.title,
             "timing": rig.timing,
             "frame_interval_s": rig.frame_interval_s,
-            "master_cone": rig.master_cone,
+            "master_cone": rig.master_cone or "",
             "colour_master_cone": rig.colour_master_cone or "",
             "reference_cone": rig.reference_cone,
         }

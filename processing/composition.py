@@ -27,11 +27,12 @@ from processing.lattice import (
 from processing.level1 import exposed_rows
 from processing.placement import (
     SensorPlacement,
+    nominal_placements,
     vip_mm_from_raw,
     vip_px_from_mm,
 )
 from processing.resampling import WEIGHT_STEP_PX, WEIGHT_UNIT, Interpolation, resample, usable_area
-from processing.rig import Sensor, VirtualImage
+from processing.rig import Rig, Sensor, VirtualImage
 from processing.seams import seam_labels, seam_weights
 
 Array = NDArray[Any]
@@ -40,6 +41,9 @@ PAN_CELL_PX: Final = 64
 COLOUR_CELL_PX: Final = 32
 """Spacing of the lattices of inverse mapping; a short lens bends its pixels faster. Linear
 interpolation between nodes is good to 0.003 px of PAN, 0.005 px of colour on every rig."""
+
+LATTICE_ERROR_PX: Final = 0.008
+"""Both ways together, at the worst place."""
 
 _NOWHERE: Final = (1.0, 0.0, 1.0, 0.0)
 
@@ -54,17 +58,49 @@ class Composition:
     balance: Balance
 
 
+def pan_cell_px(rig: Rig) -> int:
+    """The widest lattice of `PAN_CELL_PX`, its half, its quarter that follows every PAN sensor.
+
+    A head that is tilted bends straight lines of the virtual image faster.
+
+    Raises:
+        ValueError: the rig has no virtual image.
+    """
+    placements = nominal_placements(rig, {}, {})
+    sensors = [sensor for cone in rig.pan_cones for sensor in cone.sensors]
+    image = rig.virtual_image
+    if image is None:
+        raise ValueError(f"rig {rig.name} has no [virtual_image]; there is nothing to compose")
+    bend = 0.0
+    rows, columns = lattice_shape(pan_raster(image), PAN_CELL_PX)
+    for sensor in sensors:
+        lattice = np.full((rows, columns, 2), OUTSIDE)
+        fill_lattice(image, pan_raster(image), placements[sensor.name], PAN_CELL_PX, lattice)
+        lattice[lattice == OUTSIDE] = np.nan
+        for axis in (0, 1):
+            steps = np.abs(np.diff(lattice, 2, axis=axis))
+            bend = max(bend, float(np.nanmax(steps, initial=0.0)))
+    # A line between nodes is off by an eighth of the second difference; both ways add up.
+    cell = PAN_CELL_PX
+    while bend / 4.0 > LATTICE_ERROR_PX and cell > PAN_CELL_PX // 4:
+        cell, bend = cell // 2, bend / 4.0
+    return cell
+
+
 class PanComposer:
     """Level-1 frames of the PAN sensors and what is needed to make one image of them."""
 
-    def __init__(self, image: VirtualImage, sensors: Collection[Sensor]) -> None:
+    def __init__(
+        self, image: VirtualImage, sensors: Collection[Sensor], *, cell_px: int = PAN_CELL_PX
+    ) -> None:
         self.image = image
+        self.cell_px = cell_px
         self.sensors = tuple(sensors)
         self.names = tuple(sensor.name for sensor in self.sensors)
         count = len(self.sensors)
         raster = pan_raster(image)
-        rows, columns = lattice_shape(raster, PAN_CELL_PX)
-        per_cell = PAN_CELL_PX // WEIGHT_STEP_PX
+        rows, columns = lattice_shape(raster, self.cell_px)
+        per_cell = self.cell_px // WEIGHT_STEP_PX
         nodes = ((rows - 1) * per_cell + 1, (columns - 1) * per_cell + 1)
         self._frames = _stack(self.sensors)
         self._lattices = np.full((count, rows, columns, 2), OUTSIDE)
@@ -99,12 +135,12 @@ class PanComposer:
         raster = pan_raster(self.image)
         for k, name in enumerate(self.names):
             if name in present:
-                fill_lattice(self.image, raster, placements[name], PAN_CELL_PX, self._lattices[k])
+                fill_lattice(self.image, raster, placements[name], self.cell_px, self._lattices[k])
                 self._valid[k] = _usable(placements[name])
             else:
                 self._lattices[k] = OUTSIDE
                 self._valid[k] = _NOWHERE
-        node_means(self._frames, self._valid, self._lattices, PAN_CELL_PX, self._means)
+        node_means(self._frames, self._valid, self._lattices, self.cell_px, self._means)
         balance = balance_gains(self.names, self._means)
         gains = np.array([balance.gains[name] for name in self.names], np.float32)
         offsets = np.array([balance.offsets.get(name, 0.0) for name in self.names], np.float32)
@@ -114,7 +150,7 @@ class PanComposer:
             self._frames,
             self._valid,
             self._lattices,
-            PAN_CELL_PX,
+            self.cell_px,
             self._weights,
             gains,
             offsets=offsets,
@@ -141,7 +177,7 @@ class PanComposer:
             i, j = np.nonzero(self._weights[k])
             vip = np.stack([j, i], axis=1) * float(WEIGHT_STEP_PX)
             inside = (vip[:, 0] < self.image.width_px) & (vip[:, 1] < self.image.height_px)
-            raw = interpolate_lattice(lattice, PAN_CELL_PX, vip)
+            raw = interpolate_lattice(lattice, self.cell_px, vip)
             first_c, last_c, first_r, last_r = self._valid[k]
             with np.errstate(invalid="ignore"):
                 inside &= (raw[:, 0] >= first_c) & (raw[:, 0] <= last_c)
@@ -152,9 +188,9 @@ class PanComposer:
             if placements is not None:
                 used = self._spare
                 fill_lattice(
-                    self.image, pan_raster(self.image), placements[name], PAN_CELL_PX, used
+                    self.image, pan_raster(self.image), placements[name], self.cell_px, used
                 )
-                raw = interpolate_lattice(used, PAN_CELL_PX, vip)
+                raw = interpolate_lattice(used, self.cell_px, vip)
             known = np.isfinite(raw[:, 0])
             weights = self._weights[k][i[inside], j[inside]] / np.float32(WEIGHT_UNIT)
             result[f"{name}.vip"] = vip[known]

@@ -141,9 +141,9 @@ def parallax_px(rig: Rig, conditions: Conditions, relief_fraction: float) -> flo
     image, height = rig.virtual_image, conditions.height_above_ground_m
     if image is None or height is None or height <= 0 or rig.colour_master_cone is None:
         return 0.0
-    master, colour = rig.cone(rig.master_cone), rig.cone(rig.colour_master_cone)
-    along = colour.position_mm[0] - master.position_mm[0]
-    across = colour.position_mm[1] - master.position_mm[1]
+    seen_from, colour = rig.image_position_mm, rig.cone(rig.colour_master_cone)
+    along = colour.position_mm[0] - seen_from[0]
+    across = colour.position_mm[1] - seen_from[1]
     if rig.timing == "syntopic":
         along *= math.sin(conditions.crab_rad or 0.0)
     base_mm = math.hypot(along, across)

@@ -13,11 +13,18 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from processing.mosaic import Mosaic, MosaicSettings, adjust_mosaic
-from processing.mosaic_model import build_model
+from processing.mosaic import (
+    Constraint,
+    Mosaic,
+    MosaicSettings,
+    adjust_mosaic,
+    datum_candidates,
+)
+from processing.mosaic_model import ROTATION_NAMES, build_model
 from processing.placement import SensorPlacement
 from processing.rig import Rig
 from processing.tie_points import PAN_TO_COLOUR, PAN_TO_PAN, TiePoints
+from processing.topology import free_cones
 
 
 def fixed_mosaic(
@@ -28,6 +35,8 @@ def fixed_mosaic(
     settings: MosaicSettings | None = None,
 ) -> Mosaic:
     """Stitch with sensors at their given positions: 8 unknowns per layer but the master's.
+
+    Converging PAN heads, which have no master, stay at the angles of the platform calibration.
 
     Args:
         rig: the camera.
@@ -40,18 +49,23 @@ def fixed_mosaic(
         covariance of green does not hold the PAN's.
     """
     settings = settings or MosaicSettings()
-    pan_layers = [c.name for c in rig.pan_cones if c.name != rig.master_cone]
+    mountings = free_cones(rig)[1]
+    pan_layers = [c.name for c in rig.pan_cones if c.name not in (rig.master_cone, *mountings)]
     colour = rig.colour_master_cone
     colour_layers = [] if colour is None or rig.cone(colour).role == "pan" else [colour]
     pan = adjust_mosaic(
         rig,
         placements,
         tie_points,
-        model=build_model(rig, placements, free_sensors=(), free_layers=pan_layers),
-        constraints=(),
+        model=build_model(
+            rig, placements, free_sensors=(), free_layers=pan_layers, free_mountings=mountings
+        ),
+        constraints=[
+            Constraint({f"{cone}.{axis}": 1.0}) for cone in mountings for axis in ROTATION_NAMES
+        ],
         settings=settings,
         method="fixed",
-        datum_sensors=tuple(s.name for s in rig.cone(rig.master_cone).sensors),
+        datum_sensors=tuple(s.name for s in datum_candidates(rig)),
         kinds=(PAN_TO_PAN,),
     )
     if not colour_layers:
@@ -87,7 +101,13 @@ def _joined(
     covariance[unknowns:, unknowns:] = green.covariance
     return dataclasses.replace(
         pan,
-        model=build_model(rig, placements, free_sensors=(), free_layers=layers),
+        model=build_model(
+            rig,
+            placements,
+            free_sensors=(),
+            free_layers=layers,
+            free_mountings=list(pan.model.mountings),
+        ),
         placements=green.placements,
         sigma0=first.sigma0,
         sigma0_px=first.sigma0_px,

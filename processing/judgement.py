@@ -273,6 +273,20 @@ def _stitching(
         (t.sigma0_px, t.sigma0_refly_px),
         "The sensors do not fit together well; check exposure times and the mount of the heads.",
     )
+    platform = _number(figures, "platform_test")
+    if platform is not None and platform > 1.0:
+        moved = _number(figures, "platform_shift_px")
+        findings.append(
+            Finding(
+                Flag.CALIBRATION_EXPIRED,
+                Verdict.USABLE,
+                f"Head {figures.get('platform_shift_head')} sits {moved or 0.0:.2f} px off the "
+                "platform calibration; the image is corrected for it. Go on, and calibrate the "
+                "platform from this flight.",
+                platform,
+                1.0,
+            )
+        )
     displaced = figures.get("displaced_sensor")
     if displaced:
         size = math.hypot(

@@ -31,7 +31,7 @@ class Raster:
 
     width_px: int
     height_px: int
-    ratio: int
+    ratio: float
 
 
 def pan_raster(image: VirtualImage) -> Raster:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +19,13 @@ from numpy.typing import NDArray
 
 from processing.adjustment import Block, Solution, normal_equations, redundancy_numbers, solve
 from processing.mosaic_clusters import clustered_cofactor
-from processing.mosaic_model import MosaicModel, build_model, placement_at, vip_and_design
+from processing.mosaic_model import (
+    ROTATION_NAMES,
+    MosaicModel,
+    build_model,
+    placement_at,
+    vip_and_design,
+)
 from processing.mosaic_weights import (
     CLASSES,
     Group,
@@ -32,9 +38,9 @@ from processing.mosaic_weights import (
     weight_factors,
 )
 from processing.placement import SensorPlacement, corrected_mm_from_raw, start_similarity
-from processing.rig import Rig
+from processing.rig import Rig, Sensor
 from processing.tie_points import PAN_TO_COLOUR, PAN_TO_PAN, TiePoints
-from processing.topology import mosaic_cones
+from processing.topology import free_cones, mosaic_cones
 
 __all__ = [
     "Constraint",
@@ -124,6 +130,10 @@ def free_mosaic(
 ) -> Mosaic:
     """Adjust all sensors of the PAN cones and the layer of the colour master.
 
+    Which unknowns there are follows from the rig: with a master cone the layers of the others are
+    projective transformations onto its own; without one the PAN heads converge, and each has the
+    three angles of its mounting, whose mean turn is zero (DESIGN 5.6).
+
     Args:
         rig: the camera.
         placements: the start: calibration + TDM, layers by platform calibration.
@@ -142,15 +152,25 @@ def free_mosaic(
     start = _starts(placements)
     cones = mosaic_cones(rig)
     free_sensors = [s.name for cone in cones if len(cone.sensors) >= 2 for s in cone.sensors]
-    free_layers = [cone.name for cone in cones if cone.name != rig.master_cone]
-    model = build_model(rig, start, free_sensors=free_sensors, free_layers=free_layers)
+    free_layers, free_mountings = free_cones(rig)
+    model = build_model(
+        rig,
+        start,
+        free_sensors=free_sensors,
+        free_layers=free_layers,
+        free_mountings=free_mountings,
+    )
     touched = _touched(tie_points)
     datum = tuple(
         s.name
-        for s in rig.cone(rig.master_cone).sensors
-        if s.name in model.sensors and s.name in touched and s.name not in excluded_datum_sensors
+        for s in datum_candidates(rig)
+        if s.name in touched and s.name not in excluded_datum_sensors
     )
-    constraints = datum_constraints(start, datum)
+    if rig.master_cone is None:
+        constraints = mounting_constraints(dict.fromkeys(rig.cone_of(s).name for s in datum))
+    else:
+        datum = tuple(name for name in datum if name in model.sensors)
+        constraints = datum_constraints(start, datum)
     for cone in cones:
         present = [s.name for s in cone.sensors if s.name in touched]
         if cone.name != rig.master_cone and len(cone.sensors) >= 2 and present:
@@ -167,6 +187,20 @@ def free_mosaic(
         begin=begin,
         prior=prior,
     )
+
+
+def datum_candidates(rig: Rig) -> tuple[Sensor, ...]:
+    """The sensors a datum may rest on: the master's, or of all PAN heads where there is none."""
+    if rig.master_cone is not None:
+        return rig.master_sensors
+    return tuple(sensor for cone in rig.pan_cones for sensor in cone.sensors)
+
+
+def mounting_constraints(cones: Collection[str]) -> list[Constraint]:
+    """The mean turn of the heads against their construction is zero, about each axis."""
+    if not cones:
+        return []
+    return [Constraint({f"{cone}.{axis}": 1.0 for cone in cones}) for axis in ROTATION_NAMES]
 
 
 def datum_constraints(

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.bundle.rotations import exponential, skew
 from processing.placement import SensorPlacement
-from processing.projective import apply_projective, projective_jacobian
+from processing.projective import apply_projective, projective_jacobian, rotation_homography
 from processing.rig import Rig
 from processing.similarity import Similarity, apply_similarity
 
@@ -22,15 +23,18 @@ Array = NDArray[np.float64]
 
 SIMILARITY_NAMES = ("x", "y", "rotation", "scale")
 LAYER_NAMES = ("p11", "p12", "p13", "p21", "p22", "p23", "p31", "p32")
+ROTATION_NAMES = ("rotation_x", "rotation_y", "rotation_z")
 
 
 @dataclass(frozen=True)
 class MosaicModel:
-    """Free similarities and layers of a rig, and the place of their unknowns.
+    """Free similarities, layers and mountings of a rig, and the place of their unknowns.
 
     Unknowns of a sensor: x, y (mm), rotation (rad), scale (1): S = (x0 + x, y0 + y, r0 + rotation,
     s0 (1 + scale)), turned and scaled about the sensor's centre. Unknowns of a layer: p11 .. p32
-    (1) of P = N^-1 (I + p) N P0, N dividing by `half_size_mm`.
+    (1) of P = N^-1 (I + p) N P0, N dividing by `half_size_mm`. Unknowns of a mounting: the
+    rotation vector (rad) that turns a head further, about the axes of the virtual camera (x right,
+    y forward, z up): R = exp(rotation) R0, and with it P = K exp(rotation) K^-1 P0.
 
     `units` is the size of each unknown that moves the farthest image point by about one pixel.
     """
@@ -41,6 +45,8 @@ class MosaicModel:
     units: Array
     half_size_mm: float
     pitch_mm: float
+    f_mm: float
+    mountings: Mapping[str, int] = field(default_factory=dict)
 
 
 def build_model(
@@ -49,8 +55,9 @@ def build_model(
     *,
     free_sensors: Sequence[str],
     free_layers: Sequence[str],
+    free_mountings: Sequence[str] = (),
 ) -> MosaicModel:
-    """Lay out the unknowns: those of each free sensor, then those of each free layer.
+    """Lay out the unknowns: of each free sensor, of each free mounting, of each free layer.
 
     Raises:
         ValueError: the rig has no virtual image.
@@ -62,18 +69,25 @@ def build_model(
     half_size = max(image.width_px, image.height_px) / 2.0 * pitch
     names: list[str] = []
     units: list[float] = []
-    sensors, layers = {}, {}
+    sensors, layers, mountings = {}, {}, {}
     for name in free_sensors:
         sensor = placements[name].sensor
         reach = np.hypot(sensor.width_px, sensor.height_px) / 2.0 * sensor.pitch_mm
         sensors[name] = len(names)
         names += [f"{name}.{what}" for what in SIMILARITY_NAMES]
         units += [pitch, pitch, pitch / reach, pitch / reach]
+    for name in free_mountings:
+        mountings[name] = len(names)
+        names += [f"{name}.{what}" for what in ROTATION_NAMES]
+        # A turn about the axis of sight moves the farthest point by half the image.
+        units += [pitch / image.f_mm, pitch / image.f_mm, pitch / half_size]
     for name in free_layers:
         layers[name] = len(names)
         names += [f"{name}.{what}" for what in LAYER_NAMES]
         units += [pitch / half_size] * 8
-    return MosaicModel(tuple(names), sensors, layers, np.array(units), half_size, pitch)
+    return MosaicModel(
+        tuple(names), sensors, layers, np.array(units), half_size, pitch, image.f_mm, mountings
+    )
 
 
 def placement_at(model: MosaicModel, start: SensorPlacement, values: Array) -> SensorPlacement:
@@ -108,10 +122,11 @@ def vip_and_design(
     start_mm = apply_projective(start.layer, layer_mm)
     first_sensor = model.sensors.get(start.sensor.name)
     first_layer = model.layers.get(start.cone.name)
+    first_mounting = model.mountings.get(start.cone.name)
     columns = np.concatenate(
         [
             np.arange(first, first + size, dtype=np.int64)
-            for first, size in ((first_sensor, 4), (first_layer, 8))
+            for first, size in ((first_sensor, 4), (first_mounting, 3), (first_layer, 8))
             if first is not None
         ]
         or [np.empty(0, dtype=np.int64)]
@@ -120,6 +135,13 @@ def vip_and_design(
     size = model.half_size_mm
     jacobian = projective_jacobian(start.layer, layer_mm)
     vip_mm = start_mm
+    if first_mounting is not None:
+        rotation = values[first_mounting : first_mounting + 3]
+        turned = _turn(rotation, model.f_mm)
+        vip_mm = apply_projective(turned, start_mm)
+        further = further_turn(vip_mm, model.f_mm)
+        design[-3:] = np.einsum("ajn,jk->kan", further, _left_jacobian(rotation))
+        jacobian = projective_jacobian(turned, start_mm) @ jacobian
     if first_layer is not None:
         x, y = start_mm[:, 0] / size, start_mm[:, 1] / size
         scaled = np.stack([x, y], axis=1)
@@ -160,12 +182,40 @@ def _similarity(model: MosaicModel, start: SensorPlacement, values: Array) -> Si
 
 
 def _layer_correction(model: MosaicModel, start: SensorPlacement, values: Array) -> Array:
+    mounting = model.mountings.get(start.cone.name)
+    if mounting is not None:
+        return _turn(values[mounting : mounting + 3], model.f_mm)
     first = model.layers.get(start.cone.name)
     if first is None:
         return np.eye(3)
     shrink = np.diag([1.0 / model.half_size_mm, 1.0 / model.half_size_mm, 1.0])
     grow = np.diag([model.half_size_mm, model.half_size_mm, 1.0])
     return np.asarray(grow @ _scaled_correction(values[first : first + 8]) @ shrink)
+
+
+def further_turn(vip_mm: Array, f_mm: float) -> Array:
+    """How points (n, 2) of the virtual image move by a small turn of their rays, (2, 3, n), mm/rad.
+
+    The ray (x, y, -f) turned by w moves by w x (x, y, -f).
+    """
+    x, y = vip_mm[:, 0], vip_mm[:, 1]
+    return np.array(
+        [
+            [x * y / f_mm, -f_mm - x * x / f_mm, -y],
+            [f_mm + y * y / f_mm, -x * y / f_mm, x],
+        ]
+    )
+
+
+def _turn(rotation: Array, f_mm: float) -> Array:
+    """The homography of the virtual image that a turn of the head makes, (3, 3), mm."""
+    return rotation_homography(exponential(rotation[None])[0], f_mm, f_mm)
+
+
+def _left_jacobian(rotation: Array) -> Array:
+    """What a change of a small rotation vector turns further, to second order, (3, 3)."""
+    cross = skew(rotation[None])[0]
+    return np.asarray(np.eye(3) + 0.5 * cross + cross @ cross / 6.0)
 
 
 def _scaled_correction(p: Array) -> Array:

@@ -13,12 +13,20 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from processing.mosaic import Constraint, Mosaic, MosaicSettings, adjust_mosaic
+from processing.mosaic import (
+    Constraint,
+    Mosaic,
+    MosaicSettings,
+    adjust_mosaic,
+    datum_candidates,
+    mounting_constraints,
+)
 from processing.mosaic_model import build_model
 from processing.placement import SensorPlacement
 from processing.projective import rotation_homography
 from processing.rig import Rig
 from processing.tie_points import PAN_TO_PAN, TiePoints
+from processing.topology import free_cones
 
 
 def without_precorrection(
@@ -53,6 +61,9 @@ def pan_only_mosaic(
 ) -> Mosaic:
     """Stitch PAN layers onto the master's by similarities, from P/P tie points.
 
+    Without a master cone the mountings of the PAN heads, from P/P tie points alone: twelve angles,
+    nine of them determinable.
+
     Sensors stay at their given positions in their layers. The colour cones stay where `placements`
     have them.
 
@@ -63,17 +74,22 @@ def pan_only_mosaic(
         precorrected: keep the calibrated rotations of the PAN cones; the experiment did not.
         settings: None takes the defaults.
     """
-    start = dict(placements) if precorrected else without_precorrection(rig, placements)
-    layers = [cone.name for cone in rig.pan_cones if cone.name != rig.master_cone]
+    kept = precorrected or rig.master_cone is None
+    start = dict(placements) if kept else without_precorrection(rig, placements)
+    mountings = free_cones(rig)[1]
+    layers = [c.name for c in rig.pan_cones if c.name not in (rig.master_cone, *mountings)]
+    constraints = [c for name in layers for c in similarity_constraints(name)]
     return adjust_mosaic(
         rig,
         start,
         tie_points,
-        model=build_model(rig, start, free_sensors=(), free_layers=layers),
-        constraints=[c for name in layers for c in similarity_constraints(name)],
+        model=build_model(
+            rig, start, free_sensors=(), free_layers=layers, free_mountings=mountings
+        ),
+        constraints=constraints + mounting_constraints(mountings),
         settings=settings or MosaicSettings(),
         method="pan-only",
-        datum_sensors=tuple(s.name for s in rig.cone(rig.master_cone).sensors),
+        datum_sensors=tuple(s.name for s in datum_candidates(rig)),
         kinds=(PAN_TO_PAN,),
     )
 

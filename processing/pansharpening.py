@@ -6,6 +6,7 @@ colour pixel is that colour pixel: geometry is PAN's, radiometry at colour resol
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, Final
 
@@ -25,14 +26,15 @@ STRIP_ROWS: Final = 128
 _CEILING: Final = 65535.0
 
 
-def pansharpened(pan: Array, colour: Mapping[str, Array], ratio: int) -> dict[str, Array]:
+def pansharpened(pan: Array, colour: Mapping[str, Array], ratio: float) -> dict[str, Array]:
     """Bands at the resolution of PAN.
 
     Args:
         pan: (H, W) uint16, linear signal above black, 0 is no data.
         colour: bands by name, (H // ratio, W // ratio) uint16, likewise. Colour pixel (c, r) covers
             the PAN pixels ratio c .. ratio c + ratio - 1 and the rows alike.
-        ratio: PAN pixels to the colour pixel along each axis.
+        ratio: PAN pixels to the colour pixel along each axis. Where it is not whole (4.8), a PAN
+            pixel on the border of two colour pixels counts for both by its shares.
 
     Returns:
         Bands by name, (H, W) uint16 in the units of `colour`. 0 where PAN or colour has no data, at
@@ -44,7 +46,7 @@ def pansharpened(pan: Array, colour: Mapping[str, Array], ratio: int) -> dict[st
     """
     if ratio < 1 or pan.dtype != np.uint16 or pan.ndim != 2:
         raise ValueError(f"PAN is {pan.dtype} of shape {pan.shape}, ratio {ratio}; (H, W) uint16")
-    height, width = pan.shape[0] // ratio, pan.shape[1] // ratio
+    height, width = (math.floor(size / ratio + 1e-9) for size in pan.shape)
     for name, band in colour.items():
         if band.shape != (height, width) or band.dtype != np.uint16 or not band.size:
             raise ValueError(
@@ -52,38 +54,49 @@ def pansharpened(pan: Array, colour: Mapping[str, Array], ratio: int) -> dict[st
                 f"{ratio} has colour of {(height, width)} uint16"
             )
     result = {name: np.zeros(pan.shape, np.uint16) for name in colour}
-    margin = ROUNDS + 2
-    for first in range(0, height, STRIP_ROWS):
-        last = min(first + STRIP_ROWS, height)
+    # Strips begin where a colour pixel begins on a whole PAN row.
+    step = _whole_step(ratio)
+    margin = -(-(ROUNDS + 2) // step) * step
+    height_of = max(STRIP_ROWS // step, 1) * step
+    for first in range(0, height, height_of):
+        last = min(first + height_of, height)
         top, bottom = max(first - margin, 0), min(last + margin, height)
         # The rows below the last whole colour pixel belong to the last strip.
-        end = pan.shape[0] if last == height else last * ratio
-        rows = slice(top * ratio, max(bottom * ratio, end))
-        strip = pan[rows].astype(np.float32)
-        whole = strip[: (bottom - top) * ratio, : width * ratio]
+        end = pan.shape[0] if last == height else round(last * ratio)
+        begin, above = round(first * ratio), round(top * ratio)
+        strip = pan[above : max(round(bottom * ratio), end)].astype(np.float32)
+        whole = strip[: round((bottom - top) * ratio), : round(width * ratio)]
         for name, band in colour.items():
             wished = band[top:bottom].astype(np.float32)
-            sharp = _sharpened(strip, whole, wished, ratio)
-            result[name][first * ratio : end] = sharp[(first - top) * ratio : end - top * ratio]
+            sharp = _sharpened(strip, whole, wished)
+            result[name][begin:end] = sharp[begin - above : end - above]
     return result
 
 
-def _sharpened(strip: Array, whole: Array, wished: Array, ratio: int) -> Array:
+def _whole_step(ratio: float) -> int:
+    """Colour pixels after which colour and PAN pixels end together; ValueError beyond twelve."""
+    for step in range(1, 13):
+        if abs(step * ratio - round(step * ratio)) < 1e-6:
+            return step
+    raise ValueError(f"ratio {ratio}; twelve colour pixels at most cover whole PAN pixels")
+
+
+def _sharpened(strip: Array, whole: Array, wished: Array) -> Array:
     """One band of one strip, (rows, W) uint16; `whole` is the part of `strip` under colour."""
     lit = (whole > 0.0).astype(np.float32)
-    share = _block_means(lit, ratio)
+    share = _block_means(lit, wished.shape)
     target = wished * share
     usable = (target > 0.0).astype(np.float32)
     quotient = np.zeros_like(target)
-    np.divide(target, _block_means(whole, ratio), out=quotient, where=usable > 0.0)
+    np.divide(target, _block_means(whole, wished.shape), out=quotient, where=usable > 0.0)
     for _ in range(ROUNDS):
-        found = _block_means(whole * _spread(quotient, usable, whole.shape), ratio)
+        found = _block_means(whole * _spread(quotient, usable, whole.shape), wished.shape)
         np.multiply(quotient, target / np.maximum(found, 1e-6), out=quotient, where=usable > 0.0)
     smooth = _spread(quotient, usable, whole.shape)
-    found = _block_means(whole * smooth, ratio)
+    found = _block_means(whole * smooth, wished.shape)
     exact = np.zeros_like(target)
     np.divide(target, found, out=exact, where=usable > 0.0)
-    blocks = smooth * _repeated(exact, ratio)
+    blocks = smooth * _repeated(exact, whole.shape)
     field = cv2.copyMakeBorder(
         blocks,
         0,
@@ -108,14 +121,12 @@ def _spread(quotient: Array, usable: Array, shape: tuple[int, ...]) -> Array:
     return np.asarray(field / np.maximum(weight, 1e-6))
 
 
-def _block_means(image: Array, ratio: int) -> Array:
-    if ratio == 1:
+def _block_means(image: Array, shape: tuple[int, ...]) -> Array:
+    if image.shape == shape:
         return np.array(image)
-    size = (image.shape[1] // ratio, image.shape[0] // ratio)
-    # For a whole ratio, OpenCV's area interpolation is the plain mean of the block.
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+    # OpenCV's area interpolation is the mean of the block, border pixels by their shares.
+    return np.asarray(cv2.resize(image, shape[::-1], interpolation=cv2.INTER_AREA))
 
 
-def _repeated(image: Array, ratio: int) -> Array:
-    size = (image.shape[1] * ratio, image.shape[0] * ratio)
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST))
+def _repeated(image: Array, shape: tuple[int, ...]) -> Array:
+    return np.asarray(cv2.resize(image, shape[::-1], interpolation=cv2.INTER_NEAREST))

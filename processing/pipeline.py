@@ -7,9 +7,7 @@ reads a file or waits for anything.
 from __future__ import annotations
 
 import copy
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -24,7 +22,7 @@ from processing.colour import (
     nominal_registration,
     register_band,
 )
-from processing.composition import ColourComposer, PanComposer
+from processing.composition import ColourComposer, PanComposer, pan_cell_px
 from processing.conditions import (
     Conditions,
     Temperatures,
@@ -48,6 +46,7 @@ from processing.level1 import (
     level1_from_level0,
 )
 from processing.mosaic import Mosaic, MosaicSettings
+from processing.mounting import check_platform, platform_figures
 from processing.placement import SensorPlacement, nominal_placements
 from processing.precision import precision_figures
 from processing.product import Product, Settings
@@ -58,8 +57,10 @@ from processing.rehearsal import rehearsal_frames
 from processing.resampling import Interpolation
 from processing.rig import Rig
 from processing.stitching import Method, stitch
+from processing.stopwatch import Stopwatch
 from processing.tie_points import TiePoints, match_tie_points
 from processing.validity import Validity
+from processing.virtual_camera import ground_plane, projection_figures
 
 __all__ = ["Conditions", "Interpolation", "Method", "Pipeline", "Product", "Settings"]
 
@@ -97,7 +98,7 @@ class Pipeline:
         self.settings = settings or Settings()
         pan = [sensor for cone in rig.pan_cones for sensor in cone.sensors]
         self._heads = colour_heads(rig)
-        self._pan = PanComposer(rig.virtual_image, pan)
+        self._pan = PanComposer(rig.virtual_image, pan, cell_px=pan_cell_px(rig))
         self._colour = ColourComposer(rig.virtual_image, self._heads)
         known = radiometry or {}
         self._correctors = {
@@ -119,7 +120,7 @@ class Pipeline:
         Calibrations, the larger part of the memory, are shared.
         """
         other = copy.copy(self)
-        other._pan = PanComposer(self._pan.image, self._pan.sensors)
+        other._pan = PanComposer(self._pan.image, self._pan.sensors, cell_px=self._pan.cell_px)
         other._colour = ColourComposer(self._colour.image, self._heads)
         return other
 
@@ -169,10 +170,15 @@ class Pipeline:
         numba.set_num_threads(
             max(1, min(self.settings.threads, int(numba.config.NUMBA_NUM_THREADS)))
         )
-        rig, settings, clock = self.rig, self.settings, _Stopwatch()
+        rig, settings, clock = self.rig, self.settings, Stopwatch()
         temperatures = usable_temperatures(rig, conditions, settings.thresholds)
+        ground = ground_plane(rig, conditions)
         start = nominal_placements(
-            rig, temperatures.placing_c, conditions.tdi_shifts, use_drift=settings.use_drift
+            rig,
+            temperatures.placing_c,
+            conditions.tdi_shifts,
+            use_drift=settings.use_drift,
+            ground=ground,
         )
         with clock.stage("radiometry"):
             level1, statistics = self._correct(frames, conditions, temperatures)
@@ -192,6 +198,7 @@ class Pipeline:
             )
             tie_points, mosaic, validity = stitched.tie_points, stitched.image, stitched.validity
             estimated = self._estimate_dc(stitched.free, validity, temperatures)
+            platform = check_platform(rig, stitched.free, tie_points, temperatures.usable_c)
         with clock.stage("composition"):
             image = self._pan.compose(
                 mosaic.placements,
@@ -202,7 +209,7 @@ class Pipeline:
         with clock.stage("colour"):
             registrations, colour = self._register(mosaic, level1)
         with clock.stage("baselines"):
-            baselines = self._baselines(start, tie_points, temperatures, conditions)
+            baselines = self._baselines(tie_points, temperatures, conditions)
         with clock.stage("geometry"):
             geometry = self._geometry(mosaic, baselines) if settings.geometry else {}
         with clock.stage("quicklook"):
@@ -220,7 +227,8 @@ class Pipeline:
                 present=level1,
             )
             figures["resting_on_calibration"] = ", ".join(stitched.weak) or None
-            figures |= estimated_dc_figures(estimated)
+            figures |= estimated_dc_figures(estimated) | platform_figures(platform)
+            figures |= projection_figures(rig, conditions, settings.relief_fraction)
             figures |= precision_figures(rig, mosaic, level1, temperatures.usable_c)
             figures |= self._whole_figures(image.source, frames, conditions)
             report = judge(
@@ -249,6 +257,8 @@ class Pipeline:
             free=stitched.free,
             validity=validity,
             estimated_dc=estimated,
+            platform=platform,
+            ground=ground,
             temperatures=temperatures,
             balance=image.balance,
             bands=registrations,
@@ -336,24 +346,23 @@ class Pipeline:
         return tuple(registrations), rasters
 
     def _baselines(
-        self,
-        start: Placements,
-        tie_points: TiePoints,
-        temperatures: Temperatures,
-        conditions: Conditions,
+        self, tie_points: TiePoints, temperatures: Temperatures, conditions: Conditions
     ) -> dict[str, Mosaic]:
         """The fixed method with and without TDM, from the same tie points."""
         if not self.settings.baselines:
             return {}
         settings = self._mosaic_settings(conditions)
-        with_tdm = nominal_placements(self.rig, temperatures.placing_c, conditions.tdi_shifts)
-        without = nominal_placements(
-            self.rig, temperatures.placing_c, conditions.tdi_shifts, use_drift=False
-        )
-        return {
-            "fixed": fixed_mosaic(self.rig, with_tdm, tie_points, settings=settings),
-            "fixed-no-tdm": fixed_mosaic(self.rig, without, tie_points, settings=settings),
-        }
+        baselines = {}
+        for name, use_drift in (("fixed", True), ("fixed-no-tdm", False)):
+            places = nominal_placements(
+                self.rig,
+                temperatures.placing_c,
+                conditions.tdi_shifts,
+                use_drift=use_drift,
+                ground=ground_plane(self.rig, conditions),
+            )
+            baselines[name] = fixed_mosaic(self.rig, places, tie_points, settings=settings)
+        return baselines
 
     def _geometry(
         self, mosaic: Mosaic, baselines: Mapping[str, Mosaic]
@@ -392,18 +401,3 @@ class Pipeline:
     def _mosaic_settings(self, conditions: Conditions) -> MosaicSettings:
         parallax = parallax_px(self.rig, conditions, self.settings.relief_fraction)
         return replace(self.settings.mosaic, parallax_px=parallax)
-
-
-class _Stopwatch:
-    """Seconds by stage."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        began = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[name] = time.perf_counter() - began

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from processing.drift import cone_dc, physical_similarity, principal_distance, sensor_dc
 from processing.lens import ideal_from_measured, measured_from_ideal
-from processing.projective import apply_projective, rotation_homography
+from processing.projective import apply_projective
 from processing.rig import Cone, Rig, Sensor, VirtualImage
-from processing.rotation import rotation_matrix
 from processing.similarity import Similarity, apply_similarity, invert_similarity
+from processing.virtual_camera import GroundPlane, vip_from_layer
 
 Array = NDArray[np.float64]
 
@@ -50,6 +50,7 @@ def nominal_placements(
     tdi_shifts: Mapping[str, int],
     *,
     use_drift: bool = True,
+    ground: GroundPlane | None = None,
 ) -> dict[str, SensorPlacement]:
     """Placements by calibration, TDM and platform calibration: the start of any stitching.
 
@@ -59,6 +60,7 @@ def nominal_placements(
             calibration temperature; saying so is the caller's (`processing.drift.missing_probes`).
         tdi_shifts: N by cone name; a cone without one has none.
         use_drift: False ignores the temperatures (places and principal distances as calibrated).
+        ground: what a virtual camera projects onto; None takes its projection centres as one.
 
     Returns:
         One placement per sensor of the rig, by sensor name, in file order.
@@ -72,9 +74,7 @@ def nominal_placements(
     placements: dict[str, SensorPlacement] = {}
     for cone in rig.cones:
         f_ratio = cone.lens.f_mm / principal_distance(cone, cone_dc(cone, known))
-        layer = rotation_homography(
-            rotation_matrix(*cone.rotation_rad), cone.lens.f_mm, rig.virtual_image.f_mm
-        )
+        layer = vip_from_layer(rig, cone, ground)
         for sensor in cone.sensors:
             physical = physical_similarity(sensor, sensor_dc(sensor, known))
             placements[sensor.name] = SensorPlacement(

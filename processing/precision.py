@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.drift import sensor_dc
-from processing.mosaic import Mosaic, vip_precision_px
+from processing.mosaic import Mosaic, datum_candidates, vip_precision_px
 from processing.mosaic_model import vip_and_design
 from processing.placement import corrected_mm_from_raw, vip_mm_from_raw
 from processing.quality import Figure
-from processing.rig import Rig
+from processing.rig import Rig, Sensor
 
 Array = NDArray[np.float64]
 
@@ -113,9 +113,9 @@ def datum_covariance(rig: Rig, mosaic: Mosaic, measured_c: Mapping[str, float]) 
     The datum is the best similarity over the master sensors it rests on (eq. 6), so what their
     places are off by, each on its own or all with their probe, carries over by that fit.
     """
-    master = rig.cone(rig.master_cone)
-    sensors = [s for s in master.sensors if s.name in mosaic.datum_sensors] or list(master.sensors)
-    place_mm = np.array([[s.x_mm, s.y_mm] for s in sensors])
+    candidates = datum_candidates(rig)
+    sensors = [s for s in candidates if s.name in mosaic.datum_sensors] or list(candidates)
+    place_mm = np.array([_place_mm(rig, mosaic, s) for s in sensors])
     own_um2 = np.array(
         [
             s.position_sigma_um**2 + (s.drift.sigma_um_per_k * sensor_dc(s, measured_c)) ** 2
@@ -131,19 +131,30 @@ def datum_covariance(rig: Rig, mosaic: Mosaic, measured_c: Mapping[str, float]) 
     fit = np.linalg.inv(design.T @ design) @ design.T
     covariance = fit @ (np.repeat(own_um2, 2)[:, None] * fit.T)
     # um per kelvin; the principal distance takes part of an expansion back.
-    for probe in dict.fromkeys([s.probe for s in sensors] + [master.probe]):
+    cones = [rig.cone_of(s.name) for s in sensors]
+    for probe in dict.fromkeys([s.probe for s in sensors] + [cone.probe for cone in cones]):
         moved = np.zeros((len(place_mm), 2))
-        for i, s in enumerate(sensors):
+        for i, (s, cone) in enumerate(zip(sensors, cones, strict=True)):
             if s.probe == probe:
                 moved[i] = (s.drift.x_um_per_k, s.drift.y_um_per_k)
-        if master.probe == probe:
-            moved -= master.lens.f_ppm_per_k * 1e-3 * place_mm
+            if cone.probe == probe:
+                moved[i] -= cone.lens.f_ppm_per_k * 1e-3 * place_mm[i]
         if len(sensors) == 1:
             moved = np.repeat(moved, 2, axis=0)
         sigma_k = PROBE_SIGMA_K if probe in measured_c else UNKNOWN_SIGMA_K
         common = fit @ moved.reshape(-1) * sigma_k
         covariance += np.outer(common, common)
     return np.asarray(covariance / (mosaic.model.pitch_mm * 1e3) ** 2)
+
+
+def _place_mm(rig: Rig, mosaic: Mosaic, sensor: Sensor) -> tuple[float, float]:
+    """Where the sensor's middle lies: in the master's layer, which is the virtual image, or there
+    by the head's mounting."""
+    if rig.master_cone is not None:
+        return sensor.x_mm, sensor.y_mm
+    middle = np.array([[(sensor.width_px - 1) / 2.0, (sensor.height_px - 1) / 2.0]])
+    x, y = vip_mm_from_raw(mosaic.start[sensor.name], middle)[0]
+    return float(x), float(y)
 
 
 def _datum_design(xy_mm: Array) -> Array:

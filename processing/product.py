@@ -13,12 +13,14 @@ from processing.colour import BandRegistration, ColourSettings
 from processing.conditions import Temperatures
 from processing.estimated_dc import EstimatedDc
 from processing.mosaic import Mosaic, MosaicSettings
+from processing.mounting import PlatformCheck
 from processing.quality import QualityReport, Thresholds
 from processing.resampling import Interpolation
 from processing.specification import Asked
 from processing.stitching import Method
 from processing.tie_points import TiePoints, TiePointSettings
 from processing.validity import Validity
+from processing.virtual_camera import GroundPlane
 
 Array = NDArray[Any]
 
@@ -71,6 +73,8 @@ class Product:
     where calibration had to support them; `equal_datum` that whose datum rests on all master
     sensors alike, which is `free` unless one was found displaced. `estimated_dc` is dC by
     stitching, cone by cone (none with the fixed method), `temperatures` what the placing used.
+    Of converging heads `platform` holds how they are mounted and whether as calibrated, `ground`
+    the plane they were projected onto.
     """
 
     sensors: tuple[str, ...]
@@ -86,6 +90,8 @@ class Product:
     free: Mosaic
     validity: Validity | None
     estimated_dc: tuple[EstimatedDc, ...]
+    platform: PlatformCheck | None
+    ground: GroundPlane | None
     temperatures: Temperatures
     balance: Balance
     bands: tuple[BandRegistration, ...]

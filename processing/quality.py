@@ -139,6 +139,13 @@ FIGURES: Final[Mapping[str, str]] = {
     "displaced_alternatives": "master sensors that explain the stitching nearly as well",
     "displaced_several": "1 where one displaced sensor does not explain it all: several moved",
     "relative_displacements": "pairs of sensors of one cone found displaced against each other",
+    "platform_test": "mountings of converging heads against the platform calibration: test "
+    "statistic over its critical value; above one is significant",
+    "platform_shift_px": "how far the head that moved most went by it, PAN pixels at its middle",
+    "platform_shift_head": "which head that is",
+    "platform_residual_px": "largest shift an affine transformation still finds between heads",
+    "projection_height_m": "height above ground a virtual camera projected its heads onto",
+    "head_parallax_px": "parallax relief may leave between PAN heads after that, PAN pixels",
     "undetermined": "sensors and cones the tie points did not place, held at calibration and TDM",
     "resting_on_calibration": "PAN sensors that tie points place too poorly, supported",
     "smear_along_px": "motion during exposure along track that TDI left, worst PAN cone, pixels",

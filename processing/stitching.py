@@ -12,6 +12,7 @@ from typing import Literal
 
 from processing.fixed_method import fixed_mosaic
 from processing.mosaic import Mosaic, MosaicSettings, free_mosaic
+from processing.mounting import verified_mosaic
 from processing.pan_only import pan_only_mosaic
 from processing.placement import SensorPlacement
 from processing.rig import Rig
@@ -64,6 +65,8 @@ def stitch(
     if method != "free":
         other = fixed_mosaic if method == "fixed" else pan_only_mosaic
         mosaic = other(rig, start, tie_points, settings=settings)
+        if method == "pan-only":
+            mosaic = verified_mosaic(rig, mosaic, tie_points)
         return Stitching(tie_points, mosaic, mosaic, mosaic, None, ())
     mosaic = free_mosaic(rig, start, tie_points, settings=settings)
     validity = judge_master(rig, mosaic, temperatures_c)
@@ -75,6 +78,7 @@ def stitch(
         if not contradicted_colour(rig, tie_points, without, judged).any():
             # P/P points do not say so: it was a cloud, or something else that is nearer.
             tie_points, mosaic, validity = fewer, without, judged
+    mosaic = verified_mosaic(rig, mosaic, tie_points)
     robust = robust_datum(rig, start, tie_points, mosaic, validity, settings=settings)
     weak = weakly_placed(rig, robust, present)
     image = robust

@@ -133,7 +133,7 @@ def supported_mosaic(
     """
     support = support or SupportSettings()
     moved = _moved(rig, validity)
-    excluded = [s.name for s in rig.cone(rig.master_cone).sensors if s.name in moved]
+    excluded = [s.name for s in rig.master_sensors if s.name in moved]
     covariance = _covariance(rig, mosaic, moved, temperatures_c, support)
     information = np.asarray(np.linalg.inv(covariance), np.float64)
     found = mosaic
@@ -157,7 +157,7 @@ def _moved(rig: Rig, validity: Validity) -> set[str]:
     if first is not None:
         moved |= {first.sensor, *validity.alternatives}
         if validity.several:
-            moved |= {s.name for s in rig.cone(rig.master_cone).sensors}
+            moved |= {s.name for s in rig.master_sensors}
     for pair in validity.relative:
         if pair.significant:
             moved |= {pair.sensor_a, pair.sensor_b}
@@ -183,6 +183,9 @@ def _covariance(
             if sensor.name in moved:
                 covariance[at[:2], at[:2]] += (settings.displaced_px * sensor.pitch_mm) ** 2
         covariance += _probe_covariance(mosaic, free, temperatures_c, settings)
+        if cone.name in model.mountings:
+            at = np.arange(model.mountings[cone.name], model.mountings[cone.name] + 3)
+            covariance[at, at] += (cone.rotation_sigma_urad * 1e-6) ** 2
         if cone.name in model.layers:
             at = np.arange(model.layers[cone.name], model.layers[cone.name] + 8)
             covariance[np.ix_(at, at)] += _layer_covariance(mosaic, cone, settings)

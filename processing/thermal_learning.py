@@ -119,7 +119,7 @@ def empty_state(rig: Rig) -> ThermalState:
     for cone in mosaic_cones(rig):
         if cone.role == "pan" and len(cone.sensors) >= 2:
             places[cone.name] = _empty(4 * (len(cone.sensors) - 1))
-        if cone.name != rig.master_cone:
+        if rig.master_cone is not None and cone.name != rig.master_cone:
             scales[cone.name] = _empty(1)
     return ThermalState(rig.name, rig.calibration_id, places, scales)
 
@@ -142,8 +142,8 @@ def add_exposure(rig: Rig, state: ThermalState, record: StitchRecord) -> Thermal
         cone = rig.cone(name)
         if _complete(cone, record):
             places[name] = _add_places(normal, cone, record)
-    master = rig.cone(rig.master_cone)
     for name, normal in scales.items():
+        master = rig.cone(rig.master_cone)
         cone = rig.cone(name)
         names = set(record.names)
         told = {s.name for s in (*cone.sensors, *master.sensors)} <= set(record.measured)
@@ -230,7 +230,7 @@ def observability(rig: Rig) -> tuple[Observability, ...]:
             why="the scale of its layer; the master's is held",
         )
         for cone in mosaic_cones(rig)
-        if cone.name != rig.master_cone
+        if rig.master_cone is not None and cone.name != rig.master_cone
     ]
     result.append(
         Observability(

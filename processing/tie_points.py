@@ -14,10 +14,18 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.as_seen import as_seen_by
 from processing.matching import INTERPOLATION, MARGIN_PX, match_patches, select_features
 from processing.placement import SensorPlacement, raw_from_vip_mm, vip_mm_from_raw
 from processing.rig import Rig
-from processing.topology import Rectangle, colour_coverage, colour_ratio, overlaps
+from processing.topology import (
+    Overlap,
+    Rectangle,
+    colour_coverage,
+    colour_ratio,
+    exact_colour_ratio,
+    overlaps,
+)
 
 Array = NDArray[np.float64]
 Frame = NDArray[Any]
@@ -90,12 +98,19 @@ class TiePoints:
 
 @dataclass(frozen=True)
 class _Search:
-    """Positions of one pair of frames, ready for the kernel."""
+    """Positions of one pair of frames, ready for the kernel.
+
+    Where the frames differ by more than a shift, `region` (first and last column, first and last
+    row of b) is what has to be seen of a as b would see it, each pixel divided by `step`; `at_a`
+    does not count then.
+    """
 
     pair: tuple[str, str]
     kind: int
     at_a: NDArray[np.int64]
     at_b: NDArray[np.int64]
+    step: int = 1
+    region: tuple[int, int, int, int] | None = None
 
 
 def match_tie_points(
@@ -124,10 +139,9 @@ def match_tie_points(
     """
     settings = settings or TiePointSettings()
     _check_frames(rig, frames)
-    ratio = colour_ratio(rig)
+    ratio = exact_colour_ratio(rig) or 1.0
     searches = _pan_searches(rig, placements, frames, settings)
-    if ratio is not None:
-        searches += _colour_searches(rig, placements, frames, settings, ratio)
+    searches += _colour_searches(rig, placements, frames, settings, ratio)
     names = tuple(sensor.name for sensor in rig.sensors)
     index = {name: i for i, name in enumerate(names)}
     rows = []
@@ -136,12 +150,17 @@ def match_tie_points(
         to_pan = search.kind == PAN_TO_PAN
         if not len(search.at_a):
             continue
-        step = 1 if to_pan else ratio or 1
         window = settings.window_pp_px if to_pan else settings.window_pc_px
+        frame_a, at_a, seen, step = frames[a], search.at_a, None, search.step
+        if search.region is not None:
+            seen = as_seen_by(
+                placements[a], placements[b], frame_a, region=search.region, step=step
+            )
+            frame_a, at_a = seen.words, seen.at(search.at_b)
         found = match_patches(
-            frames[a],
+            frame_a,
             frames[b],
-            search.at_a,
+            at_a,
             search.at_b,
             np.array(_usable(placements[b]), dtype=np.int64),
             step,
@@ -160,7 +179,10 @@ def match_tie_points(
         columns = np.empty((len(found), 10))
         columns[:, 0], columns[:, 1] = index[a], index[b]
         columns[:, 2:6] = found[:, :4]
-        columns[:, 6] = np.hypot(found[:, 4], settings.floor_sigma_px) * step
+        if seen is not None:
+            columns[:, 2:4] = seen.raw_a(found[:, :2])
+        unit = 1.0 if to_pan else ratio
+        columns[:, 6] = np.hypot(found[:, 4], settings.floor_sigma_px) * unit
         columns[:, 7] = found[:, 5]
         columns[:, 8], columns[:, 9] = search.kind, number
         rows.append(columns)
@@ -214,7 +236,15 @@ def _pan_searches(
     for overlap in overlaps(rig):
         a, b = overlap.sensor_a, overlap.sensor_b
         at_a = at_b = np.empty((0, 2), dtype=np.int64)
-        if a in frames and b in frames and _alike(placements[a], placements[b], overlap.rectangle):
+        region = None
+        if (
+            a in frames
+            and b in frames
+            and not _alike(placements[a], placements[b], overlap.rectangle)
+        ):
+            at_b, region = _seen_searches(placements, frames, overlap, settings, room)
+            at_a = at_b
+        elif a in frames and b in frames:
             area = _shrunk(
                 _raw_area(placements[a], overlap.rectangle), _usable(placements[a]), room
             )
@@ -224,8 +254,42 @@ def _pan_searches(
                 placements[b], vip_mm_from_raw(placements[a], at_a.astype(np.float64))
             )
             at_a, at_b = _inside(at_a, predicted, _usable(placements[b]), room)
-        result.append(_Search((a, b), PAN_TO_PAN, at_a, at_b))
+        result.append(_Search((a, b), PAN_TO_PAN, at_a, at_b, region=region))
     return result
+
+
+def _seen_searches(
+    placements: Mapping[str, SensorPlacement],
+    frames: Mapping[str, Frame],
+    overlap: Overlap,
+    settings: TiePointSettings,
+    room: int,
+) -> tuple[NDArray[np.int64], tuple[int, int, int, int] | None]:
+    """Positions in b where a sees the same, and the region of b that holds their windows."""
+    a, b = placements[overlap.sensor_a], placements[overlap.sensor_b]
+    area = _shrunk(_raw_area(b, overlap.rectangle), _usable(b), room)
+    cells = _cells(area, settings.points_per_overlap, settings.window_pp_px + 3)
+    at_b = _features(
+        frames[overlap.sensor_b], cells, settings.window_pp_px // 2, settings.window_pp_px
+    )
+    in_a = raw_from_vip_mm(a, vip_mm_from_raw(b, at_b.astype(np.float64)))
+    at_b = at_b[_within(in_a, _usable(a), 2 * room)]
+    return at_b, _region_around(at_b, b, room)
+
+
+def _region_around(
+    at_b: NDArray[np.int64], b: SensorPlacement, room: int
+) -> tuple[int, int, int, int] | None:
+    """First and last column and row of b that windows at these positions need."""
+    if not len(at_b):
+        return None
+    (left, top), (right, low) = at_b.min(axis=0) - room, at_b.max(axis=0) + room
+    return (
+        max(int(left), 0),
+        min(int(right), b.sensor.width_px - 1),
+        max(int(top), 0),
+        min(int(low), b.sensor.height_px - 1),
+    )
 
 
 def _colour_searches(
@@ -233,7 +297,7 @@ def _colour_searches(
     placements: Mapping[str, SensorPlacement],
     frames: Mapping[str, Frame],
     settings: TiePointSettings,
-    ratio: int,
+    ratio: float,
 ) -> list[_Search]:
     """One grid over the colour master; each of its positions goes to one PAN sensor.
 
@@ -248,7 +312,9 @@ def _colour_searches(
     room = half + MARGIN_PX + 1
     present = [name for name in coverage if name in frames]
     empty = np.empty((0, 2), dtype=np.int64)
-    sought = dict.fromkeys(coverage, (empty, empty))
+    whole = colour_ratio(rig)
+    step = whole or max(1, math.floor(ratio))
+    sought = {name: _Search((name, colour), PAN_TO_COLOUR, empty, empty) for name in coverage}
     if colour in frames and present:
         union = Rectangle(
             min(coverage[name].x_min_mm for name in coverage),
@@ -262,11 +328,9 @@ def _colour_searches(
         at_colour = _features(frames[colour], cells, half, settings.window_pc_px)
         xy = vip_mm_from_raw(placements[colour], at_colour.astype(np.float64))
         # Boxes of ratio x ratio pixels around the prediction, and the search on top.
-        reach = ratio * (room + 1)
+        reach = math.ceil(ratio * (room + 1))
         predicted, sees = {}, np.zeros((len(at_colour), len(present)), dtype=np.bool_)
         for i, name in enumerate(present):
-            if not _alike(placements[name], placements[colour], coverage[name], ratio=ratio):
-                continue
             place = coverage[name]
             near = Rectangle(
                 place.x_min_mm - 0.5,
@@ -283,15 +347,20 @@ def _colour_searches(
             mine = chosen == i
             if not mine.any():
                 continue
-            first = np.rint(predicted[name][mine] - (ratio - 1) / 2.0).astype(np.int64)
-            centre = first + (ratio - 1) / 2.0
+            pair, there = (name, colour), placements[colour]
+            if not whole or not _alike(placements[name], there, coverage[name], ratio=whole):
+                at = at_colour[mine]
+                region = _region_around(at, there, room + 1)
+                sought[name] = _Search(pair, PAN_TO_COLOUR, at, at, step, region)
+                continue
+            first = np.rint(predicted[name][mine] - (whole - 1) / 2.0).astype(np.int64)
+            centre = first + (whole - 1) / 2.0
             expected = raw_from_vip_mm(
                 placements[colour], vip_mm_from_raw(placements[name], centre)
             )
-            sought[name] = (first, np.rint(expected).astype(np.int64))
-    return [
-        _Search((name, colour), PAN_TO_COLOUR, at_a, at_b) for name, (at_a, at_b) in sought.items()
-    ]
+            at_b = np.rint(expected).astype(np.int64)
+            sought[name] = _Search(pair, PAN_TO_COLOUR, first, at_b, step)
+    return list(sought.values())
 
 
 def _taking_turns(sees: NDArray[np.bool_], turn: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -12,16 +12,24 @@ import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.placement import SensorPlacement, nominal_placements, vip_mm_from_raw
+from processing.placement import (
+    SensorPlacement,
+    nominal_placements,
+    raw_from_vip_mm,
+    vip_mm_from_raw,
+)
 from processing.rig import Cone, Rig
 
 Array = NDArray[np.float64]
 
 # A strip runs along at least half of a sensor's side; what is shorter both ways is a corner.
 _STRIP_FRACTION = 0.5
+# A side may be askew by this share of the sensor's smaller side and still count as upright.
+_UPRIGHT_FRACTION = 0.01
 
 
 @dataclass(frozen=True)
@@ -92,6 +100,8 @@ class ParameterCounts:
     """Unknowns of the free mosaic of a rig, cone by cone."""
 
     cones: tuple[ConeCount, ...]
+    common_constraints: int = 0
+    """Of all converging heads together: their mean turn is zero."""
 
     @property
     def parameters(self) -> int:
@@ -99,7 +109,7 @@ class ParameterCounts:
 
     @property
     def constraints(self) -> int:
-        return sum(cone.constraints for cone in self.cones)
+        return sum(cone.constraints for cone in self.cones) + self.common_constraints
 
     @property
     def unknowns(self) -> int:
@@ -117,17 +127,29 @@ def mosaic_cones(rig: Rig) -> tuple[Cone, ...]:
     return tuple(cones)
 
 
+def free_cones(rig: Rig) -> tuple[list[str], list[str]]:
+    """Cones whose layer is a free projective transformation, and those whose mounting is free.
+
+    Layers are carried into the master's; where there is no master, PAN heads are turned.
+    """
+    cones = mosaic_cones(rig)
+    mountings = [c.name for c in cones if rig.master_cone is None and c.role == "pan"]
+    return [c.name for c in cones if c.name not in (rig.master_cone, *mountings)], mountings
+
+
 def counts(rig: Rig) -> ParameterCounts:
     """Parameters and constraints per cone, by the rules of tables 1 and 2.
 
     A cone of two or more sensors has a similarity (4) for each, a cone other than the master a
-    projective layer transformation (8); four constraints fix the datum (eq. 6) or separate sensor
+    projective layer transformation (8), a converging head a rotation (3)
+    instead; four constraints fix the datum (eq. 6) or separate sensor
     from layer transformations (eq. 6a, 7a, 7b).
     """
     result = []
+    layers, mountings = free_cones(rig)
     for cone in mosaic_cones(rig):
         several = len(cone.sensors) >= 2
-        layer = 0 if cone.name == rig.master_cone else 8
+        layer = 8 if cone.name in layers else 3 if cone.name in mountings else 0
         result.append(
             ConeCount(
                 cone=cone.name,
@@ -136,7 +158,7 @@ def counts(rig: Rig) -> ParameterCounts:
                 constraints=4 if several else 0,
             )
         )
-    return ParameterCounts(tuple(result))
+    return ParameterCounts(tuple(result), 3 if mountings else 0)
 
 
 def footprint(placement: SensorPlacement) -> Rectangle:
@@ -168,17 +190,55 @@ def intersection(a: Rectangle, b: Rectangle) -> Rectangle:
     )
 
 
+def seen_by_both(a: SensorPlacement, b: SensorPlacement) -> Rectangle:
+    """What two sensors both see; may be `empty`.
+
+    A sensor that is tilted against the virtual image sees no upright rectangle of it: then the box
+    around what both see, corners of which one may miss.
+    """
+    if _is_upright(a) and _is_upright(b):
+        return intersection(footprint(a), footprint(b))
+    _, common = cv2.intersectConvexConvex(_outline(a), _outline(b))
+    if common is None or len(common) < 3:
+        return Rectangle(0.0, 0.0, 0.0, 0.0)
+    low, high = common.reshape(-1, 2).min(axis=0), common.reshape(-1, 2).max(axis=0)
+    return Rectangle(float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+
+
+def _outline(placement: SensorPlacement) -> NDArray[np.float32]:
+    """The corners of a sensor in the VIP, mm, around it, (4, 2)."""
+    right, low = placement.sensor.width_px - 0.5, placement.sensor.height_px - 0.5
+    corners = np.array([[-0.5, -0.5], [right, -0.5], [right, low], [-0.5, low]])
+    return vip_mm_from_raw(placement, corners).astype(np.float32)
+
+
+def _is_upright(placement: SensorPlacement) -> bool:
+    corners = _outline(placement)
+    # Of opposite corners along a side, the coordinate across it.
+    askew = max(
+        abs(float(corners[i, k] - corners[j, k]))
+        for i, j, k in ((0, 1, 1), (3, 2, 1), (0, 3, 0), (1, 2, 0))
+    )
+    return askew < _UPRIGHT_FRACTION * float(np.ptp(corners, axis=0).min())
+
+
+def _sees(placement: SensorPlacement, xy_mm: Array) -> bool:
+    """Whether a point (1, 2) of the VIP falls on a sensor."""
+    sensor, (column, row) = placement.sensor, raw_from_vip_mm(placement, xy_mm)[0]
+    return bool(0 <= column <= sensor.width_px - 1 and 0 <= row <= sensor.height_px - 1)
+
+
 def overlaps(rig: Rig) -> tuple[Overlap, ...]:
     """The overlap strips of PAN sensors of different cones (twelve for a 3x3 grid).
 
     Where sensors meet only at a corner there is no strip: see `corners`.
     """
-    places = _pan_footprints(rig)
+    placements, places = nominal_placements(rig, {}, {}), _pan_footprints(rig)
     result = []
     for a, b in itertools.combinations(places, 2):
         if rig.cone_of(a).name == rig.cone_of(b).name:
             continue
-        common = intersection(places[a], places[b])
+        common = seen_by_both(placements[a], placements[b])
         if not common.empty and _is_strip(common, places[a], places[b]):
             result.append(Overlap(a, b, common))
     return tuple(result)
@@ -187,6 +247,7 @@ def overlaps(rig: Rig) -> tuple[Overlap, ...]:
 def corners(rig: Rig) -> tuple[Corner, ...]:
     """Areas where strips cross, with every PAN sensor that sees them (four for a 3x3 grid)."""
     places = _pan_footprints(rig)
+    placements = nominal_placements(rig, {}, {})
     found: dict[tuple[str, ...], Rectangle] = {}
     for a, b in itertools.combinations(overlaps(rig), 2):
         common = intersection(a.rectangle, b.rectangle)
@@ -200,7 +261,7 @@ def corners(rig: Rig) -> tuple[Corner, ...]:
                 ]
             ]
         )
-        sensors = tuple(name for name, place in places.items() if place.contains(centre)[0])
+        sensors = tuple(name for name in places if _sees(placements[name], centre))
         if len(sensors) >= 3 and sensors not in found:
             for name in sensors:
                 common = intersection(common, places[name])
@@ -220,29 +281,34 @@ def colour_coverage(rig: Rig) -> Mapping[str, Rectangle]:
     if colour_cone.role != "colour":
         return {}
     placements = nominal_placements(rig, {}, {})
-    colour = footprint(placements[colour_cone.sensors[0].name])
+    colour = placements[colour_cone.sensors[0].name]
     result = {}
-    for name, place in _pan_footprints(rig).items():
-        common = intersection(place, colour)
+    for name in _pan_footprints(rig):
+        common = seen_by_both(placements[name], colour)
         if not common.empty:
             result[name] = common
     return result
 
 
 def colour_ratio(rig: Rig) -> int | None:
-    """PAN pixels per colour-master pixel, from principal distances and pitches.
+    """PAN pixels per colour-master pixel where that is a whole number, to one percent.
 
-    None where there is no colour master or where the ratio is not whole to one percent: such a rig
-    (DMC, 4.8) cannot be matched by box means.
+    None where there is no colour master and where the ratio is not whole (DMC, 4.8): the frames
+    cannot be compared by box means of raw pixels.
     """
+    exact = exact_colour_ratio(rig)
+    whole = round(exact or 0.0)
+    return whole if exact and whole >= 1 and abs(exact / whole - 1.0) < 0.01 else None
+
+
+def exact_colour_ratio(rig: Rig) -> float | None:
+    """PAN pixels per colour-master pixel, from principal distances and pitches."""
     if rig.colour_master_cone is None or not rig.pan_cones:
         return None
     pan, colour = rig.pan_cones[0], rig.cone(rig.colour_master_cone)
-    exact = (pan.lens.f_mm / pan.sensors[0].pitch_um) / (
+    return (pan.lens.f_mm / pan.sensors[0].pitch_um) / (
         colour.lens.f_mm / colour.sensors[0].pitch_um
     )
-    whole = round(exact)
-    return whole if whole >= 1 and abs(exact / whole - 1.0) < 0.01 else None
 
 
 def _pan_footprints(rig: Rig) -> dict[str, Rectangle]:

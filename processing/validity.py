@@ -147,7 +147,7 @@ def judge_master(
     settings = settings or ValiditySettings()
     master = [
         s.name
-        for s in rig.cone(rig.master_cone).sensors
+        for s in rig.master_sensors
         if s.name in mosaic.model.sensors and _is_found(mosaic, s.name)
     ]
     hypotheses: list[Displacement] = []

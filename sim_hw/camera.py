@@ -180,6 +180,19 @@ def projection_centre_m(cone: Cone, pose: Pose) -> Array:
     return np.asarray(pose.position_enu_m + pose.enu_from_body @ lever_m)
 
 
+def image_centre_m(rig: Rig, pose: Pose) -> Array:
+    """Where the stitched image is seen from: the master cone's projection centre.
+
+    Of a rig without a master cone the mean of the panchromatic cones' centres.
+    """
+    seen_from = [
+        projection_centre_m(cone, pose)
+        for cone in rig.cones
+        if (cone.role == "pan" if rig.master_cone is None else cone.name == rig.master_cone)
+    ]
+    return np.asarray(np.mean(seen_from, axis=0))
+
+
 def world_directions(directions: Array, pose: Pose) -> Array:
     """Turn directions from master camera axes into east, north, up."""
     return np.asarray(directions @ (pose.enu_from_body @ BODY_FROM_CAMERA).T)
@@ -188,12 +201,12 @@ def world_directions(directions: Array, pose: Pose) -> Array:
 def ideal_image_mm(ground_m: Array, rig: Rig, pose: Pose) -> Array:
     """Where the ideal master camera sees ground points: image plane, mm, shape (..., 2).
 
-    Calibrated principal distance and point, no distortion; the camera stands where the master
-    cone's projection centre is at `pose`.
+    Calibrated principal distance and point, no distortion; the camera stands where
+    `image_centre_m` is at `pose`.
     """
     if rig.virtual_image is None:
         raise ValueError(f"rig {rig.name} has no virtual image")
-    centre = projection_centre_m(rig.cone(rig.master_cone), pose)
+    centre = image_centre_m(rig, pose)
     seen = (ground_m - centre) @ (pose.enu_from_body @ BODY_FROM_CAMERA)
     return np.asarray(-rig.virtual_image.f_mm * seen[..., :2] / seen[..., 2:])
 

@@ -149,7 +149,7 @@ def compare(
             errors.append(true_positions(truth, name, raw[inside]) - vip[inside])
         if places and sum(map(len, places)) > 2:
             at, absolute = np.concatenate(places), np.concatenate(errors)
-            found[kind] = Errors(absolute=absolute, inner=after_similarity(at, absolute))
+            found[kind] = Errors(absolute=absolute, inner=_inner(truth, at, absolute))
     return found
 
 
@@ -168,6 +168,31 @@ def true_positions(truth: Mapping[str, NDArray[Any]], sensor: str, raw: Array) -
         spline = RectBivariateSpline(rows, columns, truth[f"{sensor}.{key}"])
         belongs.append(spline.ev(raw[:, 1], raw[:, 0]))
     return np.stack(belongs, axis=1)
+
+
+def _inner(truth: Mapping[str, NDArray[Any]], places: Array, errors: Array) -> Array:
+    """What is left after the datum is taken out: three rotations of a virtual camera between
+    converging heads, four parameters of a similarity else."""
+    if "inner" in truth and str(truth["inner"]) == "rotations":
+        width, height, f_px = truth["image"]
+        return after_rotations(places - [(width - 1) / 2, (height - 1) / 2], errors, float(f_px))
+    return after_similarity(places, errors)
+
+
+def after_rotations(places: Array, errors: Array, f_px: float) -> Array:
+    """Errors left after the best-fit small rotation of a camera, points alike, (n, 2).
+
+    Args:
+        places: (column, row) from the principal point.
+        f_px: principal distance.
+    """
+    x, y = places.T
+    # What turns about the axes across, along and of sight do to (column, row).
+    design = np.empty((len(places), 2, 3))
+    design[:, 0] = np.stack([x * y / f_px, f_px + x * x / f_px, -y], axis=1)
+    design[:, 1] = np.stack([f_px + y * y / f_px, x * y / f_px, x], axis=1)
+    turns, *_ = np.linalg.lstsq(design.reshape(-1, 3), errors.reshape(-1), rcond=None)
+    return np.asarray(errors - design @ turns)
 
 
 def after_similarity(places: Array, errors: Array) -> Array:

@@ -353,7 +353,7 @@ def render_ideal(
         axis=-1,
     )
     pose = flight.pose(mid_gps_ns)
-    centre = camera.projection_centre_m(world.rig.cone(world.rig.master_cone), pose)
+    centre = camera.image_centre_m(world.rig, pose)
     ground = world.terrain.intersect(centre, camera.world_directions(seen, pose))
     positions = scene_positions(world, scene, flight, ground)
     return sample_scene(scene, "pan", positions, (r1 - r0, c1 - c0))

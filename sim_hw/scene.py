@@ -65,7 +65,7 @@ class SceneSettings:
     width_px: int
     height_px: int
     sample_m: float
-    colour_ratio: int
+    colour_ratio: float
     psf_px: float = 0.55
     file: str | None = None
     ground: str = "landscape"

@@ -138,6 +138,8 @@ def exposure_truth(world: World, flight: Flight, taken: Mapping[str, Taken]) -> 
         "temperatures_c": np.array([world.temperature_c(p, mark_ns) for p in probes]),
         "sensors": np.array(sorted(taken)),
         "pan_sensors": np.array([s.name for c in world.rig.pan_cones for s in c.sensors]),
+        "image": np.array(_image(world)),
+        "inner": np.array("similarity" if world.rig.master_cone else "rotations"),
     }
     for name, exposure in taken.items():
         sensor, look = world.rig.sensor(name), exposure.look
@@ -157,11 +159,19 @@ def exposure_truth(world: World, flight: Flight, taken: Mapping[str, Taken]) -> 
     return content
 
 
-def _mid_of_cone(world: World, cone_name: str, taken: Mapping[str, Taken]) -> int | None:
+def _mid_of_cone(world: World, cone_name: str | None, taken: Mapping[str, Taken]) -> int | None:
+    if cone_name is None:
+        return None
     for sensor in world.rig.cone(cone_name).sensors:
         if sensor.name in taken:
             return taken[sensor.name].look.mid_gps_ns
     return None
+
+
+def _image(world: World) -> list[float]:
+    """Width and height of the virtual image and its principal distance, all in pixels."""
+    image = world.image
+    return [image.width_px, image.height_px, image.f_mm / (image.pitch_um * 1e-3)]
 
 
 def true_parameters(world: World) -> dict[str, Any]:

@@ -69,7 +69,7 @@ def self_calibrating(
     name: SetName,
     parts: tuple[Part, ...] = (),
     *,
-    master_cone: str = "",
+    master_cone: str | None = "",
     interior: bool = False,
 ) -> Camera:
     """The camera with a set of additional parameters to be estimated.

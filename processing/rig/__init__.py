@@ -12,11 +12,22 @@ from processing.rig.file import (
     rig_from_mapping,
     shipped_rigs,
 )
-from processing.rig.model import Cone, Drift, Lens, Rig, Role, Sensor, Timing, VirtualImage
+from processing.rig.model import (
+    VIRTUAL_CAMERA,
+    Cone,
+    Drift,
+    Lens,
+    Rig,
+    Role,
+    Sensor,
+    Timing,
+    VirtualImage,
+)
 from processing.rig.table import RigError
 
 __all__ = [
     "RIG_FORMAT",
+    "VIRTUAL_CAMERA",
     "Cone",
     "Drift",
     "Lens",

@@ -72,7 +72,7 @@ def rig_from_mapping(content: Mapping[str, Any], file: str) -> Rig:
         if top.choice("timing", ("syntopic", "synchronous")) == "synchronous"
         else "syntopic",
         frame_interval_s=top.number("frame_interval_s", positive=True),
-        master_cone=top.text("master_cone"),
+        master_cone=top.text("master_cone", "") or None,
         colour_master_cone=top.text("colour_master_cone", "") or None,
         reference_cone=top.text("reference_cone"),
         calibration_id=calibration.text("id"),
@@ -94,8 +94,20 @@ def _virtual_image(table: Table) -> VirtualImage:
         height_px=table.integer("height_px", positive=True),
         pitch_um=table.number("pitch_um", positive=True),
         f_mm=table.number("f_mm", positive=True),
-        colour_ratio=table.integer("colour_ratio", 1, positive=True),
+        colour_ratio=_colour_ratio(table),
     )
+
+
+def _colour_ratio(table: Table) -> float:
+    """A whole ratio stays whole; another one divides the image without rest."""
+    ratio = table.number("colour_ratio", 1, positive=True)
+    if ratio == int(ratio):
+        return int(ratio)
+    for key in ("width_px", "height_px"):
+        size = table.content.get(key)
+        if isinstance(size, int) and abs(size / ratio - round(size / ratio)) > 1e-6:
+            table.complain(key, f"at a colour_ratio of {ratio:g} it is a whole number of them")
+    return ratio
 
 
 def _cone(table: Table, defaults: Table) -> Cone:
@@ -115,6 +127,7 @@ def _cone(table: Table, defaults: Table) -> Cone:
         bands=bands,
         position_mm=table.triple("position_mm"),
         rotation_rad=table.triple("rotation_rad"),
+        rotation_sigma_urad=table.number("rotation_sigma_urad", 30.0, positive=True),
         probe=probe,
         calibration_c=calibration_c,
         mark_to_mid_exposure_ns=table.integer("mark_to_mid_exposure_ns", 0),
@@ -204,6 +217,8 @@ def _check_names(rig: Rig, file: str, problems: list[str]) -> None:
         if name is not None and name not in cones:
             listed = ", ".join(cones) or "none"
             problems.append(f"{file}: {key} is {name!r}; it names a cone of this rig: {listed}")
+    if rig.master_cone is None:
+        problems.extend(_master_missing(rig, file))
     problems.extend(
         f"{file}: cone {cone.name!r} has no sensor; give it [[cone.sensor]]"
         for cone in rig.cones
@@ -215,3 +230,13 @@ def _check_names(rig: Rig, file: str, problems: list[str]) -> None:
         for sensor in rig.sensors
         if rig.virtual_image is not None and sensor.justified == "left"
     )
+
+
+def _master_missing(rig: Rig, file: str) -> list[str]:
+    """Only heads that converge, all at one instant, do without a master cone."""
+    missing = f"{file}: master_cone is missing; it names the cone whose layer is the virtual image"
+    if rig.virtual_image is None or len(rig.pan_cones) < 2:
+        return [missing]
+    if rig.timing != "synchronous":
+        return [f"{missing}. Only a synchronous rig of converging PAN heads has none"]
+    return []

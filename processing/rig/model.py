@@ -8,8 +8,12 @@ radians with R = Rx(omega) Ry(phi) Rz(kappa), camera to object. How a file becom
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal
+
+VIRTUAL_CAMERA: Final = "virtual"
+"""What the camera between converging heads is called beside the cones."""
 
 Timing = Literal["syntopic", "synchronous"]
 Role = Literal["pan", "colour"]
@@ -101,7 +105,8 @@ class Cone:
     """One lens with one focal plane.
 
     `position_mm` is the projection centre in the body frame; `rotation_rad` is (omega, phi, kappa)
-    of master_from_cone, the platform calibration.
+    of master_from_cone, the platform calibration, each small rotation with a standard deviation of
+    `rotation_sigma_urad`. Where no cone is the master, master stands for the virtual camera.
     """
 
     name: str
@@ -115,17 +120,21 @@ class Cone:
     mark_to_mid_exposure_sigma_ns: int
     lens: Lens
     sensors: tuple[Sensor, ...]
+    rotation_sigma_urad: float = 30.0
 
 
 @dataclass(frozen=True)
 class VirtualImage:
-    """The stitched image: a central perspective of `f_mm` on a raster centred on the axis."""
+    """The stitched image: a central perspective of `f_mm` on a raster centred on the axis.
+
+    `colour_ratio`, pixels to the colour pixel, need not be whole; colour width and height are.
+    """
 
     width_px: int
     height_px: int
     pitch_um: float
     f_mm: float
-    colour_ratio: int
+    colour_ratio: float
 
     @property
     def pitch_mm(self) -> float:
@@ -133,22 +142,26 @@ class VirtualImage:
 
     @property
     def colour_width_px(self) -> int:
-        return self.width_px // self.colour_ratio
+        return math.floor(self.width_px / self.colour_ratio + 1e-9)
 
     @property
     def colour_height_px(self) -> int:
-        return self.height_px // self.colour_ratio
+        return math.floor(self.height_px / self.colour_ratio + 1e-9)
 
 
 @dataclass(frozen=True)
 class Rig:
-    """A camera of several heads, as its file tells it."""
+    """A camera of several heads, as its file tells it.
+
+    `master_cone` is None where all PAN heads converge and none of them is the virtual image plane:
+    the virtual camera then stands in the middle of their projection centres.
+    """
 
     name: str
     title: str
     timing: Timing
     frame_interval_s: float
-    master_cone: str
+    master_cone: str | None
     colour_master_cone: str | None
     reference_cone: str
     calibration_id: str
@@ -156,8 +169,8 @@ class Rig:
     virtual_image: VirtualImage | None
     cones: tuple[Cone, ...]
 
-    def cone(self, name: str) -> Cone:
-        """The cone of that name; KeyError names those there are."""
+    def cone(self, name: str | None) -> Cone:
+        """The cone of that name; KeyError, None's too, names those there are."""
         for cone in self.cones:
             if cone.name == name:
                 return cone
@@ -186,6 +199,30 @@ class Rig:
     @property
     def colour_cones(self) -> tuple[Cone, ...]:
         return tuple(cone for cone in self.cones if cone.role == "colour")
+
+    @property
+    def master_sensors(self) -> tuple[Sensor, ...]:
+        """Sensors of the master cone; none where no cone is the master."""
+        return () if self.master_cone is None else self.cone(self.master_cone).sensors
+
+    @property
+    def has_virtual_camera(self) -> bool:
+        """Whether the virtual image belongs to no cone but to a camera between converging heads."""
+        return self.virtual_image is not None and self.master_cone is None
+
+    @property
+    def image_cone_name(self) -> str:
+        """The master cone's name, or that of the virtual camera."""
+        return self.master_cone or VIRTUAL_CAMERA
+
+    @property
+    def image_position_mm(self) -> tuple[float, float, float]:
+        """The projection centre of the virtual image in the body frame: the master cone's, else the
+        middle of the PAN cones'."""
+        if self.master_cone is not None:
+            return self.cone(self.master_cone).position_mm
+        x, y, z = zip(*(cone.position_mm for cone in self.pan_cones or self.cones), strict=True)
+        return (sum(x) / len(x), sum(y) / len(y), sum(z) / len(z))
 
     @property
     def probes(self) -> tuple[str, ...]:

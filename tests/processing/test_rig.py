@@ -25,7 +25,8 @@ def problems_of(changed: dict[str, Any]) -> tuple[str, ...]:
 def test_every_shipped_rig_loads_and_is_called_what_its_file_is(name: str) -> None:
     rig = find_rig(name)
     assert rig.name == name
-    assert rig.sensors and rig.cone(rig.master_cone) and rig.cone(rig.reference_cone)
+    assert rig.sensors and rig.cone(rig.reference_cone)
+    assert rig.master_sensors or rig.has_virtual_camera or rig.virtual_image is None
 
 
 def test_ultracam_x_is_thirteen_sensors_in_eight_cones_over_one_virtual_image() -> None:
