@@ -234,10 +234,7 @@ def write_calibration(
         CalibrationFolderError: the folder exists.
         OSError: the disk refused.
     """
-    if folder.exists():
-        raise CalibrationFolderError(
-            f"{folder} exists; a calibration is never overwritten: give another name with --out"
-        )
+    refuse_existing(folder)
     part = folder.with_name(folder.name + ".part")
     remove_tree(part)
     content = {
@@ -251,6 +248,18 @@ def write_calibration(
         create_file(part / name, [data])
     rename_directory(part, folder)
     return folder
+
+
+def refuse_existing(folder: Path) -> None:
+    """Before anything is computed: a folder that is there stays as it is.
+
+    Raises:
+        CalibrationFolderError: it exists.
+    """
+    if folder.exists():
+        raise CalibrationFolderError(
+            f"{folder} exists; a calibration is never overwritten: give another name with --out"
+        )
 
 
 def read_previous(path: Path, *, kind: str) -> Previous:

@@ -1,0 +1,95 @@
+"""`syntopic calibrate radiometric`: dark and flat series to the maps that correct raw frames."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import Progress
+
+HELP = """Radiometric calibration of heads from dark and flat series.
+
+Finds bias, dark signal over temperature and exposure time, gain, its change with the aperture,
+defect pixels, columns and clusters; photon transfer, PRNU, DSNU, dynamic range and linearity in
+the manner of EMVA 1288. The new folder holds one folder of maps per aperture, as `radiometry` of
+the configuration takes it, a report and the comparison with a previous calibration.
+
+Examples: `syntopic calibrate radiometric SERIES`, `syntopic calibrate radiometric SERIES --aperture
+6.3 --previous radiometric-2026-05-02 --out radiometric-2026-11-21`
+
+A series to try: `python -m sim_hw.sphere ultracam-x-mini --sensor SU00 --out sphere`
+"""
+
+
+def radiometric(
+    series: Annotated[Path, typer.Argument(help="Folder with series.json, rig.toml and frames.")],
+    out: Annotated[
+        Path | None, typer.Option(help="The new folder; by default named by rig and date.")
+    ] = None,
+    previous: Annotated[
+        Path | None, typer.Option(help="A radiometric calibration to compare with.")
+    ] = None,
+    aperture: Annotated[
+        list[float] | None,
+        typer.Option(help="Write maps for this f-number too, by the model; may be repeated."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    from daemon.calibration_report import read_previous, refuse_existing
+    from daemon.cli.calibration_outcome import hand_over
+    from daemon.laboratory.radiometric import (
+        calibrate_sensor,
+        checks_of,
+        common_level,
+        sets_of,
+        shots_of,
+    )
+    from daemon.laboratory.radiometric_maps import files_of
+    from daemon.laboratory.radiometric_report import radiometric_report
+    from daemon.laboratory.series import read_series
+
+    given = read_series(series, kind="radiometric")
+    shots = shots_of(given)
+    temperature_sigma = given.table.number("temperature_sigma_c", 0.1)
+    monitor_sigma = given.table.number("monitor_sigma", 1e-3)
+    given.checked()
+    today = f"{datetime.now(UTC):%Y-%m-%d}"
+    folder = out or Path(f"{given.rig.name}-radiometric-{today}")
+    refuse_existing(folder)
+    before = (previous, read_previous(previous, kind="radiometric")) if previous else None
+    names = [s.name for s in given.rig.sensors if any(x.sensor == s.name for x in shots)]
+    heads = []
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("reading", total=len(sets_of(shots)))
+
+        def tell(what: str) -> None:
+            progress.update(task, description=what, advance=1)
+
+        for name in names:
+            own = [s for s in shots if s.sensor == name]
+            head = calibrate_sensor(
+                given.rig.sensor(name),
+                own,
+                temperature_sigma_c=temperature_sigma,
+                monitor_sigma=monitor_sigma,
+                progress=tell,
+            )
+            heads.append(replace(head, checks=checks_of(head, own)))
+    measured = {s.f_number for s in shots if s.light == "flat" and s.use == "fit"}
+    base = [h.aperture.base_f_number for h in heads[:1]]
+    apertures = base + sorted((measured | set(aperture or [])) - set(base))
+    pan = {s.name for c in given.rig.pan_cones for s in c.sensors}
+    report = radiometric_report(
+        given,
+        heads,
+        calibration_id=folder.name,
+        date=today,
+        apertures=apertures,
+        previous=before,
+    )
+    files = files_of(heads, common_level(heads, pan), apertures)
+    hand_over(report, folder, files=files, as_json=as_json)

@@ -1,0 +1,135 @@
+"""Photon transfer, saturation, dynamic range and linearity in the manner of EMVA 1288.
+
+Numbers that need the photons counted (quantum efficiency, sensitivity) are left out: an integrating
+sphere's monitor is relative. Source: EMVA Standard 1288, release 4.0 linear, sections 2, 6 and 7.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+QUANTISATION_DN2: Final = 1.0 / 12.0
+_FIT_SHARE: Final = 0.7
+_LINEAR_SHARES: Final = (0.05, 0.95)
+_CLIPPED_SHARE: Final = 1e-3
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """A series of growing exposure, over the same good pixels.
+
+    `exposure` (n,) is light times time, any unit; `signal_dn` (n,) above the offset; `variance_dn2`
+    (n,) temporal, of one frame; `sigma_dn2` (n,) the standard deviation of that; `clipped` (n,) the
+    share of pixels at full scale. `dark_dn2` is the temporal variance without light.
+    """
+
+    exposure: Array
+    signal_dn: Array
+    variance_dn2: Array
+    sigma_dn2: Array
+    clipped: Array
+    dark_dn2: float
+    dark_sigma_dn2: float
+
+
+@dataclass(frozen=True)
+class PhotonTransfer:
+    """What EMVA 1288 asks of temporal noise and linearity.
+
+    Attributes:
+        gain_dn_per_e: overall system gain K, with its sigma.
+        dark_noise_e: temporal dark noise, quantisation taken off.
+        saturation_dn, saturation_e: signal where the variance is largest.
+        threshold_e: least detectable signal (signal to noise 1).
+        dynamic_range: saturation over threshold.
+        best_ratio: signal to noise at saturation.
+        linearity_percent: mean |deviation| from the line between 5 and 95 % of saturation.
+        responsivity: DN per unit of exposure, of that line; deviations (n,) in %, NaN outside.
+    """
+
+    gain_dn_per_e: float
+    gain_sigma: float
+    dark_noise_e: float
+    dark_noise_sigma_e: float
+    saturation_dn: float
+    saturation_e: float
+    threshold_e: float
+    dynamic_range: float
+    best_ratio: float
+    linearity_percent: float
+    responsivity: float
+    deviation_percent: Array
+
+    def variance_dn2(self, signal_dn: Array, dark_dn2: float) -> Array:
+        """Temporal variance of one frame at a signal, as the model has it."""
+        return np.asarray(dark_dn2 + self.gain_dn_per_e * signal_dn)
+
+
+def photon_transfer(ladder: Ladder) -> PhotonTransfer:
+    """Evaluate a ladder.
+
+    Raises:
+        ValueError: too few steps between 5 and 70 % of saturation.
+    """
+    top = int(np.argmax(np.where(ladder.clipped < 0.5, ladder.variance_dn2, -np.inf)))
+    saturation = float(ladder.signal_dn[top])
+    used = (ladder.signal_dn < _FIT_SHARE * saturation) & (ladder.clipped <= _CLIPPED_SHARE)
+    if used.sum() < 4:
+        raise ValueError(
+            f"{int(used.sum())} flat sets lie below {_FIT_SHARE:.0%} of saturation "
+            f"({saturation:.0f} DN); four or more are needed for photon transfer"
+        )
+    mu, var = ladder.signal_dn[used], ladder.variance_dn2[used] - ladder.dark_dn2
+    weight = 1.0 / ladder.sigma_dn2[used] ** 2
+    normal = float(np.sum(weight * mu * mu))
+    gain = float(np.sum(weight * mu * var)) / normal
+    by_dark = float(np.sum(weight * mu)) / normal * ladder.dark_sigma_dn2
+    gain_sigma = math.hypot(normal**-0.5, by_dark)
+    dark_e2 = max(ladder.dark_dn2 - QUANTISATION_DN2, 0.0) / gain**2
+    dark_noise = math.sqrt(dark_e2)
+    dark_sigma = ladder.dark_sigma_dn2 / gain**2 / (2.0 * dark_noise) if dark_noise else 0.0
+    threshold = math.sqrt(ladder.dark_dn2 / gain**2 + 0.25) + 0.5
+    saturation_e = saturation / gain
+    low, high = (share * saturation for share in _LINEAR_SHARES)
+    inside = (ladder.signal_dn >= low) & (ladder.signal_dn <= high)
+    slope, offset = _relative_line(ladder.exposure[inside], ladder.signal_dn[inside])
+    line = offset + slope * ladder.exposure
+    deviation = np.where(inside, 100.0 * (ladder.signal_dn - line) / line, np.nan)
+    return PhotonTransfer(
+        gain_dn_per_e=gain,
+        gain_sigma=gain_sigma,
+        dark_noise_e=dark_noise,
+        dark_noise_sigma_e=math.hypot(dark_sigma, dark_noise * gain_sigma / gain),
+        saturation_dn=saturation,
+        saturation_e=saturation_e,
+        threshold_e=threshold,
+        dynamic_range=saturation_e / threshold,
+        best_ratio=math.sqrt(saturation_e),
+        linearity_percent=float(np.mean(np.abs(deviation[inside]))),
+        responsivity=slope,
+        deviation_percent=np.asarray(deviation),
+    )
+
+
+def _relative_line(exposure: Array, signal: Array) -> tuple[float, float]:
+    """The line whose relative deviations are least (EMVA 1288, 6.7)."""
+    design = np.column_stack([exposure, np.ones_like(exposure)]) / signal[:, None]
+    solved, *_ = np.linalg.lstsq(design, np.ones_like(exposure), rcond=None)
+    return float(solved[0]), float(solved[1])
+
+
+def ladder_of(
+    steps: Sequence[tuple[float, float, float, float, float]], dark: tuple[float, float]
+) -> Ladder:
+    """Put steps (exposure, signal, variance, its sigma, clipped share) in order."""
+    table = np.array(sorted(steps), float).reshape(-1, 5).T
+    exposure, signal, variance, sigma, clipped = table
+    return Ladder(exposure, signal, variance, sigma, clipped, dark[0], dark[1])
