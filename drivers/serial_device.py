@@ -9,6 +9,7 @@ import errno
 import termios
 import threading
 from abc import abstractmethod
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Final, Protocol
 
@@ -33,6 +34,8 @@ from drivers.udp_port import LISTEN_SCHEME, SPEAK_SCHEME, open_udp_port
 READ_STEP_S: Final = 0.2
 """Longest wait for bytes before the driver looks up again."""
 WRITE_TIMEOUT_S: Final = 1.0
+UNLOGGED_KEPT: Final = 4096
+"""Chunks of bytes read before there is a log to put them into."""
 
 Sample = NavSample | EventMark | TemperatureSample | ClockReading
 
@@ -180,6 +183,7 @@ class SerialDevice(DeviceDriver):
         self._line: SerialLine | None = None
         self._heard_ns = 0
         self._silent = False
+        self._unlogged: deque[RawBytes] = deque(maxlen=UNLOGGED_KEPT)
 
     # What a driver says
 
@@ -235,6 +239,9 @@ class SerialDevice(DeviceDriver):
         self._line = self._line or self._open()
 
     def _tell_opened(self) -> None:
+        # What came while binding belongs into the log as well: a replay begins there.
+        while self._unlogged and self.teller.sink is not None:
+            self.teller.sink(self._unlogged.popleft())
         # A silent line is opened anew again and again, which is not news.
         if self._is_lost or not self._silent:
             self.teller.tell("opened", f"The {self.what} {self.name} is open at {self.port}.")
@@ -251,8 +258,11 @@ class SerialDevice(DeviceDriver):
 
     def _received(self, data: bytes) -> None:
         self.counters["bytes"] += len(data)
+        raw = RawBytes(self.name, self.clock.mono_ns(), data)
         if self.teller.sink is not None:
-            self.teller.sink(RawBytes(self.name, self.clock.mono_ns(), data))
+            self.teller.sink(raw)
+        else:
+            self._unlogged.append(raw)
 
     def _serve(self, sink: Sink) -> None:
         """Listen until closing, loss, or a whole silence, after which it is worth opening anew."""

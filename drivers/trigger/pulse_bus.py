@@ -15,9 +15,9 @@ from typing import ClassVar, Final, Protocol
 from drivers.clock import Clock, HostClock
 from drivers.contract import DeviceError, TriggerPulse
 from drivers.settings import Configured, Setting
+from drivers.trigger.delays import check_delays
 
 PROTOCOL: Final = ("PULSEBUS", "1")
-MAX_DELAY_NS: Final = 1_000_000_000
 MAX_LINE: Final = 4096
 EARLIER_ANSWERS: Final = 32
 """Answers that may still come twice, or after their time."""
@@ -109,18 +109,7 @@ class PulseBusTrigger(Configured):
         """
         with self._lock:
             self._connect()
-            wrong = [
-                f"output {output!r} does not exist; the unit has {', '.join(self._outputs)}"
-                for output in delays_ns
-                if output not in self._outputs
-            ]
-            wrong += [
-                f"delay of output {output!r} is {delay_ns} ns; 0 to {MAX_DELAY_NS}"
-                for output, delay_ns in delays_ns.items()
-                if not 0 <= delay_ns <= MAX_DELAY_NS
-            ]
-            if wrong:
-                raise DeviceError("\n".join(f"{self.name}: {sentence}" for sentence in wrong))
+            check_delays(self.name, delays_ns, self._outputs)
             self._delays_ns.update(delays_ns)
             try:
                 self._send_delays()

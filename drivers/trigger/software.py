@@ -7,15 +7,14 @@ import logging
 import threading
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, Final
+from typing import ClassVar
 
 from drivers.clock import Clock, HostClock
 from drivers.contract import DeviceError, Head, TriggerPulse
 from drivers.settings import Configured, Setting
+from drivers.trigger.delays import check_delays
 
 log = logging.getLogger(__name__)
-
-MAX_DELAY_NS: Final = 1_000_000_000
 
 
 class SoftwareTrigger(Configured):
@@ -57,18 +56,7 @@ class SoftwareTrigger(Configured):
 
     def program(self, delays_ns: Mapping[str, int]) -> None:
         """Set the delay of every output named, in ns from firing. DeviceError for a wrong one."""
-        wrong = [
-            f"output {output!r} does not exist; there are {', '.join(self._delays_ns)}"
-            for output in delays_ns
-            if output not in self._delays_ns
-        ]
-        wrong += [
-            f"delay of output {output!r} is {delay_ns} ns; 0 to {MAX_DELAY_NS}"
-            for output, delay_ns in delays_ns.items()
-            if not 0 <= delay_ns <= MAX_DELAY_NS
-        ]
-        if wrong:
-            raise DeviceError("\n".join(f"{self.name}: {sentence}" for sentence in wrong))
+        check_delays(self.name, delays_ns, self._delays_ns)
         self._delays_ns.update(delays_ns)
 
     def fire(self, sequence: int) -> TriggerPulse:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
-from drivers.contract import DeviceError, DeviceEvent, Record
+from drivers.contract import Device, DeviceError, DeviceEvent, Record
 
 
 class FakeClock:
@@ -76,6 +77,19 @@ class Notebook:
     @property
     def event_names(self) -> list[str]:
         return [event.name for event in self.events]
+
+
+@contextmanager
+def running(device: Device, notebook: Notebook) -> Iterator[None]:
+    """The device runs in a thread of its own, which ends with the block."""
+    thread = threading.Thread(target=device.run, args=(notebook,))
+    thread.start()
+    try:
+        yield
+    finally:
+        device.close()
+        thread.join(5)
+    assert not thread.is_alive()
 
 
 def refusing_port(path: str, baudrate: int, parity: str) -> FakePort:

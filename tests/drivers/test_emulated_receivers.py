@@ -10,8 +10,6 @@ import math
 import socket
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 
 import pytest
@@ -30,7 +28,7 @@ from sim_hw.receiver import EmulatedReceiver, ReceiverState
 from sim_hw.septentrio_receiver import SeptentrioReceiver
 from sim_hw.ublox_receiver import UbloxReceiver
 from sim_hw.world_clock import WorldClock
-from tests.drivers.stand_ins import Notebook
+from tests.drivers.stand_ins import Notebook, running
 from tests.sim_hw.receiver_state import NS, STATE, WEEK_NS
 
 WITHIN_S = 30.0
@@ -64,18 +62,6 @@ def pair(kind: str, line: str, clock: WorldClock) -> tuple[EmulatedReceiver, Lis
         clock, flying, rate_hz=10.0, line=PseudoTerminal() if line == "pty" else TcpLine()
     )
     return receiver, navigator_class("gnss", {"port": receiver.port})
-
-
-@contextmanager
-def running(navigator: ListeningNavigator, notebook: Notebook) -> Iterator[None]:
-    thread = threading.Thread(target=navigator.run, args=(notebook,))
-    thread.start()
-    try:
-        yield
-    finally:
-        navigator.close()
-        thread.join(5)
-    assert not thread.is_alive()
 
 
 @pytest.mark.parametrize(("kind", "line"), [*((k, "pty") for k in PAIRS), ("septentrio", "tcp")])

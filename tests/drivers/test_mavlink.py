@@ -9,8 +9,6 @@ import math
 import socket
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -31,7 +29,7 @@ from sim_hw.pseudo_terminal import PseudoTerminal
 from sim_hw.receiver import ReceiverState
 from sim_hw.serving import Line
 from sim_hw.world_clock import WorldClock
-from tests.drivers.stand_ins import FakeClock, FakePort, Notebook
+from tests.drivers.stand_ins import FakeClock, FakePort, Notebook, running
 from tests.sim_hw.receiver_state import STATE
 
 WITHIN_S = 30.0
@@ -299,18 +297,6 @@ def new_line(kind: str) -> Line:
     if kind == "udp":
         return UdpLine(("127.0.0.1", free_udp_port()))
     return TcpLine() if kind == "tcp" else PseudoTerminal()
-
-
-@contextmanager
-def running(navigator: MavlinkNavigator, notebook: Notebook) -> Iterator[None]:
-    thread = threading.Thread(target=navigator.run, args=(notebook,))
-    thread.start()
-    try:
-        yield
-    finally:
-        navigator.close()
-        thread.join(5)
-    assert not thread.is_alive()
 
 
 @pytest.mark.parametrize("line", ["pty", "udp", "tcp"])

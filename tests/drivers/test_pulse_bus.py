@@ -114,7 +114,7 @@ def test_outputs_and_delays_that_cannot_be_are_refused_together(trigger: PulseBu
     with pytest.raises(DeviceError) as caught:
         trigger.program({"7": 0, "0": -1, "1": 1_000_000_001})
     assert str(caught.value).splitlines() == [
-        "bus: output '7' does not exist; the unit has 0, 1, G",
+        "bus: output '7' does not exist; the trigger has 0, 1, G",
         "bus: delay of output '0' is -1 ns; 0 to 1000000000",
         "bus: delay of output '1' is 1000000001 ns; 0 to 1000000000",
     ]

@@ -81,7 +81,7 @@ def test_no_head_at_all_is_an_error_that_names_each() -> None:
 
 def test_a_delay_for_an_output_that_is_not_there_is_refused() -> None:
     trigger = _trigger(a=StubHead("a"))
-    with pytest.raises(DeviceError, match="output 'b' does not exist; there are a"):
+    with pytest.raises(DeviceError, match="output 'b' does not exist; the trigger has a"):
         trigger.program({"b": 0})
     trigger.close()
     with pytest.raises(DeviceError, match="closed"):
