@@ -26,6 +26,7 @@ REPLACED_SUFFIX = ".replaced"
 
 BAND_ORDER = ("red", "green", "blue", "nir")
 QUICKLOOK_QUALITY = 85
+THUMBNAIL_WIDTH_PX, THUMBNAIL_QUALITY = 200, 60
 
 
 class ProductError(DaemonError, ValueError):
@@ -50,6 +51,8 @@ def level2_contents(
     report_json: Mapping[str, Any],
     geometry: Mapping[str, Mapping[str, NDArray[Any]]] | None = None,
     residuals_svg: str | None = None,
+    residuals_json: Mapping[str, Any] | None = None,
+    histogram_json: Mapping[str, Any] | None = None,
     mosaic_json: Mapping[str, Any] | None = None,
 ) -> dict[str, Sequence[bytes | memoryview]]:
     """The files of an exposure's products: parts by name. Pixels are not copied.
@@ -62,6 +65,8 @@ def level2_contents(
         report_json: content of quality.json.
         geometry: by method ("free", "fixed", "fixed-no-tdm"), arrays by name.
         residuals_svg: a drawing of the residual vectors.
+        residuals_json: the same as numbers, with figures for every overlap.
+        histogram_json: counts of raw DN by sensor.
         mosaic_json: content of mosaic.json, what the stitching says about the sensors' places.
 
     Raises:
@@ -77,10 +82,15 @@ def level2_contents(
         contents["rgbn.tif"] = tiff_parts([colour[band] for band in bands], about)
     if quicklook is not None:
         contents["quicklook.jpg"] = [jpeg_bytes(quicklook)]
+        contents["thumbnail.jpg"] = [thumbnail_bytes(quicklook)]
     for method, arrays in (geometry or {}).items():
         contents[_geometry_name(method)] = [_npz(arrays)]
     if residuals_svg is not None:
         contents["residuals.svg"] = [residuals_svg.encode("utf-8")]
+    if residuals_json is not None:
+        contents["residuals.json"] = [canonical_bytes(residuals_json)]
+    if histogram_json is not None:
+        contents["histogram.json"] = [canonical_bytes(histogram_json)]
     if mosaic_json is not None:
         contents["mosaic.json"] = [canonical_bytes(mosaic_json)]
     contents["quality.json"] = [canonical_bytes(report_json)]
@@ -203,7 +213,18 @@ def _npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
     return buffer.getvalue()
 
 
-def jpeg_bytes(quicklook: NDArray[np.uint8]) -> bytes:
+def thumbnail_bytes(quicklook: NDArray[np.uint8]) -> bytes:
+    """A quick look made small enough for a thin link, a few kB."""
+    import cv2
+
+    height, width = quicklook.shape[:2]
+    scale = min(1.0, THUMBNAIL_WIDTH_PX / width)
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    small = cv2.resize(quicklook, size, interpolation=cv2.INTER_AREA)
+    return jpeg_bytes(np.asarray(small, dtype=np.uint8), quality=THUMBNAIL_QUALITY)
+
+
+def jpeg_bytes(quicklook: NDArray[np.uint8], *, quality: int = QUICKLOOK_QUALITY) -> bytes:
     """A quick look, (height, width) or (height, width, 3) in the order red, green, blue, as JPEG.
 
     Raises:
@@ -218,7 +239,7 @@ def jpeg_bytes(quicklook: NDArray[np.uint8]) -> bytes:
             "uint8 of shape (height, width) or (height, width, 3) is needed"
         )
     image = quicklook if quicklook.ndim == 2 else np.ascontiguousarray(quicklook[:, :, ::-1])
-    is_encoded, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUICKLOOK_QUALITY])
+    is_encoded, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not is_encoded:
         raise ProductError(f"quick look of shape {quicklook.shape} cannot be encoded")
     return bytes(data)

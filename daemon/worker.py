@@ -43,9 +43,11 @@ from daemon.plan.reading import read_plan
 from daemon.processes import Link
 from daemon.radiometry_folder import RadiometryFolder
 from processing.drawing import residuals_svg
+from processing.histogram import sampled_histogram
 from processing.pipeline import Conditions, Pipeline, Settings
 from processing.quality import Flag, as_json
-from processing.rig import Rig, find_rig
+from processing.residual_vectors import residual_vectors
+from processing.rig import Rig, Sensor, find_rig
 from processing.specification import Asked
 from processing.stitch_record import stitch_record, stitch_record_json
 
@@ -174,6 +176,11 @@ def make_products(
         are the pipeline's buffers and hold until its next exposure.
     """
     rig = pipeline.rig
+    # Before the pipeline lets go of the frames.
+    histograms = {
+        name: sampled_histogram(frame, _word_bits(rig.sensor(name)))
+        for name, frame in frames.items()
+    }
     product = pipeline.process(frames, conditions, frames_read=frames_read)
     report = as_json(product.report)
     report["exposure"] = number
@@ -192,9 +199,15 @@ def make_products(
         report_json=report,
         geometry=product.geometry,
         residuals_svg=residuals_svg(rig, product.tie_points, product.mosaic, product.validity),
+        residuals_json=residual_vectors(rig, product.tie_points, product.mosaic),
+        histogram_json={name: list(counts) for name, counts in histograms.items()},
         mosaic_json=stitching,
     )
     return report, contents
+
+
+def _word_bits(sensor: Sensor) -> int:
+    return 16 if sensor.justified == "left" else sensor.bits
 
 
 @dataclass(frozen=True)

@@ -26,9 +26,11 @@ from starlette.exceptions import HTTPException as StarletteHTTPException
 from starlette.websockets import WebSocketDisconnect
 
 from daemon.mission import exposure_name
+from daemon.watch.coverage import Coverage
 from daemon.watch.gate import Gate, NoAnswerError
 from daemon.watch.metrics import exposition
-from daemon.watch.state import EXPOSURES_KEPT, FlightState
+from daemon.watch.planned import add_plan
+from daemon.watch.state import EXPOSURES_KEPT, PARTS, PICTURE_PARTS, FlightState
 from daemon.watch.telemetry import LEAST_BYTES_PER_S, Subscription, packed
 from daemon.watch.tokens import Attempts, Holder, Role, Tokens
 
@@ -41,7 +43,10 @@ SEND_TIMEOUT_S = 5.0
 WATCHERS_MAX = 64
 IMAGES = {
     "quicklook.jpg": "image/jpeg",
+    "thumbnail.jpg": "image/jpeg",
     "residuals.svg": "image/svg+xml",
+    "residuals.json": "application/json",
+    "histogram.json": "application/json",
     "quality.json": "application/json",
 }
 CONTENT_SECURITY_POLICY = (
@@ -79,6 +84,14 @@ class Outcome(BaseModel):
 
 
 Number = Annotated[int, PathParameter(ge=1, lt=10**9, description="of the exposure")]
+Product = Literal[
+    "quicklook.jpg",
+    "thumbnail.jpg",
+    "residuals.svg",
+    "residuals.json",
+    "histogram.json",
+    "quality.json",
+]
 CommandName = Literal["start", "stop", "trigger", "interval", "distance", "land", "acknowledge"]
 
 
@@ -93,7 +106,9 @@ class WatchSettings:
     is_open: bool = True
 
 
-def create_app(state: FlightState, gate: Gate, settings: WatchSettings) -> FastAPI:
+def create_app(
+    state: FlightState, gate: Gate, settings: WatchSettings, coverage: Coverage | None = None
+) -> FastAPI:
     """The application; it has no state of its own but who is connected."""
     app = FastAPI(
         title="Syntopic",
@@ -111,6 +126,7 @@ def create_app(state: FlightState, gate: Gate, settings: WatchSettings) -> FastA
     _add_products(app, state, doors)
     _add_commands(app, state, gate, doors)
     _add_telemetry(app, state, doors)
+    add_plan(app, coverage or Coverage(state), Depends(doors.watch))
     _add_page(app)
     return app
 
@@ -246,10 +262,8 @@ def _add_products(app: FastAPI, state: FlightState, doors: _Doors) -> None:
         response_class=FileResponse,
         responses={200: {"content": {kind: {} for kind in IMAGES.values()}}},
     )
-    async def product(
-        number: Number, product: Literal["quicklook.jpg", "residuals.svg", "quality.json"]
-    ) -> FileResponse:
-        """Quick look, residual vectors or quality report, as they are on disk."""
+    async def product(number: Number, product: Product) -> FileResponse:
+        """Quick look, residual vectors, histogram or quality report, as they are on disk."""
         if state.mission_path is None:
             raise HTTPException(404, "no mission yet")
         path = Path(state.mission_path) / "L2" / exposure_name(number) / product
@@ -304,7 +318,9 @@ def _add_telemetry(app: FastAPI, state: FlightState, doors: _Doors) -> None:
             return
         await socket.accept()
         doors.watchers += 1
-        told = Subscription(max(bytes_per_s, LEAST_BYTES_PER_S))
+        # Over JSON pictures are fetched, not told.
+        parts = PARTS if form == "json" else (*PARTS, *PICTURE_PARTS)
+        told = Subscription(max(bytes_per_s, LEAST_BYTES_PER_S), parts)
         gone = asyncio.ensure_future(_until_gone(socket))
         try:
             while not gone.done():

@@ -26,9 +26,16 @@ DATAGRAM_MAX_BYTES = 1200
 
 BRIEF_EVERY_S = 1.0
 FAULT_EVERY_S = 2.0
+NEW_FAULT_TIMES, NEW_FAULT_EVERY_S = 6, 0.6
+"""A new fault is said densely at first: a link that loses a third loses all six once in 700."""
+
 REPEATED = 200
 """How many of the newest exposures are said again."""
 
+PICTURE_EVERY = 4
+"""One picture, or piece of one, to so many exposures that are said again."""
+
+PICTURES_KEPT = 8
 TICK_S = 0.1
 BURST_S = 1.0
 
@@ -41,9 +48,11 @@ class Sender:
     _credit: float = 0.0
     _at_s: float | None = None
     _brief_s: float = -math.inf
-    _faults_s: dict[tuple[str, bool, bool], float] = field(default_factory=dict)
+    _faults: dict[tuple[str, bool, bool], tuple[float, int]] = field(default_factory=dict)
     _told: int = 0
     _turn: int = 0
+    _shown: int = 0
+    _shown_turn: int = -1
 
     def due(self, state: FlightState, now_s: float) -> Iterator[bytes]:
         """The datagrams that are due now, as far as the budget goes."""
@@ -59,9 +68,11 @@ class Sender:
     def _candidates(self, state: FlightState, now_s: float) -> Iterator[bytes]:
         for fault in state.faults():
             key = (fault["id"], fault["stands"], fault["acknowledged"])
-            if now_s - self._faults_s.get(key, -math.inf) >= FAULT_EVERY_S:
+            told_s, times = self._faults.get(key, (-math.inf, 0))
+            pause_s = NEW_FAULT_EVERY_S if times < NEW_FAULT_TIMES else FAULT_EVERY_S
+            if now_s - told_s >= pause_s:
                 yield _datagram("fault", fault)
-                self._faults_s[key] = now_s
+                self._faults[key] = now_s, times + 1
         if now_s - self._brief_s >= BRIEF_EVERY_S:
             yield _datagram("brief", _brief_of(state))
             self._brief_s = now_s
@@ -69,10 +80,18 @@ class Sender:
             yield _datagram("exposure", one)
             self._told = one["sequence"]
         newest = state.exposures()[-REPEATED:]
+        shown = [*state.changed("residuals", 0), *state.changed("thumbnails", 0)]
         for _ in newest:
             self._turn %= len(newest)
+            if shown and self._turn % PICTURE_EVERY == 0 and self._shown_turn != self._turn:
+                self._shown %= len(shown)
+                picture = shown[-1 - self._shown]
+                yield _datagram("thumbnail" if "data" in picture else "residuals", picture)
+                self._shown += 1
+                self._shown_turn = self._turn
             yield _datagram("exposure", newest[self._turn])
             self._turn += 1  # one that did not fit is the next one's first
+            self._shown_turn = -1
 
 
 class Received:
@@ -82,7 +101,16 @@ class Received:
         self.brief: dict[str, Any] = {}
         self.faults: dict[str, dict[str, Any]] = {}
         self.exposures: dict[int, dict[str, Any]] = {}
+        self.residuals: dict[int, dict[str, Any]] = {}
+        self._pieces: dict[int, dict[int, dict[str, Any]]] = {}
         self.bad = 0
+
+    def thumbnail(self, number: int) -> bytes | None:
+        """An exposure's JPEG, once all of its pieces are here."""
+        pieces = self._pieces.get(number, {})
+        if not pieces or len(pieces) < next(iter(pieces.values()))["pieces"]:
+            return None
+        return b"".join(pieces[k]["data"] for k in sorted(pieces))
 
     def take(self, datagram: bytes) -> None:
         """Take one in; what is no datagram of ours is counted."""
@@ -97,6 +125,14 @@ class Received:
                 self._newer(self.faults, content["id"], content)
             elif kind == "exposure":
                 self._newer(self.exposures, content["number"], content)
+            elif kind == "residuals":
+                self._newer(self.residuals, content["number"], content)
+            elif kind == "thumbnail":
+                pieces = self._pieces.setdefault(content["number"], {})
+                self._newer(pieces, content["piece"], content)
+            for shown in (self.residuals, self._pieces):
+                while len(shown) > PICTURES_KEPT:
+                    del shown[min(shown)]
         except (ValueError, KeyError, TypeError, msgpack.UnpackException):
             self.bad += 1
 
@@ -105,6 +141,8 @@ class Received:
             if content["mission"] == self.brief.get("mission"):
                 return  # it was overtaken
             self.exposures.clear()
+            self.residuals.clear()
+            self._pieces.clear()
         self.brief = content
         standing = set(content["faults"])
         for gone in [known for known in self.faults if known not in standing]:

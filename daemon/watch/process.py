@@ -23,15 +23,18 @@ from daemon.orientation import mount_of
 from daemon.processes import Link
 from daemon.records import RecordError
 from daemon.watch.api import WatchSettings, create_app
+from daemon.watch.coverage import Coverage
 from daemon.watch.datagrams import send
 from daemon.watch.discovery import Announcement
 from daemon.watch.gate import Gate
 from daemon.watch.mavlink_camera import MavlinkCamera
+from daemon.watch.pictures import pictures_of
 from daemon.watch.state import FlightState
 from daemon.watch.tokens import TokenError, Tokens, read_tokens
 from processing.rig import Rig, RigError, load_rig
 
 BODY_MAX_BYTES = 64_000
+GATHER_S = 10.0
 _log = logging.getLogger(__name__)
 
 
@@ -42,10 +45,12 @@ def main(link: Link, settings: WatchSection) -> None:
 
 async def _serve(link: Link, settings: WatchSection) -> None:
     ground = _Ground()
-    state = FlightState(f"syntopic {version('syntopic')}", ground.seen_from)
+    state = FlightState(f"syntopic {version('syntopic')}", ground.seen_from, pictures_of)
     ground.state = state
     gate = Gate(link.send)
-    app = create_app(state, gate, WatchSettings(_tokens(settings.tokens), settings.open))
+    coverage = Coverage(state)
+    watchers = WatchSettings(_tokens(settings.tokens), settings.open)
+    app = create_app(state, gate, watchers, coverage)
     server = uvicorn.Server(
         uvicorn.Config(
             app,
@@ -74,6 +79,7 @@ async def _serve(link: Link, settings: WatchSection) -> None:
     ending = asyncio.Event()
     announcement = Announcement(state, settings, port)
     saying = asyncio.create_task(send(state, settings.udp_addresses, settings.udp_bytes_per_s))
+    gathering = asyncio.create_task(_gather(coverage))
     camera = await _camera(settings, state, gate, ground, link)
     loop = asyncio.get_running_loop()
     loop.add_reader(link.fileno(), _hear, link, state, gate, ending)
@@ -88,6 +94,7 @@ async def _serve(link: Link, settings: WatchSection) -> None:
         loop.remove_reader(link.fileno())
         server.should_exit = True
         saying.cancel()
+        gathering.cancel()
         if camera is not None:
             camera.end()
         with suppress(OSError):
@@ -95,6 +102,13 @@ async def _serve(link: Link, settings: WatchSection) -> None:
         if serving is not None:
             with suppress(TimeoutError):
                 await asyncio.wait_for(serving, 3.0)
+
+
+async def _gather(coverage: Coverage) -> None:
+    """Coverage hears of every exposure, whether anybody asks or not."""
+    while True:
+        coverage.gather()
+        await asyncio.sleep(GATHER_S)
 
 
 async def _camera(

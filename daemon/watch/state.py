@@ -12,6 +12,7 @@ from typing import Any
 
 from daemon.latches import DELIVERS, IS_GONE, Latches
 from daemon.phases import Phase
+from daemon.watch.pictures import Pictures
 
 PHASES = frozenset(phase.value for phase in Phase)
 EXPOSURES_KEPT = 2000
@@ -27,6 +28,11 @@ FIGURES_TOLD = (
 )
 PARTS = ("exposures", "devices", "track", "history", "events")
 """Parts of the state besides what is brief, in the order of their worth on a thin link."""
+
+PICTURE_PARTS = ("residuals", "thumbnails")
+"""Behind all of these, for those who have no page: not part of the snapshot."""
+
+RESIDUALS_KEPT, PIECES_KEPT = 5, 40
 
 PLACE_KEYS = (
     *("latitude_deg", "longitude_deg", "height_m"),
@@ -44,11 +50,20 @@ class FlightState:
     """
 
     def __init__(
-        self, software: str, footprint: Callable[[Mapping[str, Any]], Any] = lambda _: None
+        self,
+        software: str,
+        footprint: Callable[[Mapping[str, Any]], Any] = lambda _: None,
+        pictures: Callable[[str | None, int], Pictures] = lambda _mission, _number: Pictures(),
     ) -> None:
-        """`footprint` gives the corners of what an exposure's navigation saw, where it can."""
+        """`footprint` gives the corners of what an exposure's navigation saw, where it can.
+
+        `pictures` reads what is there of a mission's exposure.
+        """
         self.sequence = 0
         self._footprint = footprint
+        self._pictures = pictures
+        self._residuals: deque[Json] = deque(maxlen=RESIDUALS_KEPT)
+        self._pieces: deque[Json] = deque(maxlen=PIECES_KEPT)
         self._software = software
         self._phase = "idle"
         self._mission: Json = {}
@@ -88,7 +103,7 @@ class FlightState:
         }
 
     def changed(self, part: str, after: int) -> list[Json]:
-        """What of "exposures", "devices", "track", "history" or "events" is newer than a sequence.
+        """What of one of PARTS or PICTURE_PARTS is newer than a sequence.
 
         Ordered by sequence, so that a watcher may be given the beginning now and the rest later.
         """
@@ -98,6 +113,8 @@ class FlightState:
             "track": self._track,
             "history": self._history,
             "events": self._events,
+            "residuals": self._residuals,
+            "thumbnails": self._pieces,
         }[part]
         newer = [item for item in items if item["sequence"] > after]
         return sorted(newer, key=lambda item: item["sequence"])
@@ -216,6 +233,20 @@ class FlightState:
                 "temperatures_c": self._temperatures.pop(told["number"], {}),
             }
         )
+
+        self._show(told["number"])
+
+    def _show(self, number: int) -> None:
+        """Pieces are told one by one, so each has a sequence of its own."""
+        found = self._pictures(self.mission_path, number)
+        if found.vectors:
+            shown = {"number": number, "size_px": found.size_px, "vectors": found.vectors}
+            self.sequence += 1
+            self._residuals.append({"sequence": self.sequence, **shown})
+        for piece, data in enumerate(found.pieces):
+            self.sequence += 1
+            about = {"number": number, "piece": piece, "pieces": len(found.pieces)}
+            self._pieces.append({"sequence": self.sequence, **about, "data": data})
 
     def _on_not_processed(self, event: Mapping[str, Any]) -> None:
         told = self._exposure(event)

@@ -26,10 +26,11 @@ BURST_S = 2.0
 
 @dataclass
 class Subscription:
-    """One watcher: its budget and how far it has been told."""
+    """One watcher: its budget, what it wants to be told, and how far it has been."""
 
     bytes_per_s: float = math.inf
-    _cursors: dict[str, int] = field(default_factory=lambda: dict.fromkeys(PARTS, 0))
+    parts: tuple[str, ...] = PARTS
+    _cursors: dict[str, int] = field(default_factory=dict)
     _told_sequence: int = -1
     _told_s: float = -math.inf
     _told_faults: list[Any] = field(default_factory=list)
@@ -55,7 +56,7 @@ class Subscription:
         if left < 0 or is_too_soon:
             return None
         complete = True
-        for part in PARTS:
+        for part in self.parts:
             items, left, all_told = self._some_of(state, part, left)
             if items:
                 record[part] = items
@@ -77,7 +78,7 @@ class Subscription:
     def _some_of(self, state: FlightState, part: str, left: float) -> tuple[list[Any], float, bool]:
         """Items of a part that fit, what is left of the budget, and whether all were told."""
         told: list[Any] = []
-        for item in state.changed(part, self._cursors[part]):
+        for item in state.changed(part, self._cursors.get(part, 0)):
             nbytes = packed_nbytes(item)
             if nbytes > left:
                 return told, left, False

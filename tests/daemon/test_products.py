@@ -38,7 +38,8 @@ def _write(mission, **changes):
     content = {
         "pan": PAN, "colour": COLOUR, "quicklook": quicklook, "report_json": REPORT,
         "geometry": GEOMETRY, "residuals_svg": "<svg/>",
-        "mosaic_json": {"format": 1},
+        "mosaic_json": {"format": 1}, "residuals_json": {"vectors": []},
+        "histogram_json": {"SU00": [1, 2]},
     }  # fmt: skip
     return write_level2(mission, 7, **{**content, **changes})
 
@@ -50,6 +51,7 @@ def test_every_product_is_read_by_others(mission):
     assert set(record.files) == {p.name for p in folder.iterdir()} == {
         "pan.tif", "rgbn.tif", "quicklook.jpg", "quality.json", "geometry.npz",
         "geometry-fixed-no-tdm.npz", "residuals.svg", "mosaic.json",
+        "thumbnail.jpg", "residuals.json", "histogram.json",
     }  # fmt: skip
     assert all((folder / name).stat().st_size == size for name, size in record.files.items())
     assert record.verdict == "good"

@@ -18,6 +18,7 @@ from processing.lattice import colour_raster
 from processing.pipeline import Conditions, Pipeline, Product, Settings
 from processing.placement import nominal_placements, vip_mm_from_raw, vip_px_from_mm
 from processing.quality import FIGURES, Flag, Verdict, as_json
+from processing.residual_vectors import residual_vectors
 from processing.rig import Rig, find_rig
 from tests.processing.synthetic_exposure import Exposure, expose
 
@@ -201,6 +202,22 @@ def test_residuals_can_be_drawn(rig: Rig, product: Product) -> None:
     texts = [e.text or "" for e in ET.fromstring(svg).iter() if e.tag.endswith("text")]
     assert any("SU01 displaced by" in text for text in texts)
     assert len(svg) < 400_000
+
+
+def test_residuals_are_told_as_numbers(rig: Rig, product: Product) -> None:
+    told = residual_vectors(rig, product.tie_points, product.mosaic)
+    figures = product.report.figures
+    pan = {sensor.name for cone in rig.pan_cones for sensor in cone.sensors}
+    used = sum(one["used"] for one in told["overlaps"] if set(one["sensors"]) <= pan)
+    assert used == figures["tie_points_pp"]
+    vectors = np.array(told["vectors"])
+    assert 300 <= len(vectors) <= 600
+    assert (vectors[:, :2] > -20).all()
+    assert (vectors[:, 0] < told["width_px"] + 20).all()
+    assert (vectors[:, 1] < told["height_px"] + 20).all()
+    # A residual is small; of what is left out, some are not.
+    assert np.median(np.hypot(*vectors[vectors[:, 4] == 0, 2:4].T)) < 0.2
+    assert len(json.dumps(told)) < 40_000
 
 
 def test_nothing_compiles_after_the_warm_up(

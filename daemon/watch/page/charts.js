@@ -3,6 +3,8 @@
 import { flight } from "./state.js";
 
 const charts = {};
+const STROKES = ["#2a7fd4", "#d4572a", "#2a9a5b", "#8a5bd0", "#b58900"];
+const DASHES = [null, [6, 4], [2, 3], [10, 3, 2, 3]];
 
 function axes(unit) {
   const ink = getComputedStyle(document.documentElement).getPropertyValue("--soft").trim();
@@ -36,9 +38,25 @@ export function drawCharts() {
   }
   const numbers = flight.history.map((one) => one.number);
   const of = (key, factor = 1) => flight.history.map((one) => one[key] == null ? null : one[key] * factor);
+  drawTemperatures(numbers);
   charts.sigma0.setData([numbers, of("sigma0_px")]);
   charts.dc.setData([numbers, of("dc_k"), of("dc_estimated_k")]);
   charts.time.setData([numbers, of("time_sigma_ns", 1e-3)]);
+}
+
+// One line a probe, told apart by colour and dash; made anew when a probe comes.
+function drawTemperatures(numbers) {
+  const probes = [...new Set(flight.history.flatMap((one) => Object.keys(one.temperatures_c || {})))].sort();
+  if (!probes.length) return;
+  const key = probes.join();
+  if (charts.temperature?.probes !== key) {
+    charts.temperature?.destroy();
+    charts.temperature = chart("chart-temperature", "temperatures", "°C", probes.map((probe, k) =>
+      [probe, STROKES[k % STROKES.length], DASHES[Math.floor(k / STROKES.length) % DASHES.length]]));
+    charts.temperature.probes = key;
+  }
+  charts.temperature.setData([numbers, ...probes.map((probe) =>
+    flight.history.map((one) => one.temperatures_c?.[probe] ?? null))]);
 }
 
 export function fitCharts() {

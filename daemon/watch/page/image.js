@@ -1,6 +1,7 @@
 // The quick look: zoom, pan, histogram, residual vectors in its place.
 
 import { flight } from "./state.js";
+import { drawHistogram, drawVectors, listOverlaps, product } from "./residuals.js";
 
 const room = document.getElementById("image");
 const image = document.getElementById("quicklook");
@@ -9,11 +10,14 @@ const canvas = document.getElementById("histogram");
 const which = document.getElementById("image-which");
 const about = document.getElementById("about-image");
 const residuals = document.getElementById("show-residuals");
+const noteRoom = document.getElementById("vectors-note");
+const drawing = document.getElementById("vectors");
 const view = { scale: 1, x: 0, y: 0 };
 let shown = null;
 
 function place() {
   image.style.transform = `translate(${view.x}px, ${view.y}px) scale(${view.scale})`;
+  drawing.style.transform = image.style.transform;
 }
 
 function fit() {
@@ -32,7 +36,7 @@ function zoom(factor, x = room.clientWidth / 2, y = room.clientHeight / 2) {
   place();
 }
 
-function histogram() {
+function quicklookHistogram() {
   const sample = document.createElement("canvas");
   sample.width = Math.min(image.naturalWidth, 512);
   sample.height = Math.max(1, Math.round(sample.width * image.naturalHeight / image.naturalWidth));
@@ -56,6 +60,10 @@ function histogram() {
   });
 }
 
+function share(value) {
+  return value == null ? null : `${(100 * value).toFixed(0)} %`;
+}
+
 function figures(one) {
   about.replaceChildren();
   const told = one.figures || {};
@@ -66,6 +74,10 @@ function figures(one) {
     "displaced": told.displaced_sensor,
     "saturated": told.saturated_fraction == null ? null : `${(100 * told.saturated_fraction).toFixed(2)} %`,
     "tilt": told.tilt_deg == null ? null : `${told.tilt_deg.toFixed(1)}°`,
+    "overlap": share(told.forward_overlap),
+    "sidelap": share(told.sidelap),
+    "crab": told.crab_deg == null ? null : `${told.crab_deg.toFixed(1)}°`,
+    "sun": told.sun_deg == null ? null : `${told.sun_deg.toFixed(0)}°`,
     "GSD": told.gsd_m == null ? null : `${(100 * told.gsd_m).toFixed(1)} cm`,
     "pipeline": one.duration_s == null ? null : `${one.duration_s.toFixed(2)} s`,
   };
@@ -87,21 +99,26 @@ export function showImage(number) {
   figures(one);
   which.textContent = `${number}`;
   if (one.step !== "processed") return;
-  const name = residuals.getAttribute("aria-pressed") === "true" ? "residuals.svg" : "quicklook.jpg";
-  const address = `/api/v1/exposures/${number}/${name}`;
+  drawing.toggleAttribute("hidden", residuals.getAttribute("aria-pressed") !== "true");
+  noteRoom.hidden = drawing.hasAttribute("hidden");
+  const address = `/api/v1/exposures/${number}/quicklook.jpg`;
   if (shown === address) return;
   shown = address;
-  const refit = image.hidden || image.dataset.kind !== name;
-  image.onload = () => {
+  const refit = image.hidden;
+  image.onload = async () => {
     image.hidden = false;
     nothing.hidden = true;
-    image.dataset.kind = name;
     if (refit) fit();
-    if (name === "quicklook.jpg") histogram();
+    const [raw, vectors] = await Promise.all([product(number, "histogram.json"), product(number, "residuals.json")]);
+    if (shown !== address) return;
+    if (raw) drawHistogram(canvas, raw);
+    else quicklookHistogram();
+    drawVectors(drawing, vectors, image.naturalWidth, image.naturalHeight);
+    listOverlaps(vectors, number);
+    place();
   };
   image.onerror = () => { image.hidden = true; nothing.hidden = false; shown = null; };
-  image.alt = `${name === "quicklook.jpg" ? "Quick look" : "Residual vectors"} of exposure ${number}, ` +
-    `verdict ${one.verdict}`;
+  image.alt = `Quick look of exposure ${number}, verdict ${one.verdict}`;
   image.src = address;
 }
 

@@ -29,6 +29,44 @@ function style(one) {
   };
 }
 
+const plan = L.layerGroup().addTo(map);
+const holes = L.layerGroup().addTo(map);
+let planned = null;
+
+// The planned lines with their ids, and where exposures are due.
+export function drawPlan(told) {
+  plan.clearLayers();
+  planned = null;
+  const lines = told?.lines || [];
+  if (!lines.length) return;
+  planned = L.latLngBounds(lines.flatMap((line) => line.at));
+  for (const line of lines) {
+    L.polyline(line.at, { color: colour("--soft"), weight: 2, dashArray: "8 6", interactive: false }).addTo(plan);
+    L.circleMarker(line.at[0], { radius: 2, color: colour("--soft"), interactive: false })
+      .bindTooltip(line.id, { permanent: true, direction: "left", className: "line-label" }).addTo(plan);
+    if (line.places_m.length > 200) continue;
+    const [[lat0, lon0], [lat1, lon1]] = line.at;
+    const scale = Math.cos(lat0 * Math.PI / 180);
+    const length = 111320 * Math.hypot(lat1 - lat0, (lon1 - lon0) * scale) || 1;
+    for (const place of line.places_m) {
+      const share = place / length;
+      L.circleMarker([lat0 + share * (lat1 - lat0), lon0 + share * (lon1 - lon0)],
+        { radius: 2, weight: 1, color: colour("--soft"), interactive: false }).addTo(plan);
+    }
+  }
+}
+
+// Parts of lines that were flown and are not well seen.
+export function drawHoles(segments) {
+  holes.clearLayers();
+  for (const one of segments) {
+    if (one.kind !== "hole") continue;
+    L.polyline(one.at, { color: colour("--warning"), weight: 12, opacity: 0.55, dashArray: "2 6", lineCap: "butt" })
+      .bindTooltip(`✖ ${one.line}: ${one.from_m.toFixed(0)}–${one.to_m.toFixed(0)} m`,
+        { permanent: true, direction: "right", className: "hole-label" }).addTo(holes);
+  }
+}
+
 export function drawMap(choose) {
   track.setLatLngs(flight.track.map((point) => point.at));
   const position = flight.brief?.status?.position;
@@ -56,6 +94,7 @@ export function drawMap(choose) {
   }
   if (!framed) {
     const bounds = L.featureGroup([...footprints.values()]).getBounds();
+    if (planned && (!bounds.isValid() || !planned.intersects(bounds))) bounds.extend(planned);
     if (bounds.isValid()) map.fitBounds(bounds, { padding: [20, 20], maxZoom: 17 });
     else if (position) map.setView(here.getLatLng(), 14);
   }

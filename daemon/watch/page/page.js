@@ -3,6 +3,7 @@
 import { flight, listen, onChange } from "./state.js";
 import { command } from "./commands.js";
 import { drawMap } from "./map.js";
+import { followPlan } from "./plan.js";
 import { prepareImage, showImage } from "./image.js";
 import { drawCharts, fitCharts } from "./charts.js";
 
@@ -122,6 +123,7 @@ function row(one) {
   const cells = [
     [choose],
     [`${MARKS[one.verdict] || ""} ${word}`, one.verdict || (one.step === "lost" ? "lost" : "")],
+    [one.line || ""],
     [one.frames == null ? "" : `${one.frames}`],
     [duration(one.mark_sigma_ns) || ""],
     [figures.sigma0_px == null ? "" : figures.sigma0_px.toFixed(3)],
@@ -162,6 +164,7 @@ onChange((record) => {
   if (follows && last) chosen = last.number;
   if (record.devices) drawDevices();
   if (record.exposures || record.track) drawMap(select);
+  followPlan(Boolean(record.exposures));
   if (record.exposures) drawRows();
   if (record.history || !document.querySelector("#chart-sigma0 .uplot")) drawCharts();
   if (chosen != null) showImage(chosen);

@@ -43,8 +43,11 @@ def status(phase: str = "flying", triggers: int = 0, exposures_left: int = 100) 
     }
 
 
-def exposure(number: int, verdict: str = "good") -> list[dict[str, Any]]:
-    """From the trigger to the verdict."""
+def exposure(
+    number: int, verdict: str = "good", *, line: str = "", north_m: float = 0.0
+) -> list[dict[str, Any]]:
+    """From the trigger to the verdict; `north_m` behind the place of NAVIGATION."""
+    here = NAVIGATION | {"latitude_deg": 47.07 + north_m / 111_180}
     return [
         {"event": "triggered", "mono_ns": "1", "number": number},
         {"event": "stored", "mono_ns": "1", "number": number, "duration_s": 0.1},
@@ -57,7 +60,9 @@ def exposure(number: int, verdict: str = "good") -> list[dict[str, Any]]:
             "missing": [],
             "mark_sigma_ns": 25,
             "temperatures_c": {"0": 32.1},
-            "navigation": NAVIGATION,
+            "navigation": here,
+            "line": line,
+            "strip": line,
         },
         {
             "event": "processed",

@@ -68,11 +68,28 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (product / f"{number:06d}").mkdir(parents=True)
         picture = cv2.resize(random.integers(30, 220, (24, 36, 3), dtype=np.uint8), (900, 600))
         cv2.imwrite(str(product / f"{number:06d}/quicklook.jpg"), picture)
+        vectors = [[c, 1200, 0.05, -0.02, k] for k, c in enumerate((600, 1800, 3000))]
+        overlaps = [
+            {"sensors": ["SU00", "SU01"], "sought": 90, "found": 80, "used": 77, "rms_px": 0.05},
+            {"sensors": ["SU00", "SU02"], "sought": 90, "found": 9, "used": 5, "rms_px": 0.07},
+        ]
+        residuals = {"width_px": 3600, "height_px": 2400, "overlaps": overlaps, "vectors": vectors}
+        (product / f"{number:06d}/residuals.json").write_text(json.dumps(residuals))
+        counts = {"SU00": [0] * 20 + [100] * 20 + [0] * 24, "R": [0] * 63 + [500]}
+        (product / f"{number:06d}/histogram.json").write_text(json.dumps(counts))
     (folder / "mission/L0").mkdir()
     from processing.rig import shipped_rigs
 
     rig = shipped_rigs()["ultracam-x-mini"].read_bytes()
     (folder / "mission/rig.toml").write_bytes(rig)
+    line = {"type": "LineString", "coordinates": [[15.43, 47.07], [15.43, 47.08]]}
+    plan = {
+        "type": "FeatureCollection",
+        "features": [
+            {"type": "Feature", "properties": {"id": "A1", "strip": "S"}, "geometry": line}
+        ],
+    }
+    (folder / "mission/plan.geojson").write_text(json.dumps(plan))
     (folder / "mission/service.toml").write_text("[plan]\nground_height_m = 395.0\n")
     return folder
 
@@ -108,7 +125,57 @@ def test_a_flight_is_seen_as_it_happens(service: Service, browser: Browser) -> N
     assert browser.evaluate("document.querySelectorAll('#rows tr').length") == 3
     browser.wait_for("document.querySelectorAll('#map path').length >= 4", WITHIN_S)
     browser.wait_for("document.querySelector('#quicklook').naturalWidth === 900", WITHIN_S)
-    browser.wait_for("document.querySelectorAll('.uplot').length === 3", WITHIN_S)
+    browser.wait_for("document.querySelectorAll('.uplot').length === 4", WITHIN_S)
+
+
+def test_the_planned_line_is_on_the_map_with_the_holes_in_what_was_flown(
+    service: Service, browser: Browser
+) -> None:
+    browser.wait_for("document.querySelector('.line-label')?.innerText === 'A1'", WITHIN_S)
+    assert browser.evaluate("document.querySelectorAll('#segments tr').length") == 0
+    # An image covers 169 m along the line; between 340 m and 640 m none was made.
+    for number, north_m in enumerate((0, 68, 136, 204, 272, 340, 640, 708, 776), start=4):
+        for event in flown.exposure(number, "good", line="A1", north_m=north_m):
+            service.tell(event)
+    browser.wait_for("document.querySelectorAll('#segments tr').length === 1", WITHIN_S)
+    line, from_m, to_m, why = browser.evaluate(
+        "[...document.querySelectorAll('#segments td')].map((cell) => cell.innerText)"
+    )
+    assert line == "A1"
+    assert 300 <= int(from_m) <= 400
+    assert 560 <= int(to_m) <= 660
+    assert "✖ not seen often enough" in why
+    assert "1 hole behind" in browser.text("#well")
+    assert "A1" in browser.text(".hole-label")
+    told = browser.evaluate(
+        "fetch('/api/v1/advice/fly-again.geojson').then((answer) => answer.json())"
+    )
+    assert {f["properties"]["strip"] for f in told["features"]} == {"S"}
+
+
+def test_residuals_are_laid_over_the_image_and_told_by_overlap_and_histogram_in_words(
+    browser: Browser,
+) -> None:
+    browser.click("#rows tr:last-child button")
+    browser.wait_for("document.querySelector('#image-which').innerText === '1'", WITHIN_S)
+    browser.click("#show-residuals")
+    browser.wait_for("document.querySelector('#vectors-note').innerText !== ''", WITHIN_S)
+    assert "3 vectors" in browser.text("#vectors-note")
+    paths = browser.evaluate(
+        "[...document.querySelectorAll('#vectors path')].map((p) => p.getAttribute('d'))"
+    )
+    assert [path.split("l")[0] for path in paths] == [
+        "M150.1 300.1",
+        "M450.1 300.1",
+        "M750.1 300.1",
+    ]
+    # The row goes down, as residuals of the virtual image do here: -0.02 is up.
+    right, down = map(float, paths[0].split("l")[1].split(" "))
+    assert right > 0 > down
+    browser.evaluate("document.querySelector('#overlaps-room').open = true")
+    assert browser.evaluate("document.querySelectorAll('#overlaps tr').length") == 2
+    assert "▲ few: 5" in browser.text("#overlaps")
+    assert "R 99 / 99 % ▲ 100.0 % full" in browser.text("#histogram-note")
 
 
 def test_a_fault_is_seen_within_two_seconds_and_acknowledged_with_a_token(

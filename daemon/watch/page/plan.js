@@ -1,0 +1,62 @@
+// The plan of the mission, and what of it has to be flown again.
+
+import { flight } from "./state.js";
+import { drawHoles, drawPlan } from "./map.js";
+
+const AGAIN_MS = 3000;
+const room = document.getElementById("fly-again");
+const well = document.getElementById("well");
+const rows = document.getElementById("segments");
+let mission = null;
+let hasPlan = false;
+let asked = 0;
+let waits = null;
+
+async function told(address) {
+  const token = sessionStorage.getItem("token");
+  const headers = token ? { Authorization: `Bearer ${token}` } : {};
+  try {
+    const response = await fetch(address, { headers });
+    return response.ok ? await response.json() : null;
+  } catch {
+    return null;
+  }
+}
+
+function row(one) {
+  const made = document.createElement("tr");
+  for (const text of [one.line, one.from_m.toFixed(0), one.to_m.toFixed(0), `✖ ${one.reasons.join("; ")}`]) {
+    const cell = document.createElement("td");
+    cell.textContent = text;
+    made.append(cell);
+  }
+  return made;
+}
+
+async function advise() {
+  asked = Date.now();
+  const advice = await told("/api/v1/advice");
+  if (!advice?.segments) return;
+  const holes = advice.segments.filter((one) => one.kind === "hole");
+  const share = advice.planned_m ? 100 * advice.well_m / advice.planned_m : 0;
+  well.textContent = `${share.toFixed(0)} % of ${(advice.planned_m / 1000).toFixed(1)} km is well; ` +
+    (holes.length ? `${holes.length} ${holes.length === 1 ? "hole" : "holes"} behind:` : "no hole behind.");
+  rows.replaceChildren(...holes.map(row));
+  drawHoles(holes);
+}
+
+// Ask for the plan once a mission, and for advice when exposures came, not more often than is useful.
+export async function followPlan(hasNewExposures) {
+  const current = flight.brief?.mission?.id || null;
+  if (current !== mission) {
+    mission = current;
+    const plan = current && await told("/api/v1/plan");
+    hasPlan = Boolean(plan?.lines);
+    room.hidden = !hasPlan;
+    drawPlan(plan);
+    if (hasPlan) advise();
+    return;
+  }
+  if (!hasPlan || !hasNewExposures || waits) return;
+  waits = setTimeout(() => { waits = null; advise(); }, Math.max(0, asked + AGAIN_MS - Date.now()));
+}

@@ -1,0 +1,96 @@
+// What the stitching left over, laid over the quick look, and what the converters saw.
+
+const FEW = 12;
+const SCREEN_PX = 14;
+const KINDS = ["", "colour", "left-out"];
+const COLOURS = { PAN: "#888", R: "#d33", G: "#2a2", B: "#35e", N: "#a3a" };
+const note = document.getElementById("vectors-note");
+const said = document.getElementById("histogram-note");
+
+export async function product(number, name) {
+  const token = sessionStorage.getItem("token");
+  try {
+    const response = await fetch(`/api/v1/exposures/${number}/${name}`,
+      { headers: token ? { Authorization: `Bearer ${token}` } : {} });
+    return response.ok ? await response.json() : null;
+  } catch {
+    return null;
+  }
+}
+
+// Vectors in pixels of the virtual image, enlarged so that most are some pixels of the picture long.
+export function drawVectors(svg, told, width, height) {
+  svg.replaceChildren();
+  note.textContent = "No residuals of this exposure.";
+  if (!told?.vectors?.length) return;
+  const reduced = width / told.width_px;
+  const lengths = told.vectors.filter((v) => v[4] !== 2).map((v) => Math.hypot(v[2], v[3])).sort((a, b) => a - b);
+  const usual = lengths[Math.floor(lengths.length * 0.9)] || 1;
+  const enlarge = 2 * SCREEN_PX / usual;
+  svg.setAttribute("width", width);
+  svg.setAttribute("height", height);
+  svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
+  const most = 8 * SCREEN_PX;
+  KINDS.forEach((kind, index) => {
+    const path = document.createElementNS(svg.namespaceURI, "path");
+    path.setAttribute("class", kind);
+    path.setAttribute("d", told.vectors.filter((v) => v[4] === index).map(([column, row, right, down]) => {
+      const shrink = Math.min(1, most / (enlarge * Math.hypot(right, down) || 1)) * enlarge;
+      const [x, y] = [(column + 0.5) * reduced, (row + 0.5) * reduced];
+      return `M${x.toFixed(1)} ${y.toFixed(1)}l${(right * shrink).toFixed(1)} ${(down * shrink).toFixed(1)}`;
+    }).join(""));
+    svg.append(path);
+  });
+  note.textContent = `${told.vectors.length} vectors, ${(enlarge / reduced).toFixed(0)} times enlarged; ` +
+    `nine of ten are shorter than ${usual.toFixed(2)} px. Solid: between PAN sensors, dashed: to colour, thick: left out.`;
+}
+
+export function listOverlaps(told, number) {
+  const rows = (told?.overlaps || []).map((one) => {
+    const row = document.createElement("tr");
+    const few = one.used < FEW ? "▲ few: " : "";
+    const cells = [one.sensors.join("–"), `${few}${one.used}`, one.sought, one.rms_px == null ? "" : one.rms_px.toFixed(3)];
+    row.append(...cells.map((text) => Object.assign(document.createElement("td"),
+      { textContent: text, className: few ? "usable" : "" })));
+    return row;
+  });
+  document.getElementById("overlaps").replaceChildren(...rows);
+  document.getElementById("drawing").href = `/api/v1/exposures/${number}/residuals.svg`;
+}
+
+function quantile(counts, share) {
+  const total = counts.reduce((a, b) => a + b, 0);
+  let sum = 0;
+  for (let bin = 0; bin < counts.length; bin += 1) {
+    sum += counts[bin];
+    if (sum >= share * total) return (bin + 0.5) / counts.length;
+  }
+  return 1;
+}
+
+// Raw counts by sensor: PAN sensors together, colours each. Also in words, for those who see no colours.
+export function drawHistogram(canvas, told) {
+  const groups = {};
+  for (const [sensor, counts] of Object.entries(told)) {
+    const name = COLOURS[sensor] ? sensor : "PAN";
+    groups[name] = groups[name] ? groups[name].map((value, bin) => value + counts[bin]) : [...counts];
+  }
+  const pen = canvas.getContext("2d");
+  pen.clearRect(0, 0, canvas.width, canvas.height);
+  const words = [];
+  for (const [name, counts] of Object.entries(groups)) {
+    const most = Math.max(...counts, 1);
+    pen.strokeStyle = COLOURS[name];
+    pen.lineWidth = name === "PAN" ? 3 : 1.5;
+    pen.beginPath();
+    counts.forEach((count, bin) => pen.lineTo((bin + 0.5) * canvas.width / counts.length,
+      canvas.height * (1 - 0.95 * Math.sqrt(count / most))));
+    pen.stroke();
+    const total = counts.reduce((a, b) => a + b, 0) || 1;
+    const high = 100 * counts[counts.length - 1] / total;
+    words.push(`${name} ${(100 * quantile(counts, 0.5)).toFixed(0)} / ${(100 * quantile(counts, 0.99)).toFixed(0)} %` +
+      (high >= 0.5 ? ` ▲ ${high.toFixed(1)} % full` : ""));
+  }
+  said.textContent = `Median / brightest hundredth, of full scale: ${words.join(", ")}`;
+  canvas.setAttribute("aria-label", `Histogram of raw counts. ${said.textContent}`);
+}
