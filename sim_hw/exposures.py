@@ -20,6 +20,7 @@ from sim_hw import laboratory
 from sim_hw.__main__ import displacement, rig_file
 from sim_hw.electronics import Electronics, true_sensor
 from sim_hw.grounds import GROUNDS
+from sim_hw.post_processed import marks_of_lines, write_trajectory
 from sim_hw.rendering import Look, light_on_sensor
 from sim_hw.scene import open_scene
 from sim_hw.seeding import random_stream
@@ -32,25 +33,28 @@ FIRST_AFTER_S = 20
 MARK_SIGMA_NS = 60
 
 
-def write_exposures(world: World, out: Path, *, count: int, scenes: Path) -> Path:
-    """Render the first exposures of a line; returns the mission folder, `out/mission`.
+def write_exposures(world: World, out: Path, *, count: int, scenes: Path, lines: int = 1) -> Path:
+    """Render the first exposures of each line; returns the mission folder, `out/mission`.
 
-    `out/calibration` holds what the laboratory measured, `out/truth` what is really so. A file
-    `out/ready.json` is written last.
+    `out/calibration` holds what the laboratory measured, `out/truth` what is really so,
+    `out/trajectory.csv` what a post-processed trajectory would say. A file `out/ready.json` is
+    written last.
     """
     rig, seed = world.rig, world.settings.seed
     mission, calibration = out / "mission", out / "calibration"
     scene = open_scene(world.scene_settings, scenes)
     first_ns = EPOCH_GPS_NS + FIRST_AFTER_S * 1_000_000_000
     flight = world.flight.beginning_first_line_at(world.flight.distance_flown_m(first_ns))
-    period_ns = round(world.plan.distance_m / world.plan.ground_speed_mps * 1e9)
-    marks = [first_ns + k * period_ns for k in range(count)]
+    marks = marks_of_lines(world, flight, first_ns, count, lines)
     laboratory.write_rig(Path(world.settings.rig_file), mission)
     _write_plan(world, mission, calibration / "radiometry")
-    truth = TruthWriter(world, out / "truth")
-    truth.write_parameters()
+    write_trajectory(out / "trajectory.csv", flight, marks, seed=seed)
+    # Where no image is stitched there is no mapping to write down.
+    truth = None if rig.virtual_image is None else TruthWriter(world, out / "truth")
+    if truth is not None:
+        truth.write_parameters()
     looks: list[dict[str, Look]] = [{} for _ in marks]
-    for number in range(1, count + 1):
+    for number in range(1, len(marks) + 1):
         (mission / "L0" / f"{number:06d}").mkdir(parents=True, exist_ok=True)
     for cone in rig.cones:
         for sensor in cone.sensors:
@@ -72,12 +76,18 @@ def write_exposures(world: World, out: Path, *, count: int, scenes: Path) -> Pat
                 path = mission / "L0" / f"{k + 1:06d}" / f"{sensor.name}.tif"
                 tifffile.imwrite(path, frame)
                 looks[k][sensor.name] = look
-                truth.add(Taken(sensor.name, k + 1, look), flight)
+                if truth is not None:
+                    truth.add(Taken(sensor.name, k + 1, look), flight)
             print(sensor.name, file=sys.stderr, flush=True)
     for k, mark_ns in enumerate(marks):
         path = mission / "L0" / f"{k + 1:06d}" / "exposure.json"
-        path.write_text(json.dumps(_record(world, k + 1, mark_ns, looks[k]), indent=1))
-    (out / "ready.json").write_text(json.dumps({"exposures": count}))
+        path.write_text(
+            json.dumps(
+                _record(world, k + 1, mark_ns, looks[k]) | {"line_id": f"line {k // count + 1}"},
+                indent=1,
+            )
+        )
+    (out / "ready.json").write_text(json.dumps({"exposures": len(marks)}))
     return mission
 
 
@@ -127,7 +137,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add = line.add_argument
     add("rig", help="name of a shipped rig, or a rig file")
     add("--out", type=Path, required=True, help="folder for mission, calibration and truth")
-    add("--exposures", type=int, default=1)
+    add("--exposures", type=int, default=1, help="of each line")
+    add("--lines", type=int, default=1, help="flown there and back, 30 %% apart in overlap")
     add("--seed", type=int, default=1, help="everything random follows from it")
     add("--dc", type=float, default=0.0, help="temperature above calibration, K")
     add(
@@ -160,7 +171,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     given.out.mkdir(parents=True, exist_ok=True)
     mission = write_exposures(
-        world, given.out, count=given.exposures, scenes=given.scene_cache or given.out / "scenes"
+        world,
+        given.out,
+        count=given.exposures,
+        scenes=given.scene_cache or given.out / "scenes",
+        lines=given.lines,
     )
     print(json.dumps({"mission": str(mission), "truth": str(given.out / "truth")}))
     return 0

@@ -25,6 +25,7 @@ TDI_EXPOSURE_S = 0.005
 """Exposures are planned near this; exactly a whole number of TDI shifts long."""
 FILTERED_SMEAR_PX = 0.5
 """Heads behind a colour filter array have no TDI; they expose for at most so much motion."""
+CABIN_C = 20.0
 SIDE_MARGIN = 0.11
 """Share of the image width that the scene is wider on either side: tremor, crab and wander."""
 END_MARGIN = 0.16
@@ -108,13 +109,13 @@ class World:
 
     @property
     def image(self) -> VirtualImage:
-        """The virtual image of the rig; ValueError where it has none."""
-        if self.rig.virtual_image is None:
-            raise ValueError(f"rig {self.rig.name} has no virtual image; it cannot be flown here")
-        return self.rig.virtual_image
+        """The image the flight is planned for: the rig's, else that of its master head."""
+        return planned_image(self.rig)
 
     def temperature_c(self, probe: str, gps_ns: int) -> float:
-        """The true temperature of a probe."""
+        """The true temperature of a probe; of a sensor without one (""), that of the cabin."""
+        if not probe:
+            return CABIN_C
         return self.temperatures.at(probe, (gps_ns - self.settings.epoch_gps_ns) * 1e-9)
 
     def electrons_per_radiance_s(self, cone: Cone) -> float:
@@ -124,7 +125,10 @@ class World:
         return electrons / (self.plan.exposure_time_us[cone.name] * 1e-6)
 
     def field_radius_mm(self, cone: Cone) -> float:
-        """From the axis of a lens to the corner of its part of the virtual image."""
+        """From the axis of a lens to the corner of its part of the virtual image, or of its own."""
+        if self.rig.virtual_image is None:
+            sensor = cone.sensors[0]
+            return math.hypot(sensor.width_px, sensor.height_px) / 2 * sensor.pitch_um * 1e-3
         image = self.image
         diagonal = math.hypot(image.width_px, image.height_px) / 2 * image.pitch_um * 1e-3
         return diagonal * cone.lens.f_mm / image.f_mm
@@ -182,11 +186,18 @@ class World:
         return self.scene_settings.height_px >= along + image.height_px
 
 
+def planned_image(rig: Rig) -> VirtualImage:
+    """The virtual image, or what the master head of a rig without one sees."""
+    if rig.virtual_image is not None:
+        return rig.virtual_image
+    cone = rig.cone(rig.master_cone)
+    sensor = cone.sensors[0]
+    return VirtualImage(sensor.width_px, sensor.height_px, sensor.pitch_um, cone.lens.f_mm, 1)
+
+
 def survey_plan(rig: Rig, settings: WorldSettings) -> SurveyPlan:
     """Plan 60 % forward overlap and exposures of whole TDI shifts (none for Bayer heads)."""
-    image = rig.virtual_image
-    if image is None:
-        raise ValueError(f"rig {rig.name} has no virtual image; it cannot be flown here")
+    image = planned_image(rig)
     is_small = image.width_px < 5000
     height = settings.height_m or (3000.0 if is_small else 1000.0)
     speed = settings.ground_speed_mps or (55.0 if is_small else 70.0)

@@ -13,7 +13,7 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from daemon.cli import bands
+from daemon.cli import bands, heads
 from daemon.cli.tables import light_table
 from daemon.configuration import ConfigurationError, PlanSection, ProcessingSection
 from daemon.mission import Mission
@@ -21,7 +21,8 @@ from daemon.mission import Mission
 HELP = """Process the exposures of a mission folder again, Level-0 to Level-2.
 
 The folder may be a flight's, imported, or written by hand as docs/formats.md tells. Level-0 stays
-as it is; products are replaced. A rig without a virtual image gives one raster per band.
+as it is; products are replaced. A rig without a virtual image gives one raster per
+band, or, where its heads look apart, an image of each head in strict perspective.
 
 Examples: `syntopic process MISSION`, `syntopic process MISSION --only 3 --method fixed`
 """
@@ -47,6 +48,7 @@ def process(
     from daemon import store
     from daemon.messages import WorkerSettings
     from daemon.worker import make_pipeline, overlaps_of, process_exposure
+    from processing.perspective import looks_apart
     from processing.rig import load_rig
 
     if method not in ("free", "fixed") or interpolation not in ("bilinear", "cubic", "lanczos"):
@@ -55,7 +57,18 @@ def process(
         )
     folder = Mission.open(mission)
     rig = load_rig(folder.rig_path)
-    plan, radiometry = _as_flown(folder, radiometry)
+    plan, radiometry = as_flown(folder, radiometry)
+    if looks_apart(rig):
+        heads.process(
+            folder,
+            rig,
+            plan,
+            radiometry=radiometry,
+            interpolation=interpolation,
+            only=only or [],
+            as_json=as_json,
+        )
+        return
     if rig.virtual_image is None:
         bands.process(folder, rig, plan, radiometry=radiometry, only=only or [], as_json=as_json)
         return
@@ -119,7 +132,7 @@ def process(
     Console().print(f"Products are in [bold]{folder.level2_root}[/]")
 
 
-def _as_flown(folder: Mission, radiometry: Path | None) -> tuple[PlanSection, Path | None]:
+def as_flown(folder: Mission, radiometry: Path | None) -> tuple[PlanSection, Path | None]:
     """Plan and radiometry of the configuration that was flown, where the mission has one.
 
     Only these two are read: devices that were there in the air need not be here.
