@@ -17,6 +17,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.stats import chi2
 
 from processing.bundle.rotations import (
@@ -39,16 +40,17 @@ FAMILY_ALPHA: Final = 0.001
 """Probability of calling a healthy platform expired."""
 LEAST_SHIFT_PX: Final = 0.01
 LEAST_POINTS: Final = 24
-_ROUNDS: Final = 4
+_ROUNDS: Final = 12
 
 
 @dataclass(frozen=True)
 class Mounting:
     """One head: the angles of the platform calibration, turned as the tie points say.
 
-    `angles_rad` are omega, phi, kappa of virtual_from_head with covariance `covariance` (3, 3) of
-    the tie points alone; `turn_rad`, `turn_sigma_rad` the same against calibration, about the axes
-    of the virtual image. `shift_px` is how far the head's middle went by it, (x right, y up).
+    `angles_rad` are omega, phi, kappa of virtual_from_head with their `covariance` (3, 3), by tie
+    points and by how well the sensors' places are known; `turn_rad`, `turn_sigma_rad` the same
+    against calibration, about the axes of the virtual image; the mean of all heads is zero.
+    `shift_px` is how far the head's middle went by it, (x right, y up).
     `residual_px` is the shift that an affine transformation still finds between this head's tie
     points and its neighbours', `affine` (2, 2) the rest of it, px per px, `points` their number.
     """
@@ -136,19 +138,22 @@ def check_platform(
     mountings = {c: first for c, first in mosaic.model.mountings.items() if c not in held}
     if len(mountings) < 2 or mosaic.redundancy <= 0:
         return None
-    heads = tuple(_mounting(rig, mosaic, tie_points, name) for name in mountings)
-    at = np.concatenate([np.arange(first, first + 3) for first in mountings.values()])
-    found = mosaic.values[at]
-    expected = np.zeros((len(at), len(at)))
-    for i, name in enumerate(mountings):
-        block = slice(3 * i, 3 * i + 3)
-        expected[block, block] = np.diag(_calibration_variance(rig.cone(name), temperatures_c))
-    # Contrasts between heads: what all turn together is the datum's.
     count = len(mountings)
-    between = np.linalg.svd(np.ones((1, count)))[2][1:]
-    contrasts = np.kron(between, np.eye(3))
-    y = contrasts @ found
-    covariance = contrasts @ (mosaic.covariance[np.ix_(at, at)] + expected) @ contrasts.T
+    at = np.concatenate([np.arange(first, first + 3) for first in mountings.values()])
+    cones = [rig.cone(name) for name in mountings]
+    stitched = mosaic.covariance[np.ix_(at, at)]
+    places = block_diag(*(place_covariance(cone, temperatures_c) for cone in cones))
+    # What all heads turn together is the datum's.
+    without_mean = np.kron(np.eye(count) - 1.0 / count, np.eye(3))
+    known = stitched + without_mean @ places @ without_mean
+    heads = tuple(
+        _mounting(rig, mosaic, tie_points, name, known[3 * i : 3 * i + 3, 3 * i : 3 * i + 3])
+        for i, name in enumerate(mountings)
+    )
+    own = np.repeat([(cone.rotation_sigma_urad * 1e-6) ** 2 for cone in cones], 3)
+    contrasts = np.kron(np.linalg.svd(np.ones((1, count)))[2][1:], np.eye(3))
+    y = contrasts @ mosaic.values[at]
+    covariance = contrasts @ (stitched + places + np.diag(own)) @ contrasts.T
     return PlatformCheck(
         heads=heads,
         statistic=float(y @ np.linalg.solve(covariance, y)),
@@ -200,10 +205,11 @@ def rotation_of_layer(rig: Rig, mosaic: Mosaic, cone: Cone) -> Array | None:
     return rows
 
 
-def _mounting(rig: Rig, mosaic: Mosaic, tie_points: TiePoints, name: str) -> Mounting:
+def _mounting(
+    rig: Rig, mosaic: Mosaic, tie_points: TiePoints, name: str, covariance: Array
+) -> Mounting:
     cone, first = rig.cone(name), mosaic.model.mountings[name]
     turn = mosaic.values[first : first + 3]
-    covariance = mosaic.covariance[first : first + 3, first : first + 3]
     rotation = turned(cone, turn)
     # A turn w before the rotation is one of R'w behind it.
     jacobian = angles_by_rotation_vector(rotation[None])[0] @ rotation.T
@@ -228,18 +234,16 @@ def turned(cone: Cone, turn_rad: Array) -> Array:
     return np.asarray(exponential(turn_rad[None])[0] @ rotation_matrix(*cone.rotation_rad))
 
 
-def _calibration_variance(cone: Cone, temperatures_c: Mapping[str, float]) -> Array:
-    """How well calibration and TDM know a head's turn about x, y, z, rad squared.
+def place_covariance(cone: Cone, temperatures_c: Mapping[str, float]) -> Array:
+    """Turns (3, 3), rad squared, that the sensor's place in the head passes for.
 
-    What its sensor's place is off by looks like a turn.
+    A shift in the layer, by calibration and drift, looks like a turn about its x and y axes.
     """
     sensor = cone.sensors[0]
     tdm_um = sensor.drift.sigma_um_per_k * sensor_dc(sensor, temperatures_c)
-    place_mm = math.hypot(sensor.position_sigma_um, tdm_um) * 1e-3
-    own = cone.rotation_sigma_urad * 1e-6
-    half_mm = math.hypot(sensor.width_px, sensor.height_px) / 2.0 * sensor.pitch_mm
-    across = math.hypot(own, place_mm / cone.lens.f_mm)
-    return np.square([across, across, math.hypot(own, place_mm / half_mm)])
+    turn_rad = math.hypot(sensor.position_sigma_um, tdm_um) * 1e-3 / cone.lens.f_mm
+    rotation = rotation_matrix(*cone.rotation_rad)
+    return np.asarray(rotation @ np.diag([turn_rad**2, turn_rad**2, 0.0]) @ rotation.T)
 
 
 def _affine_shift(

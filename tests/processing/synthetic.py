@@ -17,7 +17,13 @@ from processing.placement import (
 )
 from processing.rig import Rig
 from processing.tie_points import PAN_TO_COLOUR, PAN_TO_PAN, TiePoints
-from processing.topology import Rectangle, colour_coverage, colour_ratio, overlaps
+from processing.topology import (
+    Rectangle,
+    colour_coverage,
+    colour_ratio,
+    exact_colour_ratio,
+    overlaps,
+)
 
 Array = NDArray[np.float64]
 
@@ -53,10 +59,15 @@ def make_truth(
     spread = np.zeros(len(model.names))
     for first in model.sensors.values():
         spread[first : first + 4] = sensor_px
+    for first in model.mountings.values():
+        spread[first : first + 3] = layer_px
     for first in model.layers.values():
         spread[first : first + 8] = layer_px / 3.0
         spread[first + np.array([2, 5])] = layer_px
     values = rng.normal(0.0, 1.0, len(spread)) * spread * model.units
+    for axis in range(3):
+        turns = [first + axis for first in model.mountings.values()]
+        values[turns] -= values[turns].mean() if turns else 0.0
     for name, (x, y) in (displaced or {}).items():
         values[model.sensors[name]] += x * model.pitch_mm
         values[model.sensors[name] + 1] += y * model.pitch_mm
@@ -97,7 +108,7 @@ def tie_points_of(
     """Exact tie points of the truth plus Gaussian noise of the given sigma of the difference."""
     rig = truth.rig
     names = tuple(s.name for s in rig.sensors)
-    ratio = colour_ratio(rig) or 1
+    ratio = colour_ratio(rig) or exact_colour_ratio(rig) or 1
     areas: list[tuple[str, str, Rectangle, int]] = [
         (o.sensor_a, o.sensor_b, o.rectangle, PAN_TO_PAN) for o in overlaps(rig)
     ]
