@@ -41,7 +41,10 @@ def raw(
     mission: Annotated[Path, typer.Argument(help="Mission folder.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """The receivers' own bytes, one file each in its native format, and the event file."""
+    """The receivers' own bytes, one file each in its native format, and the event file.
+
+    Example: `syntopic export raw missions/20261121T101500Z-ultracam-x-mini`
+    """
     from daemon.mission import Mission
     from daemon.raw_export import export_raw
 

@@ -31,7 +31,10 @@ def rededge(
     out: Annotated[Path, typer.Option(help="Mission folder to be written.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Import MicaSense RedEdge images; lens and radiance calibration come from their tags."""
+    """Import MicaSense RedEdge images; lens and radiance calibration come from their tags.
+
+    Example: `syntopic import rededge 000/ --out missions/field-7`
+    """
     from daemon.importers.rededge import import_rededge
 
     with Progress(console=Console(stderr=True), transient=True) as progress:
@@ -67,7 +70,10 @@ def dbat(
     script: Annotated[Path, typer.Argument(help="Script (XML) of a camera calibration.")],
     out: Annotated[Path, typer.Option(help="Folder for the adjustment project; must be new.")],
 ) -> None:
-    """Import a camera calibration of the Damped Bundle Adjustment Toolbox for `syntopic adjust`."""
+    """Import a camera calibration of the Damped Bundle Adjustment Toolbox for `syntopic adjust`.
+
+    Example: `syntopic import dbat camcal.xml --out camcal`
+    """
     from daemon.adjusting.writing import write_project
     from daemon.importers.dbat import import_dbat
 

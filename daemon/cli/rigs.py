@@ -57,7 +57,10 @@ def show(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Print topology, overlaps and the counts of the adjustment, and draw the focal planes."""
+    """Print topology, overlaps and the counts of the adjustment, and draw the focal planes.
+
+    Examples: `syntopic rigs show ultracam-x`, `syntopic rigs show my-rig.toml --drawing rig.svg`
+    """
     from processing import drawing as draw
     from processing import topology
 

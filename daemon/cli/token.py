@@ -29,7 +29,10 @@ def add(
     role: Annotated[str, typer.Option(help="watch or command.")] = "watch",
     file: TokenFile = DEFAULT_FILE,
 ) -> None:
-    """Make a token and show it once."""
+    """Make a token and show it once.
+
+    Example: `syntopic token add operator --role command`
+    """
     from daemon.watch.tokens import ROLES, TokenError, add_token
 
     chosen = next((known for known in ROLES if known == role), None)
@@ -45,7 +48,10 @@ def add(
 def remove(
     name: Annotated[str, typer.Argument(help="Whose.")], file: TokenFile = DEFAULT_FILE
 ) -> None:
-    """Take a token back."""
+    """Take a token back.
+
+    Example: `syntopic token remove operator`
+    """
     from daemon.watch.tokens import remove_token
 
     remove_token(file, name)
@@ -57,7 +63,10 @@ def list_(
     file: TokenFile = DEFAULT_FILE,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Who has a token, and what it allows."""
+    """Who has a token, and what it allows.
+
+    Example: `syntopic token list --file tokens.toml`
+    """
     from daemon.watch.tokens import read_tokens
 
     holders = sorted(read_tokens(file).holders.values(), key=lambda holder: holder.name)
