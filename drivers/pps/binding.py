@@ -9,6 +9,7 @@ import fcntl
 import os
 import struct
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 API_VERSION: Final = 1
@@ -84,7 +85,7 @@ class KernelPps:
     def is_there(self) -> bool:
         """Whether the path still leads to this device; waiting for an edge does not tell."""
         try:
-            return os.path.samestat(os.stat(self._path), os.fstat(self._fd))  # noqa: PTH116
+            return os.path.samestat(Path(self._path).stat(), os.fstat(self._fd))
         except FileNotFoundError:
             return False
 
