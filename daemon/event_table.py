@@ -75,8 +75,14 @@ TABLE: Final[Sequence[Entry]] = (
     Entry(
         "disk",
         "warning",
-        "The disk has no room for another exposure.",
+        "The disk is low, or has no room for another exposure; the sentence says which.",
         "Free or change the disk; exposures go on by themselves when there is room.",
+    ),
+    Entry(
+        "index",
+        "caution",
+        "The disk refused changes of mission.db, or has taken them after all; frames are safe.",
+        "Look at the disk; the changes are tried again, and the next start makes the index anew.",
     ),
     # Exposures
     Entry("triggered", "note", "An exposure was ordered.", _NOTHING),
@@ -93,7 +99,7 @@ TABLE: Final[Sequence[Entry]] = (
         "not-written",
         "warning",
         "The disk refused frames or a record.",
-        "Look at the disk's cable and its health; change it. Records are sealed at the next start.",
+        "Look at the disk's cable and its health; change it. A record is tried again each second.",
     ),
     Entry(
         "not-processed",

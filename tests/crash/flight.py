@@ -8,11 +8,12 @@ lands. Whatever is told to somebody goes as a line into ACKS at the moment it is
 from __future__ import annotations
 
 import os
+import stat
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -39,8 +40,13 @@ from tests.daemon.small_camera import (
 ILL = "disk"
 """Flown on a disk that refuses now and then: what the log has lost is not told as logged."""
 
+Keeps = Literal["synced", "handed over", "not all"]
+"""What a log is sure to keep: what was synced (power may fail), what was handed over (the program
+may be killed), or not even that (the disk refuses)."""
+
 NEVER_S = 1e9
 TIMES = 20
+FOR_EVER = 1_000_000
 
 
 class Ring:
@@ -67,14 +73,15 @@ class Flown:
     """Stands where the service stands: gives the orders, and tells on what is answered."""
 
     def __init__(
-        self, mission: Mission, acks: int, numbers: range, *, lands: bool, is_ill: bool
+        self, mission: Mission, acks: int, numbers: range, *, lands: bool, keeps: Keeps
     ) -> None:
         self._mission = mission
-        self._is_ill = is_ill
+        self._keeps = keeps
         self._acks = acks
         self._answers: list[object] = []
         self._orders = self._flight(numbers, lands)
         self._logged = 0
+        self._triggered = 0
         self._told = 0
 
     def send(self, message: object) -> None:
@@ -85,9 +92,16 @@ class Flown:
         self._answers.append(message)
 
     def receive(self, _timeout_s: float) -> object:
-        if not self._is_ill and self._told < self._logged and writer.LOG_SYNC_INTERVAL_S == 0.0:
+        if (
+            self._keeps == "synced"
+            and self._told < self._logged
+            and writer.LOG_SYNC_INTERVAL_S == 0.0
+        ):
             tell(self._acks, f"logged {self._logged}")
             self._told = self._logged
+        if self._keeps == "handed over" and self._triggered:
+            tell(self._acks, f"triggered {self._triggered}")
+            self._triggered = 0
         # Every now and then a second has passed.
         order = next(self._orders)
         is_logged = isinstance(order, Log)
@@ -98,6 +112,7 @@ class Flown:
     def _flight(self, numbers: range, lands: bool) -> Iterator[object]:
         for number in numbers:
             pulse = TriggerPulse(number, number * 10**9, 1000, number)
+            self._triggered = number
             yield Log(message_of(LoggedTrigger(number, pulse, {"0": 0, "1": 0})))
             yield Log(message_of(mark_of(number)))
             sensors = SENSORS if number % 2 else SENSORS[:2]
@@ -146,7 +161,7 @@ class Flown:
                     quicklook=None,
                 )
             except OSError:
-                assert self._is_ill
+                assert self._keeps == "not all"
                 return
             tell(self._acks, f"processed {number}")
             yield NoteProducts(number, done.files, done.verdict)
@@ -155,9 +170,13 @@ class Flown:
 def tell(acks: int, line: str) -> None:
     """Say something to the world: from now on it must hold.
 
-    With a call that nothing else here makes, so that a test may let any of the others fail.
+    Into a file with a call that nothing else here makes, so that a test may let the others fail.
     """
-    os.pwritev(acks, [line.encode() + b"\n"], os.fstat(acks).st_size)
+    found = os.fstat(acks)
+    if stat.S_ISFIFO(found.st_mode):
+        os.write(acks, line.encode() + b"\n")
+    else:
+        os.pwritev(acks, [line.encode() + b"\n"], found.st_size)
 
 
 def forget(what: str) -> None:
@@ -174,28 +193,31 @@ def main() -> None:
     root, acks_path, count = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])
     forget(sys.argv[4])
     acks = os.open(acks_path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-    is_ill = sys.argv[4] == ILL
+    keeps: Keeps = "not all" if sys.argv[4] == ILL else "synced"
     mission = new_mission(root)
     tell(acks, f"mission {mission.id}")
     for numbers, lands in ((range(1, count + 1), False), (range(count + 1, 2 * count + 1), True)):
         one = os.fork()
         if not one:
             with mission.held():
-                live(mission, acks, numbers, lands=lands, is_ill=is_ill)
+                live(mission, acks, numbers, lands=lands, keeps=keeps)
         _, status = os.waitpid(one, 0)
         assert status == 0, "the flight did not go on"
     tell(acks, "closing 0")
     mission.close()
 
 
-def live(mission: Mission, acks: int, numbers: range, *, lands: bool, is_ill: bool) -> None:
-    """One life of the service: recovery and flight. It never returns."""
+def live(mission: Mission, acks: int, numbers: range | None, *, lands: bool, keeps: Keeps) -> None:
+    """One life of the service: recovery and flight, without numbers for ever. It never returns."""
     report = recover(mission, seal_from_log(small_rig()))
     for exposure in report.settled:
         sealed = read_sealed(mission.level0(exposure.number))
         assert sealed is not None
         tell(acks, f"sealed {exposure.number} {sealed.sha256}")
-    link: Any = Flown(mission, acks, numbers, lands=lands, is_ill=is_ill)
+    tell(acks, "flying 0")
+    if numbers is None:
+        numbers = range(report.next_number, report.next_number + FOR_EVER)
+    link: Any = Flown(mission, acks, numbers, lands=lands, keeps=keeps)
     rings: Any = tuple(Ring(sensor) for sensor in SENSORS)
     writer.main(link, mission.path, rings)
     os._exit(0)

@@ -30,6 +30,7 @@ class Told:
     mission: str = ""
     stored: set[int] = field(default_factory=set)
     sealed: dict[int, str] = field(default_factory=dict)
+    triggered: set[int] = field(default_factory=set)
     processed: set[int] = field(default_factory=set)
     logged: list[int] = field(default_factory=list)
     is_closed: bool = False
@@ -38,6 +39,8 @@ class Told:
         what, first, *rest = line.split()
         if what == "mission":
             self.mission = first
+        elif what == "triggered":
+            self.triggered.add(int(first))
         elif what == "stored":
             self.stored.add(int(first))
         elif what == "sealed":
@@ -46,7 +49,7 @@ class Told:
             self.processed.add(int(first))
         elif what == "logged":
             self.logged.append(int(first))
-        else:
+        elif what == "closing":
             self.is_closed = True
 
 
@@ -115,6 +118,7 @@ def _check_told(mission: Mission, told: Told, logged: Sequence[int]) -> None:
     for number, sha256 in told.sealed.items():
         record = read_sealed(mission.level0(number))
         assert record is not None and record.sha256 == sha256, f"the record of {number} changed"
+    assert told.triggered <= set(mission.numbers()), "a trigger has no record"
     for number in told.processed:
         pan = read_tiff(mission.level2(number) / "pan.tif")
         assert (pan == number).all(), f"the products of {number}"
