@@ -28,6 +28,13 @@ class CommandedLine(Protocol):
     def trigger_along(self, distance_m: float) -> None: ...
 
 
+class Arming(Protocol):
+    """What a flight needs; `daemon.preflight.Preflight`."""
+
+    def lacks(self) -> Sequence[Lack]: ...
+    def override(self, by: str, missing: Sequence[Lack]) -> None: ...
+
+
 class Commanded(Protocol):
     """The service commands act on."""
 
@@ -35,8 +42,8 @@ class Commanded(Protocol):
 
     @property
     def line(self) -> CommandedLine: ...
-    def lacks(self) -> Sequence[Lack]: ...
-    def override(self, by: str, missing: Sequence[Lack]) -> None: ...
+    @property
+    def preflight(self) -> Arming: ...
     def acknowledge(self, fault: str) -> bool: ...
     def land(self) -> None: ...
 
@@ -126,7 +133,7 @@ def _not_armed(command: Command, flight: Commanded) -> Answer | None:
         return _no(command, "the planned number of exposures is flown")
     if not flight.is_ready:
         return _no(command, "the service is not ready: devices open and kernels load")
-    missing = flight.lacks()
+    missing = flight.preflight.lacks()
     firm = [lack for lack in missing if not lack.may_be_overridden]
     if firm:
         return _no(command, f"not armed: {'; '.join(map(str, firm))}")
@@ -134,7 +141,7 @@ def _not_armed(command: Command, flight: Commanded) -> Answer | None:
         told = "; ".join(map(str, missing))
         return _no(command, f"not armed: {told}; override to fly without")
     if missing:
-        flight.override(command.by, missing)
+        flight.preflight.override(command.by, missing)
     return None
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from daemon.clock import ClockEvent, HostClock
 from daemon.composing import compose, instant_of
@@ -131,6 +132,15 @@ class Flight:
         self.ledger.trigger(number)
         self._matcher.forget_before(number - 64)
         return number
+
+    def about(self, number: int) -> dict[str, Any]:
+        """What an open exposure was ordered with."""
+        exposure = self._open[number]
+        return {
+            "line_id": exposure.line_id,
+            "strip_id": exposure.strip_id,
+            "flags": int(exposure.flags),
+        }
 
     def fired(self, pulse: Pulse) -> None:
         """The pulse was given."""

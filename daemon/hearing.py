@@ -5,9 +5,11 @@ What follows from it is decided elsewhere: `daemon.flight` matches, `daemon.line
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
+from daemon.decisions import Decision
 from daemon.flight import Flight
 from daemon.latches import DELIVERS, IS_GONE
 from daemon.line import Order
@@ -43,14 +45,20 @@ class Hearing:
         flight: what the records are matched in.
         log: puts a record into the flight log.
         tell: told of what is worth knowing.
+        decided: told of what is decided here.
     """
 
     def __init__(
-        self, flight: Flight, log: Callable[[Record | LoggedTrigger], None], tell: Tell
+        self,
+        flight: Flight,
+        log: Callable[[Record | LoggedTrigger], None],
+        tell: Tell,
+        decided: Callable[[Decision], None] = lambda _: None,
     ) -> None:
         self._flight = flight
         self._log = log
         self._tell = tell
+        self._decided = decided
         self.active: set[str] = set()
         self.has_trigger = False
         self.serials: dict[str, str] = {}
@@ -63,6 +71,22 @@ class Hearing:
             return False
         handler(self, message)
         return True
+
+    def tell_of_time(self, now_ns: int) -> None:
+        """What became of marks, and of the clocks, since the last time of asking."""
+        for mark, cause in self._flight.resolved_marks:
+            self._tell("mark", count=mark.count, cause=cause.value)
+        self._flight.resolved_marks.clear()
+        for told in self._flight.clock_events(now_ns):
+            event = DeviceEvent("clock", told.name, told.is_fault, told.sentence, now_ns)
+            self._log(event)
+            self._tell(
+                "device",
+                device="clock",
+                name=told.name,
+                fault=told.is_fault,
+                sentence=told.sentence,
+            )
 
     def _on_frame(self, frame: Frame) -> None:
         cause = self._flight.frame(frame)
@@ -109,7 +133,7 @@ class Hearing:
             self._flight.absent_heads.discard(event.device)
         elif event.name in IS_GONE:
             self.active.discard(event.device)
-            if event.name == _LOST:
+            if event.name in _LEAVES:
                 self._flight.absent_heads.add(event.device)
 
     def _on_bound(self, bound: Bound) -> None:
@@ -123,12 +147,15 @@ class Hearing:
         sentence = unbound.sentence
         if unbound.kind == "head":
             self._flight.absent_heads.add(unbound.name)
+        self._log(DeviceEvent(unbound.name, "absent", True, sentence, time.monotonic_ns()))
         self._tell("device", device=unbound.name, name="absent", fault=True, sentence=sentence)
 
     def _on_fired(self, fired: Fired) -> None:
         order = self.orders.pop(fired.sequence)
         if fired.pulse is None:
             self._flight.not_fired(fired.sequence, fired.sentence)
+            said = {"sentence": fired.sentence}
+            self._decided(Decision("not-fired", time.monotonic_ns(), fired.sequence, said))
             self._tell("lost", number=fired.sequence, cause=fired.sentence)
             return
         pulse = Pulse(
@@ -146,7 +173,8 @@ class Hearing:
         )
 
 
-_LOST = "lost"
+_LEAVES = frozenset({"lost", "absent"})
+"""Heads are not waited for from then on."""
 _HANDLERS: Mapping[type, Callable[[Hearing, Any], None]] = {
     Frame: Hearing._on_frame,
     EventMark: Hearing._on_mark,

@@ -5,11 +5,13 @@ The pipeline never holds up capture: what it is too slow for is read from disk l
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from daemon.decisions import Decision
 from daemon.exposure import Exposure
 from daemon.hearing import Tell
 from daemon.messages import (
@@ -38,12 +40,20 @@ class PipelineQueue:
         lanes: exposures in work at a time.
         send: sends a message to a process of ours, by its name.
         tell: told of what became of an exposure.
+        decided: told of when an exposure is processed, and from where.
     """
 
-    def __init__(self, lanes: int, send: Callable[[str, object], None], tell: Tell) -> None:
+    def __init__(
+        self,
+        lanes: int,
+        send: Callable[[str, object], None],
+        tell: Tell,
+        decided: Callable[[Decision], None] = lambda _: None,
+    ) -> None:
         self._lanes = lanes
         self._send = send
         self._tell = tell
+        self._decided = decided
         self.is_ready = False
         self._in_work: set[int] = set()
         self._waiting: deque[_Waiting] = deque()
@@ -112,7 +122,10 @@ class PipelineQueue:
     def _feed(self) -> None:
         while self.is_ready and self._waiting and len(self._in_work) < self._lanes:
             task = self._waiting.popleft()
-            self._in_work.add(task.exposure.number)
+            number, deferred = task.exposure.number, task.slots is None
+            self._in_work.add(number)
+            now_ns = time.monotonic_ns()
+            self._decided(Decision("process", now_ns, number, {"deferred": deferred}))
             self._send("worker", Process(task.exposure, task.slots))
 
 

@@ -6,7 +6,8 @@ service is looked at.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 
 from daemon.arming import Lack, Readiness, lacks
 from daemon.configuration import Configuration
@@ -44,25 +45,26 @@ class Preflight:
         self._pipeline = pipeline
         self._machine = StateMachine()
         self.accepted: frozenset[str] = frozenset()
+        self.overridden: Callable[[str, Sequence[Lack]], None] = lambda _by, _missing: None
+        """Told of who flies without what."""
 
     @property
     def phase(self) -> Phase:
         return self._machine.phase
 
-    def lacks(self, mono_ns: int, exposures_left: int) -> tuple[Lack, ...]:
+    def lacks(self) -> tuple[Lack, ...]:
         """What is missing that nobody has accepted yet."""
-        there = self._look(mono_ns, exposures_left)
+        there = self._look(time.monotonic_ns())
         missing = lacks(there, self._configuration.limits)
         return tuple(lack for lack in missing if lack.name not in self.accepted)
 
-    def accept(self, missing: Sequence[Lack]) -> None:
+    def override(self, by: str, missing: Sequence[Lack]) -> None:
         """Somebody flies without."""
         self.accepted |= {lack.name for lack in missing if lack.may_be_overridden}
+        self.overridden(by, missing)
 
     def follow(
         self,
-        mono_ns: int,
-        exposures_left: int,
         *,
         is_prepared: bool,
         has_landed: bool,
@@ -71,14 +73,14 @@ class Preflight:
         """The phases entered since the last time of asking."""
         facts = Facts(
             is_prepared=is_prepared,
-            is_armed=is_prepared and not self.lacks(mono_ns, exposures_left),
+            is_armed=is_prepared and not self.lacks(),
             runs=self._line.runs and not self._line.is_flown,
             has_landed=has_landed,
             has_failed=has_failed,
         )
         return self._machine.follow(facts)
 
-    def _look(self, mono_ns: int, exposures_left: int) -> Readiness:
+    def _look(self, mono_ns: int) -> Readiness:
         configuration, flight = self._configuration, self._flight
         active = self._hearing.active
         absent = [f"head {h.sensor}" for h in configuration.head if h.sensor not in active]
@@ -90,7 +92,7 @@ class Preflight:
         return Readiness(
             has_kernels=self._pipeline.is_ready,
             absent=absent,
-            exposures_left=exposures_left,
+            exposures_left=self._line.guard.look().exposures,
             exposures_wanted=self._line.wanted or 1,
             wants_time=bool(configuration.navigator),
             has_time=flight.clock.gps_at(mono_ns) is not None and not flight.clock.is_doubtful,

@@ -19,6 +19,7 @@ from daemon import recovery
 from daemon.arming import Lack, note_override, override_message
 from daemon.commanding import audit_message, obey
 from daemon.configuration import Configuration
+from daemon.decisions import Decision, tick
 from daemon.departure import identity, open_mission, processes, watch_process
 from daemon.devices import serial_problem
 from daemon.exposure import Exposure
@@ -51,7 +52,6 @@ from daemon.supervisor import Supervisor
 from daemon.watching import NAME as WATCH
 from daemon.watching import Watching, status_event, summary
 from drivers.contract import (
-    DeviceEvent,
     Record,
 )
 from processing.rig import Rig
@@ -158,17 +158,26 @@ class Service:
             Ledger.resume(report.settled, heads=heads, sheet=report.ledger_sheet),
             report.next_number,
         )
-        self.hearing = Hearing(self.flight, self._log, self._event)
+        self.hearing = Hearing(self.flight, self._log, self._event, self._decided)
         lanes = self.configuration.processing.exposures_in_work
-        self.pipeline = PipelineQueue(lanes, self.supervisor.send, self._event)
+        self.pipeline = PipelineQueue(lanes, self.supervisor.send, self._event, self._decided)
         flown = len(report.settled)
         self.line = Line(self.configuration, self.rig, self.flight, mission.path, flown)
         self.preflight = Preflight(
             self.configuration, self.rig, self.flight, self.line, self.hearing, self.pipeline
         )
+        self.preflight.overridden = self._overridden
         self._tell_previous(mission)
         for process in processes(self.configuration, self.rig, mission):
             self.supervisor.spawn(*process)
+        self._decided(
+            Decision(
+                "begin",
+                time.monotonic_ns(),
+                report.next_number,
+                {"software": self.flight.identity.software, "resumed": self.is_resumed},
+            )
+        )
 
     # What the processes say
 
@@ -187,6 +196,16 @@ class Service:
             self._event(**event)
         self.watching.faults = lambda: previous_faults(self.latches.unhandled())
 
+    def _overridden(self, by: str, missing: Sequence[Lack]) -> None:
+        self.supervisor.send("writer", Log(override_message(by, missing)))
+        told = "; ".join(map(str, missing))
+        self._event("override", by=by, sentence=f"{by} flies all the same: {told}")
+        try:
+            note_override(self.mission.path, by, missing)
+        except OSError as error:
+            # The log has it too.
+            self._event("disk", fault=True, sentence=f"the override is not noted: {error}")
+
     def _child_died(self, name: str) -> None:
         if name == WATCH:
             if not self.stopping.is_set():
@@ -196,6 +215,7 @@ class Service:
 
     def _on_stored(self, stored: Stored) -> None:
         self.flight.stored(stored.number, stored.frames)
+        self._decided(Decision("stored", time.monotonic_ns(), stored.number))
         self._event("stored", number=stored.number, duration_s=round(stored.duration_s, 4))
         self.pipeline.stored(stored.number)
 
@@ -203,6 +223,7 @@ class Service:
         exposure, self.sealing = self.sealing, None
         assert exposure is not None and exposure.number == sealed.number
         self.flight.sealed(sealed.number, exposure.state)
+        self._decided(Decision("sealed", time.monotonic_ns(), sealed.number))
         sheet = canonical_bytes(self.flight.ledger.sheet().as_json())
         message = Message(recovery.LEDGER_TOPIC, time.monotonic_ns(), sheet)
         self.supervisor.send("writer", Log(message))
@@ -219,10 +240,13 @@ class Service:
             else:
                 # Recovery seals it from the log when the service starts next.
                 self.flight.not_sealed(failed.number, self.sealing.state)
+                self._decided(Decision("not-sealed", time.monotonic_ns(), failed.number))
             self.sealing = None
         else:
             self.pipeline.not_stored(failed.number)
             self.flight.not_stored(failed.number, failed.sentence)
+            said = {"sentence": failed.sentence}
+            self._decided(Decision("not-stored", time.monotonic_ns(), failed.number, said))
 
     def _on_bound(self, bound: Bound) -> None:
         self.hearing.hear(bound)
@@ -267,35 +291,23 @@ class Service:
     async def _keep_deadlines(self) -> None:
         while True:
             now_ns = time.monotonic_ns() + self.hurry_ns
-            for due in self.flight.due_to_store(now_ns):
-                self.pipeline.keep(due.capture.number, due.slots)
-                self.supervisor.send("writer", Store(due.capture, due.slots))
-            for number, cause in self.flight.due_to_give_up(now_ns):
+            may_seal = self.sealing is None and now_ns >= self.seal_again_ns
+            due = tick(self.flight, now_ns, may_seal=may_seal)
+            if (detail := due.detail) is not None:
+                self._decided(Decision("tick", now_ns, detail=detail))
+            for waiting in due.to_store:
+                self.pipeline.keep(waiting.capture.number, waiting.slots)
+                self.supervisor.send("writer", Store(waiting.capture, waiting.slots))
+            for number, cause in due.given_up:
                 self._event("lost", number=number, cause=cause)
             for head, slot in self.flight.idle_slots:
                 self.pipeline.recycle({head: slot})
             self.flight.idle_slots.clear()
-            self._tell_of_time(now_ns - self.hurry_ns)
-            if self.sealing is None and now_ns >= self.seal_again_ns:
-                self.sealing = self.flight.due_to_seal(now_ns)
-                if self.sealing is not None:
-                    self.supervisor.send("writer", Seal(self.sealing))
+            self.hearing.tell_of_time(now_ns - self.hurry_ns)
+            if due.to_seal is not None:
+                self.sealing = due.to_seal
+                self.supervisor.send("writer", Seal(due.to_seal))
             await asyncio.sleep(TICK_S)
-
-    def _tell_of_time(self, now_ns: int) -> None:
-        for mark, cause in self.flight.resolved_marks:
-            self._event("mark", count=mark.count, cause=cause.value)
-        self.flight.resolved_marks.clear()
-        for told in self.flight.clock_events(now_ns):
-            event = DeviceEvent("clock", told.name, told.is_fault, told.sentence, now_ns)
-            self._log(event)
-            self._event(
-                "device",
-                device="clock",
-                name=told.name,
-                fault=told.is_fault,
-                sentence=told.sentence,
-            )
 
     async def _watch_processes(self) -> None:
         while True:
@@ -324,8 +336,8 @@ class Service:
         self.is_ready = True
         self._event("ready", absent=absent)
         self.notifier.ready(f"flying without {', '.join(absent)}" if absent else "ready")
-        if self.line.runs and (missing := self.lacks()):
-            self.override(AT_ONCE, missing)
+        if self.line.runs and (missing := self.preflight.lacks()):
+            self.preflight.override(AT_ONCE, missing)
         self._follow_phase()
         await self.line.fly(self._fire, self._disk_full)
         await self._until(lambda: not self._is_unfinished(), END_OF_WAITING_S)
@@ -341,22 +353,6 @@ class Service:
             self.hearing.active.__contains__, has_trigger=self.hearing.has_trigger
         )
 
-    def lacks(self) -> Sequence[Lack]:
-        """What a flight needs, is missing, and nobody has accepted to fly without."""
-        return self.preflight.lacks(time.monotonic_ns(), self._exposures_left())
-
-    def override(self, by: str, missing: Sequence[Lack]) -> None:
-        """Somebody flies without; who, when and what is kept in the log and in the mission."""
-        self.preflight.accept(missing)
-        self.supervisor.send("writer", Log(override_message(by, missing)))
-        told = "; ".join(map(str, missing))
-        self._event("override", by=by, sentence=f"{by} flies all the same: {told}")
-        try:
-            note_override(self.mission.path, by, missing)
-        except OSError as error:
-            # The log has it too.
-            self._event("disk", fault=True, sentence=f"the override is not noted: {error}")
-
     def acknowledge(self, fault: str) -> bool:
         """A person has seen a fault."""
         return self.latches.acknowledge(fault)
@@ -371,21 +367,16 @@ class Service:
         return status_event(
             phase=self.preflight.phase,
             ledger=sheet.as_json(),
-            exposures_left=self._exposures_left(),
+            exposures_left=self.line.guard.look().exposures,
             position=self.flight.track.last,
             temperatures_c={t.probe: t.value_c for t in self.flight.temperatures.at(now_ns)},
             time_now=self.flight.clock.gps_at(now_ns),
             queue=len(self.pipeline),
-            missing=list(map(str, self.lacks())),
+            missing=list(map(str, self.preflight.lacks())),
         )
-
-    def _exposures_left(self) -> int:
-        return self.line.guard.look().exposures
 
     def _follow_phase(self) -> None:
         entered = self.preflight.follow(
-            time.monotonic_ns(),
-            self._exposures_left(),
             is_prepared=self.is_ready,
             has_landed=self.line.is_flown or self.stopping.is_set(),
             has_failed=self.failure is not None,
@@ -405,6 +396,9 @@ class Service:
 
     def _fire(self, order: Order) -> None:
         self.hearing.orders[order.number] = order
+        self._decided(
+            Decision("order", order.mono_ns, order.number, self.flight.about(order.number))
+        )
         self.supervisor.send("capture", Fire(order.number, order.delays_ns))
         self._event("triggered", number=order.number)
 
@@ -478,6 +472,9 @@ class Service:
 
     def _log(self, record: Record | LoggedTrigger) -> None:
         self.supervisor.send("writer", Log(message_of(record)))
+
+    def _decided(self, decision: Decision) -> None:
+        self.supervisor.send("writer", Log(decision.message()))
 
     def _event(self, event: str, **content: Any) -> None:
         told = {"event": event, "mono_ns": str(time.monotonic_ns()), **content}

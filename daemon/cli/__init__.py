@@ -28,6 +28,7 @@ from daemon.cli import (
     monitor,
     process,
     repair,
+    replay,
     report,
     rigs,
     run,
@@ -58,6 +59,7 @@ app.command(name="check", help=check.HELP)(check.check)
 app.command(name="process", help=process.HELP)(process.process)
 app.command(name="develop", help=develop.HELP)(develop.develop)
 app.command(name="verify", help=verify.HELP)(verify.verify)
+app.command(name="replay", help=replay.HELP)(replay.replay)
 app.command(name="report", help=report.HELP)(report.report)
 app.command(name="repair", help=repair.HELP)(repair.repair)
 app.command(name="transfer", help=transfer.HELP)(transfer.transfer)

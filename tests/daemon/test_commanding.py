@@ -39,6 +39,10 @@ class FakeService:
     overrides: list[tuple[str, list[str]]] = field(default_factory=list)
     faults: set[str] = field(default_factory=set)
 
+    @property
+    def preflight(self) -> FakeService:
+        return self
+
     def lacks(self) -> Sequence[Lack]:
         return self.missing
 

@@ -1,0 +1,126 @@
+"""`syntopic replay`: a recorded flight through the same code again."""
+
+from __future__ import annotations
+
+import json
+import os
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from pydantic import ValidationError
+from rich.console import Console
+from rich.progress import Progress
+
+from daemon.cli.process import as_flown
+from daemon.cli.tables import light_table
+from daemon.configuration import Configuration, ConfigurationError
+from daemon.mission import Mission
+
+HELP = """Feed what a mission recorded through the same code again, and compare.
+
+Bytes of receivers and probes go through their codecs, frames and marks through matching and ledger,
+Level-0 through the pipeline, with one exposure in work and with two. Records are compared as
+canonical JSON, images by the hash of their decoded pixels. Nothing is written. The exit status is
+1 where anything differs.
+
+Examples: `syntopic replay MISSION`, `syntopic replay MISSION --records-only --json`
+"""
+SENTENCES_SHOWN = 20
+
+
+def replay(
+    mission: Annotated[Path, typer.Argument(help="Mission folder.")],
+    lanes: Annotated[
+        list[int] | None, typer.Option(help="Exposures in work; repeatable. 1 and 2 if not given.")
+    ] = None,
+    only: Annotated[
+        list[int] | None, typer.Option(help="Images of this exposure only; repeatable.")
+    ] = None,
+    records_only: Annotated[bool, typer.Option(help="Leave the images out.")] = False,
+    radiometry: Annotated[
+        Path | None, typer.Option(help="Folder of radiometric calibrations, if it was moved.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    folder = Mission.open(mission)
+    configuration = _flown_configuration(folder)
+    threads = configuration.processing.threads
+    os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
+    from daemon.departure import identity
+    from daemon.flight_log import logs_of
+    from daemon.messages import WorkerSettings
+    from daemon.replay.flight import Replayed, replay_log
+    from daemon.replay.products import compare_products, compare_records
+    from processing.rig import load_rig
+
+    rig = load_rig(folder.rig_path)
+    made = identity(configuration, rig, folder)
+    total = Replayed(is_complete=True)
+    logs = logs_of(folder.log_dir)
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("records", total=len(logs))
+        for log in logs:
+            found = replay_log(
+                log, folder, rig, configuration, lambda boot_id: replace(made, boot_id=boot_id)
+            )
+            compare_records(folder, found)
+            total.add(found)
+            progress.advance(task)
+        if not records_only:
+            plan, radiometry = as_flown(folder, radiometry)
+            settings = WorkerSettings(
+                rig=str(folder.rig_path),
+                radiometry=radiometry,
+                mission=folder.path,
+                plan=plan,
+                processing=configuration.processing,
+            )
+            for count in lanes or [1, 2]:
+                progress.update(
+                    task,
+                    description=f"images, {count} in work",
+                    completed=0,
+                    total=len(only or total.records),
+                )
+                compare_products(
+                    folder,
+                    rig,
+                    settings,
+                    total,
+                    lanes=count,
+                    only=only or (),
+                    progress=lambda _number: progress.advance(task),
+                )
+    _show(folder, total.as_json(), as_json=as_json)
+    if not total.agrees:
+        raise typer.Exit(1)
+
+
+def _show(folder: Mission, told: dict[str, Any], *, as_json: bool) -> None:
+    if as_json:
+        typer.echo(json.dumps({"mission": str(folder.path), **told}))
+        return
+    table = light_table(f"Replay of {folder.id}", ("what",), ("equal", "different"))
+    for row in told["compared"]:
+        table.add_row(row["what"], str(row["equal"]), str(row["different"]))
+    console = Console()
+    console.print(table)
+    for sentence in told["sentences"][:SENTENCES_SHOWN]:
+        console.print(sentence, style="yellow", markup=False)
+    left = len(told["sentences"]) - SENTENCES_SHOWN
+    if left > 0:
+        console.print(f"and {left} more; --json has all of them")
+
+
+def _flown_configuration(folder: Mission) -> Configuration:
+    """The configuration that was flown; files that it names need not be here."""
+    try:
+        content = tomllib.loads(folder.service_path.read_text(encoding="utf-8"))
+        return Configuration.model_validate(content)
+    except (OSError, tomllib.TOMLDecodeError, ValidationError) as error:
+        raise ConfigurationError(
+            [f"{folder.service_path}: {error}; a replay needs what was flown"]
+        ) from error
