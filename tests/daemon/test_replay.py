@@ -1,0 +1,109 @@
+"""What a replay compares, it compares; what was recorded is enough for it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from io import BytesIO
+
+import numpy as np
+import tifffile
+from hypothesis import given
+from hypothesis import strategies as st
+
+from daemon.decisions import Decision, decision_of
+from daemon.log_records import Message
+from daemon.replay.codecs import Decoded, codec_for, decode_all
+from daemon.replay.flight import Replayed
+from daemon.replay.products import content_hash
+from drivers.contract import DeviceEvent, NavSample, RawBytes
+from sim_hw.nmea_sentences import nmea
+
+SECOND_NS = 1_000_000_000
+EPOCHS = 5
+
+
+def sentences(second: int) -> bytes:
+    """An epoch of a receiver at 47 N, 15 E."""
+    gga = f"GPGGA,1200{second:02d}.00,4700.00000,N,01500.00000,E,4,14,0.6,1000.0,M,45.0,M,1.0,0000"
+    rmc = f"GPRMC,1200{second:02d}.00,A,4700.00000,N,01500.00000,E,100.0,0.0,211126,,,R"
+    return b"".join(nmea(text) for text in (gga, rmc))
+
+
+def heard(cuts: Iterable[int]) -> list[RawBytes | DeviceEvent]:
+    """The line of a receiver, opened before its third epoch, in pieces of some sizes."""
+    records: list[RawBytes | DeviceEvent] = []
+    sizes = list(cuts)
+    for second in range(EPOCHS):
+        if second == 2:
+            records.append(DeviceEvent("gnss", "opened", False, "", second * SECOND_NS))
+        data, at = sentences(second), 0
+        for size in [*sizes, len(data)]:
+            if at < len(data):
+                chunk = data[at : at + size]
+                records.append(RawBytes("gnss", second * SECOND_NS + at, chunk))
+                at += size
+    return records
+
+
+def decode(records: list[RawBytes | DeviceEvent]) -> list[Decoded]:
+    codec = codec_for("navigator", "nmea", "gnss", {"port": "/dev/null"})
+    assert codec is not None
+    return decode_all(codec, records)
+
+
+@given(st.lists(st.integers(min_value=1, max_value=60), max_size=5))
+def test_bytes_mean_the_same_however_they_came_in_pieces(cuts: list[int]) -> None:
+    whole, pieces = decode(heard([])), decode(heard(cuts))
+    positions = [s for s in whole if isinstance(s, NavSample)]
+    assert len(positions) >= EPOCHS - 3
+    assert [s.gps_ns for s in whole] == [s.gps_ns for s in pieces]  # type: ignore[union-attr]
+
+
+def test_what_came_before_the_device_was_open_was_told_to_nobody() -> None:
+    everything = decode([r for r in heard([]) if isinstance(r, RawBytes)])
+    assert len(decode(heard([]))) < len(everything) == EPOCHS
+
+
+def test_a_device_whose_bytes_are_not_logged_has_no_codec() -> None:
+    assert codec_for("thermometer", "host", "host", {}) is None
+    assert codec_for("navigator", "no-such-driver", "gnss", {}) is None
+
+
+def test_a_decision_survives_the_log_and_damage_is_none() -> None:
+    decision = Decision("tick", 12, 0, {"store": [3], "seal": None})
+    assert decision_of(decision.message()) == decision
+    for payload in (b"", b"{}", b'{"kind": 3}', b'{"kind": "tick", "number": "x"}'):
+        assert decision_of(Message("decision", 1, payload)) is None
+
+
+def tiff(pixels: np.ndarray, **how: object) -> bytes:
+    buffer = BytesIO()
+    tifffile.imwrite(buffer, pixels, **how)
+    return buffer.getvalue()
+
+
+def test_pixels_are_compared_and_not_how_they_are_written() -> None:
+    pixels = np.arange(600, dtype=np.uint16).reshape(20, 30)
+    one, other = tiff(pixels), tiff(pixels, description="another writer")
+    assert one != other
+    assert content_hash("pan.tif", one) == content_hash("pan.tif", other)
+    pixels[7, 7] ^= 1
+    assert content_hash("pan.tif", tiff(pixels)) != content_hash("pan.tif", one)
+
+
+def test_durations_are_left_out_of_the_report_and_nothing_else() -> None:
+    def report(**content: object) -> str:
+        return content_hash("quality.json", json.dumps(content).encode())
+
+    assert report(verdict="good", timings_s=1) == report(verdict="good", timings_s=2)
+    assert report(verdict="good", timings_s=1) != report(verdict="refly", timings_s=1)
+
+
+def test_nothing_compared_is_not_agreement() -> None:
+    replayed = Replayed()
+    assert not replayed.agrees
+    replayed.compare("ledger", agrees=True)
+    assert replayed.agrees
+    replayed.compare("ledger", agrees=False, sentence="it differs")
+    assert (replayed.agrees, replayed.sentences) == (False, ["it differs"])
