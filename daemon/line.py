@@ -6,7 +6,7 @@ import asyncio
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from daemon.configuration import Configuration
@@ -14,6 +14,7 @@ from daemon.devices import exposure_times_ns, frame_nbytes
 from daemon.disk_guard import DiskGuard
 from daemon.flight import Flight
 from daemon.mission import Mission
+from daemon.navigation import LATEST_ARRIVAL_NS
 from daemon.plan.image_size import image_on_ground_m
 from daemon.plan.reading import read_plan
 from daemon.plan.steering import PlanTrigger
@@ -60,6 +61,7 @@ class Line:
         if configuration.trigger.mode == "plan" and self._steering is not None:
             self._policy = self._steering
         self.runs = configuration.trigger.start == "at once"
+        self._placed: tuple[NavSample | None, NavSample | None] = (None, None)
         self._asked_for = 0
         self._runs_until: int | None = None
 
@@ -114,9 +116,24 @@ class Line:
 
     def wait_s(self, now_ns: int) -> float:
         """How long to wait before asking again; 0 where an exposure is due."""
-        due_ns = self._policy.due(now_ns, self._last_ns, self._flight.track.last)
+        due_ns = self._policy.due(now_ns, self._last_ns, self._position())
         left_s = LOOK_AHEAD_S if due_ns is None else (due_ns - now_ns) / NS
         return max(0.0, min(LOOK_AHEAD_S, left_s))
+
+    def _position(self) -> NavSample | None:
+        """The last position, under the host's time of its own instant.
+
+        It arrives 10 to 700 ms later, which would be as much way flown at every exposure. How
+        late is known once marks or pulses per second have come; until then it is not guessed.
+        """
+        nav = self._flight.track.last
+        if nav is None or nav is self._placed[0]:
+            return self._placed[1] if nav is not None else None
+        now = self._flight.clock.gps_at(nav.mono_ns)
+        late_ns = 0 if now is None or now.is_coarse else now.gps_ns - nav.gps_ns
+        late_ns = min(max(late_ns, 0), LATEST_ARRIVAL_NS)
+        self._placed = nav, replace(nav, mono_ns=nav.mono_ns - late_ns)
+        return self._placed[1]
 
     def _readiness_s(self, now_ns: int) -> float:
         """How long until the camera can expose again."""
@@ -140,7 +157,7 @@ class Line:
 
     def order(self, now_ns: int) -> Order:
         """An exposure that is due: ordered now."""
-        nav = self._flight.track.last
+        nav = self._position()
         speed_mps = self._configuration.plan.ground_speed_mps
         if nav is not None:
             flown_mps = math.hypot(*nav.velocity_ned_mps[:2])

@@ -7,6 +7,8 @@ import copy
 import json
 from pathlib import Path
 
+import pytest
+
 from daemon.configuration import from_mapping
 from daemon.flight import Flight
 from daemon.ledger import Ledger
@@ -87,3 +89,21 @@ def test_what_is_absent_is_said_in_words(tmp_path: Path) -> None:
     assert absent[:2] == ["head SU00", "trigger"]
     assert "temperature of 0" in absent
     assert "time and position" not in absent
+
+
+def test_a_position_counts_for_its_own_instant_once_the_clock_knows_it(tmp_path: Path) -> None:
+    line = make_line(tmp_path, count=1)
+    sample = nav(1.0)
+    line._flight.navigation(sample)
+    placed = line._position()
+    assert placed is not None
+    # Messages alone do not tell how late they are.
+    assert placed.mono_ns == sample.mono_ns
+    clock = line._flight.clock
+    for second in range(-3, 1):
+        clock.pps_edge(second * 1_000_000_000, 1_000)
+    line._flight.navigation(nav(1.2))
+    placed = line._position()
+    assert placed is not None
+    assert placed.mono_ns == pytest.approx(1_200_000_000, abs=100_000)
+    assert line._position() is placed

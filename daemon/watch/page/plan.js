@@ -42,6 +42,7 @@ async function advise() {
   well.textContent = `${share.toFixed(0)} % of ${(advice.planned_m / 1000).toFixed(1)} km is well; ` +
     (holes.length ? `${holes.length} ${holes.length === 1 ? "hole" : "holes"} behind:` : "no hole behind.");
   rows.replaceChildren(...holes.map(row));
+  rows.closest(".scroll").hidden = !holes.length;
   drawHoles(holes);
 }
 
