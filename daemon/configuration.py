@@ -154,7 +154,9 @@ class MavlinkCameraSection(_Section):
 
 
 class WatchSection(_Section):
-    """Who may look in, and from where (docs/watching.md). Commands always need a token."""
+    """Who may look in, and from where (docs/watching.md). Commands over the network always need a
+    token; at the Unix socket `control` whoever is of `control_group` may give them.
+    """
 
     host: str = "127.0.0.1"
     port: int = Field(default=8470, ge=0, le=65535)
@@ -166,6 +168,8 @@ class WatchSection(_Section):
     udp: tuple[str, ...] = Field(default=(), max_length=8)
     udp_bytes_per_s: float = Field(default=4000.0, ge=1000)
     mavlink: MavlinkCameraSection | None = None
+    control: Path | None = None
+    control_group: str | None = None
 
     @property
     def udp_addresses(self) -> dict[str, tuple[str, int]]:
@@ -300,7 +304,7 @@ def _anchored(configuration: Configuration, folder: Path) -> Configuration:
         plan = plan.model_copy(update={"file": folder / plan.file})
     watch = configuration.watch
     if watch is not None:
-        files = {name: getattr(watch, name) for name in ("tokens", "certificate", "key")}
+        files = {name: getattr(watch, name) for name in ("tokens", "certificate", "key", "control")}
         update: dict[str, Any] = {
             name: folder / path for name, path in files.items() if path is not None
         }

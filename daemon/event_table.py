@@ -39,6 +39,12 @@ TABLE: Final[Sequence[Entry]] = (
     Entry("status", "note", "The state of the flight, once a second.", _NOTHING),
     Entry("watching", "note", "The page and the API can be reached.", _NOTHING),
     Entry("command", "note", "Somebody gave a command; done says what became of it.", _NOTHING),
+    Entry(
+        "control-refused",
+        "caution",
+        "Somebody who may not command asked for something at the Unix socket.",
+        "If they should: add them to the group `control_group`, and let them log in anew.",
+    ),
     Entry("done", "note", "The planned exposures are made and finished.", _NOTHING),
     Entry("ended", "note", "The service has ended.", "With a failure: read the fault before it."),
     Entry(

@@ -18,6 +18,7 @@ from daemon.cli import (
     bench,
     calibrate,
     check,
+    command,
     demo,
     develop,
     explain,
@@ -55,6 +56,7 @@ app.command(name="demo", help=demo.HELP)(demo.demo)
 app.command(name="run", help=run.HELP)(run.run)
 app.command(name="explain", help=explain.HELP)(explain.explain)
 app.command(name="monitor", help=monitor.HELP)(monitor.monitor)
+app.command(name="command", help=command.HELP)(command.command)
 app.command(name="check", help=check.HELP)(check.check)
 app.command(name="process", help=process.HELP)(process.process)
 app.command(name="develop", help=develop.HELP)(develop.develop)

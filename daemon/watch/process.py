@@ -23,6 +23,7 @@ from daemon.orientation import mount_of
 from daemon.processes import Link
 from daemon.records import RecordError
 from daemon.watch.api import WatchSettings, create_app
+from daemon.watch.control_socket import ControlError, ControlSocket
 from daemon.watch.coverage import Coverage
 from daemon.watch.datagrams import send
 from daemon.watch.discovery import Announcement
@@ -81,6 +82,7 @@ async def _serve(link: Link, settings: WatchSection) -> None:
     saying = asyncio.create_task(send(state, settings.udp_addresses, settings.udp_bytes_per_s))
     gathering = asyncio.create_task(_gather(coverage))
     camera = await _camera(settings, state, gate, ground, link)
+    control = await _control(settings, state, gate, link)
     loop = asyncio.get_running_loop()
     loop.add_reader(link.fileno(), _hear, link, state, gate, ending)
     serving = (
@@ -97,6 +99,8 @@ async def _serve(link: Link, settings: WatchSection) -> None:
         gathering.cancel()
         if camera is not None:
             camera.end()
+        if control is not None:
+            control.end()
         with suppress(OSError):
             await announcement.end()
         if serving is not None:
@@ -125,6 +129,25 @@ async def _camera(
         link.send(Told(_absent("mavlink camera", sentence)))
         return None
     return camera
+
+
+async def _control(
+    settings: WatchSection, state: FlightState, gate: Gate, link: Link
+) -> ControlSocket | None:
+    """The Unix socket for commands, where that is wanted and possible."""
+    if settings.control is None:
+        return None
+
+    def refused(sentence: str) -> None:
+        link.send(Told({"event": "control-refused", "sentence": sentence}))
+
+    try:
+        control = ControlSocket(settings.control, settings.control_group, gate, state, refused)
+        await control.begin()
+    except ControlError as error:
+        link.send(Told(_absent("control", f"no commands over the Unix socket: {error}")))
+        return None
+    return control
 
 
 class _Ground:

@@ -1,0 +1,235 @@
+"""At the Unix socket the kernel says who asks, and the group decides."""
+
+from __future__ import annotations
+
+import asyncio
+import grp
+import json
+import os
+import socket
+import stat
+import subprocess
+import sys
+import tempfile
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daemon.messages import Answer, Command
+from daemon.watch.control_socket import Caller, ControlError, ControlSocket, caller_of, give
+from daemon.watch.gate import Gate
+from daemon.watch.state import FlightState
+from tests.daemon.watch import flown
+
+ME = f"uid {os.geteuid()}"
+ASK = """
+import json, os, socket, sys
+os.setgroups([int(g) for g in sys.argv[2].split(",") if g])
+os.setgid(65534)
+os.setuid(65534)
+with socket.socket(socket.AF_UNIX) as connection:
+    connection.connect(sys.argv[1])
+    connection.sendall(b'{"command": "start"}\\n')
+    sys.stdout.write(connection.makefile().readline())
+"""
+
+
+class Service:
+    """Answers at once and remembers what it was asked."""
+
+    def __init__(self) -> None:
+        self.commands: list[Command] = []
+        self.refused: list[str] = []
+        self.state = FlightState("syntopic test")
+        self.gate = Gate(self.hear)
+
+    def hear(self, command: Command) -> None:
+        self.commands.append(command)
+        answer = Answer(command.number, command.name != "stop", "as asked")
+        asyncio.get_running_loop().call_soon(self.gate.answered, answer)
+
+    @asynccontextmanager
+    async def listening(self, path: Path, group: str | None = None) -> AsyncIterator[ControlSocket]:
+        control = ControlSocket(path, group, self.gate, self.state, self.refused.append)
+        await control.begin()
+        try:
+            yield control
+        finally:
+            control.end()
+
+
+def with_socket(service: Service, path: Path, ask: Callable[[], Any]) -> Any:
+    """Ask from another thread while the socket listens."""
+
+    async def run() -> Any:
+        async with service.listening(path), asyncio.timeout(20):
+            return await asyncio.to_thread(ask)
+
+    return asyncio.run(run())
+
+
+def lines(path: Path, *sent: bytes) -> list[dict[str, Any]]:
+    with socket.socket(socket.AF_UNIX) as connection:
+        connection.settimeout(10)
+        connection.connect(str(path))
+        with connection.makefile("rwb") as stream:
+            answers = []
+            for line in sent:
+                stream.write(line)
+                stream.flush()
+                answers.append(json.loads(stream.readline()))
+            return answers
+
+
+def test_a_command_is_given_in_the_name_the_kernel_knows(tmp_path: Path) -> None:
+    service, path = Service(), tmp_path / "control.sock"
+    done = with_socket(service, path, lambda: give(path, "start", {"override": True}))
+    assert done == (True, "as asked")
+    (command,) = service.commands
+    assert (command.name, command.by.split(" (")[0]) == ("start", ME)
+    assert command.arguments["override"] is True
+    refused = with_socket(service, path, lambda: give(path, "stop", {}))
+    assert refused == (False, "as asked")
+
+
+def test_the_socket_is_for_owner_and_group_and_goes_with_the_service(tmp_path: Path) -> None:
+    path = tmp_path / "control.sock"
+    mode = with_socket(Service(), path, lambda: stat.S_IMODE(path.stat().st_mode))
+    assert mode == 0o660
+    assert not path.exists()
+
+
+def test_a_fault_that_is_acknowledged_leaves_the_list(tmp_path: Path) -> None:
+    service, path = Service(), tmp_path / "control.sock"
+    service.state.apply(flown.lost("SU02"))
+    service.state.apply(flown.recovered("SU02"))
+    assert with_socket(service, path, lambda: give(path, "acknowledge", {"fault": "device SU02"}))
+    assert service.state.faults() == []
+
+
+def test_nonsense_is_answered_and_the_next_line_is_heard(tmp_path: Path) -> None:
+    service, path = Service(), tmp_path / "control.sock"
+    nonsense = (
+        *(b"\n", b"start\n", b"[]\n", b"{}\n", b'{"command": ["start"]}\n', b"\xff\xfe\n"),
+        *(b'{"command": "format-the-disk"}\n', b'{"command": "start", "arguments": 7}\n'),
+        b'{"command": "interval", "arguments": {"interval_s": -1}}\n',
+        b'{"command": "start", "arguments": {"by": "somebody else"}}\n',
+        b"[" * 5000 + b"\n",
+    )
+    answers = with_socket(service, path, lambda: lines(path, *nonsense, b'{"command": "start"}\n'))
+    assert [answer["done"] for answer in answers] == [False] * len(nonsense) + [True]
+    assert [command.name for command in service.commands] == ["start"]
+
+
+def test_a_line_without_end_is_cut_off_and_others_are_heard(tmp_path: Path) -> None:
+    service, path = Service(), tmp_path / "control.sock"
+
+    def flood() -> tuple[bool, str]:
+        with socket.socket(socket.AF_UNIX) as connection:
+            connection.settimeout(10)
+            connection.connect(str(path))
+            try:
+                connection.sendall(b"x" * 1_000_000)
+                assert connection.recv(1) == b""
+            except (BrokenPipeError, ConnectionResetError):
+                pass
+        return give(path, "start", {})
+
+    assert with_socket(service, path, flood)[0]
+
+
+@pytest.mark.parametrize(
+    ("caller", "may"),
+    [
+        (Caller(1, 0, frozenset()), True),
+        (Caller(1, os.geteuid(), frozenset()), True),
+        (Caller(1, 4711, frozenset({os.getegid()})), True),
+        (Caller(1, 4711, frozenset({4712})), False),
+    ],
+)
+def test_the_group_root_and_the_service_itself_may(
+    caller: Caller, may: bool, tmp_path: Path
+) -> None:
+    service = Service()
+    control = ControlSocket(
+        tmp_path / "c", None, service.gate, service.state, service.refused.append
+    )
+    assert control.may(caller) is may
+
+
+def test_the_kernel_says_which_groups_somebody_is_of() -> None:
+    here, there = socket.socketpair(socket.AF_UNIX)
+    with here, there:
+        caller = caller_of(here)
+    assert (caller.pid, caller.uid) == (os.getpid(), os.geteuid())
+    assert caller.groups == frozenset((os.getegid(), *os.getgroups()))
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to ask as somebody else")
+def test_a_stranger_is_refused_and_told_of_and_a_member_is_obeyed() -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        # Everybody may enter it, as /run/syntopic.
+        Path(folder).chmod(0o755)
+        _ask_as_others(Path(folder) / "control.sock")
+
+
+def _ask_as_others(path: Path) -> None:
+    service = Service()
+    group = grp.getgrnam("dialout")
+
+    def ask(groups: str) -> dict[str, Any]:
+        # Knocking is open to all, as where the hardened unit may not give the socket away.
+        path.chmod(0o666)
+        done = subprocess.run(
+            [sys.executable, "-c", ASK, str(path), groups],
+            capture_output=True,
+            text=True,
+            timeout=20,
+            check=True,
+        )
+        return dict(json.loads(done.stdout))
+
+    async def run() -> tuple[dict[str, Any], dict[str, Any]]:
+        async with service.listening(path, group.gr_name):
+            stranger = await asyncio.to_thread(ask, "")
+            return stranger, await asyncio.to_thread(ask, str(group.gr_gid))
+
+    stranger, member = asyncio.run(run())
+    assert (stranger["done"], "dialout may" in stranger["sentence"]) == (False, True)
+    assert service.refused == [stranger["sentence"]]
+    assert member["done"] is True
+    assert [command.by.split(" (")[0] for command in service.commands] == ["uid 65534"]
+
+
+def test_a_socket_left_by_a_killed_service_is_taken_over_and_a_file_is_not(tmp_path: Path) -> None:
+    path = tmp_path / "control.sock"
+    with socket.socket(socket.AF_UNIX) as dead:
+        dead.bind(str(path))
+    assert with_socket(Service(), path, lambda: give(path, "start", {}))[0]
+    path.write_text("precious")
+    with pytest.raises(ControlError, match="no socket"):
+        with_socket(Service(), path, lambda: None)
+    assert path.read_text() == "precious"
+
+
+def test_a_second_service_does_not_take_the_socket_of_the_first(tmp_path: Path) -> None:
+    path = tmp_path / "control.sock"
+
+    def second() -> None:
+        with_socket(Service(), path, lambda: None)
+
+    with pytest.raises(ControlError, match="another service"):
+        with_socket(Service(), path, second)
+
+
+def test_nobody_listening_and_no_such_group_end_in_sentences(tmp_path: Path) -> None:
+    with pytest.raises(ControlError, match="does the service run"):
+        give(tmp_path / "none.sock", "start", {})
+    service = Service()
+    with pytest.raises(ControlError, match="no group"):
+        ControlSocket(
+            tmp_path / "c", "no-such-group", service.gate, service.state, service.refused.append
+        )
