@@ -10,7 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from daemon.cli import calibrate_boresight, calibrate_radiometric, calibrate_rig
+from daemon.cli import (
+    calibrate_boresight,
+    calibrate_head,
+    calibrate_radiometric,
+    calibrate_rig,
+)
 from daemon.cli.tables import light_table
 
 if TYPE_CHECKING:
@@ -47,6 +52,7 @@ def calibrate() -> None:
 
 
 app.command(name="radiometric", help=calibrate_radiometric.HELP)(calibrate_radiometric.radiometric)
+app.command(name="head", help=calibrate_head.HELP)(calibrate_head.head)
 app.command(name="boresight", help=calibrate_boresight.HELP)(calibrate_boresight.boresight)
 app.command(name="rig", help=calibrate_rig.HELP)(calibrate_rig.rig)
 

@@ -1,0 +1,84 @@
+"""`syntopic calibrate head`: collimator series to the ten parameters of a head."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import Progress
+
+HELP = """Geometric calibration of single heads from collimator series.
+
+Targets seen under known angles are found by least-squares matching of the images with one another;
+the Australis ten parameters are adjusted with three unknowns for the orientation of each series,
+and what they leave becomes a residual grid. The new folder holds a dated rig file, the grids, a
+report and the comparison with a previous calibration.
+
+Examples: `syntopic calibrate head SERIES`, `syntopic calibrate head SERIES --previous
+head-2026-05-02 --k3`
+
+A series to try: `python -m sim_hw.collimator dmc --sensor P1 --out collimator`
+"""
+
+
+def head(
+    series: Annotated[Path, typer.Argument(help="Folder with series.json, rig.toml and images.")],
+    out: Annotated[
+        Path | None, typer.Option(help="The new folder; by default named by rig and date.")
+    ] = None,
+    previous: Annotated[
+        Path | None, typer.Option(help="A calibration of heads to compare with.")
+    ] = None,
+    k3: Annotated[bool, typer.Option("--k3", help="Estimate K3 too.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    from daemon.calibration_report import read_previous, refuse_existing
+    from daemon.cli.calibration_outcome import hand_over
+    from daemon.laboratory.head import FREE, calibrate_head, targets_of
+    from daemon.laboratory.head_report import calibrated_rig, head_report
+    from daemon.laboratory.series import read_series
+    from daemon.rig_text import rig_toml
+    from processing.residual_grid import grid_bytes
+
+    given = read_series(series, kind="head")
+    targets = targets_of(given)
+    radius = given.table.number("target_radius_rad", positive=True)
+    angle_sigma = given.table.number("angle_sigma_rad", 1e-6, positive=True)
+    given.checked()
+    today = f"{datetime.now(UTC):%Y-%m-%d}"
+    folder = out or Path(f"{given.rig.name}-head-{today}")
+    refuse_existing(folder)
+    before = (previous, read_previous(previous, kind="head")) if previous else None
+    heads = []
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("reading", total=None)
+
+        def tell(what: str, done: int, total: int) -> None:
+            progress.update(task, description=what, completed=done, total=total)
+
+        for sensor in given.rig.sensors:
+            own = [t for t in targets if t.sensor == sensor.name]
+            if own:
+                found = calibrate_head(
+                    given.rig.cone_of(sensor.name),
+                    sensor,
+                    own,
+                    target_radius_rad=radius,
+                    angle_sigma_rad=angle_sigma,
+                    free=(*FREE, "k3") if k3 else FREE,
+                    progress=tell,
+                )
+                heads.append(found)
+    report = head_report(given, heads, calibration_id=folder.name, date=today, previous=before)
+    rig = calibrated_rig(given.rig, heads, calibration_id=folder.name, date=today)
+    remark = (
+        f"{rig.name}, lenses of {', '.join(h.cone.name for h in heads)} by `syntopic calibrate "
+        f"head` on {today},\nin place of calibration {given.rig.calibration_id}. It counts only "
+        "where it is configured."
+    )
+    files = {"rig.toml": rig_toml(rig, remark=remark)}
+    files |= {f"residual-grid/{h.sensor.name}.npz": grid_bytes(h.grid) for h in heads}
+    hand_over(report, folder, files=files, as_json=as_json)

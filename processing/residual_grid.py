@@ -1,0 +1,126 @@
+"""What a lens does beyond the ten parameters: a grid of corrections, to be added on top of them.
+
+Direction: *ideal from measured*, as eq. 5.1. The grid is taken at the measured place and added to
+what the ten parameters made of it (DESIGN 5.2).
+"""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+DIRECTION: Final = "ideal_from_measured"
+_STIFFNESS: Final = 0.3
+
+
+@dataclass(frozen=True)
+class ResidualGrid:
+    """Nodes at `x_mm` (nx,) and `y_mm` (ny,) of the layer; `delta_mm` (ny, nx, 2) to be added."""
+
+    x_mm: Array
+    y_mm: Array
+    delta_mm: Array
+
+    def correction_to_ideal(self, measured_mm: Array) -> Array:
+        """The correction (n, 2) at measured places (n, 2); beyond the grid that of its border."""
+        design = _bilinear(self.x_mm, self.y_mm, measured_mm)
+        return np.asarray(design @ self.delta_mm.reshape(-1, 2))
+
+
+def fit_residual_grid(
+    measured_mm: Array, residual_mm: Array, *, half_mm: tuple[float, float], nodes: tuple[int, int]
+) -> ResidualGrid:
+    """Fit a grid to residuals (computed less measured, ideal side) by smoothed least squares.
+
+    Args:
+        measured_mm, residual_mm: (n, 2).
+        half_mm: the grid reaches so far from the middle of the measured places.
+        nodes: how many across and down.
+    """
+    middle = (measured_mm.max(axis=0) + measured_mm.min(axis=0)) / 2.0
+    x = middle[0] + np.linspace(-half_mm[0], half_mm[0], nodes[0])
+    y = middle[1] + np.linspace(-half_mm[1], half_mm[1], nodes[1])
+    data = _bilinear(x, y, measured_mm)
+    bend = _STIFFNESS * _second_differences(nodes)
+    design = np.vstack([data, bend])
+    wanted = np.vstack([residual_mm, np.zeros((len(bend), 2))])
+    solved, *_ = np.linalg.lstsq(design, wanted, rcond=None)
+    delta = np.asarray(solved.reshape(nodes[1], nodes[0], 2), dtype=np.float64)
+    return ResidualGrid(x, y, delta)
+
+
+def left_by_halves(
+    measured_mm: Array, residual_mm: Array, *, half_mm: tuple[float, float], nodes: tuple[int, int]
+) -> Array:
+    """What a grid fitted to every other residual leaves of the rest, and the other way, (n, 2)."""
+    left = np.empty_like(residual_mm)
+    index = np.arange(len(measured_mm))
+    for parity in (0, 1):
+        own = index % 2 == parity
+        grid = fit_residual_grid(measured_mm[~own], residual_mm[~own], half_mm=half_mm, nodes=nodes)
+        left[own] = residual_mm[own] - grid.correction_to_ideal(measured_mm[own])
+    return left
+
+
+def grid_bytes(grid: ResidualGrid) -> bytes:
+    """The grid as `.npz`."""
+    stream = io.BytesIO()
+    np.savez(
+        stream,
+        x_mm=grid.x_mm,
+        y_mm=grid.y_mm,
+        delta_mm=grid.delta_mm,
+        direction=np.array(DIRECTION),
+    )
+    return stream.getvalue()
+
+
+def grid_from_bytes(data: bytes) -> ResidualGrid:
+    """Read what `grid_bytes` wrote.
+
+    Raises:
+        ValueError: it holds other arrays, or another direction.
+    """
+    with np.load(io.BytesIO(data), allow_pickle=False) as content:
+        if sorted(content.files) != ["delta_mm", "direction", "x_mm", "y_mm"]:
+            raise ValueError(f"a residual grid holds other arrays than {sorted(content.files)}")
+        direction = str(content["direction"])
+        if direction != DIRECTION:
+            raise ValueError(f"the grid's direction is {direction!r}; {DIRECTION!r} is read here")
+        return ResidualGrid(content["x_mm"], content["y_mm"], content["delta_mm"])
+
+
+def _bilinear(x: Array, y: Array, places: Array) -> Array:
+    """Weights of the nodes at places, (n, nodes)."""
+    result = np.zeros((len(places), len(y), len(x)))
+    rows = np.arange(len(places))
+    at: list[tuple[Any, Any]] = []
+    for nodes, values in ((x, places[:, 0]), (y, places[:, 1])):
+        step = nodes[1] - nodes[0]
+        place = np.clip((values - nodes[0]) / step, 0.0, len(nodes) - 1.0)
+        low = np.minimum(place.astype(int), len(nodes) - 2)
+        at.append((low, place - low))
+    (i, u), (j, v) = at
+    for down, share_y in ((0, 1.0 - v), (1, v)):
+        for across, share_x in ((0, 1.0 - u), (1, u)):
+            result[rows, j + down, i + across] += share_x * share_y
+    return result.reshape(len(places), -1)
+
+
+def _second_differences(nodes: tuple[int, int]) -> Array:
+    across, down = nodes
+    index = np.arange(across * down).reshape(down, across)
+    rows = []
+    triples = [index[:, k : k + 3].reshape(-1, 3) for k in range(across - 2)]
+    triples += [index[k : k + 3].T.reshape(-1, 3) for k in range(down - 2)]
+    for a, b, c in np.vstack(triples):
+        row = np.zeros(across * down)
+        row[[a, b, c]] = 1.0, -2.0, 1.0
+        rows.append(row)
+    return np.array(rows)
