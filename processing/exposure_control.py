@@ -1,0 +1,147 @@
+"""From the histogram of a frame to the exposure time, gain and TDI count of the next one.
+
+A pure law: counts and limits in, settings out. Which frames are looked at, when settings may change
+and who changes them is the daemon's. Exposure time comes first, since it gains light; it ends where
+motion would smear, and gain, which amplifies noise alike, does the rest up to its own limit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+BRIGHT_SHARE: Final = 0.99
+"""Where the brightest hundredth begins is what is steered: of bright roofs little is lost."""
+
+STEP_MOST: Final = 2.0
+"""The most that light is changed at once, up or down: one odd image must not spoil the next."""
+
+SATURATED_STEP: Final = 0.5
+"""What is saturated does not tell by how much."""
+
+
+@dataclass(frozen=True)
+class ExposureSettings:
+    """What a head exposes with."""
+
+    exposure_time_us: float
+    gain_db: float = 0.0
+    tdi_shifts: int = 0
+
+    @property
+    def light(self) -> float:
+        """What the signal is proportional to."""
+        return self.exposure_time_us * 10 ** (self.gain_db / 20)
+
+
+@dataclass(frozen=True)
+class ExposureLimits:
+    """What settings may be.
+
+    `rows_per_s` is how fast the image moves over the rows of the sensor: ground speed over GSD;
+    None where height or speed are not known, then the exposure time may only become shorter.
+    `smear_px` is the motion that may be left, along track after TDI and, by `crab_rad`, across.
+    `gain_most_db` is the noise limit. `black` is the black level as a share of the full scale,
+    `target` where the brightest hundredth of the pixels should begin, `deadband` how far off that
+    is left alone.
+    """
+
+    time_least_us: float
+    time_most_us: float
+    gain_most_db: float
+    tdi_most: int
+    rows_per_s: float | None
+    smear_px: float = 0.5
+    crab_rad: float = 0.0
+    target: float = 0.6
+    deadband: float = 0.12
+    black: float = 0.0
+
+
+def next_settings(
+    counts: Sequence[int], now: ExposureSettings, limits: ExposureLimits
+) -> ExposureSettings:
+    """The settings for the next exposure; `now` itself where it is well, or nothing is known.
+
+    Args:
+        counts: of DN in equal bins of the full scale, from frames exposed with `now`.
+        now: what they were exposed with.
+        limits: what is allowed.
+    """
+    factor = light_factor(counts, limits)
+    keeps_still = smear_px(now, limits) <= limits.smear_px + 1e-9
+    if abs(math.log(factor)) <= math.log1p(limits.deadband) and keeps_still:
+        return now
+    return settings_for(now.light * factor, now, limits)
+
+
+def light_factor(counts: Sequence[int], limits: ExposureLimits) -> float:
+    """By how much more light the brightest hundredth would begin at the target; 1 for no counts."""
+    total = sum(counts)
+    if total == 0:
+        return 1.0
+    if counts[-1] > (1.0 - BRIGHT_SHARE) * total:
+        return SATURATED_STEP
+    seen, level = 0, 0.0
+    for index, count in enumerate(counts):
+        if seen + count >= BRIGHT_SHARE * total:
+            level = (index + (BRIGHT_SHARE * total - seen) / count) / len(counts)
+            break
+        seen += count
+    signal = max(level - limits.black, 1e-6)
+    factor = (limits.target - limits.black) / signal
+    return min(max(factor, 1.0 / STEP_MOST), STEP_MOST)
+
+
+def settings_for(light: float, now: ExposureSettings, limits: ExposureLimits) -> ExposureSettings:
+    """The settings that give an amount of light, or as much of it as the limits allow."""
+    longest_us = min(limits.time_most_us, _longest_still_us(now, limits))
+    time_us = min(max(light, limits.time_least_us), longest_us)
+    tdi_shifts = _tdi_shifts(time_us, longest_us, now, limits)
+    time_us = _stilled_us(time_us, tdi_shifts, limits)
+    gain_db = 20 * math.log10(max(light / time_us, 1.0))
+    return ExposureSettings(
+        exposure_time_us=round(time_us, 1),
+        gain_db=round(min(gain_db, limits.gain_most_db), 2),
+        tdi_shifts=tdi_shifts,
+    )
+
+
+def smear_px(settings: ExposureSettings, limits: ExposureLimits) -> float:
+    """Motion that TDI leaves during an exposure, along or across; 0 if not known."""
+    if limits.rows_per_s is None:
+        return 0.0
+    moved_px = limits.rows_per_s * settings.exposure_time_us * 1e-6
+    along = abs(moved_px * math.cos(limits.crab_rad) - settings.tdi_shifts)
+    return max(along, moved_px * abs(math.sin(limits.crab_rad)))
+
+
+def _longest_still_us(now: ExposureSettings, limits: ExposureLimits) -> float:
+    if limits.rows_per_s is None:
+        return now.exposure_time_us
+    along_px = limits.tdi_most + limits.smear_px
+    across_px = limits.smear_px / max(abs(math.sin(limits.crab_rad)), 1e-9)
+    return min(along_px / math.cos(limits.crab_rad), across_px) / limits.rows_per_s * 1e6
+
+
+def _tdi_shifts(
+    time_us: float, longest_us: float, now: ExposureSettings, limits: ExposureLimits
+) -> int:
+    """The whole number of rows moved, unless so many would ask for more time than there is."""
+    if limits.rows_per_s is None:
+        return now.tdi_shifts
+    rows_per_us = limits.rows_per_s * 1e-6 * math.cos(limits.crab_rad)
+    shifts = min(round(time_us * rows_per_us), limits.tdi_most)
+    return shifts if shifts - limits.smear_px <= longest_us * rows_per_us else shifts - 1
+
+
+def _stilled_us(time_us: float, tdi_shifts: int, limits: ExposureLimits) -> float:
+    """The time nearest to this at which so many shifts leave no more motion than is allowed."""
+    if limits.rows_per_s is None:
+        return time_us
+    along_per_us = limits.rows_per_s * 1e-6 * math.cos(limits.crab_rad)
+    least_us = (tdi_shifts - limits.smear_px) / along_per_us
+    most_us = (tdi_shifts + limits.smear_px) / along_per_us
+    return min(max(time_us, least_us, limits.time_least_us), most_us)
