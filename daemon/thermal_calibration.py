@@ -79,7 +79,7 @@ def gather(missions: Sequence[Path]) -> Gathered:
         exposures = {n: s.exposure for n, s in sealed.items() if s is not None}
         faults = faulty_probes(rig, exposures.values())
         for number in mission.numbers():
-            record = _record(mission, number)
+            record = stitching_of(mission, number)
             if isinstance(record, str):
                 passed_over.append(record)
                 continue
@@ -149,7 +149,7 @@ def write_rig(rig: Rig, path: Path, *, remark: str) -> None:
         ) from error
 
 
-def _record(mission: Mission, number: int) -> StitchRecord | str:
+def stitching_of(mission: Mission, number: int) -> StitchRecord | str:
     """The record of an exposure, or why there is none."""
     path = mission.level2(number) / "mosaic.json"
     try:

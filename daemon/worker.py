@@ -188,7 +188,14 @@ def make_products(
     stitching = None
     if product.mosaic.method == "free":
         stitching = stitch_record_json(
-            stitch_record(rig, product.mosaic, told.placing_c, told.usable_c, product.estimated_dc)
+            stitch_record(
+                rig,
+                product.mosaic,
+                told.placing_c,
+                told.usable_c,
+                product.estimated_dc,
+                bands=product.bands,
+            )
         )
     report["timings_s"] = {stage: round(s, 4) for stage, s in product.timings_s.items()}
     contents = products.level2_contents(

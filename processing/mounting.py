@@ -25,10 +25,12 @@ from processing.bundle.rotations import (
     exponential,
     omega_phi_kappa,
 )
+from processing.colour import BandRegistration
 from processing.drift import sensor_dc
 from processing.mosaic import Mosaic
 from processing.mosaic_model import further_turn, placement_at, vip_and_design
 from processing.placement import corrected_mm_from_raw, vip_mm_from_raw
+from processing.projective import apply_projective
 from processing.quality import Figure
 from processing.rig import Cone, Rig, Sensor
 from processing.rotation import rotation_matrix
@@ -71,11 +73,14 @@ class Mounting:
 class PlatformCheck:
     """Whether the platform calibration still holds.
 
+    `covariance` (3 n, 3 n) is that of the turns of all heads, by tie points and by the sensors'
+    places; their mean, which is the datum, has none.
     `statistic` is chi-square with `freedom` degrees of freedom on a platform as calibrated; what
     all heads turned together does not count, it cannot be seen.
     """
 
     heads: tuple[Mounting, ...]
+    covariance: Array
     statistic: float
     freedom: int
     limit: float
@@ -156,6 +161,7 @@ def check_platform(
     covariance = contrasts @ (stitched + places + np.diag(own)) @ contrasts.T
     return PlatformCheck(
         heads=heads,
+        covariance=known,
         statistic=float(y @ np.linalg.solve(covariance, y)),
         freedom=len(y),
         limit=float(chi2.ppf(1.0 - FAMILY_ALPHA, len(y))),
@@ -203,6 +209,23 @@ def rotation_of_layer(rig: Rig, mosaic: Mosaic, cone: Cone) -> Array | None:
     fit = np.linalg.pinv(np.concatenate(turns)) @ np.concatenate(moves)
     rows[:, first : first + 8] = fit
     return rows
+
+
+def turn_of_band(rig: Rig, mosaic: Mosaic, band: BandRegistration) -> tuple[Array, Array]:
+    """The turn of a colour head that its registration to green says, and its sigma, (3,) rad each.
+
+    The rotation nearest to the projective transformation over the head's sensor; green itself has
+    its place by the adjustment.
+    """
+    model, sensor = mosaic.model, rig.sensor(band.sensor)
+    seen = vip_mm_from_raw(mosaic.start[band.sensor], _grid(sensor))
+    belongs = apply_projective(np.asarray(np.linalg.inv(band.band_from_green), np.float64), seen)
+    design = further_turn(seen, model.f_mm).transpose(2, 0, 1).reshape(-1, 3)
+    turn, *_ = np.linalg.lstsq(design, (belongs - seen).reshape(-1), rcond=None)
+    unit_mm = sensor.pitch_mm * model.f_mm / rig.cone_of(band.sensor).lens.f_mm
+    per_point = (band.rms_px or 0.0) / math.sqrt(2.0) * unit_mm
+    cofactor = np.linalg.inv(design.T @ design) * len(seen) / max(band.points, 1)
+    return np.asarray(turn), np.asarray(per_point * np.sqrt(np.diag(cofactor)), np.float64)
 
 
 def _mounting(

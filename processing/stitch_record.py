@@ -12,10 +12,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
+from processing.colour import BandRegistration
 from processing.drift import sensor_dc
 from processing.estimated_dc import EstimatedDc
 from processing.mosaic import Mosaic
+from processing.mounting import rotation_of_layer, turn_of_band
 from processing.rig import Cone, Rig
 from processing.topology import mosaic_cones
 
@@ -25,6 +28,8 @@ STITCH_FORMAT = 1
 SENSOR_UNITS = {"x_um": 1e3, "y_um": 1e3, "rotation_urad": 1e6, "scale_ppm": 1e6}
 """Quantities of a sensor, and what turns the adjustment's own units (mm, rad, 1) into theirs."""
 LAYER_SCALE = "layer_scale_ppm"
+TURNS = ("rotation_x_urad", "rotation_y_urad", "rotation_z_urad")
+"""How a cone stands turned against its calibration, about the axes of the virtual image."""
 
 
 class StitchRecordError(ValueError):
@@ -36,7 +41,8 @@ class StitchRecord:
     """Corrections against the calibrated place at dC plus drift.
 
     `names` are `<sensor>.x_um`, `.y_um`, `.rotation_urad`, `.scale_ppm` for sensors of cones with
-    two or more, in their layer, and `<cone>.layer_scale_ppm` for every layer but the master's;
+    two or more, in their layer, `<cone>.layer_scale_ppm` for every layer but the master's, and
+    `<cone>.rotation_x_urad`, `_y_`, `_z_` for every cone that is not the master, colour included;
     `values` (n,) and `covariance` (n, n) go with them. What tie points did not determine is left
     out. `dc_k` is the dC by sensor the start was made with; `measured` are the sensors whose own
     probe told it. Values are in the gauge of the adjustment: a similarity common to the sensors of
@@ -60,6 +66,8 @@ def stitch_record(
     placing_c: Mapping[str, float],
     measured_c: Mapping[str, float],
     estimated_dc: Sequence[EstimatedDc] = (),
+    *,
+    bands: Sequence[BandRegistration] = (),
 ) -> StitchRecord:
     """The record of a free mosaic.
 
@@ -69,6 +77,7 @@ def stitch_record(
         placing_c: temperatures its start was made with, by probe name.
         measured_c: those of them that were read.
         estimated_dc: what `processing.estimated_dc` made of it.
+        bands: how the other colours were registered to green.
     """
     held = set(mosaic.undetermined)
     rows: list[Array] = []
@@ -89,15 +98,28 @@ def stitch_record(
             continue
         rows.append(_layer_scale(mosaic, cone, first))
         names.append(f"{cone.name}.{LAYER_SCALE}")
+    for cone in mosaic_cones(rig):
+        turn = rotation_of_layer(rig, mosaic, cone)
+        if turn is not None and not any(name.startswith(f"{cone.name}.") for name in held):
+            rows += list(turn * 1e6)
+            names += [f"{cone.name}.{what}" for what in TURNS]
     design = np.array(rows).reshape(len(rows), len(mosaic.model.names))
+    values = [design @ mosaic.values]
+    covariances = [design @ mosaic.covariance @ design.T]
+    for band in bands:
+        if band.registered:
+            turn, sigma = turn_of_band(rig, mosaic, band)
+            values.append(turn * 1e6)
+            covariances.append(np.diag((sigma * 1e6) ** 2))
+            names += [f"{rig.cone_of(band.sensor).name}.{what}" for what in TURNS]
     return StitchRecord(
         rig=rig.name,
         calibration_id=rig.calibration_id,
         dc_k={s.name: sensor_dc(s, placing_c) for s in sensors},
         measured=tuple(s.name for s in sensors if s.probe in measured_c),
         names=tuple(names),
-        values=design @ mosaic.values,
-        covariance=design @ mosaic.covariance @ design.T,
+        values=np.concatenate(values),
+        covariance=block_diag(*covariances),
         sigma0=mosaic.sigma0,
         estimated_dc=tuple(estimated_dc),
     )

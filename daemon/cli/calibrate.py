@@ -13,6 +13,7 @@ from rich.console import Console
 from daemon.cli import (
     calibrate_boresight,
     calibrate_head,
+    calibrate_platform,
     calibrate_radiometric,
     calibrate_rig,
 )
@@ -55,6 +56,7 @@ app.command(name="radiometric", help=calibrate_radiometric.HELP)(calibrate_radio
 app.command(name="head", help=calibrate_head.HELP)(calibrate_head.head)
 app.command(name="boresight", help=calibrate_boresight.HELP)(calibrate_boresight.boresight)
 app.command(name="rig", help=calibrate_rig.HELP)(calibrate_rig.rig)
+app.command(name="platform", help=calibrate_platform.HELP)(calibrate_platform.platform)
 
 
 @app.command(name="thermal", help=THERMAL_HELP)

@@ -1,0 +1,52 @@
+"""`syntopic calibrate platform`: the mountings of all heads from flown or laboratory exposures."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from daemon.cli.calibration_outcome import hand_over
+
+HELP = """Platform calibration: how every head is mounted, from many exposures.
+
+Takes the stitching of exposures that were processed before (`mosaic.json` of Level-2): a flight
+over well textured ground, or laboratory images put into a mission folder. Converging heads: three
+angles of each, by tie points of the overlaps. A rig with a master cone: the turn of every other
+cone against it. Writes a dated folder with rig.toml, report.html and calibration.json; nothing is
+overwritten, and the new rig file counts only where it is configured.
+
+Examples: `syntopic calibrate platform MISSION`,
+`syntopic calibrate platform A B --previous dmc-platform-2026-05-02 --out dmc-platform-2026-11-21`
+"""
+
+
+def platform(
+    missions: Annotated[list[Path], typer.Argument(help="Mission folders with Level-2.")],
+    out: Annotated[
+        Path | None, typer.Option(help="The new folder; by default named by rig and date.")
+    ] = None,
+    previous: Annotated[
+        Path | None,
+        typer.Option(help="A platform calibration to compare with; else the rig flown with."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    from daemon.calibration_report import read_previous, refuse_existing
+    from daemon.platform_calibration import KIND, read_missions, report_of, rig_file
+    from processing.platform_calibration import calibrate_platform, calibrated_rig
+
+    before = None if previous is None else read_previous(previous, kind=KIND)
+    flown = read_missions(missions)
+    today = f"{datetime.now(UTC):%Y-%m-%d}"
+    folder = out or Path(f"{flown.rig.name}-platform-{today}")
+    refuse_existing(folder)
+    found = calibrate_platform(flown.rig, flown.records)
+    name = f"{flown.rig.calibration_id}-platform-{today}"
+    made = calibrated_rig(flown.rig, found, calibration_id=name, date=today)
+    report = report_of(flown, found, calibration_id=name, date=today, previous=before)
+    hand_over(
+        report, folder, files={"rig.toml": rig_file(made, flown, date=today)}, as_json=as_json
+    )
