@@ -271,6 +271,14 @@ class Head(Device, Protocol):
     def trigger(self) -> None:
         """Software trigger; from any thread. DeviceError where the head waits for a line."""
 
+    def adjust(self, exposure_time_us: float, gain_db: float, tdi_shifts: int) -> None:
+        """Expose with this from the next frame on, also after a loss; from any thread.
+
+        Raises:
+            DeviceError: the head is not there, refuses it, or cannot be changed while it runs; what
+                was set before holds.
+        """
+
 
 class Thermometer(Device, Protocol):
     """Yields `TemperatureSample`."""

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 from drivers.clock import Clock
-from drivers.contract import FrameMemory
+from drivers.contract import DeviceError, FrameMemory
 from drivers.device import DeviceDriver
 
 
@@ -47,6 +47,13 @@ class HeadDevice(DeviceDriver):
     def statistics(self) -> Mapping[str, int]:
         """Counters since creation, by stable name; see the driver's page."""
         return dict(sorted(self.counters.items()))
+
+    def adjust(self, exposure_time_us: float, gain_db: float, tdi_shifts: int) -> None:
+        """See `drivers.contract.Head`; a driver that can overrides this."""
+        raise DeviceError(
+            f"{self.name}: settings of this head cannot be changed while it runs; change them in "
+            "the configuration and start again"
+        )
 
     # For a driver to say
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
@@ -20,6 +21,9 @@ from drivers.pixels import Packing
 
 LATCH_TRIES: Final = 3
 NS_PER_S: Final = 1_000_000_000
+EARLIER_SETTINGS: Final = 4
+SAME_TIME_SHARE: Final = 0.01
+"""How near the time a frame tells must be to that it was exposed with; heads round it."""
 CHUNKS: Final = ("Timestamp", "ExposureTime", "CounterValue", "Gain", "Temperature", "FrameID")
 
 
@@ -83,6 +87,7 @@ class AravisCamera:
         self._has_temperature = self._has("DeviceTemperature")
         self.exposure_time_us = float(self._camera.get_exposure_time())
         self.frame_settings = self._frame_settings()
+        self._earlier: deque[Mapping[str, float | int | str]] = deque(maxlen=EARLIER_SETTINGS)
 
     @property
     def raw(self) -> Any:
@@ -111,6 +116,36 @@ class AravisCamera:
     def release(self) -> None:
         """Let go of the head: the last reference gives control back."""
         self._camera = self.chunk_parser = None
+
+    def adjust(self, exposure_time_us: float, gain_db: float, tdi_shifts: int) -> None:
+        """Write exposure settings while the head runs; those it has not are left out.
+
+        Raises:
+            DeviceError: it refuses one.
+        """
+        camera = self._camera
+        try:
+            if gain_db != 0 or self._has("Gain"):
+                camera.set_float("Gain", gain_db)
+            if tdi_shifts != 0 or self._has("TdiShifts"):
+                camera.set_integer("TdiShifts", tdi_shifts)
+            camera.set_exposure_time(exposure_time_us)
+            self._earlier.append(self.frame_settings)
+            self.exposure_time_us = float(camera.get_exposure_time())
+            self.frame_settings = self._frame_settings()
+        except aravis_error() as error:
+            raise DeviceError(
+                f"{self._who}: {exposure_time_us:g} us, {gain_db:g} dB, {tdi_shifts} TDI shifts "
+                f"are refused ({_said(error)}); choose settings within the head's bounds"
+            ) from None
+
+    def settings_of(self, exposure_us: float | None) -> Mapping[str, float | int | str]:
+        """What a frame was exposed with, by the exposure time it tells: it may be from before."""
+        for settings in (self.frame_settings, *reversed(self._earlier)):
+            time_us = float(settings["ExposureTime"])
+            if exposure_us is None or abs(time_us - exposure_us) <= SAME_TIME_SHARE * time_us:
+                return settings
+        return self.frame_settings
 
     def software_trigger(self) -> None:
         """Raises what Aravis raises."""

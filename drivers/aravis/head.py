@@ -142,6 +142,24 @@ class AravisHead(AravisSettings, HeadDevice):
         finally:
             self._control.release()
 
+    def adjust(self, exposure_time_us: float, gain_db: float, tdi_shifts: int) -> None:
+        """Expose with this from now on, also when the head is opened again."""
+        wanted = {
+            "exposure_time_us": exposure_time_us,
+            "gain_db": gain_db,
+            "tdi_shifts": tdi_shifts,
+        }
+        if not self._control.acquire(timeout=TRIGGER_TIMEOUT_S):
+            raise DeviceError(f"{self.name}: the head was busy for {TRIGGER_TIMEOUT_S:g} s; wait")
+        try:
+            session = self._session
+            if session is None or self._state is not LifeCycle.ACTIVE:
+                raise DeviceError(f"{self.name}: the head is not running; wait for it to be opened")
+            session.camera.adjust(exposure_time_us, gain_db, tdi_shifts)
+            self.configured = {**self.configured, **wanted}
+        finally:
+            self._control.release()
+
     def statistics(self) -> Mapping[str, int]:
         """Frames by status and reason, underruns, packets missing and resent, openings."""
         found = self.counters + self._of_stream
@@ -371,7 +389,7 @@ class AravisHead(AravisSettings, HeadDevice):
             temperature_c=session.temperature_c
             if received.chunk_temperature_c is None
             else received.chunk_temperature_c,
-            settings=_as_exposed(camera.frame_settings, received),
+            settings=_as_exposed(camera.settings_of(exposure_us), received),
         )
 
     def _check(self, session: _Session) -> bool:

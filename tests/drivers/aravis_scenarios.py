@@ -399,6 +399,66 @@ def packets_fit_the_network() -> dict[str, object]:
     }
 
 
+def light_that_changes_is_followed() -> dict[str, object]:
+    """The emulated head in a light that falls to a tenth and comes back; the law steers it."""
+    from processing.exposure_control import ExposureLimits, ExposureSettings, next_settings
+    from processing.histogram import sampled_histogram
+    from sim_hw.gige.head import ExposureRequest, FrameSize, GigeHead, HeadIdentity
+    from sim_hw.world_clock import DeviceClock
+
+    random = np.random.default_rng(4)
+    ground = np.minimum(random.lognormal(-1.4, 0.5, (SIZE, SIZE)), 2.0)
+    asked: list[ExposureRequest] = []
+    sun = [*(0.88**k for k in range(18)), *(0.88 ** (17 - k) for k in range(18))]
+
+    def expose(request: ExposureRequest) -> np.ndarray[Any, np.dtype[np.uint16]]:
+        asked.append(request)
+        light = request.exposure_time_us / 4000.0 * 10 ** (request.gain_db / 20)
+        dn = 200.0 + 3300.0 * ground * sun[min(len(asked), len(sun)) - 1] * light
+        return np.minimum(dn, 4095.0).astype(np.uint16)
+
+    head = GigeHead(
+        HeadIdentity(ADDRESS, "M-1"),
+        FrameSize(SIZE, SIZE),
+        expose,
+        lambda _mono_ns: 30.0,
+        DeviceClock(),
+    )
+    head.start()
+    limits = ExposureLimits(*(100.0, 30_000.0, 12.0, 4, 256.0), smear_px=0.5, black=200.0 / 4095.0)
+    now = ExposureSettings(EXPOSURE_US)
+    flight = Flight()
+    flight.thread.start()
+    flight.wait_active()
+    for _ in sun:
+        flight.expose(1)
+        now = next_settings(sampled_histogram(flight.pictures[-1], 12), now, limits)
+        flight.head.adjust(now.exposure_time_us, now.gain_db, now.tdi_shifts)
+    try:
+        flight.head.adjust(1e12, 0.0, 0)
+        refused = ""
+    except DeviceError as error:
+        refused = str(error)
+    flight.head.close()
+    flight.thread.join(3)
+    head.close()
+    return {
+        "asked": [[r.exposure_time_us, r.gain_db, r.tdi_shifts] for r in asked],
+        "told": [
+            [f.exposure_time_us, f.settings["Gain"], f.settings["TdiShifts"]] for f in flight.frames
+        ],
+        "bright": [float(np.percentile(p, 99)) / 4095.0 for p in flight.pictures],
+        "radiance": [
+            float((p[p < 4095] - 200.0).mean())
+            / (f.exposure_time_us or 1.0)
+            / 10 ** (float(f.settings["Gain"]) / 20)
+            for p, f in zip(flight.pictures, flight.frames, strict=True)
+        ],
+        "sun": sun,
+        "refused": refused,
+    }
+
+
 def raise_loopback() -> None:
     """Bring up `lo` of a fresh namespace; without the right to, it is up already."""
     get_flags, set_flags, up = 0x8913, 0x8914, 1

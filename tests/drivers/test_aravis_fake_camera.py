@@ -158,3 +158,21 @@ def test_the_packet_size_is_negotiated_down_to_what_the_network_carries() -> Non
     assert told["statuses"] == ["complete", "complete"]
     assert told["equal"] == [True, True]
     assert all(1000 < size <= 1500 for size in told["packet_sizes"]), told["packet_sizes"]
+
+
+def test_light_that_changes_is_followed_and_every_frame_says_what_it_was_exposed_with() -> None:
+    told = _scenario("light_that_changes_is_followed")
+    count = len(told["sun"])
+    assert len(told["told"]) == len(told["asked"]) == count
+    for asked, said in zip(told["asked"], told["told"], strict=True):
+        assert said == pytest.approx(asked, rel=1e-4, abs=1e-3)
+    times_us, gains_db, shifts = zip(*told["told"], strict=True)
+    assert max(times_us) / min(times_us) > 3.0
+    assert max(gains_db) <= 12.0
+    assert len(set(shifts)) >= 3
+    assert min(told["bright"][5:]) > 0.42
+    assert max(told["bright"][5:]) < 0.8
+    # Divided by what was really used, the pictures say how bright the light was.
+    ratios = [r / s for r, s in zip(told["radiance"], told["sun"], strict=True)]
+    assert max(ratios[5:]) / min(ratios[5:]) < 1.03
+    assert "are refused" in told["refused"]
