@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import math
 
 from daemon.configuration import PlanSection
@@ -14,6 +15,7 @@ from processing.rig import Rig
 from processing.sun import sun_elevation_rad
 
 GPS_EPOCH_UNIX_S = 315_964_800
+GPS_EPOCH = datetime.datetime(1980, 1, 6, tzinfo=datetime.UTC)
 
 
 def conditions_of(
@@ -62,9 +64,19 @@ def conditions_of(
         forward_overlap=surroundings.forward_overlap if surroundings else None,
         sidelap=surroundings.sidelap if surroundings else None,
         sun_elevation_rad=_sun_elevation_rad(exposure),
-        capture_flags=Flag(exposure.flags) | flags,
+        capture_flags=Flag(exposure.flags) | flags | _calibration_flag(exposure, rig),
         simulated=exposure.simulated,
     )
+
+
+def _calibration_flag(exposure: Exposure, rig: Rig) -> Flag:
+    """Whether the calibration was too old; one without a known time is not judged."""
+    if exposure.mark_gps_ns is None:
+        return Flag(0)
+    flown = GPS_EPOCH + datetime.timedelta(seconds=exposure.mark_gps_ns // 1_000_000_000)
+    made = datetime.date.fromisoformat(rig.calibration_date)
+    is_expired = (flown.date() - made).days > rig.calibration_valid_days
+    return Flag.CALIBRATION_EXPIRED if is_expired else Flag(0)
 
 
 def _sun_elevation_rad(exposure: Exposure) -> float | None:

@@ -7,7 +7,7 @@ module imports nothing heavy, so that every process may.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -247,7 +247,11 @@ class Processed:
 
 @dataclass(frozen=True)
 class ProcessFailed:
-    """This exposure has no product; the sentence says why, and the cure."""
+    """This exposure has no product; the sentence says why, and the cure.
+
+    `report` is a quality report all the same, with the flag NOT_PROCESSED.
+    """
 
     number: int
     sentence: str
+    report: Mapping[str, Any] = field(default_factory=dict)

@@ -110,7 +110,12 @@ class PipelineQueue:
         self._is_done(done.number)
 
     def _on_failed(self, failed: ProcessFailed) -> None:
-        self._tell("not-processed", number=failed.number, sentence=failed.sentence)
+        self._tell(
+            "not-processed",
+            number=failed.number,
+            sentence=failed.sentence,
+            report=dict(failed.report),
+        )
         self._is_done(failed.number)
 
     def _is_done(self, number: int) -> None:

@@ -28,7 +28,13 @@ def rig_toml(rig: Rig, *, remark: str = "") -> bytes:
         }
     )
     lines += ["", "[calibration]"]
-    lines += _pairs({"id": rig.calibration_id, "date": rig.calibration_date})
+    lines += _pairs(
+        {
+            "id": rig.calibration_id,
+            "date": rig.calibration_date,
+            "valid_days": rig.calibration_valid_days,
+        }
+    )
     if rig.virtual_image is not None:
         lines += ["", "[virtual_image]", *_pairs(_values(rig.virtual_image))]
     for cone in rig.cones:

@@ -44,6 +44,7 @@ from daemon.processes import Link
 from daemon.radiometry_folder import RadiometryFolder
 from processing.drawing import residuals_svg
 from processing.histogram import sampled_histogram
+from processing.judgement import judge
 from processing.pipeline import Conditions, Pipeline, Settings
 from processing.quality import Flag, as_json
 from processing.residual_vectors import residual_vectors
@@ -159,6 +160,16 @@ def process_exposure(
     return report, products.write_folder(mission.level2(exposure.number), contents)
 
 
+def report_unprocessed(
+    rig: Rig, plan: PlanSection, exposure: Exposure, flags: Flag
+) -> dict[str, Any]:
+    """The quality report of an exposure that has no image: what capture knows of it."""
+    conditions = conditions_of(exposure, rig, plan, flags | Flag.NOT_PROCESSED)
+    missing = [sensor for sensor, _ in exposure.missing]
+    report = as_json(judge({}, capture_flags=conditions.flags, missing_sensors=missing))
+    return {**report, "exposure": exposure.number}
+
+
 def make_products(
     pipeline: Pipeline,
     number: int,
@@ -260,7 +271,8 @@ class _Desk:
                 f"exposure {exposure.number} was stored but not processed: {error}; "
                 f"run syntopic process {self.mission.path} after landing"
             )
-            self.link.send(ProcessFailed(exposure.number, sentence))
+            report = report_unprocessed(self.rig, self.plan, exposure, flags)
+            self.link.send(ProcessFailed(exposure.number, sentence, report))
             return
         seconds = time.monotonic() - started
         self.link.send(Processed(exposure.number, report, files, seconds))

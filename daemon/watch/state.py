@@ -214,12 +214,7 @@ class FlightState:
         report = event.get("report", {})
         figures = report.get("figures", {})
         told["step"] = "processed"
-        told["verdict"] = report.get("verdict")
-        told["flags"] = report.get("flags", [])
-        told["findings"] = [
-            {key: finding.get(key) for key in ("flag", "sentence", "verdict")}
-            for finding in report.get("findings", [])
-        ]
+        _judge(told, report)
         told["figures"] = {key: figures[key] for key in FIGURES_TOLD if key in figures}
         told["duration_s"] = event.get("duration_s")
         self._history.append(
@@ -251,6 +246,7 @@ class FlightState:
     def _on_not_processed(self, event: Mapping[str, Any]) -> None:
         told = self._exposure(event)
         told |= {"step": "not processed", "sentence": event.get("sentence")}
+        _judge(told, event.get("report", {}))
 
     def _on_lost(self, event: Mapping[str, Any]) -> None:
         told = self._exposure(event)
@@ -286,6 +282,16 @@ class FlightState:
             if verdict in counts:
                 counts[verdict] += 1
         return counts
+
+
+def _judge(told: Json, report: Mapping[str, Any]) -> None:
+    """What a quality report says, into what is told of its exposure."""
+    told["verdict"] = report.get("verdict")
+    told["flags"] = report.get("flags", [])
+    told["findings"] = [
+        {key: finding.get(key) for key in ("flag", "sentence", "verdict")}
+        for finding in report.get("findings", [])
+    ]
 
 
 _HANDLERS: Mapping[str, Callable[[FlightState, Mapping[str, Any]], None]] = {

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import datetime
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from processing.rig.model import Cone, Drift, Lens, Rig, Sensor, VirtualImage
+from processing.rig.model import (
+    CALIBRATION_VALID_DAYS,
+    Cone,
+    Drift,
+    Lens,
+    Rig,
+    Sensor,
+    VirtualImage,
+)
 from processing.rig.table import RigError, Table
 
 RIG_FORMAT = 1
@@ -76,7 +85,10 @@ def rig_from_mapping(content: Mapping[str, Any], file: str) -> Rig:
         colour_master_cone=top.text("colour_master_cone", "") or None,
         reference_cone=top.text("reference_cone"),
         calibration_id=calibration.text("id"),
-        calibration_date=calibration.text("date"),
+        calibration_date=_date(calibration),
+        calibration_valid_days=calibration.integer(
+            "valid_days", CALIBRATION_VALID_DAYS, positive=True
+        ),
         virtual_image=_virtual_image(image) if image.content else None,
         cones=tuple(_cone(cone, defaults) for cone in top.tables("cone")),
     )
@@ -86,6 +98,15 @@ def rig_from_mapping(content: Mapping[str, Any], file: str) -> Rig:
     if problems:
         raise RigError(problems)
     return rig
+
+
+def _date(calibration: Table) -> str:
+    text = calibration.text("date")
+    try:
+        datetime.date.fromisoformat(text or "2000-01-01")
+    except ValueError:
+        calibration.complain("date", "write YYYY-MM-DD")
+    return text
 
 
 def _virtual_image(table: Table) -> VirtualImage:

@@ -15,6 +15,9 @@ from typing import Final, Literal
 VIRTUAL_CAMERA: Final = "virtual"
 """What the camera between converging heads is called beside the cones."""
 
+CALIBRATION_VALID_DAYS: Final = 730
+"""Where the rig file says nothing: customers ask for a calibration of the last two years."""
+
 Timing = Literal["syntopic", "synchronous"]
 Role = Literal["pan", "colour"]
 
@@ -154,7 +157,8 @@ class Rig:
     """A camera of several heads, as its file tells it.
 
     `master_cone` is None where all PAN heads converge and none of them is the virtual image plane:
-    the virtual camera then stands in the middle of their projection centres.
+    the virtual camera then stands in the middle of their projection centres. The calibration is
+    trusted for `calibration_valid_days` after its date.
     """
 
     name: str
@@ -168,6 +172,7 @@ class Rig:
     calibration_date: str
     virtual_image: VirtualImage | None
     cones: tuple[Cone, ...]
+    calibration_valid_days: int = CALIBRATION_VALID_DAYS
 
     def cone(self, name: str | None) -> Cone:
         """The cone of that name; KeyError, None's too, names those there are."""
