@@ -25,12 +25,17 @@ from sim_hw.rendering import Look, light_on_sensor
 from sim_hw.scene import open_scene
 from sim_hw.seeding import random_stream
 from sim_hw.snapshots import PROBE_SIGMA_C, look_of
+from sim_hw.surveyed import write_surveyed
 from sim_hw.truth import Taken, TruthWriter
 from sim_hw.world import World, WorldSettings
 
 EPOCH_GPS_NS = 1_447_000_000_000_000_000
 FIRST_AFTER_S = 20
 MARK_SIGMA_NS = 60
+CONTROL, CHECKS = 12, 30
+"""Surveyed points of a block."""
+LEAST_BLOCK = 5
+"""Exposures that make one: fewer hardly overlap three times."""
 
 
 def write_exposures(world: World, out: Path, *, count: int, scenes: Path, lines: int = 1) -> Path:
@@ -49,6 +54,10 @@ def write_exposures(world: World, out: Path, *, count: int, scenes: Path, lines:
     laboratory.write_rig(Path(world.settings.rig_file), mission)
     _write_plan(world, mission, calibration / "radiometry")
     write_trajectory(out / "trajectory.csv", flight, marks, seed=seed)
+    if rig.virtual_image is not None and len(marks) >= LEAST_BLOCK:
+        write_surveyed(
+            out / "surveyed", world, flight, marks, seed=seed, control=CONTROL, checks=CHECKS
+        )
     # Where no image is stitched there is no mapping to write down.
     truth = None if rig.virtual_image is None else TruthWriter(world, out / "truth")
     if truth is not None:

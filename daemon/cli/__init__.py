@@ -15,6 +15,7 @@ from rich.console import Console
 from daemon.cli import (
     adjust,
     advise,
+    at,
     bench,
     calibrate,
     check,
@@ -66,6 +67,7 @@ app.command(name="report", help=report.HELP)(report.report)
 app.command(name="repair", help=repair.HELP)(repair.repair)
 app.command(name="transfer", help=transfer.HELP)(transfer.transfer)
 app.command(name="adjust", help=adjust.HELP)(adjust.adjust)
+app.command(name="at", help=at.HELP)(at.at)
 app.command(name="sim", help=sim.HELP)(sim.sim)
 app.command(name="bench", help=bench.HELP)(bench.bench)
 app.command(name="kernels", help=kernels.HELP)(kernels.kernels)

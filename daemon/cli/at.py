@@ -1,0 +1,146 @@
+"""`syntopic at`: aerial triangulation of a mission."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import Progress
+
+from daemon.configuration import ConfigurationError
+
+HELP = """Aerial triangulation of the stitched PAN images of a mission.
+
+Direct georeferencing is the start, tie points are matched between all exposures that overlap, lines
+flown the other way or crosswise included. Control and check points come from two tables: where they
+are on the ground (--points) and where in the images (--measured). Writes an adjustment project with
+its report (image residuals in um, control and checks in m and px, systematic image residuals on a
+grid), `exterior.csv` with the adjusted orientations, and all the tables docs/formats.md names.
+
+Examples: `syntopic at MISSION --trajectory sbet.out`,
+`syntopic at MISSION --set sensors-full --points points.csv --measured measured.csv --gnss shift`
+"""
+
+SETS = ("none", "radial", "sensors", "sensors-full")
+
+
+def at(
+    mission: Annotated[Path, typer.Argument(help="Mission folder with Level-2.")],
+    set_name: Annotated[
+        str, typer.Option("--set", help="none, radial, sensors or sensors-full (docs/bundle.md).")
+    ] = "none",
+    interior: Annotated[
+        bool, typer.Option("--interior", help="The set holds dx0, dy0, df: GNSS, two heights.")
+    ] = False,
+    points: Annotated[Path | None, typer.Option(help="Control and check points.")] = None,
+    measured: Annotated[Path | None, typer.Option(help="Their places in the images.")] = None,
+    trajectory: Annotated[
+        Path | None, typer.Option(help="Post-processed trajectory: SBET, or .csv.")
+    ] = None,
+    mount: Annotated[Path | None, typer.Option(help="TOML with the [mount] to use.")] = None,
+    crs: Annotated[str | None, typer.Option(help="Such as EPSG:25833; default: UTM zone.")] = None,
+    gnss: Annotated[
+        str, typer.Option(help="Unknown of the positions of a line: none, shift or linear.")
+    ] = "none",
+    position_sigma: Annotated[
+        tuple[float, float, float], typer.Option(help="Of the trajectory, m: east north up.")
+    ] = (0.05, 0.05, 0.08),
+    attitude_sigma: Annotated[
+        tuple[float, float, float], typer.Option(help="Roll, pitch, heading, mdeg.")
+    ] = (5.0, 5.0, 8.0),
+    search: Annotated[
+        int, typer.Option(help="Pixels around the prediction that are searched.", min=4, max=200)
+    ] = 24,
+    reject: Annotated[
+        float, typer.Option(help="Leave out image points beyond this many sigmas.", min=2.0)
+    ] = 4.0,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for results; default: in the mission's export.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    from daemon.adjusting.tables import ProjectError
+    from daemon.adjusting.telling import print_report, report_of
+    from daemon.cli.adjust import _peak_mib
+    from daemon.mission import Mission
+    from daemon.triangulation import (
+        Asked,
+        TriangulationError,
+        attitude_sigmas,
+        block_of,
+        matched,
+        project_of,
+        weighted,
+    )
+    from daemon.triangulation_report import (
+        print_triangulation,
+        triangulation_of,
+        write_triangulation,
+    )
+    from processing.block_matching import BlockMatching
+    from processing.bundle.adjust import adjust
+    from processing.bundle.network import NetworkError
+    from processing.bundle.rank import DefectError
+    from processing.bundle.start import completed
+
+    if set_name not in SETS or gnss not in ("none", "shift", "linear"):
+        raise ConfigurationError(
+            [f"--set is one of {', '.join(SETS)}; --gnss is none, shift or linear"]
+        )
+    begun = time.perf_counter()
+    folder = Mission.open(mission)
+    results = out or folder.export_dir / "triangulation" / set_name
+    if (results / "project.toml").exists():
+        raise ProjectError(
+            [f"{results} holds a triangulation already; give another folder with --out"]
+        )
+    asked = Asked(
+        parameters=set_name,  # type: ignore[arg-type]
+        interior=interior,
+        position_sigma_m=position_sigma,
+        attitude_sigma_rad=attitude_sigmas(attitude_sigma),
+        drift=gnss,
+        reject_beyond=reject,
+        matching=BlockMatching(first_search_px=search),
+    )
+    block = block_of(folder, crs=crs, trajectory_file=trajectory, mount_file=mount)
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("matching", total=len(block.names))
+        tied = matched(block, asked.matching, lambda done: progress.update(task, completed=done))
+        project = project_of(block, tied, asked, points_file=points, measured_file=measured)
+        progress.update(task, total=None, description="starting values")
+        try:
+
+            def show(what: str, number: int, squares: float) -> None:
+                progress.update(task, description=f"{what} {number}: {squares:.6g}")
+
+            project = weighted(project, tied.points, show)
+            result = adjust(completed(project.network), project.settings, progress=show)
+        except (NetworkError, DefectError) as error:
+            raise TriangulationError(f"{folder.path}: {error}") from error
+    report = report_of(
+        result,
+        project.checks,
+        name=project.name,
+        seconds=time.perf_counter() - begun,
+        peak_mib=_peak_mib(),
+    )
+    report["triangulation"] = triangulation_of(block, tied, project, result)
+    write_triangulation(results, block, project, result, report)
+    if as_json:
+        typer.echo(json.dumps(report | {"folder": str(results)}))
+        return
+    console = Console()
+    short = report | {"rejected": [], "left_out": [], "control": {"count": 0}}
+    print_report(console, short | {"checks": {"count": 0}})
+    console.print(
+        f"{len(report['rejected'])} image points and {len(report['left_out'])} object points left "
+        "out",
+        highlight=False,
+    )
+    print_triangulation(console, report["triangulation"])
+    console.print(f"Results: [bold]{results}[/], report {results / 'report.html'}", soft_wrap=True)
