@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from benchmarks import rendered
 from daemon.measuring import machine
-from processing.composition import PanComposer
+from processing.composition import PanComposer, pan_cell_px
 from processing.level1 import corrector_for, exposed_rows, level1_counts_per_dn, level1_from_level0
 from processing.pipeline import Conditions, Pipeline, Product, Settings
 from processing.radiometry import RadiometricCalibration
@@ -90,10 +90,11 @@ class Head:
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.seam_radiometry")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--rig", default=RIG, help="a shipped rig")
     parser.add_argument("--scenes", type=Path, help="folder where built scenes are kept")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="syntopic-seams-") as folder:
-        seams, defects = measure(options.scenes or Path(folder))
+        seams, defects = measure(options.scenes or Path(folder), rig=options.rig)
     if options.json:
         told = {"seams": [asdict(s) for s in seams], "defects": [asdict(d) for d in defects]}
         print(json.dumps({"machine": machine(), **told}))
@@ -117,6 +118,7 @@ def main() -> None:
 def measure(
     scenes: Path,
     *,
+    rig: str = RIG,
     levels: Sequence[float] = LEVELS,
     changes: Sequence[bool] = (False, True),
     own_contrast: bool = True,
@@ -125,11 +127,12 @@ def measure(
 
     Args:
         scenes: folder where built scenes are kept.
+        rig: a shipped rig.
         levels: shares of full scale.
         changes: whether the heads have changed since their calibration.
         own_contrast: real imagery as it is, too.
     """
-    world = World(rendered.world_settings(RIG, SEED))
+    world = World(rendered.world_settings(rig, SEED))
     scene = open_scene(world.scene_settings, scenes)
     exposure = rendered.take(world, scenes, scene=scene)
     conditions = rendered.conditions_of(exposure, seed=SEED)
@@ -250,7 +253,7 @@ def seams_of(
     sides = []
     for name in product.sensors:
         head = heads[name]
-        composer = PanComposer(world.image, [head.sensor])
+        composer = PanComposer(world.image, [head.sensor], cell_px=pan_cell_px(world.rig))
         cone = head.cone.name
         look = Look(0, conditions.exposure_time_s[cone] * 1e6, conditions.tdi_shifts[cone])
         level1_of(head, frames[name], look, conditions, composer.frame(name))

@@ -56,7 +56,7 @@ def exposures_of(rig_name: str, rig: Rig, folder: Path) -> Path:
         return folder
     command = [sys.executable, "-m", "sim_hw.exposures", rig_name, "--out", str(folder)]
     command += ["--exposures", "1", "--dc", str(DC_K)]
-    master = rig.cone(rig.master_cone).sensors
+    master = rig.master_sensors
     if len(master) > 2:
         command += ["--displace", f"{master[2].name}={DISPLACED_PX[0]},{DISPLACED_PX[1]}"]
     _json_of(command, RENDER_WITHIN_S, "rendering the exposure", needs_json=False)

@@ -95,7 +95,7 @@ def demo(
 
 def _displacement(rig: Rig) -> str:
     """The third sensor of the master cone, by a pixel; nothing where no sensor could be named."""
-    master = rig.cone(rig.master_cone).sensors
+    master = rig.master_sensors
     return f"{master[2].name}=1.0,-0.6" if len(master) >= 3 else ""
 
 
