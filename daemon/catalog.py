@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from daemon.catalog_schema import SCHEMA_VERSION, create, migrate
+from daemon.catalog_schema import SCHEMA_VERSION, create, is_plain, migrate
 from daemon.errors import DaemonError
 from daemon.exposure import Capture, Exposure, FrameRecord
 
@@ -127,6 +127,9 @@ class Catalog:
         if version != SCHEMA_VERSION:
             connection.close()
             raise CatalogError(_wrong_version(path, version))
+        if not is_plain(connection):
+            connection.close()
+            raise CatalogError(_damaged(path, "it holds views or triggers; ours has none"))
         return cls(connection)
 
     def close(self) -> None:
@@ -286,6 +289,8 @@ class Catalog:
 
 def _prepare(connection: sqlite3.Connection, path: Path) -> None:
     version = connection.execute("PRAGMA user_version").fetchone()[0]
+    if not is_plain(connection):
+        raise CatalogError(_damaged(path, "it holds views or triggers; ours has none"))
     if version == SCHEMA_VERSION:
         verdict = connection.execute("PRAGMA quick_check(1)").fetchone()[0]
         if verdict != "ok":

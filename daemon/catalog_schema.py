@@ -94,6 +94,12 @@ def migrate(connection: sqlite3.Connection) -> None:
         raise
 
 
+def is_plain(connection: sqlite3.Connection) -> bool:
+    """Whether there are tables and indexes only: a view or a trigger of a stranger runs code."""
+    kinds = connection.execute("SELECT DISTINCT type FROM sqlite_schema").fetchall()
+    return {kind for (kind,) in kinds} <= {"table", "index"}
+
+
 def _version(connection: sqlite3.Connection) -> int:
     version: int = connection.execute("PRAGMA user_version").fetchone()[0]
     return version

@@ -11,11 +11,14 @@ import os
 import struct
 import zlib
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from datetime import UTC, datetime
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import zstandard
+from lz4.frame import LZ4FrameDecompressor
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -31,6 +34,23 @@ from daemon.records import RecordError, canonical_bytes, parse_record
 PROFILE = "syntopic"
 CHECKPOINT_TOPIC = "log/checkpoint"
 """Written at every sync: CRC-32 of all bytes of the file before it."""
+
+RECORD_MAX_NBYTES = 16_000_000
+"""Nothing larger is read: messages of ours have some kB, chunks of other tools a few MB."""
+
+_DAMAGE = (
+    McapError,
+    zstandard.ZstdError,
+    struct.error,
+    ValueError,
+    LookupError,
+    TypeError,
+    ArithmeticError,
+    RuntimeError,
+    EOFError,
+    MemoryError,
+)
+"""What the readers of records and chunks raise on damaged or hostile bytes."""
 
 _KNOWN_OPCODES = {int(opcode) for opcode in Opcode}
 _RECORD_HEADER = struct.Struct("<BQ")
@@ -192,7 +212,7 @@ class LogReader:
                     break
                 try:
                     found = list(self._records(header[0], body, channels))
-                except (McapError, struct.error, UnicodeDecodeError, ValueError, KeyError):
+                except _DAMAGE:
                     break
                 for message in found:
                     if message.topic == CHECKPOINT_TOPIC:
@@ -215,7 +235,7 @@ class LogReader:
             channels[channel.id] = channel.topic
         elif opcode == Opcode.CHUNK:
             # Ours have none; a log that went through other tools may.
-            for record in breakup_chunk(Chunk.read(stream), validate_crc=True):
+            for record in breakup_chunk(_unpacked(Chunk.read(stream)), validate_crc=True):
                 if isinstance(record, Channel):
                     channels[record.id] = record.topic
                 elif isinstance(record, McapMessage):
@@ -288,10 +308,29 @@ def _read_body(file: Any, header: bytes, remaining: int) -> bytes | None:
     if len(header) < _RECORD_HEADER.size:
         return None
     opcode, length = _RECORD_HEADER.unpack(header)
-    if length > remaining or (opcode < 0x80 and opcode not in _KNOWN_OPCODES):
+    if length > min(remaining, RECORD_MAX_NBYTES) or (
+        opcode < 0x80 and opcode not in _KNOWN_OPCODES
+    ):
         return None
     body: bytes = file.read(length)
     return body if len(body) == length else None
+
+
+def _unpacked(chunk: Chunk) -> Chunk:
+    """A chunk whose records lie open; ValueError where they are more than it says, or too many."""
+    if not chunk.compression:
+        return chunk
+    limit = min(chunk.uncompressed_size, RECORD_MAX_NBYTES) + 1
+    if chunk.compression == "zstd":
+        with zstandard.ZstdDecompressor().stream_reader(chunk.data) as reader:
+            data = reader.read(limit)
+    elif chunk.compression == "lz4":
+        data = LZ4FrameDecompressor().decompress(chunk.data, max_length=limit)
+    else:
+        raise ValueError(f"compression {chunk.compression!r}")
+    if len(data) != chunk.uncompressed_size:
+        raise ValueError("a chunk is not of the size it says")
+    return replace(chunk, compression="", data=data)
 
 
 def _agrees(message: Message, position: int, crc32: int) -> bool:

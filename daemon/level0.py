@@ -7,8 +7,10 @@ reads. Which files belong to an exposure is the business of `daemon.store`.
 from __future__ import annotations
 
 import json
+import math
 import struct
 import sys
+import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -25,6 +27,13 @@ PIXEL_ALIGNMENT = 4096
 TIFF_MAX_BYTES = 4_000_000_000
 """Offsets of a classic TIFF have 32 bits."""
 
+PART_ALLOWANCE_BYTES = 1 << 20
+"""Tiles at the edges of a small image reach beyond it."""
+
+DEFLATE_MOST = 1032
+"""How many times its size Deflate can unpack to (zlib, technical details)."""
+
+_DEFLATE = (8, 32946)
 _SHORT, _LONG, _ASCII = 3, 4, 2
 _SOFTWARE = b"Syntopic\0"
 
@@ -59,9 +68,10 @@ def read_tiff(
     """Pixels of a single-plane 16-bit TIFF, shape (height, width); any writer's will do.
 
     Raises:
-        RasterError: not a TIFF, damaged, not one plane of uint16, or not of the size given.
+        RasterError: not a TIFF, damaged, not one plane of uint16, not of the size given, or one
+            that would unpack to more than it says.
     """
-    from tifffile import TiffFile, TiffFileError
+    from tifffile import TiffFile
 
     try:
         with TiffFile(path) as tiff:
@@ -78,28 +88,84 @@ def read_tiff(
                     f"{path.name}: {found[0]} x {found[1]} px; the sensor has "
                     f"{wanted[0]} x {wanted[1]} px"
                 )
+            refuse_bomb(page, path)
             pixels: NDArray[np.uint16] = page.asarray()
     except OSError as error:
         reason = error.strerror or type(error).__name__
         raise RasterError(f"{path}: cannot be read ({reason})") from error
     except RasterError:
         raise
-    except (TiffFileError, ValueError, KeyError, IndexError, struct.error, MemoryError) as error:
+    except tiff_faults() as error:
         raise RasterError(f"{path.name}: not a usable TIFF ({error})") from error
     if pixels.shape != (found[1], found[0]):
         raise RasterError(f"{path.name}: its pixels end early")
     return pixels
 
 
+def tiff_faults() -> tuple[type[Exception], ...]:
+    """What tifffile raises on bytes that are no TIFF, or a hostile one."""
+    from tifffile import TiffFileError
+
+    return (
+        TiffFileError,
+        ValueError,
+        LookupError,
+        TypeError,
+        AttributeError,
+        ArithmeticError,
+        AssertionError,
+        RuntimeError,
+        MemoryError,
+        struct.error,
+        zlib.error,
+    )
+
+
+def refuse_bomb(page: Any, path: Path) -> None:
+    """Refuse a page of tifffile's whose pixels need more memory than its file or size warrant.
+
+    Raises:
+        RasterError: compressed otherwise than by Deflate; pixels that the file does not hold; parts
+            that unpack to more than they may.
+    """
+    file_nbytes = path.stat().st_size
+    ratio = 1 if page.compression == 1 else DEFLATE_MOST
+    most = min(TIFF_MAX_BYTES, ratio * file_nbytes)
+    if page.nbytes > most:
+        raise RasterError(f"{path.name}: says {page.nbytes} bytes of pixels; it holds {most}")
+    part_nbytes = math.prod(page.chunks) * page.dtype.itemsize
+    if part_nbytes > page.nbytes + PART_ALLOWANCE_BYTES:
+        raise RasterError(f"{path.name}: one of its parts says {part_nbytes} bytes; that is more")
+    places = list(zip(page.dataoffsets, page.databytecounts, strict=True))
+    is_listed = math.prod(page.chunked) == len(places)
+    if not is_listed or any(offset + count > file_nbytes for offset, count in places):
+        raise RasterError(f"{path.name}: its pixels end early")
+    if page.compression == 1:
+        return
+    if page.compression not in _DEFLATE:
+        raise RasterError(
+            f"{path.name}: compression {int(page.compression)}; none or Deflate (8) is read"
+        )
+    with path.open("rb") as file:
+        for offset, count in places:
+            file.seek(offset)
+            unpacked = zlib.decompressobj()
+            unpacked.decompress(file.read(count), part_nbytes)
+            if unpacked.unconsumed_tail and unpacked.decompress(unpacked.unconsumed_tail, 1):
+                raise RasterError(f"{path.name}: a part unpacks to more than its pixels")
+
+
 def read_description(path: Path) -> dict[str, Any]:
     """What our own TIFF says of itself in ImageDescription; empty for a file of others."""
-    from tifffile import TiffFile, TiffFileError
+    from tifffile import TiffFile
 
     try:
         with TiffFile(path) as tiff:
             text = tiff.pages[0].description
         content = json.loads(text)
-    except (TiffFileError, OSError, ValueError, KeyError, IndexError, struct.error):
+    except OSError:
+        return {}
+    except tiff_faults():
         return {}
     return content if isinstance(content, dict) else {}
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from daemon import durable
 from daemon.errors import DaemonError
 from daemon.exposure import Exposure
-from daemon.level0 import read_description
+from daemon.level0 import read_description, refuse_bomb, tiff_faults
 from daemon.level0_folder import exposure_of, read_capture, read_sealed
 from daemon.mission import Mission, exposure_name
 from daemon.products import BAND_ORDER, take_the_place_of
@@ -284,17 +284,18 @@ def _colour(mission: Mission, number: int) -> dict[str, NDArray[np.uint16]]:
 
 
 def _read(path: Path, number: int) -> NDArray[np.uint16]:
-    import struct
-
-    from tifffile import TiffFileError, imread
+    from tifffile import TiffFile
 
     try:
-        pixels: NDArray[Any] = imread(path)
+        with TiffFile(path) as tiff:
+            page = tiff.pages[0]
+            refuse_bomb(page, path)
+            pixels: NDArray[Any] = page.asarray()
     except FileNotFoundError as error:
         raise Level3Error(
             f"exposure {number}: has no {path.name} at Level-2; run syntopic process first"
         ) from error
-    except (TiffFileError, ValueError, KeyError, IndexError, struct.error) as error:
+    except tiff_faults() as error:
         raise Level3Error(
             f"exposure {number}: {path.name} cannot be read ({error}); process it again"
         ) from error

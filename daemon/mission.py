@@ -97,12 +97,18 @@ class Mission:
         """A mission folder that exists, flown or laid out by hand.
 
         Raises:
-            MissionError: no such folder, or one without exposures' folder L0.
+            MissionError: no such folder, one without exposures' folder L0, or one that holds
+                anything but plain files and folders: what a link or a pipe leads to is not ours.
         """
         if not path.is_dir():
             raise MissionError(f"{path}: no such folder; give the path of a mission")
         if not (path / "L0").is_dir():
             raise MissionError(f"{path}: has no folder L0; a mission keeps its exposures there")
+        if (odd := _first_odd(path)) is not None:
+            raise MissionError(
+                f"{odd}: is a link, a pipe or a device; a mission holds plain files and folders: "
+                "put what it leads to in its place"
+            )
         return cls(path, path.resolve().name)
 
     @classmethod
@@ -237,6 +243,22 @@ def exposure_name(number: int) -> str:
     if number < 1:
         raise MissionError(f"exposure {number}: exposures are counted from 1")
     return f"{number:06d}"
+
+
+def _first_odd(folder: Path) -> str | None:
+    """The first entry below a folder that is neither plain file nor folder; None where none is."""
+    waiting = [str(folder)]
+    while waiting:
+        try:
+            entries = list(os.scandir(waiting.pop()))
+        except FileNotFoundError:
+            continue  # a product folder that is being replaced
+        for entry in entries:
+            if entry.is_dir(follow_symlinks=False):
+                waiting.append(entry.path)
+            elif not entry.is_file(follow_symlinks=False):
+                return entry.path
+    return None
 
 
 def _free_id(root: Path, started_utc: datetime, rig_name: str) -> str:

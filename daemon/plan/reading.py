@@ -35,6 +35,8 @@ def read_plan(path: Path) -> Plan:
         PlanError: too large, not of its kind, or without a line.
     """
     try:
+        if path.exists() and not path.is_file():
+            raise PlanError(f"{path}: is no file; give the path of a plan")
         if path.stat().st_size > PLAN_MAX_BYTES:
             raise PlanError(f"{path.name}: larger than {PLAN_MAX_BYTES / 1e6:.0f} MB, no plan")
         data = path.read_bytes()
