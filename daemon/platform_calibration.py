@@ -37,6 +37,8 @@ from processing.rig import Rig, load_rig
 from processing.stitch_record import StitchRecord
 
 KIND = "platform"
+LOOSE_RAD = 20e-6
+"""Turning from exposure to exposure, beyond what tie points explain, that is worth a sentence."""
 _ANGLES = ("omega", "phi", "kappa")
 
 
@@ -207,7 +209,9 @@ def _warnings(
         f"cone {c.cone} turns by up to {float(np.max(c.unexplained_rad)) * 1e6:.0f} urad from "
         "exposure to exposure, more than tie points explain: a loose head"
         for c in calibration.cones
-        if flown.rig.timing != "syntopic" and (c.unexplained_rad > 20e-6).any()
+        if flown.rig.timing != "syntopic"
+        and flown.rig.cone(c.cone).role == "pan"
+        and (c.unexplained_rad > LOOSE_RAD).any()
     ]
     return told
 

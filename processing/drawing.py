@@ -18,7 +18,7 @@ from processing.mosaic import Mosaic
 from processing.placement import nominal_placements, vip_mm_from_raw, vip_px_from_mm
 from processing.rig import Cone, Rig, VirtualImage
 from processing.tie_points import PAN_TO_COLOUR, PAN_TO_PAN, TiePoints
-from processing.topology import Rectangle, corners, footprint, overlaps
+from processing.topology import Rectangle, corners, footprint, outline, overlaps
 from processing.validity import Validity
 
 Array = NDArray[Any]
@@ -163,11 +163,17 @@ def _focal_plane(rig: Rig, cone: Cone, x: float, y: float, cell: float, reach: f
 def _virtual_image(
     rig: Rig, image: VirtualImage, x: float, y: float, width: float
 ) -> tuple[list[str], float]:
-    margin_px = 0.04 * image.width_px
-    unit = width / (image.width_px + 2.0 * margin_px)
-    ox, oy = x + margin_px * unit, y + 30.0 + margin_px * unit
-    height = (image.height_px + 2.0 * margin_px) * unit
     places = nominal_placements(rig, {}, {})
+    seen = {name: vip_px_from_mm(image, outline(place)) for name, place in places.items()}
+    drawn = [*rig.pan_cones, *(c for c in rig.colour_cones if c.name == rig.colour_master_cone)]
+    corners_px = np.concatenate([seen[s.name] for cone in drawn for s in cone.sensors])
+    size = np.array([image.width_px, image.height_px])
+    # What looks past the image is shown, too; labels stand above.
+    past = np.maximum(-corners_px.min(axis=0), corners_px.max(axis=0) - size)
+    margin_x, margin_y = np.maximum(0.04 * image.width_px, past + 0.02 * image.width_px)
+    unit = width / (image.width_px + 2.0 * margin_x)
+    ox, oy = x + margin_x * unit, y + 30.0 + margin_y * unit
+    height = (image.height_px + 2.0 * margin_y) * unit
     parts = [
         _text(x, y + 4, "virtual image", 17, weight="bold"),
         _text(
@@ -197,7 +203,13 @@ def _virtual_image(
         for sensor in cone.sensors:
             bx, by, bw, bh = box(footprint(places[sensor.name]))
             colour = _colour(rig, cone)
-            parts.append(_rect(bx, by, bw, bh, fill=colour, stroke=colour, opacity=0.16))
+            corner_points = " ".join(
+                f"{ox + c * unit:.1f},{oy + r * unit:.1f}" for c, r in seen[sensor.name] + 0.5
+            )
+            parts.append(
+                f'<polygon points="{corner_points}" fill="{colour}" fill-opacity="0.16" '
+                f'stroke="{colour}"/>'
+            )
             middle = (bx + bw / 2, by + bh / 2)
             parts.append(_text(*middle, sensor.name, 15, colour, anchor="middle", weight="bold"))
             parts.append(

@@ -198,22 +198,22 @@ def seen_by_both(a: SensorPlacement, b: SensorPlacement) -> Rectangle:
     """
     if _is_upright(a) and _is_upright(b):
         return intersection(footprint(a), footprint(b))
-    _, common = cv2.intersectConvexConvex(_outline(a), _outline(b))
+    _, common = cv2.intersectConvexConvex(np.float32(outline(a)), np.float32(outline(b)))
     if common is None or len(common) < 3:
         return Rectangle(0.0, 0.0, 0.0, 0.0)
     low, high = common.reshape(-1, 2).min(axis=0), common.reshape(-1, 2).max(axis=0)
     return Rectangle(float(low[0]), float(low[1]), float(high[0]), float(high[1]))
 
 
-def _outline(placement: SensorPlacement) -> NDArray[np.float32]:
+def outline(placement: SensorPlacement) -> Array:
     """The corners of a sensor in the VIP, mm, around it, (4, 2)."""
     right, low = placement.sensor.width_px - 0.5, placement.sensor.height_px - 0.5
     corners = np.array([[-0.5, -0.5], [right, -0.5], [right, low], [-0.5, low]])
-    return vip_mm_from_raw(placement, corners).astype(np.float32)
+    return vip_mm_from_raw(placement, corners)
 
 
 def _is_upright(placement: SensorPlacement) -> bool:
-    corners = _outline(placement)
+    corners = outline(placement)
     # Of opposite corners along a side, the coordinate across it.
     askew = max(
         abs(float(corners[i, k] - corners[j, k]))
