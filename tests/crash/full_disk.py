@@ -1,0 +1,107 @@
+"""A flight on a small disk that fills and is freed: `python -m tests.crash.full_disk FOLDER`.
+
+To be run in a user and mount namespace of its own (`unshare -Ur -m`): the disk is a tmpfs of 4 MB.
+Prints what became of it as JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from daemon import writer
+from daemon.exposure import Exposure
+from daemon.level0_folder import read_sealed
+from daemon.messages import Seal, Sealed, Told, WriteFailed
+from tests.crash import judging
+from tests.crash.flight import Flown, Ring
+from tests.daemon.small_camera import SENSORS, new_mission
+
+DISK = "size=4m"
+EXPOSURES = 15
+FULL_AFTER = 4
+FREED_AFTER_REFUSALS = 8
+
+
+class OnASmallDisk(Flown):
+    """Fills the disk after some exposures, and frees it after so many refused records."""
+
+    filler = Path()
+    refused_frames = 0
+    refused_records = 0
+    behind = 0
+
+    def send(self, message: object) -> None:
+        super().send(message)
+        stored = len([a for a in self._answers if isinstance(a, Sealed)])
+        if stored == FULL_AFTER and not self.filler.exists() and not self.refused_records:
+            _fill(self.filler)
+        if isinstance(message, WriteFailed):
+            assert "No space left" in message.sentence, message.sentence
+            self.refused_frames += not message.may_pass
+            self.refused_records += message.may_pass
+        if isinstance(message, Told):
+            self.behind = max(self.behind, message.event["behind"])
+        if self.refused_records == FREED_AFTER_REFUSALS:
+            self.filler.unlink(missing_ok=True)
+
+    def _seal(self, record: Exposure) -> Iterator[object]:
+        while True:
+            yield Seal(record)
+            if isinstance(self._last(Sealed, WriteFailed), Sealed):
+                return
+            answer = self._last(Sealed, WriteFailed)
+            assert self.refused_records < 2 * FREED_AFTER_REFUSALS, answer
+
+
+def _fill(path: Path) -> None:
+    """To the last byte."""
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT, 0o644)
+    for block in (4096, 1):
+        try:
+            while True:
+                os.write(descriptor, bytes(block))
+        except OSError:
+            continue
+    os.close(descriptor)
+
+
+def main() -> None:
+    folder = Path(sys.argv[1])
+    subprocess.run(["mount", "-t", "tmpfs", "-o", DISK, "tmpfs", str(folder)], check=True)
+    acks_path = folder.with_suffix(".acks")
+    acks = os.open(acks_path, os.O_WRONLY | os.O_CREAT, 0o644)
+    root = folder / "root"
+    mission = new_mission(root)
+    link: Any = OnASmallDisk(mission, acks, range(1, EXPOSURES + 1), lands=True, keeps="not all")
+    link.filler = folder / "filler"
+    with mission.held():
+        writer.main(link, mission.path, tuple(Ring(sensor) for sensor in SENSORS))
+    told = judging.Told(mission=mission.id)
+    for line in acks_path.read_text().splitlines():
+        told.hear(line)
+    lost = [
+        number
+        for number in mission.numbers()
+        if (record := read_sealed(mission.level0(number))) and record.exposure.state == "lost"
+    ]
+    outcome = judging.judge(root, told, flies_on=True)
+    figures = {
+        "exposures": outcome.exposures - 1,
+        "stored": sorted(told.stored),
+        "sealed": sorted(told.sealed),
+        "lost": lost,
+        "refused_frames": link.refused_frames,
+        "refused_records": link.refused_records,
+        "index_behind": link.behind,
+    }
+    print(json.dumps(figures))
+
+
+if __name__ == "__main__":
+    main()
