@@ -21,6 +21,24 @@ Examples: `syntopic orient MISSION`, `syntopic orient MISSION --trajectory sbet.
 `syntopic orient MISSION --mount boresight-2026-11-21/mount.toml`
 """
 
+PICTURES_HELP = """Level-2 for other programs: Cloud Optimized GeoTIFF, or JPEG with EXIF and XMP.
+
+Geometry stays that of the image, nothing is rectified. A COG has overviews, tags, and ground
+control points on level ground; a JPEG tells time, place, attitude, focal length and pixel size to
+whoever reads EXIF (exiftool, photogrammetric programs). COGs take `pip install 'syntopic[geotiff]'`.
+
+Examples: `syntopic export pictures MISSION --trajectory sbet.out`,
+`syntopic export pictures MISSION --as jpeg --only 12`
+"""
+
+CERTIFICATE_HELP = """The camera of the images as a calibration certificate: JSON and a page.
+
+The virtual camera of stitched images, or each head where heads are images of their own: principal
+distance, principal point with axes and signs, pixel size, serial numbers, what it is valid for.
+
+Example: `syntopic export certificate MISSION`
+"""
+
 app = typer.Typer(
     help="""Write what others need into the mission's export folder.
 
@@ -58,6 +76,67 @@ def raw(
         console.print(f"{name}: {nbytes} bytes")
     console.print(f"events.csv: {done.events} exposures; frames.csv: every frame of theirs")
     console.print(f"They are in [bold]{done.folder}[/]", soft_wrap=True)
+
+
+@app.command(help=PICTURES_HELP)
+def pictures(
+    mission: Annotated[Path, typer.Argument(help="Mission folder with Level-2.")],
+    kind: Annotated[str, typer.Option("--as", help="cog or jpeg.")] = "cog",
+    trajectory: Annotated[
+        Path | None, typer.Option(help="Post-processed trajectory: SBET, or .csv.")
+    ] = None,
+    mount: Annotated[Path | None, typer.Option(help="TOML with the [mount] to use.")] = None,
+    crs: Annotated[str | None, typer.Option(help="Such as EPSG:25833; default: UTM zone.")] = None,
+    only: Annotated[
+        list[int] | None, typer.Option(help="An exposure's number; repeatable.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    from daemon.mission import Mission
+    from daemon.picture_export import KINDS, PictureError, export_pictures
+
+    if kind not in KINDS:
+        raise PictureError(f"--as is {kind!r}; cog or jpeg is right")
+    folder = Mission.open(mission)
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("writing", total=len(only or folder.numbers()))
+        files = export_pictures(
+            folder,
+            kind,
+            crs=crs,
+            trajectory_file=trajectory,
+            mount_file=mount,
+            only=only or (),
+            progress=lambda count: progress.update(task, completed=count),
+        )
+    if as_json:
+        typer.echo(json.dumps({"folder": str(files[0].parent), "files": [f.name for f in files]}))
+        return
+    Console().print(f"{len(files)} pictures in [bold]{files[0].parent}[/]", soft_wrap=True)
+
+
+@app.command(help=CERTIFICATE_HELP)
+def certificate(
+    mission: Annotated[Path, typer.Argument(help="Mission folder.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    from daemon.certificate import write_certificate
+    from daemon.mission import Mission
+
+    told, path = write_certificate(Mission.open(mission))
+    if as_json:
+        typer.echo(json.dumps(told))
+        return
+    console = Console()
+    for camera in told["cameras"]:
+        x, y = camera["principal_point_mm"]
+        console.print(
+            f"{camera['name']}: principal distance {camera['principal_distance_mm']:.6f} mm, "
+            f"principal point {x:.3f} {y:.3f} mm, {camera['width_px']} x {camera['height_px']} px "
+            f"of {camera['pixel_size_um']:g} um",
+            highlight=False,
+        )
+    console.print(f"Certificate: [bold]{path}[/]", soft_wrap=True)
 
 
 @app.command(help=ORIENTATION_HELP)

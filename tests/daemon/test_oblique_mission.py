@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
+import subprocess
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +14,7 @@ import pytest
 import tifffile
 from typer.testing import CliRunner
 
+from daemon.certificate import CertificateError, certificate_of
 from daemon.cli import app
 from daemon.level0 import read_description
 from daemon.mission import Mission
@@ -22,6 +26,7 @@ from sim_hw.world import World, WorldSettings
 pyproj = pytest.importorskip("pyproj", reason="pip install 'syntopic[geodesy]'")
 RUN = CliRunner()
 EXPOSURES, LINES = 2, 2
+CRS = "EPSG:32633"
 
 
 @pytest.fixture(scope="module")
@@ -44,15 +49,15 @@ def flown(tmp_path_factory) -> tuple[World, Path]:
         )
     )
     write_exposures(world, folder, count=EXPOSURES, scenes=folder / "scenes", lines=LINES)
+    done = RUN.invoke(app, ["process", str(folder / "mission"), "--json"])
+    assert done.exit_code == 0, done.output
+    told = json.loads(done.stdout)["exposures"]
+    assert [e["heads"] for e in told] == [["nadir", "5", "7", "8", "19"]] * 4
     return world, folder
 
 
 def test_every_head_becomes_an_image_of_its_own(flown) -> None:
     _, folder = flown
-    done = RUN.invoke(app, ["process", str(folder / "mission"), "--json"])
-    assert done.exit_code == 0, done.output
-    told = json.loads(done.stdout)["exposures"]
-    assert [e["heads"] for e in told] == [["nadir", "5", "7", "8", "19"]] * 4
     for name in ("nadir", "5", "7", "8", "19"):
         path = folder / "mission/L2/000001" / f"{name}.tif"
         planes, about = tifffile.imread(path), read_description(path)
@@ -62,18 +67,21 @@ def test_every_head_becomes_an_image_of_its_own(flown) -> None:
         assert about["geometry"].startswith("strict perspective")
 
 
+def _oriented(folder: Path) -> dict[str, dict]:
+    asked = ["orient", str(folder / "mission"), "--trajectory", str(folder / "trajectory.csv")]
+    done = RUN.invoke(app, [*asked, "--crs", CRS, "--json"])
+    assert done.exit_code == 0, done.output
+    return {eo["image"]: eo for eo in json.loads(done.stdout)["oriented"]}
+
+
 def test_every_head_is_oriented_where_it_truly_looked(flown) -> None:
     world, folder = flown
-    asked = ["orient", str(folder / "mission"), "--trajectory", str(folder / "trajectory.csv")]
-    done = RUN.invoke(app, [*asked, "--json"])
-    assert done.exit_code == 0, done.output
-    told = {eo["image"]: eo for eo in json.loads(done.stdout)["oriented"]}
+    told = _oriented(folder)
     assert len(told) == EXPOSURES * LINES * 5
     rig = load_rig(Mission.open(folder / "mission").rig_path)
     first = EPOCH_GPS_NS + FIRST_AFTER_S * 1_000_000_000
     flight = world.flight.beginning_first_line_at(world.flight.distance_flown_m(first))
-    crs = json.loads(done.stdout)["crs"].split(" ")[0]
-    to_grid = pyproj.Transformer.from_crs("EPSG:4979", crs, always_xy=True)
+    to_grid = pyproj.Transformer.from_crs("EPSG:4979", CRS, always_xy=True)
     for name, eo in told.items():
         cone = rig.cone(name.split("_")[1])
         pose = flight.pose(int(eo["gps_ns"]))
@@ -104,3 +112,92 @@ def test_the_second_line_is_flown_back_beside_the_first(flown) -> None:
     assert apart == pytest.approx(world.flight.plan.line_spacing_m, rel=0.1)
     headings = [flight.pose(int(r["mark_gps_ns"])).heading_rad for r in records]
     assert abs(abs(headings[2] - headings[0]) - np.pi) < 0.1
+
+
+def _exported(folder: Path, kind: str) -> Path:
+    asked = ["export", "pictures", str(folder / "mission"), "--as", kind, "--only", "2"]
+    done = RUN.invoke(
+        app, [*asked, "--trajectory", str(folder / "trajectory.csv"), "--crs", CRS, "--json"]
+    )
+    assert done.exit_code == 0, done.output + str(done.exception)
+    told = json.loads(done.stdout)
+    assert len(told["files"]) == 5
+    return Path(told["folder"])
+
+
+def test_exiftool_reads_time_place_and_attitude_of_a_picture(flown) -> None:
+    _, folder = flown
+    pictures = _exported(folder, "jpeg")
+    if shutil.which("exiftool") is None:
+        pytest.skip("exiftool is not here; apt-get install libimage-exiftool-perl")
+    told = json.loads(
+        subprocess.run(
+            ["exiftool", "-json", "-n", str(pictures / "000002_7.jpg")],
+            capture_output=True, check=True, timeout=60,
+        ).stdout
+    )[0]  # fmt: skip
+    eo = _oriented(folder)["000002_7"]
+    assert "Warning" not in told
+    to_wgs = pyproj.Transformer.from_crs(CRS, "EPSG:4979", always_xy=True)
+    longitude, latitude, height = to_wgs.transform(eo["east_m"], eo["north_m"], eo["height_m"])
+    assert told["GPSLatitude"] == pytest.approx(latitude, abs=1e-8)
+    assert told["GPSLongitude"] == pytest.approx(longitude, abs=1e-8)
+    assert told["GPSAltitude"] == pytest.approx(height, abs=1e-3)
+    assert told["FocalLength"] == 51.0
+    assert 10.0 / told["FocalPlaneXResolution"] == pytest.approx(7.2e-3)
+    assert [told["Omega"], told["Phi"], told["Kappa"]] == pytest.approx(
+        eo["omega_phi_kappa_deg"], abs=1e-6
+    )
+    # The head looks right, 44.2 deg off the vertical: that is roll, seen from its own camera.
+    assert abs(abs(told["Roll"]) - 44.2) < 3.0 or abs(abs(told["Pitch"]) - 44.2) < 3.0
+    instant = datetime(1980, 1, 6, tzinfo=UTC) + timedelta(
+        microseconds=int(eo["gps_ns"]) // 1000, seconds=-18
+    )
+    assert told["DateTimeOriginal"] == instant.strftime("%Y:%m:%d %H:%M:%S")
+    assert told["Model"].startswith("Track'Air MIDAS") and told["ImageUniqueID"] == "000002_7"
+    assert "SIMULATED" in told["ImageDescription"]
+
+
+def test_a_cog_has_tiles_overviews_tags_and_lies_where_the_head_looked(flown) -> None:
+    rasterio = pytest.importorskip("rasterio", reason="pip install 'syntopic[geotiff]'")
+    _, folder = flown
+    eo = _oriented(folder)["000002_5"]
+    with rasterio.open(_exported(folder, "cog") / "000002_5.tif") as raster:
+        assert raster.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
+        assert (raster.width, raster.height, raster.count) == (416, 278, 3)
+        assert raster.descriptions == ("red", "green", "blue")
+        points, crs = raster.gcps
+        assert crs.to_epsg() == int(CRS.split(":")[1]) and len(points) == 25
+        middle = next(p for p in points if (p.col, p.row) == (208.0, 139.0))
+        # Forward head, 44.96 deg off the vertical: as far ahead as it is high.
+        height = eo["height_m"] - 395.0
+        reach = np.hypot(middle.x - eo["east_m"], middle.y - eo["north_m"])
+        assert reach == pytest.approx(height * np.tan(np.radians(44.96)), rel=0.15)
+        assert abs(middle.z - 395.0) < 1.0
+        assert raster.tags()["PRINCIPAL_DISTANCE_MM"] == "51.000000"
+        pixels = raster.read(1)
+    plain = tifffile.imread(folder / "mission/L2/000002/5.tif")[0]
+    assert (pixels == (plain & 0xFFFE)).all(), "lossless"
+
+
+def test_every_head_is_certified_with_axes_and_signs(flown) -> None:
+    _, folder = flown
+    done = RUN.invoke(app, ["export", "certificate", str(folder / "mission"), "--json"])
+    assert done.exit_code == 0, done.output
+    told = json.loads(done.stdout)
+    assert [c["name"] for c in told["cameras"]] == ["nadir", "5", "7", "8", "19"]
+    assert told["cameras"][1]["principal_distance_mm"] == 51.0
+    assert told["cameras"][1]["pixel_size_um"] == 7.2
+    assert told["simulated"] and "the camera looks along -z" in told["axes"]
+    page = (folder / "mission/export/certificate.html").read_text()
+    assert "SIMULATED" in page and "Axes and signs" in page
+
+
+def test_the_certificate_of_a_stitched_rig_is_that_of_its_virtual_camera() -> None:
+    told = certificate_of(load_rig(shipped_rigs()["ultracam-x"]))
+    pan, colour = told["cameras"]
+    assert (pan["width_px"], pan["height_px"], pan["pixel_size_um"]) == (14430, 9420, 7.2)
+    assert pan["principal_distance_mm"] == 100.5
+    assert colour["pixel_size_um"] == pytest.approx(21.6) and colour["width_px"] == 4810
+    with pytest.raises(CertificateError, match="no camera to certify"):
+        certificate_of(load_rig(shipped_rigs()["rededge"]))
