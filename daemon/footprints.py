@@ -126,8 +126,9 @@ def geojson(
     *,
     simulated: bool,
     verdicts: Mapping[int, str],
+    rings: Mapping[str, Sequence[tuple[float, float]] | None] | None = None,
 ) -> dict[str, Any]:
-    """A FeatureCollection of footprints (RFC 7946)."""
+    """A FeatureCollection of footprints (RFC 7946); `rings` by image in place of level ground."""
     features = []
     for eo in oriented:
         properties = {
@@ -141,7 +142,8 @@ def geojson(
             "verdict": verdicts.get(eo.exposure),
             "simulated": simulated,
         }
-        geometry = _polygon(footprint(eo, rig, ground_m))
+        ring = footprint(eo, rig, ground_m) if rings is None else rings.get(eo.name)
+        geometry = _polygon(ring)
         features.append({"type": "Feature", "geometry": geometry, "properties": properties})
     return {"type": "FeatureCollection", "features": features}
 

@@ -97,6 +97,13 @@ class Georeference:
             scale=math.hypot(*along) / _meridian_m(latitude_deg),
         )
 
+    def position(self, east_m: float, north_m: float, height_m: float) -> tuple[float, float]:
+        """Longitude and latitude, deg, of a point in the system."""
+        longitude, latitude, _ = self._transformer.transform(
+            east_m, north_m, height_m, direction="INVERSE"
+        )
+        return float(longitude), float(latitude)
+
     def _transform(
         self, longitude_deg: float, latitude_deg: float, height_m: float
     ) -> tuple[float, float, float]:

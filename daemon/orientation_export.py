@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from daemon import footprints
 from daemon.configuration import MountSection
+from daemon.elevation import read_elevation
 from daemon.errors import DaemonError
 from daemon.exposure import Exposure
 from daemon.georeference import Georeference, utm_of
@@ -39,6 +40,7 @@ from daemon.orientation_files import (
 )
 from daemon.products import verdict_of, write_folder
 from daemon.records import plain_name, sha256_hex
+from daemon.terrain_footprints import rings_on_terrain
 from daemon.trajectory import flown, read_trajectory
 from processing.rig import Rig, load_rig
 
@@ -72,6 +74,7 @@ def export_orientation(
     trajectory_file: Path | None = None,
     receiver: str | None = None,
     mount_file: Path | None = None,
+    dem_file: Path | None = None,
     progress: Callable[[int], None] = lambda _done: None,
 ) -> OrientationSet:
     """Orient all sealed exposures and write the set.
@@ -81,6 +84,7 @@ def export_orientation(
         trajectory_file: a post-processed trajectory instead of the navigation of the flight.
         receiver: whose navigation, where the flight had several.
         mount_file: TOML with a `[mount]` in place of the one that was flown.
+        dem_file: height model that footprints are followed to, in the same system.
         progress: told how many exposures are done.
 
     Raises:
@@ -124,14 +128,21 @@ def export_orientation(
             mission, oriented, rig, mount_of(mission)[0], georeference, exposures
         )
     simulated = any(exposure.simulated for exposure in exposures)
-    about = About(mission.id, rig, simulated, trajectory.name, mount, georeference)
+    on = "on level ground" if dem_file is None else f"on the height model {dem_file.name}"
+    about = About(mission.id, rig, simulated, trajectory.name, mount, georeference, on)
     verdicts = {
         e.number: verdict
         for e in exposures
         if (verdict := verdict_of(mission.level2(e.number))) is not None
     }
     ground_m = plan.ground_height_m
-    features = footprints.geojson(oriented, rig, ground_m, simulated=simulated, verdicts=verdicts)
+    rings = None
+    if dem_file is not None:
+        model = read_elevation(dem_file, georeference)
+        rings = rings_on_terrain(oriented, rig, model, georeference)
+    features = footprints.geojson(
+        oriented, rig, ground_m, simulated=simulated, verdicts=verdicts, rings=rings
+    )
     items = footprints.stac_items(
         mission, oriented, rig, ground_m, simulated=simulated, base_href="../../.."
     )

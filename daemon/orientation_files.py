@@ -40,6 +40,7 @@ class About:
     trajectory: str
     mount: MountSection
     georeference: Georeference
+    footprints: str = "on level ground"
 
 
 def header_lines(about: About) -> list[str]:
@@ -121,7 +122,7 @@ def about_text(
             "orientation.csv      omega, phi, kappa in degrees",
             "orientation.ori      PAT-B: photo number, X, Y, Z; rotation, image to grid, by rows",
             "orientation.bingo    phi, omega, kappa in gon, R = Ry(phi) Rx(omega) Rz(kappa)",
-            "footprints.geojson   on level ground, WGS 84",
+            f"footprints.geojson   {about.footprints}, WGS 84",
             "items.json           the same as STAC items with their images",
             "",
             "not oriented:" if absent else "all exposures are oriented",

@@ -25,7 +25,8 @@ PICTURES_HELP = """Level-2 for other programs: Cloud Optimized GeoTIFF, or JPEG 
 
 Geometry stays that of the image, nothing is rectified. A COG has overviews, tags, and ground
 control points on level ground; a JPEG tells time, place, attitude, focal length and pixel size to
-whoever reads EXIF (exiftool, photogrammetric programs). COGs take `pip install 'syntopic[geotiff]'`.
+whoever reads EXIF (exiftool, photogrammetric programs). COGs take
+`pip install 'syntopic[geotiff]'`.
 
 Examples: `syntopic export pictures MISSION --trajectory sbet.out`,
 `syntopic export pictures MISSION --as jpeg --only 12`
@@ -76,6 +77,26 @@ def raw(
         console.print(f"{name}: {nbytes} bytes")
     console.print(f"events.csv: {done.events} exposures; frames.csv: every frame of theirs")
     console.print(f"They are in [bold]{done.folder}[/]", soft_wrap=True)
+
+
+@app.command()
+def foxglove(
+    mission: Annotated[Path, typer.Argument(help="Mission folder.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Track, thumbnails and messages as one MCAP file that Foxglove opens.
+
+    Example: `syntopic export foxglove missions/20261121T101500Z-ultracam-x-mini`
+    """
+    from daemon.foxglove_export import export_foxglove
+    from daemon.mission import Mission
+
+    done = export_foxglove(Mission.open(mission))
+    if as_json:
+        typer.echo(json.dumps({"file": str(done.file), "messages": done.messages}))
+        return
+    told = ", ".join(f"{topic} {count}" for topic, count in done.messages.items())
+    Console().print(f"{told or 'nothing'}; written to [bold]{done.file}[/]", soft_wrap=True)
 
 
 @app.command(help=PICTURES_HELP)
@@ -154,6 +175,9 @@ def orientation(
     mount: Annotated[
         Path | None, typer.Option(help="TOML with the [mount] to use, of calibrate boresight.")
     ] = None,
+    dem: Annotated[
+        Path | None, typer.Option(help="Height model for footprints: GeoTIFF or .asc.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     from daemon import orientation_export
@@ -168,6 +192,7 @@ def orientation(
             trajectory_file=trajectory,
             receiver=receiver,
             mount_file=mount,
+            dem_file=dem,
             progress=lambda count: progress.update(task, completed=count),
         )
     if as_json:

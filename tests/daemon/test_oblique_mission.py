@@ -201,3 +201,34 @@ def test_the_certificate_of_a_stitched_rig_is_that_of_its_virtual_camera() -> No
     assert colour["pixel_size_um"] == pytest.approx(21.6) and colour["width_px"] == 4810
     with pytest.raises(CertificateError, match="no camera to certify"):
         certificate_of(load_rig(shipped_rigs()["rededge"]))
+
+
+def test_footprints_follow_a_height_model(flown, tmp_path: Path) -> None:
+    _, folder = flown
+    eo = _oriented(folder)["000001_5"]
+    # A slope that rises by a tenth to the north, through 395 m below the camera.
+    cell, rows = 50.0, 400
+    x0, y0 = eo["east_m"] - 10_000.0, eo["north_m"] - 10_000.0
+    north = y0 + (rows - 0.5 - np.arange(rows)) * cell
+    heights = np.repeat((395.0 + 0.1 * (north - eo["north_m"]))[:, None], rows, axis=1)
+    dem = tmp_path / "slope.asc"
+    head = f"ncols {rows}\nnrows {rows}\nxllcorner {x0}\nyllcorner {y0}\ncellsize {cell}\n"
+    dem.write_text(head + "\n".join(" ".join(f"{v:.3f}" for v in row) for row in heights))
+    asked = ["orient", str(folder / "mission"), "--trajectory", str(folder / "trajectory.csv")]
+    done = RUN.invoke(app, [*asked, "--crs", CRS, "--dem", str(dem), "--json"])
+    assert done.exit_code == 0, done.output + str(done.exception)
+    written = Path(json.loads(done.stdout)["folder"]) / "footprints.geojson"
+    features = {f["properties"]["image"]: f for f in json.loads(written.read_text())["features"]}
+    assert len(features) == EXPOSURES * LINES * 5
+    ring = np.array(features["000001_5"]["geometry"]["coordinates"][0])
+    assert len(ring) == 33 and (ring[0] == ring[-1]).all()
+    to_grid = pyproj.Transformer.from_crs("EPSG:4326", CRS, always_xy=True)
+    _, n = to_grid.transform(ring[:, 0], ring[:, 1])
+    # The upper middle of the forward head's image, 46 deg off the vertical, meets the slope.
+    omega, phi, kappa = np.radians(eo["omega_phi_kappa_deg"])
+    ray = camera.rotation_opk((omega, phi, kappa)) @ np.array([0.0, 278 * 7.2e-3 / 2, -51.0])
+    fall = eo["height_m"] - 395.0
+    reach = fall / (-ray[2] + 0.1 * ray[1])
+    assert n.max() == pytest.approx(eo["north_m"] + reach * ray[1], abs=8.0)
+    wrong = RUN.invoke(app, [*asked, "--crs", CRS, "--dem", str(folder / "trajectory.csv")])
+    assert wrong.exit_code != 0
