@@ -14,12 +14,11 @@ from collections.abc import Mapping
 import numpy as np
 
 from processing.mosaic import (
-    Constraint,
     Mosaic,
     MosaicSettings,
     adjust_mosaic,
-    datum_candidates,
 )
+from processing.mosaic_datum import Constraint, datum_candidates
 from processing.mosaic_model import ROTATION_NAMES, build_model
 from processing.placement import SensorPlacement
 from processing.rig import Rig

@@ -14,13 +14,11 @@ from collections.abc import Mapping
 import numpy as np
 
 from processing.mosaic import (
-    Constraint,
     Mosaic,
     MosaicSettings,
     adjust_mosaic,
-    datum_candidates,
-    mounting_constraints,
 )
+from processing.mosaic_datum import Constraint, datum_candidates, mounting_constraints
 from processing.mosaic_model import build_model
 from processing.placement import SensorPlacement
 from processing.projective import rotation_homography

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.drift import sensor_dc
-from processing.mosaic import Mosaic, datum_candidates, vip_precision_px
+from processing.mosaic import Mosaic, vip_precision_px
+from processing.mosaic_datum import datum_candidates
 from processing.mosaic_model import vip_and_design
 from processing.placement import corrected_mm_from_raw, vip_mm_from_raw
 from processing.quality import Figure
