@@ -17,6 +17,7 @@ from typing import Any, cast
 
 from daemon.configuration import MavlinkCameraSection
 from daemon.watch.gate import Gate, NoAnswerError
+from daemon.watch.mavlink_wishes import ACTIONS, BY_IDENTITY, REQUESTS, whole, wish
 from daemon.watch.state import FlightState
 from drivers.leap_seconds import leap_seconds_at
 from processing.rig import Rig
@@ -134,20 +135,20 @@ class MavlinkCamera(asyncio.DatagramProtocol):
 
     def _command(self, message: Any, address: Address) -> None:
         number = int(message.command)
-        if number in _REQUESTS:
-            self._request(message, address, _REQUESTS[number])
-        elif number in _ACTIONS:
-            self._act(message, address, _ACTIONS[number])
+        if number in REQUESTS:
+            self._request(message, address, REQUESTS[number])
+        elif number in ACTIONS:
+            self._act(message, address, ACTIONS[number])
         else:
             self._acknowledge(message, address, self._dialect.MAV_RESULT_UNSUPPORTED)
 
     def _request(self, message: Any, address: Address, wanted: str | None) -> None:
         """512 and its older siblings: tell one message again."""
         if wanted is None:
-            wanted = _BY_IDENTITY.get(_whole(message.param1))
+            wanted = BY_IDENTITY.get(whole(message.param1))
         if wanted == "CAMERA_IMAGE_CAPTURED":
             given = message.param1 if message.command == 2002 else message.param2
-            index = _whole(given)
+            index = whole(given)
             one = None if index is None else self._state.exposure(index + 1)
             if one is None or not self._is_taken(one):
                 self._acknowledge(message, address, self._dialect.MAV_RESULT_DENIED)
@@ -174,17 +175,17 @@ class MavlinkCamera(asyncio.DatagramProtocol):
             self._acknowledge(message, address, self._dialect.MAV_RESULT_DENIED)
             return
         if action == "mode":
-            is_image = _whole(message.param2) == MODE_IMAGE
+            is_image = whole(message.param2) == MODE_IMAGE
             result = "ACCEPTED" if is_image else "UNSUPPORTED"
             self._acknowledge(message, address, getattr(self._dialect, f"MAV_RESULT_{result}"))
             if is_image:
                 self._send(self._camera_settings(), address)
             return
-        wish = _wish(action, message)
-        if wish is None:
+        wanted = wish(action, message)
+        if wanted is None:
             self._acknowledge(message, address, self._dialect.MAV_RESULT_DENIED)
             return
-        task = asyncio.create_task(self._ask_service(message, address, *wish))
+        task = asyncio.create_task(self._ask_service(message, address, *wanted))
         self._commands.add(task)
         task.add_done_callback(self._commands.discard)
 
@@ -390,73 +391,6 @@ class MavlinkCamera(asyncio.DatagramProtocol):
 
 
 _ANGLES = ("roll", "pitch", "heading")
-_REQUESTS: Mapping[int, str | None] = {
-    512: None,
-    521: "CAMERA_INFORMATION",
-    522: "CAMERA_SETTINGS",
-    525: "STORAGE_INFORMATION",
-    527: "CAMERA_CAPTURE_STATUS",
-    2002: "CAMERA_IMAGE_CAPTURED",
-}
-_BY_IDENTITY: Mapping[int | None, str] = {
-    259: "CAMERA_INFORMATION",
-    260: "CAMERA_SETTINGS",
-    261: "STORAGE_INFORMATION",
-    262: "CAMERA_CAPTURE_STATUS",
-    263: "CAMERA_IMAGE_CAPTURED",
-}
-_ACTIONS: Mapping[int, str] = {
-    203: "once",
-    206: "distance",
-    214: "interval",
-    530: "mode",
-    2000: "capture",
-    2001: "stop",
-    2003: "control",
-}
-
-
-def _wish(action: str, message: Any) -> tuple[str, dict[str, Any]] | None:
-    """The service's command for a MAVLink one; None where its parameters make no sense."""
-    if action == "stop":
-        return "stop", {}
-    if action == "once":
-        return "trigger", {}
-    if action == "capture":
-        count = _whole(message.param3)
-        interval_s = _finite(message.param2)
-        if count is None or count < 0:
-            return None
-        if count == 1:
-            return "trigger", {}
-        if interval_s is None or interval_s <= 0:
-            return None
-        return "interval", {"interval_s": interval_s, "count": count}
-    if action == "distance":
-        distance_m = _finite(message.param1)
-        if distance_m is None or distance_m < 0:
-            return None
-        return ("distance", {"distance_m": distance_m}) if distance_m > 0 else ("stop", {})
-    if action == "interval":
-        interval_ms = _finite(message.param1)
-        if interval_ms is None or interval_ms == 0:
-            return None
-        if interval_ms < 0:
-            return "stop", {}
-        return "interval", {"interval_s": interval_ms / 1000, "count": 0}
-    enabled = _whole(message.param1)  # 2003 DO_TRIGGER_CONTROL
-    if enabled not in (0, 1):
-        return None
-    return ("start", {}) if enabled else ("stop", {})
-
-
-def _whole(value: float) -> int | None:
-    """A parameter as a whole number; None for what is none, such as NaN."""
-    return int(value) if math.isfinite(value) and abs(value) < 2**31 else None
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
 
 
 def _name(text: str) -> list[int]:

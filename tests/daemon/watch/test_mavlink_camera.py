@@ -18,7 +18,8 @@ from pydantic import ValidationError
 
 from daemon.configuration import MavlinkCameraSection
 from daemon.watch.gate import Gate
-from daemon.watch.mavlink_camera import MavlinkCamera, _wish
+from daemon.watch.mavlink_camera import MavlinkCamera
+from daemon.watch.mavlink_wishes import wish
 from daemon.watch.state import FlightState
 from processing.rig import load_rig, shipped_rigs
 from tests.daemon.watch import flown
@@ -148,7 +149,7 @@ def test_requests_of_every_kind_are_answered_or_refused() -> None:
 )
 def test_no_parameter_is_too_odd(action: str, parameters: list[float]) -> None:
     message = dialect.MAVLink(None).command_long_encode(1, 100, 2000, 0, *parameters)
-    wish = _wish(action, message)
+    wish = wish(action, message)
     assert wish is None or wish[0] in ("trigger", "interval", "distance", "start", "stop")
 
 
