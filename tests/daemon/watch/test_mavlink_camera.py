@@ -149,8 +149,8 @@ def test_requests_of_every_kind_are_answered_or_refused() -> None:
 )
 def test_no_parameter_is_too_odd(action: str, parameters: list[float]) -> None:
     message = dialect.MAVLink(None).command_long_encode(1, 100, 2000, 0, *parameters)
-    wish = wish(action, message)
-    assert wish is None or wish[0] in ("trigger", "interval", "distance", "start", "stop")
+    wanted = wish(action, message)
+    assert wanted is None or wanted[0] in ("trigger", "interval", "distance", "start", "stop")
 
 
 @settings(max_examples=300)
