@@ -68,7 +68,9 @@ def calibrated_rig(
     for cone in rig.cones:
         if cone.name in heads:
             angles = omega_phi_kappa(heads[cone.name].rotation)
-            cone = replace(cone, rotation_rad=angles)
+            sigma = found.sigma_rad([h.head for h in found.heads].index(cone.name))
+            spread = math.sqrt(float(np.mean(sigma**2))) * 1e6
+            cone = replace(cone, rotation_rad=angles, rotation_sigma_urad=round(spread, 3))
         if cone.name in cameras:
             camera = result.network.cameras[cameras[cone.name]]
             if camera.model != "australis" or camera.terms or len(cone.sensors) != 1:

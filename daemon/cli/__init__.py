@@ -26,6 +26,7 @@ from daemon.cli import (
     export,
     imports,
     install,
+    intersect,
     kernels,
     monitor,
     process,
@@ -73,6 +74,7 @@ app.command(name="bench", help=bench.HELP)(bench.bench)
 app.command(name="kernels", help=kernels.HELP)(kernels.kernels)
 app.command(name="advise", help=advise.HELP)(advise.advise)
 app.command(name="orient", help=export.ORIENTATION_HELP)(export.orientation)
+app.command(name="intersect", help=intersect.HELP)(intersect.intersect)
 app.command(name="install", help=install.HELP)(install.install)
 app.command(name="uninstall", help=install.UNINSTALL_HELP)(install.uninstall)
 app.add_typer(rigs.app, name="rigs")

@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 from daemon.certificate import CertificateError, certificate_of
 from daemon.cli import app
 from daemon.level0 import read_description
+from daemon.local_frame import LocalFrame
 from daemon.mission import Mission
 from processing.rig import load_rig, shipped_rigs
 from sim_hw import camera
@@ -232,3 +233,64 @@ def test_footprints_follow_a_height_model(flown, tmp_path: Path) -> None:
     assert n.max() == pytest.approx(eo["north_m"] + reach * ray[1], abs=8.0)
     wrong = RUN.invoke(app, [*asked, "--crs", CRS, "--dem", str(folder / "trajectory.csv")])
     assert wrong.exit_code != 0
+
+
+def test_intersected_points_err_as_their_sigmas_say(flown, tmp_path: Path) -> None:
+    world, folder = flown
+    rig = load_rig(Mission.open(folder / "mission").rig_path)
+    first = EPOCH_GPS_NS + FIRST_AFTER_S * 1_000_000_000
+    flight = world.flight.beginning_first_line_at(world.flight.distance_flown_m(first))
+    random = np.random.default_rng(8)
+    poses = {eo["image"]: flight.pose(int(eo["gps_ns"])) for eo in _oriented(folder).values()}
+    truth, lines = {}, ["image,point,column_px,row_px,sigma_px"]
+    for name, pose in poses.items():
+        # Rays of the first exposure of each line, followed to the true terrain.
+        if not name.startswith(("000001", "000003")):
+            continue
+        cone = rig.cone(name.split("_")[1])
+        for k in range(6):
+            xy = random.uniform(-0.4, 0.4, 2) * [416 * 7.2e-3, 278 * 7.2e-3]
+            turn = (
+                pose.enu_from_body @ camera.BODY_FROM_CAMERA @ world.camera.master_from_cone(cone)
+            )
+            ray = turn @ np.array([*xy, -cone.lens.f_mm])
+            ground = world.terrain.intersect(camera.projection_centre_m(cone, pose), ray)
+            seen = [
+                row for row in (_seen(world, rig, n, p, ground) for n, p in poses.items()) if row
+            ]
+            if len({row[0][:6] for row in seen}) < 2:
+                continue
+            point = f"{name}-{k}"
+            truth[point] = ground
+            for image, column, row in seen:
+                noise = random.normal(0.0, 0.3, 2)
+                lines.append(f"{image},{point},{column + noise[0]:.4f},{row + noise[1]:.4f},0.3")
+    lines.append("000001_5,alone,100,100,0.3")
+    (tmp_path / "measured.csv").write_text("\n".join(lines) + "\n")
+    asked = ["intersect", str(folder / "mission"), str(tmp_path / "measured.csv"), "--json"]
+    sigmas = ["--attitude-sigma", "5", "5", "5", "--position-sigma", "0.05", "0.05", "0.05"]
+    done = RUN.invoke(app, [*asked, *sigmas, "--trajectory", str(folder / "trajectory.csv")])
+    assert done.exit_code == 0, done.output + str(done.exception)
+    told = json.loads(done.stdout)
+    assert told["left_out"] == ["alone"] and len(told["points"]) == len(truth) >= 8
+    frame = LocalFrame(flight.plan.latitude_deg, flight.plan.longitude_deg)
+    ratios = []
+    for p in told["points"]:
+        place = [np.array(p[k]) for k in ("latitude_deg", "longitude_deg", "height_m")]
+        latitude, longitude, height = flight.geodetic(truth[p["name"]])
+        expected = frame.from_geodetic(np.array(latitude), np.array(longitude), np.array(height))
+        ratios.append((frame.from_geodetic(*place) - expected) / np.array(p["sigma_m"]))
+        assert (np.array(p["of_image_m"]) < np.array(p["sigma_m"])).all()
+    assert np.abs(ratios).max() < 4.5
+    assert 0.2 < np.mean(np.square(ratios)) < 3.0
+
+
+def _seen(world, rig, name, pose, ground):
+    """Image, column and row in strict perspective where the true head sees a ground point."""
+    cone = rig.cone(name.split("_")[1])
+    turn = pose.enu_from_body @ camera.BODY_FROM_CAMERA @ world.camera.master_from_cone(cone)
+    seen = (ground - camera.projection_centre_m(cone, pose)) @ turn
+    x, y = -cone.lens.f_mm * seen[:2] / seen[2] / 7.2e-3
+    column, row = x + (416 - 1) / 2, (278 - 1) / 2 - y
+    inside = seen[2] < 0 and 3 < column < 412 and 3 < row < 274
+    return (name, column, row) if inside else None

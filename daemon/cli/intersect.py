@@ -1,0 +1,104 @@
+"""`syntopic intersect`: ground points from places measured in oriented images."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from daemon.cli.tables import light_table
+
+HELP = """Ground points from places measured in two or more oriented images, with their accuracy.
+
+MEASURED is a table: image (as `syntopic orient` names it, such as 000012_5), point, column_px,
+row_px of the Level-2 image, sigma_px. Images are oriented by trajectory, boresight and the rig's
+mounting angles; what these are uncertain by is carried into the points with its correlations.
+
+Example: `syntopic intersect MISSION measured.csv --trajectory sbet.out --out points.csv`
+"""
+
+COLUMNS = (
+    *("point", "east_m", "north_m", "height_m", "latitude_deg", "longitude_deg"),
+    *("ellipsoidal_height_m", "sx_m", "sy_m", "sz_m", "image_sx_m", "image_sy_m", "image_sz_m"),
+    "rays",
+)
+
+
+def intersect(
+    mission: Annotated[Path, typer.Argument(help="Mission folder.")],
+    measured: Annotated[Path, typer.Argument(help="Places in the images, CSV.")],
+    trajectory: Annotated[
+        Path | None, typer.Option(help="Post-processed trajectory: SBET, or .csv.")
+    ] = None,
+    mount: Annotated[Path | None, typer.Option(help="TOML with the [mount] to use.")] = None,
+    crs: Annotated[str | None, typer.Option(help="Such as EPSG:25833; default: UTM zone.")] = None,
+    image_sigma: Annotated[
+        float, typer.Option(help="Of a place without sigma_px, px.", min=1e-3)
+    ] = 0.5,
+    position_sigma: Annotated[
+        tuple[float, float, float], typer.Option(help="Of the trajectory, m: east north up.")
+    ] = (0.05, 0.05, 0.08),
+    attitude_sigma: Annotated[
+        tuple[float, float, float], typer.Option(help="Roll, pitch, heading, mdeg.")
+    ] = (5.0, 5.0, 8.0),
+    boresight_sigma: Annotated[
+        tuple[float, float, float], typer.Option(help="Common to all exposures, mdeg.")
+    ] = (1.5, 1.5, 3.0),
+    out: Annotated[Path | None, typer.Option(help="Table of the points; must be new.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    from daemon.adjusting.tables import write_table
+    from daemon.intersecting import IntersectionError, Uncertain
+    from daemon.intersecting import intersect as intersected
+    from daemon.mission import Mission
+    from daemon.triangulation import attitude_sigmas
+
+    if out is not None and out.exists():
+        raise IntersectionError(f"{out} exists; give another name with --out")
+    done = intersected(
+        Mission.open(mission),
+        measured,
+        Uncertain(
+            image_px=image_sigma,
+            position_m=position_sigma,
+            attitude_rad=attitude_sigmas(attitude_sigma),
+            boresight_rad=attitude_sigmas(boresight_sigma),
+        ),
+        crs=crs,
+        trajectory_file=trajectory,
+        mount_file=mount,
+    )
+    if out is not None:
+        write_table(
+            out,
+            f"Intersected points in {done.crs}, heights: {done.height_system}; sigmas east, north, "
+            "up, and their part of the image",
+            COLUMNS,
+            (
+                (
+                    p.name, *p.place_m, p.latitude_deg, p.longitude_deg, p.height_m, *p.sigma_m,
+                    *p.of_image_m, str(p.rays),
+                )
+                for p in done.points
+            ),
+        )  # fmt: skip
+    if as_json:
+        typer.echo(json.dumps(asdict(done)))
+        return
+    console = Console()
+    columns = ("east m", "north m", "height m", "\u00b1 x", "\u00b1 y", "\u00b1 z", "rays")
+    table = light_table(f"{done.crs}, heights: {done.height_system}", ("point",), columns)
+    for p in done.points:
+        cells = [f"{v:.2f}" for v in p.place_m] + [f"{v:.2f}" for v in p.sigma_m]
+        table.add_row(p.name, *cells, str(p.rays))
+    console.print(table)
+    if done.left_out:
+        console.print(
+            f"Not fixed by their rays (one ray, or one projection centre): "
+            f"{', '.join(done.left_out)}",
+            markup=False,
+        )
