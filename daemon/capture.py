@@ -13,7 +13,18 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from daemon.memory import FrameRing
-from daemon.messages import Bound, DeviceSpec, Fire, Fired, NotBound, Ping, Pong, Recycle, Stop
+from daemon.messages import (
+    Adjust,
+    Bound,
+    DeviceSpec,
+    Fire,
+    Fired,
+    NotBound,
+    Ping,
+    Pong,
+    Recycle,
+    Stop,
+)
 from daemon.processes import Link
 from daemon.timesync import TimesyncAsker, can_be_asked
 from drivers import registry
@@ -42,7 +53,7 @@ class _Capture:
         self.devices: dict[str, tuple[DeviceSpec, Device]] = {}
         self.heads: dict[str, Head] = {}
         self.heads_of_output: dict[str, list[Head]] = {}
-        self.orders: queue.SimpleQueue[Fire | None] = queue.SimpleQueue()
+        self.orders: queue.SimpleQueue[Fire | Adjust | None] = queue.SimpleQueue()
         trigger_spec: DeviceSpec | None = None
         for spec in specs:
             if spec.kind == "trigger":
@@ -76,7 +87,7 @@ class _Capture:
             if isinstance(order, Recycle):
                 for head, slot in order.slots.items():
                     self.heads[head].recycle(slot)
-            elif isinstance(order, Fire):
+            elif isinstance(order, Fire | Adjust):
                 self.orders.put(order)
             elif isinstance(order, Ping):
                 counted = {name: dict(d.statistics()) for name, (_, d) in self.devices.items()}
@@ -118,6 +129,9 @@ class _Capture:
         except DeviceError as error:
             self.link.send(NotBound("trigger", spec.name, str(error)))
         while (order := self.orders.get()) is not None:
+            if isinstance(order, Adjust):
+                self._adjust(order)
+                continue
             try:
                 if order.delays_ns != programmed:
                     trigger.program(order.delays_ns)
@@ -131,6 +145,15 @@ class _Capture:
             else:
                 self.link.send(Fired(order.sequence, pulse, ""))
         trigger.close()
+
+    def _adjust(self, order: Adjust) -> None:
+        """In the thread of the trigger, so that no pulse comes in between."""
+        for head, wanted in order.settings.items():
+            try:
+                self.heads[head].adjust(wanted.exposure_time_us, wanted.gain_db, wanted.tdi_shifts)
+            except DeviceError as error:
+                event = DeviceEvent(head, "not-adjusted", False, str(error), time.monotonic_ns())
+                self.link.send(event)
 
 
 def open_device(

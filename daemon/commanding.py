@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Protocol, TypeGuard
+from typing import Any, Protocol, TypeGuard
 
 from daemon.arming import Lack
 from daemon.log_records import Message, loose_bytes
@@ -35,6 +35,12 @@ class Arming(Protocol):
     def override(self, by: str, missing: Sequence[Lack]) -> None: ...
 
 
+class Exposing(Protocol):
+    """Who sets the heads; `daemon.exposure_control.ExposureControl`."""
+
+    def command(self, wanted: Mapping[str, Any], by: str) -> str | None: ...
+
+
 class Commanded(Protocol):
     """The service commands act on."""
 
@@ -44,8 +50,10 @@ class Commanded(Protocol):
     def line(self) -> CommandedLine: ...
     @property
     def preflight(self) -> Arming: ...
+    @property
+    def exposure(self) -> Exposing: ...
     def acknowledge(self, fault: str) -> bool: ...
-    def land(self) -> None: ...
+    def land(self, *, again: bool = False) -> None: ...
 
 
 def obey(command: Command, flight: Commanded) -> Answer:
@@ -120,6 +128,20 @@ def _land(command: Command, flight: Commanded) -> Answer:
     return _yes(command, "no more exposures; what is open is sealed, then the service ends")
 
 
+def _new_mission(command: Command, flight: Commanded) -> Answer:
+    if flight.line.runs and not flight.line.is_flown:
+        return _no(command, "the line runs; stop it first")
+    flight.land(again=True)
+    return _yes(command, "this mission is closed, and the next one begins with its configuration")
+
+
+def _exposure(command: Command, flight: Commanded) -> Answer:
+    refusal = flight.exposure.command(command.arguments, command.by)
+    if refusal is not None:
+        return _no(command, refusal)
+    return _yes(command, "the exposures from now on are made with it")
+
+
 def _acknowledge(command: Command, flight: Commanded) -> Answer:
     fault = command.arguments.get("fault")
     if not isinstance(fault, str) or not flight.acknowledge(fault):
@@ -165,4 +187,6 @@ _COMMANDS: Mapping[str, Callable[[Command, Commanded], Answer]] = {
     "distance": _distance,
     "land": _land,
     "acknowledge": _acknowledge,
+    "new-mission": _new_mission,
+    "exposure": _exposure,
 }

@@ -113,6 +113,23 @@ class NamedSection(DeviceSection):
     name: str
 
 
+class ExposureSection(_Section):
+    """Who sets the exposure of the heads, and within what (docs/exposure.md).
+
+    `target` is where the brightest hundredth of the pixels should begin, as a share of the full
+    scale. With `lock` "line" nothing is changed any more on a line that is well exposed.
+    """
+
+    control: Literal["manual", "automatic"] = "manual"
+    lock: Literal["line", "never"] = "line"
+    target: float = Field(default=0.6, ge=0.1, le=0.95)
+    smear_px: float = Field(default=0.5, gt=0, le=10)
+    gain_most_db: float = Field(default=12.0, ge=0, le=48)
+    time_least_us: float = Field(default=100.0, gt=0)
+    time_most_us: float = Field(default=20_000.0, gt=0)
+    tdi_most: int = Field(default=32, ge=0, le=1000)
+
+
 class ProcessingSection(_Section):
     """How exposures become images."""
 
@@ -222,6 +239,7 @@ class Configuration(_Section):
     thermometer: tuple[NamedSection, ...] = ()
     navigator: tuple[NamedSection, ...] = ()
     pps: tuple[NamedSection, ...] = Field(default=(), max_length=1)
+    exposure: ExposureSection = ExposureSection()
     processing: ProcessingSection = ProcessingSection()
     limits: LimitsSection = LimitsSection()
     watch: WatchSection | None = None

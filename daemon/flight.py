@@ -119,6 +119,11 @@ class Flight:
         """Exposures that are not sealed or given up yet."""
         return tuple(self._open)
 
+    @property
+    def awaits_frames(self) -> bool:
+        """Whether heads are still exposing or sending."""
+        return any(not e.lost and e.handed_to_disk is None for e in self._open.values())
+
     def order(self, mono_ns: int, line_id: str | None = None, strip_id: str = "") -> int:
         """A trigger is being ordered: its exposure is open from now on. Returns its number.
 

@@ -65,6 +65,10 @@ class Line:
         self._asked_for = 0
         self._runs_until: int | None = None
 
+    def exposes_for(self, times_ns: Mapping[str, int]) -> None:
+        """Exposure times by cone have changed; delays follow from them."""
+        self._exposure_ns = {**self._exposure_ns, **times_ns}
+
     def trigger_once(self) -> None:
         """Order one exposure as soon as the camera can, whether the line runs or not."""
         self._asked_for += 1

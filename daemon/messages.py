@@ -15,6 +15,7 @@ from daemon.configuration import PlanSection, ProcessingSection
 from daemon.exposure import Capture, Exposure, FrameRecord
 from daemon.log_records import Message
 from drivers.contract import TriggerPulse
+from processing.exposure_control import ExposureSettings
 
 # To any child
 
@@ -91,6 +92,13 @@ class Fire:
 
     sequence: int
     delays_ns: Mapping[str, int]
+
+
+@dataclass(frozen=True)
+class Adjust:
+    """Expose with this from the next pulse on, by head."""
+
+    settings: Mapping[str, ExposureSettings]
 
 
 @dataclass(frozen=True)
@@ -237,12 +245,16 @@ class FramesRead:
 
 @dataclass(frozen=True)
 class Processed:
-    """Products are written; `report` is the content of quality.json."""
+    """Products are written; `report` is the content of quality.json.
+
+    `histograms` are counts of raw DN by sensor, as in histogram.json.
+    """
 
     number: int
     report: Mapping[str, Any]
     files: Mapping[str, int]
     duration_s: float
+    histograms: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

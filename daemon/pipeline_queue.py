@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,6 +41,7 @@ class PipelineQueue:
         send: sends a message to a process of ours, by its name.
         tell: told of what became of an exposure.
         decided: told of when an exposure is processed, and from where.
+        seen: told how bright an exposure became, counts of DN by sensor.
     """
 
     def __init__(
@@ -49,11 +50,13 @@ class PipelineQueue:
         send: Callable[[str, object], None],
         tell: Tell,
         decided: Callable[[Decision], None] = lambda _: None,
+        seen: Callable[[int, Mapping[str, Sequence[int]]], None] = lambda _number, _counts: None,
     ) -> None:
         self._lanes = lanes
         self._send = send
         self._tell = tell
         self._decided = decided
+        self._seen = seen
         self.is_ready = False
         self._in_work: set[int] = set()
         self._waiting: deque[_Waiting] = deque()
@@ -105,6 +108,7 @@ class PipelineQueue:
     def _on_processed(self, done: Processed) -> None:
         seconds = round(done.duration_s, 3)
         self._tell("processed", number=done.number, report=dict(done.report), duration_s=seconds)
+        self._seen(done.number, done.histograms)
         verdict = done.report.get("verdict")
         self._send("writer", NoteProducts(done.number, done.files, verdict))
         self._is_done(done.number)

@@ -23,6 +23,7 @@ from daemon.decisions import Decision, tick
 from daemon.departure import identity, open_mission, processes, watch_process
 from daemon.devices import serial_problem
 from daemon.exposure import Exposure
+from daemon.exposure_control import ExposureControl
 from daemon.flight import Flight
 from daemon.hearing import Hearing
 from daemon.latches import Latch, Latches, previous_faults, read_unhandled, write_unhandled
@@ -96,6 +97,7 @@ class Service:
         self.changed = asyncio.Event()
         self.sealing: Exposure | None = None
         self.seal_again_ns = 0
+        self.goes_on = False
 
     async def run(self) -> int:
         """Fly until told to stop, or until the planned exposures are done.
@@ -120,7 +122,8 @@ class Service:
             for task in tasks:
                 task.add_done_callback(self._task_ended)
             await self.stopping.wait()
-            self.notifier.stopping("landing: sealing what is open")
+            say = self.notifier.status if self.goes_on else self.notifier.stopping
+            say("landing: sealing what is open")
             await self._land(tasks)
             await self._keep_unhandled()
             self.flight.land()
@@ -159,10 +162,13 @@ class Service:
             report.next_number,
         )
         self.hearing = Hearing(self.flight, self._log, self._event, self._decided)
-        lanes = self.configuration.processing.exposures_in_work
-        self.pipeline = PipelineQueue(lanes, self.supervisor.send, self._event, self._decided)
         flown = len(report.settled)
         self.line = Line(self.configuration, self.rig, self.flight, mission.path, flown)
+        self.exposure = ExposureControl(
+            self.configuration, self.rig, self.flight, self.supervisor.send, self._event
+        )
+        lanes, send = self.configuration.processing.exposures_in_work, self.supervisor.send
+        self.pipeline = PipelineQueue(lanes, send, self._event, self._decided, self.exposure.seen)
         self.preflight = Preflight(
             self.configuration, self.rig, self.flight, self.line, self.hearing, self.pipeline
         )
@@ -303,6 +309,8 @@ class Service:
             for head, slot in self.flight.idle_slots:
                 self.pipeline.recycle({head: slot})
             self.flight.idle_slots.clear()
+            if self.exposure.apply():
+                self.line.exposes_for(self.exposure.times_ns)
             self.hearing.tell_of_time(now_ns - self.hurry_ns)
             if due.to_seal is not None:
                 self.sealing = due.to_seal
@@ -357,8 +365,9 @@ class Service:
         """A person has seen a fault."""
         return self.latches.acknowledge(fault)
 
-    def land(self) -> None:
-        """End in good order: what is open is sealed first."""
+    def land(self, *, again: bool = False) -> None:
+        """End in good order: what is open is sealed first. `again`: a new mission follows."""
+        self.goes_on = again
         self.stopping.set()
 
     def _status(self) -> dict[str, Any]:
@@ -396,10 +405,10 @@ class Service:
 
     def _fire(self, order: Order) -> None:
         self.hearing.orders[order.number] = order
-        self._decided(
-            Decision("order", order.mono_ns, order.number, self.flight.about(order.number))
-        )
+        about = self.flight.about(order.number)
+        self._decided(Decision("order", order.mono_ns, order.number, about))
         self.supervisor.send("capture", Fire(order.number, order.delays_ns))
+        self.exposure.ordered(order.number, about["line_id"])
         self._event("triggered", number=order.number)
 
     def _disk_full(self, sentence: str) -> None:

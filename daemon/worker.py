@@ -187,11 +187,7 @@ def make_products(
         are the pipeline's buffers and hold until its next exposure.
     """
     rig = pipeline.rig
-    # Before the pipeline lets go of the frames.
-    histograms = {
-        name: sampled_histogram(frame, _word_bits(rig.sensor(name)))
-        for name, frame in frames.items()
-    }
+    histograms = histograms_of(rig, frames)  # before the pipeline lets go of the frames
     product = pipeline.process(frames, conditions, frames_read=frames_read)
     report = as_json(product.report)
     report["exposure"] = number
@@ -222,6 +218,14 @@ def make_products(
         mosaic_json=stitching,
     )
     return report, contents
+
+
+def histograms_of(rig: Rig, frames: Mapping[str, NDArray[np.uint16]]) -> dict[str, tuple[int, ...]]:
+    """Counts of raw DN by sensor."""
+    return {
+        name: sampled_histogram(frame, _word_bits(rig.sensor(name)))
+        for name, frame in frames.items()
+    }
 
 
 def _word_bits(sensor: Sensor) -> int:
@@ -255,6 +259,7 @@ class _Desk:
                 frames = store.load_level0(self.mission.level0(exposure.number), self.rig)[0]
             else:
                 frames = self._frames_in_memory(exposure, order.slots)
+            histograms = histograms_of(self.rig, frames)
             report, files = process_exposure(
                 pipeline,
                 self.rig,
@@ -275,7 +280,7 @@ class _Desk:
             self.link.send(ProcessFailed(exposure.number, sentence, report))
             return
         seconds = time.monotonic() - started
-        self.link.send(Processed(exposure.number, report, files, seconds))
+        self.link.send(Processed(exposure.number, report, files, seconds, histograms))
 
     def _frames_in_memory(
         self, exposure: Exposure, slots: Mapping[str, int]

@@ -29,9 +29,14 @@ def run(
     from daemon.configuration import load
     from daemon.service import Service
 
-    configuration, rig = load(config)
     show = _print_json if json_lines else _print_line
-    status = asyncio.run(Service(configuration, rig, config, show).run())
+    goes_on, status = True, 0
+    while goes_on:
+        # Read anew: a new mission may have another plan.
+        configuration, rig = load(config)
+        service = Service(configuration, rig, config, show)
+        status = asyncio.run(service.run())
+        goes_on = service.goes_on and status == 0
     raise typer.Exit(status)
 
 

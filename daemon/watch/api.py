@@ -74,6 +74,13 @@ class CommandBody(BaseModel):
     interval_s: float | None = Field(default=None, gt=0, le=3600, description="for interval")
     count: int = Field(default=0, ge=0, le=10**6, description="for interval; 0: until stopped")
     distance_m: float | None = Field(default=None, gt=0, le=10**5, description="for distance")
+    control: Literal["manual", "automatic"] | None = Field(default=None, description="for exposure")
+    exposure_time_us: float | None = Field(default=None, gt=0, le=60e6, description="for exposure")
+    gain_db: float | None = Field(default=None, ge=0, le=60, description="for exposure")
+    tdi_shifts: int | None = Field(default=None, ge=0, le=1000, description="for exposure")
+    of: str | None = Field(
+        default=None, max_length=40, description="for exposure: pan, or a cone; else all"
+    )
 
 
 class Outcome(BaseModel):
@@ -92,7 +99,17 @@ Product = Literal[
     "histogram.json",
     "quality.json",
 ]
-CommandName = Literal["start", "stop", "trigger", "interval", "distance", "land", "acknowledge"]
+CommandName = Literal[
+    "start",
+    "stop",
+    "trigger",
+    "interval",
+    "distance",
+    "land",
+    "acknowledge",
+    "new-mission",
+    "exposure",
+]
 
 
 @dataclass(frozen=True)
@@ -279,7 +296,7 @@ def _add_commands(app: FastAPI, state: FlightState, gate: Gate, doors: _Doors) -
     async def command(
         name: CommandName, body: CommandBody | None = None, holder: Holder = somebody_who_may
     ) -> Outcome:
-        """start or stop the line, trigger once, land, acknowledge a fault. Needs a token.
+        """start or stop the line, trigger, land, acknowledge, expose otherwise. Needs a token.
 
         Every command is answered by the service and written into the flight log.
         """

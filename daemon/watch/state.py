@@ -26,7 +26,7 @@ FIGURES_TOLD = (
     *("forward_overlap", "sidelap", "sun_deg", "time_sigma_ns", "bright_fraction"),
     *("stitched_sigma_px", "missing_sensors", "smear_along_px", "smear_across_px"),
 )
-PARTS = ("exposures", "devices", "track", "history", "events")
+PARTS = ("exposures", "devices", "settings", "track", "history", "events")
 """Parts of the state besides what is brief, in the order of their worth on a thin link."""
 
 PICTURE_PARTS = ("residuals", "thumbnails")
@@ -65,6 +65,7 @@ class FlightState:
         self._residuals: deque[Json] = deque(maxlen=RESIDUALS_KEPT)
         self._pieces: deque[Json] = deque(maxlen=PIECES_KEPT)
         self._software = software
+        self._settings: list[Json] = []
         self._phase = "idle"
         self._mission: Json = {}
         self._status: Json = {}
@@ -110,6 +111,7 @@ class FlightState:
         items: Iterable[Json] = {
             "exposures": self._exposures.values(),
             "devices": self._devices.values(),
+            "settings": self._settings,
             "track": self._track,
             "history": self._history,
             "events": self._events,
@@ -195,6 +197,10 @@ class FlightState:
 
     def _on_triggered(self, event: Mapping[str, Any]) -> None:
         self._exposure(event)["step"] = "triggered"
+
+    def _on_exposure_settings(self, event: Mapping[str, Any]) -> None:
+        told = {key: value for key, value in event.items() if key not in ("event", "mono_ns")}
+        self._settings = [{"sequence": self.sequence, **told}]
 
     def _on_stored(self, event: Mapping[str, Any]) -> None:
         self._exposure(event)["step"] = "stored"
@@ -302,6 +308,7 @@ _HANDLERS: Mapping[str, Callable[[FlightState, Mapping[str, Any]], None]] = {
     "phase": FlightState._on_phase,
     "status": FlightState._on_status,
     "triggered": FlightState._on_triggered,
+    "exposure-settings": FlightState._on_exposure_settings,
     "stored": FlightState._on_stored,
     "sealed": FlightState._on_sealed,
     "processed": FlightState._on_processed,

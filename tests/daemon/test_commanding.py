@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -38,6 +38,8 @@ class FakeService:
     landed: bool = False
     overrides: list[tuple[str, list[str]]] = field(default_factory=list)
     faults: set[str] = field(default_factory=set)
+    exposed: list[tuple[str, dict[str, Any]]] = field(default_factory=list)
+    goes_on: bool = False
 
     @property
     def preflight(self) -> FakeService:
@@ -52,8 +54,18 @@ class FakeService:
     def acknowledge(self, fault: str) -> bool:
         return fault in self.faults
 
-    def land(self) -> None:
-        self.landed = True
+    @property
+    def exposure(self) -> FakeService:
+        return self
+
+    def command(self, wanted: Mapping[str, Any], by: str) -> str | None:
+        if wanted.get("gain_db", 0) > 12:
+            return "gain_db is too much"
+        self.exposed.append((by, dict(wanted)))
+        return None
+
+    def land(self, *, again: bool = False) -> None:
+        self.landed, self.goes_on = True, again
 
 
 KERNELS = Lack("arming-kernels", "kernels are not loaded", "wait", may_be_overridden=False)
@@ -137,6 +149,26 @@ def test_only_a_fault_that_is_listed_can_be_acknowledged() -> None:
     service = FakeService(faults={"device SU02"})
     assert give(service, "acknowledge", fault="device SU02")[0]
     assert not give(service, "acknowledge", fault="device SU03")[0]
+
+
+def test_a_new_mission_closes_this_one_unless_its_line_still_runs() -> None:
+    service = FakeService()
+    service.line.runs = True
+    assert give(service, "new-mission") == (False, "the line runs; stop it first")
+    assert not service.landed
+    service.line.runs = False
+    assert give(service, "new-mission")[0]
+    assert (service.landed, service.goes_on) == (True, True)
+    service = FakeService()
+    assert give(service, "land")[0]
+    assert not service.goes_on
+
+
+def test_exposure_settings_are_handed_on_with_who_wants_them() -> None:
+    service = FakeService()
+    assert give(service, "exposure", gain_db=3.0, of="pan")[0]
+    assert service.exposed == [("operator", {"gain_db": 3.0, "of": "pan"})]
+    assert give(service, "exposure", gain_db=30.0) == (False, "gain_db is too much")
 
 
 def test_landing_is_never_refused() -> None:

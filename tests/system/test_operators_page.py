@@ -37,6 +37,7 @@ IDLE_LOAD = 4.0
 """Above this the machine is doing other things, and latencies are only printed."""
 SEEN_WITHIN_S = 2.0
 LINE, STRIP = "A7", "S1"
+GAIN_DB = 3.0
 LINE_AHEAD_S, LINE_LENGTH_M = 25.0, 30_000.0
 AWAY_M = 6.0
 """A tenth of a second's flight: the machine may be busy. What was reached is printed."""
@@ -154,6 +155,10 @@ def test_a_flight_is_flown_from_the_page(
         assert not any(e["event"] == "triggered" for e in service.events)
 
         browser.evaluate(f"sessionStorage.setItem('token', {json.dumps(token)})")
+        browser.evaluate("document.querySelector('#exposure-room').open = true")
+        browser.evaluate(f"document.querySelector('#exposure [name=gain_db]').value = '{GAIN_DB}'")
+        browser.click("#exposure button[type=submit]")
+        service.wait_for(lambda e: e["event"] == "exposure-settings" and e["by"] == "operator", 10)
         browser.click("[data-command=start]")
         latencies_s = []
         for number in range(1, EXPOSURES + 1):
@@ -185,7 +190,7 @@ def test_a_flight_is_flown_from_the_page(
         record_property("away_from_place_m", [round(value, 2) for value in away_m])
         print(f"exposed beside the planned places by {[round(v, 2) for v in away_m]} m")
         commands = [(e["name"], e["by"]) for e in service.events if e["event"] == "command"]
-        assert commands == [("start", "operator"), ("land", "operator")]
+        assert commands == [("exposure", "operator"), ("start", "operator"), ("land", "operator")]
 
 
 def event_of(service: Running, name: str) -> dict[str, Any]:
@@ -204,6 +209,8 @@ def exposed_where_planned(mission: Path) -> list[float]:
     for number in range(1, EXPOSURES + 1):
         record = json.loads((mission / f"L0/{number:06d}/exposure.json").read_text())
         assert (record["line_id"], record["strip_id"]) == (LINE, STRIP)
+        # Set by hand from the page: every head was exposed with it, and says so itself.
+        assert {frame["settings"]["Gain"] for frame in record["frames"]} == {GAIN_DB}
         where = record["navigation"]
         _, along_m = plane.flat(Point(where["latitude_deg"], where["longitude_deg"]))
         places.append(round(along_m / distance_m))
@@ -212,7 +219,8 @@ def exposed_where_planned(mission: Path) -> list[float]:
         if number > 1:
             step = (along_m - before_m) / distance_m
             overlap = quality["figures"]["forward_overlap"]
-            assert overlap == pytest.approx(1.0 - 0.4 * step, abs=0.06)
+            # The mount trembles by 0.2 deg, 10 m on the ground, an image is 478 m long.
+            assert overlap == pytest.approx(1.0 - 0.4 * step, abs=0.12)
         before_m = along_m
     assert places == list(range(places[0], places[0] + EXPOSURES))
     # On a machine that is busy with other things the order itself comes late.

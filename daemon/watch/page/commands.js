@@ -50,9 +50,14 @@ export async function command(name, body = {}) {
   return false;
 }
 
+const GRAVE = {
+  land: "Land: no more exposures, the service ends. Go on?",
+  "new-mission": "New mission: this one is closed, the next begins with its configuration. Go on?",
+};
+
 for (const button of document.querySelectorAll("[data-command]")) {
   button.addEventListener("click", () => {
     const name = button.dataset.command;
-    if (name !== "land" || confirm("Land: no more exposures, the service ends. Go on?")) command(name);
+    if (!GRAVE[name] || confirm(GRAVE[name])) command(name);
   });
 }

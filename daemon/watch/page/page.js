@@ -3,6 +3,7 @@
 import { flight, listen, onChange } from "./state.js";
 import { command } from "./commands.js";
 import { drawMap } from "./map.js";
+import { drawExposure } from "./exposure.js";
 import { followPlan } from "./plan.js";
 import { prepareImage, showImage } from "./image.js";
 import { drawCharts, fitCharts } from "./charts.js";
@@ -160,6 +161,7 @@ onChange((record) => {
   drawHead();
   drawVerdict();
   drawFaults();
+  drawExposure();
   const last = lastJudged();
   if (follows && last) chosen = last.number;
   if (record.devices) drawDevices();

@@ -6,6 +6,7 @@ export const flight = {
   devices: new Map(),
   track: [],
   history: [],
+  settings: null,
 };
 
 const listeners = new Set();
@@ -22,10 +23,11 @@ function merge(record) {
     flight.track.length = 0;
     flight.history.length = 0;
   }
-  const { exposures = [], devices = [], track = [], history = [], events: _, ...brief } = record;
+  const { exposures = [], devices = [], track = [], history = [], settings = [], events: _, ...brief } = record;
   flight.brief = brief;
   for (const one of exposures) flight.exposures.set(one.number, one);
   for (const one of devices) flight.devices.set(one.name, one);
+  flight.settings = settings.at(-1) || flight.settings;
   flight.track.push(...track);
   flight.history.push(...history);
   for (const listener of listeners) listener(record);

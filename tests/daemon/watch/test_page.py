@@ -210,6 +210,28 @@ def test_a_wrong_token_is_refused_in_words(service: Service, browser: Browser) -
     service.until(lambda: service.commands[-1].name == "start")
 
 
+def test_exposure_settings_are_seen_and_set_from_the_page(
+    service: Service, browser: Browser
+) -> None:
+    settings = {
+        "pan": {"exposure_time_us": 4000.0, "gain_db": 0.0, "tdi_shifts": 1},
+        "G": {"exposure_time_us": 2000.0, "gain_db": 1.5, "tdi_shifts": 0},
+    }
+    told = {"by": "automatic", "control": "automatic", "lock": "line", "settings": settings}
+    service.tell({"event": "exposure-settings", "mono_ns": "1", **told})
+    browser.evaluate("document.querySelector('#exposure-room').open = true")
+    browser.wait_for("document.querySelectorAll('#exposure-now li').length === 2", WITHIN_S)
+    assert "G: 2000 µs, 1.5 dB, 0 TDI" in browser.text("#exposure-now")
+    assert browser.text("#exposure-control") == "(automatic)"
+    browser.evaluate("document.querySelector('#exposure [name=of]').value = 'G'")
+    browser.evaluate("document.querySelector('#exposure [name=gain_db]').value = '2.5'")
+    browser.click("#exposure button[type=submit]")
+    service.until(lambda: service.commands[-1].name == "exposure")
+    given = service.commands[-1].arguments
+    assert (given["of"], given["gain_db"]) == ("G", 2.5)
+    assert "exposure_time_us" not in given
+
+
 def test_image_zooms_by_keyboard_and_the_cabin_gets_dark(browser: Browser) -> None:
     before = browser.evaluate("document.querySelector('#quicklook').style.transform")
     browser.evaluate(

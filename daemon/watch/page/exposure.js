@@ -1,0 +1,36 @@
+// Exposure settings: what is set, by whom, and a form to set them by hand or leave them to the automatic.
+
+import { flight } from "./state.js";
+import { command } from "./commands.js";
+
+const form = document.getElementById("exposure");
+const now = document.getElementById("exposure-now");
+const control = document.getElementById("exposure-control");
+let told = "";
+
+export function drawExposure() {
+  const current = flight.settings;
+  const fresh = JSON.stringify(current || {});
+  if (fresh === told || !current?.settings) return;
+  told = fresh;
+  control.textContent = `(${current.control})`;
+  const groups = Object.entries(current.settings);
+  now.replaceChildren(...groups.map(([group, one]) => Object.assign(document.createElement("li"), {
+    textContent: `${group}: ${one.exposure_time_us.toFixed(0)} µs, ${one.gain_db.toFixed(1)} dB, ${one.tdi_shifts} TDI`,
+  })));
+  const chosen = form.of.value;
+  form.of.replaceChildren(new Option("all", ""), ...groups.map(([group]) => new Option(group, group)));
+  form.of.value = chosen;
+}
+
+form.addEventListener("submit", (event) => {
+  event.preventDefault();
+  const body = {};
+  for (const name of ["exposure_time_us", "gain_db", "tdi_shifts"]) {
+    if (form[name].value !== "") body[name] = Number(form[name].value);
+  }
+  if (form.of.value) body.of = form.of.value;
+  command("exposure", body);
+});
+
+document.getElementById("automatic").addEventListener("click", () => command("exposure", { control: "automatic" }));
