@@ -65,6 +65,8 @@ class Announcement:
         return ServiceInfo(
             SERVICE_TYPE,
             name or f"{socket.gethostname()[:40]}-{self._port}.{SERVICE_TYPE}",
+            # Given on registering where it is missing, but not on a change of the text record.
+            server=f"{socket.gethostname()[:40]}.local.",
             parsed_addresses=_addresses(self._settings.host),
             port=self._port,
             properties=self._text(),
