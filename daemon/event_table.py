@@ -163,6 +163,7 @@ TABLE: Final[Sequence[Entry]] = (
         "A head does not tell its serial number, so nobody knows whether the calibration is its.",
         "Compare the heads' labels with the calibration.",
     ),
+    Entry("exposure-settings", "note", "Exposure time, gain or TDI of heads changed.", _NOTHING),
     # Devices
     Entry("bound", "note", "A device answered; what it said of itself.", _NOTHING),
     Entry("device/opened", "note", "A device delivers.", _NOTHING),
@@ -202,6 +203,12 @@ TABLE: Final[Sequence[Entry]] = (
         "caution",
         "A head did not take a setting, or a receiver a command.",
         "Compare the setting with what the device offers.",
+    ),
+    Entry(
+        "device/not-adjusted",
+        "caution",
+        "A head did not take an exposure time, gain or TDI that was asked of it in flight.",
+        "Compare the setting with what the head offers; it goes on with the one before.",
     ),
     Entry(
         "device/frames-missing",
