@@ -6,6 +6,7 @@ because they are what is to be judged. The mathematics is in `processing.boresig
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -29,6 +30,7 @@ from daemon.configuration import MountSection
 from daemon.errors import DaemonError
 from daemon.exposure import Exposure
 from daemon.georeference import Georeference
+from daemon.local_frame import FRAME_FILE, LocalFrame
 from daemon.mission import Mission
 from daemon.navigation import metres_per_degree
 from daemon.orientation import exposures_of
@@ -139,10 +141,31 @@ def inertial_table(
     )
 
 
+def system_of(project: Path, crs: str | None) -> str | LocalFrame:
+    """What the coordinates of a project are in: `crs`, or the frame that lies beside it.
+
+    Raises:
+        BoresightError: neither is there.
+    """
+    if crs is not None:
+        return crs
+    frame = project.parent / FRAME_FILE
+    try:
+        told = json.loads(frame.read_text(encoding="utf-8"))
+        return LocalFrame(float(told["latitude_deg"]), float(told["longitude_deg"]))
+    except FileNotFoundError as error:
+        raise BoresightError(
+            "--mission needs --crs, the coordinate system of the project, such as EPSG:25833; only "
+            "projects that `syntopic at` wrote tell their own"
+        ) from error
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise BoresightError(f"{frame}: {error}; give --crs") from error
+
+
 def inertial_of_mission(
     mission: Mission,
     stations: Sequence[str],
-    crs: str,
+    system: str | LocalFrame,
     trajectory_file: Path | None,
     position_sigma_m: Array,
     attitude_sigma_rad: Array,
@@ -150,7 +173,8 @@ def inertial_of_mission(
     """The trajectory at the marks of a mission's exposures, in the project's coordinate system.
 
     Exposures are named as `syntopic export orientation` names them. Positions are those of the
-    antenna, as the trajectory tells them.
+    antenna, as the trajectory tells them. `system` is a coordinate system that PROJ knows, or the
+    local frame of a project that `syntopic at` wrote.
 
     Raises:
         BoresightError: no exposure of the project has an instant and an attitude.
@@ -164,11 +188,11 @@ def inertial_of_mission(
         if trajectory_file is None
         else read_trajectory(trajectory_file, around_gps_ns=stamped[0])
     )
-    georeference = Georeference(crs)
+    place = system if isinstance(system, LocalFrame) else Georeference(system)
     kept, rows = [], []
     for k, name in enumerate(stations):
         exposure = exposures.get(name)
-        row = None if exposure is None else _at_mark(exposure, trajectory, georeference)
+        row = None if exposure is None else _at_mark(exposure, trajectory, place)
         if row is not None:
             kept.append(k)
             rows.append(row)
@@ -367,7 +391,7 @@ def _attitude_of_station(network: Network) -> dict[int, int]:
 
 
 def _at_mark(
-    exposure: Exposure, trajectory: Trajectory, georeference: Georeference
+    exposure: Exposure, trajectory: Trajectory, system: Georeference | LocalFrame
 ) -> tuple[Array, Array, Array, Array] | None:
     """Position, velocity, rotation and rates at the mark, in grid axes; None: not known."""
     if exposure.mark_gps_ns is None:
@@ -381,8 +405,14 @@ def _at_mark(
     before, here, after = there
     if before is None or here is None or after is None:
         return None
-    place = georeference.place(here.latitude_deg, here.longitude_deg, here.height_m)
-    grid = grid_from_enu(place.azimuth_of_north_rad)
+    if isinstance(system, LocalFrame):
+        at = (here.latitude_deg, here.longitude_deg, here.height_m)
+        position = system.from_geodetic(*(np.array(v) for v in at))
+        grid = system.local_from_enu(here.latitude_deg, here.longitude_deg)
+    else:
+        place = system.place(here.latitude_deg, here.longitude_deg, here.height_m)
+        position = np.array([place.east_m, place.north_m, place.height_m])
+        grid = grid_from_enu(place.azimuth_of_north_rad)
     per_latitude, per_longitude = metres_per_degree(here.latitude_deg, here.height_m)
     span_s = 2 * STEP_NS * 1e-9
     velocity = (
@@ -396,5 +426,4 @@ def _at_mark(
         / span_s
     )
     rate = logarithm((level[0].T @ level[2])[None])[0] / span_s
-    position = np.array([place.east_m, place.north_m, place.height_m])
     return position, grid @ velocity, grid @ ENU_FROM_NED @ level[1], rate

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+FRAME_FILE = "frame.json"
+"""Beside a project in such a frame: its `latitude_deg` and `longitude_deg`."""
+
 
 class LocalFrame:
     """East, north, up at a place of WGS 84 on the ellipsoid, metres."""

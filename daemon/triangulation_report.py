@@ -6,6 +6,7 @@ coordinate system asked for.
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -21,6 +22,7 @@ from daemon.adjusting.tables import ProjectError, write_table
 from daemon.adjusting.writing import write_results
 from daemon.cli.tables import light_table
 from daemon.georeference import Georeference
+from daemon.local_frame import FRAME_FILE
 from daemon.triangulation import Block
 from processing.block_matching import TiedBlock, sides_of
 from processing.bundle.adjust import Adjustment
@@ -110,6 +112,8 @@ def write_triangulation(
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "rig.toml").write_bytes(block.mission.rig_path.read_bytes())
     write_results(folder, _named(project), result, report)
+    frame = {"latitude_deg": block.frame.latitude_deg, "longitude_deg": block.frame.longitude_deg}
+    (folder / FRAME_FILE).write_text(json.dumps(frame) + "\n", encoding="utf-8")
     georeference = Georeference(block.crs)
     place = block.frame.to_geodetic(result.state.station)
     sigma = {o.name: o for o in exposures_of(result)}

@@ -18,7 +18,8 @@ HELP = """Boresight, lever arm and time offset: inertial against controlled orie
 
 PROJECT is an adjustment project (docs/formats.md) with control; it is adjusted without its antenna
 positions and attitudes, and the result is compared with the trajectory: `inertial.csv` in the
-project, or a mission's (--mission, exposures named as their folders, --crs of the project). Fly
+project, or a mission's (--mission, exposures named as their folders; --crs of the project, which
+a project of `syntopic at` tells itself). Fly
 two heights, opposite and crossing lines and two speeds; what the flight cannot part is named and
 stays as it was given. Writes a dated folder with mount.toml, report.html and calibration.json.
 
@@ -76,14 +77,15 @@ def boresight(
     section, serials = MountSection(), {}
     if mission is not None:
         folder = Mission.open(mission)
-        if crs is None:
-            raise flight.BoresightError(
-                "--mission needs --crs, the coordinate system of the project, such as EPSG:25833"
-            )
         section = mount_of(folder)[0]
         serials = {s.name: s.serial for s in load_rig(folder.rig_path).sensors if s.serial}
         exposures, inertial = flight.inertial_of_mission(
-            folder, stations, crs, trajectory, sigma_m, sigma_rad
+            folder,
+            stations,
+            flight.system_of(path, crs),
+            trajectory,
+            sigma_m,
+            sigma_rad,
         )
     else:
         exposures, inertial = flight.inertial_table(

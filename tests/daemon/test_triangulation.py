@@ -152,3 +152,23 @@ def test_a_local_frame_is_true_to_length_and_comes_back() -> None:
     _, _, length = pyproj.Geod(ellps="WGS84").inv(back[0, 1], back[0, 0], back[1, 1], back[1, 0])
     # On the ellipsoid, 500 m below: shorter by 500 / 6378000 of 3606 m.
     assert length == pytest.approx(np.hypot(3000, 2000) * (1 - 500 / 6.378e6), abs=0.01)
+
+
+def test_a_triangulated_block_tells_the_boresight(flown, told, tmp_path: Path) -> None:
+    folder = flown[0]
+    asked = [
+        "calibrate", "boresight", str(folder / "none"), "--mission", str(folder / "mission"),
+        "--trajectory", str(folder / "trajectory.csv"), "--out", str(tmp_path / "b"), "--json",
+        "--hold", "lever", "--position-sigma", "0.05", "0.05", "0.05",
+        "--attitude-sigma", "5", "5", "5",
+    ]  # fmt: skip
+    done = RUN.invoke(app, asked)
+    assert done.exit_code == 0, done.output + str(done.exception)
+    found = {(q["where"], q["what"]): q for q in json.loads(done.stdout)["quantities"]}
+    # The emulated unit is aligned with the camera, its clock is right, both heights agree.
+    for key in (("boresight", "roll"), ("boresight", "pitch"), ("boresight", "heading")):
+        assert abs(found[key]["value"]) < 4.5 * found[key]["sigma"] < 0.2, key
+    assert abs(found["time", "offset"]["value"]) < 4.5 * found["time", "offset"]["sigma"]
+    assert found["lever arm", "down"]["sigma"] is None
+    up = found["position shift", "up"]
+    assert abs(up["value"]) < 4.5 * up["sigma"]
