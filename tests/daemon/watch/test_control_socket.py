@@ -233,3 +233,29 @@ def test_nobody_listening_and_no_such_group_end_in_sentences(tmp_path: Path) -> 
         ControlSocket(
             tmp_path / "c", "no-such-group", service.gate, service.state, service.refused.append
         )
+
+
+def test_the_command_line_gives_what_it_is_told_and_its_status_says_what_became(
+    tmp_path: Path,
+) -> None:
+    service, path = Service(), tmp_path / "control.sock"
+
+    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, "-m", "daemon", "command", *arguments, "--socket", str(path)],
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+
+    async def ask() -> tuple[subprocess.CompletedProcess[str], ...]:
+        async with service.listening(path):
+            given = ("interval", "--set", "interval_s=2.5", "--set", "count=4", "--json")
+            return await asyncio.to_thread(run, *given), await asyncio.to_thread(run, "stop")
+
+    done, refused = asyncio.run(ask())
+    assert (done.returncode, json.loads(done.stdout)["done"]) == (0, True)
+    assert (refused.returncode, refused.stdout.strip()) == (1, "as asked")
+    interval = service.commands[0].arguments
+    assert (interval["interval_s"], interval["count"]) == (2.5, 4)
