@@ -1,0 +1,45 @@
+"""The onboard service with a pipeline that stands aside: `python -m tests.crash.service CONFIG`.
+
+Service, capture, writer and drivers are those that fly. The worker says at once that it is ready
+and makes no image, so that a service that is killed every other second is in the air in between.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from daemon import departure, service
+from daemon.cli.run import run
+from daemon.messages import FramesRead, Ping, Pong, Process, ProcessFailed, Stop, WorkerReady
+from daemon.processes import Link
+
+
+def idle_worker(link: Link, _settings: Any, _rings: Any) -> None:
+    """In the place of `daemon.worker.main`."""
+    link.send(WorkerReady(0.0))
+    while not isinstance(order := link.receive(timeout_s=1.0), Stop):
+        if isinstance(order, Ping):
+            link.send(Pong({}))
+        elif isinstance(order, Process):
+            number = order.exposure.number
+            link.send(FramesRead(number))
+            link.send(ProcessFailed(number, f"exposure {number}: no pipeline flies here"))
+
+
+def _with_idle_worker(*arguments: Any) -> tuple[departure.ProcessPlan, ...]:
+    return tuple(
+        plan._replace(target="tests.crash.service:idle_worker") if plan.name == "worker" else plan
+        for plan in departure.processes(*arguments)
+    )
+
+
+if __name__ == "__main__":
+    vars(service)["processes"] = _with_idle_worker
+    try:
+        run(Path(sys.argv[1]), json_lines=True)
+    except typer.Exit as ended:
+        sys.exit(ended.exit_code)

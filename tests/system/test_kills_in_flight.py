@@ -1,0 +1,134 @@
+"""The service killed at random instants of one running flight, over and over."""
+
+from __future__ import annotations
+
+import json
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from daemon.cli.sim import Emulator, free_first_address, service_toml, simulator_arguments
+from tests.system.flown import ROOT, syntopic
+from tests.system.test_faults_in_flight import heard
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(400)]
+
+EXPOSURES_OF_A_LIFE = 1
+LIFE_LIMIT_S = 60.0
+
+
+def kill_in_flight(
+    folder: Path, kills: int, seed: int, *, every: int, scene: int = 8
+) -> dict[str, object]:
+    """Kill a flight so often; every so many lives one lives until it has stored something.
+
+    What was told stored, sealed or triggered is held against the disk at the end; the ledger and
+    `syntopic verify` as well. `scene` is how many exposures of ground the emulator builds.
+    """
+    dice = random.Random(seed)
+    rig = "ultracam-l-mini"
+    arguments = simulator_arguments(rig, folder / "sim", seed=4, dc=0, displace=[])
+    address = free_first_address()
+    emulator = Emulator([*arguments, "--first-address", address, "--exposures", str(scene)])
+    config = folder / "service.toml"
+    config.write_text(service_toml(emulator.ready, root="missions"))
+    told: dict[str, set[int]] = {"triggered": set(), "stored": set(), "sealed": set()}
+    missions: set[str] = set()
+    in_flight = 0
+    begun_s = time.monotonic()
+    try:
+        for life in range(1, kills + 1):
+            is_long = life % every == 0
+            in_flight += _live(config, dice, told, missions, is_long=is_long)
+        (mission,) = missions
+        seconds = round(time.monotonic() - begun_s, 1)
+        # Landing at once: recovery has the last word.
+        last = _start(config)
+        ended = {}
+        for event in heard(last):
+            if event["event"] == "mission":
+                last.send_signal(signal.SIGTERM)
+            elif event["event"] == "ended":
+                ended = event
+        assert last.wait(30) == 0
+    finally:
+        emulator.end()
+    assert ended["ledger"]["balanced"], ended["ledger"]["imbalances"]
+    records = {
+        record["number"]: record
+        for path in Path(mission, "L0").glob("*/exposure.json")
+        if (record := json.loads(path.read_text()))
+    }
+    kept = {number for number, record in records.items() if record["frames"]}
+    assert told["stored"] and told["stored"] <= kept
+    assert told["sealed"] <= records.keys()
+    assert ended["ledger"]["triggers"]["triggers"] == len(records)
+    verified = syntopic("verify", mission, "--json")
+    assert verified.returncode == 0, verified.stdout
+    figures = {
+        "kills": kills,
+        "killed in flight": in_flight,
+        "triggered": len(told["triggered"]),
+        "stored": len(told["stored"]),
+        "records": len(records),
+        "kept": len(kept),
+        "seconds": seconds,
+    }
+    print(json.dumps(figures))
+    return figures
+
+
+def _live(
+    config: Path,
+    dice: random.Random,
+    told: dict[str, set[int]],
+    missions: set[str],
+    *,
+    is_long: bool,
+) -> bool:
+    """One life; whether it had given a trigger when it was killed."""
+    service = _start(config)
+    killer = threading.Timer(
+        LIFE_LIMIT_S if is_long else dice.uniform(0.3, 2.0), service.send_signal, [signal.SIGKILL]
+    )
+    killer.start()
+    stored = 0
+    was_in_flight = False
+    for event in heard(service):
+        kind = event["event"]
+        if kind == "mission":
+            missions.add(event["path"])
+        elif kind in told:
+            told[kind].add(event["number"])
+            was_in_flight = True
+            stored += kind == "stored"
+        if is_long and stored == EXPOSURES_OF_A_LIFE:
+            killer.cancel()
+            threading.Timer(dice.uniform(0.0, 0.3), service.send_signal, [signal.SIGKILL]).start()
+            is_long = False
+    killer.cancel()
+    service.wait(10)
+    return was_in_flight
+
+
+def _start(config: Path) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "tests.crash.service", str(config)]
+    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+
+
+def test_25_kills_lose_nothing_that_was_acknowledged(tmp_path: Path) -> None:
+    figures = kill_in_flight(tmp_path, 25, 1, every=4)
+    assert figures["kills"] == 25 and int(str(figures["killed in flight"])) >= 6
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(7200)
+def test_500_kills_lose_nothing_that_was_acknowledged(tmp_path: Path) -> None:
+    figures = kill_in_flight(tmp_path, 500, 2, every=2, scene=40)
+    assert figures["kills"] == 500 and int(str(figures["killed in flight"])) >= 100
