@@ -12,9 +12,11 @@ from typing import Any
 import numpy as np
 
 from daemon.adjusting.project import Project
+from daemon.calibration_plots import Curve, chart_svg
 from daemon.calibration_report import (
     CalibrationReport,
     Cell,
+    Plot,
     Previous,
     Quantity,
     Sheet,
@@ -165,6 +167,7 @@ def report_of(
             _sheet(found, "deg", math.degrees(1.0)),
             _spread(found),
         ),
+        plots=_plots(found),
         previous=None if previous is None else previous.calibration_id,
         changes=() if previous is None else changes_between(previous.quantities, quantities),
     )
@@ -203,6 +206,30 @@ def _sheet(found: RelativeOrientations, unit: str, factor: float) -> Sheet:
     )
 
 
+def _plots(found: RelativeOrientations) -> tuple[Plot, ...]:
+    """What single exposures are off the averages, head by head."""
+    return tuple(
+        Plot(
+            f"Head {head.head}: single exposures less average",
+            chart_svg(
+                f"Head {head.head}",
+                ("exposure", "mgrad"),
+                [
+                    Curve(
+                        name,
+                        [float(k + 1) for k in range(len(head.single_rad))],
+                        head.single_rad[:, axis] * GRAD * 1e3,
+                        joined=False,
+                    )
+                    for axis, name in enumerate(("about x", "about y", "about z"))
+                ],
+            ),
+        )
+        for head in found.heads
+        if len(head.single_rad) > 1
+    )
+
+
 def _spread(found: RelativeOrientations) -> Sheet:
     rows: list[tuple[Cell, ...]] = [
         (
@@ -216,5 +243,6 @@ def _spread(found: RelativeOrientations) -> Sheet:
         "About the head's own axes, mgrad",
         ("head", "sigma x", "sigma y", "sigma z", "single x", "single y", "single z"),
         rows,
-        "Single: standard deviation of single exposures about the average.",
+        "Single: standard deviation of single exposures. Averages weigh exposures with their whole "
+        "covariance: what all have in common (principal points) can move them beyond the scatter.",
     )

@@ -30,14 +30,21 @@ _SETTLED_RAD = 1e-12
 class RelativeOrientation:
     """One head against the reference head.
 
-    `rotation` (3, 3) is reference_from_head; `spread_rad` (3,) the standard deviation of single
-    exposures about the head's axes, NaN where the heads were parameters of the adjustment.
+    `rotation` (3, 3) is reference_from_head; `single_rad` (n, 3) what single exposures are off it
+    about the head's axes, none where the heads were parameters of the adjustment.
     """
 
     head: str
     rotation: Array
-    spread_rad: Array
+    single_rad: Array
     exposures: int
+
+    @property
+    def spread_rad(self) -> Array:
+        """(3,) standard deviation of single exposures; NaN where there are not two."""
+        if len(self.single_rad) < 2:
+            return np.full(3, np.nan)
+        return np.asarray(self.single_rad.std(axis=0, ddof=1))
 
 
 @dataclass(frozen=True)
@@ -161,7 +168,7 @@ def _averaged(
             RelativeOrientation(
                 result.network.cameras[camera].name,
                 mean[h],
-                off[head == h].std(axis=0, ddof=1) if (head == h).sum() > 1 else np.full(3, np.nan),
+                off[head == h],
                 int((head == h).sum()),
             )
             for h, camera in enumerate(cameras)
@@ -219,7 +226,7 @@ def _of_parameters(result: Adjustment, reference: str) -> RelativeOrientations:
             RelativeOrientation(
                 network.heads[k].name,
                 turn.T @ result.state.head_rotation[k],
-                np.full(3, np.nan),
+                np.zeros((0, 3)),
                 seen[k],
             )
             for k in free
