@@ -36,7 +36,7 @@ from daemon.watch.tokens import Attempts, Holder, Role, Tokens
 
 PAGE = Path(__file__).parent / "page"
 PROBLEM_JSON = "application/problem+json"
-TELEMETRY_TICK_S = 0.2
+TELEMETRY_TICK_S = 0.05
 SEND_TIMEOUT_S = 5.0
 """A watcher that does not take a record in this time is let go."""
 
