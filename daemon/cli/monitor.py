@@ -17,6 +17,7 @@ from rich.text import Text
 
 from daemon.cli.tables import light_table
 from daemon.errors import DaemonError
+from daemon.watch.state import PARTS, PICTURE_PARTS
 
 HELP = """Watch a flight from a terminal: phase, ledger, faults, the last exposures.
 
@@ -117,7 +118,7 @@ class _Seen:
             self.exposures[one["number"]] = one
         for one in record.pop("devices", []):
             self.devices[one["name"]] = one
-        for part in ("track", "history", "events"):
+        for part in (*PARTS, *PICTURE_PARTS):
             record.pop(part, None)
         self.brief = record
 

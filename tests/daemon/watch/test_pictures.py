@@ -9,6 +9,7 @@ import msgpack
 import numpy as np
 import pytest
 
+from daemon.cli.monitor import _Seen
 from daemon.watch.datagrams import DATAGRAM_MAX_BYTES, Received, Sender
 from daemon.watch.pictures import PIECE_BYTES, VECTORS_TOLD, pictures_of
 from daemon.watch.state import PARTS, PICTURE_PARTS, FlightState
@@ -108,3 +109,12 @@ def test_a_piece_is_bytes_in_msgpack(state: FlightState) -> None:
     piece = msgpack.unpackb(packed(state.changed("thumbnails", 0)[0]))
     assert piece["data"] == JPEG[:PIECE_BYTES]
     assert piece["pieces"] == 5
+
+
+def test_the_terminal_keeps_what_it_shows_and_can_print_it(state: FlightState) -> None:
+    fly(state, 1)
+    shown = _Seen()
+    record = Subscription(parts=(*PARTS, *PICTURE_PARTS)).record(state, 0.0)
+    assert record["thumbnails"]
+    shown.take(dict(record))
+    assert json.loads(json.dumps(shown.as_json()))["exposures"][0]["number"] == 1
