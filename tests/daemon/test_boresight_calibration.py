@@ -99,3 +99,22 @@ def test_a_time_offset_moves_orientations_along_the_flight(tmp_path: Path) -> No
     late = master_of(mission, MountSection(time_offset_ms=10.0))
     moved = float(np.linalg.norm(late.centre_m - at.centre_m))
     assert moved == pytest.approx(PLAN.ground_speed_mps * 0.010, rel=0.05)
+
+
+def test_another_mount_orients_beside_the_one_that_was_flown(tmp_path: Path) -> None:
+    pytest.importorskip("pyproj", reason="pip install 'syntopic[geodesy]'")
+    mission = mission_at(tmp_path / "m")
+    mount = tmp_path / "mount.toml"
+    mount.write_text("[mount]\nboresight_deg = [0.0, 0.1, 0.0]\n")
+    folders = []
+    for more in ([], ["--mount", str(mount)]):
+        done = RUN.invoke(app, ["orient", str(mission.path), *more, "--json"])
+        assert done.exit_code == 0, done.output + str(done.exception)
+        told = json.loads(done.stdout)
+        folders.append(told["folder"])
+    assert folders[0] != folders[1] and told["change_deg"] == pytest.approx(0.1, abs=1e-4)
+    (tmp_path / "none.toml").write_text("[plan]\n")
+    wrong = RUN.invoke(
+        app, ["orient", str(mission.path), "--mount", str(tmp_path / "none.toml"), "--json"]
+    )
+    assert wrong.exit_code != 0 and "no [mount] in it" in str(wrong.exception)
