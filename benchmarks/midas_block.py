@@ -36,6 +36,7 @@ from processing.bundle.network import (
 )
 from processing.bundle.rotations import exponential, logarithm
 from processing.bundle.start import completed
+from processing.relative_orientation import relative_orientations
 from sim_hw.oblique import (
     F_MM,
     HALF_HEIGHT_MM,
@@ -153,7 +154,7 @@ def repeated(seed: int) -> Repeated:
     nadir = adjust(network_of(block, (0,), own=False))
     separate = adjust(network_of(block, (0, 1, 2, 3, 4), own=True))
     oblique = adjust(network_of(block, (0, 1, 2, 3, 4), own=False))
-    averaged = _averaged(separate)
+    averaged = {h.head: h for h in relative_orientations(separate, NADIR).heads}
     boresight = _boresight(block, oblique)
     direct = block.inertial @ boresight
     network = oblique.network
@@ -196,10 +197,14 @@ def repeated(seed: int) -> Repeated:
             h.name: {
                 "phi_omega_kappa_grad": _phi_omega_kappa_grad(oblique.state.head_rotation[k]),
                 "sigma_mgrad": [float(v) * 200e3 / np.pi for v in _head_sigma(oblique, k)],
-                "averaged_spread_mgrad": [float(v) * 200e3 / np.pi for v in averaged[k][1]],
+                "averaged_spread_mgrad": [
+                    float(v) * 200e3 / np.pi for v in averaged[h.name].spread_rad
+                ],
                 "averaged_less_adjusted_mgrad": [
                     float(v) * 200e3 / np.pi
-                    for v in logarithm((oblique.state.head_rotation[k].T @ averaged[k][0])[None])[0]
+                    for v in logarithm(
+                        (oblique.state.head_rotation[k].T @ averaged[h.name].rotation)[None]
+                    )[0]
                 ],
                 "error_mgrad": [
                     float(v) * 200e3 / np.pi
@@ -224,28 +229,6 @@ def repeated(seed: int) -> Repeated:
     return Repeated(
         figures, oblique, differences, sigma, true_error, np.sqrt(np.einsum("nii->ni", own))
     )
-
-
-def _averaged(result: Adjustment) -> list[tuple[Array, Array]]:
-    """Nadir from oblique of every head: mean over exposures, and spread of single ones (3,)."""
-    images = result.network.images
-    found = []
-    for head in range(5):
-        relative = np.array(
-            [
-                result.state.attitude[images.attitude[e * 5]].T
-                @ result.state.attitude[images.attitude[e * 5 + head]]
-                for e in range(len(images.names) // 5)
-            ]
-        )
-        seen = np.bincount(result.network.image_points.image, minlength=len(images.names))
-        enough = seen[head::5] >= LEAST_POINTS
-        mean = relative[enough][0]
-        for _ in range(5):
-            off = logarithm(np.einsum("ji,njk->nik", mean, relative[enough]))
-            mean = mean @ exponential(off.mean(axis=0)[None])[0]
-        found.append((mean, off.std(axis=0, ddof=1)))
-    return found
 
 
 def _boresight(block: ObliqueBlock, result: Adjustment) -> Array:
