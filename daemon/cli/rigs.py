@@ -63,6 +63,7 @@ def show(
     """
     from processing import drawing as draw
     from processing import topology
+    from processing.perspective import looks_apart
 
     rig = find_rig(name)
     counts = topology.counts(rig)
@@ -126,11 +127,14 @@ def show(
             f"{overlap.rectangle.height_mm / pitch_mm:.0f}",
         )
     console.print(strips)
-    console.print(
-        f"Adjustment: {counts.parameters} parameters, {counts.constraints} constraints, "
-        f"{counts.parameters - counts.constraints} independent unknowns (a cone with - is "
-        f"registered to green)"
-    )
+    if looks_apart(rig):
+        console.print("Nothing is stitched: each head is an image of its own (docs/midas.md)")
+    else:
+        console.print(
+            f"Adjustment: {counts.parameters} parameters, {counts.constraints} constraints, "
+            f"{counts.parameters - counts.constraints} independent unknowns (a cone with - is "
+            f"registered to green)"
+        )
     console.print(f"Focal planes drawn in [bold]{path}[/]")
 
 
