@@ -13,6 +13,7 @@ from rich.console import Console
 from daemon.cli import (
     calibrate_boresight,
     calibrate_head,
+    calibrate_lab,
     calibrate_platform,
     calibrate_radiometric,
     calibrate_rig,
@@ -54,6 +55,7 @@ def calibrate() -> None:
 
 app.command(name="radiometric", help=calibrate_radiometric.HELP)(calibrate_radiometric.radiometric)
 app.command(name="head", help=calibrate_head.HELP)(calibrate_head.head)
+app.command(name="lab", help=calibrate_lab.HELP)(calibrate_lab.lab)
 app.command(name="boresight", help=calibrate_boresight.HELP)(calibrate_boresight.boresight)
 app.command(name="rig", help=calibrate_rig.HELP)(calibrate_rig.rig)
 app.command(name="platform", help=calibrate_platform.HELP)(calibrate_platform.platform)

@@ -57,13 +57,19 @@ class Series:
             raise SeriesError(self.table.problems)
 
     def file(self, image: Table) -> Path:
-        """The image's file; names leave the folder neither upwards nor to the root."""
-        name = image.text("file")
-        path = PurePosixPath(name)
-        if path.is_absolute() or ".." in path.parts or not name:
-            image.complain("file", "it is a name within the folder")
-            return self.folder
-        return self.folder / path
+        """The image's file."""
+        return self.folder / within_folder(image, "file")
+
+
+def within_folder(table: Table, key: str) -> str:
+    """A file name; it leaves the folder neither upwards nor to the root, else it is complained of
+    and empty."""
+    name = table.text(key)
+    path = PurePosixPath(name)
+    if path.is_absolute() or ".." in path.parts or not name:
+        table.complain(key, "it is a name within the folder")
+        return ""
+    return name
 
 
 def read_series(folder: Path, *, kind: str) -> Series:

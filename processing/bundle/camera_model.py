@@ -33,21 +33,18 @@ def ideal_mm(camera: Camera, interior: Array, terms: Array, xy_mm: Array) -> Arr
         terms: values of the additional parameters, (t,).
         xy_mm: measured.
     """
+    xy_mm = _placed(camera, terms, xy_mm)
     if camera.model == "australis":
         x, y = xy_mm[:, 0] - camera.xp_mm, xy_mm[:, 1] - camera.yp_mm
-        ideal = np.stack([x, y], axis=1) + _ten(camera, x, y) @ interior
-    else:
-        x, y, _ = _centred(camera, interior, xy_mm)
-        delta = np.einsum("nik,k->ni", _ten(camera, x, y)[:, :, 3:8], interior[3:8])
-        ideal = np.stack([x, y], axis=1) + delta
-    for value, term in zip(terms, camera.terms, strict=True):
-        if value != 0.0:
-            ideal += value * term_design(term, _about_given(camera, xy_mm))
-    return ideal
+        return np.asarray(np.stack([x, y], axis=1) + _ten(camera, x, y) @ interior)
+    x, y, _ = _centred(camera, interior, xy_mm)
+    delta = np.einsum("nik,k->ni", _ten(camera, x, y)[:, :, 3:8], interior[3:8])
+    return np.asarray(np.stack([x, y], axis=1) + delta)
 
 
-def interior_derivatives(camera: Camera, interior: Array, xy_mm: Array) -> Array:
+def interior_derivatives(camera: Camera, interior: Array, terms: Array, xy_mm: Array) -> Array:
     """d(ideal) / d(the ten), (n, 2, 10); df of the centred model acts in the projection: zero."""
+    xy_mm = _placed(camera, terms, xy_mm)
     if camera.model == "australis":
         return _ten(camera, xy_mm[:, 0] - camera.xp_mm, xy_mm[:, 1] - camera.yp_mm)
     x, y, about = _centred(camera, interior, xy_mm)
@@ -61,12 +58,31 @@ def interior_derivatives(camera: Camera, interior: Array, xy_mm: Array) -> Array
     return result
 
 
-def term_derivatives(camera: Camera, xy_mm: Array) -> Array:
+def term_derivatives(camera: Camera, interior: Array, terms: Array, xy_mm: Array) -> Array:
     """d(ideal) / d(additional parameters), (n, 2, t)."""
     if not camera.terms:
         return np.zeros((len(xy_mm), 2, 0))
     place = _about_given(camera, xy_mm)
-    return np.stack([term_design(term, place) for term in camera.terms], axis=2)
+    moved = np.stack([term_design(term, place) for term in camera.terms], axis=2)
+    xy_mm = _placed(camera, terms, xy_mm)
+    affine = np.array([[1.0 + interior[8], interior[9]], [0.0, 1.0]])
+    if camera.model == "australis":
+        x, y = xy_mm[:, 0] - camera.xp_mm, xy_mm[:, 1] - camera.yp_mm
+        through = affine + _by_place(interior, x, y) + np.eye(2) * interior[2] / camera.f_mm
+    else:
+        x, y, _ = _centred(camera, interior, xy_mm)
+        through = (np.eye(2) + _by_place(interior, x, y)) @ affine
+    return np.asarray(through @ moved)
+
+
+def _placed(camera: Camera, terms: Array, xy_mm: Array) -> Array:
+    """Measured coordinates with what the additional parameters correct: they come before the ten,
+    as a CCD lies behind its lens."""
+    result = xy_mm
+    for value, term in zip(terms, camera.terms, strict=True):
+        if value != 0.0:
+            result = result + value * term_design(term, _about_given(camera, xy_mm))
+    return result
 
 
 def _about_given(camera: Camera, xy_mm: Array) -> Array:

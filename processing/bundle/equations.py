@@ -195,7 +195,7 @@ def _image_rows(
             by_station = -by_point * scale[:, None, None]
             if not straight:
                 by_point, by_station = by_point @ ray_by_point, by_point @ ray_by_station
-            by_interior = -interior_derivatives(camera, interior, measured_mm)
+            by_interior = -interior_derivatives(camera, interior, state.terms[index], measured_mm)
             if camera.model == "centred":
                 by_interior[:, :, 2] = -projected / c
             blocks = [
@@ -206,7 +206,7 @@ def _image_rows(
             ]
             if camera.terms:
                 columns = np.broadcast_to(layout.terms[index], (len(rows), len(camera.terms)))
-                by_term = -term_derivatives(camera, measured_mm)
+                by_term = -term_derivatives(camera, interior, state.terms[index], measured_mm)
                 blocks += _active(columns, by_term)
             if mounted.any():
                 blocks += [

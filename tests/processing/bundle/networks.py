@@ -56,15 +56,23 @@ def measured_from_ideal(camera: Camera, ideal: Array) -> Array:
     dx0, dy0, df, k1, k2, k3, p1, p2, b1, b2 = camera.interior
     measured = ideal.copy()
     for _ in range(60):
+        # A CCD's own displacement comes before the lens.
+        placed = measured
+        for term in camera.terms:
+            assert term.kind == "rotation", "what these networks are made with"
+            u, v = measured - (camera.xp_mm, camera.yp_mm)
+            if term.sensors == ("B",) and u > 0.0:
+                cu, cv = term.parts[1].centre_mm
+                placed = placed + term.value * np.array([-(v - cv), u - cu])
         if camera.model == "australis":
-            x, y = measured - (camera.xp_mm, camera.yp_mm)
+            x, y = placed - (camera.xp_mm, camera.yp_mm)
             r2 = x * x + y * y
             radial = k1 * r2 + k2 * r2**2 + k3 * r2**3 + df / camera.f_mm
             dx = dx0 + x * radial + p1 * (r2 + 2 * x * x) + 2 * p2 * x * y + b1 * x + b2 * y
             dy = dy0 + y * radial + 2 * p1 * x * y + p2 * (r2 + 2 * y * y)
             now = np.array([x + dx, y + dy])
         else:
-            a, y = measured - (camera.xp_mm, camera.yp_mm) + np.array([dx0, dy0])
+            a, y = placed - (camera.xp_mm, camera.yp_mm) + np.array([dx0, dy0])
             x = a * (1 + b1) + y * b2
             r2 = x * x + y * y
             radial = k1 * r2 + k2 * r2**2 + k3 * r2**3
@@ -74,12 +82,6 @@ def measured_from_ideal(camera: Camera, ideal: Array) -> Array:
                     y + y * radial + 2 * p1 * x * y + p2 * (r2 + 2 * y * y),
                 ]
             )
-        for term in camera.terms:
-            assert term.kind == "rotation", "what these networks are made with"
-            u, v = measured - (camera.xp_mm, camera.yp_mm)
-            if term.sensors == ("B",) and u > 0.0:
-                cu, cv = term.parts[1].centre_mm
-                now = now + term.value * np.array([-(v - cv), u - cu])
         measured = measured + (ideal - now)
     return measured
 

@@ -1,0 +1,179 @@
+"""Honest uncertainty of `calibrate lab`: seeds of rigs and test fields, errors in their covariance.
+
+    python -m benchmarks.laboratory_field ultracam-l-mini --seeds 50
+
+Image coordinates go through the emulator's projection with noise; measurement on frames is tested
+apart. One line a seed on stderr, the pooled figures as JSON on stdout.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from daemon.laboratory.field import Exposure, Field, Looks, RigCalibration, calibrate_rig
+from daemon.laboratory.field_report import Estimated, covariance_of, estimated
+from processing.bundle.rotations import logarithm
+from processing.rig import Rig, find_rig
+from processing.rotation import rotation_matrix
+from sim_hw import test_field
+
+Array = NDArray[np.float64]
+
+NOISE_PX = 0.005
+
+
+@dataclass(frozen=True)
+class Pooled:
+    """Squared errors in their covariances, how many, and the standardised ones."""
+
+    squares: float
+    count: int
+    standardised: Array
+
+    @property
+    def mean(self) -> float:
+        return self.squares / self.count
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        low, high = (float(chi2.ppf(p, self.count)) for p in (0.0005, 0.9995))
+        return low / self.count, high / self.count
+
+
+def calibrated(
+    rig: Rig, seed: int, *, exposures: int, targets: tuple[int, int]
+) -> tuple[RigCalibration, test_field.TrueRig]:
+    """One rig, one field, one calibration from image coordinates."""
+    truth = test_field.true_rig(rig, seed)
+    plan = test_field.plan_for(rig, exposures)
+    xyz = test_field.targets(seed, targets, plan.size_m, plan.depth_m)
+    random = np.random.default_rng(seed)
+    sigma = test_field.SURVEY_SIGMA_M
+    field = Field(
+        tuple(f"T{k}" for k in range(len(xyz))),
+        xyz + random.normal(0.0, sigma, xyz.shape),
+        np.full(len(xyz), sigma),
+    )
+    looks: list[tuple[int, int, NDArray[np.int64], Array]] = []
+    told = []
+    for k, (place, turn) in enumerate(test_field.poses(seed, exposures, plan.distance_m)):
+        told.append(Exposure(f"E{k}", {}, place, turn, {}))
+        for j, sensor in enumerate(rig.sensors):
+            cone = rig.cone_of(sensor.name)
+            index, px = test_field.seen(truth, cone, sensor, place, turn, xyz)
+            looks.append((k, j, index, px + random.normal(0.0, NOISE_PX, px.shape)))
+    table = Looks(
+        np.concatenate([np.full(len(i), k) for k, _, i, _ in looks]),
+        np.concatenate([np.full(len(i), j) for _, j, i, _ in looks]),
+        np.concatenate([i for _, _, i, _ in looks]),
+        np.concatenate([p for _, _, _, p in looks]),
+    )
+    found = calibrate_rig(
+        rig,
+        told,
+        field,
+        table,
+        offset_sigma_mm=test_field.OFFSET_MM,
+        skew_sigma_per_mm=test_field.SKEW_PER_MM,
+        progress=lambda _what, _done, _total: None,
+    )
+    return found, truth
+
+
+def errors_of(found: RigCalibration, truth: test_field.TrueRig) -> tuple[list[Estimated], Array]:
+    """What was estimated, and estimated less true in the adjustment's units."""
+    rows = estimated(found)
+    errors = []
+    for row in rows:
+        if row.where.startswith("cone "):
+            cone = found.rig.cone(row.where[5:])
+            if row.what in ("omega", "phi", "kappa"):
+                turn = rotation_matrix(*cone.rotation_rad).T @ truth.master_from_cone(
+                    truth.rig.cone(cone.name)
+                )
+                axis = ("omega", "phi", "kappa").index(row.what)
+                errors.append(-float(logarithm(turn[None])[0, axis]))
+            else:
+                errors.append(row.value - float(getattr(truth.rig.cone(cone.name).lens, row.what)))
+            continue
+        was, true = found.before.sensor(row.where), truth.sensors[row.where]
+        value = {
+            "x": was.x_mm + true.shift[0],
+            "y": was.y_mm + true.shift[1],
+            "rotation": was.rotation_rad + true.rotation,
+            "scale": was.scale * (1.0 + true.scale) - 1.0,
+            "skew x": true.skew[0],
+            "skew y": true.skew[1],
+        }[row.what]
+        errors.append(row.value - value)
+    return rows, np.array(errors)
+
+
+def pooled(
+    rig: Rig, seeds: range, *, exposures: int, targets: tuple[int, int], tell: bool = False
+) -> Pooled:
+    squares, count, standardised = 0.0, 0, []
+    for seed in seeds:
+        begun = time.process_time()
+        found, truth = calibrated(rig, seed, exposures=exposures, targets=targets)
+        rows, error = errors_of(found, truth)
+        covariance = covariance_of(found, rows)
+        scale = 1.0 / np.sqrt(np.diag(covariance))
+        own = float(
+            (error * scale) @ np.linalg.solve(covariance * scale[:, None] * scale, error * scale)
+        )
+        squares += own
+        count += len(rows)
+        standardised.append(error * scale)
+        if tell:
+            print(
+                f"seed {seed}: {own / len(rows):.2f}, sigma {found.sigma_px:.4f} px, "
+                f"{len(found.looks.px)} points, {time.process_time() - begun:.1f} s",
+                file=sys.stderr,
+                flush=True,
+            )
+    return Pooled(squares, count, np.concatenate(standardised))
+
+
+def main() -> None:
+    line = argparse.ArgumentParser(description=__doc__)
+    line.add_argument("rig")
+    line.add_argument("--seeds", type=int, default=50)
+    line.add_argument("--exposures", type=int, default=12)
+    line.add_argument("--targets", type=int, default=16, help="across and down")
+    line.add_argument("--out", type=Path, help="write the figures here as well")
+    given = line.parse_args()
+    result = pooled(
+        find_rig(given.rig),
+        range(1, given.seeds + 1),
+        exposures=given.exposures,
+        targets=(given.targets, given.targets),
+        tell=True,
+    )
+    size = np.abs(result.standardised)
+    figures = {
+        "rig": given.rig,
+        "seeds": given.seeds,
+        "mean_square": result.mean,
+        "interval": result.interval,
+        "errors": result.count,
+        "within_three": float(np.mean(size <= 3.0)),
+        "largest": float(size.max()),
+    }
+    text = json.dumps(figures)
+    if given.out:
+        given.out.write_text(text)
+    print(text)
+
+
+if __name__ == "__main__":
+    main()

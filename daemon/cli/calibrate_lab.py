@@ -1,0 +1,87 @@
+"""`syntopic calibrate lab`: frames of a 3D test field to a dated rig file."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import Progress
+
+HELP = """Calibration of a whole rig in a 3D test field.
+
+Every CCD's shift, rotation, scale and perspective skew, every cone's radial and decentring
+distortion and its rotation against the master cone, by one bundle adjustment. Principal distance
+and point of the cones are kept, and the first CCD of each cone is not turned. The new folder holds
+a dated rig file that holds at the recorded temperatures, the covariance, a report and the
+comparison with a previous calibration.
+
+Examples: `syntopic calibrate lab SERIES`, `syntopic calibrate lab SERIES --previous lab-2026-05-02`
+
+A series to try: `python -m sim_hw.test_field ultracam-l-mini --out field`
+"""
+
+
+def lab(
+    series: Annotated[Path, typer.Argument(help="Folder with series.json, rig.toml and frames.")],
+    out: Annotated[
+        Path | None, typer.Option(help="The new folder; by default named by rig and date.")
+    ] = None,
+    previous: Annotated[
+        Path | None, typer.Option(help="A laboratory calibration to compare with.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    from daemon.calibration_report import read_previous, refuse_existing
+    from daemon.cli.calibration_outcome import hand_over
+    from daemon.laboratory.field import calibrate_rig, exposures_of, field_of, measured
+    from daemon.laboratory.field_report import (
+        covariance_bytes,
+        covariance_of,
+        estimated,
+        field_report,
+    )
+    from daemon.laboratory.series import read_series
+    from daemon.rig_text import rig_toml
+
+    given = read_series(series, kind="lab")
+    exposures, field = exposures_of(given), field_of(given)
+    offset_sigma = given.table.number("offset_sigma_mm", 0.2, positive=True)
+    skew_sigma = given.table.number("skew_sigma_per_mm", 5e-6, positive=True)
+    given.checked()
+    today = f"{datetime.now(UTC):%Y-%m-%d}"
+    folder = out or Path(f"{given.rig.name}-lab-{today}")
+    refuse_existing(folder)
+    before = (previous, read_previous(previous, kind="lab")) if previous else None
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("measuring", total=None)
+
+        def tell(what: str, done: int, total: int) -> None:
+            progress.update(task, description=what, completed=done, total=total or None)
+
+        looks = measured(given.rig, exposures, field, progress=tell)
+        found = calibrate_rig(
+            given.rig,
+            exposures,
+            field,
+            looks,
+            offset_sigma_mm=offset_sigma,
+            skew_sigma_per_mm=skew_sigma,
+            progress=tell,
+        )
+    report = field_report(given, found, calibration_id=folder.name, date=today, previous=before)
+    rig = replace(found.rig, calibration_id=folder.name, calibration_date=today)
+    remark = (
+        f"{rig.name}, by `syntopic calibrate lab` on {today}, in place of calibration "
+        f"{given.rig.calibration_id}.\nIt counts only where it is configured. Standard deviations "
+        "and correlations: calibration.json and covariance.npz\nbeside it."
+    )
+    rows = estimated(found)
+    files = {
+        "rig.toml": rig_toml(rig, remark=remark),
+        "covariance.npz": covariance_bytes(rows, covariance_of(found, rows)),
+    }
+    hand_over(report, folder, files=files, as_json=as_json)
