@@ -31,6 +31,7 @@ from processing.platform_calibration import (
     LEAST_EXPOSURES,
     CalibratedCone,
     PlatformCalibration,
+    least_exposures,
     shift_px,
 )
 from processing.rig import Rig, load_rig
@@ -81,9 +82,10 @@ def read_missions(missions: Sequence[Path]) -> Flown:
                 passed_over.append(record)
             else:
                 records.append(record)
-    if rig is None or len(records) < LEAST_EXPOSURES:
+    least = LEAST_EXPOSURES if rig is None else least_exposures(rig)
+    if rig is None or len(records) < least:
         raise PlatformCalibrationError(
-            f"{len(records)} exposures with a stitching record; {LEAST_EXPOSURES} at least are "
+            f"{len(records)} exposures with a stitching record; {least} at least are "
             "needed: process the missions first (syntopic process MISSION)"
         )
     return Flown(rig, tuple(names), tuple(records), tuple(passed_over))
@@ -203,7 +205,9 @@ def _warnings(
     if flown.rig.timing == "syntopic":
         told.append(
             "the cones fire one after the other: an error of their delays or of the speed, always "
-            "the same, looks like a turn about the axis across the flight and is part of it"
+            "the same, looks like a turn about the axis across the flight and is part of it; so is "
+            "what the aircraft turned in between, as far as it does not average out: take a long, "
+            "calm flight, or several"
         )
     told += [
         f"cone {c.cone} turns by up to {float(np.max(c.unexplained_rad)) * 1e6:.0f} urad from "

@@ -25,6 +25,8 @@ from processing.stitch_record import TURNS, StitchRecord
 Array = NDArray[np.float64]
 
 LEAST_EXPOSURES: Final = 3
+LEAST_SYNTOPIC: Final = 12
+"""Cones that fire one after the other are turned by the aircraft in between: more are needed."""
 LEAST_SIGMA_URAD: Final = 2.0
 """A mount is not claimed to keep its angles better than this from flight to flight."""
 COLOUR_FLOOR_PX: Final = 0.02
@@ -130,7 +132,8 @@ def _calibrated(
     rig: Rig, cone: Cone, records: Sequence[StitchRecord], used: Sequence[int]
 ) -> CalibratedCone | None:
     told = [_turn(records[k], cone.name) for k in used]
-    if len(told) < LEAST_EXPOSURES:
+    least = least_exposures(rig)
+    if len(told) < least:
         return None
     turns, stated = np.array([t for t, _ in told]), np.array([c for _, c in told])
     middle = np.median(turns, axis=0)
@@ -140,7 +143,7 @@ def _calibrated(
         np.sqrt(np.median(np.diagonal(stated, axis1=1, axis2=2), axis=0)),
     )
     good = (apart <= _OUTLYING * np.maximum(spread, 1e-12)).all(axis=1)
-    if int(good.sum()) < LEAST_EXPOSURES:
+    if int(good.sum()) < least:
         return None
     turns, stated = turns[good], stated[good]
     n = len(turns)
@@ -149,7 +152,8 @@ def _calibrated(
     # Scatter counts where the exposures' own statement does not explain it.
     ratio = np.diag(seen) / np.maximum(np.diag(own), 1e-30)
     beyond = ratio > chi2.ppf(1.0 - _SCATTER_ALPHA / 3.0, n - 1) / (n - 1)
-    variance = np.where(beyond, np.diag(seen), np.diag(own))
+    # An aircraft turns slowly: neighbouring exposures err alike and count for less.
+    variance = np.where(beyond, np.diag(seen) * _alike(turns), np.diag(own))
     scale = np.sqrt(variance / np.maximum(np.diag(own), 1e-30))
     of_mean = own * np.outer(scale, scale) / n
     rotation = turned(cone, mean)
@@ -168,6 +172,19 @@ def _calibrated(
         left_out=int(np.count_nonzero(~good)),
         unexplained_rad=np.sqrt(np.where(beyond, np.maximum(np.diag(seen - own), 0.0), 0.0)),
     )
+
+
+def least_exposures(rig: Rig) -> int:
+    """Below, a cone's mean is not told."""
+    return LEAST_SYNTOPIC if rig.timing == "syntopic" else LEAST_EXPOSURES
+
+
+def _alike(turns: Array) -> Array:
+    """(1 + r) / (1 - r) of neighbouring exposures' correlation r, (3,): at least one."""
+    off = turns - turns.mean(axis=0)
+    r = np.sum(off[1:] * off[:-1], axis=0) / np.maximum(np.sum(off**2, axis=0), 1e-30)
+    r = np.clip(r, 0.0, 0.9)
+    return np.asarray((1.0 + r) / (1.0 - r))
 
 
 def _place_share(rig: Rig, cone: Cone) -> Array:
