@@ -15,8 +15,9 @@ HELP = """Platform calibration: how every head is mounted, from many exposures.
 Takes the stitching of exposures that were processed before (`mosaic.json` of Level-2): a flight
 over well textured ground, or laboratory images put into a mission folder. Converging heads: three
 angles of each, by tie points of the overlaps. A rig with a master cone: the turn of every other
-cone against it; where cones fire one after the other, from twelve exposures on. Writes a dated folder with rig.toml, report.html and calibration.json; nothing is
-overwritten, and the new rig file counts only where it is configured.
+cone against it; where cones fire one after the other, from twelve exposures on. Writes a dated
+folder with rig.toml, report.html and calibration.json; nothing is overwritten, and the new rig file
+counts only where it is configured.
 
 Examples: `syntopic calibrate platform MISSION`,
 `syntopic calibrate platform A B --previous dmc-platform-2026-05-02 --out dmc-platform-2026-11-21`
