@@ -181,6 +181,14 @@ def test_a_flight_is_flown_from_the_page(
         keep = os.environ.get("SYNTOPIC_PICTURES")
         browser.picture(Path(keep) / "page.png" if keep else tmp_path / "page.png")
 
+        service.wait_for(lambda e: e["event"] == "processed" and e["number"] == EXPOSURES, 10)
+        for number in range(1, EXPOSURES + 1):
+            print(f"exposure {number}, s after the trigger: {steps_s(service, number)}")
+        browser.click("#show-residuals")
+        browser.wait_for("document.querySelectorAll('#vectors path')[0]?.getAttribute('d')", 20)
+        browser.evaluate("document.querySelector('#exposure-room').open = false")
+        browser.evaluate("document.querySelector('#overlaps-room').open = true")
+        browser.picture(Path(keep) / "residuals.png" if keep else tmp_path / "residuals.png")
         browser.evaluate("window.confirm = () => true")
         browser.click("[data-command=land]")
         ended = service.wait_for(lambda e: e["event"] == "ended", 60)
@@ -195,6 +203,15 @@ def test_a_flight_is_flown_from_the_page(
 
 def event_of(service: Running, name: str) -> dict[str, Any]:
     return next(event for event in service.events if event["event"] == name)
+
+
+def steps_s(service: Running, number: int) -> dict[str, float]:
+    """When an exposure was stored, sealed and processed, and how long the pipeline took."""
+    told = {e["event"]: e for e in service.events if e.get("number") == number}
+    fired_ns = int(told["triggered"]["mono_ns"])
+    steps = ("stored", "sealed", "processed")
+    found = {step: round((int(told[step]["mono_ns"]) - fired_ns) * 1e-9, 2) for step in steps}
+    return {**found, "pipeline": round(told["processed"]["duration_s"], 2)}
 
 
 def exposed_where_planned(mission: Path) -> list[float]:
