@@ -1,0 +1,33 @@
+# Run by systemd in a namespace of its own: kernels, an emulated camera, the installed unit, a flight.
+# Each line of its output is a fact that test_flight.py reads.
+said() {
+    echo "$1=$2"
+}
+systemctl start kernels.service
+said kernels $?
+systemctl start sim.service
+sim=/var/lib/syntopic/sim
+for second in $(seq 300); do
+    [ -s $sim/service.toml ] && break
+    sleep 1
+done
+sed -i 's/^\[trigger\]/[trigger]\ncount = 4/; s/^end_when_done.*/end_when_done = true/' $sim/service.toml
+# Type=notify: this returns when the service has said that it is ready.
+systemctl start syntopic.service
+said started $?
+pid=$(systemctl show -P MainPID syntopic.service)
+said user "$(ps -o user= -p "$pid")"
+# What the kernel says of its confinement: no new privileges, filtered system calls, capabilities.
+for word in NoNewPrivs Seccomp CapEff; do
+    said $word "$(sed -n "s/^$word:[[:space:]]*//p" "/proc/$pid/status")"
+done
+for second in $(seq 300); do
+    systemctl is-active -q syntopic.service || break
+    sleep 1
+done
+said result "$(systemctl show -P Result syntopic.service)"
+said status "$(systemctl show -P ExecMainStatus syntopic.service)"
+said sealed "$(find $sim/missions -name exposure.json | wc -l)"
+said processed "$(find $sim/missions -name quality.json | wc -l)"
+/opt/syntopic/bin/syntopic verify $sim/missions/2*
+said verified $?
