@@ -1,7 +1,7 @@
 // What the stitching left over, laid over the quick look, and what the converters saw.
 
 const FEW = 12;
-const SCREEN_PX = 14;
+const SCREEN_PX = 24;
 const KINDS = ["", "colour", "left-out"];
 const COLOURS = { PAN: "#888", R: "#d33", G: "#2a2", B: "#35e", N: "#a3a" };
 const note = document.getElementById("vectors-note");
