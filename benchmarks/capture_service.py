@@ -15,7 +15,9 @@ from typing import Any
 from daemon import service
 from daemon.configuration import load
 from daemon.departure import ProcessPlan, processes
+from daemon.exposure import Exposure
 from daemon.mission import Mission
+from daemon.pipeline_queue import PipelineQueue
 
 
 class Told(service.Service):
@@ -27,18 +29,18 @@ class Told(service.Service):
         self._event("processes", pids={name: child.process.pid for name, child in children})
 
 
-class CaptureOnly(Told):
+class NoPipeline(PipelineQueue):
     """Hands memory back as soon as an exposure is stored and sealed."""
 
-    def _start(self, mission: Mission) -> None:
-        super()._start(mission)
-        self.is_worker_ready = True
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self.is_ready = True
 
-    def _feed_worker(self) -> None:
-        while self.waiting:
-            number = self.waiting.popleft().exposure.number
-            if number in self.in_memory:
-                self._recycle(self.in_memory.pop(number))
+    def sealed(self, exposure: Exposure) -> None:
+        """See `PipelineQueue.sealed`."""
+        slots = self._in_memory.pop(exposure.number, None)
+        if slots is not None:
+            self.recycle(slots)
 
 
 def _without_worker(*arguments: Any) -> tuple[ProcessPlan, ...]:
@@ -54,11 +56,11 @@ def main() -> None:
     """`python -m benchmarks.capture_service service.toml [--pipeline]`: events, one a line."""
     path = Path(sys.argv[1])
     configuration, rig = load(path)
-    kind: type[Told] = Told
+    flown = Told(configuration, rig, path, _say)
     if "--pipeline" not in sys.argv[2:]:
         vars(service)["processes"] = _without_worker
-        kind = CaptureOnly
-    sys.exit(asyncio.run(kind(configuration, rig, path, _say).run()))
+        vars(service)["PipelineQueue"] = NoPipeline
+    sys.exit(asyncio.run(flown.run()))
 
 
 if __name__ == "__main__":
