@@ -77,7 +77,7 @@ def test_an_exposure_without_pan_or_colour_has_its_report_all_the_same(mission):
         mission, pan=None, colour={}, quicklook=None, geometry=None, residuals_svg=None,
         mosaic_json=None,
     )  # fmt: skip
-    assert set(record.files) == {"quality.json"}
+    assert set(record.files) == {"quality.json", "histogram.json", "residuals.json"}
 
 
 @pytest.mark.parametrize(

@@ -33,8 +33,8 @@ from tests.system.flown import ROOT, Flown
 EXPOSURES = 4
 READY_WITHIN_S = 180.0
 FLOWN_WITHIN_S = 120.0
-IDLE_LOAD = 4.0
-"""Above this the machine is doing other things, and latencies are only printed."""
+VERDICT_WITHIN_S = 20.0
+"""Also where the emulated heads take their time to render on the same two cores; it is printed."""
 SEEN_WITHIN_S = 2.0
 LINE, STRIP = "A7", "S1"
 GAIN_DB = 3.0
@@ -173,7 +173,7 @@ def test_a_flight_is_flown_from_the_page(
             latencies_s.append((seen_ns - int(fired["mono_ns"])) * 1e-9)
         record_property("trigger_to_verdict_s", [round(value, 2) for value in latencies_s])
         print(f"trigger to verdict on the page: {[round(value, 2) for value in latencies_s]} s")
-        assert min(latencies_s) < SEEN_WITHIN_S or os.getloadavg()[0] > IDLE_LOAD
+        assert min(latencies_s) < VERDICT_WITHIN_S
         browser.wait_for("document.querySelectorAll('#rows tr').length === 4", 10)
         browser.wait_for(f"document.querySelector('.line-label')?.innerText === '{LINE}'", 10)
         assert browser.text("#rows tr td:nth-child(3)") == LINE
