@@ -21,7 +21,10 @@ from daemon.verification import verify
 SIZE = "size=400m"
 STORED_BEFORE = 2
 STORED_AFTER = 2
+NEARLY_FULL_BYTES = 100_000_000
+"""Left until an exposure is triggered: the rest is filled before its frames come."""
 FULL_FOR_S = 3.0
+REFUSED_WITHIN_S = 20.0
 LIMIT_S = 150.0
 
 
@@ -34,7 +37,7 @@ def main() -> None:
     assert service.stdout is not None
     events: list[dict[str, Any]] = []
     stored: list[int] = []
-    filled_s = freed_s = 0.0
+    filled_s = refused_s = freed_s = 0.0
     stored_after = 0
     mission = ""
     begun_s = time.monotonic()
@@ -46,12 +49,17 @@ def main() -> None:
             mission = event["path"]
         elif event["event"] == "triggered" and len(stored) >= STORED_BEFORE and not filled_s:
             # The guard has let it pass: its frames find a disk that is full.
-            _fill(filler)
+            _fill(filler, leave=0)
             filled_s = now_s
+        elif event["event"] == "not-written" and not refused_s:
+            refused_s = now_s
         elif event["event"] == "stored":
             stored.append(event["number"])
             stored_after += bool(freed_s)
-        if filled_s and not freed_s and now_s - filled_s > FULL_FOR_S:
+            if len(stored) == STORED_BEFORE:
+                _fill(filler, leave=NEARLY_FULL_BYTES)
+        is_over = refused_s and now_s - refused_s > FULL_FOR_S
+        if filled_s and not freed_s and (is_over or now_s - filled_s > REFUSED_WITHIN_S):
             filler.unlink()
             freed_s = now_s
         if stored_after >= STORED_AFTER or now_s - begun_s > LIMIT_S:
@@ -78,16 +86,21 @@ def main() -> None:
     )
 
 
-def _fill(path: Path) -> None:
-    """To the last page."""
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT, 0o644)
+def _fill(path: Path, *, leave: int) -> None:
+    """Up to so many bytes; with none, to the last page."""
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
     for block in (1 << 20, 4096):
         try:
-            while True:
+            while _free_bytes(path) > leave:
                 os.write(descriptor, bytes(block))
         except OSError:
             continue
     os.close(descriptor)
+
+
+def _free_bytes(path: Path) -> int:
+    disk = os.statvfs(path)
+    return disk.f_bavail * disk.f_frsize
 
 
 if __name__ == "__main__":
