@@ -127,12 +127,11 @@ def asked_of(mission: Path) -> Asked:
 
 
 def overlaps_of(mission: Mission, rig: Rig) -> Overlaps:
-    """The footprints of what has been flown of a mission after a plan."""
+    """The footprints of what has been flown of a mission."""
     mount, plan = mount_of(mission)
     overlaps = Overlaps(rig, mount, plan.ground_height_m)
-    if mission.plan_path is not None:
-        for exposure in exposures_of(mission):
-            overlaps.add(exposure)
+    for exposure in exposures_of(mission):
+        overlaps.add(exposure)
     return overlaps
 
 
