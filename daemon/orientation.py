@@ -120,10 +120,22 @@ def read_mount(path: Path) -> MountSection:
 def exposures_of(mission: Mission) -> Iterator[Exposure]:
     """The sealed records of a mission, by number."""
     for number in mission.numbers():
-        path = mission.level0(number) / "exposure.json"
-        if path.exists():
-            name = f"L0/{path.parent.name}/exposure.json"
-            yield from_json(parse_record(path.read_bytes(), name), name)
+        exposure = exposure_of(mission, number)
+        if exposure is not None:
+            yield exposure
+
+
+def exposure_of(mission: Mission, number: int) -> Exposure | None:
+    """The sealed record of one exposure; None where it has none.
+
+    Raises:
+        RecordError: it has one that cannot be read.
+    """
+    path = mission.level0(number) / "exposure.json"
+    if not path.exists():
+        return None
+    name = f"L0/{path.parent.name}/exposure.json"
+    return from_json(parse_record(path.read_bytes(), name), name)
 
 
 def orient(

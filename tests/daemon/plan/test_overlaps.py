@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
+from daemon import worker
 from daemon.configuration import MountSection
 from daemon.exposure import Exposure, NavigationRecord
+from daemon.mission import Mission
 from daemon.plan.model import Plane, Point
-from daemon.plan.overlaps import Overlaps
+from daemon.plan.overlaps import Overlaps, Surroundings
 from processing.rig import find_rig
 
 RIG = find_rig("ultracam-x-mini")
@@ -94,3 +97,11 @@ def test_without_a_line_or_an_attitude_nothing_is_said() -> None:
     blind = Exposure(number=1, line_id="a", navigation=replace(navigation, roll_rad=None))
     overlaps = overlaps_of(blind, Exposure(number=2, line_id="a"))
     assert overlaps.of(1) == overlaps.of(2) == overlaps.of(99)
+
+
+def test_a_record_that_cannot_be_read_costs_its_own_overlap_only(tmp_path: Path) -> None:
+    for number in (1, 2):
+        (tmp_path / f"L0/{number:06d}").mkdir(parents=True)
+    (tmp_path / "L0/000001/exposure.json").write_bytes(b'{"number": 1, ')
+    (tmp_path / "service.toml").write_text("[plan]\nground_height_m = 400.0\n")
+    assert worker.overlaps_of(Mission(tmp_path, tmp_path.name), RIG).of(1) == Surroundings()
