@@ -34,7 +34,8 @@ from daemon.local_frame import FRAME_FILE, LocalFrame
 from daemon.mission import Mission
 from daemon.navigation import metres_per_degree
 from daemon.orientation import exposures_of
-from daemon.trajectory import Trajectory, flown, read_trajectory
+from daemon.orienting import trajectory_of
+from daemon.trajectory import Trajectory
 from processing.boresight import (
     PARAMETERS,
     Boresight,
@@ -180,14 +181,7 @@ def inertial_of_mission(
         BoresightError: no exposure of the project has an instant and an attitude.
     """
     exposures = {f"{e.number:06d}": e for e in exposures_of(mission)}
-    stamped = [e.mark_gps_ns for e in exposures.values() if e.mark_gps_ns is not None]
-    if not stamped:
-        raise BoresightError(f"{mission.path}: no sealed exposure with a GPS time")
-    trajectory = (
-        flown(mission)
-        if trajectory_file is None
-        else read_trajectory(trajectory_file, around_gps_ns=stamped[0])
-    )
+    trajectory = trajectory_of(mission, exposures.values(), trajectory_file)
     place = system if isinstance(system, LocalFrame) else Georeference(system)
     kept, rows = [], []
     for k, name in enumerate(stations):

@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 
 from daemon.adjusting.tables import read_table
 from daemon.errors import DaemonError
-from daemon.georeference import Georeference, utm_of
 from daemon.local_frame import LocalFrame
 from daemon.mission import Mission
-from daemon.orientation import ExteriorOrientation, exposures_of, mount_of, orient, read_mount
-from daemon.trajectory import flown, read_trajectory
+from daemon.orientation import ExteriorOrientation, exposures_of
+from daemon.orienting import orienting
 from processing.block_matching import image_mm
 from processing.bundle.intersection import intersection, orientation_layout
 from processing.bundle.network import (
@@ -40,7 +39,7 @@ from processing.bundle.start import completed
 from processing.bundle.unknowns import Layout
 from processing.orientation import BODY_FROM_CAMERA
 from processing.perspective import perspective_of
-from processing.rig import Cone, Rig, VirtualImage, load_rig
+from processing.rig import Cone, Rig, VirtualImage
 from processing.rotation import rotation_matrix
 
 Array = NDArray[np.float64]
@@ -106,28 +105,12 @@ def intersect(
         IntersectionError: no oriented image, or images that are not there.
         daemon.adjusting.tables.ProjectError: the table is not as it should be.
     """
-    rig = load_rig(mission.rig_path)
-    mount, _ = mount_of(mission)
-    if mount_file is not None:
-        mount = read_mount(mount_file)
     exposures = [e for e in exposures_of(mission) if e.mark_gps_ns is not None]
-    if not exposures:
-        raise IntersectionError(f"{mission.path}: no sealed exposure with a GPS time")
-    trajectory = (
-        flown(mission)
-        if trajectory_file is None
-        else read_trajectory(trajectory_file, around_gps_ns=exposures[0].mark_gps_ns or 0)
+    means = orienting(
+        mission, exposures, crs=crs, trajectory_file=trajectory_file, mount_file=mount_file
     )
-    if crs is None:
-        first = trajectory.sample(0)
-        crs = utm_of(first.latitude_deg, first.longitude_deg)
-    georeference = Georeference(crs)
-    oriented = [
-        eo
-        for exposure in exposures
-        for eo in orient(exposure, rig, mount, trajectory, georeference)
-        if isinstance(eo, ExteriorOrientation)
-    ]
+    rig, crs, georeference = means.rig, means.crs, means.georeference
+    oriented = means.oriented(exposures)
     table = read_table(measured_file, ("image", "point", "column_px", "row_px"), ("sigma_px",))
     px = np.array([table.numbers("column_px"), table.numbers("row_px")]).T.reshape(-1, 2)
     spread = np.array(table.numbers("sigma_px", uncertain.image_px))

@@ -20,7 +20,7 @@ from daemon.configuration import MountSection
 from daemon.elevation import read_elevation
 from daemon.errors import DaemonError
 from daemon.exposure import Exposure
-from daemon.georeference import Georeference, utm_of
+from daemon.georeference import Georeference
 from daemon.mission import Mission
 from daemon.orientation import (
     ExteriorOrientation,
@@ -28,7 +28,6 @@ from daemon.orientation import (
     exposures_of,
     mount_of,
     orient,
-    read_mount,
 )
 from daemon.orientation_files import (
     About,
@@ -38,15 +37,12 @@ from daemon.orientation_files import (
     csv_text,
     patb_text,
 )
+from daemon.orienting import OrientationError, orienting
 from daemon.products import verdict_of, write_folder
 from daemon.records import plain_name, sha256_hex
 from daemon.terrain_footprints import rings_on_terrain
-from daemon.trajectory import flown, read_trajectory
-from processing.rig import Rig, load_rig
-
-
-class OrientationError(DaemonError):
-    """Nothing can be oriented; the sentence says what is missing."""
+from daemon.trajectory import flown
+from processing.rig import Rig
 
 
 @dataclass(frozen=True)
@@ -91,28 +87,19 @@ def export_orientation(
         OrientationError: no exposure could be oriented.
         TrajectoryError, GeoreferenceError, RecordError: as their modules say.
     """
-    rig = load_rig(mission.rig_path)
-    mount, plan = mount_of(mission)
-    if mount_file is not None:
-        mount = read_mount(mount_file)
     exposures = list(exposures_of(mission))
-    stamped = [e.mark_gps_ns for e in exposures if e.mark_gps_ns is not None]
-    if not stamped:
-        raise OrientationError(
-            f"{mission.path}: no sealed exposure with a GPS time, so nothing can be oriented"
-        )
-    trajectory = (
-        flown(mission, receiver)
-        if trajectory_file is None
-        else read_trajectory(trajectory_file, around_gps_ns=stamped[0])
+    means = orienting(
+        mission,
+        exposures,
+        crs=crs,
+        trajectory_file=trajectory_file,
+        mount_file=mount_file,
+        receiver=receiver,
     )
-    if crs is None:
-        first = trajectory.sample(0)
-        crs = utm_of(first.latitude_deg, first.longitude_deg)
-    georeference = Georeference(crs)
+    rig, trajectory, georeference = means.rig, means.trajectory, means.georeference
     found: list[ExteriorOrientation | Unoriented] = []
     for done, exposure in enumerate(exposures, start=1):
-        found.extend(orient(exposure, rig, mount, trajectory, georeference))
+        found.extend(means.of(exposure))
         progress(done)
     oriented = tuple(one for one in found if isinstance(one, ExteriorOrientation))
     missing = tuple(one for one in found if isinstance(one, Unoriented))
@@ -129,13 +116,13 @@ def export_orientation(
         )
     simulated = any(exposure.simulated for exposure in exposures)
     on = "on level ground" if dem_file is None else f"on the height model {dem_file.name}"
-    about = About(mission.id, rig, simulated, trajectory.name, mount, georeference, on)
+    about = About(mission.id, rig, simulated, trajectory.name, means.mount, georeference, on)
     verdicts = {
         e.number: verdict
         for e in exposures
         if (verdict := verdict_of(mission.level2(e.number))) is not None
     }
-    ground_m = plan.ground_height_m
+    ground_m = means.ground_height_m
     rings = None
     if dem_file is not None:
         model = read_elevation(dem_file, georeference)

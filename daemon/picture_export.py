@@ -20,14 +20,14 @@ from daemon.durable import make_directories, replace_file, sync_directory, sync_
 from daemon.errors import DaemonError
 from daemon.exif import Shot, told, with_metadata
 from daemon.exposure import Exposure
-from daemon.georeference import Georeference, utm_of
+from daemon.georeference import Georeference
 from daemon.level0 import read_description
 from daemon.mission import Mission
-from daemon.orientation import ExteriorOrientation, exposures_of, mount_of, orient, read_mount
+from daemon.orientation import ExteriorOrientation, exposures_of
+from daemon.orienting import orienting
 from daemon.products import jpeg_bytes
-from daemon.trajectory import flown, read_trajectory
 from processing.orientation import BODY_FROM_CAMERA, ENU_FROM_NED, on_level_ground
-from processing.rig import Rig, load_rig
+from processing.rig import Rig
 
 KINDS = ("cog", "jpeg")
 JPEG_QUALITY = 92
@@ -72,40 +72,24 @@ def export_pictures(
         PictureError: no Level-2, no orientation, or rasterio is missing.
         TrajectoryError, GeoreferenceError: as their modules say.
     """
-    rig = load_rig(mission.rig_path)
-    mount, plan = mount_of(mission)
-    if mount_file is not None:
-        mount = read_mount(mount_file)
     exposures = [
         e
         for e in exposures_of(mission)
         if e.mark_gps_ns is not None and (not only or e.number in only)
     ]
-    if not exposures:
-        raise PictureError(f"{mission.path}: no sealed exposure with a GPS time")
-    trajectory = (
-        flown(mission)
-        if trajectory_file is None
-        else read_trajectory(trajectory_file, around_gps_ns=exposures[0].mark_gps_ns or 0)
+    means = orienting(
+        mission, exposures, crs=crs, trajectory_file=trajectory_file, mount_file=mount_file
     )
-    if crs is None:
-        first = trajectory.sample(0)
-        crs = utm_of(first.latitude_deg, first.longitude_deg)
-    georeference = Georeference(crs)
+    rig = means.rig
     folder = mission.export_dir / kind
     make_directories(folder)
     written: list[Path] = []
     for done, exposure in enumerate(exposures, 1):
-        oriented = [
-            eo
-            for eo in orient(exposure, rig, mount, trajectory, georeference)
-            if isinstance(eo, ExteriorOrientation)
-        ]
-        for picture in _pictures(mission, rig, exposure, oriented):
-            shot = _shot(rig, picture, crs, simulated=exposure.simulated)
+        for picture in _pictures(mission, rig, exposure, means.oriented([exposure])):
+            shot = _shot(rig, picture, means.crs, simulated=exposure.simulated)
             if kind == "cog":
                 final = folder / f"{picture.name}.tif"
-                _cog(picture, shot, georeference, plan.ground_height_m, final)
+                _cog(picture, shot, means.georeference, means.ground_height_m, final)
             else:
                 final = folder / f"{picture.name}.jpg"
                 replace_file(final, with_metadata(_jpeg(picture.path), shot))

@@ -19,12 +19,11 @@ from daemon.adjusting.project import Checks, Project
 from daemon.adjusting.project_file import ProjectFile
 from daemon.adjusting.tables import Table, read_table
 from daemon.errors import DaemonError
-from daemon.georeference import Georeference, utm_of
 from daemon.level0 import read_tiff
 from daemon.local_frame import LocalFrame
 from daemon.mission import Mission
-from daemon.orientation import ExteriorOrientation, exposures_of, mount_of, orient, read_mount
-from daemon.trajectory import flown, read_trajectory
+from daemon.orientation import ExteriorOrientation, exposures_of
+from daemon.orienting import orienting
 from processing.block_matching import BlockMatching, TiedBlock, image_mm, tied_block
 from processing.bundle.adjust import Settings, adjust
 from processing.bundle.iterations import Progress
@@ -123,9 +122,6 @@ def block_of(
             f"rig {rig.name} stitches no PAN image; measure its heads' images and give them to "
             "`syntopic adjust`"
         )
-    mount, plan = mount_of(mission)
-    if mount_file is not None:
-        mount = read_mount(mount_file)
     exposures = [
         e
         for e in exposures_of(mission)
@@ -136,22 +132,10 @@ def block_of(
             f"{mission.path}: {len(exposures)} sealed exposures with a stitched image and a time; "
             "a block takes two or more. Run `syntopic process` first"
         )
-    around = exposures[0].mark_gps_ns or 0
-    trajectory = (
-        flown(mission)
-        if trajectory_file is None
-        else read_trajectory(trajectory_file, around_gps_ns=around)
+    means = orienting(
+        mission, exposures, crs=crs, trajectory_file=trajectory_file, mount_file=mount_file
     )
-    if crs is None:
-        first = trajectory.sample(0)
-        crs = utm_of(first.latitude_deg, first.longitude_deg)
-    georeference = Georeference(crs)
-    oriented = [
-        eo
-        for exposure in exposures
-        for eo in orient(exposure, rig, mount, trajectory, georeference)
-        if isinstance(eo, ExteriorOrientation) and eo.is_virtual
-    ]
+    oriented = [eo for eo in means.oriented(exposures) if eo.is_virtual]
     if len(oriented) < 2:
         raise TriangulationError(
             f"{mission.path}: {len(oriented)} exposures have an attitude; direct georeferencing is "
@@ -168,8 +152,8 @@ def block_of(
         ]
     )
     return Block(
-        mission, rig, rig.virtual_image, tuple(oriented), crs, frame, station, rotation,
-        plan.ground_height_m,
+        mission, rig, rig.virtual_image, tuple(oriented), means.crs, frame, station, rotation,
+        means.ground_height_m,
     )  # fmt: skip
 
 

@@ -21,7 +21,8 @@ from daemon.georeference import Georeference, GeoreferenceError, utm_of
 from daemon.log_records import message_of
 from daemon.mission import Mission
 from daemon.orientation import ExteriorOrientation, exposures_of, mount_of, orient
-from daemon.orientation_export import OrientationError, export_orientation
+from daemon.orientation_export import export_orientation
+from daemon.orienting import OrientationError
 from daemon.trajectory import TrajectoryError, flown, read_trajectory
 from drivers.contract import NavSample
 from processing.rig import load_rig, shipped_rigs
