@@ -13,8 +13,8 @@ setup: .venv/ready .venv/kernels
 	touch $@
 
 # The compiler's cache looks at a kernel's own file only, not at those of the kernels it calls.
-.venv/kernels: .venv/ready $(wildcard processing/*.py processing/*/*.py)
-	rm -f processing/__pycache__/*.nbi processing/__pycache__/*.nbc
+.venv/kernels: .venv/ready $(wildcard processing/*.py processing/*/*.py processing/*/*/*.py)
+	find processing -name "*.nb[ic]" -delete
 	@echo "Compiling the pipeline's kernels, so that nothing compiles in flight"
 	$(BIN)/syntopic kernels
 	touch $@

@@ -49,7 +49,7 @@ from processing.bundle.self_calibration import (
 )
 from processing.bundle.start import intersected
 from processing.rig import find_rig
-from sim_hw.block import (
+from sim_hw.blocks.aerial import (
     Block,
     flown,
     image_grid,

@@ -19,9 +19,8 @@ from daemon.adjusting.project import Checks
 from daemon.adjusting.project_file import ProjectFile
 from daemon.adjusting.tables import write_table
 from daemon.adjusting.writing import write_project
-from daemon.boresight_calibration import controlled_of
+from daemon.calibration.boresight import controlled_of
 from daemon.measuring import machine
-from processing.boresight import WORTH, Boresight, Inertial, calibrated, mounting_of
 from processing.bundle.adjust import adjust
 from processing.bundle.network import (
     Attitudes,
@@ -34,8 +33,9 @@ from processing.bundle.network import (
 )
 from processing.bundle.rotations import logarithm
 from processing.bundle.start import completed
-from processing.orientation import BODY_FROM_CAMERA, ENU_FROM_NED, level_from_body
-from sim_hw.calibration_flight import (
+from processing.calibration.boresight import WORTH, Boresight, Inertial, calibrated, mounting_of
+from processing.geometry.orientation import BODY_FROM_CAMERA, ENU_FROM_NED, level_from_body
+from sim_hw.blocks.calibration_flight import (
     F_MM,
     FULL,
     ONE_WAY,

@@ -30,7 +30,7 @@ from rich.table import Table
 from benchmarks.ring_heads import RING, build_ring, is_whole, number_of
 from daemon import bench
 from daemon.cli.sim import free_first_address
-from daemon.level0_folder import read_sealed
+from daemon.disk.level0_folder import read_sealed
 from daemon.measuring import machine
 from processing.rig import Rig, find_rig
 

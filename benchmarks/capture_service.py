@@ -12,12 +12,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from daemon import service
 from daemon.configuration import load
-from daemon.departure import ProcessPlan, processes
+from daemon.disk.mission import Mission
 from daemon.exposure import Exposure
-from daemon.mission import Mission
-from daemon.pipeline_queue import PipelineQueue
+from daemon.service import service
+from daemon.service.departure import ProcessPlan, processes
+from daemon.service.pipeline_queue import PipelineQueue
 
 
 class Told(service.Service):

@@ -29,8 +29,8 @@ from benchmarks.stitching_trials import (
     world_and_rig,
 )
 from daemon.measuring import machine
+from processing.mosaic.validity import Validity, judge_master
 from processing.rig import Rig, find_rig
-from processing.validity import Validity, judge_master
 
 Array = NDArray[np.float64]
 

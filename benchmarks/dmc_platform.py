@@ -19,17 +19,17 @@ from scipy.stats import chi2
 from benchmarks import rendered
 from benchmarks.stitching_trials import same_ground, world_and_rig
 from processing.conditions import Conditions
-from processing.mounting import check_platform
-from processing.pan_only import pan_only_mosaic
-from processing.placement import nominal_placements, raw_from_vip_mm
+from processing.geometry.placement import nominal_placements, raw_from_vip_mm
+from processing.geometry.rotation import rotation_matrix
+from processing.geometry.topology import overlaps
+from processing.geometry.virtual_camera import ground_plane
+from processing.matching.tie_points import PAN_TO_PAN, TiePoints
+from processing.mosaic.mounting import check_platform
+from processing.mosaic.pan_only import pan_only_mosaic
 from processing.rig import Rig
-from processing.rotation import rotation_matrix
-from processing.tie_points import PAN_TO_PAN, TiePoints
-from processing.topology import overlaps
-from processing.virtual_camera import ground_plane
-from sim_hw.camera import rotation_opk
-from sim_hw.snapshots import look_of, probe_readings
-from sim_hw.world import World
+from sim_hw.world.camera import rotation_opk
+from sim_hw.world.snapshots import look_of, probe_readings
+from sim_hw.world.world import World
 
 Array = NDArray[np.float64]
 

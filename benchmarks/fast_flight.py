@@ -18,10 +18,10 @@ from pathlib import Path
 
 from daemon.configuration import Configuration, from_mapping
 from daemon.exposure import Capture, Exposure, NavigationRecord
-from daemon.flight import Flight, Identity
-from daemon.ledger import Ledger
-from daemon.line import Line, Order
-from daemon.matching import Pulse
+from daemon.flight.flight import Flight, Identity
+from daemon.flight.ledger import Ledger
+from daemon.service.line import Line, Order
+from daemon.timing.matching import Pulse
 from drivers.clock import BackOff
 from drivers.contract import (
     DeviceError,
@@ -338,7 +338,7 @@ class FastFlight:
     # What the service does
 
     def _fire(self, order: Order) -> None:
-        """Order a pulse and tell the flight what came of it; see `daemon.capture`."""
+        """Order a pulse and tell the flight what came of it; see `daemon.service.capture`."""
         self._ordered_ns[order.number] = order.mono_ns
         try:
             if order.delays_ns != self._programmed:

@@ -35,11 +35,11 @@ from benchmarks.rendered import (
 )
 from daemon.measuring import machine
 from processing.pipeline import Conditions, Pipeline, Product, Settings
-from processing.quality import NO_FLAGS, Flag, Thresholds
-from sim_hw.rendering import residual_smear_px
-from sim_hw.scene import open_scene
-from sim_hw.snapshots import Heads, look_of
-from sim_hw.world import World
+from processing.quality.report import NO_FLAGS, Flag, Thresholds
+from sim_hw.world.rendering import residual_smear_px
+from sim_hw.world.scene import open_scene
+from sim_hw.world.snapshots import Heads, look_of
+from sim_hw.world.world import World
 
 RIG = "ultracam-x-mini"
 PLACES = 6

@@ -30,9 +30,9 @@ from benchmarks.rendered import (
 from daemon.measuring import machine
 from processing.pipeline import Pipeline, Settings
 from processing.rig import Rig, load_rig, shipped_rigs
-from sim_hw.scene import Scene, open_scene
-from sim_hw.snapshots import Heads
-from sim_hw.world import World
+from sim_hw.world.scene import Scene, open_scene
+from sim_hw.world.snapshots import Heads
+from sim_hw.world.world import World
 
 MINIS = tuple(f"ultracam-{name}-mini" for name in ("x", "xp", "d", "l", "lp"))
 DC_K = (-20.0, -10.0, 0.0, 10.0, 20.0)

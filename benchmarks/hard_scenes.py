@@ -20,11 +20,11 @@ import cv2
 from benchmarks.rendered import errors_of, process, radiometry_of, take, world_settings
 from daemon.measuring import machine
 from processing.pipeline import Pipeline, Product, Settings
-from processing.quality import NO_FLAGS, Flag
+from processing.quality.report import NO_FLAGS, Flag
 from processing.rig import find_rig
-from sim_hw.grounds import GROUNDS
-from sim_hw.snapshots import Heads
-from sim_hw.world import World
+from sim_hw.world.grounds import GROUNDS
+from sim_hw.world.snapshots import Heads
+from sim_hw.world.world import World
 
 RIG = "ultracam-x-mini"
 SEED = 5

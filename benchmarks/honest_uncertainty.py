@@ -32,11 +32,11 @@ from benchmarks.stitching_trials import (
     world_and_rig,
 )
 from daemon.measuring import machine
+from processing.mosaic.precision import datum_covariance, placed_covariance_px
 from processing.pipeline import Pipeline, Settings
-from processing.precision import datum_covariance, placed_covariance_px
-from sim_hw.scene import open_scene
-from sim_hw.snapshots import Heads
-from sim_hw.world import World
+from sim_hw.world.scene import open_scene
+from sim_hw.world.snapshots import Heads
+from sim_hw.world.world import World
 
 Array = NDArray[np.float64]
 

@@ -19,11 +19,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from daemon.laboratory.field import Exposure, Field, Looks, RigCalibration, calibrate_rig
-from daemon.laboratory.field_report import Estimated, covariance_of, estimated
+from daemon.calibration.laboratory.field import (
+    Exposure,
+    Field,
+    Looks,
+    RigCalibration,
+    calibrate_rig,
+)
+from daemon.calibration.laboratory.field_report import Estimated, covariance_of, estimated
 from processing.bundle.rotations import logarithm
+from processing.geometry.rotation import rotation_matrix
 from processing.rig import Rig, find_rig
-from processing.rotation import rotation_matrix
 from sim_hw import test_field
 
 Array = NDArray[np.float64]

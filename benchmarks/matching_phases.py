@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from benchmarks.chart import Chart
 from daemon.measuring import machine
-from processing.matching import INTERPOLATION, match_patches
-from processing.tie_points import TiePointSettings
+from processing.matching.patches import INTERPOLATION, match_patches
+from processing.matching.tie_points import TiePointSettings
 
 Array = NDArray[np.float64]
 Words = NDArray[np.uint16]

@@ -14,15 +14,16 @@ from typing import Any
 
 import numpy as np
 
-from daemon import bench, store
-from daemon.conditions import conditions_of
+from daemon import bench
 from daemon.configuration import PlanSection
-from daemon.lanes import Lanes
+from daemon.disk import store
+from daemon.disk.mission import Mission
+from daemon.disk.radiometry_folder import RadiometryFolder
 from daemon.measuring import machine
-from daemon.mission import Mission
-from daemon.radiometry_folder import RadiometryFolder
+from daemon.products.conditions import conditions_of
+from daemon.service.lanes import Lanes
 from processing.pipeline import Pipeline, Settings
-from processing.quality import Flag
+from processing.quality.report import Flag
 from processing.rig import find_rig, load_rig
 
 SETTLED_AFTER = 4

@@ -36,8 +36,8 @@ from processing.bundle.network import (
 )
 from processing.bundle.rotations import exponential, logarithm
 from processing.bundle.start import completed
-from processing.relative_orientation import relative_orientations
-from sim_hw.oblique import (
+from processing.calibration.relative_orientation import relative_orientations
+from sim_hw.blocks.oblique import (
     F_MM,
     HALF_HEIGHT_MM,
     HALF_WIDTH_MM,

@@ -23,15 +23,15 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from daemon.conditions import conditions_of
 from daemon.configuration import PlanSection
+from daemon.disk.mission import Mission
+from daemon.disk.store import Level0Writer, load_level0
 from daemon.exposure import Capture, FrameRecord
 from daemon.measuring import interleaved, machine
-from daemon.mission import Mission
-from daemon.store import Level0Writer, load_level0
+from daemon.products.conditions import conditions_of
 from processing.pipeline import Pipeline, Settings
-from processing.quality import Flag
-from processing.radiometry import load_radiometry
+from processing.quality.report import Flag
+from processing.radiometry.calibration import load_radiometry
 from processing.rig import load_rig
 
 Frames = Mapping[str, NDArray[np.uint16]]

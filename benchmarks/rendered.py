@@ -16,14 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.pipeline import Conditions, Pipeline, Product
-from processing.radiometry import RadiometricCalibration
+from processing.radiometry.calibration import RadiometricCalibration
 from processing.rig import shipped_rigs
-from sim_hw import snapshots
-from sim_hw.flight import Flight
 from sim_hw.judge import compare
-from sim_hw.scene import Scene, open_scene
-from sim_hw.snapshots import Heads, Snapshot
-from sim_hw.world import World, WorldSettings
+from sim_hw.world import snapshots
+from sim_hw.world.flight import Flight
+from sim_hw.world.scene import Scene, open_scene
+from sim_hw.world.snapshots import Heads, Snapshot
+from sim_hw.world.world import World, WorldSettings
 
 EPOCH_GPS_NS = 1_447_000_000_000_000_000
 FIRST_AFTER_S = 20.0

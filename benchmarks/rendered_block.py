@@ -36,14 +36,14 @@ from processing.bundle.network import (
 from processing.bundle.rotations import exponential
 from processing.bundle.self_calibration import SETS, SetName, parts_of, self_calibrating
 from processing.bundle.start import intersected
-from processing.matching import INTERPOLATION, match_patches, select_features
+from processing.matching.patches import INTERPOLATION, match_patches, select_features
 from processing.pipeline import Pipeline
 from processing.pipeline import Settings as PipelineSettings
 from processing.rig import VirtualImage
-from sim_hw import camera
-from sim_hw.scene import open_scene
-from sim_hw.snapshots import Heads
-from sim_hw.world import World
+from sim_hw.world import camera
+from sim_hw.world.scene import open_scene
+from sim_hw.world.snapshots import Heads
+from sim_hw.world.world import World
 
 Array = NDArray[np.float64]
 

@@ -24,8 +24,15 @@ from daemon.measuring import machine
 from processing.bundle.adjust import adjust
 from processing.bundle.network import Network
 from processing.bundle.rotations import logarithm
-from processing.relative_orientation import RelativeOrientations, relative_orientations
-from sim_hw.oblique import HEADS, NADIR, PIXEL_MM, TABLE_2_GRAD, ObliqueBlock, flown_obliquely
+from processing.calibration.relative_orientation import RelativeOrientations, relative_orientations
+from sim_hw.blocks.oblique import (
+    HEADS,
+    NADIR,
+    PIXEL_MM,
+    TABLE_2_GRAD,
+    ObliqueBlock,
+    flown_obliquely,
+)
 
 Array = NDArray[np.float64]
 

@@ -23,9 +23,9 @@ import tifffile
 from numpy.typing import NDArray
 
 from processing.rig import find_rig
+from sim_hw.devices.pulse_bus import Firing, PulseBus
 from sim_hw.ending import end_with_parent
 from sim_hw.gige.head import ExposureRequest, FrameSize, GigeHead, HeadIdentity, Pacing
-from sim_hw.pulse_bus import Firing, PulseBus
 from sim_hw.world_clock import DeviceClock
 
 RING = 3

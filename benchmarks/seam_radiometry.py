@@ -21,18 +21,23 @@ from numpy.typing import NDArray
 
 from benchmarks import rendered
 from daemon.measuring import machine
-from processing.composition import PanComposer, pan_cell_px
-from processing.level1 import corrector_for, exposed_rows, level1_counts_per_dn, level1_from_level0
+from processing.image.composition import PanComposer, pan_cell_px
 from processing.pipeline import Conditions, Pipeline, Product, Settings
-from processing.radiometry import RadiometricCalibration
+from processing.radiometry.calibration import RadiometricCalibration
+from processing.radiometry.level1 import (
+    corrector_for,
+    exposed_rows,
+    level1_counts_per_dn,
+    level1_from_level0,
+)
 from processing.rig import Cone, Sensor
-from sim_hw import laboratory
-from sim_hw.electronics import Electronics, SensorTruth, over_tdi_path, true_sensor
-from sim_hw.rendering import Look
-from sim_hw.scene import open_scene
 from sim_hw.seeding import random_stream
-from sim_hw.snapshots import Snapshot
-from sim_hw.world import World
+from sim_hw.world import laboratory
+from sim_hw.world.electronics import Electronics, SensorTruth, over_tdi_path, true_sensor
+from sim_hw.world.rendering import Look
+from sim_hw.world.scene import open_scene
+from sim_hw.world.snapshots import Snapshot
+from sim_hw.world.world import World
 
 Map = NDArray[np.float32]
 Array = NDArray[np.float64]

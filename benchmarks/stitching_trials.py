@@ -18,25 +18,25 @@ from numpy.typing import NDArray
 
 from benchmarks import rendered
 from processing.conditions import Conditions, parallax_px
-from processing.mosaic import Mosaic, MosaicSettings, free_mosaic
-from processing.pipeline import Pipeline, Settings
-from processing.placement import (
+from processing.geometry.placement import (
     nominal_placements,
     raw_from_vip_mm,
     vip_mm_from_raw,
     vip_px_from_mm,
 )
+from processing.geometry.topology import colour_ratio
+from processing.matching.tie_points import PAN_TO_COLOUR, PAN_TO_PAN, TiePoints
+from processing.mosaic.free import Mosaic, MosaicSettings, free_mosaic
+from processing.mosaic.validity import Validity, judge_master, robust_datum
+from processing.pipeline import Pipeline, Settings
 from processing.rig import Rig
-from processing.tie_points import PAN_TO_COLOUR, PAN_TO_PAN, TiePoints
-from processing.topology import colour_ratio
-from processing.validity import Validity, judge_master, robust_datum
-from sim_hw.camera import true_camera
-from sim_hw.flight import Flight
-from sim_hw.rendering import Look, ground_points
-from sim_hw.scene import Scene
-from sim_hw.snapshots import Heads, look_of, probe_readings
-from sim_hw.truth import true_vip
-from sim_hw.world import World
+from sim_hw.world.camera import true_camera
+from sim_hw.world.flight import Flight
+from sim_hw.world.rendering import Look, ground_points
+from sim_hw.world.scene import Scene
+from sim_hw.world.snapshots import Heads, look_of, probe_readings
+from sim_hw.world.truth import true_vip
+from sim_hw.world.world import World
 
 Array = NDArray[np.float64]
 

@@ -21,15 +21,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.time_truth import Fired, Host, delay_error_ns, inside, receiver_stamp
-from daemon.clock import HostClock
-from daemon.composing import compose, instant_of
 from daemon.exposure import Capture, FrameRecord
-from daemon.matching import Pulse
+from daemon.flight.composing import compose, instant_of
+from daemon.flight.navigation import Track
+from daemon.flight.temperatures import Temperatures
 from daemon.measuring import machine
-from daemon.navigation import Track
-from daemon.temperatures import Temperatures
+from daemon.timing.clock import HostClock
+from daemon.timing.matching import Pulse
 from drivers.contract import EventMark
-from processing.quality import Flag
+from processing.quality.report import Flag
 from processing.rig import find_rig
 
 Errors = tuple[NDArray[np.float64], NDArray[np.float64]]

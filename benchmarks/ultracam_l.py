@@ -21,23 +21,23 @@ from numpy.typing import NDArray
 
 from daemon.measuring import machine
 from processing.conditions import Conditions, parallax_px
-from processing.fixed_method import fixed_mosaic
-from processing.mosaic import Mosaic, MosaicSettings, free_mosaic
-from processing.pan_only import pan_only_mosaic
-from processing.placement import (
+from processing.geometry.placement import (
     SensorPlacement,
     nominal_placements,
     raw_from_vip_mm,
     vip_mm_from_raw,
     vip_px_from_mm,
 )
+from processing.geometry.topology import Rectangle, colour_coverage, overlaps
+from processing.matching.tie_points import PAN_TO_COLOUR, PAN_TO_PAN, TiePoints
+from processing.mosaic.fixed import fixed_mosaic
+from processing.mosaic.free import Mosaic, MosaicSettings, free_mosaic
+from processing.mosaic.pan_only import pan_only_mosaic
 from processing.rig import Rig, VirtualImage, shipped_rigs
-from processing.tie_points import PAN_TO_COLOUR, PAN_TO_PAN, TiePoints
-from processing.topology import Rectangle, colour_coverage, overlaps
-from sim_hw.flight import Flight
-from sim_hw.rendering import Look, ground_points
-from sim_hw.truth import true_vip
-from sim_hw.world import World, WorldSettings
+from sim_hw.world.flight import Flight
+from sim_hw.world.rendering import Look, ground_points
+from sim_hw.world.truth import true_vip
+from sim_hw.world.world import World, WorldSettings
 
 Array = NDArray[np.float64]
 Placements = Mapping[str, SensorPlacement]

@@ -23,19 +23,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon import bench_peers, store
-from daemon.conditions import conditions_of
+from daemon import bench_peers
 from daemon.configuration import PlanSection
+from daemon.disk import store
+from daemon.disk.mission import Mission
+from daemon.disk.radiometry_folder import RadiometryFolder
 from daemon.errors import DaemonError
-from daemon.lanes import Lanes
 from daemon.measuring import interleaved, machine, spread
-from daemon.mission import Mission
-from daemon.radiometry_folder import RadiometryFolder
-from daemon.worker import make_products, process_exposure, settle_threads
+from daemon.products.conditions import conditions_of
+from daemon.service.lanes import Lanes
+from daemon.service.worker import make_products, process_exposure, settle_threads
+from processing.matching.tie_points import TiePoints
 from processing.pipeline import Conditions, Pipeline, Product, Settings
-from processing.quality import Flag
+from processing.quality.report import Flag
 from processing.rig import Rig, load_rig
-from processing.tie_points import TiePoints
 
 DC_K = 12.0
 DISPLACED_PX = (1.0, -0.6)

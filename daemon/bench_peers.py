@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.errors import DaemonError
-from processing.lattice import OUTSIDE, fill_lattice, lattice_shape, pan_raster
-from processing.placement import SensorPlacement
+from processing.geometry.placement import SensorPlacement
+from processing.image.lattice import OUTSIDE, fill_lattice, lattice_shape, pan_raster
+from processing.matching.tie_points import PAN_TO_PAN, TiePoints
 from processing.rig import Rig
-from processing.tie_points import PAN_TO_PAN, TiePoints
 
 CELL_PX = 32
 PEER_WITHIN_S = 1500.0

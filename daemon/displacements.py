@@ -1,7 +1,7 @@
 """Since when a sensor has been displaced: the stitching records of a landed mission, together.
 
 Read from `mosaic.json` of every exposure and written to `export/displacements.json`; the
-mathematics is in `processing.flight_validity`.
+mathematics is in `processing.mosaic.flight_validity`.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from daemon.durable import replace_file
-from daemon.records import canonical_bytes
-from processing.flight_validity import FlightValidity, judge_flight
+from daemon.disk.durable import replace_file
+from daemon.disk.records import canonical_bytes
+from processing.mosaic.flight_validity import FlightValidity, judge_flight
+from processing.mosaic.stitch_record import StitchRecord, StitchRecordError, stitch_record_from_json
 from processing.rig import load_rig
-from processing.stitch_record import StitchRecord, StitchRecordError, stitch_record_from_json
 
 RECORD_MAX_BYTES = 4_000_000
 
@@ -26,8 +26,8 @@ def write_displacements(mission: Path) -> Mapping[str, Any]:
 
     Returns:
         The content of the file: `sentences`, one for each step; `steps`, see
-        `processing.flight_validity.Step`; `exposures` used and `left_out`, by cone; `unreadable`,
-        sentences about records that could not be read.
+        `processing.mosaic.flight_validity.Step`; `exposures` used and `left_out`, by cone;
+        `unreadable`, sentences about records that could not be read.
     """
     records, unreadable = _records(mission)
     content = _content(judge_flight(load_rig(mission / "rig.toml"), records), unreadable)

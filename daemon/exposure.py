@@ -1,7 +1,7 @@
 """The record of one exposure: what was triggered, which frames came, when and where it was.
 
-Data and their JSON form only. How a record is put on disk is in `daemon.store`, what an exposure's
-state may become in `daemon.transitions`.
+Data and their JSON form only. How a record is put on disk is in `daemon.disk.store`, what an
+exposure's state may become in `daemon.flight.transitions`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, cast, get_args
 
-from daemon.records import Fields, RecordError, canonical_bytes
+from daemon.disk.records import Fields, RecordError, canonical_bytes
 
 TimeSource = Literal["event-mark", "pps", "interpolated", "host", "none"]
 RecordState = Literal["complete", "degraded", "lost"]
@@ -119,9 +119,9 @@ class Exposure:
     """The sealed record of an exposure, `exposure.json`.
 
     `mark_gps_ns` is the instant of the rig's strobe, from the source `mark_source` says; `flags`
-    is the bit set of `processing.quality.Flag` as far as capture knows it. `time_budget_ns` are
-    the standard deviations that make up that of the least certain frame, by what they come from.
-    `previous_sha256` is the hash of the record sealed before this one.
+    is the bit set of `processing.quality.report.Flag` as far as capture knows it. `time_budget_ns`
+    are the standard deviations that make up that of the least certain frame, by what they come
+    from. `previous_sha256` is the hash of the record sealed before this one.
     """
 
     number: int

@@ -16,8 +16,8 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
+from daemon.disk.records import sha256_hex
 from daemon.errors import DaemonError
-from daemon.records import sha256_hex
 
 CONFIGURATION = PurePosixPath("/etc/syntopic/service.toml")
 MANIFEST = PurePosixPath("/etc/syntopic/installed.json")

@@ -15,7 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.band_registration import (
+from processing.conditions import Conditions
+from processing.geometry.placement import SensorPlacement
+from processing.image.band_registration import (
     BandSettings,
     RegisteredBand,
     band_placements,
@@ -23,11 +25,9 @@ from processing.band_registration import (
     reference_image,
     register_to_reference,
 )
-from processing.conditions import Conditions
-from processing.judgement import judge
-from processing.placement import SensorPlacement
-from processing.quality import Figure, QualityReport, Thresholds
-from processing.radiance import RadianceCalibration, radiance_from_words, saturated_words
+from processing.quality.judgement import judge
+from processing.quality.report import Figure, QualityReport, Thresholds
+from processing.radiometry.radiance import RadianceCalibration, radiance_from_words, saturated_words
 from processing.rig import Rig, Sensor, VirtualImage
 
 Array = NDArray[Any]
@@ -42,7 +42,7 @@ BAND_FIGURES: Final[Mapping[str, str]] = {
     "<band>_rms_px": "root mean square length of their residuals, pixels",
     "<band>_shift_px": "largest displacement of raw pixels against the reference band, pixels",
 }
-"""Figures of a band beside those of `processing.quality.FIGURES`."""
+"""Figures of a band beside those of `processing.quality.report.FIGURES`."""
 
 _MATCHING_LEVEL: Final = 1000.0
 """Frames are matched with their median at this value: the kernels' guards are made for counts."""

@@ -15,27 +15,27 @@ from typing import Any, Final
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 
-from processing.demosaic import demosaic
 from processing.pipeline import Pipeline, Settings
-from processing.radiometry import RadiometricCalibration
+from processing.radiometry.calibration import RadiometricCalibration
+from processing.radiometry.demosaic import demosaic
 from processing.rehearsal import rehearsal_radiometry
 from processing.rig import Rig
 
 _ROOMS: Final = (
-    "processing.balance",
-    "processing.cells",
-    "processing.correlation",
-    "processing.demosaic",
-    "processing.features",
-    "processing.least_squares_matching",
-    "processing.level1",
-    "processing.matching",
-    "processing.patch_sampling",
-    "processing.quicklook",
-    "processing.resampling",
-    "processing.seams",
-    "processing.sharpness",
-    "processing.taps",
+    "processing.image.balance",
+    "processing.image.cells",
+    "processing.matching.correlation",
+    "processing.radiometry.demosaic",
+    "processing.matching.features",
+    "processing.matching.least_squares",
+    "processing.radiometry.level1",
+    "processing.matching.patches",
+    "processing.matching.sampling",
+    "processing.image.quicklook",
+    "processing.image.resampling",
+    "processing.image.seams",
+    "processing.image.sharpness",
+    "processing.image.taps",
 )
 
 

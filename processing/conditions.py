@@ -1,7 +1,7 @@
 """What is known about an exposure besides its pixels, and the figures that follow from it alone.
 
 Smear, parallax, ground sampling distance and dC are computed here; they become findings in
-`processing.quality`.
+`processing.quality.report`.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from processing.drift import lagged_probe, lagged_sensors
-from processing.probe_health import bridge_by_others
-from processing.quality import NO_FLAGS, Figure, Flag, Thresholds
+from processing.geometry.drift import lagged_probe, lagged_sensors
+from processing.quality.probe_health import bridge_by_others
+from processing.quality.report import NO_FLAGS, Figure, Flag, Thresholds
 from processing.rig import Cone, Rig
 
 TIME_PARTS = ("receiver", "clock", "trigger", "delay", "head")
@@ -93,7 +93,7 @@ def usable_temperatures(rig: Rig, conditions: Conditions, thresholds: Thresholds
 def condition_figures(
     rig: Rig, conditions: Conditions, temperatures: Temperatures
 ) -> dict[str, Figure]:
-    """Figures that need no pixels, by the names of `processing.quality.FIGURES`."""
+    """Figures that need no pixels, by the names of `processing.quality.report.FIGURES`."""
     figures: dict[str, Figure] = {"gsd_m": ground_sampling_distance_m(rig, conditions)}
     figures |= _dc(rig, temperatures)
     smears = [_smear(rig, cone, conditions) for cone in rig.pan_cones]

@@ -20,14 +20,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.conditions import Conditions
-from processing.demosaic import BAYER_BANDS, demosaic, is_bayer
-from processing.judgement import judge
-from processing.level1 import LEVEL1_CEILING, LEVEL1_FLOOR, corrector_for, level1_from_level0
-from processing.placement import nominal_placements, raw_from_vip_mm, vip_mm_from_px
-from processing.quality import Figure, QualityReport, Thresholds
-from processing.radiometry import RadiometricCalibration
+from processing.geometry.placement import nominal_placements, raw_from_vip_mm, vip_mm_from_px
+from processing.geometry.rotation import rotation_matrix
+from processing.quality.judgement import judge
+from processing.quality.report import Figure, QualityReport, Thresholds
+from processing.radiometry.calibration import RadiometricCalibration
+from processing.radiometry.demosaic import BAYER_BANDS, demosaic, is_bayer
+from processing.radiometry.level1 import (
+    LEVEL1_CEILING,
+    LEVEL1_FLOOR,
+    corrector_for,
+    level1_from_level0,
+)
 from processing.rig import Cone, Rig, VirtualImage
-from processing.rotation import rotation_matrix
 
 Array = NDArray[Any]
 
@@ -126,7 +131,8 @@ class HeadPipeline:
 
         Raises:
             ValueError: a frame of the wrong shape or type.
-            processing.radiometry.CalibrationError: a calibration that is not the sensor's.
+            processing.radiometry.calibration.CalibrationError: a calibration that is not the
+                sensor's.
         """
         seconds = {"radiometry": 0.0, "resampling": 0.0}
         known = {p: t for p, t in conditions.temperatures_c.items() if t is not None}

@@ -15,14 +15,6 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.colour import (
-    BandRegistration,
-    colour_heads,
-    green_positions,
-    nominal_registration,
-    register_band,
-)
-from processing.composition import ColourComposer, PanComposer, pan_cell_px
 from processing.conditions import (
     Conditions,
     Temperatures,
@@ -30,37 +22,45 @@ from processing.conditions import (
     parallax_px,
     usable_temperatures,
 )
-from processing.estimated_dc import EstimatedDc, estimate_dc
-from processing.figures import (
+from processing.geometry.placement import SensorPlacement, nominal_placements
+from processing.geometry.virtual_camera import ground_plane, projection_figures
+from processing.image.colour import (
+    BandRegistration,
+    colour_heads,
+    green_positions,
+    nominal_registration,
+    register_band,
+)
+from processing.image.composition import ColourComposer, PanComposer, pan_cell_px
+from processing.image.quicklook import quicklook
+from processing.image.resampling import Interpolation
+from processing.matching.tie_points import TiePoints, match_tie_points
+from processing.mosaic.estimated_dc import EstimatedDc, estimate_dc
+from processing.mosaic.fixed import fixed_mosaic
+from processing.mosaic.free import Mosaic, MosaicSettings
+from processing.mosaic.mounting import check_platform, platform_figures
+from processing.mosaic.precision import precision_figures
+from processing.mosaic.stitching import Method, stitch
+from processing.mosaic.validity import Validity
+from processing.product import Product, Settings
+from processing.quality.figures import (
     estimated_dc_figures,
     frame_figures,
     stitching_figures,
 )
-from processing.fixed_method import fixed_mosaic
-from processing.judgement import judge
-from processing.level1 import (
+from processing.quality.judgement import judge
+from processing.quality.report import Figure
+from processing.radiometry.calibration import RadiometricCalibration
+from processing.radiometry.level1 import (
     FrameStatistics,
     corrector_for,
     exposed_rows,
     level1_counts_per_dn,
     level1_from_level0,
 )
-from processing.mosaic import Mosaic, MosaicSettings
-from processing.mounting import check_platform, platform_figures
-from processing.placement import SensorPlacement, nominal_placements
-from processing.precision import precision_figures
-from processing.product import Product, Settings
-from processing.quality import Figure
-from processing.quicklook import quicklook
-from processing.radiometry import RadiometricCalibration
 from processing.rehearsal import rehearsal_frames
-from processing.resampling import Interpolation
 from processing.rig import Rig
-from processing.stitching import Method, stitch
 from processing.stopwatch import Stopwatch
-from processing.tie_points import TiePoints, match_tie_points
-from processing.validity import Validity
-from processing.virtual_camera import ground_plane, projection_figures
 
 __all__ = ["Conditions", "Interpolation", "Method", "Pipeline", "Product", "Settings"]
 

@@ -8,19 +8,19 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from processing.balance import Balance
-from processing.colour import BandRegistration, ColourSettings
 from processing.conditions import Temperatures
-from processing.estimated_dc import EstimatedDc
-from processing.mosaic import Mosaic, MosaicSettings
-from processing.mounting import PlatformCheck
-from processing.quality import QualityReport, Thresholds
-from processing.resampling import Interpolation
-from processing.specification import Asked
-from processing.stitching import Method
-from processing.tie_points import TiePoints, TiePointSettings
-from processing.validity import Validity
-from processing.virtual_camera import GroundPlane
+from processing.geometry.virtual_camera import GroundPlane
+from processing.image.balance import Balance
+from processing.image.colour import BandRegistration, ColourSettings
+from processing.image.resampling import Interpolation
+from processing.matching.tie_points import TiePoints, TiePointSettings
+from processing.mosaic.estimated_dc import EstimatedDc
+from processing.mosaic.free import Mosaic, MosaicSettings
+from processing.mosaic.mounting import PlatformCheck
+from processing.mosaic.stitching import Method
+from processing.mosaic.validity import Validity
+from processing.quality.report import QualityReport, Thresholds
+from processing.quality.specification import Asked
 
 Array = NDArray[Any]
 
@@ -62,8 +62,8 @@ class Product:
     `pan` (H, W) uint16 is linear signal, `counts_per_dn` counts to the DN (8 for 12 bits), 0 no
     data. `valid` (H, W) uint8 is 0 without data, else 1 + the index into `sensors` of the sensor
     that contributes most; its highest bit marks saturation. `colour` holds the bands by name,
-    (h, w) uint16 on the raster of `processing.lattice.colour_raster`. `quicklook` is (h, w, 3)
-    uint8.
+    (h, w) uint16 on the raster of `processing.image.lattice.colour_raster`. `quicklook` is (h, w,
+    3) uint8.
 
     `geometry` is keyed by method ("free", "fixed", "fixed-no-tdm"), then `<sensor>.vip` (n, 2),
     `<sensor>.raw` (n, 2), `<sensor>.weight` (n,): which raw pixel serves which VIP pixel.

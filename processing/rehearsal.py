@@ -11,8 +11,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.placement import nominal_placements, vip_mm_from_raw, vip_px_from_mm
-from processing.radiometry import RadiometricCalibration, neutral_radiometry
+from processing.geometry.placement import nominal_placements, vip_mm_from_raw, vip_px_from_mm
+from processing.radiometry.calibration import RadiometricCalibration, neutral_radiometry
 from processing.rig import Rig, Sensor
 
 Array = NDArray[Any]

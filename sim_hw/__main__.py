@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from processing.rig import RigError, load_rig, shipped_rigs
-from sim_hw.grounds import GROUNDS
-from sim_hw.receivers import PROBES, RECEIVERS
+from sim_hw.receivers.kinds import PROBES, RECEIVERS
 from sim_hw.simulator import SimulatorSettings, simulate
-from sim_hw.world import WorldSettings
+from sim_hw.world.grounds import GROUNDS
+from sim_hw.world.world import WorldSettings
 from sim_hw.world_clock import WorldClock
 
 

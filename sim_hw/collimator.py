@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from processing.rig import Cone, Lens, Rig, RigError, Sensor, load_rig, shipped_rigs
-from sim_hw.camera import rotation_opk, undistorted
 from sim_hw.seeding import random_stream
+from sim_hw.world.camera import rotation_opk, undistorted
 
 Array = NDArray[np.float64]
 

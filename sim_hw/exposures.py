@@ -16,18 +16,18 @@ from typing import Any
 import tifffile
 
 from processing.rig import RigError
-from sim_hw import laboratory
 from sim_hw.__main__ import displacement, rig_file
-from sim_hw.electronics import Electronics, true_sensor
-from sim_hw.grounds import GROUNDS
-from sim_hw.post_processed import marks_of_lines, write_trajectory
-from sim_hw.rendering import Look, light_on_sensor
-from sim_hw.scene import open_scene
 from sim_hw.seeding import random_stream
-from sim_hw.snapshots import PROBE_SIGMA_C, look_of
-from sim_hw.surveyed import write_surveyed
-from sim_hw.truth import Taken, TruthWriter
-from sim_hw.world import World, WorldSettings
+from sim_hw.world import laboratory
+from sim_hw.world.electronics import Electronics, true_sensor
+from sim_hw.world.grounds import GROUNDS
+from sim_hw.world.post_processed import marks_of_lines, write_trajectory
+from sim_hw.world.rendering import Look, light_on_sensor
+from sim_hw.world.scene import open_scene
+from sim_hw.world.snapshots import PROBE_SIGMA_C, look_of
+from sim_hw.world.surveyed import write_surveyed
+from sim_hw.world.truth import Taken, TruthWriter
+from sim_hw.world.world import World, WorldSettings
 
 EPOCH_GPS_NS = 1_447_000_000_000_000_000
 FIRST_AFTER_S = 20

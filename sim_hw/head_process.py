@@ -21,18 +21,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.rig import Cone, Sensor
-from sim_hw import laboratory
-from sim_hw.electronics import Electronics, true_sensor
 from sim_hw.ending import end_with_parent
 from sim_hw.faults.plan import Planned
-from sim_hw.flight import Flight
 from sim_hw.gige.faults import WireFaults
 from sim_hw.gige.head import NO_PULSE, ExposureRequest, FrameSize, GigeHead, HeadIdentity
-from sim_hw.rendering import Look, light_on_sensor
-from sim_hw.scene import Scene, open_scene
 from sim_hw.seeding import random_stream
-from sim_hw.truth import Taken
-from sim_hw.world import World, WorldSettings
+from sim_hw.world import laboratory
+from sim_hw.world.electronics import Electronics, true_sensor
+from sim_hw.world.flight import Flight
+from sim_hw.world.rendering import Look, light_on_sensor
+from sim_hw.world.scene import Scene, open_scene
+from sim_hw.world.truth import Taken
+from sim_hw.world.world import World, WorldSettings
 from sim_hw.world_clock import DeviceClock, WorldClock
 
 VENDOR = "Syntopic emulator"

@@ -17,14 +17,14 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
+from sim_hw.devices.pseudo_terminal import PseudoTerminal
+from sim_hw.devices.serving import LineDevice
 from sim_hw.ending import end_with_parent
 from sim_hw.faults.catalogue import HEAD, RECEIVER, THERMOMETER, TRIGGER, DeviceKind
 from sim_hw.faults.channel import BytesDamage, Channel
 from sim_hw.faults.plan import FaultPlanError, Planned, read_plan
 from sim_hw.faults.wire import FaultyWire, FaultyWorldClock
-from sim_hw.pseudo_terminal import PseudoTerminal
-from sim_hw.receiver import ReceiverState
-from sim_hw.serving import LineDevice
+from sim_hw.receivers.receiver import ReceiverState
 from sim_hw.world_clock import NS_PER_S, WorldClock
 
 SPEED_MPS = 60.0
@@ -99,7 +99,7 @@ def _make(
         return _head(at, planned)
     channel = Channel(planned, BytesDamage(), seed=kind)
     if kind == "trigger":
-        from sim_hw.pulse_bus import PulseBus
+        from sim_hw.devices.pulse_bus import PulseBus
 
         host, _, port = at.rpartition(":")
         bus = PulseBus("lone", OUTPUTS, lambda _: None, (host, int(port)), faults=channel)
@@ -127,30 +127,30 @@ def _line_device(
 
     # Imported one by one: a device comes up as fast as it can, and needs no other.
     if kind == "ublox":
-        from sim_hw.ublox_receiver import UbloxReceiver
+        from sim_hw.receivers.ublox_receiver import UbloxReceiver
 
         return UbloxReceiver(clock, state, line=line)
     if kind == "nmea":
-        from sim_hw.nmea_receiver import NmeaReceiver
+        from sim_hw.receivers.nmea_receiver import NmeaReceiver
 
         return NmeaReceiver(clock, state, line=line)
     if kind == "novatel":
-        from sim_hw.novatel_receiver import NovatelReceiver
+        from sim_hw.receivers.novatel_receiver import NovatelReceiver
 
         return NovatelReceiver(clock, state, line=line)
     if kind == "septentrio":
-        from sim_hw.septentrio_receiver import SeptentrioReceiver
+        from sim_hw.receivers.septentrio_receiver import SeptentrioReceiver
 
         return SeptentrioReceiver(clock, state, line=line)
     if kind == "mavlink":
-        from sim_hw.mavlink_autopilot import MavlinkAutopilot
+        from sim_hw.receivers.mavlink_autopilot import MavlinkAutopilot
 
         return MavlinkAutopilot(clock, state, line=line)
     if kind == "modbus":
-        from sim_hw.modbus_probe import ModbusProbe
+        from sim_hw.devices.modbus_probe import ModbusProbe
 
         return ModbusProbe([value_c, value_c], line=line)
-    from sim_hw.ascii_probe import AsciiProbe
+    from sim_hw.devices.ascii_probe import AsciiProbe
 
     lines = ["CH1 = {0}", "CH2 = {1}"]
     return AsciiProbe([value_c, value_c], lines, interval_s=0.5, line=line)

@@ -22,8 +22,9 @@ from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Any
 
-from sim_hw import laboratory, receivers, scene, world
 from sim_hw.clockwork import PROBES_NAME, RECEIVER_NAME, TRIGGER_NAME, devices_of
+from sim_hw.devices.pps_source import PpsSource
+from sim_hw.devices.pulse_bus import Firing, PulseBus
 from sim_hw.ending import end_with_parent
 from sim_hw.faults.channel import BytesDamage, Channel, for_device
 from sim_hw.faults.plan import read_plan
@@ -37,13 +38,13 @@ from sim_hw.head_process import (
     WorkerPlan,
     run,
 )
-from sim_hw.pps_source import PpsSource
-from sim_hw.pulse_bus import Firing, PulseBus
-from sim_hw.receiver import ReceiverState
-from sim_hw.receivers import Emulated
+from sim_hw.receivers import kinds as receivers
+from sim_hw.receivers.kinds import Emulated
+from sim_hw.receivers.receiver import ReceiverState
 from sim_hw.seeding import random_stream
-from sim_hw.truth import Taken, TruthWriter
-from sim_hw.world import World, WorldSettings
+from sim_hw.world import laboratory, scene, world
+from sim_hw.world.truth import Taken, TruthWriter
+from sim_hw.world.world import World, WorldSettings
 from sim_hw.world_clock import WorldClock
 
 READY_WITHIN_S = 180.0

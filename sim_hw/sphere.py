@@ -21,9 +21,9 @@ import tifffile
 from numpy.typing import NDArray
 
 from processing.rig import Cone, Rig, RigError, Sensor, load_rig, shipped_rigs
-from sim_hw import electronics
-from sim_hw.electronics import Map, over_tdi_path, true_sensor, vignetting
 from sim_hw.seeding import random_stream
+from sim_hw.world import electronics
+from sim_hw.world.electronics import Map, over_tdi_path, true_sensor, vignetting
 
 NONE, DEAD, HOT, COLUMN, CLUSTER, NOISY = range(6)
 

@@ -20,7 +20,7 @@ def test_no_other_distribution_provides_our_import_names(package: str) -> None:
     assert not owners, f"{package} also comes from {owners}; uninstall that in this environment"
 
 
-@pytest.mark.parametrize("module", ["daemon.service", "daemon.cli", "daemon.cli.run"])
+@pytest.mark.parametrize("module", ["daemon.service.service", "daemon.cli", "daemon.cli.run"])
 def test_the_service_imports_neither_hardware_nor_kernels_nor_opencv(module: str) -> None:
     code = (
         f"import sys, {module}; print(sorted({{'gi', 'numba', 'cv2', 'scipy'}} & set(sys.modules)))"

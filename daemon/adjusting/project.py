@@ -37,8 +37,8 @@ from processing.bundle.network import (
     no_gnss,
 )
 from processing.bundle.self_calibration import parts_of, self_calibrating
+from processing.geometry.rotation import rotation_matrix
 from processing.rig import RigError, find_rig
-from processing.rotation import rotation_matrix
 
 Array = NDArray[np.float64]
 

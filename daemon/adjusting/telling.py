@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from daemon.adjusting.project import Checks
-from daemon.cli.tables import light_table
+from daemon.tables import light_table
 from processing.bundle.adjust import Adjustment
 from processing.bundle.findings import (
     Agreement,

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from daemon.cli.tables import light_table
+from daemon.tables import light_table
 
 HELP = """Which segments of the plan must be flown again, from verdicts, overlaps and gaps.
 
@@ -27,12 +27,12 @@ def advise(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from daemon.mission import Mission
-    from daemon.orientation import mount_of
+    from daemon.disk.level2 import write_folder
+    from daemon.disk.mission import Mission
+    from daemon.orientation.exterior import mount_of
     from daemon.plan import advisor, flown, writing
     from daemon.plan.image_size import image_on_ground_m
     from daemon.plan.reading import PlanError, read_plan
-    from daemon.products import write_folder
     from processing.rig import load_rig
 
     folder = Mission.open(mission)

@@ -66,8 +66,8 @@ def at(
     from daemon.adjusting.tables import ProjectError
     from daemon.adjusting.telling import print_report, report_of
     from daemon.cli.adjust import _peak_mib
-    from daemon.mission import Mission
-    from daemon.triangulation import (
+    from daemon.disk.mission import Mission
+    from daemon.orientation.triangulation import (
         Asked,
         TriangulationError,
         attitude_sigmas,
@@ -76,16 +76,16 @@ def at(
         project_of,
         weighted,
     )
-    from daemon.triangulation_report import (
+    from daemon.orientation.triangulation_report import (
         print_triangulation,
         triangulation_of,
         write_triangulation,
     )
-    from processing.block_matching import BlockMatching
     from processing.bundle.adjust import adjust
     from processing.bundle.network import NetworkError
     from processing.bundle.rank import DefectError
     from processing.bundle.start import completed
+    from processing.matching.blocks import BlockMatching
 
     if set_name not in SETS or gnss not in ("none", "shift", "linear"):
         raise ConfigurationError(

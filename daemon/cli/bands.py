@@ -12,9 +12,9 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from daemon.cli.tables import light_table
 from daemon.configuration import ConfigurationError, PlanSection
-from daemon.mission import Mission
+from daemon.disk.mission import Mission
+from daemon.tables import light_table
 from processing.rig import Rig
 
 
@@ -28,9 +28,9 @@ def process(
     as_json: bool,
 ) -> None:
     """Process the exposures and print what came of them."""
-    from daemon import store
-    from daemon.bands import make_band_pipeline, process_bands
-    from processing.radiometry import CalibrationError
+    from daemon.disk import store
+    from daemon.products.bands import make_band_pipeline, process_bands
+    from processing.radiometry.calibration import CalibrationError
 
     reports: list[dict[str, Any]] = []
     try:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from daemon.cli.tables import light_table
+from daemon.tables import light_table
 
 HELP = """Time the pipeline on one emulated exposure of a rig, beside its peers.
 

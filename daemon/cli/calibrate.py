@@ -18,12 +18,12 @@ from daemon.cli import (
     calibrate_radiometric,
     calibrate_rig,
 )
-from daemon.cli.tables import light_table
+from daemon.tables import light_table
 
 if TYPE_CHECKING:
-    from daemon.thermal_calibration import Gathered
-    from processing.thermal_learning import Learned, Observability
-    from processing.thermal_proposal import Change
+    from daemon.calibration.thermal import Gathered
+    from processing.calibration.thermal_learning import Learned, Observability
+    from processing.calibration.thermal_proposal import Change
 
 app = typer.Typer(
     help="Calibrations from flown missions.", no_args_is_help=True, rich_markup_mode="markdown"
@@ -69,9 +69,9 @@ def thermal(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from daemon.thermal_calibration import gather, write_rig
-    from processing.thermal_learning import learned, observability
-    from processing.thermal_proposal import proposed_rig
+    from daemon.calibration.thermal import gather, write_rig
+    from processing.calibration.thermal_learning import learned, observability
+    from processing.calibration.thermal_proposal import proposed_rig
 
     gathered = gather(missions)
     rig = gathered.rig
@@ -103,8 +103,8 @@ def validity(
     mission: Annotated[Path, typer.Argument(help="A mission folder with Level-2.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
+    from daemon.disk.mission import Mission
     from daemon.displacements import write_displacements
-    from daemon.mission import Mission
 
     told = write_displacements(Mission.open(mission).path)
     if as_json:

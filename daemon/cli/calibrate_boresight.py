@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from daemon.cli.calibration_outcome import hand_over
-from daemon.cli.tables import light_table
+from daemon.tables import light_table
 
 HELP = """Boresight, lever arm and time offset: inertial against controlled orientation.
 
@@ -56,12 +56,12 @@ def boresight(
     out: Annotated[Path | None, typer.Option(help="The new folder; by default dated.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from daemon import boresight_calibration as flight
     from daemon.adjusting.project import read_project
-    from daemon.calibration_report import read_previous, serial_warnings
+    from daemon.calibration import boresight as flight
+    from daemon.calibration.report import read_previous, serial_warnings
     from daemon.configuration import MountSection
-    from daemon.mission import Mission
-    from daemon.orientation import mount_of, read_mount
+    from daemon.disk.mission import Mission
+    from daemon.orientation.exterior import mount_of, read_mount
     from processing.bundle.adjust import adjust
     from processing.bundle.network import NetworkError
     from processing.bundle.rank import DefectError

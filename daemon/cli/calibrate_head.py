@@ -35,13 +35,13 @@ def head(
     k3: Annotated[bool, typer.Option("--k3", help="Estimate K3 too.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from daemon.calibration_report import read_previous, refuse_existing
+    from daemon.calibration.laboratory.head import FREE, calibrate_head, targets_of
+    from daemon.calibration.laboratory.head_report import calibrated_rig, head_report
+    from daemon.calibration.laboratory.series import read_series
+    from daemon.calibration.report import read_previous, refuse_existing
+    from daemon.calibration.rig_text import rig_toml
     from daemon.cli.calibration_outcome import hand_over
-    from daemon.laboratory.head import FREE, calibrate_head, targets_of
-    from daemon.laboratory.head_report import calibrated_rig, head_report
-    from daemon.laboratory.series import read_series
-    from daemon.rig_text import rig_toml
-    from processing.residual_grid import grid_bytes
+    from processing.geometry.residual_grid import grid_bytes
 
     given = read_series(series, kind="head")
     targets = targets_of(given)

@@ -35,17 +35,17 @@ def lab(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from daemon.calibration_report import read_previous, refuse_existing
-    from daemon.cli.calibration_outcome import hand_over
-    from daemon.laboratory.field import calibrate_rig, exposures_of, field_of, measured
-    from daemon.laboratory.field_report import (
+    from daemon.calibration.laboratory.field import calibrate_rig, exposures_of, field_of, measured
+    from daemon.calibration.laboratory.field_report import (
         covariance_bytes,
         covariance_of,
         estimated,
         field_report,
     )
-    from daemon.laboratory.series import read_series
-    from daemon.rig_text import rig_toml
+    from daemon.calibration.laboratory.series import read_series
+    from daemon.calibration.report import read_previous, refuse_existing
+    from daemon.calibration.rig_text import rig_toml
+    from daemon.cli.calibration_outcome import hand_over
 
     given = read_series(series, kind="lab")
     exposures, field = exposures_of(given), field_of(given)

@@ -35,9 +35,9 @@ def platform(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from daemon.calibration_report import read_previous, refuse_existing
-    from daemon.platform_calibration import KIND, read_missions, report_of, rig_file
-    from processing.platform_calibration import calibrate_platform, calibrated_rig
+    from daemon.calibration.platform import KIND, read_missions, report_of, rig_file
+    from daemon.calibration.report import read_previous, refuse_existing
+    from processing.calibration.platform import calibrate_platform, calibrated_rig
 
     before = None if previous is None else read_previous(previous, kind=KIND)
     flown = read_missions(missions)

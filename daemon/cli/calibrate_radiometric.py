@@ -39,18 +39,18 @@ def radiometric(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from daemon.calibration_report import read_previous, refuse_existing
-    from daemon.cli.calibration_outcome import hand_over
-    from daemon.laboratory.radiometric import (
+    from daemon.calibration.laboratory.radiometric import (
         calibrate_sensor,
         checks_of,
         common_level,
         sets_of,
         shots_of,
     )
-    from daemon.laboratory.radiometric_maps import files_of
-    from daemon.laboratory.radiometric_report import radiometric_report
-    from daemon.laboratory.series import read_series
+    from daemon.calibration.laboratory.radiometric_maps import files_of
+    from daemon.calibration.laboratory.radiometric_report import radiometric_report
+    from daemon.calibration.laboratory.series import read_series
+    from daemon.calibration.report import read_previous, refuse_existing
+    from daemon.cli.calibration_outcome import hand_over
 
     given = read_series(series, kind="radiometric")
     shots = shots_of(given)

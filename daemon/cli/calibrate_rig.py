@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from daemon.cli.calibration_outcome import hand_over
-from daemon.cli.tables import light_table
+from daemon.tables import light_table
 
 HELP = """Relative orientation of oblique heads against the nadir head, averaged over a block.
 
@@ -42,8 +42,8 @@ def rig(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     from daemon.adjusting.project import read_project
-    from daemon.calibration_report import read_previous
-    from daemon.rig_calibration import (
+    from daemon.calibration.report import read_previous
+    from daemon.calibration.rig import (
         GRAD,
         RigCalibrationError,
         calibrated_rig,
@@ -54,7 +54,7 @@ def rig(
     from processing.bundle.network import NetworkError
     from processing.bundle.rank import DefectError
     from processing.bundle.start import completed
-    from processing.relative_orientation import relative_orientations
+    from processing.calibration.relative_orientation import relative_orientations
     from processing.rig import find_rig
 
     given = read_project(project / "project.toml" if project.is_dir() else project)

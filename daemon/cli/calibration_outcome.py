@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import typer
 from rich.console import Console
 
-from daemon.cli.tables import light_table
+from daemon.tables import light_table
 
 if TYPE_CHECKING:
-    from daemon.calibration_report import CalibrationReport
+    from daemon.calibration.report import CalibrationReport
 
 _MOST_ROWS = 40
 
@@ -26,7 +26,7 @@ def hand_over(
     as_json: bool,
 ) -> None:
     """Write the calibration as a new folder and tell it, as one JSON object or for a person."""
-    from daemon.calibration_report import calibration_json, write_calibration
+    from daemon.calibration.report import calibration_json, write_calibration
 
     write_calibration(folder, report, files)
     if as_json:

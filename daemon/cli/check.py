@@ -80,9 +80,9 @@ def check_devices(config: Path, *, as_json: bool) -> None:
 
 def _open_all(configuration: Any, rig: Any) -> list[dict[str, Any]]:
     """Bind every device at once, each in its own thread and each with a time-out."""
-    from daemon.capture import open_device
-    from daemon.devices import device_specs, frame_nbytes, serial_problem
-    from daemon.memory import FrameRing
+    from daemon.service.capture import open_device
+    from daemon.service.devices import device_specs, frame_nbytes, serial_problem
+    from daemon.service.memory import FrameRing
 
     findings: list[dict[str, Any]] = []
     threads: list[tuple[threading.Thread, dict[str, Any]]] = []

@@ -27,7 +27,7 @@ from daemon.cli.sim import (
     service_toml,
     simulator_arguments,
 )
-from daemon.cli.tables import light_table
+from daemon.tables import light_table
 from processing.rig import Rig, RigError, find_rig
 
 HELP = """Fly the first flight: an emulated rig is captured, stitched and judged.

@@ -11,9 +11,9 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from daemon.cli.tables import light_table
 from daemon.configuration import ConfigurationError
-from daemon.mission import Mission
+from daemon.disk.mission import Mission
+from daemon.tables import light_table
 
 HELP = """Make Level-3 of a mission after landing: pansharpened RGB and CIR in 16 and 8 bits.
 
@@ -36,7 +36,7 @@ def develop(
 ) -> None:
     import cv2
 
-    from daemon import level3
+    from daemon.products import level3
     from processing.rig import load_rig
 
     images, depths = image or list(level3.IMAGES), bits or list(level3.DEPTHS)

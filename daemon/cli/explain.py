@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from daemon.cli.tables import light_table
+from daemon.tables import light_table
 
 HELP = """Say what an event of the service means, what causes it and what helps.
 
@@ -25,7 +25,7 @@ def explain(
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object.")] = False,
     markdown: Annotated[bool, typer.Option("--markdown", help="The page docs/events.md.")] = False,
 ) -> None:
-    from daemon.event_table import TABLE, as_markdown, entry_of
+    from daemon.flight.event_table import TABLE, as_markdown, entry_of
 
     if markdown:
         sys.stdout.write(as_markdown())

@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from daemon.cli.tables import light_table
+from daemon.tables import light_table
 
 ORIENTATION_HELP = """Exterior orientation of every cone of every exposure, at its own mid-exposure.
 
@@ -64,8 +64,8 @@ def raw(
 
     Example: `syntopic export raw missions/20261121T101500Z-ultracam-x-mini`
     """
-    from daemon.mission import Mission
-    from daemon.raw_export import export_raw
+    from daemon.disk.mission import Mission
+    from daemon.export.raw import export_raw
 
     done = export_raw(Mission.open(mission))
     if as_json:
@@ -88,8 +88,8 @@ def foxglove(
 
     Example: `syntopic export foxglove missions/20261121T101500Z-ultracam-x-mini`
     """
-    from daemon.foxglove_export import export_foxglove
-    from daemon.mission import Mission
+    from daemon.disk.mission import Mission
+    from daemon.export.foxglove import export_foxglove
 
     done = export_foxglove(Mission.open(mission))
     if as_json:
@@ -113,8 +113,8 @@ def pictures(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from daemon.mission import Mission
-    from daemon.picture_export import KINDS, PictureError, export_pictures
+    from daemon.disk.mission import Mission
+    from daemon.export.pictures import KINDS, PictureError, export_pictures
 
     if kind not in KINDS:
         raise PictureError(f"--as is {kind!r}; cog or jpeg is right")
@@ -141,8 +141,8 @@ def certificate(
     mission: Annotated[Path, typer.Argument(help="Mission folder.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from daemon.certificate import write_certificate
-    from daemon.mission import Mission
+    from daemon.disk.mission import Mission
+    from daemon.export.certificate import write_certificate
 
     told, path = write_certificate(Mission.open(mission))
     if as_json:
@@ -180,8 +180,8 @@ def orientation(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from daemon import orientation_export
-    from daemon.mission import Mission
+    from daemon.disk.mission import Mission
+    from daemon.export import orientation as orientation_export
 
     folder = Mission.open(mission)
     with Progress(console=Console(stderr=True), transient=True) as progress:

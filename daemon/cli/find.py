@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from daemon.cli.tables import light_table
+from daemon.tables import light_table
 
 if TYPE_CHECKING:
     from drivers.detection.search import Found

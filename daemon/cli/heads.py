@@ -12,9 +12,9 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from daemon.cli.tables import light_table
 from daemon.configuration import ConfigurationError, PlanSection
-from daemon.mission import Mission
+from daemon.disk.mission import Mission
+from daemon.tables import light_table
 from processing.rig import Rig
 
 
@@ -29,11 +29,11 @@ def process(
     as_json: bool,
 ) -> None:
     """Process the exposures and print what came of them."""
-    from daemon import store
-    from daemon.heads import process_heads
-    from daemon.radiometry_folder import RadiometryFolder
+    from daemon.disk import store
+    from daemon.disk.radiometry_folder import RadiometryFolder
+    from daemon.products.heads import process_heads
     from processing.perspective import HeadPipeline
-    from processing.radiometry import CalibrationError
+    from processing.radiometry.calibration import CalibrationError
 
     reports: list[dict[str, Any]] = []
     calibrations = None if radiometry is None else RadiometryFolder(radiometry, rig)

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from daemon.cli.tables import light_table
+from daemon.tables import light_table
 
 HELP = """Ground points from places measured in two or more oriented images, with their accuracy.
 
@@ -52,10 +52,10 @@ def intersect(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     from daemon.adjusting.tables import write_table
-    from daemon.intersecting import IntersectionError, Uncertain
-    from daemon.intersecting import intersect as intersected
-    from daemon.mission import Mission
-    from daemon.triangulation import attitude_sigmas
+    from daemon.disk.mission import Mission
+    from daemon.orientation.intersection import IntersectionError, Uncertain
+    from daemon.orientation.intersection import intersect as intersected
+    from daemon.orientation.triangulation import attitude_sigmas
 
     if out is not None and out.exists():
         raise IntersectionError(f"{out} exists; give another name with --out")

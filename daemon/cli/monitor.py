@@ -15,8 +15,8 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from daemon.cli.tables import light_table
 from daemon.errors import DaemonError
+from daemon.tables import light_table
 from daemon.watch.state import PARTS, PICTURE_PARTS
 
 HELP = """Watch a flight from a terminal: phase, ledger, faults, the last exposures.

@@ -14,9 +14,9 @@ from rich.console import Console
 from rich.progress import Progress
 
 from daemon.cli import bands, heads
-from daemon.cli.tables import light_table
 from daemon.configuration import ConfigurationError, PlanSection, ProcessingSection
-from daemon.mission import Mission
+from daemon.disk.mission import Mission
+from daemon.tables import light_table
 
 HELP = """Process the exposures of a mission folder again, Level-0 to Level-2.
 
@@ -45,9 +45,9 @@ def process(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
-    from daemon import store
-    from daemon.messages import WorkerSettings
-    from daemon.worker import make_pipeline, overlaps_of, process_exposure
+    from daemon.disk import store
+    from daemon.service.messages import WorkerSettings
+    from daemon.service.worker import make_pipeline, overlaps_of, process_exposure
     from processing.perspective import looks_apart
     from processing.rig import load_rig
 

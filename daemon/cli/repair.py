@@ -24,10 +24,10 @@ def repair(
     rebuild: Annotated[bool, typer.Option("--rebuild", help="Make the index anew.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from daemon import durable, recovery
-    from daemon.log_seals import seal_logs
-    from daemon.mission import Mission
-    from daemon.recovery_match import seal_from_log
+    from daemon.disk import durable, recovery
+    from daemon.disk.log_seals import seal_logs
+    from daemon.disk.mission import Mission
+    from daemon.flight.recovery_match import seal_from_log
     from processing.rig import load_rig
 
     folder = Mission.open(mission)

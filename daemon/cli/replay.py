@@ -15,9 +15,9 @@ from rich.console import Console
 from rich.progress import Progress
 
 from daemon.cli.process import as_flown
-from daemon.cli.tables import light_table
 from daemon.configuration import Configuration, ConfigurationError
-from daemon.mission import Mission
+from daemon.disk.mission import Mission
+from daemon.tables import light_table
 
 HELP = """Feed what a mission recorded through the same code again, and compare.
 
@@ -49,11 +49,11 @@ def replay(
     configuration = _flown_configuration(folder)
     threads = configuration.processing.threads
     os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
-    from daemon.departure import identity
-    from daemon.flight_log import logs_of
-    from daemon.messages import WorkerSettings
+    from daemon.disk.flight_log import logs_of
     from daemon.replay.flight import Replayed, replay_log
     from daemon.replay.products import compare_products, compare_records
+    from daemon.service.departure import identity
+    from daemon.service.messages import WorkerSettings
     from processing.rig import load_rig
 
     rig = load_rig(folder.rig_path)

@@ -23,10 +23,10 @@ def report(
     bundle: Annotated[bool, typer.Option("--bundle", help="Also what support needs.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from daemon.mission import Mission
+    from daemon.disk.mission import Mission
+    from daemon.disk.verification import verify
+    from daemon.export.support_bundle import write_bundle
     from daemon.report import write_report
-    from daemon.support_bundle import write_bundle
-    from daemon.verification import verify
 
     folder = Mission.open(mission)
     console = Console(stderr=as_json, soft_wrap=True)

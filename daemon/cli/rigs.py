@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from daemon.cli.tables import light_table
+from daemon.tables import light_table
 from processing.rig import Rig, find_rig, load_rig, shipped_rigs
 
 app = typer.Typer(
@@ -61,8 +61,8 @@ def show(
 
     Examples: `syntopic rigs show ultracam-x`, `syntopic rigs show my-rig.toml --drawing rig.svg`
     """
-    from processing import drawing as draw
-    from processing import topology
+    from processing.geometry import topology
+    from processing.mosaic import drawing as draw
     from processing.perspective import looks_apart
 
     rig = find_rig(name)

@@ -27,7 +27,7 @@ def run(
     ] = False,
 ) -> None:
     from daemon.configuration import load
-    from daemon.service import Service
+    from daemon.service.service import Service
 
     show = _print_json if json_lines else _print_line
     goes_on, status = True, 0

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from daemon.cli.tables import light_table
+from daemon.tables import light_table
 
 app = typer.Typer(
     help="""Make and take back tokens for the API and the operator's page.

@@ -33,8 +33,8 @@ def transfer(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from daemon.mission import Mission
-    from daemon.transfer import transfer as run
+    from daemon.disk.mission import Mission
+    from daemon.disk.transfer import transfer as run
 
     columns = (BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:

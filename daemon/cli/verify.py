@@ -22,8 +22,8 @@ def verify(
     mission: Annotated[Path, typer.Argument(help="Mission folder.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from daemon import store
-    from daemon.mission import Mission
+    from daemon.disk import store
+    from daemon.disk.mission import Mission
 
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("verifying", total=None)

@@ -20,16 +20,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon import durable
+from daemon.calibration.rig_text import rig_toml
+from daemon.disk import durable
+from daemon.disk.level0 import tiff_parts
+from daemon.disk.mission import Mission, exposure_name
+from daemon.disk.records import canonical_bytes, sha256_hex
 from daemon.errors import DaemonError
 from daemon.exposure import Exposure, FrameRecord, exposure_bytes
 from daemon.importers.xmp import Xmp, XmpError, read_xmp
-from daemon.level0 import tiff_parts
-from daemon.mission import Mission, exposure_name
-from daemon.records import canonical_bytes, sha256_hex
-from daemon.rig_text import rig_toml
-from processing.brown import Brown, lens_from_brown
-from processing.radiance import RadianceCalibration, radiance_as_json
+from processing.geometry.brown import Brown, lens_from_brown
+from processing.radiometry.radiance import RadianceCalibration, radiance_as_json
 from processing.rig import Cone, Rig, find_rig
 
 SENSOR_OF_BAND = {"blue": "B", "green": "G", "red": "R", "nir": "N", "red edge": "E"}

@@ -7,10 +7,10 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from daemon.disk.mission import Mission
 from daemon.exposure import Exposure
-from daemon.footprints import seen_from
-from daemon.mission import Mission
-from daemon.orientation import exposures_of, mount_of
+from daemon.orientation.exterior import exposures_of, mount_of
+from daemon.orientation.footprints import seen_from
 from daemon.plan.advisor import Taken
 from daemon.plan.model import Point, Specification
 from processing.rig import load_rig

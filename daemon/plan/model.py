@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from daemon.navigation import metres_per_degree
+from daemon.flight.navigation import metres_per_degree
 
 
 class Point(NamedTuple):

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from daemon.configuration import MountSection
 from daemon.exposure import Exposure
-from daemon.footprints import seen_from
+from daemon.orientation.footprints import seen_from
 from daemon.plan.advisor import inside
 from daemon.plan.model import Plane, Point
 from processing.rig import Rig

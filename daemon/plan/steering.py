@@ -1,7 +1,8 @@
 """From a plan to the next exposure: which line is being flown, and when its next place is reached.
 
 Pure decisions on positions and a clock handed in, with the methods of the policies in
-`daemon.triggering`. Places are fixed on the ground: a line gives the same ones flown either way.
+`daemon.flight.triggering`. Places are fixed on the ground: a line gives the same ones flown either
+way.
 """
 
 from __future__ import annotations

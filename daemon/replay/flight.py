@@ -13,20 +13,20 @@ from pathlib import Path
 from typing import Any
 
 from daemon.configuration import Configuration
-from daemon.decisions import Decision, decision_of, tick
-from daemon.devices import device_specs
+from daemon.disk.flight_log import read
+from daemon.disk.level0_folder import hash_file
+from daemon.disk.log_records import LoggedRecord, LoggedTrigger, Message, message_of, record_of
+from daemon.disk.mission import Mission
+from daemon.disk.records import RecordError, parse_record
+from daemon.disk.recovery import LEDGER_TOPIC
 from daemon.exposure import Capture, Exposure, FrameRecord
-from daemon.flight import Flight, Identity
-from daemon.flight_log import read
-from daemon.hearing import Hearing
-from daemon.ledger import Ledger
-from daemon.level0_folder import hash_file
-from daemon.log_records import LoggedRecord, LoggedTrigger, Message, message_of, record_of
-from daemon.mission import Mission
-from daemon.records import RecordError, parse_record
-from daemon.recovery import LEDGER_TOPIC
-from daemon.recovery_match import pulse_of
+from daemon.flight.decisions import Decision, decision_of, tick
+from daemon.flight.flight import Flight, Identity
+from daemon.flight.ledger import Ledger
+from daemon.flight.recovery_match import pulse_of
 from daemon.replay.codecs import Decoded, codec_for, decode_all
+from daemon.service.devices import device_specs
+from daemon.service.hearing import Hearing
 from drivers.contract import (
     ClockReading,
     DeviceEvent,
@@ -35,7 +35,7 @@ from drivers.contract import (
     RawBytes,
     TemperatureSample,
 )
-from processing.quality import Flag
+from processing.quality.report import Flag
 from processing.rig import Rig
 
 MadeIdentity = Callable[[str], Identity]

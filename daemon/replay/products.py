@@ -17,20 +17,20 @@ from typing import Any
 import numpy as np
 import tifffile
 
-from daemon.conditions import conditions_of
+from daemon.disk.level0_folder import EXPOSURE_FILE, load_level0
+from daemon.disk.mission import Mission
+from daemon.disk.records import RecordError, canonical_bytes, parse_record, sha256_hex
 from daemon.errors import DaemonError
 from daemon.exposure import Exposure, exposure_bytes
-from daemon.lanes import Lanes
-from daemon.level0_folder import EXPOSURE_FILE, load_level0
-from daemon.messages import WorkerSettings
-from daemon.mission import Mission
-from daemon.orientation import mount_of
+from daemon.orientation.exterior import mount_of
 from daemon.plan.overlaps import Overlaps
-from daemon.records import RecordError, canonical_bytes, parse_record, sha256_hex
+from daemon.products.conditions import conditions_of
 from daemon.replay.flight import Replayed
-from daemon.worker import make_pipeline, make_products, settle_threads
+from daemon.service.lanes import Lanes
+from daemon.service.messages import WorkerSettings
+from daemon.service.worker import make_pipeline, make_products, settle_threads
 from processing.pipeline import Pipeline
-from processing.quality import Flag
+from processing.quality.report import Flag
 from processing.rig import Rig
 
 UNTIMED = frozenset({"timings_s", "duration_s"})

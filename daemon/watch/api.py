@@ -25,7 +25,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.exceptions import HTTPException as StarletteHTTPException
 from starlette.websockets import WebSocketDisconnect
 
-from daemon.mission import exposure_name
+from daemon.disk.mission import exposure_name
 from daemon.watch.coverage import Coverage
 from daemon.watch.gate import Gate, NoAnswerError
 from daemon.watch.metrics import exposition

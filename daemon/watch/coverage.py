@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from daemon.configuration import ConfigurationError
+from daemon.disk.mission import Mission
 from daemon.errors import DaemonError
-from daemon.mission import Mission
-from daemon.orientation import mount_of
+from daemon.orientation.exterior import mount_of
 from daemon.plan.advisor import Advice, Segment, Taken, advise
 from daemon.plan.image_size import image_on_ground_m
 from daemon.plan.model import Plan, Plane, PlannedLine, Point

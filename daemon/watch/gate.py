@@ -10,7 +10,7 @@ import itertools
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from daemon.messages import Answer, Command
+from daemon.service.messages import Answer, Command
 
 ANSWER_TIMEOUT_S = 5.0
 

@@ -12,7 +12,7 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from daemon.phases import Phase
+from daemon.flight.phases import Phase
 from daemon.watch.state import FlightState
 
 PHASES = tuple(phase.value for phase in Phase)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from daemon.mission import exposure_name
+from daemon.disk.mission import exposure_name
 
 PIECE_BYTES = 700
 """A piece fits into a datagram, and into the burst of the thinnest link."""

@@ -14,14 +14,14 @@ from typing import Any
 import uvicorn
 
 from daemon.configuration import ConfigurationError, MountSection, WatchSection
+from daemon.disk.mission import Mission
+from daemon.disk.records import RecordError
 from daemon.errors import DaemonError
 from daemon.exposure import navigation_from_json
-from daemon.footprints import seen_from
-from daemon.messages import Answer, Ping, Pong, Stop, Told
-from daemon.mission import Mission
-from daemon.orientation import mount_of
-from daemon.processes import Link
-from daemon.records import RecordError
+from daemon.orientation.exterior import mount_of
+from daemon.orientation.footprints import seen_from
+from daemon.service.messages import Answer, Ping, Pong, Stop, Told
+from daemon.service.processes import Link
 from daemon.watch.api import WatchSettings, create_app
 from daemon.watch.control_socket import ControlError, ControlSocket
 from daemon.watch.coverage import Coverage

@@ -10,8 +10,8 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from daemon.latches import DELIVERS, IS_GONE, Latches
-from daemon.phases import Phase
+from daemon.flight.latches import DELIVERS, IS_GONE, Latches
+from daemon.flight.phases import Phase
 from daemon.watch.pictures import Pictures
 
 PHASES = frozenset(phase.value for phase in Phase)

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from daemon import durable
+from daemon.disk import durable
 from daemon.errors import DaemonError
 
 Role = Literal["watch", "command"]

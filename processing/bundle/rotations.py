@@ -2,7 +2,7 @@
 
 Unknown rotations are improved by a rotation vector about the camera's own axes, R exp([d]x), which
 has no singular attitude; angles are for people. The order of angles is that of
-`processing.rotation`.
+`processing.geometry.rotation`.
 """
 
 from __future__ import annotations

@@ -23,9 +23,9 @@ from typing import Final, Literal
 
 from processing.bundle.network import Camera
 from processing.bundle.terms import Kind, Part, Term
-from processing.placement import nominal_placements
+from processing.geometry.placement import nominal_placements
+from processing.geometry.topology import footprint
 from processing.rig import Rig
-from processing.topology import footprint
 
 SetName = Literal["none", "radial", "sensors", "sensors-full"]
 SETS: Final[tuple[SetName, ...]] = ("none", "radial", "sensors", "sensors-full")

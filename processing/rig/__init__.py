@@ -1,8 +1,8 @@
 """The rig: what the camera is made of, and the file that says so.
 
 A leaf: it imports nothing of ours. What follows from the geometry (overlaps, parameter counts) is
-in `processing.topology`; where a sensor's pixels fall in the virtual image is in
-`processing.placement`.
+in `processing.geometry.topology`; where a sensor's pixels fall in the virtual image is in
+`processing.geometry.placement`.
 """
 
 from processing.rig.file import (

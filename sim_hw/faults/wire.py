@@ -11,8 +11,8 @@ import itertools
 import time
 from typing import Protocol
 
+from sim_hw.devices.serving import LineDevice
 from sim_hw.faults.channel import Channel
-from sim_hw.serving import LineDevice
 from sim_hw.world_clock import WorldClock
 
 NOISE_BYTES = 2000

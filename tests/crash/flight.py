@@ -17,15 +17,25 @@ from typing import Any, Literal
 
 import numpy as np
 
-from daemon import durable, log_seals, writer
+from daemon.disk import durable, log_seals
+from daemon.disk.level0_folder import read_sealed
+from daemon.disk.level2 import write_level2
+from daemon.disk.log_records import LoggedTrigger, message_of
+from daemon.disk.mission import Mission
+from daemon.disk.recovery import recover
 from daemon.exposure import Exposure
-from daemon.level0_folder import read_sealed
-from daemon.log_records import LoggedTrigger, message_of
-from daemon.messages import Log, NoteProducts, Seal, Sealed, Stop, Store, Stored, WriteFailed
-from daemon.mission import Mission
-from daemon.products import write_level2
-from daemon.recovery import recover
-from daemon.recovery_match import seal_from_log
+from daemon.flight.recovery_match import seal_from_log
+from daemon.service import writer
+from daemon.service.messages import (
+    Log,
+    NoteProducts,
+    Seal,
+    Sealed,
+    Stop,
+    Store,
+    Stored,
+    WriteFailed,
+)
 from drivers.contract import TriggerPulse
 from tests.daemon.small_camera import (
     SENSORS,

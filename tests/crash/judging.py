@@ -7,16 +7,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from daemon.catalog import Catalog
-from daemon.flight_log import logs_of, read
-from daemon.ledger import Ledger
-from daemon.level0 import read_tiff
-from daemon.level0_folder import read_sealed
-from daemon.log_records import Message
-from daemon.mission import Mission
-from daemon.recovery import RecoveryReport, recover
-from daemon.recovery_match import seal_from_log
-from daemon.store import Level0Writer, verify
+from daemon.disk.catalog import Catalog
+from daemon.disk.flight_log import logs_of, read
+from daemon.disk.level0 import read_tiff
+from daemon.disk.level0_folder import read_sealed
+from daemon.disk.log_records import Message
+from daemon.disk.mission import Mission
+from daemon.disk.recovery import RecoveryReport, recover
+from daemon.disk.store import Level0Writer, verify
+from daemon.flight.ledger import Ledger
+from daemon.flight.recovery_match import seal_from_log
 from tests.daemon.small_camera import final_record, pixels_of, small_rig, store_one
 
 MAY_BE_TOLD = ("was damaged on the disk; read with care",)

@@ -12,14 +12,22 @@ from typing import Any
 
 import typer
 
-from daemon import departure, service
 from daemon.cli.run import run
-from daemon.messages import FramesRead, Ping, Pong, Process, ProcessFailed, Stop, WorkerReady
-from daemon.processes import Link
+from daemon.service import departure, service
+from daemon.service.messages import (
+    FramesRead,
+    Ping,
+    Pong,
+    Process,
+    ProcessFailed,
+    Stop,
+    WorkerReady,
+)
+from daemon.service.processes import Link
 
 
 def idle_worker(link: Link, _settings: Any, _rings: Any) -> None:
-    """In the place of `daemon.worker.main`."""
+    """In the place of `daemon.service.worker.main`."""
     link.send(WorkerReady(0.0))
     while not isinstance(order := link.receive(timeout_s=1.0), Stop):
         if isinstance(order, Ping):

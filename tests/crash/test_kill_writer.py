@@ -10,7 +10,7 @@ from tempfile import mkdtemp
 
 import pytest
 
-from daemon import durable
+from daemon.disk import durable
 from tests.crash.prefixes import ROOT
 from tests.crash.test_prefixes import MEMORY
 

@@ -10,12 +10,12 @@ import pytest
 from typer.testing import CliRunner
 
 from daemon.cli import app
+from daemon.disk.mission import Mission
 from daemon.displacements import write_displacements
-from daemon.mission import Mission
 from daemon.report import write_report
+from processing.mosaic.stitch_record import stitch_record_json
 from processing.rig import shipped_rigs
-from processing.stitch_record import stitch_record_json
-from tests.processing.test_flight_validity import Moves, records_of
+from tests.processing.mosaic.test_flight_validity import Moves, records_of
 
 
 def landed(root: Path, moves: Moves) -> Path:

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from daemon.disk.records import RecordError, parse_record
 from daemon.exposure import (
     Capture,
     Exposure,
@@ -20,7 +21,6 @@ from daemon.exposure import (
     from_json,
     to_json,
 )
-from daemon.records import RecordError, parse_record
 from tests.daemon.small_camera import capture_of, final_record
 
 instants = st.none() | st.integers(-(2**63) + 1, 2**63 - 1)

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from daemon.disk.mission import Mission
+from daemon.disk.records import parse_record
+from daemon.disk.store import load_level0, verify
 from daemon.exposure import Exposure, NavigationRecord, capture_bytes, from_json, to_json
-from daemon.mission import Mission
-from daemon.records import parse_record
-from daemon.store import load_level0, verify
-from processing.quality import FIGURES, Flag
+from processing.quality.report import FIGURES, Flag
 from processing.rig import Cone, Drift, Lens, Rig, Sensor, VirtualImage, load_rig
 from tests.daemon.small_camera import (
     HEIGHT_PX,
@@ -138,7 +138,7 @@ def test_every_key_of_a_rig_file_is_named(page):
 def test_a_hand_written_exposure_with_mistakes_is_refused_with_all_of_them(tmp_path):
     import tifffile
 
-    from daemon.records import RecordError
+    from daemon.disk.records import RecordError
 
     folder = tmp_path / "m" / "L0" / "000001"
     folder.mkdir(parents=True)

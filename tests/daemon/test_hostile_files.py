@@ -19,14 +19,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 
-from daemon.catalog import Catalog, CatalogError
-from daemon.flight_log import RECORD_MAX_NBYTES, FlightLog, read
-from daemon.level0 import RasterError, read_description, read_tiff, tiff_parts
-from daemon.log_records import record_of
-from daemon.mission import Mission, MissionError
+from daemon.disk.catalog import Catalog, CatalogError
+from daemon.disk.flight_log import RECORD_MAX_NBYTES, FlightLog, read
+from daemon.disk.level0 import RasterError, read_description, read_tiff, tiff_parts
+from daemon.disk.log_records import record_of
+from daemon.disk.mission import Mission, MissionError
+from daemon.disk.recovery import recover
+from daemon.disk.store import verify
 from daemon.plan.reading import PlanError, read_plan
-from daemon.recovery import recover
-from daemon.store import verify
 from tests.daemon.small_camera import complete_from_log, fly, new_mission
 
 MEMORY_BYTES = 40_000_000

@@ -13,22 +13,22 @@ import pytest
 import tifffile
 from typer.testing import CliRunner
 
-from daemon.bands import make_band_pipeline
 from daemon.cli import app
-from daemon.conditions import conditions_of
 from daemon.configuration import PlanSection
+from daemon.disk.mission import Mission
+from daemon.disk.store import load_level0
 from daemon.importers.rededge import (
     ImagesError,
     gps_ns_from_utc,
     import_rededge,
     read_image,
 )
-from daemon.mission import Mission
-from daemon.store import load_level0
-from processing.band_registration import band_placements, reference_image
-from processing.placement import vip_mm_from_raw, vip_px_from_mm
-from processing.projective import apply_projective
-from processing.quality import Flag
+from daemon.products.bands import make_band_pipeline
+from daemon.products.conditions import conditions_of
+from processing.geometry.placement import vip_mm_from_raw, vip_px_from_mm
+from processing.geometry.projective import apply_projective
+from processing.image.band_registration import band_placements, reference_image
+from processing.quality.report import Flag
 from processing.rig import load_rig
 from tests.daemon.rededge_data import RECORDED, needs_recording, packet, write_tiff
 

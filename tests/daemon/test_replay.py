@@ -11,13 +11,13 @@ import tifffile
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daemon.decisions import Decision, decision_of
-from daemon.log_records import Message
+from daemon.disk.log_records import Message
+from daemon.flight.decisions import Decision, decision_of
 from daemon.replay.codecs import Decoded, codec_for, decode_all
 from daemon.replay.flight import Replayed
 from daemon.replay.products import content_hash
 from drivers.contract import DeviceEvent, NavSample, RawBytes
-from sim_hw.nmea_sentences import nmea
+from sim_hw.receivers.nmea_sentences import nmea
 
 SECOND_NS = 1_000_000_000
 EPOCHS = 5

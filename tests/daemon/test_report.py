@@ -6,9 +6,9 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-from daemon.ledger import Ledger
+from daemon.disk.store import Level0Writer
+from daemon.flight.ledger import Ledger
 from daemon.report import write_report
-from daemon.store import Level0Writer
 from tests.daemon.small_camera import SENSORS, final_record, new_mission, store_one
 
 

@@ -401,8 +401,12 @@ def packets_fit_the_network() -> dict[str, object]:
 
 def light_that_changes_is_followed() -> dict[str, object]:
     """The emulated head in a light that falls to a tenth and comes back; the law steers it."""
-    from processing.exposure_control import ExposureLimits, ExposureSettings, next_settings
-    from processing.histogram import sampled_histogram
+    from processing.radiometry.exposure_control import (
+        ExposureLimits,
+        ExposureSettings,
+        next_settings,
+    )
+    from processing.radiometry.histogram import sampled_histogram
     from sim_hw.gige.head import ExposureRequest, FrameSize, GigeHead, HeadIdentity
     from sim_hw.world_clock import DeviceClock
 

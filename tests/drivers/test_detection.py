@@ -26,15 +26,15 @@ from drivers.ascii_line.pattern import LinePattern
 from drivers.detection.evidence import Evidence
 from drivers.detection.lines import lines_in
 from drivers.detection.search import Found, search
-from sim_hw.ascii_probe import AsciiProbe
-from sim_hw.mavlink_autopilot import MavlinkAutopilot
-from sim_hw.modbus_probe import ModbusProbe
-from sim_hw.network_line import TcpLine, UdpLine
-from sim_hw.nmea_receiver import NmeaReceiver
-from sim_hw.novatel_receiver import NovatelReceiver
-from sim_hw.septentrio_receiver import SeptentrioReceiver
-from sim_hw.serving import LineDevice
-from sim_hw.ublox_receiver import UbloxReceiver
+from sim_hw.devices.ascii_probe import AsciiProbe
+from sim_hw.devices.modbus_probe import ModbusProbe
+from sim_hw.devices.network_line import TcpLine, UdpLine
+from sim_hw.devices.serving import LineDevice
+from sim_hw.receivers.mavlink_autopilot import MavlinkAutopilot
+from sim_hw.receivers.nmea_receiver import NmeaReceiver
+from sim_hw.receivers.novatel_receiver import NovatelReceiver
+from sim_hw.receivers.septentrio_receiver import SeptentrioReceiver
+from sim_hw.receivers.ublox_receiver import UbloxReceiver
 from sim_hw.world_clock import WorldClock
 from tests.drivers.uart_relay import UartRelay, sampled
 from tests.sim_hw.receiver_state import state_at

@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from daemon.level0 import tiff_parts
+from daemon.disk.level0 import tiff_parts
 from drivers.contract import CHUNK_ALLOWANCE_NBYTES, DeviceError, Frame, FrameStatus, Record
 from drivers.folder.frames import FrameFileError, read_frame
 from drivers.folder.head import FolderHead

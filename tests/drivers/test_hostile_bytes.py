@@ -19,12 +19,12 @@ from drivers.nmea.decoder import NmeaDecoder
 from drivers.novatel.decoder import NovatelDecoder
 from drivers.septentrio.decoder import SbfDecoder
 from drivers.ublox.decoder import UbxDecoder
-from sim_hw.mavlink_autopilot import MavlinkAutopilot
-from sim_hw.nmea_receiver import NmeaReceiver
-from sim_hw.novatel_receiver import NovatelReceiver
-from sim_hw.receiver import Edge, EmulatedReceiver
-from sim_hw.septentrio_receiver import SeptentrioReceiver
-from sim_hw.ublox_receiver import UbloxReceiver
+from sim_hw.receivers.mavlink_autopilot import MavlinkAutopilot
+from sim_hw.receivers.nmea_receiver import NmeaReceiver
+from sim_hw.receivers.novatel_receiver import NovatelReceiver
+from sim_hw.receivers.receiver import Edge, EmulatedReceiver
+from sim_hw.receivers.septentrio_receiver import SeptentrioReceiver
+from sim_hw.receivers.ublox_receiver import UbloxReceiver
 from sim_hw.world_clock import WorldClock
 from tests.sim_hw.receiver_state import NS, START_GPS_NS, state_at
 

@@ -23,11 +23,11 @@ from drivers.mavlink.boot_clock import GPS_EPOCH_UNIX_NS, BootClock
 from drivers.mavlink.decoder import MavlinkDecoder, Timesync, angles_of, between
 from drivers.mavlink.navigator import MavlinkNavigator
 from drivers.message_decoder import Nav
-from sim_hw.mavlink_autopilot import MavlinkAutopilot
-from sim_hw.network_line import TcpLine, UdpLine
-from sim_hw.pseudo_terminal import PseudoTerminal
-from sim_hw.receiver import ReceiverState
-from sim_hw.serving import Line
+from sim_hw.devices.network_line import TcpLine, UdpLine
+from sim_hw.devices.pseudo_terminal import PseudoTerminal
+from sim_hw.devices.serving import Line
+from sim_hw.receivers.mavlink_autopilot import MavlinkAutopilot
+from sim_hw.receivers.receiver import ReceiverState
 from sim_hw.world_clock import WorldClock
 from tests.drivers.stand_ins import FakeClock, FakePort, Notebook, running
 from tests.sim_hw.receiver_state import STATE

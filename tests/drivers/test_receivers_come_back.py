@@ -17,14 +17,14 @@ from typing import Any
 
 from drivers import registry
 from drivers.contract import EventMark, NavSample
-from sim_hw.mavlink_autopilot import MavlinkAutopilot
-from sim_hw.network_line import UdpLine
-from sim_hw.nmea_receiver import NmeaReceiver
-from sim_hw.novatel_receiver import NovatelReceiver
-from sim_hw.pseudo_terminal import PseudoTerminal
-from sim_hw.receiver import EmulatedReceiver
-from sim_hw.septentrio_receiver import SeptentrioReceiver
-from sim_hw.ublox_receiver import UbloxReceiver
+from sim_hw.devices.network_line import UdpLine
+from sim_hw.devices.pseudo_terminal import PseudoTerminal
+from sim_hw.receivers.mavlink_autopilot import MavlinkAutopilot
+from sim_hw.receivers.nmea_receiver import NmeaReceiver
+from sim_hw.receivers.novatel_receiver import NovatelReceiver
+from sim_hw.receivers.receiver import EmulatedReceiver
+from sim_hw.receivers.septentrio_receiver import SeptentrioReceiver
+from sim_hw.receivers.ublox_receiver import UbloxReceiver
 from sim_hw.world_clock import WorldClock
 from tests.drivers.stand_ins import Notebook
 from tests.sim_hw.receiver_state import state_at

@@ -29,13 +29,13 @@ from drivers.trigger.pulse_bus import PulseBusTrigger
 from drivers.ublox.decoder import UbxDecoder
 from sim_hw.gige.control import Actions, ControlChannel
 from sim_hw.gige.registers import FrameSize, HeadIdentity, RegisterMemory
-from sim_hw.mavlink_autopilot import MavlinkAutopilot
-from sim_hw.mavlink_messages import by_number, x25
-from sim_hw.nmea_receiver import NmeaReceiver
-from sim_hw.novatel_receiver import NovatelReceiver
-from sim_hw.receiver import EmulatedReceiver, ReceiverState
-from sim_hw.septentrio_receiver import SeptentrioReceiver
-from sim_hw.ublox_receiver import UbloxReceiver
+from sim_hw.receivers.mavlink_autopilot import MavlinkAutopilot
+from sim_hw.receivers.mavlink_messages import by_number, x25
+from sim_hw.receivers.nmea_receiver import NmeaReceiver
+from sim_hw.receivers.novatel_receiver import NovatelReceiver
+from sim_hw.receivers.receiver import EmulatedReceiver, ReceiverState
+from sim_hw.receivers.septentrio_receiver import SeptentrioReceiver
+from sim_hw.receivers.ublox_receiver import UbloxReceiver
 from sim_hw.world_clock import WorldClock
 from tests.drivers.stand_ins import FakeClock
 

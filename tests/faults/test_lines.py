@@ -11,14 +11,14 @@ import pytest
 import serial
 from pyubx2 import UBX_PROTOCOL, UBXReader
 
+from sim_hw.devices.modbus_probe import ModbusProbe
+from sim_hw.devices.pseudo_terminal import PseudoTerminal
+from sim_hw.devices.serving import LineDevice
 from sim_hw.faults.channel import BytesDamage, Channel
 from sim_hw.faults.plan import Planned
 from sim_hw.faults.wire import FaultyWire, FaultyWorldClock
-from sim_hw.modbus_probe import ModbusProbe
-from sim_hw.pseudo_terminal import PseudoTerminal
-from sim_hw.receiver import ReceiverState
-from sim_hw.serving import LineDevice
-from sim_hw.ublox_receiver import UbloxReceiver
+from sim_hw.receivers.receiver import ReceiverState
+from sim_hw.receivers.ublox_receiver import UbloxReceiver
 from sim_hw.world_clock import NS_PER_WEEK, WorldClock
 
 WITHIN_S = 20.0

@@ -8,22 +8,22 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.mosaic import free_mosaic
-from processing.mosaic_model import MosaicModel, placement_at
-from processing.placement import (
+from processing.geometry.placement import (
     SensorPlacement,
     nominal_placements,
     raw_from_vip_mm,
 )
-from processing.rig import Rig
-from processing.tie_points import PAN_TO_COLOUR, PAN_TO_PAN, TiePoints
-from processing.topology import (
+from processing.geometry.topology import (
     Rectangle,
     colour_coverage,
     colour_ratio,
     exact_colour_ratio,
     overlaps,
 )
+from processing.matching.tie_points import PAN_TO_COLOUR, PAN_TO_PAN, TiePoints
+from processing.mosaic.free import free_mosaic
+from processing.mosaic.model import MosaicModel, placement_at
+from processing.rig import Rig
 
 Array = NDArray[np.float64]
 

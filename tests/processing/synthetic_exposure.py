@@ -1,8 +1,8 @@
 """A synthetic exposure for the imaging tests: noise texture in the virtual image plane.
 
 The ground is flat and all cones look from one place, so that one function of the virtual image
-plane is the truth of every sensor. Where pixels look is taken from `processing.placement`, which
-is checked elsewhere against an oracle of its own; what is tested here is everything after it.
+plane is the truth of every sensor. Where pixels look is taken from `processing.geometry.placement`,
+which is checked elsewhere against an oracle of its own; what is tested here is everything after it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-from processing.placement import nominal_placements, vip_mm_from_raw, vip_px_from_mm
+from processing.geometry.placement import nominal_placements, vip_mm_from_raw, vip_px_from_mm
 from processing.rig import Rig
 
 MARGIN_PX = 120

@@ -10,16 +10,16 @@ def test_installation_leaves_every_kernel_that_is_called_from_python_ready() -> 
     done = compile_for(find_rig("ultracam-x-mini"))
     assert set(done.variants) == set(kernels())
     called = {
-        "level1.flat_pass",
-        "level1.map_pass",
-        "level1.interpolate_defects",
-        "features.select_features",
-        "matching.match_patches",
-        "balance.node_means",
-        "seams.cheapest_path",
-        "seams.feather",
-        "resampling.resample",
-        "quicklook.block_means",
+        "radiometry.level1.flat_pass",
+        "radiometry.level1.map_pass",
+        "radiometry.level1.interpolate_defects",
+        "matching.features.select_features",
+        "matching.patches.match_patches",
+        "image.balance.node_means",
+        "image.seams.cheapest_path",
+        "image.seams.feather",
+        "image.resampling.resample",
+        "image.quicklook.block_means",
     }
     ready = {name.removeprefix("processing.") for name, count in done.variants.items() if count}
     assert ready >= called

@@ -12,7 +12,7 @@ from processing.conditions import (
     parallax_px,
     usable_temperatures,
 )
-from processing.quality import Figure, Flag, Thresholds
+from processing.quality.report import Figure, Flag, Thresholds
 from processing.rig import Rig, find_rig
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks.hard_scenes import SCENES, Camera, Outcome
 from processing.pipeline import Product
-from processing.quality import Flag
+from processing.quality.report import Flag
 
 pytestmark = pytest.mark.timeout(600)
 

@@ -10,7 +10,7 @@ import pytest
 from processing.conditions import Conditions
 from processing.perspective import HeadPipeline, looks_apart, perspective_of, raw_of_perspective
 from processing.rig import Cone, Rig, find_rig
-from sim_hw.camera import true_camera, undistorted
+from sim_hw.world.camera import true_camera, undistorted
 
 
 def distorting(name: str, size_mm: float) -> Rig:

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from processing.compiled import kernels, variants
-from processing.drawing import residuals_svg
-from processing.lattice import colour_raster
+from processing.geometry.placement import nominal_placements, vip_mm_from_raw, vip_px_from_mm
+from processing.image.lattice import colour_raster
+from processing.mosaic.drawing import residuals_svg
+from processing.mosaic.residual_vectors import residual_vectors
 from processing.pipeline import Conditions, Pipeline, Product, Settings
-from processing.placement import nominal_placements, vip_mm_from_raw, vip_px_from_mm
-from processing.quality import FIGURES, Flag, Verdict, as_json
-from processing.residual_vectors import residual_vectors
+from processing.quality.report import FIGURES, Flag, Verdict, as_json
 from processing.rig import Rig, find_rig
 from tests.processing.synthetic_exposure import Exposure, expose
 

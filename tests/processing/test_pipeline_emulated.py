@@ -14,17 +14,17 @@ import pytest
 from numpy.typing import NDArray
 
 from processing.pipeline import Conditions, Pipeline, Product, Settings
-from processing.quality import Flag, Verdict
-from processing.radiometry import load_radiometry
+from processing.quality.report import Flag, Verdict
+from processing.radiometry.calibration import load_radiometry
 from processing.rig import shipped_rigs
-from sim_hw import laboratory
-from sim_hw.electronics import Electronics, true_sensor
-from sim_hw.flight import Flight
-from sim_hw.rendering import Look, light_on_sensor
-from sim_hw.scene import open_scene
 from sim_hw.seeding import random_stream
-from sim_hw.truth import true_vip
-from sim_hw.world import World, WorldSettings
+from sim_hw.world import laboratory
+from sim_hw.world.electronics import Electronics, true_sensor
+from sim_hw.world.flight import Flight
+from sim_hw.world.rendering import Look, light_on_sensor
+from sim_hw.world.scene import open_scene
+from sim_hw.world.truth import true_vip
+from sim_hw.world.world import World, WorldSettings
 
 EPOCH = 1_400_000_000_000_000_000
 DISPLACED = (1.0, -0.6)

@@ -23,15 +23,15 @@ import serial
 from pymodbus.client import ModbusSerialClient
 from pyubx2 import UBXReader
 
-from sim_hw.electronics import Electronics, true_sensor
 from sim_hw.gige import features as at
 from sim_hw.head_process import FirstLine
-from sim_hw.rendering import Look, light_on_sensor
-from sim_hw.scene import open_scene
 from sim_hw.simulator import SimulatorError, head_addresses
-from sim_hw.truth import world_of
-from sim_hw.world import World, WorldSettings
-from tests.sim_hw.test_gige_head import Controller
+from sim_hw.world.electronics import Electronics, true_sensor
+from sim_hw.world.rendering import Look, light_on_sensor
+from sim_hw.world.scene import open_scene
+from sim_hw.world.truth import world_of
+from sim_hw.world.world import World, WorldSettings
+from tests.sim_hw.gige.test_head import Controller
 
 READY_WITHIN_S = 90.0
 ENDS_WITHIN_S = 60.0

@@ -13,9 +13,9 @@ import tifffile
 from numpy.typing import NDArray
 from pyubx2 import UBXReader
 
-from sim_hw.rendering import render_ideal
-from sim_hw.scene import open_scene
-from sim_hw.truth import world_of
+from sim_hw.world.rendering import render_ideal
+from sim_hw.world.scene import open_scene
+from sim_hw.world.truth import world_of
 from tests.system.flown import Flown, syntopic
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(400)]

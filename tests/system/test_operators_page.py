@@ -26,7 +26,7 @@ from daemon.cli.sim import Emulator, free_first_address, service_toml, simulator
 from daemon.plan.model import Plane, Point
 from daemon.plan.reading import read_plan
 from daemon.watch.tokens import add_token
-from sim_hw.flight import FlightPlan
+from sim_hw.world.flight import FlightPlan
 from tests.browser import Browser, chromium
 from tests.system.flown import ROOT, Flown
 

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from daemon import worker
 from daemon.configuration import MountSection
+from daemon.disk.mission import Mission
 from daemon.exposure import Exposure, NavigationRecord
-from daemon.mission import Mission
 from daemon.plan.model import Plane, Point
 from daemon.plan.overlaps import Overlaps, Surroundings
+from daemon.service import worker
 from processing.rig import find_rig
 
 RIG = find_rig("ultracam-x-mini")

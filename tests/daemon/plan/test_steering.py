@@ -12,7 +12,7 @@ import pytest
 from daemon.plan.model import Plan, Plane, PlannedLine, Point
 from daemon.plan.steering import PlanTrigger
 from drivers.contract import NavSample
-from tests.daemon.test_flight import nav as any_sample
+from tests.daemon.flight.test_flight import nav as any_sample
 
 NS = 1_000_000_000
 ORIGIN = Point(48.0, 11.0)

@@ -10,7 +10,7 @@ import msgpack
 import pytest
 from fastapi.testclient import TestClient
 
-from daemon.messages import Answer, Command
+from daemon.service.messages import Answer, Command
 from daemon.watch.api import WatchSettings, create_app
 from daemon.watch.gate import Gate
 from daemon.watch.state import FlightState

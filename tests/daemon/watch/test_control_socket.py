@@ -18,7 +18,7 @@ from typing import Any
 
 import pytest
 
-from daemon.messages import Answer, Command
+from daemon.service.messages import Answer, Command
 from daemon.watch.control_socket import Caller, ControlError, ControlSocket, caller_of, give
 from daemon.watch.gate import Gate
 from daemon.watch.state import FlightState

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from daemon.configuration import MavlinkCameraSection
-from daemon.messages import Answer, Command
+from daemon.service.messages import Answer, Command
 from daemon.watch.gate import Gate
 from daemon.watch.mavlink_camera import MavlinkCamera
 from daemon.watch.state import FlightState

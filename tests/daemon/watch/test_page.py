@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from daemon.configuration import WatchSection
-from daemon.messages import Answer, Command, Stop, Told
-from daemon.processes import Child
+from daemon.service.messages import Answer, Command, Stop, Told
+from daemon.service.processes import Child
 from daemon.watch.tokens import add_token
 from tests.browser import Browser, chromium
 from tests.daemon.watch import flown

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from daemon.configuration import WatchSection
-from daemon.messages import Stop, Told
-from daemon.processes import Child
+from daemon.service.messages import Stop, Told
+from daemon.service.processes import Child
 from tests.daemon.watch import flown
 
 WATCHERS, STALLED, EXPOSURES = 50, 10, 60

@@ -14,7 +14,7 @@ from processing.bundle.network import Camera
 from processing.bundle.self_calibration import SETS, parameter_count, parts_of, self_calibrating
 from processing.bundle.terms import part_of
 from processing.rig import find_rig
-from sim_hw.block import (
+from sim_hw.blocks.aerial import (
     Block,
     Errors,
     ccd_pattern,

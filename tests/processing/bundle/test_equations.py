@@ -17,9 +17,9 @@ from processing.bundle.rotations import (
     omega_phi_kappa,
 )
 from processing.bundle.unknowns import improved, layout_of, starting_state
-from processing.lens import ideal_from_measured
+from processing.geometry.lens import ideal_from_measured
+from processing.geometry.rotation import rotation_matrix
 from processing.rig import find_rig
-from processing.rotation import rotation_matrix
 from tests.processing.bundle.networks import aerial, turned, with_everything
 
 

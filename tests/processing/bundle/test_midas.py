@@ -10,7 +10,7 @@ import pytest
 from benchmarks.midas_block import Repeated, network_of, repeated
 from processing.bundle.adjust import adjust
 from processing.bundle.intersection import carried_covariance, intersection, orientation_layout
-from sim_hw.oblique import HEADS, TABLE_2_GRAD, Noise, flown_obliquely, table_2_rotation
+from sim_hw.blocks.oblique import HEADS, TABLE_2_GRAD, Noise, flown_obliquely, table_2_rotation
 
 
 @pytest.fixture(scope="module")

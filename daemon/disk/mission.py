@@ -1,0 +1,275 @@
+"""The mission folder: where things lie in it, how it comes to be, and which one is being flown.
+
+What is written into it, and how, is in `daemon.disk.store`, `daemon.disk.level2` and
+`daemon.disk.flight_log`.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from daemon.disk import durable
+from daemon.disk.records import canonical_bytes, parse_record, plain_name, sha256_hex
+from daemon.errors import DaemonError
+
+CURRENT_FILE = "current-mission.json"
+"""In the root: which mission a restarted service continues; absent between flights."""
+
+MISSION_FORMAT = 1
+DISCARDED = ".discarded"
+"""In L0: what recovery set aside because nobody was ever told that it is stored."""
+
+_EXPOSURE_FOLDER = re.compile(r"[0-9]{6,12}")
+
+
+class MissionError(DaemonError):
+    """A mission folder that cannot be created, opened or used; the sentence says what to do."""
+
+
+@dataclass(frozen=True)
+class Mission:
+    """A flight's folder. `id` is its name."""
+
+    path: Path
+    id: str
+
+    @classmethod
+    def create(
+        cls,
+        root: Path,
+        rig_name: str,
+        *,
+        rig_toml: bytes,
+        service_toml: bytes,
+        plan: tuple[str, bytes] | None = None,
+        started_utc: datetime,
+        started_gps_ns: int | None = None,
+    ) -> Mission:
+        """Create a mission and make it the one a restarted service continues.
+
+        The folder appears whole or not at all. A second mission within the same second gets
+        `-2` behind its id. `plan` is how the name of the flight plan ends, and its content.
+
+        Raises:
+            MissionError: a rig name that is no file name, a time without a zone, or another
+                mission still being flown.
+            OSError: the disk refused.
+        """
+        if not plain_name(rig_name):
+            raise MissionError(f"rig name {rig_name!r}: letters, digits, '_' and '-' make an id")
+        if started_utc.tzinfo is None:
+            raise MissionError("the start of a mission is told in UTC; give a time with its zone")
+        durable.make_directories(root)
+        if (flying := cls.current(root)) is not None:
+            raise MissionError(f"mission {flying.id} is not closed; continue or close it first")
+        mission_id = _free_id(root, started_utc, rig_name)
+        part = root / f".{mission_id}{durable.PART_SUFFIX}"
+        durable.remove_tree(part)
+        part.mkdir()
+        for folder in ("L0", "L2", "log", "export"):
+            (part / folder).mkdir()
+        content = {
+            "format": MISSION_FORMAT,
+            "id": mission_id,
+            "rig": rig_name,
+            "rig_sha256": sha256_hex(rig_toml),
+            "service_sha256": sha256_hex(service_toml),
+            "started_utc": _utc_text(started_utc),
+            "started_gps_ns": None if started_gps_ns is None else str(started_gps_ns),
+        }
+        durable.create_file(part / "mission.json", [canonical_bytes(content)])
+        durable.create_file(part / "rig.toml", [rig_toml])
+        durable.create_file(part / "service.toml", [service_toml], mode=0o440)
+        if plan is not None:
+            durable.create_file(part / f"plan{plan[0]}", [plan[1]])
+        durable.rename_directory(part, root / mission_id)
+        durable.replace_file(root / CURRENT_FILE, canonical_bytes({"mission": mission_id}))
+        return cls(root / mission_id, mission_id)
+
+    @classmethod
+    def open(cls, path: Path) -> Mission:
+        """A mission folder that exists, flown or laid out by hand.
+
+        Raises:
+            MissionError: no such folder, one without exposures' folder L0, or one that holds
+                anything but plain files and folders: what a link or a pipe leads to is not ours.
+        """
+        if not path.is_dir():
+            raise MissionError(f"{path}: no such folder; give the path of a mission")
+        if not (path / "L0").is_dir():
+            raise MissionError(f"{path}: has no folder L0; a mission keeps its exposures there")
+        if (odd := _first_odd(path)) is not None:
+            raise MissionError(
+                f"{odd}: is a link, a pipe or a device; a mission holds plain files and folders: "
+                "put what it leads to in its place"
+            )
+        return cls(path, path.resolve().name)
+
+    @classmethod
+    def current(cls, root: Path) -> Mission | None:
+        """The mission being flown, or None after an orderly end.
+
+        Raises:
+            MissionError: the marker is damaged or names a folder that is gone.
+        """
+        marker = root / CURRENT_FILE
+        try:
+            content = parse_record(marker.read_bytes(), CURRENT_FILE)
+        except FileNotFoundError:
+            return None
+        mission_id = content.get("mission")
+        if not isinstance(mission_id, str) or not plain_name(mission_id):
+            raise MissionError(f"{marker}: names no mission; remove it to start a new one")
+        try:
+            return cls.open(root / mission_id)
+        except MissionError as error:
+            raise MissionError(f"{marker}: {error}; remove the file to start anew") from error
+
+    @property
+    def root(self) -> Path:
+        return self.path.parent
+
+    @property
+    def level0_root(self) -> Path:
+        return self.path / "L0"
+
+    @property
+    def level2_root(self) -> Path:
+        return self.path / "L2"
+
+    @property
+    def plan_path(self) -> Path | None:
+        """The flight plan that was flown after, where there was one."""
+        return next(iter(sorted(self.path.glob("plan.*"))), None)
+
+    @property
+    def log_dir(self) -> Path:
+        return self.path / "log"
+
+    @property
+    def export_dir(self) -> Path:
+        return self.path / "export"
+
+    @property
+    def catalog_path(self) -> Path:
+        return self.path / "mission.db"
+
+    @property
+    def rig_path(self) -> Path:
+        return self.path / "rig.toml"
+
+    @property
+    def service_path(self) -> Path:
+        return self.path / "service.toml"
+
+    def level0(self, number: int) -> Path:
+        """The folder of an exposure's frames and record."""
+        return self.level0_root / exposure_name(number)
+
+    def level2(self, number: int) -> Path:
+        """The folder of an exposure's products."""
+        return self.level2_root / exposure_name(number)
+
+    def numbers(self) -> list[int]:
+        """Numbers of the exposures whose folder is there, ascending."""
+        return sorted(
+            int(entry.name)
+            for entry in os.scandir(self.level0_root)
+            if entry.is_dir(follow_symlinks=False) and _EXPOSURE_FOLDER.fullmatch(entry.name)
+        )
+
+    def next_number(self) -> int:
+        """A number no folder bears or bore, whole, begun or set aside; the first is 1.
+
+        A trigger whose frames never came leaves no folder: `daemon.disk.recovery` knows of it from
+        the log, and its report says the number to go on with.
+        """
+        return 1 + max((number for number in self._used_numbers()), default=0)
+
+    def genesis_sha256(self) -> str:
+        """What the first record of the mission quotes: the hash of its mission.json.
+
+        Empty for a mission laid out by hand, whose records are not chained.
+        """
+        try:
+            return sha256_hex((self.path / "mission.json").read_bytes())
+        except FileNotFoundError:
+            return ""
+
+    def close(self) -> None:
+        """The flight ended in good order: a service started later begins a new mission."""
+        marker = self.root / CURRENT_FILE
+        flying = Mission.current(self.root)
+        if flying is not None and flying.id == self.id:
+            marker.unlink()
+            durable.sync_directory(self.root)
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Keep other services out of the mission for as long as this process lives.
+
+        Raises:
+            MissionError: another process holds it.
+        """
+        descriptor = os.open(self.path / ".held", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        try:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise MissionError(
+                    f"mission {self.id} is held by another process; stop that one first"
+                ) from error
+            yield
+        finally:
+            os.close(descriptor)
+
+    def _used_numbers(self) -> Iterator[int]:
+        for folder in (self.level0_root, self.level0_root / DISCARDED, self.level2_root):
+            if folder.is_dir():
+                for entry in os.scandir(folder):
+                    match = _EXPOSURE_FOLDER.match(entry.name)
+                    if match:
+                        yield int(match.group())
+
+
+def exposure_name(number: int) -> str:
+    """The name of an exposure's folder, six digits or more."""
+    if number < 1:
+        raise MissionError(f"exposure {number}: exposures are counted from 1")
+    return f"{number:06d}"
+
+
+def _first_odd(folder: Path) -> str | None:
+    """The first entry below a folder that is neither plain file nor folder; None where none is."""
+    waiting = [str(folder)]
+    while waiting:
+        try:
+            entries = list(os.scandir(waiting.pop()))
+        except FileNotFoundError:
+            continue  # a product folder that is being replaced
+        for entry in entries:
+            if entry.is_dir(follow_symlinks=False):
+                waiting.append(entry.path)
+            elif not entry.is_file(follow_symlinks=False):
+                return entry.path
+    return None
+
+
+def _free_id(root: Path, started_utc: datetime, rig_name: str) -> str:
+    first = f"{started_utc.astimezone(UTC):%Y%m%dT%H%M%SZ}-{rig_name}"
+    mission_id, repetition = first, 1
+    while (root / mission_id).exists():
+        repetition += 1
+        mission_id = f"{first}-{repetition}"
+    return mission_id
+
+
+def _utc_text(instant: datetime) -> str:
+    return f"{instant.astimezone(UTC):%Y-%m-%dT%H:%M:%S.%fZ}"

@@ -1,0 +1,1 @@
+"""Missions for other programs: orientations, pictures, certificates, logs."""

@@ -1,0 +1,214 @@
+"""A mission as one MCAP file that Foxglove opens: track, thumbnails, and what was said, in UTC.
+
+Derived from the flight logs and the records, which stay as they are. Channels are JSON with the
+schema names Foxglove knows: foxglove.LocationFix, foxglove.CompressedImage, foxglove.Log.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+from mcap.writer import Writer
+
+from daemon.disk import durable
+from daemon.disk.flight_log import logs_of, read
+from daemon.disk.log_records import record_of
+from daemon.disk.mission import Mission
+from daemon.disk.records import RecordError
+from daemon.exposure import Exposure
+from daemon.orientation.exterior import exposures_of
+from daemon.service.commanding import AUDIT_TOPIC
+from drivers.contract import DeviceEvent, NavSample
+from drivers.leap_seconds import leap_seconds_at
+
+FILE_NAME = "foxglove.mcap"
+GPS_EPOCH_UNIX_NS = 315_964_800_000_000_000
+NS = 1_000_000_000
+INFO, WARNING, ERROR = 2, 3, 4
+LEVELS = {"good": INFO, "usable": WARNING, "refly": ERROR}
+DIAGONAL_KNOWN = 2
+
+_TIME = {
+    "type": "object",
+    "title": "time",
+    "properties": {
+        "sec": {"type": "integer", "minimum": 0},
+        "nsec": {"type": "integer", "minimum": 0, "maximum": 999_999_999},
+    },
+}
+SCHEMAS: Mapping[str, Mapping[str, Any]] = {
+    "foxglove.LocationFix": {
+        "timestamp": _TIME,
+        "frame_id": {"type": "string"},
+        "latitude": {"type": "number"},
+        "longitude": {"type": "number"},
+        "altitude": {"type": "number"},
+        "position_covariance": {
+            "type": "array",
+            "items": {"type": "number"},
+            "minItems": 9,
+            "maxItems": 9,
+        },
+        "position_covariance_type": {"enum": [0, 1, 2, 3]},
+    },
+    "foxglove.CompressedImage": {
+        "timestamp": _TIME,
+        "frame_id": {"type": "string"},
+        "data": {"type": "string", "contentEncoding": "base64"},
+        "format": {"type": "string"},
+    },
+    "foxglove.Log": {
+        "timestamp": _TIME,
+        "level": {"enum": [0, 1, 2, 3, 4, 5]},
+        "message": {"type": "string"},
+        "name": {"type": "string"},
+        "file": {"type": "string"},
+        "line": {"type": "integer", "minimum": 0},
+    },
+}
+"""Properties by schema name, as Foxglove publishes them."""
+
+_Told = tuple[int, str, str, dict[str, Any]]
+"""UTC in ns since 1970, topic, schema, content without its timestamp."""
+
+
+@dataclass(frozen=True)
+class FoxgloveExport:
+    """What was written: messages by topic."""
+
+    file: Path
+    messages: dict[str, int]
+
+
+def export_foxglove(mission: Mission) -> FoxgloveExport:
+    """Write `export/foxglove.mcap`, in place of an earlier one.
+
+    Raises:
+        OSError: the disk refused.
+    """
+    durable.make_directories(mission.export_dir)
+    final = mission.export_dir / FILE_NAME
+    part = final.with_name(FILE_NAME + durable.PART_SUFFIX)
+    counts: dict[str, int] = {}
+    told = sorted([*_from_logs(mission), *_from_exposures(mission)], key=itemgetter(0))
+    with part.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="", library="syntopic")
+        channels: dict[str, int] = {}
+        for utc_ns, topic, schema, content in told:
+            if topic not in channels:
+                channels[topic] = _register(writer, topic, schema)
+            message = {"timestamp": {"sec": utc_ns // NS, "nsec": utc_ns % NS}, **content}
+            counts[topic] = counts.get(topic, 0) + 1
+            writer.add_message(
+                channels[topic],
+                log_time=utc_ns,
+                publish_time=utc_ns,
+                sequence=counts[topic],
+                data=json.dumps(message).encode(),
+            )
+        writer.add_metadata("syntopic", {"mission": mission.id})
+        writer.finish()
+    part.replace(final)
+    return FoxgloveExport(final, counts)
+
+
+def _register(writer: Writer, topic: str, schema: str) -> int:
+    content = {"title": schema, "type": "object", "properties": SCHEMAS[schema]}
+    number = writer.register_schema(schema, "jsonschema", json.dumps(content).encode())
+    return int(writer.register_channel(topic, "json", number))
+
+
+def _from_logs(mission: Mission) -> Iterator[_Told]:
+    """Positions, and what devices and people said, from every log of the mission."""
+    for path in logs_of(mission.log_dir):
+        said: list[tuple[int, int, str, str]] = []
+        mono_less_gps_ns: int | None = None
+        for message in read(path):
+            if message.topic == AUDIT_TOPIC:
+                said.append((message.mono_ns, INFO, *_of_command(message.payload)))
+                continue
+            try:
+                record = record_of(message)
+            except RecordError:
+                continue
+            if isinstance(record, NavSample) and record.time_valid:
+                # The earliest arrival is the nearest to the instant itself: tens of ms.
+                lag_ns = record.mono_ns - record.gps_ns
+                known_ns = lag_ns if mono_less_gps_ns is None else mono_less_gps_ns
+                mono_less_gps_ns = min(known_ns, lag_ns)
+                yield (utc_ns(record.gps_ns), "/fix", "foxglove.LocationFix", _fix(record))
+            elif isinstance(record, DeviceEvent):
+                level = ERROR if record.is_fault else INFO
+                said.append((record.mono_ns, level, record.device, record.sentence))
+        if mono_less_gps_ns is None:
+            continue  # nobody knows when this was said
+        for mono_ns, level, name, sentence in said:
+            yield (utc_ns(mono_ns - mono_less_gps_ns), *_said(level, name, sentence))
+
+
+def _from_exposures(mission: Mission) -> Iterator[_Told]:
+    """Thumbnails and findings of every exposure whose time is known."""
+    for exposure in exposures_of(mission):
+        if exposure.mark_gps_ns is None:
+            continue
+        at_ns = utc_ns(exposure.mark_gps_ns)
+        folder = mission.level2(exposure.number)
+        thumbnail = folder / "thumbnail.jpg"
+        if thumbnail.is_file():
+            data = base64.b64encode(thumbnail.read_bytes()).decode("ascii")
+            image = {"frame_id": "camera", "data": data, "format": "jpeg"}
+            yield (at_ns, "/thumbnail", "foxglove.CompressedImage", image)
+        yield (at_ns, *_of_exposure(exposure, folder))
+
+
+def _of_exposure(exposure: Exposure, folder: Path) -> tuple[str, str, dict[str, Any]]:
+    try:
+        quality = json.loads((folder / "quality.json").read_text("utf-8"))
+        verdict = str(quality["verdict"])
+        sentences = [str(finding["sentence"]) for finding in quality["findings"]]
+    except (OSError, ValueError, KeyError, TypeError):
+        verdict, sentences = "not processed", []
+    where = f", line {exposure.line_id}" if exposure.line_id else ""
+    told = f"exposure {exposure.number}{where}: {exposure.state}, {verdict}"
+    return _said(LEVELS.get(verdict, WARNING), "exposures", " ".join([f"{told}.", *sentences]))
+
+
+def _of_command(payload: bytes) -> tuple[str, str]:
+    try:
+        told = json.loads(payload)
+        return str(told["by"]), f"{told['command']}: {told['sentence']}"
+    except (ValueError, KeyError, TypeError):
+        return "audit", "a command that cannot be read"
+
+
+def _said(level: int, name: str, sentence: str) -> tuple[str, str, dict[str, Any]]:
+    content = {"level": level, "message": sentence, "name": name, "file": "", "line": 0}
+    return "/log", "foxglove.Log", content
+
+
+def _fix(sample: NavSample) -> dict[str, Any]:
+    horizontal = sample.horizontal_sigma_m**2 / 2
+    diagonal = (horizontal, horizontal, sample.vertical_sigma_m**2)
+    covariance = [0.0] * 9
+    covariance[0::4] = diagonal
+    return {
+        "frame_id": sample.receiver,
+        "latitude": sample.latitude_deg,
+        "longitude": sample.longitude_deg,
+        "altitude": sample.height_m,
+        "position_covariance": covariance,
+        "position_covariance_type": DIAGONAL_KNOWN,
+    }
+
+
+def utc_ns(gps_ns: int) -> int:
+    """A GPS instant in ns since 1970, UTC."""
+    leap_s = leap_seconds_at(gps_ns - leap_seconds_at(gps_ns) * NS)
+    return gps_ns - leap_s * NS + GPS_EPOCH_UNIX_NS

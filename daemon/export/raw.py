@@ -1,0 +1,150 @@
+"""The receivers' own bytes out of the flight log, for post-processing software.
+
+One file a receiver in its native format, exactly as the bytes came, and the event files: one row an
+exposure, one row a frame. Nothing is decoded here.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from daemon.disk.flight_log import logs_of, read
+from daemon.disk.mission import Mission
+
+NATIVE_ENDINGS = {
+    "ublox": "ubx",
+    "novatel": "gps",
+    "septentrio": "sbf",
+    "nmea": "nmea",
+    "mavlink": "raw",
+}
+"""How post-processing software expects a receiver's recording to be called, by driver."""
+
+EVENT_COLUMNS = (
+    "exposure",
+    "gps_week",
+    "seconds_of_week",
+    "sigma_ns",
+    "source",
+    "count",
+    "latitude_deg",
+    "longitude_deg",
+    "height_ellipsoid_m",
+)
+FRAME_COLUMNS = (
+    "exposure",
+    "sensor",
+    "gps_week",
+    "seconds_of_week",
+    "sigma_ns",
+    "source",
+)
+_WEEK_NS = 604_800_000_000_000
+
+
+@dataclass(frozen=True)
+class RawExport:
+    """What was written: bytes by file name, and how many exposures are in the event file."""
+
+    folder: Path
+    nbytes: dict[str, int]
+    events: int
+
+
+def export_raw(mission: Mission) -> RawExport:
+    """Write `<receiver>.<ending>`, `events.csv` and `frames.csv` into `export/raw`.
+
+    They take the place of earlier ones.
+    Bytes of several service runs of one flight follow each other in the order they were received.
+
+    Raises:
+        OSError: the disk refused.
+    """
+    folder = mission.export_dir / "raw"
+    folder.mkdir(parents=True, exist_ok=True)
+    endings = _receivers(mission)
+    nbytes = dict.fromkeys((f"{name}.{ending}" for name, ending in endings.items()), 0)
+    with ExitStack() as stack:
+        files: dict[str, BinaryIO] = {
+            name: stack.enter_context((folder / f"{name}.{ending}").open("wb"))
+            for name, ending in endings.items()
+        }
+        for path in logs_of(mission.log_dir):
+            for message in read(path):
+                kind, _, device = message.topic.partition("/")
+                if kind == "raw" and device in files:
+                    files[device].write(message.payload)
+                    nbytes[f"{device}.{endings[device]}"] += len(message.payload)
+    records = list(_records(mission))
+    rows = [row for record in records for row in _event(record)]
+    _write(folder / "events.csv", EVENT_COLUMNS, rows)
+    _write(folder / "frames.csv", FRAME_COLUMNS, [f for record in records for f in _frames(record)])
+    return RawExport(folder, nbytes, len(rows))
+
+
+def _write(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        writer.writerows(rows)
+
+
+def _receivers(mission: Mission) -> dict[str, str]:
+    """Ending by name of every navigator the flight was configured with."""
+    if not mission.service_path.exists():
+        return {}
+    flown = tomllib.loads(mission.service_path.read_text(encoding="utf-8"))
+    return {
+        section["name"]: NATIVE_ENDINGS.get(section["driver"], "bin")
+        for section in flown.get("navigator", [])
+    }
+
+
+def _records(mission: Mission) -> Iterator[dict[str, Any]]:
+    for number in mission.numbers():
+        path = mission.level0(number) / "exposure.json"
+        if path.exists():
+            yield json.loads(path.read_text(encoding="utf-8"))
+
+
+def _event(record: Mapping[str, Any]) -> Iterator[tuple[Any, ...]]:
+    """The instant of the strobe, where it is known."""
+    if record.get("mark_gps_ns") is None:
+        return
+    place = record.get("navigation") or {}
+    yield (
+        record["number"],
+        *_week_and_seconds(record["mark_gps_ns"]),
+        record.get("mark_sigma_ns"),
+        record.get("mark_source"),
+        record.get("mark_count"),
+        place.get("latitude_deg"),
+        place.get("longitude_deg"),
+        place.get("height_m"),
+    )
+
+
+def _frames(record: Mapping[str, Any]) -> Iterator[tuple[Any, ...]]:
+    """The mid-exposure of every frame whose time is known."""
+    for frame in record.get("frames", []):
+        if frame.get("mid_exposure_gps_ns") is not None:
+            yield (
+                record["number"],
+                frame["sensor"],
+                *_week_and_seconds(frame["mid_exposure_gps_ns"]),
+                frame.get("time_sigma_ns"),
+                frame.get("time_source"),
+            )
+
+
+def _week_and_seconds(gps_ns: str) -> tuple[int, str]:
+    week, of_week_ns = divmod(int(gps_ns), _WEEK_NS)
+    seconds, nanoseconds = divmod(of_week_ns, 1_000_000_000)
+    return week, f"{seconds}.{nanoseconds:09d}"

@@ -1,0 +1,1 @@
+"""What a flight decides, without processes: open exposures, ledger, phases, latches, events."""

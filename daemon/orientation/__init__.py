@@ -1,0 +1,1 @@
+"""Where images looked from and what they saw: orientation, footprints, triangulation."""

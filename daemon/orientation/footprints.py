@@ -1,0 +1,216 @@
+"""What each image sees of the ground, as GeoJSON and as STAC items.
+
+Rays are followed to level ground in the local east, north, up of the projection centre; relief and
+the curvature of the earth (8 cm at 1 km) are left out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+import numpy as np
+
+from daemon.configuration import MountSection
+from daemon.disk.mission import Mission
+from daemon.exposure import NavigationRecord
+from daemon.flight.navigation import metres_per_degree
+from daemon.orientation.exterior import ExteriorOrientation
+from daemon.orientation.files import image_extent_mm
+from drivers.leap_seconds import leap_seconds_at
+from processing.geometry.orientation import (
+    BODY_FROM_CAMERA,
+    grid_from_camera,
+    level_from_body,
+    on_level_ground,
+)
+from processing.rig import Rig
+
+GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
+STAC_VERSION = "1.0.0"
+ASSETS = {
+    "pan.tif": ("image/tiff", "panchromatic", ["data"]),
+    "rgbn.tif": ("image/tiff", "colour", ["data"]),
+    "quicklook.jpg": ("image/jpeg", "quick look", ["thumbnail"]),
+    "quality.json": ("application/json", "quality report", ["metadata"]),
+}
+
+
+def footprint(
+    eo: ExteriorOrientation, rig: Rig, ground_m: float
+) -> list[tuple[float, float]] | None:
+    """The four corners (longitude, latitude), counter-clockwise; None where the horizon is seen.
+
+    Args:
+        ground_m: height of the ground above the ellipsoid.
+    """
+    cone = rig.cone(rig.reference_cone if eo.is_virtual else eo.cone)
+    left, bottom, right, top = image_extent_mm(rig, cone, is_virtual=eo.is_virtual)
+    f_mm = rig.virtual_image.f_mm if eo.is_virtual and rig.virtual_image else cone.lens.f_mm
+    image_mm = np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
+    centre = np.array([0.0, 0.0, eo.height_m])
+    ground = on_level_ground(centre, eo.enu_from_camera, image_mm, f_mm, ground_m)
+    if not np.isfinite(ground).all():
+        return None
+    per_latitude, per_longitude = metres_per_degree(eo.latitude_deg, ground_m)
+    return [
+        (
+            eo.longitude_deg + float(east) / per_longitude,
+            eo.latitude_deg + float(north) / per_latitude,
+        )
+        for east, north, _ in ground
+    ]
+
+
+def seen_from(
+    rig: Rig, mount: MountSection, navigation: NavigationRecord, ground_m: float
+) -> list[tuple[float, float]] | None:
+    """The corners (longitude, latitude) of the image taken there, before any georeferencing.
+
+    None without an attitude, and where the horizon is seen. The camera's own place on the aircraft
+    is left out: centimetres.
+    """
+    n = navigation
+    if n.roll_rad is None or n.pitch_rad is None or n.heading_rad is None:
+        return None
+    boresight = level_from_body(*(math.radians(angle) for angle in mount.boresight_deg))
+    eo = ExteriorOrientation(
+        exposure=0,
+        cone=rig.image_cone_name,
+        is_virtual=rig.virtual_image is not None,
+        gps_ns=n.gps_ns,
+        line_id="",
+        strip_id="",
+        latitude_deg=n.latitude_deg,
+        longitude_deg=n.longitude_deg,
+        height_m=n.height_m,
+        centre_m=np.array([0.0, 0.0, n.height_m]),
+        rotation=grid_from_camera(
+            level_from_imu=level_from_body(n.roll_rad, n.pitch_rad, n.heading_rad),
+            imu_from_body=boresight,
+            body_from_camera=BODY_FROM_CAMERA,
+            azimuth_of_north_rad=0.0,
+        ),
+        azimuth_of_north_rad=0.0,
+        scale=1.0,
+        method=n.method,
+        horizontal_sigma_m=n.horizontal_sigma_m,
+        vertical_sigma_m=n.vertical_sigma_m,
+    )
+    return footprint(eo, rig, ground_m)
+
+
+def ground_sample_m(eo: ExteriorOrientation, rig: Rig, ground_m: float) -> float:
+    """Size of a pixel on level ground straight below, m."""
+    virtual = rig.virtual_image
+    if eo.is_virtual and virtual is not None:
+        return (eo.height_m - ground_m) * virtual.pitch_mm / virtual.f_mm
+    cone = rig.cone(eo.cone)
+    return (eo.height_m - ground_m) * cone.sensors[0].pitch_mm / cone.lens.f_mm
+
+
+def utc_text(gps_ns: int) -> str:
+    """A GPS instant as UTC, RFC 3339 with microseconds."""
+    leap_s = leap_seconds_at(gps_ns)
+    leap_s = leap_seconds_at(gps_ns - leap_s * 1_000_000_000)
+    utc = GPS_EPOCH + timedelta(microseconds=gps_ns // 1000) - timedelta(seconds=leap_s)
+    return utc.strftime("%Y-%m-%dT%H:%M:%S.%fZ")
+
+
+def geojson(
+    oriented: Sequence[ExteriorOrientation],
+    rig: Rig,
+    ground_m: float,
+    *,
+    simulated: bool,
+    verdicts: Mapping[int, str],
+    rings: Mapping[str, Sequence[tuple[float, float]] | None] | None = None,
+) -> dict[str, Any]:
+    """A FeatureCollection of footprints (RFC 7946); `rings` by image in place of level ground."""
+    features = []
+    for eo in oriented:
+        properties = {
+            "image": eo.name,
+            "exposure": eo.exposure,
+            "cone": eo.cone,
+            "line": eo.line_id,
+            "strip": eo.strip_id,
+            "utc": utc_text(eo.gps_ns),
+            "gsd_m": round(ground_sample_m(eo, rig, ground_m), 4),
+            "verdict": verdicts.get(eo.exposure),
+            "simulated": simulated,
+        }
+        ring = footprint(eo, rig, ground_m) if rings is None else rings.get(eo.name)
+        geometry = _polygon(ring)
+        features.append({"type": "Feature", "geometry": geometry, "properties": properties})
+    return {"type": "FeatureCollection", "features": features}
+
+
+def stac_items(
+    mission: Mission,
+    oriented: Sequence[ExteriorOrientation],
+    rig: Rig,
+    ground_m: float,
+    *,
+    simulated: bool,
+    base_href: str,
+) -> dict[str, Any]:
+    """A STAC ItemCollection of the stitched images there are, with links to their files.
+
+    Args:
+        base_href: from where the collection lies to the mission folder.
+    """
+    items = []
+    for eo in oriented:
+        corners = footprint(eo, rig, ground_m)
+        folder = mission.level2(eo.exposure)
+        if not eo.is_virtual or corners is None:
+            continue
+        longitudes, latitudes = zip(*corners, strict=True)
+        items.append(
+            {
+                "type": "Feature",
+                "stac_version": STAC_VERSION,
+                "stac_extensions": [],
+                "id": f"{mission.id}-{eo.name}",
+                "geometry": _polygon(corners),
+                "bbox": [min(longitudes), min(latitudes), max(longitudes), max(latitudes)],
+                "properties": {
+                    "datetime": utc_text(eo.gps_ns),
+                    "platform": "aircraft",
+                    "instruments": [rig.name],
+                    "gsd": ground_sample_m(eo, rig, ground_m),
+                    "syntopic:off_nadir_deg": _off_nadir_deg(eo),
+                    "syntopic:exposure": eo.exposure,
+                    "syntopic:line": eo.line_id,
+                    "syntopic:strip": eo.strip_id,
+                    "syntopic:simulated": simulated,
+                },
+                "links": [],
+                "assets": {
+                    name.split(".")[0]: {
+                        "href": f"{base_href}/L2/{folder.name}/{name}",
+                        "type": kind,
+                        "title": title,
+                        "roles": roles,
+                    }
+                    for name, (kind, title, roles) in ASSETS.items()
+                    if (folder / name).exists()
+                },
+            }
+        )
+    return {"type": "FeatureCollection", "features": items}
+
+
+def _polygon(corners: Sequence[tuple[float, float]] | None) -> dict[str, Any] | None:
+    if corners is None:
+        return None
+    ring = [[round(longitude, 9), round(latitude, 9)] for longitude, latitude in corners]
+    return {"type": "Polygon", "coordinates": [[*ring, ring[0]]]}
+
+
+def _off_nadir_deg(eo: ExteriorOrientation) -> float:
+    """Angle between the camera's axis and straight down."""
+    return math.degrees(math.acos(max(-1.0, min(1.0, float(eo.rotation[2, 2])))))

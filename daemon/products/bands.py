@@ -1,0 +1,146 @@
+"""Level-2 of a rig without a virtual image: one raster per band, its mask, and the report.
+
+What the bands are is made by `processing.band_pipeline`; here they get their files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.configuration import PlanSection
+from daemon.disk.level2 import jpeg_bytes, write_folder
+from daemon.disk.mission import Mission
+from daemon.disk.records import canonical_bytes
+from daemon.exposure import Exposure
+from daemon.products.conditions import conditions_of
+from processing.band_pipeline import BandPipeline, BandProduct, FrameSettings
+from processing.quality.report import Flag, as_json
+from processing.radiometry.calibration import CalibrationError
+from processing.radiometry.radiance import RadianceCalibration, load_radiance
+from processing.rig import Rig
+
+RADIOMETRY = "radiometry"
+_QUICKLOOK_BANDS = ("red", "green", "blue")
+
+
+def make_band_pipeline(
+    rig: Rig, mission: Mission, radiometry: Path | None
+) -> tuple[BandPipeline, dict[str, RadianceCalibration]]:
+    """The pipeline with the radiance calibrations of a folder, by default the mission's own.
+
+    Raises:
+        CalibrationError: a file that cannot be used, or a folder that is told and not there.
+        ValueError: a rig whose cones hold no single bands.
+    """
+    if radiometry is not None and not radiometry.is_dir():
+        raise CalibrationError(f"{radiometry}: no such folder; give one with <sensor>.json")
+    folder = radiometry or mission.path / RADIOMETRY
+    radiance = {
+        sensor.name: load_radiance(folder / f"{sensor.name}.json")
+        for sensor in rig.sensors
+        if (folder / f"{sensor.name}.json").exists()
+    }
+    return BandPipeline(rig, radiance), radiance
+
+
+def process_bands(
+    pipeline: BandPipeline,
+    radiance: Mapping[str, RadianceCalibration],
+    mission: Mission,
+    plan: PlanSection,
+    exposure: Exposure,
+    frames: Mapping[str, NDArray[np.uint16]],
+) -> tuple[dict[str, Any], BandProduct]:
+    """Run one exposure and write its Level-2 folder.
+
+    Returns:
+        The content of quality.json, and the product.
+    """
+    rig = pipeline.rig
+    product = pipeline.process(
+        frames,
+        conditions_of(exposure, rig, plan, Flag(0)),
+        {frame.sensor: _told(frame.settings) for frame in exposure.frames},
+    )
+    report = as_json(product.report)
+    report["exposure"] = exposure.number
+    report["timings_s"] = {stage: round(s, 4) for stage, s in product.timings_s.items()}
+    report["reference"] = product.reference
+    report["units"] = dict(product.units)
+    report["bands"] = [
+        {
+            "band": band.band,
+            "registered": band.registered,
+            "points": band.points,
+            "sought": band.sought,
+            "rms_px": band.rms_px,
+            "rms_x_px": band.rms_x_px,
+            "rms_y_px": band.rms_y_px,
+            "shift_px": list(band.shift_px),
+            "band_from_reference": band.band_from_reference.tolist(),
+        }
+        for band in product.registrations
+    ]
+    contents: dict[str, Sequence[bytes | memoryview]] = {}
+    for cone in rig.cones:
+        name = cone.bands[0]
+        if name not in product.bands:
+            continue
+        about = {
+            "band": name,
+            "exposure": exposure.number,
+            "reference": product.reference,
+            "unit": product.units[name],
+            "f_mm": product.image.f_mm,
+            "pitch_um": product.image.pitch_um,
+        }
+        if (calibration := radiance.get(cone.sensors[0].name)) is not None:
+            about["wavelength_nm"] = calibration.wavelength_nm
+            about["bandwidth_nm"] = calibration.bandwidth_nm
+        contents[f"{name}.tif"] = [_tiff(product.bands[name], about)]
+        mask_about = {"band": name, "exposure": exposure.number, "bits": ["valid", "saturated"]}
+        contents[f"{name}-mask.tif"] = [_tiff(product.masks[name], mask_about)]
+    if product.bands:
+        contents["quicklook.jpg"] = [jpeg_bytes(_quicklook(product.bands))]
+    contents["quality.json"] = [canonical_bytes(report)]
+    write_folder(mission.level2(exposure.number), contents)
+    return report, product
+
+
+def _told(settings: Mapping[str, float | int | str]) -> FrameSettings:
+    gain, black = settings.get("Gain", 1.0), settings.get("BlackLevel")
+    return FrameSettings(
+        gain=float(gain) if isinstance(gain, float | int) else 1.0,
+        black=float(black) if isinstance(black, float | int) else None,
+    )
+
+
+def _tiff(raster: NDArray[Any], about: Mapping[str, Any]) -> bytes:
+    """A plain TIFF of one plane, uncompressed."""
+    from tifffile import imwrite
+
+    buffer = BytesIO()
+    description = canonical_bytes(about).decode("utf-8").strip()
+    imwrite(
+        buffer, raster, photometric="minisblack", description=description, metadata=None,
+        software="Syntopic", byteorder="<",
+    )  # fmt: skip
+    return buffer.getvalue()
+
+
+def _quicklook(bands: Mapping[str, NDArray[np.float32]]) -> NDArray[np.uint8]:
+    """Red, green and blue where all are there, else the first band; each in its own stretch."""
+    named = [bands[name] for name in _QUICKLOOK_BANDS if name in bands]
+    chosen = named if len(named) == 3 else [next(iter(bands.values()))] * 3
+    planes = []
+    for band in chosen:
+        low, high = np.nanpercentile(band[::4, ::4], (1.0, 98.0))
+        unit = np.clip((np.nan_to_num(band) - low) / max(high - low, 1e-12), 0.0, 1.0)
+        planes.append((255.0 * unit**0.6).astype(np.uint8))
+    return np.stack(planes, axis=-1)

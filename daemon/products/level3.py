@@ -1,0 +1,304 @@
+"""Level-3 after landing: pansharpened images in 16 and 8 bits, one tone curve for the mission.
+
+Reads Level-2, writes `L3/`. The mathematics is in `processing.image.pansharpening` and
+`processing.radiometry.tone_curve`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.disk import durable
+from daemon.disk.level0 import read_description, refuse_bomb, tiff_faults
+from daemon.disk.level0_folder import exposure_of, read_capture, read_sealed
+from daemon.disk.level2 import BAND_ORDER, take_the_place_of
+from daemon.disk.mission import Mission, exposure_name
+from daemon.disk.records import canonical_bytes, sha256_hex
+from daemon.errors import DaemonError
+from daemon.exposure import Exposure
+from processing.image.pansharpening import pansharpened
+from processing.radiometry.tone_curve import (
+    WORDS,
+    ToneCurve,
+    curve_as_json,
+    histogram,
+    lookup_table,
+    mission_curve,
+)
+from processing.rig import Rig
+
+IMAGES: Final[Mapping[str, tuple[str, str, str]]] = {
+    "rgb": ("red", "green", "blue"),
+    "cir": ("nir", "red", "green"),
+}
+"""Images by name: the bands shown as red, green and blue."""
+
+DEPTHS: Final = (16, 8)
+CURVE_FILE: Final = "tone-curve.json"
+TILE_PX: Final = 256
+
+Progress = Callable[[str, int, int], None]
+
+
+class Level3Error(DaemonError):
+    """Level-2 that cannot be developed; the sentence says which exposure and what to do."""
+
+
+@dataclass(frozen=True)
+class Developed:
+    """What was written for one exposure: file name to size in bytes, and what could not be."""
+
+    number: int
+    files: Mapping[str, int]
+    left_out: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class MissionTones:
+    """The mission's curve, the hash of its file, and the scale of each exposure by band.
+
+    A scale is the mission's median exposure time over the exposure's own: an exposure that was
+    exposed for half as long is made twice as bright before the curve is applied.
+    """
+
+    curve: ToneCurve
+    sha256: str
+    scales: Mapping[int, Mapping[str, float]]
+
+
+def level3_root(mission: Mission) -> Path:
+    """Where Level-3 lies."""
+    return mission.path / "L3"
+
+
+def mission_tones(mission: Mission, rig: Rig, progress: Progress | None = None) -> MissionTones:
+    """The tone curve of all exposures that have Level-2, written to `L3/tone-curve.json`.
+
+    Raises:
+        Level3Error: no exposure has colour at Level-2, or one cannot be read.
+        OSError: the disk refused.
+    """
+    numbers = _processed(mission)
+    scales = _scales(mission, rig, numbers)
+    sums = {band: np.zeros(WORDS, np.int64) for band in BAND_ORDER}
+    for done, number in enumerate(numbers):
+        if progress is not None:
+            progress("histograms", done, len(numbers))
+        for band, raster in _colour(mission, number).items():
+            sums[band] += histogram(raster, scales[number].get(band, 1.0))
+    try:
+        curve = mission_curve(sums)
+    except ValueError as error:
+        raise Level3Error(f"{mission.path}: {error}") from error
+    content = canonical_bytes(
+        {
+            "format": 1,
+            "curve": curve_as_json(curve),
+            "exposures": [{"number": number, "scale": dict(scales[number])} for number in numbers],
+        }
+    )
+    durable.make_directories(level3_root(mission))
+    durable.replace_file(level3_root(mission) / CURVE_FILE, content)
+    return MissionTones(curve, sha256_hex(content), scales)
+
+
+def develop(
+    mission: Mission,
+    rig: Rig,
+    number: int,
+    tones: MissionTones,
+    *,
+    images: Sequence[str] = tuple(IMAGES),
+    depths: Sequence[int] = DEPTHS,
+    threads: int = 1,
+) -> Developed:
+    """Write the Level-3 folder of one exposure, whole, in place of an earlier one.
+
+    Args:
+        images: of `IMAGES`. One whose bands are not all there is left out and named.
+        depths: 16 (linear signal, as Level-2) and 8 (through the curve).
+        threads: that compress tiles.
+
+    Raises:
+        Level3Error: Level-2 is missing or does not fit the rig.
+        OSError: the disk refused; an earlier folder is still there.
+    """
+    if rig.virtual_image is None:
+        raise Level3Error(f"rig {rig.name} has no virtual image; there is no PAN to sharpen with")
+    pan = _pan(mission, number)
+    colour = _colour(mission, number)
+    try:
+        sharp = pansharpened(pan, colour, rig.virtual_image.colour_ratio)
+    except ValueError as error:
+        raise Level3Error(f"exposure {number}: {error}; process it again") from error
+    final = level3_root(mission) / exposure_name(number)
+    part = final.with_name(final.name + durable.PART_SUFFIX)
+    durable.make_directories(final.parent)
+    durable.remove_tree(part)
+    part.mkdir()
+    files, left_out = {}, []
+    try:
+        for image in images:
+            bands = IMAGES[image]
+            if absent := [band for band in bands if band not in sharp]:
+                left_out.append(f"{image}: no {', '.join(absent)} at Level-2")
+                continue
+            for depth in depths:
+                name = f"{image}-{depth}.tif"
+                tables = _tables(tones, number, bands) if depth == 8 else None
+                about = {
+                    "bands": list(bands),
+                    "exposure": number,
+                    "level": 3,
+                    "tone_curve_sha256": tones.sha256 if depth == 8 else "",
+                    "scale": [tones.scales[number].get(band, 1.0) for band in bands],
+                }
+                planes = [sharp[band] for band in bands]
+                files[name] = _write(part / name, planes, tables, about, threads)
+        take_the_place_of(part, final)
+    except OSError:
+        durable.remove_tree(part)
+        raise
+    return Developed(number, files, tuple(left_out))
+
+
+def _tables(tones: MissionTones, number: int, bands: Sequence[str]) -> list[NDArray[np.uint8]]:
+    scales = tones.scales[number]
+    return [lookup_table(tones.curve, band, scales.get(band, 1.0)) for band in bands]
+
+
+def _write(
+    path: Path,
+    planes: Sequence[NDArray[np.uint16]],
+    tables: Sequence[NDArray[np.uint8]] | None,
+    about: Mapping[str, Any],
+    threads: int,
+) -> int:
+    """A tiled, deflated TIFF, pixel-interleaved; durable on return. Returns its size in bytes."""
+    from tifffile import imwrite
+
+    height, width = planes[0].shape
+    imwrite(
+        path,
+        _tiles(planes, tables),
+        shape=(height, width, len(planes)),
+        dtype=np.uint16 if tables is None else np.uint8,
+        tile=(TILE_PX, TILE_PX),
+        photometric="rgb",
+        compression="adobe_deflate",
+        # The default level is 1 % smaller and takes two and a half times as long.
+        compressionargs={"level": 1},
+        predictor=True,
+        maxworkers=threads,
+        description=canonical_bytes(about).decode("utf-8").strip(),
+        metadata=None,
+        software="Syntopic",
+    )
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
+        return os.fstat(file.fileno()).st_size
+
+
+def _tiles(
+    planes: Sequence[NDArray[np.uint16]], tables: Sequence[NDArray[np.uint8]] | None
+) -> Iterator[NDArray[Any]]:
+    height, width = planes[0].shape
+    for row in range(0, height, TILE_PX):
+        for column in range(0, width, TILE_PX):
+            window = np.s_[row : row + TILE_PX, column : column + TILE_PX]
+            shown: list[NDArray[Any]] = [plane[window] for plane in planes]
+            if tables is not None:
+                shown = [table[plane] for table, plane in zip(tables, shown, strict=True)]
+            tile = np.zeros((TILE_PX, TILE_PX, len(planes)), shown[0].dtype)
+            tile[: shown[0].shape[0], : shown[0].shape[1]] = np.stack(shown, axis=-1)
+            yield tile
+
+
+def _processed(mission: Mission) -> list[int]:
+    numbers = [n for n in mission.numbers() if (mission.level2(n) / "rgbn.tif").is_file()]
+    if not numbers:
+        raise Level3Error(
+            f"{mission.path}: no exposure has colour at Level-2; run syntopic process first"
+        )
+    return numbers
+
+
+def _scales(mission: Mission, rig: Rig, numbers: Sequence[int]) -> dict[int, dict[str, float]]:
+    """Median exposure time of the mission over that of each exposure, by band."""
+    times: dict[int, dict[str, float]] = {}
+    for number in numbers:
+        exposure = _record(mission, number)
+        times[number] = {
+            band: frame.exposure_time_us
+            for cone in rig.colour_cones
+            for band in cone.bands
+            if exposure is not None
+            and (frame := exposure.frame(cone.sensors[0].name)) is not None
+            and frame.exposure_time_us
+        }
+    usual = {
+        band: float(np.median([told[band] for told in times.values() if band in told]))
+        for band in {band for told in times.values() for band in told}
+    }
+    return {
+        number: {band: usual[band] / time for band, time in told.items()}
+        for number, told in times.items()
+    }
+
+
+def _record(mission: Mission, number: int) -> Exposure | None:
+    folder = mission.level0(number)
+    if (sealed := read_sealed(folder)) is not None:
+        return sealed.exposure
+    capture = read_capture(folder)
+    return None if capture is None else exposure_of(capture)
+
+
+def _pan(mission: Mission, number: int) -> NDArray[np.uint16]:
+    pan = _read(mission.level2(number) / "pan.tif", number)
+    if pan.ndim != 2:
+        raise Level3Error(f"exposure {number}: pan.tif has shape {pan.shape}; process it again")
+    return pan
+
+
+def _colour(mission: Mission, number: int) -> dict[str, NDArray[np.uint16]]:
+    """The colour bands of Level-2 that hold data, by name."""
+    path = mission.level2(number) / "rgbn.tif"
+    planes = _read(path, number)
+    planes = planes[None] if planes.ndim == 2 else planes
+    bands = read_description(path).get("bands")
+    if not isinstance(bands, list) or len(bands) != len(planes) or set(bands) - set(BAND_ORDER):
+        raise Level3Error(f"exposure {number}: rgbn.tif does not name its bands; process it again")
+    return {
+        band: np.ascontiguousarray(plane)
+        for band, plane in zip(bands, planes, strict=True)
+        if plane.any()
+    }
+
+
+def _read(path: Path, number: int) -> NDArray[np.uint16]:
+    from tifffile import TiffFile
+
+    try:
+        with TiffFile(path) as tiff:
+            page = tiff.pages[0]
+            refuse_bomb(page, path)
+            pixels: NDArray[Any] = page.asarray()
+    except FileNotFoundError as error:
+        raise Level3Error(
+            f"exposure {number}: has no {path.name} at Level-2; run syntopic process first"
+        ) from error
+    except tiff_faults() as error:
+        raise Level3Error(
+            f"exposure {number}: {path.name} cannot be read ({error}); process it again"
+        ) from error
+    if pixels.dtype != np.uint16:
+        raise Level3Error(f"exposure {number}: {path.name} holds {pixels.dtype}; process it again")
+    return pixels

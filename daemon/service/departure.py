@@ -1,0 +1,110 @@
+"""Before a flight: its mission folder, what its records repeat, and its processes.
+
+Nothing here waits or decides; `daemon.service.service` starts what is laid out.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from daemon.configuration import Configuration
+from daemon.disk.mission import Mission
+from daemon.flight.flight import Identity
+from daemon.service.devices import device_specs, frame_nbytes
+from daemon.service.memory import FrameRing
+from daemon.service.messages import WorkerSettings
+from processing.rig import Rig, shipped_rigs
+
+
+class ProcessPlan(NamedTuple):
+    """A process of the service, as `Supervisor.spawn` takes it."""
+
+    name: str
+    target: str
+    arguments: tuple[Any, ...]
+    environment: Mapping[str, str]
+
+
+def open_mission(configuration: Configuration, rig: Rig, config_path: Path) -> tuple[Mission, bool]:
+    """The mission that was being flown, else a new one; and whether it goes on.
+
+    Raises:
+        MissionError: the marker of the mission being flown is damaged.
+        OSError: the disk refused.
+    """
+    root = configuration.mission.root
+    current = Mission.current(root) if root.is_dir() else None
+    if current is not None:
+        return current, True
+    rig_path = shipped_rigs().get(configuration.mission.rig, Path(configuration.mission.rig))
+    plan_file = configuration.plan.file
+    created = Mission.create(
+        root,
+        rig.name,
+        rig_toml=rig_path.read_bytes(),
+        service_toml=config_path.read_bytes(),
+        plan=None if plan_file is None else (plan_file.suffix.lower(), plan_file.read_bytes()),
+        started_utc=datetime.now(UTC),
+    )
+    return created, False
+
+
+def identity(configuration: Configuration, rig: Rig, mission: Mission) -> Identity:
+    """What every record of this flight repeats."""
+    return Identity(
+        boot_id=Path("/proc/sys/kernel/random/boot_id").read_text().strip(),
+        line_id=configuration.plan.line,
+        calibration_id=rig.calibration_id,
+        calibration_sha256=_sha256(mission.rig_path),
+        configuration_sha256=_sha256(mission.service_path),
+        software=f"syntopic {version('syntopic')}",
+        simulated=configuration.mission.simulated,
+    )
+
+
+def processes(configuration: Configuration, rig: Rig, mission: Mission) -> tuple[ProcessPlan, ...]:
+    """Writer, worker and capture, over one set of frame memory."""
+    rings = tuple(
+        FrameRing.create(
+            head.sensor, configuration.limits.exposures_in_memory, frame_nbytes(rig, head.sensor)
+        )
+        for head in configuration.head
+    )
+    worker = WorkerSettings(
+        rig=str(mission.rig_path),
+        radiometry=configuration.mission.radiometry,
+        mission=mission.path,
+        plan=configuration.plan,
+        processing=configuration.processing,
+    )
+    one, many = _thread_counts(1), _thread_counts(configuration.processing.threads)
+    specs = device_specs(configuration, rig)
+    return (
+        ProcessPlan("writer", "daemon.service.writer:main", (mission.path, rings), one),
+        ProcessPlan("worker", "daemon.service.worker:main", (worker, rings), many),
+        ProcessPlan("capture", "daemon.service.capture:main", (specs, rings), one),
+    )
+
+
+def watch_process(configuration: Configuration) -> ProcessPlan | None:
+    """The process that serves watchers, where the configuration wants one."""
+    if configuration.watch is None:
+        return None
+    one = _thread_counts(1)
+    return ProcessPlan("watch", "daemon.watch.process:main", (configuration.watch,), one)
+
+
+def _thread_counts(threads: int) -> dict[str, str]:
+    """Compiled kernels share the cores; small matrices do not, and nobody spins while waiting."""
+    names = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")
+    fixed = {"OPENBLAS_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
+    return dict.fromkeys(names, str(threads)) | fixed
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -1,0 +1,55 @@
+"""The devices a configuration asks for, and what the rig has to say about them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from daemon.configuration import Configuration
+from daemon.service.messages import DeviceSpec
+from drivers.contract import CHUNK_ALLOWANCE_NBYTES
+from processing.rig import Rig
+
+
+def device_specs(configuration: Configuration, rig: Rig) -> tuple[DeviceSpec, ...]:
+    """Every device; the trigger last, since it may fire the heads."""
+    trigger = configuration.trigger
+    heads = [
+        DeviceSpec("head", h.driver, h.sensor, h.settings, output=rig.cone_of(h.sensor).name)
+        for h in configuration.head
+    ]
+    thermometers = [
+        DeviceSpec("thermometer", t.driver, t.name, t.settings) for t in configuration.thermometer
+    ]
+    navigators = [
+        DeviceSpec("navigator", n.driver, n.name, n.settings) for n in configuration.navigator
+    ]
+    seconds = [DeviceSpec("pps", p.driver, p.name, p.settings) for p in configuration.pps]
+    fires = DeviceSpec("trigger", trigger.driver, "trigger", dict(trigger.model_extra or {}))
+    return (*heads, *thermometers, *navigators, *seconds, fires)
+
+
+def frame_nbytes(rig: Rig, sensor_name: str) -> int:
+    """Bytes of a sensor's frame in memory, 16 bit, with room for chunk data."""
+    sensor = rig.sensor(sensor_name)
+    return sensor.width_px * sensor.height_px * 2 + CHUNK_ALLOWANCE_NBYTES
+
+
+def serial_problem(rig: Rig, head: str, found: Mapping[str, str]) -> str | None:
+    """A sentence where the connected head is not the calibrated one (promise 6)."""
+    calibrated = rig.sensor(head).serial
+    connected = found.get("serial", "")
+    if not calibrated or not connected or calibrated == connected:
+        return None
+    return (
+        f"head {head} has serial number {connected}, the calibration {rig.calibration_id} is of "
+        f"{calibrated}; connect that head, or fly with a calibration of this one"
+    )
+
+
+def exposure_times_ns(configuration: Configuration, rig: Rig) -> dict[str, int]:
+    """Exposure time by cone, as configured for its heads; zero where a cone has none."""
+    times = {cone.name: 0 for cone in rig.cones}
+    for head in configuration.head:
+        microseconds = float(head.settings.get("exposure_time_us", 0.0))
+        times[rig.cone_of(head.sensor).name] = round(microseconds * 1000)
+    return times

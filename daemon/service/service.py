@@ -1,0 +1,499 @@
+"""The service: one asyncio loop that hears every process and keeps the deadlines.
+
+It decides nothing about matching (`daemon.flight.flight`), when to expose (`daemon.service.line`),
+pixels (`daemon.service.worker`) or disk (`daemon.service.writer`), and imports none of what those
+need.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import time
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from daemon.configuration import Configuration
+from daemon.disk import recovery
+from daemon.disk.log_records import LoggedTrigger, Message, message_of
+from daemon.disk.mission import Mission
+from daemon.disk.records import canonical_bytes
+from daemon.exposure import Exposure
+from daemon.flight.arming import Lack, note_override, override_message
+from daemon.flight.decisions import Decision, tick
+from daemon.flight.flight import Flight
+from daemon.flight.latches import Latch, Latches, previous_faults, read_unhandled, write_unhandled
+from daemon.flight.ledger import Ledger
+from daemon.flight.recovery_match import seal_from_log
+from daemon.service.commanding import audit_message, obey
+from daemon.service.departure import identity, open_mission, processes, watch_process
+from daemon.service.devices import serial_problem
+from daemon.service.exposure_control import ExposureControl
+from daemon.service.hearing import Hearing
+from daemon.service.line import Line, Order
+from daemon.service.messages import (
+    Bound,
+    Command,
+    Fire,
+    Log,
+    Pong,
+    Seal,
+    Sealed,
+    Store,
+    Stored,
+    Told,
+    WriteFailed,
+)
+from daemon.service.notify import Notifier
+from daemon.service.pipeline_queue import PipelineQueue
+from daemon.service.preflight import AT_ONCE, Preflight
+from daemon.service.supervisor import Supervisor
+from daemon.service.watching import NAME as WATCH
+from daemon.service.watching import Watching, status_event, summary
+from drivers.contract import (
+    Record,
+)
+from processing.rig import Rig
+
+TICK_S = 0.05
+PING_S = 1.0
+SEAL_RETRY_NS = 1_000_000_000
+"""A disk that refused a record is asked again so much later."""
+LANDING_TIMEOUT_S = 20.0
+END_OF_WAITING_S = 1e9
+
+Events = Callable[[Mapping[str, Any]], None]
+
+
+class Service:
+    """One run of the onboard service over one mission.
+
+    Args:
+        configuration: what to do.
+        rig: the camera.
+        config_path: the file the configuration came from; its bytes go into the mission.
+        events: told of everything a person or a program may want to know, as plain JSON types.
+    """
+
+    def __init__(
+        self, configuration: Configuration, rig: Rig, config_path: Path, events: Events
+    ) -> None:
+        self.configuration = configuration
+        self.rig = rig
+        self.config_path = config_path
+        self.events = events
+        self.notifier = Notifier()
+        self.supervisor = Supervisor(self._hear, self._child_died)
+        self.latches = Latches()
+        self.unhandled: tuple[Latch, ...] = ()
+        self.watching = Watching(self.supervisor, watch_process(configuration))
+        self.is_ready = False
+        self.is_power_failing = False
+        self.hurry_ns = 0
+        self.failure: str | None = None
+        self.stopping = asyncio.Event()
+        self.changed = asyncio.Event()
+        self.sealing: Exposure | None = None
+        self.seal_again_ns = 0
+        self.goes_on = False
+
+    async def run(self) -> int:
+        """Fly until told to stop, or until the planned exposures are done.
+
+        Returns:
+            The exit status: 0 after an orderly end, 1 after a fault that needs a person or a
+            restart.
+        """
+        loop = asyncio.get_running_loop()
+        loop.set_exception_handler(lambda _, context: self._broke(context))
+        for name in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(name, self.stopping.set)
+        loop.add_signal_handler(signal.SIGPWR, self._power_fails)
+        mission, self.is_resumed = open_mission(self.configuration, self.rig, self.config_path)
+        with mission.held():
+            self._start(mission)
+            tasks = [
+                loop.create_task(self._keep_deadlines()),
+                loop.create_task(self._watch_processes()),
+                loop.create_task(self._fly()),
+            ]
+            for task in tasks:
+                task.add_done_callback(self._task_ended)
+            await self.stopping.wait()
+            say = self.notifier.status if self.goes_on else self.notifier.stopping
+            say("landing: sealing what is open")
+            await self._land(tasks)
+            await self._keep_unhandled()
+            self.flight.land()
+            left = self.flight.ledger.imbalances(has_landed=True)
+            if left:
+                self._event("ledger", fault=True, sentence=f"not settled: {'; '.join(left)}")
+        if self.failure is None:
+            mission.close()
+        self._event("ended", failure=self.failure, ledger=self.flight.ledger.sheet().as_json())
+        await self.supervisor.end((WATCH,))
+        return 0 if self.failure is None else 1
+
+    # Before the flight
+
+    def _start(self, mission: Mission) -> None:
+        self.mission = mission
+        self.watching.start()
+        report = recovery.recover(mission, seal_from_log(self.rig))
+        self._event(
+            "mission",
+            id=mission.id,
+            path=str(mission.path),
+            rig=self.rig.name,
+            simulated=self.configuration.mission.simulated,
+            resumed=self.is_resumed,
+            recovery=list(report.sentences),
+            next_number=report.next_number,
+        )
+        heads = [head.sensor for head in self.configuration.head]
+        self.flight = Flight(
+            self.rig,
+            {head: self.rig.sensor(head).serial for head in heads},
+            identity(self.configuration, self.rig, mission),
+            self.configuration.limits,
+            Ledger.resume(report.settled, heads=heads, sheet=report.ledger_sheet),
+            report.next_number,
+        )
+        self.hearing = Hearing(self.flight, self._log, self._event, self._decided)
+        flown = len(report.settled)
+        self.line = Line(self.configuration, self.rig, self.flight, mission.path, flown)
+        self.exposure = ExposureControl(
+            self.configuration, self.rig, self.flight, self.supervisor.send, self._event
+        )
+        lanes, send = self.configuration.processing.exposures_in_work, self.supervisor.send
+        self.pipeline = PipelineQueue(lanes, send, self._event, self._decided, self.exposure.seen)
+        self.preflight = Preflight(
+            self.configuration, self.rig, self.flight, self.line, self.hearing, self.pipeline
+        )
+        self.preflight.overridden = self._overridden
+        self._tell_previous(mission)
+        for process in processes(self.configuration, self.rig, mission):
+            self.supervisor.spawn(*process)
+        self._decided(
+            Decision(
+                "begin",
+                time.monotonic_ns(),
+                report.next_number,
+                {"software": self.flight.identity.software, "resumed": self.is_resumed},
+            )
+        )
+
+    # What the processes say
+
+    def _hear(self, message: object) -> None:
+        handler = self._handlers.get(type(message))
+        if handler is not None:
+            handler(self, message)
+        elif not (self.hearing.hear(message) or self.pipeline.hear(message)):
+            raise TypeError(f"a process said {type(message).__name__}, which nobody expects")
+        self.changed.set()
+
+    def _tell_previous(self, mission: Mission) -> None:
+        """What an earlier start of the service left for a person to see."""
+        self.unhandled = read_unhandled(mission.root)
+        for event in previous_faults(self.unhandled):
+            self._event(**event)
+        self.watching.faults = lambda: previous_faults(self.latches.unhandled())
+
+    def _overridden(self, by: str, missing: Sequence[Lack]) -> None:
+        self.supervisor.send("writer", Log(override_message(by, missing)))
+        told = "; ".join(map(str, missing))
+        self._event("override", by=by, sentence=f"{by} flies all the same: {told}")
+        try:
+            note_override(self.mission.path, by, missing)
+        except OSError as error:
+            # The log has it too.
+            self._event("disk", fault=True, sentence=f"the override is not noted: {error}")
+
+    def _child_died(self, name: str) -> None:
+        if name == WATCH:
+            if not self.stopping.is_set():
+                self.watching.died()
+        elif not self.stopping.is_set():
+            self._fail(f"process {name} died; started again, the service goes on in this flight")
+
+    def _on_stored(self, stored: Stored) -> None:
+        self.flight.stored(stored.number, stored.frames)
+        self._decided(Decision("stored", time.monotonic_ns(), stored.number))
+        self._event("stored", number=stored.number, duration_s=round(stored.duration_s, 4))
+        self.pipeline.stored(stored.number)
+
+    def _on_sealed(self, sealed: Sealed) -> None:
+        exposure, self.sealing = self.sealing, None
+        assert exposure is not None and exposure.number == sealed.number
+        self.flight.sealed(sealed.number, exposure.state)
+        self._decided(Decision("sealed", time.monotonic_ns(), sealed.number))
+        sheet = canonical_bytes(self.flight.ledger.sheet().as_json())
+        message = Message(recovery.LEDGER_TOPIC, time.monotonic_ns(), sheet)
+        self.supervisor.send("writer", Log(message))
+        if exposure.state == "lost":
+            return
+        self._event("sealed", **summary(exposure))
+        self.pipeline.sealed(exposure)
+
+    def _on_write_failed(self, failed: WriteFailed) -> None:
+        self._event("not-written", number=failed.number, sentence=failed.sentence)
+        if self.sealing is not None and self.sealing.number == failed.number:
+            if failed.may_pass:
+                self.seal_again_ns = time.monotonic_ns() + SEAL_RETRY_NS
+            else:
+                # Recovery seals it from the log when the service starts next.
+                self.flight.not_sealed(failed.number, self.sealing.state)
+                self._decided(Decision("not-sealed", time.monotonic_ns(), failed.number))
+            self.sealing = None
+        else:
+            self.pipeline.not_stored(failed.number)
+            self.flight.not_stored(failed.number, failed.sentence)
+            said = {"sentence": failed.sentence}
+            self._decided(Decision("not-stored", time.monotonic_ns(), failed.number, said))
+
+    def _on_bound(self, bound: Bound) -> None:
+        self.hearing.hear(bound)
+        if bound.kind == "head":
+            problem = serial_problem(self.rig, bound.name, bound.found)
+            if problem is not None:
+                self._fail(problem)
+
+    def _on_told(self, told: Told) -> None:
+        """What the watch process and the writer have to say of themselves."""
+        self._event(**told.event)
+
+    def _on_command(self, command: Command) -> None:
+        answer = obey(command, self)
+        self.watching.answer(answer)
+        self.supervisor.send("writer", Log(audit_message(command, answer)))
+        self._event(
+            "command",
+            name=command.name,
+            by=command.by,
+            done=answer.done,
+            sentence=answer.sentence,
+            override=bool(command.arguments.get("override")),
+        )
+
+    def _on_pong(self, pong: Pong) -> None:
+        if pong.statistics:
+            self.statistics = pong.statistics
+
+    _handlers: Mapping[type, Callable[[Service, Any], None]] = {
+        Bound: _on_bound,
+        Stored: _on_stored,
+        Sealed: _on_sealed,
+        WriteFailed: _on_write_failed,
+        Pong: _on_pong,
+        Told: _on_told,
+        Command: _on_command,
+    }
+
+    # In flight
+
+    async def _keep_deadlines(self) -> None:
+        while True:
+            now_ns = time.monotonic_ns() + self.hurry_ns
+            may_seal = self.sealing is None and now_ns >= self.seal_again_ns
+            due = tick(self.flight, now_ns, may_seal=may_seal)
+            if (detail := due.detail) is not None:
+                self._decided(Decision("tick", now_ns, detail=detail))
+            for waiting in due.to_store:
+                self.pipeline.keep(waiting.capture.number, waiting.slots)
+                self.supervisor.send("writer", Store(waiting.capture, waiting.slots))
+            for number, cause in due.given_up:
+                self._event("lost", number=number, cause=cause)
+            for head, slot in self.flight.idle_slots:
+                self.pipeline.recycle({head: slot})
+            self.flight.idle_slots.clear()
+            if self.exposure.apply():
+                self.line.exposes_for(self.exposure.times_ns)
+            self.hearing.tell_of_time(now_ns - self.hurry_ns)
+            if due.to_seal is not None:
+                self.sealing = due.to_seal
+                self.supervisor.send("writer", Seal(due.to_seal))
+            await asyncio.sleep(TICK_S)
+
+    async def _watch_processes(self) -> None:
+        while True:
+            imbalances = self.flight.ledger.imbalances()
+            if imbalances:
+                self._fail(f"the ledger does not balance: {'; '.join(imbalances)}")
+            silent = self.supervisor.ping()
+            if silent:
+                self.notifier.status(f"no answer from {', '.join(silent)}")
+            else:
+                self.notifier.watchdog()
+                self.notifier.status(f"{len(self.flight.open_numbers)} exposures open")
+            self._follow_phase()
+            if (warning := self.line.guard.warning()) is not None:
+                self._event("disk", fault=True, sentence=warning)
+            self.watching.tell(self._status())
+            await self._keep_unhandled()
+            await asyncio.sleep(PING_S)
+
+    async def _fly(self) -> None:
+        limit_s = self.configuration.limits.ready_timeout_s
+        await self._until(lambda: not self.absent(), limit_s)
+        # Devices may be missing and said to be; kernels may not: nothing compiles in flight.
+        await self._until(lambda: self.pipeline.is_ready, END_OF_WAITING_S)
+        absent = self.absent()
+        self.is_ready = True
+        self._event("ready", absent=absent)
+        self.notifier.ready(f"flying without {', '.join(absent)}" if absent else "ready")
+        if self.line.runs and (missing := self.preflight.lacks()):
+            self.preflight.override(AT_ONCE, missing)
+        self._follow_phase()
+        await self.line.fly(self._fire, self._disk_full)
+        await self._until(lambda: not self._is_unfinished(), END_OF_WAITING_S)
+        self._event("done")
+        if self.configuration.mission.end_when_done:
+            self.stopping.set()
+
+    # What may be commanded (`daemon.service.commanding`)
+
+    def absent(self) -> list[str]:
+        """What is not there yet, in words."""
+        return self.line.absent(
+            self.hearing.active.__contains__, has_trigger=self.hearing.has_trigger
+        )
+
+    def acknowledge(self, fault: str) -> bool:
+        """A person has seen a fault."""
+        return self.latches.acknowledge(fault)
+
+    def land(self, *, again: bool = False) -> None:
+        """End in good order: what is open is sealed first. `again`: a new mission follows."""
+        self.goes_on = again
+        self.stopping.set()
+
+    def _status(self) -> dict[str, Any]:
+        now_ns = time.monotonic_ns()
+        sheet = self.flight.ledger.sheet()
+        return status_event(
+            phase=self.preflight.phase,
+            ledger=sheet.as_json(),
+            exposures_left=self.line.guard.look().exposures,
+            position=self.flight.track.last,
+            temperatures_c={t.probe: t.value_c for t in self.flight.temperatures.at(now_ns)},
+            time_now=self.flight.clock.gps_at(now_ns),
+            queue=len(self.pipeline),
+            missing=list(map(str, self.preflight.lacks())),
+        )
+
+    def _follow_phase(self) -> None:
+        entered = self.preflight.follow(
+            is_prepared=self.is_ready,
+            has_landed=self.line.is_flown or self.stopping.is_set(),
+            has_failed=self.failure is not None,
+        )
+        for phase in entered:
+            self._event("phase", phase=phase.value)
+        if entered:
+            self.watching.tell(self._status())
+
+    async def _keep_unhandled(self) -> None:
+        """What nobody has acknowledged is there when the service starts next."""
+        if (unhandled := self.latches.unhandled()) != self.unhandled:
+            self.unhandled = unhandled
+            # A disk that refuses has told so itself.
+            with suppress(OSError):
+                await asyncio.to_thread(write_unhandled, self.mission.root, unhandled)
+
+    def _fire(self, order: Order) -> None:
+        self.hearing.orders[order.number] = order
+        about = self.flight.about(order.number)
+        self._decided(Decision("order", order.mono_ns, order.number, about))
+        self.supervisor.send("capture", Fire(order.number, order.delays_ns))
+        self.exposure.ordered(order.number, about["line_id"])
+        self._event("triggered", number=order.number)
+
+    def _disk_full(self, sentence: str) -> None:
+        self._event("disk", fault=True, sentence=sentence)
+
+    async def _until(self, is_so: Callable[[], bool], limit_s: float) -> bool:
+        """Wait for something that messages bring about; False when the time is over first."""
+        deadline = time.monotonic() + limit_s
+        while not is_so():
+            left_s = deadline - time.monotonic()
+            if left_s <= 0:
+                return False
+            self.changed.clear()
+            with suppress(TimeoutError):
+                await asyncio.wait_for(self.changed.wait(), min(left_s, PING_S))
+        return True
+
+    # After the flight
+
+    async def _land(self, tasks: list[asyncio.Task[None]]) -> None:
+        tasks[-1].cancel()  # no more exposures
+        if self.is_power_failing:
+            limit_s = self.configuration.limits.power_fail_s
+            await self._until(lambda: not self._is_unsafe(), limit_s)
+        elif self.failure is None:
+            await self._until(lambda: not self._is_unfinished(), LANDING_TIMEOUT_S)
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        await self.supervisor.end(("capture", "worker", "writer"))
+
+    def _power_fails(self) -> None:
+        """The supply said that it will be gone in seconds.
+
+        What is on its way has half of them to arrive; after that no time-out is waited for.
+        """
+        limits = self.configuration.limits
+        self.is_power_failing = True
+        asyncio.get_running_loop().call_later(limits.power_fail_s / 2, self._hurry)
+        sentence = (
+            f"power fails; what is open is stored and sealed within {limits.power_fail_s:g} s"
+        )
+        self._event("power", fault=True, sentence=sentence)
+        self.stopping.set()
+
+    def _hurry(self) -> None:
+        limits = self.configuration.limits
+        self.hurry_ns = round((limits.frame_timeout_s + limits.mark_timeout_s + 1.0) * 1e9)
+
+    def _is_unsafe(self) -> bool:
+        return self.sealing is not None or bool(self.flight.open_numbers)
+
+    def _is_unfinished(self) -> bool:
+        return self._is_unsafe() or bool(self.pipeline)
+
+    def _task_ended(self, task: asyncio.Task[None]) -> None:
+        error = None if task.cancelled() else task.exception()
+        if error is not None:
+            self._broke({"exception": error})
+
+    def _broke(self, context: Mapping[str, Any]) -> None:
+        """A fault of our own: end with its trace, and be started again into the same flight."""
+        error = context.get("exception")
+        if isinstance(error, BaseException):
+            traceback.print_exception(error)
+        told = f"{type(error).__name__}: {error}" if error else context.get("message")
+        self._fail(f"the service itself failed ({told}); it is started again; report this")
+
+    # Telling
+
+    def _log(self, record: Record | LoggedTrigger) -> None:
+        self.supervisor.send("writer", Log(message_of(record)))
+
+    def _decided(self, decision: Decision) -> None:
+        self.supervisor.send("writer", Log(decision.message()))
+
+    def _event(self, event: str, **content: Any) -> None:
+        told = {"event": event, "mono_ns": str(time.monotonic_ns()), **content}
+        self.latches.apply(told)
+        self.events(told)
+        self.watching.tell(told)
+
+    def _fail(self, sentence: str) -> None:
+        if self.failure is None:
+            self.failure = sentence
+            self._event("fault", sentence=sentence)
+        self.stopping.set()

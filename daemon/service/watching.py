@@ -1,0 +1,129 @@
+"""The service's side of watching: what is told, and a watch process that may die without harm.
+
+Telling drops rather than waits. What watchers see and how commands come in is in `daemon.watch`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from daemon.exposure import Exposure, navigation_to_json
+from daemon.service.departure import ProcessPlan
+from daemon.service.messages import Answer, Told
+from daemon.service.supervisor import Supervisor
+from daemon.timing.clock import GpsEstimate
+from drivers.contract import NavSample
+
+NAME = "watch"
+RESTART_S = 3.0
+"""How long after its death the process is started again."""
+
+
+class Watching:
+    """Tells the watch process, where there is one.
+
+    `dropped` counts events that did not fit into the line; the status of every second puts right
+    what they would have told.
+    """
+
+    def __init__(self, supervisor: Supervisor, plan: ProcessPlan | None) -> None:
+        self._supervisor = supervisor
+        self._plan = plan
+        self._first: Mapping[str, Any] | None = None
+        self.faults: Callable[[], Sequence[Mapping[str, Any]]] = tuple
+        """Events that tell a process started anew of the faults it has not heard of."""
+        self.dropped = 0
+        self.restarts = 0
+
+    def start(self) -> None:
+        if self._plan is not None:
+            self._supervisor.spawn(*self._plan)
+            if self._first is not None:
+                self.tell(self._first)
+            for event in self.faults():
+                self.tell(event)
+
+    def tell(self, event: Mapping[str, Any]) -> None:
+        """Tell of an event. What mission it is, is told again to a process started anew."""
+        if event.get("event") == "mission":
+            self._first = event
+        if self._plan is not None and not self._supervisor.tell(NAME, Told(event)):
+            self.dropped += 1
+
+    def answer(self, answer: Answer) -> None:
+        self._supervisor.tell(NAME, answer)
+
+    def died(self) -> None:
+        """Start it again after a while; the flight goes on."""
+        self.restarts += 1
+        asyncio.get_running_loop().call_later(RESTART_S, self.start)
+
+
+def status_event(
+    *,
+    phase: str,
+    ledger: Mapping[str, Any],
+    exposures_left: int,
+    position: NavSample | None,
+    temperatures_c: Mapping[str, float | None],
+    time_now: GpsEstimate | None,
+    queue: int,
+    missing: Sequence[str],
+) -> dict[str, Any]:
+    """What a watcher must not have wrong for longer than a second, as plain JSON types.
+
+    Args:
+        time_now: GPS time at this moment, or None before anything told it.
+        queue: exposures waiting for the pipeline.
+        missing: what a flight needs and does not have, with its cure.
+    """
+    now_ns = time.monotonic_ns()
+    where = None
+    if position is not None:
+        where = {
+            "receiver": position.receiver,
+            "latitude_deg": position.latitude_deg,
+            "longitude_deg": position.longitude_deg,
+            "height_m": position.height_m,
+            "velocity_ned_mps": list(position.velocity_ned_mps),
+            "heading_rad": position.heading_rad,
+            "fix": position.fix,
+            "satellites": position.satellites,
+            "age_s": round((now_ns - position.mono_ns) * 1e-9, 3),
+        }
+    return {
+        "event": "status",
+        "mono_ns": str(now_ns),
+        "phase": phase,
+        "ledger": {key: value for key, value in ledger.items() if key != "heads"},
+        "exposures_left": exposures_left,
+        "position": where,
+        "temperatures_c": dict(temperatures_c),
+        "clock_sigma_ns": None if time_now is None else time_now.sigma_ns,
+        "clock_source": None if time_now is None else time_now.source,
+        "in_holdover": time_now is not None and time_now.in_holdover,
+        "queue": queue,
+        "missing": list(missing),
+    }
+
+
+def summary(exposure: Exposure) -> dict[str, Any]:
+    """What is told of a sealed exposure, as plain JSON types."""
+    navigation = exposure.navigation
+    return {
+        "number": exposure.number,
+        "state": exposure.state,
+        "frames": len(exposure.frames),
+        "missing": [sensor for sensor, _ in exposure.missing],
+        "mark_gps_ns": None if exposure.mark_gps_ns is None else str(exposure.mark_gps_ns),
+        "mark_sigma_ns": exposure.mark_sigma_ns,
+        "mark_source": exposure.mark_source,
+        "temperatures_c": {t.probe: t.value_c for t in exposure.temperatures},
+        "height_m": navigation.height_m if navigation else None,
+        "navigation": navigation_to_json(navigation) if navigation else None,
+        "line": exposure.line_id,
+        "strip": exposure.strip_id,
+    }

@@ -1,0 +1,1 @@
+"""Calibrations from many exposures or from the laboratory."""

@@ -1,0 +1,377 @@
+"""Boresight, lever arm and time offset: inertial attitude and position against controlled images.
+
+Least squares of all exposures at once, with the whole covariance of the adjusted orientations. What
+the flight cannot separate is left at its given value and named, with what would part it.
+
+Source: seeds/multi-camera-calibration.txt (boresite calibration); DESIGN 5.9.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.bundle.rotations import exponential, logarithm, skew
+from processing.geometry.orientation import BODY_FROM_CAMERA, level_from_body
+
+Array = NDArray[np.float64]
+
+PARAMETERS: Final = (
+    *("boresight about forward", "boresight about right", "boresight about down"),
+    *("lever arm forward", "lever arm right", "lever arm down"),
+    "time offset",
+    *("position shift east", "position shift north", "position shift up"),
+)
+GROUPS: Final = {"boresight": (0, 1, 2), "lever": (3, 4, 5), "time": (6,), "shift": (7, 8, 9)}
+WORTH: Final = np.array([1e-3, 1e-3, 1e-3, 0.5, 0.5, 0.5, 5e-3, 0.5, 0.5, 0.5])
+"""rad, m, s, m: a direction known no better than this is as good as unknown."""
+
+_TAKES_PART: Final = 0.05
+_ITERATIONS: Final = 8
+_LEAST_SPREAD_MPS: Final = 2.0
+
+
+@dataclass(frozen=True)
+class Controlled:
+    """Orientations of n exposures from an adjustment that knew nothing of the trajectory.
+
+    `centre_m` (n, 3) projection centres in object axes (east, north, up); `rotation` (n, 3, 3)
+    object from rig, in camera axes; `covariance` (6n, 6n) of centres (m) and of rotation vectors
+    about the rig's camera axes (rad), exposure by exposure: three and three.
+    """
+
+    centre_m: Array
+    rotation: Array
+    covariance: Array
+
+
+@dataclass(frozen=True)
+class Inertial:
+    """What receiver and inertial unit said at the same n mid-exposures, in the same object axes.
+
+    `position_m` (n, 3) of the antenna; `velocity_mps` (n, 3); `rotation` (n, 3, 3) object from
+    inertial unit (forward, right, down); `rate_rad_per_s` (n, 3) about the unit's axes; sigmas (3,)
+    of position in object axes and of attitude about the unit's axes.
+    """
+
+    position_m: Array
+    velocity_mps: Array
+    rotation: Array
+    rate_rad_per_s: Array
+    position_sigma_m: Array
+    attitude_sigma_rad: Array
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """How the rig sits against the inertial unit and antenna.
+
+    `imu_from_body` (3, 3); `antenna_m` (3,) from the rig's origin, forward, right, down;
+    `time_offset_s`: a mid-exposure's instant on the trajectory's time scale less its own;
+    `shift_m` (3,) positions of the trajectory less those of the control, east, north, up.
+    """
+
+    imu_from_body: Array
+    antenna_m: Array
+    time_offset_s: float
+    shift_m: Array
+
+
+@dataclass(frozen=True)
+class Unseparated:
+    """Parameters this flight does not part: a sentence with the cure, and who takes part."""
+
+    sentence: str
+    parameters: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Boresight:
+    """What a calibration flight says.
+
+    `covariance` (10, 10) in the order of `PARAMETERS` (rad, m, s), within what is determined: held
+    parameters and unseparated directions have none. `determined` (10,) tells the parameters that
+    are known whole. `basis` (10, r) are the determined directions, scaled by `WORTH`. Residuals are
+    (n, 3): positions in m (object axes), attitudes in rad (rig's body axes). `sigma0` has expected
+    value one.
+    """
+
+    mounting: Mounting
+    covariance: Array
+    determined: NDArray[np.bool_]
+    basis: Array
+    held: tuple[str, ...]
+    unseparated: tuple[Unseparated, ...]
+    position_residual_m: Array
+    attitude_residual_rad: Array
+    sigma0: float
+    redundancy: int
+
+    @property
+    def sigma(self) -> Array:
+        """(10,) standard deviations; NaN where a parameter is not determined."""
+        found = np.sqrt(np.clip(np.diag(self.covariance), 0.0, None))
+        return np.where(self.determined, found, np.nan)
+
+    @property
+    def correlation(self) -> Array:
+        """(10, 10); zero for what is not determined."""
+        spread = np.sqrt(np.clip(np.diag(self.covariance), 1e-300, None))
+        return np.asarray(self.covariance / spread / spread[:, None])
+
+
+def calibrated(
+    controlled: Controlled,
+    inertial: Inertial,
+    given: Mounting,
+    *,
+    held: Collection[str] = (),
+    lever_sigma_m: float | None = None,
+) -> Boresight:
+    """Compare inertial with controlled orientation.
+
+    Args:
+        controlled, inertial: the same exposures in the same order.
+        given: what was thought so far; what is held or cannot be separated stays as it is there.
+        held: of "boresight", "lever", "time", "shift".
+        lever_sigma_m: the given lever arm was surveyed to this and counts as an observation.
+
+    Raises:
+        ValueError: fewer than three exposures, tables that do not fit, or an unknown group.
+    """
+    n = len(controlled.centre_m)
+    _check(controlled, inertial, held)
+    free = np.ones(10, dtype=bool)
+    for group in held:
+        free[list(GROUPS[group])] = False
+    at = given
+    if free[0]:
+        at = replace(given, imu_from_body=_mean_boresight(controlled, inertial))
+    for _ in range(_ITERATIONS):
+        misclosure, design, by_image = _equations(controlled, inertial, at)
+        weight = np.linalg.inv(_observation_covariance(controlled, inertial, at, by_image))
+        scaled = design[:, free] * WORTH[free]
+        normal = scaled.T @ weight @ scaled
+        right = scaled.T @ weight @ misclosure
+        prior = np.zeros(10)
+        if lever_sigma_m is not None:
+            prior[3:6] = (WORTH[3:6] / lever_sigma_m) ** 2
+            away = (at.antenna_m - given.antenna_m) / WORTH[3:6]
+            kept = np.flatnonzero(free)
+            right[np.isin(kept, (3, 4, 5))] -= (prior[3:6] * away)[free[3:6]]
+        normal = normal + np.diag(prior[free])
+        values, vectors = np.linalg.eigh(normal)
+        known = values > 1.0
+        basis = vectors[:, known]
+        step = np.zeros(10)
+        step[free] = WORTH[free] * (basis @ ((basis.T @ right) / values[known]))
+        step[free] += WORTH[free] * _back(at, step, given, vectors[:, ~known], free)
+        at = _moved(at, step)
+        if np.abs(step / WORTH).max(initial=0.0) < 1e-9:
+            break
+    misclosure, _, _ = _equations(controlled, inertial, at)
+    whole = np.zeros((10, int(known.sum())))
+    whole[free] = basis
+    covariance = (whole * WORTH[:, None]) / values[known] @ (whole * WORTH[:, None]).T
+    lost = np.zeros((10, int((~known).sum())))
+    lost[free] = vectors[:, ~known]
+    squares = float(misclosure @ weight @ misclosure)
+    observations = 6 * n
+    if lever_sigma_m is not None:
+        squares += float(np.sum(((at.antenna_m - given.antenna_m) / lever_sigma_m) ** 2))
+        observations += 3
+    redundancy = observations - int(known.sum())
+    residual = misclosure.reshape(n, 6)
+    return Boresight(
+        mounting=at,
+        covariance=np.asarray(covariance),
+        determined=free & ((lost**2).sum(axis=1) < _TAKES_PART),
+        basis=whole,
+        held=tuple(held),
+        unseparated=_named(lost, inertial),
+        position_residual_m=residual[:, :3],
+        attitude_residual_rad=residual[:, 3:],
+        sigma0=math.sqrt(squares / redundancy) if redundancy > 0 else math.nan,
+        redundancy=redundancy,
+    )
+
+
+def roll_pitch_heading(imu_from_body: Array) -> Array:
+    """Angles (3,), rad, of Rz(heading) Ry(pitch) Rx(roll): what `level_from_body` turns back."""
+    r = imu_from_body
+    return np.array(
+        [
+            math.atan2(r[2, 1], r[2, 2]),
+            -math.asin(max(-1.0, min(1.0, float(r[2, 0])))),
+            math.atan2(r[1, 0], r[0, 0]),
+        ]
+    )
+
+
+def angle_covariance(found: Boresight) -> Array:
+    """Covariance (3, 3), rad squared, of roll, pitch and heading of the boresight."""
+    step = 1e-6
+    here = roll_pitch_heading(found.mounting.imu_from_body)
+    by = np.stack(
+        [
+            (
+                roll_pitch_heading(
+                    found.mounting.imu_from_body @ exponential(step * np.eye(3)[k : k + 1])[0]
+                )
+                - here
+            )
+            / step
+            for k in range(3)
+        ],
+        axis=1,
+    )
+    return np.asarray(by @ found.covariance[:3, :3] @ by.T)
+
+
+def mounting_of(
+    antenna_m: Array,
+    boresight_rad: Array,
+    *,
+    time_offset_s: float = 0.0,
+    shift_m: Array | None = None,
+) -> Mounting:
+    """A mounting from a lever arm and roll, pitch, heading of the boresight."""
+    return Mounting(
+        level_from_body(*(float(v) for v in boresight_rad)),
+        np.asarray(antenna_m, dtype=np.float64),
+        time_offset_s,
+        np.zeros(3) if shift_m is None else np.asarray(shift_m, dtype=np.float64),
+    )
+
+
+def _check(controlled: Controlled, inertial: Inertial, held: Collection[str]) -> None:
+    n = len(controlled.centre_m)
+    unknown = sorted(set(held) - set(GROUPS))
+    if unknown:
+        raise ValueError(f"{unknown} cannot be held; one of {', '.join(GROUPS)} can")
+    if n < 3:
+        raise ValueError(f"{n} exposures with both orientations; a comparison takes three or more")
+    if len(inertial.position_m) != n or controlled.covariance.shape != (6 * n, 6 * n):
+        raise ValueError(
+            f"{n} controlled exposures, {len(inertial.position_m)} inertial ones, covariance "
+            f"{controlled.covariance.shape}; the same exposures and (6n, 6n) are needed"
+        )
+
+
+def _mean_boresight(controlled: Controlled, inertial: Inertial) -> Array:
+    body = controlled.rotation @ BODY_FROM_CAMERA.T
+    relative = np.einsum("nji,njk->nik", inertial.rotation, body)
+    mean = relative[0]
+    for _ in range(5):
+        off = logarithm(np.einsum("ji,njk->nik", mean, relative))
+        mean = mean @ exponential(off.mean(axis=0)[None])[0]
+    return np.asarray(mean)
+
+
+def _moved(at: Mounting, step: Array) -> Mounting:
+    return Mounting(
+        at.imu_from_body @ exponential(step[None, :3])[0],
+        at.antenna_m + step[3:6],
+        at.time_offset_s + float(step[6]),
+        at.shift_m + step[7:],
+    )
+
+
+def _back(at: Mounting, step: Array, given: Mounting, lost: Array, free: Array) -> Array:
+    """A way along unseparated directions (scaled) that leaves lever arm and time as given, so that
+    the shift of positions takes what nobody can tell."""
+    moved = np.zeros(10)
+    moved[3:6] = at.antenna_m - given.antenna_m
+    moved[6] = at.time_offset_s - given.time_offset_s
+    away = ((moved + step) / WORTH)[free]
+    mounted = np.isin(np.flatnonzero(free), (3, 4, 5, 6))
+    way, *_ = np.linalg.lstsq(lost[mounted], -away[mounted], rcond=1e-3)
+    return np.asarray(lost @ way)
+
+
+def _equations(
+    controlled: Controlled, inertial: Inertial, at: Mounting
+) -> tuple[Array, Array, Array]:
+    """Misclosures (6n,), their sensitivity to the ten with reversed sign (6n, 10), and to the
+    controlled orientations (n, 6, 6)."""
+    n = len(controlled.centre_m)
+    body = controlled.rotation @ BODY_FROM_CAMERA.T
+    turned = exponential(inertial.rate_rad_per_s * at.time_offset_s)
+    misclosure = np.zeros((n, 6))
+    misclosure[:, :3] = (
+        inertial.position_m
+        + inertial.velocity_mps * at.time_offset_s
+        - controlled.centre_m
+        - body @ at.antenna_m
+        - at.shift_m
+    )
+    seen = np.einsum("nji,njk->nik", body, inertial.rotation @ turned @ at.imu_from_body)
+    misclosure[:, 3:] = logarithm(seen)
+    design = np.zeros((n, 6, 10))
+    design[:, 3:, :3] = -np.eye(3)
+    design[:, :3, 3:6] = body
+    design[:, :3, 6] = -inertial.velocity_mps
+    design[:, 3:, 6] = -inertial.rate_rad_per_s @ at.imu_from_body
+    design[:, :3, 7:] = np.eye(3)
+    by_image = np.zeros((n, 6, 6))
+    by_image[:, :3, :3] = -np.eye(3)
+    arm = BODY_FROM_CAMERA.T @ at.antenna_m
+    by_image[:, :3, 3:] = controlled.rotation @ skew(arm[None])[0]
+    by_image[:, 3:, 3:] = -BODY_FROM_CAMERA
+    return misclosure.ravel(), design.reshape(6 * n, 10), by_image
+
+
+def _observation_covariance(
+    controlled: Controlled, inertial: Inertial, at: Mounting, by_image: Array
+) -> Array:
+    n = len(by_image)
+    blocks = controlled.covariance.reshape(n, 6, n, 6)
+    covariance = np.einsum("iab,ibjc,jdc->iajd", by_image, blocks, by_image, optimize=True)
+    own = at.imu_from_body.T @ np.diag(inertial.attitude_sigma_rad**2) @ at.imu_from_body
+    for k in range(n):
+        covariance[k, :3, k, :3] += np.diag(inertial.position_sigma_m**2)
+        covariance[k, 3:, k, 3:] += own
+    return np.asarray(covariance.reshape(6 * n, 6 * n))
+
+
+def _named(lost: Array, inertial: Inertial) -> tuple[Unseparated, ...]:
+    """Sentences for undetermined directions (10, k), scaled by their worth."""
+    if not lost.shape[1]:
+        return ()
+    together = (lost @ lost.T > _TAKES_PART) | (lost @ lost.T < -_TAKES_PART)
+    left = [int(k) for k in np.flatnonzero((lost**2).sum(axis=1) >= _TAKES_PART)]
+    found = []
+    while left:
+        group, queue = {left[0]}, [left[0]]
+        while queue:
+            now = queue.pop()
+            for other in left:
+                if other not in group and together[now, other]:
+                    group.add(other)
+                    queue.append(other)
+        left = [k for k in left if k not in group]
+        found.append(_sentence(sorted(group), inertial))
+    return tuple(found)
+
+
+def _sentence(group: list[int], inertial: Inertial) -> Unseparated:
+    names = tuple(PARAMETERS[k] for k in group)
+    listed = " and ".join([", ".join(names[:-1]), names[-1]]) if len(names) > 1 else names[0]
+    has = set(group)
+    speed = np.linalg.norm(inertial.velocity_mps, axis=1)
+    cures = []
+    if 6 in has and 3 in has and float(np.ptp(speed)) < _LEAST_SPREAD_MPS:
+        cures.append(f"all lines were flown at {speed.mean():.0f} m/s: fly two speeds")
+    if has & {3, 4, 6} and has & {7, 8}:
+        cures.append("fly lines in opposite and in crossing directions")
+    if {5, 9} <= has:
+        cures.append("level flight never parts them: survey the lever arm and give --lever-sigma")
+    if not cures:
+        cures.append("fly two heights, opposite and crossing lines and two speeds, or hold one")
+    verb = "cannot be told apart" if len(names) > 1 else "cannot be determined"
+    return Unseparated(f"{listed} {verb}: {'; '.join(cures)}", names)

@@ -1,0 +1,214 @@
+"""The platform calibration from many exposures: how every cone is mounted, and how well known.
+
+Each exposure's stitching tells turns against the calibration it was made with
+(`processing.mosaic.stitch_record`); here they become one. Turns are rotation vectors (rad) about
+the axes of the virtual image.
+
+Source: seeds/dmc-calibration.txt, 6.1; seeds/ultracam-calibration.txt, "platform calibration".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from processing.bundle.rotations import angles_by_rotation_vector, omega_phi_kappa
+from processing.mosaic.mounting import place_covariance, turned
+from processing.mosaic.stitch_record import TURNS, StitchRecord
+from processing.rig import Cone, Rig
+
+Array = NDArray[np.float64]
+
+LEAST_EXPOSURES: Final = 3
+LEAST_SYNTOPIC: Final = 12
+"""Cones that fire one after the other are turned by the aircraft in between: more are needed."""
+LEAST_SIGMA_URAD: Final = 2.0
+"""A mount is not claimed to keep its angles better than this from flight to flight."""
+COLOUR_FLOOR_PX: Final = 0.02
+"""What matching of another band leaves in every exposure alike, colour pixels."""
+_OUTLYING: Final = 5.0
+_SPREAD_OF_MEDIAN: Final = 1.4826
+_SCATTER_ALPHA: Final = 0.01
+
+
+@dataclass(frozen=True)
+class CalibratedCone:
+    """One cone, turned as the exposures say.
+
+    `turn_rad` against the calibration flown with, `turn_sigma_rad` of the mean, the sensor's place
+    in its head taken as calibrated; `scatter_rad` is that of a single exposure. `angles_rad` are
+    omega, phi, kappa with `angles_sigma_rad`, which holds the place's share too. `turns` (n, 3)
+    are the exposures used, numbers `used` among the records.
+    """
+
+    cone: str
+    turn_rad: Array
+    turn_sigma_rad: Array
+    scatter_rad: Array
+    angles_rad: Array
+    angles_sigma_rad: Array
+    turns: Array
+    used: tuple[int, ...]
+    left_out: int
+    unexplained_rad: Array
+    """Scatter beyond what the exposures state: turning between syntopic instants, a loose mount."""
+
+    @property
+    def sigma_urad(self) -> float:
+        """What a single exposure may find the mounting off by, for the rig file."""
+        own = float(np.sqrt(np.max(self.turn_sigma_rad**2 + self.unexplained_rad**2))) * 1e6
+        return max(own, LEAST_SIGMA_URAD)
+
+
+@dataclass(frozen=True)
+class PlatformCalibration:
+    """`cones` that could be calibrated; `missing` those that no or too few exposures tell of."""
+
+    cones: tuple[CalibratedCone, ...]
+    missing: tuple[str, ...]
+
+
+def calibrate_platform(rig: Rig, records: Sequence[StitchRecord]) -> PlatformCalibration:
+    """Average the turns of every cone but the master over exposures.
+
+    An exposure in which a cone's turn is far off (a head blurred, a cloud) is left out for it. Of
+    converging heads only exposures that tell of all of them count: their datum is their mean.
+
+    Raises:
+        ValueError: a record of another rig or calibration.
+    """
+    for record in records:
+        if (record.rig, record.calibration_id) != (rig.name, rig.calibration_id):
+            raise ValueError(
+                f"a record of {record.rig} {record.calibration_id!r} does not belong to "
+                f"{rig.name} {rig.calibration_id!r}"
+            )
+    heads = [cone.name for cone in rig.pan_cones] if rig.has_virtual_camera else []
+    complete = [k for k, r in enumerate(records) if all(_tells(r, name) for name in heads)]
+    cones, missing = [], []
+    for cone in rig.cones:
+        if cone.name == rig.master_cone:
+            continue
+        among = complete if cone.name in heads else range(len(records))
+        found = _calibrated(rig, cone, records, [k for k in among if _tells(records[k], cone.name)])
+        if found is None:
+            missing.append(cone.name)
+        else:
+            cones.append(found)
+    return PlatformCalibration(tuple(cones), tuple(missing))
+
+
+def calibrated_rig(
+    rig: Rig, calibration: PlatformCalibration, *, calibration_id: str, date: str
+) -> Rig:
+    """The rig with the new angles and how well they are known."""
+    found = {c.cone: c for c in calibration.cones}
+    cones = []
+    for cone in rig.cones:
+        if cone.name in found:
+            omega, phi, kappa = (float(angle) for angle in found[cone.name].angles_rad)
+            cone = replace(
+                cone,
+                rotation_rad=(omega, phi, kappa),
+                rotation_sigma_urad=round(found[cone.name].sigma_urad, 2),
+            )
+        cones.append(cone)
+    return replace(rig, cones=tuple(cones), calibration_id=calibration_id, calibration_date=date)
+
+
+def shift_px(rig: Rig, turn_rad: Array) -> float:
+    """How far a turn moves the middle of a cone's field, PAN pixels, about x and y alone."""
+    if rig.virtual_image is None:
+        return 0.0
+    return float(np.hypot(*turn_rad[:2])) * rig.virtual_image.f_mm / rig.virtual_image.pitch_mm
+
+
+def _calibrated(
+    rig: Rig, cone: Cone, records: Sequence[StitchRecord], used: Sequence[int]
+) -> CalibratedCone | None:
+    told = [_turn(records[k], cone.name) for k in used]
+    least = least_exposures(rig)
+    if len(told) < least:
+        return None
+    turns, stated = np.array([t for t, _ in told]), np.array([c for _, c in told])
+    middle = np.median(turns, axis=0)
+    apart = np.abs(turns - middle)
+    spread = np.maximum(
+        _SPREAD_OF_MEDIAN * np.median(apart, axis=0),
+        np.sqrt(np.median(np.diagonal(stated, axis1=1, axis2=2), axis=0)),
+    )
+    good = (apart <= _OUTLYING * np.maximum(spread, 1e-12)).all(axis=1)
+    if int(good.sum()) < least:
+        return None
+    turns, stated = turns[good], stated[good]
+    n = len(turns)
+    mean, own = turns.mean(axis=0), stated.mean(axis=0)
+    seen = np.atleast_2d(np.cov(turns.T, ddof=1))
+    # Scatter counts where the exposures' own statement does not explain it.
+    ratio = np.diag(seen) / np.maximum(np.diag(own), 1e-30)
+    beyond = ratio > chi2.ppf(1.0 - _SCATTER_ALPHA / 3.0, n - 1) / (n - 1)
+    # An aircraft turns slowly: neighbouring exposures err alike and count for less.
+    variance = np.where(beyond, np.diag(seen) * _alike(turns), np.diag(own))
+    scale = np.sqrt(variance / np.maximum(np.diag(own), 1e-30))
+    of_mean = own * np.outer(scale, scale) / n
+    rotation = turned(cone, mean)
+    # A turn w before the rotation is one of R'w behind it.
+    jacobian = angles_by_rotation_vector(rotation[None])[0] @ rotation.T
+    total = of_mean + _place_share(rig, cone)
+    return CalibratedCone(
+        cone=cone.name,
+        turn_rad=mean,
+        turn_sigma_rad=np.sqrt(np.diag(of_mean)),
+        scatter_rad=np.sqrt(np.diag(seen)),
+        angles_rad=omega_phi_kappa(rotation[None])[0],
+        angles_sigma_rad=np.sqrt(np.diag(jacobian @ total @ jacobian.T)),
+        turns=turns,
+        used=tuple(int(k) for k, kept in zip(used, good, strict=True) if kept),
+        left_out=int(np.count_nonzero(~good)),
+        unexplained_rad=np.sqrt(np.where(beyond, np.maximum(np.diag(seen - own), 0.0), 0.0)),
+    )
+
+
+def least_exposures(rig: Rig) -> int:
+    """Below, a cone's mean is not told."""
+    return LEAST_SYNTOPIC if rig.timing == "syntopic" else LEAST_EXPOSURES
+
+
+def _alike(turns: Array) -> Array:
+    """(1 + r) / (1 - r) of neighbouring exposures' correlation r, (3,): at least one."""
+    off = turns - turns.mean(axis=0)
+    r = np.sum(off[1:] * off[:-1], axis=0) / np.maximum(np.sum(off**2, axis=0), 1e-30)
+    r = np.clip(r, 0.0, 0.9)
+    return np.asarray((1.0 + r) / (1.0 - r))
+
+
+def _place_share(rig: Rig, cone: Cone) -> Array:
+    """What the places of sensors add to a turn, (3, 3): the cone's own, and that of the datum."""
+    own = place_covariance(cone, {})
+    if cone.role == "colour":
+        sensor = cone.sensors[0]
+        left_mm = COLOUR_FLOOR_PX * sensor.pitch_mm
+        half_mm = float(np.hypot(sensor.width_px, sensor.height_px)) / 2.0 * sensor.pitch_mm
+        across = left_mm / cone.lens.f_mm
+        own = own + np.diag(np.square([across, across, left_mm / half_mm]))
+    if not rig.has_virtual_camera:
+        return own + place_covariance(rig.cone(rig.master_cone), {})
+    heads = rig.pan_cones
+    of_mean = sum((place_covariance(c, {}) for c in heads), np.zeros((3, 3))) / len(heads) ** 2
+    if cone not in heads:
+        return own + of_mean
+    return own * (1.0 - 2.0 / len(heads)) + of_mean
+
+
+def _tells(record: StitchRecord, cone: str) -> bool:
+    return f"{cone}.{TURNS[0]}" in record.names
+
+
+def _turn(record: StitchRecord, cone: str) -> tuple[Array, Array]:
+    at = [record.names.index(f"{cone}.{what}") for what in TURNS]
+    return record.values[at] * 1e-6, record.covariance[np.ix_(at, at)] * 1e-12

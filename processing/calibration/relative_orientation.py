@@ -1,0 +1,249 @@
+"""Relative orientation of the heads of a rig, from a block in which every image was oriented.
+
+Every image's rotation is turned back by that of the reference image of the same exposure; what is
+left is averaged over the block with the whole covariance of the adjustment.
+
+Source: seeds/multi-camera-calibration.txt, table 2.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.bundle.adjust import Adjustment
+from processing.bundle.rotations import exponential, logarithm
+from processing.geometry.orientation import phi_omega_kappa
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+_ITERATIONS = 10
+_SETTLED_RAD = 1e-12
+
+
+@dataclass(frozen=True)
+class RelativeOrientation:
+    """One head against the reference head.
+
+    `rotation` (3, 3) is reference_from_head; `single_rad` (n, 3) what single exposures are off it
+    about the head's axes, none where the heads were parameters of the adjustment.
+    """
+
+    head: str
+    rotation: Array
+    single_rad: Array
+    exposures: int
+
+    @property
+    def spread_rad(self) -> Array:
+        """(3,) standard deviation of single exposures; NaN where there are not two."""
+        if len(self.single_rad) < 2:
+            return np.full(3, np.nan)
+        return np.asarray(self.single_rad.std(axis=0, ddof=1))
+
+
+@dataclass(frozen=True)
+class RelativeOrientations:
+    """All heads but the reference.
+
+    `covariance` (3h, 3h), rad squared, of rotation vectors about each head's own axes;
+    `squares` is the mean square of single exposures about the averages in their own covariance
+    (one where the rig did not move between exposures), NaN where there are none.
+    """
+
+    reference: str
+    heads: tuple[RelativeOrientation, ...]
+    covariance: Array
+    squares: float
+    redundancy: int
+
+    def sigma_rad(self, head: int) -> Array:
+        """(3,) about the head's own axes."""
+        own = self.covariance[3 * head : 3 * head + 3, 3 * head : 3 * head + 3]
+        return np.asarray(np.sqrt(np.diag(own)))
+
+    def angles(self, head: int) -> tuple[Array, Array]:
+        """phi, omega, kappa (3,) of R = Ry Rx Rz and their standard deviations (3,), rad."""
+        rotation = self.heads[head].rotation
+        by = _angles_by_vector(rotation)
+        own = self.covariance[3 * head : 3 * head + 3, 3 * head : 3 * head + 3]
+        return np.array(phi_omega_kappa(rotation)), np.sqrt(np.diag(by @ own @ by.T))
+
+
+def relative_orientations(
+    result: Adjustment, reference: str, *, least_points: int = 10
+) -> RelativeOrientations:
+    """Relative orientations of an adjusted block.
+
+    Where the network has heads, they were parameters and are taken as adjusted; else each exposure
+    (station) with an image of the reference camera counts.
+
+    Args:
+        result: the block, images with attitudes of their own or heads.
+        reference: the camera (head) the others are turned against.
+        least_points: image points that an image needs to count.
+
+    Raises:
+        ValueError: no such camera, or no exposure with it and another one.
+    """
+    names = [camera.name for camera in result.network.cameras]
+    if reference not in names:
+        raise ValueError(f"no camera {reference!r}; there are {', '.join(names)}")
+    if any(head.rotation_free for head in result.network.heads):
+        return _of_parameters(result, reference)
+    return _averaged(result, reference, _pairs(result, names.index(reference), least_points))
+
+
+def averaged(
+    reference_rotation: Array, head_rotation: Array, head: Indices, covariance: Array, heads: int
+) -> tuple[Array, Array, Array]:
+    """Mean relative rotations by generalised least squares.
+
+    Args:
+        reference_rotation, head_rotation: (n, 3, 3) object from camera, pair by pair.
+        head: (n,) which head a pair is of.
+        covariance: (6n, 6n) of their rotation vectors: reference, then head, of every pair.
+        heads: how many.
+
+    Returns:
+        rotations (heads, 3, 3), covariance (3 heads, 3 heads), and what single pairs are off (n, 3)
+        about the head's axes.
+    """
+    n = len(head)
+    relative = np.einsum("nji,njk->nik", reference_rotation, head_rotation)
+    mean = np.array([relative[head == h][0] for h in range(heads)])
+    design = np.zeros((n, 3, heads, 3))
+    for k in range(n):
+        design[k, :, head[k], :] = np.eye(3)
+    a = design.reshape(3 * n, 3 * heads)
+    for _ in range(_ITERATIONS):
+        off = logarithm(np.einsum("nji,njk->nik", mean[head], relative))
+        by = np.zeros((n, 3, n, 6))
+        for k in range(n):
+            by[k, :, k, :3] = -mean[head[k]].T
+            by[k, :, k, 3:] = np.eye(3)
+        flat = by.reshape(3 * n, 6 * n)
+        weight = np.linalg.inv(flat @ covariance @ flat.T)
+        cofactor = np.linalg.inv(a.T @ weight @ a)
+        step = (cofactor @ (a.T @ weight @ off.ravel())).reshape(heads, 3)
+        mean = mean @ exponential(step)
+        if np.abs(step).max() < _SETTLED_RAD:
+            break
+    off = logarithm(np.einsum("nji,njk->nik", mean[head], relative))
+    return np.asarray(mean), np.asarray(cofactor), off
+
+
+def _averaged(
+    result: Adjustment, reference: str, pairs: Sequence[tuple[int, int, int]]
+) -> RelativeOrientations:
+    cameras = list(dict.fromkeys(camera for _, _, camera in pairs))
+    first = np.array([p[0] for p in pairs])
+    second = np.array([p[1] for p in pairs])
+    head = np.array([cameras.index(p[2]) for p in pairs])
+    at = np.concatenate(
+        [
+            np.concatenate([result.layout.attitude[a], result.layout.attitude[b]])
+            for a, b in zip(first, second, strict=True)
+        ]
+    )
+    covariance = result.sigma0**2 * result.cofactor[np.ix_(at, at)]
+    covariance[np.ix_(at < 0, at < 0)] = 0.0
+    mean, own, off = averaged(
+        result.state.attitude[first], result.state.attitude[second], head, covariance, len(cameras)
+    )
+    redundancy = 3 * (len(pairs) - len(cameras))
+    by = np.zeros((len(pairs), 3, len(pairs), 6))
+    for k, h in enumerate(head):
+        by[k, :, k, :3], by[k, :, k, 3:] = -mean[h].T, np.eye(3)
+    flat = by.reshape(3 * len(pairs), -1)
+    squares = float(off.ravel() @ np.linalg.solve(flat @ covariance @ flat.T, off.ravel()))
+    return RelativeOrientations(
+        reference=reference,
+        heads=tuple(
+            RelativeOrientation(
+                result.network.cameras[camera].name,
+                mean[h],
+                off[head == h],
+                int((head == h).sum()),
+            )
+            for h, camera in enumerate(cameras)
+        ),
+        covariance=own,
+        squares=squares / redundancy if redundancy else math.nan,
+        redundancy=redundancy,
+    )
+
+
+def _pairs(result: Adjustment, reference: int, least_points: int) -> list[tuple[int, int, int]]:
+    """(attitude of the reference image, attitude of another of the exposure, its camera)."""
+    images = result.network.images
+    used = result.weight > 0.0
+    seen = np.bincount(result.network.image_points.image[used], minlength=len(images.names))
+    by_station: dict[int, int] = {}
+    for image in np.flatnonzero((images.camera == reference) & (seen >= least_points)):
+        by_station[int(images.station[image])] = int(images.attitude[image])
+    pairs = [
+        (by_station[int(images.station[i])], int(images.attitude[i]), int(images.camera[i]))
+        for i in np.flatnonzero((images.camera != reference) & (seen >= least_points))
+        if int(images.station[i]) in by_station
+    ]
+    if any(a == b for a, b, _ in pairs):
+        raise ValueError(
+            "images of an exposure share one attitude and no head is free: give the images angles "
+            'of their own, or heads with rotation = "free"'
+        )
+    if not pairs:
+        raise ValueError(
+            f"no exposure has an image of the reference camera and of another one with "
+            f"{least_points} points each"
+        )
+    return sorted(pairs, key=lambda p: p[2])
+
+
+def _of_parameters(result: Adjustment, reference: str) -> RelativeOrientations:
+    network, layout = result.network, result.layout
+    by_name: Mapping[str, int] = {head.name: k for k, head in enumerate(network.heads)}
+    base = by_name.get(reference)
+    if base is not None and network.heads[base].rotation_free:
+        raise ValueError(
+            f"head {reference!r} is the reference and free: hold it, all others are against it"
+        )
+    turn = np.eye(3) if base is None else network.heads[base].rotation
+    free = [k for k, head in enumerate(network.heads) if head.rotation_free]
+    at = np.concatenate([layout.head_rotation[k] for k in free])
+    seen = {
+        k: len(np.unique(network.images.station[network.images.head == k]))
+        for k in range(len(by_name))
+    }
+    return RelativeOrientations(
+        reference=reference,
+        heads=tuple(
+            RelativeOrientation(
+                network.heads[k].name,
+                turn.T @ result.state.head_rotation[k],
+                np.zeros((0, 3)),
+                seen[k],
+            )
+            for k in free
+        ),
+        covariance=result.sigma0**2 * result.cofactor[np.ix_(at, at)],
+        squares=math.nan,
+        redundancy=0,
+    )
+
+
+def _angles_by_vector(rotation: Array) -> Array:
+    """d(phi, omega, kappa) / d(rotation vector about the head's axes), (3, 3), by differences."""
+    step = 1e-6
+    columns = []
+    for axis in range(3):
+        turn = exponential(step * np.eye(3)[axis : axis + 1])[0]
+        ahead, behind = phi_omega_kappa(rotation @ turn), phi_omega_kappa(rotation @ turn.T)
+        difference = np.array(ahead) - np.array(behind)
+        columns.append((difference + math.pi) % (2 * math.pi) - math.pi)
+    return np.stack(columns, axis=1) / (2 * step)

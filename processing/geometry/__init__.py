@@ -1,0 +1,1 @@
+"""Cameras and planes: lens, placement, drift, topology, the virtual camera."""

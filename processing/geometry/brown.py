@@ -1,0 +1,104 @@
+"""Brown's distortion as computer vision writes it, carried into the lens correction of eq. 5.1.
+
+Makers of small cameras state measured = f(ideal); a rig file holds ideal = measured + delta. The
+correction is fitted once, and the fit says how well it does.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.geometry.lens import lens_correction
+from processing.rig import Lens
+
+Array = NDArray[np.float64]
+
+_GRID: Final = 41
+_BEYOND: Final = 1.02
+"""The fit reaches a little past the frame: no extrapolation at its corners."""
+
+
+@dataclass(frozen=True)
+class Brown:
+    """measured = ideal (1 + k1 r2 + k2 r4 + k3 r6) + tangential, in units of the focal length,
+    x right, y down; the principal point in pixels (column, row).
+
+    Tangential: x by 2 p1 x y + p2 (r2 + 2 x2), y by p1 (r2 + 2 y2) + 2 p2 x y.
+    """
+
+    f_px: float
+    principal_point_px: tuple[float, float]
+    k1: float
+    k2: float
+    k3: float
+    p1: float
+    p2: float
+
+
+def measured_from_ideal_brown(brown: Brown, xy: Array) -> Array:
+    """Distort points (n, 2) in units of the focal length, y down."""
+    x, y = xy[:, 0], xy[:, 1]
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (brown.k1 + r2 * (brown.k2 + r2 * brown.k3))
+    return np.column_stack(
+        [
+            x * radial + 2.0 * brown.p1 * x * y + brown.p2 * (r2 + 2.0 * x * x),
+            y * radial + brown.p1 * (r2 + 2.0 * y * y) + 2.0 * brown.p2 * x * y,
+        ]
+    )
+
+
+def lens_from_brown(
+    brown: Brown, *, width_px: int, height_px: int, pitch_mm: float, f_number: float, serial: str
+) -> tuple[Lens, float]:
+    """The lens of eq. 5.1 that undoes Brown's distortion best.
+
+    Returns:
+        The lens, and the largest error of the fit over the frame, px.
+
+    Raises:
+        ValueError: a distortion that folds the frame over.
+    """
+    f_mm = brown.f_px * pitch_mm
+    centre = brown.principal_point_px
+    half = _BEYOND * max(
+        centre[0], centre[1], width_px - 1 - centre[0], height_px - 1 - centre[1], 1.0
+    )
+    axis = np.linspace(-1.15 * half, 1.15 * half, _GRID) / brown.f_px
+    ideal = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    measured = measured_from_ideal_brown(brown, ideal)
+    at = measured * brown.f_px + np.array(centre)
+    inside = (
+        (at[:, 0] >= -0.02 * width_px)
+        & (at[:, 0] <= 1.02 * width_px)
+        & (at[:, 1] >= -0.02 * height_px)
+        & (at[:, 1] <= 1.02 * height_px)
+    )
+    up = np.array([f_mm, -f_mm])
+    m, delta = measured[inside] * up, (ideal - measured)[inside] * up
+    lens = Lens(
+        f_mm=f_mm, f_ppm_per_k=0.0, f_number=f_number, serial=serial, dx0_mm=0.0, dy0_mm=0.0,
+        df_mm=0.0, k1=0.0, k2=0.0, k3=0.0, p1=0.0, p2=0.0, b1=0.0, b2=0.0,
+    )  # fmt: skip
+    units = (
+        replace(lens, k1=1.0),
+        replace(lens, k2=1.0),
+        replace(lens, k3=1.0),
+        replace(lens, p1=1.0),
+        replace(lens, p2=1.0),
+    )
+    columns = [lens_correction(unit, m).ravel() for unit in units]
+    design = np.stack(columns, axis=1)
+    size = np.linalg.norm(design, axis=0)
+    solution, *_ = np.linalg.lstsq(design / size, delta.ravel(), rcond=None)
+    k1, k2, k3, p1, p2 = (float(value) for value in solution / size)
+    lens = replace(lens, k1=k1, k2=k2, k3=k3, p1=p1, p2=p2)
+    worst_px = float(np.abs(lens_correction(lens, m) - delta).max()) / pitch_mm
+    if not math.isfinite(worst_px) or worst_px > 1.0:
+        raise ValueError(f"the distortion cannot be undone within a pixel ({worst_px:.2g} px left)")
+    return lens, worst_px

@@ -1,0 +1,193 @@
+"""Where a sensor's pixels fall in the virtual image plane, and back.
+
+A placement composes TDI, TDM, lens, principal distance, similarity S and layer transformation P
+(eq. 1 of seeds/ultracam-calibration.txt); adjusting S and P is the work of
+`processing.mosaic.free`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.geometry.drift import cone_dc, physical_similarity, principal_distance, sensor_dc
+from processing.geometry.lens import ideal_from_measured, measured_from_ideal
+from processing.geometry.projective import apply_projective
+from processing.geometry.similarity import Similarity, apply_similarity, invert_similarity
+from processing.geometry.virtual_camera import GroundPlane, vip_from_layer
+from processing.rig import Cone, Rig, Sensor, VirtualImage
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SensorPlacement:
+    """One sensor of one exposure in the virtual image plane: x_vip = P S u' (eq. 1).
+
+    `similarity` is S, layer_from_sensor in the calibrated (ideal) layer; `layer` is P, the (3, 3)
+    vip_from_layer homography in mm. `physical` is layer_from_sensor at the exposure's temperature
+    in the physical layer, `f_ratio` = f_mm / f(T), `tdi_shifts` the N of the exposure.
+
+    u' are raw sensor coordinates corrected for lens and drift of the principal distance, expressed
+    at the start position, so that an adjusted placement is
+    `dataclasses.replace(start, similarity=..., layer=...)`.
+    """
+
+    sensor: Sensor
+    cone: Cone
+    similarity: Similarity
+    layer: Array
+    physical: Similarity
+    f_ratio: float
+    tdi_shifts: int
+
+
+def nominal_placements(
+    rig: Rig,
+    temperatures_c: Mapping[str, float],
+    tdi_shifts: Mapping[str, int],
+    *,
+    use_drift: bool = True,
+    ground: GroundPlane | None = None,
+) -> dict[str, SensorPlacement]:
+    """Placements by calibration, TDM and platform calibration: the start of any stitching.
+
+    Args:
+        rig: the camera.
+        temperatures_c: temperature by probe name. A probe without one leaves its sensors at their
+            calibration temperature; saying so is the caller's
+            (`processing.geometry.drift.missing_probes`).
+        tdi_shifts: N by cone name; a cone without one has none.
+        use_drift: False ignores the temperatures (places and principal distances as calibrated).
+        ground: what a virtual camera projects onto; None takes its projection centres as one.
+
+    Returns:
+        One placement per sensor of the rig, by sensor name, in file order.
+
+    Raises:
+        ValueError: the rig has no virtual image.
+    """
+    if rig.virtual_image is None:
+        raise ValueError(f"rig {rig.name} has no [virtual_image]; nothing can be placed in it")
+    known = temperatures_c if use_drift else {}
+    placements: dict[str, SensorPlacement] = {}
+    for cone in rig.cones:
+        f_ratio = cone.lens.f_mm / principal_distance(cone, cone_dc(cone, known))
+        layer = vip_from_layer(rig, cone, ground)
+        for sensor in cone.sensors:
+            physical = physical_similarity(sensor, sensor_dc(sensor, known))
+            placements[sensor.name] = SensorPlacement(
+                sensor=sensor,
+                cone=cone,
+                similarity=_start_similarity(cone, physical, f_ratio),
+                layer=layer,
+                physical=physical,
+                f_ratio=f_ratio,
+                tdi_shifts=tdi_shifts.get(cone.name, 0),
+            )
+    return placements
+
+
+def start_similarity(placement: SensorPlacement) -> Similarity:
+    """S at calibration + TDM, whatever the placement's own S has become by adjustment.
+
+    The sensor's centre goes to its lens-corrected place in the calibrated layer.
+    """
+    return _start_similarity(placement.cone, placement.physical, placement.f_ratio)
+
+
+def _start_similarity(cone: Cone, physical: Similarity, f_ratio: float) -> Similarity:
+    centre = ideal_from_measured(cone.lens, np.array([[physical.x_mm, physical.y_mm]]))[0]
+    return Similarity(
+        x_mm=float(centre[0]) * f_ratio,
+        y_mm=float(centre[1]) * f_ratio,
+        rotation_rad=physical.rotation_rad,
+        scale=physical.scale * f_ratio,
+    )
+
+
+def sensor_mm_from_raw(placement: SensorPlacement, colrow: Array) -> Array:
+    """Sensor coordinates u (n, 2), mm, y up, of raw pixels (n, 2) at mid-exposure.
+
+    With N TDI shifts the content of row R belongs to row R - tdi_row_sign * N / 2.
+    """
+    sensor = placement.sensor
+    row_shift = sensor.tdi_row_sign * placement.tdi_shifts / 2.0
+    u = np.empty((len(colrow), 2))
+    u[:, 0] = (colrow[:, 0] - (sensor.width_px - 1) / 2.0) * sensor.pitch_mm
+    u[:, 1] = ((sensor.height_px - 1) / 2.0 - (colrow[:, 1] - row_shift)) * sensor.pitch_mm
+    return u
+
+
+def raw_from_sensor_mm(placement: SensorPlacement, u_mm: Array) -> Array:
+    """Inverse of `sensor_mm_from_raw`."""
+    sensor = placement.sensor
+    row_shift = sensor.tdi_row_sign * placement.tdi_shifts / 2.0
+    colrow = np.empty((len(u_mm), 2))
+    colrow[:, 0] = u_mm[:, 0] / sensor.pitch_mm + (sensor.width_px - 1) / 2.0
+    colrow[:, 1] = (sensor.height_px - 1) / 2.0 - u_mm[:, 1] / sensor.pitch_mm + row_shift
+    return colrow
+
+
+def corrected_mm_from_raw(placement: SensorPlacement, colrow: Array) -> Array:
+    """u' of eq. 1 (n, 2), mm: what S and P act on, independent of their adjustment."""
+    physical = apply_similarity(placement.physical, sensor_mm_from_raw(placement, colrow))
+    ideal = ideal_from_measured(placement.cone.lens, physical) * placement.f_ratio
+    return apply_similarity(invert_similarity(start_similarity(placement)), ideal)
+
+
+def vip_mm_from_raw(placement: SensorPlacement, colrow: Array) -> Array:
+    """Carry raw pixels into the virtual image plane.
+
+    Args:
+        placement: start or adjusted.
+        colrow: (column, row), shape (n, 2), zero-based, integer at the pixel centre, row down.
+
+    Returns:
+        VIP points, shape (n, 2), mm, x right, y up.
+
+    Source: seeds/ultracam-calibration.txt, eq. 1.
+    """
+    corrected = corrected_mm_from_raw(placement, np.asarray(colrow, dtype=np.float64))
+    return apply_projective(placement.layer @ placement.similarity.matrix, corrected)
+
+
+def raw_from_vip_mm(placement: SensorPlacement, xy_mm: Array) -> Array:
+    """Inverse of `vip_mm_from_raw`, exact to 1e-6 px; (n, 2) to (n, 2).
+
+    Points the lens polynomial cannot reach (far outside the cone's field) are NaN; points outside
+    the sensor have coordinates outside its array.
+    """
+    xy = np.asarray(xy_mm, dtype=np.float64)
+    vip_from_ideal = (
+        placement.layer
+        @ placement.similarity.matrix
+        @ invert_similarity(start_similarity(placement)).matrix
+    )
+    ideal = (
+        apply_projective(np.asarray(np.linalg.inv(vip_from_ideal), np.float64), xy)
+        / placement.f_ratio
+    )
+    physical = measured_from_ideal(placement.cone.lens, ideal)
+    return raw_from_sensor_mm(
+        placement, apply_similarity(invert_similarity(placement.physical), physical)
+    )
+
+
+def vip_px_from_mm(image: VirtualImage, xy_mm: Array) -> Array:
+    """VIP pixels (column, row) of VIP points in mm; (n, 2) to (n, 2)."""
+    colrow = np.empty((len(xy_mm), 2))
+    colrow[:, 0] = xy_mm[:, 0] / image.pitch_mm + (image.width_px - 1) / 2.0
+    colrow[:, 1] = (image.height_px - 1) / 2.0 - xy_mm[:, 1] / image.pitch_mm
+    return colrow
+
+
+def vip_mm_from_px(image: VirtualImage, colrow: Array) -> Array:
+    """Inverse of `vip_px_from_mm`."""
+    xy = np.empty((len(colrow), 2))
+    xy[:, 0] = (colrow[:, 0] - (image.width_px - 1) / 2.0) * image.pitch_mm
+    xy[:, 1] = ((image.height_px - 1) / 2.0 - colrow[:, 1]) * image.pitch_mm
+    return xy

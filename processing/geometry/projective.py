@@ -1,0 +1,60 @@
+"""Plane projective transformations: a layer's way into the virtual image plane.
+
+Matrices (3, 3) act on homogeneous points (x, y, 1) in mm; lens distortion is not projective and
+lives in `processing.geometry.lens`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def apply_projective(target_from_source: Array, xy: Array) -> Array:
+    """Carry points (n, 2) by a (3, 3) homography; any consistent unit."""
+    h = target_from_source
+    x, y = xy[:, 0], xy[:, 1]
+    w = h[2, 0] * x + h[2, 1] * y + h[2, 2]
+    result = np.empty((len(xy), 2))
+    result[:, 0] = (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / w
+    result[:, 1] = (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / w
+    return result
+
+
+def projective_jacobian(target_from_source: Array, xy: Array) -> Array:
+    """d(target) / d(source) at points (n, 2): shape (n, 2, 2)."""
+    h = target_from_source
+    x, y = xy[:, 0], xy[:, 1]
+    w = h[2, 0] * x + h[2, 1] * y + h[2, 2]
+    u = (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / w
+    v = (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / w
+    jacobian = np.empty((len(xy), 2, 2))
+    jacobian[:, 0, 0] = (h[0, 0] - u * h[2, 0]) / w
+    jacobian[:, 0, 1] = (h[0, 1] - u * h[2, 1]) / w
+    jacobian[:, 1, 0] = (h[1, 0] - v * h[2, 0]) / w
+    jacobian[:, 1, 1] = (h[1, 1] - v * h[2, 1]) / w
+    return jacobian
+
+
+def rotation_homography(master_from_cone: Array, f_cone_mm: float, f_master_mm: float) -> Array:
+    """The homography a pure rotation makes between two image planes, K_master R K_cone^-1.
+
+    An image point is the vector (x, y, -f) in camera axes x right, y forward, z up.
+
+    Args:
+        master_from_cone: rotation matrix (3, 3).
+        f_cone_mm: principal distance of the source plane.
+        f_master_mm: principal distance of the target plane.
+
+    Returns:
+        target_from_source (3, 3), mm, with element [2, 2] equal to one.
+
+    Source: seeds/ultracam-calibration.txt, "epipolar transformation" of the platform calibration.
+    """
+    master = np.diag([f_master_mm, f_master_mm, -1.0])
+    cone = np.diag([1.0, 1.0, -f_cone_mm])
+    # (x, y, -f) = cone @ (x, y, 1); the target point is f_master * (X, Y) / -Z.
+    homography = master @ master_from_cone @ cone
+    return np.asarray(homography / homography[2, 2])

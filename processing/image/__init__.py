@@ -1,0 +1,1 @@
+"""From corrected frames to rasters: resampling, seams, balance, colour."""

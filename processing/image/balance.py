@@ -1,0 +1,305 @@
+"""Balancing the PAN heads from the histograms of their overlaps (DESIGN 5.1).
+
+A gain for each sensor; an offset too where an overlap spans light and dark enough to tell it. Also
+samples the heads at common nodes of the virtual image, which the seams use too.
+
+Source: seeds/dmc-calibration.txt, 6.2.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from processing.image.lattice import OUTSIDE
+from processing.image.resampling import WEIGHT_STEP_PX
+
+Array = NDArray[Any]
+
+NOT_COVERED: Final = -2.0
+UNUSABLE: Final = -1.0
+"""Covered, but saturated or without data somewhere in the block."""
+ALONE: Final = -3.0
+"""Covered by this frame and no other: not measured, since there is nothing to compare it with."""
+
+_BLOCK_PX: Final = 8
+_COARSE: Final = 8
+_MIN_SAMPLES: Final = 30
+_MIN_SIGNAL: Final = 80.0
+"""Level-1 counts (10 DN of 12 bits): below, the ratio of two means says little."""
+_SPAN: Final = 4.0
+"""Light over dark from which on an overlap tells an offset from a gain (DESIGN 5.1)."""
+_LEVELS: Final = 12
+_UNLIKE: Final = 2e-4
+"""What parallax and reflection leave between two cones at one level, of its signal."""
+_GAIN_SIGMA: Final = 0.05
+_OFFSET_SIGMA: Final = 24.0
+_NO_OFFSET_SIGMA: Final = 1e-3
+"""Level-1 counts: black drifts by a few DN, and where nothing tells it is not drawn on."""
+
+
+@dataclass(frozen=True)
+class PairBalance:
+    """One overlap: median of log(a / b), its standard deviation, and the samples behind it.
+
+    `span` is how many times brighter the overlap's light is than its dark (98th over 2nd
+    percentile).
+    """
+
+    sensor_a: str
+    sensor_b: str
+    log_ratio: float
+    sigma: float
+    samples: int
+    span: float = 1.0
+
+
+@dataclass(frozen=True)
+class Balance:
+    """Gains by sensor (the mean of their logarithms is zero) and what every overlap said.
+
+    Balanced signal is gain * signal + offset; `offsets` are in Level-1 counts and zero where no
+    overlap of a sensor spans enough light and dark to tell them from its gain.
+    """
+
+    gains: Mapping[str, float]
+    pairs: tuple[PairBalance, ...]
+    offsets: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def spread(self) -> float:
+        """Largest gain over smallest, less one."""
+        values = list(self.gains.values())
+        return max(values) / min(values) - 1.0 if values else 0.0
+
+
+def node_means(frames: Array, valid: Array, lattices: Array, cell_px: int, out: Array) -> None:
+    """Mean Level-1 signal of 8 x 8 raw pixels around every weight node that frames share.
+
+    Args:
+        frames, valid, lattices, cell_px: as in `processing.image.resampling.resample`.
+        out: (n, rows, columns) float32 at every `WEIGHT_STEP_PX`-th target pixel; overwritten.
+            `NOT_COVERED` where the frame does not reach, `ALONE` where only this one does,
+            `UNUSABLE` where the block holds saturated pixels or holes.
+    """
+    _node_means(frames, valid, lattices, cell_px, out)
+
+
+def covered_box(means: Array) -> tuple[slice, slice]:
+    """Rows and columns of nodes that hold all a frame covers, with a little around it.
+
+    A frame covers one coherent part of the image; every eighth node finds it.
+    """
+    rows, columns = means.shape
+    coarse = means[::_COARSE, ::_COARSE] != np.float32(NOT_COVERED)
+    i, j = np.flatnonzero(coarse.any(axis=1)), np.flatnonzero(coarse.any(axis=0))
+    if len(i) == 0:
+        covered = means != np.float32(NOT_COVERED)
+        if not covered.any():
+            return slice(0, 0), slice(0, 0)
+        return slice(0, rows), slice(0, columns)
+    return (
+        slice(max((i[0] - 1) * _COARSE, 0), min((i[-1] + 1) * _COARSE, rows)),
+        slice(max((j[0] - 1) * _COARSE, 0), min((j[-1] + 1) * _COARSE, columns)),
+    )
+
+
+def balance_gains(names: Sequence[str], means: Array) -> Balance:
+    """Gains, and offsets where they can be told, that make the overlaps agree.
+
+    First each overlap gives the median of its log ratios, which neither a car that moved between
+    two exposures nor a saturated roof can pull; gains follow by weighted least squares over all
+    pairs. Where the histogram of an overlap spans a factor of four, medians level by level tell
+    gain from offset, and both are adjusted once more. A sensor without overlap keeps the mean gain.
+
+    Args:
+        names: sensors in the order of `means`.
+        means: (n, rows, columns) from `node_means`.
+    """
+    pairs, samples = [], []
+    boxes = [covered_box(one) for one in means]
+    for a, b in itertools.combinations(range(len(names)), 2):
+        both = tuple(
+            slice(max(p.start, q.start), max(min(p.stop, q.stop), 0))
+            for p, q in zip(boxes[a], boxes[b], strict=True)
+        )
+        of_a, of_b = means[a][both], means[b][both]
+        common = (of_a > _MIN_SIGNAL) & (of_b > _MIN_SIGNAL)
+        count = int(np.count_nonzero(common))
+        if count < _MIN_SAMPLES:
+            continue
+        light_a, light_b = of_a[common], of_b[common]
+        ratios = np.log(light_a / light_b)
+        median = float(np.median(ratios))
+        spread = 1.4826 * float(np.median(np.abs(ratios - median)))
+        # 1.2533: the median's standard deviation against the mean's, for normal errors.
+        sigma = 1.2533 * max(spread, 1e-4) / np.sqrt(count)
+        low, high = np.percentile(light_a, (2.0, 98.0))
+        span = float(high / low)
+        pairs.append(PairBalance(names[a], names[b], median, float(sigma), count, span))
+        samples.append((a, b, light_a, light_b))
+    logs = _log_gains(names, pairs)
+    offsets = np.zeros(len(names))
+    wide = {k for pair, s in zip(pairs, samples, strict=True) for k in s[:2] if pair.span >= _SPAN}
+    if wide:
+        steps = [
+            step
+            for a, b, light_a, light_b in samples
+            for step in _levels(a, b, light_a * np.exp(logs[a]), light_b * np.exp(logs[b]))
+        ]
+        change, offsets = _gains_and_offsets(len(names), steps, wide)
+        logs = logs + change
+    gains = np.exp(logs).tolist()
+    return Balance(
+        dict(zip(names, gains, strict=True)),
+        tuple(pairs),
+        dict(zip(names, offsets.tolist(), strict=True)),
+    )
+
+
+@dataclass(frozen=True)
+class _Level:
+    """One level of an overlap's histogram: median difference a - b there, and its sigma."""
+
+    a: int
+    b: int
+    signal: float
+    difference: float
+    sigma: float
+
+
+def _levels(a: int, b: int, light_a: Array, light_b: Array) -> list[_Level]:
+    """The overlap cut into levels of equal numbers of samples, from dark to light."""
+    middle = 0.5 * (light_a + light_b)
+    difference = light_a - light_b
+    order = np.argsort(middle)
+    found = []
+    for part in np.array_split(order, min(_LEVELS, max(1, len(order) // _MIN_SAMPLES))):
+        off = difference[part]
+        median = float(np.median(off))
+        spread = 1.4826 * float(np.median(np.abs(off - median)))
+        signal = float(np.median(middle[part]))
+        sigma = 1.2533 * max(spread, 1.0) / np.sqrt(len(part))
+        found.append(_Level(a, b, signal, median, float(np.hypot(sigma, _UNLIKE * signal))))
+    return found
+
+
+def _gains_and_offsets(
+    count: int, levels: Sequence[_Level], free: Collection[int]
+) -> tuple[Array, Array]:
+    """Relative changes of gain, and offsets of the sensors `free` to have one, (count,) each.
+
+    What the overlaps do not tell stays near none: drift of black between heads is small.
+    """
+    rows, values = [], []
+    for level in levels:
+        row = np.zeros(2 * count)
+        row[level.a], row[level.b] = level.signal, -level.signal
+        row[count + level.a], row[count + level.b] = 1.0, -1.0
+        rows.append(row / level.sigma)
+        values.append(-level.difference / level.sigma)
+    for k in range(count):
+        gain, offset = np.zeros(2 * count), np.zeros(2 * count)
+        gain[k] = 1.0 / _GAIN_SIGMA
+        offset[count + k] = 1.0 / (_OFFSET_SIGMA if k in free else _NO_OFFSET_SIGMA)
+        rows += [gain, offset]
+        values += [0.0, 0.0]
+    common = np.zeros((2, 2 * count))
+    common[0, :count] = common[1, count:] = 1e6 / max(count, 1)
+    design = np.concatenate([np.array(rows), common])
+    solution, *_ = np.linalg.lstsq(design, np.array([*values, 0.0, 0.0]), rcond=None)
+    return np.asarray(solution[:count]), np.asarray(solution[count:])
+
+
+def _log_gains(names: Sequence[str], pairs: Sequence[PairBalance]) -> Array:
+    count = len(names)
+    # The constraint rows: mean log gain zero (strong), each gain near one (weak, for a sensor that
+    # no overlap ties to the rest; 1e3 times weaker than one part in a thousand).
+    rows = [np.full(count, 1e6 / max(count, 1))]
+    values = [0.0]
+    for k in range(count):
+        row = np.zeros(count)
+        row[k] = 1.0
+        rows.append(row)
+        values.append(0.0)
+    place = {name: k for k, name in enumerate(names)}
+    for pair in pairs:
+        row = np.zeros(count)
+        row[place[pair.sensor_a]] = 1.0
+        row[place[pair.sensor_b]] = -1.0
+        # Parallax and reflection differ between cones whatever the number of samples.
+        weight = 1.0 / np.hypot(pair.sigma, 1e-3)
+        rows.append(row * weight)
+        values.append(-pair.log_ratio * weight)
+    solution, *_ = np.linalg.lstsq(np.array(rows), np.array(values), rcond=None)
+    return np.asarray(solution)
+
+
+@njit(cache=True, parallel=True, nogil=True)
+def _node_means(frames, valid, lattices, cell, out):  # type: ignore[no-untyped-def]
+    count, rows, columns = out.shape
+    nodes = cell // WEIGHT_STEP_PX
+    cells = lattices.shape[2] - 1
+    for i in prange(rows):
+        li = min(i // nodes, lattices.shape[1] - 2)
+        f = (i - li * nodes) / nodes
+        covering = np.zeros(columns, np.int64)
+        places = np.empty((count, columns, 2), np.int64)
+        for s in range(count):
+            line = out[s, i]
+            line[:] = NOT_COVERED
+            for lj in range(cells):
+                upper_left = lattices[s, li, lj]
+                upper_right = lattices[s, li, lj + 1]
+                lower_left = lattices[s, li + 1, lj]
+                lower_right = lattices[s, li + 1, lj + 1]
+                if (
+                    upper_left[0] == OUTSIDE
+                    or upper_right[0] == OUTSIDE
+                    or lower_left[0] == OUTSIDE
+                    or lower_right[0] == OUTSIDE
+                ):
+                    continue
+                c0 = upper_left[0] + f * (lower_left[0] - upper_left[0])
+                r0 = upper_left[1] + f * (lower_left[1] - upper_left[1])
+                dc = (upper_right[0] + f * (lower_right[0] - upper_right[0]) - c0) / nodes
+                dr = (upper_right[1] + f * (lower_right[1] - upper_right[1]) - r0) / nodes
+                # The last cell has the nodes at its right end, too.
+                for k in range(nodes + (1 if lj == cells - 1 else 0)):
+                    c = c0 + dc * k
+                    r = r0 + dr * k
+                    if valid[s, 0] <= c <= valid[s, 1] and valid[s, 2] <= r <= valid[s, 3]:
+                        j = lj * nodes + k
+                        line[j] = ALONE
+                        covering[j] += 1
+                        places[s, j, 0] = np.int64(np.floor(c + 0.5)) - _BLOCK_PX // 2
+                        places[s, j, 1] = np.int64(np.floor(r + 0.5)) - _BLOCK_PX // 2
+        for s in range(count):
+            for j in range(columns):
+                if covering[j] > 1 and out[s, i, j] == ALONE:
+                    out[s, i, j] = _block_mean(frames[s], valid[s], places[s, j])
+
+
+@njit(cache=True, nogil=True)
+def _block_mean(frame, valid, corner):  # type: ignore[no-untyped-def]
+    """Mean of a block within the usable area; `UNUSABLE` where a pixel is saturated or a hole."""
+    total = np.int64(0)
+    pixels = 0
+    marred = False
+    for y in range(
+        max(corner[1], np.int64(valid[2])), min(corner[1] + _BLOCK_PX, np.int64(valid[3]) + 1)
+    ):
+        for x in range(
+            max(corner[0], np.int64(valid[0])), min(corner[0] + _BLOCK_PX, np.int64(valid[1]) + 1)
+        ):
+            word = frame[y, x]
+            marred |= (word == 0) | ((word & 1) == 1)
+            total += word
+            pixels += 1
+    return UNUSABLE if marred or pixels == 0 else total / pixels

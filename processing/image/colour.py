@@ -1,0 +1,273 @@
+"""Which head sees which colours, and registering them to green (DESIGN 5.7).
+
+Heads are registered by projective transformations; green itself is placed by the adjustment of the
+mosaic, and the pixels are fetched in `processing.image.resampling`.
+
+Source: seeds/dmc-calibration.txt, 6.1; seeds/ultracam-calibration.txt, steps 5 and 6.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.geometry.placement import SensorPlacement, raw_from_vip_mm, vip_mm_from_raw
+from processing.geometry.projective import apply_projective
+from processing.matching.patches import INTERPOLATION, MARGIN_PX, match_patches, select_features
+from processing.radiometry.demosaic import BAYER_BANDS, is_bayer
+from processing.radiometry.level1 import exposed_rows
+from processing.rig import Rig, Sensor
+
+Array = NDArray[Any]
+
+_ROUNDS: Final = 8
+_TUKEY: Final = 4.685
+
+
+@dataclass(frozen=True)
+class ColourSettings:
+    """How colour is matched to green; lengths in colour pixels.
+
+    Bands see different light, so less correlation is asked than between PAN heads.
+    """
+
+    points: int = 600
+    window_px: int = 17
+    search_px: int = 5
+    min_correlation: float = 0.45
+    min_peak_margin: float = 0.05
+    max_sigma_px: float = 0.3
+    min_points: int = 40
+
+
+@dataclass(frozen=True)
+class ColourHead:
+    """One colour sensor and the bands it gives; all of them share its geometry.
+
+    `leading` is the band the head is matched by: green of a Bayer head, else its only one.
+    """
+
+    sensor: Sensor
+    bands: tuple[str, ...]
+    leading: str
+
+
+def colour_heads(rig: Rig) -> tuple[ColourHead, ...]:
+    """The colour heads of a rig, the colour master's first.
+
+    A cone of one band has it on its only sensor; a cone of several has them behind the colour
+    filter array of its only sensor. Of two heads that see the same band the first gives it.
+    """
+    heads: list[ColourHead] = []
+    given: set[str] = set()
+    cones = sorted(rig.colour_cones, key=lambda cone: cone.name != rig.colour_master_cone)
+    for cone in cones:
+        sensor = cone.sensors[0]
+        if len(cone.sensors) > 1:
+            continue
+        if is_bayer(sensor):
+            seen = [band for band in cone.bands if band in BAYER_BANDS]
+            leading = "green"
+        elif len(cone.bands) == 1:
+            seen, leading = list(cone.bands), cone.bands[0]
+        else:
+            continue
+        bands = tuple(band for band in seen if band not in given)
+        given.update(bands)
+        if bands:
+            heads.append(ColourHead(sensor, bands, leading))
+    return tuple(heads)
+
+
+@dataclass(frozen=True)
+class BandRegistration:
+    """One head, by its leading band, against green.
+
+    `band_from_green` (3, 3) carries a VIP point in mm to where the band's own placement has it.
+    Where too few points were found it is the identity: the band lies as calibrated, and
+    `registered` is False. `rms_px` is the residual length per point, colour pixels.
+    """
+
+    band: str
+    sensor: str
+    band_from_green: Array
+    points: int
+    rms_px: float | None
+    registered: bool
+
+
+def nominal_registration(band: str, sensor: str) -> BandRegistration:
+    """A band that lies as calibrated."""
+    return BandRegistration(band, sensor, np.eye(3), 0, None, registered=False)
+
+
+def register_band(
+    band: str,
+    green: SensorPlacement,
+    other: SensorPlacement,
+    green_frame: Array,
+    band_frame: Array,
+    *,
+    positions: Array,
+    settings: ColourSettings,
+) -> BandRegistration:
+    """Find where a band lies against green.
+
+    Args:
+        green: adjusted placement of the green sensor.
+        other: placement of the band's sensor by calibration and TDM.
+        green_frame, band_frame: Level-1 frames, (h, w) uint16.
+        positions: where to match, from `green_positions`; the same for all bands.
+    """
+    raw_green, raw_band, sigma = _match(green, other, green_frame, band_frame, positions, settings)
+    if len(sigma) < settings.min_points:
+        return nominal_registration(band, other.sensor.name)
+    source = vip_mm_from_raw(green, raw_green)
+    target = vip_mm_from_raw(other, raw_band)
+    unit_mm = other.sensor.pitch_mm * _magnification(other, raw_band)
+    homography, rms, used = fit_projective(source, target, sigma * unit_mm)
+    return BandRegistration(
+        band,
+        other.sensor.name,
+        homography,
+        used,
+        rms / unit_mm,
+        registered=used >= settings.min_points,
+    )
+
+
+def green_positions(green: SensorPlacement, green_frame: Array, settings: ColourSettings) -> Array:
+    """Feature-rich pixels of the green frame on an even grid, (n, 2) int64 (column, row)."""
+    cells = _grid(green, _room(settings), settings)
+    best = select_features(green_frame, cells, settings.window_px // 2, 2, True)
+    positions: Array = best[best[:, 2] > 0.0, :2].astype(np.int64)
+    return positions
+
+
+def fit_projective(source: Array, target: Array, sigma: Array) -> tuple[Array, float, int]:
+    """The projective transformation near the identity that carries source to target, (n, 2).
+
+    Iteratively re-weighted least squares (Tukey's biweight): neither a moving car nor a false match
+    can pull it.
+
+    Returns:
+        target_from_source (3, 3) with element [2, 2] one; root mean square length of the residuals
+        of the points kept; how many were kept.
+    """
+    scale = float(np.abs(source).max()) or 1.0
+    p, q = source / scale, target / scale
+    h = np.eye(3)
+    keep = np.ones(len(p), dtype=np.bool_)
+    residuals = np.zeros_like(p)
+    for _ in range(_ROUNDS):
+        residuals = q - apply_projective(h, p)
+        length = np.hypot(residuals[:, 0], residuals[:, 1]) / (sigma / scale)
+        spread = max(1.4826 * float(np.median(length)) / 1.1774, 1e-9)
+        outlying = length / (_TUKEY * spread)
+        weight = (
+            np.where(outlying < 1.0, (1.0 - outlying**2) ** 2, 0.0) / (sigma / sigma.mean()) ** 2
+        )
+        keep = outlying < 1.0
+        design = _design(h, p) * np.sqrt(np.repeat(weight, 2))[:, None]
+        step, *_ = np.linalg.lstsq(
+            design, residuals.ravel() * np.sqrt(np.repeat(weight, 2)), rcond=None
+        )
+        h = h + np.append(step, 0.0).reshape(3, 3)
+        if float(np.abs(step).max()) < 1e-12:
+            break
+    residuals = q - apply_projective(h, p)
+    rms = float(np.sqrt(np.mean(np.sum(residuals[keep] ** 2, axis=1)))) * scale
+    # Undo the scaling of both sides: H_mm = S H S^-1 with S = diag(scale, scale, 1).
+    unscaled = np.diag([scale, scale, 1.0]) @ h @ np.diag([1.0 / scale, 1.0 / scale, 1.0])
+    return unscaled / unscaled[2, 2], rms, int(np.count_nonzero(keep))
+
+
+def _design(h: Array, p: Array) -> Array:
+    """d(target) / d(h11 .. h32), rows x, y per point: (2 n, 8)."""
+    w = h[2, 0] * p[:, 0] + h[2, 1] * p[:, 1] + h[2, 2]
+    at = apply_projective(h, p)
+    design = np.zeros((len(p), 2, 8))
+    homogeneous = np.column_stack([p, np.ones(len(p))]) / w[:, None]
+    design[:, 0, 0:3] = homogeneous
+    design[:, 1, 3:6] = homogeneous
+    design[:, :, 6:8] = -at[:, :, None] * homogeneous[:, None, :2]
+    return design.reshape(-1, 8)
+
+
+def _magnification(placement: SensorPlacement, raw: Array) -> float:
+    """VIP mm per mm on the band's own focal plane, at the points' centre."""
+    middle = raw.mean(axis=0)
+    corners = middle + np.array([[0.0, 0.0], [100.0, 0.0]])
+    xy = vip_mm_from_raw(placement, corners)
+    return float(np.hypot(*(xy[1] - xy[0]))) / (100.0 * placement.sensor.pitch_mm)
+
+
+def _match(
+    green: SensorPlacement,
+    other: SensorPlacement,
+    green_frame: Array,
+    band_frame: Array,
+    at_green: Array,
+    settings: ColourSettings,
+) -> tuple[Array, Array, Array]:
+    room = _room(settings)
+    predicted = raw_from_vip_mm(other, vip_mm_from_raw(green, at_green.astype(np.float64)))
+    first, last = exposed_rows(other.sensor, other.tdi_shifts)
+    limits = np.array([0, other.sensor.width_px - 1, first, last], dtype=np.int64)
+    with np.errstate(invalid="ignore"):
+        inside = (
+            (predicted[:, 0] >= limits[0] + room)
+            & (predicted[:, 0] <= limits[1] - room)
+            & (predicted[:, 1] >= limits[2] + room)
+            & (predicted[:, 1] <= limits[3] - room)
+        )
+    found = match_patches(
+        green_frame,
+        band_frame,
+        at_green[inside],
+        np.rint(predicted[inside]).astype(np.int64),
+        limits,
+        1,
+        settings.window_px // 2,
+        settings.search_px,
+        True,
+        INTERPOLATION,
+    )
+    found = found[
+        (found[:, 7] > 0.0)
+        & (found[:, 4] <= settings.max_sigma_px)
+        & (found[:, 5] >= settings.min_correlation)
+        & (found[:, 6] >= settings.min_peak_margin)
+    ]
+    return found[:, 0:2], found[:, 2:4], np.maximum(found[:, 4], 0.005)
+
+
+def _room(settings: ColourSettings) -> int:
+    """Pixels a window needs between its centre and the frame's border."""
+    return settings.window_px // 2 + MARGIN_PX + 2
+
+
+def _grid(green: SensorPlacement, room: int, settings: ColourSettings) -> Array:
+    first, last = exposed_rows(green.sensor, green.tdi_shifts)
+    left, right = room, green.sensor.width_px - 1 - room
+    top, bottom = first + room, last - room
+    if right <= left or bottom <= top:
+        return np.empty((0, 4), dtype=np.int64)
+    spacing = max(np.sqrt((right - left) * (bottom - top) / settings.points), 4.0)
+    columns = np.linspace(left, right, max(2, round((right - left) / spacing) + 1))
+    rows = np.linspace(top, bottom, max(2, round((bottom - top) / spacing) + 1))
+    grid = np.meshgrid(np.arange(len(columns) - 1), np.arange(len(rows) - 1))
+    c, r = grid[0].ravel(), grid[1].ravel()
+    # One pixel short, so that neighbouring cells share no position.
+    return np.stack(
+        [
+            np.ceil(columns[c]),
+            np.floor(columns[c + 1]) - 1,
+            np.ceil(rows[r]),
+            np.floor(rows[r + 1]) - 1,
+        ],
+        axis=1,
+    ).astype(np.int64)

@@ -1,0 +1,108 @@
+"""Image figures from samples of Level-1 frames: brightness and the share of the finest detail."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from processing.radiometry.level1 import level1_counts_per_dn
+from processing.rig import Sensor
+
+Array = NDArray[Any]
+
+_EVERY_ROW: Final = 16
+_BUNDLE: Final = 32
+_LEAST_LENGTH: Final = 34
+_LEAST_SIGNAL: Final = 4.0
+"""Detail at two pixels' distance must exceed its noise so many times before sharpness is told."""
+
+
+def sharpness(
+    sensor: Sensor, frame: Array, rows: tuple[int, int]
+) -> tuple[float | None, float | None]:
+    """Share of the finest detail along track (columns of pixels) and across.
+
+    The ratio of the mean squared difference of direct neighbours to that of pixels two apart, both
+    less the photon and read noise the sensor is known to have: 0.25 for a surface without detail at
+    this scale, 0.5 for sharp landscapes, 1 for pixels without any correlation. None where the image
+    is too poor in contrast to say.
+
+    Args:
+        frame: Level-1 words, (h, w) uint16.
+        rows: first and last exposed row.
+    """
+    first, last = rows
+    if last - first + 1 < _LEAST_LENGTH or frame.shape[1] < _LEAST_LENGTH:
+        return None, None
+    sums = np.zeros((last - first + 1, 2, 4))
+    _difference_sums(frame[first : last + 1], sums)
+    along, across = sums.sum(axis=0)
+    counts = level1_counts_per_dn(sensor.bits)
+    return _share(sensor, along, counts), _share(sensor, across, counts)
+
+
+def bright_level(sensors: Sequence[Sensor], frames: Sequence[Array]) -> float | None:
+    """The 95th percentile of signal above black as a share of full scale; no data left out."""
+    samples = []
+    for sensor, frame in zip(sensors, frames, strict=True):
+        sample = frame[::_EVERY_ROW, ::_EVERY_ROW].ravel()
+        full = level1_counts_per_dn(sensor.bits) * sensor.full_scale_dn
+        samples.append(sample[sample > 0] / full)
+    if not samples or not sum(len(sample) for sample in samples):
+        return None
+    return float(np.percentile(np.concatenate(samples), 95.0))
+
+
+def _share(sensor: Sensor, sums: Array, counts: float) -> float | None:
+    """The share of one direction, from its sums over pixels as `_difference_sums` makes them."""
+    near, far, signal, pixels = (float(value) for value in sums)
+    if pixels == 0:
+        return None
+    near, far = near / pixels, far / pixels
+    electrons = max(signal / pixels / counts, 0.0) * sensor.electrons_per_dn
+    # Black and rounding are part of the read noise; a calibrated gain is near one here.
+    noise_dn2 = (electrons + sensor.read_noise_e**2) / sensor.electrons_per_dn**2
+    noise = 2.0 * noise_dn2 * counts**2
+    if far < _LEAST_SIGNAL * noise or far - noise <= 0.0:
+        return None
+    return (near - noise) / (far - noise)
+
+
+@njit(cache=True, parallel=True, nogil=True, fastmath={"reassoc", "contract"})
+def _difference_sums(frame, sums):  # type: ignore[no-untyped-def]
+    """Sums of squared differences to the next pixel and to the one after it, of signal, of pixels.
+
+    `sums` is (rows, 2, 4): by row, along track from bundles of neighbouring columns (single ones
+    would each cost a line of cache), across track from every `_EVERY_ROW`-th row.
+    """
+    height, width = frame.shape
+    for r in prange(height):
+        if r + 2 < height:
+            here, next_row, after = frame[r], frame[r + 1], frame[r + 2]
+            near = far = signal = 0.0
+            for first in range(0, width - _BUNDLE + 1, _BUNDLE * _EVERY_ROW):
+                for c in range(first, first + _BUNDLE):
+                    word = np.int32(here[c])
+                    one = np.float64(np.int32(next_row[c]) - word)
+                    two = np.float64(np.int32(after[c]) - word)
+                    near += one * one
+                    far += two * two
+                    signal += np.float64(word)
+                sums[r, 0, 3] += _BUNDLE
+            sums[r, 0, 0], sums[r, 0, 1], sums[r, 0, 2] = near, far, signal
+        if r % _EVERY_ROW == 0:
+            line = frame[r]
+            near = far = signal = 0.0
+            for c in range(width - 2):
+                word = np.int32(line[c])
+                one = np.float64(np.int32(line[c + 1]) - word)
+                two = np.float64(np.int32(line[c + 2]) - word)
+                near += one * one
+                far += two * two
+                signal += np.float64(word)
+            sums[r, 1, 0], sums[r, 1, 1], sums[r, 1, 2] = near, far, signal
+            sums[r, 1, 3] = width - 2

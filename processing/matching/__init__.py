@@ -1,0 +1,1 @@
+"""Matching of small patches, and the tie points that come of it."""

@@ -1,0 +1,278 @@
+"""Tie points across exposures: features of one image found in every other that overlaps it.
+
+Prediction by direct georeferencing and the height that earlier matches of the same point gave;
+correlation and least squares as in `processing.matching.patches`. Images flown the other way or
+crosswise are turned by quarters first.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.bundle.start import intersected
+from processing.matching.patches import INTERPOLATION, MARGIN_PX, match_patches, select_features
+from processing.rig import VirtualImage
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Picture = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class BlockMatching:
+    """How to match.
+
+    Attributes:
+        cells: columns and rows of the grid with one feature each.
+        window_px: side of the patches, odd.
+        first_search_px: around the prediction while the height of the ground is a plane's.
+        search_px: once a point's height is known from an earlier match.
+        least_correlation, least_margin, most_sigma_px: what a match must reach.
+    """
+
+    cells: tuple[int, int] = (20, 14)
+    window_px: int = 19
+    first_search_px: int = 24
+    search_px: int = 8
+    least_correlation: float = 0.9
+    least_margin: float = 0.1
+    most_sigma_px: float = 0.1
+
+
+@dataclass(frozen=True)
+class TiedBlock:
+    """Image points: image (n,), point (n,), pixels (n, 2); points are numbered from zero.
+
+    `tried` and `matched` count patches by pair of images.
+    """
+
+    image: Indices
+    point: Indices
+    px: Array
+    points: int
+    tried: dict[tuple[int, int], int]
+    matched: dict[tuple[int, int], int]
+
+
+def tied_block(
+    load: Callable[[int], Picture],
+    image: VirtualImage,
+    station_m: Array,
+    rotation: Array,
+    ground_m: float,
+    settings: BlockMatching | None = None,
+    *,
+    progress: Callable[[int], None] = lambda _done: None,
+) -> TiedBlock:
+    """Match all overlapping images of a block.
+
+    Args:
+        load: an image's pixels, (h, w) float32, NaN without data.
+        image: their common geometry.
+        station_m: (n, 3) projection centres, any Cartesian frame with z up.
+        rotation: (n, 3, 3) from camera.
+        ground_m: height of the ground there, to begin with.
+        progress: told how many images are done.
+    """
+    settings = settings or BlockMatching()
+    half = settings.window_px // 2
+    cells = _cells(image, settings)
+    found: list[tuple[int, Indices, Array]] = []
+    tried: dict[tuple[int, int], int] = {}
+    matched: dict[tuple[int, int], int] = {}
+    count = 0
+    for k in range(len(station_m)):
+        here = load(k)
+        chosen = select_features(here, cells, half, 2, False)
+        places = np.round(chosen[chosen[:, 2] > 0.0][:, :2]).astype(np.int64)
+        others = _overlapping(image, station_m, rotation, ground_m, k)
+        if not len(places) or not others:
+            progress(k + 1)
+            continue
+        own = places.astype(np.float64)
+        rays = directions(image, rotation[k], own)
+        ground = station_m[k] + rays * ((ground_m - station_m[k, 2]) / rays[:, 2:])
+        known = np.zeros(len(places), dtype=bool)
+        seen = np.zeros(len(places), dtype=np.int64)
+        parts: list[tuple[Indices, int, Array]] = []
+        for j in others:
+            sought, at = _matched_in(
+                here, load(j), image, (rotation[k], rotation[j]), station_m[j], places, ground,
+                known, settings,
+            )  # fmt: skip
+            tried[k, j] = sought
+            rows = np.flatnonzero(np.isfinite(at[:, 0]))
+            matched[k, j] = len(rows)
+            if not len(rows):
+                continue
+            parts.append((rows, j, at[rows]))
+            seen[rows] += 1
+            new = rows[~known[rows]]
+            ground[new] = _intersected(
+                (station_m[k], rays[new]),
+                (station_m[j], directions(image, rotation[j], at[new])),
+                ground[new],
+            )
+            known[new] = True
+        used = np.flatnonzero(seen > 0)
+        number = np.full(len(places), -1, dtype=np.int64)
+        number[used] = count + np.arange(len(used))
+        count += len(used)
+        found.append((k, number[used], own[used]))
+        found += [(j, number[rows], at) for rows, j, at in parts]
+        progress(k + 1)
+    which = [np.full(len(p), k, dtype=np.int64) for k, p, _ in found]
+    return TiedBlock(
+        np.concatenate([np.zeros(0, np.int64), *which]),
+        np.concatenate([np.zeros(0, np.int64), *(p for _, p, _ in found)]),
+        np.concatenate([np.zeros((0, 2)), *(at for _, _, at in found)]),
+        count,
+        tried,
+        matched,
+    )
+
+
+def image_mm(image: VirtualImage, px: Array) -> Array:
+    """Image coordinates (n, 2), mm, x right, y up, of pixels (n, 2)."""
+    return np.stack(
+        [
+            (px[:, 0] - (image.width_px - 1) / 2.0) * image.pitch_mm,
+            ((image.height_px - 1) / 2.0 - px[:, 1]) * image.pitch_mm,
+        ],
+        axis=1,
+    )
+
+
+def directions(image: VirtualImage, rotation: Array, px: Array) -> Array:
+    """Rays (n, 3) of pixels (n, 2), object axes."""
+    xy = image_mm(image, px)
+    return np.asarray(np.column_stack([xy, np.full(len(xy), -image.f_mm)]) @ rotation.T)
+
+
+def pixels_of(image: VirtualImage, station_m: Array, rotation: Array, xyz_m: Array) -> Array:
+    """Pixels (n, 2) where an image sees points (n, 3); NaN behind it."""
+    seen = (xyz_m - station_m) @ rotation
+    with np.errstate(all="ignore"):
+        xy = -image.f_mm * seen[:, :2] / seen[:, 2:]
+    xy[seen[:, 2] >= 0.0] = np.nan
+    return np.stack(
+        [
+            xy[:, 0] / image.pitch_mm + (image.width_px - 1) / 2.0,
+            (image.height_px - 1) / 2.0 - xy[:, 1] / image.pitch_mm,
+        ],
+        axis=1,
+    )
+
+
+def quarter_turns(rotation: Array, other: Array) -> int:
+    """By how many quarters, counter-clockwise, another image is turned to lie like the first."""
+    between = rotation.T @ other
+    return round(math.atan2(between[1, 0], between[0, 0]) / (math.pi / 2.0)) % 4
+
+
+def turned_px(px: Array, width: int, height: int, quarters: int) -> Array:
+    """Pixels (n, 2) of an image in that image turned by `np.rot90(image, quarters)`."""
+    column, row = px[:, 0], px[:, 1]
+    turned = {
+        0: (column, row),
+        1: (row, width - 1 - column),
+        2: (width - 1 - column, height - 1 - row),
+        3: (height - 1 - row, column),
+    }[quarters]
+    return np.stack(turned, axis=1)
+
+
+def _matched_in(
+    here: Picture,
+    there: Picture,
+    image: VirtualImage,
+    rotations: tuple[Array, Array],
+    station_m: Array,
+    places: Indices,
+    ground: Array,
+    known: NDArray[np.bool_],
+    settings: BlockMatching,
+) -> tuple[int, Array]:
+    """How many places were sought in another image, and where they are in it (n, 2), else NaN."""
+    quarters = quarter_turns(*rotations)
+    height, width = there.shape
+    turned = np.ascontiguousarray(np.rot90(there, quarters))
+    predicted = turned_px(
+        pixels_of(image, station_m, rotations[1], ground), width, height, quarters
+    )
+    room = settings.window_px // 2 + MARGIN_PX + 2
+    last = np.array([turned.shape[1] - 1, turned.shape[0] - 1])
+    inside = ((predicted > room) & (predicted < last - room)).all(axis=1)
+    limits = np.array([0, last[0], 0, last[1]], dtype=np.int64)
+    at = np.full((len(places), 2), np.nan)
+    for rows, search in (
+        (np.flatnonzero(inside & known), settings.search_px),
+        (np.flatnonzero(inside & ~known), settings.first_search_px),
+    ):
+        if not len(rows):
+            continue
+        result = match_patches(
+            here, turned, places[rows], np.round(predicted[rows]).astype(np.int64), limits, 1,
+            settings.window_px // 2, search, False, INTERPOLATION,
+        )  # fmt: skip
+        good = (
+            (result[:, 7] > 0.0)
+            & (result[:, 4] <= settings.most_sigma_px)
+            & (result[:, 5] >= settings.least_correlation)
+            & (result[:, 6] >= settings.least_margin)
+        )
+        # Both places moved by a part of a pixel; what counts is where the chosen pixel is.
+        moved = result[good, 2:4] - (result[good, :2] - places[rows[good]])
+        at[rows[good]] = turned_px(moved, turned.shape[1], turned.shape[0], (4 - quarters) % 4)
+    return int(inside.sum()), at
+
+
+def _overlapping(
+    image: VirtualImage, station_m: Array, rotation: Array, ground_m: float, k: int
+) -> list[int]:
+    """Later images that see part of what image k does, the nearest first."""
+    c, r = np.meshgrid(
+        np.linspace(0, image.width_px - 1, 9), np.linspace(0, image.height_px - 1, 9)
+    )
+    rays = directions(image, rotation[k], np.stack([c.ravel(), r.ravel()], axis=1))
+    level = station_m[k] + rays * ((ground_m - station_m[k, 2]) / rays[:, 2:])
+    last = np.array([image.width_px - 1, image.height_px - 1])
+    found = []
+    for j in range(k + 1, len(station_m)):
+        at = pixels_of(image, station_m[j], rotation[j], level)
+        if ((at >= 0.0) & (at <= last)).all(axis=1).any():
+            found.append((float(np.linalg.norm(station_m[j] - station_m[k])), j))
+    return [j for _, j in sorted(found)]
+
+
+def _intersected(a: tuple[Array, Array], b: tuple[Array, Array], otherwise: Array) -> Array:
+    n = len(otherwise)
+    stations = np.concatenate([np.broadcast_to(a[0], (n, 3)), np.broadcast_to(b[0], (n, 3))])
+    point = np.concatenate([np.arange(n), np.arange(n)])
+    found, _ = intersected(n, point, stations, np.concatenate([a[1], b[1]]))
+    return np.where(np.isfinite(found), found, otherwise)
+
+
+def _cells(image: VirtualImage, settings: BlockMatching) -> NDArray[Any]:
+    room = settings.window_px // 2 + MARGIN_PX + 4
+    columns = np.linspace(room, image.width_px - room, settings.cells[0] + 1).astype(np.int64)
+    rows = np.linspace(room, image.height_px - room, settings.cells[1] + 1).astype(np.int64)
+    return np.array(
+        [
+            (columns[c], columns[c + 1] - 1, rows[r], rows[r + 1] - 1)
+            for r in range(settings.cells[1])
+            for c in range(settings.cells[0])
+        ]
+    )
+
+
+def sides_of(block: TiedBlock, line: Sequence[str]) -> tuple[int, int]:
+    """How many matches join images of one line, and of different lines."""
+    along = sum(n for (a, b), n in block.matched.items() if line[a] == line[b])
+    return along, sum(block.matched.values()) - along

@@ -1,0 +1,234 @@
+"""Area-based matching of small patches: correlation search, then least-squares matching.
+
+Compiled kernels over many points; which points, in which frames, and what the positions mean is in
+`processing.matching.tie_points`. A bad pixel makes its patch unusable: for uint16 frames a Level-1
+word that is no data or saturated, for float32 frames one that is not finite.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from processing.matching.correlation import correlate, peak
+from processing.matching.features import select_features
+from processing.matching.least_squares import (
+    INTERPOLATION,
+    PATCH_SLACK,
+    refine,
+    refinement_scratch,
+)
+
+__all__ = ["INTERPOLATION", "MARGIN_PX", "match_patches", "select_features"]
+
+Array = NDArray[Any]
+
+MARGIN_PX: Final = 4
+"""Pixels a patch needs around its window: four taps and the largest half shift."""
+
+_BLOCK: Final = 32
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _load(frame: Array, col: int, row: int, ratio: int, words: bool, patch: Array) -> bool:
+    """Fill a patch with box means of ratio x ratio pixels, the first box beginning at (col, row).
+
+    The patch is left with a mean near zero, so that single precision suffices. False: bad pixels.
+    """
+    height, width = patch.shape
+    n = width * ratio
+    share = np.float32(1.0 / (ratio * ratio))
+    origin = frame[row + ratio * (height // 2), col + ratio * (width // 2)]
+    line = np.empty(n, np.float32)
+    bad = np.int32(0)
+    for r in range(height):
+        first = row + r * ratio
+        if words and ratio == 1:
+            bad = _words_of_one(frame[first, col : col + n], np.int32(origin), patch[r])
+        elif words and ratio == 3:
+            bad = _words_of_three(
+                frame[first, col : col + n],
+                frame[first + 1, col : col + n],
+                frame[first + 2, col : col + n],
+                np.int32(3) * np.int32(origin),
+                line,
+            )
+            for c in range(width):
+                patch[r, c] = (line[3 * c] + line[3 * c + 1] + line[3 * c + 2]) * share
+        else:
+            line[:] = np.float32(0.0)
+            for i in range(ratio):
+                source = frame[first + i, col : col + n]
+                if words:
+                    for k in range(n):
+                        word = np.int32(source[k])
+                        bad |= (word & 1) | np.int32(word == 0)
+                for k in range(n):
+                    line[k] += np.float32(source[k]) - np.float32(origin)
+            for c in range(width):
+                total = np.float32(0.0)
+                for j in range(ratio):
+                    total += line[c * ratio + j]
+                patch[r, c] = total * share
+        if bad:
+            return False
+    return True
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _words_of_one(source: Array, origin: Any, line: Array) -> Any:
+    """A row of words less the origin; not zero where one is bad."""
+    bad = np.int32(0)
+    for k in range(len(line)):
+        word = np.int32(source[k])
+        bad |= (word & np.int32(1)) | np.int32(word == 0)
+        line[k] = np.float32(np.int32(word - origin))
+    return bad
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _words_of_three(upper: Array, middle: Array, lower: Array, origin: Any, line: Array) -> Any:
+    """Sums of three rows of words less the origin; not zero where one is bad."""
+    bad = np.int32(0)
+    for k in range(len(line)):
+        a, b, c = np.int32(upper[k]), np.int32(middle[k]), np.int32(lower[k])
+        bad |= ((a | b | c) & np.int32(1)) | np.int32(min(min(a, b), c) == 0)
+        line[k] = np.float32(np.int32(a + b + c - origin))
+    return bad
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _all_finite(patch: Array) -> bool:
+    total = np.float32(0.0)
+    for r in range(patch.shape[0]):
+        for c in range(patch.shape[1]):
+            total += patch[r, c] * np.float32(0.0)
+    return bool(total == 0.0)
+
+
+@njit(cache=True, parallel=True, nogil=True)  # type: ignore[untyped-decorator]
+def match_patches(
+    frame_a: Array,
+    frame_b: Array,
+    at_a: Array,
+    at_b: Array,
+    limits_b: Array,
+    ratio: int,
+    half_window: int,
+    search: int,
+    words: bool,
+    table: Array,
+) -> Array:
+    """Find windows of frame a, reduced by `ratio`, in frame b.
+
+    Args:
+        frame_a: (h, w), uint16 Level-1 words or float32; the finer frame.
+        frame_b: (h, w), same type.
+        at_a: (n, 2) int64, first pixel (column, row) of the centre box of ratio x ratio pixels.
+        at_b: (n, 2) int64, predicted pixel of frame b, rounded.
+        limits_b: (4,) int64, first and last usable column, first and last usable row of frame b.
+        ratio: pixels of a per pixel of b along each axis.
+        half_window: the window has 2 * half_window + 1 pixels of b.
+        search: offsets tried around the prediction, px of b.
+        words: the frames hold Level-1 words.
+        table: `INTERPOLATION`.
+
+    Returns:
+        (n, 8) float64: column and row in a, column and row in b of the same ground, sigma of their
+        difference (px of b, per coordinate), correlation after refinement, height of the
+        correlation peak over the next maximum, and 1 where matched (the rest of the row is
+        undefined otherwise).
+    """
+    count = len(at_a)
+    result = np.zeros((count, 8))
+    side = 2 * half_window + 1
+    margin = MARGIN_PX
+    size_a, size_b = side + 2 * margin, side + 2 * margin + 2 * search
+    blocks = (count + _BLOCK - 1) // _BLOCK
+    for block in prange(blocks):
+        flat_a = np.zeros(size_a * size_a + PATCH_SLACK, np.float32)
+        flat_b = np.zeros(size_b * size_b + PATCH_SLACK, np.float32)
+        a = flat_a[: size_a * size_a].reshape(size_a, size_a)
+        b = flat_b[: size_b * size_b].reshape(size_b, size_b)
+        width = 2 * search + 1
+        surface = np.empty((width, width), np.float32)
+        correlation = (np.zeros(size_b * size_b, np.float32), np.empty(size_b), np.empty(size_b))
+        scratch = refinement_scratch(side)
+        best = np.empty(6)
+        found = np.empty(4)
+        reach = np.empty(4, np.int64)
+        for i in range(block * _BLOCK, min((block + 1) * _BLOCK, count)):
+            col_b, row_b = at_b[i, 0], at_b[i, 1]
+            room = half_window + margin
+            reach[0] = max(-search, limits_b[0] + room - col_b)
+            reach[1] = min(search, limits_b[1] - room - col_b)
+            reach[2] = max(-search, limits_b[2] + room - row_b)
+            reach[3] = min(search, limits_b[3] - room - row_b)
+            if reach[1] - reach[0] < 2 or reach[3] - reach[2] < 2:
+                continue
+            col_a = at_a[i, 0] - ratio * room
+            row_a = at_a[i, 1] - ratio * room
+            if not _load(frame_a, col_a, row_a, ratio, words, a) or not (words or _all_finite(a)):
+                continue
+            # Only what lies in the frame is loaded; the rest of b is never looked at.
+            rows_b = 2 * room + 1 + reach[3] - reach[2]
+            cols_b = 2 * room + 1 + reach[1] - reach[0]
+            part = b[
+                search + reach[2] : search + reach[2] + rows_b,
+                search + reach[0] : search + reach[0] + cols_b,
+            ]
+            first_col, first_row = col_b - room + reach[0], row_b - room + reach[2]
+            if not _load(frame_b, first_col, first_row, 1, words, part) or not (
+                words or _all_finite(part)
+            ):
+                continue
+            correlate(a, b, half_window, margin, reach, correlation, surface)
+            if not peak(surface, reach, best):
+                continue
+            moved_col = moved_row = 0
+            shift = (best[2], best[3])
+            if ratio > 1:
+                # Reduced pixels in phase with b's: what is finer than b's pixels folds over alike.
+                moved_col = -int(np.round(best[2] * ratio))
+                moved_row = -int(np.round(best[3] * ratio))
+                if moved_col != 0 or moved_row != 0:
+                    col, row = col_a + moved_col, row_a + moved_row
+                    if (
+                        col < 0
+                        or row < 0
+                        or col + ratio * size_a > frame_a.shape[1]
+                        or row + ratio * size_a > frame_a.shape[0]
+                    ):
+                        continue
+                    if not _load(frame_a, col, row, ratio, words, a) or not (
+                        words or _all_finite(a)
+                    ):
+                        continue
+                shift = (best[2] + moved_col / ratio, best[3] + moved_row / ratio)
+            offset = (search + int(best[0]), search + int(best[1]))
+            if not refine(
+                (flat_a, flat_b),
+                (size_a, size_b),
+                offset,
+                shift,
+                half_window,
+                margin,
+                ratio * ratio,
+                table,
+                scratch,
+                found,
+            ):
+                continue
+            middle = (ratio - 1) / 2.0
+            result[i, 0] = at_a[i, 0] + moved_col + middle - 0.5 * found[0] * ratio
+            result[i, 1] = at_a[i, 1] + moved_row + middle - 0.5 * found[1] * ratio
+            result[i, 2] = col_b + best[0] + 0.5 * found[0]
+            result[i, 3] = row_b + best[1] + 0.5 * found[1]
+            result[i, 4] = found[2]
+            result[i, 5] = found[3]
+            result[i, 6] = best[4] - best[5]
+            result[i, 7] = 1.0
+    return result

@@ -1,0 +1,174 @@
+"""Tie points: the same ground in two sensors, PAN to PAN and PAN to the colour master.
+
+They are matched here, in Level-1 frames of raw geometry, where `processing.matching.tie_places`
+seeks them; the compiled kernels are in `processing.matching.patches`, what the points are good for
+in `processing.mosaic.free`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.geometry.placement import SensorPlacement
+from processing.geometry.topology import exact_colour_ratio
+from processing.image.as_seen import as_seen_by
+from processing.matching.patches import INTERPOLATION, match_patches
+from processing.matching.tie_places import (
+    PAN_TO_COLOUR,
+    PAN_TO_PAN,
+    TiePointSettings,
+    colour_searches,
+    pan_searches,
+    usable_pixels,
+)
+from processing.rig import Rig
+
+__all__ = ["PAN_TO_COLOUR", "PAN_TO_PAN", "TiePointSettings", "TiePoints", "match_tie_points"]
+
+Array = NDArray[np.float64]
+Frame = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class TiePoints:
+    """Matched points of one exposure, as columns of n rows.
+
+    `sensor_a`, `sensor_b` index `names`; `raw_a`, `raw_b` are (column, row) of the same ground.
+    `sigma_px` is the predicted standard deviation of one coordinate of their difference, in PAN
+    pixels. `kind` is PAN_TO_PAN or PAN_TO_COLOUR (then b is the colour master). `overlap` indexes
+    `pairs`, the pairs of sensors where points were sought; `sought` counts the positions tried.
+    """
+
+    names: tuple[str, ...]
+    pairs: tuple[tuple[str, str], ...]
+    sought: tuple[int, ...]
+    sensor_a: NDArray[np.int64]
+    sensor_b: NDArray[np.int64]
+    raw_a: Array
+    raw_b: Array
+    sigma_px: Array
+    correlation: Array
+    kind: NDArray[np.int64]
+    overlap: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.sigma_px)
+
+    def only(self, keep: NDArray[np.bool_]) -> TiePoints:
+        """The points whose rows `keep` (n,) marks; `pairs` and `sought` stay."""
+        columns = ("sensor_a", "sensor_b", "raw_a", "raw_b", "sigma_px", "correlation", "kind")
+        kept = {name: getattr(self, name)[keep] for name in (*columns, "overlap")}
+        return replace(self, **kept)
+
+    def counts(self) -> dict[tuple[str, str], int]:
+        """Points found per pair of sensors; pairs without any included."""
+        found = np.bincount(self.overlap, minlength=len(self.pairs))
+        return {pair: int(found[i]) for i, pair in enumerate(self.pairs)}
+
+
+def match_tie_points(
+    rig: Rig,
+    placements: Mapping[str, SensorPlacement],
+    frames: Mapping[str, Frame],
+    *,
+    settings: TiePointSettings | None = None,
+) -> TiePoints:
+    """Find the tie points of one exposure.
+
+    Args:
+        rig: the camera.
+        placements: predicted places (calibration + TDM), by sensor name.
+        frames: Level-1 frames by sensor name, (h, w), all uint16 words or all float32. A missing
+            frame has no points.
+        settings: None takes the defaults.
+
+    Returns:
+        The accepted matches, pair by pair in the order of the rig's overlaps, then P/C by sensor.
+
+    Raises:
+        ValueError: a frame of the wrong shape or type.
+
+    Source: DESIGN 5.5.
+    """
+    settings = settings or TiePointSettings()
+    _check_frames(rig, frames)
+    ratio = exact_colour_ratio(rig) or 1.0
+    searches = pan_searches(rig, placements, frames, settings)
+    searches += colour_searches(rig, placements, frames, settings, ratio)
+    names = tuple(sensor.name for sensor in rig.sensors)
+    index = {name: i for i, name in enumerate(names)}
+    rows = []
+    for number, search in enumerate(searches):
+        a, b = search.pair
+        to_pan = search.kind == PAN_TO_PAN
+        if not len(search.at_a):
+            continue
+        window = settings.window_pp_px if to_pan else settings.window_pc_px
+        frame_a, at_a, seen, step = frames[a], search.at_a, None, search.step
+        if search.region is not None:
+            seen = as_seen_by(
+                placements[a], placements[b], frame_a, region=search.region, step=step
+            )
+            frame_a, at_a = seen.words, seen.at(search.at_b)
+        found = match_patches(
+            frame_a,
+            frames[b],
+            at_a,
+            search.at_b,
+            np.array(usable_pixels(placements[b]), dtype=np.int64),
+            step,
+            window // 2,
+            settings.search_pp_px if to_pan else settings.search_pc_px,
+            frames[a].dtype == np.uint16,
+            INTERPOLATION,
+        )
+        largest = settings.max_sigma_pp_px if to_pan else settings.max_sigma_pc_px
+        found = found[
+            (found[:, 7] > 0.0)
+            & (found[:, 4] <= largest)
+            & (found[:, 5] >= settings.min_correlation)
+            & (found[:, 6] >= settings.min_peak_margin)
+        ]
+        columns = np.empty((len(found), 10))
+        columns[:, 0], columns[:, 1] = index[a], index[b]
+        columns[:, 2:6] = found[:, :4]
+        if seen is not None:
+            columns[:, 2:4] = seen.raw_a(found[:, :2])
+        unit = 1.0 if to_pan else ratio
+        columns[:, 6] = np.hypot(found[:, 4], settings.floor_sigma_px) * unit
+        columns[:, 7] = found[:, 5]
+        columns[:, 8], columns[:, 9] = search.kind, number
+        rows.append(columns)
+    table = np.concatenate(rows) if rows else np.empty((0, 10))
+    return TiePoints(
+        names=names,
+        pairs=tuple(search.pair for search in searches),
+        sought=tuple(len(search.at_a) for search in searches),
+        sensor_a=table[:, 0].astype(np.int64),
+        sensor_b=table[:, 1].astype(np.int64),
+        raw_a=table[:, 2:4].copy(),
+        raw_b=table[:, 4:6].copy(),
+        sigma_px=table[:, 6].copy(),
+        correlation=table[:, 7].copy(),
+        kind=table[:, 8].astype(np.int64),
+        overlap=table[:, 9].astype(np.int64),
+    )
+
+
+def _check_frames(rig: Rig, frames: Mapping[str, Frame]) -> None:
+    types = {frame.dtype for frame in frames.values()}
+    if len(types) > 1 or not types <= {np.dtype(np.uint16), np.dtype(np.float32)}:
+        found = ", ".join(sorted(str(t) for t in types))
+        raise ValueError(f"frames are of {found}; give them all as uint16 or all as float32")
+    for name, frame in frames.items():
+        sensor = rig.sensor(name)
+        if frame.shape != (sensor.height_px, sensor.width_px):
+            raise ValueError(
+                f"frame {name} is {frame.shape}; its sensor is "
+                f"({sensor.height_px}, {sensor.width_px})"
+            )

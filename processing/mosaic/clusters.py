@@ -1,0 +1,100 @@
+"""Neighbouring tie points err alike, and so tell less than their number says.
+
+A roof's sunny side or the edge of a field looks otherwise in green than in PAN, and every point on
+it is off the same way. What that does to the covariance of the unknowns is reckoned here from the
+residuals of one exposure; single points and their weights are judged in
+`processing.mosaic.weights`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.mosaic.adjustment import Block, normal_equations
+from processing.mosaic.weights import CLASSES, Group
+
+Array = NDArray[np.float64]
+
+_POINTS_PER_CLUSTER: Final = 30.0
+_LEAST_CLUSTERS: Final = 30
+"""Fewer sums of residuals tell their variance to no better than a quarter."""
+
+
+def clustered_cofactor(
+    groups: Sequence[Group], blocks: Sequence[Block], cofactor: Array, scale: Array, sigma0: float
+) -> Array:
+    """The cofactor of unknowns whose observations are not independent: Q + sum (k - 1) Q N_c Q.
+
+    N_c are the normal equations of a class of points, k how many times larger than for independent
+    points the variance of sums over neighbours is, one at least.
+
+    Args:
+        groups: the points, with the residuals of the last adjustment.
+        blocks: their equations, as that adjustment had them.
+        cofactor: Q (u, u), that of independent observations.
+        scale: (groups,) factor of its class on the sigmas of a group.
+        sigma0: of that adjustment.
+    """
+    result = cofactor
+    for kind in CLASSES:
+        mine = [i for i, group in enumerate(groups) if group.kind == kind]
+        k = _variance_ratio(
+            [groups[i] for i in mine],
+            [blocks[i] for i in mine],
+            cofactor,
+            scale[mine],
+            sigma0,
+        )
+        if k > 1.0:
+            normal, _ = normal_equations([blocks[i] for i in mine], len(cofactor))
+            result = result + (k - 1.0) * cofactor @ normal @ cofactor
+    return result
+
+
+def _variance_ratio(
+    groups: Sequence[Group], blocks: Sequence[Block], cofactor: Array, scale: Array, sigma0: float
+) -> float:
+    """Variance of the residuals' sums over clusters, against that of independent residuals."""
+    found = expected = 0.0
+    clusters = 0
+    for group, block, unit in zip(groups, blocks, scale, strict=True):
+        used = group.factor > 0.0
+        count = int(used.sum())
+        if count < 2:
+            continue
+        cell = _cells(group.corrected_b[used])
+        amount = np.bincount(cell)
+        some = amount > 0
+        sigma = group.sigma[used] * unit
+        q = cofactor[np.ix_(block.columns, block.columns)]
+        design = block.design.reshape(len(block.columns), 2, -1)[:, :, used] / sigma
+        member = np.zeros((count, len(amount)))
+        member[np.arange(count), cell] = 1.0
+        for axis in (0, 1):
+            sums = (group.difference[used, axis] / (sigma * sigma0)) @ member
+            common = design[:, axis] @ member
+            # What the unknowns take of a sum is lost to it.
+            left = amount - np.sum((q @ common) * common, axis=0)
+            found += float(np.sum(sums[some] ** 2))
+            expected += float(np.sum(left[some]))
+        clusters += 2 * int(some.sum())
+    if clusters < _LEAST_CLUSTERS or expected <= 0.0:
+        return 1.0
+    return found / expected
+
+
+def _cells(place_mm: Array) -> NDArray[np.int64]:
+    """Number of the square cell each of the places (n, 2) lies in, some 30 places to a cell."""
+    low, high = place_mm.min(axis=0), place_mm.max(axis=0)
+    width, height = np.maximum(high - low, 1e-9)
+    side = math.sqrt(width * height * min(1.0, _POINTS_PER_CLUSTER / len(place_mm)))
+    columns = max(1, round(width / side))
+    rows = max(1, round(height / side))
+    column = np.minimum(((place_mm[:, 0] - low[0]) / width * columns).astype(np.int64), columns - 1)
+    row = np.minimum(((place_mm[:, 1] - low[1]) / height * rows).astype(np.int64), rows - 1)
+    return np.asarray(row * columns + column)

@@ -1,0 +1,339 @@
+"""How the heads are mounted, as one exposure's stitching finds it, and whether that is calibrated.
+
+Turns are small rotation vectors (rad) about the axes of the virtual image (x right, y forward, z
+up), found against the platform calibration; the adjustment that finds them is in
+`processing.mosaic.free`.
+
+Source: seeds/dmc-calibration.txt, 6.1.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+from scipy.stats import chi2
+
+from processing.bundle.rotations import (
+    angles_by_rotation_vector,
+    exponential,
+    omega_phi_kappa,
+)
+from processing.geometry.drift import sensor_dc
+from processing.geometry.placement import corrected_mm_from_raw, vip_mm_from_raw
+from processing.geometry.projective import apply_projective
+from processing.geometry.rotation import rotation_matrix
+from processing.image.colour import BandRegistration
+from processing.matching.tie_points import PAN_TO_PAN, TiePoints
+from processing.mosaic.free import Mosaic
+from processing.mosaic.model import further_turn, placement_at, vip_and_design
+from processing.quality.report import Figure
+from processing.rig import Cone, Rig, Sensor
+
+Array = NDArray[np.float64]
+
+FAMILY_ALPHA: Final = 0.001
+"""Probability of calling a healthy platform expired."""
+LEAST_SHIFT_PX: Final = 0.01
+LEAST_POINTS: Final = 24
+_ROUNDS: Final = 12
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """One head: the angles of the platform calibration, turned as the tie points say.
+
+    `angles_rad` are omega, phi, kappa of virtual_from_head with their `covariance` (3, 3), by tie
+    points and by how well the sensors' places are known; `turn_rad`, `turn_sigma_rad` the same
+    against calibration, about the axes of the virtual image; the mean of all heads is zero.
+    `shift_px` is how far the head's middle went by it, (x right, y up).
+    `residual_px` is the shift that an affine transformation still finds between this head's tie
+    points and its neighbours', `affine` (2, 2) the rest of it, px per px, `points` their number.
+    """
+
+    cone: str
+    angles_rad: tuple[float, float, float]
+    covariance: Array
+    turn_rad: tuple[float, float, float]
+    turn_sigma_rad: tuple[float, float, float]
+    shift_px: tuple[float, float]
+    residual_px: tuple[float, float]
+    residual_sigma_px: tuple[float, float]
+    affine: Array
+    points: int
+
+
+@dataclass(frozen=True)
+class PlatformCheck:
+    """Whether the platform calibration still holds.
+
+    `covariance` (3 n, 3 n) is that of the turns of all heads, by tie points and by the sensors'
+    places; their mean, which is the datum, has none.
+    `statistic` is chi-square with `freedom` degrees of freedom on a platform as calibrated; what
+    all heads turned together does not count, it cannot be seen.
+    """
+
+    heads: tuple[Mounting, ...]
+    covariance: Array
+    statistic: float
+    freedom: int
+    limit: float
+
+    @property
+    def expired(self) -> bool:
+        return self.freedom > 0 and self.statistic > self.limit
+
+    @property
+    def farthest(self) -> Mounting:
+        """The head whose middle moved most."""
+        return max(self.heads, key=lambda head: math.hypot(*head.shift_px))
+
+
+def verified_mosaic(rig: Rig, mosaic: Mosaic, tie_points: TiePoints) -> Mosaic:
+    """The mosaic with residual shifts of its heads turned into small angle increments.
+
+    Each head's tie points are compared with its neighbours' by an affine transformation; as a rule
+    the adjustment has left no shift. Where one is left (over three standard deviations and
+    `LEAST_SHIFT_PX`), the head goes half of the way: its neighbour is found as far off.
+    """
+    if not mosaic.model.mountings:
+        return mosaic
+    for _ in range(_ROUNDS):
+        values = mosaic.values.copy()
+        moved = False
+        for name, first in mosaic.model.mountings.items():
+            shift, sigma, _, points = _affine_shift(rig, mosaic, tie_points, name)
+            significant = np.abs(shift) > np.maximum(3.0 * sigma, LEAST_SHIFT_PX)
+            if points >= LEAST_POINTS and significant.any():
+                middle = _middle_mm(rig, mosaic, name)
+                jacobian = further_turn(middle, mosaic.model.f_mm)[:, :2, 0]
+                step = np.linalg.solve(jacobian, shift * mosaic.model.pitch_mm)
+                values[first : first + 2] += 0.5 * step
+                moved = True
+        if not moved:
+            break
+        for axis in range(3):
+            at = [first + axis for first in mosaic.model.mountings.values()]
+            values[at] -= values[at].mean() - mosaic.values[at].mean()
+        mosaic = _at_values(mosaic, tie_points, values)
+    return mosaic
+
+
+def check_platform(
+    rig: Rig, mosaic: Mosaic, tie_points: TiePoints, temperatures_c: Mapping[str, float]
+) -> PlatformCheck | None:
+    """Compare the mountings an exposure found with the platform calibration.
+
+    Args:
+        rig: the camera.
+        mosaic: by tie points alone.
+        tie_points: those it was made of.
+        temperatures_c: temperatures that were read, by probe name.
+
+    Returns:
+        None where no mountings were adjusted, or of one head only.
+    """
+    held = {name.split(".")[0] for name in mosaic.undetermined}
+    mountings = {c: first for c, first in mosaic.model.mountings.items() if c not in held}
+    if len(mountings) < 2 or mosaic.redundancy <= 0:
+        return None
+    count = len(mountings)
+    at = np.concatenate([np.arange(first, first + 3) for first in mountings.values()])
+    cones = [rig.cone(name) for name in mountings]
+    stitched = mosaic.covariance[np.ix_(at, at)]
+    places = block_diag(*(place_covariance(cone, temperatures_c) for cone in cones))
+    # What all heads turn together is the datum's.
+    without_mean = np.kron(np.eye(count) - 1.0 / count, np.eye(3))
+    known = stitched + without_mean @ places @ without_mean
+    heads = tuple(
+        _mounting(rig, mosaic, tie_points, name, known[3 * i : 3 * i + 3, 3 * i : 3 * i + 3])
+        for i, name in enumerate(mountings)
+    )
+    own = np.repeat([(cone.rotation_sigma_urad * 1e-6) ** 2 for cone in cones], 3)
+    contrasts = np.kron(np.linalg.svd(np.ones((1, count)))[2][1:], np.eye(3))
+    y = contrasts @ mosaic.values[at]
+    covariance = contrasts @ (stitched + places + np.diag(own)) @ contrasts.T
+    return PlatformCheck(
+        heads=heads,
+        covariance=known,
+        statistic=float(y @ np.linalg.solve(covariance, y)),
+        freedom=len(y),
+        limit=float(chi2.ppf(1.0 - FAMILY_ALPHA, len(y))),
+    )
+
+
+def platform_figures(check: PlatformCheck | None) -> dict[str, Figure]:
+    """The check in figures of the quality report."""
+    if check is None:
+        return {}
+    farthest = check.farthest
+    residuals = [math.hypot(*head.residual_px) for head in check.heads]
+    return {
+        "platform_test": check.statistic / check.limit,
+        "platform_shift_px": math.hypot(*farthest.shift_px),
+        "platform_shift_head": farthest.cone,
+        "platform_residual_px": max(residuals),
+    }
+
+
+def rotation_of_layer(rig: Rig, mosaic: Mosaic, cone: Cone) -> Array | None:
+    """How the unknowns make the turn of a cone, (3, u), rad per unknown's own unit.
+
+    Of a mounting it is the unknowns themselves; of a projective layer the rotation nearest to it
+    over the cone's sensors. None where the cone has neither.
+    """
+    model = mosaic.model
+    rows = np.zeros((3, len(model.names)))
+    if cone.name in model.mountings:
+        first = model.mountings[cone.name]
+        rows[:, first : first + 3] = np.eye(3)
+        return rows
+    if cone.name not in model.layers:
+        return None
+    first = model.layers[cone.name]
+    turns, moves = [], []
+    for sensor in cone.sensors:
+        start = mosaic.start[sensor.name]
+        corrected = corrected_mm_from_raw(start, _grid(sensor))
+        _, columns, design = vip_and_design(model, start, corrected, np.zeros(len(model.names)))
+        layer = design[np.isin(columns, np.arange(first, first + 8))] * model.pitch_mm
+        moves.append(layer.transpose(2, 1, 0).reshape(-1, 8))
+        place = vip_mm_from_raw(start, _grid(sensor))
+        turns.append(further_turn(place, model.f_mm).transpose(2, 0, 1).reshape(-1, 3))
+    fit = np.linalg.pinv(np.concatenate(turns)) @ np.concatenate(moves)
+    rows[:, first : first + 8] = fit
+    return rows
+
+
+def turn_of_band(rig: Rig, mosaic: Mosaic, band: BandRegistration) -> tuple[Array, Array]:
+    """The turn of a colour head that its registration to green says, and its sigma, (3,) rad each.
+
+    The rotation nearest to the projective transformation over the head's sensor; green itself has
+    its place by the adjustment.
+    """
+    model, sensor = mosaic.model, rig.sensor(band.sensor)
+    seen = vip_mm_from_raw(mosaic.start[band.sensor], _grid(sensor))
+    belongs = apply_projective(np.asarray(np.linalg.inv(band.band_from_green), np.float64), seen)
+    design = further_turn(seen, model.f_mm).transpose(2, 0, 1).reshape(-1, 3)
+    turn, *_ = np.linalg.lstsq(design, (belongs - seen).reshape(-1), rcond=None)
+    unit_mm = sensor.pitch_mm * model.f_mm / rig.cone_of(band.sensor).lens.f_mm
+    per_point = (band.rms_px or 0.0) / math.sqrt(2.0) * unit_mm
+    cofactor = np.linalg.inv(design.T @ design) * len(seen) / max(band.points, 1)
+    return np.asarray(turn), np.asarray(per_point * np.sqrt(np.diag(cofactor)), np.float64)
+
+
+def _mounting(
+    rig: Rig, mosaic: Mosaic, tie_points: TiePoints, name: str, covariance: Array
+) -> Mounting:
+    cone, first = rig.cone(name), mosaic.model.mountings[name]
+    turn = mosaic.values[first : first + 3]
+    rotation = turned(cone, turn)
+    # A turn w before the rotation is one of R'w behind it.
+    jacobian = angles_by_rotation_vector(rotation[None])[0] @ rotation.T
+    moved = further_turn(_middle_mm(rig, mosaic, name), mosaic.model.f_mm)[:, :, 0] @ turn
+    shift, sigma, affine, points = _affine_shift(rig, mosaic, tie_points, name)
+    return Mounting(
+        cone=name,
+        angles_rad=_triple(omega_phi_kappa(rotation[None])[0]),
+        covariance=jacobian @ covariance @ jacobian.T,
+        turn_rad=_triple(turn),
+        turn_sigma_rad=_triple(np.sqrt(np.maximum(np.diag(covariance), 0.0))),
+        shift_px=_pair(moved / mosaic.model.pitch_mm),
+        residual_px=_pair(shift),
+        residual_sigma_px=_pair(sigma),
+        affine=affine,
+        points=points,
+    )
+
+
+def turned(cone: Cone, turn_rad: Array) -> Array:
+    """virtual_from_head (3, 3) of a cone turned further about the axes of the virtual image."""
+    return np.asarray(exponential(turn_rad[None])[0] @ rotation_matrix(*cone.rotation_rad))
+
+
+def place_covariance(cone: Cone, temperatures_c: Mapping[str, float]) -> Array:
+    """Turns (3, 3), rad squared, that the sensor's place in the head passes for.
+
+    A shift in the layer, by calibration and drift, looks like a turn about its x and y axes.
+    """
+    sensor = cone.sensors[0]
+    tdm_um = sensor.drift.sigma_um_per_k * sensor_dc(sensor, temperatures_c)
+    turn_rad = math.hypot(sensor.position_sigma_um, tdm_um) * 1e-3 / cone.lens.f_mm
+    rotation = rotation_matrix(*cone.rotation_rad)
+    return np.asarray(rotation @ np.diag([turn_rad**2, turn_rad**2, 0.0]) @ rotation.T)
+
+
+def _affine_shift(
+    rig: Rig, mosaic: Mosaic, tie_points: TiePoints, name: str
+) -> tuple[Array, Array, Array, int]:
+    """Shift at the head's middle (px right, up), its sigma, the linear part (2, 2), points used.
+
+    Fitted to where neighbours see the head's P/P points less where it sees them itself.
+    """
+    sensors = [s.name for s in rig.cone(name).sensors]
+    numbers = [i for i, n in enumerate(tie_points.names) if n in sensors]
+    good = ~mosaic.outliers & (tie_points.kind == PAN_TO_PAN)
+    places, apart, sigmas = [], [], []
+    for side, sign in ((tie_points.sensor_a, -1.0), (tie_points.sensor_b, 1.0)):
+        raw = tie_points.raw_a if sign < 0 else tie_points.raw_b
+        for number in numbers:
+            rows = good & (side == number)
+            if rows.any():
+                placement = mosaic.placements[tie_points.names[number]]
+                places.append(vip_mm_from_raw(placement, raw[rows]) / mosaic.model.pitch_mm)
+                apart.append(sign * mosaic.residuals_px[rows])
+                sigmas.append(tie_points.sigma_px[rows])
+    points = sum(map(len, places))
+    nothing = np.zeros(2), np.full(2, math.inf), np.zeros((2, 2)), points
+    if points < LEAST_POINTS:
+        return nothing
+    at, d = np.concatenate(places), np.concatenate(apart)
+    arm = at - _middle_mm(rig, mosaic, name)[0] / mosaic.model.pitch_mm
+    design = np.column_stack([np.ones(points), arm])
+    weight = 1.0 / np.concatenate(sigmas)
+    scaled = design * weight[:, None]
+    fit, *_ = np.linalg.lstsq(scaled, d * weight[:, None], rcond=None)
+    misfit = (d - design @ fit) * weight[:, None]
+    cofactor = np.linalg.pinv(scaled.T @ scaled)
+    unit = np.sqrt(np.sum(misfit**2, axis=0) / max(points - 3, 1))
+    sigma = np.asarray(unit * math.sqrt(max(float(cofactor[0, 0]), 0.0)), np.float64)
+    return np.asarray(fit[0]), sigma, np.asarray(fit[1:].T), points
+
+
+def _at_values(mosaic: Mosaic, tie_points: TiePoints, values: Array) -> Mosaic:
+    placements = {n: placement_at(mosaic.model, p, values) for n, p in mosaic.start.items()}
+    residuals = np.full_like(mosaic.residuals_px, np.nan)
+    for number, (a, b) in enumerate(tie_points.pairs):
+        rows = np.flatnonzero(tie_points.overlap == number)
+        apart = vip_mm_from_raw(placements[a], tie_points.raw_a[rows]) - vip_mm_from_raw(
+            placements[b], tie_points.raw_b[rows]
+        )
+        residuals[rows] = apart / mosaic.model.pitch_mm
+    return dataclasses.replace(mosaic, values=values, placements=placements, residuals_px=residuals)
+
+
+def _middle_mm(rig: Rig, mosaic: Mosaic, name: str) -> Array:
+    """The middle of a head's sensor in the VIP, (1, 2) mm."""
+    sensor = rig.cone(name).sensors[0]
+    middle = np.array([[(sensor.width_px - 1) / 2.0, (sensor.height_px - 1) / 2.0]])
+    return vip_mm_from_raw(mosaic.placements[sensor.name], middle)
+
+
+def _grid(sensor: Sensor) -> Array:
+    columns = np.linspace(0.0, sensor.width_px - 1.0, 5)
+    rows = np.linspace(0.0, sensor.height_px - 1.0, 5)
+    return np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+
+
+def _pair(values: Array) -> tuple[float, float]:
+    return float(values[0]), float(values[1])
+
+
+def _triple(values: Array) -> tuple[float, float, float]:
+    return float(values[0]), float(values[1]), float(values[2])

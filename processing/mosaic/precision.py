@@ -1,0 +1,168 @@
+"""The stated accuracy of a stitched image: tie points, and the calibration its datum rests on.
+
+Three parts: the adjustment's covariance, which `processing.mosaic.free` makes; calibration and
+drift coefficients of the master sensors the datum rests on; and the temperature of the master cone,
+which a common expansion hides in. Whether the calibration holds is judged in
+`processing.mosaic.validity`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.geometry.drift import sensor_dc
+from processing.geometry.placement import corrected_mm_from_raw, vip_mm_from_raw
+from processing.mosaic.datum import datum_candidates
+from processing.mosaic.free import Mosaic, vip_precision_px
+from processing.mosaic.model import vip_and_design
+from processing.quality.report import Figure
+from processing.rig import Rig, Sensor
+
+Array = NDArray[np.float64]
+
+PROBE_SIGMA_K = 0.1
+UNKNOWN_SIGMA_K = 2.0
+"""A probe that was read, and one that others stand in for."""
+
+
+def precision_figures(
+    rig: Rig, mosaic: Mosaic, present: Collection[str], measured_c: Mapping[str, float]
+) -> dict[str, Figure]:
+    """How well centre and corners of the PAN sensors that are there are placed, in figures.
+
+    Args:
+        rig: the camera.
+        mosaic: what the image was made with.
+        present: sensors with a frame.
+        measured_c: temperatures that were read, by probe name.
+    """
+    by_sensor: dict[str, float] = {}
+    for cone in rig.pan_cones:
+        for sensor in cone.sensors:
+            if sensor.name in present:
+                right, low = sensor.width_px - 1.0, sensor.height_px - 1.0
+                points = [(right / 2, low / 2), (0, 0), (right, 0), (0, low), (right, low)]
+                sigma = placed_sigma_px(
+                    rig, mosaic, sensor.name, np.array(points, np.float64), measured_c
+                )
+                by_sensor[sensor.name] = float(np.sqrt(np.mean(sigma**2)))
+    if not by_sensor:
+        return {}
+    worst = max(by_sensor, key=lambda name: by_sensor[name])
+    return {
+        "stitched_sigma_px": float(np.sqrt(np.mean(np.square(list(by_sensor.values()))))),
+        "stitched_sigma_worst_px": by_sensor[worst],
+        "stitched_sigma_worst_sensor": worst,
+    }
+
+
+def placed_sigma_px(
+    rig: Rig, mosaic: Mosaic, sensor: str, colrow: Array, measured_c: Mapping[str, float]
+) -> Array:
+    """Standard deviation (n, 2), px, of where raw pixels (n, 2) lie in the virtual image.
+
+    What tie points do not determine counts with the a-priori accuracy it is held with.
+    """
+    tie_points = vip_precision_px(mosaic, sensor, colrow)
+    held = {name.split(".")[0] for name in mosaic.undetermined}
+    if held & {sensor, rig.cone_of(sensor).name} and not mosaic.supported:
+        tie_points = tie_points * max(1.0, 1.0 / max(mosaic.sigma0, 1e-6))
+    placed_mm = vip_mm_from_raw(mosaic.placements[sensor], colrow)
+    datum = _datum_design(placed_mm)
+    variance = np.sum((datum @ datum_covariance(rig, mosaic, measured_c)) * datum, axis=1)
+    return np.asarray(np.sqrt(tie_points**2 + variance.reshape(-1, 2)))
+
+
+def placed_covariance_px(
+    rig: Rig, mosaic: Mosaic, points: Mapping[str, Array], measured_c: Mapping[str, float]
+) -> tuple[Array, Array]:
+    """Covariance of where raw pixels of several sensors lie in the virtual image.
+
+    Args:
+        rig: the camera.
+        mosaic: what the image was made with.
+        points: raw pixels (n, 2) by sensor name.
+        measured_c: temperatures that were read, by probe name.
+
+    Returns:
+        The part of the tie points, and that of the datum (calibration, drift coefficients and
+        temperature of the master cone), each (2 n, 2 n), px squared: x and y (up) of the first
+        point, of the second, and so on, sensor by sensor.
+    """
+    model = mosaic.model
+    rows, datum = [], []
+    for name, colrow in points.items():
+        start = mosaic.start[name]
+        corrected = corrected_mm_from_raw(start, colrow)
+        _, columns, design = vip_and_design(model, start, corrected, mosaic.values)
+        row = np.zeros((2 * len(colrow), len(model.names)))
+        row[:, columns] = design.transpose(2, 1, 0).reshape(2 * len(colrow), len(columns))
+        rows.append(row)
+        datum.append(_datum_design(vip_mm_from_raw(mosaic.placements[name], colrow)))
+    jacobian, similarity = np.concatenate(rows), np.concatenate(datum)
+    return (
+        jacobian @ mosaic.covariance @ jacobian.T,
+        similarity @ datum_covariance(rig, mosaic, measured_c) @ similarity.T,
+    )
+
+
+def datum_covariance(rig: Rig, mosaic: Mosaic, measured_c: Mapping[str, float]) -> Array:
+    """Covariance (4, 4) of the datum: shift x, y (px), scale and rotation (px per mm).
+
+    The datum is the best similarity over the master sensors it rests on (eq. 6), so what their
+    places are off by, each on its own or all with their probe, carries over by that fit.
+    """
+    candidates = datum_candidates(rig)
+    sensors = [s for s in candidates if s.name in mosaic.datum_sensors] or list(candidates)
+    place_mm = np.array([_place_mm(rig, mosaic, s) for s in sensors])
+    own_um2 = np.array(
+        [
+            s.position_sigma_um**2 + (s.drift.sigma_um_per_k * sensor_dc(s, measured_c)) ** 2
+            for s in sensors
+        ]
+    )
+    design = _datum_design(place_mm)
+    if len(sensors) == 1:
+        # Its own scale and rotation are held: known as its place is, at half of its height.
+        half_mm = sensors[0].height_px / 2.0 * sensors[0].pitch_mm
+        design = np.concatenate([design, _datum_design(place_mm + np.array([[0.0, half_mm]]))])
+        own_um2 = np.repeat(own_um2, 2)
+    fit = np.linalg.inv(design.T @ design) @ design.T
+    covariance = fit @ (np.repeat(own_um2, 2)[:, None] * fit.T)
+    # um per kelvin; the principal distance takes part of an expansion back.
+    cones = [rig.cone_of(s.name) for s in sensors]
+    for probe in dict.fromkeys([s.probe for s in sensors] + [cone.probe for cone in cones]):
+        moved = np.zeros((len(place_mm), 2))
+        for i, (s, cone) in enumerate(zip(sensors, cones, strict=True)):
+            if s.probe == probe:
+                moved[i] = (s.drift.x_um_per_k, s.drift.y_um_per_k)
+            if cone.probe == probe:
+                moved[i] -= cone.lens.f_ppm_per_k * 1e-3 * place_mm[i]
+        if len(sensors) == 1:
+            moved = np.repeat(moved, 2, axis=0)
+        sigma_k = PROBE_SIGMA_K if probe in measured_c else UNKNOWN_SIGMA_K
+        common = fit @ moved.reshape(-1) * sigma_k
+        covariance += np.outer(common, common)
+    return np.asarray(covariance / (mosaic.model.pitch_mm * 1e3) ** 2)
+
+
+def _place_mm(rig: Rig, mosaic: Mosaic, sensor: Sensor) -> tuple[float, float]:
+    """Where the sensor's middle lies: in the master's layer, which is the virtual image, or there
+    by the head's mounting."""
+    if rig.master_cone is not None:
+        return sensor.x_mm, sensor.y_mm
+    middle = np.array([[(sensor.width_px - 1) / 2.0, (sensor.height_px - 1) / 2.0]])
+    x, y = vip_mm_from_raw(mosaic.start[sensor.name], middle)[0]
+    return float(x), float(y)
+
+
+def _datum_design(xy_mm: Array) -> Array:
+    """How shift, scale and rotation move points: (2 n, 4), x and y of each in turn."""
+    design = np.zeros((2 * len(xy_mm), 4))
+    design[0::2, 0], design[1::2, 1] = 1.0, 1.0
+    design[0::2, 2], design[1::2, 2] = xy_mm[:, 0], xy_mm[:, 1]
+    design[0::2, 3], design[1::2, 3] = -xy_mm[:, 1], xy_mm[:, 0]
+    return design

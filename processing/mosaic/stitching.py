@@ -1,0 +1,89 @@
+"""Tie points in, judged placements out: which mosaic an image is made with, and why.
+
+The order of adjustment, judgement, robust datum and support is decided here; each has a room of
+its own (`processing.mosaic.free`, `processing.mosaic.validity`, `processing.mosaic.support`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from processing.geometry.placement import SensorPlacement
+from processing.matching.tie_points import TiePoints
+from processing.mosaic.fixed import fixed_mosaic
+from processing.mosaic.free import Mosaic, MosaicSettings, free_mosaic
+from processing.mosaic.mounting import verified_mosaic
+from processing.mosaic.pan_only import pan_only_mosaic
+from processing.mosaic.support import contradicted_colour, supported_mosaic, weakly_placed
+from processing.mosaic.validity import Validity, judge_master, robust_datum
+from processing.rig import Rig
+
+Method = Literal["free", "fixed", "pan-only"]
+
+
+@dataclass(frozen=True)
+class Stitching:
+    """The mosaics of one exposure.
+
+    `tie_points` are those believed. `equal` has its datum over all master sensors, `free` over
+    those in place, both by tie points alone; `image` is what the image is made with: `free`, or
+    supported by calibration because of the sensors `weak`. `validity` is None with the methods that
+    are there to be compared with.
+    """
+
+    tie_points: TiePoints
+    equal: Mosaic
+    free: Mosaic
+    image: Mosaic
+    validity: Validity | None
+    weak: tuple[str, ...]
+
+
+def stitch(
+    rig: Rig,
+    start: Mapping[str, SensorPlacement],
+    tie_points: TiePoints,
+    *,
+    present: Collection[str],
+    temperatures_c: Mapping[str, float],
+    method: Method,
+    settings: MosaicSettings,
+) -> Stitching:
+    """Adjust, judge, repair the datum, and support what tie points do not carry.
+
+    Args:
+        rig: the camera.
+        start: calibration + TDM, layers by platform calibration.
+        tie_points: matched points.
+        present: sensors with a frame.
+        temperatures_c: temperatures that were read, by probe name.
+        method: "free", or one to be compared with.
+        settings: of the adjustment.
+    """
+    if method != "free":
+        other = fixed_mosaic if method == "fixed" else pan_only_mosaic
+        mosaic = other(rig, start, tie_points, settings=settings)
+        if method == "pan-only":
+            mosaic = verified_mosaic(rig, mosaic, tie_points)
+        return Stitching(tie_points, mosaic, mosaic, mosaic, None, ())
+    mosaic = free_mosaic(rig, start, tie_points, settings=settings)
+    validity = judge_master(rig, mosaic, temperatures_c)
+    contradicted = contradicted_colour(rig, tie_points, mosaic, validity)
+    if contradicted.any():
+        fewer = tie_points.only(~contradicted)
+        without = free_mosaic(rig, start, fewer, settings=settings)
+        judged = judge_master(rig, without, temperatures_c)
+        if not contradicted_colour(rig, tie_points, without, judged).any():
+            # P/P points do not say so: it was a cloud, or something else that is nearer.
+            tie_points, mosaic, validity = fewer, without, judged
+    mosaic = verified_mosaic(rig, mosaic, tie_points)
+    robust = robust_datum(rig, start, tie_points, mosaic, validity, settings=settings)
+    weak = weakly_placed(rig, robust, present)
+    image = robust
+    if weak:
+        image = supported_mosaic(
+            rig, start, tie_points, robust, validity, temperatures_c, settings=settings
+        )
+    return Stitching(tie_points, mosaic, robust, image, validity, weak)

@@ -1,0 +1,1 @@
+"""What is said of an exposure: figures, flags, verdict."""

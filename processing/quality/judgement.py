@@ -1,0 +1,398 @@
+"""From figures to findings and a verdict: every rule by which a flag is raised, and its sentence.
+
+What a report consists of, the thresholds and the meaning of every figure are in
+`processing.quality.report`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+from processing.quality.report import (
+    NO_FLAGS,
+    Figure,
+    Finding,
+    Flag,
+    QualityReport,
+    Thresholds,
+    Verdict,
+    finite,
+)
+from processing.quality.specification import Asked, asked_findings
+
+_CAPTURE: Final[Mapping[Flag, tuple[Verdict, str]]] = {
+    Flag.FRAME_LATE: (
+        Verdict.GOOD,
+        "A frame came late; if it happens again, check the load of the camera network.",
+    ),
+    Flag.FRAME_DUPLICATE: (
+        Verdict.GOOD,
+        "A frame came twice; the first was kept. Check that one computer alone owns the head.",
+    ),
+    Flag.FRAME_CORRUPT: (
+        Verdict.USABLE,
+        "A frame was damaged and left out; check cable and network settings of that head.",
+    ),
+    Flag.MARK_MISSING: (
+        Verdict.USABLE,
+        "The receiver gave no event mark, the time is interpolated; check the strobe cable.",
+    ),
+    Flag.MARK_AMBIGUOUS: (
+        Verdict.USABLE,
+        "Two event marks could belong to this exposure; check the strobe line for noise.",
+    ),
+    Flag.TIME_HOLDOVER: (
+        Verdict.USABLE,
+        "The clock coasts without marks or pulse per second; check the cables of the receiver.",
+    ),
+    Flag.DC_DISAGREEMENT: (
+        Verdict.USABLE,
+        "Probes and stitching disagree on the temperature; check the probes after landing.",
+    ),
+    Flag.CALIBRATION_EXPIRED: (
+        Verdict.USABLE,
+        "The calibration has expired; go on, and have the camera calibrated.",
+    ),
+    Flag.OVERLAP: (
+        Verdict.REFLY,
+        "The overlap is below plan; fly this part of the line again.",
+    ),
+    Flag.SUN: (
+        Verdict.USABLE,
+        "The sun stands low: long shadows; go on when it is higher if the project asks for it.",
+    ),
+    Flag.GSD: (
+        Verdict.USABLE,
+        "The ground sampling distance is coarser than planned; fly lower.",
+    ),
+    Flag.GNSS: (
+        Verdict.USABLE,
+        "GNSS quality is poor; wait for a better fix before the next line if the plan allows.",
+    ),
+    Flag.DISK_LOW: (
+        Verdict.GOOD,
+        "The disk is nearly full; finish this line and change the disk.",
+    ),
+    Flag.PROCESSING_BEHIND: (
+        Verdict.GOOD,
+        "Processing is behind capture; raw frames are safe and will be processed later.",
+    ),
+    Flag.SIMULATED: (Verdict.GOOD, "Simulated hardware: not a survey."),
+    Flag.NOT_PROCESSED: (
+        Verdict.USABLE,
+        "This exposure was not processed; its raw frames are safe: process it on the ground.",
+    ),
+}
+
+
+def judge(
+    figures: Mapping[str, Figure],
+    *,
+    capture_flags: Flag = NO_FLAGS,
+    missing_sensors: Sequence[str] = (),
+    missing_probes: Sequence[str] = (),
+    probes_out_of_range: Sequence[str] = (),
+    nominal_bands: Sequence[str] = (),
+    thresholds: Thresholds | None = None,
+    asked: Asked | None = None,
+) -> QualityReport:
+    """Findings and verdict of one exposure from its figures.
+
+    A figure that is missing or None raises nothing: what is not known is not judged.
+
+    Args:
+        figures: by documented name.
+        capture_flags: what capture already knows (late frame, event mark missing, ...).
+        missing_sensors: sensors whose frame is not there.
+        missing_probes: probes that gave no temperature.
+        probes_out_of_range: probes whose temperature cannot be.
+        nominal_bands: colours placed by calibration because too few tie points were found.
+        asked: what the project asks for, where it does.
+    """
+    t = thresholds or Thresholds()
+    findings = [
+        Finding(flag, *_CAPTURE[flag]) for flag in Flag if flag & capture_flags and flag in _CAPTURE
+    ]
+    findings += _frames(figures, capture_flags, missing_sensors, t)
+    findings += _time_and_temperature(figures, missing_probes, probes_out_of_range, t)
+    findings += _stitching(figures, nominal_bands, t)
+    findings += _exposure(figures, t)
+    findings += _attitude(figures, t)
+    broken = list(asked_findings(figures, asked or Asked()))
+    findings = [f for f in findings if f.flag not in {b.flag for b in broken}] + broken
+    order = list(Verdict)
+    worst = max((order.index(finding.verdict) for finding in findings), default=0)
+    flags = capture_flags
+    for finding in findings:
+        flags |= finding.flag
+    return QualityReport(order[worst], flags, tuple(findings), finite(figures))
+
+
+def _frames(
+    figures: Mapping[str, Figure],
+    capture_flags: Flag,
+    missing_sensors: Sequence[str],
+    t: Thresholds,
+) -> list[Finding]:
+    findings = []
+    if missing_sensors or capture_flags & Flag.FRAME_MISSING:
+        named = ", ".join(missing_sensors) or "a sensor"
+        findings.append(
+            Finding(
+                Flag.FRAME_MISSING,
+                Verdict.USABLE,
+                f"No frame of {named}: that part has no data; check the head, fly again if the "
+                "neighbours do not cover it.",
+                float(len(missing_sensors)) or None,
+                0.0,
+            )
+        )
+    valid = _number(figures, "valid_fraction")
+    if valid is not None and valid < t.valid_refly_fraction:
+        findings.append(
+            Finding(
+                Flag.FRAME_MISSING,
+                Verdict.REFLY,
+                f"Only {valid:.0%} of the image holds data; fly this exposure again.",
+                valid,
+                t.valid_refly_fraction,
+            )
+        )
+    return findings
+
+
+def _time_and_temperature(
+    figures: Mapping[str, Figure],
+    missing_probes: Sequence[str],
+    probes_out_of_range: Sequence[str],
+    t: Thresholds,
+) -> list[Finding]:
+    findings = _above(
+        figures,
+        "time_sigma_ns",
+        Flag.TIME_SIGMA,
+        (t.time_sigma_ns, t.time_sigma_refly_ns),
+        "The exposure's time is uncertain; check strobe cable and receiver.",
+    )
+    findings += _above(
+        figures,
+        "time_error_px",
+        Flag.TIME_SIGMA,
+        (t.time_error_px, t.time_error_refly_px),
+        "The exposure's time is too uncertain for this speed and GSD; the budget says by what: "
+        "check strobe cable and receiver.",
+    )
+    if missing_probes:
+        findings.append(
+            Finding(
+                Flag.TEMPERATURE_MISSING,
+                Verdict.USABLE,
+                f"No temperature of probe {', '.join(missing_probes)}: the other probes stand in, "
+                "calibration where there are none; check the probe.",
+                float(len(missing_probes)),
+                0.0,
+            )
+        )
+    findings += _above(
+        figures,
+        "temperature_age_s",
+        Flag.TEMPERATURE_STALE,
+        (t.temperature_age_s, math.inf),
+        "Temperatures are old; check the probe module and its line.",
+    )
+    disagreeing = figures.get("dc_disagreement")
+    if disagreeing:
+        findings.append(
+            Finding(
+                Flag.DC_DISAGREEMENT,
+                Verdict.USABLE,
+                f"Probe and stitching disagree on the temperature of cone {disagreeing}: a stuck "
+                "probe, a moved sensor or an old calibration; check the probe after landing.",
+                _number(figures, "dc_estimated_k"),
+            )
+        )
+    if probes_out_of_range:
+        findings.append(
+            Finding(
+                Flag.TEMPERATURE_RANGE,
+                Verdict.USABLE,
+                f"Probe {', '.join(probes_out_of_range)} is outside {t.temperature_low_c:g} to "
+                f"{t.temperature_high_c:g} degC and was not used; check the probe.",
+                float(len(probes_out_of_range)),
+                0.0,
+            )
+        )
+    return findings
+
+
+def _stitching(
+    figures: Mapping[str, Figure], nominal_bands: Sequence[str], t: Thresholds
+) -> list[Finding]:
+    findings = []
+    poorest = _number(figures, "tie_points_min_overlap")
+    if poorest is not None and poorest < t.tie_points_per_overlap:
+        where = figures.get("tie_points_min_overlap_name") or "an overlap"
+        total = _number(figures, "tie_points_pp") or 0.0
+        too_few = total < t.tie_points_pp_refly
+        findings.append(
+            Finding(
+                Flag.TIE_POINTS,
+                Verdict.REFLY if too_few else Verdict.USABLE,
+                f"Few tie points in {where} (water, snow, desert or cloud?): look at the quick "
+                "look; fly again if it should have had detail.",
+                poorest,
+                float(t.tie_points_per_overlap),
+            )
+        )
+    resting = figures.get("resting_on_calibration")
+    if resting:
+        findings.append(
+            Finding(
+                Flag.TIE_POINTS,
+                Verdict.USABLE,
+                f"Too little detail to place {resting}: calibration and temperature help to place "
+                "them. Look at the quick look; fly again if there should have been detail.",
+                _number(figures, "stitched_sigma_worst_px"),
+            )
+        )
+    findings += [
+        Finding(
+            Flag.TIE_POINTS,
+            Verdict.USABLE,
+            f"Too few tie points for {band}: it is placed by calibration; expect colour fringes.",
+            _number(figures, f"{band}_points"),
+        )
+        for band in nominal_bands
+    ]
+    findings += _above(
+        figures,
+        "sigma0_px",
+        Flag.SIGMA0,
+        (t.sigma0_px, t.sigma0_refly_px),
+        "The sensors do not fit together well; check exposure times and the mount of the heads.",
+    )
+    platform = _number(figures, "platform_test")
+    if platform is not None and platform > 1.0:
+        moved = _number(figures, "platform_shift_px")
+        findings.append(
+            Finding(
+                Flag.CALIBRATION_EXPIRED,
+                Verdict.USABLE,
+                f"Head {figures.get('platform_shift_head')} sits {moved or 0.0:.2f} px off the "
+                "platform calibration; the image is corrected for it. Go on, and calibrate the "
+                "platform from this flight.",
+                platform,
+                1.0,
+            )
+        )
+    displaced = figures.get("displaced_sensor")
+    if displaced:
+        size = math.hypot(
+            _number(figures, "displacement_x_px") or 0.0,
+            _number(figures, "displacement_y_px") or 0.0,
+        )
+        sentence = (
+            f"Sensor {displaced} sits {size:.2f} px off its calibrated place; the image is "
+            "corrected for it. Go on, and have the camera calibrated."
+        )
+        alternatives = figures.get("displaced_alternatives")
+        if figures.get("displaced_several"):
+            sentence = (
+                "More than one sensor of the master cone sits off its calibrated place, and which "
+                "ones cannot be told: the image fits together, but its place in the camera is "
+                "uncertain. Go on, and have the camera calibrated."
+            )
+        elif alternatives:
+            sentence = (
+                f"Sensor {displaced} sits {size:.2f} px off its calibrated place, unless it is "
+                f"{alternatives}; the image fits together. Go on, and have the camera calibrated."
+            )
+        findings.append(Finding(Flag.DISPLACED_SENSOR, Verdict.USABLE, sentence, size))
+    return findings
+
+
+def _exposure(figures: Mapping[str, Figure], t: Thresholds) -> list[Finding]:
+    findings = []
+    bright = _number(figures, "bright_fraction")
+    if bright is not None and bright < t.bright_fraction:
+        black = bright < t.bright_refly_fraction
+        findings.append(
+            Finding(
+                Flag.UNDEREXPOSED,
+                Verdict.REFLY if black else Verdict.USABLE,
+                "The image is black; check shutter, aperture and lens cover. Fly it again."
+                if black
+                else "The image is dark; lengthen the exposure or open the aperture.",
+                bright,
+                t.bright_refly_fraction if black else t.bright_fraction,
+            )
+        )
+    findings += _above(
+        figures,
+        "saturated_fraction",
+        Flag.OVEREXPOSED,
+        (t.saturated_fraction, t.saturated_refly_fraction),
+        "Parts of the image are burnt out; shorten the exposure.",
+    )
+    for name, way in (("smear_along_px", "along"), ("smear_across_px", "across")):
+        findings += _above(
+            figures,
+            name,
+            Flag.BLUR,
+            (t.smear_px, t.smear_refly_px),
+            f"Motion blur {way} track; shorten the exposure, check TDI, speed, mount and crab.",
+        )
+    sharpness = _number(figures, "sharpness")
+    if sharpness is not None and sharpness < t.sharpness:
+        findings.append(
+            Finding(
+                Flag.BLUR,
+                Verdict.USABLE,
+                "The image holds no fine detail; look at the quick look for cloud, dew or blur.",
+                sharpness,
+                t.sharpness,
+            )
+        )
+    return findings
+
+
+def _attitude(figures: Mapping[str, Figure], t: Thresholds) -> list[Finding]:
+    return _above(
+        figures,
+        "tilt_deg",
+        Flag.TILT,
+        (math.degrees(t.tilt_rad), math.inf),
+        "The camera was tilted; check the mount and fly the line level.",
+    ) + _above(
+        figures,
+        "crab_deg",
+        Flag.DRIFT,
+        (math.degrees(t.crab_rad), math.inf),
+        "The camera does not point along the track; set the drift angle of the mount.",
+    )
+
+
+def _above(
+    figures: Mapping[str, Figure],
+    name: str,
+    flag: Flag,
+    limits: tuple[float, float],
+    sentence: str,
+) -> list[Finding]:
+    """A finding where a figure exceeds the first limit; above the second it asks for a re-fly."""
+    value = _number(figures, name)
+    usable, refly = limits
+    if value is None or value <= usable:
+        return []
+    if value > refly:
+        return [Finding(flag, Verdict.REFLY, f"{sentence} Fly it again.", value, refly)]
+    return [Finding(flag, Verdict.USABLE, sentence, value, usable)]
+
+
+def _number(figures: Mapping[str, Figure], name: str) -> float | None:
+    value = figures.get(name)
+    if value is None or isinstance(value, str) or not math.isfinite(value):
+        return None
+    return float(value)

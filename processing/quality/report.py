@@ -1,0 +1,218 @@
+"""The quality report of one exposure: flags, the figures behind them, and the verdict.
+
+Every figure has one documented name (`FIGURES`). How figures become findings is in
+`processing.quality.judgement`.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+Figure = float | int | str | None
+
+
+class Flag(enum.IntFlag):
+    """The documented bit set of DESIGN 5.11. A bit keeps its place for ever."""
+
+    FRAME_MISSING = 1 << 0
+    FRAME_LATE = 1 << 1
+    FRAME_DUPLICATE = 1 << 2
+    FRAME_CORRUPT = 1 << 3
+    MARK_MISSING = 1 << 4
+    MARK_AMBIGUOUS = 1 << 5
+    TIME_SIGMA = 1 << 6
+    TEMPERATURE_MISSING = 1 << 7
+    TEMPERATURE_STALE = 1 << 8
+    TEMPERATURE_RANGE = 1 << 9
+    DC_DISAGREEMENT = 1 << 10
+    TIE_POINTS = 1 << 11
+    SIGMA0 = 1 << 12
+    DISPLACED_SENSOR = 1 << 13
+    CALIBRATION_EXPIRED = 1 << 14
+    UNDEREXPOSED = 1 << 15
+    OVEREXPOSED = 1 << 16
+    BLUR = 1 << 17
+    TILT = 1 << 18
+    DRIFT = 1 << 19
+    OVERLAP = 1 << 20
+    GNSS = 1 << 21
+    DISK_LOW = 1 << 22
+    PROCESSING_BEHIND = 1 << 23
+    SIMULATED = 1 << 24
+    NOT_PROCESSED = 1 << 25
+    TIME_HOLDOVER = 1 << 26
+    SUN = 1 << 27
+    GSD = 1 << 28
+
+
+NO_FLAGS: Final = Flag(0)
+
+
+class Verdict(enum.Enum):
+    GOOD = "good"
+    USABLE = "usable"
+    REFLY = "refly"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One raised flag: which, how grave, the figure against its threshold, and what to do."""
+
+    flag: Flag
+    verdict: Verdict
+    sentence: str
+    value: float | None = None
+    threshold: float | None = None
+
+
+@dataclass(frozen=True)
+class QualityReport:
+    """What is known about one exposure. `figures` are numbers by documented name."""
+
+    verdict: Verdict
+    flags: Flag
+    findings: tuple[Finding, ...]
+    figures: Mapping[str, float | int | str | None] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """Where a figure becomes a finding. `*_refly` asks for another run over the same ground.
+
+    Defaults suit a survey at 5 to 25 cm GSD and 60 to 100 m/s: 0.1 ms of time is below a tenth of a
+    pixel there. A whole number of TDI shifts leaves up to half a pixel of smear, which is no fault.
+    They are the configuration's to change.
+    """
+
+    time_sigma_ns: float = 100_000.0
+    time_sigma_refly_ns: float = 20_000_000.0
+    time_error_px: float = 0.1
+    """Way flown in one standard deviation of time, as a fraction of the GSD."""
+    time_error_refly_px: float = 10.0
+    temperature_age_s: float = 30.0
+    temperature_low_c: float = -40.0
+    temperature_high_c: float = 70.0
+    tie_points_per_overlap: int = 12
+    tie_points_pp_refly: int = 20
+    sigma0_px: float = 0.3
+    sigma0_refly_px: float = 1.0
+    bright_fraction: float = 0.06
+    """The 95th percentile of the signal as a share of full scale; below, the image is dark."""
+    bright_refly_fraction: float = 0.01
+    saturated_fraction: float = 0.005
+    saturated_refly_fraction: float = 0.05
+    smear_px: float = 0.8
+    smear_refly_px: float = 2.0
+    sharpness: float = 0.27
+    tilt_rad: float = math.radians(5.0)
+    crab_rad: float = math.radians(5.0)
+    valid_refly_fraction: float = 0.75
+
+
+FIGURES: Final[Mapping[str, str]] = {
+    "method": "how the image was stitched: free, fixed",
+    "sigma0": "a posteriori standard deviation of unit weight",
+    "sigma0_px": "sigma0 as one P/P coordinate difference, PAN pixels",
+    "sigma0_um": "the same in um in the image plane",
+    "redundancy": "redundancy of the adjustment",
+    "outliers": "tie points rejected by data snooping",
+    "tie_points_pp": "tie points between PAN sensors",
+    "tie_points_pc": "tie points between PAN and the colour master",
+    "tie_points_min_overlap": "tie points in the poorest overlap",
+    "tie_points_min_overlap_name": "which overlap that is",
+    "dc_k": "temperature at exposure less that at calibration, mean of the PAN cones, K",
+    "dc_estimated_k": "the same as the stitching sees it, cones of two or more CCDs, K",
+    "dc_estimated_sigma_k": "standard deviation of that; null where it cannot be determined",
+    "dc_disagreement": "cones whose probes and stitching disagree, comma separated",
+    "stitched_sigma_px": "standard deviation of a stitched point, RMS over PAN sensors, pixels",
+    "stitched_sigma_worst_px": "the same of the worst PAN sensor",
+    "stitched_sigma_worst_sensor": "which sensor that is",
+    "displaced_sensor": "name of the one master sensor found displaced",
+    "displacement_x_px": "its displacement against calibration and TDM, PAN pixels, x right",
+    "displacement_y_px": "the same, y up",
+    "displacement_sigma_px": "standard deviation of a coordinate of it",
+    "displacement_test": "test statistic over its critical value; above one is significant",
+    "displaced_alternatives": "master sensors that explain the stitching nearly as well",
+    "displaced_several": "1 where one displaced sensor does not explain it all: several moved",
+    "relative_displacements": "pairs of sensors of one cone found displaced against each other",
+    "platform_test": "mountings of converging heads against the platform calibration: test "
+    "statistic over its critical value; above one is significant",
+    "platform_shift_px": "how far the head that moved most went by it, PAN pixels at its middle",
+    "platform_shift_head": "which head that is",
+    "platform_residual_px": "largest shift an affine transformation still finds between heads",
+    "projection_height_m": "height above ground a virtual camera projected its heads onto",
+    "head_parallax_px": "parallax relief may leave between PAN heads after that, PAN pixels",
+    "undetermined": "sensors and cones the tie points did not place, held at calibration and TDM",
+    "resting_on_calibration": "PAN sensors that tie points place too poorly, supported",
+    "smear_along_px": "motion during exposure along track that TDI left, worst PAN cone, pixels",
+    "smear_across_px": "the same across track",
+    "gsd_m": "ground sampling distance of the virtual image",
+    "saturated_fraction": "share of saturated pixels, all PAN sensors",
+    "saturated_worst_fraction": "the same of the worst sensor",
+    "saturated_worst_sensor": "which sensor that is",
+    "mean_dn": "mean signal above black of the PAN sensors, DN",
+    "bright_fraction": "95th percentile of PAN signal as a share of full scale",
+    "balance_spread": "largest over smallest gain between PAN heads, less one",
+    "sharpness": "share of the finest detail: 0.25 smooth, 1 without any correlation",
+    "time_sigma_ns": "standard deviation of the time of the least certain frame",
+    "time_error_px": "way flown in that, speed x sigma, as a fraction of the GSD",
+    "time_sigma_receiver_ns": "part of it: the receiver's event mark",
+    "time_sigma_clock_ns": "part of it: the host's clock, where there is no mark",
+    "time_sigma_trigger_ns": "part of it: when the pulse was given, where there is no mark",
+    "time_sigma_delay_ns": "part of it: how well the trigger unit keeps its delays",
+    "time_sigma_head_ns": "part of it: from the head's trigger to its mid-exposure",
+    "temperature_age_s": "age of the oldest temperature used",
+    "valid_fraction": "share of virtual image pixels that hold data",
+    "missing_sensors": "sensors without a frame, comma separated",
+    "tilt_deg": "largest of roll and pitch",
+    "crab_deg": "angle between the image's along axis and the track",
+    "forward_overlap": "share of the ground seen that the image before it on the line saw, too",
+    "sidelap": "share of it that images of the neighbouring line saw, the poorer side",
+    "sun_deg": "elevation of the sun",
+    "tdi_shifts": "TDI shifts of the reference cone",
+    "parallax_px": "parallax relief may leave between PAN and the colour master, PAN pixels",
+    "green_rms_px": "residual of P/C tie points, colour pixels",
+    "red_points": "tie points red to green",
+    "red_rms_px": "residual of red to green, colour pixels",
+    "blue_points": "tie points blue to green",
+    "blue_rms_px": "residual of blue to green, colour pixels",
+    "nir_points": "tie points near infrared to green",
+    "nir_rms_px": "residual of near infrared to green, colour pixels",
+}
+"""Documented names of figures; `dc_k_<cone>` is one cone's own dC, K."""
+
+
+def as_json(report: QualityReport) -> dict[str, Any]:
+    """The report as JSON-ready data: no NaN, no infinity, flags by name."""
+    return {
+        "verdict": report.verdict.value,
+        "flags": [flag.name for flag in Flag if flag & report.flags],
+        "flag_bits": int(report.flags),
+        "findings": [
+            {
+                "flag": finding.flag.name,
+                "verdict": finding.verdict.value,
+                "sentence": finding.sentence,
+                "value": _finite_value(finding.value),
+                "threshold": _finite_value(finding.threshold),
+            }
+            for finding in report.findings
+        ],
+        "figures": finite(report.figures),
+    }
+
+
+def finite(figures: Mapping[str, Figure]) -> dict[str, Figure]:
+    """The figures with None for what is no number, as JSON wants them."""
+    return {
+        name: None if isinstance(value, float) and not math.isfinite(value) else value
+        for name, value in figures.items()
+    }
+
+
+def _finite_value(value: float | None) -> float | None:
+    return value if value is not None and math.isfinite(value) else None

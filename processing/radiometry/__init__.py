@@ -1,0 +1,1 @@
+"""From counts to linear signal and radiance, and how bright the next frame shall be."""

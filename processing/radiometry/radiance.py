@@ -1,0 +1,161 @@
+"""Radiance: calibrated heads' counts to W/m2/sr/nm, and the file that holds such a calibration.
+
+For heads whose maker states an absolute calibration; relative calibration of our own heads is in
+`processing.radiometry.calibration`. Source: MicaSense, "RedEdge camera radiometric calibration
+model".
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.radiometry.calibration import CalibrationError
+from processing.rig import Sensor
+
+Array = NDArray[Any]
+
+RADIANCE_FILE_MAX_BYTES: Final = 100_000
+_WORDS: Final = 65536.0
+
+
+@dataclass(frozen=True)
+class RadianceCalibration:
+    """One head's absolute response.
+
+    L = V R (word - black) a1 / (gain t 65536) with words of 16 bits, t the exposure time in s,
+    V = 1 / (1 + sum k_i r^i), i from 1, r the distance in px from the vignetting centre (column,
+    row), and R = 1 / (1 + a2 row / t - a3 row), the rows being read one after another.
+    """
+
+    a1: float
+    a2: float
+    a3: float
+    vignetting_centre_px: tuple[float, float]
+    vignetting: tuple[float, ...]
+    wavelength_nm: float
+    bandwidth_nm: float
+
+
+def radiance_from_words(
+    sensor: Sensor,
+    calibration: RadianceCalibration,
+    words: Array,
+    *,
+    exposure_time_s: float,
+    gain: float = 1.0,
+    black: float | None = None,
+) -> Array:
+    """Radiance of a raw frame in its own geometry.
+
+    Args:
+        sensor: says how its words hold DN, and the black level where `black` does not.
+        words: (h, w) uint16 as stored.
+        exposure_time_s, gain: of this exposure.
+        black: word without light, as the head told it for this frame.
+
+    Returns:
+        (h, w) float32, W/m2/sr/nm. Noise may leave it below zero.
+
+    Raises:
+        ValueError: a frame of the wrong shape or type, or a time or gain that is not positive.
+    """
+    shape = (sensor.height_px, sensor.width_px)
+    if words.shape != shape or words.dtype != np.uint16:
+        raise ValueError(
+            f"frame of {sensor.name} is {words.dtype} of shape {words.shape}; uint16 of {shape}"
+        )
+    if not (exposure_time_s > 0.0 and gain > 0.0):
+        raise ValueError(
+            f"{sensor.name}: exposure time {exposure_time_s:g} s and gain {gain:g}; radiance needs "
+            f"both, and positive"
+        )
+    if black is None:
+        black = sensor.black_dn * sensor.words_per_dn
+    # A right-justified word is carried to the 16 bits the calibration is made for.
+    unit = (1 << (16 - sensor.bits)) / sensor.words_per_dn
+    column = np.arange(sensor.width_px, dtype=np.float64)[None, :]
+    row = np.arange(sensor.height_px, dtype=np.float64)[:, None]
+    centre = calibration.vignetting_centre_px
+    r = np.hypot(column - centre[0], row - centre[1])
+    fall_off = np.polynomial.polynomial.polyval(r, (1.0, *calibration.vignetting))
+    rows = 1.0 + calibration.a2 * row / exposure_time_s - calibration.a3 * row
+    scale = unit * calibration.a1 / (gain * exposure_time_s * _WORDS)
+    radiance: Array = ((words - black) * scale / (fall_off * rows)).astype(np.float32)
+    return radiance
+
+
+def saturated_words(sensor: Sensor, words: Array) -> Array:
+    """Where a raw frame is at full scale, (h, w) bool."""
+    full: Array = words >= sensor.full_scale_dn * sensor.words_per_dn
+    return full
+
+
+def radiance_as_json(calibration: RadianceCalibration) -> dict[str, Any]:
+    """The content of `<sensor>.json`."""
+    content = asdict(calibration)
+    return {
+        key: list(value) if isinstance(value, tuple) else value for key, value in content.items()
+    }
+
+
+def load_radiance(path: Path) -> RadianceCalibration:
+    """Read `<sensor>.json`, which holds exactly the fields of `RadianceCalibration`.
+
+    Raises:
+        CalibrationError: the file is missing, too large, damaged, or holds other than it should.
+    """
+    try:
+        if path.stat().st_size > RADIANCE_FILE_MAX_BYTES:
+            raise CalibrationError(
+                f"{path.name}: larger than {RADIANCE_FILE_MAX_BYTES} bytes; not a calibration"
+            )
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        reason = error.strerror or type(error).__name__
+        raise CalibrationError(f"{path}: cannot be read ({reason}); give a JSON file") from error
+    except (ValueError, RecursionError) as error:
+        raise CalibrationError(f"{path.name}: not valid JSON ({error})") from error
+    return radiance_from_mapping(content, path.name)
+
+
+def radiance_from_mapping(content: Any, name: str) -> RadianceCalibration:
+    """Build a calibration from parsed JSON; `name` begins the error sentences.
+
+    Raises:
+        CalibrationError: a key is missing, unknown, or no finite number.
+    """
+    keys = [field.name for field in fields(RadianceCalibration)]
+    if not isinstance(content, Mapping) or sorted(content) != sorted(keys):
+        raise CalibrationError(f"{name}: holds other keys than it should: {', '.join(keys)}")
+    centre = _numbers(content, "vignetting_centre_px", name)
+    if len(centre) != 2:
+        raise CalibrationError(f"{name}: vignetting_centre_px has two numbers, column and row")
+    calibration = RadianceCalibration(
+        vignetting_centre_px=(centre[0], centre[1]),
+        vignetting=_numbers(content, "vignetting", name),
+        **{key: _number(content[key], key, name) for key in keys if "vignetting" not in key},
+    )
+    if calibration.a1 <= 0.0:
+        raise CalibrationError(f"{name}: a1 is {calibration.a1:g}; it is positive")
+    return calibration
+
+
+def _numbers(content: Mapping[str, Any], key: str, name: str) -> tuple[float, ...]:
+    values = content[key]
+    if not isinstance(values, list) or len(values) > 16:
+        raise CalibrationError(f"{name}: {key} is a list of at most 16 numbers")
+    return tuple(_number(value, key, name) for value in values)
+
+
+def _number(value: Any, key: str, name: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise CalibrationError(f"{name}: {key} is {value!r}; a finite number is needed")
+    return float(value)

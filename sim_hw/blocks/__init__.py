@@ -1,0 +1,1 @@
+"""Blocks of image coordinates with their truth, for adjustments without pixels."""

@@ -1,0 +1,1 @@
+"""Emulated probes and trigger units, and the lines on which devices are."""

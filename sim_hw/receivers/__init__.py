@@ -1,0 +1,1 @@
+"""Emulated receivers and autopilots, and their protocols as bytes."""

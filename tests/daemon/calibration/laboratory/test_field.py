@@ -1,0 +1,139 @@
+"""`calibrate lab` before the emulated 3D test field, held against its truth."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+from typer.testing import CliRunner
+
+from benchmarks.laboratory_field import calibrated, errors_of, pooled
+from daemon.calibration.laboratory.field import LENS_FREE
+from daemon.calibration.laboratory.field_report import covariance_of
+from daemon.cli.calibrate import app
+from processing.matching.discs import disc_positions, identified
+from processing.rig import find_rig, load_rig, shipped_rigs
+from sim_hw import test_field
+
+RIG = "ultracam-l-mini"
+PAN = ("0", "1")
+
+
+@pytest.fixture(scope="module")
+def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Frames of the two PAN cones only, which keeps the room small."""
+    root = tmp_path_factory.mktemp("field")
+    rig = find_rig(RIG)
+    plan = replace(test_field.plan_for(rig, 7), count=(19, 19))
+    pan = replace(rig, cones=rig.pan_cones)
+    file = shipped_rigs()[RIG]
+    for take in (1, 2):
+        test_field.write_series(pan, file, root / str(take), seed=1, take=take, plan=plan)
+    yield root
+
+
+def _calibrated(*arguments: str) -> dict[str, Any]:
+    run = CliRunner().invoke(app, ["lab", *arguments, "--json"])
+    assert run.exit_code == 0, run.output
+    told: dict[str, Any] = json.loads(run.stdout)
+    return told
+
+
+def test_frames_of_the_field_give_the_true_places_within_their_sigmas(laboratory: Path) -> None:
+    told = _calibrated(str(laboratory / "1" / "series"), "--out", str(laboratory / "a"))
+    truth = test_field.true_rig(replace(find_rig(RIG), cones=find_rig(RIG).pan_cones), 1)
+    before, rig = find_rig(RIG), load_rig(laboratory / "a" / "rig.toml")
+    assert told["figures"]["sigma_px"] < 0.02
+    assert told["figures"]["image_points"] > 800
+    sigma = {(q["where"], q["what"]): q["sigma"] for q in told["quantities"]}
+    for name in ("SU00", "SU10"):
+        new, old, true = rig.sensor(name), before.sensor(name), truth.sensors[name]
+        for what, error_um in (
+            ("x", 1e3 * (new.x_mm - old.x_mm - true.shift[0])),
+            ("y", 1e3 * (new.y_mm - old.y_mm - true.shift[1])),
+            ("scale", 1e6 * (new.scale / old.scale - 1 - true.scale)),
+        ):
+            assert abs(error_um) < 4.0 * sigma[name, what], (name, what, error_um)
+        assert sigma[name, "x"] < 10.0
+        # The datum: the only CCD of a cone is not turned, f and the principal point stay.
+        assert new.rotation_rad == old.rotation_rad
+        assert rig.cone_of(name).lens.f_mm == before.cone_of(name).lens.f_mm
+        assert rig.cone_of(name).calibration_c == pytest.approx(22.0, abs=0.1)
+    # Colour cones were not looked at and are as they were, probes apart.
+    assert rig.cone("N").lens == before.cone("N").lens
+    with np.load(laboratory / "a" / "covariance.npz") as covariance:
+        assert covariance["covariance"].shape == (len(covariance["names"]),) * 2
+
+
+def test_calibrated_again_nothing_has_changed(laboratory: Path, tmp_path: Path) -> None:
+    if not (laboratory / "a").exists():
+        _calibrated(str(laboratory / "1" / "series"), "--out", str(laboratory / "a"))
+    again = _calibrated(
+        *(str(laboratory / "2" / "series"), "--out", str(tmp_path / "b")),
+        *("--previous", str(laboratory / "a")),
+    )
+    assert len(again["changes"]) > 15
+    assert not [c for c in again["changes"] if c["significant"]]
+
+
+def test_errors_of_rig_parameters_agree_with_their_covariance() -> None:
+    found = pooled(find_rig(RIG), range(1, 5), exposures=12, targets=(16, 16))
+    low, high = found.interval
+    assert low < found.mean < high
+    size = np.abs(found.standardised)
+    assert float(np.mean(size <= 3.0)) >= 0.98
+    assert float(size.max()) < 5.0
+
+
+def test_every_ccd_has_its_place_scale_and_skew_and_all_but_one_of_a_cone_its_rotation() -> None:
+    rig = find_rig("ultracam-x-mini")
+    found, truth = calibrated(rig, 1, exposures=12, targets=(16, 16))
+    rows, error = errors_of(found, truth)
+    covariance = covariance_of(found, rows)
+    scale = 1.0 / np.sqrt(np.diag(covariance))
+    squares = (error * scale) @ np.linalg.solve(covariance * scale[:, None] * scale, error * scale)
+    assert chi2.ppf(0.0005, len(rows)) < squares < chi2.ppf(0.9995, len(rows))
+    kinds = [r.what for r in rows]
+    assert kinds.count("x") == kinds.count("scale") == kinds.count("skew x") == 13
+    assert kinds.count("rotation") == 13 - len(rig.cones)
+    assert kinds.count("omega") == len(rig.cones) - 1
+    assert kinds.count("k1") == len(rig.cones)
+    assert len(rows) == len(error) == 13 * 5 + 5 + 3 * 7 + len(LENS_FREE) * 8
+    assert [r.where for r in rows if r.what == "rotation"] == [
+        *("SU01", "SU02", "SU03", "SU11", "SU21")
+    ]
+
+
+def test_discs_are_measured_without_bias_and_touching_ones_left_out() -> None:
+    random = np.random.default_rng(1)
+    sensor = find_rig(RIG).sensors[0]
+    row, column = np.mgrid[100:1600:90, 100:1200:90]
+    true = np.stack([column.ravel(), row.ravel()], axis=1) + random.uniform(0, 1, (row.size, 2))
+    pair = np.array([[300.0, 60.0], [309.0, 60.0]])
+    pixels = test_field.frame(sensor, np.vstack([true, pair]), random)
+    found = disc_positions(pixels)
+    assert len(found) == len(true)
+    distance = np.hypot(*(found[:, None] - true[None]).transpose(2, 0, 1))
+    error = found - true[np.argmin(distance, axis=1)]
+    assert float(np.sqrt(np.mean(error**2))) < 0.01
+    assert float(np.abs(error.mean(axis=0)).max()) < 0.002
+
+
+def test_targets_are_told_apart_although_the_holder_is_off_by_tens_of_pixels() -> None:
+    random = np.random.default_rng(2)
+    predicted = random.uniform(0, 1200, (120, 2))
+    turned = np.array([[1.0, 0.004], [-0.004, 1.002]])
+    found = predicted @ turned.T + np.array([47.0, -61.0]) + random.normal(0, 0.3, (120, 2))
+    kept = random.permutation(120)[:90]
+    strangers = random.uniform(0, 1200, (25, 2))
+    a, b = identified(predicted, np.vstack([found[kept], strangers]), reach_px=120.0)
+    right = b < 90
+    assert right.sum() > 80
+    assert (kept[b[right]] == a[right]).all()
+    assert (~right).sum() <= 1

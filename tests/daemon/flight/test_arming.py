@@ -1,0 +1,72 @@
+"""A service is armed when nothing is missing; what is, is named with its cure."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daemon.configuration import LimitsSection
+from daemon.flight.arming import Lack, Readiness, lacks, note_override, overrides_of
+from daemon.flight.event_table import entry_of
+
+ALL_THERE = Readiness(
+    has_kernels=True,
+    absent=(),
+    exposures_left=500,
+    exposures_wanted=400,
+    wants_time=True,
+    has_time=True,
+    position_age_s=0.1,
+    has_fix=True,
+    probes_c={"0": (21.0, 0.5), "1": (22.0, 0.5)},
+)
+
+
+def test_nothing_is_missing_where_all_is_there() -> None:
+    assert lacks(ALL_THERE, LimitsSection()) == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "name", "says"),
+    [
+        ({"has_kernels": False}, "arming-kernels", "kernels"),
+        ({"absent": ["head SU02"]}, "arming-device", "no head SU02"),
+        ({"exposures_left": 399}, "arming-disk", "room for 399 of 400"),
+        ({"has_time": False}, "arming-time", "GPS time"),
+        ({"position_age_s": None}, "arming-navigation", "no position"),
+        ({"has_fix": False}, "arming-navigation", "no position"),
+        ({"position_age_s": 9.0}, "arming-navigation", "9 s old"),
+        ({"probes_c": {"1": None}}, "arming-temperature", "probe 1"),
+        ({"probes_c": {"1": (None, 0.1)}}, "arming-temperature", "probe 1"),
+        ({"probes_c": {"1": (20.0, 60.0)}}, "arming-temperature", "older than 10 s"),
+        ({"serials_untold": ["SU00"]}, "arming-serial", "SU00"),
+    ],
+)
+def test_each_thing_that_is_missing_is_named_with_its_cure(
+    change: dict[str, Any], name: str, says: str
+) -> None:
+    (lack,) = lacks(replace(ALL_THERE, **change), LimitsSection())
+    assert (lack.name, says in str(lack)) == (name, True)
+    assert lack.cure and lack.cure in str(lack)
+    assert lack.may_be_overridden is (name != "arming-kernels")
+    assert entry_of(lack.name) is not None
+
+
+def test_a_rig_without_receiver_and_probes_needs_neither() -> None:
+    bare = replace(ALL_THERE, wants_time=False, has_time=False, position_age_s=None, probes_c={})
+    assert lacks(bare, LimitsSection()) == ()
+
+
+def test_an_override_is_kept_with_who_when_and_what(tmp_path: Path) -> None:
+    assert overrides_of(tmp_path) == []
+    missing = Lack("arming-device", "no head SU02", "check its cable")
+    note_override(tmp_path, "operator", [missing])
+    note_override(tmp_path, "uid 1000", [missing])
+    first, second = overrides_of(tmp_path)
+    assert first["by"] == "operator"
+    assert second["by"] == "uid 1000"
+    assert first["missing"] == ["no head SU02 (check its cable)"]
+    assert first["utc"].endswith("+00:00")

@@ -1,0 +1,67 @@
+"""A fault stays until a person has acknowledged it, over the end of the service too."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from daemon.flight.latches import (
+    FILE,
+    KEPT,
+    Latches,
+    previous_faults,
+    read_unhandled,
+    write_unhandled,
+)
+
+
+def device(name: str, *, fault: bool = True, of: str = "SU02") -> dict[str, Any]:
+    return {"event": "device", "device": of, "name": name, "fault": fault, "sentence": "look"}
+
+
+def latches_of(*events: dict[str, Any]) -> Latches:
+    latches = Latches()
+    for sequence, event in enumerate(events, 1):
+        latches.apply(event, sequence=sequence)
+    return latches
+
+
+def test_what_nobody_acknowledged_is_told_again_after_a_restart(tmp_path: Path) -> None:
+    before = latches_of(device("lost"), {"event": "disk", "sentence": "full"})
+    assert before.acknowledge("disk")
+    write_unhandled(tmp_path, before.unhandled())
+    after = latches_of(*previous_faults(read_unhandled(tmp_path)))
+    (fault,) = after.listed()
+    assert (fault["id"], fault["previous"], fault["stands"]) == ("device SU02", True, False)
+    assert after.acknowledge("device SU02")
+    write_unhandled(tmp_path, after.unhandled())
+    assert read_unhandled(tmp_path) == ()
+
+
+def test_a_fault_that_comes_again_stands_and_counts_on() -> None:
+    latches = latches_of(*previous_faults(latches_of(device("lost")).unhandled()), device("lost"))
+    (fault,) = latches.listed()
+    assert (fault["stands"], fault["previous"], fault["count"]) == (True, False, 2)
+
+
+def test_a_complaint_of_a_device_that_delivers_does_not_stand() -> None:
+    (fault,) = latches_of(device("checksum", of="gnss")).listed()
+    assert (fault["id"], fault["stands"], fault["acknowledged"]) == ("checksum gnss", False, False)
+
+
+def test_a_clock_that_coasts_passes_by_itself_and_stays_listed() -> None:
+    holdover = device("pps-holdover", of="clock")
+    back = device("pps-holdover", of="clock", fault=False)
+    (fault,) = latches_of(holdover, back).listed()
+    assert (fault["id"], fault["stands"]) == ("clock pps-holdover", False)
+
+
+def test_a_damaged_file_of_faults_hinders_no_start(tmp_path: Path) -> None:
+    for content in (b"", b"{", b'{"faults": 7}', b'{"faults": [{"id": 3}, [], "x"]}'):
+        (tmp_path / FILE).write_bytes(content)
+        assert read_unhandled(tmp_path) == ()
+
+
+def test_they_never_grow_beyond_their_bounds() -> None:
+    latches = latches_of(*({"event": "lost", "number": n, "cause": "x"} for n in range(KEPT + 50)))
+    assert len(latches.listed()) == KEPT

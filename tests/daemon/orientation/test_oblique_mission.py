@@ -1,0 +1,296 @@
+"""A flown five-head mission: processed to perspectives, oriented head by head, against truth."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from typer.testing import CliRunner
+
+from daemon.cli import app
+from daemon.disk.level0 import read_description
+from daemon.disk.mission import Mission
+from daemon.export.certificate import CertificateError, certificate_of
+from daemon.orientation.local_frame import LocalFrame
+from processing.rig import load_rig, shipped_rigs
+from sim_hw.exposures import EPOCH_GPS_NS, FIRST_AFTER_S, write_exposures
+from sim_hw.world import camera
+from sim_hw.world.world import World, WorldSettings
+
+pyproj = pytest.importorskip("pyproj", reason="pip install 'syntopic[geodesy]'")
+RUN = CliRunner()
+EXPOSURES, LINES = 2, 2
+CRS = "EPSG:32633"
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory) -> tuple[World, Path]:
+    """Four exposures on two lines by a still smaller sibling of the rig, with distorting lenses."""
+    folder = tmp_path_factory.mktemp("oblique")
+    text = shipped_rigs()["midas-mini"].read_text()
+    text = text.replace("width_px = 1248", "width_px = 416")
+    text = text.replace("height_px = 832", "height_px = 278")
+    text = re.sub(
+        r"^f_number = .*$", "f_number = 4.0\nk1 = -5e-4\nk2 = 1e-5", text, flags=re.MULTILINE
+    )
+    (folder / "rig.toml").write_text(text)
+    world = World(
+        WorldSettings(
+            rig_file=str(folder / "rig.toml"),
+            seed=3,
+            epoch_gps_ns=EPOCH_GPS_NS,
+            exposures=EXPOSURES,
+        )
+    )
+    write_exposures(world, folder, count=EXPOSURES, scenes=folder / "scenes", lines=LINES)
+    done = RUN.invoke(app, ["process", str(folder / "mission"), "--json"])
+    assert done.exit_code == 0, done.output
+    told = json.loads(done.stdout)["exposures"]
+    assert [e["heads"] for e in told] == [["nadir", "5", "7", "8", "19"]] * 4
+    return world, folder
+
+
+def test_every_head_becomes_an_image_of_its_own(flown) -> None:
+    _, folder = flown
+    for name in ("nadir", "5", "7", "8", "19"):
+        path = folder / "mission/L2/000001" / f"{name}.tif"
+        planes, about = tifffile.imread(path), read_description(path)
+        assert planes.shape == (3, 278, 416) and about["bands"] == ["red", "green", "blue"]
+        seen = (planes > 0).all(axis=0)
+        assert seen.mean() > 0.9 and planes[:, seen].std() > 100.0
+        assert about["geometry"].startswith("strict perspective")
+
+
+def _oriented(folder: Path) -> dict[str, dict]:
+    asked = ["orient", str(folder / "mission"), "--trajectory", str(folder / "trajectory.csv")]
+    done = RUN.invoke(app, [*asked, "--crs", CRS, "--json"])
+    assert done.exit_code == 0, done.output
+    return {eo["image"]: eo for eo in json.loads(done.stdout)["oriented"]}
+
+
+def test_every_head_is_oriented_where_it_truly_looked(flown) -> None:
+    world, folder = flown
+    told = _oriented(folder)
+    assert len(told) == EXPOSURES * LINES * 5
+    rig = load_rig(Mission.open(folder / "mission").rig_path)
+    first = EPOCH_GPS_NS + FIRST_AFTER_S * 1_000_000_000
+    flight = world.flight.beginning_first_line_at(world.flight.distance_flown_m(first))
+    to_grid = pyproj.Transformer.from_crs("EPSG:4979", CRS, always_xy=True)
+    for name, eo in told.items():
+        cone = rig.cone(name.split("_")[1])
+        pose = flight.pose(int(eo["gps_ns"]))
+        latitude, longitude, height = flight.geodetic(camera.projection_centre_m(cone, pose))
+        east, north, up = to_grid.transform(longitude, latitude, height)
+        off = np.array([east - eo["east_m"], north - eo["north_m"], up - eo["height_m"]])
+        assert np.abs(off).max() < 0.3, "five standard deviations of the trajectory"
+        # Where the middle of the head's image meets the ground.
+        truth = pose.enu_from_body @ camera.BODY_FROM_CAMERA @ world.camera.master_from_cone(cone)
+        omega, phi, kappa = np.radians(eo["omega_phi_kappa_deg"])
+        found = camera.rotation_opk((omega, phi, kappa))
+        axis = found[:, 2] @ truth[:, 2]
+        # The grid turns by its convergence; the angle off the vertical stays but for the curvature.
+        assert np.degrees(np.arccos(min(1.0, axis))) < 1.0
+        assert abs(np.degrees(np.arccos(found[2, 2]) - np.arccos(truth[2, 2]))) < 0.05
+
+
+def test_the_second_line_is_flown_back_beside_the_first(flown) -> None:
+    world, folder = flown
+    records = [
+        json.loads((folder / f"mission/L0/{k:06d}/exposure.json").read_text()) for k in (1, 2, 3, 4)
+    ]
+    assert [r["line_id"] for r in records] == ["line 1", "line 1", "line 2", "line 2"]
+    first = EPOCH_GPS_NS + FIRST_AFTER_S * 1_000_000_000
+    flight = world.flight.beginning_first_line_at(world.flight.distance_flown_m(first))
+    places = [flight.pose(int(r["mark_gps_ns"])).position_enu_m for r in records]
+    apart = np.linalg.norm((places[3] - places[0])[:2])
+    assert apart == pytest.approx(world.flight.plan.line_spacing_m, rel=0.1)
+    headings = [flight.pose(int(r["mark_gps_ns"])).heading_rad for r in records]
+    assert abs(abs(headings[2] - headings[0]) - np.pi) < 0.1
+
+
+def _exported(folder: Path, kind: str) -> Path:
+    asked = ["export", "pictures", str(folder / "mission"), "--as", kind, "--only", "2"]
+    done = RUN.invoke(
+        app, [*asked, "--trajectory", str(folder / "trajectory.csv"), "--crs", CRS, "--json"]
+    )
+    assert done.exit_code == 0, done.output + str(done.exception)
+    told = json.loads(done.stdout)
+    assert len(told["files"]) == 5
+    return Path(told["folder"])
+
+
+def test_exiftool_reads_time_place_and_attitude_of_a_picture(flown) -> None:
+    _, folder = flown
+    pictures = _exported(folder, "jpeg")
+    if shutil.which("exiftool") is None:
+        pytest.skip("exiftool is not here; apt-get install libimage-exiftool-perl")
+    told = json.loads(
+        subprocess.run(
+            ["exiftool", "-json", "-n", str(pictures / "000002_7.jpg")],
+            capture_output=True, check=True, timeout=60,
+        ).stdout
+    )[0]  # fmt: skip
+    eo = _oriented(folder)["000002_7"]
+    assert "Warning" not in told
+    to_wgs = pyproj.Transformer.from_crs(CRS, "EPSG:4979", always_xy=True)
+    longitude, latitude, height = to_wgs.transform(eo["east_m"], eo["north_m"], eo["height_m"])
+    assert told["GPSLatitude"] == pytest.approx(latitude, abs=1e-8)
+    assert told["GPSLongitude"] == pytest.approx(longitude, abs=1e-8)
+    assert told["GPSAltitude"] == pytest.approx(height, abs=1e-3)
+    assert told["FocalLength"] == 51.0
+    assert 10.0 / told["FocalPlaneXResolution"] == pytest.approx(7.2e-3)
+    assert [told["Omega"], told["Phi"], told["Kappa"]] == pytest.approx(
+        eo["omega_phi_kappa_deg"], abs=1e-6
+    )
+    # The head looks right, 44.2 deg off the vertical: that is roll, seen from its own camera.
+    assert abs(abs(told["Roll"]) - 44.2) < 3.0 or abs(abs(told["Pitch"]) - 44.2) < 3.0
+    instant = datetime(1980, 1, 6, tzinfo=UTC) + timedelta(
+        microseconds=int(eo["gps_ns"]) // 1000, seconds=-18
+    )
+    assert told["DateTimeOriginal"] == instant.strftime("%Y:%m:%d %H:%M:%S")
+    assert told["Model"].startswith("Track'Air MIDAS") and told["ImageUniqueID"] == "000002_7"
+    assert "SIMULATED" in told["ImageDescription"]
+
+
+def test_a_cog_has_tiles_overviews_tags_and_lies_where_the_head_looked(flown) -> None:
+    rasterio = pytest.importorskip("rasterio", reason="pip install 'syntopic[geotiff]'")
+    _, folder = flown
+    eo = _oriented(folder)["000002_5"]
+    with rasterio.open(_exported(folder, "cog") / "000002_5.tif") as raster:
+        assert raster.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
+        assert (raster.width, raster.height, raster.count) == (416, 278, 3)
+        assert raster.descriptions == ("red", "green", "blue")
+        points, crs = raster.gcps
+        assert crs.to_epsg() == int(CRS.split(":")[1]) and len(points) == 25
+        middle = next(p for p in points if (p.col, p.row) == (208.0, 139.0))
+        # Forward head, 44.96 deg off the vertical: as far ahead as it is high.
+        height = eo["height_m"] - 395.0
+        reach = np.hypot(middle.x - eo["east_m"], middle.y - eo["north_m"])
+        assert reach == pytest.approx(height * np.tan(np.radians(44.96)), rel=0.15)
+        assert abs(middle.z - 395.0) < 1.0
+        assert raster.tags()["PRINCIPAL_DISTANCE_MM"] == "51.000000"
+        pixels = raster.read(1)
+    plain = tifffile.imread(folder / "mission/L2/000002/5.tif")[0]
+    assert (pixels == (plain & 0xFFFE)).all(), "lossless"
+
+
+def test_every_head_is_certified_with_axes_and_signs(flown) -> None:
+    _, folder = flown
+    done = RUN.invoke(app, ["export", "certificate", str(folder / "mission"), "--json"])
+    assert done.exit_code == 0, done.output
+    told = json.loads(done.stdout)
+    assert [c["name"] for c in told["cameras"]] == ["nadir", "5", "7", "8", "19"]
+    assert told["cameras"][1]["principal_distance_mm"] == 51.0
+    assert told["cameras"][1]["pixel_size_um"] == 7.2
+    assert told["simulated"] and "the camera looks along -z" in told["axes"]
+    page = (folder / "mission/export/certificate.html").read_text()
+    assert "SIMULATED" in page and "Axes and signs" in page
+
+
+def test_the_certificate_of_a_stitched_rig_is_that_of_its_virtual_camera() -> None:
+    told = certificate_of(load_rig(shipped_rigs()["ultracam-x"]))
+    pan, colour = told["cameras"]
+    assert (pan["width_px"], pan["height_px"], pan["pixel_size_um"]) == (14430, 9420, 7.2)
+    assert pan["principal_distance_mm"] == 100.5
+    assert colour["pixel_size_um"] == pytest.approx(21.6) and colour["width_px"] == 4810
+    with pytest.raises(CertificateError, match="no camera to certify"):
+        certificate_of(load_rig(shipped_rigs()["rededge"]))
+
+
+def test_footprints_follow_a_height_model(flown, tmp_path: Path) -> None:
+    _, folder = flown
+    eo = _oriented(folder)["000001_5"]
+    # A slope that rises by a tenth to the north, through 395 m below the camera.
+    cell, rows = 50.0, 400
+    x0, y0 = eo["east_m"] - 10_000.0, eo["north_m"] - 10_000.0
+    north = y0 + (rows - 0.5 - np.arange(rows)) * cell
+    heights = np.repeat((395.0 + 0.1 * (north - eo["north_m"]))[:, None], rows, axis=1)
+    dem = tmp_path / "slope.asc"
+    head = f"ncols {rows}\nnrows {rows}\nxllcorner {x0}\nyllcorner {y0}\ncellsize {cell}\n"
+    dem.write_text(head + "\n".join(" ".join(f"{v:.3f}" for v in row) for row in heights))
+    asked = ["orient", str(folder / "mission"), "--trajectory", str(folder / "trajectory.csv")]
+    done = RUN.invoke(app, [*asked, "--crs", CRS, "--dem", str(dem), "--json"])
+    assert done.exit_code == 0, done.output + str(done.exception)
+    written = Path(json.loads(done.stdout)["folder"]) / "footprints.geojson"
+    features = {f["properties"]["image"]: f for f in json.loads(written.read_text())["features"]}
+    assert len(features) == EXPOSURES * LINES * 5
+    ring = np.array(features["000001_5"]["geometry"]["coordinates"][0])
+    assert len(ring) == 33 and (ring[0] == ring[-1]).all()
+    to_grid = pyproj.Transformer.from_crs("EPSG:4326", CRS, always_xy=True)
+    _, n = to_grid.transform(ring[:, 0], ring[:, 1])
+    # The upper middle of the forward head's image, 46 deg off the vertical, meets the slope.
+    omega, phi, kappa = np.radians(eo["omega_phi_kappa_deg"])
+    ray = camera.rotation_opk((omega, phi, kappa)) @ np.array([0.0, 278 * 7.2e-3 / 2, -51.0])
+    fall = eo["height_m"] - 395.0
+    reach = fall / (-ray[2] + 0.1 * ray[1])
+    assert n.max() == pytest.approx(eo["north_m"] + reach * ray[1], abs=8.0)
+    wrong = RUN.invoke(app, [*asked, "--crs", CRS, "--dem", str(folder / "trajectory.csv")])
+    assert wrong.exit_code != 0
+
+
+def test_intersected_points_err_as_their_sigmas_say(flown, tmp_path: Path) -> None:
+    world, folder = flown
+    rig = load_rig(Mission.open(folder / "mission").rig_path)
+    first = EPOCH_GPS_NS + FIRST_AFTER_S * 1_000_000_000
+    flight = world.flight.beginning_first_line_at(world.flight.distance_flown_m(first))
+    random = np.random.default_rng(8)
+    poses = {eo["image"]: flight.pose(int(eo["gps_ns"])) for eo in _oriented(folder).values()}
+    truth, lines = {}, ["image,point,column_px,row_px,sigma_px"]
+    for name, pose in poses.items():
+        # Rays of the first exposure of each line, followed to the true terrain.
+        if not name.startswith(("000001", "000003")):
+            continue
+        cone = rig.cone(name.split("_")[1])
+        for k in range(6):
+            xy = random.uniform(-0.4, 0.4, 2) * [416 * 7.2e-3, 278 * 7.2e-3]
+            turn = (
+                pose.enu_from_body @ camera.BODY_FROM_CAMERA @ world.camera.master_from_cone(cone)
+            )
+            ray = turn @ np.array([*xy, -cone.lens.f_mm])
+            ground = world.terrain.intersect(camera.projection_centre_m(cone, pose), ray)
+            seen = [
+                row for row in (_seen(world, rig, n, p, ground) for n, p in poses.items()) if row
+            ]
+            if len({row[0][:6] for row in seen}) < 2:
+                continue
+            point = f"{name}-{k}"
+            truth[point] = ground
+            for image, column, row in seen:
+                noise = random.normal(0.0, 0.3, 2)
+                lines.append(f"{image},{point},{column + noise[0]:.4f},{row + noise[1]:.4f},0.3")
+    lines.append("000001_5,alone,100,100,0.3")
+    (tmp_path / "measured.csv").write_text("\n".join(lines) + "\n")
+    asked = ["intersect", str(folder / "mission"), str(tmp_path / "measured.csv"), "--json"]
+    sigmas = ["--attitude-sigma", "5", "5", "5", "--position-sigma", "0.05", "0.05", "0.05"]
+    done = RUN.invoke(app, [*asked, *sigmas, "--trajectory", str(folder / "trajectory.csv")])
+    assert done.exit_code == 0, done.output + str(done.exception)
+    told = json.loads(done.stdout)
+    assert told["left_out"] == ["alone"] and len(told["points"]) == len(truth) >= 8
+    frame = LocalFrame(flight.plan.latitude_deg, flight.plan.longitude_deg)
+    ratios = []
+    for p in told["points"]:
+        place = [np.array(p[k]) for k in ("latitude_deg", "longitude_deg", "height_m")]
+        latitude, longitude, height = flight.geodetic(truth[p["name"]])
+        expected = frame.from_geodetic(np.array(latitude), np.array(longitude), np.array(height))
+        ratios.append((frame.from_geodetic(*place) - expected) / np.array(p["sigma_m"]))
+        assert (np.array(p["of_image_m"]) < np.array(p["sigma_m"])).all()
+    assert np.abs(ratios).max() < 4.5
+    assert 0.2 < np.mean(np.square(ratios)) < 3.0
+
+
+def _seen(world, rig, name, pose, ground):
+    """Image, column and row in strict perspective where the true head sees a ground point."""
+    cone = rig.cone(name.split("_")[1])
+    turn = pose.enu_from_body @ camera.BODY_FROM_CAMERA @ world.camera.master_from_cone(cone)
+    seen = (ground - camera.projection_centre_m(cone, pose)) @ turn
+    x, y = -cone.lens.f_mm * seen[:2] / seen[2] / 7.2e-3
+    column, row = x + (416 - 1) / 2, (278 - 1) / 2 - y
+    inside = seen[2] < 0 and 3 < column < 412 and 3 < row < 274
+    return (name, column, row) if inside else None

@@ -1,0 +1,174 @@
+"""`syntopic at`: two lines, flown there and back, matched and held against check points."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from daemon.adjusting.project import read_project
+from daemon.cli import app
+from daemon.disk.level0 import tiff_parts
+from daemon.orientation.local_frame import LocalFrame
+from processing.rig import shipped_rigs
+from sim_hw.exposures import EPOCH_GPS_NS, FIRST_AFTER_S
+from sim_hw.world import camera
+from sim_hw.world.flight import Flight
+from sim_hw.world.post_processed import marks_of_lines, write_trajectory
+from sim_hw.world.rendering import render_ideal
+from sim_hw.world.scene import open_scene
+from sim_hw.world.surveyed import write_surveyed
+from sim_hw.world.world import World, WorldSettings
+
+pyproj = pytest.importorskip("pyproj", reason="pip install 'syntopic[geodesy]'")
+RUN = CliRunner()
+EACH, LINES = 4, 2
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory) -> tuple[Path, World, Flight, list[int]]:
+    """Eight ideal images with shot noise over true terrain, a trajectory, surveyed points."""
+    folder = tmp_path_factory.mktemp("block")
+    text = shipped_rigs()["ultracam-l-mini"].read_text()
+    file = folder / "rig.toml"
+    file.write_text(text.replace("width_px = 2364", "width_px = 1182"))
+    world = World(
+        WorldSettings(
+            rig_file=str(file), seed=5, epoch_gps_ns=EPOCH_GPS_NS, exposures=EACH, height_m=1500.0
+        )
+    )
+    first = EPOCH_GPS_NS + FIRST_AFTER_S * 1_000_000_000
+    flight = world.flight.beginning_first_line_at(world.flight.distance_flown_m(first))
+    marks = marks_of_lines(world, flight, first, EACH, LINES)
+    write_trajectory(folder / "trajectory.csv", flight, marks, seed=5)
+    write_surveyed(
+        folder / "surveyed", world, flight, marks, seed=5, control=6, checks=12, measured_px=0.05
+    )
+    scene = open_scene(world.scene_settings, folder / "scenes")
+    mission, noise = folder / "mission", np.random.default_rng(5)
+    for number, mark in enumerate(marks, 1):
+        light = render_ideal(world, scene, flight, mark)
+        words = np.clip(light / light.mean() * 8000.0, 2, 60000)
+        words = (words + noise.normal(0.0, 40.0, words.shape)).clip(2, 65534).astype(np.uint16)
+        (mission / f"L2/{number:06d}").mkdir(parents=True)
+        (mission / f"L0/{number:06d}").mkdir(parents=True)
+        parts = tiff_parts([np.ascontiguousarray(words & 0xFFFE)], {"bands": ["pan"]})
+        (mission / f"L2/{number:06d}/pan.tif").write_bytes(b"".join(bytes(p) for p in parts))
+        record = {
+            "number": number,
+            "simulated": True,
+            "mark_gps_ns": str(mark),
+            "mark_source": "event-mark",
+            "line_id": f"line {(number - 1) // EACH + 1}",
+            "frames": [{"sensor": s.name, "mid_exposure_gps_ns": str(mark)} for s in _pan(world)],
+        }
+        (mission / f"L0/{number:06d}/exposure.json").write_text(json.dumps(record))
+    (mission / "rig.toml").write_text(file.read_text())
+    plan = f"[plan]\nground_height_m = {world.plan.ground_height_m}\n"
+    (mission / "service.toml").write_text(plan)
+    return folder, world, flight, marks
+
+
+def _pan(world: World):
+    return [s for cone in world.rig.pan_cones for s in cone.sensors]
+
+
+def _asked(folder: Path, out: str, *more: str) -> list[str]:
+    return [
+        "at", str(folder / "mission"), "--trajectory", str(folder / "trajectory.csv"),
+        "--out", str(folder / out), "--json", *more,
+    ]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def told(flown) -> dict:
+    folder = flown[0]
+    points = ["--points", str(folder / "surveyed/points.csv")]
+    measured = ["--measured", str(folder / "surveyed/measured.csv")]
+    done = RUN.invoke(app, _asked(folder, "none", *points, *measured))
+    assert done.exit_code == 0, done.output
+    return json.loads(done.stdout)
+
+
+def test_lines_flown_there_and_back_are_tied_to_each_other(told) -> None:
+    t = told["triangulation"]
+    assert (t["exposures"], t["lines"]) == (EACH * LINES, LINES)
+    assert t["matches_across"] > 100 and t["matches_along"] > 500
+    assert t["rays"]["3"] > 50
+
+
+def test_check_points_err_as_predicted_and_matching_by_hundredths_of_a_pixel(told) -> None:
+    t = told["triangulation"]
+    assert max(t["image_rms_px"]) < 0.05
+    assert t["checks"]["count"] == 12 and t["control"]["count"] == 6
+    assert max(t["checks"]["rms_px"][:2]) < 0.3
+    for rms, predicted in zip(t["checks"]["rms_m"], t["checks"]["predicted_m"], strict=True):
+        assert rms < 2.0 * predicted
+    assert t["systematic_most_um"] < 1.0
+
+
+def test_adjusted_orientations_are_those_of_the_true_camera(flown, told) -> None:
+    folder, world, flight, marks = flown
+    rows = [
+        line.split(",")
+        for line in (folder / "none/exterior.csv").read_text().splitlines()
+        if line.startswith("0")
+    ]
+    assert len(rows) == len(marks)
+    frame = LocalFrame(world.flight.plan.latitude_deg, world.flight.plan.longitude_deg)
+    for row, mark in zip(rows, marks, strict=True):
+        pose = flight.pose(mark)
+        truth = flight.geodetic(camera.image_centre_m(world.rig, pose))
+        found = frame.from_geodetic(float(row[7]), float(row[8]), np.array(float(row[3])))
+        expected = frame.from_geodetic(*(np.array(v) for v in truth))
+        sigma = np.array([float(v) for v in row[9:12]])
+        assert (np.abs(found - expected) < 5.0 * sigma + 0.02).all(), row[0]
+
+
+def test_the_result_is_a_project_that_adjusts_again(flown, told) -> None:
+    folder = flown[0]
+    again = read_project(folder / "none/project.toml")
+    assert len(again.network.images.names) == EACH * LINES
+    page = (folder / "none/report.html").read_text()
+    assert "RMSE" in page and "Mean image residuals" in page and "checks, RMS" in page
+    twice = RUN.invoke(app, _asked(folder, "none"))
+    assert twice.exit_code != 0
+
+
+def test_control_without_its_places_in_the_images_is_refused_with_the_cure(flown) -> None:
+    folder = flown[0]
+    done = RUN.invoke(app, _asked(folder, "half", "--points", str(folder / "surveyed/points.csv")))
+    assert done.exit_code != 0 and "--measured go together" in str(done.exception)
+
+
+def test_a_local_frame_is_true_to_length_and_comes_back() -> None:
+    frame = LocalFrame(47.0, 15.0)
+    places = np.array([[0.0, 0.0, 400.0], [3000.0, -2000.0, 500.0]])
+    back = frame.to_geodetic(places)
+    assert frame.from_geodetic(*back.T) == pytest.approx(places, abs=1e-6)
+    _, _, length = pyproj.Geod(ellps="WGS84").inv(back[0, 1], back[0, 0], back[1, 1], back[1, 0])
+    # On the ellipsoid, 500 m below: shorter by 500 / 6378000 of 3606 m.
+    assert length == pytest.approx(np.hypot(3000, 2000) * (1 - 500 / 6.378e6), abs=0.01)
+
+
+def test_a_triangulated_block_tells_the_boresight(flown, told, tmp_path: Path) -> None:
+    folder = flown[0]
+    asked = [
+        "calibrate", "boresight", str(folder / "none"), "--mission", str(folder / "mission"),
+        "--trajectory", str(folder / "trajectory.csv"), "--out", str(tmp_path / "b"), "--json",
+        "--hold", "lever", "--position-sigma", "0.05", "0.05", "0.05",
+        "--attitude-sigma", "5", "5", "5",
+    ]  # fmt: skip
+    done = RUN.invoke(app, asked)
+    assert done.exit_code == 0, done.output + str(done.exception)
+    found = {(q["where"], q["what"]): q for q in json.loads(done.stdout)["quantities"]}
+    # The emulated unit is aligned with the camera, its clock is right, both heights agree.
+    for key in (("boresight", "roll"), ("boresight", "pitch"), ("boresight", "heading")):
+        assert abs(found[key]["value"]) < 4.5 * found[key]["sigma"] < 0.2, key
+    assert abs(found["time", "offset"]["value"]) < 4.5 * found["time", "offset"]["sigma"]
+    assert found["lever arm", "down"]["sigma"] is None
+    up = found["position shift", "up"]
+    assert abs(up["value"]) < 4.5 * up["sigma"]

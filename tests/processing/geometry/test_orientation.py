@@ -1,0 +1,104 @@
+"""Roll, pitch and heading become omega, phi and kappa through the matrix, never by renaming."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from processing.geometry.orientation import (
+    BODY_FROM_CAMERA,
+    grid_from_camera,
+    grid_from_enu,
+    level_from_body,
+    omega_phi_kappa,
+    on_level_ground,
+    phi_omega_kappa,
+)
+from processing.geometry.rotation import rotation_matrix
+from sim_hw.world import camera, flight
+
+ANGLE = st.floats(-math.pi, math.pi)
+HALF_ANGLE = st.floats(-1.5, 1.5)
+ALIGNED = np.eye(3)
+
+
+def looking(roll_deg: float, pitch_deg: float, heading_deg: float, north_deg: float = 0.0):
+    return grid_from_camera(
+        level_from_imu=level_from_body(*np.radians([roll_deg, pitch_deg, heading_deg])),
+        imu_from_body=ALIGNED,
+        body_from_camera=BODY_FROM_CAMERA,
+        azimuth_of_north_rad=math.radians(north_deg),
+    )
+
+
+@given(ANGLE, HALF_ANGLE, ANGLE)
+def test_angles_come_back_out_of_the_matrix(omega: float, phi: float, kappa: float) -> None:
+    r = rotation_matrix(omega, phi, kappa)
+    assert rotation_matrix(*omega_phi_kappa(r)) == pytest.approx(r, abs=1e-12)
+    p, o, k = phi_omega_kappa(r)
+    again = rotation_matrix(0, p, 0) @ rotation_matrix(o, 0, 0) @ rotation_matrix(0, 0, k)
+    assert again == pytest.approx(r, abs=1e-12)
+
+
+@pytest.mark.parametrize("phi", [math.pi / 2, -math.pi / 2])
+def test_at_the_pole_of_the_angles_the_matrix_still_comes_back(phi: float) -> None:
+    r = rotation_matrix(0.3, phi, 0.2)
+    assert rotation_matrix(*omega_phi_kappa(r)) == pytest.approx(r, abs=1e-9)
+    r = rotation_matrix(phi, 0.0, 0.0) @ rotation_matrix(0, 0, 0.4)
+    p, o, k = phi_omega_kappa(r)
+    again = rotation_matrix(0, p, 0) @ rotation_matrix(o, 0, 0) @ rotation_matrix(0, 0, k)
+    assert again == pytest.approx(r, abs=1e-9)
+
+
+@given(HALF_ANGLE, HALF_ANGLE, ANGLE)
+def test_the_emulated_aircraft_agrees(roll: float, pitch: float, heading: float) -> None:
+    ours = grid_from_camera(
+        level_from_imu=level_from_body(roll, pitch, heading),
+        imu_from_body=ALIGNED,
+        body_from_camera=BODY_FROM_CAMERA,
+        azimuth_of_north_rad=0.0,
+    )
+    theirs = flight.enu_from_body(roll, pitch, heading) @ camera.BODY_FROM_CAMERA
+    assert ours == pytest.approx(theirs, abs=1e-12)
+
+
+def test_level_and_northbound_all_angles_are_zero() -> None:
+    assert omega_phi_kappa(looking(0, 0, 0)) == pytest.approx((0, 0, 0), abs=1e-15)
+
+
+def test_eastbound_the_image_is_turned_clockwise() -> None:
+    assert np.degrees(omega_phi_kappa(looking(0, 0, 90))) == pytest.approx([0, 0, -90])
+
+
+def test_right_wing_down_northbound_is_seen_to_the_left() -> None:
+    # A camera fixed to the body looks away from the wing that goes down.
+    axis = looking(10, 0, 0) @ np.array([0.0, 0.0, -1.0])
+    assert axis[0] == pytest.approx(-math.sin(math.radians(10)))
+    assert np.degrees(omega_phi_kappa(looking(10, 0, 0))) == pytest.approx([0, 10, 0])
+
+
+def test_nose_up_looks_ahead() -> None:
+    axis = looking(0, 5, 0) @ np.array([0.0, 0.0, -1.0])
+    assert axis[1] == pytest.approx(math.sin(math.radians(5)))
+    assert np.degrees(omega_phi_kappa(looking(0, 5, 0))) == pytest.approx([5, 0, 0])
+
+
+def test_a_grid_whose_north_lies_west_of_true_north_turns_kappa() -> None:
+    # True north at azimuth +1.5 deg of the grid: flying true north is flying 1.5 deg in the grid.
+    assert np.degrees(omega_phi_kappa(looking(0, 0, 0, 1.5))) == pytest.approx([0, 0, -1.5])
+    assert grid_from_enu(0.1) @ np.array([0, 1, 0]) == pytest.approx(
+        [math.sin(0.1), math.cos(0.1), 0]
+    )
+
+
+def test_rays_meet_level_ground_and_those_above_the_horizon_do_not() -> None:
+    centre = np.array([100.0, 200.0, 1100.0])
+    image = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, -20.0]])
+    ground = on_level_ground(centre, np.eye(3), image, 100.0, 100.0)
+    assert ground == pytest.approx(np.array([[100, 200, 100], [200, 200, 100], [100, 0, 100]]))
+    up = on_level_ground(centre, looking(0, 95, 0), np.zeros((1, 2)), 100.0, 100.0)
+    assert np.isnan(up).all()

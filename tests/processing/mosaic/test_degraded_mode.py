@@ -1,0 +1,129 @@
+"""Any sensor or any cone may be missing: an image, its validity, its accuracy, and a flag."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from processing.matching.tie_points import TiePointSettings
+from processing.pipeline import Pipeline, Product, Settings
+from processing.quality.report import Flag, Verdict, as_json
+from processing.rig import Rig, find_rig
+from tests.processing.synthetic_exposure import Exposure, expose
+from tests.processing.test_pipeline import conditions, errors_px, rms
+
+RIG = find_rig("ultracam-x-mini")
+SINGLE = [(sensor.name,) for sensor in RIG.sensors]
+CONES = [tuple(s.name for s in cone.sensors) for cone in RIG.cones]
+MASTER = CONES[0]
+CASES = list(dict.fromkeys(SINGLE + CONES))
+"""Cones of one sensor are among the single ones."""
+
+
+@pytest.fixture(scope="module")
+def exposure() -> Exposure:
+    return expose(RIG, dc_k=12.0, tdi_shifts=6)
+
+
+@pytest.fixture(scope="module")
+def pipeline() -> Pipeline:
+    few = TiePointSettings(points_per_overlap=200, points_per_sensor=400)
+    return Pipeline(RIG, {}, Settings(interpolation="bilinear", tie_points=few))
+
+
+@pytest.fixture(scope="module")
+def whole(pipeline: Pipeline, exposure: Exposure) -> Product:
+    made = pipeline.process(exposure.frames, conditions(RIG, exposure))
+    return replace(made, pan=made.pan.copy(), valid=made.valid.copy())
+
+
+def number(product: Product, figure: str) -> float:
+    value = product.report.figures[figure]
+    assert isinstance(value, float | int)
+    return float(value)
+
+
+def pan_sensors(rig: Rig) -> set[str]:
+    return {sensor.name for cone in rig.pan_cones for sensor in cone.sensors}
+
+
+def test_every_sensor_and_every_cone_has_its_case() -> None:
+    assert len(SINGLE) == 13 and len(CONES) == 8 and len(CASES) == 16
+
+
+def test_the_whole_camera_states_its_accuracy(whole: Product, exposure: Exposure) -> None:
+    absolute, _ = errors_px(RIG, exposure, whole.geometry["free"])
+    stated = number(whole, "stitched_sigma_px")
+    assert 0.01 < stated < 0.04
+    # Errors are lengths of two coordinates; the calibration of this exposure is without error.
+    assert rms(absolute) < np.sqrt(2.0) * stated
+    assert whole.report.flags == Flag.SIMULATED and whole.report.verdict is Verdict.GOOD
+
+
+@pytest.mark.parametrize("missing", CASES, ids="+".join)
+def test_what_is_missing_leaves_an_image_that_says_so(
+    pipeline: Pipeline, exposure: Exposure, whole: Product, missing: tuple[str, ...]
+) -> None:
+    frames = {name: frame for name, frame in exposure.frames.items() if name not in missing}
+    made = pipeline.process(frames, conditions(RIG, exposure))
+    figures = made.report.figures
+    json.dumps(as_json(made.report), allow_nan=False)
+
+    assert made.report.flags & Flag.FRAME_MISSING
+    assert figures["missing_sensors"] == ", ".join(missing)
+    expected = Verdict.REFLY if missing == MASTER else Verdict.USABLE
+    assert made.report.verdict is expected
+    assert not made.report.flags & (Flag.DC_DISAGREEMENT | Flag.DISPLACED_SENSOR | Flag.SIGMA0)
+
+    absent = [made.sensors.index(name) + 1 for name in missing if name in made.sensors]
+    contributing = made.valid & 0x7F
+    assert not np.isin(contributing, absent).any()
+    assert np.array_equal(made.valid == 0, made.pan == 0)
+    lost = np.isin(whole.valid & 0x7F, absent)
+    assert (made.valid[~lost] > 0).sum() >= (whole.valid[~lost] > 0).sum() - 200
+    for band, name in (("red", "R"), ("green", "G"), ("blue", "B"), ("nir", "N")):
+        assert bool(made.colour[band].any()) == (name not in missing)
+
+    absolute, inner = errors_px(RIG, exposure, made.geometry["free"])
+    stated, before = number(made, "stitched_sigma_px"), number(whole, "stitched_sigma_px")
+    assert rms(inner) < 0.02 and inner.max() < 0.05
+    assert rms(absolute) < np.sqrt(2.0) * stated
+    # It grows where what is missing carried the datum, and never shrinks.
+    assert stated > 0.98 * before
+    if set(missing) < set(MASTER):
+        assert stated > 1.08 * before
+    if missing == MASTER:
+        # Nothing but the platform calibration says where the image lies.
+        assert stated > 0.5
+    assert set(missing) & pan_sensors(RIG) <= set(_held(made)) or missing == ("SU30",)
+
+
+def _held(made: Product) -> list[str]:
+    return str(made.report.figures["undetermined"]).split(", ")
+
+
+def test_a_stuck_probe_is_told_by_the_stitching(pipeline: Pipeline, exposure: Exposure) -> None:
+    stuck = dict(exposure.temperatures_c) | {"1": 20.0}
+    made = pipeline.process(
+        exposure.frames, replace(conditions(RIG, exposure), temperatures_c=stuck)
+    )
+    assert made.report.flags & Flag.DC_DISAGREEMENT and made.report.verdict is Verdict.USABLE
+    assert made.report.figures["dc_disagreement"] == "1"
+    estimated, sigma = number(made, "dc_estimated_k"), number(made, "dc_estimated_sigma_k")
+    assert abs(estimated - 12.0) < 4.0 * sigma and sigma < 0.5
+
+
+def test_without_a_probe_the_others_stand_in_and_the_image_is_as_good(
+    pipeline: Pipeline, exposure: Exposure, whole: Product
+) -> None:
+    open_probe = dict(exposure.temperatures_c) | {"0": None}
+    made = pipeline.process(
+        exposure.frames, replace(conditions(RIG, exposure), temperatures_c=open_probe)
+    )
+    assert made.report.flags == Flag.TEMPERATURE_MISSING | Flag.SIMULATED
+    absolute, _ = errors_px(RIG, exposure, made.geometry["free"])
+    assert rms(absolute) < 0.02
+    assert number(made, "stitched_sigma_px") > 3.0 * number(whole, "stitched_sigma_px")

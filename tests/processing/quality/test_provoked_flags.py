@@ -1,0 +1,66 @@
+"""Each flag is raised by what it is there for, at twice its threshold, and by nothing else.
+
+The faults are in the light, the true camera, the probes or the instruments of a rendered exposure;
+flags of capture are provoked in tests/daemon. Rates over many exposures: docs/accuracy.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from benchmarks.flags import FAULTS, THRESHOLDS, Camera, Fault
+from processing.pipeline import Conditions
+from processing.quality.report import NO_FLAGS, Flag, Verdict
+
+SEED = 50_001
+pytestmark = pytest.mark.timeout(600)
+
+FAULTY = (
+    *("dark", "burnt", "defocused", "no-detail"),
+    # In a shorter run test_pipeline_emulated and test_degraded_mode raise these two.
+    pytest.param("displaced", marks=pytest.mark.soak),
+    pytest.param("stuck-probe", marks=pytest.mark.soak),
+)
+
+
+@pytest.fixture(scope="module")
+def camera(tmp_path_factory: pytest.TempPathFactory) -> Camera:
+    return Camera(tmp_path_factory.mktemp("scenes"), places=1)
+
+
+def test_a_clean_exposure_raises_nothing(camera: Camera) -> None:
+    report = camera.product(SEED, None).report
+    assert report.flags == NO_FLAGS and report.verdict is Verdict.GOOD
+
+
+@pytest.mark.parametrize("name", FAULTY)
+def test_a_fault_raises_its_flag(camera: Camera, name: str) -> None:
+    report = camera.product(SEED, FAULTS[name]).report
+    assert report.flags & FAULTS[name].flag, report.figures
+    allowed = FAULTS[name].flag
+    if name == "no-detail":
+        # Sensors that see nothing are dark or bright alike, and their detail cannot be judged.
+        allowed |= Flag.BLUR
+    assert not report.flags & ~allowed, report.findings
+
+
+def _everything(told: Conditions) -> Conditions:
+    """Instruments say twice what is allowed of everything that they tell."""
+    probes = dict(told.temperatures_c) | {"1": None, "2": 2 * THRESHOLDS.temperature_high_c}
+    turning = FAULTS["turning"].conditions(told)
+    return replace(
+        turning,
+        temperatures_c=probes,
+        temperature_age_s=dict.fromkeys(probes, 2 * THRESHOLDS.temperature_age_s),
+        roll_rad=2 * THRESHOLDS.tilt_rad,
+        crab_rad=-2 * THRESHOLDS.crab_rad,
+    )
+
+
+def test_what_instruments_tell_raises_its_flags(camera: Camera) -> None:
+    fault = Fault(NO_FLAGS, "all instruments at once", conditions=_everything)
+    report = camera.product(SEED, fault).report
+    probes = Flag.TEMPERATURE_MISSING | Flag.TEMPERATURE_RANGE | Flag.TEMPERATURE_STALE
+    assert report.flags == probes | Flag.TILT | Flag.DRIFT | Flag.BLUR
