@@ -4,7 +4,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: setup demo test test-v4l2 check bench soak clean
+.PHONY: setup demo test test-v4l2 check audit bench soak clean
 
 setup: .venv/ready .venv/kernels
 
@@ -39,6 +39,11 @@ check: setup
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python -m tests.licences
+	$(BIN)/python -m tests.audit
+
+# Known vulnerabilities of what is pinned; unlike in `check`, a database out of reach is a failure.
+audit: setup
+	$(BIN)/python -m tests.audit --required
 
 bench: setup
 	$(BIN)/python -m benchmarks.mini

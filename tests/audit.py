@@ -1,0 +1,126 @@
+"""`python -m tests.audit`: known vulnerabilities of what is in requirements.lock and in the page.
+
+Asks the advisory database of OSV in one request. Where it cannot be asked that is said in capitals
+and the exit status is 0, with `--required` 2; it is 1 where an advisory matches that nobody has
+looked at.
+
+Source: https://google.github.io/osv.dev/post-v1-querybatch/.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+import urllib.error
+import urllib.request
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+ROOT: Final = Path(__file__).parents[1]
+VENDOR: Final = ROOT / "daemon" / "watch" / "page" / "vendor"
+DATABASE: Final = "https://api.osv.dev/v1/querybatch"
+TIMEOUT_S: Final = 20.0
+LARGEST_ANSWER_BYTES: Final = 10_000_000
+
+LOOKED_AT: Final[Mapping[str, str]] = {}
+"""Advisories that do not touch us, by name, and why; a person has looked. What is listed here and
+matches nothing any more is complained of."""
+
+_HEADERS: Final = {"leaflet": r"Leaflet (\d[\d.]*\d)", "uplot": r"uPlot \(v(\d[\d.]*\d)\)"}
+
+
+class NotAskedError(Exception):
+    """The database did not answer, or not as it is specified; the sentence says how."""
+
+
+@dataclass(frozen=True)
+class Package:
+    """What is installed or vendored, in exactly this version."""
+
+    ecosystem: str
+    name: str
+    version: str
+
+    @property
+    def query(self) -> dict[str, Any]:
+        """As the database takes it."""
+        package = {"ecosystem": self.ecosystem, "name": self.name}
+        return {"package": package, "version": self.version}
+
+
+def packages() -> list[Package]:
+    """All of the lock, those of other systems included, and the page's scripts."""
+    text = (ROOT / "requirements.lock").read_text(encoding="utf-8")
+    pinned = re.findall(r"^([A-Za-z0-9][A-Za-z0-9._-]*)==([^\s;]+)", text, re.MULTILINE)
+    listed = [Package("PyPI", name, version) for name, version in sorted(set(pinned))]
+    for name, header in _HEADERS.items():
+        found = re.search(header, (VENDOR / f"{name}.js").read_text(encoding="utf-8")[:500])
+        if found is None:
+            raise NotAskedError(f"{name}.js does not say its version")
+        listed.append(Package("npm", name, found[1]))
+    return listed
+
+
+def advisories(asked: list[Package], database: str = DATABASE) -> dict[Package, list[str]]:
+    """Names of the advisories that match, by package; those without are left out.
+
+    Raises:
+        NotAskedError: no network, another answer than the one specified, or not all of it.
+    """
+    body = json.dumps({"queries": [package.query for package in asked]}).encode()
+    request = urllib.request.Request(database, body, {"Content-Type": "application/json"})
+    try:
+        with urllib.request.urlopen(request, timeout=TIMEOUT_S) as answer:
+            results = json.loads(answer.read(LARGEST_ANSWER_BYTES))["results"]
+        if len(results) != len(asked):
+            raise NotAskedError(f"{database}: {len(results)} answers to {len(asked)} questions")
+        named = [[str(one["id"]) for one in result.get("vulns", ())] for result in results]
+        if any(
+            "next_page_token" in r and not names for r, names in zip(results, named, strict=True)
+        ):
+            raise NotAskedError(f"{database}: answers in pages; look at osv.dev yourself")
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        reason = getattr(error, "reason", error)
+        raise NotAskedError(f"{database}: {reason}") from error
+    # What has a further page and names on this one fails as it is.
+    return {package: names for package, names in zip(asked, named, strict=True) if names}
+
+
+def problems(found: Mapping[Package, list[str]], looked_at: Mapping[str, str]) -> list[str]:
+    """A sentence for every advisory nobody has looked at, and every look that is out of date."""
+    unseen = [
+        f"{package.name} {package.version}: https://osv.dev/vulnerability/{name}; take a version "
+        "without it, or have a person look at it and note it in tests/audit.py"
+        for package, names in found.items()
+        for name in names
+        if name not in looked_at
+    ]
+    matched = {name for names in found.values() for name in names}
+    gone = [f"{name} matches nothing any more; take it out of tests/audit.py" for name in looked_at]
+    return unseen + [
+        said for said, name in zip(gone, looked_at, strict=True) if name not in matched
+    ]
+
+
+def main(arguments: list[str], database: str = DATABASE) -> int:
+    """The exit status; see the top of this file."""
+    asked = packages()
+    try:
+        found = advisories(asked, database)
+    except NotAskedError as error:
+        print(f"NOT AUDITED: {error}", file=sys.stderr)
+        print("NOT AUDITED: run `make audit` where the network reaches it", file=sys.stderr)
+        return 2 if "--required" in arguments else 0
+    told = problems(found, LOOKED_AT)
+    for sentence in told:
+        print(sentence, file=sys.stderr)
+    matching = sum(len(names) for names in found.values())
+    print(f"{len(asked)} packages audited, {matching} advisories match, {len(told)} problems")
+    return 1 if told else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
