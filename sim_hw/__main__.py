@@ -53,6 +53,7 @@ def parser() -> argparse.ArgumentParser:
     add("--first-address", default="127.0.0.2", help="loopback address of the first head")
     add("--scene", help="a GeoTIFF to fly over instead of the shipped photographs")
     add("--ground", choices=list(GROUNDS), default="landscape", help="what is flown over")
+    add("--still", action="store_true", help="render one exposure, and send it for every pulse")
     add("--scene-cache", type=Path, help="folder where built scenes are kept (default: OUT/scenes)")
     add("--processes", type=int, default=2, help="worker processes that render")
     return line
@@ -112,6 +113,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         scenario=given.scenario,
         receiver=given.receiver,
         has_pps=given.pps,
+        is_still=given.still,
         probe=given.probe,
     )
     return simulate(settings, world, clock)

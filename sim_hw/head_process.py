@@ -29,8 +29,9 @@ from sim_hw.seeding import random_stream
 from sim_hw.world import laboratory
 from sim_hw.world.electronics import Electronics, true_sensor
 from sim_hw.world.flight import Flight
-from sim_hw.world.rendering import Look, light_on_sensor
+from sim_hw.world.rendering import Look, Map, light_on_sensor
 from sim_hw.world.scene import Scene, open_scene
+from sim_hw.world.snapshots import look_of
 from sim_hw.world.truth import Taken
 from sim_hw.world.world import World, WorldSettings
 from sim_hw.world_clock import DeviceClock, WorldClock
@@ -41,6 +42,8 @@ POLL_S = 0.5
 STRAIGHT_ON_M = 1e7
 """A first line so far ahead that the aircraft does not turn for two days."""
 HEAD_TEMPERATURE_SIGMA_C = 0.1
+STILL_AFTER_NS = 20_000_000_000
+"""Flown so far when the one exposure that heads hold still is taken."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +65,7 @@ class WorkerPlan:
     scene_cache: Path
     calibration: Path
     heads: tuple[HeadPlan, ...]
+    is_still: bool = False
 
 
 @dataclass(frozen=True)
@@ -134,6 +138,8 @@ class RenderedHead:
         self._line = line
         self._clock = clock
         self._report = report
+        self._still: Map | None = None
+        self._held: tuple[tuple[float, int, float], NDArray[np.uint16]] | None = None
         self.sensor: Sensor = world.rig.sensor(plan.sensor)
         self.cone: Cone = world.rig.cone_of(plan.sensor)
         seed = world.settings.seed
@@ -178,12 +184,37 @@ class RenderedHead:
         self._line.begin(look.mid_gps_ns)
         if request.pulse_count != NO_PULSE:
             self._report(Taken(self.sensor.name, request.pulse_count, look))
-        return self.frame(look, gain_db=request.gain_db, number=request.start_mono_ns)
+        if self._still is None:
+            return self.frame(look, gain_db=request.gain_db, number=request.start_mono_ns)
+        return self._held_still(look, request.gain_db)
+
+    def hold_still(self) -> None:
+        """From now on show the same ground in the same light: nothing is rendered any more."""
+        world = self._world
+        mark_ns = world.settings.epoch_gps_ns + STILL_AFTER_NS
+        flight = world.flight.beginning_first_line_at(world.flight.distance_flown_m(mark_ns))
+        look = look_of(world, self.cone, mark_ns)
+        self._still = light_on_sensor(world, self._scene, flight, self.cone, self.sensor, look)
+        self._held_still(look, 0.0)
+
+    def _held_still(self, look: Look, gain_db: float) -> NDArray[np.uint16]:
+        """The frame that is sent again and again; made anew where the settings have changed."""
+        settings = (look.exposure_time_us, look.tdi_shifts, gain_db)
+        if self._held is None or self._held[0] != settings:
+            assert self._still is not None
+            self._held = settings, self._read_out(self._still, look, gain_db, number=0)
+        return self._held[1]
 
     def frame(self, look: Look, *, gain_db: float, number: int) -> NDArray[np.uint16]:
         """Render a frame; `number` chooses its noise."""
         world = self._world
         light = light_on_sensor(world, self._scene, self._line.flight, self.cone, self.sensor, look)
+        return self._read_out(light, look, gain_db, number=number)
+
+    def _read_out(
+        self, light: Map, look: Look, gain_db: float, *, number: int
+    ) -> NDArray[np.uint16]:
+        world = self._world
         return self._electronics.frame(
             light,
             exposure_time_us=look.exposure_time_us,
@@ -232,6 +263,9 @@ def _open(
         laboratory.write_radiometry(plan.calibration, head.sensor, radiometry)
     # Kernels are compiled, or read from their cache, before anyone waits for a frame.
     heads[0].frame(WARM_UP, gain_db=0.0, number=0)
+    if plan.is_still:
+        for head in heads:
+            head.hold_still()
     started: list[RenderedHead] = []
     try:
         for head in heads:

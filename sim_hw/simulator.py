@@ -74,6 +74,7 @@ class SimulatorSettings:
     receiver: str = "ublox"
     probe: str = "modbus"
     has_pps: bool = False
+    is_still: bool = False
 
 
 class Simulator:
@@ -244,6 +245,7 @@ class Simulator:
                     )
                     for s in group
                 ),
+                is_still=self._settings.is_still,
             )
             ours, theirs = self._context.Pipe()
             worker = self._context.Process(
@@ -312,7 +314,8 @@ class Simulator:
     def _taken(self, taken: Taken) -> None:
         if taken.sensor == self._strobe:
             self._receiver.device.mark(self._receiver_clock.own_gps_ns(taken.look.mid_gps_ns))
-        self._truth.add(taken, self._line.flight)
+        if not self._settings.is_still:
+            self._truth.add(taken, self._line.flight)
 
     def _receiver_state(self, gps_ns: int) -> ReceiverState:
         flight = self._line.flight
