@@ -218,8 +218,14 @@ def tie_points(
     looks: Mapping[str, Look],
     start: Placements,
     rng: np.random.Generator,
+    *,
+    per_overlap: int = POINTS_PER_OVERLAP,
+    per_sensor: int = POINTS_PER_SENSOR,
 ) -> TiePoints:
-    """Where two sensors truly see the same ground, relief and all, with the noise of matching."""
+    """Where two sensors truly see the same ground, relief and all, with the noise of matching.
+
+    `per_overlap` P/P points in every overlap, `per_sensor` P/C points on every PAN sensor.
+    """
     rig = world.rig
     names = tuple(sensor.name for sensor in rig.sensors)
     areas: list[tuple[str, str, Rectangle, int]] = [
@@ -230,7 +236,7 @@ def tie_points(
     areas += [(n, green, r, PAN_TO_COLOUR) for n, r in colour_coverage(rig).items()]
     rows = []
     for number, (a, b, area, kind) in enumerate(areas):
-        count = POINTS_PER_OVERLAP if kind == PAN_TO_PAN else POINTS_PER_SENSOR
+        count = per_overlap if kind == PAN_TO_PAN else per_sensor
         sigma = SIGMA_PP_PX if kind == PAN_TO_PAN else SIGMA_PC_PX
         xy = np.stack(
             [

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daemon.calibration.plots import Curve, chart_svg
 from daemon.calibration.report import (
@@ -32,10 +33,13 @@ from processing.calibration.platform import (
     CalibratedCone,
     PlatformCalibration,
     least_exposures,
+    mistaken,
     shift_px,
 )
 from processing.mosaic.stitch_record import StitchRecord
 from processing.rig import Rig, load_rig
+
+Array = NDArray[np.float64]
 
 KIND = "platform"
 LOOSE_RAD = 20e-6
@@ -148,12 +152,20 @@ def report_of(
             "turn_sigma_urad": {
                 c.cone: [float(v) for v in c.turn_sigma_rad * 1e6] for c in calibration.cones
             },
+            "with_places_urad": {
+                c.cone: [float(v) for v in np.sqrt(np.diag(c.covariance)) * 1e6]
+                for c in calibration.cones
+            },
             "shift_px": {c.cone: shift_px(rig, c.turn_rad) for c in calibration.cones},
             "missing": list(calibration.missing),
         },
         verdicts=tuple(_verdict(rig, cone) for cone in calibration.cones),
         warnings=_warnings(flown, calibration, previous, serials),
-        sheets=(_angles(calibration), _turns(rig, calibration)),
+        sheets=(
+            _angles(calibration),
+            _turns(rig, calibration),
+            _not_told_apart(flown, calibration),
+        ),
         plots=tuple(_plot(cone) for cone in calibration.cones),
         previous=rig.calibration_id if previous is None else previous.calibration_id,
         changes=changes_between(before, quantities),
@@ -194,8 +206,8 @@ def _warnings(
     told = [] if previous is None else serial_warnings(previous, serials)
     if calibration.missing:
         told.append(
-            f"no or too few exposures tell of cone {', '.join(calibration.missing)}: its angles "
-            "are as they were"
+            f"no or too few exposures tell of cone {', '.join(calibration.missing)} (beside the "
+            "flight axis their height above ground must be known): its angles are as they were"
         )
     told += [
         f"cone {c.cone}: {c.left_out} exposures far off the others were left out"
@@ -204,10 +216,10 @@ def _warnings(
     ]
     if flown.rig.timing == "syntopic":
         told.append(
-            "the cones fire one after the other: an error of their delays or of the speed, always "
-            "the same, looks like a turn about the axis across the flight and is part of it; so is "
-            "what the aircraft turned in between, as far as it does not average out: take a long, "
-            "calm flight, or several"
+            "the cones fire one after the other: what the aircraft turned in between is part of "
+            "the turns as far as it does not average out; fly long and calm, and lines both ways, "
+            "which take out the crab of the wind. A speed, delay or crab that is always off the "
+            "same way stays in (see the table)"
         )
     told += [
         f"cone {c.cone} turns by up to {float(np.max(c.unexplained_rad)) * 1e6:.0f} urad from "
@@ -261,6 +273,27 @@ def _turns(rig: Rig, calibration: PlatformCalibration) -> Sheet:
         rows,
         "Sensors' places in their heads taken as calibrated.",
     )
+
+
+def _not_told_apart(flown: Flown, calibration: PlatformCalibration) -> Sheet:
+    rows = []
+    for cone in calibration.cones:
+        used = [flown.records[k] for k in cone.used]
+        found = mistaken(flown.rig, flown.rig.cone(cone.cone), used)
+        parts = (found.places, found.speed, found.crab, found.height)
+        rows.append((cone.cone, *(_about(part) for part in parts)))
+    return Sheet(
+        "What passes for a turn and cannot be told from one, urad about x, y, z",
+        ("cone", "places, one sigma", "speed or delay 1 %", "crab 1 deg", "height 1 %"),
+        rows,
+        "Places are within the standard deviations of the angles; so is 2 % of height. A turn of "
+        "all cones together, and a move of all sensors of the datum together, cannot be seen: "
+        "they are the boresight's (syntopic calibrate boresight) and the laboratory's.",
+    )
+
+
+def _about(turn_rad: Array) -> str:
+    return " ".join("0" if v == 0.0 else f"{v * 1e6:.2f}" for v in turn_rad)
 
 
 def _plot(cone: CalibratedCone) -> Plot:

@@ -208,6 +208,7 @@ def make_products(
                 told.usable_c,
                 product.estimated_dc,
                 bands=product.bands,
+                height_m=conditions.height_above_ground_m,
             )
         )
     report["timings_s"] = {stage: round(s, 4) for stage, s in product.timings_s.items()}

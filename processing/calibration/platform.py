@@ -4,11 +4,15 @@ Each exposure's stitching tells turns against the calibration it was made with
 (`processing.mosaic.stitch_record`); here they become one. Turns are rotation vectors (rad) about
 the axes of the virtual image.
 
+A cone beside the flight axis sees from another place than the master cone; what that turns its
+image by is taken off with the height above ground.
+
 Source: seeds/dmc-calibration.txt, 6.1; seeds/ultracam-calibration.txt, "platform calibration".
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -31,6 +35,8 @@ LEAST_SIGMA_URAD: Final = 2.0
 """A mount is not claimed to keep its angles better than this from flight to flight."""
 COLOUR_FLOOR_PX: Final = 0.02
 """What matching of another band leaves in every exposure alike, colour pixels."""
+HEIGHT_SIGMA: Final = 0.02
+"""How well the mean height above ground is known, of itself: relief, and the plan's own error."""
 _OUTLYING: Final = 5.0
 _SPREAD_OF_MEDIAN: Final = 1.4826
 _SCATTER_ALPHA: Final = 0.01
@@ -42,8 +48,8 @@ class CalibratedCone:
 
     `turn_rad` against the calibration flown with, `turn_sigma_rad` of the mean, the sensor's place
     in its head taken as calibrated; `scatter_rad` is that of a single exposure. `angles_rad` are
-    omega, phi, kappa with `angles_sigma_rad`, which holds the place's share too. `turns` (n, 3)
-    are the exposures used, numbers `used` among the records.
+    omega, phi, kappa with `angles_sigma_rad`, which holds the place's share too; so does the turn's
+    `covariance` (3, 3). `turns` (n, 3) are the exposures used, numbers `used` among the records.
     """
 
     cone: str
@@ -52,6 +58,7 @@ class CalibratedCone:
     scatter_rad: Array
     angles_rad: Array
     angles_sigma_rad: Array
+    covariance: Array
     turns: Array
     used: tuple[int, ...]
     left_out: int
@@ -89,13 +96,16 @@ def calibrate_platform(rig: Rig, records: Sequence[StitchRecord]) -> PlatformCal
                 f"{rig.name} {rig.calibration_id!r}"
             )
     heads = [cone.name for cone in rig.pan_cones] if rig.has_virtual_camera else []
-    complete = [k for k, r in enumerate(records) if all(_tells(r, name) for name in heads)]
+    complete = [
+        k for k, r in enumerate(records) if all(_tells(rig, rig.cone(name), r) for name in heads)
+    ]
     cones, missing = [], []
     for cone in rig.cones:
         if cone.name == rig.master_cone:
             continue
         among = complete if cone.name in heads else range(len(records))
-        found = _calibrated(rig, cone, records, [k for k in among if _tells(records[k], cone.name)])
+        telling = [k for k in among if _tells(rig, cone, records[k])]
+        found = _calibrated(rig, cone, records, telling)
         if found is None:
             missing.append(cone.name)
         else:
@@ -121,6 +131,37 @@ def calibrated_rig(
     return replace(rig, cones=tuple(cones), calibration_id=calibration_id, calibration_date=date)
 
 
+@dataclass(frozen=True)
+class Mistaken:
+    """What passes for a turn of a cone and cannot be told from one, rad (about x, y, z).
+
+    `places` of the sensors, the datum's too (one standard deviation, held in the angles' sigma);
+    `speed` a speed or delay off by 1 %, always the same; `crab` of one degree, always the same;
+    `height` above ground off by 1 %.
+    """
+
+    places: Array
+    speed: Array
+    crab: Array
+    height: Array
+
+
+def mistaken(rig: Rig, cone: Cone, records: Sequence[StitchRecord]) -> Mistaken:
+    """How far each of these would turn a cone's image, at the heights that were flown."""
+    heights = [r.height_m for r in records if r.height_m]
+    per_m = 1.0 / float(np.mean(heights)) if heights else 0.0
+    apart_m = 0.0
+    if rig.timing == "syntopic":
+        apart_m = abs(cone.position_mm[0] - rig.image_position_mm[0]) * 1e-3
+    right, forward = (abs(b) * 1e-3 for b in base_mm(rig, cone))
+    return Mistaken(
+        places=np.sqrt(np.diag(_places_of(rig, cone, records))),
+        speed=np.array([0.01 * apart_m * per_m, 0.0, 0.0]),
+        crab=np.array([0.0, math.sin(math.radians(1.0)) * apart_m * per_m, 0.0]),
+        height=np.array([forward, right, 0.0]) * 0.01 * per_m,
+    )
+
+
 def shift_px(rig: Rig, turn_rad: Array) -> float:
     """How far a turn moves the middle of a cone's field, PAN pixels, about x and y alone."""
     if rig.virtual_image is None:
@@ -131,7 +172,7 @@ def shift_px(rig: Rig, turn_rad: Array) -> float:
 def _calibrated(
     rig: Rig, cone: Cone, records: Sequence[StitchRecord], used: Sequence[int]
 ) -> CalibratedCone | None:
-    told = [_turn(records[k], cone.name) for k in used]
+    told = [_turn(rig, cone, records[k]) for k in used]
     least = least_exposures(rig)
     if len(told) < least:
         return None
@@ -159,7 +200,7 @@ def _calibrated(
     rotation = turned(cone, mean)
     # A turn w before the rotation is one of R'w behind it.
     jacobian = angles_by_rotation_vector(rotation[None])[0] @ rotation.T
-    total = of_mean + _place_share(rig, cone)
+    total = of_mean + _share_of_all(rig, cone, [records[k] for k in used])
     return CalibratedCone(
         cone=cone.name,
         turn_rad=mean,
@@ -167,6 +208,7 @@ def _calibrated(
         scatter_rad=np.sqrt(np.diag(seen)),
         angles_rad=omega_phi_kappa(rotation[None])[0],
         angles_sigma_rad=np.sqrt(np.diag(jacobian @ total @ jacobian.T)),
+        covariance=total,
         turns=turns,
         used=tuple(int(k) for k, kept in zip(used, good, strict=True) if kept),
         left_out=int(np.count_nonzero(~good)),
@@ -187,28 +229,59 @@ def _alike(turns: Array) -> Array:
     return np.asarray((1.0 + r) / (1.0 - r))
 
 
-def _place_share(rig: Rig, cone: Cone) -> Array:
-    """What the places of sensors add to a turn, (3, 3): the cone's own, and that of the datum."""
-    own = place_covariance(cone, {})
+def base_mm(rig: Rig, cone: Cone) -> tuple[float, float]:
+    """From where the virtual image is seen to where the cone sees from, mm, right and forward.
+
+    None forward of cones that fire one after the other over one place.
+    """
+    forward, right, _ = np.subtract(cone.position_mm, rig.image_position_mm)
+    if rig.has_virtual_camera:
+        return 0.0, 0.0  # its placement takes the ground's height into account
+    return float(right), 0.0 if rig.timing == "syntopic" else float(forward)
+
+
+def _share_of_all(rig: Rig, cone: Cone, records: Sequence[StitchRecord]) -> Array:
+    """What all exposures err by alike, (3, 3): places, matching of colour, height."""
+    share = _places_of(rig, cone, records)
     if cone.role == "colour":
         sensor = cone.sensors[0]
         left_mm = COLOUR_FLOOR_PX * sensor.pitch_mm
         half_mm = float(np.hypot(sensor.width_px, sensor.height_px)) / 2.0 * sensor.pitch_mm
         across = left_mm / cone.lens.f_mm
-        own = own + np.diag(np.square([across, across, left_mm / half_mm]))
+        share = share + np.diag(np.square([across, across, left_mm / half_mm]))
+    base = np.mean([_turn_by_base(rig, cone, r) for r in records], axis=0)
+    return np.asarray(share + np.diag(np.square(HEIGHT_SIGMA * base)))
+
+
+def _places_of(rig: Rig, cone: Cone, records: Sequence[StitchRecord]) -> Array:
+    """What places of sensors add to a turn, (3, 3): the cone's own, and that of the datum."""
+    dc_k = {
+        s.name: float(np.mean([abs(r.dc_k.get(s.name, 0.0)) for r in records])) for s in rig.sensors
+    }
+    own = place_covariance(cone, dc_k)
     if not rig.has_virtual_camera:
-        return own + place_covariance(rig.cone(rig.master_cone), {})
+        return own + place_covariance(rig.cone(rig.master_cone), dc_k, is_datum=True)
     heads = rig.pan_cones
-    of_mean = sum((place_covariance(c, {}) for c in heads), np.zeros((3, 3))) / len(heads) ** 2
+    of_mean = sum((place_covariance(c, dc_k) for c in heads), np.zeros((3, 3))) / len(heads) ** 2
     if cone not in heads:
         return own + of_mean
     return own * (1.0 - 2.0 / len(heads)) + of_mean
 
 
-def _tells(record: StitchRecord, cone: str) -> bool:
-    return f"{cone}.{TURNS[0]}" in record.names
+def _tells(rig: Rig, cone: Cone, record: StitchRecord) -> bool:
+    known = record.height_m is not None and record.height_m > 0.0
+    return f"{cone.name}.{TURNS[0]}" in record.names and (known or not any(base_mm(rig, cone)))
 
 
-def _turn(record: StitchRecord, cone: str) -> tuple[Array, Array]:
-    at = [record.names.index(f"{cone}.{what}") for what in TURNS]
-    return record.values[at] * 1e-6, record.covariance[np.ix_(at, at)] * 1e-12
+def _turn(rig: Rig, cone: Cone, record: StitchRecord) -> tuple[Array, Array]:
+    at = [record.names.index(f"{cone.name}.{what}") for what in TURNS]
+    turn = record.values[at] * 1e-6 - _turn_by_base(rig, cone, record)
+    return turn, record.covariance[np.ix_(at, at)] * 1e-12
+
+
+def _turn_by_base(rig: Rig, cone: Cone, record: StitchRecord) -> Array:
+    """The turn a base passes for over even ground: seen from the right, all lies farther left."""
+    right, forward = base_mm(rig, cone)
+    if record.height_m is None:
+        return np.zeros(3)
+    return np.array([forward, -right, 0.0]) * 1e-3 / record.height_m

@@ -147,7 +147,8 @@ def check_platform(
     at = np.concatenate([np.arange(first, first + 3) for first in mountings.values()])
     cones = [rig.cone(name) for name in mountings]
     stitched = mosaic.covariance[np.ix_(at, at)]
-    places = block_diag(*(place_covariance(cone, temperatures_c) for cone in cones))
+    dc_k = {s.name: sensor_dc(s, temperatures_c) for cone in cones for s in cone.sensors}
+    places = block_diag(*(place_covariance(cone, dc_k) for cone in cones))
     # What all heads turn together is the datum's.
     without_mean = np.kron(np.eye(count) - 1.0 / count, np.eye(3))
     known = stitched + without_mean @ places @ without_mean
@@ -257,16 +258,26 @@ def turned(cone: Cone, turn_rad: Array) -> Array:
     return np.asarray(exponential(turn_rad[None])[0] @ rotation_matrix(*cone.rotation_rad))
 
 
-def place_covariance(cone: Cone, temperatures_c: Mapping[str, float]) -> Array:
-    """Turns (3, 3), rad squared, that the sensor's place in the head passes for.
+def place_covariance(cone: Cone, dc_k: Mapping[str, float], *, is_datum: bool = False) -> Array:
+    """Turns (3, 3), rad squared, that the sensors' places in the head pass for.
 
-    A shift in the layer, by calibration and drift, looks like a turn about its x and y axes.
+    A shift in the layer, by calibration and drift at `dc_k` by sensor, looks like a turn about its
+    x and y axes; of a cone with several sensors the mean shift does. Where the places of three or
+    more are the datum (eq. 6), their rotation about each other looks like a turn about z.
     """
-    sensor = cone.sensors[0]
-    tdm_um = sensor.drift.sigma_um_per_k * sensor_dc(sensor, temperatures_c)
-    turn_rad = math.hypot(sensor.position_sigma_um, tdm_um) * 1e-3 / cone.lens.f_mm
+    sensors = cone.sensors
+    tdm_um = [s.drift.sigma_um_per_k * dc_k.get(s.name, 0.0) for s in sensors]
+    variance = np.array(
+        [s.position_sigma_um**2 + t**2 for s, t in zip(sensors, tdm_um, strict=True)]
+    )
+    across = float(variance.sum()) / len(sensors) ** 2 * (1e-3 / cone.lens.f_mm) ** 2
+    about_z = 0.0
+    if is_datum and len(sensors) > 2:
+        arm = np.array([[s.x_mm, s.y_mm] for s in sensors])
+        square = np.sum((arm - arm.mean(axis=0)) ** 2, axis=1)
+        about_z = float(np.sum(square * variance)) * 1e-6 / float(square.sum()) ** 2
     rotation = rotation_matrix(*cone.rotation_rad)
-    return np.asarray(rotation @ np.diag([turn_rad**2, turn_rad**2, 0.0]) @ rotation.T)
+    return np.asarray(rotation @ np.diag([across, across, about_z]) @ rotation.T)
 
 
 def _affine_shift(

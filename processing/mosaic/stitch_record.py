@@ -46,7 +46,7 @@ class StitchRecord:
     `values` (n,) and `covariance` (n, n) go with them. What tie points did not determine is left
     out. `dc_k` is the dC by sensor the start was made with; `measured` are the sensors whose own
     probe told it. Values are in the gauge of the adjustment: a similarity common to the sensors of
-    a cone means nothing.
+    a cone means nothing. `height_m` above ground is None where it was not known.
     """
 
     rig: str
@@ -58,6 +58,7 @@ class StitchRecord:
     covariance: Array
     sigma0: float
     estimated_dc: tuple[EstimatedDc, ...] = ()
+    height_m: float | None = None
 
 
 def stitch_record(
@@ -68,6 +69,7 @@ def stitch_record(
     estimated_dc: Sequence[EstimatedDc] = (),
     *,
     bands: Sequence[BandRegistration] = (),
+    height_m: float | None = None,
 ) -> StitchRecord:
     """The record of a free mosaic.
 
@@ -78,6 +80,7 @@ def stitch_record(
         measured_c: those of them that were read.
         estimated_dc: what `processing.mosaic.estimated_dc` made of it.
         bands: how the other colours were registered to green.
+        height_m: of the exposure above ground.
     """
     held = set(mosaic.undetermined)
     rows: list[Array] = []
@@ -122,6 +125,7 @@ def stitch_record(
         covariance=block_diag(*covariances),
         sigma0=mosaic.sigma0,
         estimated_dc=tuple(estimated_dc),
+        height_m=height_m,
     )
 
 
@@ -138,6 +142,7 @@ def stitch_record_json(record: StitchRecord) -> dict[str, Any]:
         "values": [_short(v) for v in record.values],
         "covariance": [_short(v) for v in lower],
         "sigma0": _short(record.sigma0),
+        "height_m": record.height_m,
         "estimated_dc": [
             {
                 "cone": e.cone,
@@ -184,6 +189,7 @@ def stitch_record_from_json(content: Mapping[str, Any]) -> StitchRecord:
             covariance=covariance,
             sigma0=float(content["sigma0"]),
             estimated_dc=tuple(EstimatedDc(**e) for e in content["estimated_dc"]),
+            height_m=None if content.get("height_m") is None else float(content["height_m"]),
         )
     except (KeyError, TypeError, AttributeError) as error:
         raise StitchRecordError(f"mosaic.json cannot be used: {error!r}") from error

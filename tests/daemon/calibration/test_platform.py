@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-from benchmarks import dmc_platform
+from benchmarks import dmc_platform, ultracam_platform
 from daemon.cli import app
 from daemon.disk.mission import Mission
 from processing.bundle.rotations import exponential, omega_phi_kappa
@@ -28,6 +28,10 @@ Array = NDArray[np.float64]
 
 DMC_TURNS = {"1": (30e-6, -10e-6, 5e-6), "2": (-20e-6, 40e-6, 0.0), "3": (-10e-6, -30e-6, -5e-6)}
 UCX_TURNS = {"1": (60e-6, 0.0, 20e-6), "2": (0.0, -50e-6, 0.0), "3": (20e-6, 20e-6, -60e-6)}
+L_TURNS = {"1": (40e-6, -30e-6, 20e-6)}
+
+HIGH_M = 1e12
+"""So high that a cone beside the flight axis sees as the others do: the points are drawn so."""
 
 
 def turned(rig: Rig, turns: dict[str, tuple[float, float, float]]) -> Rig:
@@ -51,7 +55,7 @@ def flight(
     records = []
     for _ in range(exposures):
         points = tie_points_of(truth, rng, sigma_pp_px=0.05, sigma_pc_px=0.15)
-        records.append(stitch_record(rig, free_mosaic(rig, start, points), {}, {}))
+        records.append(stitch_record(rig, free_mosaic(rig, start, points), {}, {}, height_m=HIGH_M))
     return records
 
 
@@ -97,6 +101,25 @@ def test_an_exposure_without_one_head_does_not_move_the_datum_of_the_others() ->
     assert len(found["1"].turns) == 3 and found["1"].used == (1, 2, 3)
     with pytest.raises(ValueError, match="does not belong"):
         calibrate_platform(find_rig("dmc"), records)
+
+
+def test_a_base_beside_the_flight_axis_is_no_turn() -> None:
+    rig = find_rig("ultracam-l-mini")
+    records = flight(rig, L_TURNS, 12)
+    low = [replace(r, height_m=1000.0) for r in records]
+    high = {c.cone: c.turn_rad for c in calibrate_platform(rig, records).cones}
+    near = {c.cone: c.turn_rad for c in calibrate_platform(rig, low).cones}
+    # Green sees from 80 mm to the right; at 1000 m all lies 80 urad farther left.
+    assert near["RGB"] - high["RGB"] == pytest.approx([0.0, 80e-6, 0.0], abs=1e-9)
+    assert near["1"] == pytest.approx(high["1"])
+    unknown = calibrate_platform(rig, [replace(r, height_m=None) for r in records])
+    assert "RGB" in unknown.missing and "1" not in unknown.missing
+
+
+def test_turns_found_in_whole_flights_are_as_good_as_stated() -> None:
+    figures = ultracam_platform.judged("ultracam-l-mini", 4, 6)["1"]
+    low, high = figures["bounds"]
+    assert low < figures["squares_per_rank"] < high and figures["largest"] < 5.0
 
 
 def test_a_blurred_exposure_is_left_out_and_said(tmp_path: Path) -> None:

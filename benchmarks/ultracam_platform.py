@@ -1,0 +1,140 @@
+"""`python -m benchmarks.ultracam_platform`: cones turned against the master's, from whole flights.
+
+Cameras whose mounting, places and drift are off their calibration by what the rig file says, each
+flown there and back. Tie points are drawn where the emulator's true cones see the same ground at
+their own instants, with the noise of matching; the turns that `syntopic calibrate platform` finds
+are held against the true ones. `--mission` compares a calibration from rendered frames instead.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from benchmarks import rendered
+from benchmarks.stitching_trials import mosaic_settings, world_and_rig
+from benchmarks.ultracam_l import tie_points
+from daemon.measuring import machine
+from processing.calibration.platform import PlatformCalibration, calibrate_platform
+from processing.geometry.placement import nominal_placements
+from processing.mosaic.free import free_mosaic
+from processing.mosaic.stitch_record import StitchRecord, stitch_record
+from sim_hw.world.camera import rotation_opk
+from sim_hw.world.post_processed import marks_of_lines
+from sim_hw.world.snapshots import look_of, probe_readings
+from sim_hw.world.world import World
+
+Array = NDArray[np.float64]
+
+DC_K = 6.0
+LINES = 2
+POINTS_PER_OVERLAP, POINTS_PER_SENSOR = 60, 150
+
+
+def flown(name: str, seed: int, exposures: int) -> tuple[World, PlatformCalibration]:
+    """One camera and what one flight of `exposures` on each line finds of it."""
+    world, rig = world_and_rig(name, seed, dc_k=DC_K, exposures=exposures)
+    flight, first_ns = rendered.flight_and_mark(world, 0)
+    random = np.random.default_rng([seed, 13])
+    settings = mosaic_settings(world)
+    records: list[StitchRecord] = []
+    for mark_ns in marks_of_lines(world, flight, first_ns, exposures, LINES):
+        looks = {cone.name: look_of(world, cone, mark_ns) for cone in rig.cones}
+        probes = probe_readings(world, mark_ns, seed=seed * 1000 + len(records))
+        start = nominal_placements(rig, probes, world.plan.tdi_shifts)
+        points = tie_points(
+            world,
+            flight,
+            looks,
+            start,
+            random,
+            per_overlap=POINTS_PER_OVERLAP,
+            per_sensor=POINTS_PER_SENSOR,
+        )
+        mosaic = free_mosaic(rig, start, points, settings=settings)
+        height_m = world.plan.height_above_ground_m
+        records.append(stitch_record(rig, mosaic, probes, probes, height_m=height_m))
+    return world, calibrate_platform(rig, records)
+
+
+def true_turn(master_from_cone: Array, mounting_error_rad: tuple[float, float, float]) -> Array:
+    """What the emulator turned a cone by, about the axes of the virtual image, (3,) rad."""
+    turn = master_from_cone @ rotation_opk(mounting_error_rad) @ master_from_cone.T
+    return np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
+
+
+def judged(name: str, seeds: int, exposures: int) -> dict[str, Any]:
+    """By cone: errors of the turns in their covariance over `seeds` flights."""
+    squares: dict[str, float] = {}
+    ratios: dict[str, list[Array]] = {}
+    errors: dict[str, list[Array]] = {}
+    for seed in range(1, seeds + 1):
+        world, found = flown(name, seed, exposures)
+        for cone in found.cones:
+            true = world.camera.master_from_cone(world.rig.cone(cone.cone))
+            error = cone.turn_rad - true_turn(true, world.camera.mounting_error_rad[cone.cone])
+            own = float(error @ np.linalg.solve(cone.covariance, error))
+            squares[cone.cone] = squares.get(cone.cone, 0.0) + own
+            ratios.setdefault(cone.cone, []).append(error / np.sqrt(np.diag(cone.covariance)))
+            errors.setdefault(cone.cone, []).append(error)
+        told = ", ".join(f"{c} {3.0 * v / seed / 9.0:.2f}" for c, v in squares.items())
+        print(f"flight {seed}: squares per rank so far: {told}", file=sys.stderr, flush=True)
+    return {
+        cone: {
+            "errors": 3 * len(ratios[cone]),
+            "squares_per_rank": squares[cone] / (3 * len(ratios[cone])),
+            "bounds": [
+                float(chi2.ppf(p, 3 * len(ratios[cone]))) / (3 * len(ratios[cone]))
+                for p in (0.0005, 0.9995)
+            ],
+            "within_3_sigma": float(np.mean(np.abs(ratios[cone]) < 3.0)),
+            "largest": float(np.max(np.abs(ratios[cone]))),
+            "rms_error_urad": (np.sqrt(np.mean(np.square(errors[cone]), axis=0)) * 1e6).tolist(),
+        }
+        for cone in squares
+    }
+
+
+def compared(calibration: Path, truth: Path) -> dict[str, Any]:
+    """Turns of a `calibration.json` less those of the emulator's truth, urad."""
+    found = json.loads((calibration / "calibration.json").read_text())["figures"]
+    cones = json.loads((truth / "parameters.json").read_text())["cones"]
+    told = {}
+    for cone, turn in found["turn_urad"].items():
+        true = cones[cone]
+        error = true_turn(np.array(true["master_from_cone"]), true["mounting_error_rad"])
+        told[cone] = {
+            "error_urad": (np.array(turn) - error * 1e6).tolist(),
+            "sigma_urad": found["turn_sigma_urad"][cone],
+            "with_places_urad": found["with_places_urad"][cone],
+        }
+    return told
+
+
+def main() -> None:
+    line = argparse.ArgumentParser(
+        prog="python -m benchmarks.ultracam_platform", description=__doc__
+    )
+    line.add_argument("--rig", default="ultracam-l-mini")
+    line.add_argument("--seeds", type=int, default=50)
+    line.add_argument("--exposures", type=int, default=12, help="of each of two lines")
+    line.add_argument("--calibration", type=Path, help="compare this one of rendered exposures")
+    line.add_argument("--truth", type=Path, help="truth folder of those exposures")
+    given = line.parse_args()
+    if given.calibration is not None:
+        print(json.dumps(compared(given.calibration, given.truth), indent=1))
+        return
+    figures = judged(given.rig, given.seeds, given.exposures)
+    told = {"machine": machine(), "rig": given.rig, "flights": given.seeds, "cones": figures}
+    print(json.dumps(told, indent=1))
+
+
+if __name__ == "__main__":
+    main()
