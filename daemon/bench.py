@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -30,11 +30,15 @@ from daemon.disk.mission import Mission
 from daemon.disk.radiometry_folder import RadiometryFolder
 from daemon.errors import DaemonError
 from daemon.measuring import interleaved, machine, spread
+from daemon.orientation.exterior import mount_of
 from daemon.products.conditions import conditions_of
+from daemon.products.processor import Processor, make_products
+from daemon.products.reports import Made
+from daemon.products.stitched import StitchedProcessor
 from daemon.service.lanes import Lanes
-from daemon.service.worker import make_products, process_exposure, settle_threads
+from daemon.service.worker import process_exposure, settle_threads
 from processing.matching.tie_points import TiePoints
-from processing.pipeline import Conditions, Pipeline, Product, Settings
+from processing.pipeline import Pipeline, Product, Settings
 from processing.quality.report import Flag
 from processing.rig import Rig, load_rig
 
@@ -91,14 +95,19 @@ def measure(
     frames = {name: np.array(frame) for name, frame in stored.items()}
     conditions = conditions_of(exposure, rig, plan, Flag(0))
     product = pipeline.process(frames, conditions)
+    processor, mount = StitchedProcessor(pipeline), mount_of(mission)[0]
+
+    def make(lane: Processor) -> Made:
+        return make_products(lane, mount, plan, exposure, frames, conditions)
+
     result = {
         "rig": rig.name,
         "machine": machine(),
         "runs": runs,
         "threads": threads,
-        **_timed(rig, pipeline, frames, conditions, product, runs),
+        **_timed(processor, make, frames, product, runs),
     }
-    result |= _side_by_side(rig, pipeline, frames, conditions, lanes=lanes, count=3 * runs)
+    result |= _side_by_side(processor, make, lanes=lanes, count=3 * runs)
     if peers:
         product = pipeline.process(frames, conditions)
         tie_points = product.tie_points
@@ -106,7 +115,7 @@ def measure(
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     result["peak_rss_mib"] = round(peak / 1024)
     pipeline.settings = replace(pipeline.settings, geometry=True, baselines=True)
-    process_exposure(pipeline, rig, mission, plan, exposure, frames)
+    process_exposure(processor, mission, mount, plan, exposure, frames)
     result |= _geometry(mission, folder / "truth")
     if peers and "skipped" not in result["peers"]["nona_enblend"]:
         told = _peer_geometry(rig, mission, folder / "truth", tie_points)
@@ -115,13 +124,13 @@ def measure(
 
 
 def _timed(
-    rig: Rig,
-    pipeline: Pipeline,
+    processor: StitchedProcessor,
+    make: Callable[[Processor], Made],
     frames: Mapping[str, NDArray[np.uint16]],
-    conditions: Conditions,
     product: Product,
     runs: int,
 ) -> dict[str, Any]:
+    rig, pipeline = processor.rig, processor.pipeline
     outputs = [product.pan, *product.colour.values()]
     sources = [*frames.values(), *outputs]
     copies = [np.zeros_like(array) for array in sources]
@@ -133,7 +142,7 @@ def _timed(
 
         def free() -> None:
             began = time.process_time()
-            report, contents = make_products(pipeline, 1, frames, conditions)
+            report, contents = make(processor)
             started = time.perf_counter()
             _to_page_cache(contents, Path(scratch))
             stages.setdefault("writing", []).append(time.perf_counter() - started)
@@ -143,7 +152,7 @@ def _timed(
 
         def fixed() -> None:
             pipeline.settings = replace(settings, method="fixed")
-            _to_page_cache(make_products(pipeline, 1, frames, conditions)[1], Path(scratch))
+            _to_page_cache(make(processor)[1], Path(scratch))
             pipeline.settings = settings
 
         def copy() -> None:
@@ -170,31 +179,25 @@ def _timed(
 
 
 def _side_by_side(
-    rig: Rig,
-    pipeline: Pipeline,
-    frames: Mapping[str, NDArray[np.uint16]],
-    conditions: Conditions,
-    *,
-    lanes: int,
-    count: int,
+    processor: Processor, make: Callable[[Processor], Made], *, lanes: int, count: int
 ) -> dict[str, Any]:
     """The pace with exposures in work side by side, as in the service, and each one's latency.
 
     Timed from the end of the first exposures to the end of the last, all lanes full all the while.
     Each file is written anew, and removed when as many others were written as there are lanes.
     """
-    work = Lanes(pipeline, lanes)
+    work = Lanes[Processor](processor, lanes)
     ends: list[float] = []
     latencies: list[float] = []
     used: list[float] = []
 
     with tempfile.TemporaryDirectory(prefix="syntopic-bench-") as scratch:
 
-        def one(number: int, lane: Pipeline) -> None:
+        def one(number: int, lane: Processor) -> None:
             started = time.perf_counter()
             folder = Path(scratch) / str(number)
             folder.mkdir()
-            _to_page_cache(make_products(lane, number, frames, conditions)[1], folder)
+            _to_page_cache(make(lane)[1], folder)
             ended = time.perf_counter()
             ends.append(ended)
             used.append(time.process_time())
@@ -209,7 +212,7 @@ def _side_by_side(
     first, last = work.count - 1, work.count - 1 + count
     seconds = (ends[last] - ends[first]) / count
     return {
-        "realtime_factor": rig.frame_interval_s / seconds,
+        "realtime_factor": processor.rig.frame_interval_s / seconds,
         "side_by_side": {
             "lanes": work.count,
             "exposures": count,

@@ -6,16 +6,22 @@ registered to the reference band and resampled once. Rigs that stitch are `proce
 
 from __future__ import annotations
 
+import copy
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import cv2
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.conditions import Conditions
+from processing.conditions import (
+    Conditions,
+    condition_figures,
+    usable_temperatures,
+)
 from processing.geometry.placement import SensorPlacement
 from processing.image.band_registration import (
     BandSettings,
@@ -27,7 +33,9 @@ from processing.image.band_registration import (
 )
 from processing.quality.judgement import judge
 from processing.quality.report import Figure, QualityReport, Thresholds
+from processing.quality.specification import Asked
 from processing.radiometry.radiance import RadianceCalibration, radiance_from_words, saturated_words
+from processing.rehearsal import plain_frames
 from processing.rig import Rig, Sensor, VirtualImage
 
 Array = NDArray[Any]
@@ -83,6 +91,7 @@ class BandPipeline:
         radiance: by sensor name; a sensor without one gives DN above black.
         thresholds: of the verdict. None asks ten times less saturation than for a picture: a
             radiance that is wrong is worse than a roof without detail.
+        asked: what the project asks for, where it does.
 
     Raises:
         ValueError: a rig of other make.
@@ -94,7 +103,9 @@ class BandPipeline:
         radiance: Mapping[str, RadianceCalibration] | None = None,
         *,
         settings: BandSettings | None = None,
+        threads: int = 2,
         thresholds: Thresholds | None = None,
+        asked: Asked | None = None,
     ) -> None:
         single = all(len(c.sensors) == 1 and len(c.bands) == 1 for c in rig.cones)
         bands = [cone.bands[0] for cone in rig.cones if cone.bands]
@@ -108,17 +119,34 @@ class BandPipeline:
         self.thresholds = thresholds or replace(
             Thresholds(), saturated_fraction=0.0005, saturated_refly_fraction=0.01
         )
+        self._asked = asked or Asked()
+        self._threads = threads
         self._radiance = dict(radiance or {})
         self._image = reference_image(rig)
         self._band_of = {cone.sensors[0].name: cone.bands[0] for cone in rig.cones}
         assert rig.colour_master_cone is not None
         self._reference = rig.cone(rig.colour_master_cone).sensors[0].name
 
+    def twin(self) -> BandPipeline:
+        """Another for an exposure at the same time; calibrations are shared."""
+        return copy.copy(self)
+
+    def warm_up(self) -> None:
+        """Compile every kernel a flight will need, from the cache where there is one."""
+        exposure_time_s = {cone.name: 0.001 for cone in self.rig.cones}
+        for is_writeable in (True, False):
+            frames = plain_frames(self.rig)
+            for frame in frames.values():
+                frame.flags.writeable = is_writeable
+            self.process(frames, Conditions(exposure_time_s=exposure_time_s))
+
     def process(
         self,
         frames: Mapping[str, Array],
         conditions: Conditions,
         heads: Mapping[str, FrameSettings] | None = None,
+        *,
+        frames_read: Callable[[], None] | None = None,
     ) -> BandProduct:
         """Make the bands of one exposure and judge it.
 
@@ -127,11 +155,15 @@ class BandPipeline:
                 without the reference all bands lie as calibrated.
             conditions: exposure times, temperatures, what capture knows.
             heads: gain and black level by sensor name.
+            frames_read: called once the pixels of `frames` are no longer needed.
 
         Raises:
             ValueError: a frame of the wrong shape or type, or a radiance calibration without an
                 exposure time.
         """
+        cv2.setNumThreads(self._threads)
+        numba.set_num_threads(max(1, min(self._threads, int(numba.config.NUMBA_NUM_THREADS))))
+        temperatures = usable_temperatures(self.rig, conditions, self.thresholds)
         seconds: dict[str, float] = {}
         began = time.perf_counter()
         linear, saturated, units = {}, {}, {}
@@ -140,9 +172,11 @@ class BandPipeline:
             told = (heads or {}).get(name, FrameSettings())
             linear[name], units[name] = self._linear(sensor, frames[name], conditions, told)
             saturated[name] = saturated_words(sensor, frames[name])
+        if frames_read is not None:
+            frames_read()
         seconds["radiometry"] = time.perf_counter() - began
         began = time.perf_counter()
-        placements = band_placements(self.rig, _known(conditions))
+        placements = band_placements(self.rig, temperatures.placing_c)
         found = self._register(placements, linear, saturated)
         seconds["registration"] = time.perf_counter() - began
         began = time.perf_counter()
@@ -154,13 +188,17 @@ class BandPipeline:
             bands[band], masks[band] = _resampled(frame, saturated[name], at)
         seconds["resampling"] = time.perf_counter() - began
         missing = [name for name in self._band_of if name not in frames]
-        figures = self._figures(found, saturated, masks, linear, missing)
+        figures = condition_figures(self.rig, conditions, temperatures)
+        figures |= self._figures(found, saturated, masks, missing)
         report = judge(
             figures,
             capture_flags=conditions.flags,
             missing_sensors=missing,
+            missing_probes=temperatures.missing,
+            probes_out_of_range=temperatures.out_of_range,
             nominal_bands=[f.band for f in found.values() if not f.registered],
             thresholds=self.thresholds,
+            asked=self._asked,
         )
         return BandProduct(
             image=self._image,
@@ -224,7 +262,6 @@ class BandPipeline:
         found: Mapping[str, RegisteredBand],
         saturated: Mapping[str, Array],
         masks: Mapping[str, Array],
-        linear: Mapping[str, Array],
         missing: list[str],
     ) -> dict[str, Figure]:
         figures: dict[str, Figure] = {"method": "bands", "missing_sensors": ", ".join(missing)}
@@ -243,10 +280,6 @@ class BandPipeline:
             everywhere = np.logical_and.reduce([mask & VALID != 0 for mask in masks.values()])
             figures["valid_fraction"] = float(np.mean(everywhere))
         return figures
-
-
-def _known(conditions: Conditions) -> dict[str, float]:
-    return {p: t for p, t in conditions.temperatures_c.items() if t is not None}
 
 
 def _for_matching(frame: Array, saturated: Array) -> Array:

@@ -15,6 +15,8 @@ from typing import Any, Final
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 
+from processing.band_pipeline import BandPipeline
+from processing.perspective import HeadPipeline, looks_apart
 from processing.pipeline import Pipeline, Settings
 from processing.radiometry.calibration import RadiometricCalibration
 from processing.radiometry.demosaic import demosaic
@@ -74,15 +76,20 @@ def compile_for(
     is what a Bayer head needs, whether this rig has one or not.
 
     Raises:
-        ValueError, CalibrationError: as `Pipeline`.
+        ValueError, CalibrationError: as `Pipeline`, `HeadPipeline` or `BandPipeline`.
     """
     began = time.perf_counter()
     before = _cache_misses()
     if radiometry is None:
-        first = rig.pan_cones[0].sensors[0] if rig.pan_cones else None
-        radiometry = {first.name: rehearsal_radiometry(first)} if first else {}
+        first = (rig.pan_cones or rig.cones)[0].sensors[0]
+        radiometry = {first.name: rehearsal_radiometry(first)}
     demosaic(np.zeros((8, 8), np.uint16), "RGGB", out=np.zeros((3, 8, 8), np.uint16))
-    Pipeline(rig, radiometry, settings).warm_up()
+    if rig.virtual_image is not None:
+        Pipeline(rig, radiometry, settings).warm_up()
+    elif looks_apart(rig):
+        HeadPipeline(rig, radiometry).warm_up()
+    else:
+        BandPipeline(rig).warm_up()
     return Compilation(variants(), _cache_misses() - before, time.perf_counter() - began)
 
 

@@ -10,7 +10,10 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from processing.geometry.drift import lagged_probe, lagged_sensors
+from processing.geometry.rotation import rotation_matrix
 from processing.quality.probe_health import bridge_by_others
 from processing.quality.report import NO_FLAGS, Figure, Flag, Thresholds
 from processing.rig import Cone, Rig
@@ -96,9 +99,7 @@ def condition_figures(
     """Figures that need no pixels, by the names of `processing.quality.report.FIGURES`."""
     figures: dict[str, Figure] = {"gsd_m": ground_sampling_distance_m(rig, conditions)}
     figures |= _dc(rig, temperatures)
-    smears = [_smear(rig, cone, conditions) for cone in rig.pan_cones]
-    for k, name in enumerate(("smear_along_px", "smear_across_px")):
-        figures[name] = max((s[k] for s in smears if s is not None), default=None)
+    figures |= _smears(rig, conditions)
     ages = [conditions.temperature_age_s.get(probe) for probe in temperatures.usable_c]
     figures["temperature_age_s"] = max((age for age in ages if age is not None), default=None)
     figures |= _time(conditions, figures["gsd_m"])
@@ -125,11 +126,15 @@ def _time(conditions: Conditions, gsd_m: Figure) -> dict[str, Figure]:
 
 
 def ground_sampling_distance_m(rig: Rig, conditions: Conditions) -> float | None:
-    """Ground covered by one pixel of the virtual image, at the foot of the camera."""
+    """Ground covered by one pixel at the foot of the camera; without a virtual image by the master
+    cone's."""
     image, height = rig.virtual_image, conditions.height_above_ground_m
-    if image is None or height is None or height <= 0:
+    if height is None or height <= 0:
         return None
-    return height * image.pitch_mm / image.f_mm
+    if image is not None:
+        return height * image.pitch_mm / image.f_mm
+    cone = rig.cone(rig.master_cone or rig.reference_cone)
+    return height * cone.sensors[0].pitch_mm / cone.lens.f_mm
 
 
 def parallax_px(rig: Rig, conditions: Conditions, relief_fraction: float) -> float:
@@ -161,6 +166,47 @@ def _dc(rig: Rig, temperatures: Temperatures) -> dict[str, Figure]:
             pan.append(dc)
     figures["dc_k"] = sum(pan) / len(pan) if pan else None
     return figures
+
+
+def _smears(rig: Rig, conditions: Conditions) -> dict[str, Figure]:
+    if rig.virtual_image is None:
+        heads = {cone.name: head_smear_px(cone, conditions) for cone in rig.cones}
+        known = {name: px for name, px in heads.items() if px is not None}
+        worst = max(known, key=lambda name: known[name], default=None)
+        return {
+            "smear_along_px": None if worst is None else known[worst],
+            "smear_across_px": None,
+            "smear_worst_head": worst,
+        }
+    smears = [_smear(rig, cone, conditions) for cone in rig.pan_cones]
+    return {
+        name: max((s[k] for s in smears if s is not None), default=None)
+        for k, name in enumerate(("smear_along_px", "smear_across_px"))
+    }
+
+
+def head_smear_px(cone: Cone, conditions: Conditions) -> float | None:
+    """How far flat ground moves during the exposure where it moves farthest in a head's image.
+
+    A head that looks aslant has the ground nearest, and so the longest way, at one edge: all
+    corners count and the middle. None where speed, height or exposure time are not known.
+    """
+    time_s = conditions.exposure_time_s.get(cone.name)
+    speed_mps, height_m = conditions.ground_speed_mps, conditions.height_above_ground_m
+    if time_s is None or speed_mps is None or height_m is None or height_m <= 0:
+        return None
+    sensor, f_mm = cone.sensors[0], cone.lens.f_mm
+    half = np.array([sensor.width_px, sensor.height_px]) * sensor.pitch_mm / 2.0
+    xy = np.array([[0, 0], [-1, -1], [1, -1], [1, 1], [-1, 1]]) * half
+    rig_from_head = rotation_matrix(*cone.rotation_rad)
+    rays = np.column_stack([xy, np.full(len(xy), -f_mm)]) @ rig_from_head.T
+    rays = rays[rays[:, 2] < 0.0]
+    crab = conditions.crab_rad or 0.0
+    moved_m = speed_mps * time_s * np.array([-math.sin(crab), math.cos(crab), 0.0])
+    before = rays * (-height_m / rays[:, 2:]) @ rig_from_head
+    after = before - moved_m @ rig_from_head
+    away = -f_mm * (after[:, :2] / after[:, 2:] - before[:, :2] / before[:, 2:])
+    return float(np.hypot(away[:, 0], away[:, 1]).max(initial=0.0)) / sensor.pitch_mm
 
 
 def _smear(rig: Rig, cone: Cone, conditions: Conditions) -> tuple[float, float] | None:

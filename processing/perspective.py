@@ -9,29 +9,40 @@ Source: seeds/multi-camera-calibration.txt ("perfect perspective based on a resa
 
 from __future__ import annotations
 
+import copy
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import cv2
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.conditions import Conditions
+from processing.conditions import (
+    Conditions,
+    Temperatures,
+    condition_figures,
+    usable_temperatures,
+)
 from processing.geometry.placement import nominal_placements, raw_from_vip_mm, vip_mm_from_px
 from processing.geometry.rotation import rotation_matrix
+from processing.image.sharpness import bright_level
 from processing.quality.judgement import judge
-from processing.quality.report import Figure, QualityReport, Thresholds
+from processing.quality.report import QualityReport, Thresholds
+from processing.quality.specification import Asked
 from processing.radiometry.calibration import RadiometricCalibration
 from processing.radiometry.demosaic import BAYER_BANDS, demosaic, is_bayer
 from processing.radiometry.level1 import (
     LEVEL1_CEILING,
     LEVEL1_FLOOR,
+    FrameStatistics,
     corrector_for,
     level1_from_level0,
 )
+from processing.rehearsal import plain_frames
 from processing.rig import Cone, Rig, VirtualImage
 
 Array = NDArray[Any]
@@ -98,9 +109,11 @@ class HeadPipeline:
         rig: every cone has one sensor.
         radiometry: by sensor name; a sensor without one is taken as flat.
         interpolation: bilinear, cubic or lanczos.
+        asked: what the project asks for, where it does.
 
     Raises:
         ValueError: a rig of other make.
+        processing.radiometry.calibration.CalibrationError: a calibration that is not the sensor's.
     """
 
     def __init__(
@@ -109,7 +122,9 @@ class HeadPipeline:
         radiometry: Mapping[str, RadiometricCalibration] | None = None,
         *,
         interpolation: str = "cubic",
+        threads: int = 2,
         thresholds: Thresholds | None = None,
+        asked: Asked | None = None,
     ) -> None:
         if rig.virtual_image is not None or any(len(c.sensors) != 1 for c in rig.cones):
             raise ValueError(
@@ -117,66 +132,110 @@ class HeadPipeline:
                 "there is no [virtual_image]"
             )
         self.rig = rig
-        self._radiometry = radiometry or {}
+        self._correctors = {
+            sensor.name: corrector_for(sensor, (radiometry or {}).get(sensor.name))
+            for sensor in rig.sensors
+        }
         self._interpolation = _INTERPOLATION[interpolation]
+        self._threads = threads
         self._thresholds = thresholds or Thresholds()
+        self._asked = asked or Asked()
         self._maps: dict[str, tuple[tuple[float | None, float | None], Array]] = {}
 
-    def process(self, frames: Mapping[str, Array], conditions: Conditions) -> HeadsProduct:
+    def twin(self) -> HeadPipeline:
+        """Another for an exposure at the same time; calibrations and maps are shared."""
+        return copy.copy(self)
+
+    def warm_up(self) -> None:
+        """Compile every kernel a flight will need, from the cache where there is one."""
+        for is_writeable in (True, False):
+            frames = plain_frames(self.rig)
+            for frame in frames.values():
+                frame.flags.writeable = is_writeable
+            self.process(frames, Conditions())
+
+    def process(
+        self,
+        frames: Mapping[str, Array],
+        conditions: Conditions,
+        *,
+        frames_read: Callable[[], None] | None = None,
+    ) -> HeadsProduct:
         """Make the images of one exposure.
 
         Args:
             frames: Level-0 by sensor name, (h, w) uint16; a missing one leaves no image.
             conditions: temperatures, exposure times, what capture knows.
+            frames_read: called once the pixels of `frames` are no longer needed.
 
         Raises:
             ValueError: a frame of the wrong shape or type.
-            processing.radiometry.calibration.CalibrationError: a calibration that is not the
-                sensor's.
         """
+        cv2.setNumThreads(self._threads)
+        numba.set_num_threads(max(1, min(self._threads, int(numba.config.NUMBA_NUM_THREADS))))
         seconds = {"radiometry": 0.0, "resampling": 0.0}
-        known = {p: t for p, t in conditions.temperatures_c.items() if t is not None}
+        temperatures = usable_temperatures(self.rig, conditions, self._thresholds)
+        known = temperatures.placing_c
         heads: dict[str, HeadImage] = {}
-        saturated: dict[str, float] = {}
-        for cone in self.rig.cones:
+        level1: dict[str, Array] = {}
+        statistics: dict[str, FrameStatistics] = {}
+        present = [cone for cone in self.rig.cones if cone.sensors[0].name in frames]
+        for cone in present:
             sensor = cone.sensors[0]
-            if sensor.name not in frames:
-                continue
             began = time.perf_counter()
-            level1 = np.empty((sensor.height_px, sensor.width_px), np.uint16)
-            seen = level1_from_level0(
-                corrector_for(sensor, self._radiometry.get(sensor.name)),
-                frames[sensor.name],
+            level1[sensor.name] = np.empty((sensor.height_px, sensor.width_px), np.uint16)
+            statistics[sensor.name] = level1_from_level0(
+                self._correctors[sensor.name],
+                np.ascontiguousarray(frames[sensor.name]),
                 temperature_c=known.get(sensor.probe),
                 exposure_time_s=conditions.exposure_time_s.get(cone.name, 0.0),
                 tdi_shifts=0,
-                out=level1,
+                out=level1[sensor.name],
             )
-            saturated[sensor.name] = seen.saturated_fraction
-            planes = _planes(cone, level1)
             seconds["radiometry"] += time.perf_counter() - began
+        if frames_read is not None:
+            frames_read()
+        for cone in present:
             began = time.perf_counter()
+            planes = _planes(cone, level1[cone.sensors[0].name])
             at = self._map(cone, known)
             bands = {name: self._resampled(plane, at) for name, plane in planes.items()}
             heads[cone.name] = HeadImage(cone.name, perspective_of(cone), bands)
             seconds["resampling"] += time.perf_counter() - began
-        missing = [s.name for s in self.rig.sensors if s.name not in frames]
-        figures: dict[str, Figure] = {
-            "method": "heads",
-            "missing_sensors": ", ".join(missing) or None,
-        }
-        if saturated:
+        report = self._judged(conditions, temperatures, level1, statistics)
+        return HeadsProduct(heads, report, seconds)
+
+    def _judged(
+        self,
+        conditions: Conditions,
+        temperatures: Temperatures,
+        level1: Mapping[str, Array],
+        statistics: Mapping[str, FrameStatistics],
+    ) -> QualityReport:
+        missing = [s.name for s in self.rig.sensors if s.name not in level1]
+        figures = condition_figures(self.rig, conditions, temperatures)
+        figures |= {"method": "heads", "missing_sensors": ", ".join(missing) or None}
+        if statistics:
+            saturated = {name: seen.saturated_fraction for name, seen in statistics.items()}
             worst = max(saturated, key=lambda name: saturated[name])
-            figures["saturated_fraction"] = float(np.mean(list(saturated.values())))
-            figures["saturated_worst_fraction"] = saturated[worst]
-            figures["saturated_worst_sensor"] = worst
-        report = judge(
+            figures |= {
+                "mean_dn": float(np.mean([seen.mean_dn for seen in statistics.values()])),
+                "saturated_fraction": float(np.mean(list(saturated.values()))),
+                "saturated_worst_fraction": saturated[worst],
+                "saturated_worst_sensor": worst,
+                "bright_fraction": bright_level(
+                    [self.rig.sensor(name) for name in level1], list(level1.values())
+                ),
+            }
+        return judge(
             figures,
             capture_flags=conditions.flags,
             missing_sensors=missing,
+            missing_probes=temperatures.missing,
+            probes_out_of_range=temperatures.out_of_range,
             thresholds=self._thresholds,
+            asked=self._asked,
         )
-        return HeadsProduct(heads, report, seconds)
 
     def _map(self, cone: Cone, known: Mapping[str, float]) -> Array:
         """(h, w, 2) float32: where in the raw frame each pixel is; kept while temperatures stay."""

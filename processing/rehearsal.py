@@ -39,6 +39,18 @@ def rehearsal_frames(rig: Rig) -> dict[str, Array]:
     return frames
 
 
+def plain_frames(rig: Rig) -> dict[str, Array]:
+    """Level-0 frames by sensor, (h, w) uint16, for rigs whose images lie in no common plane."""
+    tile = _tile()
+    frames = {}
+    for sensor in rig.sensors:
+        rows, columns = np.arange(sensor.height_px) * 0.5, np.arange(sensor.width_px) * 0.5
+        signal = _periodic(tile, rows, columns) * (sensor.full_scale_dn - sensor.black_dn)
+        words = (sensor.black_dn + signal) * sensor.words_per_dn
+        frames[sensor.name] = words.astype(np.uint16)
+    return frames
+
+
 def rehearsal_radiometry(sensor: Sensor) -> RadiometricCalibration:
     """A calibration with maps and a defect, for a sensor of no flight."""
     shape = (sensor.height_px, sensor.width_px)

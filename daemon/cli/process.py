@@ -13,10 +13,9 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from daemon.cli import bands, heads
+from daemon.cli.level2_tables import print_reports
 from daemon.configuration import ConfigurationError, PlanSection, ProcessingSection
 from daemon.disk.mission import Mission
-from daemon.tables import light_table
 
 HELP = """Process the exposures of a mission folder again, Level-0 to Level-2.
 
@@ -46,9 +45,10 @@ def process(
 ) -> None:
     os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
     from daemon.disk import store
-    from daemon.service.messages import WorkerSettings
-    from daemon.service.worker import make_pipeline, overlaps_of, process_exposure
-    from processing.perspective import looks_apart
+    from daemon.orientation.exterior import mount_of
+    from daemon.products.processor import processor_for
+    from daemon.service.worker import overlaps_of, process_exposure
+    from processing.radiometry.calibration import CalibrationError
     from processing.rig import load_rig
 
     if method not in ("free", "fixed") or interpolation not in ("bilinear", "cubic", "lanczos"):
@@ -58,78 +58,47 @@ def process(
     folder = Mission.open(mission)
     rig = load_rig(folder.rig_path)
     plan, radiometry = as_flown(folder, radiometry)
-    if looks_apart(rig):
-        heads.process(
-            folder,
-            rig,
-            plan,
-            radiometry=radiometry,
-            interpolation=interpolation,
-            only=only or [],
-            as_json=as_json,
-        )
-        return
-    if rig.virtual_image is None:
-        bands.process(folder, rig, plan, radiometry=radiometry, only=only or [], as_json=as_json)
-        return
-    settings = WorkerSettings(
-        rig=str(folder.rig_path),
-        radiometry=radiometry,
-        mission=folder.path,
-        plan=plan,
-        processing=ProcessingSection.model_validate(
-            {
-                "method": method,
-                "interpolation": interpolation,
-                "baselines": baselines,
-                "threads": threads,
-            }
-        ),
+    processing = ProcessingSection.model_validate(
+        {
+            "method": method,
+            "interpolation": interpolation,
+            "baselines": baselines,
+            "threads": threads,
+        }
     )
-    console = Console(stderr=True)
-    pipeline = make_pipeline(rig, settings)
+    mount, _ = mount_of(folder)
     overlaps = overlaps_of(folder, rig)
     reports = []
-    with Progress(console=console, transient=True) as progress:
-        task = progress.add_task("compiling kernels", total=None)
-        pipeline.warm_up()
-        numbers = only or folder.numbers()
-        progress.update(task, description="processing", total=len(numbers))
-        for number in numbers:
-            started = time.monotonic()
-            frames, exposure = store.load_level0(folder.level0(number), rig)
-            report, _ = process_exposure(
-                pipeline,
-                rig,
-                folder,
-                plan,
-                exposure,
-                frames,
-                surroundings=overlaps.of(number),
-            )
-            report["duration_s"] = round(time.monotonic() - started, 3)
-            reports.append(report)
-            progress.advance(task)
+    try:
+        processor = processor_for(rig, folder, processing, radiometry)
+        with Progress(console=Console(stderr=True), transient=True) as progress:
+            task = progress.add_task("compiling kernels", total=None)
+            processor.warm_up()
+            numbers = only or folder.numbers()
+            progress.update(task, description="processing", total=len(numbers))
+            for number in numbers:
+                started = time.monotonic()
+                frames, exposure = store.load_level0(folder.level0(number), rig)
+                report, _ = process_exposure(
+                    processor,
+                    folder,
+                    mount,
+                    plan,
+                    exposure,
+                    frames,
+                    surroundings=overlaps.of(number),
+                )
+                report["duration_s"] = round(time.monotonic() - started, 3)
+                reports.append(report)
+                progress.advance(task)
+    except CalibrationError as error:
+        raise ConfigurationError([str(error)]) from error
     if as_json:
         typer.echo(json.dumps({"mission": str(folder.path), "exposures": reports}))
         return
-    table = light_table(
-        f"Level-2 of {folder.id}",
-        (),
-        ("exposure", "tie points", "sigma0 px", "sigma0 um", "verdict", "s"),
-    )
-    for report in reports:
-        figures = report["figures"]
-        table.add_row(
-            str(report["exposure"]),
-            f"{figures.get('tie_points_pp', 0)} + {figures.get('tie_points_pc', 0)}",
-            f"{figures.get('sigma0_px') or 0:.3f}",
-            f"{figures.get('sigma0_um') or 0:.2f}",
-            report["verdict"],
-            f"{report['duration_s']:.1f}",
-        )
-    Console().print(table)
-    Console().print(f"Products are in [bold]{folder.level2_root}[/]")
+    console = Console()
+    print_reports(console, f"Level-2 of {folder.id}", reports)
+    console.print(f"Products are in [bold]{folder.level2_root}[/]")
 
 
 def as_flown(folder: Mission, radiometry: Path | None) -> tuple[PlanSection, Path | None]:

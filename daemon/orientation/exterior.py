@@ -14,7 +14,7 @@ import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +24,7 @@ from daemon.disk.mission import Mission
 from daemon.disk.records import parse_record
 from daemon.exposure import Exposure, NavigationRecord, from_json
 from daemon.flight.navigation import metres_per_degree
-from daemon.orientation.georeference import Georeference
-from daemon.orientation.trajectory import Trajectory
+from daemon.orientation.georeference import Place
 from processing.geometry.orientation import (
     BODY_FROM_CAMERA,
     grid_from_camera,
@@ -90,6 +89,20 @@ class Unoriented:
     why: Literal["no instant", "no navigation", "no attitude"]
 
 
+class Navigated(Protocol):
+    """Tells navigation at an instant: a trajectory, or one record's."""
+
+    def at(self, gps_ns: int) -> NavigationRecord | None:
+        """None where nothing is known about that instant."""
+
+
+class Placing(Protocol):
+    """Tells where a place is in the coordinate system wanted."""
+
+    def place(self, latitude_deg: float, longitude_deg: float, height_m: float) -> Place:
+        """See `daemon.orientation.georeference.Georeference.place`."""
+
+
 def mount_of(mission: Mission) -> tuple[MountSection, PlanSection]:
     """Mount and plan of the configuration that was flown; defaults where there is none."""
     if not mission.service_path.exists():
@@ -143,8 +156,8 @@ def orient(
     exposure: Exposure,
     rig: Rig,
     mount: MountSection,
-    trajectory: Trajectory,
-    georeference: Georeference,
+    trajectory: Navigated,
+    georeference: Placing,
 ) -> Iterator[ExteriorOrientation | Unoriented]:
     """Orient every cone of an exposure, the one the image belongs to first.
 
@@ -174,7 +187,7 @@ def _oriented(
     mount: MountSection,
     there: NavigationRecord,
     level_from_imu: Array,
-    georeference: Georeference,
+    georeference: Placing,
 ) -> ExteriorOrientation:
     roll, pitch, heading = (math.radians(angle) for angle in mount.boresight_deg)
     imu_from_body = level_from_body(roll, pitch, heading)

@@ -5,7 +5,7 @@ What the bands are is made by `processing.band_pipeline`; here they get their fi
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -13,14 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.configuration import PlanSection
-from daemon.disk.level2 import jpeg_bytes, write_folder
 from daemon.disk.mission import Mission
 from daemon.disk.records import canonical_bytes
 from daemon.exposure import Exposure
-from daemon.products.conditions import conditions_of
-from processing.band_pipeline import BandPipeline, BandProduct, FrameSettings
-from processing.quality.report import Flag, as_json
+from daemon.products.reports import Contents, Made, pictures, report_json
+from processing.band_pipeline import BandPipeline, FrameSettings
+from processing.conditions import Conditions
+from processing.image.band_registration import RegisteredBand
 from processing.radiometry.calibration import CalibrationError
 from processing.radiometry.radiance import RadianceCalibration, load_radiance
 from processing.rig import Rig
@@ -29,88 +28,96 @@ RADIOMETRY = "radiometry"
 _QUICKLOOK_BANDS = ("red", "green", "blue")
 
 
-def make_band_pipeline(
+def radiance_of(
     rig: Rig, mission: Mission, radiometry: Path | None
-) -> tuple[BandPipeline, dict[str, RadianceCalibration]]:
-    """The pipeline with the radiance calibrations of a folder, by default the mission's own.
+) -> dict[str, RadianceCalibration]:
+    """The radiance calibrations of a folder by sensor name, by default the mission's own.
 
     Raises:
         CalibrationError: a file that cannot be used, or a folder that is told and not there.
-        ValueError: a rig whose cones hold no single bands.
     """
     if radiometry is not None and not radiometry.is_dir():
         raise CalibrationError(f"{radiometry}: no such folder; give one with <sensor>.json")
     folder = radiometry or mission.path / RADIOMETRY
-    radiance = {
+    return {
         sensor.name: load_radiance(folder / f"{sensor.name}.json")
         for sensor in rig.sensors
         if (folder / f"{sensor.name}.json").exists()
     }
-    return BandPipeline(rig, radiance), radiance
 
 
-def process_bands(
-    pipeline: BandPipeline,
-    radiance: Mapping[str, RadianceCalibration],
-    mission: Mission,
-    plan: PlanSection,
-    exposure: Exposure,
-    frames: Mapping[str, NDArray[np.uint16]],
-) -> tuple[dict[str, Any], BandProduct]:
-    """Run one exposure and write its Level-2 folder.
+class BandsProcessor:
+    """One raster a band, as the worker wants it (`daemon.products.processor`).
 
-    Returns:
-        The content of quality.json, and the product.
+    Args:
+        radiance: by sensor name, those the pipeline has: wavelengths go into the files.
     """
-    rig = pipeline.rig
-    product = pipeline.process(
-        frames,
-        conditions_of(exposure, rig, plan, Flag(0)),
-        {frame.sensor: _told(frame.settings) for frame in exposure.frames},
-    )
-    report = as_json(product.report)
-    report["exposure"] = exposure.number
-    report["timings_s"] = {stage: round(s, 4) for stage, s in product.timings_s.items()}
-    report["reference"] = product.reference
-    report["units"] = dict(product.units)
-    report["bands"] = [
-        {
-            "band": band.band,
-            "registered": band.registered,
-            "points": band.points,
-            "sought": band.sought,
-            "rms_px": band.rms_px,
-            "rms_x_px": band.rms_x_px,
-            "rms_y_px": band.rms_y_px,
-            "shift_px": list(band.shift_px),
-            "band_from_reference": band.band_from_reference.tolist(),
-        }
-        for band in product.registrations
-    ]
-    contents: dict[str, Sequence[bytes | memoryview]] = {}
-    for cone in rig.cones:
-        name = cone.bands[0]
-        if name not in product.bands:
-            continue
-        about = {
-            "band": name,
-            "exposure": exposure.number,
-            "reference": product.reference,
-            "unit": product.units[name],
-            "f_mm": product.image.f_mm,
-            "pitch_um": product.image.pitch_um,
-        }
-        if (calibration := radiance.get(cone.sensors[0].name)) is not None:
-            about["wavelength_nm"] = calibration.wavelength_nm
-            about["bandwidth_nm"] = calibration.bandwidth_nm
-        contents[f"{name}.tif"] = [_tiff(product.bands[name], about)]
-        mask_about = {"band": name, "exposure": exposure.number, "bits": ["valid", "saturated"]}
-        contents[f"{name}-mask.tif"] = [_tiff(product.masks[name], mask_about)]
-    if product.bands:
-        contents["quicklook.jpg"] = [jpeg_bytes(_quicklook(product.bands))]
-    contents["quality.json"] = [canonical_bytes(report)]
-    write_folder(mission.level2(exposure.number), contents)
-    return report, product
+
+    def __init__(self, pipeline: BandPipeline, radiance: Mapping[str, RadianceCalibration]) -> None:
+        self.pipeline = pipeline
+        self._radiance = radiance
+
+    @property
+    def rig(self) -> Rig:
+        return self.pipeline.rig
+
+    def warm_up(self) -> None:
+        self.pipeline.warm_up()
+
+    def twin(self) -> BandsProcessor:
+        return BandsProcessor(self.pipeline.twin(), self._radiance)
+
+    def make(
+        self,
+        exposure: Exposure,
+        frames: Mapping[str, NDArray[np.uint16]],
+        conditions: Conditions,
+        *,
+        frames_read: Callable[[], None] | None = None,
+    ) -> Made:
+        settings = {frame.sensor: _told(frame.settings) for frame in exposure.frames}
+        product = self.pipeline.process(frames, conditions, settings, frames_read=frames_read)
+        report = report_json(product.report, exposure.number, product.timings_s)
+        report["reference"] = product.reference
+        report["units"] = dict(product.units)
+        report["bands"] = [_registration(band) for band in product.registrations]
+        contents: Contents = {}
+        for cone in self.rig.cones:
+            name = cone.bands[0]
+            if name not in product.bands:
+                continue
+            about = {
+                "band": name,
+                "exposure": exposure.number,
+                "reference": product.reference,
+                "unit": product.units[name],
+                "f_mm": product.image.f_mm,
+                "pitch_um": product.image.pitch_um,
+            }
+            if (calibration := self._radiance.get(cone.sensors[0].name)) is not None:
+                about["wavelength_nm"] = calibration.wavelength_nm
+                about["bandwidth_nm"] = calibration.bandwidth_nm
+            contents[f"{name}.tif"] = [_tiff(product.bands[name], about)]
+            about = {"band": name, "exposure": exposure.number, "bits": ["valid", "saturated"]}
+            contents[f"{name}-mask.tif"] = [_tiff(product.masks[name], about)]
+        if product.bands:
+            contents |= pictures(_quicklook(product.bands))
+        contents["quality.json"] = [canonical_bytes(report)]
+        return report, contents
+
+
+def _registration(band: RegisteredBand) -> dict[str, Any]:
+    return {
+        "band": band.band,
+        "registered": band.registered,
+        "points": band.points,
+        "sought": band.sought,
+        "rms_px": band.rms_px,
+        "rms_x_px": band.rms_x_px,
+        "rms_y_px": band.rms_y_px,
+        "shift_px": list(band.shift_px),
+        "band_from_reference": band.band_from_reference.tolist(),
+    }
 
 
 def _told(settings: Mapping[str, float | int | str]) -> FrameSettings:

@@ -5,58 +5,65 @@ What they are is made by `processing.perspective`; here they get their files.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.configuration import PlanSection
 from daemon.disk.level0 import tiff_parts
-from daemon.disk.level2 import jpeg_bytes, write_folder
-from daemon.disk.mission import Mission
 from daemon.disk.records import canonical_bytes
 from daemon.exposure import Exposure
-from daemon.products.conditions import conditions_of
+from daemon.products.reports import Contents, Made, pictures, report_json
+from processing.conditions import Conditions
 from processing.perspective import HeadPipeline, HeadsProduct
-from processing.quality.report import Flag, as_json
+from processing.rig import Rig
 
 _TILE_PX = 480
 _RGB = ("red", "green", "blue")
 
 
-def process_heads(
-    pipeline: HeadPipeline,
-    mission: Mission,
-    plan: PlanSection,
-    exposure: Exposure,
-    frames: Mapping[str, NDArray[np.uint16]],
-) -> tuple[dict[str, Any], HeadsProduct]:
-    """Run one exposure and write its Level-2 folder: `<cone>.tif`, quick look, report.
+class HeadsProcessor:
+    """Every head an image of its own, as the worker wants it (`daemon.products.processor`)."""
 
-    Returns:
-        The content of quality.json, and the product.
-    """
-    product = pipeline.process(frames, conditions_of(exposure, pipeline.rig, plan, Flag(0)))
-    report = as_json(product.report)
-    report["exposure"] = exposure.number
-    report["timings_s"] = {stage: round(s, 4) for stage, s in product.timings_s.items()}
-    contents: dict[str, Sequence[bytes | memoryview]] = {}
-    for name, head in product.heads.items():
-        about = {
-            "bands": list(head.bands),
-            "exposure": exposure.number,
-            "cone": name,
-            "f_mm": head.image.f_mm,
-            "pitch_um": head.image.pitch_um,
-            "geometry": "strict perspective, principal point at the centre",
-        }
-        contents[f"{name}.tif"] = tiff_parts(list(head.bands.values()), about)
-    if product.heads:
-        contents["quicklook.jpg"] = [jpeg_bytes(_side_by_side(product))]
-    contents["quality.json"] = [canonical_bytes(report)]
-    write_folder(mission.level2(exposure.number), contents)
-    return report, product
+    def __init__(self, pipeline: HeadPipeline) -> None:
+        self.pipeline = pipeline
+
+    @property
+    def rig(self) -> Rig:
+        return self.pipeline.rig
+
+    def warm_up(self) -> None:
+        self.pipeline.warm_up()
+
+    def twin(self) -> HeadsProcessor:
+        return HeadsProcessor(self.pipeline.twin())
+
+    def make(
+        self,
+        exposure: Exposure,
+        frames: Mapping[str, NDArray[np.uint16]],
+        conditions: Conditions,
+        *,
+        frames_read: Callable[[], None] | None = None,
+    ) -> Made:
+        product = self.pipeline.process(frames, conditions, frames_read=frames_read)
+        report = report_json(product.report, exposure.number, product.timings_s)
+        report["heads"] = list(product.heads)
+        contents: Contents = {}
+        for name, head in product.heads.items():
+            about = {
+                "bands": list(head.bands),
+                "exposure": exposure.number,
+                "cone": name,
+                "f_mm": head.image.f_mm,
+                "pitch_um": head.image.pitch_um,
+                "geometry": "strict perspective, principal point at the centre",
+            }
+            contents[f"{name}.tif"] = tiff_parts(list(head.bands.values()), about)
+        if product.heads:
+            contents |= pictures(_side_by_side(product))
+        contents["quality.json"] = [canonical_bytes(report)]
+        return report, contents
 
 
 def _side_by_side(product: HeadsProduct) -> NDArray[np.uint8]:

@@ -25,11 +25,11 @@ from daemon.exposure import Exposure, exposure_bytes
 from daemon.orientation.exterior import mount_of
 from daemon.plan.overlaps import Overlaps
 from daemon.products.conditions import conditions_of
+from daemon.products.processor import Processor, make_products, processor_for
 from daemon.replay.flight import Replayed
 from daemon.service.lanes import Lanes
 from daemon.service.messages import WorkerSettings
-from daemon.service.worker import make_pipeline, make_products, settle_threads
-from processing.pipeline import Pipeline
+from daemon.service.worker import settle_threads
 from processing.quality.report import Flag
 from processing.rig import Rig
 
@@ -71,8 +71,9 @@ def compare_products(
 ) -> None:
     """The images of every exposure that has some, made again with so many exposures in work."""
     settle_threads()
-    pipeline = make_pipeline(rig, settings)
-    pipeline.warm_up()
+    processor = processor_for(rig, mission, settings.processing, settings.radiometry)
+    processor.warm_up()
+    mount, _ = mount_of(mission)
     overlaps = _overlaps(mission, rig, out.records)
     chosen = [
         exposure
@@ -80,15 +81,15 @@ def compare_products(
         if (not only or exposure.number in only) and mission.level2(exposure.number).is_dir()
     ]
 
-    def again(exposure: Exposure, free: Pipeline) -> dict[str, str]:
+    def again(exposure: Exposure, free: Processor) -> dict[str, str]:
         frames, _ = load_level0(mission.level0(exposure.number), rig)
         flags = Flag.PROCESSING_BEHIND if out.deferred.get(exposure.number) else Flag(0)
         surroundings = overlaps.of(exposure.number)
         conditions = conditions_of(exposure, rig, settings.plan, flags, surroundings)
-        _, contents = make_products(free, exposure.number, frames, conditions)
+        _, contents = make_products(free, mount, settings.plan, exposure, frames, conditions)
         return {name: content_hash(name, b"".join(parts)) for name, parts in contents.items()}
 
-    working = Lanes(pipeline, lanes)
+    working = Lanes[Processor](processor, lanes)
     results = [working.submit(partial(again, exposure)) for exposure in chosen]
     for exposure, result in zip(chosen, results, strict=True):
         name = f"L2/{mission.level2(exposure.number).name}"

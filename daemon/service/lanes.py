@@ -1,7 +1,7 @@
-"""Exposures in work side by side: a few pipelines, each with buffers of its own, and their threads.
+"""Exposures in work side by side: a few processors with buffers of their own, and their threads.
 
 One exposure leaves cores idle wherever its work cannot be shared out (adjustment, seams, writing);
-a second one fills them. Every exposure goes through one pipeline alone, so what comes out does not
+a second one fills them. Every exposure goes through one processor alone, so what comes out does not
 depend on what its neighbour does.
 """
 
@@ -10,44 +10,52 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from queue import SimpleQueue
-from typing import TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import numba
-
-from processing.pipeline import Pipeline
 
 Result = TypeVar("Result")
 
 
-class Lanes:
-    """`count` pipelines and as many threads.
+class Twinned(Protocol):
+    """What makes images of one exposure at a time, and can be had several times."""
+
+    def twin(self: Lane) -> Lane:
+        """Another with buffers of its own; calibrations are shared."""
+
+
+Lane = TypeVar("Lane", bound=Twinned)
+
+
+class Lanes(Generic[Lane]):
+    """`count` processors and as many threads.
 
     Args:
-        pipeline: warmed up; the others share its calibrations.
+        first: warmed up; the others share its calibrations.
         count: exposures in work at a time. Where numba has only its own thread pool ("workqueue"),
             which two threads may not enter, it is one.
     """
 
-    def __init__(self, pipeline: Pipeline, count: int) -> None:
+    def __init__(self, first: Lane, count: int) -> None:
         self.count = 1 if numba.threading_layer() == "workqueue" else count
-        self._free: SimpleQueue[Pipeline] = SimpleQueue()
-        self._free.put(pipeline)
+        self._free: SimpleQueue[Lane] = SimpleQueue()
+        self._free.put(first)
         for _ in range(self.count - 1):
-            self._free.put(pipeline.twin())
+            self._free.put(first.twin())
         self._threads = ThreadPoolExecutor(self.count, thread_name_prefix="exposure")
 
-    def submit(self, task: Callable[[Pipeline], Result]) -> Future[Result]:
-        """Run a task with a pipeline of its own, as soon as one is free."""
+    def submit(self, task: Callable[[Lane], Result]) -> Future[Result]:
+        """Run a task with a processor of its own, as soon as one is free."""
         return self._threads.submit(self._run, task)
 
     def end(self) -> None:
         """Finish what is in work and let the threads go."""
         self._threads.shutdown()
 
-    def _run(self, task: Callable[[Pipeline], Result]) -> Result:
-        # There are as many pipelines as threads: one is free whenever a task begins.
-        pipeline = self._free.get_nowait()
+    def _run(self, task: Callable[[Lane], Result]) -> Result:
+        # There are as many as threads: one is free whenever a task begins.
+        lane = self._free.get_nowait()
         try:
-            return task(pipeline)
+            return task(lane)
         finally:
-            self._free.put(pipeline)
+            self._free.put(lane)

@@ -9,26 +9,24 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.configuration import PlanSection
+from daemon.configuration import MountSection, PlanSection
 from daemon.disk import level2, store
 from daemon.disk.mission import Mission
-from daemon.disk.radiometry_folder import RadiometryFolder
 from daemon.disk.records import RecordError
 from daemon.exposure import Exposure
 from daemon.orientation.exterior import exposure_of, mount_of
 from daemon.plan.overlaps import Overlaps, Surroundings
-from daemon.plan.reading import read_plan
 from daemon.products.conditions import conditions_of
+from daemon.products.processor import Processor, histograms_of, make_products, processor_for
 from daemon.service.lanes import Lanes
 from daemon.service.memory import FrameRing
 from daemon.service.messages import (
@@ -43,15 +41,9 @@ from daemon.service.messages import (
     WorkerSettings,
 )
 from daemon.service.processes import Link
-from processing.mosaic.drawing import residuals_svg
-from processing.mosaic.residual_vectors import residual_vectors
-from processing.mosaic.stitch_record import stitch_record, stitch_record_json
-from processing.pipeline import Conditions, Pipeline, Settings
 from processing.quality.judgement import judge
 from processing.quality.report import Flag, as_json
-from processing.quality.specification import Asked
-from processing.radiometry.histogram import sampled_histogram
-from processing.rig import Rig, Sensor, find_rig
+from processing.rig import Rig, find_rig
 
 SWITCH_INTERVAL_S = 0.001
 """How long one thread may hold the interpreter while another waits to enter a kernel."""
@@ -62,11 +54,12 @@ def main(link: Link, settings: WorkerSettings, rings: tuple[FrameRing, ...]) -> 
     started = time.monotonic()
     settle_threads()
     rig = find_rig(settings.rig)
-    pipeline = make_pipeline(rig, settings)
-    pipeline.warm_up()
-    lanes = Lanes(pipeline, settings.processing.exposures_in_work)
     mission = Mission.open(settings.mission)
-    desk = _Desk(link, rig, mission, settings.plan, rings, overlaps_of(mission, rig))
+    processor = processor_for(rig, mission, settings.processing, settings.radiometry)
+    processor.warm_up()
+    lanes = Lanes[Processor](processor, settings.processing.exposures_in_work)
+    mount, _ = mount_of(mission)
+    desk = _Desk(link, rig, mission, mount, settings.plan, rings, overlaps_of(mission, rig))
     link.send(WorkerReady(time.monotonic() - started))
     in_work: set[Future[None]] = set()
     while not isinstance(order := link.receive(timeout_s=1.0), Stop):
@@ -92,41 +85,6 @@ def settle_threads() -> None:
     sys.setswitchinterval(SWITCH_INTERVAL_S)
 
 
-def make_pipeline(rig: Rig, settings: WorkerSettings) -> Pipeline:
-    """The pipeline with the calibrations of its folder; sensors without one are taken as ideal."""
-    folder = settings.radiometry
-    radiometry = None if folder is None else RadiometryFolder(folder, rig)
-    return Pipeline(
-        rig,
-        radiometry,
-        Settings(
-            method=settings.processing.method,
-            interpolation=settings.processing.interpolation,
-            baselines=settings.processing.baselines,
-            geometry=settings.processing.geometry,
-            threads=settings.processing.threads,
-            asked=asked_of(settings.mission),
-        ),
-    )
-
-
-def asked_of(mission: Path) -> Asked:
-    """What the mission's plan asks of every exposure; nothing where there is none."""
-    path = Mission(mission, mission.name).plan_path
-    if path is None:
-        return Asked()
-    wanted = read_plan(path).specification
-    return Asked(
-        forward_overlap=max(0.0, wanted.forward_overlap - wanted.overlap_tolerance),
-        sidelap=max(0.0, wanted.sidelap - wanted.overlap_tolerance),
-        gsd_m=wanted.gsd_m,
-        tilt_deg=wanted.tilt_deg,
-        crab_deg=wanted.crab_deg,
-        sun_deg=wanted.sun_deg,
-        time_sigma_ns=wanted.time_sigma_ns,
-    )
-
-
 def overlaps_of(mission: Mission, rig: Rig) -> Overlaps:
     """The footprints of what has been flown of a mission, as far as its records can be read."""
     mount, plan = mount_of(mission)
@@ -143,9 +101,9 @@ def overlaps_of(mission: Mission, rig: Rig) -> Overlaps:
 
 
 def process_exposure(
-    pipeline: Pipeline,
-    rig: Rig,
+    processor: Processor,
     mission: Mission,
+    mount: MountSection,
     plan: PlanSection,
     exposure: Exposure,
     frames: Mapping[str, NDArray[np.uint16]],
@@ -154,14 +112,14 @@ def process_exposure(
     surroundings: Surroundings | None = None,
     frames_read: Callable[[], None] | None = None,
 ) -> tuple[dict[str, Any], Mapping[str, int]]:
-    """Run the pipeline on one exposure and write its Level-2 folder.
+    """Make the images of one exposure and write its Level-2 folder.
 
     Returns:
         The content of quality.json, and the files written with their sizes in bytes.
     """
-    conditions = conditions_of(exposure, rig, plan, flags, surroundings)
+    conditions = conditions_of(exposure, processor.rig, plan, flags, surroundings)
     report, contents = make_products(
-        pipeline, exposure.number, frames, conditions, frames_read=frames_read
+        processor, mount, plan, exposure, frames, conditions, frames_read=frames_read
     )
     return report, level2.write_folder(mission.level2(exposure.number), contents)
 
@@ -176,69 +134,6 @@ def report_unprocessed(
     return {**report, "exposure": exposure.number}
 
 
-def make_products(
-    pipeline: Pipeline,
-    number: int,
-    frames: Mapping[str, NDArray[np.uint16]],
-    conditions: Conditions,
-    *,
-    frames_read: Callable[[], None] | None = None,
-) -> tuple[dict[str, Any], Mapping[str, Sequence[bytes | memoryview]]]:
-    """Run the pipeline on one exposure.
-
-    `frames_read` is called once the pixels of `frames` are no longer needed.
-
-    Returns:
-        The content of quality.json, and the parts of every file by its name. Pixels among them
-        are the pipeline's buffers and hold until its next exposure.
-    """
-    rig = pipeline.rig
-    histograms = histograms_of(rig, frames)  # before the pipeline lets go of the frames
-    product = pipeline.process(frames, conditions, frames_read=frames_read)
-    report = as_json(product.report)
-    report["exposure"] = number
-    told = product.temperatures
-    stitching = None
-    if product.mosaic.method == "free":
-        stitching = stitch_record_json(
-            stitch_record(
-                rig,
-                product.mosaic,
-                told.placing_c,
-                told.usable_c,
-                product.estimated_dc,
-                bands=product.bands,
-                height_m=conditions.height_above_ground_m,
-            )
-        )
-    report["timings_s"] = {stage: round(s, 4) for stage, s in product.timings_s.items()}
-    contents = level2.level2_contents(
-        number,
-        pan=product.pan,
-        colour=product.colour,
-        quicklook=product.quicklook,
-        report_json=report,
-        geometry=product.geometry,
-        residuals_svg=residuals_svg(rig, product.tie_points, product.mosaic, product.validity),
-        residuals_json=residual_vectors(rig, product.tie_points, product.mosaic),
-        histogram_json={name: list(counts) for name, counts in histograms.items()},
-        mosaic_json=stitching,
-    )
-    return report, contents
-
-
-def histograms_of(rig: Rig, frames: Mapping[str, NDArray[np.uint16]]) -> dict[str, tuple[int, ...]]:
-    """Counts of raw DN by sensor."""
-    return {
-        name: sampled_histogram(frame, _word_bits(rig.sensor(name)))
-        for name, frame in frames.items()
-    }
-
-
-def _word_bits(sensor: Sensor) -> int:
-    return 16 if sensor.justified == "left" else sensor.bits
-
-
 @dataclass(frozen=True)
 class _Desk:
     """What every exposure needs on its way through a lane."""
@@ -246,6 +141,7 @@ class _Desk:
     link: Link
     rig: Rig
     mission: Mission
+    mount: MountSection
     plan: PlanSection
     rings: tuple[FrameRing, ...]
     overlaps: Overlaps
@@ -255,7 +151,7 @@ class _Desk:
         self.overlaps.add(exposure)
         return self.overlaps.of(exposure.number)
 
-    def process(self, order: Process, surroundings: Surroundings, pipeline: Pipeline) -> None:
+    def process(self, order: Process, surroundings: Surroundings, lane: Processor) -> None:
         """Process one exposure and say what became of it."""
         started = time.monotonic()
         exposure = order.exposure
@@ -268,9 +164,9 @@ class _Desk:
                 frames = self._frames_in_memory(exposure, order.slots)
             histograms = histograms_of(self.rig, frames)
             report, files = process_exposure(
-                pipeline,
-                self.rig,
+                lane,
                 self.mission,
+                self.mount,
                 self.plan,
                 exposure,
                 frames,

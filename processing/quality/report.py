@@ -150,6 +150,8 @@ FIGURES: Final[Mapping[str, str]] = {
     "resting_on_calibration": "PAN sensors that tie points place too poorly, supported",
     "smear_along_px": "motion during exposure along track that TDI left, worst PAN cone, pixels",
     "smear_across_px": "the same across track",
+    "smear_worst_head": "without a virtual image: the head whose ground moves farthest; the way's "
+    "length, where the head sees it longest, is smear_along_px",
     "gsd_m": "ground sampling distance of the virtual image",
     "saturated_fraction": "share of saturated pixels, all PAN sensors",
     "saturated_worst_fraction": "the same of the worst sensor",

@@ -23,8 +23,9 @@ from daemon.importers.rededge import (
     import_rededge,
     read_image,
 )
-from daemon.products.bands import make_band_pipeline
+from daemon.products.bands import radiance_of
 from daemon.products.conditions import conditions_of
+from processing.band_pipeline import BandPipeline
 from processing.geometry.placement import vip_mm_from_raw, vip_px_from_mm
 from processing.geometry.projective import apply_projective
 from processing.image.band_registration import band_placements, reference_image
@@ -152,7 +153,8 @@ def test_the_saturation_flag_is_raised_on_the_flight_frame_and_not_on_the_panel(
 @needs_recording
 def test_a_missing_reference_band_leaves_the_others_as_calibrated_and_says_so(processed):
     mission, rig, _ = processed
-    pipeline, radiance = make_band_pipeline(rig, mission, None)
+    radiance = radiance_of(rig, mission, None)
+    pipeline = BandPipeline(rig, radiance)
     frames, exposure = load_level0(mission.level0(2), rig)
     del frames["G"]
     told = conditions_of(exposure, rig, PlanSection.model_validate({}), Flag(0))

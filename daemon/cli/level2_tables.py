@@ -1,0 +1,72 @@
+"""What `syntopic process` prints, by the kind of image that was made."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich.console import Console
+
+from daemon.tables import light_table
+
+Reports = Sequence[Mapping[str, Any]]
+
+
+def print_reports(console: Console, title: str, reports: Reports) -> None:
+    """One table for all exposures, in the columns that their method has figures for."""
+    methods = {report["figures"].get("method") for report in reports}
+    show = _heads if "heads" in methods else _bands if "bands" in methods else _stitched
+    show(console, title, reports)
+
+
+def _stitched(console: Console, title: str, reports: Reports) -> None:
+    table = light_table(
+        title, (), ("exposure", "tie points", "sigma0 px", "sigma0 um", "verdict", "s")
+    )
+    for report in reports:
+        figures = report["figures"]
+        table.add_row(
+            str(report["exposure"]),
+            f"{figures.get('tie_points_pp', 0)} + {figures.get('tie_points_pc', 0)}",
+            f"{figures.get('sigma0_px') or 0:.3f}",
+            f"{figures.get('sigma0_um') or 0:.2f}",
+            report["verdict"],
+            f"{report['duration_s']:.1f}",
+        )
+    console.print(table)
+
+
+def _heads(console: Console, title: str, reports: Reports) -> None:
+    table = light_table(title, ("exposure", "heads"), ("verdict", "s"))
+    for report in reports:
+        heads, seconds = ", ".join(report["heads"]), f"{report['duration_s']:.1f}"
+        table.add_row(str(report["exposure"]), heads, report["verdict"], seconds)
+    console.print(table)
+
+
+def _bands(console: Console, title: str, reports: Reports) -> None:
+    table = light_table(
+        title,
+        (),
+        ("exposure", "band", "tie points", "shift px", "rms px", "rms x", "rms y", "verdict"),
+    )
+    for report in reports:
+        for k, band in enumerate(report["bands"]):
+            table.add_row(
+                str(report["exposure"]) if k == 0 else "",
+                band["band"],
+                f"{band['points']} of {band['sought']}",
+                _px(report["figures"].get(f"{band['band']}_shift_px"), 1),
+                _px(band["rms_px"], 3),
+                _px(band["rms_x_px"], 3),
+                _px(band["rms_y_px"], 3),
+                report["verdict"] if k == 0 else "",
+            )
+    console.print(table)
+    for report in reports:
+        for finding in report["findings"]:
+            console.print(f"Exposure {report['exposure']}: {finding['sentence']}", markup=False)
+
+
+def _px(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"

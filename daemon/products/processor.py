@@ -1,0 +1,151 @@
+"""What makes the images of an exposure, whatever the rig: one interface, chosen by the rig alone.
+
+The worker in flight, `syntopic process` after landing and the replay all come through here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.configuration import MountSection, PlanSection, ProcessingSection
+from daemon.disk.mission import Mission
+from daemon.disk.radiometry_folder import RadiometryFolder
+from daemon.disk.records import canonical_bytes
+from daemon.exposure import Exposure
+from daemon.orientation.in_flight import orientation_json
+from daemon.plan.reading import read_plan
+from daemon.products.bands import BandsProcessor, radiance_of
+from daemon.products.heads import HeadsProcessor
+from daemon.products.reports import Made
+from daemon.products.stitched import StitchedProcessor
+from processing.band_pipeline import BandPipeline
+from processing.perspective import HeadPipeline, looks_apart
+from processing.pipeline import Conditions, Pipeline, Settings
+from processing.quality.specification import Asked
+from processing.radiometry.histogram import sampled_histogram
+from processing.rig import Rig, Sensor
+
+
+class Processor(Protocol):
+    """Frames of one exposure in, the files of its Level-2 folder out; one exposure at a time."""
+
+    @property
+    def rig(self) -> Rig:
+        """The camera."""
+
+    def warm_up(self) -> None:
+        """Compile, or load, every kernel a flight will need."""
+
+    def twin(self) -> Processor:
+        """A second one for another exposure at the same time; calibrations are shared."""
+
+    def make(
+        self,
+        exposure: Exposure,
+        frames: Mapping[str, NDArray[np.uint16]],
+        conditions: Conditions,
+        *,
+        frames_read: Callable[[], None] | None = None,
+    ) -> Made:
+        """Make the images of one exposure and judge it.
+
+        `frames_read` is called once the pixels of `frames` are no longer needed. Pixels in what
+        comes back may be buffers that hold until the next exposure.
+        """
+
+
+def processor_for(
+    rig: Rig, mission: Mission, processing: ProcessingSection, radiometry: Path | None
+) -> Processor:
+    """What makes the images of this rig: stitched, head by head, or band by band.
+
+    Args:
+        radiometry: folder of calibrations; sensors without one are taken as ideal.
+
+    Raises:
+        CalibrationError, ValueError: a calibration that does not fit, or a rig of no known kind.
+    """
+    asked = asked_of(mission)
+    threads = processing.threads
+    if rig.virtual_image is None and not looks_apart(rig):
+        radiance = radiance_of(rig, mission, radiometry)
+        return BandsProcessor(BandPipeline(rig, radiance, threads=threads, asked=asked), radiance)
+    known = None if radiometry is None else RadiometryFolder(radiometry, rig)
+    if rig.virtual_image is None:
+        return HeadsProcessor(
+            HeadPipeline(
+                rig, known, interpolation=processing.interpolation, threads=threads, asked=asked
+            )
+        )
+    return StitchedProcessor(
+        Pipeline(
+            rig,
+            known,
+            Settings(
+                method=processing.method,
+                interpolation=processing.interpolation,
+                baselines=processing.baselines,
+                geometry=processing.geometry,
+                threads=threads,
+                asked=asked,
+            ),
+        )
+    )
+
+
+def make_products(
+    processor: Processor,
+    mount: MountSection,
+    plan: PlanSection,
+    exposure: Exposure,
+    frames: Mapping[str, NDArray[np.uint16]],
+    conditions: Conditions,
+    *,
+    frames_read: Callable[[], None] | None = None,
+) -> Made:
+    """All that Level-2 of one exposure holds: its images, and what is the same for every rig.
+
+    Returns:
+        The content of quality.json, and the parts of every file by its name. Pixels among them
+        hold until the processor's next exposure.
+    """
+    histograms = histograms_of(processor.rig, frames)  # before the frames are let go
+    report, contents = processor.make(exposure, frames, conditions, frames_read=frames_read)
+    told = orientation_json(exposure, processor.rig, mount, plan.ground_height_m)
+    contents["histogram.json"] = [canonical_bytes({k: list(v) for k, v in histograms.items()})]
+    contents["orientation.json"] = [canonical_bytes(told)]
+    return report, contents
+
+
+def histograms_of(rig: Rig, frames: Mapping[str, NDArray[np.uint16]]) -> dict[str, tuple[int, ...]]:
+    """Counts of raw DN by sensor."""
+    return {
+        name: sampled_histogram(frame, _word_bits(rig.sensor(name)))
+        for name, frame in frames.items()
+    }
+
+
+def asked_of(mission: Mission) -> Asked:
+    """What the mission's plan asks of every exposure; nothing where there is none."""
+    path = mission.plan_path
+    if path is None:
+        return Asked()
+    wanted = read_plan(path).specification
+    return Asked(
+        forward_overlap=max(0.0, wanted.forward_overlap - wanted.overlap_tolerance),
+        sidelap=max(0.0, wanted.sidelap - wanted.overlap_tolerance),
+        gsd_m=wanted.gsd_m,
+        tilt_deg=wanted.tilt_deg,
+        crab_deg=wanted.crab_deg,
+        sun_deg=wanted.sun_deg,
+        time_sigma_ns=wanted.time_sigma_ns,
+    )
+
+
+def _word_bits(sensor: Sensor) -> int:
+    return 16 if sensor.justified == "left" else sensor.bits

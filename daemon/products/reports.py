@@ -1,0 +1,32 @@
+"""What every kind of Level-2 has in common: its report, quick look and files by name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.disk.level2 import jpeg_bytes, thumbnail_bytes
+from processing.quality.report import QualityReport, as_json
+
+Contents: TypeAlias = dict[str, Sequence[bytes | memoryview]]
+Made: TypeAlias = tuple[dict[str, Any], Contents]
+"""The content of quality.json, and the parts of every file by its name."""
+
+
+def report_json(
+    report: QualityReport, number: int, timings_s: Mapping[str, float]
+) -> dict[str, Any]:
+    """The content of quality.json, as far as it is the same for every rig."""
+    timings = {stage: round(seconds, 4) for stage, seconds in timings_s.items()}
+    return {**as_json(report), "exposure": number, "timings_s": timings}
+
+
+def pictures(quicklook: NDArray[np.uint8]) -> Contents:
+    """The quick look and its thumbnail."""
+    return {
+        "quicklook.jpg": [jpeg_bytes(quicklook)],
+        "thumbnail.jpg": [thumbnail_bytes(quicklook)],
+    }
