@@ -252,6 +252,7 @@ class Service:
         else:
             self.pipeline.not_stored(failed.number)
             self.flight.not_stored(failed.number, failed.sentence)
+            self._event("lost", number=failed.number, cause=failed.sentence)
             said = {"sentence": failed.sentence}
             self._decided(Decision("not-stored", time.monotonic_ns(), failed.number, said))
 

@@ -87,7 +87,14 @@ def record(command: Sequence[str], folder: Path, log: Path, *, cwd: Path) -> lis
     ]
 
 
-def run_ill(command: Sequence[str], faults: Sequence[str], trace: Path, *, cwd: Path) -> int:
+def run_ill(
+    command: Sequence[str],
+    faults: Sequence[str],
+    trace: Path,
+    *,
+    cwd: Path,
+    said: Path = Path("/dev/stdout"),
+) -> int:
     """Run a program some of whose calls fail or wait; how many did.
 
     Args:
@@ -96,13 +103,15 @@ def run_ill(command: Sequence[str], faults: Sequence[str], trace: Path, *, cwd: 
             counted in each thread for itself.
         trace: the recorder's own file.
         cwd: where the program runs.
+        said: where it prints.
     """
     assert STRACE is not None
     calls = ",".join(fault.partition(":")[0] for fault in faults)
     traced = [STRACE, "-f", "--seccomp-bpf", "-qq", "-o", str(trace), "-e", f"trace={calls}"]
     for fault in faults:
         traced += ["-e", f"inject={fault}"]
-    subprocess.run([*traced, *command], cwd=cwd, check=True, timeout=300)
+    with said.open("w") as out:
+        subprocess.run([*traced, *command], cwd=cwd, stdout=out, check=True, timeout=300)
     return sum("INJECTED" in line or "DELAYED" in line for line in trace.open())
 
 

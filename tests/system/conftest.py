@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from tests.system.flown import Flown, fly
@@ -10,3 +12,10 @@ from tests.system.flown import Flown, fly
 @pytest.fixture(scope="session")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
     return fly(tmp_path_factory.mktemp("first-flight"))
+
+
+@pytest.fixture(scope="session")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where emulators of one session keep the ground they have built, for those that fly over it
+    again."""
+    return tmp_path_factory.mktemp("scenes")

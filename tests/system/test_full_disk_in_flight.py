@@ -17,11 +17,12 @@ pytestmark = [pytest.mark.system, pytest.mark.timeout(400)]
 
 
 @pytest.mark.skipif(REASON is not None, reason=f"no namespace with a disk of its own: {REASON}")
-def test_a_full_disk_costs_exposures_and_never_the_service(tmp_path: Path) -> None:
+def test_a_full_disk_costs_exposures_and_never_the_service(tmp_path: Path, scenes: Path) -> None:
     rig = "ultracam-l-mini"
     arguments = simulator_arguments(rig, tmp_path / "sim", seed=4, dc=0, displace=[])
     address = free_first_address()
-    emulator = Emulator([*arguments, "--first-address", address, "--exposures", "8"])
+    arguments += ["--first-address", address, "--exposures", "8", "--scene-cache", str(scenes)]
+    emulator = Emulator(arguments)
     config = tmp_path / "service.toml"
     disk = tmp_path / "missions"
     disk.mkdir()

@@ -24,18 +24,20 @@ LIFE_LIMIT_S = 60.0
 
 
 def kill_in_flight(
-    folder: Path, kills: int, seed: int, *, every: int, scene: int = 8
+    folder: Path, scenes: Path, kills: int, seed: int, *, every: int, scene: int = 8
 ) -> dict[str, object]:
     """Kill a flight so often; every so many lives one lives until it has stored something.
 
     What was told stored, sealed or triggered is held against the disk at the end; the ledger and
-    `syntopic verify` as well. `scene` is how many exposures of ground the emulator builds.
+    `syntopic verify` as well. `scene` is how many exposures of ground the emulator builds,
+    `scenes` where it keeps them.
     """
     dice = random.Random(seed)
     rig = "ultracam-l-mini"
     arguments = simulator_arguments(rig, folder / "sim", seed=4, dc=0, displace=[])
     address = free_first_address()
-    emulator = Emulator([*arguments, "--first-address", address, "--exposures", str(scene)])
+    arguments += ["--first-address", address, "--exposures", str(scene)]
+    emulator = Emulator([*arguments, "--scene-cache", str(scenes)])
     config = folder / "service.toml"
     config.write_text(service_toml(emulator.ready, root="missions"))
     told: dict[str, set[int]] = {"triggered": set(), "stored": set(), "sealed": set()}
@@ -122,13 +124,13 @@ def _start(config: Path) -> subprocess.Popen[str]:
     return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
 
 
-def test_25_kills_lose_nothing_that_was_acknowledged(tmp_path: Path) -> None:
-    figures = kill_in_flight(tmp_path, 25, 1, every=4)
+def test_25_kills_lose_nothing_that_was_acknowledged(tmp_path: Path, scenes: Path) -> None:
+    figures = kill_in_flight(tmp_path, scenes, 25, 1, every=4)
     assert figures["kills"] == 25 and int(str(figures["killed in flight"])) >= 6
 
 
 @pytest.mark.soak
 @pytest.mark.timeout(7200)
-def test_500_kills_lose_nothing_that_was_acknowledged(tmp_path: Path) -> None:
-    figures = kill_in_flight(tmp_path, 500, 2, every=2, scene=40)
+def test_500_kills_lose_nothing_that_was_acknowledged(tmp_path: Path, scenes: Path) -> None:
+    figures = kill_in_flight(tmp_path, scenes, 500, 2, every=4, scene=40)
     assert figures["kills"] == 500 and int(str(figures["killed in flight"])) >= 100
