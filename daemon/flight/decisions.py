@@ -52,11 +52,15 @@ def decision_of(message: Message) -> Decision | None:
 
 @dataclass(frozen=True)
 class Tick:
-    """What fell due at an instant: exposures to store, given up (number, cause), and to seal."""
+    """What fell due at an instant: exposures to store, given up (number, cause), and to seal.
+
+    `foreseen` is the record of one that is only not sealed yet because its mark is the first.
+    """
 
     to_store: tuple[ToStore, ...]
     given_up: tuple[tuple[int, str], ...]
     to_seal: Exposure | None
+    foreseen: Exposure | None
     asked_to_seal: bool
     resolved: int
 
@@ -67,14 +71,16 @@ class Tick:
             "store": [due.capture.number for due in self.to_store],
             "given_up": [number for number, _ in self.given_up],
             "seal": None if self.to_seal is None else self.to_seal.number,
+            "foreseen": None if self.foreseen is None else self.foreseen.number,
             "resolved": self.resolved,
         }
         return {**told, "asked_to_seal": self.asked_to_seal} if any(told.values()) else None
 
 
-def tick(flight: Flight, mono_ns: int, *, may_seal: bool) -> Tick:
+def tick(flight: Flight, mono_ns: int, *, may_seal: bool, may_foresee: bool = True) -> Tick:
     """What falls due now; `may_seal`: no record is on its way to the disk."""
     to_store = tuple(flight.due_to_store(mono_ns))
     given_up = tuple(flight.due_to_give_up(mono_ns))
     to_seal = flight.due_to_seal(mono_ns) if may_seal else None
-    return Tick(to_store, given_up, to_seal, may_seal, len(flight.resolved_marks))
+    foreseen = flight.due_to_foresee() if may_seal and may_foresee and to_seal is None else None
+    return Tick(to_store, given_up, to_seal, foreseen, may_seal, len(flight.resolved_marks))

@@ -94,6 +94,7 @@ TABLE: Final[Sequence[Entry]] = (
     Entry("triggered", "note", "An exposure was ordered.", _NOTHING),
     Entry("stored", "note", "Its frames are on disk.", _NOTHING),
     Entry("sealed", "note", "Its record is on disk.", _NOTHING),
+    Entry("judged", "note", "Its verdict is known; the products are being written.", _NOTHING),
     Entry("processed", "note", "It has products and a verdict.", _NOTHING),
     Entry(
         "lost",

@@ -74,6 +74,7 @@ class _Open:
     strip_id: str = ""
     handed_to_disk: Capture | None = None
     stored: Capture | None = None
+    foreseen: tuple[EventMark, Flag, Exposure] | None = None
     lost: str = ""
 
 
@@ -297,12 +298,29 @@ class Flight:
             return None
         waited_ns = mono_ns - exposure.ordered_mono_ns
         is_patient = waited_ns <= self.limits.mark_timeout_s * NS
-        mark = self._matcher.mark_of(exposure.number)
-        has_navigation = mark is not None and self.track.reaches(mark.gps_ns)
         is_sure = self._matcher.marks.is_corroborated(exposure.number)
-        if is_patient and not (has_navigation and is_sure):
+        if is_patient and not (is_sure and self._has_navigation(exposure)):
             return None
         return self._seal(exposure, exposure.stored)
+
+    def due_to_foresee(self) -> Exposure | None:
+        """The oldest open exposure where nothing but a second mark is awaited; returned once.
+
+        It is sealed with this very record unless that mark makes its own another's.
+        """
+        exposure = next(iter(self._open.values()), None)
+        if exposure is None or exposure.stored is None or exposure.lost or exposure.foreseen:
+            return None
+        mark = self._matcher.mark_of(exposure.number)
+        if mark is None or not self._has_navigation(exposure):
+            return None
+        record = self._compose(exposure, exposure.stored, mark)
+        exposure.foreseen = mark, exposure.flags, record
+        return record
+
+    def _has_navigation(self, exposure: _Open) -> bool:
+        mark = self._matcher.mark_of(exposure.number)
+        return mark is not None and self.track.reaches(mark.gps_ns)
 
     def sealed(self, number: int, state: RecordState) -> None:
         """The record is on disk: the exposure is closed."""
@@ -385,7 +403,13 @@ class Flight:
         if mark is None and self._matcher.marks.has_ambiguous(exposure.number):
             exposure.flags |= Flag.MARK_AMBIGUOUS
         self._matcher.marks.seal(exposure.number)
-        record = compose(
+        if exposure.foreseen is not None and exposure.foreseen[:2] == (mark, exposure.flags):
+            return exposure.foreseen[2]
+        record = self._compose(exposure, stored, mark)
+        return record if state is None else replace(record, state=state)
+
+    def _compose(self, exposure: _Open, stored: Capture, mark: EventMark | None) -> Exposure:
+        return compose(
             self.rig,
             stored,
             exposure.pulse,
@@ -394,7 +418,6 @@ class Flight:
             self.temperatures,
             exposure.flags,
         )
-        return record if state is None else replace(record, state=state)
 
 
 def _in_order(frames: Mapping[str, Frame], heads: Iterable[str]) -> dict[str, Frame]:

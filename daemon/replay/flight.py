@@ -181,7 +181,8 @@ class _Run:
 
     def _tick(self, decision: Decision) -> None:
         may_seal = bool(decision.detail.get("asked_to_seal"))
-        due = tick(self._flight, decision.mono_ns, may_seal=may_seal)
+        may_foresee = decision.detail.get("foreseen") is not None
+        due = tick(self._flight, decision.mono_ns, may_seal=may_seal, may_foresee=may_foresee)
         self._flight.resolved_marks.clear()
         self._flight.idle_slots.clear()
         self._captures |= {one.capture.number: one.capture for one in due.to_store}
@@ -223,7 +224,7 @@ class _Run:
         self._out.deferred[decision.number] = bool(decision.detail.get("deferred"))
 
 
-_COMPARED = {"store": "stores", "given_up": "given up", "seal": "seals"}
+_COMPARED = {"store": "stores", "given_up": "given up", "seal": "seals", "foreseen": "foreseen"}
 _HANDLERS: Mapping[str, Callable[[_Run, Decision], None]] = {
     "order": _Run._order,
     "not-fired": _Run._not_fired,

@@ -220,10 +220,22 @@ class WorkerSettings:
 
 @dataclass(frozen=True)
 class Process:
-    """Process this exposure; `slots` by head, or None to read Level-0."""
+    """Process this exposure; `slots` by head, or None to read Level-0.
+
+    While it is not sealed its verdict may be told, but nothing is written: `Settled` follows.
+    """
 
     exposure: Exposure
     slots: Mapping[str, int] | None
+    is_sealed: bool = True
+
+
+@dataclass(frozen=True)
+class Settled:
+    """What became of an exposure that was begun unsealed: its record, or None for none."""
+
+    number: int
+    exposure: Exposure | None
 
 
 # From the worker
@@ -241,6 +253,14 @@ class FramesRead:
     """The frames of this exposure are no longer needed in memory; it is still in work."""
 
     number: int
+
+
+@dataclass(frozen=True)
+class Judged:
+    """The verdict is known, its products are not written yet; `report` as in `Processed`."""
+
+    number: int
+    report: Mapping[str, Any]
 
 
 @dataclass(frozen=True)

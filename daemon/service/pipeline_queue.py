@@ -16,11 +16,13 @@ from daemon.flight.decisions import Decision
 from daemon.service.hearing import Tell
 from daemon.service.messages import (
     FramesRead,
+    Judged,
     NoteProducts,
     Process,
     Processed,
     ProcessFailed,
     Recycle,
+    Settled,
     WorkerReady,
 )
 
@@ -31,6 +33,7 @@ class _Waiting:
 
     exposure: Exposure
     slots: Mapping[str, int] | None
+    is_sealed: bool = True
 
 
 class PipelineQueue:
@@ -59,6 +62,7 @@ class PipelineQueue:
         self._seen = seen
         self.is_ready = False
         self._in_work: set[int] = set()
+        self._unsealed: set[int] = set()
         self._waiting: deque[_Waiting] = deque()
         self._in_memory: dict[int, Mapping[str, int]] = {}
 
@@ -79,10 +83,36 @@ class PipelineQueue:
         """The disk refused the frames; the flight hands back their slots."""
         self._in_memory.pop(number, None)
 
+    def foreseen(self, exposure: Exposure) -> None:
+        """An exposure may be begun; its record is as good as certain, and `sealed` will follow."""
+        self._unsealed.add(exposure.number)
+        self._wait(exposure, is_sealed=False)
+
     def sealed(self, exposure: Exposure) -> None:
-        """An exposure may be processed."""
-        self._waiting.append(_Waiting(exposure, self._in_memory.get(exposure.number)))
+        """An exposure may be processed, and its products written."""
+        if exposure.number in self._unsealed and not self._forget(exposure.number):
+            self._send("worker", Settled(exposure.number, exposure))
+        else:
+            self._wait(exposure, is_sealed=True)
+
+    def not_sealed(self, number: int) -> None:
+        """The disk has no record of it: what was begun comes to nothing."""
+        if number in self._unsealed and not self._forget(number):
+            self._send("worker", Settled(number, None))
+        self._is_done(number)
+
+    def _wait(self, exposure: Exposure, *, is_sealed: bool) -> None:
+        slots = self._in_memory.get(exposure.number)
+        self._waiting.append(_Waiting(exposure, slots, is_sealed))
         self._feed()
+
+    def _forget(self, number: int) -> bool:
+        """An unsealed exposure is one no longer; whether it was still waiting, and does not now."""
+        self._unsealed.discard(number)
+        waiting = [task for task in self._waiting if task.exposure.number != number]
+        was_waiting = len(waiting) < len(self._waiting)
+        self._waiting = deque(waiting)
+        return was_waiting
 
     def hear(self, message: object) -> bool:
         """Take in a message of the worker; False where it is not from there."""
@@ -104,6 +134,9 @@ class PipelineQueue:
     def _on_frames_read(self, read: FramesRead) -> None:
         if read.number in self._in_memory:
             self.recycle(self._in_memory.pop(read.number))
+
+    def _on_judged(self, judged: Judged) -> None:
+        self._tell("judged", number=judged.number, report=dict(judged.report))
 
     def _on_processed(self, done: Processed) -> None:
         seconds = round(done.duration_s, 3)
@@ -135,12 +168,13 @@ class PipelineQueue:
             self._in_work.add(number)
             now_ns = time.monotonic_ns()
             self._decided(Decision("process", now_ns, number, {"deferred": deferred}))
-            self._send("worker", Process(task.exposure, task.slots))
+            self._send("worker", Process(task.exposure, task.slots, task.is_sealed))
 
 
 _HANDLERS: Mapping[type, Callable[[PipelineQueue, Any], None]] = {
     WorkerReady: PipelineQueue._on_worker_ready,
     FramesRead: PipelineQueue._on_frames_read,
+    Judged: PipelineQueue._on_judged,
     Processed: PipelineQueue._on_processed,
     ProcessFailed: PipelineQueue._on_failed,
 }

@@ -53,9 +53,7 @@ from daemon.service.preflight import AT_ONCE, Preflight
 from daemon.service.supervisor import Supervisor
 from daemon.service.watching import NAME as WATCH
 from daemon.service.watching import Watching, status_event, summary
-from drivers.contract import (
-    Record,
-)
+from drivers.contract import Record
 from processing.rig import Rig
 
 TICK_S = 0.05
@@ -128,8 +126,7 @@ class Service:
             await self._land(tasks)
             await self._keep_unhandled()
             self.flight.land()
-            left = self.flight.ledger.imbalances(has_landed=True)
-            if left:
+            if left := self.flight.ledger.imbalances(has_landed=True):
                 self._event("ledger", fault=True, sentence=f"not settled: {'; '.join(left)}")
         if self.failure is None:
             mission.close()
@@ -247,6 +244,7 @@ class Service:
             else:
                 # Recovery seals it from the log when the service starts next.
                 self.flight.not_sealed(failed.number, self.sealing.state)
+                self.pipeline.not_sealed(failed.number)
                 self._decided(Decision("not-sealed", time.monotonic_ns(), failed.number))
             self.sealing = None
         else:
@@ -314,6 +312,8 @@ class Service:
             if self.exposure.apply():
                 self.line.exposes_for(self.exposure.times_ns)
             self.hearing.tell_of_time(now_ns - self.hurry_ns)
+            if due.foreseen is not None:
+                self.pipeline.foreseen(due.foreseen)
             if due.to_seal is not None:
                 self.sealing = due.to_seal
                 self.supervisor.send("writer", Seal(due.to_seal))

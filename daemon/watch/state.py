@@ -85,7 +85,7 @@ class FlightState:
         handler = _HANDLERS.get(kind)
         if handler is not None:
             handler(self, event)
-        if kind not in ("status", "processed"):
+        if kind not in ("status", "judged", "processed"):
             self._events.append({"sequence": self.sequence, **event})
 
     def brief(self) -> Json:
@@ -215,13 +215,19 @@ class FlightState:
             told["footprint"] = self._footprint(event["navigation"])
             told["place"] = {key: event["navigation"].get(key) for key in PLACE_KEYS}
 
-    def _on_processed(self, event: Mapping[str, Any]) -> None:
+    def _on_judged(self, event: Mapping[str, Any]) -> None:
+        """The verdict, before there are pictures to it."""
         told = self._exposure(event)
         report = event.get("report", {})
-        figures = report.get("figures", {})
-        told["step"] = "processed"
         _judge(told, report)
+        figures = report.get("figures", {})
         told["figures"] = {key: figures[key] for key in FIGURES_TOLD if key in figures}
+
+    def _on_processed(self, event: Mapping[str, Any]) -> None:
+        self._on_judged(event)
+        told = self._exposure(event)
+        figures = event.get("report", {}).get("figures", {})
+        told["step"] = "processed"
         told["duration_s"] = event.get("duration_s")
         self._history.append(
             {
@@ -311,6 +317,7 @@ _HANDLERS: Mapping[str, Callable[[FlightState, Mapping[str, Any]], None]] = {
     "exposure-settings": FlightState._on_exposure_settings,
     "stored": FlightState._on_stored,
     "sealed": FlightState._on_sealed,
+    "judged": FlightState._on_judged,
     "processed": FlightState._on_processed,
     "not-processed": FlightState._on_not_processed,
     "not-written": FlightState._on_not_written,

@@ -10,6 +10,7 @@ from typing import Any
 
 from daemon.configuration import from_mapping
 from daemon.service.messages import WriteFailed
+from daemon.service.pipeline_queue import PipelineQueue
 from daemon.service.service import SEAL_RETRY_NS, Service
 from tests.daemon.flight.test_flight import (
     HEADS,
@@ -52,6 +53,7 @@ def test_the_service_asks_again_after_a_second_and_closes_nothing(tmp_path: Path
     made, now_ns = flown()
     service.flight = made
     service.mission = SimpleNamespace(path=tmp_path)  # type: ignore[assignment]
+    service.pipeline = PipelineQueue(1, lambda _name, _message: None, service._event)
     service.sealing = made.due_to_seal(now_ns)
     before_ns = time.monotonic_ns()
     service._on_write_failed(WriteFailed(1, "the disk is full", may_pass=True))

@@ -348,3 +348,35 @@ def test_holdover_is_told_with_cause_and_cure_and_flagged_and_ends() -> None:
     flying.pps(PpsEdge("gnss", 30, 25 * NS, 1_000))
     (back,) = flying.clock_events(25 * NS)
     assert back.name == "pps-holdover" and not back.is_fault
+
+
+def test_an_exposure_that_only_waits_for_a_second_mark_is_foreseen_as_it_is_sealed() -> None:
+    flying = flight(has_pps=False)
+    first, second = fly_one(flying, 1, 0.0), fly_one(flying, 2, 2.0)
+    flying.stored(1, flying.due_to_store(NS)[0].capture.frames)
+    assert flying.due_to_foresee() is None, "it has no mark yet"
+    flying.mark(mark(first))
+    assert flying.due_to_foresee() is None, "the position beyond the mark is awaited"
+    flying.navigation(nav(0.2))
+    foreseen = flying.due_to_foresee()
+    assert foreseen is not None and foreseen.mark_source == "event-mark"
+    assert flying.due_to_foresee() is None, "it is told once"
+    assert flying.due_to_seal(NS) is None, "and not sealed yet"
+    flying.temperature(TemperatureSample("cone", 44.0, NS))
+    flying.mark(mark(second))
+    assert seal(flying, 3 * NS) is foreseen, "what is learned later does not make it another"
+
+
+def test_what_was_foreseen_with_a_mark_that_was_noise_is_sealed_without_it() -> None:
+    flying = flight(has_pps=False)
+    given = [fly_one(flying, number, 2.0 * (number - 1)) for number in (1, 2, 3)]
+    flying.stored(1, flying.due_to_store(NS)[0].capture.frames)
+    flying.mark(replace(mark(given[0]), gps_ns=mark(given[0]).gps_ns + 200_000_000, count=0))
+    flying.navigation(nav(1.0))
+    foreseen = flying.due_to_foresee()
+    assert foreseen is not None
+    flying.mark(mark(given[1]))
+    flying.mark(mark(given[2]))
+    flying.navigation(nav(4.5))
+    exposure = seal(flying, 5 * NS)
+    assert exposure != foreseen and exposure.mark_source == "interpolated"
