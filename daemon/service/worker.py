@@ -11,8 +11,9 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
+from queue import Empty, SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -27,15 +28,18 @@ from daemon.orientation.exterior import exposure_of, mount_of
 from daemon.plan.overlaps import Overlaps, Surroundings
 from daemon.products.conditions import conditions_of
 from daemon.products.processor import Processor, histograms_of, make_products, processor_for
+from daemon.products.reports import Made
 from daemon.service.lanes import Lanes
 from daemon.service.memory import FrameRing
 from daemon.service.messages import (
     FramesRead,
+    Judged,
     Ping,
     Pong,
     Process,
     Processed,
     ProcessFailed,
+    Settled,
     Stop,
     WorkerReady,
     WorkerSettings,
@@ -47,6 +51,8 @@ from processing.rig import Rig, find_rig
 
 SWITCH_INTERVAL_S = 0.001
 """How long one thread may hold the interpreter while another waits to enter a kernel."""
+SETTLED_WITHIN_S = 3600.0
+"""A disk that refuses a record is asked again and again; its products wait as long as that."""
 
 
 def main(link: Link, settings: WorkerSettings, rings: tuple[FrameRing, ...]) -> None:
@@ -68,11 +74,15 @@ def main(link: Link, settings: WorkerSettings, rings: tuple[FrameRing, ...]) -> 
         elif isinstance(order, Process):
             # Here and not in a lane: the overlaps of one exposure follow from those before it.
             surroundings = desk.surroundings_of(order.exposure)
+            desk.begin(order)
             in_work.add(lanes.submit(partial(desk.process, order, surroundings)))
+        elif isinstance(order, Settled):
+            desk.settle(order)
         done = {future for future in in_work if future.done()}
         in_work -= done
         for future in done:
             future.result()  # a fault of our own ends the process, and the service says so
+    desk.settle_all()
     lanes.end()
 
 
@@ -145,6 +155,26 @@ class _Desk:
     plan: PlanSection
     rings: tuple[FrameRing, ...]
     overlaps: Overlaps
+    unsettled: dict[int, SimpleQueue[tuple[Exposure, Surroundings] | None]] = field(
+        default_factory=dict
+    )
+
+    def begin(self, order: Process) -> None:
+        """An exposure goes into a lane; one that is not sealed yet will be heard of again."""
+        if not order.is_sealed:
+            self.unsettled[order.exposure.number] = SimpleQueue()
+
+    def settle(self, settled: Settled) -> None:
+        """The record of an exposure in work is final, or will never be."""
+        if (outcome := self.unsettled.get(settled.number)) is None:
+            return  # it could not be processed, and said so
+        record = settled.exposure
+        outcome.put(None if record is None else (record, self.surroundings_of(record)))
+
+    def settle_all(self) -> None:
+        """The end: what is not sealed by now is not waited for."""
+        for outcome in list(self.unsettled.values()):
+            outcome.put(None)
 
     def surroundings_of(self, exposure: Exposure) -> Surroundings:
         """The overlaps of an exposure; call it in the order they were made."""
@@ -163,18 +193,21 @@ class _Desk:
             else:
                 frames = self._frames_in_memory(exposure, order.slots)
             histograms = histograms_of(self.rig, frames)
-            report, files = process_exposure(
-                lane,
-                self.mission,
-                self.mount,
-                self.plan,
-                exposure,
-                frames,
-                flags,
-                surroundings=surroundings,
-                frames_read=partial(self.link.send, FramesRead(exposure.number)),
-            )
-        except (OSError, ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
+            made = self._make(order.exposure, frames, flags, surroundings, lane)
+            if not order.is_sealed:
+                waits_since = time.monotonic()
+                settled = self.unsettled[exposure.number].get(timeout=SETTLED_WITHIN_S)
+                started += time.monotonic() - waits_since
+                if settled is None:
+                    return
+                if settled[0] != exposure:
+                    # Its mark was another's: what was told is told anew.
+                    exposure = settled[0]
+                    frames = store.load_level0(self.mission.level0(exposure.number), self.rig)[0]
+                    made = self._make(exposure, frames, flags, settled[1], lane)
+            report, contents = made
+            files = level2.write_folder(self.mission.level2(exposure.number), contents)
+        except (OSError, ValueError, ArithmeticError, np.linalg.LinAlgError, Empty) as error:
             sentence = (
                 f"exposure {exposure.number} was stored but not processed: {error}; "
                 f"run syntopic process {self.mission.path} after landing"
@@ -182,8 +215,32 @@ class _Desk:
             report = report_unprocessed(self.rig, self.plan, exposure, flags)
             self.link.send(ProcessFailed(exposure.number, sentence, report))
             return
+        finally:
+            self.unsettled.pop(exposure.number, None)
         seconds = time.monotonic() - started
         self.link.send(Processed(exposure.number, report, files, seconds, histograms))
+
+    def _make(
+        self,
+        exposure: Exposure,
+        frames: Mapping[str, NDArray[np.uint16]],
+        flags: Flag,
+        surroundings: Surroundings,
+        lane: Processor,
+    ) -> Made:
+        """The products of an exposure; its verdict is told before they are written."""
+        conditions = conditions_of(exposure, self.rig, self.plan, flags, surroundings)
+        made = make_products(
+            lane,
+            self.mount,
+            self.plan,
+            exposure,
+            frames,
+            conditions,
+            frames_read=partial(self.link.send, FramesRead(exposure.number)),
+        )
+        self.link.send(Judged(exposure.number, made[0]))
+        return made
 
     def _frames_in_memory(
         self, exposure: Exposure, slots: Mapping[str, int]
