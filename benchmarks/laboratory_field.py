@@ -19,13 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from daemon.calibration.laboratory.field import (
-    Exposure,
-    Field,
-    Looks,
-    RigCalibration,
-    calibrate_rig,
-)
+from daemon.calibration.laboratory.field import RigCalibration, calibrate_rig
+from daemon.calibration.laboratory.field_measuring import Exposure, Field, Looks
 from daemon.calibration.laboratory.field_report import Estimated, covariance_of, estimated
 from processing.bundle.rotations import logarithm
 from processing.geometry.rotation import rotation_matrix

@@ -8,7 +8,6 @@ lens, which has more than ten parameters can say. Projection code of its own.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 from collections.abc import Sequence
@@ -21,8 +20,9 @@ import tifffile
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from processing.rig import Cone, Lens, Rig, RigError, Sensor, load_rig, shipped_rigs
+from processing.rig import Cone, Lens, Rig, Sensor
 from sim_hw.seeding import random_stream
+from sim_hw.series import command, new_series, run, write_list
 from sim_hw.world.camera import rotation_opk, undistorted
 
 Array = NDArray[np.float64]
@@ -207,10 +207,7 @@ def write_series(
 
     `seed` draws the lenses, `take` what happens while the series is taken.
     """
-    series = out / "series"
-    series.mkdir(parents=True)
-    (out / "truth").mkdir()
-    (series / "rig.toml").write_bytes(rig_file.read_bytes())
+    series = new_series(out, rig_file)
     images = []
     for name in sensors:
         head = true_head(rig, name, seed, extra_um=extra_um)
@@ -250,52 +247,39 @@ def write_series(
             lens=np.array([getattr(head.lens, key) for key in LENS_SPREAD]),
         )
         print(f"{name}: {len(centres)} targets", file=sys.stderr)
-    content = {
-        "format": 1,
-        "kind": "head",
-        "date": "2026-11-21",
-        "source": "emulated collimator",
-        "simulated": True,
-        "serials": {"collimator": "SIM-COLLIMATOR-1", "probe": "SIM-PT100-1"},
-        "angle_sigma_rad": ANGLE_SIGMA_RAD,
-        "target_radius_rad": TARGET_RADIUS_PX
-        * rig.sensor(sensors[0]).pitch_um
-        * 1e-3
-        / rig.cone_of(sensors[0]).lens.f_mm,
-        "images": images,
-    }
-    (series / "series.json").write_text(json.dumps(content, indent=1))
+    first = rig.sensor(sensors[0])
+    radius_mm = TARGET_RADIUS_PX * first.pitch_um * 1e-3
+    write_list(
+        series,
+        "head",
+        source="emulated collimator",
+        serials={"collimator": "SIM-COLLIMATOR-1", "probe": "SIM-PT100-1"},
+        angle_sigma_rad=ANGLE_SIGMA_RAD,
+        target_radius_rad=radius_mm / rig.cone_of(first.name).lens.f_mm,
+        images=images,
+    )
     return series
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    line = argparse.ArgumentParser(prog="python -m sim_hw.collimator", description=__doc__)
-    line.add_argument("rig", help="name of a shipped rig, or a rig file")
+    line = command("collimator", __doc__)
     line.add_argument("--sensor", action="append", required=True, help="may be repeated")
-    line.add_argument("--out", type=Path, required=True, help="a new folder for series and truth")
-    line.add_argument("--seed", type=int, default=1, help="everything random follows from it")
-    line.add_argument("--take", type=int, default=1, help="2: the same heads, calibrated again")
     line.add_argument("--grid", type=int, nargs=2, default=(11, 7), help="targets across and down")
     line.add_argument("--extra", type=float, default=EXTRA_UM, help="um beyond ten parameters")
-    given = line.parse_args(arguments)
-    try:
-        file = shipped_rigs().get(given.rig, Path(given.rig))
-        rig = load_rig(file)
-    except RigError as error:
-        print(error, file=sys.stderr)
-        return 2
-    series = write_series(
-        rig,
-        file,
-        given.out,
-        sensors=given.sensor,
-        seed=given.seed,
-        take=given.take,
-        grid=(given.grid[0], given.grid[1]),
-        extra_um=given.extra,
-    )
-    print(json.dumps({"series": str(series)}))
-    return 0
+
+    def take(rig: Rig, file: Path, given: argparse.Namespace) -> Path:
+        return write_series(
+            rig,
+            file,
+            given.out,
+            sensors=given.sensor,
+            seed=given.seed,
+            take=given.take,
+            grid=(given.grid[0], given.grid[1]),
+            extra_um=given.extra,
+        )
+
+    return run(line, arguments, take)
 
 
 if __name__ == "__main__":

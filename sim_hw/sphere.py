@@ -9,7 +9,6 @@ need not be straight.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -20,8 +19,9 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from processing.rig import Cone, Rig, RigError, Sensor, load_rig, shipped_rigs
+from processing.rig import Cone, Rig, Sensor
 from sim_hw.seeding import random_stream
+from sim_hw.series import command, new_series, run, write_list
 from sim_hw.world import electronics
 from sim_hw.world.electronics import Map, over_tdi_path, true_sensor, vignetting
 
@@ -228,10 +228,7 @@ def write_series(
     `seed` draws the sensors, `take` what happens while the series is taken: two takes of one seed
     are the same camera, calibrated twice.
     """
-    series = out / "series"
-    series.mkdir(parents=True)
-    (out / "truth").mkdir()
-    (series / "rig.toml").write_bytes(rig_file.read_bytes())
+    series = new_series(out, rig_file)
     images = []
     for name in sensors:
         sensor, cone = rig.sensor(name), rig.cone_of(name)
@@ -269,49 +266,37 @@ def write_series(
             bias_dn=truth.bias_dn,
         )
         print(f"{name}: {number} frames", file=sys.stderr)
-    content = {
-        "format": 1,
-        "kind": "radiometric",
-        "date": "2026-11-21",
-        "source": "emulated integrating sphere",
-        "simulated": True,
-        "serials": {"sphere": "SIM-SPHERE-1", "monitor": "SIM-DIODE-1", "probe": "SIM-PT100-1"},
-        "temperature_sigma_c": PROBE_NOISE_K,
-        "monitor_sigma": MONITOR_NOISE,
-        "images": images,
-    }
-    (series / "series.json").write_text(json.dumps(content, indent=1))
+    write_list(
+        series,
+        "radiometric",
+        source="emulated integrating sphere",
+        serials={"sphere": "SIM-SPHERE-1", "monitor": "SIM-DIODE-1", "probe": "SIM-PT100-1"},
+        temperature_sigma_c=PROBE_NOISE_K,
+        monitor_sigma=MONITOR_NOISE,
+        images=images,
+    )
     return series
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    line = argparse.ArgumentParser(prog="python -m sim_hw.sphere", description=__doc__)
-    line.add_argument("rig", help="name of a shipped rig, or a rig file")
-    line.add_argument("--out", type=Path, required=True, help="a new folder for series and truth")
+    line = command("sphere", __doc__)
     line.add_argument("--sensor", action="append", help="only this sensor; may be repeated")
-    line.add_argument("--seed", type=int, default=1, help="everything random follows from it")
-    line.add_argument("--take", type=int, default=1, help="2: the same camera, calibrated again")
     line.add_argument("--frames", type=float, default=1.0, help="scales frames per condition")
     line.add_argument("--nonlinearity", type=float, default=0.0, help="loss at full scale, 0.02")
-    given = line.parse_args(arguments)
-    try:
-        file = shipped_rigs().get(given.rig, Path(given.rig))
-        rig = load_rig(file)
-    except RigError as error:
-        print(error, file=sys.stderr)
-        return 2
-    series = write_series(
-        rig,
-        file,
-        given.out,
-        seed=given.seed,
-        take=given.take,
-        sensors=given.sensor or [s.name for s in rig.sensors],
-        frames=given.frames,
-        nonlinearity=given.nonlinearity,
-    )
-    print(json.dumps({"series": str(series)}))
-    return 0
+
+    def take(rig: Rig, file: Path, given: argparse.Namespace) -> Path:
+        return write_series(
+            rig,
+            file,
+            given.out,
+            seed=given.seed,
+            take=given.take,
+            sensors=given.sensor or [s.name for s in rig.sensors],
+            frames=given.frames,
+            nonlinearity=given.nonlinearity,
+        )
+
+    return run(line, arguments, take)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ its own.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,8 +20,9 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from processing.rig import Cone, Rig, RigError, Sensor, load_rig, shipped_rigs
+from processing.rig import Cone, Rig, Sensor
 from sim_hw.seeding import random_stream
+from sim_hw.series import command, new_series, run, write_list
 from sim_hw.world.camera import rotation_opk, undistorted
 
 Array = NDArray[np.float64]
@@ -233,10 +233,7 @@ def write_series(
     rig: Rig, rig_file: Path, out: Path, *, seed: int, take: int = 1, plan: FieldPlan
 ) -> Path:
     """Take the frames; returns the folder with `series.json`."""
-    series = out / "series"
-    series.mkdir(parents=True)
-    (out / "truth").mkdir()
-    (series / "rig.toml").write_bytes(rig_file.read_bytes())
+    series = new_series(out, rig_file)
     truth = true_rig(rig, seed)
     xyz = targets(seed, plan.count, plan.size_m, plan.depth_m)
     random = random_stream(seed, "test field frames", take)
@@ -271,43 +268,31 @@ def write_series(
         )
         print(f"exposure {k + 1} of {plan.exposures}", file=sys.stderr)
     np.savez(out / "truth" / "places.npz", **places)  # type: ignore[arg-type]
-    content = {
-        "format": 1,
-        "kind": "lab",
-        "date": "2026-11-21",
-        "source": "emulated 3D test field",
-        "simulated": True,
-        "serials": {"test field": "SIM-FIELD-1"},
-        "offset_sigma_mm": OFFSET_MM,
-        "skew_sigma_per_mm": SKEW_PER_MM,
-        "targets": [
+    write_list(
+        series,
+        "lab",
+        source="emulated 3D test field",
+        serials={"test field": "SIM-FIELD-1"},
+        offset_sigma_mm=OFFSET_MM,
+        skew_sigma_per_mm=SKEW_PER_MM,
+        targets=[
             {"name": f"T{k}", "xyz_m": [float(v) for v in p], "sigma_m": SURVEY_SIGMA_M}
             for k, p in enumerate(surveyed)
         ],
-        "images": exposures,
-    }
-    (series / "series.json").write_text(json.dumps(content))
+        images=exposures,
+    )
     return series
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    line = argparse.ArgumentParser(prog="python -m sim_hw.test_field", description=__doc__)
-    line.add_argument("rig", help="name of a shipped rig, or a rig file")
-    line.add_argument("--out", type=Path, required=True, help="a new folder for series and truth")
-    line.add_argument("--seed", type=int, default=1, help="everything random follows from it")
-    line.add_argument("--take", type=int, default=1, help="2: the same rig, calibrated again")
+    line = command("test_field", __doc__)
     line.add_argument("--exposures", type=int, default=18, help="how often the field is looked at")
-    given = line.parse_args(arguments)
-    try:
-        file = shipped_rigs().get(given.rig, Path(given.rig))
-        rig = load_rig(file)
-    except RigError as error:
-        print(error, file=sys.stderr)
-        return 2
-    plan = plan_for(rig, given.exposures)
-    series = write_series(rig, file, given.out, seed=given.seed, take=given.take, plan=plan)
-    print(json.dumps({"series": str(series)}))
-    return 0
+
+    def take(rig: Rig, file: Path, given: argparse.Namespace) -> Path:
+        plan = plan_for(rig, given.exposures)
+        return write_series(rig, file, given.out, seed=given.seed, take=given.take, plan=plan)
+
+    return run(line, arguments, take)
 
 
 if __name__ == "__main__":

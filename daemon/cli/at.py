@@ -11,6 +11,7 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
+from daemon.cli.options import AsJson, AttitudeSigma, Crs, MountFile, PositionSigma, Trajectory
 from daemon.configuration import ConfigurationError
 
 HELP = """Aerial triangulation of the stitched PAN images of a mission.
@@ -38,20 +39,14 @@ def at(
     ] = False,
     points: Annotated[Path | None, typer.Option(help="Control and check points.")] = None,
     measured: Annotated[Path | None, typer.Option(help="Their places in the images.")] = None,
-    trajectory: Annotated[
-        Path | None, typer.Option(help="Post-processed trajectory: SBET, or .csv.")
-    ] = None,
-    mount: Annotated[Path | None, typer.Option(help="TOML with the [mount] to use.")] = None,
-    crs: Annotated[str | None, typer.Option(help="Such as EPSG:25833; default: UTM zone.")] = None,
+    trajectory: Trajectory = None,
+    mount: MountFile = None,
+    crs: Crs = None,
     gnss: Annotated[
         str, typer.Option(help="Unknown of the positions of a line: none, shift or linear.")
     ] = "none",
-    position_sigma: Annotated[
-        tuple[float, float, float], typer.Option(help="Of the trajectory, m: east north up.")
-    ] = (0.05, 0.05, 0.08),
-    attitude_sigma: Annotated[
-        tuple[float, float, float], typer.Option(help="Roll, pitch, heading, mdeg.")
-    ] = (5.0, 5.0, 8.0),
+    position_sigma: PositionSigma = (0.05, 0.05, 0.08),
+    attitude_sigma: AttitudeSigma = (5.0, 5.0, 8.0),
     search: Annotated[
         int, typer.Option(help="Pixels around the prediction that are searched.", min=4, max=200)
     ] = 24,
@@ -61,7 +56,7 @@ def at(
     out: Annotated[
         Path | None, typer.Option(help="Folder for results; default: in the mission's export.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     from daemon.adjusting.tables import ProjectError
     from daemon.adjusting.telling import print_report, report_of

@@ -10,6 +10,8 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
+from daemon.cli.options import AsJson, NewFolder
+
 HELP = """Geometric calibration of single heads from collimator series.
 
 Targets seen under known angles are found by least-squares matching of the images with one another;
@@ -26,14 +28,12 @@ A series to try: `python -m sim_hw.collimator dmc --sensor P1 --out collimator`
 
 def head(
     series: Annotated[Path, typer.Argument(help="Folder with series.json, rig.toml and images.")],
-    out: Annotated[
-        Path | None, typer.Option(help="The new folder; by default named by rig and date.")
-    ] = None,
+    out: NewFolder = None,
     previous: Annotated[
         Path | None, typer.Option(help="A calibration of heads to compare with.")
     ] = None,
     k3: Annotated[bool, typer.Option("--k3", help="Estimate K3 too.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     from daemon.calibration.laboratory.head import FREE, calibrate_head, targets_of
     from daemon.calibration.laboratory.head_report import calibrated_rig, head_report

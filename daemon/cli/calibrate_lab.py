@@ -11,6 +11,8 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
+from daemon.cli.options import AsJson, NewFolder, Series
+
 HELP = """Calibration of a whole rig in a 3D test field.
 
 Every CCD's shift, rotation, scale and perspective skew, every cone's radial and decentring
@@ -26,16 +28,15 @@ A series to try: `python -m sim_hw.test_field ultracam-l-mini --out field`
 
 
 def lab(
-    series: Annotated[Path, typer.Argument(help="Folder with series.json, rig.toml and frames.")],
-    out: Annotated[
-        Path | None, typer.Option(help="The new folder; by default named by rig and date.")
-    ] = None,
+    series: Series,
+    out: NewFolder = None,
     previous: Annotated[
         Path | None, typer.Option(help="A laboratory calibration to compare with.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
-    from daemon.calibration.laboratory.field import calibrate_rig, exposures_of, field_of, measured
+    from daemon.calibration.laboratory.field import calibrate_rig
+    from daemon.calibration.laboratory.field_measuring import exposures_of, field_of, measured
     from daemon.calibration.laboratory.field_report import (
         covariance_bytes,
         covariance_of,

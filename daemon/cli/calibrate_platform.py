@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from daemon.cli.calibration_outcome import hand_over
+from daemon.cli.options import AsJson, NewFolder
 
 HELP = """Platform calibration: how every head is mounted, from many exposures.
 
@@ -26,14 +27,12 @@ Examples: `syntopic calibrate platform MISSION`,
 
 def platform(
     missions: Annotated[list[Path], typer.Argument(help="Mission folders with Level-2.")],
-    out: Annotated[
-        Path | None, typer.Option(help="The new folder; by default named by rig and date.")
-    ] = None,
+    out: NewFolder = None,
     previous: Annotated[
         Path | None,
         typer.Option(help="A platform calibration to compare with; else the rig flown with."),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     from daemon.calibration.platform import KIND, read_missions, report_of, rig_file
     from daemon.calibration.report import read_previous, refuse_existing

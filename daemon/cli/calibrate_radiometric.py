@@ -11,6 +11,8 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
+from daemon.cli.options import AsJson, NewFolder, Series
+
 HELP = """Radiometric calibration of heads from dark and flat series.
 
 Finds bias, dark signal over temperature and exposure time, gain, its change with the aperture,
@@ -26,10 +28,8 @@ A series to try: `python -m sim_hw.sphere ultracam-x-mini --sensor SU00 --out sp
 
 
 def radiometric(
-    series: Annotated[Path, typer.Argument(help="Folder with series.json, rig.toml and frames.")],
-    out: Annotated[
-        Path | None, typer.Option(help="The new folder; by default named by rig and date.")
-    ] = None,
+    series: Series,
+    out: NewFolder = None,
     previous: Annotated[
         Path | None, typer.Option(help="A radiometric calibration to compare with.")
     ] = None,
@@ -37,7 +37,7 @@ def radiometric(
         list[float] | None,
         typer.Option(help="Write maps for this f-number too, by the model; may be repeated."),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     from daemon.calibration.laboratory.radiometric import (
         calibrate_sensor,

@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from daemon.cli.options import AsJson, AttitudeSigma, Crs, MountFile, PositionSigma, Trajectory
 from daemon.tables import light_table
 
 HELP = """Ground points from places measured in two or more oriented images, with their accuracy.
@@ -31,25 +32,19 @@ COLUMNS = (
 def intersect(
     mission: Annotated[Path, typer.Argument(help="Mission folder.")],
     measured: Annotated[Path, typer.Argument(help="Places in the images, CSV.")],
-    trajectory: Annotated[
-        Path | None, typer.Option(help="Post-processed trajectory: SBET, or .csv.")
-    ] = None,
-    mount: Annotated[Path | None, typer.Option(help="TOML with the [mount] to use.")] = None,
-    crs: Annotated[str | None, typer.Option(help="Such as EPSG:25833; default: UTM zone.")] = None,
+    trajectory: Trajectory = None,
+    mount: MountFile = None,
+    crs: Crs = None,
     image_sigma: Annotated[
         float, typer.Option(help="Of a place without sigma_px, px.", min=1e-3)
     ] = 0.5,
-    position_sigma: Annotated[
-        tuple[float, float, float], typer.Option(help="Of the trajectory, m: east north up.")
-    ] = (0.05, 0.05, 0.08),
-    attitude_sigma: Annotated[
-        tuple[float, float, float], typer.Option(help="Roll, pitch, heading, mdeg.")
-    ] = (5.0, 5.0, 8.0),
+    position_sigma: PositionSigma = (0.05, 0.05, 0.08),
+    attitude_sigma: AttitudeSigma = (5.0, 5.0, 8.0),
     boresight_sigma: Annotated[
         tuple[float, float, float], typer.Option(help="Common to all exposures, mdeg.")
     ] = (1.5, 1.5, 3.0),
     out: Annotated[Path | None, typer.Option(help="Table of the points; must be new.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     from daemon.adjusting.tables import write_table
     from daemon.disk.mission import Mission

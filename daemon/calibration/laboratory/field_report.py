@@ -11,19 +11,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.calibration.laboratory.field import LENS_FREE, RigCalibration
+from daemon.calibration.laboratory.field import RigCalibration
+from daemon.calibration.laboratory.field_network import LENS_FREE
 from daemon.calibration.laboratory.head import LENS_KEYS
-from daemon.calibration.laboratory.series import Series, part_serials
+from daemon.calibration.laboratory.report import of_series
+from daemon.calibration.laboratory.series import Series
 from daemon.calibration.plots import histogram_svg, map_svg, vectors_svg
-from daemon.calibration.report import (
-    CalibrationReport,
-    Plot,
-    Previous,
-    Quantity,
-    Sheet,
-    changes_between,
-    serial_warnings,
-)
+from daemon.calibration.report import CalibrationReport, Plot, Previous, Quantity, Sheet
 from processing.bundle.findings import image_residuals_mm, systematic_residuals
 from processing.bundle.network import INTERIOR
 from processing.rig import Rig
@@ -145,10 +139,9 @@ def field_report(
         for name, value in found.temperatures_c.items()
     ]
     rig, result = found.rig, found.adjustment
-    serials = {**series.serials, **part_serials(rig, set(found.skew_per_mm))}
     residual = image_residuals_mm(result)
     good = np.isfinite(residual).all(axis=1)
-    warnings = [] if previous is None else serial_warnings(previous[1], serials)
+    warnings = []
     taken = [c for k, c in enumerate(rig.cones) if result.network.cameras[k].terms]
     missing = {c.probe for c in taken if c.probe} - set(found.temperatures_c)
     if len(taken) < len(rig.cones):
@@ -159,24 +152,19 @@ def field_report(
             f"no temperature of {', '.join(sorted(missing))}: the new places are taken to hold at "
             "the old calibration's temperature"
         )
-    if series.simulated:
-        warnings.append("Emulated images: no calibration of a real camera.")
     looks = int(good.sum())
-    return CalibrationReport(
+    report = CalibrationReport(
         kind="lab",
         title=f"Laboratory calibration of {rig.name}",
         calibration_id=calibration_id,
         date=date,
         facts=[
-            ("measured", series.date),
-            ("source", series.source),
-            ("rig", f"{rig.name}, calibration {series.rig.calibration_id}"),
             ("exposures", str(len(result.network.stations.names))),
             ("targets", str(len(result.network.points.names))),
             ("image points", f"{looks}, {found.rejected} left out"),
             *((f"probe {n}", f"{v:.2f} degC") for n, v in found.temperatures_c.items()),
         ],
-        serials=serials,
+        serials={},
         quantities=[*quantities, *probes],
         figures={
             "sigma_px": found.sigma_px,
@@ -196,8 +184,9 @@ def field_report(
         warnings=warnings,
         sheets=[_parameters(rows, sigma), _correlated(rows, covariance), _cones(found)],
         plots=_plots(found, rows, covariance),
-        previous=None if previous is None else previous[1].calibration_id,
-        changes=() if previous is None else changes_between(previous[1].quantities, quantities),
+    )
+    return of_series(
+        report, series, sensors=set(found.skew_per_mm), previous=previous, compared=quantities
     )
 
 

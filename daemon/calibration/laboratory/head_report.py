@@ -11,17 +11,10 @@ from typing import Any, Final
 import numpy as np
 
 from daemon.calibration.laboratory.head import LENS_KEYS, HeadGeometry
-from daemon.calibration.laboratory.series import Series, part_serials
+from daemon.calibration.laboratory.report import of_series
+from daemon.calibration.laboratory.series import Series
 from daemon.calibration.plots import Curve, chart_svg, histogram_svg, vectors_svg
-from daemon.calibration.report import (
-    CalibrationReport,
-    Plot,
-    Previous,
-    Quantity,
-    Sheet,
-    changes_between,
-    serial_warnings,
-)
+from daemon.calibration.report import CalibrationReport, Plot, Previous, Quantity, Sheet
 from processing.bundle.findings import Parameter, exposures_of, parameters_of
 from processing.bundle.network import INTERIOR
 from processing.rig import Rig
@@ -69,7 +62,6 @@ def head_report(
 ) -> CalibrationReport:
     """Tell it all."""
     quantities = [q for head in heads for q in quantities_of(head)]
-    serials = {**series.serials, **part_serials(series.rig, {h.sensor.name for h in heads})}
     verdicts, warnings = [], []
     for head in heads:
         told = (
@@ -83,32 +75,25 @@ def head_report(
         else:
             warnings.append(f"{told}; 1/20 px is the bar.")
         warnings += _warnings(head)
-    if previous is not None:
-        warnings += serial_warnings(previous[1], serials)
-    if series.simulated:
-        warnings.append("Emulated images: no calibration of a real head.")
-    return CalibrationReport(
+    report = CalibrationReport(
         kind="head",
         title=f"Heads of {series.rig.name}: geometric calibration",
         calibration_id=calibration_id,
         date=date,
         facts=[
-            ("measured", series.date),
-            ("source", series.source),
-            ("rig", f"{series.rig.name}, calibration {series.rig.calibration_id}"),
             ("heads", ", ".join(h.cone.name for h in heads)),
             *((f"temperature of {h.cone.name}", f"{h.temperature_c:.2f} degC") for h in heads),
         ],
-        serials=serials,
+        serials={},
         quantities=quantities,
         figures={h.cone.name: _figures(h) for h in heads},
         verdicts=verdicts,
         warnings=warnings,
         sheets=[_parameters(heads), _correlations(heads), _series(heads), _fit(heads)],
         plots=[plot for head in heads for plot in _plots(head)],
-        previous=None if previous is None else previous[1].calibration_id,
-        changes=() if previous is None else changes_between(previous[1].quantities, quantities),
     )
+    sensors = {h.sensor.name for h in heads}
+    return of_series(report, series, sensors=sensors, previous=previous)
 
 
 def _warnings(head: HeadGeometry) -> list[str]:

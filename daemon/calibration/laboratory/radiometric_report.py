@@ -11,17 +11,10 @@ import numpy as np
 
 from daemon.calibration.laboratory.radiometric import HeadCalibration
 from daemon.calibration.laboratory.radiometric_maps import maps_against
-from daemon.calibration.laboratory.series import Series, part_serials
+from daemon.calibration.laboratory.report import of_series
+from daemon.calibration.laboratory.series import Series
 from daemon.calibration.plots import Curve, chart_svg, histogram_svg, map_svg
-from daemon.calibration.report import (
-    CalibrationReport,
-    Plot,
-    Previous,
-    Quantity,
-    Sheet,
-    changes_between,
-    serial_warnings,
-)
+from daemon.calibration.report import CalibrationReport, Plot, Previous, Quantity, Sheet
 from processing.calibration.radiometric.defects import relative_response
 
 RATIO_BAR: Final = 1.05
@@ -79,7 +72,6 @@ def radiometric_report(
 ) -> CalibrationReport:
     """Tell it all."""
     quantities = [q for head in heads for q in quantities_of(head)]
-    serials = {**series.serials, **part_serials(series.rig, {h.sensor.name for h in heads})}
     worst = max((c.ratio for h in heads for _, c in h.checks), default=None)
     verdicts = [
         f"{len(heads)} sensors from {sum(h.frames for h in heads)} frames; maps for "
@@ -97,36 +89,30 @@ def radiometric_report(
             warnings.append(f"{told}; up to {RATIO_BAR:g} is limited by shot noise.")
     for head in heads:
         warnings += _warnings(head)
-    if series.simulated:
-        warnings.append("Emulated images: no calibration of a real head.")
     sheets = [_emva(heads), _defects(heads), _functional(heads), _checks(heads)]
     if previous is not None:
-        warnings += serial_warnings(previous[1], serials)
         compared = maps_against(previous[0], heads, apertures[0])
         if compared is not None:
             sheets.append(compared)
-    return CalibrationReport(
+    report = CalibrationReport(
         kind="radiometric",
         title=f"Radiometric calibration of {series.rig.name}",
         calibration_id=calibration_id,
         date=date,
         facts=[
-            ("measured", series.date),
-            ("source", series.source),
-            ("rig", f"{series.rig.name}, calibration {series.rig.calibration_id}"),
             ("sensors", ", ".join(h.sensor.name for h in heads)),
             ("frames", str(sum(h.frames for h in heads))),
         ],
-        serials=serials,
+        serials={},
         quantities=quantities,
         figures={h.sensor.name: _figures(h) for h in heads},
         verdicts=verdicts,
         warnings=warnings,
         sheets=sheets,
         plots=[plot for head in heads for plot in _plots(head)],
-        previous=None if previous is None else previous[1].calibration_id,
-        changes=() if previous is None else changes_between(previous[1].quantities, quantities),
     )
+    sensors = {h.sensor.name for h in heads}
+    return of_series(report, series, sensors=sensors, previous=previous)
 
 
 def _warnings(head: HeadCalibration) -> list[str]:

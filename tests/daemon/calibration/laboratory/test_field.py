@@ -14,7 +14,7 @@ from scipy.stats import chi2
 from typer.testing import CliRunner
 
 from benchmarks.laboratory_field import calibrated, errors_of, pooled
-from daemon.calibration.laboratory.field import LENS_FREE
+from daemon.calibration.laboratory.field_network import LENS_FREE
 from daemon.calibration.laboratory.field_report import covariance_of
 from daemon.cli.calibrate import app
 from processing.matching.discs import disc_positions, identified
