@@ -145,6 +145,8 @@ def _fly(
                 elif "number" in event:
                     rows.setdefault(event["number"], {})[name] = event
                 live.update(_table(rows, exposures))
+        if not console.is_terminal:  # a live table ends without an end of line there
+            console.print()
         status = service.wait(30)
     finally:
         if service.poll() is None:
@@ -290,6 +292,17 @@ def _print_result(console: Console, result: Mapping[str, Any], ledger: Mapping[s
         received.add_row(name, *(str(ledger[name][cause]) for cause in causes))
     console.print(received)
     console.print("balanced" if result["ledger_balanced"] else "[bold red]does not balance[/]")
+    if result["rms_px"] is None:
+        console.print("Nothing is stitched: every head has an image and an orientation of its own")
+    else:
+        _print_geometry(console, result)
+    console.print(f"Event marks: sigma {result['time_sigma_ns']} ns")
+    console.print(f"Mission  {result['mission']}", soft_wrap=True)
+    console.print(f"Report   {result['report']}", soft_wrap=True)
+    console.print(f"Next: syntopic verify {result['mission']}", soft_wrap=True)
+
+
+def _print_geometry(console: Console, result: Mapping[str, Any]) -> None:
     geometry = light_table("Geometry against truth, PAN pixels", ("method",), ("RMS", "worst"))
     geometry.add_row("free mosaic, inner", *_pair(result["rms_px"], result["max_px"]))
     geometry.add_row(
@@ -299,10 +312,6 @@ def _print_result(console: Console, result: Mapping[str, Any], ledger: Mapping[s
     geometry.add_row("fixed method without TDM, inner", *_pair(result["rms_px_no_tdm"], None))
     console.print(geometry)
     console.print(f"Displaced sensor found: [bold]{result['displaced_sensor'] or 'none'}[/]")
-    console.print(f"Event marks: sigma {result['time_sigma_ns']} ns")
-    console.print(f"Mission  {result['mission']}", soft_wrap=True)
-    console.print(f"Report   {result['report']}", soft_wrap=True)
-    console.print(f"Next: syntopic verify {result['mission']}", soft_wrap=True)
 
 
 def _pair(rms: float | None, worst: float | None) -> tuple[str, str]:
