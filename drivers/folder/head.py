@@ -113,6 +113,13 @@ class FolderHead(HeadDevice):
             "frame": f"{self._shape[1]} x {self._shape[0]} {first.pixel_format}",
         }
 
+    def adjust(self, exposure_time_us: float, gain_db: float, tdi_shifts: int) -> None:
+        """Refused: the frames are exposed already."""
+        raise DeviceError(
+            f"{self.name}: frames of a folder are as they were exposed once; fly them with "
+            '[exposure] control = "manual"'
+        )
+
     def trigger(self) -> None:
         """Play the next file; from any thread. See `drivers.contract.Head`."""
         if self.trigger_source != "software":

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Mapping
-from typing import Final
+from typing import Final, TypeAlias
 
 from drivers.contract import DeviceError
 from drivers.v4l2 import uapi
@@ -25,6 +25,8 @@ RECORDED_CLASSES: Final = (
     uapi.CTRL_CLASS_IMAGE_PROC,
 )
 CLASS_MASK: Final = 0x0FFF_0000
+Write: TypeAlias = tuple[str, Control, int]
+"""The setting it is for, the control, and its new value."""
 NOT_FOUND: Final = (errno.ENOENT, errno.ENXIO, errno.ENODEV)
 
 
@@ -103,6 +105,54 @@ class V4l2Camera:
         """Press a button; OSError where the head refuses."""
         self.node.write(self.controls[name], 1)
 
+    def adjust(self, exposure_time_us: float, gain_db: float) -> None:
+        """Write another exposure time, and a gain counted from the one it was opened with.
+
+        Raises:
+            DeviceError: the head has no such control, or refuses; it is left as it was.
+        """
+        writes, refusals = self._adjustments(exposure_time_us, gain_db), list[str]()
+        before = [(key, control, self.node.read(control)) for key, control, _ in writes]
+        for key, control, value in writes:
+            self._write(key, control, value, refusals)
+        if refusals:
+            for key, control, value in before:
+                self._write(key, control, value, [])
+            raise DeviceError("\n".join(f"{self._who}: {refusal}" for refusal in refusals))
+
+    def _adjustments(self, exposure_time_us: float, gain_db: float) -> list[Write]:
+        settings = self._settings
+        if self._exposure is None or not self._exposure_unit_us:
+            raise DeviceError(
+                f"{self._who}: the head has no control of its exposure time; it cannot be changed "
+                "while it runs, set exposure_control if there is one"
+            )
+        by_id = {c.id: c for c in self.controls.values()}
+        writes: list[Write] = []
+        if (automatic := by_id.get(uapi.CID_EXPOSURE_AUTO)) is not None:
+            writes.append(("exposure_time_us", automatic, uapi.EXPOSURE_MANUAL))
+        steps = max(1, round(exposure_time_us / self._exposure_unit_us))
+        writes.append(("exposure_time_us", self._exposure, steps))
+        if gain_db == self.gain_db:
+            return writes
+        if not settings.gain_unit_db or self._gain_control is None:
+            raise DeviceError(
+                f"{self._who}: gain is asked to be {gain_db:g} dB; set gain_unit_db, what a step "
+                "of the head's gain is, or [exposure] gain_most_db = 0"
+            )
+        if (automatic := by_id.get(uapi.CID_AUTOGAIN)) is not None:
+            writes.append(("gain_db", automatic, 0))
+        value = self._gain_at_0_db + round(gain_db / settings.gain_unit_db)
+        return [*writes, ("gain_db", self._gain_control, value)]
+
+    @property
+    def gain_db(self) -> float:
+        """What the gain is above that of the configuration; 0 where nobody knows its unit."""
+        unit_db = self._settings.gain_unit_db
+        if not unit_db or self._gain_control is None:
+            return 0.0
+        return (self.node.read(self._gain_control) - self._gain_at_0_db) * unit_db
+
     def _configure(self, settings: V4l2Settings) -> None:
         node = self.node
         self.serial = serial_number(node.path)
@@ -129,6 +179,9 @@ class V4l2Camera:
         self._named = {name for name, _ in assignments(settings.controls)}
         self._find_exposure(refusals)
         self._write_controls(refusals)
+        gain = self._find_gain()
+        self._gain_control = gain if gain is not None and gain.is_readable_number else None
+        self._gain_at_0_db = 0 if self._gain_control is None else node.read(self._gain_control)
         if refusals:
             raise DeviceError("\n".join(f"{self._who}: {refusal}" for refusal in refusals))
 
@@ -206,7 +259,7 @@ class V4l2Camera:
     def _write_controls(self, refusals: list[str]) -> None:
         settings = self._settings
         by_id = {c.id: c for c in self.controls.values()}
-        writes: list[tuple[str, Control, int]] = []
+        writes: list[Write] = []
         if settings.exposure_time_us > 0 and settings.exposure_control != "none":
             automatic = by_id.get(uapi.CID_EXPOSURE_AUTO)
             if automatic is not None:
@@ -235,20 +288,20 @@ class V4l2Camera:
         for key, control, value in writes:
             self._write(key, control, value, refusals)
 
-    def _gain(
-        self, by_id: Mapping[int, Control], refusals: list[str]
-    ) -> list[tuple[str, Control, int]]:
-        settings = self._settings
-        if settings.gain_control:
-            control = self.controls.get(settings.gain_control)
-        else:
-            control = by_id.get(uapi.CID_ANALOGUE_GAIN) or by_id.get(uapi.CID_GAIN)
+    def _gain(self, by_id: Mapping[int, Control], refusals: list[str]) -> list[Write]:
+        settings, control = self._settings, self._find_gain()
         if control is None:
             refusals.append(self._no_control("gain_control", settings.gain_control or "gain"))
             return []
         automatic = by_id.get(uapi.CID_AUTOGAIN)
         first = [("gain", automatic, 0)] if automatic is not None else []
         return [*first, ("gain", control, settings.gain)]
+
+    def _find_gain(self) -> Control | None:
+        if self._settings.gain_control:
+            return self.controls.get(self._settings.gain_control)
+        by_id = {c.id: c for c in self.controls.values()}
+        return by_id.get(uapi.CID_ANALOGUE_GAIN) or by_id.get(uapi.CID_GAIN)
 
     def _write(self, key: str, control: Control, value: int, refusals: list[str]) -> None:
         bounded = not control.is_button

@@ -72,6 +72,7 @@ class V4l2Head(V4l2Settings, HeadDevice):
     )
 
     _session: _Session | None = None
+    _adjusted: tuple[float, float] | None = None
 
     def bind(self, sink: Sink | None = None) -> Mapping[str, str]:
         """Open the head, write its settings, say what was found. See `drivers.contract.Head`."""
@@ -110,6 +111,26 @@ class V4l2Head(V4l2Settings, HeadDevice):
                 "the head is lost"
             ) from None
 
+    def adjust(self, exposure_time_us: float, gain_db: float, tdi_shifts: int) -> None:
+        """Write the controls; also when the head is opened again. See `drivers.contract.Head`."""
+        if tdi_shifts:
+            raise DeviceError(
+                f"{self.name}: {tdi_shifts} TDI shifts are asked for; this head has none, set "
+                "[exposure] tdi_most = 0"
+            )
+        session = self._session
+        if session is None or self._state is not LifeCycle.ACTIVE:
+            raise DeviceError(f"{self.name}: the head is not running; wait for it to be opened")
+        try:
+            session.camera.adjust(exposure_time_us, gain_db)
+            session.settings = session.camera.recorded()
+        except OSError as error:
+            raise DeviceError(
+                f"{self.name}: the head was lost while it was set ({error.strerror}); it is "
+                "opened again by itself"
+            ) from None
+        self._adjusted = (exposure_time_us, gain_db)
+
     # Finding
 
     def _reach(self) -> None:
@@ -118,6 +139,8 @@ class V4l2Head(V4l2Settings, HeadDevice):
         camera = V4l2Camera(self)
         try:
             self._check_size(camera)
+            if self._adjusted is not None:
+                camera.adjust(*self._adjusted)
             session = _Session(camera, camera.recorded(), camera.temperature_c())
         except OSError as error:
             camera.node.close()

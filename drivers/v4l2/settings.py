@@ -41,6 +41,12 @@ class V4l2Settings(Configured):
         -1, minimum=-1, maximum=1 << 31, says="gain in the head's own unit; -1 leaves it"
     )
     gain_control = Setting("", says="name of its control; empty finds it")
+    gain_unit_db = Setting(
+        0.0,
+        minimum=0,
+        maximum=60,
+        says="a step of that control, dB; 0: not known, gain is not changed in flight",
+    )
     controls = Setting(
         tuple[str, ...](), says="further controls to be set, each name=number, in this order"
     )

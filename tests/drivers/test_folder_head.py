@@ -259,3 +259,9 @@ def test_a_folder_that_comes_later_is_found(tmp_path: Path) -> None:
     player.play(create)
     assert player.notebook.event_names == ["lost", "opened", "played-out"]
     assert len(player.frames) == 4
+
+
+def test_what_a_frame_was_exposed_with_cannot_be_changed(tmp_path: Path) -> None:
+    head = FolderHead("SU00", {"folder": str(tmp_path)}, memory=Memory())
+    with pytest.raises(DeviceError, match="as they were exposed once"):
+        head.adjust(1000.0, 0.0, 0)

@@ -1,0 +1,74 @@
+"""A V4L2 head's exposure time and gain are changed while it runs, or it says why not."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import pytest
+
+from drivers.contract import DeviceError
+from drivers.v4l2 import uapi
+from drivers.v4l2.camera import V4l2Camera
+from drivers.v4l2.node import Control, VideoNode
+from drivers.v4l2.settings import V4l2Settings
+
+INTEGER = 1
+EXPOSURE = Control(uapi.CID_EXPOSURE_ABSOLUTE, "exposure_time_absolute", INTEGER, 1, 400, 0)
+GAIN = Control(uapi.CID_GAIN, "gain", INTEGER, 0, 100, 0)
+
+
+class Node:
+    """The controls of a head, that may refuse one."""
+
+    def __init__(self, values: dict[str, int], refuses: str = "") -> None:
+        self.values = values
+        self.refuses = refuses
+
+    def read(self, control: Control) -> int:
+        return self.values[control.name]
+
+    def write(self, control: Control, value: int) -> None:
+        if control.name == self.refuses and value > 30:
+            raise OSError(22, "Invalid argument")
+        self.values[control.name] = value
+
+
+def camera(node: Node, *, exposure: Control | None = EXPOSURE, **settings: Any) -> V4l2Camera:
+    """One that was opened with the values of its node."""
+    made = V4l2Camera.__new__(V4l2Camera)
+    made._settings = V4l2Settings("cam", {"device": "/dev/video0", **settings})
+    made._who = "cam at /dev/video0"
+    made.node = cast(VideoNode, node)
+    made.controls = {c.name: c for c in (EXPOSURE, GAIN)}
+    made._exposure, made._exposure_unit_us = exposure, 100.0
+    made._gain_control, made._gain_at_0_db = made._find_gain(), node.values["gain"]
+    return made
+
+
+def test_exposure_time_and_gain_are_written_in_the_units_of_the_head() -> None:
+    node = Node({"exposure_time_absolute": 50, "gain": 10})
+    head = camera(node, gain_unit_db=0.3)
+    head.adjust(2040.0, 6.0)
+    assert node.values == {"exposure_time_absolute": 20, "gain": 30}
+    assert head.gain_db == pytest.approx(6.0)
+    head.adjust(4000.0, 0.0)
+    assert node.values == {"exposure_time_absolute": 40, "gain": 10}
+
+
+def test_what_the_head_refuses_leaves_it_as_it_was() -> None:
+    node = Node({"exposure_time_absolute": 50, "gain": 10}, refuses="gain")
+    with pytest.raises(DeviceError, match="gain_db: gain = 40 is refused"):
+        camera(node, gain_unit_db=0.3).adjust(1000.0, 9.0)
+    assert node.values == {"exposure_time_absolute": 50, "gain": 10}
+    with pytest.raises(DeviceError, match="takes 1 to 400"):
+        camera(node).adjust(60_000.0, 0.0)
+    assert node.values["exposure_time_absolute"] == 50
+
+
+def test_a_head_without_control_or_unit_says_what_to_set() -> None:
+    node = Node({"exposure_time_absolute": 50, "gain": 10})
+    with pytest.raises(DeviceError, match="no control of its exposure time"):
+        camera(node, exposure=None).adjust(1000.0, 0.0)
+    with pytest.raises(DeviceError, match="set gain_unit_db"):
+        camera(node).adjust(1000.0, 3.0)
+    assert node.values == {"exposure_time_absolute": 50, "gain": 10}
