@@ -203,7 +203,7 @@ def service_toml(
             if watch_port is not None
             else []
         ),
-        *_section("thermometer", "probes", probes),
+        *(_section("thermometer", "probes", probes) if rig.probes else []),
         *_section("navigator", "gnss", ready["receiver"]),
         *(_section("pps", "pps", ready["pps"]) if ready.get("pps") else []),
     ]

@@ -20,7 +20,7 @@ from processing.rig import Cone, Sensor
 from sim_hw.world import camera
 from sim_hw.world.flight import Flight
 from sim_hw.world.rendering import Look, content_rows, grid_axis, sensor_directions
-from sim_hw.world.world import World, WorldSettings
+from sim_hw.world.world import CABIN_C, World, WorldSettings
 
 Array = NDArray[np.float64]
 
@@ -138,25 +138,43 @@ def exposure_truth(world: World, flight: Flight, taken: Mapping[str, Taken]) -> 
         "temperatures_c": np.array([world.temperature_c(p, mark_ns) for p in probes]),
         "sensors": np.array(sorted(taken)),
         "pan_sensors": np.array([s.name for c in world.rig.pan_cones for s in c.sensors]),
-        "image": np.array(_image(world)),
-        "inner": np.array("similarity" if world.rig.master_cone else "rotations"),
     }
+    is_stitched = world.rig.virtual_image is not None
+    if is_stitched:
+        content["image"] = np.array(_image(world))
+        content["inner"] = np.array("similarity" if world.rig.master_cone else "rotations")
     for name, exposure in taken.items():
         sensor, look = world.rig.sensor(name), exposure.look
+        content |= {
+            f"{name}.mid_gps_ns": np.array(look.mid_gps_ns, dtype=np.int64),
+            f"{name}.exposure_time_us": np.array(look.exposure_time_us),
+            f"{name}.tdi_shifts": np.array(look.tdi_shifts),
+        }
+        if not is_stitched:
+            content |= _head(world, flight, name, look)
+            continue
         columns = grid_axis(sensor.width_px, GRID_PX)
         rows = grid_axis(sensor.height_px, GRID_PX)
         c, r = np.meshgrid(columns, rows)
         vip = true_vip(world, flight, name, look, columns=c, rows=r, master_mid_gps_ns=master_ns)
         content |= {
-            f"{name}.mid_gps_ns": np.array(look.mid_gps_ns, dtype=np.int64),
-            f"{name}.exposure_time_us": np.array(look.exposure_time_us),
-            f"{name}.tdi_shifts": np.array(look.tdi_shifts),
             f"{name}.columns": columns,
             f"{name}.rows": rows,
             f"{name}.vip_column": vip[0],
             f"{name}.vip_row": vip[1],
         }
     return content
+
+
+def _head(world: World, flight: Flight, name: str, look: Look) -> dict[str, Any]:
+    """Where a head that is an image of its own stood and looked."""
+    cone, pose = world.rig.cone_of(name), flight.pose(look.mid_gps_ns)
+    centre = camera.projection_centre_m(cone, pose)
+    turn = pose.enu_from_body @ camera.BODY_FROM_CAMERA @ world.camera.master_from_cone(cone)
+    return {
+        f"{name}.latitude_longitude_height": np.array(flight.geodetic(centre)),
+        f"{name}.enu_from_camera": turn,
+    }
 
 
 def _mid_of_cone(world: World, cone_name: str | None, taken: Mapping[str, Taken]) -> int | None:
@@ -199,7 +217,7 @@ def true_parameters(world: World) -> dict[str, Any]:
 def _true_place(world: World, cone: Cone, sensor: Sensor) -> dict[str, Any]:
     """A sensor's true place at its calibration temperature, and at the base of the flight's."""
     error = world.camera.place_error_mm[sensor.name]
-    base_c = world.temperatures.base_c[sensor.probe]
+    base_c = world.temperatures.base_c.get(sensor.probe, CABIN_C)
     middle = (np.array((sensor.width_px - 1) / 2), np.array((sensor.height_px - 1) / 2))
     placed = world.camera.layer_from_pixel(sensor, *middle, temperature_c=base_c)
     return {
@@ -212,7 +230,7 @@ def _true_place(world: World, cone: Cone, sensor: Sensor) -> dict[str, Any]:
         "x_at_base_temperature_mm": float(placed[0]),
         "y_at_base_temperature_mm": float(placed[1]),
         "f_at_base_temperature_mm": camera.principal_distance_mm(
-            cone, world.temperatures.base_c[cone.probe]
+            cone, world.temperatures.base_c.get(cone.probe, CABIN_C)
         ),
     }
 

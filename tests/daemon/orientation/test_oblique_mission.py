@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -15,10 +16,25 @@ import tifffile
 from typer.testing import CliRunner
 
 from daemon.cli import app
+from daemon.cli.process import as_flown
+from daemon.configuration import PlanSection, ProcessingSection
+from daemon.disk import store
 from daemon.disk.level0 import read_description
 from daemon.disk.mission import Mission
 from daemon.export.certificate import CertificateError, certificate_of
+from daemon.exposure import NavigationRecord
 from daemon.orientation.local_frame import LocalFrame
+from daemon.service import worker
+from daemon.service.memory import FrameRing
+from daemon.service.messages import (
+    FramesRead,
+    Judged,
+    Process,
+    Processed,
+    Stop,
+    WorkerReady,
+    WorkerSettings,
+)
 from processing.rig import load_rig, shipped_rigs
 from sim_hw.exposures import EPOCH_GPS_NS, FIRST_AFTER_S, write_exposures
 from sim_hw.world import camera
@@ -66,6 +82,71 @@ def test_every_head_becomes_an_image_of_its_own(flown) -> None:
         seen = (planes > 0).all(axis=0)
         assert seen.mean() > 0.9 and planes[:, seen].std() > 100.0
         assert about["geometry"].startswith("strict perspective")
+
+
+class _Link:
+    """The worker's end of a link: one exposure from memory, then the end."""
+
+    def __init__(self, *orders: object) -> None:
+        self.orders, self.said = [*orders, Stop()], []
+
+    def receive(self, *, timeout_s: float) -> object:
+        return self.orders.pop(0)
+
+    def send(self, message: object) -> None:
+        self.said.append(message)
+
+
+def test_the_onboard_worker_makes_every_head_and_its_orientation_as_exposures_come(
+    flown, tmp_path: Path
+) -> None:
+    world, folder = flown
+    mission = Mission.open(shutil.copytree(folder / "mission", tmp_path / "flown"))
+    shutil.rmtree(mission.level2_root)
+    rig = load_rig(mission.rig_path)
+    frames, exposure = store.load_level0(mission.level0(2), rig)
+    rings = tuple(FrameRing.create(name, 2, frame.nbytes) for name, frame in frames.items())
+    for ring in rings:
+        ring.frame(1, *frames[ring.head].shape)[:] = frames[ring.head]
+    first = EPOCH_GPS_NS + FIRST_AFTER_S * 1_000_000_000
+    flight = world.flight.beginning_first_line_at(world.flight.distance_flown_m(first))
+    pose = flight.pose(exposure.mark_gps_ns)
+    latitude, longitude, height = flight.geodetic(pose.position_enu_m)
+    east, north, up = pose.velocity_enu_mps
+    navigation = NavigationRecord(
+        *("gnss", exposure.mark_gps_ns, "interpolated", 0, "fixed", 20),
+        *(latitude, longitude, height, 0.02, 0.03, (north, east, -up), 0.01),
+        *(pose.roll_rad, pose.pitch_rad, pose.heading_rad),
+    )
+    exposure = replace(exposure, navigation=navigation)
+    plan = PlanSection(ground_height_m=395.0)
+    settings = WorkerSettings(
+        str(mission.rig_path), as_flown(mission, None)[1], mission.path, plan, ProcessingSection()
+    )
+    link = _Link(Process(exposure, dict.fromkeys(frames, 1)))
+    worker.main(link, settings, rings)
+    assert [type(said) for said in link.said] == [WorkerReady, FramesRead, Judged, Processed]
+    flown_folder, again = mission.level2(2), folder / "mission/L2/000002"
+    for name in ("nadir.tif", "5.tif", "7.tif", "8.tif", "19.tif", "quicklook.jpg"):
+        assert (flown_folder / name).read_bytes() == (again / name).read_bytes()
+    report = json.loads((flown_folder / "quality.json").read_text())
+    assert report["heads"] == ["nadir", "5", "7", "8", "19"]
+    assert report["verdict"] in ("good", "usable") and report["figures"]["tilt_deg"] < 3.0
+    # An exposure time of the plan leaves a third of a pixel or so under the nadir head.
+    assert 0.05 < report["figures"]["smear_along_px"] < 1.0
+    told = json.loads((flown_folder / "orientation.json").read_text())
+    assert [head["cone"] for head in told["heads"]] == report["heads"]
+    for head in told["heads"]:
+        cone = rig.cone(head["cone"])
+        there = flight.geodetic(camera.projection_centre_m(cone, pose))
+        place = (head["latitude_deg"], head["longitude_deg"], head["height_m"])
+        assert np.abs(np.subtract(there, place) * [111_000, 111_000, 1]).max() < 0.002
+        truth = pose.enu_from_body @ camera.BODY_FROM_CAMERA @ world.camera.master_from_cone(cone)
+        turn = camera.rotation_opk(np.radians(head["omega_phi_kappa_deg"])).T @ truth
+        # The emulated mounting is off by 20 urad about each axis.
+        assert np.abs(turn - np.eye(3)).max() < 2e-4, cone.name
+        ground = np.array(head["footprint"]) - [longitude, latitude]
+        assert (ground[:, 1].min() > 0.02) == (cone.name == "5"), "the head that looks ahead"
 
 
 def _oriented(folder: Path) -> dict[str, dict]:
