@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.disk import durable
+from daemon.disk import direct, durable
 from daemon.disk.level0 import tiff_parts
 from daemon.disk.mission import Mission
 from daemon.disk.records import RecordError, canonical_bytes, parse_record, plain_name
@@ -139,7 +139,7 @@ def write_folder(
     part.mkdir()
     try:
         files = {
-            name: durable.create_file(part / name, parts, mode=0o644)
+            name: direct.create_file(part / name, parts, mode=0o644)
             for name, parts in contents.items()
         }
         take_the_place_of(part, final)

@@ -6,6 +6,7 @@ given by placements; what they are good for is not asked here.
 
 from __future__ import annotations
 
+import mmap
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -114,7 +115,7 @@ class PanComposer:
         self._valid = np.tile(np.array(_NOWHERE), (count, 1))
         self._means = np.zeros((count, *nodes), np.float32)
         self._weights = np.zeros((count, *nodes), np.uint8)
-        self._pan = np.zeros((image.height_px, image.width_px), np.uint16)
+        self._pan = _paged((image.height_px, image.width_px))
         self._source = np.zeros((image.height_px, image.width_px), np.uint8)
 
     def frame(self, name: str) -> Array:
@@ -239,7 +240,7 @@ class ColourComposer:
                 self._frames[band] = self._planes[name][k : k + 1]
         self._lattice = np.full((1, rows, columns, 2), OUTSIDE)
         self._weights = np.full((1, *nodes), WEIGHT_UNIT, np.uint8)
-        self._bands = {band: np.zeros(shape, np.uint16) for band in self._frames}
+        self._bands = {band: _paged(shape) for band in self._frames}
         self._source = np.zeros(shape, np.uint8)
 
     def frame(self, head: ColourHead) -> Array:
@@ -299,6 +300,14 @@ def _stack(sensors: Collection[Sensor]) -> Array:
     height = max(sensor.height_px for sensor in sensors)
     width = max(sensor.width_px for sensor in sensors)
     return np.zeros((len(sensors), height, width), np.uint16)
+
+
+def _paged(shape: tuple[int, int]) -> Array:
+    """Zeros of uint16 that begin on a page of memory, from where a disk takes them uncopied."""
+    words = shape[0] * shape[1]
+    memory = np.zeros(words + mmap.PAGESIZE // 2, np.uint16)
+    first = -memory.ctypes.data % mmap.PAGESIZE // 2
+    return memory[first : first + words].reshape(shape)
 
 
 def _usable(placement: SensorPlacement) -> tuple[float, ...]:
