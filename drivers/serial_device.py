@@ -37,6 +37,9 @@ WRITE_TIMEOUT_S: Final = 1.0
 UNLOGGED_KEPT: Final = 4096
 """Chunks of bytes read before there is a log to put them into."""
 
+STALE: Final = ".stale"
+"""Ends the name under which bytes are logged that came too late to be read."""
+
 Sample = NavSample | EventMark | TemperatureSample | ClockReading
 
 
@@ -62,9 +65,15 @@ class LineLostError(Exception):
 class SerialLine:
     """One open port. Every byte read is counted and handed to the flight log."""
 
-    def __init__(self, port: Port, received: Callable[[bytes], None]) -> None:
+    def __init__(
+        self,
+        port: Port,
+        received: Callable[[bytes], None],
+        stale: Callable[[bytes], None] = lambda _data: None,
+    ) -> None:
         self._port = port
         self._received = received
+        self._stale = stale
 
     def read(self, timeout_s: float) -> bytes:
         """What has come, waiting for the first byte at most so long; may be empty.
@@ -72,6 +81,26 @@ class SerialLine:
         Raises:
             LineLostError: the port is gone.
         """
+        data = self._take(timeout_s)
+        if data:
+            self._received(data)
+        return data
+
+    def drain(self, steps: int) -> int:
+        """Take away what came unasked, in so many reads at most; how many bytes that were.
+
+        They are logged apart: a replay that took them for an answer would have one too many.
+        """
+        count = 0
+        for _ in range(steps):
+            data = self._take(0.0)
+            if not data:
+                break
+            self._stale(data)
+            count += len(data)
+        return count
+
+    def _take(self, timeout_s: float) -> bytes:
         try:
             self._port.timeout = timeout_s
             data = bytes(self._port.read(1))
@@ -80,8 +109,6 @@ class SerialLine:
                 data += bytes(self._port.read(waiting))
         except (serial.SerialException, OSError, termios.error, TypeError) as error:
             raise LineLostError(_reason(error)) from error
-        if data:
-            self._received(data)
         return data
 
     def write(self, data: bytes) -> None:
@@ -254,11 +281,11 @@ class SerialDevice(DeviceDriver):
             raise DeviceError(f"{self.name}: {error}") from error
         self.counters["opened"] += 1
         self.connected()
-        return SerialLine(port, self._received)
+        return SerialLine(port, self._received, lambda data: self._received(data, STALE))
 
-    def _received(self, data: bytes) -> None:
+    def _received(self, data: bytes, suffix: str = "") -> None:
         self.counters["bytes"] += len(data)
-        raw = RawBytes(self.name, self.clock.mono_ns(), data)
+        raw = RawBytes(self.name + suffix, self.clock.mono_ns(), data)
         if self.teller.sink is not None:
             self.teller.sink(raw)
         else:

@@ -61,7 +61,7 @@ class _Port:
             self._rest = chunk.data
             self._clock.now_ns = max(self._clock.now_ns, chunk.mono_ns)
         elif not self._rest:
-            # Nothing is stale in a recording, so a driver that drains its line finds it empty.
+            # What was drained in flight is logged apart: a driver finds its line empty.
             self._clock.now_ns += round((self.timeout or 0.0) * 1e9)
         data, self._rest = self._rest[:size], self._rest[size:]
         return data

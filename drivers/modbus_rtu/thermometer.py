@@ -118,7 +118,7 @@ class ModbusThermometer(SerialDevice):
 
     def _ask(self, line: SerialLine) -> Reply | None:
         """One request; None where no valid answer came in time."""
-        self._drain(line)
+        self.counters["bad_bytes"] += line.drain(DRAIN_STEPS)
         line.write(read_request(self.unit, self.first_register, len(self.channels)))
         received = b""
         deadline_ns = self.clock.mono_ns() + round(self.answer_timeout_s * 1e9)
@@ -139,14 +139,6 @@ class ModbusThermometer(SerialDevice):
                 "sense. Check baud rate, parity and the line's termination.",
             )
         return None
-
-    def _drain(self, line: SerialLine) -> None:
-        """Take away what came unasked, such as an answer after its time-out."""
-        for _ in range(DRAIN_STEPS):
-            stale = line.read(0.0)
-            if not stale:
-                return
-            self.counters["bad_bytes"] += len(stale)
 
     def _exception(self, code: int) -> str:
         meaning = EXCEPTIONS.get(code, "an exception the standard does not name")

@@ -16,8 +16,11 @@ from daemon.flight.decisions import Decision, decision_of
 from daemon.replay.codecs import Decoded, codec_for, decode_all
 from daemon.replay.flight import Replayed
 from daemon.replay.products import content_hash
-from drivers.contract import DeviceEvent, NavSample, RawBytes
+from drivers.contract import DeviceEvent, NavSample, RawBytes, TemperatureSample
+from drivers.modbus_rtu.thermometer import ModbusThermometer
 from sim_hw.receivers.nmea_sentences import nmea
+from tests.drivers.stand_ins import FakeClock, FakePort, Notebook
+from tests.drivers.test_modbus_rtu import reply
 
 SECOND_NS = 1_000_000_000
 EPOCHS = 5
@@ -63,6 +66,37 @@ def test_bytes_mean_the_same_however_they_came_in_pieces(cuts: list[int]) -> Non
 def test_what_came_before_the_device_was_open_was_told_to_nobody() -> None:
     everything = decode([r for r in heard([]) if isinstance(r, RawBytes)])
     assert len(decode(heard([]))) < len(everything) == EPOCHS
+
+
+def test_an_answer_that_came_too_late_in_flight_is_none_in_the_replay() -> None:
+    clock = FakeClock()
+    late = [reply(1, [999])]
+
+    def answer(port: FakePort) -> bytes:
+        if port.written:
+            port.written = b""
+            return b"" if late else reply(1, [7])
+        return late.pop() if late and clock.now_ns > 1_900_000_000 else b""
+
+    section = {"port": "/dev/probes", "channels": ["nose"], "parity": "N"}
+    flown = ModbusThermometer(
+        "probes", section, clock=clock, open_port=lambda *_: FakePort(clock, answer)
+    )
+    notebook = Notebook()
+    notebook.stop = lambda _: flown._closing.set() if len(notebook.records) > 8 else None
+    flown.run(notebook)
+    records = notebook.records
+    said = [r for r in records if isinstance(r, TemperatureSample)]
+    assert len(said) >= 2 and said[0].value_c == 0.7
+    (stale,) = [r for r in records if isinstance(r, RawBytes) and r.device == "probes.stale"]
+    assert stale.data == reply(1, [999])
+    # A replay takes only what has the device's name.
+    of_device = (RawBytes, DeviceEvent)
+    heard = [r for r in records if isinstance(r, of_device) and r.device == "probes"]
+    codec = codec_for("thermometer", "modbus-rtu", "probes", section)
+    assert codec is not None
+    found = [r.value_c for r in decode_all(codec, heard) if isinstance(r, TemperatureSample)]
+    assert found == [r.value_c for r in said]
 
 
 def test_a_device_whose_bytes_are_not_logged_has_no_codec() -> None:
