@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -64,6 +64,7 @@ class HeadTruth:
     mechanical: Map
     kind: NDArray[np.uint8]
     nonlinearity: float
+    response_per_k: float = 0.0
 
     def lit(self, stop: float) -> Map:
         """Relative signal of even light at a multiple of the base f-number."""
@@ -197,6 +198,7 @@ def frame(
     seconds = np.float32(shot.exposure_time_s)
     light = shot.share * lamp * full / REFERENCE_TIME_S / shot.stop**2
     warm = 2.0 ** ((temperature_c - electronics.DARK_REFERENCE_C) / electronics.DARK_DOUBLING_K)
+    light *= 1.0 + truth.response_per_k * (temperature_c - electronics.DARK_REFERENCE_C)
     rate = truth.lit(shot.stop) * np.float32(light) + truth.dark_e_per_s * np.float32(warm)
     mean = over_tdi_path(rate, shifts=shot.tdi_shifts, row_sign=sensor.tdi_row_sign) * seconds
     variance = mean + np.float32(sensor.read_noise_e**2)
@@ -222,6 +224,7 @@ def write_series(
     sensors: Sequence[str],
     frames: float = 1.0,
     nonlinearity: float = 0.0,
+    response_per_k: float = 0.0,
 ) -> Path:
     """Take the series of the named sensors; returns the folder with `series.json`.
 
@@ -233,6 +236,7 @@ def write_series(
     for name in sensors:
         sensor, cone = rig.sensor(name), rig.cone_of(name)
         truth = head_truth(cone, sensor, seed, nonlinearity=nonlinearity)
+        truth = replace(truth, response_per_k=response_per_k)
         random = random_stream(seed, "sphere frames", take, name)
         (series / name).mkdir()
         number = 0
@@ -282,6 +286,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     line = command("sphere", __doc__)
     line.add_argument("--sensor", action="append", help="only this sensor; may be repeated")
     line.add_argument("--frames", type=float, default=1.0, help="scales frames per condition")
+    line.add_argument("--response-per-k", type=float, default=0.0, help="relative, 0.0005")
     line.add_argument("--nonlinearity", type=float, default=0.0, help="loss at full scale, 0.02")
 
     def take(rig: Rig, file: Path, given: argparse.Namespace) -> Path:
@@ -294,6 +299,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             sensors=given.sensor or [s.name for s in rig.sensors],
             frames=given.frames,
             nonlinearity=given.nonlinearity,
+            response_per_k=given.response_per_k,
         )
 
     return run(line, arguments, take)

@@ -32,8 +32,11 @@ _KINDS: Final = {
     "reference_c": "fiu",
     "gain": "f",
     "defect": "ub",
+    "response_per_k": "fiu",
 }
-_SCALARS: Final = ("doubling_k", "reference_c")
+_SCALARS: Final = ("doubling_k", "reference_c", "response_per_k")
+_OPTIONAL: Final = "response_per_k"
+RESPONSE_LIMIT_PER_K: Final = 0.01
 
 
 class CalibrationError(ValueError):
@@ -42,12 +45,12 @@ class CalibrationError(ValueError):
 
 @dataclass(frozen=True)
 class RadiometricCalibration:
-    """One sensor's response: signal = (DN - offset) * gain, pixel by pixel.
+    """One sensor's response: signal = (DN - offset) * gain(T), pixel by pixel.
 
     offset(T, t) = bias_dn + dark_dn_per_s * t * 2**((T - reference_c) / doubling_k), t the exposure
-    time in seconds. All maps have the shape of the sensor, (height, width). `defect` is not zero
-    where a pixel's word means nothing. `gain` holds vignetting and filter too, where it was
-    calibrated on the finished head.
+    time in seconds; gain(T) = gain / (1 + response_per_k * (T - reference_c)). All maps have the
+    shape of the sensor, (height, width). `defect` is not zero where a pixel's word means nothing.
+    `gain` holds vignetting and filter too, where it was calibrated on the finished head.
     """
 
     bias_dn: Array
@@ -56,6 +59,7 @@ class RadiometricCalibration:
     reference_c: float
     gain: Array
     defect: Array
+    response_per_k: float = 0.0
 
 
 def neutral_radiometry(sensor: Sensor) -> RadiometricCalibration:
@@ -72,7 +76,7 @@ def neutral_radiometry(sensor: Sensor) -> RadiometricCalibration:
 
 
 def load_radiometry(path: Path) -> RadiometricCalibration:
-    """Read `<sensor>.npz`, which holds exactly the six names of `RadiometricCalibration`.
+    """Read `<sensor>.npz`, which holds the names of `RadiometricCalibration`; the last may lack.
 
     Nothing is unpickled, and no array is read before its announced size was checked.
 
@@ -111,6 +115,7 @@ def load_radiometry(path: Path) -> RadiometricCalibration:
         reference_c=float(values["reference_c"]),
         gain=values["gain"].astype(np.float32),
         defect=values["defect"].astype(np.uint8),
+        response_per_k=float(values.get(_OPTIONAL, 0.0)),
     )
     check_radiometry(path.name, calibration)
     return calibration
@@ -149,18 +154,24 @@ def check_radiometry(
             )
     if not (math.isfinite(calibration.doubling_k) and calibration.doubling_k > 0):
         raise CalibrationError(f"{name}: doubling_k is {calibration.doubling_k}; it is positive")
+    if not abs(calibration.response_per_k) <= RESPONSE_LIMIT_PER_K:
+        raise CalibrationError(
+            f"{name}: response_per_k is {calibration.response_per_k}; it stays within "
+            f"{RESPONSE_LIMIT_PER_K:g} either way"
+        )
     if not math.isfinite(calibration.reference_c):
         raise CalibrationError(f"{name}: reference_c is {calibration.reference_c}; it is finite")
 
 
 def _read_members(file: str, archive: zipfile.ZipFile) -> dict[str, Array]:
     members = sorted(member.filename for member in archive.infolist())
-    wanted = sorted(f"{key}.npy" for key in _KINDS)
-    if members != wanted:
+    wanted = sorted(f"{key}.npy" for key in _KINDS if key != _OPTIONAL)
+    keys = [key for key in _KINDS if key != _OPTIONAL or f"{key}.npy" in members]
+    if members != sorted(f"{key}.npy" for key in keys):
         raise CalibrationError(
             f"{file}: holds {', '.join(members)[:200] or 'nothing'}; it holds {', '.join(wanted)}"
         )
-    return {key: _read_array(file, key, archive) for key in _KINDS}
+    return {key: _read_array(file, key, archive) for key in keys}
 
 
 def _read_array(file: str, key: str, archive: zipfile.ZipFile) -> Array:

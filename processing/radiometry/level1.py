@@ -76,6 +76,7 @@ class Corrector:
     flat_gain: float
     doubling_k: float
     reference_c: float
+    response_per_k: float
     defect: Array | None
     defects_by_shifts: dict[int, tuple[Array, Array]] = field(default_factory=dict)
 
@@ -109,6 +110,7 @@ def corrector_for(sensor: Sensor, calibration: RadiometricCalibration | None) ->
         flat_gain=float(calibration.gain.flat[0]),
         doubling_k=calibration.doubling_k,
         reference_c=calibration.reference_c,
+        response_per_k=calibration.response_per_k,
         defect=(calibration.defect != 0).astype(np.uint8) if np.any(calibration.defect) else None,
     )
 
@@ -148,13 +150,14 @@ def level1_from_level0(
     dark_time_s = exposure_time_s * 2.0 ** min(max(warmth / corrector.doubling_k, -30.0), 30.0)
     offset_dn = corrector.least_bias_dn + corrector.least_dark_dn_per_s * dark_time_s
     counts = level1_counts_per_dn(sensor.bits)
+    by_gain = 0.5 * counts / max(1.0 + corrector.response_per_k * warmth, 0.5)
     bands = (sensor.height_px + _BAND_ROWS - 1) // _BAND_ROWS
     sums = np.zeros((bands, 2), np.float64)
     if corrector.bias is None or corrector.dark is None or corrector.response is None:
         _flat_pass(
             raw,
             np.float32(offset_dn),
-            np.float32(0.5 * counts * corrector.flat_gain),
+            np.float32(by_gain * corrector.flat_gain),
             shifts,
             sensor.tdi_row_sign,
             sensor.full_scale_dn,
@@ -170,7 +173,7 @@ def level1_from_level0(
             np.float32(corrector.bias_unit_dn),
             np.float32(corrector.dark_unit_dn_per_s * dark_time_s / (shifts + 1)),
             np.float32(offset_dn),
-            np.float32(0.5 * counts * _RESPONSE_UNIT * (shifts + 1)),
+            np.float32(by_gain * _RESPONSE_UNIT * (shifts + 1)),
             shifts,
             sensor.tdi_row_sign,
             sensor.full_scale_dn,

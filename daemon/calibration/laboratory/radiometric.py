@@ -36,6 +36,7 @@ Progress = Callable[[str], None]
 
 _SET_SPREAD_K: Final = 3.0
 _SAME_TEMPERATURE_K: Final = 2.0
+_TOLD_SIGMAS: Final = 4.0
 
 
 @dataclass(frozen=True)
@@ -59,8 +60,8 @@ class HeadCalibration:
     """What was found of one sensor.
 
     `signal_per_light` is the mean signal of the main flat set per monitored light and second.
-    `gain_noise` is the relative standard deviation of a pixel's gain; `response_per_k` and its
-    sigma, relative, None where flat sets have one temperature. `checks` by what was checked.
+    `gain`, at `gain_c`, has a relative standard deviation of `gain_noise` a pixel; `response_per_k`
+    and its sigma, relative, None where flat sets have one temperature. `checks` by what they were.
     """
 
     sensor: Sensor
@@ -72,6 +73,7 @@ class HeadCalibration:
     defects: Defects
     signal_per_light: Map
     gain: Map
+    gain_c: float
     gain_noise: float
     aperture: ApertureModel
     r2_mm2: NDArray[np.float64]
@@ -82,7 +84,9 @@ class HeadCalibration:
 
     def at_aperture(self, f_number: float) -> RadiometricCalibration:
         """The calibration at an aperture, by the functional model."""
-        gain = self.gain / self.aperture.ratio(self.r2_mm2, f_number)
+        per_k = self.response_per_k[0] if self.response_per_k and self.follows_temperature else 0.0
+        at_reference = 1.0 + per_k * (self.dark.reference_c - self.gain_c)
+        gain = self.gain / self.aperture.ratio(self.r2_mm2, f_number) / at_reference
         return RadiometricCalibration(
             bias_dn=np.clip(self.dark.bias_dn, 0.0, None),
             dark_dn_per_s=self.dark.dark_dn_per_s,
@@ -90,7 +94,16 @@ class HeadCalibration:
             reference_c=self.dark.reference_c,
             gain=np.clip(gain, *GAIN_LIMITS).astype(np.float32),
             defect=self.defects.mask,
+            response_per_k=per_k / at_reference,
         )
+
+    @property
+    def follows_temperature(self) -> bool:
+        """The response changes with temperature by more than its measurement could."""
+        if self.response_per_k is None:
+            return False
+        value, sigma = self.response_per_k
+        return abs(value) > _TOLD_SIGMAS * sigma
 
 
 def shots_of(series: Series) -> list[Shot]:
@@ -206,6 +219,7 @@ def calibrate_sensor(
         defects=defects,
         signal_per_light=per_light,
         gain=_gain(per_light, good, float(smooth.max()) / light),
+        gain_c=main.condition.temperature_c,
         gain_noise=math.sqrt(level),
         aperture=_aperture(main, plain, dark, r2_mm2=r2, good=good),
         r2_mm2=r2,

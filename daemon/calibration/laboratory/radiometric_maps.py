@@ -57,6 +57,7 @@ def calibration_bytes(calibration: RadiometricCalibration) -> bytes:
         reference_c=np.array(calibration.reference_c),
         gain=calibration.gain.astype(np.float32),
         defect=calibration.defect.astype(np.uint8),
+        response_per_k=np.array(calibration.response_per_k),
     )
     return stream.getvalue()
 

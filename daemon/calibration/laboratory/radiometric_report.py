@@ -19,7 +19,6 @@ from processing.calibration.radiometric.defects import relative_response
 
 RATIO_BAR: Final = 1.05
 """Corrected flat fields within 5 % of photon transfer are limited by shot noise."""
-_TOLD_SIGMAS: Final = 4.0
 _SAME_TEMPERATURE_K: Final = 2.0
 
 
@@ -118,13 +117,10 @@ def radiometric_report(
 def _warnings(head: HeadCalibration) -> list[str]:
     found = []
     name = head.sensor.name
-    if head.response_per_k is not None:
-        value, sigma = head.response_per_k
-        if abs(value) > _TOLD_SIGMAS * sigma:
-            found.append(
-                f"{name}: the response changes by {100 * value:+.4f} +- {100 * sigma:.4f} % per "
-                "kelvin; the maps hold one response for all temperatures"
-            )
+    if head.response_per_k is None:
+        found.append(
+            f"{name}: flat sets of one temperature; the maps hold one response for all temperatures"
+        )
     if head.dark.misfit > 1.2:
         found.append(
             f"{name}: the dark model leaves {head.dark.misfit:.2f} of the frames' noise; look for "
@@ -212,6 +208,7 @@ def _functional(heads: Sequence[HeadCalibration]) -> Sheet:
         per_k = "–"
         if h.response_per_k is not None:
             per_k = f"{100 * h.response_per_k[0]:+.4f} ± {100 * h.response_per_k[1]:.4f}"
+            per_k += "" if h.follows_temperature else " (taken as none)"
         rows.append(
             (
                 h.sensor.name,

@@ -38,6 +38,9 @@ def test_a_good_file_is_read_as_it_was_written(tmp_path: Path) -> None:
     found = load_radiometry(written(tmp_path / "SU00.npz"))
     assert found.gain.dtype == np.float32 and found.gain.shape == SHAPE
     assert found.doubling_k == 6.5 and found.reference_c == 20.0
+    assert found.response_per_k == 0.0
+    warming = load_radiometry(written(tmp_path / "SU01.npz", response_per_k=np.float64(1e-4)))
+    assert warming.response_per_k == 1e-4
     assert np.all(found.bias_dn == 64) and found.defect.dtype == np.uint8
 
 
@@ -54,6 +57,7 @@ def test_a_good_file_is_read_as_it_was_written(tmp_path: Path) -> None:
         ({"dark_dn_per_s": np.full(SHAPE, np.inf, np.float32)}, "dark_dn_per_s runs from inf"),
         ({"doubling_k": np.float64(0)}, "doubling_k is 0.0; it is positive"),
         ({"reference_c": np.zeros(2)}, "reference_c has shape"),
+        ({"response_per_k": np.float64(0.5)}, "response_per_k is 0.5; it stays within 0.01"),
         ({"defect": np.zeros(SHAPE, np.complex128)}, "defect is of type complex128"),
         ({"bias_dn": np.zeros((2, 3, 4), np.float32)}, "bias_dn has shape"),
     ],

@@ -75,6 +75,28 @@ def words(dn: NDArray[np.float64]) -> NDArray[np.uint16]:
     return np.clip(np.rint(dn), 0, 4095).astype(np.uint16)
 
 
+@pytest.mark.parametrize("flat", [False, True])
+def test_a_response_that_grows_with_temperature_is_taken_off(
+    sensor: Sensor, calibration: RadiometricCalibration, flat: bool
+) -> None:
+    if flat:
+        calibration = neutral_radiometry(sensor)
+    warming = replace(calibration, response_per_k=1e-3)
+    warmth = 35.0 - calibration.reference_c
+    light = np.full(SHAPE, 1000.0)
+    raw = words(expose(calibration, light * (1.0 + 1e-3 * warmth), temperature_c=35.0))
+    out = np.empty(SHAPE, np.uint16)
+    level1_from_level0(
+        corrector_for(sensor, warming),
+        raw,
+        temperature_c=35.0,
+        exposure_time_s=0.01,
+        tdi_shifts=0,
+        out=out,
+    )
+    assert float(np.mean(signal_of(out))) == pytest.approx(1000.0, abs=0.1)
+
+
 @pytest.mark.parametrize("temperature_c", [8.0, 20.0, 33.0])
 def test_signal_comes_back_through_bias_dark_and_gain(
     sensor: Sensor, calibration: RadiometricCalibration, temperature_c: float

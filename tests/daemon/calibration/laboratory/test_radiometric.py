@@ -169,7 +169,7 @@ def test_calibrated_again_nothing_has_changed_and_other_apertures_follow_from_th
     assert float(np.std(by_neighbour)) > 5.0 * noise
 
 
-def test_a_calibration_is_not_overwritten_and_a_bent_converter_is_seen(
+def test_no_overwriting_and_a_bent_converter_and_a_warming_response_are_seen(
     laboratory: tuple[Path, Rig], tmp_path: Path
 ) -> None:
     root, rig = laboratory
@@ -179,7 +179,14 @@ def test_a_calibration_is_not_overwritten_and_a_bent_converter_is_seen(
     assert again.exit_code != 0
     assert "never overwritten" in str(again.exception)
     sphere.write_series(
-        rig, root / "two.toml", tmp_path, seed=3, sensors=["S0"], nonlinearity=0.03, frames=0.4
+        rig,
+        root / "two.toml",
+        tmp_path,
+        seed=3,
+        sensors=["S0"],
+        nonlinearity=0.03,
+        response_per_k=5e-4,
+        frames=0.4,
     )
     run = CliRunner().invoke(
         app, ["radiometric", str(tmp_path / "series"), "--out", str(tmp_path / "c"), "--json"]
@@ -189,6 +196,10 @@ def test_a_calibration_is_not_overwritten_and_a_bent_converter_is_seen(
     error = next(q["value"] for q in told["quantities"] if q["what"] == "linearity error")
     assert 0.2 < error < 1.0
     assert any("photon transfer" in w for w in told["warnings"])
+    # The pass in flight follows it: the bent converter takes a thirtieth of it.
+    found = RadiometryFolder(tmp_path / "c" / "f4", rig)["S0"]
+    assert found.response_per_k == pytest.approx(5e-4, rel=0.06)
+    assert RadiometryFolder(root / "a" / "f4", rig)["S0"].response_per_k == 0.0
 
 
 def test_a_list_with_mistakes_is_refused_with_all_of_them(
