@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from daemon import bench_peers
 from daemon.configuration import PlanSection
-from daemon.disk import store
+from daemon.disk import direct, store
 from daemon.disk.mission import Mission
 from daemon.disk.radiometry_folder import RadiometryFolder
 from daemon.errors import DaemonError
@@ -144,7 +144,7 @@ def _timed(
             began = time.process_time()
             report, contents = make(processor)
             started = time.perf_counter()
-            _to_page_cache(contents, Path(scratch))
+            _to_disk(contents, Path(scratch))
             stages.setdefault("writing", []).append(time.perf_counter() - started)
             for stage, seconds in report["timings_s"].items():
                 stages.setdefault(stage, []).append(seconds)
@@ -152,7 +152,7 @@ def _timed(
 
         def fixed() -> None:
             pipeline.settings = replace(settings, method="fixed")
-            _to_page_cache(make(processor)[1], Path(scratch))
+            _to_disk(make(processor)[1], Path(scratch))
             pipeline.settings = settings
 
         def copy() -> None:
@@ -197,7 +197,7 @@ def _side_by_side(
             started = time.perf_counter()
             folder = Path(scratch) / str(number)
             folder.mkdir()
-            _to_page_cache(make(lane)[1], folder)
+            _to_disk(make(lane)[1], folder)
             ended = time.perf_counter()
             ends.append(ended)
             used.append(time.process_time())
@@ -290,14 +290,11 @@ def _geometry(mission: Mission, truth: Path) -> dict[str, Any]:
     }
 
 
-def _to_page_cache(contents: Mapping[str, Sequence[bytes | memoryview]], folder: Path) -> None:
-    """Write all files of an exposure as the service does, but for the sync."""
+def _to_disk(contents: Mapping[str, Sequence[bytes | memoryview]], folder: Path) -> None:
+    """Write all files of an exposure as the service does, synced; earlier ones make way."""
     for name, parts in contents.items():
-        with (folder / name).open("wb", buffering=0) as file:
-            for part in parts:
-                left = memoryview(part).cast("B")
-                while left:
-                    left = left[file.write(left) :]
+        (folder / name).unlink(missing_ok=True)
+        direct.create_file(folder / name, parts)
 
 
 def _plan_of(mission: Mission) -> PlanSection:
