@@ -1,9 +1,9 @@
 """Neighbouring tie points err alike, and so tell less than their number says.
 
-A roof's sunny side or the edge of a field looks otherwise in green than in PAN, and every point on
-it is off the same way. What that does to the covariance of the unknowns is reckoned here from the
-residuals of one exposure; single points and their weights are judged in
-`processing.mosaic.weights`.
+A roof's sunny side or the edge of a field looks otherwise in green than in PAN, and so does ground
+whose colours are not quite in one place: every point on it is off the same way. What that does to
+the covariance of the unknowns is reckoned here from the residuals of one exposure; single points
+and their weights are judged in `processing.mosaic.weights`.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.matching.tie_points import PAN_TO_COLOUR
 from processing.mosaic.adjustment import Block, normal_equations
 from processing.mosaic.weights import CLASSES, Group
 
@@ -23,15 +24,25 @@ Array = NDArray[np.float64]
 _POINTS_PER_CLUSTER: Final = 30.0
 _LEAST_CLUSTERS: Final = 30
 """Fewer sums of residuals tell their variance to no better than a quarter."""
+_REACH_PX: Final = 93.0
+"""How far, in colour pixels, P/C points err alike: sums over cells of area a show a / (a + reach^2)
+of what sums over whole sensors have. Measured on rendered exposures (docs/matching.md)."""
 
 
 def clustered_cofactor(
-    groups: Sequence[Group], blocks: Sequence[Block], cofactor: Array, scale: Array, sigma0: float
+    groups: Sequence[Group],
+    blocks: Sequence[Block],
+    cofactor: Array,
+    scale: Array,
+    sigma0: float,
+    *,
+    pitch_mm: float,
 ) -> Array:
     """The cofactor of unknowns whose observations are not independent: Q + sum (k - 1) Q N_c Q.
 
     N_c are the normal equations of a class of points, k how many times larger than for independent
-    points the variance of sums over neighbours is, one at least.
+    points the variance of sums over neighbours is, one at least. Cells of a few points tell it from
+    one exposure; unknowns are sums over whole sensors, and to these it is carried on.
 
     Args:
         groups: the points, with the residuals of the last adjustment.
@@ -39,7 +50,9 @@ def clustered_cofactor(
         cofactor: Q (u, u), that of independent observations.
         scale: (groups,) factor of its class on the sigmas of a group.
         sigma0: of that adjustment.
+        pitch_mm: of the pixels; those of colour heads are as large.
     """
+    reach_mm = {PAN_TO_COLOUR: _REACH_PX * pitch_mm}
     result = cofactor
     for kind in CLASSES:
         mine = [i for i, group in enumerate(groups) if group.kind == kind]
@@ -49,6 +62,7 @@ def clustered_cofactor(
             cofactor,
             scale[mine],
             sigma0,
+            reach_mm.get(kind, 0.0),
         )
         if k > 1.0:
             normal, _ = normal_equations([blocks[i] for i in mine], len(cofactor))
@@ -57,17 +71,25 @@ def clustered_cofactor(
 
 
 def _variance_ratio(
-    groups: Sequence[Group], blocks: Sequence[Block], cofactor: Array, scale: Array, sigma0: float
+    groups: Sequence[Group],
+    blocks: Sequence[Block],
+    cofactor: Array,
+    scale: Array,
+    sigma0: float,
+    reach_mm: float,
 ) -> float:
-    """Variance of the residuals' sums over clusters, against that of independent residuals."""
-    found = expected = 0.0
+    """Variance of the residuals' sums over whole sensors, against that of independent residuals.
+
+    Found as that of sums over clusters, and carried on from their area.
+    """
+    found = expected = shown = 0.0
     clusters = 0
     for group, block, unit in zip(groups, blocks, scale, strict=True):
         used = group.factor > 0.0
         count = int(used.sum())
         if count < 2:
             continue
-        cell = _cells(group.corrected_b[used])
+        cell, area_mm2 = _cells(group.corrected_b[used])
         amount = np.bincount(cell)
         some = amount > 0
         sigma = group.sigma[used] * unit
@@ -82,14 +104,18 @@ def _variance_ratio(
             left = amount - np.sum((q @ common) * common, axis=0)
             found += float(np.sum(sums[some] ** 2))
             expected += float(np.sum(left[some]))
+            shown += float(np.sum(left[some])) * area_mm2 / (area_mm2 + reach_mm**2)
         clusters += 2 * int(some.sum())
     if clusters < _LEAST_CLUSTERS or expected <= 0.0:
         return 1.0
-    return found / expected
+    return 1.0 + (found - expected) / shown
 
 
-def _cells(place_mm: Array) -> NDArray[np.int64]:
-    """Number of the square cell each of the places (n, 2) lies in, some 30 places to a cell."""
+def _cells(place_mm: Array) -> tuple[NDArray[np.int64], float]:
+    """Number of the square cell each of the places (n, 2) lies in, and the area of a cell, mm².
+
+    Some 30 places are to a cell.
+    """
     low, high = place_mm.min(axis=0), place_mm.max(axis=0)
     width, height = np.maximum(high - low, 1e-9)
     side = math.sqrt(width * height * min(1.0, _POINTS_PER_CLUSTER / len(place_mm)))
@@ -97,4 +123,4 @@ def _cells(place_mm: Array) -> NDArray[np.int64]:
     rows = max(1, round(height / side))
     column = np.minimum(((place_mm[:, 0] - low[0]) / width * columns).astype(np.int64), columns - 1)
     row = np.minimum(((place_mm[:, 1] - low[1]) / height * rows).astype(np.int64), rows - 1)
-    return np.asarray(row * columns + column)
+    return np.asarray(row * columns + column), float(width * height / (columns * rows))

@@ -320,7 +320,9 @@ def _mosaic(
     cofactor = np.zeros((unknowns, unknowns))
     if solution is not None:
         scales = np.array([class_scale[group.kind] for group in groups])
-        cofactor = clustered_cofactor(groups, blocks, solution.cofactor, scales, sigma0)
+        cofactor = clustered_cofactor(
+            groups, blocks, solution.cofactor, scales, sigma0, pitch_mm=model.pitch_mm
+        )
     ratio = class_scale[PAN_TO_COLOUR] / class_scale[PAN_TO_PAN]
     pitch_um = model.pitch_mm * 1e3
     sigma0_px = sigma0 * settings.sigma_pp_px * class_scale[PAN_TO_PAN]
