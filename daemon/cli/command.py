@@ -11,10 +11,10 @@ from rich.console import Console
 
 HELP = """Give a running service a command.
 
-Commands are those of the API (docs/watching.md): start, stop, trigger, interval, distance, land,
-acknowledge, exposure, new-mission. They go over the service's Unix socket (`[watch] control`) and
-need no token: the machine knows who you are, and your group decides. The exit status is 1 where the
-service refuses.
+Commands are those of the API (docs/watching.md): arm, start, stop, trigger, interval, distance,
+land, acknowledge, exposure, new-mission. They go over the service's Unix socket (`[watch] control`)
+and need no token: the machine knows who you are, and your group decides. The exit status is 1 where
+the service refuses.
 
 Examples: `syntopic command start`, `syntopic command start --override`,
 `syntopic command interval --set interval_s=2.5 --set count=40`,

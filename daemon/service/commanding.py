@@ -76,6 +76,11 @@ def audit_message(command: Command, answer: Answer) -> Message:
     return Message(AUDIT_TOPIC, time.monotonic_ns(), loose_bytes(content))
 
 
+def _arm(command: Command, flight: Commanded) -> Answer:
+    refusal = _not_armed(command, flight)
+    return refusal or _yes(command, "armed; the line may be started")
+
+
 def _start(command: Command, flight: Commanded) -> Answer:
     if flight.line.runs and not flight.line.is_flown:
         return _no(command, "the line runs already")
@@ -180,6 +185,7 @@ def _no(command: Command, sentence: str) -> Answer:
 
 
 _COMMANDS: Mapping[str, Callable[[Command, Commanded], Answer]] = {
+    "arm": _arm,
     "start": _start,
     "stop": _stop,
     "trigger": _trigger,

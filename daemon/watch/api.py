@@ -100,6 +100,7 @@ Product = Literal[
     "quality.json",
 ]
 CommandName = Literal[
+    "arm",
     "start",
     "stop",
     "trigger",
@@ -296,7 +297,7 @@ def _add_commands(app: FastAPI, state: FlightState, gate: Gate, doors: _Doors) -
     async def command(
         name: CommandName, body: CommandBody | None = None, holder: Holder = somebody_who_may
     ) -> Outcome:
-        """start or stop the line, trigger, land, acknowledge, expose otherwise. Needs a token.
+        """arm, start or stop the line, trigger, land, acknowledge, expose otherwise. Needs a token.
 
         Every command is answered by the service and written into the flight log.
         """

@@ -102,7 +102,7 @@ def test_exposures_are_asked_for(name: str, arguments: dict[str, Any], did: Any)
     assert service.line.done == [did]
 
 
-@pytest.mark.parametrize("name", ["start", "trigger", "interval", "distance"])
+@pytest.mark.parametrize("name", ["arm", "start", "trigger", "interval", "distance"])
 def test_a_camera_that_is_not_ready_is_not_armed_unless_somebody_takes_it_upon_them(
     name: str,
 ) -> None:
