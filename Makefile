@@ -22,18 +22,17 @@ setup: .venv/ready .venv/kernels
 demo: setup
 	$(BIN)/syntopic demo
 
-# Whole flights run in real time and are given the machine to themselves.
+# Whole flights run in real time and have the right of way (tests/conftest.py).
 test: setup
-	$(BIN)/python -m pytest -n 2 --dist loadfile --ignore=tests/system
-	$(BIN)/python -m pytest tests/system
+	$(BIN)/python -m pytest -n 3 --dist loadgroup --no-loadscope-reorder
 
 # V4L2 heads and pulses per second against the real kernel, in a virtual machine; REQUIRED=--required where skipping is no
 # answer.
-test-v4l2: setup
+test-v4l2: .venv/ready
 	sh bootstrap.sh --machine
 	$(BIN)/python -m tests.kernel.machine $(REQUIRED)
 
-check: setup
+check: .venv/ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
