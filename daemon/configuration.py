@@ -70,6 +70,21 @@ class MountSection(_Section):
     time_offset_ms: float = 0.0
 
 
+class SerialsSection(_Section):
+    """Serial numbers that no bus tells, read off the labels of lenses (by cone) and probes;
+    compared with the calibration's before a flight (docs/arming.md).
+    """
+
+    lens: Mapping[str, str] = {}
+    probe: Mapping[str, str] = {}
+
+    @property
+    def parts(self) -> dict[str, str]:
+        """As `Rig.serials` names them."""
+        named = {f"lens {name}": serial for name, serial in self.lens.items()}
+        return named | {f"probe {name}": serial for name, serial in self.probe.items()}
+
+
 class TriggerSection(BaseModel):
     """When to expose, and who fires. Further keys are settings of the trigger's driver."""
 
@@ -234,6 +249,7 @@ class Configuration(_Section):
     mission: MissionSection
     plan: PlanSection = PlanSection()
     mount: MountSection = MountSection()
+    serials: SerialsSection = SerialsSection()
     trigger: TriggerSection
     head: tuple[HeadSection, ...] = Field(min_length=1)
     thermometer: tuple[NamedSection, ...] = ()
@@ -399,7 +415,19 @@ def _rig_problems(content: Mapping[str, Any], rig: Rig, file: str) -> list[str]:
             problems.append(f"{file}: head[{index}].sensor is {name!r}; {rig.name} has {listed}")
         elif name in given[:index]:
             problems.append(f"{file}: head[{index}].sensor is {name!r} for the second time")
-    return problems + _tdi_problems(content, rig, file)
+    return [*problems, *_serial_problems(content, rig, file), *_tdi_problems(content, rig, file)]
+
+
+def _serial_problems(content: Mapping[str, Any], rig: Rig, file: str) -> list[str]:
+    """Parts that the rig does not have."""
+    there = {"lens": [cone.name for cone in rig.cones], "probe": list(rig.probes)}
+    return [
+        f"{file}: serials.{kind}.{name} is of nothing {rig.name} has: {', '.join(names) or 'none'}"
+        for kind, names in there.items()
+        if isinstance(given := _dig(content, "serials", kind), Mapping)
+        for name in given
+        if name not in names
+    ]
 
 
 def _tdi_problems(content: Mapping[str, Any], rig: Rig, file: str) -> list[str]:

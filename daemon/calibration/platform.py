@@ -129,8 +129,6 @@ def report_of(
 ) -> CalibrationReport:
     """The calibration as told and written; compared with the rig flown with, or a previous one."""
     rig, quantities = flown.rig, quantities_of(calibration)
-    serials = {s.name: s.serial for s in rig.sensors if s.serial}
-    serials |= {f"lens {c.name}": c.lens.serial for c in rig.cones if c.lens.serial}
     before = quantities_of_rig(rig) if previous is None else previous.quantities
     return CalibrationReport(
         kind=KIND,
@@ -144,7 +142,7 @@ def report_of(
             ("flown with", rig.calibration_id),
             ("datum", _datum(rig)),
         ),
-        serials=serials,
+        serials=rig.serials,
         quantities=quantities,
         figures={
             "exposures": {c.cone: len(c.turns) for c in calibration.cones},
@@ -160,7 +158,7 @@ def report_of(
             "missing": list(calibration.missing),
         },
         verdicts=tuple(_verdict(rig, cone) for cone in calibration.cones),
-        warnings=_warnings(flown, calibration, previous, serials),
+        warnings=_warnings(flown, calibration, previous, rig.serials),
         sheets=(
             _angles(calibration),
             _turns(rig, calibration),

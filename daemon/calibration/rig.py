@@ -116,9 +116,7 @@ def report_of(
 ) -> CalibrationReport:
     """The calibration as told and written."""
     quantities = quantities_of(result, found)
-    serials = {s.name: s.serial for s in rig.sensors if s.serial}
-    serials |= {f"lens {c.name}": c.lens.serial for c in rig.cones if c.lens.serial}
-    warnings = [] if previous is None else serial_warnings(previous, serials)
+    warnings = [] if previous is None else serial_warnings(previous, rig.serials)
     if math.isfinite(found.squares) and found.squares > MOVED:
         warnings.append(
             f"single exposures scatter about the averages {math.sqrt(found.squares):.1f} times as "
@@ -146,7 +144,7 @@ def report_of(
                 f"{found.squares:.2f}" if found.redundancy else "not known",
             ),
         ),
-        serials=serials,
+        serials=rig.serials,
         quantities=quantities,
         figures={
             "sigma0": result.sigma0,

@@ -37,6 +37,9 @@ def rig_toml(rig: Rig, *, remark: str = "") -> bytes:
     )
     if rig.virtual_image is not None:
         lines += ["", "[virtual_image]", *_pairs(_values(rig.virtual_image))]
+    if rig.probe_serials:
+        named = {json.dumps(name): serial for name, serial in rig.probe_serials.items()}
+        lines += ["", "[probe_serials]", *_pairs(named)]
     for cone in rig.cones:
         lines += ["", "[[cone]]", *_cone(cone)]
     return ("\n".join(lines) + "\n").encode("utf-8")

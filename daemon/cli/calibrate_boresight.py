@@ -78,7 +78,7 @@ def boresight(
     if mission is not None:
         folder = Mission.open(mission)
         section = mount_of(folder)[0]
-        serials = {s.name: s.serial for s in load_rig(folder.rig_path).sensors if s.serial}
+        serials = load_rig(folder.rig_path).serials
         exposures, inertial = flight.inertial_of_mission(
             folder,
             stations,

@@ -32,7 +32,8 @@ class Readiness:
     `absent` are devices in words; `exposures_wanted` what the plan still asks for, 1 without one.
     `position_age_s` is None before the first position. `probes_c` holds a reading and its age in
     seconds for each probe of the rig, None for one never read. `serials_untold` are heads that do
-    not say which they are, though the calibration knows.
+    not say which they are, though the calibration knows; `serials_differing` are sentences about
+    parts that are stated to be others than the calibrated ones.
     """
 
     has_kernels: bool
@@ -45,6 +46,7 @@ class Readiness:
     has_fix: bool
     probes_c: Mapping[str, tuple[float | None, float] | None] = field(default_factory=dict)
     serials_untold: Sequence[str] = ()
+    serials_differing: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,8 @@ def lacks(there: Readiness, limits: LimitsSection) -> tuple[Lack, ...]:
         heads = ", ".join(there.serials_untold)
         cure = "compare their labels with the calibration"
         found.append(Lack("arming-serial", f"no serial number told by {heads}", cure))
+    cure = "fit that part, or fly with a calibration of this one"
+    found += [Lack("arming-serial", told, cure) for told in there.serials_differing]
     return tuple(found)
 
 

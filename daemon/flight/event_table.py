@@ -161,8 +161,9 @@ TABLE: Final[Sequence[Entry]] = (
     Entry(
         "arming-serial",
         "caution",
-        "A head does not tell its serial number, so nobody knows whether the calibration is its.",
-        "Compare the heads' labels with the calibration.",
+        "A head does not tell its serial number, or a lens or probe is stated to be another than "
+        "the calibrated one.",
+        "Compare the labels with the calibration.",
     ),
     Entry("exposure-settings", "note", "Exposure time, gain or TDI of heads changed.", _NOTHING),
     # Devices

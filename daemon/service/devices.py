@@ -46,6 +46,17 @@ def serial_problem(rig: Rig, head: str, found: Mapping[str, str]) -> str | None:
     )
 
 
+def stated_serial_problems(configuration: Configuration, rig: Rig) -> list[str]:
+    """A sentence for each lens and probe that is stated to be another than the calibrated one."""
+    calibrated = rig.serials
+    return [
+        f"{part} is stated to be {serial!r}, the calibration {rig.calibration_id} is of "
+        f"{calibrated[part]!r}"
+        for part, serial in configuration.serials.parts.items()
+        if calibrated.get(part, serial) != serial
+    ]
+
+
 def exposure_times_ns(configuration: Configuration, rig: Rig) -> dict[str, int]:
     """Exposure time by cone, as configured for its heads; zero where a cone has none."""
     times = {cone.name: 0 for cone in rig.cones}

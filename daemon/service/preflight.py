@@ -13,6 +13,7 @@ from daemon.configuration import Configuration
 from daemon.flight.arming import Lack, Readiness, lacks
 from daemon.flight.flight import Flight
 from daemon.flight.phases import Facts, Phase, StateMachine
+from daemon.service.devices import stated_serial_problems
 from daemon.service.hearing import Hearing
 from daemon.service.line import Line
 from daemon.service.pipeline_queue import PipelineQueue
@@ -104,4 +105,5 @@ class Preflight:
                 for head, serial in self._hearing.serials.items()
                 if not serial and self._rig.sensor(head).serial
             ],
+            serials_differing=stated_serial_problems(configuration, self._rig),
         )

@@ -74,6 +74,7 @@ def rig_from_mapping(content: Mapping[str, Any], file: str) -> Rig:
     defaults = top.table("defaults", optional=True)
     calibration = top.table("calibration")
     image = top.table("virtual_image", optional=True)
+    probes = top.table("probe_serials", optional=True)
     rig = Rig(
         name=top.text("name"),
         title=top.text("title", ""),
@@ -91,6 +92,7 @@ def rig_from_mapping(content: Mapping[str, Any], file: str) -> Rig:
         ),
         virtual_image=_virtual_image(image) if image.content else None,
         cones=tuple(_cone(cone, defaults) for cone in top.tables("cone")),
+        probe_serials={name: probes.text(name) for name in probes.content},
     )
     for table in (defaults, calibration, image, top):
         table.refuse_unknown()
@@ -244,6 +246,11 @@ def _check_names(rig: Rig, file: str, problems: list[str]) -> None:
         f"{file}: cone {cone.name!r} has no sensor; give it [[cone.sensor]]"
         for cone in rig.cones
         if not cone.sensors
+    )
+    problems.extend(
+        f"{file}: probe_serials.{name} is of no probe here: {', '.join(rig.probes) or 'none'}"
+        for name in rig.probe_serials
+        if name not in rig.probes
     )
     problems.extend(
         f"{file}: sensor {sensor.name!r} is left-justified; a rig with [virtual_image] has "

@@ -9,7 +9,8 @@ radians with R = Rx(omega) Ry(phi) Rz(kappa), camera to object. How a file becom
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Final, Literal
 
 VIRTUAL_CAMERA: Final = "virtual"
@@ -158,7 +159,8 @@ class Rig:
 
     `master_cone` is None where all PAN heads converge and none of them is the virtual image plane:
     the virtual camera then stands in the middle of their projection centres. The calibration is
-    trusted for `calibration_valid_days` after its date.
+    trusted for `calibration_valid_days` after its date; `probe_serials` are those of the probes it
+    was made with.
     """
 
     name: str
@@ -173,6 +175,7 @@ class Rig:
     virtual_image: VirtualImage | None
     cones: tuple[Cone, ...]
     calibration_valid_days: int = CALIBRATION_VALID_DAYS
+    probe_serials: Mapping[str, str] = field(default_factory=dict, hash=False)
 
     def cone(self, name: str | None) -> Cone:
         """The cone of that name; KeyError, None's too, names those there are."""
@@ -196,6 +199,14 @@ class Rig:
     def sensors(self) -> tuple[Sensor, ...]:
         """All sensors in file order."""
         return tuple(sensor for cone in self.cones for sensor in cone.sensors)
+
+    @property
+    def serials(self) -> dict[str, str]:
+        """Serial numbers of the parts that have one: sensors by name, "lens ...", "probe ..."."""
+        named = {sensor.name: sensor.serial for sensor in self.sensors}
+        named |= {f"lens {cone.name}": cone.lens.serial for cone in self.cones}
+        named |= {f"probe {name}": serial for name, serial in self.probe_serials.items()}
+        return {name: serial for name, serial in named.items() if serial}
 
     @property
     def pan_cones(self) -> tuple[Cone, ...]:

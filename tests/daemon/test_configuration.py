@@ -116,3 +116,15 @@ def test_a_plan_to_follow_has_to_be_there_and_readable(tmp_path: Path) -> None:
             (tmp_path / "block.kml").write_text(text)
         with pytest.raises(ConfigurationError, match=rf"plan\.file: .*block\.kml: {why}"):
             from_mapping(content, tmp_path / "service.toml")
+
+
+def test_parts_that_no_bus_tells_are_stated_and_only_those_the_rig_has() -> None:
+    content = copy.deepcopy(GOOD)
+    content["serials"] = {"lens": {"0": "L-1"}, "probe": {"0": "PT-17"}}
+    configuration, _ = from_mapping(content, FILE)
+    assert configuration.serials.parts == {"lens 0": "L-1", "probe 0": "PT-17"}
+    content["serials"] = {"lens": {"9": "L-1"}, "probe": {"boiler": "PT-17"}}
+    said = problems_of(content)
+    assert len(said) == 2 and "serials.lens.9" in said[0] and "serials.probe.boiler" in said[1]
+    content["serials"] = {"lens": "L-1"}
+    assert "serials.lens" in problems_of(content)[0]

@@ -95,3 +95,16 @@ def test_what_is_no_rig_file_is_refused_in_one_sentence(tmp_path: Path) -> None:
         assert len(refused.value.problems) == 1
     with pytest.raises(RigError, match="ultracam-x-mini"):
         find_rig("ultracam-y")
+
+
+def test_probes_have_serial_numbers_of_their_own_and_only_those_of_the_rig() -> None:
+    changed = content()
+    changed["probe_serials"] = {"0": "PT-17"}
+    changed["cone"][0]["lens"]["serial"] = "L-1"
+    rig = rig_from_mapping(changed, "rig.toml")
+    parts = rig.serials
+    assert parts["probe 0"] == "PT-17" and parts[f"lens {rig.cones[0].name}"] == "L-1"
+    assert parts["SU00"] == rig.sensor("SU00").serial
+    assert "probe 1" not in parts
+    changed["probe_serials"] = {"boiler": "PT-18"}
+    assert "probe_serials.boiler" in problems_of(changed)[0]

@@ -117,11 +117,13 @@ def read_series(folder: Path, *, kind: str) -> Series:
 
 
 def part_serials(rig: Rig, sensors: set[str]) -> dict[str, str]:
-    """Serial numbers of the sensors named and of their lenses, as the rig file has them."""
+    """Serial numbers of the sensors named, of their lenses and probes, as the rig file has them."""
     result: dict[str, str] = {}
     for cone in rig.cones:
         for sensor in cone.sensors:
             if sensor.name in sensors:
                 result[f"sensor {sensor.name}"] = sensor.serial
                 result[f"lens {cone.name}"] = cone.lens.serial
+                for probe in sorted({cone.probe, sensor.probe} - {""}):
+                    result[f"probe {probe}"] = rig.probe_serials.get(probe, "")
     return result

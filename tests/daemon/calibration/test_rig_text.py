@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from dataclasses import replace
 
 import pytest
 
@@ -16,6 +17,12 @@ def test_every_shipped_rig_survives_writing_and_reading(name):
     text = rig_toml(rig, remark="a remark\nof two lines").decode()
     assert text.startswith("# a remark\n# of two lines\n")
     assert rig_from_mapping(tomllib.loads(text), "rig.toml") == rig
+
+
+def test_serial_numbers_of_probes_survive_it_too():
+    rig = load_rig(shipped_rigs()["ultracam-x-mini"])
+    rig = replace(rig, probe_serials={"0": "PT-17", "N": 'PT "18"'})
+    assert rig_from_mapping(tomllib.loads(rig_toml(rig).decode()), "rig.toml") == rig
 
 
 def test_left_justified_words_are_refused_where_images_are_stitched():

@@ -43,6 +43,7 @@ def test_nothing_is_missing_where_all_is_there() -> None:
         ({"probes_c": {"1": (None, 0.1)}}, "arming-temperature", "probe 1"),
         ({"probes_c": {"1": (20.0, 60.0)}}, "arming-temperature", "older than 10 s"),
         ({"serials_untold": ["SU00"]}, "arming-serial", "SU00"),
+        ({"serials_differing": ["lens 0 is 'L-2'"]}, "arming-serial", "lens 0 is 'L-2'"),
     ],
 )
 def test_each_thing_that_is_missing_is_named_with_its_cure(

@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 from pathlib import Path
 
 from daemon.configuration import Configuration, from_mapping
-from daemon.service.devices import device_specs, exposure_times_ns, frame_nbytes, serial_problem
+from daemon.service.devices import (
+    device_specs,
+    exposure_times_ns,
+    frame_nbytes,
+    serial_problem,
+    stated_serial_problems,
+)
 from processing.rig import Rig, find_rig
 from tests.daemon.test_configuration import GOOD
 
@@ -24,6 +31,20 @@ def test_a_head_with_another_serial_number_than_the_calibration_is_refused_with_
     sentence = serial_problem(rig, "SU00", {"serial": "M-SU01"})
     assert sentence is not None
     assert "M-SU00" in sentence and "M-SU01" in sentence and "connect" in sentence
+
+
+def test_a_lens_or_probe_stated_to_be_another_than_the_calibrated_one_is_told_with_both() -> None:
+    content = copy.deepcopy(GOOD)
+    content["serials"] = {"lens": {"0": "L-2"}, "probe": {"0": "PT-17", "1": "PT-19"}}
+    configuration, rig = from_mapping(content, Path("service.toml"))
+    cone = rig.cone("0")
+    lens = replace(cone.lens, serial="L-1")
+    cones = tuple(replace(c, lens=lens) if c is cone else c for c in rig.cones)
+    # Of probe 1 the calibration says nothing.
+    made = replace(rig, cones=cones, probe_serials={"0": "PT-17"})
+    (sentence,) = stated_serial_problems(configuration, made)
+    assert "lens 0" in sentence and "'L-2'" in sentence and "'L-1'" in sentence
+    assert stated_serial_problems(configuration, rig) == []
 
 
 def test_a_head_knows_its_output_and_the_trigger_comes_last() -> None:
