@@ -208,7 +208,8 @@ def _warnings(
             "flight axis their height above ground must be known): its angles are as they were"
         )
     told += [
-        f"cone {c.cone}: {c.left_out} exposures far off the others were left out"
+        f"cone {c.cone}: {c.left_out} of {c.left_out + len(c.used)} exposures left out, far off "
+        "the others"
         for c in calibration.cones
         if c.left_out
     ]
