@@ -85,9 +85,8 @@ def calibrated_rig(
                 _LENS_FIELD.get(name, name): float(v) for name, v in values.items()
             }
             sensor = replace(cone.sensors[0], x_mm=0.0 - camera.xp_mm, y_mm=0.0 - camera.yp_mm)
-            cone = replace(
-                cone, lens=replace(cone.lens, f_mm=camera.f_mm, **changed), sensors=(sensor,)
-            )
+            lens = replace(cone.lens, f_mm=camera.f_mm, **changed, residual_grid=None)
+            cone = replace(cone, lens=lens, sensors=(sensor,))
         made.append(cone)
     return replace(rig, calibration_id=calibration_id, calibration_date=date, cones=tuple(made))
 

@@ -47,7 +47,10 @@ def rig_toml(rig: Rig, *, remark: str = "") -> bytes:
 
 def _cone(cone: Cone) -> list[str]:
     values = _values(cone, without=("lens", "sensors"))
-    lines = [*_pairs(values), "", "[cone.lens]", *_pairs(_values(cone.lens))]
+    lens = _values(cone.lens, without=("residual_grid",))
+    lines = [*_pairs(values), "", "[cone.lens]", *_pairs(lens)]
+    if cone.lens.residual_grid is not None:
+        lines += ["", "[cone.lens.residual_grid]", *_pairs(_values(cone.lens.residual_grid))]
     for sensor in cone.sensors:
         lines += ["", "[[cone.sensor]]", *_sensor(sensor)]
     return lines

@@ -1,4 +1,5 @@
-"""The lens correction of a cone: Australis ten parameters, eq. 5.1 of seeds/dmc-calibration.txt.
+"""The lens correction of a cone: Australis ten parameters, eq. 5.1 of seeds/dmc-calibration.txt,
+and the grid of what they leave, where the rig file holds one.
 
 Points are mm in the layer, origin at the calibrated principal point; the direction is part of
 each function's name.
@@ -9,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.geometry.residual_grid import grid_of_lens
 from processing.rig import Lens
 
 Array = NDArray[np.float64]
@@ -18,7 +20,7 @@ _INVERSION_STEPS = 25
 
 
 def lens_correction(lens: Lens, measured_mm: Array) -> Array:
-    """The correction (dx, dy) of eq. 5.1 at measured points (n, 2), mm.
+    """The correction (dx, dy) of eq. 5.1 at measured points (n, 2), mm, and that of the grid.
 
     The equation divides by z = -f, so the df term is +x df / f.
     """
@@ -35,6 +37,8 @@ def lens_correction(lens: Lens, measured_mm: Array) -> Array:
         + y * lens.b2
     )
     delta[:, 1] = lens.dy0_mm + y * radial + 2.0 * x * y * lens.p1 + (r2 + 2.0 * y * y) * lens.p2
+    if lens.residual_grid is not None:
+        delta += grid_of_lens(lens.residual_grid).correction_to_ideal(measured_mm)
     return delta
 
 
@@ -67,7 +71,10 @@ def measured_from_ideal(lens: Lens, ideal_mm: Array) -> Array:
 
 
 def _jacobian(lens: Lens, measured_mm: Array) -> Array:
-    """d(ideal) / d(measured), columns xx, xy, yx, yy: shape (n, 4)."""
+    """d(ideal) / d(measured), columns xx, xy, yx, yy: shape (n, 4).
+
+    The grid's slopes, some 1e-4, are left out: they cost a step of the inversion, no accuracy.
+    """
     x, y = measured_mm[:, 0], measured_mm[:, 1]
     r2 = x * x + y * y
     radial = r2 * (lens.k1 + r2 * (lens.k2 + r2 * lens.k3)) + lens.df_mm / lens.f_mm

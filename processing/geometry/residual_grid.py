@@ -8,10 +8,13 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+
+from processing.rig import LensGrid
 
 Array = NDArray[np.float64]
 
@@ -29,8 +32,28 @@ class ResidualGrid:
 
     def correction_to_ideal(self, measured_mm: Array) -> Array:
         """The correction (n, 2) at measured places (n, 2); beyond the grid that of its border."""
-        design = _bilinear(self.x_mm, self.y_mm, measured_mm)
-        return np.asarray(design @ self.delta_mm.reshape(-1, 2))
+        (i, u), (j, v) = _cells(self.x_mm, self.y_mm, measured_mm)
+        u, v, delta = u[:, None], v[:, None], self.delta_mm
+        lower = delta[j, i] * (1.0 - u) + delta[j, i + 1] * u
+        upper = delta[j + 1, i] * (1.0 - u) + delta[j + 1, i + 1] * u
+        return np.asarray(lower * (1.0 - v) + upper * v)
+
+    def for_lens(self) -> LensGrid:
+        """As a rig file holds it."""
+        um = np.round(self.delta_mm * 1e3, 6)
+        return LensGrid(
+            tuple(self.x_mm.tolist()),
+            tuple(self.y_mm.tolist()),
+            tuple(tuple(row) for row in um[..., 0].tolist()),
+            tuple(tuple(row) for row in um[..., 1].tolist()),
+        )
+
+
+@lru_cache(maxsize=64)
+def grid_of_lens(grid: LensGrid) -> ResidualGrid:
+    """The grid of a rig file's lens."""
+    delta_mm = np.stack([np.array(grid.dx_um), np.array(grid.dy_um)], axis=-1) * 1e-3
+    return ResidualGrid(np.array(grid.x_mm), np.array(grid.y_mm), delta_mm)
 
 
 def fit_residual_grid(
@@ -100,17 +123,23 @@ def _bilinear(x: Array, y: Array, places: Array) -> Array:
     """Weights of the nodes at places, (n, nodes)."""
     result = np.zeros((len(places), len(y), len(x)))
     rows = np.arange(len(places))
-    at: list[tuple[Any, Any]] = []
-    for nodes, values in ((x, places[:, 0]), (y, places[:, 1])):
-        step = nodes[1] - nodes[0]
-        place = np.clip((values - nodes[0]) / step, 0.0, len(nodes) - 1.0)
-        low = np.minimum(place.astype(int), len(nodes) - 2)
-        at.append((low, place - low))
-    (i, u), (j, v) = at
+    (i, u), (j, v) = _cells(x, y, places)
     for down, share_y in ((0, 1.0 - v), (1, v)):
         for across, share_x in ((0, 1.0 - u), (1, u)):
             result[rows, j + down, i + across] += share_x * share_y
     return result.reshape(len(places), -1)
+
+
+def _cells(x: Array, y: Array, places: Array) -> list[tuple[Any, Any]]:
+    """Of places (n, 2): the node before, and how far towards the next, across and down."""
+    at: list[tuple[Any, Any]] = []
+    for nodes, values in ((x, places[:, 0]), (y, places[:, 1])):
+        step = nodes[1] - nodes[0]
+        place = np.clip((values - nodes[0]) / step, 0.0, len(nodes) - 1.0)
+        # Where a lens folds there is no place, and no correction either.
+        low = np.minimum(np.nan_to_num(place).astype(int), len(nodes) - 2)
+        at.append((low, place - low))
+    return at
 
 
 def _second_differences(nodes: tuple[int, int]) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import stat
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,6 +14,7 @@ from processing.rig.model import (
     Cone,
     Drift,
     Lens,
+    LensGrid,
     Rig,
     Sensor,
     VirtualImage,
@@ -54,7 +56,10 @@ def load_rig(path: Path) -> Rig:
         RigError: with one sentence per mistake: file, key, value, and what would be right.
     """
     try:
-        if path.stat().st_size > RIG_FILE_MAX_BYTES:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise RigError([f"{path}: not a regular file; give a rig file"])
+        if status.st_size > RIG_FILE_MAX_BYTES:
             raise RigError([f"{path.name}: larger than {RIG_FILE_MAX_BYTES} bytes; not a rig file"])
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -182,9 +187,24 @@ def _lens(table: Table) -> Lens:
         p2=number("p2", 0.0),
         b1=number("b1", 0.0),
         b2=number("b2", 0.0),
+        residual_grid=_lens_grid(table.table("residual_grid", optional=True)),
     )
     table.refuse_unknown()
     return lens
+
+
+def _lens_grid(table: Table) -> LensGrid | None:
+    if not table.content:
+        return None
+    x_mm, y_mm = table.steps("x_mm"), table.steps("y_mm")
+    grid = LensGrid(
+        x_mm,
+        y_mm,
+        table.matrix("dx_um", len(y_mm), len(x_mm)),
+        table.matrix("dy_um", len(y_mm), len(x_mm)),
+    )
+    table.refuse_unknown()
+    return grid
 
 
 def _sensor(table: Table, probe: str, calibration_c: float) -> Sensor:

@@ -81,11 +81,26 @@ class Sensor:
 
 
 @dataclass(frozen=True)
+class LensGrid:
+    """What a lens does beyond the Australis ten: corrections to be added to theirs.
+
+    `dx_um`, `dy_um` are rows of nodes by `y_mm`, columns by `x_mm` (both evenly spaced, ascending);
+    taken at the measured place, bilinear between nodes, beyond them that of the border.
+    """
+
+    x_mm: tuple[float, ...]
+    y_mm: tuple[float, ...]
+    dx_um: tuple[tuple[float, ...], ...]
+    dy_um: tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True)
 class Lens:
     """Principal distance and the Australis ten, eq. 5.1 of seeds/dmc-calibration.txt.
 
-    The correction carries *measured* image coordinates to *ideal* ones: ideal = measured + delta.
-    `f_ppm_per_k` is the drift of the principal distance against dC of the cone's probe.
+    The correction carries *measured* image coordinates to *ideal* ones: ideal = measured + delta,
+    with what `residual_grid` adds. `f_ppm_per_k` is the drift of the principal distance against dC
+    of the cone's probe.
     """
 
     f_mm: float
@@ -102,6 +117,7 @@ class Lens:
     p2: float
     b1: float
     b2: float
+    residual_grid: LensGrid | None = None
 
 
 @dataclass(frozen=True)

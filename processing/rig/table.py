@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 
@@ -98,6 +99,28 @@ class Table:
             return (0.0, 0.0, 0.0)
         return (float(value[0]), float(value[1]), float(value[2]))
 
+    def steps(self, key: str) -> tuple[float, ...]:
+        """Two numbers or more, ascending by equal steps."""
+        cure = "two numbers or more are needed, ascending by equal steps"
+        values = _numbers(self._get(key, None, cure))
+        steps = [b - a for a, b in pairwise(values)]
+        if not steps or min(steps) <= 0 or max(steps) - min(steps) > 1e-6 * max(steps):
+            if key in self.content:
+                self.complain(key, cure)
+            return (0.0, 1.0)
+        return values
+
+    def matrix(self, key: str, rows: int, columns: int) -> tuple[tuple[float, ...], ...]:
+        """Lists of numbers, so many and so long."""
+        cure = f"{rows} lists of {columns} numbers are needed"
+        value = self._get(key, None, cure)
+        found = tuple(_numbers(row) for row in value) if isinstance(value, list) else ()
+        if len(found) != rows or any(len(row) != columns for row in found):
+            if key in self.content:
+                self.complain(key, cure)
+            return ((0.0,) * columns,) * rows
+        return found
+
     def table(self, key: str, *, optional: bool = False) -> Table:
         value = self._get(key, {} if optional else None, f"a table [{self._key(key)}] is needed")
         if value is not None and not isinstance(value, dict):
@@ -135,3 +158,13 @@ class Table:
 
     def _key(self, key: str) -> str:
         return f"{self.path}.{key}" if self.path else key
+
+
+def _numbers(value: object) -> tuple[float, ...]:
+    """A list's numbers; none of them where one is no finite number."""
+    if not isinstance(value, list):
+        return ()
+    good = all(
+        isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in value
+    )
+    return tuple(float(v) for v in value) if good else ()

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from processing.rig import Cone, Lens, Rig, Sensor
 from sim_hw.seeding import random_stream
@@ -140,7 +141,7 @@ def true_camera(
 
 
 def undistorted(lens: Lens, xy_mm: Array) -> Array:
-    """Ideal from measured image coordinates: the ten parameters, z = -f.
+    """Ideal from measured image coordinates: the ten parameters, z = -f, and the grid on top.
 
     Source: seeds/dmc-calibration.txt, eq. 5.1.
     """
@@ -156,6 +157,16 @@ def undistorted(lens: Lens, xy_mm: Array) -> Array:
         + lens.b2 * y
     )
     dy = lens.dy0_mm + y * radial + 2 * lens.p1 * x * y + lens.p2 * (r2 + 2 * y * y)
+    if (grid := lens.residual_grid) is not None:
+        nodes = [
+            (value - axis[0]) / (axis[-1] - axis[0]) * (len(axis) - 1)
+            for value, axis in ((y, grid.y_mm), (x, grid.x_mm))
+        ]
+        more_um = [
+            map_coordinates(np.array(table), nodes, order=1, mode="nearest")
+            for table in (grid.dx_um, grid.dy_um)
+        ]
+        dx, dy = dx + 1e-3 * more_um[0], dy + 1e-3 * more_um[1]
     return np.stack([x + dx, y + dy], axis=-1)
 
 

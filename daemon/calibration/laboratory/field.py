@@ -166,7 +166,7 @@ def _moved(rig: Rig, result: Adjustment) -> Rig:
         cones.append(
             replace(
                 cone,
-                lens=replace(cone.lens, **lens),
+                lens=replace(cone.lens, **lens, residual_grid=None),
                 rotation_rad=cone.rotation_rad
                 if is_master
                 else (float(angles[k, 0]), float(angles[k, 1]), float(angles[k, 2])),

@@ -94,12 +94,13 @@ class HeadGeometry:
 
     @property
     def lens(self) -> Lens:
-        """The rig's lens with what was found."""
+        """The rig's lens with what was found; the grid where it helps at targets not its own."""
         found = self.adjustment.state.interior[0]
         values: dict[str, Any] = {
             LENS_KEYS[n]: float(v) for n, v in zip(INTERIOR, found, strict=True)
         }
-        return replace(self.cone.lens, **values)
+        grid = self.grid.for_lens() if self.left_px < self.residual_px else None
+        return replace(self.cone.lens, **values, residual_grid=grid)
 
 
 def targets_of(series: Series) -> list[Target]:
