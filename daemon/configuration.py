@@ -6,6 +6,7 @@ Settings of a device are the business of its driver; here they are only checked 
 
 from __future__ import annotations
 
+import stat
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -276,7 +277,10 @@ def load(path: Path) -> tuple[Configuration, Rig]:
         ConfigurationError: with a sentence per mistake: file, key, value, and what is right.
     """
     try:
-        if path.stat().st_size > CONFIGURATION_MAX_BYTES:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise ConfigurationError([f"{path}: not a regular file; give a service.toml"])
+        if status.st_size > CONFIGURATION_MAX_BYTES:
             raise ConfigurationError([f"{path.name}: too large for a configuration"])
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import os
 from pathlib import Path
 from typing import Any
 
@@ -88,7 +89,9 @@ def test_an_unknown_rig_is_refused_with_the_names_of_those_there_are() -> None:
 def test_a_file_that_is_not_toml_or_not_there_is_refused_in_one_sentence(tmp_path: Path) -> None:
     broken = tmp_path / "service.toml"
     broken.write_text("[mission\n")
-    for path in (broken, tmp_path / "absent.toml"):
+    pipe = tmp_path / "pipe.toml"
+    os.mkfifo(pipe)
+    for path in (broken, tmp_path / "absent.toml", pipe, Path("/dev/zero")):
         with pytest.raises(ConfigurationError) as refused:
             load(path)
         assert len(refused.value.problems) == 1

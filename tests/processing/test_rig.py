@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -89,7 +90,11 @@ def test_what_is_no_rig_file_is_refused_in_one_sentence(tmp_path: Path) -> None:
     broken.write_bytes(b"\xff\xfe[cone")
     huge = tmp_path / "huge.toml"
     huge.write_bytes(b"#" * 1_100_000)
-    for path in (broken, huge, tmp_path / "absent.toml"):
+    pipe = tmp_path / "pipe.toml"
+    os.mkfifo(pipe)
+    endless = tmp_path / "endless.toml"
+    endless.symlink_to("/dev/zero")
+    for path in (broken, huge, tmp_path / "absent.toml", pipe, endless):
         with pytest.raises(RigError) as refused:
             load_rig(path)
         assert len(refused.value.problems) == 1
