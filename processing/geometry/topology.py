@@ -11,6 +11,8 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
 
 import cv2
 import numpy as np
@@ -25,6 +27,9 @@ from processing.geometry.placement import (
 from processing.rig import Cone, Rig
 
 Array = NDArray[np.float64]
+
+_RIGS: Final = 8
+"""What follows from a rig alone is reckoned once, not for every exposure."""
 
 # A strip runs along at least half of a sensor's side; what is shorter both ways is a corner.
 _STRIP_FRACTION = 0.5
@@ -228,6 +233,7 @@ def _sees(placement: SensorPlacement, xy_mm: Array) -> bool:
     return bool(0 <= column <= sensor.width_px - 1 and 0 <= row <= sensor.height_px - 1)
 
 
+@lru_cache(maxsize=_RIGS)
 def overlaps(rig: Rig) -> tuple[Overlap, ...]:
     """The overlap strips of PAN sensors of different cones (twelve for a 3x3 grid).
 
@@ -244,6 +250,7 @@ def overlaps(rig: Rig) -> tuple[Overlap, ...]:
     return tuple(result)
 
 
+@lru_cache(maxsize=_RIGS)
 def corners(rig: Rig) -> tuple[Corner, ...]:
     """Areas where strips cross, with every PAN sensor that sees them (four for a 3x3 grid)."""
     places = _pan_footprints(rig)
@@ -269,6 +276,7 @@ def corners(rig: Rig) -> tuple[Corner, ...]:
     return tuple(Corner(sensors, rectangle) for sensors, rectangle in found.items())
 
 
+@lru_cache(maxsize=_RIGS)
 def colour_coverage(rig: Rig) -> Mapping[str, Rectangle]:
     """What of each PAN sensor the colour master sees, by PAN sensor name.
 

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 # Eigenvalues of a datum defect are not quite zero: residuals shrink a little with the scale.
 _RANK_TOLERANCE = 1e-7
 
-_PART = 512
+_PART = 2048
 
 
 @dataclass(frozen=True)
@@ -58,10 +58,10 @@ def normal_equations(blocks: Sequence[Block], unknowns: int) -> tuple[Array, Arr
     for block in blocks:
         at = np.ix_(block.columns, block.columns)
         for part in _parts(block):
-            design = block.design[:, part]
-            weighted = design * block.weight[part]
-            normal[at] += weighted @ design.T
-            right[block.columns] += weighted @ block.misclosure[part]
+            root = np.sqrt(block.weight[part])
+            design = block.design[:, part] * root
+            normal[at] += design @ design.T
+            right[block.columns] += design @ (root * block.misclosure[part])
     return normal, right
 
 

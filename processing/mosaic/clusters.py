@@ -90,22 +90,23 @@ def _variance_ratio(
         if count < 2:
             continue
         cell, area_mm2 = _cells(group.corrected_b[used])
-        amount = np.bincount(cell)
-        some = amount > 0
-        sigma = group.sigma[used] * unit
+        # Neighbours side by side, so that the sums over a cluster are those of a run.
+        order = np.argsort(cell, kind="stable")
+        first = np.flatnonzero(np.diff(cell[order], prepend=-1))
+        rows = np.flatnonzero(used)[order]
+        amount = np.diff(first, append=count)
+        sigma = group.sigma[rows] * unit
         q = cofactor[np.ix_(block.columns, block.columns)]
-        design = block.design.reshape(len(block.columns), 2, -1)[:, :, used] / sigma
-        member = np.zeros((count, len(amount)))
-        member[np.arange(count), cell] = 1.0
+        design = block.design.reshape(len(block.columns), 2, -1)
         for axis in (0, 1):
-            sums = (group.difference[used, axis] / (sigma * sigma0)) @ member
-            common = design[:, axis] @ member
+            sums = np.add.reduceat(group.difference[rows, axis] / (sigma * sigma0), first)
+            common = np.add.reduceat(design[:, axis, rows] / sigma, first, axis=1)
             # What the unknowns take of a sum is lost to it.
             left = amount - np.sum((q @ common) * common, axis=0)
-            found += float(np.sum(sums[some] ** 2))
-            expected += float(np.sum(left[some]))
-            shown += float(np.sum(left[some])) * area_mm2 / (area_mm2 + reach_mm**2)
-        clusters += 2 * int(some.sum())
+            found += float(np.sum(sums**2))
+            expected += float(np.sum(left))
+            shown += float(np.sum(left)) * area_mm2 / (area_mm2 + reach_mm**2)
+        clusters += 2 * len(amount)
     if clusters < _LEAST_CLUSTERS or expected <= 0.0:
         return 1.0
     return 1.0 + (found - expected) / shown

@@ -13,6 +13,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +46,7 @@ from processing.mosaic.weights import (
     first_look,
     full_weight,
     groups_of,
+    moved_on,
     weight_factors,
 )
 from processing.rig import Rig
@@ -61,6 +63,10 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
+
+_STRAIGHT_PX: Final = 0.05
+"""Steps this small change neither derivatives nor, by more than 1e-6 px, what they foretell: a step
+d is off by d squared over the size of the image."""
 
 
 @dataclass(frozen=True)
@@ -205,10 +211,11 @@ def adjust_mosaic(
 ) -> Mosaic:
     """Gauss-Newton with robust weights, variance components and data snooping.
 
-    Each round linearises, weighs (a soft weight while the model is still far off, then points whose
-    normalised residual exceeds `outlier_limit` are left out), solves, and estimates what the two
-    classes of points are worth, until corrections and outliers come to rest. From `begin` on, an
-    adjustment of the same points and unknowns, nothing needs a first look or soft weights.
+    Each round linearises (but after a step too small to matter), weighs (a soft weight while the
+    model is still far off, then points whose normalised residual exceeds `outlier_limit` are left
+    out), solves, and estimates what the two classes of points are worth, until corrections and
+    outliers come to rest. From `begin` on, an adjustment of the same points and unknowns, nothing
+    needs a first look or soft weights.
 
     `prior` (u, u) is information that draws the unknowns to their start, in the inverse square of
     `MosaicModel.units` and of a weight like that of the points.
@@ -230,8 +237,15 @@ def adjust_mosaic(
     solution: Solution | None = None
     blocks: list[Block] = []
     iterations = 0
+    bent = True
     for iterations in range(1, settings.max_iterations + 1):
-        blocks = [block_of(model, start, g, values, class_scale[g.kind]) for g in groups]
+        if bent:
+            blocks = [block_of(model, start, g, values, class_scale[g.kind]) for g in groups]
+        else:
+            blocks = [
+                moved_on(block, g, class_scale[g.kind])
+                for block, g in zip(blocks, groups, strict=True)
+            ]
         normal, right = normal_equations(blocks, len(values))
         if prior is not None:
             normal += prior
@@ -256,7 +270,8 @@ def adjust_mosaic(
         for group, factor in zip(groups, weight_factors(groups, settings, soft=soft), strict=True):
             changed = changed or bool(np.any((factor > 0.0) != (group.factor > 0.0)))
             group.factor = factor
-        still = float(np.abs(solution.dp).max(initial=0.0)) < settings.converged_px
+        largest = float(np.abs(solution.dp).max(initial=0.0))
+        bent, still = largest > _STRAIGHT_PX, largest < settings.converged_px
         if iterations >= least and still and not changed and not moved:
             break
     return _mosaic(

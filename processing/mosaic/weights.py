@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from processing.geometry.placement import SensorPlacement, corrected_mm_from_raw, vip_mm_from_raw
+from processing.geometry.projective import apply_projective
 from processing.geometry.topology import corners
 from processing.matching.tie_points import PAN_TO_COLOUR, PAN_TO_PAN, TiePoints
 from processing.mosaic.adjustment import Block
@@ -121,15 +122,19 @@ def groups_of(
 
 def first_look(model: MosaicModel, start: Mapping[str, SensorPlacement], group: Group) -> Array:
     """Weight factors before any adjustment: points far from their pair's median are left out."""
-    zero = np.zeros(len(model.names))
-    a = vip_and_design(model, start[group.a], group.corrected_a, zero)[0]
-    b = vip_and_design(model, start[group.b], group.corrected_b, zero)[0]
+    a = _started_px(model, start[group.a], group.corrected_a)
+    b = _started_px(model, start[group.b], group.corrected_b)
     off = a - b
     off = np.abs(off - np.median(off, axis=0))
     spread = np.maximum(_SPREAD_OF_MEDIAN * np.median(off, axis=0), 0.2)
     group.difference = a - b
     group.redundancy = np.ones((len(a), 2))
     return np.asarray((off < 6.0 * spread).all(axis=1), dtype=np.float64)
+
+
+def _started_px(model: MosaicModel, start: SensorPlacement, corrected_mm: Array) -> Array:
+    xy = apply_projective(start.layer @ start.similarity.matrix, corrected_mm)
+    return np.asarray(xy / model.pitch_mm)
 
 
 def full_weight(group: Group, class_scale: Mapping[int, float]) -> Array:
@@ -155,6 +160,15 @@ def block_of(
         columns=columns,
         design=design,
         misclosure=(b - a).T.reshape(-1),
+        weight=np.tile(group.factor / (group.sigma * scale) ** 2, 2),
+    )
+
+
+def moved_on(block: Block, group: Group, scale: float) -> Block:
+    """A block after a step along its derivatives that left `group.difference`, newly weighed."""
+    return replace(
+        block,
+        misclosure=-group.difference.T.reshape(-1),
         weight=np.tile(group.factor / (group.sigma * scale) ** 2, 2),
     )
 
