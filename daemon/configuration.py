@@ -48,6 +48,8 @@ class PlanSection(_Section):
 
     `file` holds the lines (docs/plan.md); beside them by more than `corridor_m`, a quarter of the
     image where it is not given, none is flown. `line` names the line where there is no file.
+    `elevation` is a height model in `elevation_crs` (docs/dmc.md): the height above the mean of the
+    terrain an image shows is then the model's.
     """
 
     line: str = ""
@@ -56,6 +58,16 @@ class PlanSection(_Section):
     ground_height_m: float = 0.0
     height_above_ground_m: float = Field(default=1000.0, gt=0)
     ground_speed_mps: float = Field(default=60.0, gt=0)
+    elevation: Path | None = None
+    elevation_crs: str = ""
+
+    @model_validator(mode="after")
+    def _says_where_the_model_lies(self) -> PlanSection:
+        if self.elevation is not None and not self.elevation_crs:
+            raise ValueError(
+                "elevation needs elevation_crs, the model's system, such as EPSG:25833+7837"
+            )
+        return self
 
 
 class MountSection(_Section):
@@ -317,6 +329,9 @@ def from_mapping(content: Mapping[str, Any], path: Path) -> tuple[Configuration,
             read_plan(path.parent / plan_file)
         except PlanError as error:
             problems.append(f"{file}: plan.file: {error}")
+    model = _dig(content, "plan", "elevation")
+    if isinstance(model, str) and not (path.parent / model).is_file():
+        problems.append(f"{file}: plan.elevation is {model!r}, and there is no such file")
     if problems or configuration is None or rig is None:
         raise ConfigurationError(problems)
     return _anchored(configuration, path.parent.resolve()), rig
@@ -340,6 +355,8 @@ def _anchored(configuration: Configuration, folder: Path) -> Configuration:
     plan = configuration.plan
     if plan.file is not None:
         plan = plan.model_copy(update={"file": folder / plan.file})
+    if plan.elevation is not None:
+        plan = plan.model_copy(update={"elevation": folder / plan.elevation})
     watch = configuration.watch
     if watch is not None:
         files = {name: getattr(watch, name) for name in ("tokens", "certificate", "key", "control")}

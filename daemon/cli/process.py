@@ -37,6 +37,9 @@ def process(
     radiometry: Annotated[
         Path | None, typer.Option(help="Folder of radiometric calibrations.")
     ] = None,
+    elevation: Annotated[
+        Path | None, typer.Option(help="Height model, where that of the flight lies elsewhere.")
+    ] = None,
     baselines: Annotated[
         bool, typer.Option(help="Also solve the fixed method, with and without TDM.")
     ] = False,
@@ -46,6 +49,7 @@ def process(
     os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
     from daemon.disk import store
     from daemon.orientation.exterior import mount_of
+    from daemon.orientation.ground import ground_of
     from daemon.products.processor import processor_for
     from daemon.service.worker import overlaps_of, process_exposure
     from processing.radiometry.calibration import CalibrationError
@@ -57,7 +61,7 @@ def process(
         )
     folder = Mission.open(mission)
     rig = load_rig(folder.rig_path)
-    plan, radiometry = as_flown(folder, radiometry)
+    plan, radiometry = as_flown(folder, radiometry, elevation)
     processing = ProcessingSection.model_validate(
         {
             "method": method,
@@ -68,6 +72,7 @@ def process(
     )
     mount, _ = mount_of(folder)
     overlaps = overlaps_of(folder, rig)
+    ground = ground_of(rig, mount, plan)
     reports = []
     try:
         processor = processor_for(rig, folder, processing, radiometry)
@@ -87,6 +92,7 @@ def process(
                     exposure,
                     frames,
                     surroundings=overlaps.of(number),
+                    ground=ground,
                 )
                 report["duration_s"] = round(time.monotonic() - started, 3)
                 reports.append(report)
@@ -101,7 +107,9 @@ def process(
     console.print(f"Products are in [bold]{folder.level2_root}[/]")
 
 
-def as_flown(folder: Mission, radiometry: Path | None) -> tuple[PlanSection, Path | None]:
+def as_flown(
+    folder: Mission, radiometry: Path | None, elevation: Path | None = None
+) -> tuple[PlanSection, Path | None]:
     """Plan and radiometry of the configuration that was flown, where the mission has one.
 
     Only these two are read: devices that were there in the air need not be here.
@@ -110,6 +118,15 @@ def as_flown(folder: Mission, radiometry: Path | None) -> tuple[PlanSection, Pat
         return PlanSection.model_validate({}), radiometry
     flown = tomllib.loads(folder.service_path.read_text(encoding="utf-8"))
     plan = PlanSection.model_validate(flown.get("plan", {}))
+    if elevation is not None:
+        plan = plan.model_copy(update={"elevation": elevation})
+    if plan.elevation is not None and not plan.elevation.is_file():
+        raise ConfigurationError(
+            [
+                f"{folder.service_path}: plan.elevation is {str(plan.elevation)!r}, and that file "
+                f"is not here; give syntopic process --elevation FILE"
+            ]
+        )
     told = flown.get("mission", {}).get("radiometry")
     if radiometry is None and told is not None:
         radiometry = Path(told)

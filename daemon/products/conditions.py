@@ -7,6 +7,7 @@ import math
 
 from daemon.configuration import PlanSection
 from daemon.exposure import Exposure
+from daemon.orientation.ground import Ground
 from daemon.plan.overlaps import Surroundings
 from drivers.leap_seconds import leap_seconds_at
 from processing.geometry.sun import sun_elevation_rad
@@ -24,10 +25,13 @@ def conditions_of(
     plan: PlanSection,
     flags: Flag,
     surroundings: Surroundings | None = None,
+    *,
+    ground: Ground | None = None,
 ) -> Conditions:
     """The conditions of an exposure; what the record does not know comes from the plan.
 
-    `flags` are added to those the record holds; `surroundings` are its overlaps, where known.
+    `flags` are added to those the record holds; `surroundings` are its overlaps, where known, and
+    `ground` is the height model under it.
     """
     navigation = exposure.navigation
     speed_mps = plan.ground_speed_mps
@@ -37,6 +41,8 @@ def conditions_of(
         north, east, _ = navigation.velocity_ned_mps
         speed_mps = math.hypot(north, east)
         height_m = navigation.height_m - plan.ground_height_m
+        if ground is not None and (above_m := ground.height_above_m(navigation)) is not None:
+            height_m = above_m
         if navigation.heading_rad is not None and speed_mps > 1.0:
             crab = navigation.heading_rad - math.atan2(east, north)
             crab_rad = math.remainder(crab, 2 * math.pi)

@@ -23,6 +23,7 @@ from daemon.disk.records import RecordError, canonical_bytes, parse_record, sha2
 from daemon.errors import DaemonError
 from daemon.exposure import Exposure, exposure_bytes
 from daemon.orientation.exterior import mount_of
+from daemon.orientation.ground import ground_of
 from daemon.plan.overlaps import Overlaps
 from daemon.products.conditions import conditions_of
 from daemon.products.processor import Processor, make_products, processor_for
@@ -74,6 +75,7 @@ def compare_products(
     processor = processor_for(rig, mission, settings.processing, settings.radiometry)
     processor.warm_up()
     mount, _ = mount_of(mission)
+    ground = ground_of(rig, mount, settings.plan)
     overlaps = _overlaps(mission, rig, out.records)
     chosen = [
         exposure
@@ -85,7 +87,7 @@ def compare_products(
         frames, _ = load_level0(mission.level0(exposure.number), rig)
         flags = Flag.PROCESSING_BEHIND if out.deferred.get(exposure.number) else Flag(0)
         surroundings = overlaps.of(exposure.number)
-        conditions = conditions_of(exposure, rig, settings.plan, flags, surroundings)
+        conditions = conditions_of(exposure, rig, settings.plan, flags, surroundings, ground=ground)
         _, contents = make_products(free, mount, settings.plan, exposure, frames, conditions)
         return {name: content_hash(name, b"".join(parts)) for name, parts in contents.items()}
 

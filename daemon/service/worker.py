@@ -25,6 +25,7 @@ from daemon.disk.mission import Mission
 from daemon.disk.records import RecordError
 from daemon.exposure import Exposure
 from daemon.orientation.exterior import exposure_of, mount_of
+from daemon.orientation.ground import Ground, ground_of
 from daemon.plan.overlaps import Overlaps, Surroundings
 from daemon.products.conditions import conditions_of
 from daemon.products.processor import Processor, histograms_of, make_products, processor_for
@@ -65,7 +66,9 @@ def main(link: Link, settings: WorkerSettings, rings: tuple[FrameRing, ...]) -> 
     processor.warm_up()
     lanes = Lanes[Processor](processor, settings.processing.exposures_in_work)
     mount, _ = mount_of(mission)
-    desk = _Desk(link, rig, mission, mount, settings.plan, rings, overlaps_of(mission, rig))
+    plan = settings.plan
+    overlaps, ground = overlaps_of(mission, rig), ground_of(rig, mount, plan)
+    desk = _Desk(link, rig, mission, mount, plan, rings, overlaps, ground)
     link.send(WorkerReady(time.monotonic() - started))
     in_work: set[Future[None]] = set()
     while not isinstance(order := link.receive(timeout_s=1.0), Stop):
@@ -120,6 +123,7 @@ def process_exposure(
     flags: Flag = Flag(0),  # noqa: B008 - an immutable value
     *,
     surroundings: Surroundings | None = None,
+    ground: Ground | None = None,
     frames_read: Callable[[], None] | None = None,
 ) -> tuple[dict[str, Any], Mapping[str, int]]:
     """Make the images of one exposure and write its Level-2 folder.
@@ -127,7 +131,7 @@ def process_exposure(
     Returns:
         The content of quality.json, and the files written with their sizes in bytes.
     """
-    conditions = conditions_of(exposure, processor.rig, plan, flags, surroundings)
+    conditions = conditions_of(exposure, processor.rig, plan, flags, surroundings, ground=ground)
     report, contents = make_products(
         processor, mount, plan, exposure, frames, conditions, frames_read=frames_read
     )
@@ -155,6 +159,7 @@ class _Desk:
     plan: PlanSection
     rings: tuple[FrameRing, ...]
     overlaps: Overlaps
+    ground: Ground | None
     unsettled: dict[int, SimpleQueue[tuple[Exposure, Surroundings] | None]] = field(
         default_factory=dict
     )
@@ -229,7 +234,9 @@ class _Desk:
         lane: Processor,
     ) -> Made:
         """The products of an exposure; its verdict is told before they are written."""
-        conditions = conditions_of(exposure, self.rig, self.plan, flags, surroundings)
+        conditions = conditions_of(
+            exposure, self.rig, self.plan, flags, surroundings, ground=self.ground
+        )
         made = make_products(
             lane,
             self.mount,
