@@ -152,7 +152,7 @@ def export_orientation(
         folder=folder,
         oriented=oriented,
         missing=missing,
-        crs=f"{crs} ({georeference.crs.name})",
+        crs=f"{georeference.name} ({georeference.crs.name})",
         height_system=georeference.height_system,
         trajectory=trajectory.name,
         change_m=change_m,

@@ -194,6 +194,7 @@ def test_true_north_in_the_grid_is_what_proj_calls_convergence() -> None:
 
 def test_the_files_say_the_same_in_their_own_words(tmp_path: Path) -> None:
     done = export_orientation(mission_at(tmp_path))
+    assert done.crs.startswith("EPSG:32"), "the system that was chosen is named"
     lines = (done.folder / "orientation.csv").read_text().splitlines()
     assert "# SIMULATED: emulated hardware, no survey" in lines
     assert any(
