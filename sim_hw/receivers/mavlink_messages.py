@@ -33,6 +33,7 @@ DEFINITIONS = """
   float rollspeed, float pitchspeed, float yawspeed | float[4] repr_offset_q
 33 GLOBAL_POSITION_INT uint32_t time_boot_ms, int32_t lat, int32_t lon, int32_t alt,
   int32_t relative_alt, int16_t vx, int16_t vy, int16_t vz, uint16_t hdg
+46 MISSION_ITEM_REACHED uint16_t seq
 66 REQUEST_DATA_STREAM uint8_t target_system, uint8_t target_component, uint8_t req_stream_id,
   uint16_t req_message_rate, uint8_t start_stop
 76 COMMAND_LONG uint8_t target_system, uint8_t target_component, uint16_t command,

@@ -5,11 +5,13 @@ In a real browser, with the emulated rig on the wire.
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import os
 import queue
 import sqlite3
+import statistics
 import subprocess
 import sys
 import threading
@@ -28,16 +30,23 @@ from daemon.plan.reading import read_plan
 from daemon.watch.tokens import add_token
 from sim_hw.world.flight import FlightPlan
 from tests.browser import Browser, chromium
+from tests.daemon.watch.test_mavsdk_camera import free_port
 from tests.system.flown import ROOT, Flown
+from tests.system.waypoints import darkened, fly_mission
 
 EXPOSURES = 4
 READY_WITHIN_S = 180.0
 FLOWN_WITHIN_S = 120.0
-VERDICT_WITHIN_S = 20.0
-"""Also where the emulated heads take their time to render on the same two cores; it is printed."""
+VERDICT_WITHIN_S = 2.0
+SLACK = 1.5
+"""A machine that has nothing else to do may be a slow one; what was measured is printed."""
+OTHERS_BUSY = 0.25
+"""With more of its cores busy before or after the flight a machine cannot judge."""
 SEEN_WITHIN_S = 2.0
 LINE, STRIP = "A7", "S1"
 GAIN_DB = 3.0
+STEPS = (0.95, 1.1, 1.2)
+"""Ways between waypoints, of what the overlap asks for."""
 LINE_AHEAD_S, LINE_LENGTH_M = 25.0, 30_000.0
 AWAY_M = 6.0
 """A tenth of a second's flight: the machine may be busy. What was reached is printed."""
@@ -82,7 +91,7 @@ def planned_line(ready: Mapping[str, Any]) -> dict[str, Any]:
     """A line to the north, long enough to be reached whenever the service is ready.
 
     The emulated aircraft flies north over its origin from the start on, and straight on until it
-    has exposed.
+    has exposed. The places on the line are unevenly spaced: each is a waypoint of its own.
     """
     passed_s = (time.monotonic_ns() - ready["mono_ns_at_line_start"]) * 1e-9
     begins_m = (passed_s + LINE_AHEAD_S) * ready["plan"]["ground_speed_mps"]
@@ -96,9 +105,22 @@ def planned_line(ready: Mapping[str, Any]) -> dict[str, Any]:
             "coordinates": [[end.longitude_deg, end.latitude_deg] for end in ends],
         },
     }
+    steps_m = itertools.cycle(step * ready["plan"]["distance_m"] for step in STEPS)
+    along_m = itertools.takewhile(lambda m: m < LINE_LENGTH_M, itertools.accumulate(steps_m))
+    waypoints = [
+        {
+            "type": "Feature",
+            "properties": {"line": LINE},
+            "geometry": {
+                "type": "Point",
+                "coordinates": [place.longitude_deg, place.latitude_deg],
+            },
+        }
+        for place in (plane.place(0.0, begins_m + m) for m in along_m)
+    ]
     return {
         "type": "FeatureCollection",
-        "features": [line],
+        "features": [line, *waypoints],
         "specification": {"forward_overlap": 0.6, "tilt_deg": 3.0},
     }
 
@@ -114,7 +136,8 @@ def camera(
         "ultracam-x-mini", folder / "sim", seed=1, dc=12.0, displace=["SU02=1.0,-0.6"]
     )
     arguments += ["--scene-cache", str(flown.scenes), "--exposures", str(EXPOSURES + 1)]
-    emulator = Emulator([*arguments, "--first-address", free_first_address()])
+    # What is timed is not rendered meanwhile.
+    emulator = Emulator([*arguments, "--still", "--first-address", free_first_address()])
     config = folder / "service.toml"
     text = service_toml(
         emulator.ready, root="missions", count=EXPOSURES, end_when_done=False, watch_port=0
@@ -159,6 +182,7 @@ def test_a_flight_is_flown_from_the_page(
         browser.evaluate(f"document.querySelector('#exposure [name=gain_db]').value = '{GAIN_DB}'")
         browser.click("#exposure button[type=submit]")
         service.wait_for(lambda e: e["event"] == "exposure-settings" and e["by"] == "operator", 10)
+        busy = [busy_share()]
         browser.click("[data-command=start]")
         latencies_s = []
         for number in range(1, EXPOSURES + 1):
@@ -173,7 +197,6 @@ def test_a_flight_is_flown_from_the_page(
             latencies_s.append((seen_ns - int(fired["mono_ns"])) * 1e-9)
         record_property("trigger_to_verdict_s", [round(value, 2) for value in latencies_s])
         print(f"trigger to verdict on the page: {[round(value, 2) for value in latencies_s]} s")
-        assert min(latencies_s) < VERDICT_WITHIN_S
         browser.wait_for("document.querySelectorAll('#rows tr').length === 4", 10)
         browser.wait_for(f"document.querySelector('.line-label')?.innerText === '{LINE}'", 10)
         assert browser.text("#rows tr td:nth-child(3)") == LINE
@@ -184,6 +207,12 @@ def test_a_flight_is_flown_from_the_page(
         service.wait_for(lambda e: e["event"] == "processed" and e["number"] == EXPOSURES, 10)
         for number in range(1, EXPOSURES + 1):
             print(f"exposure {number}, s after the trigger: {steps_s(service, number)}")
+        busy.append(busy_share())
+        can_judge = max(busy) < OTHERS_BUSY
+        told = "" if can_judge else ": too busy to judge by"
+        print(f"cores busy before and after the flight: {busy[0]:.0%}, {busy[1]:.0%}{told}")
+        if can_judge:
+            assert statistics.median(latencies_s) < SLACK * VERDICT_WITHIN_S
         browser.click("#show-residuals")
         browser.wait_for("document.querySelectorAll('#vectors path')[0]?.getAttribute('d')", 20)
         browser.evaluate("document.querySelector('#exposure-room').open = false")
@@ -201,26 +230,39 @@ def test_a_flight_is_flown_from_the_page(
         assert commands == [("exposure", "operator"), ("start", "operator"), ("land", "operator")]
 
 
+def busy_share(over_s: float = 1.0) -> float:
+    """How much of all cores is busy while this flight has nothing to do."""
+
+    def jiffies() -> tuple[int, int]:
+        numbers = [int(text) for text in Path("/proc/stat").read_text().split("\n")[0].split()[1:9]]
+        return sum(numbers), numbers[3] + numbers[4]
+
+    total, idle = jiffies()
+    threading.Event().wait(over_s)
+    total_after, idle_after = jiffies()
+    return 1.0 - (idle_after - idle) / max(1, total_after - total)
+
+
 def event_of(service: Running, name: str) -> dict[str, Any]:
     return next(event for event in service.events if event["event"] == name)
 
 
 def steps_s(service: Running, number: int) -> dict[str, float]:
-    """When an exposure was stored, sealed and processed, and how long the pipeline took."""
+    """When an exposure was stored, sealed, judged and processed, and how long the pipeline took."""
     told = {e["event"]: e for e in service.events if e.get("number") == number}
     fired_ns = int(told["triggered"]["mono_ns"])
-    steps = ("stored", "sealed", "processed")
+    steps = ("stored", "sealed", "judged", "processed")
     found = {step: round((int(told[step]["mono_ns"]) - fired_ns) * 1e-9, 2) for step in steps}
     return {**found, "pipeline": round(told["processed"]["duration_s"], 2)}
 
 
 def exposed_where_planned(mission: Path) -> list[float]:
-    """How far along the line each exposure lies from its planned place, metres.
+    """How far along the line each exposure lies from its waypoint, metres.
 
     Records, index and footprints must name line and strip, and the overlap be that of the plan.
     """
     plan = read_plan(next(mission.glob("plan.*")))
-    plane = Plane(plan.lines[0].start)
+    plane, at_m = Plane(plan.lines[0].start), plan.lines[0].at_m
     distance_m = tomllib.loads((mission / "service.toml").read_text())["trigger"]["distance_m"]
     places, away_m, before_m = [], [], math.nan
     for number in range(1, EXPOSURES + 1):
@@ -230,8 +272,8 @@ def exposed_where_planned(mission: Path) -> list[float]:
         assert {frame["settings"]["Gain"] for frame in record["frames"]} == {GAIN_DB}
         where = record["navigation"]
         _, along_m = plane.flat(Point(where["latitude_deg"], where["longitude_deg"]))
-        places.append(round(along_m / distance_m))
-        away_m.append(along_m - places[-1] * distance_m)
+        places.append(min(range(len(at_m)), key=lambda k, m=along_m: abs(at_m[k] - m)))
+        away_m.append(along_m - at_m[places[-1]])
         quality = json.loads((mission / f"L2/{number:06d}/quality.json").read_text())
         if number > 1:
             step = (along_m - before_m) / distance_m
@@ -252,18 +294,22 @@ def exposed_where_planned(mission: Path) -> list[float]:
 
 @pytest.mark.system
 @pytest.mark.timeout(600)
-def test_a_head_that_goes_is_seen_within_two_seconds_and_acknowledged(
+def test_a_mission_of_waypoints_is_exposed_and_a_head_that_goes_is_seen_and_acknowledged(
     tmp_path: Path, flown: Flown
 ) -> None:
-    """The emulator is killed under a waiting service: every device is lost, and is told so."""
+    """An autopilot orders exposures at its waypoints, in a light that the heads follow.
+
+    Then the emulator is killed under the service: every device is lost, and is told so.
+    """
     chromium()
     arguments = simulator_arguments(
         "ultracam-x-mini", tmp_path / "sim", seed=1, dc=0.0, displace=[]
     )
-    arguments += ["--scene-cache", str(flown.scenes), "--exposures", "2"]
+    arguments += ["--scene-cache", str(flown.scenes), "--exposures", "9", "--still"]
     emulator = Emulator([*arguments, "--first-address", free_first_address()])
-    config = tmp_path / "service.toml"
-    text = service_toml(emulator.ready, root="missions", count=1, watch_port=0)
+    config, port = tmp_path / "service.toml", free_port()
+    text = darkened(service_toml(emulator.ready, root="missions", watch_port=0))
+    text += f'\n[watch.mavlink]\nconnect = "udpin:127.0.0.1:{port}"\ncommands = "any"\n'
     config.write_text(text.replace("[trigger]\n", '[trigger]\nstart = "on command"\n'))
     token = add_token(tmp_path / "tokens.toml", "operator", "command")
     service = Running(config)
@@ -273,6 +319,8 @@ def test_a_head_that_goes_is_seen_within_two_seconds_and_acknowledged(
             browser.open(f"http://{told['host']}:{told['port']}/")
             browser.wait_for("document.querySelector('#link')?.innerText === 'linked'", 60)
             service.wait_for(lambda e: e["event"] == "ready", READY_WITHIN_S)
+            browser.wait_for("document.querySelector('#phase').innerText === 'armed'", 30)
+            fly_mission(emulator.ready, port, service)
             emulator.process.kill()
             fault = service.wait_for(
                 lambda e: e["event"] == "device" and e["fault"] and e["name"] == "lost", 60
