@@ -36,6 +36,10 @@ SATURATED_BIT: Final = 1
 _RESPONSE_UNIT: Final = 16384
 """Fixed-point word of a response of one. Integer running sums are exact, so the result does not
 depend on how many threads shared the rows."""
+_BIAS_STEP_DN: Final = 1.0 / 32.0
+_DARK_STEP_DN_PER_S: Final = 0.5
+"""Steps of the maps: rounded to at most a sixty-fourth of a DN, where a Level-1 word is a quarter
+(12 bits); dark signal to as much in a sixteenth of a second."""
 _BAND_ROWS: Final = 128
 _MATHEMATICS: Final = {"contract", "nnan", "ninf", "nsz"}
 """No approximate reciprocals: compilers take them or not as loops happen to vectorise, and the same
@@ -58,7 +62,8 @@ class FrameStatistics:
 
 @dataclass(frozen=True)
 class Corrector:
-    """A calibration made ready for the pass: maps as 16-bit fixed point, scalars where it is flat.
+    """A calibration made ready for the pass: maps as fixed point of 8 or 16 bits, scalars where it
+    is flat.
 
     `bias` and `dark` count in units above their least value, `response` is one over gain; they are
     None together, where the calibration is the same for all pixels. `defects_by_shifts` keeps the
@@ -96,13 +101,19 @@ def corrector_for(sensor: Sensor, calibration: RadiometricCalibration | None) ->
     check_radiometry(f"radiometry of {sensor.name}", calibration, sensor=sensor)
     maps = (calibration.bias_dn, calibration.dark_dn_per_s, calibration.gain)
     flat = all(float(np.min(m)) == float(np.max(m)) for m in maps)
-    least_bias, bias_unit = _range(calibration.bias_dn)
-    least_dark, dark_unit = _range(calibration.dark_dn_per_s)
+    bias = dark = response = None
+    least_bias, bias_unit = float(calibration.bias_dn.flat[0]), 0.0
+    least_dark, dark_unit = float(calibration.dark_dn_per_s.flat[0]), 0.0
+    if not flat:
+        good = calibration.defect == 0
+        bias, least_bias, bias_unit = _words(calibration.bias_dn, good, _BIAS_STEP_DN)
+        dark, least_dark, dark_unit = _words(calibration.dark_dn_per_s, good, _DARK_STEP_DN_PER_S)
+        response = _fixed_point(1.0 / calibration.gain, 1.0 / _RESPONSE_UNIT)
     return Corrector(
         sensor=sensor,
-        bias=None if flat else _fixed_point(calibration.bias_dn - least_bias, bias_unit),
-        dark=None if flat else _fixed_point(calibration.dark_dn_per_s - least_dark, dark_unit),
-        response=None if flat else _fixed_point(1.0 / calibration.gain, 1.0 / _RESPONSE_UNIT),
+        bias=bias,
+        dark=dark,
+        response=response,
         bias_unit_dn=bias_unit,
         dark_unit_dn_per_s=dark_unit,
         least_bias_dn=least_bias,
@@ -200,15 +211,27 @@ def exposed_rows(sensor: Sensor, tdi_shifts: int) -> tuple[int, int]:
     return 0, sensor.height_px - 1 - shifts
 
 
-def _fixed_point(values: Array, unit: float) -> Array:
-    words: Array = np.clip(np.rint(np.asarray(values) / np.float32(unit)), 0, 65535)
-    return np.ascontiguousarray(words.astype(np.uint16))
+def _fixed_point(
+    values: Array, unit: float, kind: type[np.unsignedinteger[Any]] = np.uint16
+) -> Array:
+    words: Array = np.clip(np.rint(np.asarray(values) / np.float32(unit)), 0, np.iinfo(kind).max)
+    return np.ascontiguousarray(words.astype(kind))
 
 
-def _range(values: Array) -> tuple[float, float]:
-    """Least value, and the unit that carries the rest in 16 bits."""
-    least, most = float(np.min(values)), float(np.max(values))
-    return least, max(most - least, 1e-6) / 65535.0
+def _words(values: Array, good: Array, coarsest: float) -> tuple[Array, float, float]:
+    """A map as words above its least value, in 8 bits where steps stay below the coarsest allowed.
+
+    Half the bytes are half the time: the pass waits for memory. Words of defects, which nobody
+    reads, are cut off to the range of good pixels.
+
+    Returns:
+        The words, the least value, the unit of a word.
+    """
+    of_good = values[good] if good.any() else values
+    least, most = float(np.min(of_good)), float(np.max(of_good))
+    kind = np.uint8 if most - least <= coarsest * np.iinfo(np.uint8).max else np.uint16
+    unit = max(most - least, 1e-6) / np.iinfo(kind).max
+    return _fixed_point(values - np.float32(least), unit, kind), least, unit
 
 
 def _spread(defect: Array, shifts: int, sign: int) -> tuple[Array, Array]:

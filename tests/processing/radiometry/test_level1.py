@@ -287,3 +287,22 @@ def test_a_frame_of_another_size_is_refused_with_its_shape(sensor: Sensor) -> No
             tdi_shifts=0,
             out=np.zeros(SHAPE, np.uint16),
         )
+
+
+def test_maps_of_a_narrow_range_take_eight_bits_and_wide_ones_keep_sixteen(
+    sensor: Sensor, calibration: RadiometricCalibration
+) -> None:
+    random = np.random.default_rng(5)
+    spread = random.uniform(0.0, 7.0, SHAPE).astype(np.float32)
+    spread[3, 5] = 4000.0
+    defect = np.zeros(SHAPE, np.uint8)
+    defect[3, 5] = 1
+    narrow = replace(calibration, bias_dn=60.0 + spread, dark_dn_per_s=spread, defect=defect)
+    wide = replace(narrow, defect=np.zeros_like(defect))
+    kept, kept_wide = corrector_for(sensor, narrow), corrector_for(sensor, wide)
+    assert kept.bias is not None and kept.bias.dtype == np.uint8
+    assert kept.dark is not None and kept.dark.dtype == np.uint8
+    assert kept_wide.bias is not None and kept_wide.bias.dtype == np.uint16
+    good = defect == 0
+    told = kept.least_bias_dn + kept.bias * kept.bias_unit_dn
+    assert np.abs(told - narrow.bias_dn)[good].max() < 1.0 / 64.0
