@@ -2,13 +2,12 @@
 
 Line, trigger client, decoders, flight, matching, clock, track and ledger are the ones that fly.
 What stands in for processes and disks is here: reopening of lost devices, slots of memory, a disk
-that takes 150 ms. What is true only `sim_hw.clockwork` knows; here the two are compared.
+that takes 150 ms. What was recorded is compared with the truth in `benchmarks.fast_flight_score`.
 """
 
 from __future__ import annotations
 
 import functools
-import math
 import random
 import threading
 from collections import Counter, deque
@@ -16,8 +15,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from benchmarks.fast_flight_score import Comparison, Score, Truth
 from daemon.configuration import Configuration, from_mapping
-from daemon.exposure import Capture, Exposure, NavigationRecord
+from daemon.exposure import Capture, Exposure
 from daemon.flight.flight import Flight, Identity
 from daemon.flight.ledger import Ledger
 from daemon.service.line import Line, Order
@@ -35,7 +35,7 @@ from drivers.modbus_rtu.frames import find_reply
 from drivers.trigger.pulse_bus import PulseBusTrigger
 from drivers.ublox.decoder import UbxDecoder
 from processing.rig import Rig, find_rig
-from sim_hw.clockwork import EARTH_M_PER_DEG, ClockworkHead, ClockworkRig, SentFrame, Timeline
+from sim_hw.clockwork import ClockworkHead, ClockworkRig, SentFrame, Timeline
 from sim_hw.faults.plan import Planned
 from sim_hw.world_clock import NS_PER_S, NS_PER_WEEK, WorldClock
 
@@ -50,10 +50,6 @@ REOPENED_SERIAL_NS = 5 * NS_PER_S
 ANSWER_TIMEOUT_NS = NS_PER_S // 2
 DISK_NS = 150_000_000
 PROBE_C = 32.5
-NAV_TOLERANCE_M = 1.0
-SIGMAS = 6
-RECOVERY_NS = 3 * NS_PER_S
-"""After a fault of a whole device: a head's clock is read every 2 s, a mark comes within one."""
 FOREVER_NS = 60 * NS_PER_S
 """An exposure that is open for so long hangs."""
 
@@ -69,55 +65,6 @@ class FakeClock:
 
     def wait(self, event: threading.Event, timeout_s: float) -> bool:
         return event.is_set()
-
-
-@dataclass
-class Truth:
-    """What became of one pulse that was given."""
-
-    number: int
-    ordered_ns: int
-    frames: set[str] = field(default_factory=set)
-    """Heads whose frame of this pulse came whole and in time."""
-    mark_came: bool = False
-
-
-@dataclass
-class Score:
-    """How the records of a flight compare with the truth; counts of pairs unless said otherwise."""
-
-    exposures: int = 0
-    sealed: int = 0
-    frames_came: int = 0
-    frames_right: int = 0
-    frames_wrong: int = 0
-    marks_came: int = 0
-    marks_right: int = 0
-    marks_wrong: int = 0
-    pairs: int = 0
-    """Of one head and one exposure, whose frame and mark both came."""
-    pairs_matched: int = 0
-    untouched: int = 0
-    """Exposures of which everything came, and nothing was touched by a fault."""
-    untouched_matched: int = 0
-    navigation_wrong: int = 0
-    times_wrong: int = 0
-    """Times without a mark that are further off than six of their sigmas."""
-    hangs: int = 0
-    imbalances: int = 0
-    hits: int = 0
-    longest_open_s: float = 0.0
-    examples: list[str] = field(default_factory=list)
-
-    @property
-    def wrong(self) -> int:
-        """Wrong pairings of any kind."""
-        return self.frames_wrong + self.marks_wrong + self.navigation_wrong
-
-    def blame(self, sentence: str) -> None:
-        """Keep the first few examples of what went wrong."""
-        if len(self.examples) < 8:
-            self.examples.append(sentence)
 
 
 class _Wire:
@@ -237,7 +184,17 @@ class FastFlight:
         end_ns = self.clock.now_ns + FOREVER_NS
         self.advance(end_ns, until=lambda: not self.flight.open_numbers)
         self.score.hangs += len(self.flight.open_numbers)
-        self._compare()
+        for exposure in self.clockwork.pulses:
+            self._truth(exposure)
+        Comparison(
+            self.clockwork,
+            self._sessions,
+            self.truth,
+            self.records,
+            self._stored_pixels,
+            self.open_s,
+            self.score,
+        ).compare()
         return self.score
 
     def advance(self, end_ns: int, until: Callable[[], bool] | None = None) -> None:
@@ -459,130 +416,6 @@ class FastFlight:
             if now_ns >= self._receiver_back_ns:
                 self._receiver_is_open, self._receiver_back_ns = True, 0
                 self._decoder.reset()
-
-    # The comparison
-
-    def _compare(self) -> None:
-        score = self.score
-        exposure_of = {number: exposure for exposure, number in self.clockwork.pulses.items()}
-        for exposure in exposure_of.values():
-            self._truth(exposure)
-        whole: dict[int, Exposure] = {}
-        marked: set[int] = set()
-        for record in self.records:
-            score.sealed += 1
-            exposure = exposure_of.get(record.number, 0)
-            whole[exposure] = record
-            self._compare_frames(record, exposure)
-            if self._compare_mark(record, exposure):
-                marked.add(exposure)
-            if exposure:
-                self._compare_navigation(record, exposure)
-        touched = self._touched()
-        heads = set(self._sessions)
-        for exposure, truth in self.truth.items():
-            pixels = self._stored_pixels.get(truth.number, {})
-            score.frames_came += len(truth.frames)
-            score.marks_came += truth.mark_came
-            matched = {h for h in truth.frames if pixels.get(h) == exposure and exposure in whole}
-            if truth.mark_came:
-                score.pairs += len(truth.frames)
-                score.pairs_matched += len(matched) if exposure in marked else 0
-            if truth.mark_came and truth.frames == heads and exposure not in touched:
-                score.untouched += 1
-                is_matched = matched == heads and exposure in marked
-                score.untouched_matched += is_matched
-                if not is_matched:
-                    score.blame(
-                        f"exposure {truth.number}: untouched, but {len(matched)} frames and "
-                        f"{'the' if exposure in marked else 'no'} mark"
-                    )
-        score.hits = sum(len(channel.hits) for channel in self.clockwork.channels.values())
-        score.longest_open_s = max(self.open_s, default=0.0)
-
-    def _compare_frames(self, record: Exposure, exposure: int) -> None:
-        pixels = self._stored_pixels.get(record.number, {})
-        for frame in record.frames:
-            if pixels.get(frame.sensor) == exposure:
-                self.score.frames_right += 1
-            else:
-                self.score.frames_wrong += 1
-                self.score.blame(
-                    f"exposure {record.number}: {frame.sensor} has the pixels of pulse "
-                    f"{pixels.get(frame.sensor)}, its pulse is {exposure}"
-                )
-
-    def _compare_mark(self, record: Exposure, exposure: int) -> bool:
-        """Whether the record has the mark of its own pulse."""
-        gps_ns, sigma_ns = record.mark_gps_ns, record.mark_sigma_ns
-        if gps_ns is None or sigma_ns is None:
-            return False
-        if record.mark_source == "event-mark":
-            told = self.clockwork.receiver.told.get(gps_ns)
-            if told is not None and told.exposure == exposure:
-                self.score.marks_right += 1
-                return True
-            self.score.marks_wrong += 1
-            self.score.blame(
-                f"exposure {record.number}: has the mark of pulse "
-                f"{None if told is None else told.exposure}, its pulse is {exposure}"
-            )
-            return False
-        if exposure:
-            error_ns = gps_ns - self.clockwork.true_strobe_gps_ns[exposure]
-            if abs(error_ns) > SIGMAS * sigma_ns and not self._receiver_clock_is_at_fault:
-                self.score.times_wrong += 1
-                self.score.blame(
-                    f"exposure {record.number}: {record.mark_source} time is off by "
-                    f"{error_ns / 1e6:.3f} ms, its sigma is {sigma_ns / 1e6:.3f} ms"
-                )
-        return False
-
-    @property
-    def _receiver_clock_is_at_fault(self) -> bool:
-        """Its time is then not the true one, and nobody on board can know."""
-        names = {hit.fault for hit in self.clockwork.receiver.channel.hits}
-        return bool(names & {"clock-step", "clock-drift", "wrong-week"})
-
-    def _compare_navigation(self, record: Exposure, exposure: int) -> None:
-        if record.navigation is None:
-            return
-        error_m = self._navigation_error_m(record.navigation, exposure)
-        # Two seconds without a position leave the turn out: 1.2 m on this track.
-        limit_m = NAV_TOLERANCE_M * (1.0 if record.navigation.method == "interpolated" else 3.0)
-        if record.mark_sigma_ns is not None:
-            limit_m += SIGMAS * record.mark_sigma_ns * 1e-9 * 65.0
-        if error_m > limit_m:
-            self.score.navigation_wrong += 1
-            self.score.blame(
-                f"exposure {record.number}: its position is {error_m:.1f} m off "
-                f"({record.navigation.method}, {record.mark_source})"
-            )
-
-    def _navigation_error_m(self, navigation: NavigationRecord, exposure: int) -> float:
-        gps_ns = self.clockwork.true_strobe_gps_ns[exposure]
-        state = self.clockwork.receiver.state(gps_ns)
-        north_m = (navigation.latitude_deg - state.latitude_deg) * EARTH_M_PER_DEG
-        east_m = (navigation.longitude_deg - state.longitude_deg) * EARTH_M_PER_DEG * 0.669
-        return math.hypot(north_m, east_m, navigation.height_m - state.height_m)
-
-    def _touched(self) -> set[int]:
-        """Exposures that a fault had to do with: named by it, or taken while it lasted."""
-        touched: set[int] = set()
-        spans: list[tuple[int, int]] = []
-        for channel in self.clockwork.channels.values():
-            for hit in channel.hits:
-                if hit.what.isdecimal():
-                    touched.add(int(hit.what))
-                else:
-                    spans.append((hit.at_ns - NS_PER_S, hit.at_ns + RECOVERY_NS))
-        if spans:
-            touched |= {
-                exposure
-                for exposure, truth in self.truth.items()
-                if any(begin <= truth.ordered_ns <= end for begin, end in spans)
-            }
-        return touched
 
 
 def configuration(rig: Rig, exposures: int) -> Configuration:

@@ -16,7 +16,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-from benchmarks.fast_flight import FastFlight, Score
+from benchmarks.fast_flight import FastFlight
+from benchmarks.fast_flight_score import Score
 from processing.rig import find_rig
 from sim_hw.clockwork import RECEIVER_NAME, devices_of
 from sim_hw.faults.catalogue import CATALOGUE
