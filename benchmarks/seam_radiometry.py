@@ -16,6 +16,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -49,6 +50,11 @@ LEVELS = (0.2, 0.5, 0.8)
 TEXTURE = 0.25
 """How much of its own contrast an image keeps at one level, so that its lights do not burn out."""
 BRIGHTEST = 0.97
+LEAST_COLUMN_PX = 64
+"""Length from which spoilt pixels above each other are a defect column."""
+DUST = 12
+DUST_PX = 3
+"""Grains on every sensor beside its own defects, and the side of one."""
 GAIN_CHANGE = 0.01
 BLACK_CHANGE_DN = 2.0
 """What heads may have changed by since the laboratory saw them (standard deviations)."""
@@ -70,11 +76,17 @@ class Seams:
 
 @dataclass(frozen=True)
 class Defects:
-    """Interpolated pixels against the light, in standard deviations of a good pixel's noise."""
+    """Interpolated pixels against the light, in standard deviations of a good pixel's noise.
+
+    `single`, `column` and `dust` are the root mean squares of the three kinds.
+    """
 
     scene: str
     pixels: int
     rms: float
+    single: float
+    column: float
+    dust: float
     median: float
     inside_1: float
     good_rms: float
@@ -111,12 +123,16 @@ def main() -> None:
             f"| {s.scene} | {s.level:.0%} | {s.strips} | {s.rms:.3f} | {s.p99:.3f} "
             f"| {s.largest:.3f} | {s.inside:.1%} | {s.noise:.3f} |"
         )
-    print("\n| defects of | pixels | RMS | median | within 1 | good pixels RMS | RMS of contrast |")
-    print("|---|---|---|---|---|---|---|")
+    print(
+        "\n| defects of | pixels | RMS | single | column | dust | median | within 1 "
+        "| good pixels RMS | RMS of contrast |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|---|")
     for d in defects:
         print(
-            f"| {d.scene} | {d.pixels} | {d.rms:.2f} | {d.median:.2f} | {d.inside_1:.1%} "
-            f"| {d.good_rms:.2f} | {d.rms_of_contrast:.2f} |"
+            f"| {d.scene} | {d.pixels} | {d.rms:.2f} | {d.single:.2f} | {d.column:.2f} "
+            f"| {d.dust:.2f} | {d.median:.2f} | {d.inside_1:.1%} | {d.good_rms:.2f} "
+            f"| {d.rms_of_contrast:.2f} |"
         )
 
 
@@ -173,6 +189,7 @@ def heads_of(world: World, *, changed: bool) -> dict[str, Head]:
     for cone in world.rig.cones:
         for sensor in cone.sensors:
             truth = true_sensor(cone, sensor, SEED, field_radius_mm=world.field_radius_mm(cone))
+            truth = replace(truth, defect=dusty(truth.defect, sensor.name))
             measured = laboratory.measure(sensor, truth, SEED)
             if changed:
                 gain, black = random_stream(SEED, "change", sensor.name).normal(0.0, 1.0, 2)
@@ -189,6 +206,17 @@ def heads_of(world: World, *, changed: bool) -> dict[str, Head]:
                 RadiometricCalibration(**measured.arrays()),
             )
     return heads
+
+
+def dusty(defect: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
+    """A map of defects with grains of dust."""
+    found = defect.copy()
+    random = random_stream(SEED, "dust", name)
+    rows = random.integers(0, found.shape[0] - DUST_PX, DUST)
+    columns = random.integers(0, found.shape[1] - DUST_PX, DUST)
+    for row, column in zip(rows, columns, strict=True):
+        found[row : row + DUST_PX, column : column + DUST_PX] = 1
+    return found
 
 
 def light_of(
@@ -328,6 +356,7 @@ def defects_of(
 ) -> Defects:
     """Interpolated pixels of all PAN sensors against the light that fell on them."""
     off, spread, good = [], [], []
+    kinds: list[NDArray[np.uint8]] = []
     for cone in world.rig.pan_cones:
         for sensor in cone.sensors:
             head, look = heads[sensor.name], snapshot.looks[sensor.name]
@@ -344,21 +373,35 @@ def defects_of(
             whole[first + 8 : last - 7, 8:-8] = True
             whole &= (out > 0) & ((out & 1) == 0)
             spoilt = over_tdi_path(head.truth.defect.astype(np.float32), **path) > 0
+            kinds.append(kinds_of(spoilt, look.tdi_shifts)[whole & spoilt])
             off.append((error / sigma)[whole & spoilt])
             good.append((error / sigma)[whole & ~spoilt][::50])
             mean = _box(ideal)
             local = np.sqrt(np.maximum(_box(ideal * ideal) - mean * mean, 0.0) + sigma**2)
             spread.append((error / local)[whole & spoilt])
-    z, contrast = np.concatenate(off), np.concatenate(spread)
+    z, contrast, kind = np.concatenate(off), np.concatenate(spread), np.concatenate(kinds)
+    single, column, dust = (float(np.sqrt(np.mean(z[kind == k] ** 2))) for k in range(3))
     return Defects(
         scene=scene,
         pixels=len(z),
         rms=float(np.sqrt(np.mean(z**2))),
+        single=single,
+        column=column,
+        dust=dust,
         median=float(np.median(np.abs(z))),
         inside_1=float(np.mean(np.abs(z) < 1.0)),
         good_rms=float(np.sqrt(np.mean(np.concatenate(good) ** 2))),
         rms_of_contrast=float(np.sqrt(np.mean(contrast**2))),
     )
+
+
+def kinds_of(spoilt: NDArray[np.bool_], tdi_shifts: int) -> NDArray[np.uint8]:
+    """0 where a single pixel spoils, 1 where a column, 2 where more side by side."""
+    _, labels, found, _ = cv2.connectedComponentsWithStats(spoilt.astype(np.uint8), connectivity=8)
+    width, height, area = (found[:, k] for k in (2, 3, 4))
+    kind = np.where(height >= LEAST_COLUMN_PX, 1, np.where(area > tdi_shifts + 1, 2, 0))
+    kind[(kind == 2) & (width == 1)] = 0
+    return np.asarray(kind.astype(np.uint8)[labels])
 
 
 def _box(values: Map) -> Map:
