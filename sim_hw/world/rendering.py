@@ -156,8 +156,9 @@ def _hide(
     )
     x, y = (np.ascontiguousarray(places[..., i]) for i in (0, 1))
     opacity, white = np.empty_like(light), np.empty_like(light)
-    _sample(cloud.opacity, x, y, _TABLE, opacity)
-    _sample(cloud.radiance, x, y, _TABLE, white)
+    rows, columns = (2 * n - 2 for n in cloud.opacity.shape)
+    _sample(cloud.opacity, x, y, (rows, columns), _TABLE, opacity)
+    _sample(cloud.radiance, x, y, (rows, columns), _TABLE, white)
     np.clip(opacity, 0.0, 1.0, out=opacity)
     light += opacity * (white - light)
 
@@ -252,10 +253,13 @@ def sample_scene(scene: Scene, band: str, grid: Array, size: tuple[int, int]) ->
     """
     out = np.empty(size, dtype=np.float32)
     step = scene.step(band)
+    # All bands are mirrored where PAN ends; that may lie between two samples of a colour.
+    rows, columns = (2 * (n - 1) // step for n in scene.bands["pan"].shape)
     _sample(
         scene.bands[band],
         np.ascontiguousarray(grid[..., 0] / step),
         np.ascontiguousarray(grid[..., 1] / step),
+        (rows, columns),
         _TABLE,
         out,
     )
@@ -266,14 +270,21 @@ _TABLE = spline.weight_table()
 
 
 @numba.njit(inline="always")  # type: ignore[untyped-decorator]
-def _mirrored(index: int, length: int) -> int:
-    period = 2 * length - 2
+def _mirrored(index: int, period: int) -> int:
+    """Mirrored at 0 and at half the period."""
     index = index % period
-    return period - index if index >= length else index
+    return period - index if 2 * index > period else index
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)  # type: ignore[untyped-decorator]
-def _sample(band: NDArray[np.uint16], grid_x: Array, grid_y: Array, table: Map, out: Map) -> None:
+def _sample(
+    band: NDArray[np.uint16],
+    grid_x: Array,
+    grid_y: Array,
+    periods: tuple[int, int],
+    table: Map,
+    out: Map,
+) -> None:
     height, width = out.shape
     rows, columns = band.shape
     wx = np.empty(6, dtype=np.float32)
@@ -312,9 +323,9 @@ def _sample(band: NDArray[np.uint16], grid_x: Array, grid_y: Array, table: Map, 
                 else:
                     for m in range(6):
                         line = np.float32(0.0)
-                        row = _mirrored(cy - 2 + m, rows)
+                        row = _mirrored(cy - 2 + m, periods[0])
                         for n in range(6):
-                            line += wx[n] * np.float32(band[row, _mirrored(cx - 2 + n, columns)])
+                            line += wx[n] * np.float32(band[row, _mirrored(cx - 2 + n, periods[1])])
                         total += wy[m] * line
                 out[i, j] = max((total - ZERO) / UNIT, np.float32(0.0))
 

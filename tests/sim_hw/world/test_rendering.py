@@ -121,6 +121,25 @@ def test_sampling_moves_no_wave_at_any_phase(wavelength_px: float) -> None:
         assert amplitude == pytest.approx(0.2, rel=5e-3)
 
 
+@pytest.mark.parametrize("columns", [400, 401])
+def test_beyond_the_scene_all_bands_are_mirrored_at_one_line(columns: int) -> None:
+    settings = SceneSettings(seed=1, width_px=columns, height_px=128, sample_m=0.1, colour_ratio=3)
+    x = np.arange(columns)
+    wave = np.broadcast_to(0.5 + 0.2 * np.sin(x / 17.0), (128, columns))
+    bands = {
+        name: spline.stored(spline.coefficients(wave[::step, ::step].astype(np.float32)))
+        for name, step in (("pan", 1), ("red", 2))
+    }
+    scene = Scene(settings=settings, bands=bands, patches=0, reused_patches=0)
+    assert scene.step("red") == 2
+    nodes = np.arange(0, 64 + GRID_PX, GRID_PX, dtype=float)
+    grid = np.empty((len(nodes), len(nodes), 2))
+    grid[..., 0], grid[..., 1] = columns + 20.0 + nodes[None, :], 30.0 + nodes[:, None]
+    seen = {band: rendering.sample_scene(scene, band, grid, (64, 64)) for band in ("pan", "red")}
+    assert float(np.ptp(seen["pan"][0])) > 0.2
+    assert seen["red"] == pytest.approx(seen["pan"], abs=2e-3)
+
+
 def test_overlapping_frames_agree_with_the_ideal_image_where_the_truth_puts_them(
     world: World, scene: Scene
 ) -> None:
