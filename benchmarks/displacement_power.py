@@ -3,7 +3,8 @@
 Thousands of outcomes of stitching with one master sensor moved a known way, and of healthy ones for
 false alarms, go through the pipeline's own judgement. What calibration, drift, probes and stitching
 are off by is drawn, the last from the covariance that `benchmarks.honest_uncertainty` holds; some
-are stitched in full as a control. Beside each figure stands what the best test could reach.
+are stitched in full as a control. Beside each figure stands what the best test could reach. Then
+whole flights are judged together, warm ones among them.
 """
 
 from __future__ import annotations
@@ -29,13 +30,25 @@ from benchmarks.stitching_trials import (
     world_and_rig,
 )
 from daemon.measuring import machine
+from processing.mosaic.flight_validity import judge_flight
+from processing.mosaic.free import Mosaic
+from processing.mosaic.stitch_record import stitch_record
 from processing.mosaic.validity import Validity, judge_master
 from processing.rig import Rig, find_rig
 
 Array = NDArray[np.float64]
 
 LENGTHS_PX = (0.05, 0.10, 0.15, 0.20, 0.25, 0.30, 0.40, 0.50)
-DC_K = (0.0, 10.0, 20.0)
+DC_K = (0.0, 5.0, 10.0, 20.0)
+COLOURS = ("#2980b9", "#8e44ad", "#27ae60", "#c0392b")
+FLIGHT_EXPOSURES = 24
+FLIGHTS = {
+    "20 K throughout, moved half way": (20.0, 20.0, FLIGHT_EXPOSURES // 2 + 1),
+    "from 20 K to 0 K, moved before it": (20.0, 0.0, 1),
+    "20 K throughout, moved before it": (20.0, 20.0, 1),
+}
+"""dC at the first and the last exposure of a flight, and the first that is displaced."""
+FLIGHT_LENGTHS_PX = (0.10, 0.15, 0.30)
 FAMILY_ALPHA = 0.001
 PROBE_SIGMA_K = 0.1
 IDEAL_DRAWS = 40_000
@@ -62,6 +75,26 @@ class Power:
     ideal_named: float
 
 
+@dataclass(frozen=True)
+class FlightPower:
+    """Shares of `flights` of which a step was told, and of the right sensor (or as alternative)."""
+
+    flight: str
+    length_px: float
+    flights: int
+    found: float
+    named: float
+    alone: float
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Where master sensors are against their calibration: `off_um`, and `um_per_k` beside TDM."""
+
+    off_um: dict[str, Array]
+    um_per_k: dict[str, Array]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.displacement_power")
     parser.add_argument("--errors", type=Path, help="errors of matching; rendered where not given")
@@ -69,6 +102,7 @@ def main() -> None:
     parser.add_argument("--exposures", type=int, default=1000, help="for each length and dC")
     parser.add_argument("--healthy", type=int, default=10_000)
     parser.add_argument("--stitched", type=int, default=60, help="for each length of the control")
+    parser.add_argument("--flights", type=int, default=40, help="for each kind and length")
     parser.add_argument("--drawing", type=Path, help="where to draw the curves (SVG)")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
@@ -85,11 +119,17 @@ def main() -> None:
         for length in LENGTHS_PX
     ]
     control = [stitched(errors, length_px=length, exposures=options.stitched) for length in CONTROL]
+    flights = [
+        outcomes.flights(kind, length_px=length, flights=options.flights)
+        for kind in (FLIGHTS if options.flights else ())
+        for length in (0.0, *FLIGHT_LENGTHS_PX)
+    ]
     if options.drawing is not None:
         options.drawing.write_text(drawing(powers), encoding="utf-8")
     if options.json:
         told = {"healthy": options.healthy, "alarms": alarms}
         told |= {"power": [vars(p) for p in powers], "control": [vars(p) for p in control]}
+        told |= {"flights": [vars(f) for f in flights]}
         print(json.dumps({"machine": machine(), **told}))
         return
     print(f"{honest_uncertainty.RIG}: {alarms} false alarms of {options.healthy} healthy\n")
@@ -102,6 +142,13 @@ def main() -> None:
         print(
             f"| {p.dc_k:g} | {p.length_px:.2f} | {p.exposures} | {p.found:.1%} | {p.named:.1%} "
             f"| {p.alone:.1%} | {p.ideal_found:.1%} | {p.ideal_named:.1%} |"
+        )
+    print("\n| flight | moved px | flights | told | the right sensor | named alone |")
+    print("|---|---|---|---|---|---|")
+    for f in flights:
+        print(
+            f"| {f.flight} | {f.length_px:.2f} | {f.flights} | {f.found:.1%} | {f.named:.1%} "
+            f"| {f.alone:.1%} |"
         )
 
 
@@ -120,25 +167,65 @@ class Outcomes:
             self._templates.append((mosaic, units[:, None] * root))
         self._random = np.random.default_rng(7)
 
-    def judge(self, dc_k: float, moved: str | None, shift_px: tuple[float, float]) -> Validity:
-        """One exposure: errors drawn from the sigmas of the rig file, and one sensor moved."""
+    def camera(self) -> Camera:
+        """A camera's calibration and drift coefficients, off by the sigmas of the rig file."""
+        draw = self._random.normal
+        sensors = self.rig.master_sensors
+        return Camera(
+            {s.name: draw(0.0, s.position_sigma_um, 2) for s in sensors},
+            {s.name: draw(0.0, s.drift.sigma_um_per_k, 2) for s in sensors},
+        )
+
+    def stitched(
+        self, camera: Camera, dc_k: float, moved: str | None, shift_px: tuple[float, float]
+    ) -> tuple[Mosaic, dict[str, float]]:
+        """One exposure's stitching with one sensor moved, and what the probes say."""
         random = self._random
         mosaic, root = self._templates[int(random.integers(0, TEMPLATES))]
         values = root @ random.standard_normal(root.shape[1])
         probe_k = float(random.normal(0.0, PROBE_SIGMA_K))
-        pitch_mm = mosaic.model.pitch_mm
-        temperatures = {}
-        for sensor in self.rig.cone(self.rig.master_cone).sensors:
+        temperatures = {
+            cone.probe: cone.calibration_c + dc_k + probe_k for cone in self.rig.pan_cones
+        }
+        for sensor in self.rig.master_sensors:
             drift = sensor.drift
-            off_um = random.normal(0.0, sensor.position_sigma_um, 2)
-            off_um += random.normal(0.0, drift.sigma_um_per_k, 2) * dc_k
+            off_um = camera.off_um[sensor.name] + camera.um_per_k[sensor.name] * dc_k
             off_um -= np.array([drift.x_um_per_k, drift.y_um_per_k]) * probe_k
             if sensor.name == moved:
-                off_um += np.array(shift_px) * pitch_mm * 1e3
+                off_um += np.array(shift_px) * mosaic.model.pitch_mm * 1e3
             first = mosaic.model.sensors[sensor.name]
             values[first : first + 2] += off_um * 1e-3
             temperatures[sensor.probe] = sensor.calibration_c + dc_k + probe_k
-        return judge_master(self.rig, replace(mosaic, values=values), temperatures)
+        return replace(mosaic, values=values), temperatures
+
+    def judge(self, dc_k: float, moved: str | None, shift_px: tuple[float, float]) -> Validity:
+        """One exposure of a camera drawn anew."""
+        mosaic, temperatures = self.stitched(self.camera(), dc_k, moved, shift_px)
+        return judge_master(self.rig, mosaic, temperatures)
+
+    def flights(self, kind: str, *, length_px: float, flights: int) -> FlightPower:
+        """Flights judged together, each by a camera of its own; one master sensor moves."""
+        first_k, last_k, since = FLIGHTS[kind]
+        found = named = alone = 0
+        for k in range(flights):
+            camera = self.camera()
+            moved = self.rig.master_sensors[k % len(self.rig.master_sensors)].name
+            angle = float(self._random.uniform(0.0, 2.0 * math.pi))
+            shift = (length_px * math.cos(angle), length_px * math.sin(angle))
+            records = {}
+            for number, dc_k in enumerate(np.linspace(first_k, last_k, FLIGHT_EXPOSURES), start=1):
+                far = shift if number >= since else (0.0, 0.0)
+                mosaic, read = self.stitched(camera, float(dc_k), moved, far)
+                records[number] = stitch_record(self.rig, mosaic, read, read)
+            steps = [
+                s for s in judge_flight(self.rig, records).steps if s.cone == self.rig.master_cone
+            ]
+            found += bool(steps)
+            named += any(moved in (s.sensor, *s.alternatives) for s in steps)
+            alone += len(steps) == 1 and (steps[0].sensor, steps[0].alternatives) == (moved, ())
+        return FlightPower(
+            kind, length_px, flights, found / flights, named / flights, alone / flights
+        )
 
     def false_alarms(self, count: int) -> int:
         """How many of `count` healthy exposures, dC within +-20 K, name a sensor."""
@@ -257,7 +344,7 @@ def drawing(powers: Sequence[Power]) -> str:
         x_range=(0.0, 0.5),
         y_range=(0.0, 1.0),
     )
-    for dc_k, colour in zip(DC_K, ("#2980b9", "#27ae60", "#c0392b"), strict=True):
+    for dc_k, colour in zip(DC_K, COLOURS, strict=True):
         some = [p for p in powers if p.dc_k == dc_k]
         x = [p.length_px for p in some]
         chart.line(x, [p.ideal_found for p in some], colour, dashed=True)
