@@ -82,13 +82,17 @@ class Child:
         self.connection.send(message)
 
     def tell(self, message: object) -> bool:
-        """Send only if that is certain not to wait; False where it was not sent."""
+        """Send only if that is certain not to wait; False where it was not sent.
+
+        Raises:
+            ValueError: a message that is too large ever to be sent so.
+        """
         _, writable, _ = select.select([], [self.connection], [], 0)
         if not writable:
             return False
         data = ForkingPickler.dumps(message)
         if len(data) > TELL_MAX_BYTES:
-            return False
+            raise ValueError(f"a message of {len(data)} bytes; {TELL_MAX_BYTES} may be told")
         self.connection.send_bytes(data)
         return True
 

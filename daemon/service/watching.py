@@ -1,12 +1,14 @@
 """The service's side of watching: what is told, and a watch process that may die without harm.
 
-Telling drops rather than waits. What watchers see and how commands come in is in `daemon.watch`.
+Telling holds back, and at last drops, rather than waits. What watchers see and how commands come in
+is in `daemon.watch`.
 """
 
 from __future__ import annotations
 
 import asyncio
 import time
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -20,13 +22,15 @@ from drivers.contract import NavSample
 NAME = "watch"
 RESTART_S = 3.0
 """How long after its death the process is started again."""
+HELD_MOST = 1000
+"""Events kept for a process that is busy, as it is while it starts; the oldest are dropped."""
 
 
 class Watching:
     """Tells the watch process, where there is one.
 
-    `dropped` counts events that did not fit into the line; the status of every second puts right
-    what they would have told.
+    Events that do not fit into the line are held, and told before the next one, at the latest with
+    the status of every second. `dropped` counts those that were never told.
     """
 
     def __init__(self, supervisor: Supervisor, plan: ProcessPlan | None) -> None:
@@ -35,6 +39,7 @@ class Watching:
         self._first: Mapping[str, Any] | None = None
         self.faults: Callable[[], Sequence[Mapping[str, Any]]] = tuple
         """Events that tell a process started anew of the faults it has not heard of."""
+        self._held: deque[Told] = deque()
         self.dropped = 0
         self.restarts = 0
 
@@ -50,8 +55,21 @@ class Watching:
         """Tell of an event. What mission it is, is told again to a process started anew."""
         if event.get("event") == "mission":
             self._first = event
-        if self._plan is not None and not self._supervisor.tell(NAME, Told(event)):
+        if self._plan is None:
+            return
+        self._held.append(Told(event))
+        if len(self._held) > HELD_MOST:
+            self._held.popleft()
             self.dropped += 1
+        while self._held and self._is_told(self._held[0]):
+            self._held.popleft()
+
+    def _is_told(self, told: Told) -> bool:
+        try:
+            return self._supervisor.tell(NAME, told)
+        except ValueError:
+            self.dropped += 1
+            return True
 
     def answer(self, answer: Answer) -> None:
         self._supervisor.tell(NAME, answer)
@@ -59,6 +77,7 @@ class Watching:
     def died(self) -> None:
         """Start it again after a while; the flight goes on."""
         self.restarts += 1
+        self._held.clear()
         asyncio.get_running_loop().call_later(RESTART_S, self.start)
 
 
