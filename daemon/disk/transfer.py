@@ -12,6 +12,7 @@ import json
 import os
 import stat
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,8 +24,8 @@ from daemon.disk.verification import VerifyReport, verify
 from daemon.errors import DaemonError
 
 JOURNAL = "transfer.json"
-JOURNAL_EVERY_BYTES = 2_000_000_000
-"""How much may have to be copied again after an interruption, about."""
+JOURNAL_EVERY_BYTES = 500_000_000
+"""How much may have to be copied again after a kill, about; after anything else, one file."""
 
 BLOCK_BYTES = 4 << 20
 LEFT_OUT = frozenset({".held", JOURNAL, "mission.db-wal", "mission.db-shm"})
@@ -104,16 +105,22 @@ def transfer(
             progress(done, 2 * total)
 
         step(0)
-        for entry in here.values():
-            journal[entry.name] = {
-                "nbytes": entry.nbytes,
-                "modified_ns": str(entry.modified_ns),
-                "sha256": _copy(source / entry.name, target / entry.name, step),
-            }
-            since_noted += entry.nbytes
-            if since_noted >= JOURNAL_EVERY_BYTES:
+        try:
+            for entry in here.values():
+                journal[entry.name] = {
+                    "nbytes": entry.nbytes,
+                    "modified_ns": str(entry.modified_ns),
+                    "sha256": _copy(source / entry.name, target / entry.name, step),
+                }
+                since_noted += entry.nbytes
+                if since_noted >= JOURNAL_EVERY_BYTES:
+                    _write_journal(target, mission, journal)
+                    since_noted = 0
+        except BaseException:
+            # A disk that refused, or Ctrl-C: what is there is not to be copied again.
+            with suppress(OSError):
                 _write_journal(target, mission, journal)
-                since_noted = 0
+            raise
         _remove_strangers(target, {entry.name for entry in entries})
         _write_journal(target, mission, journal)
         verified = verify(Mission.open(target))

@@ -52,7 +52,6 @@ def test_every_byte_arrives_and_the_copy_verifies(mission: Mission, tmp_path: Pa
 def test_interrupted_at_any_file_it_goes_on_where_it_stopped(
     mission: Mission, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(transfer, "JOURNAL_EVERY_BYTES", 1)
     real = transfer._copy
     count = 0
 
