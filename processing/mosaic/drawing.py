@@ -273,7 +273,7 @@ def _vector_panel(
         ends = np.clip(residuals[chosen] * enlarge, -60.0, 60.0)
         path = " ".join(
             f"M{(c + 0.5) * scale:.1f} {(r + 0.5) * scale:.1f}l{dx:.1f} {-dy:.1f}"
-            for (c, r), (dx, dy) in zip(px[chosen], ends, strict=True)
+            for (c, r), (dx, dy) in zip(px[chosen].tolist(), ends.tolist(), strict=True)
         )
         if path:
             parts.append(
