@@ -5,14 +5,22 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.system.flown import Flown, syntopic
+from daemon.cli.sim import Emulator, free_first_address, service_toml, simulator_arguments
+from tests.system.flown import ROOT, Flown, syntopic
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(300)]
+
+LINE_EXPOSURES = 40
+"""So long are the lines of the long flight; between them it turns, exposing."""
+IMAGES = ("pan.tif", "rgbn.tif", "geometry.npz", "quality.json")
+LONG_RUN_S = 7000.0
 
 
 def compared(told: dict[str, Any]) -> dict[str, tuple[int, int]]:
@@ -60,3 +68,50 @@ def test_a_replay_finds_one_flipped_bit_in_what_the_receiver_said(
     # The message's checksum is wrong now, so what was told then is not in the bytes any more.
     assert compared(told)["records of gnss"][1] > 0
     assert told["sentences"]
+
+
+def fly_long(folder: Path, count: int) -> Path:
+    """The mission folder of so many exposures by the service as it flies, with its pipeline."""
+    rig = "ultracam-l-mini"
+    arguments = simulator_arguments(rig, folder / "sim", seed=5, dc=6, displace=[])
+    address = free_first_address()
+    line = str(min(count, LINE_EXPOSURES))
+    emulator = Emulator([*arguments, "--first-address", address, "--exposures", line])
+    try:
+        config = folder / "service.toml"
+        config.write_text(
+            service_toml(emulator.ready, root="missions", count=count, end_when_done=True)
+        )
+        done = subprocess.run(
+            [sys.executable, "-m", "daemon", "run", str(config), "--json-lines"],
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            text=True,
+            timeout=LONG_RUN_S,
+            check=True,
+        )
+    finally:
+        emulator.end()
+    events = [json.loads(line) for line in done.stdout.splitlines()]
+    ledger = events[-1]["ledger"]
+    assert ledger["balanced"] and ledger["triggers"]["triggers"] == count, ledger
+    return Path(next(event["path"] for event in events if event["event"] == "mission"))
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(7200)
+def test_two_hundred_exposures_replayed_give_equal_hashes(tmp_path: Path) -> None:
+    """About 13 GB; a busy machine may put images off or lose frames, and replays that as well."""
+    count = 200
+    mission = fly_long(tmp_path, count)
+    made = len(list((mission / "L2").glob("[0-9]*")))
+    done = syntopic("replay", str(mission), "--json", within_s=LONG_RUN_S)
+    told = json.loads(done.stdout)
+    print(json.dumps(told))
+    found = compared(told)
+    assert done.returncode == 0, told["sentences"][:5]
+    assert found["exposure records"] == (count, 0) and found["ledger"] == (1, 0)
+    for lanes in (1, 2):
+        for file in IMAGES:
+            assert found[f"{file}, {lanes} in work"] == (made, 0)
+    assert made >= 0.9 * count
