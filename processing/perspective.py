@@ -148,11 +148,19 @@ class HeadPipeline:
 
     def warm_up(self) -> None:
         """Compile every kernel a flight will need, from the cache where there is one."""
-        for is_writeable in (True, False):
-            frames = plain_frames(self.rig)
-            for frame in frames.values():
-                frame.flags.writeable = is_writeable
-            self.process(frames, Conditions())
+        frames = plain_frames(self.rig)
+        self.process(frames, Conditions())
+        # Frames in memory may be read-only to the kernels: that is another variant of one of them.
+        for sensor in self.rig.sensors:
+            frames[sensor.name].flags.writeable = False
+            level1_from_level0(
+                self._correctors[sensor.name],
+                frames[sensor.name],
+                temperature_c=None,
+                exposure_time_s=0.0,
+                tdi_shifts=0,
+                out=np.empty((sensor.height_px, sensor.width_px), np.uint16),
+            )
 
     def process(
         self,
