@@ -43,7 +43,9 @@ Array = NDArray[np.float64]
 RIG = "ultracam-x-mini"
 LARGEST_DC_K = 20.0
 PLACES = 8
+SCENES = 2
 FIRST_SEED = 1000
+SEEDS_OF_SCENE = 4000
 REFERENCE_SHARE = 0.03
 """Of the errors of matching, where they should be out of the way."""
 _RANK_TOLERANCE = 1e-7
@@ -85,7 +87,7 @@ class Pooled:
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.honest_uncertainty")
-    parser.add_argument("--rendered", type=int, default=40, help="exposures to render")
+    parser.add_argument("--rendered", type=int, default=48, help="exposures to render")
     parser.add_argument("--drawn", type=int, default=200, help="exposures with drawn tie points")
     parser.add_argument("--keep-errors", type=Path, help="where to keep the errors of matching")
     parser.add_argument("--kept", type=int, default=40, help="how many exposures' errors to keep")
@@ -118,17 +120,26 @@ def main() -> None:
 
 
 def render(count: int, scenes: Path) -> list[Trial]:
-    """Exposures along one line, each by a camera of its own, dC drawn from +-20 K."""
-    first = World(rendered.world_settings(RIG, 1, exposures=PLACES))
+    """Exposures along a line over each scene, each by a camera of its own, dC from +-20 K."""
+    return [
+        trial
+        for number in range(SCENES)
+        for trial in _over_scene(number, (count + SCENES - 1 - number) // SCENES, scenes)
+    ]
+
+
+def _over_scene(number: int, count: int, scenes: Path) -> list[Trial]:
+    first = World(rendered.world_settings(RIG, 1 + number, exposures=PLACES))
     scene = open_scene(first.scene_settings, scenes)
     heads = Heads(first, seed=1)
     settings = Settings(geometry=False, threads=len(os.sched_getaffinity(0)))
     pipeline = Pipeline(first.rig, rendered.radiometry_of(heads), settings)
     trials = []
     for k in range(count):
-        world, _ = world_and_rig(RIG, FIRST_SEED + k, dc_k=_dc_k(k), exposures=PLACES)
+        seed = SEEDS_OF_SCENE * number + k
+        world, _ = world_and_rig(RIG, FIRST_SEED + seed, dc_k=_dc_k(seed), exposures=PLACES)
         trials.append(
-            rendered_trial(world, pipeline, heads, scene, seed=FIRST_SEED + k, place=k % PLACES)
+            rendered_trial(world, pipeline, heads, scene, seed=FIRST_SEED + seed, place=k % PLACES)
         )
     return trials
 

@@ -136,6 +136,29 @@ def test_the_datum_holds_for_accumulated_corrections() -> None:
             assert abs(mosaic.value(f"{a}.{what}") + mosaic.value(f"{b}.{what}")) < 1e-12
 
 
+def test_the_datum_leaves_the_smallest_sum_of_squares_at_the_master_sensors() -> None:
+    """No shift, scale or turn of the image brings them nearer to their calibration (eq. 6)."""
+    rng = np.random.default_rng(5)
+    truth = make_truth(MINI, rng, sensor_px=2.0)
+    points = tie_points_of(truth, rng)
+    names = ["SU00", "SU01", "SU02", "SU03"]
+    placed = [truth.start[n].similarity for n in names]
+    calibrated = np.array([[place.x_mm, place.y_mm] for place in placed])
+
+    def found(mosaic: Mosaic) -> Array:
+        moved = [[mosaic.value(f"{n}.x"), mosaic.value(f"{n}.y")] for n in names]
+        return np.asarray(calibrated + np.array(moved))
+
+    def squares(places: Array) -> float:
+        return float(np.sum((places - calibrated) ** 2))
+
+    ours = found(free_mosaic(MINI, truth.start, points))
+    nearest = apply_similarity(fit_similarity(ours, calibrated), ours)
+    assert squares(ours) == pytest.approx(squares(nearest), rel=1e-4)
+    other = found(free_mosaic(MINI, truth.start, points, excluded_datum_sensors=("SU02",)))
+    assert squares(other) > 1.1 * squares(ours)
+
+
 def test_the_choice_of_the_datum_does_not_touch_the_inner_geometry() -> None:
     """To second order in the noise: a smaller mosaic has smaller residuals (0.003 px at 0.1 px)."""
     rng = np.random.default_rng(6)
@@ -173,7 +196,7 @@ def test_errors_are_as_large_as_the_covariance_says() -> None:
         total += float(np.sum((directions[:, good].T @ error) ** 2 / eigenvalues[good]))
         degrees += 52
         within.append(np.abs(error) / np.sqrt(np.diag(covariance)))
-    low, high = chi2.ppf([0.0005, 0.9995], degrees)
+    low, high = (float(chi2.ppf(p, degrees)) for p in (0.0005, 0.9995))
     assert low < total < high
     assert np.mean(np.concatenate(within) < 3.0) > 0.99
     assert np.concatenate(within).max() < 5.0
