@@ -49,6 +49,9 @@ def main() -> None:
         "settled_mib": round(settled, 1),
         "last_mib": round(seen[-1], 1),
         "most_mib": round(max(seen), 1),
+        "tenths_mib": [
+            round(float(np.median(part)), 1) for part in np.array_split(seen, 10) if len(part)
+        ],
     }
     print(json.dumps(told))
 
