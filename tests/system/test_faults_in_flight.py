@@ -233,7 +233,7 @@ def test_a_failing_supply_finds_everything_safe_within_the_stated_time(
     service = start(config)
     mission, stored, triggered = "", set(), set()
     status: dict[str, Any] = {}
-    begun = 0.0
+    begun = safe_s = 0.0
     for event in heard(service):
         if event["event"] == "mission":
             mission = event["path"]
@@ -246,8 +246,10 @@ def test_a_failing_supply_finds_everything_safe_within_the_stated_time(
             stored.add(event["number"])
         elif event["event"] == "ended":
             status = event
+        if begun and event["event"] in ("stored", "sealed", "lost"):
+            safe_s = time.monotonic() - begun
     took_s = time.monotonic() - begun
-    print(json.dumps({"seconds": round(took_s, 2)}))
+    print(json.dumps({"safe after s": round(safe_s, 2), "ended after s": round(took_s, 2)}))
     assert service.wait(30) == 0
     # 5 s for what is open, and what ending the processes takes on a busy machine.
     assert took_s < 15.0, f"{took_s:.1f} s"
