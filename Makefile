@@ -24,7 +24,7 @@ demo: setup
 
 # Whole flights run in real time and have the right of way (tests/conftest.py).
 test: setup
-	$(BIN)/python -m pytest -n 3 --dist loadgroup --no-loadscope-reorder
+	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 # V4L2 heads and pulses per second against the real kernel, in a virtual machine; REQUIRED=--required where skipping is no
 # answer.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -41,8 +42,7 @@ def run(
 
 
 def _print_json(event: Mapping[str, Any]) -> None:
-    sys.stdout.write(json.dumps(event) + "\n")
-    sys.stdout.flush()
+    _say(json.dumps(event))
 
 
 def _print_line(event: Mapping[str, Any]) -> None:
@@ -54,5 +54,12 @@ def _print_line(event: Mapping[str, Any]) -> None:
     ]
     if "report" in event:
         told.append(f"verdict={event['report'].get('verdict')}")
-    sys.stdout.write(f"{event['event']} {' '.join(told)}\n")
-    sys.stdout.flush()
+    _say(f"{event['event']} {' '.join(told)}")
+
+
+def _say(line: str) -> None:
+    """Nobody need listen: a reader that has gone, or a full disk behind it, ends no flight."""
+    try:
+        print(line, flush=True)
+    except OSError:
+        sys.stdout = Path(os.devnull).open("w")

@@ -1,7 +1,8 @@
 """Large files written past the page cache: pixels go from where they lie to the disk.
 
-A copy of every pixel into the page cache costs more of a core than making a tenth of them. Which
-files are written so is decided by `daemon.disk.level2`; all others go by `daemon.disk.durable`.
+A copy of every pixel into the page cache costs more of a core than making a tenth of them. Frames
+(`daemon.disk.store`) and rasters (`daemon.disk.level2`) are written so; all else goes by
+`daemon.disk.durable`.
 """
 
 from __future__ import annotations
@@ -34,12 +35,14 @@ def create_file(path: Path, parts: Sequence[bytes | memoryview], *, mode: int = 
     Raises:
         OSError: the disk refused; what was begun is left for the caller to clear.
     """
-    if sum(memoryview(part).nbytes for part in parts) < WORTH_IT_BYTES:
+    total = sum(memoryview(part).nbytes for part in parts)
+    if total < WORTH_IT_BYTES:
         return durable.create_file(path, parts, mode=mode)
     descriptor = _open(path, mode)
     if descriptor is None:
         return durable.create_file(path, parts, mode=mode)
     try:
+        os.posix_fallocate(descriptor, 0, total)  # a full disk says so before the first byte
         written = _write_all(descriptor, parts)
         os.fsync(descriptor)
     except OSError as error:

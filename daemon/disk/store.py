@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.disk import durable
+from daemon.disk import direct, durable
 from daemon.disk.catalog import Catalog
 from daemon.disk.level0 import tiff_parts
 from daemon.disk.level0_folder import (
@@ -233,7 +233,7 @@ def _write_frame(
 ) -> FrameRecord:
     name = f"{frame.sensor}.tif"
     parts = tiff_parts([pixels], _description(capture, frame))
-    durable.create_file(part / name, parts)
+    direct.create_file(part / name, parts)
     digest = hashlib.sha256()
     for piece in parts:
         digest.update(piece)

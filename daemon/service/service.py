@@ -494,7 +494,7 @@ class Service:
         self.watching.tell(told)
 
     def _fail(self, sentence: str) -> None:
+        self.stopping.set()
         if self.failure is None:
             self.failure = sentence
             self._event("fault", sentence=sentence)
-        self.stopping.set()
