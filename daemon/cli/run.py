@@ -62,4 +62,4 @@ def _say(line: str) -> None:
     try:
         print(line, flush=True)
     except OSError:
-        sys.stdout = Path(os.devnull).open("w")
+        sys.stdout = Path(os.devnull).open("w")  # noqa: SIM115 - open as long as the service lives
