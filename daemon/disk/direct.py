@@ -71,16 +71,17 @@ def _open(path: Path, mode: int) -> int | None:
 
 
 def _write_all(descriptor: int, parts: Sequence[bytes | memoryview]) -> int:
-    total = filled = 0
+    """One call writes all, as long as what has to be gathered fits into the buffer."""
+    total = filled = taken = 0
     buffer = memoryview(mmap.mmap(-1, _GATHERED_BYTES))
+    waiting: list[memoryview] = []
     for part in parts:
         left = memoryview(part).cast("B")
         total += len(left)
         if filled % BLOCK == 0 and _address(left) % BLOCK == 0 and len(left) >= BLOCK:
-            _write(descriptor, buffer[:filled])
-            filled = 0
             whole = len(left) // BLOCK * BLOCK
-            _write(descriptor, left[:whole])
+            waiting += [buffer[taken:filled], left[:whole]]
+            taken = filled
             left = left[whole:]
         while left:
             count = min(len(left), len(buffer) - filled)
@@ -88,16 +89,12 @@ def _write_all(descriptor: int, parts: Sequence[bytes | memoryview]) -> int:
             left = left[count:]
             filled += count
             if filled == len(buffer):
-                _write(descriptor, buffer)
-                filled = 0
-    _write(descriptor, buffer[: -(-filled // BLOCK) * BLOCK])
+                durable.write_all(descriptor, [*waiting, buffer[taken:]])
+                waiting.clear()
+                filled = taken = 0
+    durable.write_all(descriptor, [*waiting, buffer[taken : -(-filled // BLOCK) * BLOCK]])
     os.ftruncate(descriptor, total)
     return total
-
-
-def _write(descriptor: int, data: memoryview) -> None:
-    while data:
-        data = data[os.write(descriptor, data) :]
 
 
 def _address(data: memoryview) -> int:

@@ -27,7 +27,7 @@ def create_file(path: Path, parts: Sequence[bytes | memoryview], *, mode: int = 
     """
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
     try:
-        written = _write_all(descriptor, parts)
+        written = write_all(descriptor, parts)
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
@@ -106,7 +106,8 @@ def free_bytes(path: Path) -> int:
     return status.f_bavail * status.f_frsize
 
 
-def _write_all(descriptor: int, parts: Sequence[bytes | memoryview]) -> int:
+def write_all(descriptor: int, parts: Sequence[bytes | memoryview]) -> int:
+    """Write parts one after another, however few bytes the disk takes at a time; their number."""
     waiting = [memoryview(part).cast("B") for part in parts if len(part)]
     total = 0
     while waiting:

@@ -28,10 +28,10 @@ def test_pixels_reach_the_file_wherever_they_lie(tmp_path: Path, offset: int, pi
 def test_where_the_disk_has_no_way_past_the_cache_the_file_is_whole_all_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refusing(descriptor: int, data: memoryview) -> None:
+    def refusing(descriptor: int, parts: object) -> int:
         raise OSError(errno.EINVAL, "Invalid argument")
 
-    monkeypatch.setattr(direct, "_write", refusing)
+    monkeypatch.setattr(direct, "_write_all", refusing)
     content = os.urandom(direct.WORTH_IT_BYTES)
     assert direct.create_file(tmp_path / "pan.tif", [content]) == len(content)
     assert (tmp_path / "pan.tif").read_bytes() == content
@@ -40,9 +40,9 @@ def test_where_the_disk_has_no_way_past_the_cache_the_file_is_whole_all_the_same
 def test_a_full_disk_is_told_and_not_tried_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(descriptor: int, data: memoryview) -> None:
+    def full(descriptor: int, parts: object) -> int:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(direct, "_write", full)
+    monkeypatch.setattr(direct, "_write_all", full)
     with pytest.raises(OSError, match="No space left"):
         direct.create_file(tmp_path / "pan.tif", [bytes(direct.WORTH_IT_BYTES)])
