@@ -58,8 +58,9 @@ def cars_of(settings: SceneSettings) -> tuple[Car, ...]:
 
 
 def scene_with(cars: Sequence[Car], scene: Scene, t_s: float, bands: Sequence[str]) -> Scene:
-    """The scene with every car where it is at an instant; only `bands` are kept."""
-    return replace(scene, bands={name: _with(cars, scene, name, t_s) for name in bands})
+    """The scene with every car where it is at an instant, in the `bands` that are looked at."""
+    driven = {name: _with(cars, scene, name, t_s) for name in bands}
+    return replace(scene, bands={**scene.bands, **driven})
 
 
 def _with(cars: Sequence[Car], scene: Scene, band: str, t_s: float) -> NDArray[np.uint16]:
