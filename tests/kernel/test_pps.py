@@ -71,6 +71,10 @@ class Seen:
                 self.events.append(record)
             self._changed.notify_all()
 
+    def has_edges(self, count: int, limit_s: float) -> bool:
+        with self._changed:
+            return self._changed.wait_for(lambda: len(self.edges) >= count, limit_s)
+
     def wait_edges(self, count: int) -> None:
         with self._changed:
             assert self._changed.wait_for(lambda: len(self.edges) >= count, PATIENCE_S), self.events
@@ -115,13 +119,22 @@ def test_the_kernel_says_what_the_source_can_and_waits_no_longer_than_asked() ->
     pps.close()
 
 
+def pulse_until(seen: Seen, count: int) -> tuple[int, int]:
+    """A pulse that comes through: the emulated port now and then swallows one."""
+    for _ in range(4):
+        bracket = pulse()
+        if seen.has_edges(count, PATIENCE_S / 4):
+            break
+    seen.wait_edges(count)
+    return bracket
+
+
 def test_edges_carry_the_monotonic_time_of_their_interrupt() -> None:
     with running() as (device, seen):
         brackets = []
         seen.edges.clear()
         for count in range(1, 9):
-            brackets.append(pulse())
-            seen.wait_edges(count)
+            brackets.append(pulse_until(seen, count))
         assert [edge.sequence for edge in seen.edges] == list(
             range(seen.edges[0].sequence, seen.edges[0].sequence + 8)
         )
