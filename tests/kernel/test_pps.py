@@ -131,10 +131,8 @@ def pulse_until(seen: Seen, count: int) -> tuple[int, int]:
 
 def test_edges_carry_the_monotonic_time_of_their_interrupt() -> None:
     with running() as (device, seen):
-        brackets = []
         seen.edges.clear()
-        for count in range(1, 9):
-            brackets.append(pulse_until(seen, count))
+        brackets = [pulse_until(seen, count) for count in range(1, 9)]
         assert [edge.sequence for edge in seen.edges] == list(
             range(seen.edges[0].sequence, seen.edges[0].sequence + 8)
         )
