@@ -7,6 +7,7 @@ no pattern a configuration can hold, and no line a device can send, holds the dr
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
@@ -18,6 +19,13 @@ MAX_LINE: Final = 256
 _LATIN: Final = "".join(map(chr, range(256)))
 _REPEAT: Final = re.compile(r"\{(\d{0,4})(,?)(\d{0,4})\}")
 _GROUP: Final = re.compile(r"\?P<([A-Za-z_]\w*)>|\?:")
+
+
+def _compiled(text: str) -> re.Pattern[str]:
+    with warnings.catch_warnings():
+        # A bracket inside a class is a bracket here, whatever later versions of Python make of it.
+        warnings.simplefilter("ignore", FutureWarning)
+        return re.compile(text, re.ASCII | re.DOTALL)
 
 
 class PatternError(ValueError):
@@ -52,7 +60,7 @@ class LinePattern:
         if len(text) > MAX_PATTERN:
             raise PatternError(f"it has {len(text)} characters; at most {MAX_PATTERN}")
         try:
-            re.compile(text, re.ASCII)
+            _compiled(text)
         except (re.error, RecursionError, OverflowError) as error:
             raise PatternError(f"it does not compile: {error}") from error
         self._text = text
@@ -209,7 +217,7 @@ class LinePattern:
             self._at += 2
         else:
             self._at += 1
-        one = re.compile(self._text[begin : self._at], re.ASCII | re.DOTALL)
+        one = _compiled(self._text[begin : self._at])
         characters = frozenset(c for c in _LATIN if one.fullmatch(c))
         return lambda after: self._add(_Step("char", characters, (after,)))
 

@@ -71,6 +71,9 @@ class UartRelay:
         os.close(host_end)
         self._device = os.open(device_port, os.O_RDWR | os.O_NOCTTY)
         tty.setraw(self._device)
+        # A host that has gone makes a port ready; once it is back, reading would wait for it.
+        for fd in (self._host, self._device):
+            os.set_blocking(fd, False)
         self._end_read, self._end_write = os.pipe()
         self._thread = threading.Thread(target=self._pump, daemon=True)
         self.speeds: set[int] = set()
