@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from processing.rig import RigError, load_rig, shipped_rigs
+from sim_hw.ending import end_with_parent
 from sim_hw.receivers.kinds import PROBES, RECEIVERS
 from sim_hw.simulator import SimulatorSettings, simulate
 from sim_hw.world.grounds import GROUNDS
@@ -56,6 +57,7 @@ def parser() -> argparse.ArgumentParser:
     add("--still", action="store_true", help="render one exposure, and send it for every pulse")
     add("--scene-cache", type=Path, help="folder where built scenes are kept (default: OUT/scenes)")
     add("--processes", type=int, default=2, help="worker processes that render")
+    add("--parent", type=int, metavar="PID", help="end when this process, which started us, does")
     return line
 
 
@@ -81,6 +83,8 @@ def rig_file(name_or_path: str) -> Path:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     given = parser().parse_args(arguments)
+    if given.parent is not None:
+        end_with_parent(given.parent)
     if given.processes < 1 or given.exposures < 1:
         print("sim_hw: processes and exposures are at least 1", file=sys.stderr)
         return 2

@@ -10,13 +10,14 @@ import signal
 PR_SET_PDEATHSIG = 1
 
 
-def end_with_parent() -> None:
+def end_with_parent(parent_pid: int | None = None) -> None:
     """Have the kernel end this process when the parent dies; it may have died before we asked.
 
     SIGKILL, since nobody is left for whom an orderly end would make a difference, and an orderly
-    end can hang.
+    end can hang. Without a pid the parent is the one that multiprocessing names.
     """
     ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     parent = multiprocessing.parent_process()
-    if parent is not None and os.getppid() != parent.pid:
+    wanted = parent.pid if parent_pid is None and parent is not None else parent_pid
+    if wanted is not None and os.getppid() != wanted:
         os.kill(os.getpid(), signal.SIGKILL)

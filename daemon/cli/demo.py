@@ -7,6 +7,7 @@ shows what they say.
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import time
@@ -120,7 +121,10 @@ def _fly(
     )
     log = (folder / "service.log").open("w")
     service = subprocess.Popen(
-        [sys.executable, "-m", "daemon", "run", str(config), "--json-lines"],
+        [
+            *(sys.executable, "-m", "daemon", "run", str(config), "--json-lines"),
+            *("--parent", str(os.getpid())),
+        ],
         stdout=subprocess.PIPE,
         stderr=log,
         text=True,

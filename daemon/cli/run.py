@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import signal
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -26,10 +27,17 @@ def run(
     json_lines: Annotated[
         bool, typer.Option("--json-lines", help="One JSON object an event.")
     ] = False,
+    parent: Annotated[
+        int | None,
+        typer.Option(help="Land when this process, which started us, is gone.", metavar="PID"),
+    ] = None,
 ) -> None:
     from daemon.configuration import load
+    from daemon.service.processes import die_with_parent
     from daemon.service.service import Service
 
+    if parent is not None:
+        die_with_parent(parent, signal.SIGTERM)
     show = _print_json if json_lines else _print_line
     goes_on, status = True, 0
     while goes_on:

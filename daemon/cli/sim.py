@@ -38,11 +38,14 @@ class EmulatorError(RuntimeError):
 
 
 class Emulator:
-    """A running emulator process and what it said when it was ready."""
+    """A running emulator process and what it said when it was ready.
+
+    It ends with the thread that made it, however that ends.
+    """
 
     def __init__(self, arguments: Sequence[str]) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "sim_hw", *arguments],
+            [sys.executable, "-m", "sim_hw", *arguments, "--parent", str(os.getpid())],
             stdout=subprocess.PIPE,
             text=True,
             start_new_session=True,
