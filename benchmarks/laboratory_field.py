@@ -112,8 +112,8 @@ def errors_of(found: RigCalibration, truth: test_field.TrueRig) -> tuple[list[Es
             "y": was.y_mm + true.shift[1],
             "rotation": was.rotation_rad + true.rotation,
             "scale": was.scale * (1.0 + true.scale) - 1.0,
-            "skew x": true.skew[0],
-            "skew y": true.skew[1],
+            "skew x": was.skew_per_mm[0] + true.skew[0],
+            "skew y": was.skew_per_mm[1] + true.skew[1],
         }[row.what]
         errors.append(row.value - value)
     return rows, np.array(errors)

@@ -23,7 +23,7 @@ from scipy.ndimage import gaussian_filter
 from processing.rig import Cone, Lens, Rig, Sensor
 from sim_hw.seeding import random_stream
 from sim_hw.series import command, new_series, run, write_list
-from sim_hw.world.camera import rotation_opk, undistorted
+from sim_hw.world.camera import rotation_opk, skewed_by, undistorted
 
 Array = NDArray[np.float64]
 
@@ -68,6 +68,7 @@ class TrueHead:
         v = ((s.height_px - 1) / 2 - row) * s.pitch_um * 1e-3
         c, t = s.scale * math.cos(s.rotation_rad), s.scale * math.sin(s.rotation_rad)
         layer = np.stack([s.x_mm + c * u - t * v, s.y_mm + t * u + c * v], axis=-1)
+        layer = layer + skewed_by(s, layer - np.array([s.x_mm, s.y_mm]))
         x, y = layer[..., 0], layer[..., 1]
         w = 2 * math.pi / self.period_mm
         extra = np.stack([np.sin(w * x) * np.cos(w * y), np.cos(w * x + 1) * np.sin(w * y)], -1)

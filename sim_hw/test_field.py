@@ -82,7 +82,8 @@ class TrueRig:
         angle, s = sensor.rotation_rad + t.rotation, sensor.scale * (1 + t.scale)
         a, b = s * math.cos(angle), s * math.sin(angle)
         x, y = a * u - b * v, b * u + a * v
-        skew = t.skew[0] * x + t.skew[1] * y
+        drawn = (sensor.skew_x_ppm_per_mm * 1e-6, sensor.skew_y_ppm_per_mm * 1e-6)
+        skew = (drawn[0] + t.skew[0]) * x + (drawn[1] + t.skew[1]) * y
         return np.stack(
             [sensor.x_mm + t.shift[0] + x * (1 + skew), sensor.y_mm + t.shift[1] + y * (1 + skew)],
             axis=1,

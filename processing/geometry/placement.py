@@ -1,7 +1,7 @@
 """Where a sensor's pixels fall in the virtual image plane, and back.
 
-A placement composes TDI, TDM, lens, principal distance, similarity S and layer transformation P
-(eq. 1 of seeds/ultracam-calibration.txt); adjusting S and P is the work of
+A placement composes TDI, TDM, skew, lens, principal distance, similarity S and layer
+transformation P (eq. 1 of seeds/ultracam-calibration.txt); adjusting S and P is the work of
 `processing.mosaic.free`.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,8 @@ from processing.rig import Cone, Rig, Sensor, VirtualImage
 
 Array = NDArray[np.float64]
 
+UNSKEWED: Final = (0.0, 0.0)
+
 
 @dataclass(frozen=True)
 class SensorPlacement:
@@ -31,8 +34,8 @@ class SensorPlacement:
     vip_from_layer homography in mm. `physical` is layer_from_sensor at the exposure's temperature
     in the physical layer, `f_ratio` = f_mm / f(T), `tdi_shifts` the N of the exposure.
 
-    u' are raw sensor coordinates corrected for lens and drift of the principal distance, expressed
-    at the start position, so that an adjusted placement is
+    u' are raw sensor coordinates corrected for skew, lens and drift of the principal distance,
+    expressed at the start position, so that an adjusted placement is
     `dataclasses.replace(start, similarity=..., layer=...)`.
     """
 
@@ -135,6 +138,8 @@ def raw_from_sensor_mm(placement: SensorPlacement, u_mm: Array) -> Array:
 def corrected_mm_from_raw(placement: SensorPlacement, colrow: Array) -> Array:
     """u' of eq. 1 (n, 2), mm: what S and P act on, independent of their adjustment."""
     physical = apply_similarity(placement.physical, sensor_mm_from_raw(placement, colrow))
+    if placement.sensor.skew_per_mm != UNSKEWED:
+        physical = _skewed(placement, physical)
     ideal = ideal_from_measured(placement.cone.lens, physical) * placement.f_ratio
     return apply_similarity(invert_similarity(start_similarity(placement)), ideal)
 
@@ -172,9 +177,26 @@ def raw_from_vip_mm(placement: SensorPlacement, xy_mm: Array) -> Array:
         / placement.f_ratio
     )
     physical = measured_from_ideal(placement.cone.lens, ideal)
+    if placement.sensor.skew_per_mm != UNSKEWED:
+        physical = _unskewed(placement, physical)
     return raw_from_sensor_mm(
         placement, apply_similarity(invert_similarity(placement.physical), physical)
     )
+
+
+def _skewed(placement: SensorPlacement, physical_mm: Array) -> Array:
+    """Perspective skew of the sensor: q (1 + k q) for q about its centre; (n, 2) to (n, 2)."""
+    about = physical_mm - (placement.physical.x_mm, placement.physical.y_mm)
+    return physical_mm + about * (about @ placement.sensor.skew_per_mm)[:, None]
+
+
+def _unskewed(placement: SensorPlacement, physical_mm: Array) -> Array:
+    """Inverse of `_skewed`: with w = k q the skewed point p has k p = w (1 + w)."""
+    centre = np.array((placement.physical.x_mm, placement.physical.y_mm))
+    about = physical_mm - centre
+    with np.errstate(invalid="ignore"):
+        w = (np.sqrt(1.0 + 4.0 * (about @ placement.sensor.skew_per_mm)) - 1.0) / 2.0
+    return np.asarray(centre + about / (1.0 + w)[:, None])
 
 
 def vip_px_from_mm(image: VirtualImage, xy_mm: Array) -> Array:

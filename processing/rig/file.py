@@ -25,6 +25,7 @@ RIG_FORMAT = 1
 RIG_FILE_MAX_BYTES = 1_000_000
 BANDS = ("pan", "red", "green", "blue", "nir", "red_edge")
 JUSTIFICATIONS = ("right", "left")
+MOST_SKEW_PPM_PER_MM = 1000.0
 COLOUR_FILTER_ARRAYS = ("none", "RGGB", "BGGR", "GRBG", "GBRG")
 
 
@@ -243,10 +244,19 @@ def _sensor(table: Table, probe: str, calibration_c: float) -> Sensor:
         colour_filter_array=table.choice("colour_filter_array", COLOUR_FILTER_ARRAYS, "none"),
         tdi_row_sign=sign,
         justified=table.choice("justified", JUSTIFICATIONS, "right"),
+        skew_x_ppm_per_mm=_skew(table, "skew_x_ppm_per_mm"),
+        skew_y_ppm_per_mm=_skew(table, "skew_y_ppm_per_mm"),
     )
     drift.refuse_unknown()
     table.refuse_unknown()
     return sensor
+
+
+def _skew(table: Table, key: str) -> float:
+    skew = table.number(key, 0.0)
+    if abs(skew) > MOST_SKEW_PPM_PER_MM:
+        table.complain(key, f"a skew is {MOST_SKEW_PPM_PER_MM:g} ppm/mm at most")
+    return skew
 
 
 def _check_names(rig: Rig, file: str, problems: list[str]) -> None:

@@ -41,8 +41,10 @@ class Sensor:
 
     `x_mm`, `y_mm` place the centre of the pixel array, `rotation_rad` turns it counter-clockwise,
     `scale` is near one. The place holds at `calibration_c`. `position_sigma_um` is the standard
-    deviation of each calibrated coordinate. A left-justified sensor keeps its DN in the highest
-    bits of a 16-bit word: word = DN * `words_per_dn`.
+    deviation of each calibrated coordinate. Perspective skew: what without it lay (x, y) mm from
+    the centre, along the axes of the layer, lies at (x, y) * (1 + 1e-6 * (skew_x_ppm_per_mm * x +
+    skew_y_ppm_per_mm * y)). A left-justified sensor keeps its DN in the highest bits of a 16-bit
+    word: word = DN * `words_per_dn`.
     """
 
     name: str
@@ -65,10 +67,16 @@ class Sensor:
     colour_filter_array: str
     tdi_row_sign: int
     justified: str = "right"
+    skew_x_ppm_per_mm: float = 0.0
+    skew_y_ppm_per_mm: float = 0.0
 
     @property
     def pitch_mm(self) -> float:
         return self.pitch_um * 1e-3
+
+    @property
+    def skew_per_mm(self) -> tuple[float, float]:
+        return (self.skew_x_ppm_per_mm * 1e-6, self.skew_y_ppm_per_mm * 1e-6)
 
     @property
     def full_scale_dn(self) -> int:

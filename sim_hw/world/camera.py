@@ -95,7 +95,8 @@ class TrueCamera:
         x = sensor.x_mm + error[0] + sensor.drift.x_um_per_k * 1e-3 * dc
         y = sensor.y_mm + error[1] + sensor.drift.y_um_per_k * 1e-3 * dc
         c, s = scale * math.cos(turn), scale * math.sin(turn)
-        return np.stack([x + c * right - s * up, y + s * right + c * up], axis=-1)
+        straight = np.stack([x + c * right - s * up, y + s * right + c * up], axis=-1)
+        return straight + skewed_by(sensor, straight - np.array([x, y]))
 
     def directions(
         self,
@@ -138,6 +139,13 @@ def true_camera(
             draw = np.zeros(3)
         mounting[cone.name] = (float(draw[0]), float(draw[1]), float(draw[2]))
     return TrueCamera(rig=rig, place_error_mm=place, mounting_error_rad=mounting)
+
+
+def skewed_by(sensor: Sensor, about_mm: Array) -> Array:
+    """How far perspective skew moves points (..., 2) about the sensor's centre, in its layer."""
+    x, y = about_mm[..., 0], about_mm[..., 1]
+    ppm = sensor.skew_x_ppm_per_mm * x + sensor.skew_y_ppm_per_mm * y
+    return np.stack([x * ppm * 1e-6, y * ppm * 1e-6], axis=-1)
 
 
 def undistorted(lens: Lens, xy_mm: Array) -> Array:

@@ -226,6 +226,7 @@ def _true_place(world: World, cone: Cone, sensor: Sensor) -> dict[str, Any]:
         "place_error_mm": list(error),
         "rotation_rad": sensor.rotation_rad,
         "scale": sensor.scale,
+        "skew_ppm_per_mm": [sensor.skew_x_ppm_per_mm, sensor.skew_y_ppm_per_mm],
         "drift": asdict(sensor.drift),
         "x_at_base_temperature_mm": float(placed[0]),
         "y_at_base_temperature_mm": float(placed[1]),

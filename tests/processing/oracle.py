@@ -53,7 +53,9 @@ def vip_px_of_raw(
         true_row = row - sensor.tdi_row_sign * tdi_shifts / 2.0
         right = (column - (sensor.width_px - 1) / 2.0) * pitch * scale
         up = ((sensor.height_px - 1) / 2.0 - true_row) * pitch * scale
-        place = complex(*centre) + complex(right, up) * np.exp(1j * turn)
+        turned = complex(right, up) * np.exp(1j * turn)
+        skew = sensor.skew_x_ppm_per_mm * turned.real + sensor.skew_y_ppm_per_mm * turned.imag
+        place = complex(*centre) + turned * (1.0 + skew / 1e6)
         points.append((place.real, place.imag))
     ideal = ideal_from_measured(cone.lens, np.array(points))
     # Rays at f(T), turned into the master camera and seen by a pinhole that looks down -z.

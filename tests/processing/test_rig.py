@@ -78,6 +78,22 @@ def test_a_number_that_is_none_is_refused(value: object) -> None:
     assert "cone[0].sensor[0].x_mm" in problem
 
 
+def test_perspective_skew_is_optional_and_within_reason() -> None:
+    changed = content()
+    first, second = changed["cone"][0]["sensor"][:2]
+    first["skew_x_ppm_per_mm"] = -3.5
+    rig = rig_from_mapping(changed, "rig.toml")
+    assert rig.sensors[0].skew_per_mm == pytest.approx((-3.5e-6, 0.0))
+    assert rig.sensors[1].skew_per_mm == (0.0, 0.0)
+    first["skew_y_ppm_per_mm"], second["skew_x_ppm_per_mm"] = 1001.0, "much"
+    problems = problems_of(changed)
+    assert len(problems) == 2
+    assert (
+        "cone[0].sensor[0].skew_y_ppm_per_mm is 1001.0; a skew is 1000 ppm/mm at most"
+        in (problems[0])
+    )
+
+
 def test_two_sensors_of_one_name_are_refused() -> None:
     changed = content()
     changed["cone"][0]["sensor"][1]["name"] = "SU00"

@@ -28,9 +28,11 @@ from processing.bundle.adjust import Adjustment, Settings, adjust
 from processing.bundle.network import INTERIOR, NetworkError
 from processing.bundle.rank import DefectError
 from processing.bundle.rotations import omega_phi_kappa
+from processing.bundle.terms import Kind
 from processing.rig import Rig, Sensor
 
 EXPECTED_SIGMA_PX: Final = 0.02
+_SKEW: Final[tuple[Kind, Kind]] = ("perspective-x", "perspective-y")
 _MOST_ROUNDS: Final = 6
 _SETTLED: Final = 0.03
 _SETTLED_MM: Final = 5e-5
@@ -40,7 +42,7 @@ _SETTLED_MM: Final = 5e-5
 @dataclass(frozen=True)
 class RigCalibration:
     """What was found: the rig with its new places, and the last adjustment, whose cofactor holds
-    for them. `skew_per_mm` and its sigmas by sensor: a rig file has no place for them."""
+    for them."""
 
     rig: Rig
     before: Rig
@@ -49,7 +51,6 @@ class RigCalibration:
     sigma_px: float
     rejected: int
     temperatures_c: Mapping[str, float]
-    skew_per_mm: Mapping[str, tuple[float, float]]
 
 
 def calibrate_rig(
@@ -67,7 +68,7 @@ def calibrate_rig(
 
     Args:
         offset_sigma_mm: how well the drawing knows the cones' projection centres.
-        skew_sigma_per_mm: how far a CCD is skewed, beforehand (one sigma).
+        skew_sigma_per_mm: how far a CCD's skew is from the rig file's, beforehand (one sigma).
 
     Raises:
         SeriesError: what cannot be determined, named.
@@ -112,14 +113,13 @@ def calibrate_rig(
     probes = {name for t in seen for name in t}
     mean = {p: float(np.mean([t[p] for t in seen if p in t])) for p in sorted(probes)}
     return RigCalibration(
-        rig=_at_temperatures(current, mean),
+        rig=_at_temperatures(_skewed(current, result), mean),
         before=rig,
         looks=looks,
         adjustment=result,
         sigma_px=found_px,
         rejected=int((~kept).sum()),
         temperatures_c=mean,
-        skew_per_mm=_skew(rig, result),
     )
 
 
@@ -143,7 +143,8 @@ def _largest_move(result: Adjustment) -> float:
 
 
 def _moved(rig: Rig, result: Adjustment) -> Rig:
-    """The rig with what an adjustment found; skew is not part of a rig."""
+    """The rig with what an adjustment found, but for skew: it is held to the rig file's in every
+    round, and so counted from there."""
     master = master_of(rig)
     cones = []
     angles = omega_phi_kappa(result.state.head_rotation)
@@ -207,14 +208,23 @@ def _at_temperatures(rig: Rig, mean: Mapping[str, float]) -> Rig:
     )
 
 
-def _skew(rig: Rig, result: Adjustment) -> dict[str, tuple[float, float]]:
-    found = {}
-    for k, cone in enumerate(rig.cones):
-        names = [t.name for t in result.network.cameras[k].terms]
-        for sensor in cone.sensors if names else ():
-            x, y = (
-                float(result.state.terms[k][names.index(term_name(sensor, kind))])
-                for kind in ("perspective-x", "perspective-y")
-            )
-            found[sensor.name] = (x, y)
-    return found
+def _skewed(rig: Rig, result: Adjustment) -> Rig:
+    """The rig with the skew that the last adjustment found."""
+    found = {
+        term.name: float(value) * 1e6
+        for camera, values in zip(result.network.cameras, result.state.terms, strict=True)
+        for term, value in zip(camera.terms, values, strict=True)
+    }
+
+    def skewed(sensor: Sensor) -> Sensor:
+        x, y = (found.get(term_name(sensor, kind), 0.0) for kind in _SKEW)
+        return replace(
+            sensor,
+            skew_x_ppm_per_mm=sensor.skew_x_ppm_per_mm + x,
+            skew_y_ppm_per_mm=sensor.skew_y_ppm_per_mm + y,
+        )
+
+    return replace(
+        rig,
+        cones=tuple(replace(c, sensors=tuple(skewed(s) for s in c.sensors)) for c in rig.cones),
+    )

@@ -53,7 +53,7 @@ class Estimated:
 
 
 def estimated(found: RigCalibration) -> list[Estimated]:
-    """All parameters of the rig, as the rig file has them; skew besides."""
+    """All parameters of the rig, as the rig file has them."""
     result, rows = found.adjustment, []
     new, old = found.rig, found.before
     for k, cone in enumerate(new.cones):
@@ -71,14 +71,13 @@ def estimated(found: RigCalibration) -> list[Estimated]:
             sensor, kind = name.rsplit(" ", 1)
             what, unit, factor = _KINDS[kind]
             a, b = new.sensor(sensor), old.sensor(sensor)
-            skew = found.skew_per_mm[sensor]
             value, was = {
                 "shift-x": (a.x_mm, b.x_mm),
                 "shift-y": (a.y_mm, b.y_mm),
                 "rotation": (a.rotation_rad, b.rotation_rad),
                 "scale": (a.scale - 1.0, b.scale - 1.0),
-                "perspective-x": (skew[0], 0.0),
-                "perspective-y": (skew[1], 0.0),
+                "perspective-x": (a.skew_per_mm[0], b.skew_per_mm[0]),
+                "perspective-y": (a.skew_per_mm[1], b.skew_per_mm[1]),
             }[kind]
             rows.append(Estimated(sensor, what, unit, factor, value, was, int(column)))
         for axis, what in enumerate(("omega", "phi", "kappa")):
@@ -186,7 +185,11 @@ def field_report(
         plots=_plots(found, rows, covariance),
     )
     return of_series(
-        report, series, sensors=set(found.skew_per_mm), previous=previous, compared=quantities
+        report,
+        series,
+        sensors={sensor.name for cone in taken for sensor in cone.sensors},
+        previous=previous,
+        compared=quantities,
     )
 
 
@@ -208,8 +211,7 @@ def _parameters(rows: Sequence[Estimated], sigma: Array) -> Sheet:
             for r, s in zip(rows, sigma.tolist(), strict=True)
         ],
         "Places and rotations of CCDs in their layers, scale less one, skew: x, y of a CCD about "
-        "its centre times (1 + skew x u + skew y v). Skew is not part of a rig file; it is told "
-        "here and in calibration.json.",
+        "its centre times (1 + skew x u + skew y v).",
     )
 
 

@@ -136,6 +136,7 @@ def layer_mm(sensor: Sensor, px: Array) -> Array:
     v = ((sensor.height_px - 1) / 2 - px[:, 1]) * sensor.pitch_mm
     c, s = math.cos(sensor.rotation_rad), math.sin(sensor.rotation_rad)
     turned = sensor.scale * np.stack([c * u - s * v, s * u + c * v], axis=1)
+    turned *= 1.0 + (turned @ sensor.skew_per_mm)[:, None]
     return np.asarray(turned + np.array([sensor.x_mm, sensor.y_mm]))
 
 

@@ -78,6 +78,25 @@ def test_raw_pixels_come_back_from_the_virtual_image_to_a_millionth_of_a_pixel()
             assert np.abs(back - raw).max() < 1e-6
 
 
+def test_a_skewed_sensor_falls_where_the_oracle_puts_it_and_comes_back() -> None:
+    straight = find_rig("ultracam-x-mini")
+    cone = straight.cones[0]
+    skewed = dataclasses.replace(
+        cone.sensors[1], skew_x_ppm_per_mm=-80.0, skew_y_ppm_per_mm=120.0, rotation_rad=0.02
+    )
+    sensors = (cone.sensors[0], skewed, *cone.sensors[2:])
+    cone = dataclasses.replace(cone, sensors=sensors)
+    rig = dataclasses.replace(straight, cones=(cone, *straight.cones[1:]))
+    assert rig.virtual_image is not None
+    warm = dict.fromkeys(rig.probes, 41.0)
+    start = nominal_placements(rig, warm, {cone.name: 12})[skewed.name]
+    raw = np.random.default_rng(6).uniform(-30, (1277, 861), (200, 2))
+    found = vip_mm_from_raw(start, raw)
+    truth = oracle.vip_px_of_raw(rig, cone, skewed, raw, 41.0, 12)
+    np.testing.assert_allclose(vip_px_from_mm(rig.virtual_image, found), truth, atol=2e-8)
+    assert np.abs(raw_from_vip_mm(start, found) - raw).max() < 1e-6
+
+
 def test_tdi_moves_the_row_origin_by_half_the_shifts_towards_where_the_charge_came_from() -> None:
     rig = find_rig("ultracam-x-mini")
     still = nominal_placements(rig, {}, {})["SU00"]

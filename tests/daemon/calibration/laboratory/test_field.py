@@ -3,25 +3,37 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.stats import chi2
 from typer.testing import CliRunner
 
 from benchmarks.laboratory_field import calibrated, errors_of, pooled
+from daemon.calibration.laboratory.field import RigCalibration
 from daemon.calibration.laboratory.field_network import LENS_FREE
 from daemon.calibration.laboratory.field_report import covariance_of
+from daemon.calibration.rig_text import rig_toml
 from daemon.cli.calibrate import app
+from processing.geometry.placement import nominal_placements, raw_from_vip_mm, vip_mm_from_raw
+from processing.geometry.similarity import apply_similarity, fit_similarity
+from processing.geometry.topology import overlaps
 from processing.matching.discs import disc_positions, identified
-from processing.rig import find_rig, load_rig, shipped_rigs
+from processing.matching.tie_points import PAN_TO_PAN, TiePoints
+from processing.mosaic.free import free_mosaic
+from processing.rig import Rig, Sensor, find_rig, load_rig, shipped_rigs
 from sim_hw import test_field
+from sim_hw.world.camera import TrueCamera
+
+Array = NDArray[np.float64]
 
 RIG = "ultracam-l-mini"
+FOUR_CONES = "ultracam-x-mini"
 PAN = ("0", "1")
 
 
@@ -91,9 +103,19 @@ def test_errors_of_rig_parameters_agree_with_their_covariance() -> None:
     assert float(size.max()) < 5.0
 
 
-def test_every_ccd_has_its_place_scale_and_skew_and_all_but_one_of_a_cone_its_rotation() -> None:
-    rig = find_rig("ultracam-x-mini")
-    found, truth = calibrated(rig, 1, exposures=12, targets=(16, 16))
+@pytest.fixture(scope="module")
+def skewed() -> Iterator[tuple[RigCalibration, test_field.TrueRig]]:
+    """CCDs so small are skewed twenty times as much as large ones: some um at the corner."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(test_field, "SKEW_PER_MM", 60e-6)
+        yield calibrated(find_rig(FOUR_CONES), 1, exposures=12, targets=(16, 16))
+
+
+def test_every_ccd_has_its_place_scale_and_skew_and_all_but_one_of_a_cone_its_rotation(
+    skewed: tuple[RigCalibration, test_field.TrueRig],
+) -> None:
+    rig = find_rig(FOUR_CONES)
+    found, truth = skewed
     rows, error = errors_of(found, truth)
     covariance = covariance_of(found, rows)
     scale = 1.0 / np.sqrt(np.diag(covariance))
@@ -108,6 +130,95 @@ def test_every_ccd_has_its_place_scale_and_skew_and_all_but_one_of_a_cone_its_ro
     assert [r.where for r in rows if r.what == "rotation"] == [
         *("SU01", "SU02", "SU03", "SU11", "SU21")
     ]
+
+
+def test_the_stitched_image_is_right_with_the_skew_that_was_found_and_wrong_without(
+    skewed: tuple[RigCalibration, test_field.TrueRig], tmp_path: Path
+) -> None:
+    found, truth = skewed
+    corner_um = [
+        1e3 * np.hypot(u, v) * (abs(truth.sensors[s.name].skew[0]) * u + abs(k) * v)
+        for s in found.rig.master_sensors
+        for k in [truth.sensors[s.name].skew[1]]
+        for u, v in [(s.width_px * s.pitch_mm / 2, s.height_px * s.pitch_mm / 2)]
+    ]
+    assert 1.0 < max(corner_um) < 6.0
+    file = tmp_path / "rig.toml"
+    file.write_bytes(rig_toml(found.rig))
+    assert inner_error_px(load_rig(file), truth) < 0.05
+    straight = {"skew_x_ppm_per_mm": 0.0, "skew_y_ppm_per_mm": 0.0}
+    assert inner_error_px(with_sensors(found.rig, lambda _: straight), truth) > 0.12
+
+
+def with_sensors(rig: Rig, changes: Callable[[Sensor], Mapping[str, Any]]) -> Rig:
+    cones = (
+        replace(c, sensors=tuple(replace(s, **changes(s)) for s in c.sensors)) for c in rig.cones
+    )
+    return replace(rig, cones=tuple(cones))
+
+
+def inner_error_px(rig: Rig, truth: test_field.TrueRig) -> float:
+    """RMS of where a rig's stitching puts pixels, less where the emulated camera really looks,
+    after the best similarity. Tie points are the emulator's too, with 0.02 px of noise."""
+
+    def lies(sensor: Sensor) -> dict[str, float]:
+        true = truth.sensors[sensor.name]
+        return {
+            "x_mm": sensor.x_mm + true.shift[0],
+            "y_mm": sensor.y_mm + true.shift[1],
+            "rotation_rad": sensor.rotation_rad + true.rotation,
+            "scale": sensor.scale * (1 + true.scale),
+            "skew_x_ppm_per_mm": 1e6 * true.skew[0],
+            "skew_y_ppm_per_mm": 1e6 * true.skew[1],
+        }
+
+    exact = with_sensors(truth.rig, lies)
+    camera = TrueCamera(exact, {s.name: (0.0, 0.0) for s in exact.sensors}, truth.turn)
+    random = np.random.default_rng(1)
+    areas, count = overlaps(rig), 100
+    start = nominal_placements(rig, {}, {}, use_drift=False)
+
+    def seen_mm(name: str, raw: Array) -> Array:
+        cone, sensor = exact.cone_of(name), exact.sensor(name)
+        cold = {"sensor_c": sensor.calibration_c, "cone_c": cone.calibration_c}
+        ray = camera.directions(cone, sensor, raw[:, 0], raw[:, 1], **cold)
+        return np.asarray(-cone.lens.f_mm * ray[:, :2] / ray[:, 2:])
+
+    def seeing(name: str, xy_mm: Array) -> Array:
+        raw = raw_from_vip_mm(start[name], xy_mm)
+        for _ in range(4):
+            off = xy_mm - seen_mm(name, raw)
+            raw = raw + off * np.array([1.0, -1.0]) / exact.sensor(name).pitch_mm
+        return raw + random.normal(0, 0.02, raw.shape)
+
+    places = [
+        random.uniform((r.x_min_mm, r.y_min_mm), (r.x_max_mm, r.y_max_mm), (count, 2))
+        for r in (area.rectangle for area in areas)
+    ]
+    names = tuple(s.name for s in rig.sensors)
+    ties = TiePoints(
+        names=names,
+        pairs=tuple((o.sensor_a, o.sensor_b) for o in areas),
+        sought=(count,) * len(areas),
+        sensor_a=np.repeat([names.index(o.sensor_a) for o in areas], count),
+        sensor_b=np.repeat([names.index(o.sensor_b) for o in areas], count),
+        raw_a=np.concatenate([seeing(o.sensor_a, p) for o, p in zip(areas, places, strict=True)]),
+        raw_b=np.concatenate([seeing(o.sensor_b, p) for o, p in zip(areas, places, strict=True)]),
+        sigma_px=np.full(count * len(areas), 0.03),
+        correlation=np.ones(count * len(areas)),
+        kind=np.full(count * len(areas), PAN_TO_PAN),
+        overlap=np.repeat(np.arange(len(areas)), count),
+    )
+    stitched = free_mosaic(rig, start, ties).placements
+    put, true = [], []
+    for sensor in (s for cone in rig.pan_cones for s in cone.sensors):
+        axes = (np.linspace(0, n - 1, 12) for n in (sensor.width_px, sensor.height_px))
+        raw = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+        put.append(vip_mm_from_raw(stitched[sensor.name], raw))
+        true.append(seen_mm(sensor.name, raw))
+    ours, theirs = np.concatenate(put), np.concatenate(true)
+    off = apply_similarity(fit_similarity(ours, theirs), ours) - theirs
+    return float(np.sqrt(np.mean(np.sum(off**2, axis=1)))) / rig.sensors[0].pitch_mm
 
 
 def test_discs_are_measured_without_bias_and_touching_ones_left_out() -> None:
