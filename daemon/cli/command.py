@@ -16,7 +16,8 @@ land, acknowledge, exposure, new-mission. They go over the service's Unix socket
 and need no token: the machine knows who you are, and your group decides. The exit status is 1 where
 the service refuses.
 
-Examples: `syntopic command start`, `syntopic command start --override`,
+Examples: `syntopic command start`,
+`syntopic command arm --override --set reason="probe 3 is known to be broken"`,
 `syntopic command interval --set interval_s=2.5 --set count=40`,
 `syntopic command acknowledge --set fault="device SU02"`
 """

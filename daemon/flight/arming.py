@@ -1,8 +1,7 @@
 """What a flight needs before it may begin, and what is missing of it, each with its cure.
 
-Pure: what is there is handed in. Who flies all the same is answered by `daemon.service.commanding`,
-    and
-recorded (`override_message`, `note_override`).
+Pure: what is there is handed in. Who flies all the same is answered by `daemon.service.commanding`
+and recorded (`override_message`, `note_override`).
 """
 
 from __future__ import annotations
@@ -80,18 +79,18 @@ def lacks(there: Readiness, limits: LimitsSection) -> tuple[Lack, ...]:
     return tuple(found)
 
 
-def override_message(by: str, missing: Sequence[Lack]) -> Message:
+def override_message(by: str, missing: Sequence[Lack], reason: str = "") -> Message:
     """The override for the flight log."""
-    return Message(TOPIC, time.monotonic_ns(), loose_bytes(_override(by, missing)))
+    return Message(TOPIC, time.monotonic_ns(), loose_bytes(_override(by, missing, reason)))
 
 
-def note_override(mission: Path, by: str, missing: Sequence[Lack]) -> None:
+def note_override(mission: Path, by: str, missing: Sequence[Lack], *, reason: str = "") -> None:
     """Write an override beside the mission's records.
 
     Raises:
         OSError: the disk refused.
     """
-    noted = [*overrides_of(mission), _override(by, missing)]
+    noted = [*overrides_of(mission), _override(by, missing, reason)]
     durable.replace_file(mission / FILE, canonical_bytes({"overrides": noted}))
 
 
@@ -104,9 +103,10 @@ def overrides_of(mission: Path) -> list[dict[str, Any]]:
     return [dict(one) for one in listed if isinstance(one, Mapping)] if listed else []
 
 
-def _override(by: str, missing: Sequence[Lack]) -> dict[str, Any]:
+def _override(by: str, missing: Sequence[Lack], reason: str) -> dict[str, Any]:
     return {
         "by": by,
+        **({"reason": reason} if reason else {}),
         "utc": datetime.now(UTC).isoformat(timespec="seconds"),
         "missing": [str(lack) for lack in missing],
     }

@@ -32,7 +32,7 @@ class Arming(Protocol):
     """What a flight needs; `daemon.service.preflight.Preflight`."""
 
     def lacks(self) -> Sequence[Lack]: ...
-    def override(self, by: str, missing: Sequence[Lack]) -> None: ...
+    def override(self, by: str, missing: Sequence[Lack], reason: str = "") -> None: ...
 
 
 class Exposing(Protocol):
@@ -168,7 +168,8 @@ def _not_armed(command: Command, flight: Commanded) -> Answer | None:
         told = "; ".join(map(str, missing))
         return _no(command, f"not armed: {told}; override to fly without")
     if missing:
-        flight.preflight.override(command.by, missing)
+        reason = str(command.arguments.get("reason", ""))
+        flight.preflight.override(command.by, missing, reason)
     return None
 
 

@@ -46,7 +46,7 @@ class Preflight:
         self._pipeline = pipeline
         self._machine = StateMachine()
         self.accepted: frozenset[str] = frozenset()
-        self.overridden: Callable[[str, Sequence[Lack]], None] = lambda _by, _missing: None
+        self.overridden: Callable[[str, Sequence[Lack], str], None] = lambda *_: None
         """Told of who flies without what."""
 
     @property
@@ -59,10 +59,10 @@ class Preflight:
         missing = lacks(there, self._configuration.limits)
         return tuple(lack for lack in missing if lack.name not in self.accepted)
 
-    def override(self, by: str, missing: Sequence[Lack]) -> None:
+    def override(self, by: str, missing: Sequence[Lack], reason: str = "") -> None:
         """Somebody flies without."""
         self.accepted |= {lack.name for lack in missing if lack.may_be_overridden}
-        self.overridden(by, missing)
+        self.overridden(by, missing, reason)
 
     def follow(
         self,

@@ -200,12 +200,12 @@ class Service:
             self._event(**event)
         self.watching.faults = lambda: previous_faults(self.latches.unhandled())
 
-    def _overridden(self, by: str, missing: Sequence[Lack]) -> None:
-        self.supervisor.send("writer", Log(override_message(by, missing)))
-        told = "; ".join(map(str, missing))
+    def _overridden(self, by: str, missing: Sequence[Lack], reason: str) -> None:
+        self.supervisor.send("writer", Log(override_message(by, missing, reason)))
+        told = "; ".join(map(str, missing)) + (f". Why: {reason}" if reason else "")
         self._event("override", by=by, sentence=f"{by} flies all the same: {told}")
         try:
-            note_override(self.mission.path, by, missing)
+            note_override(self.mission.path, by, missing, reason=reason)
         except OSError as error:
             # The log has it too.
             self._event("disk", fault=True, sentence=f"the override is not noted: {error}")

@@ -71,6 +71,7 @@ class CommandBody(BaseModel):
 
     fault: str | None = Field(default=None, max_length=200, description="which, for acknowledge")
     override: bool = Field(default=False, description="start although something is missing")
+    reason: str | None = Field(default=None, max_length=200, description="why, for override")
     interval_s: float | None = Field(default=None, gt=0, le=3600, description="for interval")
     count: int = Field(default=0, ge=0, le=10**6, description="for interval; 0: until stopped")
     distance_m: float | None = Field(default=None, gt=0, le=10**5, description="for distance")

@@ -1,16 +1,28 @@
 // Commands: asked for with a token, answered in a sentence.
 
-const dialog = document.getElementById("ask-token");
-const field = document.getElementById("token");
+import { flight } from "./state.js";
+
 const answer = document.getElementById("answer");
 
-function askToken() {
+// What is typed into a dialog; nothing where it is left.
+function ask(dialogId, fieldId) {
+  const dialog = document.getElementById(dialogId);
+  const field = document.getElementById(fieldId);
   return new Promise((resolve) => {
     field.value = "";
+    dialog.returnValue = "";
     dialog.addEventListener("close", () => resolve(dialog.returnValue === "use" ? field.value.trim() : ""),
       { once: true });
     dialog.showModal();
   });
+}
+
+// Why somebody flies although something is missing; each of that is listed with its cure.
+function askReason(refusal) {
+  const missing = flight.brief?.status?.missing;
+  document.getElementById("lacking").replaceChildren(...(missing?.length ? missing : [refusal]).map((one) =>
+    Object.assign(document.createElement("li"), { textContent: one })));
+  return ask("ask-override", "reason");
 }
 
 function say(sentence, refused) {
@@ -21,7 +33,7 @@ function say(sentence, refused) {
 export async function command(name, body = {}) {
   let token = sessionStorage.getItem("token");
   if (!token) {
-    token = await askToken();
+    token = await ask("ask-token", "token");
     if (!token) return false;
   }
   let response;
@@ -43,11 +55,9 @@ export async function command(name, body = {}) {
     return true;
   }
   say(`${told.title}: ${told.detail}`, true);
-  if (response.status === 409 && told.detail.includes("override") &&
-      confirm(`${told.detail}\n\nFly all the same? It is noted in the flight log.`)) {
-    return command(name, { ...body, override: true });
-  }
-  return false;
+  if (response.status !== 409 || !told.detail.includes("override")) return false;
+  const why = await askReason(told.detail);
+  return why ? command(name, { ...body, override: true, reason: why }) : false;
 }
 
 const GRAVE = {

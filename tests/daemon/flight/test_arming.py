@@ -61,13 +61,13 @@ def test_a_rig_without_receiver_and_probes_needs_neither() -> None:
     assert lacks(bare, LimitsSection()) == ()
 
 
-def test_an_override_is_kept_with_who_when_and_what(tmp_path: Path) -> None:
+def test_an_override_is_kept_with_who_when_what_and_why(tmp_path: Path) -> None:
     assert overrides_of(tmp_path) == []
     missing = Lack("arming-device", "no head SU02", "check its cable")
     note_override(tmp_path, "operator", [missing])
-    note_override(tmp_path, "uid 1000", [missing])
+    note_override(tmp_path, "uid 1000", [missing], reason="it is not needed")
     first, second = overrides_of(tmp_path)
     assert first["by"] == "operator"
-    assert second["by"] == "uid 1000"
+    assert (second["by"], second["reason"]) == ("uid 1000", "it is not needed")
     assert first["missing"] == ["no head SU02 (check its cable)"]
     assert first["utc"].endswith("+00:00")

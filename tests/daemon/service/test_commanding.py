@@ -36,7 +36,7 @@ class FakeService:
     is_ready: bool = True
     missing: list[Lack] = field(default_factory=list)
     landed: bool = False
-    overrides: list[tuple[str, list[str]]] = field(default_factory=list)
+    overrides: list[tuple[str, list[str], str]] = field(default_factory=list)
     faults: set[str] = field(default_factory=set)
     exposed: list[tuple[str, dict[str, Any]]] = field(default_factory=list)
     goes_on: bool = False
@@ -48,8 +48,8 @@ class FakeService:
     def lacks(self) -> Sequence[Lack]:
         return self.missing
 
-    def override(self, by: str, missing: Sequence[Lack]) -> None:
-        self.overrides.append((by, [lack.name for lack in missing]))
+    def override(self, by: str, missing: Sequence[Lack], reason: str = "") -> None:
+        self.overrides.append((by, [lack.name for lack in missing], reason))
 
     def acknowledge(self, fault: str) -> bool:
         return fault in self.faults
@@ -115,8 +115,8 @@ def test_a_camera_that_is_not_ready_is_not_armed_unless_somebody_takes_it_upon_t
     assert not done
     assert "no head SU02 (check its cable); override to fly without" in sentence
     assert lacking.overrides == []
-    assert give(lacking, name, override=True, **how)[0]
-    assert lacking.overrides == [("operator", ["arming-device"])]
+    assert give(lacking, name, override=True, reason="no need of it", **how)[0]
+    assert lacking.overrides == [("operator", ["arming-device"], "no need of it")]
     done, sentence = give(FakeService(line=FakeLine(is_flown=True)), name, **how)
     assert (done, "is flown" in sentence) == (False, True)
 

@@ -31,6 +31,7 @@ class Service:
         settings = WatchSection(port=0, tokens=folder / "tokens.toml", announce=False)
         self.child = Child("watch", "daemon.watch.process:main", (settings,), {})
         self.commands: list[Command] = []
+        self.refusal = ""
         self.address = ""
         self.until(lambda: bool(self.address))
 
@@ -49,7 +50,9 @@ class Service:
             self.address = f"http://{message.event['host']}:{message.event['port']}/"
         elif isinstance(message, Command):
             self.commands.append(message)
-            self.child.send(Answer(message.number, True, "done as asked"))
+            refuses = self.refusal and not message.arguments["override"]
+            said = self.refusal if refuses else "done as asked"
+            self.child.send(Answer(message.number, not refuses, said))
 
     def end(self) -> None:
         self.child.send(Stop())
@@ -210,6 +213,43 @@ def test_a_wrong_token_is_refused_in_words(service: Service, browser: Browser) -
     service.until(lambda: service.commands[-1].name == "start")
 
 
+def test_what_forbids_arming_is_listed_with_its_cure_and_overridden_for_a_recorded_reason(
+    service: Service, browser: Browser
+) -> None:
+    lacking = ["no head SU02 (check its power and cable)", "no position (check the antenna)"]
+    service.tell(flown.status("ready", triggers=3) | {"missing": lacking})
+    browser.wait_for("document.querySelectorAll('#missing li').length === 2", WITHIN_S)
+    service.refusal = f"not armed: {'; '.join(lacking)}; override to fly without"
+    is_open = "document.querySelector('#ask-override').open"
+    # Leaving it by the keyboard overrides nothing; neither does a reason of blanks.
+    browser.evaluate("document.querySelector('[data-command=arm]').focus()")
+    press(browser, "Enter")
+    service.until(lambda: service.commands[-1].name == "arm")
+    browser.wait_for(is_open, WITHIN_S)
+    listed = "[...document.querySelectorAll('#lacking li')].map((one) => one.innerText)"
+    assert browser.evaluate(listed) == lacking
+    assert browser.evaluate("document.activeElement.id") == "reason"
+    browser.evaluate("document.querySelector('#reason').value = '  '")
+    press(browser, "Enter")
+    assert browser.evaluate(is_open)
+    keep_picture(browser, "arming")
+    press(browser, "Escape")
+    browser.wait_for(f"!{is_open}", WITHIN_S)
+    assert [c.arguments["override"] for c in service.commands if c.name == "arm"] == [False]
+    browser.click("[data-command=arm]")
+    service.until(lambda: len([c for c in service.commands if c.name == "arm"]) == 2)
+    browser.wait_for(is_open, WITHIN_S)
+    browser.evaluate("document.querySelector('#reason').value = 'SU02 is not needed here'")
+    press(browser, "Enter")
+    service.until(lambda: service.commands[-1].arguments["override"])
+    given = service.commands[-1]
+    assert (given.name, given.by) == ("arm", "operator")
+    assert given.arguments["reason"] == "SU02 is not needed here"
+    browser.wait_for("document.querySelector('#answer').innerText === 'Done: done as asked'", 30)
+    service.refusal = ""
+    service.tell(flown.status(triggers=3))
+
+
 def test_exposure_settings_are_seen_and_set_from_the_page(
     service: Service, browser: Browser
 ) -> None:
@@ -248,8 +288,9 @@ def test_nothing_leaves_the_host_and_nothing_breaks(service: Service, browser: B
     outside = [url for url in browser.requested if not url.startswith(("data:", "blob:"))]
     assert outside
     assert all(url.replace("ws:", "http:").startswith(service.address) for url in outside), outside
-    # The wrong token's refusal and the residuals that are not there are told by the browser, too.
-    broken = [c for c in browser.complaints if "401" not in c and "404" not in c]
+    # Refused tokens and commands, and residuals that are not there, are told by the browser, too.
+    refused = ("401", "404", "409")
+    broken = [c for c in browser.complaints if not any(status in c for status in refused)]
     assert broken == []
 
 
@@ -259,12 +300,10 @@ def test_axe_finds_nothing_serious(browser: Browser, tmp_path: Path) -> None:
     for theme in ("dark", ""):
         browser.evaluate(f"document.documentElement.dataset.theme = '{theme}'")
         browser.evaluate(axe.read_text())
-        found = browser.evaluate("axe.run(document, {resultTypes: ['violations']})")
-        grave = [
-            (one["id"], [node["html"][:120] for node in one["nodes"]])
-            for one in found["violations"]
-            if one["impact"] in ("serious", "critical")
-        ]
+        grave = _grave(browser, "document")
+        browser.evaluate("document.querySelector('#ask-override').showModal()")
+        grave += _grave(browser, "'#ask-override'")
+        browser.evaluate("document.querySelector('#ask-override').close()")
         assert grave == [], f"theme {theme or 'light'}"
 
 
@@ -273,6 +312,32 @@ def test_a_picture_is_taken(browser: Browser, tmp_path: Path) -> None:
     path = Path(keep) / "page-test.png" if keep else tmp_path / "page.png"
     browser.picture(path)
     assert path.stat().st_size > 20_000
+
+
+def _grave(browser: Browser, where: str) -> list[tuple[str, list[str]]]:
+    found = browser.evaluate(f"axe.run({where}, {{resultTypes: ['violations']}})")
+    return [
+        (one["id"], [node["html"][:120] for node in one["nodes"]])
+        for one in found["violations"]
+        if one["impact"] in ("serious", "critical")
+    ]
+
+
+def press(browser: Browser, key: str) -> None:
+    """A key, as from the keyboard."""
+    code = {"Enter": 13, "Escape": 27}[key]
+    text = {"text": "\r"} if key == "Enter" else {}
+    about = {"key": key, "windowsVirtualKeyCode": code, **text}
+    browser.call("Input.dispatchKeyEvent", type="keyDown", **about)
+    browser.call("Input.dispatchKeyEvent", type="keyUp", key=key, windowsVirtualKeyCode=code)
+
+
+def keep_picture(browser: Browser, name: str) -> None:
+    """What is seen, by day and by night, where somebody wants to look at it."""
+    if keep := os.environ.get("SYNTOPIC_PICTURES"):
+        for theme in ("dark", ""):
+            browser.evaluate(f"document.documentElement.dataset.theme = '{theme}'")
+            browser.picture(Path(keep) / f"{name}-{theme or 'light'}.png")
 
 
 def _axe(folder: Path) -> Path:
