@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -260,8 +260,9 @@ def report_of(
     done: Compared,
     project: Project,
     *,
+    calibration_id: str,
     date: str,
-    serials: dict[str, str],
+    serials: Mapping[str, str],
     previous: Previous | None,
     warnings: Sequence[str] = (),
 ) -> CalibrationReport:
@@ -301,7 +302,7 @@ def report_of(
     return CalibrationReport(
         kind="boresight",
         title=f"Boresight of {project.name}",
-        calibration_id=f"boresight-{date}",
+        calibration_id=calibration_id,
         date=date,
         facts=(
             ("project", project.name),

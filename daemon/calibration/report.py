@@ -7,9 +7,10 @@ A calibration is never overwritten: its folder is new, complete when it has its 
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -260,6 +261,28 @@ def refuse_existing(folder: Path) -> None:
         raise CalibrationFolderError(
             f"{folder} exists; a calibration is never overwritten: give another name with --out"
         )
+
+
+def dated_folder(out: Path | None, stem: str, date: str, *, known: Collection[str] = ()) -> Path:
+    """The folder of a new calibration, whose name is the calibration's id.
+
+    Args:
+        out: the name asked for; None takes `stem` and `date`, and a number from the second
+            calibration of a day on.
+        known: ids of other calibrations, which a new one must not have.
+
+    Raises:
+        CalibrationFolderError: the folder asked for exists, or is named as another calibration.
+    """
+    if out is not None:
+        refuse_existing(out)
+        if out.name in known:
+            raise CalibrationFolderError(
+                f"{out.name} is the id of another calibration; give another name with --out"
+            )
+        return out
+    names = (f"{stem}-{date}" + (f"-{k}" if k > 1 else "") for k in itertools.count(1))
+    return next(Path(n) for n in names if n not in known and not Path(n).exists())
 
 
 def read_previous(path: Path, *, kind: str) -> Previous:

@@ -125,7 +125,7 @@ def report_of(
     return CalibrationReport(
         kind="rig",
         title=f"Relative orientation of {rig.name} against {found.reference}",
-        calibration_id=f"{rig.name}-rig-{date}",
+        calibration_id=rig.calibration_id,
         date=date,
         facts=(
             ("block", project.name),

@@ -21,9 +21,10 @@ positions and attitudes, and the result is compared with the trajectory: `inerti
 project, or a mission's (--mission, exposures named as their folders; --crs of the project, which
 a project of `syntopic at` tells itself). Fly
 two heights, opposite and crossing lines and two speeds; what the flight cannot part is named and
-stays as it was given. Writes a dated folder with mount.toml, report.html and calibration.json.
+stays as it was given. The rig (--rig, or the mission's) tells the serial numbers of heads, lenses
+and probes. Writes a dated folder with mount.toml, report.html and calibration.json.
 
-Examples: `syntopic calibrate boresight project`,
+Examples: `syntopic calibrate boresight project --rig midas`,
 `syntopic calibrate boresight project --mission M --trajectory sbet.out --crs EPSG:25833`
 """
 
@@ -37,6 +38,9 @@ def boresight(
     crs: Annotated[str | None, typer.Option(help="Coordinate system of the project.")] = None,
     mount: Annotated[
         Path | None, typer.Option(help="TOML with the [mount] so far; default: the mission's.")
+    ] = None,
+    rig: Annotated[
+        str | None, typer.Option(help="Shipped rig or rig file flown; default: the mission's.")
     ] = None,
     hold: Annotated[
         list[str] | None, typer.Option(help="boresight, lever, time or shift; repeatable.")
@@ -58,7 +62,7 @@ def boresight(
 ) -> None:
     from daemon.adjusting.project import read_project
     from daemon.calibration import boresight as flight
-    from daemon.calibration.report import read_previous, serial_warnings
+    from daemon.calibration.report import dated_folder, read_previous, serial_warnings
     from daemon.configuration import MountSection
     from daemon.disk.mission import Mission
     from daemon.orientation.exterior import mount_of, read_mount
@@ -66,19 +70,23 @@ def boresight(
     from processing.bundle.network import NetworkError
     from processing.bundle.rank import DefectError
     from processing.bundle.start import completed
-    from processing.rig import load_rig
+    from processing.rig import find_rig, load_rig
 
     path = project / "project.toml" if project.is_dir() else project
     given = read_project(path)
     before = None if previous is None else read_previous(previous, kind="boresight")
+    today = f"{datetime.now(UTC):%Y-%m-%d}"
+    others = [before.calibration_id] if before else []
+    calibrated = dated_folder(out, "boresight", today, known=others)
+    flown_with = None if rig is None else find_rig(rig)
     sigma_m = np.array(position_sigma)
     sigma_rad = np.radians(np.array(attitude_sigma) * 1e-3)
     stations = given.network.stations.names
-    section, serials = MountSection(), {}
+    section = MountSection()
     if mission is not None:
         folder = Mission.open(mission)
         section = mount_of(folder)[0]
-        serials = load_rig(folder.rig_path).serials
+        flown_with = flown_with or load_rig(folder.rig_path)
         exposures, inertial = flight.inertial_of_mission(
             folder,
             stations,
@@ -110,14 +118,18 @@ def boresight(
     done = flight.compared(
         adjusted, exposures, inertial, section, held=tuple(hold or ()), lever_sigma_m=lever_sigma
     )
-    today = f"{datetime.now(UTC):%Y-%m-%d}"
+    serials = {} if flown_with is None else flown_with.serials
+    warnings = [] if before is None else serial_warnings(before, serials)
+    if flown_with is None:
+        warnings.append("the rig is not told, nor serial numbers of its parts: give --rig")
     report = flight.report_of(
         done,
         given,
+        calibration_id=calibrated.name,
         date=today,
         serials=serials,
         previous=before,
-        warnings=() if before is None else serial_warnings(before, serials),
+        warnings=warnings,
     )
     if not as_json:
         console = Console()
@@ -129,7 +141,7 @@ def boresight(
         console.print(f"sigma0 {done.found.sigma0:.3f}, redundancy {done.found.redundancy}")
     hand_over(
         report,
-        out or Path(f"boresight-{today}"),
+        calibrated,
         files={"mount.toml": flight.mount_toml(done, date=today, project=given.name)},
         as_json=as_json,
     )

@@ -38,7 +38,7 @@ def head(
     from daemon.calibration.laboratory.head import FREE, calibrate_head, targets_of
     from daemon.calibration.laboratory.head_report import calibrated_rig, head_report
     from daemon.calibration.laboratory.series import read_series
-    from daemon.calibration.report import read_previous, refuse_existing
+    from daemon.calibration.report import dated_folder, read_previous
     from daemon.calibration.rig_text import rig_toml
     from daemon.cli.calibration_outcome import hand_over
     from processing.geometry.residual_grid import grid_bytes
@@ -49,8 +49,7 @@ def head(
     angle_sigma = given.table.number("angle_sigma_rad", 1e-6, positive=True)
     given.checked()
     today = f"{datetime.now(UTC):%Y-%m-%d}"
-    folder = out or Path(f"{given.rig.name}-head-{today}")
-    refuse_existing(folder)
+    folder = dated_folder(out, f"{given.rig.name}-head", today)
     before = (previous, read_previous(previous, kind="head")) if previous else None
     heads = []
     with Progress(console=Console(stderr=True), transient=True) as progress:

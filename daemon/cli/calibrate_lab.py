@@ -44,7 +44,7 @@ def lab(
         field_report,
     )
     from daemon.calibration.laboratory.series import read_series
-    from daemon.calibration.report import read_previous, refuse_existing
+    from daemon.calibration.report import dated_folder, read_previous
     from daemon.calibration.rig_text import rig_toml
     from daemon.cli.calibration_outcome import hand_over
 
@@ -54,8 +54,7 @@ def lab(
     skew_sigma = given.table.number("skew_sigma_per_mm", 5e-6, positive=True)
     given.checked()
     today = f"{datetime.now(UTC):%Y-%m-%d}"
-    folder = out or Path(f"{given.rig.name}-lab-{today}")
-    refuse_existing(folder)
+    folder = dated_folder(out, f"{given.rig.name}-lab", today)
     before = (previous, read_previous(previous, kind="lab")) if previous else None
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("measuring", total=None)

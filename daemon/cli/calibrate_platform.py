@@ -35,18 +35,17 @@ def platform(
     as_json: AsJson = False,
 ) -> None:
     from daemon.calibration.platform import KIND, read_missions, report_of, rig_file
-    from daemon.calibration.report import read_previous, refuse_existing
+    from daemon.calibration.report import dated_folder, read_previous
     from processing.calibration.platform import calibrate_platform, calibrated_rig
 
     before = None if previous is None else read_previous(previous, kind=KIND)
     flown = read_missions(missions)
     today = f"{datetime.now(UTC):%Y-%m-%d}"
-    folder = out or Path(f"{flown.rig.name}-platform-{today}")
-    refuse_existing(folder)
+    known = {flown.rig.calibration_id, *([before.calibration_id] if before else [])}
+    folder = dated_folder(out, f"{flown.rig.name}-platform", today, known=known)
     found = calibrate_platform(flown.rig, flown.records)
-    name = f"{flown.rig.calibration_id}-platform-{today}"
-    made = calibrated_rig(flown.rig, found, calibration_id=name, date=today)
-    report = report_of(flown, found, calibration_id=name, date=today, previous=before)
+    made = calibrated_rig(flown.rig, found, calibration_id=folder.name, date=today)
+    report = report_of(flown, found, calibration_id=folder.name, date=today, previous=before)
     hand_over(
         report, folder, files={"rig.toml": rig_file(made, flown, date=today)}, as_json=as_json
     )

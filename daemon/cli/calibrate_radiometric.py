@@ -49,7 +49,7 @@ def radiometric(
     from daemon.calibration.laboratory.radiometric_maps import files_of
     from daemon.calibration.laboratory.radiometric_report import radiometric_report
     from daemon.calibration.laboratory.series import read_series
-    from daemon.calibration.report import read_previous, refuse_existing
+    from daemon.calibration.report import dated_folder, read_previous
     from daemon.cli.calibration_outcome import hand_over
 
     given = read_series(series, kind="radiometric")
@@ -58,8 +58,7 @@ def radiometric(
     monitor_sigma = given.table.number("monitor_sigma", 1e-3)
     given.checked()
     today = f"{datetime.now(UTC):%Y-%m-%d}"
-    folder = out or Path(f"{given.rig.name}-radiometric-{today}")
-    refuse_existing(folder)
+    folder = dated_folder(out, f"{given.rig.name}-radiometric", today)
     before = (previous, read_previous(previous, kind="radiometric")) if previous else None
     names = [s.name for s in given.rig.sensors if any(x.sensor == s.name for x in shots)]
     heads = []

@@ -42,7 +42,7 @@ def rig(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     from daemon.adjusting.project import read_project
-    from daemon.calibration.report import read_previous
+    from daemon.calibration.report import dated_folder, read_previous
     from daemon.calibration.rig import (
         GRAD,
         RigCalibrationError,
@@ -60,6 +60,9 @@ def rig(
     given = read_project(project / "project.toml" if project.is_dir() else project)
     old = find_rig(rig)
     before = None if previous is None else read_previous(previous, kind="rig")
+    today = f"{datetime.now(UTC):%Y-%m-%d}"
+    known = {old.calibration_id, *([before.calibration_id] if before else [])}
+    folder = dated_folder(out, f"{old.name}-rig", today, known=known)
     try:
         with Progress(console=Console(stderr=True), transient=True) as progress:
             task = progress.add_task("starting values", total=None)
@@ -74,8 +77,7 @@ def rig(
         found = relative_orientations(result, name, least_points=least_points)
     except (NetworkError, DefectError, ValueError) as error:
         raise RigCalibrationError(f"{given.name}: {error}") from error
-    today = f"{datetime.now(UTC):%Y-%m-%d}"
-    made = calibrated_rig(old, result, found, calibration_id=f"{old.name}-rig-{today}", date=today)
+    made = calibrated_rig(old, result, found, calibration_id=folder.name, date=today)
     report = report_of(given, result, found, made, date=today, previous=before)
     if not as_json:
         console = Console()
@@ -96,7 +98,7 @@ def rig(
             console.print(table)
     hand_over(
         report,
-        out or Path(f"{old.name}-rig-{today}"),
+        folder,
         files={"rig.toml": rig_file(made, given, found, date=today)},
         as_json=as_json,
     )

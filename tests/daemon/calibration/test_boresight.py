@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,11 @@ from typer.testing import CliRunner
 
 from benchmarks.boresight import write_flight
 from daemon.calibration.boresight import BoresightError, inertial_of_mission, inertial_table
+from daemon.calibration.rig_text import rig_toml
 from daemon.cli import app
 from daemon.configuration import MountSection
 from daemon.orientation.georeference import Georeference, utm_of
+from processing.rig import find_rig, load_rig
 from sim_hw.blocks.calibration_flight import flown_for_boresight
 from tests.daemon.orientation.test_orientation import (
     EPOCH_NS,
@@ -50,11 +53,18 @@ def test_a_flight_becomes_a_dated_mount_that_is_compared_and_never_overwritten(
     assert np.abs(np.radians(mount.boresight_deg) - truth.boresight_rad).max() < 1e-4
     assert any("lever arm down and position shift up" in w for w in told["warnings"])
     assert "lever arm down and position shift up" in (out / "report.html").read_text()
+    assert told["serials"] == {} and any("give --rig" in w for w in told["warnings"])
     again = RUN.invoke(app, ["calibrate", "boresight", str(project), "--out", str(out)])
     assert again.exit_code != 0
+    fitted = rig_toml(replace(find_rig("ultracam-x-mini"), probe_serials={"0": "PT-1"}))
+    (tmp_path / "rig.toml").write_bytes(fitted)
     second = ["--out", str(tmp_path / "second"), "--previous", str(out), "--json"]
+    second += ["--rig", str(tmp_path / "rig.toml")]
     compared = RUN.invoke(app, ["calibrate", "boresight", str(project), *second])
     changes = json.loads(compared.stdout)["changes"]
+    serials = json.loads(compared.stdout)["serials"]
+    assert serials == load_rig(tmp_path / "rig.toml").serials and serials["probe 0"] == "PT-1"
+    assert "PT-1" in (tmp_path / "second" / "report.html").read_text()
     assert {c["what"] for c in changes} >= {"roll", "pitch", "heading", "offset"}
     assert not any(c["significant"] for c in changes)
 

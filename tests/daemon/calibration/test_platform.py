@@ -130,7 +130,9 @@ def test_a_blurred_exposure_is_left_out_and_said(tmp_path: Path) -> None:
     assert all(cone.left_out == 1 and 2 not in cone.used for cone in found.cones)
 
 
-def test_the_command_writes_a_dated_folder_and_compares(tmp_path: Path) -> None:
+def test_the_command_writes_a_dated_folder_and_compares(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rig = find_rig("dmc-mini")
     mission = Mission.create(
         tmp_path,
@@ -153,13 +155,21 @@ def test_the_command_writes_a_dated_folder_and_compares(tmp_path: Path) -> None:
     assert told["kind"] == "platform" and told["previous"] == rig.calibration_id
     assert ("2", "phi") in {(c["where"], c["what"]) for c in told["changes"] if c["significant"]}
     made = load_rig(out / "rig.toml")
-    assert made.calibration_id.startswith(f"{rig.calibration_id}-platform-")
+    assert made.calibration_id == told["calibration_id"] == "dmc-mini-platform"
     moved = made.cone("2").rotation_rad[1] - rig.cone("2").rotation_rad[1]
     # A quarter of the turn is the mean of the four, which is the datum.
     assert moved == pytest.approx(300e-6, abs=3e-6)
     assert "svg" in (out / "report.html").read_text()
     again = CliRunner().invoke(app, line)
     assert again.exit_code != 0 and load_rig(out / "rig.toml") == made
+    monkeypatch.chdir(tmp_path)
+    written = []
+    for _ in range(2):
+        done = CliRunner().invoke(app, ["calibrate", "platform", str(mission.path), "--json"])
+        assert done.exit_code == 0, done.output
+        written.append(json.loads(done.stdout)["written"])
+    assert written[1] == f"{written[0]}-2" and written[0].startswith("dmc-mini-platform-20")
+    assert [load_rig(Path(w) / "rig.toml").calibration_id for w in written] == written
 
 
 def test_the_nine_angles_are_as_good_as_stated_against_the_emulators_truth() -> None:

@@ -17,6 +17,7 @@ from daemon.calibration.report import (
     Quantity,
     Sheet,
     changes_between,
+    dated_folder,
     read_previous,
     serial_warnings,
     write_calibration,
@@ -50,6 +51,24 @@ def test_a_calibration_is_read_back_as_the_previous_one_and_never_overwritten(
     assert "a&amp;b" in page
     assert "http-equiv" not in page
     assert json.loads((folder / "calibration.json").read_text())["changes"] == []
+
+
+def test_a_second_calibration_of_a_day_has_a_name_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    day = "2026-11-22"
+    assert dated_folder(None, "x-lab", day) == Path("x-lab-2026-11-22")
+    Path("x-lab-2026-11-22").mkdir()
+    assert dated_folder(None, "x-lab", day) == Path("x-lab-2026-11-22-2")
+    # The rig that was flown with has its name wherever its folder lies.
+    known = {"x-lab-2026-11-22-2"}
+    assert dated_folder(None, "x-lab", day, known=known) == Path("x-lab-2026-11-22-3")
+    assert dated_folder(tmp_path / "mine", "x-lab", day) == tmp_path / "mine"
+    with pytest.raises(CalibrationFolderError, match="never overwritten"):
+        dated_folder(Path("x-lab-2026-11-22"), "x-lab", day)
+    with pytest.raises(CalibrationFolderError, match="another calibration"):
+        dated_folder(tmp_path / "x-lab-2026-11-22-2", "x-lab", day, known=known)
 
 
 def test_a_change_is_significant_only_beyond_the_limit_of_all_that_are_compared() -> None:
