@@ -5,8 +5,9 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterator
 from pathlib import Path
+from typing import get_args
 
-from daemon.flight.event_table import TABLE, as_markdown, entry_of
+from daemon.flight.event_table import TABLE, Severity, as_markdown, entry_of
 
 ROOT = Path(__file__).parents[3]
 TELLERS = {"_event": "", "_tell": "", "tell": "device/", "complain": "device/", "_alarm": "device/"}
@@ -62,6 +63,7 @@ def test_nothing_in_the_table_is_never_told() -> None:
 def test_every_entry_says_what_helps_in_whole_sentences() -> None:
     assert len({entry.name for entry in TABLE}) == len(TABLE)
     for entry in TABLE:
+        assert entry.severity in get_args(Severity), entry
         assert entry.cause.endswith("."), entry
         assert entry.cure.endswith("."), entry
         assert entry.severity == "note" or entry.cure != "Nothing to do.", entry
