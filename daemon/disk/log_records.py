@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, fields
+from enum import Enum
+from typing import Any, Final, get_type_hints
 
 from daemon.disk.records import (
     EXACT_INTEGER_LIMIT,
@@ -69,44 +70,18 @@ LoggedRecord = (
 
 
 def message_of(record: Record | LoggedTrigger) -> Message:
-    """The message of a record: raw bytes as they came, everything else as canonical JSON."""
+    """The message of a record: raw bytes as they came, everything else as canonical JSON.
+
+    The keys are the names of the record's fields (docs/formats.md).
+    """
     if isinstance(record, RawBytes):
         return Message(f"raw/{record.device}", record.mono_ns, record.data)
     if isinstance(record, LoggedTrigger):
         return Message("trigger", record.pulse.mono_ns, loose_bytes(_trigger_json(record)))
-    if isinstance(record, Frame):
-        topic, content = f"frame/{record.head}", _frame_json(record)
-    elif isinstance(record, EventMark):
-        topic, content = f"mark/{record.receiver}", _mark_json(record)
-    elif isinstance(record, NavSample):
-        topic, content = f"navigation/{record.receiver}", _navigation_json(record)
-    elif isinstance(record, TemperatureSample):
-        topic = f"temperature/{record.probe}"
-        content = {"probe": record.probe, "value_c": record.value_c}
-    elif isinstance(record, PpsEdge):
-        topic = f"pps/{record.source}"
-        content = {
-            "source": record.source,
-            "sequence": record.sequence,
-            "sigma_ns": record.sigma_ns,
-        }
-    elif isinstance(record, ClockReading):
-        topic = f"clock/{record.device}"
-        content = {
-            "device": record.device,
-            "device_ns": str(record.device_ns),
-            "half_width_ns": record.half_width_ns,
-        }
-    else:
-        topic = f"event/{record.device}"
-        content = {
-            "device": record.device,
-            "name": record.name,
-            "is_fault": record.is_fault,
-            "sentence": record.sentence,
-        }
-    content["mono_ns"] = str(record.mono_ns)
-    return Message(topic, record.mono_ns, loose_bytes(content))
+    content = {field.name: getattr(record, field.name) for field in fields(record)}
+    name = next(iter(content.values()))
+    content |= {key: _text(content[key]) for key in _INSTANTS & content.keys()}
+    return Message(f"{_TOPICS[type(record)]}/{name}", record.mono_ns, loose_bytes(content))
 
 
 def record_of(message: Message) -> LoggedRecord | None:
@@ -116,8 +91,9 @@ def record_of(message: Message) -> LoggedRecord | None:
         return None
     problems: list[str] = []
     try:
-        fields = Fields(parse_record(message.payload, message.topic), "", message.topic, problems)
-        record = read(fields)
+        record = read(
+            Fields(parse_record(message.payload, message.topic), "", message.topic, problems)
+        )
     except RecordError:
         return None
     return None if problems else record
@@ -133,6 +109,8 @@ def _loose(value: Any) -> Any:
         return value
     if isinstance(value, str):
         return _unicode(value)
+    if isinstance(value, Enum):
+        return value.value
     if isinstance(value, int):
         return int(value) if abs(value) <= EXACT_INTEGER_LIMIT else str(int(value))
     if isinstance(value, float):
@@ -157,59 +135,6 @@ def _trigger_json(record: LoggedTrigger) -> dict[str, Any]:
     }
 
 
-def _frame_json(frame: Frame) -> dict[str, Any]:
-    return {
-        "head": frame.head,
-        "slot": frame.slot,
-        "status": frame.status.value,
-        "frame_id": str(frame.frame_id),
-        "counter": frame.counter,
-        "width_px": frame.width_px,
-        "height_px": frame.height_px,
-        "pixel_format": frame.pixel_format,
-        "device_ns": _text(frame.device_ns),
-        "device_clock_ns": _text(frame.device_clock_ns),
-        "device_clock_mono_ns": _text(frame.device_clock_mono_ns),
-        "latch_sigma_ns": frame.latch_sigma_ns,
-        "exposure_time_us": frame.exposure_time_us,
-        "temperature_c": frame.temperature_c,
-        "settings": _loose(frame.settings),
-    }
-
-
-def _mark_json(mark: EventMark) -> dict[str, Any]:
-    return {
-        "receiver": mark.receiver,
-        "channel": mark.channel,
-        "gps_ns": str(mark.gps_ns),
-        "accuracy_ns": mark.accuracy_ns,
-        "count": mark.count,
-        "count_bits": mark.count_bits,
-        "time_valid": mark.time_valid,
-    }
-
-
-def _navigation_json(sample: NavSample) -> dict[str, Any]:
-    return {
-        "receiver": sample.receiver,
-        "gps_ns": str(sample.gps_ns),
-        "fix": sample.fix,
-        "satellites": sample.satellites,
-        "latitude_deg": sample.latitude_deg,
-        "longitude_deg": sample.longitude_deg,
-        "height_m": sample.height_m,
-        "horizontal_sigma_m": sample.horizontal_sigma_m,
-        "vertical_sigma_m": sample.vertical_sigma_m,
-        "velocity_ned_mps": list(sample.velocity_ned_mps),
-        "speed_sigma_mps": sample.speed_sigma_mps,
-        "roll_rad": sample.roll_rad,
-        "pitch_rad": sample.pitch_rad,
-        "heading_rad": sample.heading_rad,
-        "leap_seconds": sample.leap_seconds,
-        "time_valid": sample.time_valid,
-    }
-
-
 def _trigger(fields: Fields) -> LoggedTrigger:
     pulse = TriggerPulse(
         sequence=_needed(fields, "sequence"),
@@ -225,111 +150,6 @@ def _trigger(fields: Fields) -> LoggedTrigger:
     return LoggedTrigger(fields.integer("number", minimum=1), pulse, delays_ns, strobe_ns)
 
 
-def _frame(fields: Fields) -> Frame:
-    statuses = [status.value for status in FrameStatus]
-    return Frame(
-        head=fields.text("head"),
-        slot=fields.integer("slot"),
-        status=FrameStatus(fields.choice("status", statuses)),
-        frame_id=_needed(fields, "frame_id"),
-        counter=fields.integer_or_none("counter"),
-        width_px=fields.integer("width_px"),
-        height_px=fields.integer("height_px"),
-        pixel_format=fields.text("pixel_format"),
-        device_ns=fields.instant("device_ns"),
-        device_clock_ns=fields.instant("device_clock_ns"),
-        device_clock_mono_ns=fields.instant("device_clock_mono_ns"),
-        latch_sigma_ns=fields.integer_or_none("latch_sigma_ns"),
-        mono_ns=_needed(fields, "mono_ns"),
-        exposure_time_us=fields.number_or_none("exposure_time_us"),
-        temperature_c=fields.number_or_none("temperature_c"),
-        settings=fields.scalars("settings"),
-    )
-
-
-def _mark(fields: Fields) -> EventMark:
-    return EventMark(
-        receiver=fields.text("receiver"),
-        channel=fields.integer("channel"),
-        gps_ns=_needed(fields, "gps_ns"),
-        accuracy_ns=fields.integer("accuracy_ns"),
-        count=fields.integer("count"),
-        count_bits=fields.integer("count_bits"),
-        time_valid=fields.flag("time_valid", default=False),
-        mono_ns=_needed(fields, "mono_ns"),
-    )
-
-
-def _navigation(fields: Fields) -> NavSample:
-    return NavSample(
-        receiver=fields.text("receiver"),
-        gps_ns=_needed(fields, "gps_ns"),
-        mono_ns=_needed(fields, "mono_ns"),
-        fix=fields.text("fix"),
-        satellites=fields.integer("satellites"),
-        latitude_deg=fields.number("latitude_deg"),
-        longitude_deg=fields.number("longitude_deg"),
-        height_m=fields.number("height_m"),
-        horizontal_sigma_m=fields.number("horizontal_sigma_m"),
-        vertical_sigma_m=fields.number("vertical_sigma_m"),
-        velocity_ned_mps=fields.triple("velocity_ned_mps"),
-        speed_sigma_mps=fields.number("speed_sigma_mps"),
-        roll_rad=fields.number_or_none("roll_rad"),
-        pitch_rad=fields.number_or_none("pitch_rad"),
-        heading_rad=fields.number_or_none("heading_rad"),
-        leap_seconds=fields.integer_or_none("leap_seconds", minimum=-1000),
-        time_valid=fields.flag("time_valid", default=False),
-    )
-
-
-def _temperature(fields: Fields) -> TemperatureSample:
-    return TemperatureSample(
-        probe=fields.text("probe"),
-        value_c=fields.number_or_none("value_c"),
-        mono_ns=_needed(fields, "mono_ns"),
-    )
-
-
-def _pps(fields: Fields) -> PpsEdge:
-    return PpsEdge(
-        source=fields.text("source"),
-        sequence=fields.integer("sequence"),
-        mono_ns=_needed(fields, "mono_ns"),
-        sigma_ns=fields.integer("sigma_ns"),
-    )
-
-
-def _clock(fields: Fields) -> ClockReading:
-    return ClockReading(
-        device=fields.text("device"),
-        device_ns=_needed(fields, "device_ns"),
-        mono_ns=_needed(fields, "mono_ns"),
-        half_width_ns=fields.integer("half_width_ns"),
-    )
-
-
-def _event(fields: Fields) -> DeviceEvent:
-    return DeviceEvent(
-        device=fields.text("device"),
-        name=fields.text("name"),
-        is_fault=fields.flag("is_fault", default=False),
-        sentence=fields.text("sentence"),
-        mono_ns=_needed(fields, "mono_ns"),
-    )
-
-
-_READERS: Mapping[str, Callable[[Fields], LoggedRecord]] = {
-    "trigger": _trigger,
-    "frame": _frame,
-    "mark": _mark,
-    "navigation": _navigation,
-    "temperature": _temperature,
-    "pps": _pps,
-    "clock": _clock,
-    "event": _event,
-}
-
-
 def _needed(fields: Fields, key: str) -> int:
     value = fields.instant(key)
     if value is None:
@@ -338,9 +158,67 @@ def _needed(fields: Fields, key: str) -> int:
     return value
 
 
+def _status(fields: Fields, key: str) -> FrameStatus:
+    return FrameStatus(fields.choice(key, [status.value for status in FrameStatus]))
+
+
+def _flag(fields: Fields, key: str) -> bool:
+    return fields.flag(key, default=False)
+
+
+def _leap_seconds(fields: Fields, key: str) -> int | None:
+    return fields.integer_or_none(key, minimum=-1000)
+
+
 def _text(value: int | None) -> str | None:
     return None if value is None else str(value)
 
 
 def _unicode(text: str) -> str:
     return text.encode("utf-8", "replace").decode("utf-8")
+
+
+_KINDS: Final[Mapping[str, type[Any]]] = {
+    "frame": Frame,
+    "mark": EventMark,
+    "navigation": NavSample,
+    "temperature": TemperatureSample,
+    "pps": PpsEdge,
+    "clock": ClockReading,
+    "event": DeviceEvent,
+}
+"""By the first word of their topic; the second is what the first field says."""
+
+_TOPICS: Final = {kind: topic for topic, kind in _KINDS.items()}
+_INSTANTS: Final = frozenset(
+    ("gps_ns", "mono_ns", "device_ns", "device_clock_ns", "device_clock_mono_ns", "frame_id")
+)
+"""Written as texts: they may exceed what JSON's numbers hold."""
+
+_QUESTIONS: Final[Mapping[Any, Callable[[Fields, str], Any]]] = {
+    "leap_seconds": _leap_seconds,
+    **{(name, int): _needed for name in _INSTANTS},
+    **{(name, int | None): Fields.instant for name in _INSTANTS},
+    str: Fields.text,
+    int: Fields.integer,
+    int | None: Fields.integer_or_none,
+    float: Fields.number,
+    float | None: Fields.number_or_none,
+    bool: _flag,
+    tuple[float, float, float]: Fields.triple,
+    Mapping[str, float | int | str]: Fields.scalars,
+    FrameStatus: _status,
+}
+"""How a field is read: by its name, its name and type, or its type."""
+
+
+def _reader(kind: type[Any]) -> Callable[[Fields], LoggedRecord]:
+    """A function that reads a record field by field, as the fields are declared."""
+    asked = {
+        name: next(_QUESTIONS[key] for key in (name, (name, hint), hint) if key in _QUESTIONS)
+        for name, hint in get_type_hints(kind).items()
+    }
+    return lambda fields: kind(**{name: ask(fields, name) for name, ask in asked.items()})
+
+
+_READERS: Final = {"trigger": _trigger} | {topic: _reader(kind) for topic, kind in _KINDS.items()}
