@@ -34,7 +34,7 @@ from daemon.orientation.exterior import mount_of
 from daemon.products.conditions import conditions_of
 from daemon.products.processor import Processor, make_products
 from daemon.products.reports import Made
-from daemon.products.stitched import StitchedProcessor
+from daemon.products.stitched import stitched_made
 from daemon.service.lanes import Lanes
 from daemon.service.worker import process_exposure, settle_threads
 from processing.matching.tie_points import TiePoints
@@ -95,7 +95,7 @@ def measure(
     frames = {name: np.array(frame) for name, frame in stored.items()}
     conditions = conditions_of(exposure, rig, plan, Flag(0))
     product = pipeline.process(frames, conditions)
-    processor, mount = StitchedProcessor(pipeline), mount_of(mission)[0]
+    processor, mount = Processor(pipeline, stitched_made), mount_of(mission)[0]
 
     def make(lane: Processor) -> Made:
         return make_products(lane, mount, plan, exposure, frames, conditions)
@@ -105,7 +105,7 @@ def measure(
         "machine": machine(),
         "runs": runs,
         "threads": threads,
-        **_timed(processor, make, frames, product, runs),
+        **_timed(pipeline, lambda: make(processor), frames, product, runs),
     }
     result |= _side_by_side(processor, make, lanes=lanes, count=3 * runs)
     if peers:
@@ -124,13 +124,12 @@ def measure(
 
 
 def _timed(
-    processor: StitchedProcessor,
-    make: Callable[[Processor], Made],
+    pipeline: Pipeline,
+    make: Callable[[], Made],
     frames: Mapping[str, NDArray[np.uint16]],
     product: Product,
     runs: int,
 ) -> dict[str, Any]:
-    rig, pipeline = processor.rig, processor.pipeline
     outputs = [product.pan, *product.colour.values()]
     sources = [*frames.values(), *outputs]
     copies = [np.zeros_like(array) for array in sources]
@@ -142,7 +141,7 @@ def _timed(
 
         def free() -> None:
             began = time.process_time()
-            report, contents = make(processor)
+            report, contents = make()
             started = time.perf_counter()
             _to_disk(contents, Path(scratch))
             stages.setdefault("writing", []).append(time.perf_counter() - started)
@@ -152,7 +151,7 @@ def _timed(
 
         def fixed() -> None:
             pipeline.settings = replace(settings, method="fixed")
-            _to_disk(make(processor)[1], Path(scratch))
+            _to_disk(make()[1], Path(scratch))
             pipeline.settings = settings
 
         def copy() -> None:
@@ -172,8 +171,8 @@ def _timed(
         "megapixels_in": round(pixels / 1e6, 1),
         "megapixels_per_s": pixels / 1e6 / seconds,
         "ratio_to_copy": seconds / timed["copy"]["median_s"],
-        "frame_interval_s": rig.frame_interval_s,
-        "realtime_factor_alone": rig.frame_interval_s / seconds,
+        "frame_interval_s": pipeline.rig.frame_interval_s,
+        "realtime_factor_alone": pipeline.rig.frame_interval_s / seconds,
         "tie_points": len(product.tie_points),
     }
 

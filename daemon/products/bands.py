@@ -5,7 +5,7 @@ What the bands are is made by `processing.band_pipeline`; here they get their fi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from daemon.disk.mission import Mission
 from daemon.disk.records import canonical_bytes
 from daemon.exposure import Exposure
-from daemon.products.reports import Contents, Made, pictures, report_json
+from daemon.products.reports import Contents, FramesRead, Made, pictures, report_json
 from processing.band_pipeline import BandPipeline, FrameSettings
 from processing.conditions import Conditions
 from processing.image.band_registration import RegisteredBand
@@ -46,64 +46,48 @@ def radiance_of(
     }
 
 
-class BandsProcessor:
-    """One raster a band, as the worker wants it (`daemon.products.processor`).
+def bands_made(
+    radiance: Mapping[str, RadianceCalibration],
+    pipeline: BandPipeline,
+    exposure: Exposure,
+    frames: Mapping[str, NDArray[np.uint16]],
+    conditions: Conditions,
+    frames_read: FramesRead,
+) -> Made:
+    """One raster a band (`daemon.products.processor`).
 
     Args:
         radiance: by sensor name, those the pipeline has: wavelengths go into the files.
     """
-
-    def __init__(self, pipeline: BandPipeline, radiance: Mapping[str, RadianceCalibration]) -> None:
-        self.pipeline = pipeline
-        self._radiance = radiance
-
-    @property
-    def rig(self) -> Rig:
-        return self.pipeline.rig
-
-    def warm_up(self) -> None:
-        self.pipeline.warm_up()
-
-    def twin(self) -> BandsProcessor:
-        return BandsProcessor(self.pipeline.twin(), self._radiance)
-
-    def make(
-        self,
-        exposure: Exposure,
-        frames: Mapping[str, NDArray[np.uint16]],
-        conditions: Conditions,
-        *,
-        frames_read: Callable[[], None] | None = None,
-    ) -> Made:
-        settings = {frame.sensor: _told(frame.settings) for frame in exposure.frames}
-        product = self.pipeline.process(frames, conditions, settings, frames_read=frames_read)
-        report = report_json(product.report, exposure.number, product.timings_s)
-        report["reference"] = product.reference
-        report["units"] = dict(product.units)
-        report["bands"] = [_registration(band) for band in product.registrations]
-        contents: Contents = {}
-        for cone in self.rig.cones:
-            name = cone.bands[0]
-            if name not in product.bands:
-                continue
-            about = {
-                "band": name,
-                "exposure": exposure.number,
-                "reference": product.reference,
-                "unit": product.units[name],
-                "f_mm": product.image.f_mm,
-                "pitch_um": product.image.pitch_um,
-            }
-            if (calibration := self._radiance.get(cone.sensors[0].name)) is not None:
-                about["wavelength_nm"] = calibration.wavelength_nm
-                about["bandwidth_nm"] = calibration.bandwidth_nm
-            contents[f"{name}.tif"] = [_tiff(product.bands[name], about)]
-            about = {"band": name, "exposure": exposure.number, "bits": ["valid", "saturated"]}
-            contents[f"{name}-mask.tif"] = [_tiff(product.masks[name], about)]
-        if product.bands:
-            contents |= pictures(_quicklook(product.bands))
-        contents["quality.json"] = [canonical_bytes(report)]
-        return report, contents
+    settings = {frame.sensor: _told(frame.settings) for frame in exposure.frames}
+    product = pipeline.process(frames, conditions, settings, frames_read=frames_read)
+    report = report_json(product.report, exposure.number, product.timings_s)
+    report["reference"] = product.reference
+    report["units"] = dict(product.units)
+    report["bands"] = [_registration(band) for band in product.registrations]
+    contents: Contents = {}
+    for cone in pipeline.rig.cones:
+        name = cone.bands[0]
+        if name not in product.bands:
+            continue
+        about = {
+            "band": name,
+            "exposure": exposure.number,
+            "reference": product.reference,
+            "unit": product.units[name],
+            "f_mm": product.image.f_mm,
+            "pitch_um": product.image.pitch_um,
+        }
+        if (calibration := radiance.get(cone.sensors[0].name)) is not None:
+            about["wavelength_nm"] = calibration.wavelength_nm
+            about["bandwidth_nm"] = calibration.bandwidth_nm
+        contents[f"{name}.tif"] = [_tiff(product.bands[name], about)]
+        about = {"band": name, "exposure": exposure.number, "bits": ["valid", "saturated"]}
+        contents[f"{name}-mask.tif"] = [_tiff(product.masks[name], about)]
+    if product.bands:
+        contents |= pictures(_quicklook(product.bands))
+    contents["quality.json"] = [canonical_bytes(report)]
+    return report, contents
 
 
 def _registration(band: RegisteredBand) -> dict[str, Any]:

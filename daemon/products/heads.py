@@ -5,7 +5,7 @@ What they are is made by `processing.perspective`; here they get their files.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,57 +13,40 @@ from numpy.typing import NDArray
 from daemon.disk.level0 import tiff_parts
 from daemon.disk.records import canonical_bytes
 from daemon.exposure import Exposure
-from daemon.products.reports import Contents, Made, pictures, report_json
+from daemon.products.reports import Contents, FramesRead, Made, pictures, report_json
 from processing.conditions import Conditions
 from processing.perspective import HeadPipeline, HeadsProduct
-from processing.rig import Rig
 
 _TILE_PX = 480
 _RGB = ("red", "green", "blue")
 
 
-class HeadsProcessor:
-    """Every head an image of its own, as the worker wants it (`daemon.products.processor`)."""
-
-    def __init__(self, pipeline: HeadPipeline) -> None:
-        self.pipeline = pipeline
-
-    @property
-    def rig(self) -> Rig:
-        return self.pipeline.rig
-
-    def warm_up(self) -> None:
-        self.pipeline.warm_up()
-
-    def twin(self) -> HeadsProcessor:
-        return HeadsProcessor(self.pipeline.twin())
-
-    def make(
-        self,
-        exposure: Exposure,
-        frames: Mapping[str, NDArray[np.uint16]],
-        conditions: Conditions,
-        *,
-        frames_read: Callable[[], None] | None = None,
-    ) -> Made:
-        product = self.pipeline.process(frames, conditions, frames_read=frames_read)
-        report = report_json(product.report, exposure.number, product.timings_s)
-        report["heads"] = list(product.heads)
-        contents: Contents = {}
-        for name, head in product.heads.items():
-            about = {
-                "bands": list(head.bands),
-                "exposure": exposure.number,
-                "cone": name,
-                "f_mm": head.image.f_mm,
-                "pitch_um": head.image.pitch_um,
-                "geometry": "strict perspective, principal point at the centre",
-            }
-            contents[f"{name}.tif"] = tiff_parts(list(head.bands.values()), about)
-        if product.heads:
-            contents |= pictures(_side_by_side(product))
-        contents["quality.json"] = [canonical_bytes(report)]
-        return report, contents
+def heads_made(
+    pipeline: HeadPipeline,
+    exposure: Exposure,
+    frames: Mapping[str, NDArray[np.uint16]],
+    conditions: Conditions,
+    frames_read: FramesRead,
+) -> Made:
+    """Every head an image of its own (`daemon.products.processor`)."""
+    product = pipeline.process(frames, conditions, frames_read=frames_read)
+    report = report_json(product.report, exposure.number, product.timings_s)
+    report["heads"] = list(product.heads)
+    contents: Contents = {}
+    for name, head in product.heads.items():
+        about = {
+            "bands": list(head.bands),
+            "exposure": exposure.number,
+            "cone": name,
+            "f_mm": head.image.f_mm,
+            "pitch_um": head.image.pitch_um,
+            "geometry": "strict perspective, principal point at the centre",
+        }
+        contents[f"{name}.tif"] = tiff_parts(list(head.bands.values()), about)
+    if product.heads:
+        contents |= pictures(_side_by_side(product))
+    contents["quality.json"] = [canonical_bytes(report)]
+    return report, contents
 
 
 def _side_by_side(product: HeadsProduct) -> NDArray[np.uint8]:

@@ -6,8 +6,10 @@ The worker in flight, `syntopic process` after landing and the replay all come t
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +21,10 @@ from daemon.disk.records import canonical_bytes
 from daemon.exposure import Exposure
 from daemon.orientation.in_flight import orientation_json
 from daemon.plan.reading import read_plan
-from daemon.products.bands import BandsProcessor, radiance_of
-from daemon.products.heads import HeadsProcessor
-from daemon.products.reports import Made
-from daemon.products.stitched import StitchedProcessor
+from daemon.products.bands import bands_made, radiance_of
+from daemon.products.heads import heads_made
+from daemon.products.reports import FramesRead, Made
+from daemon.products.stitched import stitched_made
 from processing.band_pipeline import BandPipeline
 from processing.perspective import HeadPipeline, looks_apart
 from processing.pipeline import Conditions, Pipeline, Settings
@@ -30,9 +32,11 @@ from processing.quality.specification import Asked
 from processing.radiometry.histogram import sampled_histogram
 from processing.rig import Rig, Sensor
 
+Frames: TypeAlias = Mapping[str, NDArray[np.uint16]]
 
-class Processor(Protocol):
-    """Frames of one exposure in, the files of its Level-2 folder out; one exposure at a time."""
+
+class AnyPipeline(Protocol):
+    """What the pipelines of all kinds of rig have in common."""
 
     @property
     def rig(self) -> Rig:
@@ -41,22 +45,41 @@ class Processor(Protocol):
     def warm_up(self) -> None:
         """Compile, or load, every kernel a flight will need."""
 
-    def twin(self) -> Processor:
+    def twin(self) -> AnyPipeline:
         """A second one for another exposure at the same time; calibrations are shared."""
+
+
+@dataclass(frozen=True)
+class Processor:
+    """Frames of one exposure in, the files of its Level-2 folder out; one exposure at a time.
+
+    `made` gets the pipeline, the exposure, frames, conditions and whom to tell that the frames are
+    read. Pixels in what comes back may be buffers that hold until the next exposure.
+    """
+
+    pipeline: AnyPipeline
+    made: Callable[[Any, Exposure, Frames, Conditions, FramesRead], Made]
+
+    @property
+    def rig(self) -> Rig:
+        return self.pipeline.rig
+
+    def warm_up(self) -> None:
+        self.pipeline.warm_up()
+
+    def twin(self) -> Processor:
+        return replace(self, pipeline=self.pipeline.twin())
 
     def make(
         self,
         exposure: Exposure,
-        frames: Mapping[str, NDArray[np.uint16]],
+        frames: Frames,
         conditions: Conditions,
         *,
-        frames_read: Callable[[], None] | None = None,
+        frames_read: FramesRead = None,
     ) -> Made:
-        """Make the images of one exposure and judge it.
-
-        `frames_read` is called once the pixels of `frames` are no longer needed. Pixels in what
-        comes back may be buffers that hold until the next exposure.
-        """
+        """Make the images of one exposure and judge it."""
+        return self.made(self.pipeline, exposure, frames, conditions, frames_read)
 
 
 def processor_for(
@@ -74,15 +97,17 @@ def processor_for(
     threads = processing.threads
     if rig.virtual_image is None and not looks_apart(rig):
         radiance = radiance_of(rig, mission, radiometry)
-        return BandsProcessor(BandPipeline(rig, radiance, threads=threads, asked=asked), radiance)
+        pipeline = BandPipeline(rig, radiance, threads=threads, asked=asked)
+        return Processor(pipeline, partial(bands_made, radiance))
     known = None if radiometry is None else RadiometryFolder(radiometry, rig)
     if rig.virtual_image is None:
-        return HeadsProcessor(
+        return Processor(
             HeadPipeline(
                 rig, known, interpolation=processing.interpolation, threads=threads, asked=asked
-            )
+            ),
+            heads_made,
         )
-    return StitchedProcessor(
+    return Processor(
         Pipeline(
             rig,
             known,
@@ -94,7 +119,8 @@ def processor_for(
                 threads=threads,
                 asked=asked,
             ),
-        )
+        ),
+        stitched_made,
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -14,6 +14,9 @@ from processing.quality.report import QualityReport, as_json
 Contents: TypeAlias = dict[str, Sequence[bytes | memoryview]]
 Made: TypeAlias = tuple[dict[str, Any], Contents]
 """The content of quality.json, and the parts of every file by its name."""
+
+FramesRead: TypeAlias = Callable[[], None] | None
+"""Called once the pixels of the frames are no longer needed."""
 
 
 def report_json(

@@ -5,72 +5,57 @@ What they are is made by `processing.pipeline`; here they get their files.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 from daemon.disk import level2
 from daemon.exposure import Exposure
-from daemon.products.reports import Made, report_json
+from daemon.products.reports import FramesRead, Made, report_json
 from processing.mosaic.drawing import residuals_svg
 from processing.mosaic.residual_vectors import residual_vectors
 from processing.mosaic.stitch_record import stitch_record, stitch_record_json
 from processing.pipeline import Conditions, Pipeline
-from processing.rig import Rig
 
 
-class StitchedProcessor:
-    """A pipeline that stitches, as the worker wants it (`daemon.products.processor`)."""
+def stitched_made(
+    pipeline: Pipeline,
+    exposure: Exposure,
+    frames: Mapping[str, NDArray[np.uint16]],
+    conditions: Conditions,
+    frames_read: FramesRead,
+) -> Made:
+    """One image of all heads (`daemon.products.processor`).
 
-    def __init__(self, pipeline: Pipeline) -> None:
-        self.pipeline = pipeline
-
-    @property
-    def rig(self) -> Rig:
-        return self.pipeline.rig
-
-    def warm_up(self) -> None:
-        self.pipeline.warm_up()
-
-    def twin(self) -> StitchedProcessor:
-        return StitchedProcessor(self.pipeline.twin())
-
-    def make(
-        self,
-        exposure: Exposure,
-        frames: Mapping[str, NDArray[np.uint16]],
-        conditions: Conditions,
-        *,
-        frames_read: Callable[[], None] | None = None,
-    ) -> Made:
-        """Pixels in what comes back are the pipeline's buffers, until its next exposure."""
-        rig = self.rig
-        product = self.pipeline.process(frames, conditions, frames_read=frames_read)
-        told = product.temperatures
-        stitching = None
-        if product.mosaic.method == "free":
-            stitching = stitch_record_json(
-                stitch_record(
-                    rig,
-                    product.mosaic,
-                    told.placing_c,
-                    told.usable_c,
-                    product.estimated_dc,
-                    bands=product.bands,
-                    height_m=conditions.height_above_ground_m,
-                )
+    Pixels in what comes back are the pipeline's buffers, until its next exposure.
+    """
+    rig = pipeline.rig
+    product = pipeline.process(frames, conditions, frames_read=frames_read)
+    told = product.temperatures
+    stitching = None
+    if product.mosaic.method == "free":
+        stitching = stitch_record_json(
+            stitch_record(
+                rig,
+                product.mosaic,
+                told.placing_c,
+                told.usable_c,
+                product.estimated_dc,
+                bands=product.bands,
+                height_m=conditions.height_above_ground_m,
             )
-        report = report_json(product.report, exposure.number, product.timings_s)
-        contents = level2.level2_contents(
-            exposure.number,
-            pan=product.pan,
-            colour=product.colour,
-            quicklook=product.quicklook,
-            report_json=report,
-            geometry=product.geometry,
-            residuals_svg=residuals_svg(rig, product.tie_points, product.mosaic, product.validity),
-            residuals_json=residual_vectors(rig, product.tie_points, product.mosaic),
-            mosaic_json=stitching,
         )
-        return report, contents
+    report = report_json(product.report, exposure.number, product.timings_s)
+    contents = level2.level2_contents(
+        exposure.number,
+        pan=product.pan,
+        colour=product.colour,
+        quicklook=product.quicklook,
+        report_json=report,
+        geometry=product.geometry,
+        residuals_svg=residuals_svg(rig, product.tie_points, product.mosaic, product.validity),
+        residuals_json=residual_vectors(rig, product.tie_points, product.mosaic),
+        mosaic_json=stitching,
+    )
+    return report, contents
