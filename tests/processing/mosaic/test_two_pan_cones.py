@@ -11,134 +11,44 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from processing.geometry.placement import nominal_placements, vip_mm_from_raw, vip_px_from_mm
+from processing.geometry.placement import (
+    SensorPlacement,
+    nominal_placements,
+    vip_mm_from_raw,
+    vip_px_from_mm,
+)
 from processing.geometry.projective import apply_projective
 from processing.mosaic.free import free_mosaic
 from processing.mosaic.pan_only import pan_only_mosaic
-from processing.pipeline import Conditions, Pipeline, Product, Settings
+from processing.pipeline import Pipeline, Product, Settings
 from processing.quality.report import Flag, Verdict
-from processing.rig import Rig, find_rig, shipped_rigs
-from sim_hw.seeding import random_stream
-from sim_hw.world.electronics import Electronics, true_sensor
-from sim_hw.world.flight import Flight
-from sim_hw.world.rendering import Look, light_on_sensor
-from sim_hw.world.scene import open_scene
-from sim_hw.world.truth import true_vip
-from sim_hw.world.world import World, WorldSettings
+from processing.rig import Rig, find_rig
+from tests.processing.emulated import Emulated, after_similarity, expose, rms
 from tests.processing.synthetic import make_truth, tie_points_of
-
-Array = NDArray[np.float64]
-
-EPOCH = 1_400_000_000_000_000_000
 
 
 @dataclass(frozen=True)
 class Flown:
-    """A processed exposure beside the world it was taken of."""
+    """An emulated exposure, and what the pipeline made of it."""
 
+    emulated: Emulated
     pipeline: Pipeline
-    frames: Mapping[str, NDArray[np.uint16]]
-    conditions: Conditions
     product: Product
-    world: World
-    flight: Flight
-    looks: Mapping[str, Look]
-
-    def errors_px(self, name: str, raw: Array, vip: Array) -> Array:
-        """Where the ideal master camera sees raw pixels less where they were put, (n, 2)."""
-        column, row = true_vip(
-            self.world,
-            self.flight,
-            name,
-            self.looks[name],
-            columns=raw[:, 0],
-            rows=raw[:, 1],
-            master_mid_gps_ns=self.looks["SU00"].mid_gps_ns,
-        )
-        return np.stack([column, row], axis=1) - vip
 
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
-    seed = 3
-    world = World(
-        WorldSettings(
-            rig_file=str(shipped_rigs()["ultracam-l-mini"]),
-            seed=seed,
-            epoch_gps_ns=EPOCH,
-            dc_k=12.0,
-        )
-    )
-    rig, plan = world.rig, world.plan
-    folder = tmp_path_factory.mktemp("emulated")
-    scene = open_scene(replace(world.scene_settings, height_px=2300), folder / "scene")
-    flight = world.flight.beginning_first_line_at(1100.0)
-    reference_ns = EPOCH + 20_000_000_000
-    reference_mm = rig.cone(rig.reference_cone).position_mm[0]
-    frames, looks = {}, {}
-    for cone in rig.cones:
-        ahead_m = (cone.position_mm[0] - reference_mm) * 1e-3
-        look = Look(
-            mid_gps_ns=reference_ns - round(ahead_m / plan.ground_speed_mps * 1e9),
-            exposure_time_us=plan.exposure_time_us[cone.name],
-            tdi_shifts=plan.tdi_shifts[cone.name],
-        )
-        (sensor,) = cone.sensors
-        truth = true_sensor(cone, sensor, seed, field_radius_mm=world.field_radius_mm(cone))
-        head = Electronics(sensor, truth, world.electrons_per_radiance_s(cone))
-        frames[sensor.name] = head.frame(
-            light_on_sensor(world, scene, flight, cone, sensor, look),
-            exposure_time_us=look.exposure_time_us,
-            tdi_shifts=look.tdi_shifts,
-            gain_db=0.0,
-            temperature_c=world.temperature_c(sensor.probe, look.mid_gps_ns),
-            random=random_stream(seed, "noise", sensor.name, 1),
-        )
-        looks[sensor.name] = look
-    noise = np.random.default_rng(1)
-    conditions = Conditions(
-        temperatures_c={
-            probe: world.temperature_c(probe, reference_ns) + noise.normal(0, 0.1)
-            for probe in rig.probes
-        },
-        exposure_time_s={name: t * 1e-6 for name, t in plan.exposure_time_us.items()},
-        tdi_shifts=plan.tdi_shifts,
-        ground_speed_mps=plan.ground_speed_mps,
-        height_above_ground_m=plan.height_above_ground_m,
-    )
-    pipeline = Pipeline(rig, None, Settings())
-    product = pipeline.process(frames, conditions)
+    emulated = expose("ultracam-l-mini", tmp_path_factory.mktemp("emulated"), height_px=2300)
+    pipeline = Pipeline(emulated.world.rig, None, Settings())
+    product = pipeline.process(emulated.frames, emulated.conditions)
     colour = {name: band.copy() for name, band in product.colour.items()}
     kept = replace(product, pan=product.pan.copy(), valid=product.valid.copy(), colour=colour)
-    return Flown(pipeline, frames, conditions, kept, world, flight, looks)
-
-
-def rms(vectors: Array) -> float:
-    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
-
-
-def after_similarity(vip: Array, errors: Array) -> Array:
-    a = (vip + errors) @ [1, 1j]
-    b = vip @ [1, 1j]
-    a, b = a - a.mean(), b - b.mean()
-    left = a - np.vdot(b, a) / np.vdot(b, b) * b
-    return np.stack([left.real, left.imag], axis=1)
-
-
-def errors_of(flown: Flown, geometry: Mapping[str, Array]) -> tuple[Array, Array]:
-    """Absolute and inner errors of all VIP nodes, (n, 2) px."""
-    names = [name for name in ("SU00", "SU10") if f"{name}.vip" in geometry]
-    vip = np.concatenate([geometry[f"{name}.vip"] for name in names])
-    errors = np.concatenate(
-        [flown.errors_px(n, geometry[f"{n}.raw"], geometry[f"{n}.vip"]) for n in names]
-    )
-    return errors, after_similarity(vip, errors)
+    return Flown(emulated, pipeline, kept)
 
 
 def test_the_stitched_geometry_is_within_its_bars(flown: Flown) -> None:
-    errors, inner = errors_of(flown, flown.product.geometry["free"])
+    errors, inner = flown.emulated.errors_px(flown.product.geometry["free"])
     assert rms(inner) < 0.02 and np.hypot(*inner.T).max() < 0.06
     assert rms(errors) < 0.1 and np.hypot(*errors.T).max() < 0.3
 
@@ -164,9 +74,9 @@ def test_the_bayer_heads_colours_share_greens_place_and_nir_comes_to_it(flown: F
     product = flown.product
     assert list(product.colour) == ["red", "green", "blue", "nir"]
     assert [(b.band, b.registered) for b in product.bands] == [("nir", True)]
-    image = flown.world.image
+    image = flown.emulated.world.image
     for name, bar in (("RGB", 0.1), ("N", 0.2)):
-        sensor = flown.world.rig.sensor(name)
+        sensor = flown.emulated.world.rig.sensor(name)
         c, r = np.meshgrid(
             np.linspace(40, sensor.width_px - 40, 15), np.linspace(20, sensor.height_px - 20, 11)
         )
@@ -175,12 +85,17 @@ def test_the_bayer_heads_colours_share_greens_place_and_nir_comes_to_it(flown: F
         if name == "N":
             (nir,) = product.bands
             xy = apply_projective(np.linalg.inv(nir.band_from_green), xy)
-        assert rms(flown.errors_px(name, raw, vip_px_from_mm(image, xy))) < bar * 2  # PAN px
+        assert (
+            rms(flown.emulated.errors_of(name, raw, vip_px_from_mm(image, xy))) < bar * 2
+        )  # PAN px
 
 
 def test_all_bands_have_the_light_of_the_ground(flown: Flown) -> None:
     colour = flown.product.colour
-    shape = (flown.world.image.colour_height_px, flown.world.image.colour_width_px)
+    shape = (
+        flown.emulated.world.image.colour_height_px,
+        flown.emulated.world.image.colour_width_px,
+    )
     for band in colour.values():
         assert band.shape == shape
         assert (band[4:-4, 4:-4] > 0).mean() > 0.99
@@ -195,7 +110,9 @@ def full_size() -> Rig:
     return find_rig("ultracam-l")
 
 
-def misfit_px(rig: Rig, placements: Mapping[str, object], truth: Mapping[str, object]) -> float:
+def misfit_px(
+    rig: Rig, placements: Mapping[str, SensorPlacement], truth: Mapping[str, SensorPlacement]
+) -> float:
     """RMS of how the right sensor lies against the left, after a similarity of the whole, px."""
     image = rig.virtual_image
     assert image is not None
@@ -206,8 +123,8 @@ def misfit_px(rig: Rig, placements: Mapping[str, object], truth: Mapping[str, ob
             np.linspace(0, sensor.width_px - 1, 12), np.linspace(0, sensor.height_px - 1, 15)
         )
         raw = np.stack([c.ravel(), r.ravel()], axis=1)
-        put.append(vip_px_from_mm(image, vip_mm_from_raw(placements[name], raw)))  # type: ignore[arg-type]
-        belongs.append(vip_px_from_mm(image, vip_mm_from_raw(truth[name], raw)))  # type: ignore[arg-type]
+        put.append(vip_px_from_mm(image, vip_mm_from_raw(placements[name], raw)))
+        belongs.append(vip_px_from_mm(image, vip_mm_from_raw(truth[name], raw)))
     vip = np.concatenate(put)
     return rms(after_similarity(vip, np.concatenate(belongs) - vip))
 
@@ -243,9 +160,9 @@ def test_the_layer_of_the_experiment_is_a_similarity(full_size: Rig) -> None:
 def test_a_missing_frame_leaves_an_image_of_what_is_there(
     flown: Flown, missing: str, bar: float, pan: float
 ) -> None:
-    frames = {name: frame for name, frame in flown.frames.items() if name != missing}
-    product = flown.pipeline.process(frames, flown.conditions)
-    errors, inner = errors_of(flown, product.geometry["free"])
+    frames = {name: frame for name, frame in flown.emulated.frames.items() if name != missing}
+    product = flown.pipeline.process(frames, flown.emulated.conditions)
+    errors, inner = flown.emulated.errors_px(product.geometry["free"])
     assert rms(inner) < bar
     assert (product.valid > 0).mean() == pytest.approx(pan, abs=0.06)
     assert Flag.FRAME_MISSING in product.report.flags
