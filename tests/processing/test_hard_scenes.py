@@ -51,7 +51,7 @@ def test_the_image_is_right_or_says_that_it_is_not(camera: Camera, name: str) ->
     elif name == "desert":
         assert outcome.verdict == "refly"
     elif name == "snow":
-        assert outcome.absolute_rms_px < 0.15
+        assert outcome.absolute_rms_px < 0.15 and outcome.flags & Flag.SIGMA0
     else:
         # Nothing moved in this camera, and nobody is to be accused.
         assert outcome.right and outcome.displaced == "", outcome

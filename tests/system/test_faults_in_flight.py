@@ -64,6 +64,13 @@ def is_running(pid: int) -> bool:
         return False
 
 
+def worker_of(service: subprocess.Popen[str]) -> int:
+    (worker,) = [
+        pid for pid in children(service.pid) if "llvmlite" in Path(f"/proc/{pid}/maps").read_text()
+    ]
+    return worker
+
+
 def test_a_killed_service_goes_on_in_the_same_flight(emulator: tuple[Emulator, Path]) -> None:
     devices, folder = emulator
     config = folder / "service.toml"
@@ -167,12 +174,7 @@ def test_a_process_that_dies_ends_the_service_with_a_sentence_and_the_flight_sta
         if event["event"] == "mission":
             mission = event["path"]
         elif event["event"] == "kernels":
-            (worker,) = [
-                pid
-                for pid in children(service.pid)
-                if "llvmlite" in Path(f"/proc/{pid}/maps").read_text()
-            ]
-            os.kill(worker, signal.SIGKILL)
+            os.kill(worker_of(service), signal.SIGKILL)
         elif event["event"] == "fault":
             faults.append(event["sentence"])
     assert service.wait(30) == 1
@@ -181,29 +183,38 @@ def test_a_process_that_dies_ends_the_service_with_a_sentence_and_the_flight_sta
     assert marker["mission"] == Path(mission).name
 
 
-def test_a_head_that_is_not_there_degrades_the_exposures_and_nothing_else(
+def test_a_head_that_is_not_there_and_a_slow_pipeline_cost_flags_and_nothing_else(
     emulator: tuple[Emulator, Path],
 ) -> None:
     devices, folder = emulator
     config = folder / "service.toml"
-    text = service_toml(devices.ready, root="degraded", count=2, end_when_done=True)
+    text = service_toml(devices.ready, root="degraded", count=3, end_when_done=True)
     address = devices.ready["heads"]["SU11"]["address"]
     text = text.replace(f'"{address}"', f'"{NOBODY}"') + "\n[limits]\nready_timeout_s = 4.0\n"
     config.write_text(text)
     service = start(config)
-    events = list(heard(service))
+    events = []
+    worker = 0
+    for event in heard(service):
+        events.append(event)
+        if event["event"] == "kernels":
+            worker = worker_of(service)
+            os.kill(worker, signal.SIGSTOP)
+        elif event["event"] == "stored" and event["number"] == 3:
+            os.kill(worker, signal.SIGCONT)
     assert service.wait(30) == 0
     (ready,) = [event for event in events if event["event"] == "ready"]
     assert ready["absent"] == ["head SU11"]
     sealed = [event for event in events if event["event"] == "sealed"]
-    assert [(event["state"], event["missing"]) for event in sealed] == [("degraded", ["SU11"])] * 2
-    for event in events:
-        if event["event"] == "processed":
-            report = event["report"]
-            assert "FRAME_MISSING" in report["flags"] and report["verdict"] != "good"
-            assert 0.85 < report["figures"]["valid_fraction"] < 0.95
+    assert [(event["state"], event["missing"]) for event in sealed] == [("degraded", ["SU11"])] * 3
+    reports = {e["number"]: e["report"] for e in events if e["event"] == "processed"}
+    assert sorted(reports) == [1, 2, 3]
+    for report in reports.values():
+        assert "FRAME_MISSING" in report["flags"] and report["verdict"] != "good"
+        assert 0.85 < report["figures"]["valid_fraction"] < 0.95
+    assert "PROCESSING_BEHIND" in reports[3]["flags"], "the first one's frames are still in memory"
     (ended,) = [event for event in events if event["event"] == "ended"]
-    assert ended["ledger"]["balanced"] and ended["ledger"]["triggers"]["degraded"] == 2
+    assert ended["ledger"]["balanced"] and ended["ledger"]["triggers"]["degraded"] == 3
 
 
 def test_sigterm_lands_in_good_order(emulator: tuple[Emulator, Path]) -> None:

@@ -12,6 +12,7 @@ from daemon.exposure import Exposure
 from daemon.plan.overlaps import Surroundings
 from daemon.service import worker
 from daemon.service.messages import Judged, Process, Processed, Settled
+from processing.quality.report import Flag
 
 FORESEEN = Exposure(number=1, mark_source="event-mark")
 OTHERWISE = Exposure(number=1, mark_source="interpolated")
@@ -23,6 +24,7 @@ class Bench:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.said: list[Any] = []
         self.written: list[Any] = []
+        self.flags: list[Flag] = []
         overlaps = SimpleNamespace(add=lambda _: None, of=lambda _: Surroundings())
         mission = SimpleNamespace(
             path=Path("m"), level0=lambda _: Path("L0"), level2=lambda _: Path("L2")
@@ -32,12 +34,15 @@ class Bench:
         self.desk = worker._Desk(rings=(), **cast(Any, nothing), **about)
         monkeypatch.setattr(worker.store, "load_level0", lambda *_: ({}, ()))
         monkeypatch.setattr(worker, "histograms_of", lambda *_: {})
-        monkeypatch.setattr(worker, "conditions_of", lambda *_, **__: None)
+        monkeypatch.setattr(worker, "conditions_of", self._conditions)
         monkeypatch.setattr(worker, "make_products", _made)
         monkeypatch.setattr(worker.level2, "write_folder", self._write)
 
     def send(self, message: object) -> None:
         self.said.append(message)
+
+    def _conditions(self, *told: Any, **_: Any) -> None:
+        self.flags.append(told[3])
 
     def _write(self, _folder: Path, contents: Any) -> dict[str, int]:
         self.written.append(contents)
@@ -82,3 +87,11 @@ def test_what_is_never_sealed_is_never_written(bench: Bench, settled: Settled | 
     bench.work(settled)
     assert bench.judged == ["event-mark"] and bench.written == []
     assert not any(isinstance(one, Processed) for one in bench.said)
+
+
+@pytest.mark.parametrize(("slots", "flag"), [({}, Flag(0)), (None, Flag.PROCESSING_BEHIND)])
+def test_what_had_to_be_read_from_disk_was_behind(
+    bench: Bench, slots: dict[str, int] | None, flag: Flag
+) -> None:
+    bench.desk.process(Process(FORESEEN, slots), Surroundings(), cast(Any, None))
+    assert bench.flags == [flag]

@@ -1,11 +1,12 @@
 """Each flag is raised by what it is there for, at twice its threshold, and by nothing else.
 
 The faults are in the light, the true camera, the probes or the instruments of a rendered exposure;
-flags of capture are provoked in tests/daemon. Rates over many exposures: docs/accuracy.md.
+flags of capture are provoked in tests/faults. Rates over many exposures: docs/accuracy.md.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -13,6 +14,7 @@ import pytest
 from benchmarks.flags import FAULTS, THRESHOLDS, Camera, Fault
 from processing.pipeline import Conditions
 from processing.quality.report import NO_FLAGS, Flag, Verdict
+from processing.quality.specification import Asked
 
 SEED = 50_001
 pytestmark = pytest.mark.timeout(600)
@@ -56,11 +58,20 @@ def _everything(told: Conditions) -> Conditions:
         temperature_age_s=dict.fromkeys(probes, 2 * THRESHOLDS.temperature_age_s),
         roll_rad=2 * THRESHOLDS.tilt_rad,
         crab_rad=-2 * THRESHOLDS.crab_rad,
+        time_sigma_ns=2 * round(THRESHOLDS.time_sigma_ns),
+        forward_overlap=0.3,
+        sun_elevation_rad=math.radians(15.0),
     )
 
 
-def test_what_instruments_tell_raises_its_flags(camera: Camera) -> None:
+def test_what_instruments_tell_raises_its_flags(
+    camera: Camera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The emulated camera flies for a GSD three times as wide.
+    asked = Asked(forward_overlap=0.6, sun_deg=30.0, gsd_m=0.1)
+    monkeypatch.setattr(camera.pipeline, "settings", replace(camera.pipeline.settings, asked=asked))
     fault = Fault(NO_FLAGS, "all instruments at once", conditions=_everything)
     report = camera.product(SEED, fault).report
     probes = Flag.TEMPERATURE_MISSING | Flag.TEMPERATURE_RANGE | Flag.TEMPERATURE_STALE
-    assert report.flags == probes | Flag.TILT | Flag.DRIFT | Flag.BLUR
+    project = Flag.OVERLAP | Flag.SUN | Flag.GSD
+    assert report.flags == probes | project | Flag.TILT | Flag.DRIFT | Flag.BLUR | Flag.TIME_SIGMA
