@@ -124,7 +124,7 @@ def as_flown(
         raise ConfigurationError(
             [
                 f"{folder.service_path}: plan.elevation is {str(plan.elevation)!r}, and that file "
-                f"is not here; give syntopic process --elevation FILE"
+                f"is not here; give --elevation FILE"
             ]
         )
     told = flown.get("mission", {}).get("radiometry")

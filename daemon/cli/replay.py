@@ -26,7 +26,8 @@ Level-0 through the pipeline, with one exposure in work and with two. Records ar
 canonical JSON, images by the hash of their decoded pixels. Nothing is written. The exit status is
 1 where anything differs.
 
-Examples: `syntopic replay MISSION`, `syntopic replay MISSION --records-only --json`
+Examples: `syntopic replay MISSION`, `syntopic replay MISSION --records-only --json`,
+`syntopic replay MISSION --elevation terrain.asc`
 """
 SENTENCES_SHOWN = 20
 
@@ -43,6 +44,7 @@ def replay(
     radiometry: Annotated[
         Path | None, typer.Option(help="Folder of radiometric calibrations, if it was moved.")
     ] = None,
+    elevation: Annotated[Path | None, typer.Option(help="Height model, if it was moved.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     folder = Mission.open(mission)
@@ -70,7 +72,7 @@ def replay(
             total.add(found)
             progress.advance(task)
         if not records_only:
-            plan, radiometry = as_flown(folder, radiometry)
+            plan, radiometry = as_flown(folder, radiometry, elevation)
             settings = WorkerSettings(
                 rig=str(folder.rig_path),
                 radiometry=radiometry,

@@ -22,8 +22,9 @@ from daemon.disk import store
 from daemon.disk.level0 import read_description
 from daemon.disk.mission import Mission
 from daemon.export.certificate import CertificateError, certificate_of
-from daemon.exposure import NavigationRecord
+from daemon.exposure import NavigationRecord, exposure_bytes
 from daemon.orientation.local_frame import LocalFrame
+from daemon.replay.flight import Replayed
 from daemon.service import worker
 from daemon.service.memory import FrameRing
 from daemon.service.messages import (
@@ -149,6 +150,53 @@ def test_the_onboard_worker_makes_every_head_and_its_orientation_as_exposures_co
         assert np.abs(turn - np.eye(3)).max() < 2e-4, cone.name
         ground = np.array(head["footprint"]) - [longitude, latitude]
         assert (ground[:, 1].min() > 0.02) == (cone.name == "5"), "the head that looks ahead"
+
+
+def test_a_flight_over_a_height_model_is_replayed_with_the_model_from_elsewhere(
+    flown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world, folder = flown
+    mission = Mission.open(shutil.copytree(folder / "mission", tmp_path / "flown"))
+    text = mission.service_path.read_text().replace(
+        "[plan]", f'[plan]\nelevation = "terrain.asc"\nelevation_crs = "{CRS}"'
+    )
+    rest = 'root = "."\nrig = "rig.toml"\n\n[trigger]\ndriver = "t"\n\n[[head]]\nsensor = "nadir"\n'
+    mission.service_path.write_text(text + rest + 'driver = "h"\n')
+    # What the log would give again: one sealed exposure with its position.
+    _, exposure = store.load_level0(mission.level0(2), load_rig(mission.rig_path))
+    here = world.flight.geodetic(np.zeros(3))
+    navigation = NavigationRecord(
+        *("gnss", exposure.mark_gps_ns, "interpolated", 0, "fixed", 20),
+        *(here[0], here[1], here[2] + 1000.0, 0.02, 0.03, (60.0, 0.0, 0.0), 0.01, 0.0, 0.0, 0.0),
+    )
+    exposure = replace(exposure, navigation=navigation)
+    (mission.level0(2) / "exposure.json").write_bytes(exposure_bytes(exposure))
+    (mission.path / "log").mkdir()
+    (mission.path / "log" / "1.mcap").touch()
+    again = {"records": [exposure], "is_complete": True}
+    monkeypatch.setattr("daemon.replay.flight.replay_log", lambda *_: Replayed(**again))
+    models = [hill(tmp_path / f"{top}.asc", here, top) for top in (150.0, 300.0)]
+    shutil.rmtree(mission.level2_root)
+    flown_with = ["process", str(mission.path), "--only", "2", "--elevation", str(models[0])]
+    assert RUN.invoke(app, flown_with).exit_code == 0
+    asked = ["replay", str(mission.path), "--lanes", "1", "--json"]
+    without = RUN.invoke(app, asked)
+    assert without.exit_code != 0 and "give --elevation FILE" in str(without.exception)
+    told = [
+        json.loads(RUN.invoke(app, [*asked, "--elevation", str(model)]).stdout) for model in models
+    ]
+    assert told[0]["agrees"], told[0]["sentences"]
+    assert told[1]["sentences"] == ["L2/000002/quality.json: differs with 1 in work"]
+
+
+def hill(path: Path, here: tuple[float, float, float], top_m: float) -> Path:
+    """A plateau so high above what was planned, as an ESRI ASCII grid."""
+    to_grid = pyproj.Transformer.from_crs("EPSG:4979", CRS, always_xy=True)
+    east, north, height = to_grid.transform(here[1], here[0], here[2])
+    row = " ".join([f"{height + top_m:.3f}"] * 80)
+    corner = f"xllcorner {east - 2000}\nyllcorner {north - 2000}\ncellsize 50\n"
+    path.write_text(f"ncols 80\nnrows 80\n{corner}" + "\n".join([row] * 80))
+    return path
 
 
 def _oriented(folder: Path) -> dict[str, dict]:
