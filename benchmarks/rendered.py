@@ -11,6 +11,7 @@ import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,11 +46,11 @@ class Exposure:
     snapshot: Snapshot
 
 
-def world_settings(rig: str | Path, seed: int, **others: object) -> WorldSettings:
+def world_settings(rig: str | Path, seed: int, **others: Any) -> WorldSettings:
     """Settings of a world with one exposure; `rig` is a shipped rig's name or a file."""
     file = shipped_rigs()[rig] if isinstance(rig, str) else rig
     plain = WorldSettings(rig_file=str(file), seed=seed, epoch_gps_ns=EPOCH_GPS_NS, exposures=1)
-    return replace(plain, **others)  # type: ignore[arg-type]
+    return replace(plain, **others)
 
 
 def take(

@@ -260,8 +260,10 @@ def _peer_geometry(
             stitched = Path(scratch) / "L2" / "000001"
             stitched.mkdir(parents=True)
             (Path(scratch) / "L0").symlink_to(mission.level0(1).parent.resolve())
-            table = bench_peers.nona_geometry(rig, mission.level0(1), ours, given)
-            np.savez(stitched / "geometry.npz", **table)  # type: ignore[arg-type]
+            table: Mapping[str, Any] = bench_peers.nona_geometry(
+                rig, mission.level0(1), ours, given
+            )
+            np.savez(stitched / "geometry.npz", **table)
             figures = _judged(Path(scratch), truth)["free"]
         result |= {
             f"rms_px{suffix}": figures["inner_rms_px"],

@@ -240,7 +240,7 @@ def write_series(
     random = random_stream(seed, "test field frames", take)
     surveyed = xyz + random.normal(0, SURVEY_SIGMA_M, xyz.shape)
     exposures = []
-    places: dict[str, Array] = {}
+    places: dict[str, Any] = {}
     for k, (place, rotation) in enumerate(
         poses(seed + 1000 * take, plan.exposures, plan.distance_m)
     ):
@@ -268,7 +268,7 @@ def write_series(
             }
         )
         print(f"exposure {k + 1} of {plan.exposures}", file=sys.stderr)
-    np.savez(out / "truth" / "places.npz", **places)  # type: ignore[arg-type]
+    np.savez(out / "truth" / "places.npz", **places)
     write_list(
         series,
         "lab",

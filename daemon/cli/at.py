@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 from rich.console import Console
@@ -13,6 +13,9 @@ from rich.progress import Progress
 
 from daemon.cli.options import AsJson, AttitudeSigma, Crs, MountFile, PositionSigma, Trajectory
 from daemon.configuration import ConfigurationError
+
+if TYPE_CHECKING:
+    from processing.bundle.self_calibration import SetName
 
 HELP = """Aerial triangulation of the stitched PAN images of a mission.
 
@@ -94,7 +97,7 @@ def at(
             [f"{results} holds a triangulation already; give another folder with --out"]
         )
     asked = Asked(
-        parameters=set_name,  # type: ignore[arg-type]
+        parameters=cast("SetName", set_name),
         interior=interior,
         position_sigma_m=position_sigma,
         attitude_sigma_rad=attitude_sigmas(attitude_sigma),

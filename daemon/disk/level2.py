@@ -209,7 +209,8 @@ def _npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
         if array.dtype.hasobject:
             raise ProductError(f"geometry array {name!r} holds objects; numbers are needed")
     buffer = BytesIO()
-    np.savez(buffer, **{name: arrays[name] for name in sorted(arrays)})  # type: ignore[arg-type]
+    named: dict[str, Any] = {name: arrays[name] for name in sorted(arrays)}
+    np.savez(buffer, **named)
     return buffer.getvalue()
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 from daemon.disk.log_records import Message, loose_bytes
 from daemon.disk.records import RecordError, parse_record
@@ -47,7 +47,8 @@ def decision_of(message: Message) -> Decision | None:
     kind, number = content.pop("kind", None), content.pop("number", 0)
     if not isinstance(kind, str) or not isinstance(number, int):
         return None
-    return Decision(kind, message.mono_ns, number, content)  # type: ignore[arg-type]
+    # A word of a later version is kept as it is.
+    return Decision(cast(Kind, kind), message.mono_ns, number, content)
 
 
 @dataclass(frozen=True)

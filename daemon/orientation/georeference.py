@@ -128,7 +128,7 @@ def import_proj() -> None:
         GeoreferenceError: pyproj is not installed.
     """
     try:
-        import pyproj  # noqa: F401
+        import pyproj  # noqa: F401 - whether it can be
     except ImportError as error:
         raise GeoreferenceError(
             "coordinate systems need pyproj; install the extra: pip install 'syntopic[geodesy]'"

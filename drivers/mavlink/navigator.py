@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable, Mapping
-from typing import ClassVar, Final
+from typing import Any, ClassVar, Final
 
 from drivers.clock import Clock
 from drivers.contract import ClockReading
@@ -248,10 +248,10 @@ class MavlinkNavigator(ListeningNavigator):
             "SYSTEM_TIME on there for this port.",
         )
 
-    def _say(self, line: SerialLine, message: object) -> None:
+    def _say(self, line: SerialLine, message: Any) -> None:
         """Pack and send as a companion of the autopilot's own system."""
         with self._writing:
             packer = dialect().MAVLink(None, self.decoder.system or self.system or 1, COMPANION)
             packer.seq = self._sequence
             self._sequence = (self._sequence + 1) % 256
-            line.write(bytes(message.pack(packer)))  # type: ignore[attr-defined]
+            line.write(bytes(message.pack(packer)))
