@@ -25,24 +25,37 @@ TELL_MAX_BYTES = 100_000
 _SPAWN = multiprocessing.get_context("spawn")
 
 
+class ServiceGoneError(Exception):
+    """The other end of a child's line is closed: nothing is left to be told."""
+
+
 class Link:
-    """The child's end of the line to the service; `send` may be called from any thread."""
+    """The child's end of the line to the service; `send` may be called from any thread.
+
+    Both ways raise ServiceGoneError once the service is gone.
+    """
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
         self._lock = threading.Lock()
 
     def send(self, message: object) -> None:
-        with self._lock:
-            self._connection.send(message)
+        try:
+            with self._lock:
+                self._connection.send(message)
+        except OSError as error:
+            raise ServiceGoneError(str(error)) from error
 
     def fileno(self) -> int:
         """What an event loop waits on."""
         return self._connection.fileno()
 
     def receive(self, timeout_s: float) -> object | None:
-        """The next message, or None when none came in time. EOFError: the service is gone."""
-        return self._connection.recv() if self._connection.poll(timeout_s) else None
+        """The next message, or None when none came in time."""
+        try:
+            return self._connection.recv() if self._connection.poll(timeout_s) else None
+        except (EOFError, OSError) as error:
+            raise ServiceGoneError(str(error)) from error
 
 
 class Child:
@@ -127,8 +140,16 @@ def _child_main(
     # Ctrl-C reaches the whole process group; the service ends its children in order.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    threading.excepthook = _end_without_service
     module, _, function = target.partition(":")
     try:
         getattr(importlib.import_module(module), function)(Link(connection), *arguments)
-    except (EOFError, BrokenPipeError):
-        os._exit(1)  # the service is gone; nothing is left to be told
+    except ServiceGoneError:
+        os._exit(1)
+
+
+def _end_without_service(failed: threading.ExceptHookArgs) -> None:
+    """A thread that finds the service gone ends the process without a word."""
+    if isinstance(failed.exc_value, ServiceGoneError):
+        os._exit(1)
+    threading.__excepthook__(failed)

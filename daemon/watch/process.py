@@ -21,7 +21,7 @@ from daemon.exposure import navigation_from_json
 from daemon.orientation.exterior import mount_of
 from daemon.orientation.footprints import seen_from
 from daemon.service.messages import Answer, Ping, Pong, Stop, Told
-from daemon.service.processes import Link
+from daemon.service.processes import Link, ServiceGoneError
 from daemon.watch.api import WatchSettings, create_app
 from daemon.watch.control_socket import ControlError, ControlSocket
 from daemon.watch.coverage import Coverage
@@ -208,7 +208,7 @@ def _hear(link: Link, state: FlightState, gate: Gate, ending: asyncio.Event) -> 
             elif isinstance(message, Stop):
                 ending.set()
                 return
-    except (EOFError, ConnectionError):
+    except ServiceGoneError:
         ending.set()
 
 

@@ -111,8 +111,6 @@ def test_a_killed_service_goes_on_in_the_same_flight(emulator: tuple[Emulator, P
     for number in unsealed:
         done = f"exposure {number}: was stored but not sealed; sealed from the log (event-mark)"
         assert done in told["recovery"]
-    held = [event for event in events if event.get("name") == "held-by-another"]
-    assert held, "the heads hold the dead controller's privilege, and that is said"
     (ended,) = [event for event in events if event["event"] == "ended"]
     counts = ended["ledger"]["triggers"]
     assert counts["triggers"] == 6
