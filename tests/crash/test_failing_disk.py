@@ -17,10 +17,10 @@ from daemon.disk.mission import Mission
 from tests.crash.flight import ILL
 from tests.crash.judging import Told, judge
 from tests.crash.prefixes import ACKS, FLOWN, ROOT
-from tests.crash.test_prefixes import MEMORY, REASON
-from tests.crash.write_log import run_ill
+from tests.crash.test_prefixes import MEMORY
+from tests.crash.write_log import needs_strace, run_ill
 
-pytestmark = pytest.mark.skipif(REASON is not None, reason=f"nothing can be injected: {REASON}")
+pytestmark = needs_strace
 
 EXPOSURES = 6
 

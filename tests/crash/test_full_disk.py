@@ -29,10 +29,13 @@ def why_not() -> str | None:
     return None if done.returncode == 0 else done.stderr.strip()
 
 
-REASON = why_not()
+WHY_NOT = why_not()
+needs_namespace = pytest.mark.skipif(
+    WHY_NOT is not None, reason=f"a small disk is mounted in a namespace of its own: {WHY_NOT}"
+)
 
 
-@pytest.mark.skipif(REASON is not None, reason=f"no namespace with a disk of its own: {REASON}")
+@needs_namespace
 def test_a_disk_that_fills_costs_what_did_not_fit_and_flight_goes_on_when_it_is_freed(
     tmp_path: Path,
 ) -> None:

@@ -12,10 +12,9 @@ import pytest
 from daemon.disk import durable
 from tests.crash.disk import DROPPED, KEPT, TORN, VARIANTS, ZEROS, Disk, everything
 from tests.crash.prefixes import ACKS, Figures, cut, fly
-from tests.crash.write_log import why_not
+from tests.crash.write_log import needs_strace
 
-REASON = why_not()
-pytestmark = pytest.mark.skipif(REASON is not None, reason=f"no write log: {REASON}")
+pytestmark = needs_strace
 
 IN_CI = frozenset({KEPT, TORN, DROPPED, ZEROS})
 MEMORY = Path("/dev/shm")

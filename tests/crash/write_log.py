@@ -14,6 +14,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import pytest
+
 STRACE = shutil.which("strace")
 CALLS = (
     "openat,creat,write,pwrite64,writev,pwritev,pwritev2,fsync,fdatasync,ftruncate,truncate,"
@@ -54,6 +56,12 @@ def why_not() -> str | None:
     if probe.returncode == 0:
         return None
     return f"strace may not trace here ({probe.stderr.strip().splitlines()[-1:]})"
+
+
+WHY_NOT = why_not()
+needs_strace = pytest.mark.skipif(
+    WHY_NOT is not None, reason=f"writes are recorded, and failures injected, by strace: {WHY_NOT}"
+)
 
 
 def record(command: Sequence[str], folder: Path, log: Path, *, cwd: Path) -> list[Operation]:

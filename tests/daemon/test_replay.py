@@ -60,7 +60,7 @@ def test_bytes_mean_the_same_however_they_came_in_pieces(cuts: list[int]) -> Non
     whole, pieces = decode(heard([])), decode(heard(cuts))
     positions = [s for s in whole if isinstance(s, NavSample)]
     assert len(positions) >= EPOCHS - 3
-    assert [s.gps_ns for s in whole] == [s.gps_ns for s in pieces]  # type: ignore[union-attr]
+    assert [s.gps_ns for s in whole] == [s.gps_ns for s in pieces]
 
 
 def test_what_came_before_the_device_was_open_was_told_to_nobody() -> None:

@@ -115,7 +115,7 @@ class Flight:
             expected = len(self.frames) + 1
             before = time.monotonic()
             self.head.trigger()
-            if self.wait(lambda n=expected: len(self.frames) >= n, 2):  # type: ignore[misc]
+            if self.wait(lambda n=expected: len(self.frames) >= n, 2):
                 arrived = self.frames[-1].mono_ns * 1e-9
                 found.append((arrived - before) * 1e3 - EXPOSURE_US * 1e-3)
         return found

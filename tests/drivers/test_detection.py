@@ -113,8 +113,8 @@ def test_every_device_is_found_with_its_protocol_and_its_speed() -> None:
         for section in written:
             own = {key: value for key, value in section.items() if key not in ("name", "driver")}
             assert registry.problems(kind, section["driver"], own) == []
-    assert by_kind["modbus"].speaker.settings["unit"] == 2  # type: ignore[union-attr]
-    assert by_kind["ascii"].speaker.settings["channels"] == ["0", "1"]  # type: ignore[union-attr]
+    assert by_kind["modbus"].speaker.settings["unit"] == 2
+    assert by_kind["ascii"].speaker.settings["channels"] == ["0", "1"]
 
 
 def test_devices_on_the_network_are_found_without_a_speed() -> None:

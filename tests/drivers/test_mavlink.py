@@ -270,7 +270,7 @@ def test_rotations_are_interpolated_along_the_shorter_arc() -> None:
         return math.cos(half), 0.0, 0.0, math.sin(half)
 
     there = tuple(-n for n in heading(20.0))
-    _, _, angle = angles_of(between(heading(10.0), there, 0.25))  # type: ignore[arg-type]
+    _, _, angle = angles_of(between(heading(10.0), there, 0.25))
     assert math.degrees(angle) == pytest.approx(12.5)
 
 

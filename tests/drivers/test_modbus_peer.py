@@ -14,7 +14,7 @@ from tests.drivers.lines import PtyLine
 from tests.drivers.stand_ins import Notebook
 
 pymodbus_server = pytest.importorskip("pymodbus.server", reason="needs pymodbus (group dev)")
-pymodbus_datastore = pytest.importorskip("pymodbus.datastore")
+pymodbus_datastore = pytest.importorskip("pymodbus.datastore", reason="needs pymodbus")
 pytestmark = pytest.mark.peer
 
 UNIT = 3

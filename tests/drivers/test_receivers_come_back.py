@@ -100,18 +100,18 @@ def test_a_pulled_cable_is_told_and_healed_for_every_kind(tmp_path: Path) -> Non
     pairs = on_cables(tmp_path)
     with running(pairs):
         for pair in pairs:
-            wait_for(lambda pair=pair: pair.samples() >= 3, f"{pair.kind} to begin")  # type: ignore[misc]
+            wait_for(lambda pair=pair: pair.samples() >= 3, f"{pair.kind} to begin")
         for pair in pairs[:-1]:
             assert pair.cable is not None
             pair.cable.unplug()
         for pair in pairs[:-1]:
-            wait_for(lambda pair=pair: "lost" in pair.notebook.event_names, f"{pair.kind} lost")  # type: ignore[misc]
+            wait_for(lambda pair=pair: "lost" in pair.notebook.event_names, f"{pair.kind} lost")
         before = [pair.samples() for pair in pairs]
         for pair in pairs[:-1]:
             assert pair.cable is not None
             pair.cable.plug_in()
         for pair, had in zip(pairs, before, strict=True):
-            wait_for(lambda pair=pair, had=had: pair.samples() >= had + 3, f"{pair.kind} back")  # type: ignore[misc]
+            wait_for(lambda pair=pair, had=had: pair.samples() >= had + 3, f"{pair.kind} back")
     for pair in pairs[:-1]:
         assert pair.notebook.event_names[:3] == ["opened", "lost", "opened"]
         lost = next(e for e in pair.notebook.events if e.name == "lost")
@@ -146,4 +146,4 @@ def test_an_autopilot_that_falls_silent_and_restarts_is_heard_again_at_the_right
     mark = next(r for r in pair.notebook.records if isinstance(r, EventMark))
     assert mark.time_valid
     assert abs(mark.gps_ns - given_ns) < 1_500_000
-    assert navigator.statistics()["clock_steps"] == 1  # type: ignore[attr-defined]
+    assert navigator.statistics()["clock_steps"] == 1

@@ -57,7 +57,7 @@ def _run_until(parrot: Parrot, clock: FakeClock, seconds: float) -> Notebook:
             event.set()
         return event.is_set()
 
-    clock.wait = wait_and_end  # type: ignore[method-assign]
+    clock.wait = wait_and_end
     parrot.run(notebook)
     return notebook
 

@@ -280,7 +280,7 @@ def ascii_line() -> Parser:
 
     def feed(data: bytes) -> None:
         inbox.append(data)
-        for _ in thermometer.step(line):  # type: ignore[arg-type]
+        for _ in thermometer.step(line):
             pass
 
     return Parser(

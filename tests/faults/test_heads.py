@@ -133,7 +133,7 @@ def test_each_fault_of_a_frame_is_seen_as_what_it_is_and_touches_no_other() -> N
         for pulse in range(1, 20):
             head.line(time.monotonic_ns(), pulse)
             due = pulse - 1
-            host.wait(lambda due=due: len(host.frames) >= due, 1.0)  # type: ignore[misc]
+            host.wait(lambda due=due: len(host.frames) >= due, 1.0)
             time.sleep(0.1)
         assert host.wait(lambda: len(host.frames) >= 19), "one is lost, one comes twice"
         frames = host.frames

@@ -101,7 +101,7 @@ def test_a_mark_is_lost_alone(tmp_path: Path) -> None:
             return data.count(b"\xb5\x62\x0d\x03") >= 3
 
         data = heard(str(link), three)
-    counts = [message.count for message in messages(data, "TIM-TM2")]  # type: ignore[attr-defined]
+    counts = [message.count for message in messages(data, "TIM-TM2")]
     assert counts == list(range(counts[0], counts[0] + len(counts))) and counts[0] >= 2
 
 
@@ -111,7 +111,7 @@ def test_a_wrong_week_is_said_and_then_right_again(tmp_path: Path) -> None:
         week = made.clock.gps_ns(time.monotonic_ns()) // NS_PER_WEEK
 
         def weeks(data: bytes) -> list[int]:
-            return [m.week for m in messages(data, "NAV-TIMEGPS")]  # type: ignore[attr-defined]
+            return [m.week for m in messages(data, "NAV-TIMEGPS")]
 
         data = heard(
             str(link),
@@ -151,7 +151,7 @@ def test_power_off_and_on_starts_the_count_again(tmp_path: Path) -> None:
             return b"\xb5\x62\x0d\x03" in data and data.count(b"\xb5\x62\x01\x07") > 3
 
         data = heard(str(link), marked)
-    assert [m.count for m in messages(data, "TIM-TM2")] == [1]  # type: ignore[attr-defined]
+    assert [m.count for m in messages(data, "TIM-TM2")] == [1]
 
 
 def test_a_late_answer_of_a_probe_comes_all_the_same(tmp_path: Path) -> None:

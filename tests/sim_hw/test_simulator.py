@@ -144,8 +144,7 @@ def test_frames_marks_and_truth_of_a_pulse_belong_together(emulator: Emulator) -
     port = serial.Serial(ready["receiver"]["port"], timeout=0.5)
     names = ("SU00", "SU10")
     hosts = {
-        name: Controller(SimpleNamespace(address=ready["heads"][name]["address"]))  # type: ignore[arg-type]
-        for name in names
+        name: Controller(SimpleNamespace(address=ready["heads"][name]["address"])) for name in names
     }
     try:
         for host in hosts.values():
@@ -207,7 +206,7 @@ def two_frames(host: Controller) -> list[bytes]:
 
 
 def emulator_cache(emulator: Emulator) -> str:
-    arguments = list(map(str, emulator.process.args))  # type: ignore[arg-type]
+    arguments = list(map(str, emulator.process.args))
     return arguments[arguments.index("--scene-cache") + 1]
 
 

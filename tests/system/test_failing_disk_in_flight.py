@@ -12,14 +12,13 @@ from daemon.cli.sim import Emulator, free_first_address, service_toml, simulator
 from daemon.disk.level0_folder import read_sealed
 from daemon.disk.mission import Mission
 from daemon.disk.verification import verify
-from tests.crash.test_prefixes import REASON
-from tests.crash.write_log import run_ill
+from tests.crash.write_log import needs_strace, run_ill
 from tests.system.flown import ROOT
 
 pytestmark = [
     pytest.mark.system,
     pytest.mark.timeout(400),
-    pytest.mark.skipif(REASON is not None, reason=f"nothing can be injected: {REASON}"),
+    needs_strace,
 ]
 
 EXPOSURES = 7

@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 
 from daemon.cli.sim import Emulator, free_first_address, service_toml, simulator_arguments
-from tests.crash.test_full_disk import NAMESPACE, REASON
+from tests.crash.test_full_disk import NAMESPACE, needs_namespace
 from tests.system.flown import ROOT
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(400)]
 
 
-@pytest.mark.skipif(REASON is not None, reason=f"no namespace with a disk of its own: {REASON}")
+@needs_namespace
 def test_a_full_disk_costs_exposures_and_never_the_service(tmp_path: Path, scenes: Path) -> None:
     rig = "ultracam-l-mini"
     arguments = simulator_arguments(rig, tmp_path / "sim", seed=4, dc=0, displace=[])

@@ -52,7 +52,7 @@ def test_the_service_asks_again_after_a_second_and_closes_nothing(tmp_path: Path
     service = Service(configuration, rig, tmp_path / "service.toml", lambda e: events.append({**e}))
     made, now_ns = flown()
     service.flight = made
-    service.mission = SimpleNamespace(path=tmp_path)  # type: ignore[assignment]
+    service.mission = SimpleNamespace(path=tmp_path)
     service.pipeline = PipelineQueue(1, lambda _name, _message: None, service._event)
     service.sealing = made.due_to_seal(now_ns)
     before_ns = time.monotonic_ns()

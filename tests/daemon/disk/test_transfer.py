@@ -60,7 +60,7 @@ def test_interrupted_at_any_file_it_goes_on_where_it_stopped(
         count += 1
         if count % 4 == 0:
             raise OSError(5, "Input/output error")
-        return real(*arguments)  # type: ignore[arg-type]
+        return real(*arguments)
 
     monkeypatch.setattr(transfer, "_copy", copy_three_and_pull_the_cable)
     attempts = 0

@@ -46,7 +46,7 @@ def flown(**changed: object) -> NavigationRecord:
         *("gnss", 0, "interpolated", 0, "fixed", 20, LATITUDE, LONGITUDE, HEIGHT_M),
         *(0.02, 0.03, (60.0, 0.0, 0.0), 0.01, 0.0, 0.0, 0.0),
     )
-    return replace(there, **changed)  # type: ignore[arg-type]
+    return replace(there, **changed)
 
 
 def ground(rig: Rig, model: Path) -> Ground:

@@ -40,7 +40,7 @@ def test_exposures_side_by_side_are_bit_for_bit_those_of_one_at_a_time(pipeline:
     assert len(set(alone)) == 4
     lanes = Lanes(pipeline, 2)
     futures = [
-        lanes.submit(lambda lane, k=k: pixels(lane.process(frames, conditions(k))))  # type: ignore[misc]
+        lanes.submit(lambda lane, k=k: pixels(lane.process(frames, conditions(k))))
         for k in range(4)
     ]
     wait(futures, timeout=300)

@@ -71,7 +71,7 @@ class Port:
         self.heard = None
         self.asked: list[int] = []
 
-    def listen_for_timesync(self, heard):  # type: ignore[no-untyped-def]
+    def listen_for_timesync(self, heard):
         self.heard = heard
 
     def send_timesync(self, *, tc1_ns: int, ts1_ns: int) -> bool:

@@ -78,7 +78,7 @@ class Bench:
 
     def __init__(self, receiver: str, start_ns: int, *, has_pps: bool = True) -> None:
         decoder, self._say = RECEIVERS[receiver]
-        self._decoder = decoder("gnss")  # type: ignore[call-arg]
+        self._decoder = decoder("gnss")
         self.start_ns = start_ns
         self.clock = HostClock()
         second_ns = -(start_ns % NS)

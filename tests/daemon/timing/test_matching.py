@@ -40,7 +40,7 @@ def frame(number: int, head: str = "SU00", **changes: object) -> Frame:
         exposure_time_us=4000.0,
         temperature_c=None,
     )
-    return replace(made, **changes)  # type: ignore[arg-type]
+    return replace(made, **changes)
 
 
 def mark(number: int, count: int | None = None, **changes: object) -> EventMark:
@@ -55,7 +55,7 @@ def mark(number: int, count: int | None = None, **changes: object) -> EventMark:
         True,
         at_ns,
     )
-    return replace(made, **changes)  # type: ignore[arg-type]
+    return replace(made, **changes)
 
 
 def matcher(pulses: range) -> Matcher:
@@ -88,7 +88,7 @@ def test_a_second_frame_of_one_pulse_is_a_duplicate() -> None:
 
 def test_a_frame_of_no_pulse_is_spurious_and_an_incomplete_one_corrupt() -> None:
     matching = matcher(range(1, 3))
-    stray = frame(1, device_ns=frame(1).device_ns + NS)  # type: ignore[operator]
+    stray = frame(1, device_ns=frame(1).device_ns + NS)
     assert matching.frame(stray).cause is Cause.SPURIOUS
     assert matching.frame(frame(2, status=FrameStatus.INCOMPLETE)).cause is Cause.CORRUPT
     assert matching.frame(frame(2)).cause is Cause.USED
@@ -180,7 +180,7 @@ def test_whatever_is_lost_or_reordered_nothing_is_paired_wrongly(
     matching = matcher(range(1, 31))
     matching.mark(mark(1))
     shuffled = list(kept)
-    rng.shuffle(shuffled)  # type: ignore[attr-defined]
+    rng.shuffle(shuffled)
     for number in shuffled:
         assert matching.frame(frame(number)).number == number
         assert matching.mark(mark(number)).number == number
@@ -190,7 +190,7 @@ def test_a_frame_nobody_asked_for_is_not_taken_for_that_of_a_pulse_nearby() -> N
     matching = matcher(range(1, 30))
     for number in range(1, 8):
         assert matching.frame(frame(number)).cause is Cause.USED
-    stray = frame(8, device_ns=frame(8).device_ns - 9_000_000)  # type: ignore[operator]
+    stray = frame(8, device_ns=frame(8).device_ns - 9_000_000)
     assert matching.frame(stray).cause is Cause.SPURIOUS
     assert matching.frame(frame(8)).cause is Cause.USED
 
@@ -200,8 +200,7 @@ def test_a_head_whose_delay_has_changed_is_believed_again_after_three_frames() -
     for number in range(1, 8):
         matching.frame(frame(number))
     later = [
-        matching.frame(frame(n, device_ns=frame(n).device_ns + 9_000_000))  # type: ignore[operator]
-        for n in range(8, 14)
+        matching.frame(frame(n, device_ns=frame(n).device_ns + 9_000_000)) for n in range(8, 14)
     ]
     assert [match.cause is Cause.USED for match in later] == [False, False, True, True, True, True]
 
@@ -211,7 +210,7 @@ def test_none_of_the_frames_of_a_head_that_floods_is_believed_until_it_stops() -
     for number in range(1, 8):
         matching.frame(frame(number))
     for tenth in (1, 2, 3):
-        device_ns = frame(8).device_ns - tenth * 100_000_000  # type: ignore[operator]
+        device_ns = frame(8).device_ns - tenth * 100_000_000
         assert matching.frame(frame(8, device_ns=device_ns)).cause is Cause.SPURIOUS
     assert matching.frame(frame(8)).is_ambiguous
     assert matching.frame(frame(9)).cause is Cause.USED

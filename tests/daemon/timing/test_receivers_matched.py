@@ -57,7 +57,7 @@ class Chain:
         self.matcher = MarkMatcher(self.clock)
         driver = registry.driver_for("navigator", self.kind)
         self.navigator = driver("gnss", {"port": self.receiver.port})
-        run = self.navigator.run  # type: ignore[attr-defined]
+        run = self.navigator.run
         self.thread = threading.Thread(target=run, args=(self.heard.put,), daemon=True)
 
     def listen_until(self, mono_ns: int) -> None:
@@ -86,7 +86,7 @@ class Chain:
             self.listen_until(time.monotonic_ns() + 50_000_000)
 
     def close(self) -> None:
-        self.navigator.close()  # type: ignore[attr-defined]
+        self.navigator.close()
         self.thread.join(5)
         self.receiver.close()
 
@@ -115,7 +115,7 @@ def test_every_kind_of_receiver_has_its_marks_matched_to_their_own_pulses() -> N
     for chain in chains:
         chain.close()
     for chain in chains:
-        kind, statistics = chain.kind, chain.navigator.statistics()  # type: ignore[attr-defined]
+        kind, statistics = chain.kind, chain.navigator.statistics()
         assert len(chain.matches) == PULSES - 1, (kind, statistics)
         assert statistics["bad_messages"] == 0, kind
         for number in range(1, PULSES + 1):

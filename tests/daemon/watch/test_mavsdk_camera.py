@@ -57,7 +57,7 @@ class Flying:
                     return
             really_send(message, address)
 
-        self.camera._send = send  # type: ignore[method-assign]
+        self.camera._send = send
         self._begun.set()
         self._loop.run_forever()
 

@@ -17,8 +17,8 @@ def test_a_token_is_known_by_its_hash_only(tmp_path: Path) -> None:
     assert path.stat().st_mode & 0o777 == 0o640
     tokens = read_tokens(path)
     assert tokens.holder_of(operator) is not None
-    assert tokens.holder_of(operator).role == "command"  # type: ignore[union-attr]
-    assert tokens.holder_of(pilot).name == "pilot"  # type: ignore[union-attr]
+    assert tokens.holder_of(operator).role == "command"
+    assert tokens.holder_of(pilot).name == "pilot"
     assert tokens.holder_of(operator + "x") is None
     assert tokens.holder_of("") is None
     assert tokens.holder_of("\udcff") is None

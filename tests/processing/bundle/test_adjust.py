@@ -148,7 +148,7 @@ def test_a_point_seen_once_is_left_out_and_changes_nothing() -> None:
     assert result.redundancy == reference.redundancy
 
 
-def _only(table, keep):  # type: ignore[no-untyped-def]
+def _only(table, keep):
     return replace(
         table,
         image=table.image[keep],

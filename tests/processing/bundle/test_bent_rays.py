@@ -96,7 +96,7 @@ def test_a_block_in_map_coordinates_takes_curvature_to_come_out_right() -> None:
     curved = adjust(replace(network, rays=Rays(r)))
     flat = adjust(network)
 
-    def height_error(result) -> float:  # type: ignore[no-untyped-def]
+    def height_error(result) -> float:
         """Mean over the middle of the strips, m: where a bow shows."""
         good = np.isfinite(result.point_cofactor).all(axis=(1, 2))
         good &= np.abs(made.points[:, 0] - middle[0]) < 900.0

@@ -13,7 +13,7 @@ from processing.bundle.rank import DefectError
 from tests.processing.bundle.networks import aerial, turned
 
 
-def _without_control(**more):  # type: ignore[no-untyped-def]
+def _without_control(**more):
     made = aerial(control=0, **more)
     return made, made.network
 

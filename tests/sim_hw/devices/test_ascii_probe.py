@@ -97,8 +97,8 @@ def test_the_settings_that_are_told_fit_the_device(kind: str, tmp_path: Path) ->
     emulated.device.start()
     device = registry.driver_for("thermometer", driver)("probes", settings)
     try:
-        found = device.bind()  # type: ignore[attr-defined]
+        found = device.bind()
         assert "27" in str(found)
     finally:
-        device.close()  # type: ignore[attr-defined]
+        device.close()
         emulated.device.close()

@@ -21,7 +21,7 @@ RIG = shipped_rigs()["ultracam-x-mini"]
 
 def world(**changes: object) -> World:
     settings = WorldSettings(rig_file=str(RIG), seed=3, epoch_gps_ns=EPOCH, dc_k=12.0)
-    return World(replace(settings, **changes))  # type: ignore[arg-type]
+    return World(replace(settings, **changes))
 
 
 def test_the_ideal_camera_agrees_with_opencv_on_a_pinhole() -> None:

@@ -50,7 +50,7 @@ def test_the_coarse_mapping_is_exact_to_a_thousandth_of_a_pixel(world: World, sc
         cone, sensor = world.rig.cone_of(name), world.rig.sensor(name)
 
         def at(c: np.ndarray, r: np.ndarray) -> np.ndarray:
-            ground = rendering.ground_points(world, cone, sensor, c, r, LOOK, pose)  # noqa: B023
+            ground = rendering.ground_points(world, cone, sensor, c, r, LOOK, pose)  # noqa: B023 - called in the same turn
             return rendering.scene_positions(world, scene, flight, ground)
 
         columns, rows = np.meshgrid(np.arange(0.0, 1240, GRID_PX), np.arange(0.0, 824, GRID_PX))
