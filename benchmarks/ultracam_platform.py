@@ -2,8 +2,8 @@
 
 Cameras whose mounting, places and drift are off their calibration by what the rig file says, each
 flown there and back. Tie points are drawn where the emulator's true cones see the same ground at
-their own instants, with the noise of matching; the turns that `syntopic calibrate platform` finds
-are held against the true ones. `--mission` compares a calibration from rendered frames instead.
+their own instants, with noise and bias of matching; the turns that `syntopic calibrate platform`
+finds are held against the true ones. `--calibration` compares one from rendered frames instead.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +23,17 @@ from benchmarks import rendered
 from benchmarks.stitching_trials import mosaic_settings, world_and_rig
 from benchmarks.ultracam_l import tie_points
 from daemon.measuring import machine
-from processing.calibration.platform import PlatformCalibration, calibrate_platform
+from processing.calibration.platform import (
+    COLOUR_SHIFT_PX,
+    COLOUR_TURN_PX,
+    PlatformCalibration,
+    calibrate_platform,
+)
 from processing.geometry.placement import nominal_placements
+from processing.matching.tie_points import PAN_TO_COLOUR, TiePoints
 from processing.mosaic.free import free_mosaic
 from processing.mosaic.stitch_record import StitchRecord, stitch_record
+from processing.rig import Rig
 from sim_hw.world.camera import rotation_opk
 from sim_hw.world.post_processed import marks_of_lines
 from sim_hw.world.snapshots import look_of, probe_readings
@@ -44,6 +52,8 @@ def flown(name: str, seed: int, exposures: int) -> tuple[World, PlatformCalibrat
     flight, first_ns = rendered.flight_and_mark(world, 0)
     random = np.random.default_rng([seed, 13])
     settings = mosaic_settings(world)
+    left = np.random.default_rng([seed, 17])
+    bias = left.normal(0.0, (COLOUR_SHIFT_PX, COLOUR_SHIFT_PX, COLOUR_TURN_PX))
     records: list[StitchRecord] = []
     for mark_ns in marks_of_lines(world, flight, first_ns, exposures, LINES):
         looks = {cone.name: look_of(world, cone, mark_ns) for cone in rig.cones}
@@ -58,10 +68,21 @@ def flown(name: str, seed: int, exposures: int) -> tuple[World, PlatformCalibrat
             per_overlap=POINTS_PER_OVERLAP,
             per_sensor=POINTS_PER_SENSOR,
         )
+        points = biased(rig, points, bias)
         mosaic = free_mosaic(rig, start, points, settings=settings)
         height_m = world.plan.height_above_ground_m
         records.append(stitch_record(rig, mosaic, probes, probes, height_m=height_m))
     return world, calibrate_platform(rig, records)
+
+
+def biased(rig: Rig, points: TiePoints, bias: Array) -> TiePoints:
+    """P/C points with what matching leaves in every exposure alike: a shift (column, row) of the
+    colour master's pixels, and a turn by so much at its corners."""
+    green = rig.sensor(points.names[points.sensor_b[points.kind == PAN_TO_COLOUR][0]])
+    size = np.array([green.width_px, green.height_px])
+    arm = (points.raw_b - (size - 1) / 2.0) / (np.hypot(*size) / 2.0)
+    off = bias[:2] + bias[2] * np.stack([-arm[:, 1], arm[:, 0]], axis=1)
+    return replace(points, raw_b=points.raw_b + off * (points.kind == PAN_TO_COLOUR)[:, None])
 
 
 def true_turn(master_from_cone: Array, mounting_error_rad: tuple[float, float, float]) -> Array:
@@ -75,6 +96,7 @@ def judged(name: str, seeds: int, exposures: int) -> dict[str, Any]:
     squares: dict[str, float] = {}
     ratios: dict[str, list[Array]] = {}
     errors: dict[str, list[Array]] = {}
+    stated: dict[str, list[Array]] = {}
     for seed in range(1, seeds + 1):
         world, found = flown(name, seed, exposures)
         for cone in found.cones:
@@ -84,6 +106,7 @@ def judged(name: str, seeds: int, exposures: int) -> dict[str, Any]:
             squares[cone.cone] = squares.get(cone.cone, 0.0) + own
             ratios.setdefault(cone.cone, []).append(error / np.sqrt(np.diag(cone.covariance)))
             errors.setdefault(cone.cone, []).append(error)
+            stated.setdefault(cone.cone, []).append(np.diag(cone.covariance))
         told = ", ".join(f"{c} {3.0 * v / seed / 9.0:.2f}" for c, v in squares.items())
         print(f"flight {seed}: squares per rank so far: {told}", file=sys.stderr, flush=True)
     return {
@@ -97,6 +120,7 @@ def judged(name: str, seeds: int, exposures: int) -> dict[str, Any]:
             "within_3_sigma": float(np.mean(np.abs(ratios[cone]) < 3.0)),
             "largest": float(np.max(np.abs(ratios[cone]))),
             "rms_error_urad": (np.sqrt(np.mean(np.square(errors[cone]), axis=0)) * 1e6).tolist(),
+            "rms_sigma_urad": (np.sqrt(np.mean(stated[cone], axis=0)) * 1e6).tolist(),
         }
         for cone in squares
     }
