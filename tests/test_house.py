@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import subprocess
 import sys
@@ -49,3 +50,13 @@ def test_processes_are_spawned_never_forked() -> None:
             assert "os.fork(" not in text, path
             for context in re.findall(r"get_context\(([^)]*)\)", text):
                 assert context == '"spawn"', path
+
+
+def test_only_kernels_go_without_types() -> None:
+    for package in PACKAGES:
+        for path in (ROOT / package).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, ast.FunctionDef) and node.returns is None:
+                    assert any("njit" in ast.unparse(d) for d in node.decorator_list), (
+                        f"{path.relative_to(ROOT)}: {node.name} has no types and is no kernel"
+                    )

@@ -242,7 +242,7 @@ def _log_gains(names: Sequence[str], pairs: Sequence[PairBalance]) -> Array:
 
 
 @njit(cache=True, parallel=True, nogil=True)
-def _node_means(frames, valid, lattices, cell, out):  # type: ignore[no-untyped-def]
+def _node_means(frames, valid, lattices, cell, out):
     count, rows, columns = out.shape
     nodes = cell // WEIGHT_STEP_PX
     cells = lattices.shape[2] - 1
@@ -287,7 +287,7 @@ def _node_means(frames, valid, lattices, cell, out):  # type: ignore[no-untyped-
 
 
 @njit(cache=True, nogil=True)
-def _block_mean(frame, valid, corner):  # type: ignore[no-untyped-def]
+def _block_mean(frame, valid, corner):
     """Mean of a block within the usable area; `UNUSABLE` where a pixel is saturated or a hole."""
     total = np.int64(0)
     pixels = 0

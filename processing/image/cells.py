@@ -48,14 +48,14 @@ _LANES: Final = 8
 """Columns of the first pass come in whole vectors of this many words."""
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def scratch_words(cell: int) -> int:
     """Words of scratch that `fetch_cell` needs for cells of this side."""
     return cell + cell // 16 + 2 * _LANES
 
 
 @njit(cache=True, nogil=True)
-def _run_length(phase, step, slack, most):  # type: ignore[no-untyped-def]
+def _run_length(phase, step, slack, most):
     """How many pixels a run goes on, from a phase in 0..1 until it leaves by more than `slack`."""
     if step > 0.0:
         room = (1.0 + slack - phase) / step
@@ -67,9 +67,7 @@ def _run_length(phase, step, slack, most):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def _fetch_points(  # type: ignore[no-untyped-def]
-    frame, code, table, c0, dc, r0, dr, values, flags, y, first, last
-):
+def _fetch_points(frame, code, table, c0, dc, r0, dr, values, flags, y, first, last):
     """Pixel by pixel: Lanczos, and whatever is far from the identity."""
     for k in range(first, last):
         c = c0 + dc * k
@@ -105,9 +103,7 @@ def _fetch_points(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def _fetch_row(  # type: ignore[no-untyped-def]
-    flat, width, code, c0, dc, r0, dr, values, flags, y, first, last, line, clean
-):
+def _fetch_row(flat, width, code, c0, dc, r0, dr, values, flags, y, first, last, line, clean):
     """Pixels first .. last - 1 of one row of a cell in two passes; flags unless `clean`."""
     n = last - first
     slack = _SLACK if code == CUBIC else 0.0
@@ -179,7 +175,7 @@ def _fetch_row(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _corners(lattice, band, column, cell):  # type: ignore[no-untyped-def]
+def _corners(lattice, band, column, cell):
     """Raw (column, row) at the left end of a cell's first and last row, and their change per pixel.
 
     In this order: column, row, change of column, change of row; then the same of the last row.
@@ -201,7 +197,7 @@ def _corners(lattice, band, column, cell):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _row_of(corners, f):  # type: ignore[no-untyped-def]
+def _row_of(corners, f):
     """Column, row and their change per pixel of the cell's row at a share `f` of its height."""
     return (
         corners[0] + f * (corners[4] - corners[0]),
@@ -212,7 +208,7 @@ def _row_of(corners, f):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _bounds(corners, cell):  # type: ignore[no-untyped-def]
+def _bounds(corners, cell):
     """Least and most raw column, least and most raw row of a cell."""
     c1 = corners[0] + corners[2] * cell
     r1 = corners[1] + corners[3] * cell
@@ -227,13 +223,13 @@ def _bounds(corners, cell):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _is_near_identity(corners):  # type: ignore[no-untyped-def]
+def _is_near_identity(corners):
     across = max(abs(corners[2] - 1.0), abs(corners[6] - 1.0))
     return max(across, max(abs(corners[3]), abs(corners[7]))) < _NEARLY
 
 
 @njit(cache=True, nogil=True)
-def straight_taps(frame, valid, lattice, band, column, cell, code):  # type: ignore[no-untyped-def]
+def straight_taps(frame, valid, lattice, band, column, cell, code):
     """Whether a cell's taps are one rectangle of raw pixels, and none of them marred.
 
     Returns:
@@ -270,7 +266,7 @@ def straight_taps(frame, valid, lattice, band, column, cell, code):  # type: ign
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def fetch_straight(  # type: ignore[no-untyped-def]
+def fetch_straight(
     frame, lattice, band, column, cell, left, top, first, last, gain, offset, lines, out, x0, n
 ):
     """Rows first .. last - 1 of a cell of straight taps, gain and offset applied, into `out`.
@@ -312,14 +308,14 @@ def fetch_straight(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _inside(valid, c0, dc, r0, dr, k):  # type: ignore[no-untyped-def]
+def _inside(valid, c0, dc, r0, dr, k):
     c = c0 + dc * k
     r = r0 + dr * k
     return valid[0] <= c <= valid[1] and valid[2] <= r <= valid[3]
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def fetch_cell(  # type: ignore[no-untyped-def]
+def fetch_cell(
     frame, valid, lattice, band, column, cell, rows, n, code, table, line, values, flags
 ):
     """All pixels of one cell from one frame.

@@ -98,7 +98,7 @@ _TINT: Final = (np.linspace(0.0, 2.0, 1025) ** 0.8).astype(np.float32)
 
 
 @njit(cache=True, parallel=True, nogil=True)
-def _paint(  # type: ignore[no-untyped-def]
+def _paint(
     grey, low, span, red, green, blue, rows, columns, whites, coloured, light, tint, picture
 ):
     """Each band in its own stretch, brightened so that together they have PAN's brightness."""
@@ -125,13 +125,13 @@ def _paint(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _tinted(bright, share, tint):  # type: ignore[no-untyped-def]
+def _tinted(bright, share, tint):
     within = min(max(share, np.float32(0.25)), np.float32(2.0))
     return np.uint8(min(bright * tint[np.int64(within * np.float32(512.0))], np.float32(255.0)))
 
 
 @njit(cache=True, parallel=True, nogil=True)
-def _block_means(image, factor, step, out):  # type: ignore[no-untyped-def]
+def _block_means(image, factor, step, out):
     """Means of the pixels that hold data in every `step`-th row of factor x factor blocks; 0 where
     none does."""
     rows, columns = out.shape

@@ -96,7 +96,7 @@ def usable_area(placement: SensorPlacement, rows: tuple[int, int]) -> Sequence[f
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def _weights_along(weights, y, x0, n, line):  # type: ignore[no-untyped-def]
+def _weights_along(weights, y, x0, n, line):
     """Weights of n pixels of a target row, bilinear between their nodes."""
     i = y // WEIGHT_STEP_PX
     f = np.float32(y - i * WEIGHT_STEP_PX) / np.float32(WEIGHT_STEP_PX)
@@ -111,7 +111,7 @@ def _weights_along(weights, y, x0, n, line):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def _add_share(  # type: ignore[no-untyped-def]
+def _add_share(
     weights, y0, x0, rows, n, name, gain, offset, values, flags, line, total, weight, best, mark
 ):
     """Add one frame's weighted values of a cell."""
@@ -138,7 +138,7 @@ def _add_share(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def _finish_single(values, flags, gain, offset, name, out, source, y0, x0, rows, n):  # type: ignore[no-untyped-def]
+def _finish_single(values, flags, gain, offset, name, out, source, y0, x0, rows, n):
     """Write a cell that one frame fills alone."""
     rise = offset + np.float32(0.5)
     floor = np.float32(1.0)
@@ -156,7 +156,7 @@ def _finish_single(values, flags, gain, offset, name, out, source, y0, x0, rows,
 
 
 @njit(cache=True, nogil=True)
-def _serving(lattices, weights, band, column, nodes, chosen):  # type: ignore[no-untyped-def]
+def _serving(lattices, weights, band, column, nodes, chosen):
     """Indices of the frames with weight in a cell; returns how many."""
     found = 0
     for s in range(lattices.shape[0]):
@@ -178,7 +178,7 @@ def _serving(lattices, weights, band, column, nodes, chosen):  # type: ignore[no
 
 
 @njit(cache=True, fastmath={"contract", "nnan", "ninf", "nsz"}, nogil=True)
-def _finish_blend(total, weight, mark, out, source, y0, x0, rows, n):  # type: ignore[no-untyped-def]
+def _finish_blend(total, weight, mark, out, source, y0, x0, rows, n):
     """Write a cell that several frames share, or none fills.
 
     Divided exactly: an approximate reciprocal depends on how the loop was compiled.
@@ -201,7 +201,7 @@ def _finish_blend(total, weight, mark, out, source, y0, x0, rows, n):  # type: i
 
 
 @njit(cache=True, nogil=True)
-def _mixed_cell(  # type: ignore[no-untyped-def]
+def _mixed_cell(
     frames,
     valid,
     lattices,
@@ -278,9 +278,7 @@ def _mixed_cell(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True, fastmath=True, nogil=True)
-def _resample(  # type: ignore[no-untyped-def]
-    frames, valid, lattices, cell, weights, gains, offsets, code, table, out, source
-):
+def _resample(frames, valid, lattices, cell, weights, gains, offsets, code, table, out, source):
     height, width = out.shape
     nodes = cell // WEIGHT_STEP_PX
     columns = (width + cell - 1) // cell

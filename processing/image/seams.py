@@ -235,7 +235,7 @@ def _eroded(mask: Array, margin: int) -> Array:
 
 
 @njit(cache=True, nogil=True)
-def _cheapest_path(cost, step_cost):  # type: ignore[no-untyped-def]
+def _cheapest_path(cost, step_cost):
     """One position per row, neighbours differing by one at most, of least total cost."""
     rows, positions = cost.shape
     total = cost[0].astype(np.float64)
@@ -264,7 +264,7 @@ def _cheapest_path(cost, step_cost):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True, nogil=True)
-def _feather(labels, kernel, out):  # type: ignore[no-untyped-def]
+def _feather(labels, kernel, out):
     rows, columns = labels.shape
     reach = kernel.shape[0] // 2
     for i in prange(rows):

@@ -73,7 +73,7 @@ def _share(sensor: Sensor, sums: Array, counts: float) -> float | None:
 
 
 @njit(cache=True, parallel=True, nogil=True, fastmath={"reassoc", "contract"})
-def _difference_sums(frame, sums):  # type: ignore[no-untyped-def]
+def _difference_sums(frame, sums):
     """Sums of squared differences to the next pixel and to the one after it, of signal, of pixels.
 
     `sums` is (rows, 2, 4): by row, along track from bundles of neighbouring columns (single ones

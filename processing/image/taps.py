@@ -37,23 +37,28 @@ def _lanczos_table() -> Array:
 LANCZOS_TABLE: Final = _lanczos_table()
 
 
+@njit(cache=True, fastmath=True, nogil=True, inline="always")
+def _catmull_rom(z):
+    """Weights of the pixels -1 .. 2 at a phase."""
+    half = np.float32(0.5)
+    z2 = z * z
+    z3 = z2 * z
+    w0 = z2 - half * (z3 + z)
+    w3 = half * (z3 - z2)
+    w2 = half * (z + z2) + np.float32(1.5) * (z2 - z3)
+    return w0, np.float32(1.0) - w0 - w2 - w3, w2, w3
+
+
 @njit(cache=True, fastmath=True, nogil=True)
-def cubic_down(flat, start, width, first, step, line, n):  # type: ignore[no-untyped-def]
+def cubic_down(flat, start, width, first, step, line, n):
     """Catmull-Rom across four raw rows at n columns; phases first + step * j."""
     a0 = flat[start - width : start - width + n]
     a1 = flat[start : start + n]
     a2 = flat[start + width : start + width + n]
     a3 = flat[start + 2 * width : start + 2 * width + n]
-    half = np.float32(0.5)
-    one_half = np.float32(1.5)
     for j in range(n):
         z = first + step * np.float32(np.int32(j))
-        z2 = z * z
-        z3 = z2 * z
-        w0 = z2 - half * (z3 + z)
-        w3 = half * (z3 - z2)
-        w2 = half * (z + z2) + one_half * (z2 - z3)
-        w1 = np.float32(1.0) - w0 - w2 - w3
+        w0, w1, w2, w3 = _catmull_rom(z)
         line[j] = (
             w0 * np.float32(np.int32(a0[j]))
             + w1 * np.float32(np.int32(a1[j]))
@@ -63,44 +68,30 @@ def cubic_down(flat, start, width, first, step, line, n):  # type: ignore[no-unt
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def cubic_along(line, start, first, step, values, y, k0, n):  # type: ignore[no-untyped-def]
+def cubic_along(line, start, first, step, values, y, k0, n):
     """Catmull-Rom along the scratch row; phases first + step * k, taps from `start` + k on."""
     a = line[start : start + n + 3]
     out = values[y, k0 : k0 + n]
-    half = np.float32(0.5)
-    one_half = np.float32(1.5)
     for k in range(n):
         x = first + step * np.float32(np.int32(k))
-        x2 = x * x
-        x3 = x2 * x
-        u0 = x2 - half * (x3 + x)
-        u3 = half * (x3 - x2)
-        u2 = half * (x + x2) + one_half * (x2 - x3)
-        u1 = np.float32(1.0) - u0 - u2 - u3
+        u0, u1, u2, u3 = _catmull_rom(x)
         out[k] = u0 * a[k] + u1 * a[k + 1] + u2 * a[k + 2] + u3 * a[k + 3]
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def cubic_words(a, first, step, gain, offset, out, n):  # type: ignore[no-untyped-def]
+def cubic_words(a, first, step, gain, offset, out, n):
     """As `cubic_along`, times gain plus offset, rounded to a word that is signal."""
-    half = np.float32(0.5)
-    rise = offset + half
-    one_half = np.float32(1.5)
+    rise = offset + np.float32(0.5)
     for k in range(n):
         x = first + step * np.float32(np.int32(k))
-        x2 = x * x
-        x3 = x2 * x
-        u0 = x2 - half * (x3 + x)
-        u3 = half * (x3 - x2)
-        u2 = half * (x + x2) + one_half * (x2 - x3)
-        u1 = np.float32(1.0) - u0 - u2 - u3
+        u0, u1, u2, u3 = _catmull_rom(x)
         v = u0 * a[k] + u1 * a[k + 1] + u2 * a[k + 2] + u3 * a[k + 3]
         v = min(max(v * gain + rise, np.float32(1.0)), np.float32(65535.0))
         out[k] = np.uint16(np.int32(v))
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def linear_down(flat, start, width, first, step, line, n):  # type: ignore[no-untyped-def]
+def linear_down(flat, start, width, first, step, line, n):
     """Linear across two raw rows; arguments as in `cubic_down`."""
     a1 = flat[start : start + n]
     a2 = flat[start + width : start + width + n]
@@ -111,7 +102,7 @@ def linear_down(flat, start, width, first, step, line, n):  # type: ignore[no-un
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def linear_along(line, start, first, step, values, y, k0, n):  # type: ignore[no-untyped-def]
+def linear_along(line, start, first, step, values, y, k0, n):
     """Linear along the scratch row; arguments as in `cubic_along`."""
     a = line[start + 1 : start + n + 2]
     out = values[y, k0 : k0 + n]
@@ -121,7 +112,7 @@ def linear_along(line, start, first, step, values, y, k0, n):  # type: ignore[no
 
 
 @njit(cache=True, nogil=True)
-def is_clean(flat, start, width, rows, columns):  # type: ignore[no-untyped-def]
+def is_clean(flat, start, width, rows, columns):
     """Whether a box of raw words holds neither saturated pixels nor holes."""
     least = np.uint16(65535)
     odd = np.uint16(0)
@@ -134,7 +125,7 @@ def is_clean(flat, start, width, rows, columns):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def flags_along(flat, start, width, flags, y, k0, n):  # type: ignore[no-untyped-def]
+def flags_along(flat, start, width, flags, y, k0, n):
     """Flags of n pixels whose taps move along the raw row that `start` lies on."""
     a0 = flat[start - width - 1 : start - width + n + 2]
     a1 = flat[start - 1 : start + n + 2]
@@ -152,7 +143,7 @@ def flags_along(flat, start, width, flags, y, k0, n):  # type: ignore[no-untyped
 
 
 @njit(cache=True, nogil=True)
-def flags_along_linear(flat, start, width, flags, y, k0, n):  # type: ignore[no-untyped-def]
+def flags_along_linear(flat, start, width, flags, y, k0, n):
     """As `flags_along`, where only the four nearest pixels are read."""
     a1 = flat[start : start + n + 1]
     a2 = flat[start + width : start + width + n + 1]
@@ -164,7 +155,7 @@ def flags_along_linear(flat, start, width, flags, y, k0, n):  # type: ignore[no-
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def tap_weight(code, distance):  # type: ignore[no-untyped-def]
+def tap_weight(code, distance):
     """What a raw pixel at a distance weighs: linear, or Keys' cubic with a = -1/2."""
     d = abs(distance)
     one = np.float32(1.0)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 
 
-@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, fastmath=True)
 def correlate(
     a: Array,
     b: Array,
@@ -86,7 +86,7 @@ def correlate(
                 squares[j] += coming * coming - leaving * leaving
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def peak(surface: Array, reach: Array, found: Array) -> bool:
     """Best offset, its sub-pixel part by parabola, its height and that of the next maximum.
 
@@ -124,7 +124,7 @@ def peak(surface: Array, reach: Array, found: Array) -> bool:
     return True
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def _vertex(before: float, at: float, after: float) -> float:
     curvature = before - 2.0 * at + after
     if curvature >= 0.0:

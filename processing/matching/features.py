@@ -21,7 +21,7 @@ _MATHEMATICS: Final = {"contract", "reassoc"}
 """Not a number must stay one: it marks what cannot be used."""
 
 
-@njit(cache=True, parallel=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, parallel=True, nogil=True)
 def select_features(
     frame: Array, cells: Array, half_window: int, stride: int, words: bool
 ) -> Array:
@@ -84,7 +84,7 @@ def select_features(
 
 
 @njit(cache=True, nogil=True)
-def _load(frame, row, column, stride, rows, columns, sides, heres, uppers):  # type: ignore[no-untyped-def]
+def _load(frame, row, column, stride, rows, columns, sides, heres, uppers):
     """Samples of a cell, their left and their upper neighbours, and those of the next samples."""
     two = 2 // stride
     wide = columns + two
@@ -108,7 +108,7 @@ def _load(frame, row, column, stride, rows, columns, sides, heres, uppers):  # t
 
 
 @njit(cache=True, fastmath=_MATHEMATICS, nogil=True)
-def _products(sides, heres, uppers, two, wide, n, words, planes):  # type: ignore[no-untyped-def]
+def _products(sides, heres, uppers, two, wide, n, words, planes):
     """Products of the gradients xx, xy, yy, and where they cannot be used; whether that is any.
 
     What lies beyond the last sample of a row is filled somehow and never looked at.
@@ -151,7 +151,7 @@ def _products(sides, heres, uppers, two, wide, n, words, planes):  # type: ignor
 
 
 @njit(cache=True, fastmath=_MATHEMATICS, nogil=True)
-def _box_sums(plane, wide, n, reach, spare):  # type: ignore[no-untyped-def]
+def _box_sums(plane, wide, n, reach, spare):
     """Each sample becomes the sum of the reach x reach ones right of it and below, in place."""
     along = n - reach + 1
     out = spare[:along]
@@ -170,7 +170,7 @@ def _box_sums(plane, wide, n, reach, spare):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=_MATHEMATICS, nogil=True)
-def _best(planes, wide, rows, columns):  # type: ignore[no-untyped-def]
+def _best(planes, wide, rows, columns):
     """The largest smaller eigenvalue among whole windows, -1 where there is none, and its place."""
     n = (rows - 1) * wide + columns
     xx, xy, yy, bad = planes[0], planes[1], planes[2], planes[3]

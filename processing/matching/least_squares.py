@@ -38,7 +38,7 @@ _CONVERGED_PX: Final = 0.004
 _LARGEST_SHIFT_PX: Final = 1.2
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def refinement_scratch(side: int) -> tuple[Array, Array, Array, Array, Array]:
     """Memory for `refine`: rows (2, .), tap weights of a and of b, windows (8, .), wide (4, .)."""
     stride = window_stride(side)
@@ -51,7 +51,7 @@ def refinement_scratch(side: int) -> tuple[Array, Array, Array, Array, Array]:
     )
 
 
-@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, fastmath=True)
 def _centre(values: Array, side: int, stride: int) -> float:
     """Take the mean away; returns the sum of squares that is left."""
     mean = np.float32(0.0)
@@ -64,7 +64,7 @@ def _centre(values: Array, side: int, stride: int) -> float:
     return float(_dot(values, values))
 
 
-@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, fastmath=True)
 def _dot(a: Array, b: Array) -> float:
     total = np.float32(0.0)
     for p in range(a.shape[0]):
@@ -72,7 +72,7 @@ def _dot(a: Array, b: Array) -> float:
     return float(total)
 
 
-@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, fastmath=True)
 def _take_away(values: Array, direction: Array, square: float) -> None:
     """Leave what is orthogonal to a direction, whose sum of squares is given."""
     share = np.float32(_dot(values, direction) / max(square, 1e-12))
@@ -80,7 +80,7 @@ def _take_away(values: Array, direction: Array, square: float) -> None:
         values[p] -= share * direction[p]
 
 
-@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, fastmath=True)
 def _spread(
     jacobian: Array, w: Array, side: int, stride: int, spare: tuple[Array, Array], out: Array
 ) -> None:
@@ -111,7 +111,7 @@ def _spread(
             out[p] += weight * source[p]
 
 
-@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, fastmath=True)
 def refine(
     patches: tuple[Array, Array],
     widths: tuple[int, int],

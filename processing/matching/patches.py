@@ -32,7 +32,7 @@ MARGIN_PX: Final = 4
 _BLOCK: Final = 32
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def _load(frame: Array, col: int, row: int, ratio: int, words: bool, patch: Array) -> bool:
     """Fill a patch with box means of ratio x ratio pixels, the first box beginning at (col, row).
 
@@ -78,7 +78,7 @@ def _load(frame: Array, col: int, row: int, ratio: int, words: bool, patch: Arra
     return True
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def _words_of_one(source: Array, origin: Any, line: Array) -> Any:
     """A row of words less the origin; not zero where one is bad."""
     bad = np.int32(0)
@@ -89,7 +89,7 @@ def _words_of_one(source: Array, origin: Any, line: Array) -> Any:
     return bad
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def _words_of_three(upper: Array, middle: Array, lower: Array, origin: Any, line: Array) -> Any:
     """Sums of three rows of words less the origin; not zero where one is bad."""
     bad = np.int32(0)
@@ -100,7 +100,7 @@ def _words_of_three(upper: Array, middle: Array, lower: Array, origin: Any, line
     return bad
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def _all_finite(patch: Array) -> bool:
     total = np.float32(0.0)
     for r in range(patch.shape[0]):
@@ -109,7 +109,7 @@ def _all_finite(patch: Array) -> bool:
     return bool(total == 0.0)
 
 
-@njit(cache=True, parallel=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, parallel=True, nogil=True)
 def match_patches(
     frame_a: Array,
     frame_b: Array,

@@ -60,13 +60,13 @@ INTERPOLATION: Final = _kernel_table()
 """The one table `refine` takes."""
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def window_stride(side: int) -> int:
     """Words from row to row of a window: whole vectors of eight; what is beyond `side` is zero."""
     return (side + 7) // 8 * 8
 
 
-@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, fastmath=True)
 def _tap_weights(table: Array, order: int, phase: float, out: Array) -> None:
     """Weights of a derivative of that order, between the two nearest phases."""
     at = phase * (table.shape[1] - 1)
@@ -76,7 +76,7 @@ def _tap_weights(table: Array, order: int, phase: float, out: Array) -> None:
         out[k] = table[order, i, k] * (np.float32(1.0) - f) + table[order, i + 1, k] * f
 
 
-@njit(cache=True, fastmath=True, inline="always")  # type: ignore[untyped-decorator]
+@njit(cache=True, fastmath=True, inline="always")
 def _row_taps(s: Array, w: tuple[Any, ...], o: Array, count: int) -> None:
     w0, w1, w2, w3, w4, w5, w6, w7 = w
     for c in range(count):
@@ -92,7 +92,7 @@ def _row_taps(s: Array, w: tuple[Any, ...], o: Array, count: int) -> None:
         )
 
 
-@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, fastmath=True)
 def _along_rows(
     source: Array, width: int, first: int, w: Array, out: Array, stride: int, rows: int
 ) -> None:
@@ -111,7 +111,7 @@ def _along_rows(
             _row_taps(s, taps, o, stride)
 
 
-@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, fastmath=True)
 def _along_columns(source: Array, w: Array, out: Array, side: int, stride: int) -> None:
     """Eight taps along the columns; columns beyond `side` become zero."""
     w0, w1, w2, w3, w4, w5, w6, w7 = w[0], w[1], w[2], w[3], w[4], w[5], w[6], w[7]
@@ -138,14 +138,14 @@ def _along_columns(source: Array, w: Array, out: Array, side: int, stride: int) 
     clear_beyond(out, side, stride)
 
 
-@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, fastmath=True)
 def clear_beyond(window: Array, side: int, stride: int) -> None:
     for r in range(side):
         for c in range(r * stride + side, (r + 1) * stride):
             window[c] = np.float32(0.0)
 
 
-@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, fastmath=True)
 def sample_window(
     patch: Array,
     width: int,
@@ -185,7 +185,7 @@ def sample_window(
     return power_x * power_y, 0.5 * (slope_power_x * power_y + slope_power_y * power_x)
 
 
-@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, fastmath=True)
 def add_laplacian(
     patch: Array,
     width: int,

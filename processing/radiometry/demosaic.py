@@ -84,14 +84,14 @@ _GREEN_TAPS: Final = _green_taps()
 
 
 @njit(cache=True)
-def _word(value, saturated, floor, ceiling):  # type: ignore[no-untyped-def]
+def _word(value, saturated, floor, ceiling):
     half = int(0.5 * value + 0.5)
     half = min(max(half, floor // 2), ceiling // 2)
     return np.uint16(2 * half + saturated)
 
 
 @njit(cache=True, parallel=True, nogil=True)
-def _green(level1, letters, taps, out):  # type: ignore[no-untyped-def]
+def _green(level1, letters, taps, out):
     height, width = level1.shape
     for row in prange(height):
         for col in range(width):
@@ -125,7 +125,7 @@ def _green(level1, letters, taps, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True, nogil=True)
-def _red_and_blue(level1, letters, out):  # type: ignore[no-untyped-def]
+def _red_and_blue(level1, letters, out):
     height, width = level1.shape
     green = out[1]
     for row in prange(height):

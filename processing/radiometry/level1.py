@@ -245,7 +245,7 @@ def _spread(defect: Array, shifts: int, sign: int) -> tuple[Array, Array]:
 
 
 @njit(cache=True, parallel=True, fastmath=_MATHEMATICS, nogil=True)
-def _flat_pass(raw, offset, factor, shifts, sign, full_scale, out, sums):  # type: ignore[no-untyped-def]
+def _flat_pass(raw, offset, factor, shifts, sign, full_scale, out, sums):
     """The pass where one offset and one gain hold for all pixels."""
     height, width = raw.shape
     # Sums and limits stay 32 bits wide, so that vectors hold eight pixels and not four.
@@ -276,7 +276,7 @@ def _flat_pass(raw, offset, factor, shifts, sign, full_scale, out, sums):  # typ
 
 
 @njit(cache=True, parallel=True, fastmath=_MATHEMATICS, nogil=True)
-def _map_pass(  # type: ignore[no-untyped-def]
+def _map_pass(
     raw,
     bias,
     dark,
@@ -350,14 +350,14 @@ def _map_pass(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _slide(sums, leaving, coming):  # type: ignore[no-untyped-def]
+def _slide(sums, leaving, coming):
     """Move running sums on by one row."""
     for k in range(len(sums)):
         sums[k] += np.int32(coming[k]) - np.int32(leaving[k])
 
 
 @njit(cache=True, parallel=True, nogil=True)
-def _interpolate_defects(level1, mask, places, period):  # type: ignore[no-untyped-def]
+def _interpolate_defects(level1, mask, places, period):
     """Fill each defect from the nearest good pixels on both sides, along the least gradient.
 
     Directions of nearly the least gradient share, for their noise is not the same. Where two good

@@ -169,7 +169,7 @@ class Electronics:
         return np.asarray(radiance * np.float32(factor / self.sensor.electrons_per_dn))
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True, nogil=True, fastmath=True)
 def _convert(
     radiance: Map,
     response: Map,

@@ -269,14 +269,14 @@ def sample_scene(scene: Scene, band: str, grid: Array, size: tuple[int, int]) ->
 _TABLE = spline.weight_table()
 
 
-@numba.njit(inline="always")  # type: ignore[untyped-decorator]
+@numba.njit(inline="always")
 def _mirrored(index: int, period: int) -> int:
     """Mirrored at 0 and at half the period."""
     index = index % period
     return period - index if 2 * index > period else index
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True, nogil=True, fastmath=True)
 def _sample(
     band: NDArray[np.uint16],
     grid_x: Array,
