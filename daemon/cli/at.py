@@ -17,7 +17,7 @@ from daemon.configuration import ConfigurationError
 if TYPE_CHECKING:
     from processing.bundle.self_calibration import SetName
 
-HELP = """Aerial triangulation of the stitched PAN images of a mission.
+HELP = """Aerial triangulation of the stitched PAN images of a mission, or of its heads' images.
 
 Direct georeferencing is the start, tie points are matched between all exposures that overlap, lines
 flown the other way or crosswise included. Control and check points come from two tables: where they
@@ -25,7 +25,10 @@ are on the ground (--points) and where in the images (--measured). Writes an adj
 its report (image residuals in um, control and checks in m and px, systematic image residuals on a
 grid), `exterior.csv` with the adjusted orientations, and all the tables docs/formats.md names.
 
-Examples: `syntopic at MISSION --trajectory sbet.out`,
+Of a rig whose heads look apart, those alike in pixels and principal distance make a block (--head):
+views that look about the same way are matched, oblique ones by the plane of the ground.
+
+Examples: `syntopic at MISSION --trajectory sbet.out`, `syntopic at MISSION --head 5 --head 8`,
 `syntopic at MISSION --set sensors-full --points points.csv --measured measured.csv --gnss shift`
 """
 
@@ -42,6 +45,10 @@ def at(
     ] = False,
     points: Annotated[Path | None, typer.Option(help="Control and check points.")] = None,
     measured: Annotated[Path | None, typer.Option(help="Their places in the images.")] = None,
+    head: Annotated[
+        list[str] | None,
+        typer.Option(help="Cone whose own images make the block, not stitched ones; repeatable."),
+    ] = None,
     trajectory: Trajectory = None,
     mount: MountFile = None,
     crs: Crs = None,
@@ -105,7 +112,9 @@ def at(
         reject_beyond=reject,
         matching=BlockMatching(first_search_px=search),
     )
-    block = block_of(folder, crs=crs, trajectory_file=trajectory, mount_file=mount)
+    block = block_of(
+        folder, crs=crs, trajectory_file=trajectory, mount_file=mount, heads=head or ()
+    )
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("matching", total=len(block.names))
         tied = matched(block, asked.matching, lambda done: progress.update(task, completed=done))

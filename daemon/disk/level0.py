@@ -63,9 +63,15 @@ def tiff_parts(
 
 
 def read_tiff(
-    path: Path, *, width_px: int | None = None, height_px: int | None = None
+    path: Path,
+    *,
+    width_px: int | None = None,
+    height_px: int | None = None,
+    plane: int | None = None,
 ) -> NDArray[np.uint16]:
     """Pixels of a single-plane 16-bit TIFF, shape (height, width); any writer's will do.
+
+    `plane` takes that one of several planes, one after another in the file.
 
     Raises:
         RasterError: not a TIFF, damaged, not one plane of uint16, not of the size given, or one
@@ -76,12 +82,13 @@ def read_tiff(
     try:
         with TiffFile(path) as tiff:
             page = tiff.pages[0]
-            if page.shape is None or len(page.shape) != 2 or page.dtype != np.uint16:
+            shape = page.shape if plane is None else page.shape[1:]
+            if len(shape) != 2 or page.dtype != np.uint16 or (plane or 0) >= page.shape[0]:
                 raise RasterError(
                     f"{path.name}: holds {page.dtype} of shape {page.shape}; "
                     "a frame is one plane of 16-bit words"
                 )
-            found = (page.shape[1], page.shape[0])
+            found = (shape[1], shape[0])
             wanted = (width_px or found[0], height_px or found[1])
             if found != wanted:
                 raise RasterError(
@@ -90,6 +97,7 @@ def read_tiff(
                 )
             refuse_bomb(page, path)
             pixels: NDArray[np.uint16] = page.asarray()
+            pixels = pixels if plane is None else pixels[plane]
     except OSError as error:
         reason = error.strerror or type(error).__name__
         raise RasterError(f"{path}: cannot be read ({reason})") from error

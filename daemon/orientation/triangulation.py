@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from daemon.adjusting.project import Checks, Project
 from daemon.adjusting.project_file import ProjectFile
 from daemon.adjusting.tables import Table, read_table
-from daemon.disk.level0 import read_tiff
+from daemon.disk.level0 import read_description, read_tiff
 from daemon.disk.mission import Mission
 from daemon.errors import DaemonError
 from daemon.orientation.exterior import ExteriorOrientation, exposures_of
@@ -40,6 +40,7 @@ from processing.bundle.network import (
 from processing.bundle.self_calibration import SetName, parts_of, self_calibrating
 from processing.bundle.start import completed
 from processing.matching.blocks import BlockMatching, TiedBlock, image_mm, tied_block
+from processing.perspective import perspective_of
 from processing.rig import Rig, VirtualImage, load_rig
 
 Array = NDArray[np.float64]
@@ -76,7 +77,7 @@ class Asked:
 
 @dataclass(frozen=True)
 class Block:
-    """Exposures with a stitched image and a start orientation, in a local frame."""
+    """Images of one geometry, stitched or of heads, with a start orientation in a local frame."""
 
     mission: Mission
     rig: Rig
@@ -91,6 +92,12 @@ class Block:
     @property
     def names(self) -> tuple[str, ...]:
         return tuple(eo.name for eo in self.oriented)
+
+    @property
+    def camera(self) -> str:
+        """What the images' common camera is called."""
+        heads = dict.fromkeys(eo.cone for eo in self.oriented if not eo.is_virtual)
+        return "-".join(heads) or "stitched"
 
     @property
     def lines(self) -> tuple[str, ...]:
@@ -109,33 +116,38 @@ def block_of(
     crs: str | None = None,
     trajectory_file: Path | None = None,
     mount_file: Path | None = None,
+    heads: Sequence[str] = (),
 ) -> Block:
-    """Orient the exposures that have a stitched PAN image.
+    """Orient the exposures that have a stitched PAN image, or the images of heads.
+
+    Args:
+        heads: cones whose own images make the block, alike in pixels and principal distance; none:
+            the stitched images.
 
     Raises:
-        TriangulationError: a rig that is not stitched, or fewer than two such exposures.
+        TriangulationError: a rig without such images, or fewer than two of them.
         TrajectoryError, GeoreferenceError: as their modules say.
     """
     rig = load_rig(mission.rig_path)
-    if rig.virtual_image is None:
-        raise TriangulationError(
-            f"rig {rig.name} stitches no PAN image; measure its heads' images and give them to "
-            "`syntopic adjust`"
-        )
+    image = _common_image(rig, heads)
+    files = [f"{name}.tif" for name in heads or ("pan",)]
     exposures = [
         e
         for e in exposures_of(mission)
-        if e.mark_gps_ns is not None and (mission.level2(e.number) / "pan.tif").exists()
+        if e.mark_gps_ns is not None
+        and all((mission.level2(e.number) / file).exists() for file in files)
     ]
     if len(exposures) < 2:
         raise TriangulationError(
-            f"{mission.path}: {len(exposures)} sealed exposures with a stitched image and a time; "
-            "a block takes two or more. Run `syntopic process` first"
+            f"{mission.path}: {len(exposures)} sealed exposures with {', '.join(files)} and a "
+            "time; a block takes two or more. Run `syntopic process` first"
         )
     means = orienting(
         mission, exposures, crs=crs, trajectory_file=trajectory_file, mount_file=mount_file
     )
-    oriented = [eo for eo in means.oriented(exposures) if eo.is_virtual]
+    oriented = [
+        eo for eo in means.oriented(exposures) if (eo.cone in heads if heads else eo.is_virtual)
+    ]
     if len(oriented) < 2:
         raise TriangulationError(
             f"{mission.path}: {len(oriented)} exposures have an attitude; direct georeferencing is "
@@ -152,9 +164,29 @@ def block_of(
         ]
     )
     return Block(
-        mission, rig, rig.virtual_image, tuple(oriented), means.crs, frame, station, rotation,
+        mission, rig, image, tuple(oriented), means.crs, frame, station, rotation,
         means.ground_height_m,
     )  # fmt: skip
+
+
+def _common_image(rig: Rig, heads: Sequence[str]) -> VirtualImage:
+    """The geometry of all images of a block."""
+    if not heads:
+        if rig.virtual_image is None:
+            raise TriangulationError(
+                f"rig {rig.name} stitches no PAN image; name heads whose own images make a block: "
+                f"--head, of {', '.join(cone.name for cone in rig.cones)}"
+            )
+        return rig.virtual_image
+    known = {} if rig.virtual_image else {c.name: perspective_of(c) for c in rig.cones}
+    images = {known.get(name) for name in heads}
+    image = images.pop()
+    if image is None or images:
+        raise TriangulationError(
+            f"--head {', '.join(heads)}: a block is made of images of heads alike in pixels and "
+            f"principal distance; {rig.name} has {', '.join(known) or 'stitched images, no heads'}"
+        )
+    return image
 
 
 def matched(block: Block, settings: BlockMatching, progress: Callable[[int], None]) -> TiedBlock:
@@ -165,8 +197,7 @@ def matched(block: Block, settings: BlockMatching, progress: Callable[[int], Non
         if k in kept:
             kept.move_to_end(k)
             return kept[k]
-        path = block.mission.level2(block.oriented[k].exposure) / "pan.tif"
-        words = read_tiff(path, width_px=block.image.width_px, height_px=block.image.height_px)
+        words = _words(block, block.oriented[k])
         kept[k] = np.where(words == 0, np.nan, words).astype(np.float32)
         if len(kept) > KEPT_IMAGES:
             kept.popitem(last=False)
@@ -176,6 +207,16 @@ def matched(block: Block, settings: BlockMatching, progress: Callable[[int], Non
         load, block.image, block.station_m, block.rotation, block.ground_m, settings,
         progress=progress,
     )  # fmt: skip
+
+
+def _words(block: Block, eo: ExteriorOrientation) -> NDArray[np.uint16]:
+    """Pixels of an image: PAN, or of a head the green band, else the first."""
+    path = block.mission.level2(eo.exposure) / ("pan.tif" if eo.is_virtual else f"{eo.cone}.tif")
+    bands = [] if eo.is_virtual else read_description(path).get("bands", [])
+    plane = bands.index("green") if "green" in bands else 0 if len(bands) > 1 else None
+    return read_tiff(
+        path, width_px=block.image.width_px, height_px=block.image.height_px, plane=plane
+    )
 
 
 def project_of(
@@ -214,7 +255,7 @@ def project_of(
     file = _file(block, asked)
     try:
         camera = self_calibrating(
-            Camera("stitched", block.image.f_mm, pixel_mm=pitch),
+            Camera(block.camera, block.image.f_mm, pixel_mm=pitch),
             asked.parameters,
             parts_of(block.rig) if asked.parameters.startswith("sensors") else (),
             master_cone=block.rig.master_cone,
@@ -350,7 +391,7 @@ def _index(table: Table, column: str, names: Sequence[str]) -> NDArray[np.int64]
 
 def _file(block: Block, asked: Asked) -> ProjectFile:
     camera = {
-        "name": "stitched",
+        "name": block.camera,
         "f_mm": block.image.f_mm,
         "pixel_um": block.image.pitch_um,
         "width_px": block.image.width_px,

@@ -2,7 +2,8 @@
 
 Prediction by direct georeferencing and the height that earlier matches of the same point gave;
 correlation and least squares as in `processing.matching.patches`. Images flown the other way or
-crosswise are turned by quarters first.
+crosswise are turned by quarters first, oblique ones brought to where the other stood and looked, by
+the plane of the ground. Views from too far apart are not matched.
 """
 
 from __future__ import annotations
@@ -10,18 +11,27 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from processing.bundle.start import intersected
+from processing.geometry.projective import apply_projective
 from processing.matching.patches import INTERPOLATION, MARGIN_PX, match_patches, select_features
 from processing.rig import VirtualImage
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Picture = NDArray[np.float32]
+Carry = Callable[[Array], Array]
+
+_OBLIQUE: Final = math.cos(math.radians(20.0))
+"""Looking farther from the vertical, an image differs from its neighbour by more than a turn."""
+_ALIKE: Final = math.cos(math.radians(35.0))
+"""Views farther apart show other sides of what stands on the ground."""
 
 
 @dataclass(frozen=True)
@@ -102,9 +112,10 @@ def tied_block(
         seen = np.zeros(len(places), dtype=np.int64)
         parts: list[tuple[Indices, int, Array]] = []
         for j in others:
+            poses = ((station_m[k], rotation[k]), (station_m[j], rotation[j]))
             sought, at = _matched_in(
-                here, load(j), image, (rotation[k], rotation[j]), station_m[j], places, ground,
-                known, settings,
+                here, _brought(load(j), image, *poses, ground_m), image, rotation[j], station_m[j],
+                places, ground, known, settings,
             )  # fmt: skip
             tried[k, j] = sought
             rows = np.flatnonzero(np.isfinite(at[:, 0]))
@@ -188,11 +199,54 @@ def turned_px(px: Array, width: int, height: int, quarters: int) -> Array:
     return np.stack(turned, axis=1)
 
 
-def _matched_in(
-    here: Picture,
+def plane_homography(
+    image: VirtualImage, here: tuple[Array, Array], there: tuple[Array, Array], ground_m: float
+) -> Array:
+    """There from here, (3, 3) on pixels, of level ground at a height; poses are place, rotation."""
+    pitch, middle = image.pitch_mm, ((image.width_px - 1) / 2.0, (image.height_px - 1) / 2.0)
+    right, up = -middle[0] * pitch, middle[1] * pitch
+    ray_from_px = np.array([[pitch, 0.0, right], [0.0, -pitch, up], [0.0, 0.0, -image.f_mm]])
+    # A ray d from S meets the ground at S + d (g - S_z) / d_z; d_z times that, less T d_z:
+    seen = np.outer(here[0] - there[0], [0.0, 0.0, 1.0]) + (ground_m - here[0][2]) * np.eye(3)
+    px_from_ray = np.linalg.inv(ray_from_px)
+    return np.asarray(px_from_ray @ there[1].T @ seen @ here[1] @ ray_from_px)
+
+
+def _brought(
     there: Picture,
     image: VirtualImage,
-    rotations: tuple[Array, Array],
+    own: tuple[Array, Array],
+    other: tuple[Array, Array],
+    ground_m: float,
+) -> tuple[Picture, Carry, Carry]:
+    """Another image so that about a shift is left to find, and pixels' way into it and back."""
+    height, width = there.shape
+    if min(own[1][2, 2], other[1][2, 2]) < _OBLIQUE:
+        from_here = plane_homography(image, own, other, ground_m)
+        to_here = np.asarray(np.linalg.inv(from_here))
+        seen = cv2.warpPerspective(
+            there, from_here, (width, height), flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_CONSTANT, borderValue=math.nan,
+        )  # fmt: skip
+        return (
+            np.asarray(seen, np.float32),
+            partial(apply_projective, to_here),
+            partial(apply_projective, from_here),
+        )
+    quarters = quarter_turns(own[1], other[1])
+    turned = np.ascontiguousarray(np.rot90(there, quarters))
+    return (
+        turned,
+        lambda px: turned_px(px, width, height, quarters),
+        lambda px: turned_px(px, turned.shape[1], turned.shape[0], (4 - quarters) % 4),
+    )
+
+
+def _matched_in(
+    here: Picture,
+    brought: tuple[Picture, Carry, Carry],
+    image: VirtualImage,
+    rotation: Array,
     station_m: Array,
     places: Indices,
     ground: Array,
@@ -200,15 +254,14 @@ def _matched_in(
     settings: BlockMatching,
 ) -> tuple[int, Array]:
     """How many places were sought in another image, and where they are in it (n, 2), else NaN."""
-    quarters = quarter_turns(*rotations)
-    height, width = there.shape
-    turned = np.ascontiguousarray(np.rot90(there, quarters))
-    predicted = turned_px(
-        pixels_of(image, station_m, rotations[1], ground), width, height, quarters
-    )
+    turned, into, back = brought
+    seen = pixels_of(image, station_m, rotation, ground)
+    predicted = into(seen)
     room = settings.window_px // 2 + MARGIN_PX + 2
     last = np.array([turned.shape[1] - 1, turned.shape[0] - 1])
     inside = ((predicted > room) & (predicted < last - room)).all(axis=1)
+    own = np.array([image.width_px - 1, image.height_px - 1])
+    inside &= ((seen > room) & (seen < own - room)).all(axis=1)
     limits = np.array([0, last[0], 0, last[1]], dtype=np.int64)
     at = np.full((len(places), 2), np.nan)
     for rows, search in (
@@ -229,14 +282,14 @@ def _matched_in(
         )
         # Both places moved by a part of a pixel; what counts is where the chosen pixel is.
         moved = result[good, 2:4] - (result[good, :2] - places[rows[good]])
-        at[rows[good]] = turned_px(moved, turned.shape[1], turned.shape[0], (4 - quarters) % 4)
+        at[rows[good]] = back(moved)
     return int(inside.sum()), at
 
 
 def _overlapping(
     image: VirtualImage, station_m: Array, rotation: Array, ground_m: float, k: int
 ) -> list[int]:
-    """Later images that see part of what image k does, the nearest first."""
+    """Later images that see part of what image k does from about its side, the nearest first."""
     c, r = np.meshgrid(
         np.linspace(0, image.width_px - 1, 9), np.linspace(0, image.height_px - 1, 9)
     )
@@ -245,6 +298,8 @@ def _overlapping(
     last = np.array([image.width_px - 1, image.height_px - 1])
     found = []
     for j in range(k + 1, len(station_m)):
+        if rotation[j][:, 2] @ rotation[k][:, 2] < _ALIKE:
+            continue
         at = pixels_of(image, station_m[j], rotation[j], level)
         if ((at >= 0.0) & (at <= last)).all(axis=1).any():
             found.append((float(np.linalg.norm(station_m[j] - station_m[k])), j))

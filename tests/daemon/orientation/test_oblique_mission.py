@@ -24,6 +24,7 @@ from daemon.disk.mission import Mission
 from daemon.export.certificate import CertificateError, certificate_of
 from daemon.exposure import NavigationRecord, exposure_bytes
 from daemon.orientation.local_frame import LocalFrame
+from daemon.orientation.triangulation import TriangulationError, block_of, matched
 from daemon.replay.flight import Replayed
 from daemon.service import worker
 from daemon.service.memory import FrameRing
@@ -36,6 +37,7 @@ from daemon.service.messages import (
     WorkerReady,
     WorkerSettings,
 )
+from processing.matching.blocks import BlockMatching
 from processing.rig import load_rig, shipped_rigs
 from sim_hw.exposures import EPOCH_GPS_NS, FIRST_AFTER_S, write_exposures
 from sim_hw.world import camera
@@ -187,6 +189,42 @@ def test_a_flight_over_a_height_model_is_replayed_with_the_model_from_elsewhere(
     ]
     assert told[0]["agrees"], told[0]["sentences"]
     assert told[1]["sentences"] == ["L2/000002/quality.json: differs with 1 in work"]
+
+
+def test_like_looking_obliques_are_tied_where_both_see_the_same_ground(flown) -> None:
+    world, folder = flown
+    mission = Mission.open(folder / "mission")
+    trajectory = folder / "trajectory.csv"
+    block = block_of(mission, crs=CRS, trajectory_file=trajectory, heads=("5", "8"))
+    tied = matched(block, BlockMatching(cells=(14, 10)), lambda _done: None)
+    assert len(block.names) == EXPOSURES * LINES * 2 and tied.points > 100
+    first = EPOCH_GPS_NS + FIRST_AFTER_S * 1_000_000_000
+    flight = world.flight.beginning_first_line_at(world.flight.distance_flown_m(first))
+    places, turns = [], []
+    for eo in block.oriented:
+        pose, cone = flight.pose(eo.gps_ns), world.rig.cone(eo.cone)
+        places.append(camera.projection_centre_m(cone, pose))
+        own = world.camera.master_from_cone(cone)
+        turns.append(pose.enu_from_body @ camera.BODY_FROM_CAMERA @ own)
+    ground: dict[int, np.ndarray] = {}
+    errors = []
+    middle = np.array([block.image.width_px - 1, block.image.height_px - 1]) / 2
+    for k, point, px in zip(tied.image, tied.point, tied.px, strict=True):
+        if point not in ground:
+            x, y = (px - middle) * block.image.pitch_mm
+            ray = turns[k] @ np.array([x, -y, -block.image.f_mm])
+            ground[point] = world.terrain.intersect(places[k], ray[None])[0]
+            continue
+        seen = turns[k].T @ (ground[point] - places[k])
+        at = -block.image.f_mm / seen[2] / block.image.pitch_mm * seen[:2]
+        errors.append(px - middle - at * [1, -1])
+    size = np.array(errors)
+    assert float(np.sqrt(np.mean(size**2))) < 0.08
+    assert float(np.abs(size).max()) < 0.5
+    with pytest.raises(TriangulationError, match="alike"):
+        block_of(mission, crs=CRS, trajectory_file=trajectory, heads=("5", "nadir"))
+    with pytest.raises(TriangulationError, match="--head"):
+        block_of(mission, crs=CRS, trajectory_file=trajectory)
 
 
 def hill(path: Path, here: tuple[float, float, float], top_m: float) -> Path:
