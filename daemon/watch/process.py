@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -52,7 +52,7 @@ async def _serve(link: Link, settings: WatchSection) -> None:
     coverage = Coverage(state)
     watchers = WatchSettings(_tokens(settings.tokens), settings.open)
     app = create_app(state, gate, watchers, coverage)
-    server = uvicorn.Server(
+    server = _Server(
         uvicorn.Config(
             app,
             log_level="warning",
@@ -65,7 +65,6 @@ async def _serve(link: Link, settings: WatchSection) -> None:
             ssl_keyfile=settings.key,
         )
     )
-    server.install_signal_handlers = lambda: None  # type: ignore[attr-defined]
     listening = _listen(settings.host, settings.port)
     port = settings.port if listening is None else int(listening.getsockname()[1])
     if listening is None:
@@ -106,6 +105,14 @@ async def _serve(link: Link, settings: WatchSection) -> None:
         if serving is not None:
             with suppress(TimeoutError):
                 await asyncio.wait_for(serving, 3.0)
+
+
+class _Server(uvicorn.Server):
+    """Ends when the service says so: signals of the whole process group are the service's."""
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        yield
 
 
 async def _gather(coverage: Coverage) -> None:

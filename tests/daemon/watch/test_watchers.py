@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
+import signal
 import threading
 import time
 from collections.abc import Iterator
@@ -92,3 +94,23 @@ def test_stalled_watchers_cost_the_others_nothing(watch: tuple[Child, int]) -> N
     for seen in asyncio.run(look()):
         assert seen == set(range(1, EXPOSURES + 1))
     assert resident_kb(child.process.pid or 0) - before_kb < GROWTH_MAX_KB
+
+
+def test_who_watches_is_served_until_the_service_says_so_whoever_is_signalled(
+    watch: tuple[Child, int],
+) -> None:
+    """Ctrl-C and systemd signal the whole group; the service has exposures to seal."""
+    child, port = watch
+
+    async def look() -> set[int]:
+        following = asyncio.create_task(follow(port, 20))
+        for number in range(1, 21):
+            for event in flown.exposure(number):
+                assert child.tell(Told(event))
+            await asyncio.sleep(0.05)
+            if number == 5:
+                os.kill(child.process.pid or 0, signal.SIGTERM)
+                os.kill(child.process.pid or 0, signal.SIGINT)
+        return await following
+
+    assert asyncio.run(look()) == set(range(1, 21))
