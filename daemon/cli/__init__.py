@@ -46,7 +46,8 @@ from processing.rig import RigError
 
 app = typer.Typer(
     name="syntopic",
-    help="Onboard software of an aerial camera made of several heads.",
+    help="Onboard software of an aerial camera made of several heads.\n\n"
+    "Examples: `syntopic demo`, `syntopic run service.toml`, `syntopic calibrate lab --help`",
     epilog="Begin with: syntopic demo",
     no_args_is_help=True,
     add_completion=False,

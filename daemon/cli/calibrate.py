@@ -25,9 +25,12 @@ if TYPE_CHECKING:
     from processing.calibration.thermal_learning import Learned, Observability
     from processing.calibration.thermal_proposal import Change
 
-app = typer.Typer(
-    help="Calibrations from flown missions.", no_args_is_help=True, rich_markup_mode="markdown"
-)
+HELP = """Calibrations from the laboratory, and from flown missions; each is a new, dated file.
+
+Examples: `syntopic calibrate lab SERIES`, `syntopic calibrate thermal MISSION...`
+"""
+
+app = typer.Typer(help=HELP, no_args_is_help=True, rich_markup_mode="markdown")
 
 THERMAL_HELP = """Learn the temperature-dependent model from flown missions.
 
@@ -50,7 +53,7 @@ Example: `syntopic calibrate validity MISSION`
 
 @app.callback()
 def calibrate() -> None:
-    """Calibrations from flown missions."""
+    """Calibrations from the laboratory, and from flown missions."""
 
 
 app.command(name="radiometric", help=calibrate_radiometric.HELP)(calibrate_radiometric.radiometric)

@@ -69,6 +69,7 @@ def rededge(
 def dbat(
     script: Annotated[Path, typer.Argument(help="Script (XML) of a camera calibration.")],
     out: Annotated[Path, typer.Option(help="Folder for the adjustment project; must be new.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Import a camera calibration of the Damped Bundle Adjustment Toolbox for `syntopic adjust`.
 
@@ -80,9 +81,17 @@ def dbat(
     imported = import_dbat(script)
     write_project(out, imported.file, imported.network, imported.checks)
     network = imported.network
+    counts = {
+        "images": len(network.images.names),
+        "object_points": len(network.points.names),
+        "image_points": len(network.image_points.image),
+    }
+    if as_json:
+        typer.echo(json.dumps({"project": str(out), **counts}))
+        return
     console = Console()
     console.print(
-        f"{len(network.images.names)} images, {len(network.points.names)} object points, "
-        f"{len(network.image_points.image)} image points in [bold]{out}[/]"
+        f"{counts['images']} images, {counts['object_points']} object points, "
+        f"{counts['image_points']} image points in [bold]{out}[/]"
     )
     console.print(f"Next: [bold]syntopic adjust {out}[/]")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Annotated
 
 import typer
@@ -18,11 +19,16 @@ def kernels(
     rig: Annotated[
         str, typer.Argument(help="Name of a shipped rig, or a rig file.")
     ] = "ultracam-x-mini",
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     from processing import compiled
 
     found = find_rig(rig)
     done = compiled.compile_for(found)
+    if as_json:
+        told = {"rig": found.name, "compiled": done.compiled, "seconds": round(done.seconds, 2)}
+        typer.echo(json.dumps(told | {"variants": dict(done.variants)}))
+        return
     typer.echo(
         f"{sum(done.variants.values())} kernels ready for {rig}, {done.compiled} of them compiled "
         f"just now, {done.seconds:.1f} s"
