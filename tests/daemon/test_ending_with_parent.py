@@ -128,7 +128,16 @@ def test_a_demonstration_that_is_killed_leaves_a_sealed_mission_and_no_process(
 ) -> None:
     mark = f"SYNTOPIC_DEMO={tmp_path}"
     demo = subprocess.Popen(
-        [sys.executable, "-m", "daemon", "demo", "--out", str(tmp_path)],
+        [
+            sys.executable,
+            "-m",
+            "daemon",
+            "demo",
+            "--rig",
+            "ultracam-l-mini",
+            "--out",
+            str(tmp_path),
+        ],
         cwd=ROOT,
         env=os.environ | {"SYNTOPIC_DEMO": str(tmp_path)},
         stdout=subprocess.DEVNULL,
