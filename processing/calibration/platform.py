@@ -35,8 +35,10 @@ LEAST_SIGMA_URAD: Final = 2.0
 """A mount is not claimed to keep its angles better than this from flight to flight."""
 COLOUR_SHIFT_PX: Final = 0.002
 COLOUR_TURN_PX: Final = 0.001
-"""What matching of another band leaves in every exposure alike, colour pixels: of shift, and at the
-corners turned about the middle. Measured on rendered flights (docs/calibration.md)."""
+"""What matching of PAN to the colour master leaves in every exposure alike, colour pixels: of
+shift, and at the corners turned about the middle. Measured on rendered flights (docs/calibration.md)."""
+REGISTERED_PX: Final = 0.02
+"""The same of a band registered to the colour master, shift and turn (docs/dmc.md)."""
 HEIGHT_SIGMA: Final = 0.02
 """How well the mean height above ground is known, of itself: relief, and the plan's own error."""
 _OUTLYING: Final = 5.0
@@ -247,9 +249,12 @@ def _share_of_all(rig: Rig, cone: Cone, records: Sequence[StitchRecord]) -> Arra
     share = _places_of(rig, cone, records)
     if cone.role == "colour":
         sensor = cone.sensors[0]
+        is_master = cone.name == rig.colour_master_cone
+        shift_px = COLOUR_SHIFT_PX if is_master else REGISTERED_PX
+        turn_px = COLOUR_TURN_PX if is_master else REGISTERED_PX
         half_px = math.hypot(sensor.width_px, sensor.height_px) / 2.0
-        across = COLOUR_SHIFT_PX * sensor.pitch_mm / cone.lens.f_mm
-        share = share + np.diag(np.square([across, across, COLOUR_TURN_PX / half_px]))
+        across = shift_px * sensor.pitch_mm / cone.lens.f_mm
+        share = share + np.diag(np.square([across, across, turn_px / half_px]))
     base = np.mean([_turn_by_base(rig, cone, r) for r in records], axis=0)
     return np.asarray(share + np.diag(np.square(HEIGHT_SIGMA * base)))
 
