@@ -36,7 +36,8 @@ LEAST_SIGMA_URAD: Final = 2.0
 COLOUR_SHIFT_PX: Final = 0.002
 COLOUR_TURN_PX: Final = 0.001
 """What matching of PAN to the colour master leaves in every exposure alike, colour pixels: of
-shift, and at the corners turned about the middle. Measured on rendered flights (docs/calibration.md)."""
+shift, and at the corners turned about the middle. Measured on rendered flights
+(docs/calibration.md)."""
 REGISTERED_PX: Final = 0.02
 """The same of a band registered to the colour master, shift and turn (docs/dmc.md)."""
 HEIGHT_SIGMA: Final = 0.02
