@@ -72,7 +72,10 @@ class KernelPps:
         fcntl.ioctl(self._fd, SETPARAMS, bytearray(PARAMS.pack(API_VERSION, mode, *params[2:])))
 
     def fetch(self, timeout_s: float) -> Edges | None:
-        """The edges after the next one came; None where none comes in time."""
+        """The edges after the next one came; None where none comes in time.
+
+        One that comes before the kernel is asked is not waited for: `latest` has it.
+        """
         seconds, nanoseconds = divmod(round(timeout_s * 1e9), 1_000_000_000)
         zeros = (0,) * 9
         data = bytearray(FDATA.pack(*zeros, seconds, nanoseconds, 0))
@@ -81,6 +84,10 @@ class KernelPps:
         except (TimeoutError, InterruptedError):
             return None
         return edges_of(bytes(data))
+
+    def latest(self) -> Edges | None:
+        """The last edges, without waiting: asked for no time at all, the kernel tells at once."""
+        return self.fetch(0.0)
 
     def is_there(self) -> bool:
         """Whether the path still leads to this device; waiting for an edge does not tell."""

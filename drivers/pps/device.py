@@ -39,6 +39,8 @@ class Source(Protocol):
 
     def fetch(self, timeout_s: float) -> Edges | None: ...
 
+    def latest(self) -> Edges | None: ...
+
     def is_there(self) -> bool: ...
 
     def close(self) -> None: ...
@@ -182,8 +184,10 @@ class PpsDevice(DeviceDriver):
         silence_ns = round(self.silence_s * 1e9)
         heard_ns, is_silent = self.clock.mono_ns(), False
         self._last_wall = self._wall()
+        if self._last_sequence is None and (before := source.latest()) is not None:
+            self._last_sequence = self._of(before)[0]
         while not self._closing.is_set():
-            edges = source.fetch(WAIT_S)
+            edges = source.fetch(WAIT_S) or self._unwaited(source)
             edge = None if edges is None else self.edge_of(edges)
             if edge is not None:
                 sink(edge)
@@ -202,6 +206,11 @@ class PpsDevice(DeviceDriver):
                 )
             if is_silent and not source.is_there():
                 raise OSError(errno.ENODEV, os.strerror(errno.ENODEV))
+
+    def _unwaited(self, source: Source) -> Edges | None:
+        """An edge that came between two waits; None where none did."""
+        edges = source.latest()
+        return None if edges is None or self._of(edges)[0] == self._last_sequence else edges
 
     def _of(self, edges: Edges) -> tuple[int, int]:
         if self.edge == "assert":

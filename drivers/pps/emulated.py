@@ -56,6 +56,10 @@ class EmulatedPps:
             self._received = (self._received + piece)[-4096:]
         return None
 
+    def latest(self) -> Edges | None:
+        """None: edges wait in the line until they are fetched."""
+        return None
+
     def is_there(self) -> bool:
         """Yes: `fetch` raises where the source hung up."""
         return True

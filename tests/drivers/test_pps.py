@@ -7,11 +7,12 @@ import shutil
 import socket
 import subprocess
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
-from drivers.contract import DeviceError, DeviceEvent, LifeCycle, PpsEdge
+from drivers.contract import DeviceError, DeviceEvent, LifeCycle, PpsEdge, Record
 from drivers.pps import binding
 from drivers.pps.binding import CAN_WAIT, CAPTURE_ASSERT, CAPTURE_CLEAR, Edges, edges_of
 from drivers.pps.device import PpsDevice, wall_clock
@@ -70,10 +71,19 @@ def test_structures_and_requests_are_those_of_the_kernels_header(tmp_path: Path)
 
 
 class Scripted:
-    """A source that says what it was told to, then nothing; OSError entries are raised."""
+    """A source that says what it was told to, then nothing; OSError entries are raised.
 
-    def __init__(self, *script: Edges | OSError | None, can: int = 0x103, mode: int = 1) -> None:
-        self.script = list(script)
+    `unwaited` is what it answers who does not wait.
+    """
+
+    def __init__(
+        self,
+        *script: Edges | OSError | None,
+        unwaited: Sequence[Edges] = (),
+        can: int = 0x103,
+        mode: int = 1,
+    ) -> None:
+        self.script, self.unwaited = list(script), list(unwaited)
         self.can, self.is_mode = can, mode
         self.is_closed = False
 
@@ -91,6 +101,9 @@ class Scripted:
         if isinstance(said, OSError):
             raise said
         return said
+
+    def latest(self) -> Edges | None:
+        return self.unwaited.pop(0) if self.unwaited else None
 
     def is_there(self) -> bool:
         return True
@@ -162,6 +175,29 @@ def test_an_old_edge_of_a_source_that_has_stopped_is_not_taken_for_a_new_one() -
     wall = Wall()
     pps = device(wall)
     assert pps.edge_of(wall.edge(5, age_ns=40 * NS)) is None
+
+
+def test_an_edge_that_came_between_two_waits_is_delivered_and_an_old_one_is_not() -> None:
+    wall = Wall()
+    before = wall.edge(1)
+    between = wall.edge(2)
+    source = Scripted(None, None, wall.edge(3), unwaited=[before, between, between])
+    got: list[Record] = []
+    seen = threading.Event()
+
+    def sink(record: Record) -> None:
+        got.append(record)
+        if isinstance(record, PpsEdge) and record.sequence == 3:
+            seen.set()
+
+    pps = PpsDevice("pps", {"device": "/dev/pps9"}, opener=lambda _: source, wall=wall)
+    thread = threading.Thread(target=pps.run, args=(sink,), daemon=True)
+    thread.start()
+    assert seen.wait(10)
+    pps.close()
+    thread.join(10)
+    assert [record.sequence for record in got if isinstance(record, PpsEdge)] == [2, 3]
+    assert pps.statistics()["edges_repeated"] == pps.statistics()["edges_missed"] == 0
 
 
 def test_what_cannot_be_opened_names_the_cure() -> None:
