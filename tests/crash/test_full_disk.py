@@ -30,6 +30,7 @@ def why_not() -> str | None:
 
 
 WHY_NOT = why_not()
+# Filling the machine's own disk would be no test of ours alone.
 needs_namespace = pytest.mark.skipif(
     WHY_NOT is not None, reason=f"a small disk is mounted in a namespace of its own: {WHY_NOT}"
 )

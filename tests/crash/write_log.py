@@ -59,6 +59,7 @@ def why_not() -> str | None:
 
 
 WHY_NOT = why_not()
+# Containers often forbid tracing; there is no other way to see each write of the real program.
 needs_strace = pytest.mark.skipif(
     WHY_NOT is not None, reason=f"writes are recorded, and failures injected, by strace: {WHY_NOT}"
 )

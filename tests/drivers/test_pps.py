@@ -131,6 +131,25 @@ def device(wall: Wall, **settings: object) -> PpsDevice:
     return PpsDevice("pps", {"device": "/dev/pps9", **settings}, wall=wall)
 
 
+def told_until(sequence: int, pps: PpsDevice) -> list[Record]:
+    """What a driver tells in its thread up to that edge; it is closed then, and has ended."""
+    got: list[Record] = []
+    seen = threading.Event()
+
+    def sink(record: Record) -> None:
+        got.append(record)
+        if isinstance(record, PpsEdge) and record.sequence == sequence:
+            seen.set()
+
+    thread = threading.Thread(target=pps.run, args=(sink,), daemon=True)
+    thread.start()
+    assert seen.wait(20)
+    pps.close()
+    thread.join(20)
+    assert not thread.is_alive()
+    return got
+
+
 def test_an_edge_is_carried_to_the_monotonic_clock_and_its_latency_taken_off() -> None:
     wall = Wall()
     pps = device(wall, latency_ns=4_000, sigma_ns=1_500)
@@ -182,20 +201,8 @@ def test_an_edge_that_came_between_two_waits_is_delivered_and_an_old_one_is_not(
     before = wall.edge(1)
     between = wall.edge(2)
     source = Scripted(None, None, wall.edge(3), unwaited=[before, between, between])
-    got: list[Record] = []
-    seen = threading.Event()
-
-    def sink(record: Record) -> None:
-        got.append(record)
-        if isinstance(record, PpsEdge) and record.sequence == 3:
-            seen.set()
-
     pps = PpsDevice("pps", {"device": "/dev/pps9"}, opener=lambda _: source, wall=wall)
-    thread = threading.Thread(target=pps.run, args=(sink,), daemon=True)
-    thread.start()
-    assert seen.wait(10)
-    pps.close()
-    thread.join(10)
+    got = told_until(3, pps)
     assert [record.sequence for record in got if isinstance(record, PpsEdge)] == [2, 3]
     assert pps.statistics()["edges_repeated"] == pps.statistics()["edges_missed"] == 0
 
@@ -222,26 +229,14 @@ def test_it_goes_on_after_a_loss_and_says_what_happened() -> None:
     lost = Scripted(wall.edge(1), OSError(errno.ENODEV, "No such device"))
     again = Scripted(wall.edge(2))
     sources = [lost, again]
-    got: list[object] = []
-    seen = threading.Event()
-
-    def sink(record: object) -> None:
-        got.append(record)
-        if isinstance(record, PpsEdge) and record.sequence == 2:
-            seen.set()
-
     pps = PpsDevice(
         "pps",
         {"device": "/dev/pps9"},
         opener=lambda _: sources.pop(0) if sources else Scripted(),
         wall=lambda: (102 * NS, OFFSET_NS),
     )
-    thread = threading.Thread(target=pps.run, args=(sink,))
-    thread.start()
-    assert seen.wait(20)
-    pps.close()
-    thread.join(20)
-    assert not thread.is_alive() and lost.is_closed and pps.state is LifeCycle.INACTIVE
+    got = told_until(2, pps)
+    assert lost.is_closed and pps.state is LifeCycle.INACTIVE
     names = [record.name for record in got if isinstance(record, DeviceEvent)]
     assert names[:3] == ["opened", "lost", "opened"]
 
