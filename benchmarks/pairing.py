@@ -66,8 +66,6 @@ def single_cases(exposures: int, seed: int = 1, rig_name: str = RIG) -> Iterator
                 continue
             if topic and kind.level != "message":
                 continue
-            if topic and kind.name == "flooding":
-                continue
             for amount in varied.get((kind.name, device), (kind.amount,)):
                 chance = random.Random(f"{seed}-{kind.name}-{device}-{amount}")
                 times_s = sorted(FIRST_FAULT_S + chance.uniform(0.0, span_s) for _ in range(2))

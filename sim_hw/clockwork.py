@@ -17,10 +17,18 @@ from typing import Literal, Protocol
 
 from processing.rig import Rig
 from sim_hw.devices.modbus_probe import OPEN_SENSOR, READ_INPUT_REGISTERS, crc16
-from sim_hw.faults.catalogue import HEAD, RECEIVER, THERMOMETER, TRIGGER, DeviceKind
+from sim_hw.faults.catalogue import (
+    HEAD,
+    MARK,
+    NAVIGATION,
+    RECEIVER,
+    THERMOMETER,
+    TRIGGER,
+    DeviceKind,
+)
 from sim_hw.faults.channel import BytesDamage, Channel, for_device
 from sim_hw.faults.plan import Planned
-from sim_hw.receivers.receiver import MARK, NAVIGATION, ReceiverAccuracy, ReceiverState
+from sim_hw.receivers.receiver import ReceiverAccuracy, ReceiverState
 from sim_hw.receivers.ublox_messages import (
     nav_att,
     nav_pvt,

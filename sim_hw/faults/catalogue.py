@@ -17,6 +17,10 @@ RECEIVER: Final[DeviceKind] = "receiver"
 THERMOMETER: Final[DeviceKind] = "thermometer"
 TRIGGER: Final[DeviceKind] = "trigger"
 
+MARK, NAVIGATION = "mark", "navigation"
+TOPICS: Final[Mapping[DeviceKind, tuple[str, ...]]] = {RECEIVER: (MARK, NAVIGATION)}
+"""What the messages of a device are about, where a fault may be of some of them only."""
+
 _ALL: Final = frozenset((HEAD, RECEIVER, THERMOMETER, TRIGGER))
 
 
@@ -55,7 +59,7 @@ _KINDS: Final = (
     FaultKind("silent", "message", "powered and connected, but nothing is said", lasts_s=5.0),
     FaultKind(
         "flooding",
-        "message",
+        "link",
         "far more is said than was asked for: noise, and frames nobody triggered",
         lasts_s=5.0,
     ),

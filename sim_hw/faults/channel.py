@@ -231,6 +231,9 @@ class Channel(Generic[T]):
             return due
 
     def _sent(self, message: T, now_ns: int, topic: str, what: str) -> list[Delivery[T]]:
+        # Silent is here what says some things and not others; a silent device comes not so far.
+        if self._take("silent", now_ns, topic, what) is not None:
+            return []
         last = self._last.get(topic)
         if self._take("stuck", now_ns, topic, what) is not None and last is not None:
             message = last
@@ -275,10 +278,14 @@ class Channel(Generic[T]):
         return None
 
     def _is_on(self, name: str, now_ns: int, *, note: bool = False) -> bool:
+        """Whether a fault of the whole device is on; one of some of its messages is not."""
         if not self._armed:
             return False
         with self._lock:
-            on = any(a.planned.name == name and a.is_on(now_ns) for a in self._armed)
+            on = any(
+                a.planned.name == name and not a.planned.topic and a.is_on(now_ns)
+                for a in self._armed
+            )
             if on and note:
                 self._note(name, now_ns)
             return on

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sim_hw.faults.catalogue import CATALOGUE, DeviceKind, FaultKind
+from sim_hw.faults.catalogue import CATALOGUE, TOPICS, DeviceKind, FaultKind
 
 SCENARIO_MAX_BYTES = 1 << 20
 _TEXT = re.compile(
@@ -214,6 +214,9 @@ def _targets(
         )
     elif topic and kind.level != "message":
         problems.append(f"{where}: {kind.name} is of the whole device; leave out /{topic}")
+    elif topic and topic not in TOPICS.get(devices[name], ()):
+        known = " or ".join(f"{name}/{one}" for one in TOPICS.get(devices[name], ()))
+        problems.append(f"{where}: {device} is nothing that is said; write {known or name}")
     return [(name, topic)]
 
 

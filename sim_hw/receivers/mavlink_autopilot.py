@@ -16,9 +16,10 @@ from typing import Any
 
 from sim_hw.devices.pseudo_terminal import PseudoTerminal
 from sim_hw.devices.serving import Line, LineDevice
+from sim_hw.faults.catalogue import MARK, NAVIGATION
 from sim_hw.receivers.mavlink_messages import Listener, Received, by_number, message, messages_in
 from sim_hw.receivers.nmea_sentences import GEOID_UNDULATION_M, course_deg, longitude_deg, speed_mps
-from sim_hw.receivers.receiver import BOOT_NS, MARK, NAVIGATION, ReceiverAccuracy, ReceiverState
+from sim_hw.receivers.receiver import BOOT_NS, ReceiverAccuracy, ReceiverState
 from sim_hw.world_clock import LEAP_SECONDS, NS_PER_S, DeviceClock, WorldClock, unix_ns_from_gps_ns
 
 FIXED_WING, PX4, ACTIVE = 1, 12, 4

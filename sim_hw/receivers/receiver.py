@@ -15,6 +15,7 @@ from typing import ClassVar
 
 from sim_hw.devices.pseudo_terminal import PseudoTerminal
 from sim_hw.devices.serving import Line, LineDevice
+from sim_hw.faults.catalogue import MARK, NAVIGATION
 from sim_hw.world_clock import LEAP_SECONDS, NS_PER_S, WorldClock
 
 STROBE_WIDTH_NS = 50_000
@@ -24,8 +25,6 @@ LATENCY_NS = (30_000_000, 80_000_000)
 EVENT_LATENCY_NS = (8_000_000, 30_000_000)
 """Likewise from an edge, where the receiver tells it at once."""
 CLOCK_DRIFT_PPM = 0.2
-MARK, NAVIGATION = "mark", "navigation"
-"""What a receiver says, as topics of faults."""
 BOOT_NS = 3 * NS_PER_S
 """From power on to the first position."""
 STEP_NS = 2 * NS_PER_S

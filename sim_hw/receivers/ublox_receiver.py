@@ -8,11 +8,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, ClassVar
 
+from sim_hw.faults.catalogue import MARK, NAVIGATION
 from sim_hw.receivers.nmea_sentences import gga, rmc
 from sim_hw.receivers.receiver import (
     LATENCY_NS,
-    MARK,
-    NAVIGATION,
     STROBE_WIDTH_NS,
     EmulatedReceiver,
     ReceiverAccuracy,

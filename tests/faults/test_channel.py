@@ -108,6 +108,16 @@ def test_a_fault_of_marks_leaves_positions_alone() -> None:
     assert made.send(b"mark", 4 * NS_PER_S, topic="mark")
 
 
+def test_silence_about_marks_leaves_positions_alone() -> None:
+    made = channel("silent", lasts_s=3.0, topic="mark")
+    assert not made.is_silent(3 * NS_PER_S)
+    assert not made.send(b"mark", 3 * NS_PER_S, topic="mark")
+    assert made.send(b"position", 3 * NS_PER_S, topic="navigation")
+    assert not made.send(b"mark", 4 * NS_PER_S, topic="mark")
+    assert made.send(b"mark", 5 * NS_PER_S, topic="mark")
+    assert {hit.fault for hit in made.hits} == {"silent"}
+
+
 def test_a_fault_that_waits_for_a_pulse_begins_with_it() -> None:
     made = Channel([Planned("lost", "d", None, 3, None, 0.0)], BytesDamage(), seed=1)
     made.begin(0)

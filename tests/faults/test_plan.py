@@ -64,6 +64,7 @@ def test_all_mistakes_are_told_at_once_each_with_its_cure(tmp_path: Path) -> Non
         '[[fault]]\nfault = "silent"\nat_s = true\ndevice = 5\n'
     )
     texts = ["lost", "lost@x", "open-sensor@3:SU00", "lost@3:SU09", "clock-step@3:receiver/mark"]
+    texts += ["flooding@3:receiver/mark", "lost@3:receiver/marks", "lost@3:SU00/mark"]
     with pytest.raises(FaultPlanError) as caught:
         read_plan(texts, scenario, DEVICES)
     problems = caught.value.problems
@@ -73,6 +74,9 @@ def test_all_mistakes_are_told_at_once_each_with_its_cure(tmp_path: Path) -> Non
         "SU00 is a head, which cannot have open-sensor; it can be had by probes",
         "there is no device 'SU09'; lost can be had by SU00, SU01",
         "clock-step is of the whole device; leave out /mark",
+        "flooding is of the whole device; leave out /mark",
+        "receiver/marks is nothing that is said; write receiver/mark or receiver/navigation",
+        "SU00/mark is nothing that is said; write SU00",
         "wrong.toml: colour is not known here",
         "wrong.toml: fault[0]: there is no fault 'lots'; did you mean lost?",
         "wrong.toml: fault[1].by_s is not known; lost has at_pulse, at_s, device",
