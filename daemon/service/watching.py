@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from daemon.exposure import Exposure, navigation_to_json
+from daemon.flight.latches import DELIVERS, IS_GONE
 from daemon.service.departure import ProcessPlan
 from daemon.service.messages import Answer, Told
 from daemon.service.supervisor import Supervisor
@@ -36,7 +37,7 @@ class Watching:
     def __init__(self, supervisor: Supervisor, plan: ProcessPlan | None) -> None:
         self._supervisor = supervisor
         self._plan = plan
-        self._first: Mapping[str, Any] | None = None
+        self._again: dict[str, Mapping[str, Any]] = {}
         self.faults: Callable[[], Sequence[Mapping[str, Any]]] = tuple
         """Events that tell a process started anew of the faults it has not heard of."""
         self._held: deque[Told] = deque()
@@ -46,15 +47,17 @@ class Watching:
     def start(self) -> None:
         if self._plan is not None:
             self._supervisor.spawn(*self._plan)
-            if self._first is not None:
-                self.tell(self._first)
+            for event in list(self._again.values()):
+                self.tell(event)
             for event in self.faults():
                 self.tell(event)
 
     def tell(self, event: Mapping[str, Any]) -> None:
-        """Tell of an event. What mission it is, is told again to a process started anew."""
-        if event.get("event") == "mission":
-            self._first = event
+        """Tell of an event. What holds until it is told otherwise is told again to a process
+        started anew: the mission, devices, how the heads expose."""
+        lasting = _lasting(event)
+        if lasting is not None:
+            self._again[lasting] = event
         if self._plan is None:
             return
         self._held.append(Told(event))
@@ -79,6 +82,16 @@ class Watching:
         self.restarts += 1
         self._held.clear()
         asyncio.get_running_loop().call_later(RESTART_S, self.start)
+
+
+def _lasting(event: Mapping[str, Any]) -> str | None:
+    """What an event says that stays true; its successor has the same name."""
+    kind = event.get("event")
+    if kind in ("mission", "exposure-settings"):
+        return str(kind)
+    if kind == "bound" or (kind == "device" and event.get("name") in DELIVERS | IS_GONE):
+        return f"{kind} {event.get('device')}"
+    return None
 
 
 def status_event(

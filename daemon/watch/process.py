@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
@@ -27,6 +27,7 @@ from daemon.watch.control_socket import ControlError, ControlSocket
 from daemon.watch.coverage import Coverage
 from daemon.watch.datagrams import send
 from daemon.watch.discovery import Announcement
+from daemon.watch.earlier import remember
 from daemon.watch.gate import Gate
 from daemon.watch.mavlink_camera import MavlinkCamera
 from daemon.watch.pictures import pictures_of
@@ -83,7 +84,12 @@ async def _serve(link: Link, settings: WatchSection) -> None:
     camera = await _camera(settings, state, gate, ground, link)
     control = await _control(settings, state, gate, link)
     loop = asyncio.get_running_loop()
-    loop.add_reader(link.fileno(), _hear, link, state, gate, ending)
+    remembering: set[asyncio.Task[None]] = set()
+
+    def recall(path: str) -> None:
+        remembering.add(loop.create_task(remember(state, Path(path), coverage.gather)))
+
+    loop.add_reader(link.fileno(), _hear, link, state, gate, ending, recall)
     serving = (
         asyncio.create_task(server.serve(sockets=[listening])) if listening is not None else None
     )
@@ -96,6 +102,8 @@ async def _serve(link: Link, settings: WatchSection) -> None:
         server.should_exit = True
         saying.cancel()
         gathering.cancel()
+        for task in remembering:
+            task.cancel()
         if camera is not None:
             camera.end()
         if control is not None:
@@ -202,12 +210,20 @@ def _rig_and_ground(path: Path) -> tuple[Rig, MountSection, float] | None:
         return None
 
 
-def _hear(link: Link, state: FlightState, gate: Gate, ending: asyncio.Event) -> None:
+def _hear(
+    link: Link,
+    state: FlightState,
+    gate: Gate,
+    ending: asyncio.Event,
+    recall: Callable[[str], None],
+) -> None:
     """Everything the service has said."""
     try:
         while (message := link.receive(0.0)) is not None:
             if isinstance(message, Told):
                 state.apply(message.event)
+                if message.event.get("event") == "mission":
+                    recall(str(message.event.get("path")))
             elif isinstance(message, Answer):
                 gate.answered(message)
             elif isinstance(message, Ping):

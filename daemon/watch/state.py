@@ -72,6 +72,8 @@ class FlightState:
         self._devices: dict[str, Json] = {}
         self._latches = Latches()
         self._exposures: dict[int, Json] = {}
+        self._forgotten = dict.fromkeys(VERDICT_RANK, 0)
+        """Verdicts of exposures that are no longer kept: who counts must not see fewer."""
         self._temperatures: dict[int, Any] = {}
         self._events: deque[Json] = deque(maxlen=EVENTS_KEPT)
         self._history: deque[Json] = deque(maxlen=HISTORY_KEPT)
@@ -90,7 +92,6 @@ class FlightState:
 
     def brief(self) -> Json:
         """What everybody must know at all times; a few hundred bytes."""
-        last = next(reversed(self._exposures.values()), None)
         return {
             "sequence": self.sequence,
             "software": self._software,
@@ -99,7 +100,7 @@ class FlightState:
             "simulated": bool(self._mission.get("simulated")),
             "status": self._status,
             "faults": self.faults(),
-            "last_number": None if last is None else last["number"],
+            "last_number": max(self._exposures, default=None),
             "verdicts": self._verdict_counts(),
         }
 
@@ -149,6 +150,18 @@ class FlightState:
         """A person has seen a fault. One that has passed leaves the list; one that stands stays."""
         self.sequence += 1
         return self._latches.acknowledge(fault)
+
+    def add_earlier(self, sealed: Mapping[str, Any], report: Mapping[str, Any] | None) -> None:
+        """An exposure made before this state began, as its files tell; what was heard holds."""
+        number = sealed["number"]
+        if number in self._exposures:
+            return
+        self.sequence += 1
+        self._on_sealed(sealed)
+        if sealed["state"] == "lost":
+            self._exposure(sealed)["step"] = "lost"
+        elif report is not None:
+            self._finish({"number": number, "report": report})
 
     # What each event means
 
@@ -224,6 +237,10 @@ class FlightState:
         told["figures"] = {key: figures[key] for key in FIGURES_TOLD if key in figures}
 
     def _on_processed(self, event: Mapping[str, Any]) -> None:
+        self._finish(event)
+        self._show(int(event["number"]))
+
+    def _finish(self, event: Mapping[str, Any]) -> None:
         self._on_judged(event)
         told = self._exposure(event)
         figures = event.get("report", {}).get("figures", {})
@@ -240,8 +257,6 @@ class FlightState:
                 "temperatures_c": self._temperatures.pop(told["number"], {}),
             }
         )
-
-        self._show(told["number"])
 
     def _show(self, number: int) -> None:
         """Pieces are told one by one, so each has a sequence of its own."""
@@ -284,11 +299,13 @@ class FlightState:
         told = self._exposures.setdefault(number, {"number": number, "step": "triggered"})
         told["sequence"] = self.sequence
         while len(self._exposures) > EXPOSURES_KEPT:
-            del self._exposures[next(iter(self._exposures))]
+            verdict = self._exposures.pop(min(self._exposures)).get("verdict")
+            if verdict in self._forgotten:
+                self._forgotten[verdict] += 1
         return told
 
     def _verdict_counts(self) -> dict[str, int]:
-        counts = dict.fromkeys(VERDICT_RANK, 0)
+        counts = dict(self._forgotten)
         for told in self._exposures.values():
             verdict = told.get("verdict")
             if verdict in counts:

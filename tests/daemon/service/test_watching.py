@@ -27,6 +27,9 @@ class Line:
             self.told.append(message.event["number"])
         return not self.is_full
 
+    def spawn(self, *_plan: object) -> None:
+        self.told.clear()
+
 
 def watching() -> tuple[Watching, Line]:
     line = Line()
@@ -54,3 +57,16 @@ def test_what_is_held_is_bounded_and_one_that_never_fits_holds_up_nothing() -> N
     seen.tell({"event": "status", "number": -1})
     assert line.told == [*range(6, HELD_MOST + 5), -1]
     assert seen.dropped == 7
+
+
+def test_a_process_started_anew_is_told_what_still_holds() -> None:
+    seen, line = watching()
+    seen.tell({"event": "mission", "number": 1})
+    seen.tell({"event": "bound", "device": "SU02", "number": 2})
+    seen.tell({"event": "device", "device": "SU02", "name": "opened", "number": 3})
+    seen.tell({"event": "device", "device": "SU02", "name": "corrupt", "number": 4})
+    seen.tell({"event": "exposure-settings", "number": 5})
+    seen.tell({"event": "device", "device": "SU02", "name": "lost", "number": 6})
+    seen.tell({"event": "exposure-settings", "number": 7})
+    seen.start()
+    assert line.told == [1, 2, 6, 7]

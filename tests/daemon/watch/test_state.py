@@ -75,6 +75,8 @@ def test_it_never_grows_beyond_its_bounds() -> None:
     assert len(state.changed("exposures", 0)) == EXPOSURES_KEPT
     assert len(state.changed("events", 0)) == EVENTS_KEPT
     assert state.exposure(1) is None
+    # What is no longer kept still counts: a counter that falls is a restart to who scrapes it.
+    assert state.brief()["verdicts"]["good"] == EXPOSURES_KEPT + 499
 
 
 def test_events_nobody_knows_are_listed_and_harm_nothing() -> None:
