@@ -42,6 +42,13 @@ _TIME = {
         "nsec": {"type": "integer", "minimum": 0, "maximum": 999_999_999},
     },
 }
+
+
+def _one_of(*names: str) -> dict[str, Any]:
+    """Names numbered from 0, in the one form of an enumeration that Foxglove reads."""
+    return {"oneOf": [{"title": name, "const": number} for number, name in enumerate(names)]}
+
+
 SCHEMAS: Mapping[str, Mapping[str, Any]] = {
     "foxglove.LocationFix": {
         "timestamp": _TIME,
@@ -55,7 +62,7 @@ SCHEMAS: Mapping[str, Mapping[str, Any]] = {
             "minItems": 9,
             "maxItems": 9,
         },
-        "position_covariance_type": {"enum": [0, 1, 2, 3]},
+        "position_covariance_type": _one_of("UNKNOWN", "APPROXIMATED", "DIAGONAL_KNOWN", "KNOWN"),
     },
     "foxglove.CompressedImage": {
         "timestamp": _TIME,
@@ -65,7 +72,7 @@ SCHEMAS: Mapping[str, Mapping[str, Any]] = {
     },
     "foxglove.Log": {
         "timestamp": _TIME,
-        "level": {"enum": [0, 1, 2, 3, 4, 5]},
+        "level": _one_of("UNKNOWN", "DEBUG", "INFO", "WARNING", "ERROR", "FATAL"),
         "message": {"type": "string"},
         "name": {"type": "string"},
         "file": {"type": "string"},

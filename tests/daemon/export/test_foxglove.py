@@ -75,6 +75,8 @@ def told(path: Path) -> list[tuple[str, str, int, dict[str, Any]]]:
             jsonschema_rs.validate(own, content)
             assert set(own["properties"]) == set(content) == PUBLISHED[schema.name]
             assert own["title"] == schema.name
+            # Foxglove's own reader refuses a field that says neither.
+            assert all("type" in field or "oneOf" in field for field in own["properties"].values())
             stamp = content["timestamp"]
             assert stamp["sec"] * 10**9 + stamp["nsec"] == message.log_time
             found.append((schema.name, channel.topic, message.log_time, content))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,6 +18,7 @@ from daemon.service.processes import Child
 from daemon.watch.tokens import add_token
 from tests.browser import Browser, chromium
 from tests.daemon.watch import flown
+from tests.npm import npm_package
 
 WITHIN_S = 30.0
 
@@ -295,7 +295,7 @@ def test_nothing_leaves_the_host_and_nothing_breaks(service: Service, browser: B
 
 
 def test_axe_finds_nothing_serious(browser: Browser, tmp_path: Path) -> None:
-    axe = _axe(tmp_path)
+    axe = npm_package("axe-core@4", tmp_path / "axe") / "axe.min.js"
     browser.call("Page.setBypassCSP", enabled=True)
     for theme in ("dark", ""):
         browser.evaluate(f"document.documentElement.dataset.theme = '{theme}'")
@@ -338,29 +338,3 @@ def keep_picture(browser: Browser, name: str) -> None:
         for theme in ("dark", ""):
             browser.evaluate(f"document.documentElement.dataset.theme = '{theme}'")
             browser.picture(Path(keep) / f"{name}-{theme or 'light'}.png")
-
-
-def _axe(folder: Path) -> Path:
-    """axe-core from npm, or a visible skip."""
-    packed = (
-        subprocess.run(
-            ["npm", "pack", "axe-core@4", "--silent"],
-            cwd=folder,
-            capture_output=True,
-            text=True,
-            timeout=100,
-            check=False,
-        )
-        if _has_npm()
-        else None
-    )
-    if packed is None or packed.returncode != 0:
-        pytest.skip("axe-core is not to be had; apt-get install npm, and a network is needed")
-    subprocess.run(["tar", "xzf", packed.stdout.strip()], cwd=folder, check=True, timeout=60)
-    return folder / "package" / "axe.min.js"
-
-
-def _has_npm() -> bool:
-    import shutil
-
-    return shutil.which("npm") is not None

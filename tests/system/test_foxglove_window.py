@@ -1,0 +1,97 @@
+"""A flown mission's log, opened in Foxglove Studio itself: its last open release, from npm."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import threading
+from collections.abc import Iterator
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+
+from tests.browser import Browser
+from tests.npm import npm_package
+from tests.system.flown import Flown, syntopic
+
+PAGE = Path(__file__).parent / "foxglove"
+PACKAGES = {
+    "react": "react@17.0.2",
+    "react-dom": "react-dom@17.0.2",
+    "studio": "@foxglove/studio-base@1.48.0",
+}
+WITHIN_S = 60.0
+PROBLEMS = "[...document.querySelectorAll('button')].find(b => b.innerText.startsWith('Problems'))"
+
+
+class Quiet(SimpleHTTPRequestHandler):
+    """Files of a folder, without a line for each."""
+
+    def log_message(self, format: str, *arguments: object) -> None:  # noqa: A002 (its name there)
+        pass
+
+
+@pytest.fixture
+def studio(tmp_path: Path) -> Iterator[str]:
+    """The address Foxglove Studio is served at."""
+    folder = tmp_path / "www"
+    shutil.copytree(PAGE, folder)
+    for name, wanted in PACKAGES.items():
+        npm_package(wanted, tmp_path / name).rename(folder / name)
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=folder)) as server:
+        serving = threading.Thread(target=server.serve_forever)
+        serving.start()
+        yield f"http://127.0.0.1:{server.server_port}/index.html"
+        server.shutdown()
+        serving.join(10)
+
+
+def test_foxglove_opens_the_log_of_a_mission(flown: Flown, studio: str, tmp_path: Path) -> None:
+    done = syntopic("export", "foxglove", str(flown.mission), "--json")
+    assert done.returncode == 0, done.stderr
+    exported = json.loads(done.stdout)
+    with Browser(tmp_path / "profile", height=1000) as browser:
+        browser.open(studio)
+        browser.wait_for(shows("Waiting for first GPS point"), WITHIN_S)
+        choose(browser, "[data-puppeteer-file-upload]", Path(exported["file"]))
+        browser.wait_for(shows("Problems"), WITHIN_S)
+        for topic, count in exported["messages"].items():
+            browser.wait_for(shows(f"{topic}\tfoxglove."), WITHIN_S)
+            assert f"\t{count}\t" in line_of(browser, f"{topic}\tfoxglove.")
+        press(browser, "Play")
+        browser.wait_for(shows("[exposures]:\xa0exposure"), WITHIN_S)
+        press(browser, "Pause")
+        assert "Waiting for" not in browser.text("#root"), "the map or the image is empty"
+        browser.evaluate(f"{PROBLEMS}.click()")
+        browser.wait_for(shows("No problems found"), WITHIN_S)
+        if keep := os.environ.get("SYNTOPIC_PICTURES"):
+            browser.picture(Path(keep) / "foxglove.png")
+        assert [url for url in browser.requested if "//127.0.0.1" not in url and "://" in url] == []
+
+
+def shows(text: str) -> str:
+    """An expression that is true where the page shows a text."""
+    return f"document.getElementById('root')?.innerText.includes({json.dumps(text)})"
+
+
+def press(browser: Browser, name: str) -> None:
+    """A button, once it can be pressed; it is named by its title, or by its label."""
+    button = f"[title={name}]:not(:disabled), [aria-label={name}]:not(:disabled)"
+    browser.wait_for(f"!!document.querySelector('{button}')", WITHIN_S)
+    browser.click(button)
+
+
+def line_of(browser: Browser, begun: str) -> str:
+    """The line that begins like this."""
+    lines = browser.text("#root").splitlines()
+    return next(line for line in lines if line.startswith(begun))
+
+
+def choose(browser: Browser, selector: str, file: Path) -> None:
+    """A file for an input, as a person would choose it."""
+    root = browser.call("DOM.getDocument")["root"]["nodeId"]
+    node = browser.call("DOM.querySelector", nodeId=root, selector=selector)["nodeId"]
+    browser.call("DOM.setFileInputFiles", files=[str(file.resolve())], nodeId=node)
