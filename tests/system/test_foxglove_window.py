@@ -17,6 +17,8 @@ from tests.browser import Browser
 from tests.npm import npm_package
 from tests.system.flown import Flown, syntopic
 
+pytestmark = [pytest.mark.system, pytest.mark.timeout(400)]
+
 PAGE = Path(__file__).parent / "foxglove"
 PACKAGES = {
     "react": "react@17.0.2",
