@@ -101,6 +101,7 @@ def fly(
 ) -> list[Row]:
     """Render and judge one exposure for every dC, displacement and scene."""
     file = shipped_rigs()[rig]
+    cache.mkdir(parents=True, exist_ok=True)
     heads: Heads | None = None
     rows: list[Row] = []
     for number in scenes:
