@@ -110,6 +110,15 @@ def codec_for(kind: str, driver: str, name: str, settings: Mapping[str, object])
     return Codec(made(name, settings, clock=clock, open_port=lambda *_: port), port, clock)
 
 
+def has_first_bytes(heard: Iterable[RawBytes | DeviceEvent]) -> bool:
+    """Whether the log holds what a device said before it was open, or there was nothing.
+
+    That was told to nobody, but the decoder learned from it, such as whether attitudes come.
+    """
+    first = next(iter(heard), None)
+    return not isinstance(first, DeviceEvent) or first.name != "opened"
+
+
 def decode_all(codec: Codec, heard: Iterable[RawBytes | DeviceEvent]) -> list[Decoded]:
     """Everything a device said in one run of the service.
 

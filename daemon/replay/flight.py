@@ -24,7 +24,7 @@ from daemon.flight.decisions import Decision, decision_of, tick
 from daemon.flight.flight import Flight, Identity
 from daemon.flight.ledger import Ledger
 from daemon.flight.recovery_match import pulse_of
-from daemon.replay.codecs import Decoded, codec_for, decode_all
+from daemon.replay.codecs import Decoded, codec_for, decode_all, has_first_bytes
 from daemon.service.devices import device_specs
 from daemon.service.hearing import Hearing
 from drivers.contract import (
@@ -269,7 +269,7 @@ def _decode(
         record = record_of(message)
         if isinstance(record, DeviceEvent):
             heard[record.device].append(record)
-        elif isinstance(record, NavSample | EventMark | ClockReading):
+        elif isinstance(record, NavSample | EventMark):
             told[name].append((message, record))
         elif isinstance(record, TemperatureSample):
             told[probes.get(name, "")].append((message, record))
@@ -280,10 +280,20 @@ def _decode(
         if codec is None:
             continue
         what = f"records of {name}"
-        found = decode_all(codec, heard[name])
-        for (message, said), again in zip(told[name], found, strict=False):
-            again = replace(again, mono_ns=said.mono_ns)
-            agrees = message_of(again).payload == message.payload
+        # A reading of a clock answers a question; when that was asked is not among the bytes.
+        found = [r for r in decode_all(codec, heard[name]) if not isinstance(r, ClockReading)]
+        pairs = [
+            (message, said, replace(again, mono_ns=said.mono_ns))
+            for (message, said), again in zip(told[name], found, strict=False)
+        ]
+        agree = [message_of(again).payload == message.payload for message, _, again in pairs]
+        first = 0 if has_first_bytes(heard[name]) or True not in agree else agree.index(True)
+        if first:
+            out.sentences.append(
+                f"{what}: the log does not hold what {name} said before it was open, which early "
+                f"versions did not log; the first {first} after it are taken as logged"
+            )
+        for (message, said, again), agrees in zip(pairs[first:], agree[first:], strict=True):
             sentence = f"{what}: {again} where the flight had {said}"
             out.compare(what, agrees=agrees, sentence=sentence)
             decoded[id(message)] = again

@@ -4,26 +4,44 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
+from dataclasses import replace
 from io import BytesIO
+from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
+import pytest
 import tifffile
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daemon.disk.log_records import Message
+from daemon.configuration import from_mapping
+from daemon.disk.flight_log import FlightLog
+from daemon.disk.log_records import Message, message_of
+from daemon.disk.mission import Mission
 from daemon.flight.decisions import Decision, decision_of
 from daemon.replay.codecs import Decoded, codec_for, decode_all
-from daemon.replay.flight import Replayed
+from daemon.replay.flight import Replayed, replay_log
 from daemon.replay.products import content_hash
-from drivers.contract import DeviceEvent, NavSample, RawBytes, TemperatureSample
+from drivers.contract import (
+    ClockReading,
+    DeviceEvent,
+    NavSample,
+    RawBytes,
+    Record,
+    TemperatureSample,
+)
 from drivers.modbus_rtu.thermometer import ModbusThermometer
 from sim_hw.receivers.nmea_sentences import nmea
+from sim_hw.receivers.receiver import ReceiverAccuracy, ReceiverState
+from sim_hw.receivers.ublox_messages import nav_att, nav_pvt
+from tests.daemon.test_configuration import GOOD
 from tests.drivers.stand_ins import FakeClock, FakePort, Notebook
 from tests.drivers.test_modbus_rtu import reply
 
 SECOND_NS = 1_000_000_000
 EPOCHS = 5
+GPS_NS = 1_479_000_000 * SECOND_NS
 
 
 def sentences(second: int) -> bytes:
@@ -53,6 +71,63 @@ def decode(records: list[RawBytes | DeviceEvent]) -> list[Decoded]:
     codec = codec_for("navigator", "nmea", "gnss", {"port": "/dev/null"})
     assert codec is not None
     return decode_all(codec, records)
+
+
+def flown_log() -> list[Record]:
+    """What is logged of a u-blox receiver whose attitudes come behind its positions, opened before
+    its third epoch; and readings of a clock, as of a receiver that can be asked."""
+    state = ReceiverState(47.0, 15.0, 1000.0, (55.0, 0.0, 0.0), 1.0, 2.0, 0.0)
+    heard: list[RawBytes | DeviceEvent] = []
+    for epoch in range(EPOCHS):
+        mono_ns, gps_ns = (epoch + 1) * SECOND_NS, GPS_NS + epoch * SECOND_NS
+        if epoch == 2:
+            heard.append(DeviceEvent("gnss", "opened", False, "", mono_ns))
+        position = nav_pvt(gps_ns, state, ReceiverAccuracy(), 14, 18)
+        attitude = nav_att(gps_ns, state, ReceiverAccuracy())
+        heard.append(RawBytes("gnss", mono_ns, position + attitude))
+    codec = codec_for("navigator", "ublox", "gnss", {"port": "/dev/null"})
+    assert codec is not None
+    told = decode_all(codec, heard)
+    assert len(told) == EPOCHS - 2
+    readings = [ClockReading("gnss", 7, record.mono_ns, 3) for record in told]
+    both = [record for pair in zip(readings, told, strict=True) for record in pair]
+    return [*heard, *both]
+
+
+def replay_of(log: Iterable[Record], folder: Path) -> Replayed:
+    written = FlightLog.create(folder, boot_id="a boot")
+    for record in log:
+        written.write(message_of(record))
+    written.close()
+    configuration, rig = from_mapping({**GOOD, "thermometer": []}, folder / "service.toml")
+    return replay_log(written.path, Mission(folder, "none"), rig, configuration, Mock())
+
+
+def test_a_reading_of_a_clock_is_no_record_of_the_bytes(tmp_path: Path) -> None:
+    replayed = replay_of(flown_log(), tmp_path)
+    assert replayed.agrees, replayed.sentences
+    assert replayed.agreements["records of gnss"] == EPOCHS - 2
+
+
+def test_what_a_decoder_learned_from_bytes_that_were_not_logged_is_no_difference(
+    tmp_path: Path,
+) -> None:
+    log = flown_log()
+    opened = next(i for i, record in enumerate(log) if isinstance(record, DeviceEvent))
+    replayed = replay_of(log[opened:], tmp_path)
+    assert replayed.agrees, replayed.sentences
+    assert replayed.agreements["records of gnss"] == EPOCHS - 3
+    assert "the first 1 after it are taken as logged" in replayed.sentences[0]
+
+
+@pytest.mark.parametrize("logs_first_bytes", [True, False])
+def test_a_later_record_that_differs_is_a_difference(
+    tmp_path: Path, logs_first_bytes: bool
+) -> None:
+    log = flown_log()
+    log[-1] = replace(log[-1], height_m=999.0)
+    replayed = replay_of(log[0 if logs_first_bytes else 2 :], tmp_path)
+    assert replayed.disagreements == {"records of gnss": 1}
 
 
 @given(st.lists(st.integers(min_value=1, max_value=60), max_size=5))

@@ -29,8 +29,8 @@ def kill_in_flight(
     """Kill a flight so often; every so many lives one lives until it has stored something.
 
     What was told stored, sealed or triggered is held against the disk at the end; the ledger and
-    `syntopic verify` as well. `scene` is how many exposures of ground the emulator builds,
-    `scenes` where it keeps them.
+    `syntopic verify` as well, and what the logs hold of every life is replayed. `scene` is how many
+    exposures of ground the emulator builds, `scenes` where it keeps them.
     """
     dice = random.Random(seed)
     rig = "ultracam-l-mini"
@@ -73,6 +73,8 @@ def kill_in_flight(
     assert ended["ledger"]["triggers"]["triggers"] == len(records)
     verified = syntopic("verify", mission, "--json")
     assert verified.returncode == 0, verified.stdout
+    replayed = syntopic("replay", mission, "--records-only", "--json")
+    assert replayed.returncode == 0, replayed.stdout
     figures = {
         "kills": kills,
         "killed in flight": in_flight,

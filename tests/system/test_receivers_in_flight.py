@@ -44,6 +44,8 @@ def test_three_of_three_exposures_have_the_mark_of_their_own_strobe(
         assert abs(place["height_m"] - height) < 0.1
     raw = syntopic("export", "raw", str(flown.mission), "--json")
     assert json.loads(raw.stdout)["events"] == 3
+    replayed = syntopic("replay", str(flown.mission), "--records-only", "--json")
+    assert replayed.returncode == 0, replayed.stdout
 
 
 def test_check_finds_all_devices_of_a_rig_with_an_ascii_instrument_and_an_autopilot(
