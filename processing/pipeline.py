@@ -34,6 +34,7 @@ from processing.image.colour import (
 from processing.image.composition import ColourComposer, PanComposer, pan_cell_px
 from processing.image.quicklook import quicklook
 from processing.image.resampling import Interpolation
+from processing.matching.tie_places import burnt_share
 from processing.matching.tie_points import TiePoints, match_tie_points
 from processing.mosaic.estimated_dc import EstimatedDc, estimate_dc
 from processing.mosaic.fixed import fixed_mosaic
@@ -226,6 +227,7 @@ class Pipeline:
                 bands=registrations,
                 present=level1,
             )
+            figures |= self._burnt_overlap(figures, tie_points, start, level1)
             figures["resting_on_calibration"] = ", ".join(stitched.weak) or None
             figures |= estimated_dc_figures(estimated) | platform_figures(platform)
             figures |= projection_figures(rig, conditions, settings.relief_fraction)
@@ -385,6 +387,23 @@ class Pipeline:
             [exposed_rows(s, start[s.name].tdi_shifts) for s in present],
             [statistics[s.name] for s in present],
         )
+
+    def _burnt_overlap(
+        self,
+        figures: Mapping[str, Figure],
+        tie_points: TiePoints,
+        start: Placements,
+        level1: Mapping[str, Array],
+    ) -> dict[str, Figure]:
+        """Whether saturation is why the poorest overlap has too few tie points."""
+        few = self.settings.thresholds.tie_points_per_overlap
+        points = figures.get("tie_points_min_overlap")
+        pairs = {"-".join(pair): pair for pair in tie_points.pairs}
+        pair = pairs.get(str(figures.get("tie_points_min_overlap_name")))
+        if pair is None or not isinstance(points, int) or points >= few:
+            return {}
+        burnt = burnt_share(self.rig, start, level1, pair, settings=self.settings.tie_points)
+        return {"tie_points_min_overlap_burnt": burnt}
 
     def _whole_figures(
         self, source: Array, frames: Mapping[str, Array], conditions: Conditions

@@ -22,6 +22,7 @@ from processing.geometry.topology import (
     overlaps,
 )
 from processing.matching.patches import MARGIN_PX, select_features
+from processing.radiometry.level1 import SATURATED_BIT
 from processing.rig import Rig
 
 Array = NDArray[np.float64]
@@ -220,6 +221,42 @@ def colour_searches(
             at_b = np.rint(expected).astype(np.int64)
             sought[name] = Search(pair, PAN_TO_COLOUR, first, at_b, step)
     return list(sought.values())
+
+
+def burnt_share(
+    rig: Rig,
+    placements: Mapping[str, SensorPlacement],
+    frames: Mapping[str, Frame],
+    pair: tuple[str, str],
+    *,
+    settings: TiePointSettings | None = None,
+) -> float | None:
+    """Share of the windows side by side in an overlap that saturation makes useless for matching.
+
+    Args:
+        rig: the camera.
+        placements: predicted places, by sensor name.
+        frames: Level-1 words by sensor name.
+        pair: two PAN sensors that overlap.
+        settings: None takes the defaults.
+
+    Returns:
+        The share in the frame that is burnt more; None where the pair has no overlap or no frame.
+    """
+    size = (settings or TiePointSettings()).window_pp_px
+    shares = []
+    for overlap in overlaps(rig):
+        if (overlap.sensor_a, overlap.sensor_b) != pair:
+            continue
+        for name in pair:
+            area = _raw_area(placements[name], overlap.rectangle)
+            left, right, top, low = _shrunk(area, usable_pixels(placements[name]), 0)
+            columns, rows = (right + 1 - left) // size, (low + 1 - top) // size
+            if name in frames and columns > 0 and rows > 0:
+                words = frames[name][top : top + rows * size, left : left + columns * size]
+                full = (words & SATURATED_BIT).reshape(rows, size, columns, size)
+                shares.append(float(np.mean(full.any(axis=(1, 3)))))
+    return max(shares, default=None)
 
 
 def _taking_turns(sees: NDArray[np.bool_], turn: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -82,6 +82,8 @@ def contradicted_colour(
     cones: all P/C points of a sensor that sees the cloud are off alike, and hide P/P points, too.
     """
     blamed = {h.sensor for h in (validity.displaced, validity.unproven) if h is not None}
+    if validity.misread is not None:
+        blamed.add(validity.hypotheses[0].sensor)
     for pair in validity.relative:
         if pair.significant:
             blamed |= {pair.sensor_a, pair.sensor_b}

@@ -11,18 +11,27 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from processing.geometry.drift import sensor_dc
 from processing.geometry.placement import SensorPlacement
 from processing.matching.tie_points import TiePoints
 from processing.mosaic.free import Mosaic, MosaicSettings, datum_constraints, free_mosaic
-from processing.rig import Rig, Sensor
+from processing.mosaic.misfit import (
+    PLACE,
+    PLACE_AND_SCALE,
+    Knowledge,
+    Misfit,
+    expected_covariance,
+    found_quantities,
+    misfit,
+    similarity_directions,
+)
+from processing.rig import Rig
 
 Array = NDArray[np.float64]
 
@@ -36,13 +45,11 @@ Observability = Literal["named", "relative", "unobservable"]
 class ValiditySettings:
     """What the tests assume and demand.
 
-    `probe_sigma_k` is common to all sensors of a probe; a probe without a temperature has
-    `unknown_sigma_k`. `family_alpha` is the probability of naming any sensor of a healthy rig.
-    A sensor is an alternative to the named one unless it is `odds` times less likely.
+    `family_alpha` is the probability of naming any sensor of a healthy rig. A sensor is an
+    alternative to the named one unless it is `odds` times less likely; so is a probe.
     """
 
-    probe_sigma_k: float = 0.1
-    unknown_sigma_k: float = 10.0
+    knowledge: Knowledge = field(default_factory=Knowledge)
     family_alpha: float = 0.001
     odds: float = 19.0
 
@@ -78,6 +85,19 @@ class Displacement:
 
 
 @dataclass(frozen=True)
+class Misread:
+    """A probe of the master cone that reads `off_k` too much, if that alone were wrong.
+
+    `statistic` is chi-square with one degree of freedom where it reads right.
+    """
+
+    probe: str
+    off_k: float
+    sigma_k: float
+    statistic: float
+
+
+@dataclass(frozen=True)
 class RelativeDisplacement:
     """Two sensors of one cone against each other (a minus b); which of them moved is not known."""
 
@@ -104,7 +124,9 @@ class Validity:
     relative displacement is seen, or nothing (one sensor: the layer transformation absorbs it).
     `consistent` is the global test of the master sensors. `displaced` is the named sensor, with
     `alternatives` that fit nearly as well; `several` says that one sensor does not explain it all.
-    `unproven` is a sensor that would be named if more than P/C points and a few P/P said so.
+    `misread` is a probe whose error explains the misfit nearly as well as the named sensor, or,
+    with no sensor named, clearly better. `unproven` is a sensor that would be named if more than
+    P/C points and a few P/P said so.
     """
 
     observability: Mapping[str, Observability]
@@ -118,6 +140,7 @@ class Validity:
     alternatives: tuple[str, ...]
     several: bool
     relative: tuple[RelativeDisplacement, ...]
+    misread: Misread | None = None
     unproven: Displacement | None = None
 
     @property
@@ -136,7 +159,8 @@ def judge_master(
 
     The covariance of the residuals is that of stitching + calibration (`position_sigma_um`) + TDM
     (coefficient sigma times dC, and the probe's sigma common to its sensors). The datum does not
-    matter: shift, rotation and scale common to the master sensors are taken out.
+    matter: shift, rotation and scale common to the master sensors are taken out. A sensor is only
+    accused where no probe's error explains it better.
 
     Args:
         rig: the camera.
@@ -150,61 +174,126 @@ def judge_master(
         for s in rig.master_sensors
         if s.name in mosaic.model.sensors and _is_found(mosaic, s.name)
     ]
-    hypotheses: list[Displacement] = []
-    global_statistic, freedom, remainder = 0.0, 0, 0.0
+    cause = _Cause()
+    places = None
     limit = math.inf
     if len(master) >= 3:
-        found, stitching = _positions(mosaic, master)
-        prior = _prior(rig, mosaic, master, temperatures_c, settings)
-        contrasts = _contrasts(_similarity_directions(mosaic, master))
-        y = contrasts @ found
-        weight = np.linalg.inv(contrasts @ (stitching + prior) @ contrasts.T)
-        global_statistic, freedom = float(y @ weight @ y), len(y)
+        places = misfit(rig, mosaic, master, temperatures_c, knowledge=settings.knowledge)
         limit = float(chi2.ppf(1.0 - settings.family_alpha / len(master), 2))
-        for i, name in enumerate(master):
-            design = contrasts[:, 2 * i : 2 * i + 2]
-            cofactor = np.linalg.inv(design.T @ weight @ design)
-            delta = cofactor @ design.T @ weight @ y
-            hypotheses.append(
-                Displacement(
-                    sensor=name,
-                    dx_px=float(delta[0]),
-                    dy_px=float(delta[1]),
-                    sigma_x_px=math.sqrt(float(cofactor[0, 0])),
-                    sigma_y_px=math.sqrt(float(cofactor[1, 1])),
-                    statistic=float(delta @ design.T @ weight @ y),
-                )
-            )
-        hypotheses.sort(key=lambda h: -h.statistic)
-        remainder = global_statistic - hypotheses[0].statistic
-    displaced = hypotheses[0] if hypotheses and hypotheses[0].statistic > limit else None
-    unproven = None
-    if displaced and pan_points(rig, mosaic)[displaced.sensor] < LEAST_PAN_POINTS:
-        displaced, unproven = None, displaced
+        cause = _cause(rig, mosaic, places, temperatures_c, settings, limit)
+    freedom = 0 if places is None else len(places.y)
+    hypotheses = cause.hypotheses
+    accused = cause.displaced or cause.unproven
     fits = [
         h.sensor
         for h in hypotheses[1:]
         if hypotheses[0].statistic - h.statistic < 2.0 * math.log(settings.odds)
     ]
     several = bool(
-        (displaced or unproven)
-        and freedom > 2
-        and remainder > chi2.ppf(1.0 - settings.family_alpha, freedom - 2)
+        accused
+        and cause.freedom > 0
+        and cause.remainder > chi2.ppf(1.0 - settings.family_alpha, cause.freedom)
     )
     return Validity(
         observability=_observability(rig, mosaic),
         residuals=_residuals(rig, mosaic, master, temperatures_c, settings),
-        global_statistic=global_statistic,
+        global_statistic=0.0 if places is None else places.statistic,
         global_freedom=freedom,
         global_limit=float(chi2.ppf(1.0 - settings.family_alpha, freedom)) if freedom else 0.0,
-        hypotheses=tuple(hypotheses),
+        hypotheses=hypotheses,
         limit=limit,
-        displaced=displaced,
-        alternatives=tuple(fits) if displaced or unproven else (),
+        displaced=cause.displaced,
+        alternatives=tuple(fits) if accused else (),
         several=several,
         relative=_relative(rig, mosaic, temperatures_c, settings),
-        unproven=unproven,
+        misread=cause.misread,
+        unproven=cause.unproven,
     )
+
+
+@dataclass(frozen=True)
+class _Cause:
+    """What is accused, by hypotheses best first; the chi-square it leaves, and its freedom."""
+
+    hypotheses: tuple[Displacement, ...] = ()
+    displaced: Displacement | None = None
+    unproven: Displacement | None = None
+    misread: Misread | None = None
+    remainder: float = 0.0
+    freedom: int = 0
+
+
+def _cause(
+    rig: Rig,
+    mosaic: Mosaic,
+    places: Misfit,
+    temperatures_c: Mapping[str, float],
+    settings: ValiditySettings,
+    limit: float,
+) -> _Cause:
+    """A sensor that moved or a probe that misreads: which explains the misfit.
+
+    That something is wrong is seen in the sensors' places. What it is, their scales tell, too: a
+    wrong temperature grows the cone and its sensors by the drift coefficients, a slip does not.
+    """
+    hypotheses = _hypotheses(places)
+    best = hypotheses[0]
+    remainder, freedom = places.statistic - best.statistic, len(places.y) - 2
+    healthy = _Cause(hypotheses, remainder=remainder, freedom=freedom)
+    if best.statistic <= limit:
+        return healthy
+    if pan_points(rig, mosaic)[best.sensor] < LEAST_PAN_POINTS:
+        return replace(healthy, unproven=best)
+    moved = replace(healthy, displaced=best)
+    names = [s.name for s in places.sensors]
+    scaled = all(f"{name}.scale" not in mosaic.undetermined for name in names)
+    wide = misfit(
+        rig,
+        mosaic,
+        names,
+        temperatures_c,
+        quantities=PLACE_AND_SCALE if scaled else PLACE,
+        knowledge=settings.knowledge,
+    )
+    read = [p for p in dict.fromkeys(s.probe for s in wide.sensors) if p in temperatures_c]
+    if not read:
+        return moved
+    misread = max((_misread(wide, probe) for probe in read), key=lambda m: m.statistic)
+    lead = misread.statistic - _hypotheses(wide)[0].statistic
+    near = 2.0 * math.log(settings.odds)
+    if lead < -near:
+        return moved
+    beside = wide.beside(wide.misread(misread.probe))
+    still = _hypotheses(beside)
+    if still[0].statistic > limit:
+        # However wrong the probe may be, a sensor has moved, too.
+        left = beside.statistic - still[0].statistic
+        return _Cause(still, still[0], remainder=left, freedom=len(beside.y) - 3)
+    return replace(moved if lead <= near else healthy, misread=misread)
+
+
+def _hypotheses(found: Misfit) -> tuple[Displacement, ...]:
+    """Each sensor, if it alone had moved; the likeliest first."""
+    result = []
+    for i, sensor in enumerate(found.sensors):
+        fit = found.fit(found.moved(i))
+        result.append(
+            Displacement(
+                sensor=sensor.name,
+                dx_px=float(fit.size[0]),
+                dy_px=float(fit.size[1]),
+                sigma_x_px=math.sqrt(float(fit.cofactor[0, 0])),
+                sigma_y_px=math.sqrt(float(fit.cofactor[1, 1])),
+                statistic=fit.statistic,
+            )
+        )
+    return tuple(sorted(result, key=lambda h: -h.statistic))
+
+
+def _misread(found: Misfit, probe: str) -> Misread:
+    fit = found.fit(found.misread(probe))
+    sigma_k = math.sqrt(float(fit.cofactor[0, 0]))
+    return Misread(probe, float(fit.size[0]), sigma_k, fit.statistic)
 
 
 def pan_points(rig: Rig, mosaic: Mosaic) -> dict[str, int]:
@@ -265,58 +354,6 @@ def _observability(rig: Rig, mosaic: Mosaic) -> dict[str, Observability]:
     return result
 
 
-def _positions(mosaic: Mosaic, sensors: Sequence[str]) -> tuple[Array, Array]:
-    """Corrections x, y of sensors one after the other, px, and their stitching covariance."""
-    rows = [mosaic.model.sensors[name] + axis for name in sensors for axis in (0, 1)]
-    pitch = mosaic.model.pitch_mm
-    return mosaic.values[rows] / pitch, mosaic.covariance[np.ix_(rows, rows)] / pitch**2
-
-
-def _prior(
-    rig: Rig,
-    mosaic: Mosaic,
-    sensors: Sequence[str],
-    temperatures_c: Mapping[str, float],
-    settings: ValiditySettings,
-) -> Array:
-    """Covariance of where calibration + TDM expect the sensors, px squared."""
-    pitch_um = mosaic.model.pitch_mm * 1e3
-    found = [rig.sensor(name) for name in sensors]
-    covariance = np.zeros((2 * len(found), 2 * len(found)))
-    for i, sensor in enumerate(found):
-        dc = sensor_dc(sensor, temperatures_c)
-        unknown = 0.0 if sensor.probe in temperatures_c else settings.unknown_sigma_k
-        tdm = sensor.drift.sigma_um_per_k * math.hypot(dc, unknown)
-        variance = sensor.position_sigma_um**2 + tdm**2
-        covariance[2 * i, 2 * i] = covariance[2 * i + 1, 2 * i + 1] = variance
-    for probe in dict.fromkeys(sensor.probe for sensor in found):
-        known = probe in temperatures_c
-        sigma_k = settings.probe_sigma_k if known else settings.unknown_sigma_k
-        moved = np.concatenate([_per_kelvin(s) * (s.probe == probe) for s in found])
-        covariance += np.outer(moved, moved) * sigma_k**2
-    return covariance / pitch_um**2
-
-
-def _per_kelvin(sensor: Sensor) -> Array:
-    return np.array([sensor.drift.x_um_per_k, sensor.drift.y_um_per_k])
-
-
-def _similarity_directions(mosaic: Mosaic, sensors: Sequence[str]) -> Array:
-    """How a common shift, scale and rotation moves the sensors: (2 m, 4)."""
-    directions = np.zeros((2 * len(sensors), 4))
-    for i, name in enumerate(sensors):
-        place = mosaic.start[name].similarity
-        directions[2 * i] = (1.0, 0.0, place.x_mm, -place.y_mm)
-        directions[2 * i + 1] = (0.0, 1.0, place.y_mm, place.x_mm)
-    return directions
-
-
-def _contrasts(directions: Array) -> Array:
-    """An orthonormal basis of what the directions cannot produce, as rows."""
-    full, _, _ = np.linalg.svd(directions, full_matrices=True)
-    return np.asarray(full[:, directions.shape[1] :].T)
-
-
 def _residuals(
     rig: Rig,
     mosaic: Mosaic,
@@ -326,11 +363,11 @@ def _residuals(
 ) -> tuple[Residual, ...]:
     if not sensors:
         return ()
-    found, stitching = _positions(mosaic, sensors)
-    prior = _prior(rig, mosaic, sensors, temperatures_c, settings)
+    found, stitching = found_quantities(mosaic, sensors)
+    prior = expected_covariance(rig, mosaic, sensors, temperatures_c, knowledge=settings.knowledge)
     datum = [name for name in mosaic.datum_sensors if name in sensors]
     if len(datum) >= 2:
-        directions = _similarity_directions(mosaic, sensors)
+        directions = similarity_directions(mosaic, sensors)
         rows = np.zeros((4, len(found)))
         for k, constraint in enumerate(datum_constraints(mosaic.start, datum)):
             for name, coefficient in constraint.coefficients.items():
@@ -363,8 +400,10 @@ def _relative(
     result = []
     difference = np.hstack([np.eye(2), -np.eye(2)])
     for cone_name, a, b in pairs:
-        found, stitching = _positions(mosaic, (a, b))
-        prior = _prior(rig, mosaic, (a, b), temperatures_c, settings)
+        found, stitching = found_quantities(mosaic, (a, b))
+        prior = expected_covariance(
+            rig, mosaic, (a, b), temperatures_c, knowledge=settings.knowledge
+        )
         delta = difference @ found
         covariance = difference @ (stitching + prior) @ difference.T
         result.append(

@@ -136,6 +136,12 @@ def _displacement(validity: Validity | None) -> Mapping[str, Figure]:
         )
         or None,
     }
+    if validity.misread is not None:
+        figures |= {
+            "misread_probe": validity.misread.probe,
+            "misread_k": validity.misread.off_k,
+            "misread_sigma_k": validity.misread.sigma_k,
+        }
     if validity.displaced is not None:
         figures |= {
             "displaced_sensor": validity.displaced.sensor,

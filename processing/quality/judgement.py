@@ -35,6 +35,11 @@ _CAPTURE: Final[Mapping[Flag, tuple[Verdict, str]]] = {
         Verdict.USABLE,
         "A frame was damaged and left out; check cable and network settings of that head.",
     ),
+    Flag.FRAME_AMBIGUOUS: (
+        Verdict.USABLE,
+        "A frame came that may be the missing one or another exposure's, and was left out; check "
+        "cable and network settings of that head.",
+    ),
     Flag.MARK_MISSING: (
         Verdict.USABLE,
         "The receiver gave no event mark, the time is interpolated; check the strobe cable.",
@@ -202,17 +207,7 @@ def _time_and_temperature(
         (t.temperature_age_s, math.inf),
         "Temperatures are old; check the probe module and its line.",
     )
-    disagreeing = figures.get("dc_disagreement")
-    if disagreeing:
-        findings.append(
-            Finding(
-                Flag.DC_DISAGREEMENT,
-                Verdict.USABLE,
-                f"Probe and stitching disagree on the temperature of cone {disagreeing}: a stuck "
-                "probe, a moved sensor or an old calibration; check the probe after landing.",
-                _number(figures, "dc_estimated_k"),
-            )
-        )
+    findings += _temperature_by_stitching(figures)
     if probes_out_of_range:
         findings.append(
             Finding(
@@ -227,6 +222,33 @@ def _time_and_temperature(
     return findings
 
 
+def _temperature_by_stitching(figures: Mapping[str, Figure]) -> list[Finding]:
+    disagreeing = figures.get("dc_disagreement")
+    misread, displaced = _misreading(figures), figures.get("displaced_sensor")
+    if not (disagreeing or misread):
+        return []
+    where = f" of cone {disagreeing}" if disagreeing else ""
+    why = "a stuck probe, a moved sensor or an old calibration"
+    if misread and displaced:
+        why = f"{misread}, or sensor {displaced} has moved"
+    elif misread:
+        why = f"{misread}, which explains where the sensors are better than a moved sensor"
+    sentence = (
+        f"Probe and stitching disagree on the temperature{where}: {why}; check the probe after "
+        "landing."
+    )
+    value = _number(figures, "dc_estimated_k")
+    return [Finding(Flag.DC_DISAGREEMENT, Verdict.USABLE, sentence, value)]
+
+
+def _misreading(figures: Mapping[str, Figure]) -> str | None:
+    """The probe that may be wrong, and by how much, as part of a sentence."""
+    off, probe = _number(figures, "misread_k"), figures.get("misread_probe")
+    if off is None or not probe:
+        return None
+    return f"probe {probe} reads {abs(off):.1f} K too {'high' if off > 0.0 else 'low'}"
+
+
 def _stitching(
     figures: Mapping[str, Figure], nominal_bands: Sequence[str], t: Thresholds
 ) -> list[Finding]:
@@ -236,12 +258,21 @@ def _stitching(
         where = figures.get("tie_points_min_overlap_name") or "an overlap"
         total = _number(figures, "tie_points_pp") or 0.0
         too_few = total < t.tie_points_pp_refly
+        burnt = _number(figures, "tie_points_min_overlap_burnt") or 0.0
+        sentence = (
+            f"Few tie points in {where} (water, snow, desert or cloud?): look at the quick look; "
+            "fly again if it should have had detail."
+        )
+        if burnt > t.burnt_overlap_fraction:
+            sentence = (
+                f"Few tie points in {where} because it is burnt out: {burnt:.0%} of the places "
+                "where points are sought hold saturated pixels. Shorten the exposure."
+            )
         findings.append(
             Finding(
                 Flag.TIE_POINTS,
                 Verdict.REFLY if too_few else Verdict.USABLE,
-                f"Few tie points in {where} (water, snow, desert or cloud?): look at the quick "
-                "look; fly again if it should have had detail.",
+                sentence,
                 poorest,
                 float(t.tie_points_per_overlap),
             )
@@ -297,12 +328,19 @@ def _stitching(
             f"Sensor {displaced} sits {size:.2f} px off its calibrated place; the image is "
             "corrected for it. Go on, and have the camera calibrated."
         )
-        alternatives = figures.get("displaced_alternatives")
+        alternatives, misread = figures.get("displaced_alternatives"), _misreading(figures)
         if figures.get("displaced_several"):
             sentence = (
                 "More than one sensor of the master cone sits off its calibrated place, and which "
                 "ones cannot be told: the image fits together, but its place in the camera is "
                 "uncertain. Go on, and have the camera calibrated."
+            )
+        elif misread:
+            others = f" or {alternatives}" if alternatives else ""
+            sentence = (
+                f"Either sensor {displaced}{others} sits {size:.2f} px off its calibrated place or "
+                f"{misread}; the stitching cannot tell, and the image fits together. Go on, check "
+                "the probe after landing, and have the camera calibrated."
             )
         elif alternatives:
             sentence = (

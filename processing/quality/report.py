@@ -47,6 +47,7 @@ class Flag(enum.IntFlag):
     TIME_HOLDOVER = 1 << 26
     SUN = 1 << 27
     GSD = 1 << 28
+    FRAME_AMBIGUOUS = 1 << 29
 
 
 NO_FLAGS: Final = Flag(0)
@@ -98,6 +99,9 @@ class Thresholds:
     temperature_high_c: float = 70.0
     tie_points_per_overlap: int = 12
     tie_points_pp_refly: int = 20
+    burnt_overlap_fraction: float = 0.5
+    """Share of an overlap's matching windows that saturation spoils, above which it is the cause of
+    too few tie points."""
     sigma0_px: float = 0.3
     sigma0_refly_px: float = 1.0
     bright_fraction: float = 0.06
@@ -124,6 +128,8 @@ FIGURES: Final[Mapping[str, str]] = {
     "tie_points_pc": "tie points between PAN and the colour master",
     "tie_points_min_overlap": "tie points in the poorest overlap",
     "tie_points_min_overlap_name": "which overlap that is",
+    "tie_points_min_overlap_burnt": "share of matching windows there that hold saturated pixels, "
+    "where points are too few",
     "dc_k": "temperature at exposure less that at calibration, mean of the PAN cones, K",
     "dc_estimated_k": "the same as the stitching sees it, cones of two or more CCDs, K",
     "dc_estimated_sigma_k": "standard deviation of that; null where it cannot be determined",
@@ -138,6 +144,10 @@ FIGURES: Final[Mapping[str, str]] = {
     "displacement_test": "test statistic over its critical value; above one is significant",
     "displaced_alternatives": "master sensors that explain the stitching nearly as well",
     "displaced_several": "1 where one displaced sensor does not explain it all: several moved",
+    "misread_probe": "probe of the master cone whose error explains the stitching as well as the "
+    "displaced sensor; without one, better than any",
+    "misread_k": "how much too high it reads then, K",
+    "misread_sigma_k": "standard deviation of that",
     "relative_displacements": "pairs of sensors of one cone found displaced against each other",
     "platform_test": "mountings of converging heads against the platform calibration: test "
     "statistic over its critical value; above one is significant",

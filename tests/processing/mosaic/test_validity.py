@@ -10,11 +10,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from processing.geometry.placement import vip_mm_from_raw
+from processing.geometry.placement import nominal_placements, vip_mm_from_raw
 from processing.matching.tie_points import TiePoints
 from processing.mosaic.free import Mosaic, free_mosaic
 from processing.mosaic.validity import judge_master, robust_datum
-from processing.rig import find_rig
+from processing.rig import Rig, find_rig
 from tests.processing.geometry.test_topology import side_by_side_rig
 from tests.processing.synthetic import Truth, make_truth, tie_points_of
 
@@ -46,15 +46,19 @@ def exposure(
     dc_k: float = 10.0,
     sigma_pp_px: float = 0.03,
     sigma_pc_px: float = 0.15,
+    misread_k: float = 0.0,
+    rig: Rig = MINI,
 ) -> tuple[Truth, TiePoints, Mosaic, dict[str, float]]:
+    """An exposure whose probe 0 reads `misread_k` too much."""
     rng = np.random.default_rng(seed)
     offsets = healthy_offsets(rng, dc_k)
     for name, (x, y) in displaced.items():
         offsets[name] = (offsets[name][0] + x, offsets[name][1] + y)
-    truth = make_truth(MINI, rng, temperature_c=20.0 + dc_k, sensor_px=0.0, displaced=offsets)
+    truth = make_truth(rig, rng, temperature_c=20.0 + dc_k, sensor_px=0.0, displaced=offsets)
     points = tie_points_of(truth, rng, sigma_pp_px=sigma_pp_px, sigma_pc_px=sigma_pc_px)
-    mosaic = free_mosaic(MINI, truth.start, points)
-    return truth, points, mosaic, dict.fromkeys(MINI.probes, 20.0 + dc_k)
+    read = dict.fromkeys(rig.probes, 20.0 + dc_k) | {"0": 20.0 + dc_k + misread_k}
+    mosaic = free_mosaic(rig, nominal_placements(rig, read, {}), points)
+    return truth, points, mosaic, read
 
 
 def absolute_error_px(truth: Truth, mosaic: Mosaic) -> float:
@@ -162,6 +166,51 @@ def test_a_small_displacement_that_two_sensors_explain_alike_is_said_to_be_ambig
 def test_two_displaced_sensors_are_not_passed_off_as_one() -> None:
     _, _, mosaic, temperatures = exposure(15, {"SU00": (2.0, 0.0), "SU03": (0.0, 2.0)})
     assert judge_master(MINI, mosaic, temperatures).several
+
+
+def test_a_probe_that_misreads_is_named_and_no_sensor_accused() -> None:
+    off = []
+    for seed in range(40, 46):
+        _, _, mosaic, temperatures = exposure(seed, {}, dc_k=0.0, misread_k=9.0)
+        judged = judge_master(MINI, mosaic, temperatures)
+        assert judged.hypotheses[0].statistic > judged.limit, "a sensor would have been accused"
+        assert judged.displaced is None and not judged.several
+        assert judged.misread is not None and judged.misread.probe == "0"
+        assert judged.misread.sigma_k < 0.5
+        off.append((judged.misread.off_k - 9.0) / judged.misread.sigma_k)
+    assert max(np.abs(off)) < 4.0
+
+
+def test_a_sensor_that_moved_is_named_whatever_the_probe_reads() -> None:
+    for misread_k in (-4.0, 0.0, 4.0):
+        _, _, mosaic, temperatures = exposure(47, {"SU03": (0.5, 0.3)}, misread_k=misread_k)
+        judged = judge_master(MINI, mosaic, temperatures)
+        assert judged.displaced is not None and judged.displaced.sensor == "SU03", misread_k
+        assert judged.misread is None and not judged.several
+
+
+def test_a_sensor_with_a_probe_of_its_own_may_be_warm_or_displaced() -> None:
+    cones = [
+        dataclasses.replace(
+            cone,
+            sensors=tuple(
+                dataclasses.replace(s, probe="9") if s.name == "SU02" else s for s in cone.sensors
+            ),
+        )
+        for cone in MINI.cones
+    ]
+    rig = dataclasses.replace(MINI, cones=tuple(cones))
+    drift = rig.sensor("SU02").drift
+    two_kelvin = (2.0 * drift.x_um_per_k / 7.2, 2.0 * drift.y_um_per_k / 7.2)
+    _, _, mosaic, temperatures = exposure(48, {"SU02": two_kelvin}, dc_k=0.0, rig=rig)
+    judged = judge_master(rig, mosaic, temperatures)
+    assert judged.displaced is not None and judged.displaced.sensor == "SU02"
+    assert judged.misread is not None and judged.misread.probe == "9"
+    assert judged.misread.off_k == pytest.approx(-2.0, abs=4.0 * judged.misread.sigma_k)
+    across = (-two_kelvin[1], two_kelvin[0])
+    _, _, mosaic, temperatures = exposure(49, {"SU02": across}, dc_k=0.0, rig=rig)
+    judged = judge_master(rig, mosaic, temperatures)
+    assert judged.displaced is not None and judged.misread is None
 
 
 def test_in_a_two_sensor_cone_only_the_relative_displacement_is_known() -> None:

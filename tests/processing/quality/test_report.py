@@ -157,7 +157,7 @@ def test_bits_keep_their_places_for_ever() -> None:
         *("TEMPERATURE_RANGE", "DC_DISAGREEMENT", "TIE_POINTS", "SIGMA0", "DISPLACED_SENSOR"),
         *("CALIBRATION_EXPIRED", "UNDEREXPOSED", "OVEREXPOSED", "BLUR", "TILT", "DRIFT"),
         *("OVERLAP", "GNSS", "DISK_LOW", "PROCESSING_BEHIND", "SIMULATED", "NOT_PROCESSED"),
-        *("TIME_HOLDOVER", "SUN", "GSD"),
+        *("TIME_HOLDOVER", "SUN", "GSD", "FRAME_AMBIGUOUS"),
     ]
     assert {name: int(Flag[name]) for name in names} == {
         name: 1 << bit for bit, name in enumerate(names)
@@ -172,6 +172,31 @@ def test_two_displaced_sensors_are_said_to_be_ambiguous() -> None:
     assert "cannot be told" in report.findings[0].sentence
     unsure = judge(GOOD | moved | {"displaced_alternatives": "SU00, SU03"})
     assert "unless it is SU00, SU03" in unsure.findings[0].sentence
+
+
+def test_a_probe_that_explains_it_is_named_instead_of_a_sensor_or_beside_it() -> None:
+    misread = {"misread_probe": "0", "misread_k": 3.96, "misread_sigma_k": 0.2}
+    report = judge(GOOD | misread | {"dc_disagreement": "0"})
+    assert report.flags == Flag.DC_DISAGREEMENT and report.verdict is Verdict.USABLE
+    (finding,) = report.findings
+    assert "probe 0 reads 4.0 K too high" in finding.sentence
+    moved = {"displaced_sensor": "SU01", "displacement_x_px": 0.6, "displacement_y_px": -0.8}
+    report = judge(GOOD | misread | moved | {"misread_k": -2.0})
+    assert report.flags == Flag.DC_DISAGREEMENT | Flag.DISPLACED_SENSOR
+    for finding in report.findings:
+        assert "probe 0 reads 2.0 K too low" in finding.sentence and "SU01" in finding.sentence
+    assert "the stitching cannot tell" in report.findings[1].sentence
+
+
+def test_an_overlap_without_tie_points_because_it_is_burnt_says_so() -> None:
+    few = {"tie_points_min_overlap": 3, "tie_points_min_overlap_name": "SU03-SU11"}
+    burnt = judge(GOOD | few | {"tie_points_min_overlap_burnt": 0.83, "saturated_fraction": 0.06})
+    assert burnt.flags == Flag.TIE_POINTS | Flag.OVEREXPOSED
+    told = next(f.sentence for f in burnt.findings if f.flag == Flag.TIE_POINTS)
+    assert "SU03-SU11 because it is burnt out: 83%" in told and "water" not in told
+    lake = judge(GOOD | few | {"tie_points_min_overlap_burnt": 0.1, "saturated_fraction": 0.06})
+    told = next(f.sentence for f in lake.findings if f.flag == Flag.TIE_POINTS)
+    assert "water" in told
 
 
 def test_sensors_that_rest_on_calibration_are_told() -> None:

@@ -1,0 +1,212 @@
+"""How far the stitching puts sensors of a cone from where calibration + TDM expect them.
+
+The part of it that no shift, rotation and scale of the whole cone can make, with its covariance,
+and how well one cause or another fits it. What is concluded from that is in
+`processing.mosaic.validity`.
+
+Source: DESIGN 5.3, 5.4.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.geometry.drift import sensor_dc
+from processing.mosaic.free import Mosaic
+from processing.rig import Rig, Sensor
+
+Array = NDArray[np.float64]
+
+PLACE = ("x", "y")
+PLACE_AND_SCALE = ("x", "y", "scale")
+"""Quantities of a sensor: px, px, ppm. A displaced sensor keeps its scale, a warm one does not."""
+_UNKNOWN = {"x": 0, "y": 1, "scale": 3}
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """Standard deviations of what is known besides the rig file's.
+
+    `probe_sigma_k` is common to all sensors of a probe; a probe without a temperature has
+    `unknown_sigma_k`.
+    """
+
+    probe_sigma_k: float = 0.1
+    unknown_sigma_k: float = 10.0
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A cause's best size (k,), its cofactor (k, k), and the chi-square with k it explains."""
+
+    size: Array
+    cofactor: Array
+    statistic: float
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """Found minus expected of some sensors, as `contrasts` (c, n) of their quantities.
+
+    `y` (c,) are the contrasts, `weight` (c, c) the inverse of their covariance.
+    """
+
+    sensors: tuple[Sensor, ...]
+    quantities: tuple[str, ...]
+    pitch_um: float
+    contrasts: Array
+    y: Array
+    weight: Array
+
+    @property
+    def statistic(self) -> float:
+        """Chi-square of nothing being wrong."""
+        return float(self.y @ self.weight @ self.y)
+
+    def moved(self, index: int) -> Array:
+        """Design (c, 2) of a displacement, px, of one of the sensors."""
+        first = index * len(self.quantities)
+        return self.contrasts[:, first : first + 2]
+
+    def misread(self, probe: str) -> Array:
+        """Design (c, 1) of what one kelvin read too much makes of the sensors of a probe."""
+        warmed = [
+            per_kelvin(s, self.quantities, self.pitch_um) * (s.probe == probe) for s in self.sensors
+        ]
+        return -self.contrasts @ np.concatenate(warmed)[:, None]
+
+    def fit(self, design: Array) -> Fit:
+        """The best size of a cause with the given design (c, k)."""
+        cofactor = np.asarray(np.linalg.inv(design.T @ self.weight @ design), np.float64)
+        pull = design.T @ self.weight @ self.y
+        size = cofactor @ pull
+        return Fit(size, cofactor, float(size @ pull))
+
+    def beside(self, design: Array) -> Misfit:
+        """The same where a cause with this design may have any size."""
+        weighted = self.weight @ design
+        taken = weighted @ np.linalg.inv(design.T @ weighted) @ weighted.T
+        return replace(self, weight=self.weight - taken)
+
+
+def misfit(
+    rig: Rig,
+    mosaic: Mosaic,
+    sensors: Sequence[str],
+    temperatures_c: Mapping[str, float],
+    *,
+    quantities: tuple[str, ...] = PLACE,
+    knowledge: Knowledge | None = None,
+) -> Misfit:
+    """The misfit of sensors of one cone, three at least.
+
+    Args:
+        rig: the camera.
+        mosaic: a free mosaic, in any datum.
+        sensors: by name; the stitching has found them.
+        temperatures_c: temperature by probe name, as the mosaic's start was made with.
+        quantities: `PLACE` or `PLACE_AND_SCALE`.
+        knowledge: None takes the defaults.
+    """
+    found, stitching = found_quantities(mosaic, sensors, quantities)
+    expected = expected_covariance(
+        rig, mosaic, sensors, temperatures_c, quantities=quantities, knowledge=knowledge
+    )
+    covariance = stitching + expected
+    contrasts = _contrasts(similarity_directions(mosaic, sensors, quantities))
+    return Misfit(
+        sensors=tuple(rig.sensor(name) for name in sensors),
+        quantities=quantities,
+        pitch_um=mosaic.model.pitch_mm * 1e3,
+        contrasts=contrasts,
+        y=contrasts @ found,
+        weight=np.asarray(np.linalg.inv(contrasts @ covariance @ contrasts.T), np.float64),
+    )
+
+
+def found_quantities(
+    mosaic: Mosaic, sensors: Sequence[str], quantities: Sequence[str] = PLACE
+) -> tuple[Array, Array]:
+    """Corrections of sensors one after the other (n,), and their stitching covariance (n, n)."""
+    rows = [mosaic.model.sensors[name] + _UNKNOWN[q] for name in sensors for q in quantities]
+    unit = np.tile([_per_unknown(q, mosaic) for q in quantities], len(sensors))
+    return mosaic.values[rows] * unit, mosaic.covariance[np.ix_(rows, rows)] * np.outer(unit, unit)
+
+
+def expected_covariance(
+    rig: Rig,
+    mosaic: Mosaic,
+    sensors: Sequence[str],
+    temperatures_c: Mapping[str, float],
+    *,
+    quantities: Sequence[str] = PLACE,
+    knowledge: Knowledge | None = None,
+) -> Array:
+    """Covariance (n, n) of where calibration + TDM expect the sensors.
+
+    A calibrated scale is as good as places of the same sigma half a diagonal from the centre.
+    """
+    knowledge = knowledge or Knowledge()
+    pitch_um = mosaic.model.pitch_mm * 1e3
+    expected = [rig.sensor(name) for name in sensors]
+    variances = []
+    for sensor in expected:
+        dc = sensor_dc(sensor, temperatures_c)
+        unknown = 0.0 if sensor.probe in temperatures_c else knowledge.unknown_sigma_k
+        tdm_um = sensor.drift.sigma_um_per_k * math.hypot(dc, unknown)
+        place_px = math.hypot(sensor.position_sigma_um, tdm_um) / pitch_um
+        half_mm = math.hypot(sensor.width_px, sensor.height_px) / 2.0 * sensor.pitch_mm
+        scale_ppm = sensor.position_sigma_um / half_mm * 1e3
+        variances += [(scale_ppm if q == "scale" else place_px) ** 2 for q in quantities]
+    covariance = np.diag(variances)
+    for probe in dict.fromkeys(sensor.probe for sensor in expected):
+        known = probe in temperatures_c
+        sigma_k = knowledge.probe_sigma_k if known else knowledge.unknown_sigma_k
+        moved = np.concatenate(
+            [per_kelvin(s, quantities, pitch_um) * (s.probe == probe) for s in expected]
+        )
+        covariance += np.outer(moved, moved) * sigma_k**2
+    return covariance
+
+
+def per_kelvin(sensor: Sensor, quantities: Sequence[str], pitch_um: float) -> Array:
+    """What a kelvin does to a sensor."""
+    drift = sensor.drift
+    known = {
+        "x": drift.x_um_per_k / pitch_um,
+        "y": drift.y_um_per_k / pitch_um,
+        "scale": drift.scale_ppm_per_k,
+    }
+    return np.array([known[q] for q in quantities])
+
+
+def similarity_directions(
+    mosaic: Mosaic, sensors: Sequence[str], quantities: Sequence[str] = PLACE
+) -> Array:
+    """How a common shift, scale and rotation moves the sensors: (n, 4)."""
+    rows = []
+    for name in sensors:
+        place = mosaic.start[name].similarity
+        moves = {
+            "x": (1.0, 0.0, place.x_mm, -place.y_mm),
+            "y": (0.0, 1.0, place.y_mm, place.x_mm),
+            # Places are in px, per mm of lever arm.
+            "scale": (0.0, 0.0, mosaic.model.pitch_mm * 1e6, 0.0),
+        }
+        rows += [moves[q] for q in quantities]
+    return np.array(rows)
+
+
+def _per_unknown(quantity: str, mosaic: Mosaic) -> float:
+    return 1e6 if quantity == "scale" else 1.0 / mosaic.model.pitch_mm
+
+
+def _contrasts(directions: Array) -> Array:
+    """An orthonormal basis of what the directions cannot produce, as rows."""
+    full, _, _ = np.linalg.svd(directions, full_matrices=True)
+    return np.asarray(full[:, directions.shape[1] :].T)
