@@ -70,12 +70,24 @@ class _Open:
     frames: dict[str, Frame] = field(default_factory=dict)
     flags: Flag = NO_FLAG
     causes: dict[str, str] = field(default_factory=dict)
+    doubted: dict[str, str] = field(default_factory=dict)
+    """Heads of which a frame came that may be this exposure's, and what is to be said of it."""
     line_id: str = ""
     strip_id: str = ""
     handed_to_disk: Capture | None = None
     stored: Capture | None = None
     foreseen: tuple[EventMark, Flag, Exposure] | None = None
     lost: str = ""
+
+    @property
+    def told_flags(self) -> Flag:
+        """The flags, and whether a missing frame may have come all the same."""
+        in_doubt = self.doubted.keys() - self.frames.keys() - self.causes.keys()
+        return self.flags | (Flag.FRAME_AMBIGUOUS if in_doubt else NO_FLAG)
+
+    def why_missing(self, head: str) -> str:
+        """What is to be said of a frame that is not there."""
+        return self.causes.get(head) or self.doubted.get(head, "no frame came")
 
 
 class Flight:
@@ -168,6 +180,9 @@ class Flight:
                 return cause
             exposure.flags |= _FRAME_FLAGS[cause]
             exposure.causes[frame.head] = cause.value
+        for number in match.possible:
+            if number in self._open:
+                self._open[number].doubted[frame.head] = _DOUBTS[cause]
         self.idle_slots.append((frame.head, frame.slot))
         return cause
 
@@ -315,7 +330,7 @@ class Flight:
         if mark is None or not self._has_navigation(exposure):
             return None
         record = self._compose(exposure, exposure.stored, mark)
-        exposure.foreseen = mark, exposure.flags, record
+        exposure.foreseen = mark, exposure.told_flags, record
         return record
 
     def _has_navigation(self, exposure: _Open) -> bool:
@@ -334,7 +349,7 @@ class Flight:
     def _settle(self, number: int, state: RecordState) -> None:
         exposure = self._open.pop(number)
         causes = {
-            head: exposure.causes.get(head, "no frame came")
+            head: exposure.why_missing(head)
             for head in self.serial_of_head
             if head not in exposure.frames
         }
@@ -356,11 +371,11 @@ class Flight:
     def _capture(self, exposure: _Open) -> Capture:
         usable = {} if exposure.lost else _in_order(exposure.frames, self.serial_of_head)
         missing = [
-            (head, exposure.lost or exposure.causes.get(head, "no frame came"))
+            (head, exposure.lost or exposure.why_missing(head))
             for head in self.serial_of_head
             if head not in usable
         ]
-        flags = exposure.flags | (Flag.FRAME_MISSING if missing else NO_FLAG)
+        flags = exposure.told_flags | (Flag.FRAME_MISSING if missing else NO_FLAG)
         return Capture(
             number=exposure.number,
             trigger_sequence=exposure.number,
@@ -403,8 +418,9 @@ class Flight:
         if mark is None and self._matcher.marks.has_ambiguous(exposure.number):
             exposure.flags |= Flag.MARK_AMBIGUOUS
         self._matcher.marks.seal(exposure.number)
-        if exposure.foreseen is not None and exposure.foreseen[:2] == (mark, exposure.flags):
-            return exposure.foreseen[2]
+        foreseen = exposure.foreseen
+        if foreseen is not None and foreseen[:2] == (mark, exposure.told_flags):
+            return foreseen[2]
         record = self._compose(exposure, stored, mark)
         return record if state is None else replace(record, state=state)
 
@@ -416,7 +432,7 @@ class Flight:
             instant_of(mark, exposure.pulse, self.clock),
             self.track,
             self.temperatures,
-            exposure.flags,
+            exposure.told_flags,
         )
 
 
@@ -430,3 +446,8 @@ _FRAME_FLAGS = {
     Cause.CORRUPT: Flag.FRAME_CORRUPT,
     Cause.SPURIOUS: NO_FLAG,
 }
+_DOUBTS = {
+    Cause.CORRUPT: "may be a corrupt frame that came, which may be of another exposure",
+    Cause.SPURIOUS: "may be a frame that came and could not be told from others",
+}
+"""Of a frame that may be of several exposures, or of none."""

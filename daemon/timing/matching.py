@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import statistics
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -121,16 +121,16 @@ class Matcher:
 
     def frame(self, frame: Frame) -> Match:
         """The exposure a frame belongs to."""
-        number, is_ambiguous = self._pulse_of(frame)
+        number, possible = self._pulse_of(frame)
         if frame.status is not FrameStatus.COMPLETE:
-            return Match(number, Cause.CORRUPT)
+            return Match(number, Cause.CORRUPT, bool(possible), possible)
         if number is not None and not self._is_like_the_others(frame, self._pulses[number]):
-            number, is_ambiguous = None, True
+            possible, number = (number,), None
         if number is None:
             start_ns = start_of_exposure_mono_ns(frame)
             if start_ns is not None:
                 self._heads[frame.head].spurious_ns.append(start_ns)
-            return Match(None, Cause.SPURIOUS, is_ambiguous)
+            return Match(None, Cause.SPURIOUS, bool(possible), possible)
         if (frame.head, number) in self._frames:
             return Match(number, Cause.DUPLICATE)
         self._frames.add((frame.head, number))
@@ -140,30 +140,30 @@ class Matcher:
         head.arrivals_ns.append(frame.mono_ns - self._start_ns(frame, pulse))
         return Match(number, Cause.USED)
 
-    def _pulse_of(self, frame: Frame) -> tuple[int | None, bool]:
-        """The pulse of a frame, or None and whether that is for doubt."""
+    def _pulse_of(self, frame: Frame) -> tuple[int | None, tuple[int, ...]]:
+        """The pulse of a frame, or None and those it may be of."""
         possible = [pulse for pulse in self._pulses.values() if self._arrives(frame, pulse)]
         counted = self._counted(frame, possible)
         start_ns = start_of_exposure_mono_ns(frame)
         if start_ns is not None:
             near = [p for p in possible if self._is_near(frame, p, start_ns)]
             if len(near) != 1:
-                return None, len(near) > 1
+                return None, _numbers(near)
             pulse = near[0]
             is_other = counted is not None and counted is not pulse
             if is_other and counted is not None and self._speaks_for(frame, counted):
                 # The head's clock says one pulse, its count and perhaps the arrival another.
                 is_sure = self._speaks_for(frame, pulse)
-                return (pulse.number, False) if is_sure else (None, True)
-            return pulse.number, False
+                return (pulse.number, ()) if is_sure else (None, _numbers([pulse, counted]))
+            return pulse.number, ()
+        waiting = [p for p in possible if (frame.head, p.number) not in self._frames]
         if counted is not None:
             # Without a time of its own, a count alone may be that of before a restart.
             head = self._heads[frame.head]
             if head.usual_ns is None or self._speaks_for(frame, counted):
-                return counted.number, False
-            return None, True
-        waiting = [p for p in possible if (frame.head, p.number) not in self._frames]
-        return (waiting[0].number, False) if len(waiting) == 1 else (None, len(waiting) > 1)
+                return counted.number, ()
+            return None, _numbers(waiting)
+        return (waiting[0].number, ()) if len(waiting) == 1 else (None, _numbers(waiting))
 
     def _is_like_the_others(self, frame: Frame, pulse: Pulse) -> bool:
         """Whether a frame near a pulse began as its head's frames do, and not there by chance."""
@@ -205,6 +205,10 @@ class Matcher:
         if usual_ns is None or (frame.head, pulse.number) in self._frames:
             return False
         return abs(frame.mono_ns - self._start_ns(frame, pulse) - usual_ns) <= USUAL_SLACK_NS
+
+
+def _numbers(pulses: Iterable[Pulse]) -> tuple[int, ...]:
+    return tuple(pulse.number for pulse in pulses)
 
 
 def start_of_exposure_mono_ns(frame: Frame) -> int | None:

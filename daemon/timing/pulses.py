@@ -39,8 +39,12 @@ class Pulse:
 
 @dataclass(frozen=True)
 class Match:
-    """Where a frame or mark belongs: `number` is None where it belongs nowhere."""
+    """Where a frame or mark belongs: `number` is None where it belongs nowhere.
+
+    `possible` are the exposures a frame may be of, where that is for doubt.
+    """
 
     number: int | None
     cause: Cause
     is_ambiguous: bool = False
+    possible: tuple[int, ...] = ()

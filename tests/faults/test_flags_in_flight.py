@@ -55,6 +55,17 @@ FLAGGED = {
 }
 
 
+def test_a_damaged_frame_that_may_be_of_two_exposures_accuses_neither_alone(
+    tmp_path: Path,
+) -> None:
+    faults = (hit("lost", "SU10", 5), hit("corrupt", "SU10", 6))
+    flight = FastFlight(SMALL_RIG, faults, exposures=10, seed=1, mission=tmp_path)
+    assert not shortcomings(flight.fly())
+    flagged = {r.number: Flag(r.flags) & ~Flag.SIMULATED for r in flight.records if r.missing}
+    both = Flag.FRAME_MISSING | Flag.FRAME_AMBIGUOUS
+    assert flagged == {5: both, 6: both}
+
+
 def test_each_exposure_is_flagged_with_what_hit_it_and_with_nothing_else(tmp_path: Path) -> None:
     flight = FastFlight(SMALL_RIG, FAULTS, exposures=EXPOSURES, seed=1, mission=tmp_path)
     flight.flight.limits = LimitsSection(frame_timeout_s=STORED_WITHIN_S)

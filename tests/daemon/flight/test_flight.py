@@ -172,6 +172,62 @@ def test_a_missing_frame_is_waited_for_and_then_the_exposure_is_degraded() -> No
     assert (sheet.degraded, sheet.frames.late) == (1, 1) and sheet.is_balanced
 
 
+def in_two_that_wait(flying: Flight, status: FrameStatus) -> tuple[Pulse, Pulse]:
+    """Two exposures wait for G, of which a frame comes that says nothing of when it was made."""
+    first, second = (fly_one(flying, number, 1.35 * number, HEADS[:2]) for number in (1, 2))
+    unknown = {"device_ns": None, "counter": None, "status": status}
+    came = replace(frame("G", second, slot=5), **unknown)
+    cause = Cause.SPURIOUS if status is FrameStatus.COMPLETE else Cause.CORRUPT
+    assert flying.frame(came) is cause and flying.idle_slots == [("G", 5)]
+    return first, second
+
+
+def missing_of(flying: Flight) -> dict[int, tuple[str, Flag]]:
+    """What is stored when waiting is over: why G is missing, and the flags."""
+    due = [one.capture for one in flying.due_to_store(12 * NS)]
+    return {c.number: (dict(c.missing).get("G", ""), Flag(c.flags)) for c in due}
+
+
+def test_a_damaged_frame_that_may_be_of_two_exposures_is_told_at_both() -> None:
+    flying = flight()
+    in_two_that_wait(flying, FrameStatus.INCOMPLETE)
+    sentence = "may be a corrupt frame that came, which may be of another exposure"
+    flags = Flag.FRAME_MISSING | Flag.FRAME_AMBIGUOUS
+    assert missing_of(flying) == dict.fromkeys((1, 2), (sentence, flags))
+
+
+def test_a_whole_frame_that_may_be_of_two_exposures_is_told_at_both() -> None:
+    flying = flight()
+    in_two_that_wait(flying, FrameStatus.COMPLETE)
+    sentence = "may be a frame that came and could not be told from others"
+    flags = Flag.FRAME_MISSING | Flag.FRAME_AMBIGUOUS
+    assert missing_of(flying) == dict.fromkeys((1, 2), (sentence, flags))
+
+
+def test_an_exposure_that_has_its_frame_is_not_accused_of_the_damaged_one() -> None:
+    flying = flight()
+    _, second = in_two_that_wait(flying, FrameStatus.CORRUPT)
+    assert flying.frame(frame("G", second)) is Cause.USED
+    found = missing_of(flying)
+    assert found[2] == ("", Flag(0))
+    assert found[1][0].startswith("may be") and found[1][1] & Flag.FRAME_AMBIGUOUS
+
+
+def test_a_damaged_frame_that_comes_when_two_are_stored_is_told_in_both_records() -> None:
+    flying = flight()
+    first, second = (fly_one(flying, number, 1.35 * number, HEADS[:2]) for number in (1, 2))
+    for due in flying.due_to_store(12 * NS):
+        flying.stored(due.capture.number, due.capture.frames)
+    damaged = replace(frame("G", second), status=FrameStatus.INCOMPLETE)
+    flying.frame(replace(damaged, device_ns=None, counter=None, mono_ns=12 * NS))
+    for given in (first, second):
+        flying.mark(mark(given))
+        flying.navigation(nav(given.mono_ns / NS + 0.2))
+    for _ in (first, second):
+        flags = Flag(seal(flying, 13 * NS).flags)
+        assert flags & Flag.FRAME_AMBIGUOUS and not flags & Flag.FRAME_CORRUPT
+
+
 def test_a_head_that_is_known_to_be_lost_is_not_waited_for() -> None:
     flying = flight()
     flying.absent_heads.add("G")

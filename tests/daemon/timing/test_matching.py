@@ -94,6 +94,17 @@ def test_a_frame_of_no_pulse_is_spurious_and_an_incomplete_one_corrupt() -> None
     assert matching.frame(frame(2)).cause is Cause.USED
 
 
+def test_a_damaged_frame_without_a_time_may_be_of_every_pulse_that_waits() -> None:
+    matching = matcher(range(1, 5))
+    matching.frame(frame(1))
+    clockless = {"device_ns": None, "device_clock_ns": None, "device_clock_mono_ns": None}
+    damaged = frame(3, status=FrameStatus.INCOMPLETE, counter=None, **clockless)
+    found = matching.frame(damaged)
+    assert (found.number, found.cause, found.possible) == (None, Cause.CORRUPT, (2, 3))
+    matching.frame(frame(2))
+    assert matching.frame(damaged).number == 3, "nothing else is left"
+
+
 def test_a_head_without_a_clock_is_matched_by_its_count_once_that_is_known() -> None:
     matching = matcher(range(1, 4))
     matching.frame(frame(1))
