@@ -99,15 +99,15 @@ class ExposureControl:
         """An exposure is made with what is set now."""
         self._used[number] = (line_id, dict(self.settings))
         self._used.pop(number - REMEMBERED, None)
-        if line_id != self._settled_on:
-            self._settled_on = None
+        if self._settled_on not in (None, line_id):
+            self._settle_on(None)
 
     def seen(self, number: int, histograms: Mapping[str, Sequence[int]]) -> None:
         """How bright an exposure became: what the next ones should be made with."""
         if not self.is_automatic or number not in self._used or not histograms:
             return
         line_id, used = self._used[number]
-        if self._section.lock == "line" and line_id and line_id == self._settled_on:
+        if line_id and line_id == self._settled_on:
             return
         for group, heads in self._heads.items():
             columns = [histograms[head] for head in heads if head in histograms]
@@ -117,8 +117,14 @@ class ExposureControl:
                 next_settings(counts, used[group], limits) if counts else used[group]
             )
         self._by = "automatic"
-        if all(_alike(self._wanted[group], used[group]) for group in used):
-            self._settled_on = line_id
+        is_well = all(_alike(self._wanted[group], used[group]) for group in used)
+        if is_well and line_id and self._section.lock == "line":
+            self._settle_on(line_id)
+
+    def _settle_on(self, line_id: str | None) -> None:
+        """Nothing is changed on this line any more; None: a change is possible again."""
+        self._settled_on = line_id
+        self._tell("exposure-settings", by="automatic", **self.as_json())
 
     def apply(self) -> bool:
         """Write what is wanted into the heads, between two exposures; True where that was done."""
@@ -140,6 +146,7 @@ class ExposureControl:
         return {
             "control": "automatic" if self.is_automatic else "manual",
             "lock": self._section.lock,
+            "locked_on": self._settled_on,
             "settings": {group: asdict(one) for group, one in self.settings.items()},
         }
 

@@ -352,7 +352,7 @@ def _add_telemetry(app: FastAPI, state: FlightState, doors: _Doors) -> None:
         finally:
             gone.cancel()
             doors.watchers -= 1
-            with suppress(RuntimeError):
+            with suppress(RuntimeError, WebSocketDisconnect):
                 await socket.close()
 
 

@@ -1,5 +1,7 @@
 // The API's routes, read from the OpenAPI document this service serves.
 
+import { askedJson } from "./asking.js";
+
 const room = document.getElementById("routes");
 const api = await (await fetch("openapi.json")).json();
 
@@ -8,6 +10,8 @@ function element(name, properties = {}, ...children) {
   made.append(...children);
   return made;
 }
+
+document.getElementById("simulated").hidden = !(await askedJson("api/v1/brief"))?.simulated;
 
 const sections = [];
 for (const [path, methods] of Object.entries(api.paths)) {

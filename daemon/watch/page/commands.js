@@ -5,7 +5,7 @@ import { flight } from "./state.js";
 const answer = document.getElementById("answer");
 
 // What is typed into a dialog; nothing where it is left.
-function ask(dialogId, fieldId) {
+export function ask(dialogId, fieldId) {
   const dialog = document.getElementById(dialogId);
   const field = document.getElementById(fieldId);
   return new Promise((resolve) => {
@@ -37,17 +37,18 @@ export async function command(name, body = {}) {
     if (!token) return false;
   }
   let response;
+  let told;
   try {
     response = await fetch(`/api/v1/commands/${name}`, {
       method: "POST",
       headers: { "Authorization": `Bearer ${token}`, "Content-Type": "application/json" },
       body: JSON.stringify(body),
     });
+    told = await response.json();
   } catch {
-    say("No link to the camera; the command was not given.", true);
+    say("No link to the camera; whether the command was heard is not known.", true);
     return false;
   }
-  const told = await response.json();
   if (response.status === 401) sessionStorage.removeItem("token");
   else sessionStorage.setItem("token", token);
   if (response.ok) {

@@ -13,7 +13,8 @@ export function drawExposure() {
   const fresh = JSON.stringify(current || {});
   if (fresh === told || !current?.settings) return;
   told = fresh;
-  control.textContent = `(${current.control})`;
+  const locked = current.locked_on ? `, locked on line ${current.locked_on}` : "";
+  control.textContent = `(${current.control}${locked})`;
   const groups = Object.entries(current.settings);
   now.replaceChildren(...groups.map(([group, one]) => Object.assign(document.createElement("li"), {
     textContent: `${group}: ${one.exposure_time_us.toFixed(0)} µs, ${one.gain_db.toFixed(1)} dB, ${one.tdi_shifts} TDI`,

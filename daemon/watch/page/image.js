@@ -1,7 +1,8 @@
 // The quick look: zoom, pan, histogram, residual vectors in its place.
 
+import { asked, askedJson } from "./asking.js";
 import { flight } from "./state.js";
-import { drawHistogram, drawVectors, listOverlaps, product } from "./residuals.js";
+import { drawHistogram, drawVectors, forgetHistogram, listOverlaps } from "./residuals.js";
 
 const room = document.getElementById("image");
 const image = document.getElementById("quicklook");
@@ -48,7 +49,8 @@ function quicklookHistogram() {
     for (let band = 0; band < 3; band += 1) counts[band][pixels[i + band]] += 1;
   }
   const draw = canvas.getContext("2d");
-  draw.clearRect(0, 0, canvas.width, canvas.height);
+  forgetHistogram(canvas);
+  canvas.setAttribute("aria-label", "Histogram of the quick look");
   const most = Math.max(...counts.flatMap((one) => [...one.slice(1, 255)]), 1);
   ["#d33", "#2a2", "#35e"].forEach((colour, band) => {
     draw.strokeStyle = colour;
@@ -93,23 +95,28 @@ function figures(one) {
   }
 }
 
-export function showImage(number) {
+export async function showImage(number) {
   const one = flight.exposures.get(number);
   if (!one) return;
   figures(one);
   which.textContent = `${number}`;
-  if (one.step !== "processed") return;
+  if (one.step !== "processed") {
+    showNone(`exposure ${number}: ${one.step === "lost" ? "lost, no image" : `${one.step}, no image yet`}`);
+    return;
+  }
   drawing.toggleAttribute("hidden", residuals.getAttribute("aria-pressed") !== "true");
   noteRoom.hidden = drawing.hasAttribute("hidden");
   const address = `/api/v1/exposures/${number}/quicklook.jpg`;
   if (shown === address) return;
   shown = address;
   const refit = image.hidden;
+  const products = Promise.all(["histogram.json", "residuals.json"].map((name) =>
+    askedJson(`/api/v1/exposures/${number}/${name}`)));
   image.onload = async () => {
     image.hidden = false;
     nothing.hidden = true;
     if (refit) fit();
-    const [raw, vectors] = await Promise.all([product(number, "histogram.json"), product(number, "residuals.json")]);
+    const [raw, vectors] = await products;
     if (shown !== address) return;
     if (raw) drawHistogram(canvas, raw);
     else quicklookHistogram();
@@ -117,9 +124,34 @@ export function showImage(number) {
     listOverlaps(vectors, number);
     place();
   };
-  image.onerror = () => { image.hidden = true; nothing.hidden = false; shown = null; };
+  image.onerror = () => showNone(`exposure ${number}: its quick look cannot be read`);
   image.alt = `Quick look of exposure ${number}, verdict ${one.verdict}`;
-  image.src = address;
+  const picture = await (await asked(address))?.blob();
+  if (shown !== address) return;
+  if (!picture) {
+    showNone(`exposure ${number}: no quick look`);
+    return;
+  }
+  if (image.src) URL.revokeObjectURL(image.src);
+  image.src = URL.createObjectURL(picture);
+}
+
+export function forgetImage() {
+  showNone("no image yet");
+  which.textContent = "";
+  about.replaceChildren();
+}
+
+// Better no image than that of another exposure.
+function showNone(why) {
+  shown = null;
+  image.hidden = true;
+  nothing.hidden = false;
+  nothing.textContent = why;
+  drawVectors(drawing, null);
+  noteRoom.hidden = true;
+  forgetHistogram(canvas);
+  listOverlaps(null, null);
 }
 
 export function prepareImage(again) {
@@ -148,16 +180,29 @@ export function prepareImage(again) {
     else return;
     event.preventDefault();
   });
-  let held = null;
+  // One finger moves, two zoom about the middle between them.
+  const fingers = new Map();
+  const grip = () => {
+    const at = [...fingers.values()];
+    const middle = [0, 1].map((k) => at.reduce((sum, one) => sum + one[k], 0) / at.length);
+    return [...middle, at.length > 1 ? Math.hypot(at[0][0] - at[1][0], at[0][1] - at[1][1]) : 0];
+  };
   room.addEventListener("pointerdown", (event) => {
-    held = [event.clientX - view.x, event.clientY - view.y];
+    fingers.set(event.pointerId, [event.clientX, event.clientY]);
     room.setPointerCapture(event.pointerId);
   });
   room.addEventListener("pointermove", (event) => {
-    if (!held) return;
-    view.x = event.clientX - held[0];
-    view.y = event.clientY - held[1];
-    place();
+    if (!fingers.has(event.pointerId)) return;
+    const [x0, y0, apart0] = grip();
+    fingers.set(event.pointerId, [event.clientX, event.clientY]);
+    const [x, y, apart] = grip();
+    view.x += x - x0;
+    view.y += y - y0;
+    const box = room.getBoundingClientRect();
+    zoom(apart0 && apart ? apart / apart0 : 1, x - box.left, y - box.top);
   });
-  room.addEventListener("pointerup", () => { held = null; });
+  for (const end of ["pointerup", "pointercancel"]) {
+    room.addEventListener(end, (event) => fingers.delete(event.pointerId));
+  }
+  addEventListener("resize", fit);
 }

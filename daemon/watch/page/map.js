@@ -3,7 +3,7 @@
 import { flight } from "./state.js";
 
 const COLOURS = { good: "--good", usable: "--caution", refly: "--warning", lost: "--warning" };
-const DASHES = { good: null, usable: "6 3", refly: "2 4", lost: "2 4" };
+const DASHES = { good: null, usable: "6 3", refly: "2 4", lost: "1 7" };
 
 const map = L.map("map", { zoomControl: true, attributionControl: false, zoomSnap: 0.25 });
 map.setView([0, 0], 2);
@@ -11,9 +11,21 @@ L.control.scale({ imperial: false }).addTo(map);
 const track = L.polyline([], { color: "#777", weight: 2 }).addTo(map);
 const here = L.circleMarker([0, 0], { radius: 6, weight: 3 });
 const footprints = new Map();
-let framed = false;
+const follow = document.getElementById("map-follow");
+let follows = true;
+let isOurs = false;
 
-map.on("dragstart", () => { framed = true; });
+function setFollows(wanted) {
+  follows = wanted;
+  follow.setAttribute("aria-pressed", String(wanted));
+}
+
+// Whoever moves the map, by finger, wheel, button or key, keeps it where it is put.
+map.on("movestart", () => { if (!isOurs) setFollows(false); });
+follow.addEventListener("click", () => {
+  setFollows(!follows);
+  frame();
+});
 
 function colour(name) {
   return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
@@ -25,13 +37,20 @@ function style(one) {
     color: colour(COLOURS[verdict] || "--soft"),
     dashArray: DASHES[verdict] || null,
     weight: one.number === flight.brief?.last_number ? 4 : 2,
-    fillOpacity: verdict ? 0.12 : 0.03,
+    fillOpacity: !verdict || verdict === "lost" ? 0.03 : 0.12,
   };
 }
 
 const plan = L.layerGroup().addTo(map);
 const holes = L.layerGroup().addTo(map);
 let planned = null;
+
+// Where a line's id stands beside no other line: away from where it leads.
+function behind([[lat0, lon0], [lat1, lon1]]) {
+  const [north, east] = [lat1 - lat0, (lon1 - lon0) * Math.cos(lat0 * Math.PI / 180)];
+  if (Math.abs(north) > Math.abs(east)) return north > 0 ? "bottom" : "top";
+  return east > 0 ? "left" : "right";
+}
 
 // The planned lines with their ids, and where exposures are due.
 export function drawPlan(told) {
@@ -43,7 +62,7 @@ export function drawPlan(told) {
   for (const line of lines) {
     L.polyline(line.at, { color: colour("--soft"), weight: 2, dashArray: "8 6", interactive: false }).addTo(plan);
     L.circleMarker(line.at[0], { radius: 2, color: colour("--soft"), interactive: false })
-      .bindTooltip(line.id, { permanent: true, direction: "left", className: "line-label" }).addTo(plan);
+      .bindTooltip(line.id, { permanent: true, direction: behind(line.at), className: "line-label" }).addTo(plan);
     if (line.places_m.length > 200) continue;
     const [[lat0, lon0], [lat1, lon1]] = line.at;
     const scale = Math.cos(lat0 * Math.PI / 180);
@@ -62,7 +81,7 @@ export function drawHoles(segments) {
   for (const one of segments) {
     if (one.kind !== "hole") continue;
     L.polyline(one.at, { color: colour("--warning"), weight: 12, opacity: 0.55, dashArray: "2 6", lineCap: "butt" })
-      .bindTooltip(`✖ ${one.line}: ${one.from_m.toFixed(0)}–${one.to_m.toFixed(0)} m`,
+      .bindTooltip(`✖ ${one.line}`,
         { permanent: true, direction: "right", className: "hole-label" }).addTo(holes);
   }
 }
@@ -92,10 +111,19 @@ export function drawMap(choose) {
       footprints.delete(number);
     }
   }
-  if (!framed) {
-    const bounds = L.featureGroup([...footprints.values()]).getBounds();
-    if (planned && (!bounds.isValid() || !planned.intersects(bounds))) bounds.extend(planned);
-    if (bounds.isValid()) map.fitBounds(bounds, { padding: [20, 20], maxZoom: 17 });
-    else if (position) map.setView(here.getLatLng(), 14);
-  }
+  frame();
+}
+
+// Where the camera is, with what was exposed, or what is planned.
+function frame() {
+  if (!follows) return;
+  const bounds = L.featureGroup([...footprints.values()]).getBounds();
+  if (planned && (!bounds.isValid() || !planned.intersects(bounds))) bounds.extend(planned);
+  const isSomewhere = map.hasLayer(here);
+  isOurs = true;
+  if (bounds.isValid()) {
+    if (isSomewhere) bounds.extend(here.getLatLng());
+    map.fitBounds(bounds, { padding: [20, 20], maxZoom: 17, animate: false });
+  } else if (isSomewhere) map.setView(here.getLatLng(), 14, { animate: false });
+  isOurs = false;
 }

@@ -1,16 +1,18 @@
 // The operator's page: what came by telemetry, put where an operator looks for it.
 
 import { flight, listen, onChange } from "./state.js";
-import { command } from "./commands.js";
+import { ask, command } from "./commands.js";
 import { drawMap } from "./map.js";
 import { drawExposure } from "./exposure.js";
 import { followPlan } from "./plan.js";
-import { prepareImage, showImage } from "./image.js";
+import { forgetImage, prepareImage, showImage } from "./image.js";
 import { drawCharts, fitCharts } from "./charts.js";
 
 const MARKS = { good: "●", usable: "▲", refly: "■", lost: "✖" };
 const PHASE_CLASS = { flying: "good", armed: "good", ready: "caution", fault: "warning", idle: "caution" };
 const DEVICE_MARKS = { ready: "●", found: "○", unknown: "○", lost: "✖", absent: "✖" };
+const KINDS = { head: "heads", navigator: "receivers", thermometer: "thermometers", trigger: "trigger", pps: "pulse per second" };
+const GRAVITY = { refly: 0, usable: 1, good: 2 };
 const ROWS_SHOWN = 300;
 
 const by = (id) => document.getElementById(id);
@@ -25,7 +27,8 @@ function duration(ns) {
   if (ns == null) return null;
   if (ns < 1e3) return `${ns} ns`;
   if (ns < 1e6) return `${(ns / 1e3).toPrecision(3)} µs`;
-  return `${(ns / 1e6).toPrecision(3)} ms`;
+  if (ns < 1e9) return `${(ns / 1e6).toPrecision(3)} ms`;
+  return ns < 1e14 ? `${(ns / 1e9).toFixed(1)} s` : "unknown";
 }
 
 function element(name, properties = {}, ...children) {
@@ -41,6 +44,8 @@ function drawHead() {
   phase.textContent = brief.phase;
   phase.className = `chip ${PHASE_CLASS[brief.phase] || ""}`;
   by("simulated").hidden = !brief.simulated;
+  by("recovery").replaceChildren(...(brief.mission.recovery || []).map((one) =>
+    element("li", { textContent: `At the restart: ${one}` })));
   document.title = `${brief.simulated ? "SIMULATED · " : ""}${brief.mission.rig || ""} · Syntopic`;
   text("left", status.exposures_left);
   text("sigma", duration(status.clock_sigma_ns));
@@ -57,28 +62,27 @@ function drawHead() {
     element("dd", { textContent: value == null ? "open" : `${value.toFixed(2)} °C` }))));
 }
 
-function lastJudged() {
-  let last = null;
-  for (const one of flight.exposures.values()) {
-    if ((one.verdict || one.step === "lost") && (!last || one.number > last.number)) last = one;
-  }
-  return last;
+function last(isIt) {
+  let found = null;
+  for (const one of flight.exposures.values()) if (isIt(one) && (!found || one.number > found.number)) found = one;
+  return found;
 }
 
 function drawVerdict() {
-  const last = lastJudged();
-  if (!last) return;
-  const word = last.verdict || "lost";
+  const judged = last((one) => one.verdict || one.step === "lost");
+  const word = judged ? judged.verdict || "lost" : "waiting";
   const room = by("verdict");
-  const which = `exposure ${last.number}`;
+  const which = judged ? `exposure ${judged.number}` : "";
   if (room.dataset.told === `${which} ${word}`) return;
   room.dataset.told = `${which} ${word}`;
   room.className = `verdict ${word}`;
-  room.querySelector(".mark").textContent = MARKS[word];
+  room.querySelector(".mark").textContent = MARKS[word] || "·";
   room.querySelector(".word").textContent = word;
   room.querySelector(".which").textContent = which;
-  by("findings").replaceChildren(...(last.findings || []).map((finding) =>
-    element("li", { textContent: finding.sentence })));
+  const lost = { verdict: "lost", sentence: judged?.sentence || "Its frames are not to be had; fly its place again." };
+  const findings = (word === "lost" ? [lost] : [...(judged?.findings || [])]).sort((a, b) => GRAVITY[a.verdict] - GRAVITY[b.verdict]);
+  by("findings").replaceChildren(...findings.map((finding) =>
+    element("li", { textContent: `${MARKS[finding.verdict] || ""} ${finding.sentence}`, className: finding.verdict })));
 }
 
 function drawFaults() {
@@ -106,24 +110,39 @@ function drawFaults() {
   }));
 }
 
-function drawDevices() {
-  const devices = [...flight.devices.values()].sort((a, b) =>
-    (a.state === "ready") - (b.state === "ready") || a.name.localeCompare(b.name));
-  by("devices").replaceChildren(...devices.map((device) => element("li", { className: device.state },
+function deviceItem(device) {
+  return element("li", { className: device.state },
     element("span", { textContent: DEVICE_MARKS[device.state] || "○", ariaHidden: "true" }),
     element("span", { textContent: device.name }),
     element("span", { className: "said", textContent:
-      device.state === "ready" ? "ready" : `${device.state}. ${device.sentence}` }))));
+      device.state === "ready" ? "ready" : `${device.state}. ${device.sentence}` }));
+}
+
+// By kind; what is wrong is on top and open, what is well can be looked into.
+function drawDevices() {
+  const kinds = Map.groupBy([...flight.devices.values()].sort((a, b) => a.name.localeCompare(b.name)),
+    (device) => KINDS[device.kind] || device.kind || "other");
+  const ill = (devices) => devices.filter((device) => device.state !== "ready");
+  const opened = new Set([...by("devices").querySelectorAll("details[open]")].map((one) => one.dataset.kind));
+  const sorted = [...kinds].sort((a, b) => ill(b[1]).length - ill(a[1]).length || a[0].localeCompare(b[0]));
+  by("devices").replaceChildren(...sorted.map(([kind, devices]) => {
+    const wrong = ill(devices);
+    const well = devices.length - wrong.length;
+    const room = element("details", { open: wrong.length > 0 || opened.has(kind), className: wrong.length ? "ill" : "well" },
+      element("summary", { textContent: `${wrong.length ? "✖" : "●"} ${kind}: ${well} of ${devices.length} ready` }),
+      element("ul", {}, ...wrong.map(deviceItem), ...devices.filter((one) => !wrong.includes(one)).map(deviceItem)));
+    room.dataset.kind = kind;
+    return element("li", {}, room);
+  }));
 }
 
 function row(one) {
   const figures = one.figures || {};
   const word = one.verdict || one.step;
   const choose = element("button", { type: "button", textContent: one.number });
-  choose.addEventListener("click", () => select(one.number));
   const cells = [
     [choose],
-    [`${MARKS[one.verdict] || ""} ${word}`, one.verdict || (one.step === "lost" ? "lost" : "")],
+    [`${MARKS[word] || ""} ${word}`, one.verdict || (one.step === "lost" ? "lost" : "")],
     [one.line || ""],
     [one.frames == null ? "" : `${one.frames}`],
     [duration(one.mark_sigma_ns) || ""],
@@ -134,6 +153,7 @@ function row(one) {
   ];
   const made = element("tr", {}, ...cells.map(([content, style]) =>
     element("td", { className: style || "" }, content)));
+  made.addEventListener("click", () => select(one.number));
   made.setAttribute("aria-selected", String(one.number === chosen));
   return made;
 }
@@ -157,33 +177,55 @@ function follow(wanted) {
   by("follow").setAttribute("aria-pressed", String(wanted));
 }
 
-onChange((record) => {
+onChange((record, isFresh) => {
+  if (isFresh) {
+    chosen = null;
+    forgetImage();
+  }
   drawHead();
   drawVerdict();
   drawFaults();
   drawExposure();
-  const last = lastJudged();
-  if (follows && last) chosen = last.number;
-  if (record.devices) drawDevices();
-  if (record.exposures || record.track) drawMap(select);
+  // The image that is followed is the last there is, under its own number.
+  if (follows) chosen = last((one) => one.step === "processed")?.number ?? chosen;
+  if (isFresh || record.devices) drawDevices();
+  if (isFresh || record.exposures || record.track) drawMap(select);
   followPlan(Boolean(record.exposures));
-  if (record.exposures) drawRows();
-  if (record.history || !document.querySelector("#chart-sigma0 .uplot")) drawCharts();
+  if (isFresh || record.exposures) drawRows();
+  if (isFresh || record.history) drawCharts();
   if (chosen != null) showImage(chosen);
 });
 
 by("follow").addEventListener("click", () => follow(!follows));
-by("theme").addEventListener("click", () => {
-  const dark = document.documentElement.dataset.theme !== "dark";
-  document.documentElement.dataset.theme = dark ? "dark" : "";
-  by("theme").setAttribute("aria-pressed", String(dark));
+function cabin(isDark) {
+  document.documentElement.dataset.theme = isDark ? "dark" : "";
+  by("theme").setAttribute("aria-pressed", String(isDark));
+  localStorage.setItem("cabin", isDark ? "dark" : "");
   if (flight.brief) drawMap(select);
-});
+  fitCharts();
+}
+
+by("theme").addEventListener("click", () => cabin(document.documentElement.dataset.theme !== "dark"));
+cabin(localStorage.getItem("cabin") === "dark");
 addEventListener("resize", fitCharts);
 prepareImage(() => chosen != null && showImage(chosen));
+
+let isLive = false;
 
 listen((isLinked) => {
   const link = by("link");
   link.textContent = isLinked ? "linked" : "no link";
   link.className = `chip ${isLinked ? "good" : "warning"}`;
+  document.body.classList.toggle("stale", !isLinked);
+  if (!isLinked && isLive) {
+    by("stale").textContent = `✖ NO LINK since ${new Date().toLocaleTimeString("en-GB")}: what is shown is of then.`;
+    document.title = `NO LINK · ${document.title}`;
+  }
+  by("stale").hidden = isLinked || !(isLive || flight.brief);
+  isLive = isLinked;
+}, async () => {
+  by("link").textContent = "token needed";
+  let token = "";
+  while (!token) token = await ask("ask-token", "token");
+  sessionStorage.setItem("token", token);
 });

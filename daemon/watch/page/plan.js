@@ -1,5 +1,6 @@
 // The plan of the mission, and what of it has to be flown again.
 
+import { askedJson } from "./asking.js";
 import { flight } from "./state.js";
 import { drawHoles, drawPlan } from "./map.js";
 
@@ -11,17 +12,6 @@ let mission = null;
 let hasPlan = false;
 let asked = 0;
 let waits = null;
-
-async function told(address) {
-  const token = sessionStorage.getItem("token");
-  const headers = token ? { Authorization: `Bearer ${token}` } : {};
-  try {
-    const response = await fetch(address, { headers });
-    return response.ok ? await response.json() : null;
-  } catch {
-    return null;
-  }
-}
 
 function row(one) {
   const made = document.createElement("tr");
@@ -35,11 +25,11 @@ function row(one) {
 
 async function advise() {
   asked = Date.now();
-  const advice = await told("/api/v1/advice");
+  const advice = await askedJson("/api/v1/advice");
   if (!advice?.segments) return;
   const holes = advice.segments.filter((one) => one.kind === "hole");
   const share = advice.planned_m ? 100 * advice.well_m / advice.planned_m : 0;
-  well.textContent = `${share.toFixed(0)} % of ${(advice.planned_m / 1000).toFixed(1)} km is well; ` +
+  well.textContent = `${share.toFixed(0)} % of ${(advice.planned_m / 1000).toFixed(1)} km is well seen; ` +
     (holes.length ? `${holes.length} ${holes.length === 1 ? "hole" : "holes"} behind:` : "no hole behind.");
   rows.replaceChildren(...holes.map(row));
   rows.closest(".scroll").hidden = !holes.length;
@@ -51,7 +41,7 @@ export async function followPlan(hasNewExposures) {
   const current = flight.brief?.mission?.id || null;
   if (current !== mission) {
     mission = current;
-    const plan = current && await told("/api/v1/plan");
+    const plan = current && await askedJson("/api/v1/plan");
     hasPlan = Boolean(plan?.lines);
     room.hidden = !hasPlan;
     drawPlan(plan);

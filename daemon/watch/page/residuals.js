@@ -7,17 +7,6 @@ const COLOURS = { PAN: "#888", R: "#d33", G: "#2a2", B: "#35e", N: "#a3a" };
 const note = document.getElementById("vectors-note");
 const said = document.getElementById("histogram-note");
 
-export async function product(number, name) {
-  const token = sessionStorage.getItem("token");
-  try {
-    const response = await fetch(`/api/v1/exposures/${number}/${name}`,
-      { headers: token ? { Authorization: `Bearer ${token}` } : {} });
-    return response.ok ? await response.json() : null;
-  } catch {
-    return null;
-  }
-}
-
 // Vectors in pixels of the virtual image, enlarged so that most are some pixels of the picture long.
 export function drawVectors(svg, told, width, height) {
   svg.replaceChildren();
@@ -45,6 +34,12 @@ export function drawVectors(svg, told, width, height) {
     `nine of ten are shorter than ${usual.toFixed(2)} px. Solid: between PAN sensors, dashed: to colour, thick: left out.`;
 }
 
+export function forgetHistogram(canvas) {
+  canvas.getContext("2d").clearRect(0, 0, canvas.width, canvas.height);
+  canvas.setAttribute("aria-label", "Histogram");
+  said.replaceChildren();
+}
+
 export function listOverlaps(told, number) {
   const rows = (told?.overlaps || []).map((one) => {
     const row = document.createElement("tr");
@@ -55,7 +50,9 @@ export function listOverlaps(told, number) {
     return row;
   });
   document.getElementById("overlaps").replaceChildren(...rows);
-  document.getElementById("drawing").href = `/api/v1/exposures/${number}/residuals.svg`;
+  const drawing = document.getElementById("drawing");
+  drawing.hidden = !told;
+  drawing.href = `/api/v1/exposures/${number}/residuals.svg`;
 }
 
 function quantile(counts, share) {
@@ -77,7 +74,7 @@ export function drawHistogram(canvas, told) {
   }
   const pen = canvas.getContext("2d");
   pen.clearRect(0, 0, canvas.width, canvas.height);
-  const words = [];
+  said.replaceChildren("Raw counts, black to full scale. Median / brightest hundredth: ");
   for (const [name, counts] of Object.entries(groups)) {
     const most = Math.max(...counts, 1);
     pen.strokeStyle = COLOURS[name];
@@ -88,9 +85,14 @@ export function drawHistogram(canvas, told) {
     pen.stroke();
     const total = counts.reduce((a, b) => a + b, 0) || 1;
     const high = 100 * counts[counts.length - 1] / total;
-    words.push(`${name} ${(100 * quantile(counts, 0.5)).toFixed(0)} / ${(100 * quantile(counts, 0.99)).toFixed(0)} %` +
-      (high >= 0.5 ? ` ▲ ${high.toFixed(1)} % full` : ""));
+    const word = `${name} ${(100 * quantile(counts, 0.5)).toFixed(0)} / ${(100 * quantile(counts, 0.99)).toFixed(0)} %` +
+      (high >= 0.5 ? ` ▲ ${high.toFixed(1)} % full` : "");
+    const swatch = document.createElement("i");
+    swatch.className = "swatch";
+    swatch.style.borderTop = `${name === "PAN" ? 4 : 2}px solid ${COLOURS[name]}`;
+    const whole = Object.assign(document.createElement("span"), { className: "curve" });
+    whole.append(swatch, word);
+    said.append(whole, " ");
   }
-  said.textContent = `Median / brightest hundredth, of full scale: ${words.join(", ")}`;
   canvas.setAttribute("aria-label", `Histogram of raw counts. ${said.textContent}`);
 }

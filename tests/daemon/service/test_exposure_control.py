@@ -106,8 +106,11 @@ def test_a_line_that_is_well_is_locked_and_the_next_one_is_not(tmp_path: Path) -
     flown.fly(2, 0.6)
     flown.fly(3, 0.31)
     assert len(flown.sent) == 1
+    assert flown.told[-1]["locked_on"] == "A"
     flown.fly(4, 0.31, line="B")
     assert len(flown.sent) == 2
+    # Who looks is told of the lock and of its end.
+    assert [one["locked_on"] for one in flown.told] == [None, None, "A", None, None]
     free = bench(tmp_path, control="automatic", lock="never")
     free.fly(1, 0.6)
     free.fly(2, 0.31)

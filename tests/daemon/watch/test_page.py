@@ -26,9 +26,10 @@ WITHIN_S = 30.0
 class Service:
     """The service's end of the watch process, in the hands of the test."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, port: int = 0, is_open: bool = True) -> None:
         self.token = add_token(folder / "tokens.toml", "operator", "command")
-        settings = WatchSection(port=0, tokens=folder / "tokens.toml", announce=False)
+        tokens = folder / "tokens.toml"
+        settings = WatchSection(port=port, tokens=tokens, announce=False, open=is_open)
         self.child = Child("watch", "daemon.watch.process:main", (settings,), {})
         self.commands: list[Command] = []
         self.refusal = ""
@@ -162,8 +163,9 @@ def test_residuals_are_laid_over_the_image_and_told_by_overlap_and_histogram_in_
     browser.click("#rows tr:last-child button")
     browser.wait_for("document.querySelector('#image-which').innerText === '1'", WITHIN_S)
     browser.click("#show-residuals")
-    browser.wait_for("document.querySelector('#vectors-note').innerText !== ''", WITHIN_S)
-    assert "3 vectors" in browser.text("#vectors-note")
+    browser.wait_for(
+        "document.querySelector('#vectors-note').innerText.includes('3 vectors')", WITHIN_S
+    )
     paths = browser.evaluate(
         "[...document.querySelectorAll('#vectors path')].map((p) => p.getAttribute('d'))"
     )
@@ -179,6 +181,15 @@ def test_residuals_are_laid_over_the_image_and_told_by_overlap_and_histogram_in_
     assert browser.evaluate("document.querySelectorAll('#overlaps tr').length") == 2
     assert "▲ few: 5" in browser.text("#overlaps")
     assert "R 99 / 99 % ▲ 100.0 % full" in browser.text("#histogram-note")
+
+
+def test_an_exposure_without_image_shows_none_not_that_of_another(browser: Browser) -> None:
+    assert browser.evaluate("!document.querySelector('#quicklook').hidden")
+    browser.click("#rows tr:nth-last-child(4) td:nth-child(2)")
+    browser.wait_for("document.querySelector('#quicklook').hidden", WITHIN_S)
+    assert browser.text("#image-which") == "4"
+    assert browser.text("#no-image") == "exposure 4: no quick look"
+    assert browser.text("#histogram-note") == ""
 
 
 def test_a_fault_is_seen_within_two_seconds_and_acknowledged_with_a_token(
@@ -305,6 +316,37 @@ def test_axe_finds_nothing_serious(browser: Browser, tmp_path: Path) -> None:
         grave += _grave(browser, "'#ask-override'")
         browser.evaluate("document.querySelector('#ask-override').close()")
         assert grave == [], f"theme {theme or 'light'}"
+
+
+def test_what_is_shown_without_a_link_is_marked_and_forgotten_when_another_flight_is_watched(
+    folder: Path, browser: Browser, tmp_path: Path
+) -> None:
+    """Looking needs a token here; the page asks for it, and shows images with it."""
+    closed = Service(tmp_path, is_open=False)
+    try:
+        closed.tell(flown.mission(str(folder / "mission")))
+        for event in (*flown.exposure(1, "refly"), flown.status(triggers=1)):
+            closed.tell(event)
+        browser.open(closed.address)
+        browser.wait_for("document.querySelector('#ask-token')?.open", WITHIN_S)
+        assert browser.text("#link") == "token needed"
+        browser.evaluate(f"document.querySelector('#token').value = {json.dumps(closed.token)}")
+        browser.click("#ask-token button[value=use]")
+        browser.wait_for("document.querySelector('#quicklook').naturalWidth === 900", WITHIN_S)
+        assert "REFLY" in browser.text("#verdict").upper()
+    finally:
+        closed.end()
+    browser.wait_for("document.querySelector('#stale').innerText.includes('NO LINK')", WITHIN_S)
+    (tmp_path / "another").mkdir()
+    another = Service(tmp_path / "another", port=int(closed.address.rstrip("/").split(":")[-1]))
+    try:
+        another.tell(flown.mission() | {"id": "20261122T080000Z-other"})
+        browser.wait_for("document.querySelector('#link').innerText === 'linked'", WITHIN_S)
+        browser.wait_for("document.querySelector('#rows').childElementCount === 0", WITHIN_S)
+        assert browser.evaluate("document.querySelector('#stale').hidden")
+        browser.wait_for("document.querySelector('#verdict .word').innerText === 'WAITING'", 30)
+    finally:
+        another.end()
 
 
 def test_a_picture_is_taken(browser: Browser, tmp_path: Path) -> None:
