@@ -218,7 +218,9 @@ class Outcomes:
                 mosaic, read = self.stitched(camera, float(dc_k), moved, far)
                 records[number] = stitch_record(self.rig, mosaic, read, read)
             steps = [
-                s for s in judge_flight(self.rig, records).steps if s.cone == self.rig.master_cone
+                s
+                for s in judge_flight(self.rig, records).steps
+                if s.cone == self.rig.master_cone and s.kind != "misread"
             ]
             found += bool(steps)
             named += any(moved in (s.sensor, *s.alternatives) for s in steps)

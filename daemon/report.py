@@ -113,6 +113,9 @@ def _displaced(exposures: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     found: dict[str, list[Mapping[str, Any]]] = {}
     for exposure in exposures:
         name = exposure["figures"].get("displaced_sensor")
+        probe = exposure["figures"].get("misread_probe")
+        if name and probe:
+            name = f"{name}, or probe {probe} misreads"
         if name:
             found.setdefault(name, []).append(exposure["figures"])
     return [

@@ -299,6 +299,9 @@ def _master_panel(
     title = "master cone against calibration: no sensor displaced"
     if found:
         title = f"master cone: {displaced} displaced by {found.dx_px:+.3f} {found.dy_px:+.3f} px"
+    if validity.misread:
+        probe = f"probe {validity.misread.probe} {validity.misread.off_k:+.1f} K off"
+        title = f"{title}, or {probe}" if found else f"master cone: {probe}, no sensor displaced"
     parts = [
         *_outline(rig, image, frame),
         _text(x, y - 8, title, 13, _DISPLACED if displaced else _INK),

@@ -7,6 +7,7 @@ exposure is judged in `processing.mosaic.validity`.
 Model, cone by cone, of contrasts y of the sensors' places that no shift, scale or rotation of the
 whole cone can change: y_t = b + k dC_t + steps + noise. b is what calibration leaves, k what drift
 coefficients leave, both with the rig file's sigmas; the noise is the adjustment's and the probe's.
+What a step is, a sensor that slipped or a probe that misreads since, the sensors' scales tell, too.
 """
 
 from __future__ import annotations
@@ -20,11 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from processing.mosaic.flight_series import Series, View, is_master, series_of, view_of
+from processing.mosaic.misfit import PLACE_AND_SCALE, Misread
 from processing.mosaic.stitch_record import StitchRecord
-from processing.rig import Cone, Rig, Sensor
+from processing.rig import Cone, Rig
 
 Array = NDArray[np.float64]
-Kind = Literal["named", "several", "relative"]
+Kind = Literal["named", "several", "relative", "misread"]
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,7 @@ class FlightSettings:
 
     `family_alpha` is the probability of telling of any step in a healthy flight, all cones and
     exposures together. A step is told from `least_exposures` on either side of it, for one
-    exposure may be wrong. Sensors and exposures within `odds` of the best are alternatives to it.
+    exposure may be wrong. Sensors, probes and exposures within `odds` of the best are alternatives.
     """
 
     family_alpha: float = 0.001
@@ -51,7 +54,10 @@ class Step:
 
     "named": it is `sensor`, unless one of `alternatives`. "several": more than one sensor of the
     cone moved, and which cannot be told; dx, dy are of the one that fits best. "relative": of two
-    sensors, `sensor` has moved against `alternatives[0]`, or that against this.
+    sensors, `sensor` has moved against `alternatives[0]`, or that against this. "misread": no
+    sensor need have moved (`sensor` is empty, dx and dy are of the one that fits best), for the
+    probe of `misread` explains it better; with the other kinds, `misread` is a probe that explains
+    it nearly as well, None if none does.
     `since` is the first exposure with it, between `earliest` and `latest`; `from_start` says that
     all of the flight has it. `sigma_px` is that of the length.
     """
@@ -69,6 +75,7 @@ class Step:
     sigma_px: float
     statistic: float
     limit: float
+    misread: Misread | None = None
 
     @property
     def length_px(self) -> float:
@@ -83,17 +90,26 @@ class Step:
             since = f"since before exposure {self.since}"
         elif self.earliest != self.latest:
             since += f" (it began between {self.earliest} and {self.latest})"
+        probe = ""
+        if self.misread is not None:
+            way = "high" if self.misread.off_k > 0.0 else "low"
+            off = f"{abs(self.misread.off_k):.1f} +- {self.misread.sigma_k:.1f} K too {way}"
+            probe = f"probe {self.misread.probe} has read {off}"
+        if self.kind == "misread":
+            return f"P{probe[1:]} {since}; no sensor need have moved."
         if self.kind == "relative":
+            culprit = f"or {probe}; what it was" if probe else "which of them moved"
             return (
                 f"{self.sensor} and {self.alternatives[0]} have been displaced against each other "
-                f"by {size} {since}; which of them moved cannot be told."
+                f"by {size} {since}{', ' if probe else '; '}{culprit} cannot be told."
             )
         if self.kind == "several":
             return (
                 f"More than one sensor of cone {self.cone} has been displaced {since}; which ones "
                 "cannot be told from the stitching."
             )
-        unless = f", unless it is {' or '.join(self.alternatives)}" if self.alternatives else ""
+        others = [*self.alternatives, *([f"that {probe}"] if probe else [])]
+        unless = f", unless it is {' or '.join(others)}" if others else ""
         return f"{self.sensor} has been displaced by {size} {since}{unless}."
 
 
@@ -104,16 +120,6 @@ class FlightValidity:
     steps: tuple[Step, ...]
     exposures: Mapping[str, int]
     left_out: Mapping[str, tuple[int, ...]]
-
-
-@dataclass(frozen=True)
-class _Series:
-    """Contrasts of one cone over a flight: y (t, c), weights (t, c, c), dC (t,)."""
-
-    numbers: tuple[int, ...]
-    y: Array
-    covariance: Array
-    dc_k: Array
 
 
 def judge_flight(
@@ -133,66 +139,24 @@ def judge_flight(
         settings: None takes the defaults.
     """
     settings = settings or FlightSettings()
-    judged = [c for c in rig.pan_cones if len(c.sensors) >= (3 if _is_master(rig, c) else 2)]
+    judged = [c for c in rig.pan_cones if len(c.sensors) >= (3 if is_master(rig, c) else 2)]
     steps: list[Step] = []
     used, left_out = {}, {}
     for cone in judged:
-        pairs = [cone.sensors] if _is_master(rig, cone) else [cone.sensors[:2]]
-        for sensors in pairs:
-            series = _series(rig, sensors, records, relative=not _is_master(rig, cone))
-            series, dropped = _without_outliers(series, settings)
-            used[cone.name], left_out[cone.name] = len(series.numbers), dropped
-            if len(series.numbers) >= 2 * settings.least_exposures:
-                relative = not _is_master(rig, cone)
-                steps += _steps(cone, sensors, series, settings, len(judged), relative=relative)
+        view = view_of(rig, cone)
+        series, dropped = _without_outliers(series_of(rig, view, records), settings)
+        used[cone.name], left_out[cone.name] = len(series.numbers), dropped
+        if len(series.numbers) >= 2 * settings.least_exposures:
+            wide = view
+            if is_master(rig, cone):
+                wide = view_of(rig, cone, quantities=PLACE_AND_SCALE)
+            kept = {number: records[number] for number in series.numbers}
+            both = (view, series), (wide, series_of(rig, wide, kept))
+            steps += _steps(rig, cone, both, settings, len(judged))
     return FlightValidity(tuple(steps), used, left_out)
 
 
-def _is_master(rig: Rig, cone: Cone) -> bool:
-    return cone.name == rig.master_cone
-
-
-def _contrasts(sensors: Sequence[Sensor], *, relative: bool) -> Array:
-    if relative:
-        return np.hstack([np.eye(2), -np.eye(2)])
-    directions = np.zeros((2 * len(sensors), 4))
-    for i, sensor in enumerate(sensors):
-        directions[2 * i] = (1.0, 0.0, sensor.x_mm, -sensor.y_mm)
-        directions[2 * i + 1] = (0.0, 1.0, sensor.y_mm, sensor.x_mm)
-    full, _, _ = np.linalg.svd(directions, full_matrices=True)
-    return np.asarray(full[:, 4:].T, np.float64)
-
-
-def _series(
-    rig: Rig,
-    sensors: Sequence[Sensor],
-    records: Mapping[int, StitchRecord],
-    *,
-    relative: bool,
-) -> _Series:
-    pitch_um = sensors[0].pitch_um if rig.virtual_image is None else rig.virtual_image.pitch_um
-    names = [f"{s.name}.{axis}_um" for s in sensors for axis in "xy"]
-    contrasts = _contrasts(sensors, relative=relative) / pitch_um
-    numbers, y, covariance, dc = [], [], [], []
-    for number in sorted(records):
-        record = records[number]
-        if record.calibration_id != rig.calibration_id or not set(names) <= set(record.names):
-            continue
-        at = [record.names.index(name) for name in names]
-        numbers.append(number)
-        y.append(contrasts @ record.values[at])
-        covariance.append(contrasts @ record.covariance[np.ix_(at, at)] @ contrasts.T)
-        dc.append(float(np.mean([record.dc_k[s.name] for s in sensors])))
-    size = len(contrasts)
-    return _Series(
-        tuple(numbers),
-        np.array(y).reshape(-1, size),
-        np.array(covariance).reshape(-1, size, size),
-        np.array(dc),
-    )
-
-
-def _without_outliers(series: _Series, settings: FlightSettings) -> tuple[_Series, tuple[int, ...]]:
+def _without_outliers(series: Series, settings: FlightSettings) -> tuple[Series, tuple[int, ...]]:
     """Leave out exposures that agree with neither their neighbours before nor those after."""
     count, size = series.y.shape
     limit = float(chi2.isf(settings.outlier_alpha, size))
@@ -211,12 +175,12 @@ def _without_outliers(series: _Series, settings: FlightSettings) -> tuple[_Serie
     dropped = tuple(n for n, is_good in zip(series.numbers, good, strict=True) if not is_good)
     kept = tuple(n for n, is_good in zip(series.numbers, good, strict=True) if is_good)
     return (
-        _Series(kept, series.y[good], series.covariance[good], series.dc_k[good]),
+        Series(kept, series.y[good], series.covariance[good], series.dc_k[good]),
         dropped,
     )
 
 
-def _variance_factor(series: _Series) -> float:
+def _variance_factor(series: Series) -> float:
     """By how much exposures differ more from their neighbours than their covariance says; >= 1."""
     size = series.y.shape[1]
     if len(series.numbers) < 4:
@@ -228,16 +192,17 @@ def _variance_factor(series: _Series) -> float:
 
 
 def _steps(
+    rig: Rig,
     cone: Cone,
-    sensors: Sequence[Sensor],
-    series: _Series,
+    views: tuple[tuple[View, Series], tuple[View, Series]],
     settings: FlightSettings,
     cones: int,
-    *,
-    relative: bool,
 ) -> list[Step]:
-    """Steps one after the other, each with those before it taken out, in order of strength."""
-    contrasts = _contrasts(sensors, relative=relative)
+    """Steps one after the other, each with those before it taken out, in order of strength.
+
+    They are sought by the first view, and weighed by the second.
+    """
+    (view, series), wide = views
     count, size = series.y.shape
     limit = float(chi2.isf(settings.family_alpha / count / cones, size))
     reach = settings.least_exposures
@@ -245,7 +210,7 @@ def _steps(
     found: list[Step] = []
     taken: list[int] = []
     for _ in range(settings.most_steps):
-        information, right = _scan(sensors, series, contrasts, settings, taken)
+        information, right = _scan(view, series, settings, taken)
         statistics = np.full(count, -np.inf)
         for t in places:
             if t not in taken:
@@ -253,28 +218,31 @@ def _steps(
         best = int(np.argmax(statistics))
         if statistics[best] <= limit:
             break
+        normal = information[best], right[best]
+        weighed = normal
+        if wide[0] is not view:
+            known, pull = _scan(*wide, settings, taken)
+            weighed = known[best], pull[best]
         taken.append(best)
         near = np.flatnonzero(statistics > statistics[best] - 2.0 * math.log(settings.odds))
         found.append(
             _step(
                 cone,
-                sensors,
-                contrasts,
-                (information[best], right[best]),
+                (view, normal),
+                (wide[0], weighed),
                 (float(statistics[best]), limit),
                 [series.numbers[t] for t in (best, near.min(), near.max())],
                 settings,
                 from_start=best == 0,
-                relative=relative,
+                relative=not is_master(rig, cone),
             )
         )
     return sorted(found, key=lambda step: step.since)
 
 
 def _scan(
-    sensors: Sequence[Sensor],
-    series: _Series,
-    contrasts: Array,
+    view: View,
+    series: Series,
     settings: FlightSettings,
     taken: Sequence[int],
 ) -> tuple[Array, Array]:
@@ -283,17 +251,10 @@ def _scan(
     Everything else (calibration, drift, steps taken) is eliminated.
     """
     count, size = series.y.shape
-    pitch_um = sensors[0].pitch_um
-    moved = np.array([[s.drift.x_um_per_k, s.drift.y_um_per_k] for s in sensors]).ravel()
-    per_kelvin = contrasts @ moved / pitch_um
-    probe = np.outer(per_kelvin, per_kelvin) * settings.probe_sigma_k**2
+    warmed = np.array(list(view.warmed.values()))
+    probe = warmed.T @ warmed * settings.probe_sigma_k**2
     weight = np.linalg.inv((series.covariance + probe) * _variance_factor(series))
-    place = np.repeat([s.position_sigma_um**2 for s in sensors], 2)
-    drift = np.repeat([s.drift.sigma_um_per_k**2 for s in sensors], 2)
-    known = [
-        contrasts * variance @ contrasts.T / pitch_um**2 + 1e-12 * np.eye(size)
-        for variance in (place, drift)
-    ]
+    known = [covariance + 1e-12 * np.eye(size) for covariance in (view.place, view.drift)]
     # Columns of the nuisance: offset, drift by dC, and the steps already taken.
     after = [(np.arange(count) >= t).astype(np.float64) for t in taken]
     design = np.stack([np.ones(count), series.dc_k, *after])
@@ -317,11 +278,14 @@ def _scan(
     return information + 1e-12 * np.eye(size), right
 
 
+_Normal = tuple[Array, Array]
+"""Information (c, c) and right-hand side (c,) of a step."""
+
+
 def _step(
     cone: Cone,
-    sensors: Sequence[Sensor],
-    contrasts: Array,
-    normal: tuple[Array, Array],
+    narrow: tuple[View, _Normal],
+    wide: tuple[View, _Normal],
     test: tuple[float, float],
     numbers: Sequence[int],
     settings: FlightSettings,
@@ -329,27 +293,34 @@ def _step(
     from_start: bool,
     relative: bool,
 ) -> Step:
-    information, right = normal
-    fits = []
-    for i, sensor in enumerate(sensors):
-        design = contrasts[:, 2 * i : 2 * i + 2]
-        cofactor = np.linalg.inv(design.T @ information @ design)
-        delta = cofactor @ design.T @ right
-        fits.append((float(delta @ design.T @ right), sensor.name, delta, cofactor))
-    fits.sort(key=lambda fit: -fit[0])
-    statistic, name, delta, cofactor = fits[0]
-    freedom = len(right) - 2
+    odds = 2.0 * math.log(settings.odds)
+    fits = _moved(*narrow)
     kind: Kind = "relative" if relative else "named"
-    if freedom > 0 and test[0] - statistic > chi2.isf(settings.family_alpha, freedom):
+    misread = max((_misread(*wide, probe) for probe in wide[0].warmed), key=lambda m: m.statistic)
+    lead = misread.statistic - _moved(*wide)[0][0]
+    total, freedom = test[0], len(narrow[1][1]) - 2
+    beside = _freed(*wide, misread.probe)
+    if not relative and lead >= -odds:
+        still = _moved(wide[0], beside)
+        if still[0][0] > chi2.isf(settings.family_alpha / len(still), 2):
+            # However wrong the probe may be, a sensor has moved, too.
+            fits, lead = still, -math.inf
+            total = float(beside[1] @ np.linalg.lstsq(beside[0], beside[1], rcond=None)[0])
+            freedom = len(beside[1]) - 3
+        elif lead > odds:
+            kind = "misread"
+    statistic, name, delta, cofactor = fits[0]
+    several = freedom > 0 and total - statistic > chi2.isf(settings.family_alpha, freedom)
+    if kind == "named" and several:
         kind = "several"
-    near = [f[1] for f in fits[1:] if statistic - f[0] < 2.0 * math.log(settings.odds)]
+    near = [f[1] for f in fits[1:] if statistic - f[0] < odds]
     length = max(float(np.hypot(*delta)), 1e-12)
     sigma = math.sqrt(float(delta @ cofactor @ delta)) / length
     return Step(
         cone=cone.name,
         kind=kind,
-        sensor=name,
-        alternatives=tuple(near),
+        sensor="" if kind == "misread" else name,
+        alternatives=() if kind == "misread" else tuple(near),
         since=numbers[0],
         earliest=numbers[1],
         latest=numbers[2],
@@ -359,4 +330,34 @@ def _step(
         sigma_px=sigma,
         statistic=test[0],
         limit=test[1],
+        misread=misread if lead >= -odds else None,
     )
+
+
+def _moved(view: View, normal: _Normal) -> list[tuple[float, str, Array, Array]]:
+    """Each sensor, if it alone had moved: chi-square, name, displacement and its cofactor."""
+    information, right = normal
+    fits = []
+    for i, sensor in enumerate(view.sensors):
+        design = view.moved[:, 2 * i : 2 * i + 2]
+        cofactor = np.asarray(np.linalg.inv(design.T @ information @ design), np.float64)
+        delta = cofactor @ design.T @ right
+        fits.append((float(delta @ design.T @ right), sensor.name, delta, cofactor))
+    return sorted(fits, key=lambda fit: -fit[0])
+
+
+def _misread(view: View, normal: _Normal, probe: str) -> Misread:
+    information, right = normal
+    design = -view.warmed[probe]
+    known = float(design @ information @ design)
+    pull = float(design @ right)
+    return Misread(probe, pull / known, 1.0 / math.sqrt(known), pull**2 / known)
+
+
+def _freed(view: View, normal: _Normal, probe: str) -> _Normal:
+    """The same where the probe may read anything since then."""
+    information, right = normal
+    design = view.warmed[probe]
+    taken = information @ design / float(design @ information @ design)
+    pull = float(design @ right)
+    return information - np.outer(taken, design @ information), right - taken * pull

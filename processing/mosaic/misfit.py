@@ -41,6 +41,19 @@ class Knowledge:
 
 
 @dataclass(frozen=True)
+class Misread:
+    """A probe that reads `off_k` too much, if that alone were wrong.
+
+    `statistic` is chi-square with one degree of freedom where it reads right.
+    """
+
+    probe: str
+    off_k: float
+    sigma_k: float
+    statistic: float
+
+
+@dataclass(frozen=True)
 class Fit:
     """A cause's best size (k,), its cofactor (k, k), and the chi-square with k it explains."""
 
@@ -118,7 +131,10 @@ def misfit(
         rig, mosaic, sensors, temperatures_c, quantities=quantities, knowledge=knowledge
     )
     covariance = stitching + expected
-    contrasts = _contrasts(similarity_directions(mosaic, sensors, quantities))
+    places = [mosaic.start[name].similarity for name in sensors]
+    pitch_mm = mosaic.model.pitch_mm
+    directions = similarity_directions([(p.x_mm, p.y_mm) for p in places], pitch_mm, quantities)
+    contrasts = beside_directions(directions)
     return Misfit(
         sensors=tuple(rig.sensor(name) for name in sensors),
         quantities=quantities,
@@ -186,27 +202,26 @@ def per_kelvin(sensor: Sensor, quantities: Sequence[str], pitch_um: float) -> Ar
 
 
 def similarity_directions(
-    mosaic: Mosaic, sensors: Sequence[str], quantities: Sequence[str] = PLACE
+    places_mm: Sequence[tuple[float, float]], pitch_mm: float, quantities: Sequence[str] = PLACE
 ) -> Array:
-    """How a common shift, scale and rotation moves the sensors: (n, 4)."""
+    """How a common shift, scale and rotation moves the sensors at these places: (n, 4)."""
     rows = []
-    for name in sensors:
-        place = mosaic.start[name].similarity
+    for x_mm, y_mm in places_mm:
         moves = {
-            "x": (1.0, 0.0, place.x_mm, -place.y_mm),
-            "y": (0.0, 1.0, place.y_mm, place.x_mm),
+            "x": (1.0, 0.0, x_mm, -y_mm),
+            "y": (0.0, 1.0, y_mm, x_mm),
             # Places are in px, per mm of lever arm.
-            "scale": (0.0, 0.0, mosaic.model.pitch_mm * 1e6, 0.0),
+            "scale": (0.0, 0.0, pitch_mm * 1e6, 0.0),
         }
         rows += [moves[q] for q in quantities]
     return np.array(rows)
 
 
-def _per_unknown(quantity: str, mosaic: Mosaic) -> float:
-    return 1e6 if quantity == "scale" else 1.0 / mosaic.model.pitch_mm
-
-
-def _contrasts(directions: Array) -> Array:
+def beside_directions(directions: Array) -> Array:
     """An orthonormal basis of what the directions cannot produce, as rows."""
     full, _, _ = np.linalg.svd(directions, full_matrices=True)
     return np.asarray(full[:, directions.shape[1] :].T)
+
+
+def _per_unknown(quantity: str, mosaic: Mosaic) -> float:
+    return 1e6 if quantity == "scale" else 1.0 / mosaic.model.pitch_mm

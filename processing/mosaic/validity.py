@@ -26,6 +26,7 @@ from processing.mosaic.misfit import (
     PLACE_AND_SCALE,
     Knowledge,
     Misfit,
+    Misread,
     expected_covariance,
     found_quantities,
     misfit,
@@ -82,19 +83,6 @@ class Displacement:
     @property
     def length_px(self) -> float:
         return math.hypot(self.dx_px, self.dy_px)
-
-
-@dataclass(frozen=True)
-class Misread:
-    """A probe of the master cone that reads `off_k` too much, if that alone were wrong.
-
-    `statistic` is chi-square with one degree of freedom where it reads right.
-    """
-
-    probe: str
-    off_k: float
-    sigma_k: float
-    statistic: float
 
 
 @dataclass(frozen=True)
@@ -367,7 +355,10 @@ def _residuals(
     prior = expected_covariance(rig, mosaic, sensors, temperatures_c, knowledge=settings.knowledge)
     datum = [name for name in mosaic.datum_sensors if name in sensors]
     if len(datum) >= 2:
-        directions = similarity_directions(mosaic, sensors)
+        places = [mosaic.start[name].similarity for name in sensors]
+        directions = similarity_directions(
+            [(p.x_mm, p.y_mm) for p in places], mosaic.model.pitch_mm
+        )
         rows = np.zeros((4, len(found)))
         for k, constraint in enumerate(datum_constraints(mosaic.start, datum)):
             for name, coefficient in constraint.coefficients.items():

@@ -174,5 +174,30 @@ def test_real_adjustments_of_a_flight_tell_the_same() -> None:
     assert math.hypot(step.dx_px - 0.1, step.dy_px + 0.1) < 4.0 * step.sigma_px
 
 
+def test_probes_that_misread_since_an_exposure_are_told_and_no_sensor_of_the_master() -> None:
+    errors = camera_errors(MINI, 9)
+    records = {}
+    for number in range(1, 13):
+        rng = np.random.default_rng([9, number])
+        truth = make_truth(MINI, rng, temperature_c=25.0, sensor_px=0.0, displaced=errors)
+        points = tie_points_of(truth, rng, per_overlap=60, per_sensor=60, sigma_pp_px=0.02)
+        read = dict.fromkeys(MINI.probes, 25.0)
+        if number >= 7:
+            read |= {"0": 29.0, "1": 22.0}
+        mosaic = free_mosaic(MINI, nominal_placements(MINI, read, {}), points)
+        records[number] = stitch_record(MINI, mosaic, read, read)
+    master, other = sorted(judge_flight(MINI, records).steps, key=lambda step: step.cone)
+    assert (master.kind, master.since, master.sensor) == ("misread", 7, "")
+    assert master.misread is not None and master.misread.probe == "0"
+    assert abs(master.misread.off_k - 4.0) < 4.0 * master.misread.sigma_k < 2.0
+    assert master.sentence.startswith("Probe 0 has read ")
+    assert "too high since exposure 7; no sensor need have moved." in master.sentence
+    # Of two sensors only the way between them is seen: a probe explains it as well as a slip.
+    assert (other.kind, other.cone, other.since) == ("relative", "1", 7)
+    assert other.misread is not None and other.misread.probe == "1"
+    assert abs(other.misread.off_k + 3.0) < 4.0 * other.misread.sigma_k < 2.0
+    assert "or probe 1 has read " in other.sentence and "too low" in other.sentence
+
+
 def test_too_few_exposures_tell_nothing() -> None:
     assert judge_flight(MINI, {}).steps == ()

@@ -1,0 +1,133 @@
+"""What the stitching records of a flight say of the sensors of one cone, exposure by exposure.
+
+Contrasts of their places that no shift, scale or rotation of the whole cone can change, and what
+calibration, drift coefficients and probes make of them; what follows for the sensors is in
+`processing.mosaic.flight_validity`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.mosaic.misfit import (
+    PLACE,
+    beside_directions,
+    per_kelvin,
+    similarity_directions,
+)
+from processing.mosaic.stitch_record import StitchRecord
+from processing.rig import Cone, Rig, Sensor
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class View:
+    """Contrasts (c, n) of what records call `names` (n,), and what is known of them.
+
+    `moved` (c, 2 m) is what a px of each sensor's x and y makes of them, `warmed` (c,) what a
+    kelvin, by probe; `place`, `drift` (c, c) are covariances of what calibration leaves, and of
+    what coefficients leave of a kelvin.
+    """
+
+    sensors: tuple[Sensor, ...]
+    names: tuple[str, ...]
+    contrasts: Array
+    moved: Array
+    warmed: Mapping[str, Array]
+    place: Array
+    drift: Array
+
+
+@dataclass(frozen=True)
+class Series:
+    """Contrasts of one cone over a flight: y (t, c), covariance (t, c, c), dC (t,)."""
+
+    numbers: tuple[int, ...]
+    y: Array
+    covariance: Array
+    dc_k: Array
+
+
+def is_master(rig: Rig, cone: Cone) -> bool:
+    return cone.name == rig.master_cone
+
+
+def view_of(rig: Rig, cone: Cone, *, quantities: Sequence[str] = PLACE) -> View:
+    """The master's sensors beside a similarity in common, two sensors of others by difference."""
+    relative = not is_master(rig, cone)
+    sensors = cone.sensors[:2] if relative else cone.sensors
+    pitch_um = sensors[0].pitch_um if rig.virtual_image is None else rig.virtual_image.pitch_um
+    places = [(s.x_mm, s.y_mm) for s in sensors]
+    contrasts = np.hstack([np.eye(2), -np.eye(2)])
+    if not relative:
+        contrasts = beside_directions(similarity_directions(places, pitch_um * 1e-3, quantities))
+    unit = np.array([1.0 if q == "scale" else 1.0 / pitch_um for q in quantities])
+    # A calibrated scale is as good as places of the same sigma half a diagonal from the centre.
+    half_mm = [math.hypot(s.width_px, s.height_px) / 2.0 * s.pitch_mm for s in sensors]
+    known = np.array(
+        [[1e3 / h if q == "scale" else 1.0 / pitch_um for q in quantities] for h in half_mm]
+    )
+    variances = [
+        np.concatenate([(k * sigma) ** 2 for k, sigma in zip(known, sigmas, strict=True)])
+        for sigmas in (
+            [s.position_sigma_um for s in sensors],
+            [s.drift.sigma_um_per_k for s in sensors],
+        )
+    ]
+    warmed = {}
+    for probe in dict.fromkeys(s.probe for s in sensors):
+        own = [s.probe == probe for s in sensors]
+        moves = np.array([per_kelvin(s, quantities, pitch_um) for s in sensors])
+        moves *= np.array(own)[:, None]
+        if relative:
+            moves -= _of_layer(sensors, own) / pitch_um
+        warmed[probe] = contrasts @ moves.ravel()
+    units = {"x": "x_um", "y": "y_um", "scale": "scale_ppm"}
+    width = len(quantities)
+    axes = [i * width + k for i in range(len(sensors)) for k in (0, 1)]
+    return View(
+        sensors=sensors,
+        names=tuple(f"{s.name}.{units[q]}" for s in sensors for q in quantities),
+        contrasts=contrasts * np.tile(unit, len(sensors)),
+        moved=contrasts[:, axes],
+        warmed=warmed,
+        place=contrasts * variances[0] @ contrasts.T,
+        drift=contrasts * variances[1] @ contrasts.T,
+    )
+
+
+def _of_layer(sensors: Sequence[Sensor], own: Sequence[bool]) -> Array:
+    """What their scales and rotations make of the sensors' places per kelvin, um: the layer's."""
+    drifts = [s.drift for s, mine in zip(sensors, own, strict=True) if mine]
+    scale = sum(d.scale_ppm_per_k for d in drifts) / len(sensors) * 1e-3
+    turn = sum(d.rotation_urad_per_k for d in drifts) / len(sensors) * 1e-3
+    return np.array(
+        [[scale * s.x_mm - turn * s.y_mm, scale * s.y_mm + turn * s.x_mm] for s in sensors]
+    )
+
+
+def series_of(rig: Rig, view: View, records: Mapping[int, StitchRecord]) -> Series:
+    """The exposures that tell of all of the view's sensors, with the rig's own calibration."""
+    numbers, y, covariance, dc = [], [], [], []
+    for number in sorted(records):
+        record = records[number]
+        if record.calibration_id != rig.calibration_id or not set(view.names) <= set(record.names):
+            continue
+        at = [record.names.index(name) for name in view.names]
+        numbers.append(number)
+        y.append(view.contrasts @ record.values[at])
+        covariance.append(view.contrasts @ record.covariance[np.ix_(at, at)] @ view.contrasts.T)
+        dc.append(float(np.mean([record.dc_k[s.name] for s in view.sensors])))
+    size = len(view.contrasts)
+    return Series(
+        tuple(numbers),
+        np.array(y).reshape(-1, size),
+        np.array(covariance).reshape(-1, size, size),
+        np.array(dc),
+    )
