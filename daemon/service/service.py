@@ -1,8 +1,8 @@
 """The service: one asyncio loop that hears every process and keeps the deadlines.
 
 It decides nothing about matching (`daemon.flight.flight`), when to expose (`daemon.service.line`),
-pixels (`daemon.service.worker`) or disk (`daemon.service.writer`), and imports none of what those
-need.
+what goes to disk (`daemon.service.keeping`) or pixels (`daemon.service.worker`), and imports none
+of what those need.
 """
 
 from __future__ import annotations
@@ -18,10 +18,8 @@ from typing import Any
 
 from daemon.configuration import Configuration
 from daemon.disk import recovery
-from daemon.disk.log_records import LoggedTrigger, Message, message_of
+from daemon.disk.log_records import LoggedTrigger, message_of
 from daemon.disk.mission import Mission
-from daemon.disk.records import canonical_bytes
-from daemon.exposure import Exposure
 from daemon.flight.arming import Lack, note_override, override_message
 from daemon.flight.decisions import Decision, tick
 from daemon.flight.flight import Flight
@@ -33,33 +31,20 @@ from daemon.service.departure import identity, open_mission, processes, watch_pr
 from daemon.service.devices import serial_problem
 from daemon.service.exposure_control import ExposureControl
 from daemon.service.hearing import Hearing
+from daemon.service.keeping import Keeping
 from daemon.service.line import Line, Order
-from daemon.service.messages import (
-    Bound,
-    Command,
-    Fire,
-    Log,
-    Pong,
-    Seal,
-    Sealed,
-    Store,
-    Stored,
-    Told,
-    WriteFailed,
-)
+from daemon.service.messages import Bound, Command, Fire, Log, Pong, Told
 from daemon.service.notify import Notifier
 from daemon.service.pipeline_queue import PipelineQueue
 from daemon.service.preflight import AT_ONCE, Preflight
 from daemon.service.supervisor import Supervisor
 from daemon.service.watching import NAME as WATCH
-from daemon.service.watching import Watching, status_event, summary
+from daemon.service.watching import Watching, status_event
 from drivers.contract import Record
 from processing.rig import Rig
 
 TICK_S = 0.05
 PING_S = 1.0
-SEAL_RETRY_NS = 1_000_000_000
-"""A disk that refused a record is asked again so much later."""
 LANDING_TIMEOUT_S = 20.0
 END_OF_WAITING_S = 1e9
 
@@ -94,8 +79,6 @@ class Service:
         self.failure: str | None = None
         self.stopping = asyncio.Event()
         self.changed = asyncio.Event()
-        self.sealing: Exposure | None = None
-        self.seal_again_ns = 0
         self.goes_on = False
 
     async def run(self) -> int:
@@ -167,6 +150,7 @@ class Service:
         )
         lanes, send = self.configuration.processing.exposures_in_work, self.supervisor.send
         self.pipeline = PipelineQueue(lanes, send, self._event, self._decided, self.exposure.seen)
+        self.keeping = Keeping(self.flight, self.pipeline, send, self._event, self._decided)
         self.preflight = Preflight(
             self.configuration, self.rig, self.flight, self.line, self.hearing, self.pipeline
         )
@@ -189,7 +173,7 @@ class Service:
         handler = self._handlers.get(type(message))
         if handler is not None:
             handler(self, message)
-        elif not (self.hearing.hear(message) or self.pipeline.hear(message)):
+        elif not any(desk.hear(message) for desk in (self.hearing, self.keeping, self.pipeline)):
             raise TypeError(f"a process said {type(message).__name__}, which nobody expects")
         self.changed.set()
 
@@ -216,43 +200,6 @@ class Service:
                 self.watching.died()
         elif not self.stopping.is_set():
             self._fail(f"process {name} died; started again, the service goes on in this flight")
-
-    def _on_stored(self, stored: Stored) -> None:
-        self.flight.stored(stored.number, stored.frames)
-        self._decided(Decision("stored", time.monotonic_ns(), stored.number))
-        self._event("stored", number=stored.number, duration_s=round(stored.duration_s, 4))
-        self.pipeline.stored(stored.number)
-
-    def _on_sealed(self, sealed: Sealed) -> None:
-        exposure, self.sealing = self.sealing, None
-        assert exposure is not None and exposure.number == sealed.number
-        self.flight.sealed(sealed.number, exposure.state)
-        self._decided(Decision("sealed", time.monotonic_ns(), sealed.number))
-        sheet = canonical_bytes(self.flight.ledger.sheet().as_json())
-        message = Message(recovery.LEDGER_TOPIC, time.monotonic_ns(), sheet)
-        self.supervisor.send("writer", Log(message))
-        if exposure.state == "lost":
-            return
-        self._event("sealed", **summary(exposure))
-        self.pipeline.sealed(exposure)
-
-    def _on_write_failed(self, failed: WriteFailed) -> None:
-        self._event("not-written", number=failed.number, sentence=failed.sentence)
-        if self.sealing is not None and self.sealing.number == failed.number:
-            if failed.may_pass:
-                self.seal_again_ns = time.monotonic_ns() + SEAL_RETRY_NS
-            else:
-                # Recovery seals it from the log when the service starts next.
-                self.flight.not_sealed(failed.number, self.sealing.state)
-                self.pipeline.not_sealed(failed.number)
-                self._decided(Decision("not-sealed", time.monotonic_ns(), failed.number))
-            self.sealing = None
-        else:
-            self.pipeline.not_stored(failed.number)
-            self.flight.not_stored(failed.number, failed.sentence)
-            self._event("lost", number=failed.number, cause=failed.sentence)
-            said = {"sentence": failed.sentence}
-            self._decided(Decision("not-stored", time.monotonic_ns(), failed.number, said))
 
     def _on_bound(self, bound: Bound) -> None:
         self.hearing.hear(bound)
@@ -284,9 +231,6 @@ class Service:
 
     _handlers: Mapping[type, Callable[[Service, Any], None]] = {
         Bound: _on_bound,
-        Stored: _on_stored,
-        Sealed: _on_sealed,
-        WriteFailed: _on_write_failed,
         Pong: _on_pong,
         Told: _on_told,
         Command: _on_command,
@@ -297,13 +241,11 @@ class Service:
     async def _keep_deadlines(self) -> None:
         while True:
             now_ns = time.monotonic_ns() + self.hurry_ns
-            may_seal = self.sealing is None and now_ns >= self.seal_again_ns
-            due = tick(self.flight, now_ns, may_seal=may_seal)
+            due = tick(self.flight, now_ns, may_seal=self.keeping.may_seal(now_ns))
             if (detail := due.detail) is not None:
                 self._decided(Decision("tick", now_ns, detail=detail))
             for waiting in due.to_store:
-                self.pipeline.keep(waiting.capture.number, waiting.slots)
-                self.supervisor.send("writer", Store(waiting.capture, waiting.slots))
+                self.keeping.store(waiting)
             for number, cause in due.given_up:
                 self._event("lost", number=number, cause=cause)
             for head, slot in self.flight.idle_slots:
@@ -315,8 +257,7 @@ class Service:
             if due.foreseen is not None:
                 self.pipeline.foreseen(due.foreseen)
             if due.to_seal is not None:
-                self.sealing = due.to_seal
-                self.supervisor.send("writer", Seal(due.to_seal))
+                self.keeping.seal(due.to_seal)
             await asyncio.sleep(TICK_S)
 
     async def _watch_processes(self) -> None:
@@ -461,7 +402,7 @@ class Service:
         self.hurry_ns = round((limits.frame_timeout_s + limits.mark_timeout_s + 1.0) * 1e9)
 
     def _is_unsafe(self) -> bool:
-        return self.sealing is not None or bool(self.flight.open_numbers)
+        return self.keeping.is_sealing or bool(self.flight.open_numbers)
 
     def _is_unfinished(self) -> bool:
         return self._is_unsafe() or bool(self.pipeline)

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import copy
 import time
-from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
-from daemon.configuration import from_mapping
+from daemon.service.keeping import SEAL_RETRY_NS, Keeping
 from daemon.service.messages import WriteFailed
 from daemon.service.pipeline_queue import PipelineQueue
-from daemon.service.service import SEAL_RETRY_NS, Service
 from tests.daemon.flight.test_flight import (
     HEADS,
     NS,
@@ -22,7 +18,6 @@ from tests.daemon.flight.test_flight import (
     nav,
     stored_frames,
 )
-from tests.daemon.test_configuration import GOOD
 
 
 def flown() -> tuple[Flight, int]:
@@ -46,21 +41,28 @@ def test_a_record_that_was_refused_is_made_again_the_same() -> None:
     assert made.ledger.imbalances(has_landed=True) == []
 
 
-def test_the_service_asks_again_after_a_second_and_closes_nothing(tmp_path: Path) -> None:
-    configuration, rig = from_mapping(copy.deepcopy(GOOD), tmp_path / "service.toml")
-    events: list[dict[str, Any]] = []
-    service = Service(configuration, rig, tmp_path / "service.toml", lambda e: events.append({**e}))
+def test_the_service_asks_again_after_a_second_and_closes_nothing() -> None:
+    events: list[str] = []
+
+    def tell(event: str, **_: Any) -> None:
+        events.append(event)
+
+    def send(_process: str, _message: object) -> None:
+        pass
+
     made, now_ns = flown()
-    service.flight = made
-    service.mission = SimpleNamespace(path=tmp_path)
-    service.pipeline = PipelineQueue(1, lambda _name, _message: None, service._event)
-    service.sealing = made.due_to_seal(now_ns)
+    keeping = Keeping(made, PipelineQueue(1, send, tell), send, tell, lambda _: None)
+    due = made.due_to_seal(now_ns)
+    assert due is not None
+    keeping.seal(due)
     before_ns = time.monotonic_ns()
-    service._on_write_failed(WriteFailed(1, "the disk is full", may_pass=True))
-    assert service.sealing is None and made.open_numbers == (1,)
-    assert service.seal_again_ns >= before_ns + SEAL_RETRY_NS
-    assert [event["event"] for event in events] == ["not-written"]
+    assert keeping.is_sealing and not keeping.may_seal(before_ns)
+    assert keeping.hear(WriteFailed(1, "the disk is full", may_pass=True))
+    assert not keeping.is_sealing and made.open_numbers == (1,)
+    assert not keeping.may_seal(before_ns + SEAL_RETRY_NS - 1)
+    assert keeping.may_seal(time.monotonic_ns() + SEAL_RETRY_NS)
+    assert events == ["not-written"]
     # What cannot become right by waiting is closed, and left to recovery.
-    service.sealing = made.due_to_seal(now_ns)
-    service._on_write_failed(WriteFailed(1, "sealed with other content"))
-    assert service.sealing is None and made.open_numbers == ()
+    keeping.seal(due)
+    assert keeping.hear(WriteFailed(1, "sealed with other content"))
+    assert not keeping.is_sealing and made.open_numbers == ()
