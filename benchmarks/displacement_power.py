@@ -4,7 +4,7 @@ Thousands of outcomes of stitching with one master sensor moved a known way, and
 false alarms, go through the pipeline's own judgement. What calibration, drift, probes and stitching
 are off by is drawn, the last from the covariance that `benchmarks.honest_uncertainty` holds; some
 are stitched in full as a control. Beside each figure stands what the best test could reach. Then
-whole flights are judged together, warm ones among them.
+whole flights are judged together, warm ones among them, and at last the probe is wrong instead.
 """
 
 from __future__ import annotations
@@ -49,6 +49,8 @@ FLIGHTS = {
 }
 """dC at the first and the last exposure of a flight, and the first that is displaced."""
 FLIGHT_LENGTHS_PX = (0.10, 0.15, 0.30)
+MISREAD_K = (1.0, 2.0, 4.0, 8.0, 16.0)
+MISREAD_DC_K = (0.0, 20.0)
 FAMILY_ALPHA = 0.001
 PROBE_SIGMA_K = 0.1
 IDEAL_DRAWS = 40_000
@@ -88,6 +90,25 @@ class FlightPower:
 
 
 @dataclass(frozen=True)
+class Misreading:
+    """What is said where the master cone's probe reads `off_k` too much and no sensor has moved.
+
+    Shares of `exposures`, or of `flights` from whose middle on it does: a sensor accused alone,
+    sensor or probe, the probe named.
+    """
+
+    dc_k: float
+    off_k: float
+    exposures: int
+    accused: float
+    either: float
+    named: float
+    flights: int
+    flights_accused: float
+    flights_named: float
+
+
+@dataclass(frozen=True)
 class Camera:
     """Where master sensors are against their calibration: `off_um`, and `um_per_k` beside TDM."""
 
@@ -124,12 +145,18 @@ def main() -> None:
         for kind in (FLIGHTS if options.flights else ())
         for length in (0.0, *FLIGHT_LENGTHS_PX)
     ]
+    misreadings = [
+        outcomes.misread(dc_k, off_k, exposures=options.exposures, flights=options.flights)
+        for dc_k in MISREAD_DC_K
+        for off_k in MISREAD_K
+    ]
     if options.drawing is not None:
         options.drawing.write_text(drawing(powers), encoding="utf-8")
     if options.json:
         told = {"healthy": options.healthy, "alarms": alarms}
         told |= {"power": [vars(p) for p in powers], "control": [vars(p) for p in control]}
         told |= {"flights": [vars(f) for f in flights]}
+        told |= {"misread": [vars(m) for m in misreadings]}
         print(json.dumps({"machine": machine(), **told}))
         return
     print(f"{honest_uncertainty.RIG}: {alarms} false alarms of {options.healthy} healthy\n")
@@ -149,6 +176,16 @@ def main() -> None:
         print(
             f"| {f.flight} | {f.length_px:.2f} | {f.flights} | {f.found:.1%} | {f.named:.1%} "
             f"| {f.alone:.1%} |"
+        )
+    print(
+        "\n| dC K | probe off K | exposures | sensor accused | sensor or probe | probe named "
+        "| flights | sensor accused | probe named |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|")
+    for m in misreadings:
+        print(
+            f"| {m.dc_k:g} | {m.off_k:g} | {m.exposures} | {m.accused:.1%} | {m.either:.1%} "
+            f"| {m.named:.1%} | {m.flights} | {m.flights_accused:.1%} | {m.flights_named:.1%} |"
         )
 
 
@@ -177,9 +214,17 @@ class Outcomes:
         )
 
     def stitched(
-        self, camera: Camera, dc_k: float, moved: str | None, shift_px: tuple[float, float]
+        self,
+        camera: Camera,
+        dc_k: float,
+        moved: str | None,
+        shift_px: tuple[float, float],
+        misread_k: float = 0.0,
     ) -> tuple[Mosaic, dict[str, float]]:
-        """One exposure's stitching with one sensor moved, and what the probes say."""
+        """One exposure's stitching with one sensor moved, and what the probes say.
+
+        That of the master cone reads `misread_k` too much.
+        """
         random = self._random
         mosaic, root = self._templates[int(random.integers(0, TEMPLATES))]
         values = root @ random.standard_normal(root.shape[1])
@@ -190,12 +235,13 @@ class Outcomes:
         for sensor in self.rig.master_sensors:
             drift = sensor.drift
             off_um = camera.off_um[sensor.name] + camera.um_per_k[sensor.name] * dc_k
-            off_um -= np.array([drift.x_um_per_k, drift.y_um_per_k]) * probe_k
+            off_um -= np.array([drift.x_um_per_k, drift.y_um_per_k]) * (probe_k + misread_k)
             if sensor.name == moved:
                 off_um += np.array(shift_px) * mosaic.model.pitch_mm * 1e3
             first = mosaic.model.sensors[sensor.name]
             values[first : first + 2] += off_um * 1e-3
-            temperatures[sensor.probe] = sensor.calibration_c + dc_k + probe_k
+            values[first + 3] -= drift.scale_ppm_per_k * 1e-6 * misread_k
+            temperatures[sensor.probe] = sensor.calibration_c + dc_k + probe_k + misread_k
         return replace(mosaic, values=values), temperatures
 
     def judge(self, dc_k: float, moved: str | None, shift_px: tuple[float, float]) -> Validity:
@@ -227,6 +273,38 @@ class Outcomes:
             alone += len(steps) == 1 and (steps[0].sensor, steps[0].alternatives) == (moved, ())
         return FlightPower(
             kind, length_px, flights, found / flights, named / flights, alone / flights
+        )
+
+    def misread(self, dc_k: float, off_k: float, *, exposures: int, flights: int) -> Misreading:
+        """The master cone's probe is wrong: in single exposures, and from half a flight on."""
+        accused = either = named = flights_accused = flights_named = 0
+        for _ in range(exposures):
+            found = judge_master(
+                self.rig, *self.stitched(self.camera(), dc_k, None, (0.0, 0.0), off_k)
+            )
+            accused += found.displaced is not None and found.misread is None
+            either += found.displaced is not None and found.misread is not None
+            named += found.displaced is None and found.misread is not None
+        for _ in range(flights):
+            camera, records = self.camera(), {}
+            for number in range(1, FLIGHT_EXPOSURES + 1):
+                wrong_k = off_k if number > FLIGHT_EXPOSURES // 2 else 0.0
+                mosaic, read = self.stitched(camera, dc_k, None, (0.0, 0.0), wrong_k)
+                records[number] = stitch_record(self.rig, mosaic, read, read)
+            steps = judge_flight(self.rig, records).steps
+            kinds = [s.kind for s in steps if s.cone == self.rig.master_cone]
+            flights_accused += any(kind != "misread" for kind in kinds)
+            flights_named += "misread" in kinds
+        return Misreading(
+            dc_k,
+            off_k,
+            exposures,
+            accused / max(exposures, 1),
+            either / max(exposures, 1),
+            named / max(exposures, 1),
+            flights,
+            flights_accused / max(flights, 1),
+            flights_named / max(flights, 1),
         )
 
     def false_alarms(self, count: int) -> int:

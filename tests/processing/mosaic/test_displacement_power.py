@@ -36,6 +36,13 @@ def test_at_twice_that_the_right_sensor_is_named(outcomes: Outcomes, dc_k: float
     assert power.named > 0.95
 
 
+@pytest.mark.parametrize("off_k", [4.0, 16.0])
+def test_no_sensor_is_accused_of_what_a_probe_misreads(outcomes: Outcomes, off_k: float) -> None:
+    told = outcomes.misread(0.0, off_k, exposures=300, flights=2)
+    assert told.accused + told.either <= 0.01 and told.flights_accused == 0.0
+    assert told.named > (0.1 if off_k < 10.0 else 0.95)
+
+
 def test_the_best_test_there_is_finds_little_more() -> None:
     found, named = ideal(find_rig("ultracam-x"), dc_k=0.0, length_px=0.15)
     assert 0.9 < found < 0.96
