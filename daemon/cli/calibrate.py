@@ -42,7 +42,7 @@ Examples: `syntopic calibrate thermal MISSION...`, `syntopic calibrate thermal A
 """
 
 
-VALIDITY_HELP = """Say whether a sensor moved during a flight, since when and how far.
+VALIDITY_HELP = """Say whether a sensor moved in flight or a probe misread, since when and how far.
 
 Takes the stitching of all exposures together (`mosaic.json` of Level-2) and so sees less than one
 exposure can: a few hundredths of a pixel. Writes `export/displacements.json` into the mission.
