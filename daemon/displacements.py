@@ -19,6 +19,8 @@ from processing.mosaic.stitch_record import StitchRecord, StitchRecordError, sti
 from processing.rig import load_rig
 
 RECORD_MAX_BYTES = 4_000_000
+DISPLACEMENTS_FILE = "export/displacements.json"
+"""Where a mission holds what its flight says of displaced sensors."""
 
 
 def write_displacements(mission: Path) -> Mapping[str, Any]:
@@ -31,9 +33,9 @@ def write_displacements(mission: Path) -> Mapping[str, Any]:
     """
     records, unreadable = _records(mission)
     content = _content(judge_flight(load_rig(mission / "rig.toml"), records), unreadable)
-    folder = mission / "export"
-    folder.mkdir(exist_ok=True)
-    replace_file(folder / "displacements.json", canonical_bytes(content))
+    path = mission / DISPLACEMENTS_FILE
+    path.parent.mkdir(exist_ok=True)
+    replace_file(path, canonical_bytes(content))
     return content
 
 

@@ -7,11 +7,12 @@ A calibration is never overwritten: its folder is new, complete when it has its 
 
 from __future__ import annotations
 
-import itertools
+import hashlib
 import json
 import math
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -263,26 +264,70 @@ def refuse_existing(folder: Path) -> None:
         )
 
 
-def dated_folder(out: Path | None, stem: str, date: str, *, known: Collection[str] = ()) -> Path:
-    """The folder of a new calibration, whose name is the calibration's id.
+@dataclass(frozen=True)
+class Place:
+    """Where a new calibration will lie: in `folder`, or in one named by its id in `parent`.
+
+    `name` is what its id begins with; a digest of its content follows (`identified`).
+    """
+
+    name: str
+    parent: Path
+    folder: Path | None = None
+
+    def of(self, calibration_id: str) -> Path:
+        """The folder of the calibration of this id."""
+        return self.folder or self.parent / calibration_id
+
+
+def place_of(out: Path | None, stem: str, date: str, *, beside: Path) -> Place:
+    """Where a new calibration will lie, before anything is computed.
 
     Args:
-        out: the name asked for; None takes `stem` and `date`, and a number from the second
-            calibration of a day on.
-        known: ids of other calibrations, which a new one must not have.
+        out: the folder asked for; None takes one beside `beside`, which the calibration is made
+            from, named by `stem`, `date` and content.
 
     Raises:
-        CalibrationFolderError: the folder asked for exists, or is named as another calibration.
+        CalibrationFolderError: the folder asked for exists, or nothing can be written there.
     """
     if out is not None:
         refuse_existing(out)
-        if out.name in known:
-            raise CalibrationFolderError(
-                f"{out.name} is the id of another calibration; give another name with --out"
-            )
-        return out
-    names = (f"{stem}-{date}" + (f"-{k}" if k > 1 else "") for k in itertools.count(1))
-    return next(Path(n) for n in names if n not in known and not Path(n).exists())
+        return Place(out.name, out.parent, out)
+    parent = beside.resolve().parent
+    if not os.access(parent, os.W_OK):
+        raise CalibrationFolderError(
+            f"{parent} cannot be written to; say with --out where the new calibration is to lie"
+        )
+    return Place(f"{stem}-{date}", parent)
+
+
+def content_digest(files: Mapping[str, bytes]) -> str:
+    """What tells calibrations apart that are named alike: eight hexadecimal digits of SHA-256."""
+    digest = hashlib.sha256()
+    for name in sorted(files):
+        digest.update(f"{name} {len(files[name])}\n".encode())
+        digest.update(files[name])
+    return digest.hexdigest()[:8]
+
+
+def identified(
+    report: CalibrationReport,
+    files: Mapping[str, bytes],
+    rig_file: Callable[[str], bytes] | None = None,
+) -> tuple[CalibrationReport, dict[str, bytes]]:
+    """A calibration with an id that no other content has, and its files.
+
+    Args:
+        report: its id is what the new one begins with.
+        rig_file: makes its `rig.toml`, where it has one, by its id.
+    """
+    name = report.calibration_id
+    content = {**files, "calibration.json": canonical_bytes(calibration_json(report))}
+    if rig_file is not None:
+        content["rig.toml"] = rig_file(name)
+    made = replace(report, calibration_id=f"{name}-{content_digest(content)}")
+    own = {} if rig_file is None else {"rig.toml": rig_file(made.calibration_id)}
+    return made, {**files, **own}
 
 
 def read_previous(path: Path, *, kind: str) -> Previous:

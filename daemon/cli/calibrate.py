@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -42,7 +43,7 @@ Examples: `syntopic calibrate thermal MISSION...`, `syntopic calibrate thermal A
 """
 
 
-VALIDITY_HELP = """Say whether a sensor moved in flight or a probe misread, since when and how far.
+VALIDITY_HELP = """Say whether a sensor moved during a flight, since when and how far.
 
 Takes the stitching of all exposures together (`mosaic.json` of Level-2) and so sees less than one
 exposure can: a few hundredths of a pixel. Writes `export/displacements.json` into the mission.
@@ -68,10 +69,12 @@ app.command(name="platform", help=calibrate_platform.HELP)(calibrate_platform.pl
 def thermal(
     missions: Annotated[list[Path], typer.Argument(help="Mission folders with Level-2.")],
     out: Annotated[
-        Path | None, typer.Option(help="The new rig file; by default named by rig and date.")
+        Path | None, typer.Option(help="The new rig file; else beside the mission, dated.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
+    from daemon.calibration.report import content_digest
+    from daemon.calibration.rig_text import rig_toml
     from daemon.calibration.thermal import gather, write_rig
     from processing.calibration.thermal_learning import learned, observability
     from processing.calibration.thermal_proposal import proposed_rig
@@ -80,11 +83,10 @@ def thermal(
     rig = gathered.rig
     found = learned(rig, gathered.state)
     today = f"{datetime.now(UTC):%Y-%m-%d}"
-    calibration_id = f"{rig.calibration_id}-thermal-{today}"
-    proposal, changes = proposed_rig(rig, found, calibration_id=calibration_id, date=today)
+    name = f"{rig.calibration_id}-thermal-{today}"
+    proposal, changes = proposed_rig(rig, found, calibration_id=name, date=today)
     written: Path | None = None
     if changes:
-        written = out or Path(f"{rig.name}-thermal-{today}.toml")
         remark = (
             f"{rig.name}, proposed by `syntopic calibrate thermal` on {today} from "
             f"{gathered.exposures} exposures,\nin place of calibration {rig.calibration_id}. "
@@ -92,7 +94,12 @@ def thermal(
             "relative to each other are learned; what is common to\nthe sensors of a cone is as "
             "it was."
         )
-        write_rig(proposal, written, remark=remark)
+        digest = content_digest({"rig.toml": rig_toml(proposal, remark=remark)})
+        beside = missions[0].resolve().parent / f"{rig.name}-thermal-{today}-{digest}.toml"
+        written = out or beside
+        # The same content has the same name: it is there already.
+        if out is not None or not beside.exists():
+            write_rig(replace(proposal, calibration_id=f"{name}-{digest}"), written, remark=remark)
     seen = observability(rig)
     if as_json:
         typer.echo(json.dumps(_json(gathered, found, changes, seen, written)))
@@ -107,17 +114,20 @@ def validity(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     from daemon.disk.mission import Mission
-    from daemon.displacements import write_displacements
+    from daemon.displacements import DISPLACEMENTS_FILE, write_displacements
 
-    told = write_displacements(Mission.open(mission).path)
+    folder = Mission.open(mission).path
+    told = write_displacements(folder)
+    path = folder / DISPLACEMENTS_FILE
     if as_json:
-        typer.echo(json.dumps(told))
+        typer.echo(json.dumps({**told, "written": str(path)}))
     else:
         console = Console()
         counted = ", ".join(f"{n} of cone {cone}" for cone, n in told["exposures"].items())
         console.print(f"Exposures judged: {counted or 'none; process the mission first'}")
         for sentence in told["unreadable"] + (told["sentences"] or ["No sensor is seen to move."]):
             console.print(sentence)
+        console.print(f"Written: [bold]{path}[/]", soft_wrap=True)
     raise typer.Exit(1 if told["steps"] else 0)
 
 

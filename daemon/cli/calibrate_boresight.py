@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from daemon.cli.calibration_outcome import hand_over
+from daemon.cli.options import AsJson, NewFolder
 from daemon.tables import light_table
 
 HELP = """Boresight, lever arm and time offset: inertial against controlled orientation.
@@ -57,12 +58,12 @@ def boresight(
     previous: Annotated[
         Path | None, typer.Option(help="Folder of the calibration to compare with.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="The new folder; by default dated.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    out: NewFolder = None,
+    as_json: AsJson = False,
 ) -> None:
     from daemon.adjusting.project import read_project
     from daemon.calibration import boresight as flight
-    from daemon.calibration.report import dated_folder, read_previous, serial_warnings
+    from daemon.calibration.report import place_of, read_previous, serial_warnings
     from daemon.configuration import MountSection
     from daemon.disk.mission import Mission
     from daemon.orientation.exterior import mount_of, read_mount
@@ -76,8 +77,7 @@ def boresight(
     given = read_project(path)
     before = None if previous is None else read_previous(previous, kind="boresight")
     today = f"{datetime.now(UTC):%Y-%m-%d}"
-    others = [before.calibration_id] if before else []
-    calibrated = dated_folder(out, "boresight", today, known=others)
+    place = place_of(out, "boresight", today, beside=path.parent)
     flown_with = None if rig is None else find_rig(rig)
     sigma_m = np.array(position_sigma)
     sigma_rad = np.radians(np.array(attitude_sigma) * 1e-3)
@@ -125,7 +125,7 @@ def boresight(
     report = flight.report_of(
         done,
         given,
-        calibration_id=calibrated.name,
+        calibration_id=place.name,
         date=today,
         serials=serials,
         previous=before,
@@ -141,7 +141,7 @@ def boresight(
         console.print(f"sigma0 {done.found.sigma0:.3f}, redundancy {done.found.redundancy}")
     hand_over(
         report,
-        calibrated,
+        place,
         files={"mount.toml": flight.mount_toml(done, date=today, project=given.name)},
         as_json=as_json,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
@@ -38,7 +39,7 @@ def head(
     from daemon.calibration.laboratory.head import FREE, calibrate_head, targets_of
     from daemon.calibration.laboratory.head_report import calibrated_rig, head_report
     from daemon.calibration.laboratory.series import read_series
-    from daemon.calibration.report import dated_folder, read_previous
+    from daemon.calibration.report import place_of, read_previous
     from daemon.calibration.rig_text import rig_toml
     from daemon.cli.calibration_outcome import hand_over
     from processing.geometry.residual_grid import grid_bytes
@@ -49,7 +50,7 @@ def head(
     angle_sigma = given.table.number("angle_sigma_rad", 1e-6, positive=True)
     given.checked()
     today = f"{datetime.now(UTC):%Y-%m-%d}"
-    folder = dated_folder(out, f"{given.rig.name}-head", today)
+    place = place_of(out, f"{given.rig.name}-head", today, beside=series)
     before = (previous, read_previous(previous, kind="head")) if previous else None
     heads = []
     with Progress(console=Console(stderr=True), transient=True) as progress:
@@ -71,13 +72,17 @@ def head(
                     progress=tell,
                 )
                 heads.append(found)
-    report = head_report(given, heads, calibration_id=folder.name, date=today, previous=before)
-    rig = calibrated_rig(given.rig, heads, calibration_id=folder.name, date=today)
+    report = head_report(given, heads, calibration_id=place.name, date=today, previous=before)
+    rig = calibrated_rig(given.rig, heads, calibration_id=place.name, date=today)
     remark = (
         f"{rig.name}, lenses of {', '.join(h.cone.name for h in heads)} by `syntopic calibrate "
         f"head` on {today},\nin place of calibration {given.rig.calibration_id}. It counts only "
         "where it is configured."
     )
-    files = {"rig.toml": rig_toml(rig, remark=remark)}
-    files |= {f"residual-grid/{h.sensor.name}.npz": grid_bytes(h.grid) for h in heads}
-    hand_over(report, folder, files=files, as_json=as_json)
+    hand_over(
+        report,
+        place,
+        files={f"residual-grid/{h.sensor.name}.npz": grid_bytes(h.grid) for h in heads},
+        rig_file=lambda made: rig_toml(replace(rig, calibration_id=made), remark=remark),
+        as_json=as_json,
+    )

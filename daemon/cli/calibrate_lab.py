@@ -44,7 +44,7 @@ def lab(
         field_report,
     )
     from daemon.calibration.laboratory.series import read_series
-    from daemon.calibration.report import dated_folder, read_previous
+    from daemon.calibration.report import place_of, read_previous
     from daemon.calibration.rig_text import rig_toml
     from daemon.cli.calibration_outcome import hand_over
 
@@ -54,7 +54,7 @@ def lab(
     skew_sigma = given.table.number("skew_sigma_per_mm", 5e-6, positive=True)
     given.checked()
     today = f"{datetime.now(UTC):%Y-%m-%d}"
-    folder = dated_folder(out, f"{given.rig.name}-lab", today)
+    place = place_of(out, f"{given.rig.name}-lab", today, beside=series)
     before = (previous, read_previous(previous, kind="lab")) if previous else None
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("measuring", total=None)
@@ -72,16 +72,18 @@ def lab(
             skew_sigma_per_mm=skew_sigma,
             progress=tell,
         )
-    report = field_report(given, found, calibration_id=folder.name, date=today, previous=before)
-    rig = replace(found.rig, calibration_id=folder.name, calibration_date=today)
+    report = field_report(given, found, calibration_id=place.name, date=today, previous=before)
+    rig = replace(found.rig, calibration_date=today)
     remark = (
         f"{rig.name}, by `syntopic calibrate lab` on {today}, in place of calibration "
         f"{given.rig.calibration_id}.\nIt counts only where it is configured. Standard deviations "
         "and correlations: calibration.json and covariance.npz\nbeside it."
     )
     rows = estimated(found)
-    files = {
-        "rig.toml": rig_toml(rig, remark=remark),
-        "covariance.npz": covariance_bytes(rows, covariance_of(found, rows)),
-    }
-    hand_over(report, folder, files=files, as_json=as_json)
+    hand_over(
+        report,
+        place,
+        files={"covariance.npz": covariance_bytes(rows, covariance_of(found, rows))},
+        rig_file=lambda made: rig_toml(replace(rig, calibration_id=made), remark=remark),
+        as_json=as_json,
+    )

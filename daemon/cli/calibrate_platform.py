@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
@@ -35,17 +36,19 @@ def platform(
     as_json: AsJson = False,
 ) -> None:
     from daemon.calibration.platform import KIND, read_missions, report_of, rig_file
-    from daemon.calibration.report import dated_folder, read_previous
+    from daemon.calibration.report import place_of, read_previous
     from processing.calibration.platform import calibrate_platform, calibrated_rig
 
     before = None if previous is None else read_previous(previous, kind=KIND)
     flown = read_missions(missions)
     today = f"{datetime.now(UTC):%Y-%m-%d}"
-    known = {flown.rig.calibration_id, *([before.calibration_id] if before else [])}
-    folder = dated_folder(out, f"{flown.rig.name}-platform", today, known=known)
+    place = place_of(out, f"{flown.rig.name}-platform", today, beside=missions[0])
     found = calibrate_platform(flown.rig, flown.records)
-    made = calibrated_rig(flown.rig, found, calibration_id=folder.name, date=today)
-    report = report_of(flown, found, calibration_id=folder.name, date=today, previous=before)
+    made = calibrated_rig(flown.rig, found, calibration_id=place.name, date=today)
+    report = report_of(flown, found, calibration_id=place.name, date=today, previous=before)
     hand_over(
-        report, folder, files={"rig.toml": rig_file(made, flown, date=today)}, as_json=as_json
+        report,
+        place,
+        rig_file=lambda name: rig_file(replace(made, calibration_id=name), flown, date=today),
+        as_json=as_json,
     )

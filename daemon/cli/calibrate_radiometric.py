@@ -49,7 +49,7 @@ def radiometric(
     from daemon.calibration.laboratory.radiometric_maps import files_of
     from daemon.calibration.laboratory.radiometric_report import radiometric_report
     from daemon.calibration.laboratory.series import read_series
-    from daemon.calibration.report import dated_folder, read_previous
+    from daemon.calibration.report import place_of, read_previous
     from daemon.cli.calibration_outcome import hand_over
 
     given = read_series(series, kind="radiometric")
@@ -58,7 +58,7 @@ def radiometric(
     monitor_sigma = given.table.number("monitor_sigma", 1e-3)
     given.checked()
     today = f"{datetime.now(UTC):%Y-%m-%d}"
-    folder = dated_folder(out, f"{given.rig.name}-radiometric", today)
+    place = place_of(out, f"{given.rig.name}-radiometric", today, beside=series)
     before = (previous, read_previous(previous, kind="radiometric")) if previous else None
     names = [s.name for s in given.rig.sensors if any(x.sensor == s.name for x in shots)]
     heads = []
@@ -85,10 +85,10 @@ def radiometric(
     report = radiometric_report(
         given,
         heads,
-        calibration_id=folder.name,
+        calibration_id=place.name,
         date=today,
         apertures=apertures,
         previous=before,
     )
     files = files_of(heads, common_level(heads, pan), apertures)
-    hand_over(report, folder, files=files, as_json=as_json)
+    hand_over(report, place, files=files, as_json=as_json)

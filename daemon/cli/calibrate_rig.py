@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
@@ -11,6 +12,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from daemon.cli.calibration_outcome import hand_over
+from daemon.cli.options import AsJson, NewFolder
 from daemon.tables import light_table
 
 HELP = """Relative orientation of oblique heads against the nadir head, averaged over a block.
@@ -38,11 +40,11 @@ def rig(
     previous: Annotated[
         Path | None, typer.Option(help="Folder of the calibration to compare with.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="The new folder; by default dated.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    out: NewFolder = None,
+    as_json: AsJson = False,
 ) -> None:
     from daemon.adjusting.project import read_project
-    from daemon.calibration.report import dated_folder, read_previous
+    from daemon.calibration.report import place_of, read_previous
     from daemon.calibration.rig import (
         GRAD,
         RigCalibrationError,
@@ -57,12 +59,12 @@ def rig(
     from processing.calibration.relative_orientation import relative_orientations
     from processing.rig import find_rig
 
-    given = read_project(project / "project.toml" if project.is_dir() else project)
+    path = project / "project.toml" if project.is_dir() else project
+    given = read_project(path)
     old = find_rig(rig)
     before = None if previous is None else read_previous(previous, kind="rig")
     today = f"{datetime.now(UTC):%Y-%m-%d}"
-    known = {old.calibration_id, *([before.calibration_id] if before else [])}
-    folder = dated_folder(out, f"{old.name}-rig", today, known=known)
+    place = place_of(out, f"{old.name}-rig", today, beside=path.parent)
     try:
         with Progress(console=Console(stderr=True), transient=True) as progress:
             task = progress.add_task("starting values", total=None)
@@ -77,7 +79,7 @@ def rig(
         found = relative_orientations(result, name, least_points=least_points)
     except (NetworkError, DefectError, ValueError) as error:
         raise RigCalibrationError(f"{given.name}: {error}") from error
-    made = calibrated_rig(old, result, found, calibration_id=folder.name, date=today)
+    made = calibrated_rig(old, result, found, calibration_id=place.name, date=today)
     report = report_of(given, result, found, made, date=today, previous=before)
     if not as_json:
         console = Console()
@@ -98,7 +100,9 @@ def rig(
             console.print(table)
     hand_over(
         report,
-        folder,
-        files={"rig.toml": rig_file(made, given, found, date=today)},
+        place,
+        rig_file=lambda name: rig_file(
+            replace(made, calibration_id=name), given, found, date=today
+        ),
         as_json=as_json,
     )

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 import typer
@@ -13,22 +12,31 @@ from rich.console import Console
 from daemon.tables import light_table
 
 if TYPE_CHECKING:
-    from daemon.calibration.report import CalibrationReport
+    from daemon.calibration.report import CalibrationReport, Place
 
 _MOST_ROWS = 40
 
 
 def hand_over(
     report: CalibrationReport,
-    folder: Path,
+    place: Place,
     *,
     files: Mapping[str, bytes] | None = None,
+    rig_file: Callable[[str], bytes] | None = None,
     as_json: bool,
 ) -> None:
-    """Write the calibration as a new folder and tell it, as one JSON object or for a person."""
-    from daemon.calibration.report import calibration_json, write_calibration
+    """Write the calibration as a new folder and tell it, as one JSON object or for a person.
 
-    write_calibration(folder, report, files)
+    The report's id is `place.name`; a digest of the content is put behind it. `rig_file` makes
+    `rig.toml` by the whole id.
+    """
+    from daemon.calibration.report import calibration_json, identified, write_calibration
+
+    report, files = identified(report, files or {}, rig_file)
+    folder = place.of(report.calibration_id)
+    # The same content has the same id: it is there already.
+    if place.folder is not None or not folder.exists():
+        write_calibration(folder, report, files)
     if as_json:
         typer.echo(json.dumps({**calibration_json(report), "written": str(folder)}))
         return

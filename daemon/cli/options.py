@@ -11,7 +11,8 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
 Series = Annotated[Path, typer.Argument(help="Folder with series.json, rig.toml and frames.")]
 NewFolder = Annotated[
-    Path | None, typer.Option(help="The new folder; by default named by rig and date.")
+    Path | None,
+    typer.Option(help="The new folder; else beside what it is made from, named by its id."),
 ]
 
 Trajectory = Annotated[Path | None, typer.Option(help="Post-processed trajectory: SBET, or .csv.")]

@@ -53,11 +53,11 @@ def rigs(
 def show(
     name: Annotated[str, typer.Argument(help="Name of a shipped rig, or a rig file.")],
     drawing: Annotated[
-        Path | None, typer.Option(help="Where to draw the focal planes (SVG).")
+        Path | None, typer.Option(help="Draw the focal planes into this file (SVG).")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Print topology, overlaps and the counts of the adjustment, and draw the focal planes.
+    """Print topology, overlaps and the counts of the adjustment; on request, draw the focal planes.
 
     Examples: `syntopic rigs show ultracam-x`, `syntopic rigs show my-rig.toml --drawing rig.svg`
     """
@@ -69,8 +69,8 @@ def show(
     counts = topology.counts(rig)
     overlaps = topology.overlaps(rig) if rig.virtual_image else ()
     pitch_mm = rig.virtual_image.pitch_mm if rig.virtual_image else rig.sensors[0].pitch_mm
-    path = drawing or Path(f"{rig.name}.svg")
-    path.write_text(draw.focal_planes_svg(rig), encoding="utf-8")
+    if drawing is not None:
+        drawing.write_text(draw.focal_planes_svg(rig), encoding="utf-8")
     if as_json:
         typer.echo(
             json.dumps(
@@ -96,7 +96,7 @@ def show(
                         }
                         for overlap in overlaps
                     ],
-                    "drawing": str(path),
+                    "drawing": None if drawing is None else str(drawing),
                 }
             )
         )
@@ -135,7 +135,10 @@ def show(
             f"{counts.parameters - counts.constraints} independent unknowns (a cone with - is "
             f"registered to green)"
         )
-    console.print(f"Focal planes drawn in [bold]{path}[/]")
+    if drawing is None:
+        console.print("Next: [bold]--drawing FILE[/] draws the focal planes")
+    else:
+        console.print(f"Focal planes drawn in [bold]{drawing}[/]", soft_wrap=True)
 
 
 def _row(rig: Rig) -> dict[str, object]:

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from daemon.cli import app
 from daemon.disk.mission import Mission
-from daemon.displacements import write_displacements
+from daemon.displacements import DISPLACEMENTS_FILE, write_displacements
 from daemon.report import write_report
 from processing.mosaic.stitch_record import stitch_record_json
 from processing.rig import shipped_rigs
@@ -55,6 +55,7 @@ def test_the_command_prints_it_and_tells_by_its_exit_code(moved: Path, tmp_path:
     healthy = landed(tmp_path, {})
     said = CliRunner().invoke(app, ["calibrate", "validity", str(healthy)])
     assert said.exit_code == 0 and "No sensor is seen to move." in said.stdout
+    assert f"Written: {healthy / DISPLACEMENTS_FILE}" in said.stdout
 
 
 def test_a_damaged_record_is_named_and_the_others_count(tmp_path: Path) -> None:

@@ -134,23 +134,28 @@ def test_a_blurred_exposure_is_left_out_and_said(tmp_path: Path) -> None:
     assert all(cone.left_out == 1 and 2 not in cone.used for cone in found.cones)
 
 
-def test_the_command_writes_a_dated_folder_and_compares(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rig = find_rig("dmc-mini")
+def flown(root: Path, turn_rad: float) -> Mission:
+    """A mission of four exposures with one head turned."""
     mission = Mission.create(
-        tmp_path,
+        root,
         "dmc-mini",
         rig_toml=shipped_rigs()["dmc-mini"].read_bytes(),
         service_toml=b"",
         started_utc=datetime(2026, 11, 21, 10, 15, tzinfo=UTC),
     )
     mission.close()
-    for k, record in enumerate(flight(rig, {"2": (0.0, 400e-6, 0.0)}, 4)):
+    turned = {"2": (0.0, turn_rad, 0.0)}
+    for k, record in enumerate(flight(find_rig("dmc-mini"), turned, 4)):
         mission.level0(k + 1).mkdir(parents=True)
         mission.level2(k + 1).mkdir(parents=True)
         text = json.dumps(stitch_record_json(record))
         (mission.level2(k + 1) / "mosaic.json").write_text(text)
+    return mission
+
+
+def test_the_command_writes_a_new_folder_and_compares(tmp_path: Path) -> None:
+    rig = find_rig("dmc-mini")
+    mission = flown(tmp_path, 400e-6)
     out = tmp_path / "dmc-mini-platform"
     line = ["calibrate", "platform", str(mission.path), "--out", str(out), "--json"]
     said = CliRunner().invoke(app, line)
@@ -159,21 +164,31 @@ def test_the_command_writes_a_dated_folder_and_compares(
     assert told["kind"] == "platform" and told["previous"] == rig.calibration_id
     assert ("2", "phi") in {(c["where"], c["what"]) for c in told["changes"] if c["significant"]}
     made = load_rig(out / "rig.toml")
-    assert made.calibration_id == told["calibration_id"] == "dmc-mini-platform"
+    assert made.calibration_id == told["calibration_id"]
+    assert made.calibration_id.startswith("dmc-mini-platform-")
     moved = made.cone("2").rotation_rad[1] - rig.cone("2").rotation_rad[1]
     # A quarter of the turn is the mean of the four, which is the datum.
     assert moved == pytest.approx(300e-6, abs=3e-6)
     assert "svg" in (out / "report.html").read_text()
     again = CliRunner().invoke(app, line)
     assert again.exit_code != 0 and load_rig(out / "rig.toml") == made
-    monkeypatch.chdir(tmp_path)
-    written = []
-    for _ in range(2):
+
+
+def test_calibrations_of_one_day_have_the_ids_of_their_content_wherever_they_are_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = []
+    for name, turn in (("a", 400e-6), ("b", 300e-6)):
+        mission = flown(tmp_path / name, turn)
+        (tmp_path / name / "elsewhere").mkdir()
+        monkeypatch.chdir(tmp_path / name / "elsewhere")
         done = CliRunner().invoke(app, ["calibrate", "platform", str(mission.path), "--json"])
         assert done.exit_code == 0, done.output
-        written.append(json.loads(done.stdout)["written"])
-    assert written[1] == f"{written[0]}-2" and written[0].startswith("dmc-mini-platform-20")
-    assert [load_rig(Path(w) / "rig.toml").calibration_id for w in written] == written
+        written = Path(json.loads(done.stdout)["written"])
+        assert written.parent == tmp_path / name and not list(Path.cwd().iterdir())
+        assert load_rig(written / "rig.toml").calibration_id == written.name
+        made.append(written.name)
+    assert made[0] != made[1] and all(one.startswith("dmc-mini-platform-20") for one in made)
 
 
 def test_the_nine_angles_are_as_good_as_stated_against_the_emulators_truth() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +18,8 @@ from daemon.calibration.report import (
     Quantity,
     Sheet,
     changes_between,
-    dated_folder,
+    identified,
+    place_of,
     read_previous,
     serial_warnings,
     write_calibration,
@@ -53,22 +55,39 @@ def test_a_calibration_is_read_back_as_the_previous_one_and_never_overwritten(
     assert json.loads((folder / "calibration.json").read_text())["changes"] == []
 
 
-def test_a_second_calibration_of_a_day_has_a_name_of_its_own(
+def test_a_new_calibration_lies_beside_what_it_is_made_from_or_where_it_is_asked_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    day = "2026-11-22"
-    assert dated_folder(None, "x-lab", day) == Path("x-lab-2026-11-22")
-    Path("x-lab-2026-11-22").mkdir()
-    assert dated_folder(None, "x-lab", day) == Path("x-lab-2026-11-22-2")
-    # The rig that was flown with has its name wherever its folder lies.
-    known = {"x-lab-2026-11-22-2"}
-    assert dated_folder(None, "x-lab", day, known=known) == Path("x-lab-2026-11-22-3")
-    assert dated_folder(tmp_path / "mine", "x-lab", day) == tmp_path / "mine"
+    series = tmp_path / "field" / "series"
+    series.mkdir(parents=True)
+    monkeypatch.chdir(series)
+    place = place_of(None, "x-lab", "2026-11-22", beside=Path())
+    assert (place.name, place.of("an id")) == ("x-lab-2026-11-22", tmp_path / "field" / "an id")
+    asked = place_of(tmp_path / "mine", "x-lab", "2026-11-22", beside=series)
+    assert (asked.name, asked.of("an id")) == ("mine", tmp_path / "mine")
     with pytest.raises(CalibrationFolderError, match="never overwritten"):
-        dated_folder(Path("x-lab-2026-11-22"), "x-lab", day)
-    with pytest.raises(CalibrationFolderError, match="another calibration"):
-        dated_folder(tmp_path / "x-lab-2026-11-22-2", "x-lab", day, known=known)
+        place_of(series, "x-lab", "2026-11-22", beside=series)
+    monkeypatch.setattr("os.access", lambda *_: False)
+    with pytest.raises(CalibrationFolderError, match="cannot be written to; say with --out"):
+        place_of(None, "x-lab", "2026-11-22", beside=series)
+
+
+def test_an_id_tells_content_apart() -> None:
+    def rig_file(made: str) -> bytes:
+        return f"id = {made}".encode()
+
+    made, files = identified(REPORT, {"maps.npz": b"1"}, rig_file)
+    assert re.fullmatch(r"head-1-[0-9a-f]{8}", made.calibration_id)
+    assert files == {"maps.npz": b"1", "rig.toml": rig_file(made.calibration_id)}
+    assert identified(REPORT, {"maps.npz": b"1"}, rig_file)[0] == made
+    moved = replace(REPORT.quantities[0], value=REPORT.quantities[0].value + 1e-9)
+    others = (
+        identified(REPORT, {"maps.npz": b"2"}, rig_file),
+        identified(REPORT, {"maps.npz": b"1"}, lambda name: rig_file(name) + b" "),
+        identified(replace(REPORT, quantities=[moved]), {"maps.npz": b"1"}, rig_file),
+        identified(REPORT, {}),
+    )
+    assert len({made.calibration_id, *(other.calibration_id for other, _ in others)}) == 5
 
 
 def test_a_change_is_significant_only_beyond_the_limit_of_all_that_are_compared() -> None:

@@ -46,7 +46,8 @@ def test_a_block_becomes_a_dated_rig_that_is_compared_and_never_overwritten(
     assert done.exit_code == 0, done.output
     told = json.loads(done.stdout)
     made = load_rig(out / "rig.toml")
-    assert made.calibration_id == "first"
+    assert made.calibration_id == told["calibration_id"]
+    assert made.calibration_id.startswith("first-")
     for k, head in enumerate(("nadir", *TABLE_2_GRAD)):
         cone = made.cone(head)
         turn = rotation_matrix(*cone.rotation_rad).T @ block.head_rotation[k]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -82,7 +83,9 @@ def test_the_command_writes_a_new_dated_rig_and_shows_old_against_new(
     told = json.loads(said.stdout)
     proposal = load_rig(out)
     assert told["written"] == str(out) and told["exposures"] == len(DC_K)
-    assert proposal.calibration_id.startswith(f"{rig.calibration_id}-thermal-")
+    assert re.fullmatch(
+        rf"{rig.calibration_id}-thermal-[-\d]+-[0-9a-f]{{8}}", proposal.calibration_id
+    )
     assert proposal.calibration_date == f"{datetime.now(UTC):%Y-%m-%d}"
     changes = {(c["where"], c["what"]): c for c in told["changes"]}
     change = changes["SU00", "x_um_per_k"]
@@ -134,6 +137,18 @@ def test_an_existing_file_is_never_overwritten(
     mission = flown(tmp_path, records)
     said = CliRunner().invoke(app, ["calibrate", "thermal", str(mission.path), "--out", str(out)])
     assert said.exit_code != 0 and out.read_text() == "mine\n"
+
+
+def test_without_a_name_the_proposal_lies_beside_the_mission(
+    tmp_path: Path, records: list[StitchRecord], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mission = flown(tmp_path, records)
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    said = CliRunner().invoke(app, ["calibrate", "thermal", str(mission.path), "--json"])
+    written = Path(json.loads(said.stdout)["written"])
+    assert written.parent == tmp_path and not list(Path.cwd().iterdir())
+    assert load_rig(written).calibration_id[-8:] == written.stem[-8:]
 
 
 def test_too_little_spread_writes_nothing(tmp_path: Path, records: list[StitchRecord]) -> None:

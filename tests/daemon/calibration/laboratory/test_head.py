@@ -58,7 +58,7 @@ def test_a_head_comes_out_below_a_twentieth_of_a_pixel_and_the_grid_takes_the_re
     assert told["serials"]["collimator"] == "SIM-COLLIMATOR-1"
     assert told["serials"]["sensor P1"] == "DM-P1"
     rig = load_rig(laboratory / "a" / "rig.toml")
-    assert rig.calibration_id == "a"
+    assert rig.calibration_id == told["calibration_id"] and rig.calibration_id.startswith("a-")
     assert rig.cone("1").calibration_c == pytest.approx(21.5, abs=0.1)
     assert rig.cone("2") == find_rig(RIG).cone("2")
     truth = collimator.true_head(find_rig(RIG), "P1", 1, extra_um=0.0)
