@@ -88,6 +88,7 @@ def advise(
             f"{share:.1%} of {advice.planned_m / 1000:.1f} km is well, "
             f"from {len(taken)} exposures. The segments are in [bold]{out}[/]"
             if advice.segments
-            else f"All of {advice.planned_m / 1000:.1f} km is well; nothing is to be flown again."
+            else f"All of {advice.planned_m / 1000:.1f} km is well; nothing is to be flown again. "
+            f"[bold]{out}[/] says so."
         )
     raise typer.Exit(0 if advice.is_complete else 1)

@@ -43,6 +43,7 @@ def bench(
     told = Console(stderr=True)
     with told.status(f"timing {found.name}"):
         place = measuring.exposures_of(rig, found, folder or _kept(found.name))
+        told.print(f"Rendered exposures are kept in [bold]{place}[/]", soft_wrap=True)
         result = measuring.measure(place, runs=runs, threads=threads, peers=peers, lanes=lanes)
     if as_json:
         typer.echo(json.dumps(result))

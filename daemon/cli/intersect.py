@@ -97,3 +97,5 @@ def intersect(
             f"{', '.join(done.left_out)}",
             markup=False,
         )
+    if out is not None:
+        console.print(f"Table: [bold]{out}[/]", soft_wrap=True)
