@@ -28,8 +28,8 @@ Examples: `syntopic monitor`, `syntopic monitor 10.0.0.5:8470 --bytes-per-s 4000
 FIND_S = 3.0
 SILENT_S = 10.0
 ROWS = 12
-COLOURS = {"good": "green", "usable": "yellow", "refly": "red"}
-MARKS = {"good": "●", "usable": "▲", "refly": "■"}
+COLOURS = {"good": "green", "usable": "yellow", "refly": "red", "lost": "red"}
+MARKS = {"good": "●", "usable": "▲", "refly": "■", "lost": "✖"}
 
 
 class MonitorError(DaemonError):
@@ -66,16 +66,23 @@ def monitor(
             raise typer.Exit(2)
         address, tls = found[0].address, found[0].text.get("tls") == "true"
     scheme = "wss" if tls else "ws"
-    url = f"{scheme}://{address}/api/v1/telemetry?form=msgpack&bytes_per_s={bytes_per_s:g}"
-    state = _Seen()
-    if as_json:
-        state.take(next(_records(url, token)))
-        typer.echo(json.dumps(state.as_json()))
-        return
+    url = f"{scheme}://{address}/api/v1/telemetry?form=msgpack&bytes_per_s={bytes_per_s:.0f}"
+    state: _Seen | None = None
     with Live(Text(f"calling {address}"), console=console, refresh_per_second=4) as live:
         for record in _records(url, token):
-            state.take(record)
-            live.update(state.drawn(address))
+            if record is None and state is not None:
+                since = f"✖ NO LINK since {time.strftime('%H:%M:%S')}: what is shown is of then"
+                live.update(Group(Text(since, style="bold red"), state.drawn(address)))
+                state = None
+            elif record is not None:
+                # Each link tells all there is.
+                state = state or _Seen()
+                state.take(record)
+                if as_json:
+                    live.update(Text())
+                    typer.echo(json.dumps(state.as_json()))
+                    return
+                live.update(state.drawn(address))
 
 
 def find_services(within_s: float = FIND_S) -> list[Found]:
@@ -138,7 +145,7 @@ class _Seen:
             f"{self.brief['phase']}   triggers {ledger.get('triggers', 0)}, complete "
             f"{ledger.get('complete', 0)}, degraded {ledger.get('degraded', 0)}, lost "
             f"{ledger.get('lost', 0)}   {status.get('exposures_left', '?')} exposures left   "
-            f"time ±{status.get('clock_sigma_ns', '?')} ns"
+            f"clock ±{_duration(status.get('clock_sigma_ns'))}"
         )
         return Group(Panel(head), *self._faults(), self._table())
 
@@ -151,10 +158,10 @@ class _Seen:
         table = light_table("", ("exposure", "verdict"), ("frames", "s0 px", "dC", "tie points"))
         for _, one in sorted(self.exposures.items())[-ROWS:]:
             figures, verdict = one.get("figures", {}), str(one.get("verdict") or "")
-            word = f"{MARKS.get(verdict, '')} {verdict or one['step']}"
+            word = verdict or str(one["step"])
             table.add_row(
                 str(one["number"]),
-                Text(word, COLOURS.get(verdict, "")),
+                Text(f"{MARKS.get(word, '')} {word}", COLOURS.get(word, "")),
                 str(one.get("frames", "")),
                 _number(figures.get("sigma0_px"), ".3f"),
                 _number(figures.get("dc_k"), "+.1f"),
@@ -167,8 +174,18 @@ def _number(value: float | None, form: str) -> str:
     return "" if value is None else format(value, form)
 
 
-def _records(url: str, token: str) -> Iterator[dict[str, Any]]:
-    """Telemetry for ever; the link is taken up again when it breaks."""
+def _duration(ns: float | None) -> str:
+    """Nanoseconds, in the unit that suits."""
+    if ns is None:
+        return "?"
+    for factor, unit in ((1e9, "s"), (1e6, "ms"), (1e3, "us")):
+        if ns >= factor:
+            return f"{ns / factor:.3g} {unit}"
+    return f"{ns:.0f} ns"
+
+
+def _records(url: str, token: str) -> Iterator[dict[str, Any] | None]:
+    """Telemetry for ever; None when the link breaks, which is taken up again."""
     import msgpack
     from websockets.exceptions import ConnectionClosed, InvalidHandshake
     from websockets.sync.client import connect
@@ -186,6 +203,7 @@ def _records(url: str, token: str) -> Iterator[dict[str, Any]]:
                     f"{url.split('?')[0]}: no telemetry ({error}); look at the address, and "
                     "whether looking needs a token"
                 ) from error
+            yield None
             time.sleep(1.0)
 
 

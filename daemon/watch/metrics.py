@@ -12,6 +12,7 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily, Metric
 from prometheus_client.registry import Collector
 
+from daemon.flight.ledger import CAUSES, PENDING
 from daemon.flight.phases import Phase
 from daemon.watch.state import FlightState
 
@@ -80,10 +81,14 @@ class _Flight(Collector):
             received = CounterMetricFamily(
                 f"syntopic_{what}", f"Received {what}, by cause.", labels=["cause"]
             )
-            for cause, count in (ledger.get(what) or {}).items():
-                if cause != "received":
-                    received.add_metric([cause], count)
+            receipts = ledger.get(what) or {}
+            for cause in (*CAUSES, "missing"):
+                received.add_metric([cause], receipts.get(cause, 0))
             yield received
+            pending = receipts.get(PENDING, 0)
+            yield GaugeMetricFamily(
+                f"syntopic_{what}_pending", f"Received {what}, not attributed yet.", value=pending
+            )
         balanced = float(bool(ledger.get("balanced", True)))
         yield GaugeMetricFamily(
             "syntopic_ledger_balanced", "1 while the ledger balances.", value=balanced

@@ -20,6 +20,9 @@ LEAST_BYTES_PER_S = 1000
 """Below this not even what is brief gets through once in a few seconds."""
 
 BRIEF_SHARE = 0.5
+ARRAY_HEAD_BYTES = 3
+"""Of a list of up to 65535 items."""
+
 BURST_S = 2.0
 """How much of unused budget is kept for a moment when more is to be said."""
 
@@ -80,6 +83,8 @@ class Subscription:
         told: list[Any] = []
         for item in state.changed(part, self._cursors.get(part, 0)):
             nbytes = packed_nbytes(item)
+            if not told:
+                nbytes += packed_nbytes(part) + ARRAY_HEAD_BYTES
             if nbytes > left:
                 return told, left, False
             left -= nbytes

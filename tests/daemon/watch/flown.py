@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from daemon.flight.ledger import LedgerSheet, Receipts
+
 NAVIGATION = {
     "receiver": "gnss",
     "gps_ns": "1479300000000000000",
@@ -25,16 +27,17 @@ NAVIGATION = {
 
 
 def status(phase: str = "flying", triggers: int = 0, exposures_left: int = 100) -> dict[str, Any]:
+    sheet = LedgerSheet(
+        *(triggers, 0, triggers, 0, 0, triggers, triggers, ()),
+        frames=Receipts("frames", received=13 * triggers, used=13 * triggers),
+        marks=Receipts("marks", received=triggers, used=triggers),
+        imbalances=(),
+    )
     return {
         "event": "status",
         "mono_ns": "1",
         "phase": phase,
-        "ledger": {
-            "triggers": {"triggers": triggers, "complete": triggers, "degraded": 0, "lost": 0},
-            "frames": {"received": 13 * triggers, "used": 13 * triggers, "late": 0},
-            "marks": {"received": triggers, "used": triggers, "late": 0},
-            "balanced": True,
-        },
+        "ledger": sheet.as_json(),
         "exposures_left": exposures_left,
         "position": {"latitude_deg": 47.07 + triggers * 1e-3, "longitude_deg": 15.43},
         "temperatures_c": {"0": 32.1, "1": None},

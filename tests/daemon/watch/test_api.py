@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -182,6 +183,11 @@ def test_metrics_speak_prometheus(camera: Camera, client: TestClient) -> None:
     }
     assert samples["syntopic_triggers_total", ()] == 1
     assert samples["syntopic_exposures_total", (("state", "complete"),)] == 1
+    assert samples["syntopic_frames_total", (("cause", "used"),)] == 13
+    assert samples["syntopic_marks_pending", ()] == 0
+    rules = (Path(__file__).parents[3] / "systemd/alerts.yml").read_text()
+    asked = set(re.findall(r"syntopic_\w+", rules))
+    assert asked and asked <= {name for name, _ in samples}
     assert samples["syntopic_clock_sigma_seconds", ()] == pytest.approx(25e-9)
     assert samples["syntopic_device_ready", (("device", "SU02"), ("kind", ""))] == 0
     assert samples["syntopic_phase", (("phase", "flying"),)] == 1
