@@ -99,11 +99,15 @@ export function drawMap(choose) {
     if (!drawn) {
       drawn = L.polygon(one.footprint, { interactive: true }).addTo(map);
       drawn.on("click", () => choose(one.number));
+      drawn.bindTooltip(() => `${one.number}: ${flight.exposures.get(one.number)?.verdict || one.step}`);
+      // By keyboard the table of exposures does the same; nobody steps through a thousand footprints.
+      drawn.getElement().setAttribute("tabindex", "-1");
       footprints.set(one.number, drawn);
     }
-    drawn.setStyle(style(one));
-    const word = one.verdict || one.step;
-    drawn.bindTooltip(`${one.number}: ${word}`);
+    const looks = style(one);
+    const told = JSON.stringify(looks);
+    if (drawn.told !== told) drawn.setStyle(looks);
+    drawn.told = told;
   }
   for (const number of footprints.keys()) {
     if (!flight.exposures.has(number)) {

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import msgpack
 import pytest
 
@@ -72,3 +74,23 @@ def test_nothing_new_is_said_only_once_in_a_while() -> None:
     told = Subscription()
     times = [step * 0.1 for step in range(100) if told.record(state, step * 0.1) is not None]
     assert len(times) == pytest.approx(10, abs=1)
+
+
+def test_the_schema_names_every_key_that_is_told() -> None:
+    state = FlightState("syntopic test")
+    settings = {"by": "operator", "control": "manual", "lock": "line", "locked_on": None}
+    lost = {"event": "lost", "mono_ns": "1", "number": 2, "cause": "no frames"}
+    bound = {"event": "bound", "device": "SU02", "kind": "head", "found": {}}
+    for event in (
+        *(flown.mission(), bound, flown.lost("SU02"), *flown.exposure(1), lost, flown.status()),
+        {"event": "exposure-settings", "settings": {}, **settings},
+    ):
+        state.apply(event)
+    snapshot = state.snapshot()
+    del snapshot["events"]  # each kind has its own keys, docs/events.md
+    told = set(snapshot)
+    for part in snapshot.values():
+        for item in part if isinstance(part, list) else [part]:
+            told |= set(item) if isinstance(item, dict) else set()
+    schema = (Path(__file__).parents[3] / "docs/telemetry.md").read_text()
+    assert {key for key in told if f"`{key}`" not in schema} == set()
