@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -35,8 +37,8 @@ def bench(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
     from daemon import bench as measuring
+    from daemon.service.departure import thread_counts
     from processing.rig import find_rig
 
     found = find_rig(rig)
@@ -44,7 +46,13 @@ def bench(
     with told.status(f"timing {found.name}"):
         place = measuring.exposures_of(rig, found, folder or _kept(found.name))
         told.print(f"Rendered exposures are kept in [bold]{place}[/]", soft_wrap=True)
-        result = measuring.measure(place, runs=runs, threads=threads, peers=peers, lanes=lanes)
+        # In a process of its own, which begins as the service's worker does.
+        for name, count in thread_counts(threads).items():
+            os.environ.setdefault(name, count)
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as worker:
+            result = worker.submit(
+                measuring.measure, place, runs=runs, threads=threads, peers=peers, lanes=lanes
+            ).result()
     if as_json:
         typer.echo(json.dumps(result))
     else:

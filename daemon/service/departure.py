@@ -82,7 +82,7 @@ def processes(configuration: Configuration, rig: Rig, mission: Mission) -> tuple
         plan=configuration.plan,
         processing=configuration.processing,
     )
-    one, many = _thread_counts(1), _thread_counts(configuration.processing.threads)
+    one, many = thread_counts(1), thread_counts(configuration.processing.threads)
     specs = device_specs(configuration, rig)
     return (
         ProcessPlan("writer", "daemon.service.writer:main", (mission.path, rings), one),
@@ -95,12 +95,15 @@ def watch_process(configuration: Configuration) -> ProcessPlan | None:
     """The process that serves watchers, where the configuration wants one."""
     if configuration.watch is None:
         return None
-    one = _thread_counts(1)
+    one = thread_counts(1)
     return ProcessPlan("watch", "daemon.watch.process:main", (configuration.watch,), one)
 
 
-def _thread_counts(threads: int) -> dict[str, str]:
-    """Compiled kernels share the cores; small matrices do not, and nobody spins while waiting."""
+def thread_counts(threads: int) -> dict[str, str]:
+    """What a process finds in its environment.
+
+    Compiled kernels share the cores; small matrices do not, and nobody spins while waiting.
+    """
     names = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")
     fixed = {"OPENBLAS_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
     return dict.fromkeys(names, str(threads)) | fixed
