@@ -49,12 +49,17 @@ class MavlinkCamera(asyncio.DatagramProtocol):
         state: FlightState,
         gate: Gate,
         rig: Callable[[], Rig | None],
+        ground_height_m: Callable[[], float | None] = lambda: None,
     ) -> None:
-        """`rig` is asked for the camera's figures; None until a mission has begun."""
+        """`rig` is asked for the camera's figures, `ground_height_m` for what an exposure is above.
+
+        Both are None until a mission has begun.
+        """
         self._settings = settings
         self._state = state
         self._gate = gate
         self._rig = rig
+        self._ground_height_m = ground_height_m
         self._dialect = _dialect()
         self._mav = self._dialect.MAVLink(
             None, srcSystem=settings.system_id, srcComponent=settings.component_id
@@ -335,6 +340,8 @@ class MavlinkCamera(asyncio.DatagramProtocol):
         place = one.get("place") or {}
         latitude, longitude = place.get("latitude_deg"), place.get("longitude_deg")
         height_m = place.get("height_m") or 0.0
+        ground_m = self._ground_height_m() if place else None
+        above_m = 0.0 if ground_m is None else height_m - ground_m
         return self._mav.camera_image_captured_encode(
             self._boot_ms(),
             _utc_us(one.get("mark_gps_ns")),
@@ -342,7 +349,7 @@ class MavlinkCamera(asyncio.DatagramProtocol):
             round((latitude or 0.0) * 1e7),
             round((longitude or 0.0) * 1e7),
             round(height_m * 1000),
-            0,
+            round(above_m * 1000),
             _quaternion(place),
             one["number"] - 1,
             0 if one.get("state") == "lost" else 1,

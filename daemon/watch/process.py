@@ -137,7 +137,9 @@ async def _camera(
     if settings.mavlink is None:
         return None
     try:
-        camera = MavlinkCamera(settings.mavlink, state, gate, lambda: ground.rig)
+        camera = MavlinkCamera(
+            settings.mavlink, state, gate, lambda: ground.rig, lambda: ground.height_m
+        )
         await camera.begin()
     except (ImportError, OSError, ValueError) as error:
         sentence = f"no MAVLink camera: {error}; look at [watch.mavlink]"
@@ -178,6 +180,12 @@ class _Ground:
         """The rig that flies, once that is known."""
         known = self._look()
         return None if known is None else known[0]
+
+    @property
+    def height_m(self) -> float | None:
+        """Of the ground, as planned."""
+        known = self._look()
+        return None if known is None else known[2]
 
     def _look(self) -> tuple[Rig, MountSection, float] | None:
         path = self.state.mission_path if self.state else None

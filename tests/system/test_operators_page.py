@@ -333,7 +333,7 @@ def test_a_mission_of_waypoints_is_exposed_and_a_head_that_goes_is_seen_and_ackn
             browser.click(f"[data-fault={name}] button")
             # It stands still, so it stays; but somebody has seen it.
             browser.wait_for(f"document.querySelector('[data-fault={name}] button') === null", 30)
-            assert "WARNING" in browser.text("#faults")
+            assert "WARNING, acknowledged" in browser.text("#faults")
             keep = os.environ.get("SYNTOPIC_PICTURES")
             browser.picture(Path(keep) / "faults.png" if keep else tmp_path / "faults.png")
     finally:

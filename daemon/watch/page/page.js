@@ -97,7 +97,7 @@ function drawFaults() {
   }
   list.replaceChildren(...faults.map((fault) => {
     const word = fault.stands ? "✖ WARNING" : fault.previous ? "▲ BEFORE THE RESTART" : "▲ PASSED";
-    const repeated = fault.count > 1 ? ` (${fault.count} times)` : "";
+    const repeated = (fault.count > 1 ? ` (${fault.count} times)` : "") + (fault.acknowledged ? ", acknowledged" : "");
     const item = element("li", { className: fault.stands ? "stands" : "passed" },
       element("span", {}, element("strong", { textContent: word + repeated }), fault.sentence));
     item.dataset.fault = fault.id;
@@ -123,7 +123,7 @@ function drawDevices() {
   const kinds = Map.groupBy([...flight.devices.values()].sort((a, b) => a.name.localeCompare(b.name)),
     (device) => KINDS[device.kind] || device.kind || "other");
   const ill = (devices) => devices.filter((device) => device.state !== "ready");
-  const opened = new Set([...by("devices").querySelectorAll("details[open]")].map((one) => one.dataset.kind));
+  const opened = new Set([...by("devices").querySelectorAll("details.well[open]")].map((one) => one.dataset.kind));
   const sorted = [...kinds].sort((a, b) => ill(b[1]).length - ill(a[1]).length || a[0].localeCompare(b[0]));
   by("devices").replaceChildren(...sorted.map(([kind, devices]) => {
     const wrong = ill(devices);

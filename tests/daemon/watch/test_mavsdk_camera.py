@@ -45,7 +45,9 @@ class Flying:
     def _run(self) -> None:
         asyncio.set_event_loop(self._loop)
         self.gate = Gate(self._obey)
-        self.camera = MavlinkCamera(self.settings, self.state, self.gate, lambda: RIG)
+        self.camera = MavlinkCamera(
+            self.settings, self.state, self.gate, lambda: RIG, lambda: 395.0
+        )
         self._loop.run_until_complete(self.camera.begin())
         really_send = self.camera._send
 
@@ -149,6 +151,7 @@ def test_mavsdk_takes_photos_and_recovers_a_lost_record(client: Any, flying: Fly
     lost = next(one for one in heard if one.index == 1)
     assert lost.position.latitude_deg == pytest.approx(47.07)
     assert lost.position.absolute_altitude_m == pytest.approx(1395.0)
+    assert lost.position.relative_altitude_m == pytest.approx(1000.0)
     assert lost.time_utc_us == 1_479_300_000_000_000 + 315_964_800_000_000 - 18_000_000
 
 
