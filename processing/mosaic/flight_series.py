@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from processing.mosaic.misfit import (
     PLACE,
@@ -46,12 +47,16 @@ class View:
 
 @dataclass(frozen=True)
 class Series:
-    """Contrasts of one cone over a flight: y (t, c), covariance (t, c, c), dC (t,)."""
+    """Contrasts of one cone over a flight: y (t, c), covariance (t, c, c), dC (t,).
+
+    `factor` is by how much exposures differ more from their neighbours than their covariance says.
+    """
 
     numbers: tuple[int, ...]
     y: Array
     covariance: Array
     dc_k: Array
+    factor: float = 1.0
 
 
 def is_master(rig: Rig, cone: Cone) -> bool:
@@ -130,4 +135,36 @@ def series_of(rig: Rig, view: View, records: Mapping[int, StitchRecord]) -> Seri
         np.array(y).reshape(-1, size),
         np.array(covariance).reshape(-1, size, size),
         np.array(dc),
+    )
+
+
+def variance_factor(series: Series) -> float:
+    """By how much exposures differ more from their neighbours than their covariance says; >= 1."""
+    size = series.y.shape[1]
+    if len(series.numbers) < 4:
+        return 1.0
+    off = np.diff(series.y, axis=0)
+    spread = series.covariance[1:] + series.covariance[:-1]
+    q = np.einsum("ti,ti->t", off, np.linalg.solve(spread, off[..., None])[..., 0])
+    return max(1.0, float(np.median(q)) / float(chi2.ppf(0.5, size)))
+
+
+def read_too_much(view: View, series: Series, probe: str) -> Array:
+    """What a probe reads too much in each exposure (t,), K, as far as places and scales tell."""
+    design = -view.warmed[probe]
+    weight = np.linalg.inv(series.covariance + view.place)
+    pull = np.einsum("i,tij,tj->t", design, weight, series.y)
+    return np.asarray(pull / np.einsum("i,tij,j->t", design, weight, design), np.float64)
+
+
+def not_believing(
+    view: View, series: Series, probe: str, *, off_k: Array, sigma_k: float
+) -> Series:
+    """The series where a probe's readings, found `off_k` (t,) too large, count for nothing."""
+    warmed = view.warmed[probe]
+    share = sum(s.probe == probe for s in view.sensors) / len(view.sensors)
+    return replace(
+        series,
+        covariance=series.covariance + np.outer(warmed, warmed) * sigma_k**2,
+        dc_k=series.dc_k - share * off_k,
     )

@@ -14,14 +14,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from processing.mosaic.flight_series import Series, View, is_master, series_of, view_of
+from processing.mosaic.flight_series import (
+    Series,
+    View,
+    is_master,
+    not_believing,
+    read_too_much,
+    series_of,
+    variance_factor,
+    view_of,
+)
 from processing.mosaic.misfit import PLACE_AND_SCALE, Misread
 from processing.mosaic.stitch_record import StitchRecord
 from processing.rig import Cone, Rig
@@ -37,11 +46,13 @@ class FlightSettings:
     `family_alpha` is the probability of telling of any step in a healthy flight, all cones and
     exposures together. A step is told from `least_exposures` on either side of it, for one
     exposure may be wrong. Sensors, probes and exposures within `odds` of the best are alternatives.
+    What a probe that misreads says is worth `unknown_sigma_k`.
     """
 
     family_alpha: float = 0.001
     odds: float = 19.0
     probe_sigma_k: float = 0.1
+    unknown_sigma_k: float = 10.0
     least_exposures: int = 3
     most_steps: int = 4
     outlier_alpha: float = 1e-4
@@ -54,10 +65,10 @@ class Step:
 
     "named": it is `sensor`, unless one of `alternatives`. "several": more than one sensor of the
     cone moved, and which cannot be told; dx, dy are of the one that fits best. "relative": of two
-    sensors, `sensor` has moved against `alternatives[0]`, or that against this. "misread": no
-    sensor need have moved (`sensor` is empty, dx and dy are of the one that fits best), for the
-    probe of `misread` explains it better; with the other kinds, `misread` is a probe that explains
-    it nearly as well, None if none does.
+    sensors, `sensor` has moved against `alternatives[0]`, or that against this. "misread": the
+    probe of `misread` reads wrong, by that on average (`sensor` is empty, dx and dy are of the one
+    that fits best); with the other kinds, `misread` is a probe that explains it nearly as well,
+    None if none does.
     `since` is the first exposure with it, between `earliest` and `latest`; `from_start` says that
     all of the flight has it. `sigma_px` is that of the length.
     """
@@ -96,7 +107,8 @@ class Step:
             off = f"{abs(self.misread.off_k):.1f} +- {self.misread.sigma_k:.1f} K too {way}"
             probe = f"probe {self.misread.probe} has read {off}"
         if self.kind == "misread":
-            return f"P{probe[1:]} {since}; no sensor need have moved."
+            earlier = "" if self.from_start else " or earlier"
+            return f"P{probe[1:]} on average since exposure {self.since}{earlier}; check it."
         if self.kind == "relative":
             culprit = f"or {probe}; what it was" if probe else "which of them moved"
             return (
@@ -160,7 +172,7 @@ def _without_outliers(series: Series, settings: FlightSettings) -> tuple[Series,
     """Leave out exposures that agree with neither their neighbours before nor those after."""
     count, size = series.y.shape
     limit = float(chi2.isf(settings.outlier_alpha, size))
-    factor = _variance_factor(series)
+    factor = variance_factor(series)
     good = np.ones(count, np.bool_)
     reach = settings.neighbours
     for t in range(count):
@@ -180,17 +192,6 @@ def _without_outliers(series: Series, settings: FlightSettings) -> tuple[Series,
     )
 
 
-def _variance_factor(series: Series) -> float:
-    """By how much exposures differ more from their neighbours than their covariance says; >= 1."""
-    size = series.y.shape[1]
-    if len(series.numbers) < 4:
-        return 1.0
-    off = np.diff(series.y, axis=0)
-    spread = series.covariance[1:] + series.covariance[:-1]
-    q = np.einsum("ti,ti->t", off, np.linalg.solve(spread, off[..., None])[..., 0])
-    return max(1.0, float(np.median(q)) / float(chi2.ppf(0.5, size)))
-
-
 def _steps(
     rig: Rig,
     cone: Cone,
@@ -200,16 +201,19 @@ def _steps(
 ) -> list[Step]:
     """Steps one after the other, each with those before it taken out, in order of strength.
 
-    They are sought by the first view, and weighed by the second.
+    They are sought by the first view, and weighed by the second. Where a probe misreads, the rest
+    of the flight is judged without believing it: what a stuck probe does is no single step.
     """
-    (view, series), wide = views
+    (view, series), wide = ((v, replace(s, factor=variance_factor(s))) for v, s in views)
     count, size = series.y.shape
     limit = float(chi2.isf(settings.family_alpha / count / cones, size))
     reach = settings.least_exposures
     places = np.array([0, *range(reach, count - reach + 1)])
     found: list[Step] = []
+    misread: list[Step] = []
     taken: list[int] = []
-    for _ in range(settings.most_steps):
+    doubted: set[str] = set()
+    while len(found) < settings.most_steps:
         information, right = _scan(view, series, settings, taken)
         statistics = np.full(count, -np.inf)
         for t in places:
@@ -225,19 +229,28 @@ def _steps(
             weighed = known[best], pull[best]
         taken.append(best)
         near = np.flatnonzero(statistics > statistics[best] - 2.0 * math.log(settings.odds))
-        found.append(
-            _step(
-                cone,
-                (view, normal),
-                (wide[0], weighed),
-                (float(statistics[best]), limit),
-                [series.numbers[t] for t in (best, near.min(), near.max())],
-                settings,
-                from_start=best == 0,
-                relative=not is_master(rig, cone),
-            )
+        step = _step(
+            cone,
+            (view, normal),
+            (wide[0], weighed),
+            (float(statistics[best]), limit),
+            [series.numbers[t] for t in (best, near.min(), near.max())],
+            settings,
+            from_start=best == 0,
+            relative=not is_master(rig, cone),
         )
-    return sorted(found, key=lambda step: step.since)
+        probe = step.misread.probe if step.misread else ""
+        if step.kind == "misread" and probe not in doubted:
+            doubted.add(probe)
+            off_k = read_too_much(*wide, probe)
+            unknown = settings.unknown_sigma_k
+            series = not_believing(view, series, probe, off_k=off_k, sigma_k=unknown)
+            believed = not_believing(*wide, probe, off_k=off_k, sigma_k=unknown)
+            wide = wide[0], believed
+            misread, found, taken = [*misread, step], [], []
+        else:
+            found.append(step)
+    return sorted(misread + found, key=lambda step: step.since)
 
 
 def _scan(
@@ -253,7 +266,7 @@ def _scan(
     count, size = series.y.shape
     warmed = np.array(list(view.warmed.values()))
     probe = warmed.T @ warmed * settings.probe_sigma_k**2
-    weight = np.linalg.inv((series.covariance + probe) * _variance_factor(series))
+    weight = np.linalg.inv((series.covariance + probe) * series.factor)
     known = [covariance + 1e-12 * np.eye(size) for covariance in (view.place, view.drift)]
     # Columns of the nuisance: offset, drift by dC, and the steps already taken.
     after = [(np.arange(count) >= t).astype(np.float64) for t in taken]
@@ -298,19 +311,15 @@ def _step(
     kind: Kind = "relative" if relative else "named"
     misread = max((_misread(*wide, probe) for probe in wide[0].warmed), key=lambda m: m.statistic)
     lead = misread.statistic - _moved(*wide)[0][0]
-    total, freedom = test[0], len(narrow[1][1]) - 2
-    beside = _freed(*wide, misread.probe)
+    freedom = len(narrow[1][1]) - 2
     if not relative and lead >= -odds:
-        still = _moved(wide[0], beside)
-        if still[0][0] > chi2.isf(settings.family_alpha / len(still), 2):
-            # However wrong the probe may be, a sensor has moved, too.
-            fits, lead = still, -math.inf
-            total = float(beside[1] @ np.linalg.lstsq(beside[0], beside[1], rcond=None)[0])
-            freedom = len(beside[1]) - 3
-        elif lead > odds:
+        # Where sensors have moved, too, that is sought again without the probe.
+        beside = _moved(wide[0], _freed(*wide, misread.probe))
+        moved = beside[0][0] > chi2.isf(settings.family_alpha / len(beside), 2)
+        if lead > odds or moved:
             kind = "misread"
     statistic, name, delta, cofactor = fits[0]
-    several = freedom > 0 and total - statistic > chi2.isf(settings.family_alpha, freedom)
+    several = freedom > 0 and test[0] - statistic > chi2.isf(settings.family_alpha, freedom)
     if kind == "named" and several:
         kind = "several"
     near = [f[1] for f in fits[1:] if statistic - f[0] < odds]
