@@ -218,6 +218,10 @@ def test_a_flight_is_flown_from_the_page(
         browser.evaluate("document.querySelector('#exposure-room').open = false")
         browser.evaluate("document.querySelector('#overlaps-room').open = true")
         browser.picture(Path(keep) / "residuals.png" if keep else tmp_path / "residuals.png")
+        tablet = {"width": 768, "height": 1024, "deviceScaleFactor": 1, "mobile": True}
+        browser.call("Emulation.setDeviceMetricsOverride", **tablet)
+        browser.click("#theme")
+        browser.picture(Path(keep) / "night.png" if keep else tmp_path / "night.png")
         browser.evaluate("window.confirm = () => true")
         browser.click("[data-command=land]")
         ended = service.wait_for(lambda e: e["event"] == "ended", 60)

@@ -16,21 +16,29 @@ function axes(unit) {
   const grid = { stroke: "#8884", width: 1 };
   return [
     { stroke: ink, grid, size: 26, incrs: [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000] },
-    { stroke: ink, grid, size: 54, space: 22, label: unit, labelSize: 14, labelGap: 0 },
+    { stroke: ink, grid, size: 60, space: 22, label: unit, labelSize: 14, labelGap: 0,
+      values: (_, ticks) => ticks.map((value) => `${Number(value.toPrecision(5))}`) },
   ];
 }
 
-function chart(id, title, unit, series) {
+// A sigma is seen from zero on; half a kelvin fills the room at least: noise must not look like news.
+const fromZero = (_, __, most) => [0, most ? 1.2 * most : 1];
+const aKelvin = (_, least, most) => {
+  const half = Math.max(0.25, 0.6 * (most - least));
+  return least == null ? [0, 1] : [(least + most) / 2 - half, (least + most) / 2 + half];
+};
+
+function chart(id, title, unit, range, series) {
   const room = document.getElementById(id);
   return new uPlot({
     title,
     width: Math.max(room.clientWidth, 200),
     height: HEIGHT_PX,
-    scales: { x: { time: false } },
+    scales: { x: { time: false }, y: { range } },
     axes: axes(unit),
     cursor: { show: false },
     legend: {
-      show: series.length > 1, live: false,
+      show: series.length > 1 || range === aKelvin, live: false,
       markers: { dash: (_, k) => series[k - 1]?.[2] ? (series[k - 1][2][0] < 4 ? "dotted" : "dashed") : "solid" },
     },
     series: [{ label: "exposure" }, ...series.map(([label, stroke, dash]) => ({
@@ -44,9 +52,9 @@ export function drawCharts() {
   none.hidden = history.length > 0;
   if (!charts.sigma0) {
     if (!history.length) return;
-    charts.sigma0 = chart("chart-sigma0", "σ0", "px", [["σ0", STROKES[0]]]);
-    charts.dc = chart("chart-dc", "dC", "K", [["measured", STROKES[1]], ["estimated", STROKES[3], [6, 4]]]);
-    charts.time = chart("chart-time", "time σ", "µs", [["time σ", STROKES[2]]]);
+    charts.sigma0 = chart("chart-sigma0", "σ0", "px", fromZero, [["σ0", STROKES[0]]]);
+    charts.dc = chart("chart-dc", "dC", "K", aKelvin, [["measured", STROKES[1]], ["estimated", STROKES[3], [6, 4]]]);
+    charts.time = chart("chart-time", "time σ", "µs", fromZero, [["time σ", STROKES[2]]]);
   }
   const numbers = history.map((one) => one.number);
   const of = (key, factor = 1) => history.map((one) => one[key] == null ? null : one[key] * factor);
@@ -67,7 +75,7 @@ function drawTemperatures(history, numbers) {
   }
   if (charts.temperature?.probes !== key) {
     charts.temperature?.destroy();
-    charts.temperature = chart("chart-temperature", "temperatures", "°C", probes.map((probe, k) =>
+    charts.temperature = chart("chart-temperature", "temperatures", "°C", aKelvin, probes.map((probe, k) =>
       [probe, STROKES[k % STROKES.length], DASHES[Math.floor(k / STROKES.length) % DASHES.length]]));
     charts.temperature.probes = key;
   }

@@ -13,6 +13,7 @@ const about = document.getElementById("about-image");
 const residuals = document.getElementById("show-residuals");
 const noteRoom = document.getElementById("vectors-note");
 const drawing = document.getElementById("vectors");
+const AGAIN_MS = 5000;
 const view = { scale: 1, x: 0, y: 0 };
 let shown = null;
 
@@ -130,6 +131,9 @@ export async function showImage(number) {
   if (shown !== address) return;
   if (!picture) {
     showNone(`exposure ${number}: no quick look`);
+    // Asked for again in a while, not with every word of the service.
+    shown = address;
+    setTimeout(() => { if (shown === address) shown = null; }, AGAIN_MS);
     return;
   }
   if (image.src) URL.revokeObjectURL(image.src);
