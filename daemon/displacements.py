@@ -14,7 +14,7 @@ from typing import Any
 
 from daemon.disk.durable import replace_file
 from daemon.disk.records import canonical_bytes
-from processing.mosaic.flight_validity import FlightValidity, judge_flight
+from processing.mosaic.flight_validity import FlightSettings, FlightValidity, judge_flight
 from processing.mosaic.stitch_record import StitchRecord, StitchRecordError, stitch_record_from_json
 from processing.rig import load_rig
 
@@ -37,6 +37,19 @@ def write_displacements(mission: Path) -> Mapping[str, Any]:
     path.parent.mkdir(exist_ok=True)
     replace_file(path, canonical_bytes(content))
     return content
+
+
+def without_steps(exposures: Mapping[str, int]) -> str:
+    """What a flight without steps says, by how many exposures of each cone were judged."""
+    if not exposures:
+        return "Not judged: a sensor that is alone in its cone is not seen to move."
+    least = 2 * FlightSettings().least_exposures
+    few = [cone for cone, count in exposures.items() if count < least]
+    if len(few) == len(exposures):
+        return f"Not judged: whether a sensor moved shows in {least} exposures of a cone or more."
+    if few:
+        return f"No sensor is seen to move; not judged: cone {', '.join(few)} (too few exposures)."
+    return "No sensor is seen to move."
 
 
 def _records(mission: Path) -> tuple[dict[int, StitchRecord], list[str]]:

@@ -45,6 +45,7 @@ def write_report(
         exposures=exposures,
         simulated=any(exposure["record"].get("simulated") for exposure in exposures),
         displaced=_displaced(exposures),
+        tested=len(_figure(exposures, "displacement_test")),
         flight_says=write_displacements(mission)["sentences"],
         ledger=ledger,
         geometry=geometry,

@@ -57,16 +57,23 @@ def gather(missions: Sequence[Path]) -> Gathered:
     A sensor whose probe was stuck, jumping, open or silent at an exposure does not count there.
 
     Raises:
-        ThermalCalibrationError: different calibrations, or no mission with products.
+        ThermalCalibrationError: different calibrations, a mission given twice, or no mission with
+            products.
         processing.rig.RigError: a mission's rig file cannot be used.
     """
     rig: Rig | None = None
     state: ThermalState | None = None
     used = 0
+    seen: set[Path] = set()
     passed_over: list[str] = []
     estimates: dict[tuple[str, int], tuple[EstimatedDc, ...]] = {}
     for path in missions:
         mission = Mission.open(path)
+        if mission.path.resolve() in seen:
+            raise ThermalCalibrationError(
+                f"{mission.id} is given twice; what it says counts once: leave one out"
+            )
+        seen.add(mission.path.resolve())
         own = load_rig(mission.rig_path)
         if rig is None or state is None:
             rig, state = own, empty_state(own)

@@ -43,7 +43,7 @@ Examples: `syntopic calibrate thermal MISSION...`, `syntopic calibrate thermal A
 """
 
 
-VALIDITY_HELP = """Say whether a sensor moved during a flight, since when and how far.
+VALIDITY_HELP = """Say whether a sensor moved in flight or a probe misread, since when and how far.
 
 Takes the stitching of all exposures together (`mosaic.json` of Level-2) and so sees less than one
 exposure can: a few hundredths of a pixel. Writes `export/displacements.json` into the mission.
@@ -114,7 +114,7 @@ def validity(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     from daemon.disk.mission import Mission
-    from daemon.displacements import DISPLACEMENTS_FILE, write_displacements
+    from daemon.displacements import DISPLACEMENTS_FILE, without_steps, write_displacements
 
     folder = Mission.open(mission).path
     told = write_displacements(folder)
@@ -124,8 +124,12 @@ def validity(
     else:
         console = Console()
         counted = ", ".join(f"{n} of cone {cone}" for cone, n in told["exposures"].items())
-        console.print(f"Exposures judged: {counted or 'none; process the mission first'}")
-        for sentence in told["unreadable"] + (told["sentences"] or ["No sensor is seen to move."]):
+        if not any(told["exposures"].values()):
+            counted = "none; has the mission been processed?" if told["exposures"] else "none"
+        console.print(f"Exposures with a record: {counted}")
+        for sentence in told["unreadable"] + (
+            told["sentences"] or [without_steps(told["exposures"])]
+        ):
             console.print(sentence)
         console.print(f"Written: [bold]{path}[/]", soft_wrap=True)
     raise typer.Exit(1 if told["steps"] else 0)
@@ -180,7 +184,7 @@ def _print(
     if len(gathered.passed_over) > 10:
         console.print(f"  and {len(gathered.passed_over) - 10} more")
     for key, reason in found.reasons.items():
-        console.print(f"  {key}: nothing learned, {reason}", markup=False, highlight=False)
+        console.print(f"  cone {key}: nothing learned, {reason}", markup=False, highlight=False)
     if changes:
         table = light_table("Old and new", ("", "value"), ("old", "new", "sigma", "t", "px"))
         for c in changes:

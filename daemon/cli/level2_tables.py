@@ -13,10 +13,16 @@ Reports = Sequence[Mapping[str, Any]]
 
 
 def print_reports(console: Console, title: str, reports: Reports) -> None:
-    """One table for all exposures, in the columns that their method has figures for."""
+    """One table for all exposures, in the columns that their method has figures for, and beneath it
+    why an exposure is not good."""
     methods = {report["figures"].get("method") for report in reports}
     show = _heads if "heads" in methods else _bands if "bands" in methods else _stitched
     show(console, title, reports)
+    for report in reports:
+        for finding in report["findings"]:
+            if finding["verdict"] != "good":
+                said = f"Exposure {report['exposure']}: {finding['sentence']}"
+                console.print(said, markup=False, highlight=False)
 
 
 def _stitched(console: Console, title: str, reports: Reports) -> None:
@@ -63,9 +69,6 @@ def _bands(console: Console, title: str, reports: Reports) -> None:
                 report["verdict"] if k == 0 else "",
             )
     console.print(table)
-    for report in reports:
-        for finding in report["findings"]:
-            console.print(f"Exposure {report['exposure']}: {finding['sentence']}", markup=False)
 
 
 def _px(value: float | None, digits: int) -> str:

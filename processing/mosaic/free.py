@@ -218,7 +218,8 @@ def adjust_mosaic(
     needs a first look or soft weights.
 
     `prior` (u, u) is information that draws the unknowns to their start, in the inverse square of
-    `MosaicModel.units` and of a weight like that of the points.
+    `MosaicModel.units` and of a weight like that of the points. With it nothing else is held: what
+    is known of every unknown is in it, and is not to be taken for better known.
     """
     groups = groups_of(rig, start, tie_points, settings, kinds)
     for group in groups:
@@ -256,7 +257,7 @@ def adjust_mosaic(
             scaled_matrix,
             -scaled_matrix @ (values / model.units),
             held_at=-values / model.units,
-            least_information=1.0 / settings.undetermined_px**2,
+            least_information=1.0 / settings.undetermined_px**2 if prior is None else 0.0,
         )
         values = values + solution.dp * model.units
         soft = iterations < least - 1

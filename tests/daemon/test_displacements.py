@@ -11,14 +11,14 @@ from typer.testing import CliRunner
 
 from daemon.cli import app
 from daemon.disk.mission import Mission
-from daemon.displacements import DISPLACEMENTS_FILE, write_displacements
+from daemon.displacements import DISPLACEMENTS_FILE, without_steps, write_displacements
 from daemon.report import write_report
 from processing.mosaic.stitch_record import stitch_record_json
 from processing.rig import shipped_rigs
 from tests.processing.mosaic.test_flight_validity import Moves, records_of
 
 
-def landed(root: Path, moves: Moves) -> Path:
+def landed(root: Path, moves: Moves, *, count: int = 40) -> Path:
     mission = Mission.create(
         root,
         "ultracam-x-mini",
@@ -27,7 +27,7 @@ def landed(root: Path, moves: Moves) -> Path:
         started_utc=datetime(2026, 11, 21, 10, 15, tzinfo=UTC),
     )
     mission.close()
-    for number, record in records_of(moves, seed=8, count=40).items():
+    for number, record in records_of(moves, seed=8, count=count).items():
         folder = mission.level2(number)
         folder.mkdir(parents=True)
         (folder / "mosaic.json").write_text(json.dumps(stitch_record_json(record)))
@@ -56,6 +56,23 @@ def test_the_command_prints_it_and_tells_by_its_exit_code(moved: Path, tmp_path:
     said = CliRunner().invoke(app, ["calibrate", "validity", str(healthy)])
     assert said.exit_code == 0 and "No sensor is seen to move." in said.stdout
     assert f"Written: {healthy / DISPLACEMENTS_FILE}" in said.stdout
+
+
+def test_a_flight_that_shows_nothing_is_not_called_healthy() -> None:
+    assert without_steps({"0": 12, "1": 6}) == "No sensor is seen to move."
+    assert without_steps({"0": 12, "1": 5}).endswith("not judged: cone 1 (too few exposures).")
+    assert without_steps({"0": 0, "1": 5}).startswith("Not judged:")
+    assert without_steps({}).startswith("Not judged: a sensor that is alone")
+
+
+def test_a_mission_without_products_is_not_called_healthy(tmp_path: Path) -> None:
+    mission = landed(tmp_path, {}, count=0)
+    said = CliRunner().invoke(app, ["calibrate", "validity", str(mission)])
+    assert "none; has the mission been processed?" in said.stdout
+    assert "No sensor is seen to move" not in said.stdout
+    assert "Whether a sensor of the camera was displaced is not known" in (
+        write_report(mission).read_text()
+    )
 
 
 def test_a_damaged_record_is_named_and_the_others_count(tmp_path: Path) -> None:

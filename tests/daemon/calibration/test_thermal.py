@@ -71,6 +71,14 @@ def flown(root: Path, records: list[StitchRecord], *, rig_bytes: bytes | None = 
     return mission
 
 
+def test_a_mission_given_twice_is_refused_for_it_would_count_twice(
+    tmp_path: Path, records: list[StitchRecord]
+) -> None:
+    path = flown(tmp_path, records).path
+    with pytest.raises(ThermalCalibrationError, match="given twice"):
+        gather([path, path.parent / "." / path.name])
+
+
 def test_the_command_writes_a_new_dated_rig_and_shows_old_against_new(
     tmp_path: Path, rig: Rig, records: list[StitchRecord]
 ) -> None:

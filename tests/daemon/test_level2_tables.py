@@ -1,0 +1,27 @@
+"""What `syntopic process` prints says why an exposure is not good."""
+
+from __future__ import annotations
+
+import io
+
+from rich.console import Console
+
+from daemon.cli.level2_tables import print_reports
+
+
+def test_beneath_the_table_stands_why_an_exposure_is_not_good() -> None:
+    findings = [
+        {"verdict": "good", "sentence": "Simulated hardware: not a survey."},
+        {"verdict": "usable", "sentence": "No frame of SU10: that part has no data."},
+    ]
+    report = {
+        "exposure": 7,
+        "figures": {"method": "free"},
+        "findings": findings,
+        "verdict": "usable",
+        "duration_s": 1.0,
+    }
+    told = io.StringIO()
+    print_reports(Console(file=told, width=100), "Level-2", [report])
+    assert "Exposure 7: No frame of SU10: that part has no data." in told.getvalue()
+    assert "Simulated" not in told.getvalue()
