@@ -5,7 +5,7 @@ Compiled kernels; refining the place is done in `processing.matching.least_squar
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numba import njit
@@ -13,23 +13,46 @@ from numpy.typing import NDArray
 
 Array = NDArray[Any]
 
+MARGIN_PX: Final = 4
+"""Pixels a patch needs around its window: four taps and the largest half shift."""
+
+
+_TAPS: Final = 8
+"""Pixels of the template that are taken at once."""
+
+
+@njit(cache=True)
+def correlation_scratch(side: int, search: int) -> tuple[Array, Array, Array, Array, Array]:
+    """Memory for `correlate`: template, products at all offsets, spreads of a row of them, two rows
+    of sums of b.
+
+    Rows of the first two come in whole vectors of eight.
+    """
+    wide = side + 2 * MARGIN_PX + 2 * search
+    return (
+        np.zeros((side, (side + _TAPS - 1) // _TAPS * _TAPS), np.float32),
+        np.empty((2 * search + 1, (2 * search + 8) // 8 * 8), np.float32),
+        np.empty(2 * search + 1, np.float32),
+        np.empty(wide),
+        np.empty(wide),
+    )
+
 
 @njit(cache=True, fastmath=True)
 def correlate(
     a: Array,
     b: Array,
     half: int,
-    margin: int,
     reach: Array,
-    scratch: tuple[Array, Array, Array],
+    scratch: tuple[Array, Array, Array, Array, Array],
     surface: Array,
 ) -> None:
     """Normalised cross correlation of a's window with b at all offsets; -2 where not tried.
 
-    `reach` holds the first and last column offset and the first and last row offset to be tried.
-    `scratch` is a flat template, as long as b, and two rows of sums, as long as b is wide.
+    `reach` holds the first and last column offset and the first and last row offset to be tried;
+    `scratch` is from `correlation_scratch`.
     """
-    template, sums, squares = scratch
+    template, products, spreads, sums, squares = scratch
     side = 2 * half + 1
     n = side * side
     search = (surface.shape[1] - 1) // 2
@@ -37,53 +60,89 @@ def correlate(
     mean = np.float32(0.0)
     for r in range(side):
         for c in range(side):
-            mean += a[r + margin, c + margin]
+            mean += a[r + MARGIN_PX, c + MARGIN_PX]
     mean /= np.float32(n)
-    # The template has the stride of b, so that a window is one run of memory; zeros between rows.
-    flat = b.reshape(-1)
-    length = (side - 1) * wide + side
-    template[:length] = np.float32(0.0)
     energy = 0.0
     for r in range(side):
         for c in range(side):
-            value = a[r + margin, c + margin] - mean
-            template[r * wide + c] = value
+            value = a[r + MARGIN_PX, c + MARGIN_PX] - mean
+            template[r, c] = value
             energy += value * value
     surface[:] = np.float32(-2.0)
     sums[:] = 0.0
     squares[:] = 0.0
-    first = margin + search + reach[2]
+    first = MARGIN_PX + search + reach[2]
     for r in range(first, first + side):
         for j in range(wide):
             value = float(b[r, j])
             sums[j] += value
             squares[j] += value * value
+    left = MARGIN_PX + search + reach[0]
+    count = reach[1] - reach[0] + 1
+    products = products[: reach[3] - reach[2] + 1]
+    _products(b.reshape(-1), first * wide + left, wide, template, products)
     for dr in range(reach[2], reach[3] + 1):
-        top = margin + search + dr
-        left = margin + search + reach[0]
+        top = MARGIN_PX + search + dr
         total = square = 0.0
         for j in range(left, left + side):
             total += sums[j]
             square += squares[j]
-        for dc in range(reach[0], reach[1] + 1):
-            at = margin + search + dc
-            start = top * wide + at
-            window = flat[start : start + length]
-            product = np.float32(0.0)
-            for k in range(length):
-                product += template[k] * window[k]
-            spread = (square - total * total / n) * energy
-            if spread > 1e-6:
-                surface[search + dr, search + dc] = product / np.sqrt(spread)
-            if dc < reach[1]:
-                total += sums[at + side] - sums[at]
-                square += squares[at + side] - squares[at]
+        for k in range(count):
+            spreads[k] = (square - total * total / n) * energy
+            total += sums[left + k + side] - sums[left + k]
+            square += squares[left + k + side] - squares[left + k]
+        product = products[dr - reach[2]]
+        line = surface[search + dr, search + reach[0] : search + reach[1] + 1]
+        for k in range(count):
+            steep = spreads[k] > np.float32(1e-6)
+            found = product[k] / np.sqrt(spreads[k] if steep else np.float32(1.0))
+            line[k] = found if steep else np.float32(-2.0)
         if dr < reach[3]:
             for j in range(wide):
                 leaving = float(b[top, j])
                 coming = float(b[top + side, j])
                 sums[j] += coming - leaving
                 squares[j] += coming * coming - leaving * leaving
+
+
+@njit(cache=True, fastmath=True)
+def _products(flat: Array, first: int, wide: int, template: Array, products: Array) -> None:
+    """Sums of template times window for all offsets, the first window beginning at word `first`.
+
+    Vectors hold neighbouring offsets, so nothing is summed across them, and rows of offsets take
+    turns, so that no sum waits for itself. What is read beyond a window stays within the patch:
+    it has a margin below.
+    """
+    products[:] = np.float32(0.0)
+    count, lanes = products.shape
+    for r in range(template.shape[0]):
+        for c in range(0, template.shape[1], _TAPS):
+            t = template[r, c : c + _TAPS]
+            taps = (t[0], t[1], t[2], t[3], t[4], t[5], t[6], t[7])
+            for k in range(count):
+                start = first + (r + k) * wide + c
+                source = flat[start : start + lanes + _TAPS - 1]
+                # A count known to the compiler: two vectors and nothing left over.
+                if lanes == 16:
+                    _add_taps(source, taps, products[k], 16)
+                else:
+                    _add_taps(source, taps, products[k], lanes)
+
+
+@njit(cache=True, fastmath=True, inline="always")
+def _add_taps(s: Array, w: tuple[Any, ...], o: Array, count: int) -> None:
+    w0, w1, w2, w3, w4, w5, w6, w7 = w
+    for j in range(count):
+        o[j] += (
+            w0 * s[j]
+            + w1 * s[j + 1]
+            + w2 * s[j + 2]
+            + w3 * s[j + 3]
+            + w4 * s[j + 4]
+            + w5 * s[j + 5]
+            + w6 * s[j + 6]
+            + w7 * s[j + 7]
+        )
 
 
 @njit(cache=True)
@@ -112,6 +171,9 @@ def peak(surface: Array, reach: Array, found: Array) -> bool:
                 for j in range(max(dc - 1, reach[0]), min(dc + 1, reach[1]) + 1):
                     if surface[search + i, search + j] > value:
                         highest = False
+                        break
+                if not highest:
+                    break
             if highest:
                 second = value
     r, c = search + row, search + col

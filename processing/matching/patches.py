@@ -13,7 +13,12 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from processing.matching.correlation import correlate, peak
+from processing.matching.correlation import (
+    MARGIN_PX,
+    correlate,
+    correlation_scratch,
+    peak,
+)
 from processing.matching.features import select_features
 from processing.matching.least_squares import (
     INTERPOLATION,
@@ -25,9 +30,6 @@ from processing.matching.least_squares import (
 __all__ = ["INTERPOLATION", "MARGIN_PX", "match_patches", "select_features"]
 
 Array = NDArray[Any]
-
-MARGIN_PX: Final = 4
-"""Pixels a patch needs around its window: four taps and the largest half shift."""
 
 _BLOCK: Final = 32
 
@@ -155,7 +157,7 @@ def match_patches(
         b = flat_b[: size_b * size_b].reshape(size_b, size_b)
         width = 2 * search + 1
         surface = np.empty((width, width), np.float32)
-        correlation = (np.zeros(size_b * size_b, np.float32), np.empty(size_b), np.empty(size_b))
+        correlation = correlation_scratch(side, search)
         scratch = refinement_scratch(side)
         best = np.empty(6)
         found = np.empty(4)
@@ -185,7 +187,7 @@ def match_patches(
                 words or _all_finite(part)
             ):
                 continue
-            correlate(a, b, half_window, margin, reach, correlation, surface)
+            correlate(a, b, half_window, reach, correlation, surface)
             if not peak(surface, reach, best):
                 continue
             moved_col = moved_row = 0
