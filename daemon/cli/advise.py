@@ -29,7 +29,7 @@ def advise(
 ) -> None:
     from daemon.disk.level2 import write_folder
     from daemon.disk.mission import Mission
-    from daemon.orientation.exterior import mount_of
+    from daemon.orientation.exterior import exposures_of, mount_of
     from daemon.plan import advisor, flown, writing
     from daemon.plan.image_size import image_on_ground_m
     from daemon.plan.reading import PlanError, read_plan
@@ -46,10 +46,11 @@ def advise(
     taken = flown.taken_of(folder, read.specification)
     advice = advisor.advise(read, taken, image_along_m=along_m, image_across_m=across_m)
     base_m = along_m * (1.0 - read.specification.forward_overlap)
+    simulated = any(exposure.simulated for exposure in exposures_of(folder))
     out = folder.export_dir / "fly-again"
     texts = {
-        "fly-again.geojson": writing.geojson(advice.segments),
-        "fly-again.kml": writing.kml(advice.segments),
+        "fly-again.geojson": writing.geojson(advice.segments, simulated=simulated),
+        "fly-again.kml": writing.kml(advice.segments, simulated=simulated),
         "fly-again.waypoints": writing.mavlink_mission(
             advice.segments, height_m=section.height_above_ground_m, distance_m=base_m
         ),

@@ -33,6 +33,14 @@ class ProductError(DaemonError, ValueError):
     """Products that cannot be written as they are; disk faults come as OSError instead."""
 
 
+SIMULATED = "SIMULATED"
+"""The flag of a quality report."""
+
+_COMMENT = b"SIMULATED: emulated hardware, no survey"
+JPEG_COMMENT = b"\xff\xfe" + (len(_COMMENT) + 2).to_bytes(2, "big") + _COMMENT
+"""A comment segment, ITU-T T.81, B.2.4.5; it follows the marker that begins an image."""
+
+
 @dataclass(frozen=True)
 class Level2Record:
     """What was written: file name to size in bytes, and the verdict of quality.json."""
@@ -74,15 +82,15 @@ def level2_contents(
         RecordError: a report that JSON cannot hold.
     """
     contents: dict[str, Sequence[bytes | memoryview]] = {}
+    mark = simulated_mark(report_json)
     if pan is not None:
-        contents["pan.tif"] = tiff_parts([pan], {"bands": ["pan"], "exposure": number})
+        contents["pan.tif"] = tiff_parts([pan], {"bands": ["pan"], "exposure": number, **mark})
     if colour:
         bands = _ordered(colour)
-        about = {"bands": bands, "exposure": number}
+        about = {"bands": bands, "exposure": number, **mark}
         contents["rgbn.tif"] = tiff_parts([colour[band] for band in bands], about)
     if quicklook is not None:
-        contents["quicklook.jpg"] = [jpeg_bytes(quicklook)]
-        contents["thumbnail.jpg"] = [thumbnail_bytes(quicklook)]
+        contents |= pictures(quicklook, report_json)
     for method, arrays in (geometry or {}).items():
         contents[_geometry_name(method)] = [_npz(arrays)]
     if residuals_svg is not None:
@@ -212,6 +220,22 @@ def _npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
     named: dict[str, Any] = {name: arrays[name] for name in sorted(arrays)}
     np.savez(buffer, **named)
     return buffer.getvalue()
+
+
+def simulated_mark(report_json: Mapping[str, Any]) -> dict[str, bool]:
+    """What goes into the description of an image of emulated hardware; nothing for any other."""
+    flags = report_json.get("flags")
+    return {"simulated": True} if isinstance(flags, list) and SIMULATED in flags else {}
+
+
+def pictures(
+    quicklook: NDArray[np.uint8], report_json: Mapping[str, Any]
+) -> dict[str, Sequence[bytes | memoryview]]:
+    """The quick look and its thumbnail; those of emulated hardware say so in a comment."""
+    whole, small = jpeg_bytes(quicklook), thumbnail_bytes(quicklook)
+    if simulated_mark(report_json):
+        whole, small = (jpeg[:2] + JPEG_COMMENT + jpeg[2:] for jpeg in (whole, small))
+    return {"quicklook.jpg": [whole], "thumbnail.jpg": [small]}
 
 
 def thumbnail_bytes(quicklook: NDArray[np.uint8]) -> bytes:

@@ -18,7 +18,7 @@ def segment_name(segment: Segment) -> str:
     return f"{segment.line.id}: {segment.from_m:.0f} m to {segment.to_m:.0f} m"
 
 
-def geojson(segments: Sequence[Segment]) -> str:
+def geojson(segments: Sequence[Segment], *, simulated: bool = False) -> str:
     """A FeatureCollection of LineStrings; also a plan that can be read again."""
     features: list[dict[str, Any]] = [
         {
@@ -29,6 +29,7 @@ def geojson(segments: Sequence[Segment]) -> str:
                 "from_m": round(one.from_m, 1),
                 "to_m": round(one.to_m, 1),
                 "reasons": list(one.reasons),
+                **({"simulated": True} if simulated else {}),
             },
             "geometry": {
                 "type": "LineString",
@@ -43,8 +44,9 @@ def geojson(segments: Sequence[Segment]) -> str:
     return json.dumps({"type": "FeatureCollection", "features": features}, indent=1) + "\n"
 
 
-def kml(segments: Sequence[Segment]) -> str:
+def kml(segments: Sequence[Segment], *, simulated: bool = False) -> str:
     """Placemarks with LineStrings (OGC KML 2.2)."""
+    title = "Fly again (SIMULATED: emulated hardware, no survey)" if simulated else "Fly again"
     marks = [
         "<Placemark><name>{name}</name><description>{why}</description><LineString>"
         "<coordinates>{a[1]:.8f},{a[0]:.8f} {b[1]:.8f},{b[0]:.8f}</coordinates>"
@@ -58,7 +60,7 @@ def kml(segments: Sequence[Segment]) -> str:
     ]
     return (
         '<?xml version="1.0" encoding="UTF-8"?>\n'
-        '<kml xmlns="http://www.opengis.net/kml/2.2"><Document><name>Fly again</name>\n'
+        f'<kml xmlns="http://www.opengis.net/kml/2.2"><Document><name>{title}</name>\n'
         + "\n".join(marks)
         + "\n</Document></kml>\n"
     )

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.disk.level2 import pictures, simulated_mark
 from daemon.disk.mission import Mission
 from daemon.disk.records import canonical_bytes
 from daemon.exposure import Exposure
-from daemon.products.reports import Contents, FramesRead, Made, pictures, report_json
+from daemon.products.reports import Contents, FramesRead, Made, report_json
 from processing.band_pipeline import BandPipeline, FrameSettings
 from processing.conditions import Conditions
 from processing.image.band_registration import RegisteredBand
@@ -66,6 +67,7 @@ def bands_made(
     report["units"] = dict(product.units)
     report["bands"] = [_registration(band) for band in product.registrations]
     contents: Contents = {}
+    mark = simulated_mark(report)
     for cone in pipeline.rig.cones:
         name = cone.bands[0]
         if name not in product.bands:
@@ -77,15 +79,16 @@ def bands_made(
             "unit": product.units[name],
             "f_mm": product.image.f_mm,
             "pitch_um": product.image.pitch_um,
+            **mark,
         }
         if (calibration := radiance.get(cone.sensors[0].name)) is not None:
             about["wavelength_nm"] = calibration.wavelength_nm
             about["bandwidth_nm"] = calibration.bandwidth_nm
         contents[f"{name}.tif"] = [_tiff(product.bands[name], about)]
-        about = {"band": name, "exposure": exposure.number, "bits": ["valid", "saturated"]}
+        about = {"band": name, "exposure": exposure.number, "bits": ["valid", "saturated"], **mark}
         contents[f"{name}-mask.tif"] = [_tiff(product.masks[name], about)]
     if product.bands:
-        contents |= pictures(_quicklook(product.bands))
+        contents |= pictures(_quicklook(product.bands), report)
     contents["quality.json"] = [canonical_bytes(report)]
     return report, contents
 

@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.disk.level0 import tiff_parts
+from daemon.disk.level2 import pictures, simulated_mark
 from daemon.disk.records import canonical_bytes
 from daemon.exposure import Exposure
-from daemon.products.reports import Contents, FramesRead, Made, pictures, report_json
+from daemon.products.reports import Contents, FramesRead, Made, report_json
 from processing.conditions import Conditions
 from processing.perspective import HeadPipeline, HeadsProduct
 
@@ -41,10 +42,11 @@ def heads_made(
             "f_mm": head.image.f_mm,
             "pitch_um": head.image.pitch_um,
             "geometry": "strict perspective, principal point at the centre",
+            **simulated_mark(report),
         }
         contents[f"{name}.tif"] = tiff_parts(list(head.bands.values()), about)
     if product.heads:
-        contents |= pictures(_side_by_side(product))
+        contents |= pictures(_side_by_side(product), report)
     contents["quality.json"] = [canonical_bytes(report)]
     return report, contents
 

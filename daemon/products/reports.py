@@ -5,10 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeAlias
 
-import numpy as np
-from numpy.typing import NDArray
-
-from daemon.disk.level2 import jpeg_bytes, thumbnail_bytes
 from processing.quality.report import QualityReport, as_json
 
 Contents: TypeAlias = dict[str, Sequence[bytes | memoryview]]
@@ -25,11 +21,3 @@ def report_json(
     """The content of quality.json, as far as it is the same for every rig."""
     timings = {stage: round(seconds, 4) for stage, seconds in timings_s.items()}
     return {**as_json(report), "exposure": number, "timings_s": timings}
-
-
-def pictures(quicklook: NDArray[np.uint8]) -> Contents:
-    """The quick look and its thumbnail."""
-    return {
-        "quicklook.jpg": [jpeg_bytes(quicklook)],
-        "thumbnail.jpg": [thumbnail_bytes(quicklook)],
-    }

@@ -111,6 +111,10 @@ class Coverage:
         return "hole" if is_passed or latest != segment.line.id else "to fly"
 
     @property
+    def is_simulated(self) -> bool:
+        return bool(self._state.brief()["simulated"])
+
+    @property
     def height_m(self) -> float:
         """Height above ground as planned, for missions that are written out."""
         return self._known.height_m if self._known else 0.0

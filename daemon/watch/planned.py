@@ -48,8 +48,10 @@ def add_plan(app: FastAPI, coverage: Coverage, watcher: Depends) -> None:
             raise HTTPException(404, NO_PLAN)
         found = await asyncio.to_thread(question)
         texts = {
-            "fly-again.geojson": lambda: writing.geojson(found.segments),
-            "fly-again.kml": lambda: writing.kml(found.segments),
+            "fly-again.geojson": lambda: writing.geojson(
+                found.segments, simulated=coverage.is_simulated
+            ),
+            "fly-again.kml": lambda: writing.kml(found.segments, simulated=coverage.is_simulated),
             "fly-again.waypoints": lambda: writing.mavlink_mission(
                 found.segments, height_m=coverage.height_m, distance_m=coverage.distance_m
             ),

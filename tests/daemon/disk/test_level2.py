@@ -65,6 +65,24 @@ def test_every_product_is_read_by_others(mission):
     assert json.loads((folder / "quality.json").read_bytes()) == REPORT
 
 
+def test_images_of_emulated_hardware_say_so_themselves(mission):
+    import cv2
+
+    _write(mission)
+    folder = mission.level2(7)
+    real = {path.name: path.read_bytes() for path in folder.iterdir()}
+    _write(mission, report_json=REPORT | {"flags": ["SIGMA0", "SIMULATED"]})
+    for name in ("pan.tif", "rgbn.tif"):
+        with tifffile.TiffFile(folder / name) as told:
+            assert json.loads(told.pages[0].description)["simulated"] is True
+        assert b"simulated" not in real[name]
+    for name in ("quicklook.jpg", "thumbnail.jpg"):
+        told = (folder / name).read_bytes()
+        assert b"SIMULATED: emulated hardware" in told and b"SIMULATED" not in real[name]
+        pixels = [cv2.imdecode(np.frombuffer(data, np.uint8), 1) for data in (told, real[name])]
+        assert np.array_equal(*pixels)
+
+
 def test_the_same_products_are_the_same_bytes(mission):
     _write(mission)
     first = {p.name: p.read_bytes() for p in mission.level2(7).iterdir()}

@@ -155,6 +155,7 @@ def test_the_planned_line_is_on_the_map_with_the_holes_in_what_was_flown(
         "fetch('/api/v1/advice/fly-again.geojson').then((answer) => answer.json())"
     )
     assert {f["properties"]["strip"] for f in told["features"]} == {"S"}
+    assert all(f["properties"]["simulated"] for f in told["features"])
 
 
 def test_residuals_are_laid_over_the_image_and_told_by_overlap_and_histogram_in_words(
