@@ -42,7 +42,7 @@ def write_displacements(mission: Path) -> Mapping[str, Any]:
 def without_steps(exposures: Mapping[str, int]) -> str:
     """What a flight without steps says, by how many exposures of each cone were judged."""
     if not exposures:
-        return "Not judged: a sensor that is alone in its cone is not seen to move."
+        return "Not judged: it takes three sensors in the master cone, or two in another PAN cone."
     least = 2 * FlightSettings().least_exposures
     few = [cone for cone, count in exposures.items() if count < least]
     if len(few) == len(exposures):

@@ -54,7 +54,7 @@ def _bands(console: Console, title: str, reports: Reports) -> None:
     table = light_table(
         title,
         (),
-        ("exposure", "band", "tie points", "shift px", "rms px", "rms x", "rms y", "verdict"),
+        ("exposure", "band", "tie points", "largest shift", "rms px", "rms x", "rms y", "verdict"),
     )
     for report in reports:
         for k, band in enumerate(report["bands"]):

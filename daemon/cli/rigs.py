@@ -132,8 +132,12 @@ def show(
     else:
         console.print(
             f"Adjustment: {counts.parameters} parameters, {counts.constraints} constraints, "
-            f"{counts.parameters - counts.constraints} independent unknowns (a cone with - is "
-            f"registered to green)"
+            f"{counts.parameters - counts.constraints} independent unknowns"
+            + (
+                " (a cone with - is registered to green)"
+                if any(cone.name not in layers for cone in rig.cones)
+                else ""
+            )
         )
     if drawing is None:
         console.print("Next: [bold]--drawing FILE[/] draws the focal planes")
