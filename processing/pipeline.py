@@ -50,6 +50,7 @@ from processing.quality.figures import (
     stitching_figures,
 )
 from processing.quality.judgement import judge
+from processing.quality.read_out import unread_figures
 from processing.quality.report import Figure
 from processing.radiometry.calibration import RadiometricCalibration
 from processing.radiometry.level1 import (
@@ -183,6 +184,7 @@ class Pipeline:
         )
         with clock.stage("radiometry"):
             level1, statistics = self._correct(frames, conditions, temperatures)
+            unread = unread_figures(rig, frames)
         if frames_read is not None:
             frames_read()
         with clock.stage("tie_points"):
@@ -217,7 +219,7 @@ class Pipeline:
             picture = quicklook(image.pan, colour)
         with clock.stage("quality"):
             figures = condition_figures(rig, conditions, temperatures)
-            figures |= self._frame_figures(level1, statistics, start)
+            figures |= unread | self._frame_figures(level1, statistics, start)
             figures |= stitching_figures(
                 rig,
                 tie_points,

@@ -154,6 +154,18 @@ def _frames(
                 0.0,
             )
         )
+    unread = _number(figures, "unread_worst_fraction")
+    if unread is not None and unread > t.unread_fraction:
+        findings.append(
+            Finding(
+                Flag.FRAME_CORRUPT,
+                Verdict.USABLE,
+                f"{unread:.0%} of {figures.get('unread_worst_sensor')} was not read out: it is "
+                "below black; check head and cable, fly again if the neighbours do not cover it.",
+                unread,
+                t.unread_fraction,
+            )
+        )
     valid = _number(figures, "valid_fraction")
     if valid is not None and valid < t.valid_refly_fraction:
         findings.append(

@@ -107,6 +107,7 @@ class Thresholds:
     bright_fraction: float = 0.06
     """The 95th percentile of the signal as a share of full scale; below, the image is dark."""
     bright_refly_fraction: float = 0.01
+    unread_fraction: float = 0.01
     saturated_fraction: float = 0.005
     saturated_refly_fraction: float = 0.05
     smear_px: float = 0.8
@@ -163,6 +164,8 @@ FIGURES: Final[Mapping[str, str]] = {
     "smear_worst_head": "without a virtual image: the head whose ground moves farthest; the way's "
     "length, where the head sees it longest, is smear_along_px",
     "gsd_m": "ground sampling distance of the virtual image",
+    "unread_worst_fraction": "share of the worst sensor's pixels far below black: not read out",
+    "unread_worst_sensor": "which sensor that is",
     "saturated_fraction": "share of saturated pixels, all PAN sensors",
     "saturated_worst_fraction": "the same of the worst sensor",
     "saturated_worst_sensor": "which sensor that is",

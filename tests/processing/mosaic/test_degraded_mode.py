@@ -101,6 +101,18 @@ def test_what_is_missing_leaves_an_image_that_says_so(
     assert set(missing) & pan_sensors(RIG) <= set(_held(made)) or missing == ("SU30",)
 
 
+@pytest.mark.parametrize(("name", "lost"), [("SU02", 0.5), ("N", 1.0)])
+def test_a_frame_that_was_read_out_in_part_is_told(
+    pipeline: Pipeline, exposure: Exposure, name: str, lost: float
+) -> None:
+    frame = exposure.frames[name].copy()
+    frame[round((1.0 - lost) * len(frame)) :] = 0
+    made = pipeline.process(dict(exposure.frames) | {name: frame}, conditions(RIG, exposure))
+    assert made.report.flags & Flag.FRAME_CORRUPT and made.report.verdict is Verdict.USABLE
+    assert number(made, "unread_worst_fraction") == pytest.approx(lost, abs=0.03)
+    assert any(f"of {name} was not read out" in f.sentence for f in made.report.findings)
+
+
 def _held(made: Product) -> list[str]:
     return str(made.report.figures["undetermined"]).split(", ")
 
