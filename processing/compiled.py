@@ -32,6 +32,7 @@ _ROOMS: Final = (
     "processing.matching.least_squares",
     "processing.radiometry.level1",
     "processing.matching.patches",
+    "processing.matching.prefetch",
     "processing.matching.sampling",
     "processing.image.quicklook",
     "processing.image.resampling",

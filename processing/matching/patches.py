@@ -26,6 +26,7 @@ from processing.matching.least_squares import (
     refine,
     refinement_scratch,
 )
+from processing.matching.prefetch import fetch_ahead
 
 __all__ = ["INTERPOLATION", "MARGIN_PX", "match_patches", "select_features"]
 
@@ -165,6 +166,21 @@ def match_patches(
         for i in range(block * _BLOCK, min((block + 1) * _BLOCK, count)):
             col_b, row_b = at_b[i, 0], at_b[i, 1]
             room = half_window + margin
+            if i + 1 < count:
+                fetch_ahead(
+                    frame_a,
+                    at_a[i + 1, 0] - ratio * room,
+                    at_a[i + 1, 1] - ratio * room,
+                    ratio * size_a,
+                    ratio * size_a,
+                )
+                fetch_ahead(
+                    frame_b,
+                    at_b[i + 1, 0] - room - search,
+                    at_b[i + 1, 1] - room - search,
+                    size_b,
+                    size_b,
+                )
             reach[0] = max(-search, limits_b[0] + room - col_b)
             reach[1] = min(search, limits_b[1] - room - col_b)
             reach[2] = max(-search, limits_b[2] + room - row_b)
