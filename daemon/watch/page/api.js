@@ -11,6 +11,24 @@ function element(name, properties = {}, ...children) {
   return made;
 }
 
+// A schema in words: what it is, within which bounds, what for.
+function words(schema) {
+  if (schema.$ref) return words(api.components.schemas[schema.$ref.split("/").at(-1)]);
+  const one = schema.anyOf ? schema.anyOf.find((other) => other.type !== "null") : schema;
+  const bounds = [["minimum", "≥"], ["exclusiveMinimum", ">"], ["maximum", "≤"], ["exclusiveMaximum", "<"]]
+    .filter(([key]) => one[key] != null).map(([key, sign]) => `${sign} ${one[key]}`);
+  const chosen = one.enum ? [one.enum.join(" | ")] : [one.type, ...bounds];
+  const usual = schema.default == null || schema.default === "" ? [] : [`${schema.default} if left out`];
+  return [...chosen, ...usual].join(", ") + (schema.description ? `; ${schema.description}` : "");
+}
+
+function fields(schema) {
+  const found = schema.anyOf?.find((one) => one.$ref) || schema;
+  const object = found.$ref ? api.components.schemas[found.$ref.split("/").at(-1)] : found;
+  return Object.entries(object.properties || {}).map(([name, one]) => element("li", {},
+    element("code", { textContent: name }), ` in the body: ${words(one)}`));
+}
+
 document.getElementById("simulated").hidden = !(await askedJson("api/v1/brief"))?.simulated;
 
 const sections = [];
@@ -18,14 +36,13 @@ for (const [path, methods] of Object.entries(api.paths)) {
   for (const [method, route] of Object.entries(methods)) {
     const parameters = (route.parameters || []).map((one) => element("li", {},
       element("code", { textContent: one.name }), ` in ${one.in}${one.required ? ", needed" : ""}: `,
-      element("code", { textContent: JSON.stringify(one.schema) })));
+      words({ ...one.schema, description: one.schema.description || one.description })));
     const body = route.requestBody?.content?.["application/json"]?.schema;
     sections.push(element("section", {},
       element("h2", {}, element("span", { className: "method", textContent: method.toUpperCase() }),
         element("code", { textContent: path })),
       element("p", { textContent: route.description || "" }),
-      element("ul", {}, ...parameters),
-      ...(body ? [element("pre", { textContent: JSON.stringify(body) })] : [])));
+      element("ul", {}, ...parameters, ...(body ? fields(body) : []))));
   }
 }
 sections.push(element("section", {},

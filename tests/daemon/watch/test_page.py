@@ -357,6 +357,16 @@ def test_a_picture_is_taken(browser: Browser, tmp_path: Path) -> None:
     assert path.stat().st_size > 20_000
 
 
+def test_the_api_is_told_in_words_and_by_nobody_else(service: Service, browser: Browser) -> None:
+    browser.requested.clear()
+    browser.open(f"{service.address}docs")
+    browser.wait_for("document.querySelectorAll('#routes section').length > 10", WITHIN_S)
+    assert browser.text("#simulated") == "SIMULATED"
+    assert "interval_s in the body: number, > 0, ≤ 3600; for interval" in browser.text("#routes")
+    outside = [url for url in browser.requested if not url.startswith(("data:", service.address))]
+    assert outside == []
+
+
 def _grave(browser: Browser, where: str) -> list[tuple[str, list[str]]]:
     found = browser.evaluate(f"axe.run({where}, {{resultTypes: ['violations']}})")
     return [
