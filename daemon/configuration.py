@@ -9,13 +9,23 @@ from __future__ import annotations
 import stat
 import tomllib
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from daemon.plan.reading import PlanError, read_plan
 from drivers import registry
+from processing.quality.report import Thresholds
 from processing.rig import Rig, RigError, find_rig
 
 CONFIGURATION_MAX_BYTES = 1_000_000
@@ -159,7 +169,10 @@ class ExposureSection(_Section):
 
 
 class ProcessingSection(_Section):
-    """How exposures become images."""
+    """How exposures become images, and by which thresholds they are judged.
+
+    `thresholds` are those of `processing.quality.report.Thresholds` that are not the defaults.
+    """
 
     method: Literal["free", "fixed"] = "free"
     interpolation: Literal["bilinear", "cubic", "lanczos"] = "cubic"
@@ -167,6 +180,17 @@ class ProcessingSection(_Section):
     geometry: bool = True
     threads: int = Field(default=2, ge=1, le=256)
     exposures_in_work: int = Field(default=2, ge=1, le=16)
+    thresholds: dict[str, FiniteFloat] = Field(default_factory=dict)
+
+    @field_validator("thresholds")
+    @classmethod
+    def _are_thresholds(cls, given: dict[str, float]) -> dict[str, float]:
+        unknown = sorted(given.keys() - {field.name for field in fields(Thresholds)})
+        if unknown:
+            raise ValueError(
+                f"{', '.join(unknown)}: no such threshold; docs/formats.md lists them by flag"
+            )
+        return given
 
 
 class MavlinkCameraSection(_Section):

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from pydantic import ValidationError
 from rich.console import Console
 from rich.progress import Progress
 
@@ -68,6 +69,7 @@ def process(
             "interpolation": interpolation,
             "baselines": baselines,
             "threads": threads,
+            "thresholds": flown_thresholds(folder),
         }
     )
     mount, _ = mount_of(folder)
@@ -105,6 +107,21 @@ def process(
     console = Console()
     print_reports(console, f"Level-2 of {folder.id}", reports)
     console.print(f"Products are in [bold]{folder.level2_root}[/]")
+
+
+def flown_thresholds(folder: Mission) -> dict[str, float]:
+    """Thresholds of the configuration that was flown, so that it is judged as in the air."""
+    if not folder.service_path.exists():
+        return {}
+    flown = tomllib.loads(folder.service_path.read_text(encoding="utf-8"))
+    given = flown.get("processing", {}).get("thresholds", {})
+    try:
+        return ProcessingSection.model_validate({"thresholds": given}).thresholds
+    except ValidationError as error:
+        said = error.errors()[0]["msg"].removeprefix("Value error, ")
+        raise ConfigurationError(
+            [f"{folder.service_path}: processing.thresholds: {said}"]
+        ) from error
 
 
 def as_flown(

@@ -28,6 +28,7 @@ from daemon.products.stitched import stitched_made
 from processing.band_pipeline import BandPipeline
 from processing.perspective import HeadPipeline, looks_apart
 from processing.pipeline import Conditions, Pipeline, Settings
+from processing.quality.report import Thresholds
 from processing.quality.specification import Asked
 from processing.radiometry.histogram import sampled_histogram
 from processing.rig import Rig, Sensor
@@ -95,15 +96,23 @@ def processor_for(
     """
     asked = asked_of(mission)
     threads = processing.threads
+    given: dict[str, Any] = processing.thresholds
+    thresholds = replace(Thresholds(), **given)
     if rig.virtual_image is None and not looks_apart(rig):
         radiance = radiance_of(rig, mission, radiometry)
         pipeline = BandPipeline(rig, radiance, threads=threads, asked=asked)
+        pipeline.thresholds = replace(pipeline.thresholds, **given)
         return Processor(pipeline, partial(bands_made, radiance))
     known = None if radiometry is None else RadiometryFolder(radiometry, rig)
     if rig.virtual_image is None:
         return Processor(
             HeadPipeline(
-                rig, known, interpolation=processing.interpolation, threads=threads, asked=asked
+                rig,
+                known,
+                interpolation=processing.interpolation,
+                threads=threads,
+                thresholds=thresholds,
+                asked=asked,
             ),
             heads_made,
         )
@@ -117,6 +126,7 @@ def processor_for(
                 baselines=processing.baselines,
                 geometry=processing.geometry,
                 threads=threads,
+                thresholds=thresholds,
                 asked=asked,
             ),
         ),

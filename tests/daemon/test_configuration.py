@@ -65,6 +65,16 @@ def test_a_distance_trigger_without_a_distance_is_refused() -> None:
     assert "distance_m" in sentence
 
 
+def test_a_threshold_is_taken_and_an_unknown_one_refused() -> None:
+    content = copy.deepcopy(GOOD)
+    content["processing"] = {"thresholds": {"sharpness": 0.3}}
+    configuration, _ = from_mapping(content, Path("service.toml"))
+    assert configuration.processing.thresholds == {"sharpness": 0.3}
+    content["processing"] = {"thresholds": {"sharpnes": 0.3}}
+    (sentence,) = problems_of(content)
+    assert "processing.thresholds" in sentence and "sharpnes: no such threshold;" in sentence
+
+
 def test_a_misspelt_key_is_refused_by_its_name() -> None:
     content = copy.deepcopy(GOOD)
     content["mission"]["simulatd"] = True

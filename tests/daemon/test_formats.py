@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import fields
+from dataclasses import asdict, fields
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ from daemon.disk.mission import Mission
 from daemon.disk.records import parse_record
 from daemon.disk.store import load_level0, verify
 from daemon.exposure import Exposure, NavigationRecord, capture_bytes, from_json, to_json
-from processing.quality.report import FIGURES, Flag
+from processing.quality.report import FIGURES, Flag, Thresholds
 from processing.rig import Cone, Drift, Lens, Rig, Sensor, VirtualImage, load_rig
 from tests.daemon.small_camera import (
     HEIGHT_PX,
@@ -114,6 +114,15 @@ def test_the_defaults_told_are_the_defaults_taken(page):
             "null" if plain == "null" else plain
         )
     assert Exposure(number=1).state == "complete"
+
+
+def test_every_threshold_is_named_with_its_default(page):
+    table = page.partition("| threshold |")[2].split("\n\n")[0].splitlines()
+    told = {}
+    for row in (line.split("|") for line in table[2:]):
+        values = row[3].split("(")[0].split(",")
+        told |= dict(zip(re.findall(r"`(\w+)`", row[1]), map(float, values), strict=True))
+    assert told == pytest.approx(asdict(Thresholds()), rel=1e-3)
 
 
 def test_every_figure_and_every_flag_is_named_with_its_meaning_and_place(page):
