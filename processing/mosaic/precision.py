@@ -25,7 +25,8 @@ Array = NDArray[np.float64]
 
 PROBE_SIGMA_K = 0.1
 UNKNOWN_SIGMA_K = 2.0
-"""A probe that was read, and one that others stand in for."""
+BLIND_SIGMA_K = 15.0
+"""A probe that was read, one that others stand in for, and all of them where none was read."""
 
 
 def precision_figures(
@@ -143,7 +144,8 @@ def datum_covariance(rig: Rig, mosaic: Mosaic, measured_c: Mapping[str, float]) 
                 moved[i] -= cone.lens.f_ppm_per_k * 1e-3 * place_mm[i]
         if len(sensors) == 1:
             moved = np.repeat(moved, 2, axis=0)
-        sigma_k = PROBE_SIGMA_K if probe in measured_c else UNKNOWN_SIGMA_K
+        unknown_k = UNKNOWN_SIGMA_K if measured_c else BLIND_SIGMA_K
+        sigma_k = PROBE_SIGMA_K if probe in measured_c else unknown_k
         common = fit @ moved.reshape(-1) * sigma_k
         covariance += np.outer(common, common)
     return np.asarray(covariance / (mosaic.model.pitch_mm * 1e3) ** 2)

@@ -37,7 +37,9 @@ class SupportSettings:
     and corners) rests on calibration. `rotation_rad` is the standard deviation of a cone's rotation
     against the master's: the platform calibration's, and what the aircraft turns between syntopic
     instants. `floor_px` is for all that is not modelled in a layer; of the colour master, whose
-    parallax is the terrain's, `colour_shift_px` and `colour_floor_px`.
+    parallax is the terrain's, `colour_shift_px` and `colour_floor_px`. A temperature is known to
+    `probe_sigma_k` where its probe was read, to `unknown_sigma_k` where others stand in for it, and
+    to `blind_sigma_k` where none was read at all.
     """
 
     above_px: float = 0.04
@@ -47,6 +49,7 @@ class SupportSettings:
     colour_floor_px: float = 0.3
     probe_sigma_k: float = 0.1
     unknown_sigma_k: float = 2.0
+    blind_sigma_k: float = 15.0
     displaced_px: float = 10.0
 
 
@@ -225,7 +228,8 @@ def _probe_covariance(
                     drift.scale_ppm_per_k * 1e-6,
                 )
         read = probe in temperatures_c
-        sigma_k = settings.probe_sigma_k if read else settings.unknown_sigma_k
+        unknown_k = settings.unknown_sigma_k if temperatures_c else settings.blind_sigma_k
+        sigma_k = settings.probe_sigma_k if read else unknown_k
         covariance += np.outer(moved, moved) * sigma_k**2
     return covariance
 

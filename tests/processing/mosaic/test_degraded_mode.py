@@ -101,6 +101,20 @@ def test_what_is_missing_leaves_an_image_that_says_so(
     assert set(missing) & pan_sensors(RIG) <= set(_held(made)) or missing == ("SU30",)
 
 
+def test_without_any_probe_the_image_is_as_unsure_as_temperatures_are(
+    pipeline: Pipeline, exposure: Exposure
+) -> None:
+    unread = dict.fromkeys(exposure.temperatures_c)
+    made = pipeline.process(
+        exposure.frames, replace(conditions(RIG, exposure), temperatures_c=unread)
+    )
+    assert made.report.flags == Flag.TEMPERATURE_MISSING | Flag.SIMULATED
+    absolute, inner = errors_px(RIG, exposure, made.geometry["free"])
+    # It is 12 K warmer than is taken for granted.
+    assert rms(inner) < 0.02 < 0.3 < rms(absolute)
+    assert rms(absolute) < np.sqrt(2.0) * number(made, "stitched_sigma_px")
+
+
 @pytest.mark.parametrize(("name", "lost"), [("SU02", 0.5), ("N", 1.0)])
 def test_a_frame_that_was_read_out_in_part_is_told(
     pipeline: Pipeline, exposure: Exposure, name: str, lost: float
