@@ -37,6 +37,9 @@ from processing.rig import Rig, RigError, load_rig
 
 BODY_MAX_BYTES = 64_000
 GATHER_S = 10.0
+PING_S, PONG_WITHIN_S = 5.0, 10.0
+"""So often a watcher is asked whether it still listens, and has so long to answer: what the kernel
+holds for one that stalls may be minutes of telemetry."""
 _log = logging.getLogger(__name__)
 
 
@@ -61,6 +64,8 @@ async def _serve(link: Link, settings: WatchSection) -> None:
             lifespan="off",
             ws="websockets-sansio",
             ws_max_size=BODY_MAX_BYTES,
+            ws_ping_interval=PING_S,
+            ws_ping_timeout=PONG_WITHIN_S,
             timeout_graceful_shutdown=1,
             ssl_certfile=settings.certificate,
             ssl_keyfile=settings.key,

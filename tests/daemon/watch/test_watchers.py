@@ -6,9 +6,11 @@ import asyncio
 import json
 import os
 import signal
+import socket
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -16,10 +18,12 @@ import pytest
 from daemon.configuration import WatchSection
 from daemon.service.messages import Stop, Told
 from daemon.service.processes import Child
+from daemon.watch.process import PING_S, PONG_WITHIN_S
 from tests.daemon.watch import flown
 
 WATCHERS, STALLED, EXPOSURES = 50, 10, 60
 GROWTH_MAX_KB = 60_000
+LET_GO_WITHIN_S = PING_S + PONG_WITHIN_S + 2.0
 
 
 @pytest.fixture
@@ -53,14 +57,24 @@ async def follow(port: int, until: int) -> set[int]:
 
 
 async def stall(port: int, release: asyncio.Event) -> None:
-    """Connect, and take nothing."""
-    _reader, writer = await asyncio.open_connection("127.0.0.1", port, limit=1024)
+    """Connect, and take nothing; in the end find oneself let go."""
+    narrow = socket.socket()
+    narrow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    narrow.connect(("127.0.0.1", port))
+    connected_s = time.monotonic()
+    reader, writer = await asyncio.open_connection(sock=narrow, limit=1024)
     writer.write(
         b"GET /api/v1/telemetry?form=json HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\n"
         b"Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
         b"Sec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\n\r\n"
     )
     await release.wait()
+    await asyncio.sleep(max(0.0, connected_s + LET_GO_WITHIN_S - time.monotonic()))
+    # What was on its way comes, then the end; a living link would be told something every second.
+    with suppress(ConnectionError):
+        async with asyncio.timeout(PING_S):
+            while await reader.read(65536):
+                pass
     writer.close()
 
 
