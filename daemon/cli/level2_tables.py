@@ -34,8 +34,8 @@ def _stitched(console: Console, title: str, reports: Reports) -> None:
         table.add_row(
             str(report["exposure"]),
             f"{figures.get('tie_points_pp', 0)} + {figures.get('tie_points_pc', 0)}",
-            f"{figures.get('sigma0_px') or 0:.3f}",
-            f"{figures.get('sigma0_um') or 0:.2f}",
+            _px(figures.get("sigma0_px"), 3),
+            _px(figures.get("sigma0_um"), 2),
             report["verdict"],
             f"{report['duration_s']:.1f}",
         )

@@ -25,3 +25,4 @@ def test_beneath_the_table_stands_why_an_exposure_is_not_good() -> None:
     print_reports(Console(file=told, width=100), "Level-2", [report])
     assert "Exposure 7: No frame of SU10: that part has no data." in told.getvalue()
     assert "Simulated" not in told.getvalue()
+    assert "0.000" not in told.getvalue(), "an unknown sigma0 is not a perfect one"
