@@ -34,7 +34,7 @@ SUPPORT_MARGIN_PX: Final = 2
 
 _STRIP_ROWS: Final = 16
 """Rows that are fetched side by side: their scratch stays in the nearest cache, and a core keeps
-the addresses of about so many pages it writes to at hand. Twice as many take twice the time."""
+the addresses of about so many pages it writes to at hand. Twice as many take 1.7 times as long."""
 _CODES: Final = {"bilinear": BILINEAR, "cubic": CUBIC, "lanczos": LANCZOS}
 
 
