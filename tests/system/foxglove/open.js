@@ -14,7 +14,7 @@ const layout = {
   },
   globalVariables: {},
   userNodes: {},
-  playbackConfig: { speed: 3 },
+  playbackConfig: { speed: 1 },
 };
 const kept = new Map([["flight", {
   id: "flight",
@@ -46,7 +46,7 @@ initI18n().then(() => {
   const app = React.createElement(App, {
     appConfiguration,
     dataSources: [new McapLocalDataSourceFactory()],
-    deepLinks: [],
+    deepLinks: [location.href],
     enableGlobalCss: true,
     extensionLoaders: [],
     layoutStorage,
