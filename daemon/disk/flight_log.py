@@ -65,7 +65,9 @@ class FlightLog:
     `dropped`, never an exception: exposures matter more than their log.
     """
 
-    def __init__(self, path: Path, *, boot_id: str, software: str = "") -> None:
+    def __init__(
+        self, path: Path, *, boot_id: str, software: str = "", simulated: bool = False
+    ) -> None:
         self.path = path
         self.dropped = 0
         self._reported = 0
@@ -87,11 +89,19 @@ class FlightLog:
             "software": software,
             "started_utc": f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%S.%fZ}",
             "clock": "CLOCK_MONOTONIC, nanoseconds since boot",
+            **({"simulated": "true"} if simulated else {}),
         }
         self._writer.add_metadata(PROFILE, about)
 
     @classmethod
-    def create(cls, log_dir: Path, *, boot_id: str | None = None, software: str = "") -> FlightLog:
+    def create(
+        cls,
+        log_dir: Path,
+        *,
+        boot_id: str | None = None,
+        software: str = "",
+        simulated: bool = False,
+    ) -> FlightLog:
         """Begin a new file named after the present UTC; its name is durable on return.
 
         Raises:
@@ -99,7 +109,8 @@ class FlightLog:
         """
         durable.make_directories(log_dir)
         path = log_dir / f"{datetime.now(UTC):%Y%m%dT%H%M%S.%fZ}.mcap"
-        log = cls(path, boot_id=boot_id or host_boot_id(), software=software)
+        boot_id = boot_id or host_boot_id()
+        log = cls(path, boot_id=boot_id, software=software, simulated=simulated)
         log.sync()
         durable.sync_directory(log_dir)
         return log

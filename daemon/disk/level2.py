@@ -96,11 +96,11 @@ def level2_contents(
     if residuals_svg is not None:
         contents["residuals.svg"] = [residuals_svg.encode("utf-8")]
     if residuals_json is not None:
-        contents["residuals.json"] = [canonical_bytes(residuals_json)]
+        contents["residuals.json"] = [canonical_bytes({**residuals_json, **mark})]
     if histogram_json is not None:
         contents["histogram.json"] = [canonical_bytes(histogram_json)]
     if mosaic_json is not None:
-        contents["mosaic.json"] = [canonical_bytes(mosaic_json)]
+        contents["mosaic.json"] = [canonical_bytes({**mosaic_json, **mark})]
     contents["quality.json"] = [canonical_bytes(report_json)]
     return contents
 

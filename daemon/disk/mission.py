@@ -16,7 +16,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from daemon.disk import durable
-from daemon.disk.records import canonical_bytes, parse_record, plain_name, sha256_hex
+from daemon.disk.records import (
+    RecordError,
+    canonical_bytes,
+    parse_record,
+    plain_name,
+    sha256_hex,
+)
 from daemon.errors import DaemonError
 
 CURRENT_FILE = "current-mission.json"
@@ -51,6 +57,7 @@ class Mission:
         plan: tuple[str, bytes] | None = None,
         started_utc: datetime,
         started_gps_ns: int | None = None,
+        simulated: bool = False,
     ) -> Mission:
         """Create a mission and make it the one a restarted service continues.
 
@@ -83,6 +90,7 @@ class Mission:
             "service_sha256": sha256_hex(service_toml),
             "started_utc": _utc_text(started_utc),
             "started_gps_ns": None if started_gps_ns is None else str(started_gps_ns),
+            **({"simulated": True} if simulated else {}),
         }
         durable.create_file(part / "mission.json", [canonical_bytes(content)])
         durable.create_file(part / "rig.toml", [rig_toml])
@@ -176,6 +184,15 @@ class Mission:
     def level2(self, number: int) -> Path:
         """The folder of an exposure's products."""
         return self.level2_root / exposure_name(number)
+
+    @property
+    def is_simulated(self) -> bool:
+        """Whether mission.json says that the hardware is emulated; False where there is none."""
+        try:
+            content = parse_record((self.path / "mission.json").read_bytes(), "mission.json")
+        except (OSError, RecordError):
+            return False
+        return content.get("simulated") is True
 
     def numbers(self) -> list[int]:
         """Numbers of the exposures whose folder is there, ascending."""

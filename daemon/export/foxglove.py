@@ -120,7 +120,8 @@ def export_foxglove(mission: Mission) -> FoxgloveExport:
                 sequence=counts[topic],
                 data=json.dumps(message).encode(),
             )
-        writer.add_metadata("syntopic", {"mission": mission.id})
+        mark = {"simulated": "true"} if mission.is_simulated else {}
+        writer.add_metadata("syntopic", {"mission": mission.id, **mark})
         writer.finish()
     part.replace(final)
     return FoxgloveExport(final, counts)

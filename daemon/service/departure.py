@@ -50,6 +50,7 @@ def open_mission(configuration: Configuration, rig: Rig, config_path: Path) -> t
         service_toml=config_path.read_bytes(),
         plan=None if plan_file is None else (plan_file.suffix.lower(), plan_file.read_bytes()),
         started_utc=datetime.now(UTC),
+        simulated=configuration.mission.simulated,
     )
     return created, False
 

@@ -43,7 +43,7 @@ def main(link: Link, mission_path: Path, rings: tuple[FrameRing, ...]) -> None:
     memory = {ring.head: ring for ring in rings}
     writer = Level0Writer(mission)
     _seal_logs(mission)  # those of earlier runs; ours is not there yet
-    log = FlightLog.create(mission.log_dir)
+    log = FlightLog.create(mission.log_dir, simulated=mission.is_simulated)
     synced = time.monotonic()
     refused = 0
     while not isinstance(order := link.receive(LOG_SYNC_INTERVAL_S), Stop):

@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
+from mcap.records import Metadata
+from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
 from pyubx2 import UBXReader
 
@@ -46,6 +48,17 @@ def test_the_stitched_images_are_where_the_truth_says(flown: Flown) -> None:
     assert said["rms_px_absolute"] < 0.15
     assert said["rms_px_no_tdm"] > 3 * said["rms_px"]
     assert said["rms_px_fixed"] > said["rms_px"]
+
+
+def test_the_mission_and_its_log_say_that_it_is_simulated(flown: Flown) -> None:
+    assert json.loads((flown.mission / "mission.json").read_text())["simulated"] is True
+    for name in ("residuals.json", "mosaic.json"):
+        told = json.loads((flown.mission / "L2/000001" / name).read_text())
+        assert told["simulated"] is True, name
+    (log,) = (flown.mission / "log").glob("*.mcap")
+    with log.open("rb") as file:
+        about = next(one for one in StreamReader(file).records if isinstance(one, Metadata))
+    assert about.metadata["simulated"] == "true"
 
 
 def test_the_displaced_sensor_is_named_in_every_exposure(flown: Flown) -> None:
