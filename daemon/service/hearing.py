@@ -7,13 +7,14 @@ orders.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Any, ClassVar, Protocol
 
 from daemon.disk.log_records import LoggedTrigger
 from daemon.flight.decisions import Decision
 from daemon.flight.flight import Flight
 from daemon.flight.latches import DELIVERS, IS_GONE
+from daemon.service.desk import Desk
 from daemon.service.line import Order
 from daemon.service.messages import Bound, Fired, NotBound
 from daemon.timing.matching import Cause, Pulse
@@ -29,6 +30,9 @@ from drivers.contract import (
     TemperatureSample,
 )
 
+_LEAVES = frozenset({"lost", "absent"})
+"""Heads are not waited for from then on."""
+
 
 class Tell(Protocol):
     """Says something to whoever watches: what kind of event it is, and its content."""
@@ -36,7 +40,7 @@ class Tell(Protocol):
     def __call__(self, event: str, **content: Any) -> None: ...
 
 
-class Hearing:
+class Hearing(Desk):
     """Takes in what `daemon.service.capture` passes on.
 
     `active` are the devices that deliver, `serials` what heads said they are ("" for nothing), and
@@ -64,14 +68,6 @@ class Hearing:
         self.has_trigger = False
         self.serials: dict[str, str] = {}
         self.orders: dict[int, Order] = {}
-
-    def hear(self, message: object) -> bool:
-        """Take in a message; False where it is not from a device."""
-        handler = _HANDLERS.get(type(message))
-        if handler is None:
-            return False
-        handler(self, message)
-        return True
 
     def tell_of_time(self, now_ns: int) -> None:
         """What became of marks, and of the clocks, since the last time of asking."""
@@ -173,19 +169,16 @@ class Hearing:
             LoggedTrigger(fired.sequence, fired.pulse, order.delays_ns, order.strobe_delay_ns)
         )
 
-
-_LEAVES = frozenset({"lost", "absent"})
-"""Heads are not waited for from then on."""
-_HANDLERS: Mapping[type, Callable[[Hearing, Any], None]] = {
-    Frame: Hearing._on_frame,
-    EventMark: Hearing._on_mark,
-    NavSample: Hearing._on_navigation,
-    TemperatureSample: Hearing._on_temperature,
-    PpsEdge: Hearing._on_pps,
-    ClockReading: Hearing._on_clock_reading,
-    RawBytes: Hearing._on_raw,
-    DeviceEvent: Hearing._on_device_event,
-    Bound: Hearing._on_bound,
-    NotBound: Hearing._on_not_bound,
-    Fired: Hearing._on_fired,
-}
+    handlers: ClassVar = {
+        Frame: _on_frame,
+        EventMark: _on_mark,
+        NavSample: _on_navigation,
+        TemperatureSample: _on_temperature,
+        PpsEdge: _on_pps,
+        ClockReading: _on_clock_reading,
+        RawBytes: _on_raw,
+        DeviceEvent: _on_device_event,
+        Bound: _on_bound,
+        NotBound: _on_not_bound,
+        Fired: _on_fired,
+    }

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 from daemon.disk.log_records import Message
 from daemon.disk.records import canonical_bytes
@@ -15,6 +15,7 @@ from daemon.disk.recovery import LEDGER_TOPIC
 from daemon.exposure import Exposure
 from daemon.flight.decisions import Decision, Kind
 from daemon.flight.flight import Flight, ToStore
+from daemon.service.desk import Desk
 from daemon.service.hearing import Tell
 from daemon.service.messages import Log, Seal, Sealed, Store, Stored, WriteFailed
 from daemon.service.pipeline_queue import PipelineQueue
@@ -24,7 +25,7 @@ SEAL_RETRY_NS = 1_000_000_000
 """A disk that refused a record is asked again so much later."""
 
 
-class Keeping:
+class Keeping(Desk):
     """Hands exposures to the writer, and tells flight and pipeline what the disk has of them.
 
     Args:
@@ -70,14 +71,6 @@ class Keeping:
         self._sealing = exposure
         self._send("writer", Seal(exposure))
 
-    def hear(self, message: object) -> bool:
-        """Take in what the writer says of an exposure; False where it is something else."""
-        handler = _HANDLERS.get(type(message))
-        if handler is None:
-            return False
-        handler(self, message)
-        return True
-
     def _on_stored(self, stored: Stored) -> None:
         self._flight.stored(stored.number, stored.frames)
         self._decide("stored", stored.number)
@@ -119,9 +112,8 @@ class Keeping:
     def _decide(self, kind: Kind, number: int, detail: Mapping[str, Any] | None = None) -> None:
         self._decided(Decision(kind, time.monotonic_ns(), number, detail or {}))
 
-
-_HANDLERS: Mapping[type, Callable[[Keeping, Any], None]] = {
-    Stored: Keeping._on_stored,
-    Sealed: Keeping._on_sealed,
-    WriteFailed: Keeping._on_write_failed,
-}
+    handlers: ClassVar = {
+        Stored: _on_stored,
+        Sealed: _on_sealed,
+        WriteFailed: _on_write_failed,
+    }

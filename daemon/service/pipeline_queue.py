@@ -9,10 +9,11 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import ClassVar
 
 from daemon.exposure import Exposure
 from daemon.flight.decisions import Decision
+from daemon.service.desk import Desk
 from daemon.service.hearing import Tell
 from daemon.service.messages import (
     FramesRead,
@@ -36,7 +37,7 @@ class _Waiting:
     is_sealed: bool = True
 
 
-class PipelineQueue:
+class PipelineQueue(Desk):
     """Hands exposures to the worker, so many at a time.
 
     Args:
@@ -114,14 +115,6 @@ class PipelineQueue:
         self._waiting = deque(waiting)
         return was_waiting
 
-    def hear(self, message: object) -> bool:
-        """Take in a message of the worker; False where it is not from there."""
-        handler = _HANDLERS.get(type(message))
-        if handler is None:
-            return False
-        handler(self, message)
-        return True
-
     def recycle(self, slots: Mapping[str, int]) -> None:
         """These slots, by head, may be filled again."""
         self._send("capture", Recycle(slots))
@@ -170,11 +163,10 @@ class PipelineQueue:
             self._decided(Decision("process", now_ns, number, {"deferred": deferred}))
             self._send("worker", Process(task.exposure, task.slots, task.is_sealed))
 
-
-_HANDLERS: Mapping[type, Callable[[PipelineQueue, Any], None]] = {
-    WorkerReady: PipelineQueue._on_worker_ready,
-    FramesRead: PipelineQueue._on_frames_read,
-    Judged: PipelineQueue._on_judged,
-    Processed: PipelineQueue._on_processed,
-    ProcessFailed: PipelineQueue._on_failed,
-}
+    handlers: ClassVar = {
+        WorkerReady: _on_worker_ready,
+        FramesRead: _on_frames_read,
+        Judged: _on_judged,
+        Processed: _on_processed,
+        ProcessFailed: _on_failed,
+    }

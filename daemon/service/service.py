@@ -14,7 +14,7 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from daemon.configuration import Configuration
 from daemon.disk import recovery
@@ -28,6 +28,7 @@ from daemon.flight.ledger import Ledger
 from daemon.flight.recovery_match import seal_from_log
 from daemon.service.commanding import audit_message, obey
 from daemon.service.departure import identity, open_mission, processes, watch_process
+from daemon.service.desk import Desk
 from daemon.service.devices import serial_problem
 from daemon.service.exposure_control import ExposureControl
 from daemon.service.hearing import Hearing
@@ -51,7 +52,7 @@ END_OF_WAITING_S = 1e9
 Events = Callable[[Mapping[str, Any]], None]
 
 
-class Service:
+class Service(Desk):
     """One run of the onboard service over one mission.
 
     Args:
@@ -170,10 +171,8 @@ class Service:
     # What the processes say
 
     def _hear(self, message: object) -> None:
-        handler = self._handlers.get(type(message))
-        if handler is not None:
-            handler(self, message)
-        elif not any(desk.hear(message) for desk in (self.hearing, self.keeping, self.pipeline)):
+        desks: tuple[Desk, ...] = (self, self.hearing, self.keeping, self.pipeline)
+        if not any(desk.hear(message) for desk in desks):
             raise TypeError(f"a process said {type(message).__name__}, which nobody expects")
         self.changed.set()
 
@@ -229,7 +228,7 @@ class Service:
         if pong.statistics:
             self.statistics = pong.statistics
 
-    _handlers: Mapping[type, Callable[[Service, Any], None]] = {
+    handlers: ClassVar = {
         Bound: _on_bound,
         Pong: _on_pong,
         Told: _on_told,
