@@ -1,0 +1,227 @@
+"""`python -m benchmarks.mutation_sample`: do the nearest tests notice a changed decision?
+
+Draws mutations by seed from the modules that decide truth, applies each to a copy of the tree, and
+runs the tests nearest to the module: those that import it, the one of its name first. A mutation
+that they do not notice is listed. Names in `EQUIVALENT` are changes that alter no outcome.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import json
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from benchmarks.mutations import Mutation, mutations
+
+ROOT = Path(__file__).parent.parent
+COPIED = ("daemon", "drivers", "processing", "sim_hw", "tests", "benchmarks", "docs", "systemd")
+DECIDING = (
+    "daemon/flight/*.py",
+    "daemon/timing/*.py",
+    "daemon/disk/*.py",
+    "daemon/plan/*.py",
+    "drivers/*/decoder.py",
+    "drivers/*/framing.py",
+    "drivers/nmea/sentences.py",
+    "drivers/gpsd/reports.py",
+    "drivers/message_framer.py",
+    "drivers/gps_time.py",
+    "processing/mosaic/*.py",
+    "processing/bundle/*.py",
+    "processing/quality/*.py",
+    "processing/geometry/*.py",
+)
+NOT_DECIDING = ("drawing.py", "findings.py")
+"""Pictures and sentences: no decision rests on them."""
+MOST_TEST_FILES = 8
+"""So many of the nearest test files run, nearest first."""
+SLOWEST_S = 300
+NOTICED_GOAL = 0.9
+EQUIVALENT: dict[str, str] = {}
+"""Mutation as printed, without its line -> why no outcome differs."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one mutation."""
+
+    module: str
+    line: int
+    before: str
+    after: str
+    source: str
+    outcome: str
+    tests: int
+    seconds: float
+
+    @property
+    def name(self) -> str:
+        return f"{self.module}: {self.source}: {self.before} -> {self.after}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.mutation_sample", description=__doc__
+    )
+    parser.add_argument("--count", type=int, default=300, help="mutations to draw (default: 300)")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the draw (default: 1)")
+    parser.add_argument("--skip", type=int, default=0, help="leave out the first ones of the draw")
+    parser.add_argument("--only", default="", help="only modules whose path contains this")
+    parser.add_argument("--record", type=Path, help="append each outcome as a line of JSON")
+    parser.add_argument("--json", action="store_true", help="print one JSON object at the end")
+    options = parser.parse_args()
+    drawn = draw(options.count, options.seed, options.only)[options.skip :]
+    outcomes = []
+    with tempfile.TemporaryDirectory(prefix="syntopic-mutations-") as folder:
+        tree = _copy_tree(Path(folder))
+        importers = _importers()
+        for number, (module, mutation) in enumerate(drawn, 1 + options.skip):
+            outcome = _try(tree, module, mutation, nearest_tests(module, importers))
+            outcomes.append(outcome)
+            if not options.json:
+                progress = f"{number}/{options.skip + len(drawn)}"
+                print(f"{progress} {outcome.outcome:9} {outcome.name}", flush=True)
+            if options.record:
+                with options.record.open("a") as record:
+                    record.write(json.dumps(asdict(outcome)) + "\n")
+    _print(outcomes, options.seed, as_json=options.json)
+
+
+def draw(count: int, seed: int, only: str = "") -> list[tuple[str, Mutation]]:
+    """Draw mutations, every place of every deciding module with the same probability."""
+    modules = sorted(
+        str(path.relative_to(ROOT))
+        for pattern in DECIDING
+        for path in ROOT.glob(pattern)
+        if path.name not in NOT_DECIDING and only in str(path)
+    )
+    places = [(m, place) for m in modules for place in mutations((ROOT / m).read_text())]
+    return random.Random(seed).sample(places, min(count, len(places)))
+
+
+def nearest_tests(module: str, importers: dict[str, set[str]]) -> list[str]:
+    """Choose the test files nearest to a module: of its name, of its folder, then its importers."""
+    dotted = module.removesuffix(".py").replace("/", ".")
+    folder = Path("tests") / Path(module).parent
+    direct = importers.get(dotted, set())
+
+    def distance(test: str) -> tuple[bool, bool, bool, str]:
+        named = Path(module).stem in Path(test).stem
+        return (not named, test not in direct, Path(test).parent != folder, test)
+
+    of_folder = {str(p.relative_to(ROOT)) for p in (ROOT / folder).glob("test_*.py")}
+    driver = Path(module).parts[1] if module.startswith("drivers/") else None
+    of_driver = {
+        str(p.relative_to(ROOT))
+        for p in ROOT.glob("tests/drivers/test_*.py")
+        if driver and driver.removesuffix(".py") in p.stem
+    }
+    candidates = {t for t in direct | of_folder | of_driver if "/system/" not in t}
+    return sorted(candidates, key=distance)[:MOST_TEST_FILES]
+
+
+def _importers() -> dict[str, set[str]]:
+    """Which test files import which module."""
+    found: dict[str, set[str]] = {}
+    for path in (ROOT / "tests").rglob("test_*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            names: Iterable[str] = ()
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+            for name in names:
+                found.setdefault(name, set()).add(str(path.relative_to(ROOT)))
+    return found
+
+
+def _copy_tree(folder: Path) -> Path:
+    tree = folder / "tree"
+    tree.mkdir()
+    for name in COPIED:
+        shutil.copytree(ROOT / name, tree / name)
+    for name in ("pyproject.toml", "README.md", "CHANGELOG.md", "Makefile", "requirements.lock"):
+        shutil.copy2(ROOT / name, tree / name)
+    shared = ROOT.parent / "shared"
+    if shared.exists():
+        (folder / "shared").symlink_to(shared.resolve())
+    return tree
+
+
+def _try(tree: Path, module: str, mutation: Mutation, tests: Sequence[str]) -> Outcome:
+    path = tree / module
+    source = (ROOT / module).read_text()
+    started = time.monotonic()
+    try:
+        path.write_text(mutation.apply(source))
+        outcome = _run(tree, tests) if tests else "no tests"
+    finally:
+        path.write_text(source)
+    result = Outcome(
+        module,
+        mutation.line,
+        mutation.before,
+        mutation.after,
+        source.splitlines()[mutation.line - 1].strip(),
+        outcome,
+        len(tests),
+        round(time.monotonic() - started, 1),
+    )
+    if outcome == "survived" and result.name in EQUIVALENT:
+        return Outcome(**{**asdict(result), "outcome": "equivalent"})
+    return result
+
+
+def _run(tree: Path, tests: Sequence[str]) -> str:
+    """Run the nearest tests, the nearest first, until one of them fails."""
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider"]
+    environment = os.environ | {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
+    started = time.monotonic()
+    for test in tests:
+        left_s = SLOWEST_S - (time.monotonic() - started)
+        if left_s <= 0:
+            break
+        try:
+            ran = subprocess.run(
+                [*command, test],
+                cwd=tree,
+                env=environment,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                timeout=left_s,
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            return "timeout"
+        if ran.returncode not in (0, 5):
+            return "noticed"
+    return "survived"
+
+
+def _print(outcomes: Sequence[Outcome], seed: int, *, as_json: bool) -> None:
+    counts = Counter(outcome.outcome for outcome in outcomes)
+    judged = len(outcomes) - counts["equivalent"]
+    noticed = counts["noticed"] + counts["timeout"]
+    share = noticed / judged if judged else 1.0
+    unnoticed = [asdict(o) for o in outcomes if o.outcome in ("survived", "no tests")]
+    if as_json:
+        figures = {"seed": seed, "counts": counts, "noticed_share": share, "survived": unnoticed}
+        print(json.dumps(figures))
+    else:
+        print(f"seed {seed}: {dict(counts)}; noticed {share:.1%} (goal {NOTICED_GOAL:.0%})")
+    sys.exit(share < NOTICED_GOAL)
+
+
+if __name__ == "__main__":
+    main()
