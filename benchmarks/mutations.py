@@ -117,11 +117,12 @@ def _changes(node: ast.AST) -> Iterator[_Change]:
         yield _start(node), _end(node), None, _other_constant(node.value)
 
 
-def _other_constant(value: float) -> str:
+def _other_constant(value: object) -> str:
     if isinstance(value, bool):
         return repr(not value)
     if isinstance(value, int):
         return repr(value + 1 if abs(value) < LARGE else value * 2)
+    assert isinstance(value, float)
     return repr(value * 1.5) if value else "1.0"
 
 
