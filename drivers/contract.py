@@ -72,7 +72,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class EventMark:
-    """The receiver's time of one strobe, rising edge.
+    """The receiver's time of one strobe: of its edge at mid-exposure.
 
     `count` is the receiver's own count of edges (`count_bits` wide, it wraps); where `count_bits`
     is 0 the receiver does not count and `count` says nothing. `time_valid` is the receiver's word

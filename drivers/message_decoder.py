@@ -49,6 +49,8 @@ class MessageDecoder:
         """Messages understood, by name."""
         self._framer = framer
         self._leap: int | None = None
+        self.other_edges = 0
+        """Event marks in succession of the edge that is not the configured one."""
         self._gps_ns: int | None = None
         """GPS time of the last navigation epoch whose time could be trusted."""
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
+from typing import Final
 
 from drivers.clock import Clock
 from drivers.contract import DeviceError
@@ -21,6 +22,13 @@ from drivers.serial_device import (
     open_serial_port,
 )
 from drivers.settings import Setting
+
+EDGE: Final = Setting(
+    "rising", choices=("rising", "falling"), says="edge of the strobe at mid-exposure"
+)
+"""Of receivers that say which edge a mark is."""
+OTHER_EDGES: Final = 3
+"""So many marks of the other edge in succession: no mark of the configured one comes between."""
 
 
 class ListeningNavigator(SerialDevice):
@@ -100,6 +108,7 @@ class ListeningNavigator(SerialDevice):
 
     def step(self, line: SerialLine) -> Iterable[Sample]:
         frames, bad = self.decoder.frames, self.decoder.bad_messages
+        other_edges = self.decoder.other_edges
         records = self.decoder.feed(line.read(READ_STEP_S), self.clock.mono_ns())
         self.heard(messages=self.decoder.frames - frames)
         if self.decoder.bad_messages > bad:
@@ -108,7 +117,20 @@ class ListeningNavigator(SerialDevice):
                 f"The receiver {self.name} at {self.port} sent damaged messages. Check the cable, "
                 "and whether the line can carry all that is switched on.",
             )
+        if self.decoder.other_edges >= max(OTHER_EDGES, other_edges + 1):
+            self._on_other_edges(self.decoder.other_edges)
         return records
+
+    def _on_other_edges(self, count: int) -> None:
+        configured = str(self.configured["edge"])
+        other = "rising" if configured == "falling" else "falling"
+        self.teller.complain(
+            "other-edge",
+            f"The receiver {self.name} at {self.port} reported {count} event marks of the {other} "
+            f"edge and none of the {configured} one, which is configured: these exposures have no "
+            f'mark. Set edge = "{other}" if that is mid-exposure, or switch the receiver\'s input '
+            f"to the {configured} edge.",
+        )
 
     def statistics(self) -> Mapping[str, int]:
         """Those of every serial device and those of the decoder."""

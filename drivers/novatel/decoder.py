@@ -12,6 +12,7 @@ import struct
 from collections import Counter
 from typing import Any, Final
 
+from drivers.ascii_numbers import decimal_number, whole_number
 from drivers.contract import EventMark, NavSample
 from drivers.gps_time import RECENT_NS, SECOND_NS, WEEK_NS
 from drivers.message_decoder import MessageDecoder, Nav
@@ -30,10 +31,15 @@ LAYOUTS: Final = {
     "TIME": struct.Struct("<I3dIBBBBII"),
     "INSPVAX": struct.Struct("<II3df6d9fIH"),
 }
-ASCII_FIELDS: Final = {
-    # Where the values of LAYOUTS stand among the words of a line.
-    "BESTPOS": (0, 1, 2, 3, 4, 5, 7, 8, 9, 11, 12, 13, 14),
-    "BESTVEL": (0, 1, 2, 3, 4, 5, 6),
+ASCII_PVA: Final = "i" + "f" * 10 + "w"
+ASCII_MARKTIME: Final = "iffffw"
+ASCII_KINDS: Final = {
+    # Type of each word of a line: whole number, decimal number, word of an enumeration; "-" is not
+    # read, hexadecimal status words among them.
+    "BESTPOS": "wwffff-fff-ffii",
+    "BESTVEL": "wwfffff",
+    "TIME": "wfffiiiiiiw",
+    "INSPVAX": "ww" + "f" * 19 + "--",
 }
 INS_FIXES: Final = {
     2: "dead-reckoning", 3: "3d", 6: "dead-reckoning", 7: "3d",
@@ -210,32 +216,32 @@ class NovatelDecoder(MessageDecoder):
 
 
 def _values(name: str, body: bytes | list[str]) -> tuple[Any, ...]:
-    layout = LAYOUTS.get(name)
-    if layout is None:
-        layout = _MARKTIME if name.endswith("TIME") else _PVA
+    is_mark_time = name.endswith("TIME")
     if isinstance(body, bytes):
-        return layout.unpack_from(body)
-    picked = ASCII_FIELDS.get(name)
-    return tuple(_word(text) for text in ([body[n] for n in picked] if picked else body))
+        return LAYOUTS.get(name, _MARKTIME if is_mark_time else _PVA).unpack_from(body)
+    kinds = ASCII_KINDS.get(name, ASCII_MARKTIME if is_mark_time else ASCII_PVA)
+    if len(body) < len(kinds):
+        raise ValueError(f"{name} has {len(body)} words; {len(kinds)} are needed")
+    return tuple(_READ[kind](text) for kind, text in zip(kinds, body, strict=False) if kind != "-")
 
 
-def _word(text: str) -> int | float | str:
-    """A number where the text is one, a word of an enumeration otherwise."""
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            continue
-    return text
+def _enumerated(text: str) -> int | str:
+    """A word of an enumeration; its number where the receiver has no word for it."""
+    return int(text) if text.isascii() and text.isdigit() else text
 
 
-def _gps_ns(week: object, seconds: object) -> int:
-    if not isinstance(week, int) or not isinstance(seconds, int | float):
-        raise ValueError("week and seconds that are no numbers")
-    if not (0 <= week < 65_536 and 0 <= seconds <= 604_800):
-        raise ValueError("week or seconds out of range")
-    return week * WEEK_NS + round(seconds * 1e9)
+_READ: Final = {"i": whole_number, "f": decimal_number, "w": _enumerated}
+
+
+def _gps_ns(week: int, seconds: float) -> int:
+    return _gps_of(week, round(seconds * 1e9))
 
 
 def _header_ns(log: Log) -> int:
-    return log.week * WEEK_NS + log.tow_ns
+    return _gps_of(log.week, log.tow_ns)
+
+
+def _gps_of(week: int, tow_ns: int) -> int:
+    if not (0 <= week < 65_536 and 0 <= tow_ns <= WEEK_NS):
+        raise ValueError(f"week {week} or time of week {tow_ns} ns out of range")
+    return week * WEEK_NS + tow_ns

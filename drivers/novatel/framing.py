@@ -13,6 +13,7 @@ import zlib
 from dataclasses import dataclass
 from typing import Final
 
+from drivers.ascii_numbers import decimal_number, whole_number
 from drivers.message_framer import MessageFramer, line_size
 
 STARTS: Final = b"\xaa#%"
@@ -61,10 +62,14 @@ def log_of(frame: bytes) -> Log:
     words = head.split(",")
     name = words[0].removesuffix("A")
     if frame[:1] == b"%":
-        return Log(name, int(words[1]), round(float(words[2]) * 1e9), None, body.split(","))
+        return Log(name, whole_number(words[1]), _tow_ns(words[2]), None, body.split(","))
     if len(words) < 10:
         raise ValueError("a header of fewer than ten words")
-    return Log(name, int(words[5]), round(float(words[6]) * 1e9), words[4], body.split(","))
+    return Log(name, whole_number(words[5]), _tow_ns(words[6]), words[4], body.split(","))
+
+
+def _tow_ns(text: str) -> int:
+    return round(decimal_number(text) * 1e9)
 
 
 def _size_of(buffer: bytes, at: int) -> int | None:

@@ -28,6 +28,7 @@ RANGE_ERROR_M: Final = 5.0
 WEEK_AND_TOW_SET: Final = 0x03
 LEAP_UNKNOWN: Final = -128
 RISING: Final = 0
+FALLING: Final = 1
 OSCILLATOR_NS_PER_S: Final = 100
 """By which a mark's accuracy worsens with the age of the last PVT: 0.1 ppm, a TCXO."""
 COUNT_BITS: Final = 32
@@ -61,20 +62,21 @@ class SbfDecoder(MessageDecoder):
 
     Blocks of one time stamp (PVTGeodetic, covariances, DOP, AttEuler) become one NavSample, as soon
     as all kinds of the epoch before have come or the next epoch begins. INSNavGeod becomes one by
-    itself, and while it comes the others do not. ExtEvent with a rising edge becomes an EventMark.
+    itself, and while it comes the others do not. ExtEvent of the kind `edge` becomes an EventMark.
     Nothing that is fed raises.
     """
 
     unreadable = (ValueError, TypeError, struct.error, OverflowError)
     bad_counter = "bad_blocks"
 
-    def __init__(self, receiver: str, *, mark_accuracy_ns: int = 100) -> None:
+    def __init__(self, receiver: str, *, edge: str = "rising", mark_accuracy_ns: int = 100) -> None:
         super().__init__(
             receiver,
             sbf_framer(),
-            ("samples", "blocks_without_time", "marks", "marks_far", "marks_falling",
+            ("samples", "blocks_without_time", "marks", "marks_far", "marks_other_edge",
              "marks_without_time", "marks_lost"),
         )  # fmt: skip
+        self._polarity = FALLING if edge == "falling" else RISING
         self._mark_accuracy_ns = mark_accuracy_ns
         self._time_good = True
         self._satellites = 0
@@ -258,9 +260,11 @@ class SbfDecoder(MessageDecoder):
     def _on_event(self, block: Block, rx_ns: int, mono_ns: int) -> list[Nav]:
         channel, polarity, offset_s, bias_s = block.values
         self._marked_rx_ns = rx_ns
-        if polarity != RISING:
-            self.counters["marks_falling"] += 1
+        if polarity != self._polarity:
+            self.counters["marks_other_edge"] += 1
+            self.other_edges += 1
             return []
+        self.other_edges = 0
         # t = TOW + Offset - RxClkBias; without a bias the receiver has had no PVT for ten minutes.
         gps_ns = rx_ns + round(offset_s * 1e9) - round((bias_s or 0.0) * 1e9)
         age_s = int.from_bytes(block.rest[:2], "little") if block.revision >= 1 else 0
@@ -286,7 +290,7 @@ class SbfDecoder(MessageDecoder):
             return
         self._marked_rx_ns = rx_ns
         # It says neither its input nor its edge: only where there is one kind is it known.
-        if len(self._counts) == 1 and not self.counters["marks_falling"]:
+        if len(self._counts) == 1 and not self.counters["marks_other_edge"]:
             self._counts[next(iter(self._counts))] += 1
             self.counters["marks_lost"] += 1
 

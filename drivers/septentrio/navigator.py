@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from drivers.receiver import ListeningNavigator
+from drivers.receiver import EDGE, ListeningNavigator
 from drivers.septentrio.decoder import SbfDecoder
 from drivers.settings import Setting
 
@@ -16,7 +16,7 @@ class SeptentrioNavigator(ListeningNavigator):
     """A Septentrio receiver that sends SBF by itself.
 
     Yields a NavSample for every INSNavGeod, or for every PVTGeodetic where there is none, and an
-    EventMark for every rising edge of ExtEvent. The receiver's configuration is left as it is.
+    EventMark for every ExtEvent of the kind `edge`. The receiver's configuration is left as it is.
 
     Source: Septentrio mosaic-X5 reference guide, firmware 4.14.
     """
@@ -26,9 +26,10 @@ class SeptentrioNavigator(ListeningNavigator):
     required = ("PVTGeodetic", "INSNavGeod")
     switch_on = "switch on PVTGeodetic and ExtEvent for this port (setSBFOutput)"
 
+    edge = EDGE
     mark_accuracy_ns = Setting(
         100, minimum=1, maximum=1_000_000_000, says="accuracy of an event mark, by the data sheet"
     )
 
     def new_decoder(self) -> SbfDecoder:
-        return SbfDecoder(self.name, mark_accuracy_ns=self.mark_accuracy_ns)
+        return SbfDecoder(self.name, edge=self.edge, mark_accuracy_ns=self.mark_accuracy_ns)

@@ -49,8 +49,9 @@ class UbxDecoder(MessageDecoder):
     """Decodes what a u-blox receiver sends.
 
     NAV-PVT becomes a NavSample; NAV-ATT or HNR-ATT of the same iTOW gives its attitude. TIM-TM2
-    with its new-rising-edge flag becomes an EventMark. NAV-TIMEGPS and NAV-TIMELS give week and
-    leap seconds. Everything else is framed and left alone. Nothing that is fed raises.
+    becomes an EventMark where it has a new edge of the kind `edge`. NAV-TIMEGPS and NAV-TIMELS
+    give week and leap seconds. Everything else is framed and left alone. Nothing that is fed
+    raises.
     """
 
     unreadable = (
@@ -63,11 +64,10 @@ class UbxDecoder(MessageDecoder):
         KeyError,
     )
 
-    def __init__(self, receiver: str) -> None:
+    def __init__(self, receiver: str, *, edge: str = "rising") -> None:
         self._ubx = UbxFramer(LENGTHS)
-        super().__init__(
-            receiver, self._ubx, ("samples", "marks", "marks_without_rising_edge", "marks_far")
-        )
+        super().__init__(receiver, self._ubx, ("samples", "marks", "marks_other_edge", "marks_far"))
+        self._is_falling = edge == "falling"
         self._leap_is_default = False
         self._timegps_ns: int | None = None
         self._attitudes: deque[tuple[int, tuple[float, float, float]]] = deque(
@@ -214,10 +214,18 @@ class UbxDecoder(MessageDecoder):
     # Marks
 
     def _on_mark(self, message: Any, mono_ns: int) -> list[Nav]:
-        if not message.newRisingEdge:
-            self.counters["marks_without_rising_edge"] += 1
+        if self._is_falling:
+            is_new, is_other = message.newFallingEdge, message.newRisingEdge
+            week, tow_ms, sub_ms_ns = message.wnF, message.towMsF, message.towSubMsF
+        else:
+            is_new, is_other = message.newRisingEdge, message.newFallingEdge
+            week, tow_ms, sub_ms_ns = message.wnR, message.towMsR, message.towSubMsR
+        if not is_new:
+            self.counters["marks_other_edge"] += is_other
+            self.other_edges += is_other
             return []
-        gps_ns = message.wnR * WEEK_NS + message.towMsR * 1_000_000 + message.towSubMsR
+        self.other_edges = 0
+        gps_ns = week * WEEK_NS + tow_ms * 1_000_000 + sub_ms_ns
         valid = bool(message.time) and message.timeBase != TIME_BASE_RECEIVER
         if message.timeBase == TIME_BASE_UTC:
             valid = valid and self._leap is not None
@@ -231,7 +239,8 @@ class UbxDecoder(MessageDecoder):
                 gps_ns=gps_ns,
                 accuracy_ns=int(message.accEst),
                 count=int(message.count),
-                count_bits=16,
+                # The receiver counts rising edges only.
+                count_bits=0 if self._is_falling else 16,
                 time_valid=valid,
                 mono_ns=mono_ns,
             )

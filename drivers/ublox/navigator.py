@@ -8,17 +8,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import ClassVar
 
-from drivers.receiver import ListeningNavigator
+from drivers.receiver import EDGE, ListeningNavigator
 from drivers.ublox.decoder import UbxDecoder
 
 
 class UbloxNavigator(ListeningNavigator):
     """A u-blox receiver (M8 or later) that sends UBX by itself.
 
-    Yields a NavSample for every NAV-PVT and an EventMark for every rising edge of TIM-TM2. The
-    receiver's configuration is left as it is; it has to send NAV-PVT, TIM-TM2, NAV-TIMEGPS and
-    NAV-TIMELS on this port, with a navigation rate above the exposure rate, because TIM-TM2 holds
-    only the last edge of an epoch.
+    Yields a NavSample for every NAV-PVT and an EventMark for every edge of TIM-TM2 of the kind
+    `edge`. The receiver's configuration is left as it is; it has to send NAV-PVT, TIM-TM2,
+    NAV-TIMEGPS and NAV-TIMELS on this port, with a navigation rate above the exposure rate, because
+    TIM-TM2 holds only the last edge of an epoch.
 
     Source: u-blox M8 receiver description UBX-13003221.
     """
@@ -28,10 +28,12 @@ class UbloxNavigator(ListeningNavigator):
     required = ("NAV-PVT",)
     switch_on = "switch on UBX-NAV-PVT and UBX-TIM-TM2 for this port"
 
+    edge = EDGE
+
     decoder: UbxDecoder
 
     def new_decoder(self) -> UbxDecoder:
-        return UbxDecoder(self.name)
+        return UbxDecoder(self.name, edge=self.edge)
 
     def not_understood(self) -> str:
         if self.decoder.other_bytes > self.decoder.bad_bytes:

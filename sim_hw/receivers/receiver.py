@@ -75,7 +75,7 @@ class EmulatedReceiver(LineDevice):
     `state` gets a GPS time in ns and says what the receiver reports for it: noise is the caller's.
     Epochs are whole periods of the receiver's own clock, which is off GPS by `bias_ns`: a slow
     saw-tooth within `clock_bias_max_ns`. Unless `tells_events_at_once`, edges wait for the epoch
-    after them.
+    after them. With `is_active_low` strobes fall first and rise at their end.
     """
 
     tells_events_at_once: ClassVar[bool] = True
@@ -91,6 +91,7 @@ class EmulatedReceiver(LineDevice):
         accuracy: ReceiverAccuracy = ReceiverAccuracy(),
         first_edge_count: int = 0,
         line: Line | None = None,
+        is_active_low: bool = False,
     ) -> None:
         super().__init__(type(self).__name__, line or PseudoTerminal())
         self.clock = clock
@@ -98,6 +99,7 @@ class EmulatedReceiver(LineDevice):
         self.leap_seconds = leap_seconds
         self.accuracy = accuracy
         self.random = random.Random(seed)
+        self._is_active_low = is_active_low
         self._period_ns = round(NS_PER_S / rate_hz)
         widest_ns = self.clock_bias_max_ns
         self._bias_at_start_ns = self.random.randrange(-widest_ns, widest_ns) if widest_ns else 0
@@ -120,7 +122,7 @@ class EmulatedReceiver(LineDevice):
         return b""
 
     def mark(self, gps_ns: int) -> None:
-        """The rising edge of a strobe at that GPS time; from any thread.
+        """The first edge of a strobe at that GPS time; from any thread.
 
         It may be announced before it happens.
         """
@@ -128,8 +130,8 @@ class EmulatedReceiver(LineDevice):
             self._edge_count += 1
             number = self._edge_count
             self._edges += [
-                Edge(gps_ns, True, number),
-                Edge(gps_ns + STROBE_WIDTH_NS, False, number),
+                Edge(gps_ns, not self._is_active_low, number),
+                Edge(gps_ns + STROBE_WIDTH_NS, self._is_active_low, number),
             ]
             self._edges.sort(key=lambda edge: edge.gps_ns)
 

@@ -19,10 +19,10 @@ class SeptentrioReceiver(EmulatedReceiver):
 
     Epochs are whole periods of the receiver's own time, which its clock bias takes off GPS by up to
     half a millisecond, as these receivers let it wander. Once a second it tells its time. As after
-    switching on, rising edges only are told, unless `tells_both_edges`.
+    switching on, rising edges only are reported; `reported_edges` says which are.
     """
 
-    tells_both_edges = False
+    reported_edges: frozenset[int] = frozenset((sbf.RISING,))
 
     clock_bias_max_ns: ClassVar[int] = 500_000
 
@@ -44,12 +44,12 @@ class SeptentrioReceiver(EmulatedReceiver):
         return b"".join(parts)
 
     def event_bytes(self, edge: Edge) -> bytes:
-        if not (edge.is_rising or self.tells_both_edges):
+        polarity = sbf.RISING if edge.is_rising else sbf.FALLING
+        if polarity not in self.reported_edges:
             return b""
         bias_ns = -self.bias_ns(edge.gps_ns)
         rx_ns = edge.gps_ns + bias_ns
         self.counts["mark_messages"] += 1
-        polarity = sbf.RISING if edge.is_rising else sbf.FALLING
         said = sbf.ext_event(rx_ns, bias_ns, source=EVENT_A, polarity=polarity)
         return said + sbf.ext_event_pvt_geodetic(
             rx_ns, bias_ns, self.state(edge.gps_ns), self.accuracy, SATELLITES

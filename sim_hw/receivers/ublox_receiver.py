@@ -119,7 +119,9 @@ class UbloxReceiver(EmulatedReceiver):
             return b""
         rising = [edge.gps_ns for edge in due if edge.is_rising]
         falling = [edge.gps_ns for edge in due if not edge.is_rising]
-        self._rising_count = max((edge.number for edge in due), default=self._rising_count)
+        self._rising_count = max(
+            (edge.number for edge in due if edge.is_rising), default=self._rising_count
+        )
         self.counts["mark_messages"] += 1
         self._last_rising_ns = rising[-1] if rising else self._last_rising_ns
         self._last_falling_ns = falling[-1] if falling else self._last_falling_ns

@@ -175,3 +175,90 @@ def test_a_checked_line_of_nonsense_raises_nothing(name: str, body: str) -> None
     decoder, records = decode(b"#" + said + b"*%08x\r\n" % crc32(said))
     assert decoder.frames == 1
     assert records == []
+
+
+INSPVAX_WORDS = (
+    "INS_SOLUTION_GOOD,INS_RTKFIXED,47.5,8.5,952.5,47.5000,60.0,3.0,1.0,1.5,-2.0,359.0,"
+    "0.0300,0.0400,0.0900,0.01,0.01,1.0e-02,0.02,0.02,0.05,{status},0"
+)
+
+
+def line(name: str, body: str, *, week: str = str(WEEK), seconds: str = "360018.250") -> bytes:
+    said = f"{name}A,COM1,0,1.0,FINESTEERING,{week},{seconds},02000000,0,1;{body}".encode()
+    return b"#" + said + b"*%08x\r\n" % crc32(said)
+
+
+@pytest.mark.trust
+@pytest.mark.parametrize("status", ["2e000343", "00000000", "1e5", "12345678", "e2000343", "nan"])
+def test_a_solution_in_text_is_read_whatever_its_hexadecimal_status(status: str) -> None:
+    said = line("INSPVAX", INSPVAX_WORDS.format(status=status))
+    decoder, records = decode(said)
+    (sample,) = records
+    assert isinstance(sample, NavSample)
+    assert sample.gps_ns == WEEK * WEEK_NS + 360_018_250_000_000
+    assert (sample.latitude_deg, sample.height_m, sample.fix) == (47.5, 1000.0, "3d")
+    assert sample.velocity_ned_mps == (60.0, 3.0, -1.0)
+    assert sample.horizontal_sigma_m == pytest.approx(0.05)
+    assert decoder.bad_messages == 0
+
+
+TEXT = {
+    "INSPVAX": INSPVAX_WORDS.format(status="2e000343"),
+    "INSPVA": f"{WEEK},360018.25,47.5,8.5,1000.0,60.0,3.0,1.0,1.5,-2.0,359.0,INS_SOLUTION_GOOD",
+    "BESTPOS": 'SOL_COMPUTED,NARROW_INT,47.5,8.5,952.5,47.5,WGS84,0.03,0.04,0.09,"",0.0,0.0,17,16,'
+    "16,16,0,2e,7f,37",
+    "BESTVEL": "SOL_COMPUTED,DOPPLER_VELOCITY,0.0,0.0,60.0,90.0,1.0,0.0",
+    "TIME": "VALID,1.667187222e-10,9.641617960e-10,-18.00000000000,2026,11,21,9,0,0,VALID",
+    "MARK1TIME": f"{WEEK},360018.25,1.5e-07,3.0e-09,-18.0,VALID",
+    "MARK1PVA": f"{WEEK},360018.25,47.5,8.5,1000.0,60.0,3.0,1.0,1.5,-2.0,359.0,INS_SOLUTION_GOOD",
+}
+NOT_READ = {"INSPVAX": (21, 22), "BESTPOS": (6, 10, *range(15, 21)), "BESTVEL": (7,)}
+WORDS = {"BESTPOS": (0, 1), "BESTVEL": (0, 1), "INSPVAX": (0, 1), "TIME": (0, 10), "INSPVA": (11,),
+         "MARK1TIME": (5,), "MARK1PVA": (11,)}  # fmt: skip
+
+
+@pytest.mark.trust
+@pytest.mark.parametrize("name", TEXT)
+def test_a_number_in_text_that_is_none_makes_a_bad_log_and_never_a_value(name: str) -> None:
+    whole, records = decode(line(name, TEXT[name]))
+    assert (whole.bad_messages, whole.seen[name]) == (0, 1)
+    words = TEXT[name].split(",")
+    for position in range(len(words)):
+        is_read = position not in (*NOT_READ.get(name, ()), *WORDS[name])
+        for damaged in (
+            "",
+            "nan",
+            "inf",
+            "-inf",
+            "1e999",
+            "1_0",
+            "2e000343",
+            "0x10",
+            " 1",
+            "1.5.2",
+        ):
+            said = [*words[:position], damaged, *words[position + 1 :]]
+            decoder, made = decode(line(name, ",".join(said)))
+            if is_read:
+                assert (decoder.bad_messages, made) == (1, []), (position, damaged)
+            elif position not in WORDS[name]:
+                assert (decoder.bad_messages, made) == (0, records), (position, damaged)
+
+
+@pytest.mark.trust
+@pytest.mark.parametrize(
+    "header",
+    [
+        {"week": "2_445"},
+        {"week": "70000"},
+        {"week": ""},
+        {"seconds": "nan"},
+        {"seconds": "1e999"},
+        {"seconds": "-5"},
+    ],
+)
+def test_a_header_in_text_with_a_number_that_is_none_makes_a_bad_log(
+    header: dict[str, str],
+) -> None:
+    decoder, records = decode(line("BESTPOS", TEXT["BESTPOS"], **header))
+    assert (decoder.bad_messages, records) == (1, [])

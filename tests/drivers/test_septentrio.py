@@ -201,7 +201,7 @@ def test_only_rising_edges_are_marks_and_inputs_are_channels() -> None:
         (1, 1),
         (2, 1),
     ]
-    assert decoder.counters["marks_falling"] == 1
+    assert decoder.counters["marks_other_edge"] == 1
 
 
 def test_a_position_of_an_event_without_its_event_is_a_lost_mark_and_a_gap_in_the_count() -> None:

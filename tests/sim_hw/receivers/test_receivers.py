@@ -19,6 +19,7 @@ from sim_hw.faults.catalogue import MARK, NAVIGATION
 from sim_hw.receivers.nmea_receiver import NmeaReceiver
 from sim_hw.receivers.novatel_receiver import CLOCK_OFFSET_MAX_NS, NovatelReceiver
 from sim_hw.receivers.receiver import Edge, EmulatedReceiver
+from sim_hw.receivers.septentrio_messages import FALLING, RISING
 from sim_hw.receivers.septentrio_receiver import SeptentrioReceiver
 from sim_hw.world_clock import WorldClock
 from tests.sim_hw.receiver_state import NS, START_GPS_NS, STATE, WEEK_NS, state_at
@@ -167,7 +168,7 @@ def test_every_mark_input_of_the_novatel_has_logs_of_its_own(mark_input: int) ->
 
 def test_asked_for_both_edges_the_septentrio_tells_each_with_its_polarity() -> None:
     receiver = make(SeptentrioReceiver)
-    receiver.tells_both_edges = True
+    receiver.reported_edges = frozenset((RISING, FALLING))
     edges = [Edge(EDGES_NS[0], True, 1), Edge(EDGES_NS[0] + 50_000, False, 1)]
     data = b"".join(map(receiver.event_bytes, edges))
     receiver.close()

@@ -1,0 +1,47 @@
+"""Numbers in ASCII text, by the type of their field; what a field means is in the decoders.
+
+Python's own `int` and `float` accept more than receivers send: "nan", "inf", underscores, blanks,
+and as exponents what is hexadecimal ("2e000343").
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Final
+
+_WHOLE: Final = re.compile(r"[-+]?[0-9]{1,18}")
+_DECIMAL: Final = re.compile(
+    r"[-+]?([0-9]{1,20}(\.[0-9]{0,30})?|\.[0-9]{1,30})([eE][-+]?[0-9]{1,3})?"
+)
+
+
+def whole_number(text: str) -> int:
+    """The value of a field of a whole number.
+
+    Raises:
+        ValueError: it is empty or anything else, "1.0" and "1_0" too.
+
+    Example:
+        >>> whole_number("2445")
+        2445
+    """
+    if _WHOLE.fullmatch(text) is None:
+        raise ValueError(f"{text!r} is not a whole number")
+    return int(text)
+
+
+def decimal_number(text: str) -> float:
+    """The value of a field of a finite decimal number, with or without an exponent.
+
+    Raises:
+        ValueError: it is empty, not finite or anything else.
+
+    Example:
+        >>> decimal_number("-1.5e-03")
+        -0.0015
+    """
+    value = float(text) if _DECIMAL.fullmatch(text) else math.nan
+    if not math.isfinite(value):
+        raise ValueError(f"{text!r} is not a decimal number")
+    return value
