@@ -29,7 +29,7 @@ from drivers.contract import (
 from drivers.device import DeviceDriver
 from drivers.settings import Setting
 from drivers.tcp_port import SCHEME, open_tcp_port
-from drivers.udp_port import LISTEN_SCHEME, SPEAK_SCHEME, open_udp_port
+from drivers.udp_port import LISTEN_SCHEME, SPEAK_SCHEME, Sender, UdpPort, open_udp_port
 
 READ_STEP_S: Final = 0.2
 """Longest wait for bytes before the driver looks up again."""
@@ -132,7 +132,8 @@ PortOpener = Callable[[str, int, str], Port]
 def open_serial_port(path: str, baudrate: int, parity: str) -> Port:
     """Open a port for ourselves alone, 8 data bits, one stop bit; or a network address.
 
-    Addresses are tcp://host:port, udpin://host:port (listens) and udpout://host:port (speaks).
+    Addresses are tcp://host:port, udpin://host:port (listens; with ?from=ADDRESS to that sender
+    only) and udpout://host:port (speaks).
 
     Raises:
         DeviceError: it cannot be opened; the sentence says why and what to do.
@@ -210,6 +211,7 @@ class SerialDevice(DeviceDriver):
         self._line: SerialLine | None = None
         self._heard_ns = 0
         self._silent = False
+        self._sender: Sender | None = None
         self._unlogged: deque[RawBytes] = deque(maxlen=UNLOGGED_KEPT)
 
     # What a driver says
@@ -229,11 +231,17 @@ class SerialDevice(DeviceDriver):
     def connected(self) -> None:
         """A port was opened: what was half received on the one before is of no use."""
 
+    def is_identified(self) -> bool:
+        """Whether what was understood is of the device itself, not of somebody else on its bus."""
+        return True
+
     def heard(self, *, messages: int = 1) -> None:
         """So many messages were understood just now."""
         if messages <= 0:
             return
         self.counters["messages"] += messages
+        if self._sender is not None and self.is_identified():
+            self._sender.lock()
         self._heard_ns = self.clock.mono_ns()
         if self._silent:
             self._silent = False
@@ -254,9 +262,11 @@ class SerialDevice(DeviceDriver):
             raise DeviceError(
                 f"{self.name}: port {self.port} was lost: {error}; check the cable"
             ) from error
-        except DeviceError:
+        except DeviceError as error:
             self._let_go()
-            raise
+            if self._sender is None or not self._sender.others:
+                raise
+            raise DeviceError(f"{error}; {self._sender.sentence()}") from error
         self._state = LifeCycle.BOUND
         return found
 
@@ -280,6 +290,9 @@ class SerialDevice(DeviceDriver):
         except DeviceError as error:
             raise DeviceError(f"{self.name}: {error}") from error
         self.counters["opened"] += 1
+        if isinstance(port, UdpPort) and port.sender is not None:
+            # Who is listened to does not change because the port was opened again.
+            self._sender = port.sender = self._sender or port.sender
         self.connected()
         return SerialLine(port, self._received, lambda data: self._received(data, STALE))
 
@@ -302,6 +315,7 @@ class SerialDevice(DeviceDriver):
             try:
                 for sample in self.step(line):
                     sink(sample)
+                self._count_other_senders()
             except LineLostError as error:
                 self._state = LifeCycle.INACTIVE
                 self._tell_lost(
@@ -312,6 +326,15 @@ class SerialDevice(DeviceDriver):
             if self.clock.mono_ns() - self._heard_ns >= silence_ns:
                 self._tell_silence()
                 return
+
+    def _count_other_senders(self) -> None:
+        if self._sender is None or self._sender.others == self.counters["other_senders"]:
+            return
+        self.counters["other_senders"] = self._sender.others
+        self.teller.complain(
+            "other-sender",
+            f"The {self.what} {self.name} at {self.port}: {self._sender.sentence()}.",
+        )
 
     def _tell_silence(self) -> None:
         if self._silent:

@@ -140,6 +140,9 @@ class MavlinkNavigator(ListeningNavigator):
         kind = "unknown" if number is None else AUTOPILOTS.get(number, f"kind {number}")
         return {"autopilot": kind, "system": str(self.decoder.system), **found}
 
+    def is_identified(self) -> bool:
+        return self.decoder.autopilot is not None
+
     def connected(self) -> None:
         super().connected()
         self._heartbeat_ns = self._ask_ns = self._timesync_ns = self.clock.mono_ns()

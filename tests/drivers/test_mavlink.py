@@ -438,29 +438,3 @@ def test_it_says_that_it_is_there_and_asks_for_what_does_not_come() -> None:
         (2.0, 1e6), (24.0, 1e6), (33.0, 1e5), (31.0, 2e4),
     }  # fmt: skip
     assert len(asked) == 12, "every five seconds, while they do not come"
-
-
-def test_udp_listens_to_the_first_that_speaks_and_names_what_is_wrong() -> None:
-    from drivers.udp_port import open_udp_port
-
-    number = free_udp_port()
-    port = open_udp_port(f"udpin://127.0.0.1:{number}")
-    port.timeout = 0.05
-    assert port.read(1) == b""
-    assert port.write(b"to nobody") == 0
-    speaker = open_udp_port(f"udpout://127.0.0.1:{number}")
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
-        speaker.timeout = port.timeout = 5.0
-        assert speaker.write(b"hello") == 5
-        assert port.read(1) + port.read(port.in_waiting) == b"hello"
-        port.timeout = 0.05
-        stranger.sendto(b"and me", ("127.0.0.1", number))
-        assert port.read(1) == b""
-        assert port.write(b"welcome") == 7
-        assert speaker.read(7) == b"welcome"
-    with pytest.raises(DeviceError, match="no other program listens there"):
-        open_udp_port(f"udpin://127.0.0.1:{number}")
-    port.close()
-    speaker.close()
-    with pytest.raises(DeviceError, match="udpin://host:port"):
-        open_udp_port("udpin://nowhere")
