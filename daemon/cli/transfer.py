@@ -16,10 +16,11 @@ from rich.progress import (
     TransferSpeedColumn,
 )
 
-HELP = """Copy a mission to another disk, every byte read back and every hash checked.
+HELP = """Copy a mission to another disk and verify every file.
 
-Interrupted, it goes on where it stopped when it is started again. The source is kept, unless
---remove-source is given and the whole copy is verified.
+Each file is read back from the other disk and compared by hash, in every run. An interrupted
+transfer continues when the same command is run again. The source is kept unless --remove-source is
+given: then the copy is sealed, the source is removed, and no later run changes the copy.
 
 Example: `syntopic transfer MISSION /media/shuttle`
 """
@@ -29,21 +30,26 @@ def transfer(
     mission: Annotated[Path, typer.Argument(help="Mission folder.")],
     disk: Annotated[Path, typer.Argument(help="Folder of the other disk.")],
     remove_source: Annotated[
-        bool, typer.Option("--remove-source", help="Delete the mission here once it is verified.")
+        bool, typer.Option("--remove-source", help="Remove the source after the copy is sealed.")
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     from daemon.disk.mission import Mission
+    from daemon.disk.transfer import finish_transfer
     from daemon.disk.transfer import transfer as run
 
     columns = (BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("copying and reading back", total=None)
-        report = run(
-            Mission.open(mission),
-            disk,
-            remove_source=remove_source,
-            progress=lambda done, total: progress.update(task, completed=done, total=total),
+
+        def show(done: int, total: int) -> None:
+            progress.update(task, completed=done, total=total)
+
+        finished = None
+        if not mission.exists():
+            finished = finish_transfer(mission, disk, progress=show)
+        report = finished or run(
+            Mission.open(mission), disk, remove_source=remove_source, progress=show
         )
     if as_json:
         typer.echo(
@@ -56,16 +62,17 @@ def transfer(
                     "exposures": report.verified.exposures,
                     "frames": report.verified.frames,
                     "source_removed": report.source_removed,
+                    "sealed_utc": report.sealed_utc,
                 }
             )
         )
         return
     console = Console(soft_wrap=True)
     console.print(
-        f"{report.copied} files copied, {report.kept} were there already, "
+        f"{report.copied} files copied, {report.kept} identical files kept, "
         f"{report.nbytes / 1e9:.2f} GB in all; {report.verified.exposures} exposures and "
         f"{report.verified.frames} frames verified in [bold]{report.target}[/]"
     )
-    console.print(
-        "The source was removed." if report.source_removed else "The source is where it was."
-    )
+    if report.sealed_utc:
+        console.print(f"The copy is sealed since {report.sealed_utc}.")
+    console.print("The source is removed." if report.source_removed else "The source is kept.")

@@ -1,49 +1,54 @@
-"""Copying a mission to another disk: resumable, verified, never at the cost of the source.
+"""Copying a mission to another disk: resumable, verified, never at the cost of the last copy.
 
-A file counts as copied when its bytes, read back from the other disk, hash to what was read from
-the source. What was copied is noted beside the copy (`transfer.json`), so that a transfer that was
-interrupted goes on where it stopped.
+Every file is hashed in the source and read back from the copy's disk in each run, whatever an
+earlier run noted. The states of a copy are in `daemon.disk.transfer_note`; removing the source is
+in `daemon.disk.transfer_removal`.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
-import os
-import stat
+import fcntl
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
-from dataclasses import dataclass
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 from daemon.disk import durable
 from daemon.disk.catalog import Catalog, CatalogError
-from daemon.disk.level0_folder import hash_file
-from daemon.disk.mission import Mission
+from daemon.disk.mission import Mission, MissionError
+from daemon.disk.transfer_note import (
+    LEFT_OUT,
+    NOTE_FILE,
+    CopiedFile,
+    TransferError,
+    TransferNote,
+    read_note,
+)
+from daemon.disk.transfer_removal import (
+    REMOVING_SUFFIX,
+    check_sealed,
+    copy_named_by,
+    finish_removal,
+    remove_sealed_source,
+    removing_path,
+)
+from daemon.disk.tree import FileEntry, FileTree, Step
 from daemon.disk.verification import VerifyReport, verify
-from daemon.errors import DaemonError
-
-JOURNAL = "transfer.json"
-JOURNAL_EVERY_BYTES = 500_000_000
-"""How much may have to be copied again after a kill, about; after anything else, one file."""
-
-BLOCK_BYTES = 4 << 20
-LEFT_OUT = frozenset({".held", JOURNAL, "mission.db-wal", "mission.db-shm"})
-"""Locks, and what is in the index once it was closed."""
 
 Progress = Callable[[int, int], None]
 
 
-class TransferError(DaemonError):
-    """The mission was not copied; the sentence says what is in the way."""
+def no_progress(_done: int, _total: int) -> None:
+    """For callers that show none."""
 
 
 @dataclass(frozen=True)
 class TransferReport:
     """What was done.
 
-    `copied` files came anew, `kept` were there and verified from an earlier attempt; the source is
-    removed only after all of it was verified.
+    `copied` files were written, `kept` were identical in the copy of an earlier run. `sealed_utc`
+    is empty where the copy is not sealed.
     """
 
     target: Path
@@ -52,15 +57,7 @@ class TransferReport:
     nbytes: int
     verified: VerifyReport
     source_removed: bool
-
-
-@dataclass(frozen=True)
-class _Entry:
-    """A file of the source: relative name, size, modification time."""
-
-    name: str
-    nbytes: int
-    modified_ns: int
+    sealed_utc: str = ""
 
 
 def transfer(
@@ -68,73 +65,286 @@ def transfer(
     disk: Path,
     *,
     remove_source: bool = False,
-    progress: Progress = lambda done, total: None,
+    progress: Progress = no_progress,
 ) -> TransferReport:
     """Copy a mission into the folder `disk`, under its own id.
 
     Args:
-        remove_source: delete the source once the copy is complete and verified.
-        progress: told bytes done and bytes in total; each byte is read twice, once here and once
-            there.
+        mission: the source.
+        disk: a folder of another disk; it is created if it is missing.
+        remove_source: seal the copy and remove the source once the copy is complete and verified.
+        progress: called with bytes done and bytes in total; each byte is read in the source and in
+            the copy.
 
     Raises:
-        TransferError: no room, a mission that is being flown, something that is no plain file, a
-            different mission of that name, or a copy that cannot be verified.
-        MissionError: another process holds the mission.
-        OSError: a disk refused; what was copied so far is kept for the next attempt.
+        TransferError: no room, a target that is not empty and not ours, a source that lacks what
+            the copy has, or a copy that cannot be verified.
+        TreeError: links or devices in source or target, or a disk that returns other bytes.
+        MissionError: another process holds the mission or the copy.
+        OSError: a disk refused; what was copied so far is kept for the next run.
     """
-    target = disk.resolve() / mission.id
-    source = mission.path.resolve()
-    if target == source or target.is_relative_to(source):
-        raise TransferError(f"{disk}: that is where the mission is; name a folder of another disk")
-    with mission.held():
+    source_path = mission.path.resolve()
+    target_path = disk.resolve() / mission.id
+    if mission.id.endswith(REMOVING_SUFFIX):
+        raise TransferError(
+            f"{source_path} is what is left of a mission that was transferred to "
+            f"{copy_named_by(source_path)}; name the mission as it was called before"
+        )
+    if target_path == source_path or target_path.is_relative_to(source_path):
+        raise TransferError(f"{disk} is where the mission is; name a folder of another disk")
+    with ExitStack() as stack:
+        stack.enter_context(mission.held())
+        source = stack.enter_context(FileTree.open(source_path))
+        durable.make_directories(target_path.parent)
+        target = stack.enter_context(_locked_target(target_path, source))
+        note = read_note(target, mission)
         _settle_index(mission)
-        entries = list(_entries(source))
-        total = sum(entry.nbytes for entry in entries)
-        durable.make_directories(target)
-        journal = _read_journal(target, mission)
-        here = {entry.name: entry for entry in entries if not _is_copied(entry, journal, target)}
-        _refuse_without_room(target, sum(entry.nbytes for entry in here.values()))
-        _write_journal(target, mission, journal)
-        done = 2 * (total - sum(entry.nbytes for entry in here.values()))
-        since_noted = 0
+        if note is not None and note.state == "sealed":
+            copying = _Copying(source, target, note.files, progress)
+            return copying.confirm_sealed(note, remove=remove_source)
+        copying = _Copying(source, target, note.files if note else {}, progress)
+        return copying.run(mission, remove=remove_source)
 
-        def step(count: int) -> None:
-            nonlocal done
-            done += count
-            progress(done, 2 * total)
 
-        step(0)
-        try:
-            for entry in here.values():
-                journal[entry.name] = {
-                    "nbytes": entry.nbytes,
-                    "modified_ns": str(entry.modified_ns),
-                    "sha256": _copy(source / entry.name, target / entry.name, step),
-                }
-                since_noted += entry.nbytes
-                if since_noted >= JOURNAL_EVERY_BYTES:
-                    _write_journal(target, mission, journal)
-                    since_noted = 0
-        except BaseException:
-            # A disk that refused, or Ctrl-C: what is there is not to be copied again.
-            with suppress(OSError):
-                _write_journal(target, mission, journal)
-            raise
-        _remove_strangers(target, {entry.name for entry in entries})
-        _write_journal(target, mission, journal)
-        verified = verify(Mission.open(target))
+def finish_transfer(
+    source_path: Path, disk: Path, *, progress: Progress = no_progress
+) -> TransferReport | None:
+    """Go on where a transfer was interrupted after the source lost its name.
+
+    Args:
+        source_path: where the mission was.
+        disk: the folder it was transferred to.
+        progress: as for `transfer`.
+
+    Returns:
+        None where nothing suggests that this mission was ever transferred.
+
+    Raises:
+        TransferError: the copy is not sealed, or not as it was sealed.
+    """
+    source_path = source_path.resolve()
+    target_path = disk.resolve() / source_path.name
+    removing = removing_path(source_path)
+    is_left = removing.is_dir()
+    if not target_path.is_dir():
+        if is_left:
+            raise TransferError(
+                f"{source_path} was transferred to {copy_named_by(removing)}; name that disk"
+            )
+        return None
+    with ExitStack() as stack:
+        target = stack.enter_context(_locked_target(target_path, None))
+        note = read_note(target)
+        if note is None or note.state != "sealed" or note.mission != source_path.name:
+            if is_left:
+                raise TransferError(
+                    f"{target_path} is not the sealed copy; {source_path} was transferred to "
+                    f"{copy_named_by(removing)}: name that disk"
+                )
+            return None
+        if is_left:
+            stack.enter_context(Mission(removing, note.mission).held())
+        step = _counter(note.nbytes, progress)
+        check_sealed(target, note, step)
+        if is_left:
+            finish_removal(removing, note)
+    return _sealed_report(target_path, note, source_removed=True)
+
+
+class _Copying:
+    """One run over one source and one target, both held."""
+
+    def __init__(
+        self,
+        source: FileTree,
+        target: FileTree,
+        noted: Mapping[str, CopiedFile],
+        progress: Progress,
+    ) -> None:
+        self._source = source
+        self._target = target
+        self._noted = noted
+        self._folders, files = source.walk()
+        self._entries = [entry for entry in files if entry.name not in LEFT_OUT]
+        self._nbytes = sum(entry.nbytes for entry in self._entries)
+        self._step = _counter(2 * self._nbytes, progress)
+
+    def run(self, mission: Mission, *, remove: bool) -> TransferReport:
+        """Copy, verify, and seal and remove the source where that is wanted."""
+        gone = self._gone_from_source()
+        self._refuse_without_room()
+        note = TransferNote(mission.id, mission.genesis_sha256(), "copying")
+        expected = {e.name: CopiedFile(e.nbytes, self._verified(e.name)) for e in self._entries}
+        still_there = {name: self._noted[name] for name in gone}
+        replace(note, files={**still_there, **expected}).write(self._target)
+        for folder in self._folders:
+            self._target.make_folder(folder)
+        files: dict[str, CopiedFile] = {}
+        kept = 0
+        for entry in self._entries:
+            sha256, is_kept = self._copy(entry)
+            kept += is_kept
+            files[entry.name] = CopiedFile(entry.nbytes, sha256)
+        for name in gone:
+            self._target.unlink(name)
+        self._target.sync_folders(self._folders)
+        _sync_above(self._target.path)
+        verified = verify(Mission.open(self._target.path))
         if not verified.is_well:
             raise TransferError(
-                f"the copy in {target} is not well: {verified.problems[0]} "
-                f"({len(verified.problems)} in all). If the source says the same (syntopic verify "
-                f"{source}), the copy is faithful; the source is kept"
+                f"the copy in {self._target.path} has an error: {verified.problems[0]} "
+                f"({len(verified.problems)} in all). If `syntopic verify {self._source.path}` "
+                "reports the same, the copy is faithful; the source is kept"
             )
-        if remove_source:
-            _remove(source, entries)
-    return TransferReport(
-        target, len(here), len(entries) - len(here), total, verified, remove_source
-    )
+        note = replace(
+            note,
+            state="complete",
+            files=files,
+            exposures=verified.exposures,
+            frames=verified.frames,
+        )
+        note.write(self._target)
+        if remove:
+            note = replace(note, state="sealed", sealed_utc=f"{datetime.now(UTC):%FT%TZ}")
+            self._refuse_changed_source(self._entries)
+            note.write(self._target)
+            remove_sealed_source(self._source, note, self._target.path)
+        return TransferReport(
+            self._target.path,
+            len(files) - kept,
+            kept,
+            self._nbytes,
+            verified,
+            remove,
+            note.sealed_utc,
+        )
+
+    def confirm_sealed(self, note: TransferNote, *, remove: bool) -> TransferReport:
+        """The copy was sealed by an earlier run: it is read again and never written."""
+        found = {entry.name: entry.nbytes for entry in self._entries}
+        differing = sorted(
+            name
+            for name in {*found, *note.files}
+            if name not in note.files or found.get(name) != note.files[name].nbytes
+        )
+        for name in note.files:
+            if not differing and self._hash_source(name) != note.files[name].sha256:
+                differing.append(name)
+        if differing:
+            raise TransferError(
+                f"{self._source.path / differing[0]} differs from the copy that was sealed on "
+                f"{note.sealed_utc} ({len(differing)} such files); source and copy are kept. "
+                "Transfer the mission into another folder, or remove the one that is not wanted"
+            )
+        check_sealed(self._target, note, self._step)
+        if remove:
+            self._refuse_changed_source(self._entries)
+            remove_sealed_source(self._source, note, self._target.path)
+        return _sealed_report(self._target.path, note, source_removed=remove)
+
+    def _copy(self, entry: FileEntry) -> tuple[str, bool]:
+        """Bring one file into the copy; its SHA-256, and whether the copy had it already."""
+        size = self._target.size(entry.name)
+        if size is not None:
+            there = self._target.sha256(entry.name, self._step, from_disk=True)
+            if size == entry.nbytes:
+                here = self._hash_source(entry.name)
+                if here == there:
+                    return here, True
+            if _is_captured(entry.name) and there == self._verified(entry.name):
+                raise TransferError(
+                    f"{self._source.path / entry.name} differs from the copy that was verified "
+                    f"earlier in {self._target.path}; both are kept. Run `syntopic verify "
+                    f"{self._source.path}`, or transfer the mission into another folder"
+                )
+        return self._target.copy_from(self._source, entry, self._step), False
+
+    def _gone_from_source(self) -> list[str]:
+        """Files of the copy, products and exports only, that the source does not have any more.
+
+        Unfinished files of an interrupted run are removed.
+
+        Raises:
+            TransferError: the target holds files that no transfer put there, or captured data that
+                the source has lost.
+        """
+        ours = {entry.name for entry in self._entries}
+        gone = []
+        unfinished = []
+        for file in self._target.walk()[1]:
+            if file.name in ours or file.name in LEFT_OUT:
+                continue
+            whole = _name_of_part(file.name)
+            if whole in ours or whole in self._noted:
+                unfinished.append(file.name)
+            elif file.name not in self._noted:
+                raise TransferError(
+                    f"{self._target.path / file.name} is not part of this mission; move it away or "
+                    "choose another disk"
+                )
+            elif _is_captured(file.name):
+                raise TransferError(
+                    f"{self._source.path} has lost {file.name}, which the copy in "
+                    f"{self._target.path} has; the copy is left as it is. Transfer the mission "
+                    "into another folder if that file is not wanted"
+                )
+            else:
+                gone.append(file.name)
+        for name in unfinished:
+            self._target.unlink(name)
+        return gone
+
+    def _refuse_without_room(self) -> None:
+        needed = sum(e.nbytes for e in self._entries if self._target.size(e.name) != e.nbytes)
+        free = durable.free_bytes(self._target.path)
+        if free < needed:
+            raise TransferError(
+                f"{self._target.path}: {needed / 1e9:.1f} GB are to be copied and "
+                f"{free / 1e9:.1f} GB are free"
+            )
+
+    def _refuse_changed_source(self, entries: list[FileEntry]) -> None:
+        found = [entry for entry in self._source.walk()[1] if entry.name not in LEFT_OUT]
+        if found != entries:
+            raise TransferError(
+                f"{self._source.path} changed while it was copied; it is kept. "
+                "Run the transfer again"
+            )
+
+    def _verified(self, name: str) -> str | None:
+        noted = self._noted.get(name)
+        return noted.sha256 if noted else None
+
+    def _hash_source(self, name: str) -> str:
+        return self._source.sha256(name, self._step, from_disk=False)
+
+
+@contextmanager
+def _locked_target(path: Path, source: FileTree | None) -> Iterator[FileTree]:
+    """Open the folder of the copy, create it if missing, and keep others out.
+
+    Raises:
+        TransferError: the folder is the source, or not empty and not from a transfer.
+        MissionError: another process writes there.
+    """
+    if source is not None and not path.is_symlink():
+        durable.make_directories(path)
+    with FileTree.open(path) as target:
+        if source is not None and target.is_same(source):
+            raise TransferError(f"{path} is where the mission is; name a folder of another disk")
+        try:
+            fcntl.flock(target.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise MissionError(f"another transfer writes to {path}; wait for its end") from error
+        folders, files = target.walk()
+        has_note = any(file.name == NOTE_FILE for file in files)
+        if not has_note and (folders or any(file.name not in LEFT_OUT for file in files)):
+            raise TransferError(
+                f"{path} is not empty and was not made by a transfer; move it away or choose "
+                "another disk"
+            )
+        with Mission(path, path.name).held():
+            yield target
 
 
 def _settle_index(mission: Mission) -> None:
@@ -147,107 +357,47 @@ def _settle_index(mission: Mission) -> None:
         raise TransferError(f"{error}; run syntopic repair first") from error
 
 
-def _entries(root: Path, below: str = "") -> Iterator[_Entry]:
-    for item in sorted(os.scandir(root / below), key=lambda item: item.name):
-        name = f"{below}/{item.name}" if below else item.name
-        if name in LEFT_OUT:
-            continue
-        status = item.stat(follow_symlinks=False)
-        if stat.S_ISDIR(status.st_mode):
-            yield from _entries(root, name)
-        elif stat.S_ISREG(status.st_mode):
-            yield _Entry(name, status.st_size, status.st_mtime_ns)
-        else:
-            raise TransferError(
-                f"{root / name} is no plain file; a mission holds files and folders, no links"
-            )
+def _sync_above(path: Path) -> None:
+    """Make the names of the folders above durable, also of those that an earlier run created."""
+    device = path.stat().st_dev
+    for folder in path.parents:
+        if folder.stat().st_dev != device:
+            return
+        with suppress(PermissionError):  # a folder that we may not read was not created by us
+            durable.sync_directory(folder)
 
 
-def _is_copied(entry: _Entry, journal: Mapping[str, Mapping[str, object]], target: Path) -> bool:
-    """Whether an earlier attempt copied and verified the file as it is now."""
-    noted = journal.get(entry.name)
-    if noted is None or noted.get("nbytes") != entry.nbytes:
-        return False
-    if noted.get("modified_ns") != str(entry.modified_ns):
-        return False
-    try:
-        there = (target / entry.name).lstat()
-    except FileNotFoundError:
-        return False
-    return stat.S_ISREG(there.st_mode) and there.st_size == entry.nbytes
+def _is_captured(name: str) -> bool:
+    """Whether a file holds what cannot be made again: frames, records, logs, the configuration."""
+    first, _, below = name.partition("/")
+    if first == "log":
+        return below.endswith(".mcap")
+    return first in ("L0", "mission.json", "rig.toml", "service.toml") or first.startswith("plan.")
 
 
-def _copy(source: Path, target: Path, step: Callable[[int], None]) -> str:
-    """Copy a file and read it back; returns its SHA-256."""
-    durable.make_directories(target.parent)
-    part = target.with_name(f".{target.name}{durable.PART_SUFFIX}")
-    part.unlink(missing_ok=True)
-    digest = hashlib.sha256()
-    buffer = memoryview(bytearray(BLOCK_BYTES))
-    with source.open("rb", buffering=0) as reading, part.open("wb", buffering=0) as writing:
-        while count := reading.readinto(buffer):
-            digest.update(buffer[:count])
-            written = 0
-            while written < count:
-                written += writing.write(buffer[written:count]) or 0
-            step(count)
-        os.fsync(writing.fileno())
-        # Read back what the disk has, not what memory still knows.
-        os.posix_fadvise(writing.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
-    found = hash_file(part, step)
-    if found != digest.hexdigest():
-        part.unlink()
-        raise TransferError(
-            f"{target}: read back differently from what was written; the disk is not to be trusted"
-        )
-    status = source.stat()
-    part.chmod(stat.S_IMODE(status.st_mode))
-    os.utime(part, ns=(status.st_atime_ns, status.st_mtime_ns))
-    part.rename(target)
-    durable.sync_directory(target.parent)
-    return found
+def _name_of_part(name: str) -> str | None:
+    """The name that an unfinished file was to get; None for any other file."""
+    folder, _, last = name.rpartition("/")
+    if not (last.startswith(".") and last.endswith(durable.PART_SUFFIX)):
+        return None
+    whole = last[1 : -len(durable.PART_SUFFIX)]
+    return f"{folder}/{whole}" if folder else whole
 
 
-def _read_journal(target: Path, mission: Mission) -> dict[str, dict[str, object]]:
-    try:
-        noted = json.loads((target / JOURNAL).read_text("utf-8"))
-        if noted["mission"] == mission.id and noted["genesis"] == mission.genesis_sha256():
-            return dict(noted["files"])
-    except FileNotFoundError:
-        if any(target.iterdir()):
-            raise TransferError(
-                f"{target} exists and no transfer began it; move it away or choose another disk"
-            ) from None
-        return {}
-    except (ValueError, KeyError, TypeError):
-        return {}  # a damaged note costs copying again
-    raise TransferError(f"{target} holds another mission of the same name; choose another disk")
+def _counter(total: int, progress: Progress) -> Step:
+    done = 0
+
+    def step(count: int) -> None:
+        nonlocal done
+        done += count
+        progress(done, max(total, done))
+
+    progress(0, total)
+    return step
 
 
-def _write_journal(
-    target: Path, mission: Mission, journal: Mapping[str, Mapping[str, object]]
-) -> None:
-    content = {"mission": mission.id, "genesis": mission.genesis_sha256(), "files": journal}
-    durable.replace_file(target / JOURNAL, json.dumps(content, indent=0).encode())
-
-
-def _refuse_without_room(target: Path, nbytes: int) -> None:
-    free = durable.free_bytes(target)
-    if free < nbytes:
-        raise TransferError(
-            f"{target}: {nbytes / 1e9:.1f} GB are to be copied and {free / 1e9:.1f} GB are free"
-        )
-
-
-def _remove_strangers(target: Path, names: set[str]) -> None:
-    """What an earlier attempt copied and the source has not any more, and unfinished files."""
-    for entry in list(_entries(target)):
-        if entry.name not in names:
-            (target / entry.name).unlink()
-
-
-def _remove(source: Path, entries: list[_Entry]) -> None:
-    """Delete the source, unless it changed since it was read."""
-    if list(_entries(source)) != entries:
-        raise TransferError(f"{source} changed while it was copied; it is kept, transfer it again")
-    durable.remove_tree(source)
+def _sealed_report(target: Path, note: TransferNote, *, source_removed: bool) -> TransferReport:
+    verified = VerifyReport(note.exposures, note.frames, note.nbytes, ())
+    return TransferReport(
+        target, 0, len(note.files), note.nbytes, verified, source_removed, note.sealed_utc
+    )

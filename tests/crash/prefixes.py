@@ -83,7 +83,7 @@ def cut(
         states += at_random(disk, random.Random(f"{seed}-{index}"), random_ones)
         for name, tree in states:
             figures.states += 1
-            key = _key(tree, said)
+            key = key_of(tree, said)
             if key in seen:
                 continue
             seen.add(key)
@@ -112,7 +112,8 @@ def _judge(tree: Tree, told: Told, scratch: Path, figures: Figures, *, flies_on:
     figures.discarded += outcome.discarded
 
 
-def _key(tree: Tree, said: str) -> bytes:
+def key_of(tree: Tree, said: str = "") -> bytes:
+    """Two states with the same key need to be judged only once."""
     digest = hashlib.sha256(said.encode())
     for path, data in sorted(tree.items()):
         digest.update(f"{path}\0{-1 if data is None else len(data)}\0".encode())

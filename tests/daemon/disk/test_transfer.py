@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -12,6 +13,7 @@ from daemon.disk import durable, transfer
 from daemon.disk.flight_log import FlightLog
 from daemon.disk.log_seals import seal_logs
 from daemon.disk.mission import Mission, MissionError
+from daemon.disk.tree import FileTree, TreeError
 from daemon.disk.verification import verify
 from tests.daemon.small_camera import fly, new_mission
 
@@ -52,17 +54,17 @@ def test_every_byte_arrives_and_the_copy_verifies(mission: Mission, tmp_path: Pa
 def test_interrupted_at_any_file_it_goes_on_where_it_stopped(
     mission: Mission, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = transfer._copy
+    real = FileTree.copy_from
     count = 0
 
-    def copy_three_and_pull_the_cable(*arguments: object) -> str:
+    def copy_three_and_fail(*arguments: Any) -> str:
         nonlocal count
         count += 1
         if count % 4 == 0:
             raise OSError(5, "Input/output error")
         return real(*arguments)
 
-    monkeypatch.setattr(transfer, "_copy", copy_three_and_pull_the_cable)
+    monkeypatch.setattr(FileTree, "copy_from", copy_three_and_fail)
     attempts = 0
     while True:
         attempts += 1
@@ -93,12 +95,12 @@ def test_what_changed_since_is_copied_again_and_what_is_gone_is_removed(
 def test_the_source_goes_only_after_all_of_it_is_verified(
     mission: Mission, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = transfer.hash_file
-    monkeypatch.setattr(transfer, "hash_file", lambda *a: "0" * 64)
-    with pytest.raises(transfer.TransferError, match="not to be trusted"):
-        transfer.transfer(mission, tmp_path / "disk", remove_source=True)
+    with monkeypatch.context() as patch:
+        patch.setattr(FileTree, "sha256", lambda *a, **k: "0" * 64)
+        with pytest.raises(TreeError, match="do not use this disk"):
+            transfer.transfer(mission, tmp_path / "disk", remove_source=True)
     assert verify(mission).is_well
-    monkeypatch.setattr(transfer, "hash_file", real)
+    assert not list((tmp_path / "disk").rglob("*.part"))
     frame = mission.level0(2) / "SU00.tif"
     frame.chmod(0o644)
     data = bytearray(frame.read_bytes())
@@ -122,13 +124,13 @@ def test_a_mission_that_is_being_flown_is_not_copied(mission: Mission, tmp_path:
 
 def test_links_and_strangers_are_refused(mission: Mission, tmp_path: Path) -> None:
     (mission.export_dir / "link").symlink_to("/etc/passwd")
-    with pytest.raises(transfer.TransferError, match="no plain file"):
+    with pytest.raises(TreeError, match="not a plain file"):
         transfer.transfer(mission, tmp_path / "disk")
     (mission.export_dir / "link").unlink()
     other = tmp_path / "other" / mission.id
     other.mkdir(parents=True)
     (other / "thesis.doc").write_text("mine")
-    with pytest.raises(transfer.TransferError, match="no transfer began it"):
+    with pytest.raises(transfer.TransferError, match="was not made by a transfer"):
         transfer.transfer(mission, tmp_path / "other")
     assert (other / "thesis.doc").read_text() == "mine"
     with pytest.raises(transfer.TransferError, match="where the mission is"):
@@ -141,7 +143,7 @@ def test_a_disk_without_room_is_refused_before_anything_is_copied(
     monkeypatch.setattr(durable, "free_bytes", lambda path: 1000)
     with pytest.raises(transfer.TransferError, match=r"are to be copied and 0\.0 GB are free"):
         transfer.transfer(mission, tmp_path / "disk")
-    assert [p.name for p in (tmp_path / "disk" / mission.id).iterdir()] == []
+    assert [p.name for p in (tmp_path / "disk" / mission.id).iterdir()] == [".held"]
 
 
 def test_a_truncated_or_altered_log_is_found(mission: Mission) -> None:

@@ -1,0 +1,228 @@
+"""`transfer`, killed at its calls: `python -m tests.crash.kill_transfer FOLDER WHAT`.
+
+WHAT is `every`, for one kill at each state-changing call; `pairs:COUNT:SEED`, for two kills in a
+row at random calls; or `once:FORGOTTEN`, for one run whose writes are recorded. After each kill a
+complete, verified copy must exist. In the end the copy must be sealed and complete, and the source
+removed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import random
+import shutil
+import stat
+import sys
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from daemon.disk import durable
+from daemon.disk.catalog import Catalog
+from daemon.disk.flight_log import FlightLog
+from daemon.disk.level2 import write_level2
+from daemon.disk.log_seals import seal_logs
+from daemon.disk.mission import Mission
+from daemon.disk.store import Level0Writer
+from daemon.disk.transfer import finish_transfer, transfer
+from daemon.disk.transfer_note import LEFT_OUT, NOTE_FILE
+from daemon.disk.transfer_removal import removing_path
+from daemon.disk.verification import verify
+from tests.crash.kill_at_call import WRITES, run_to_call
+from tests.daemon.small_camera import final_record, new_mission, store_one
+
+FLOWN = "flown"
+OTHER_DISK = "disk"
+BEGUN = "begun"
+"""Created below the folder of a recorded run when the transfer begins."""
+
+INDEX = "mission.db"
+"""Not compared byte by byte: `verify` compares what it says."""
+
+Content = Mapping[str, str]
+"""SHA-256 by file name."""
+
+
+@dataclass
+class Figures:
+    """What was done, and what was found."""
+
+    calls: int = 0
+    kills: int = 0
+    torn_writes: int = 0
+    wrong: list[str] = field(default_factory=list)
+
+
+def three_exposures(root: Path) -> Mission:
+    """A mission of three exposures with products, a log and an export."""
+    mission = new_mission(root)
+    writer = Level0Writer(mission)
+    for number in (1, 2, 3):
+        writer.seal(final_record(store_one(writer, number, ["SU00"])))
+    writer.close()
+    write_level2(
+        mission,
+        1,
+        report_json={"verdict": "good"},
+        pan=None,
+        colour={},
+        quicklook=None,
+    )
+    durable.create_file(mission.export_dir / "report.html", [b"report"], mode=0o644)
+    log = FlightLog.create(mission.log_dir)
+    log.append("raw/gnss", 1, b"bytes" * 100)
+    log.close()
+    seal_logs(mission)
+    mission.close()
+    Catalog.open(mission.catalog_path).close()
+    for path in (*mission.path.rglob("*"), mission.path, root):
+        durable.sync_file(path)  # as a mission is that was flown a while ago
+    return mission
+
+
+def content_of(folder: Path) -> Content:
+    """What is in a folder, without notes, locks and unfinished files."""
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.name not in {*LEFT_OUT, INDEX}
+    }
+
+
+def is_complete(folder: Path, original: Content) -> bool:
+    """Whether a folder is a complete copy that verifies."""
+    return (
+        (folder / "L0").is_dir()
+        and content_of(folder) == original
+        and (folder / INDEX).is_file()
+        and verify(Mission.open(folder)).is_well
+    )
+
+
+class Trial:
+    """A mission on one disk, and the folder of another."""
+
+    def __init__(self, source: Path, disk: Path, original: Content | None = None) -> None:
+        self.source = source
+        self.disk = disk
+        self.target = disk / source.name
+        self.original = original or content_of(source)
+
+    def moved_to(self, folder: Path) -> Trial:
+        """The same trial with both disks below another folder."""
+        return Trial(folder / FLOWN / self.source.name, folder / OTHER_DISK, self.original)
+
+    def run(self) -> None:
+        """What the command does."""
+        if self.source.exists():
+            transfer(Mission.open(self.source), self.disk, remove_source=True)
+        else:
+            assert finish_transfer(self.source, self.disk) is not None
+
+    def check_interrupted(self, *, reruns: bool) -> None:
+        """What holds at any instant; then the next run finishes.
+
+        Raises:
+            AssertionError: something was lost or changed.
+        """
+        source = self.source.exists() and is_complete(self.source, self.original)
+        assert source or not self.source.exists(), "half of the source has the source's name"
+        assert source or is_complete(self.target, self.original), "no complete copy is left"
+        if reruns:
+            sealed = self.seal()
+            self.run()
+            assert sealed in (None, self.seal()), "a sealed copy was changed"
+            self.check_finished()
+
+    def seal(self) -> Content | None:
+        """All of the copy, once it is sealed."""
+        note = self.target / NOTE_FILE
+        if not note.exists() or json.loads(note.read_text())["state"] != "sealed":
+            return None
+        return {**content_of(self.target), NOTE_FILE: note.read_text()}
+
+    def check_finished(self) -> None:
+        """What holds after a run that came to its end."""
+        assert is_complete(self.target, self.original), "the copy is not complete"
+        assert self.seal() is not None, "the copy is not sealed"
+        assert not self.source.exists() and not removing_path(self.source).exists()
+        assert not list(self.disk.parent.rglob("*.part")), "unfinished files are left"
+
+
+def kill_at(pristine: Trial, scratch: Path, positions: list[tuple[int, bool]]) -> None:
+    """Kill one run after the other, then let one finish.
+
+    Raises:
+        AssertionError: something was lost, or a run does not finish.
+    """
+    trial = _begin(pristine, scratch)
+    sealed: Content | None = None
+    for last, torn in positions:
+        run_to_call(trial.run, last, torn=torn)
+        assert sealed in (None, trial.seal()), "a sealed copy was changed"
+        sealed = trial.seal()
+        trial.check_interrupted(reruns=False)
+    trial.check_interrupted(reruns=True)
+
+
+def _begin(pristine: Trial, scratch: Path) -> Trial:
+    shutil.rmtree(scratch, ignore_errors=True)
+    trial = pristine.moved_to(scratch)
+    trial.disk.mkdir(parents=True)
+    shutil.copytree(pristine.source, trial.source)
+    return trial
+
+
+def run_once(folder: Path, forgets: str) -> None:
+    """Fly, note that the transfer begins, and transfer; `forgets` leaves syncs out."""
+    mission = three_exposures(folder / FLOWN)
+    (folder / BEGUN).touch()
+    if forgets != "nothing":
+        _forget(is_folder=forgets == "folders")
+    Trial(mission.path, folder / OTHER_DISK).run()
+
+
+def _forget(*, is_folder: bool) -> None:
+    sync = os.fsync
+
+    def some(descriptor: int) -> None:
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode) != is_folder:
+            sync(descriptor)
+
+    os.fsync = some
+
+
+def main() -> None:
+    folder, (what, *given) = Path(sys.argv[1]), sys.argv[2].split(":")
+    if what == "once":
+        run_once(folder, given[0])
+        return
+    figures = Figures()
+    pristine = Trial(three_exposures(folder / FLOWN).path, folder / OTHER_DISK)
+    trial = _begin(pristine, folder / "trial")
+    calls = run_to_call(trial.run, None)
+    trial.check_finished()
+    figures.calls = len(calls)
+    if what == "every":
+        rounds = [[(number, False)] for number in range(1, len(calls) + 1)]
+        rounds += [[(n, True)] for n, call in enumerate(calls, 1) if call in WRITES]
+    else:
+        dice = random.Random(int(given[1]))
+        rounds = [
+            [(dice.randint(1, len(calls)), dice.random() < 0.2) for _ in range(2)]
+            for _ in range(int(given[0]))
+        ]
+    for positions in rounds:
+        figures.kills += len(positions)
+        figures.torn_writes += sum(torn for _, torn in positions)
+        try:
+            kill_at(pristine, folder / "trial", positions)
+        except Exception as error:  # noqa: BLE001 - whatever a later run raises is a finding
+            figures.wrong.append(f"{positions}: {type(error).__name__}: {error}")
+    print(json.dumps(asdict(figures)))
+
+
+if __name__ == "__main__":
+    main()
