@@ -29,6 +29,8 @@ from processing.quality.report import Thresholds
 from processing.rig import Rig, RigError, find_rig
 
 CONFIGURATION_MAX_BYTES = 1_000_000
+SIGNING_STATE = ".mavlink-signing.json"
+"""Below the missions: the last timestamps of signed MAVLink messages."""
 
 
 class ConfigurationError(ValueError):
@@ -198,7 +200,8 @@ class MavlinkCameraSection(_Section):
 
     `connect` is "udpout:HOST:PORT", where a ground station or autopilot listens, or
     "udpin:HOST:PORT". `commands` from others are obeyed when "signed" (with `signing_key`, a file
-    of 64 hexadecimal digits), from "any", or from "none".
+    of 64 hexadecimal digits), from "any", or from "none". `signing_state` is the file that keeps
+    the last timestamps of signed messages; below the missions if omitted.
     """
 
     connect: str = "udpout:127.0.0.1:14550"
@@ -206,6 +209,7 @@ class MavlinkCameraSection(_Section):
     component_id: int = Field(default=100, ge=100, le=105)
     commands: Literal["signed", "any", "none"] = "none"
     signing_key: Path | None = None
+    signing_state: Path | None = None
     feedback: bool = False
 
     @model_validator(mode="after")
@@ -388,8 +392,13 @@ def _anchored(configuration: Configuration, folder: Path) -> Configuration:
             name: folder / path for name, path in files.items() if path is not None
         }
         if watch.mavlink is not None and watch.mavlink.signing_key is not None:
-            key = {"signing_key": folder / watch.mavlink.signing_key}
-            update["mavlink"] = watch.mavlink.model_copy(update=key)
+            signing = {
+                "signing_key": folder / watch.mavlink.signing_key,
+                "signing_state": anchored.root / SIGNING_STATE
+                if watch.mavlink.signing_state is None
+                else folder / watch.mavlink.signing_state,
+            }
+            update["mavlink"] = watch.mavlink.model_copy(update=signing)
         watch = watch.model_copy(update=update)
     return configuration.model_copy(update={"mission": anchored, "plan": plan, "watch": watch})
 

@@ -135,6 +135,7 @@ def status_event(
         "position": where,
         "temperatures_c": dict(temperatures_c),
         "clock_sigma_ns": None if time_now is None else time_now.sigma_ns,
+        "gps_ns": None if time_now is None else str(time_now.gps_ns),
         "clock_source": None if time_now is None else time_now.source,
         "in_holdover": time_now is not None and time_now.in_holdover,
         "queue": queue,

@@ -13,28 +13,30 @@ import math
 import os
 import time
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, cast
 
 from daemon.configuration import MavlinkCameraSection
 from daemon.watch.gate import Gate, NoAnswerError
+from daemon.watch.mavlink_senders import Address, Senders
+from daemon.watch.mavlink_signatures import Signatures, read_key
 from daemon.watch.mavlink_wishes import ACTIONS, BY_IDENTITY, REQUESTS, whole, wish
 from daemon.watch.state import FlightState
 from drivers.leap_seconds import leap_seconds_at
+from drivers.mavlink.library import MavlinkParser
 from processing.rig import Rig
 
 HEARTBEAT_S = 1.0
 TICK_S = 0.1
-PEER_FORGOTTEN_S = 60.0
-PEERS_MAX = 8
+SAVE_EVERY_S = 30.0
+SAVE_WITHIN_S = 1.0
+"""How long a command waits for the disk that keeps the last timestamps."""
 GPS_EPOCH_UNIX_S = 315_964_800
 UNKNOWN_ANGLE = (1.0, 0.0, 0.0, 0.0)
 VENDOR, FIRMWARE = "Syntopic", 1 << 24
 NAME_BYTES = 32
 MODE_IMAGE = 0
-SIGNING_KEY_BYTES = 32
 _log = logging.getLogger(__name__)
-
-Address = tuple[str, int]
 
 
 class MavlinkCamera(asyncio.DatagramProtocol):
@@ -50,24 +52,27 @@ class MavlinkCamera(asyncio.DatagramProtocol):
         gate: Gate,
         rig: Callable[[], Rig | None],
         ground_height_m: Callable[[], float | None] = lambda: None,
+        report: Callable[[str], None] = _log.error,
     ) -> None:
         """`rig` is asked for the camera's figures, `ground_height_m` for what an exposure is above.
 
-        Both are None until a mission has begun.
+        Both are None until a mission has begun. `report` gets a sentence about what is wrong.
         """
         self._settings = settings
         self._state = state
         self._gate = gate
         self._rig = rig
         self._ground_height_m = ground_height_m
+        self._report = report
         self._dialect = _dialect()
         self._mav = self._dialect.MAVLink(
             None, srcSystem=settings.system_id, srcComponent=settings.component_id
         )
-        self._mav.robust_parsing = True
-        self._sign()
+        self._parser = MavlinkParser()
+        self._senders = Senders(self._parser)
+        self._signatures = self._sign()
+        self._saver = ThreadPoolExecutor(1, "mavlink-timestamps")
         self._boot_s = time.monotonic()
-        self._peers: dict[Address, float] = {}
         self._fixed: tuple[Address, ...] = ()
         self._told: set[int] = set()
         self._told_mission: str | None = None
@@ -95,6 +100,9 @@ class MavlinkCamera(asyncio.DatagramProtocol):
         for task in (self._task, *self._commands):
             if task is not None:
                 task.cancel()
+        if self._signatures is not None:
+            self._saver.submit(self._signatures.save)
+        self._saver.shutdown(wait=False)
         if self._transport is not None:
             self._transport.close()
 
@@ -108,42 +116,37 @@ class MavlinkCamera(asyncio.DatagramProtocol):
 
     def datagram_received(self, data: bytes, addr: Address) -> None:
         """Parse and answer; bad bytes are counted, never raised."""
-        try:
-            messages = self._mav.parse_buffer(bytearray(data)) or []
-        except (self._dialect.MAVError, ValueError, TypeError, IndexError):
-            self._count("bad_bytes")
-            return
-        for message in messages:
-            if message.get_type() == "BAD_DATA":
-                self._count("bad_bytes")
+        now_s = time.monotonic()
+        frames, bad_bytes = self._senders.messages(data, addr, now_s)
+        self._count("bad_bytes", bad_bytes)
+        for frame in frames:
+            is_signed = self._signatures is not None and self._signatures.accept(frame)
+            try:
+                message = self._parser.parse(frame)
+            except self._parser.errors:
+                self._count("bad_bytes", len(frame))
                 continue
             self._count("messages")
-            self._remember(addr)
-            if message.get_type() == "COMMAND_LONG" and self._is_for_us(message):
-                self._command(message, addr)
+            is_peer = self._senders.met(addr, now_s, is_signed=is_signed)
+            if message.get_type() == "HEARTBEAT" and not is_peer:
+                # One for one: however many others there are, nobody misses that the camera is here.
+                self._send(self._heartbeat(), addr)
+            elif message.get_type() == "COMMAND_LONG" and self._is_for_us(message):
+                self._command(message, addr, is_signed=is_signed)
 
     def _is_for_us(self, message: Any) -> bool:
         return message.target_system in (0, self._settings.system_id) and (
             message.target_component in (0, self._settings.component_id)
         )
 
-    def _remember(self, address: Address) -> None:
-        now_s = time.monotonic()
-        self._peers[address] = now_s
-        for old, seen_s in list(self._peers.items()):
-            if now_s - seen_s > PEER_FORGOTTEN_S:
-                del self._peers[old]
-        while len(self._peers) > PEERS_MAX:
-            del self._peers[min(self._peers, key=self._peers.__getitem__)]
-
     # Commands
 
-    def _command(self, message: Any, address: Address) -> None:
+    def _command(self, message: Any, address: Address, *, is_signed: bool) -> None:
         number = int(message.command)
         if number in REQUESTS:
             self._request(message, address, REQUESTS[number])
         elif number in ACTIONS:
-            self._act(message, address, ACTIONS[number])
+            self._act(message, address, ACTIONS[number], is_signed=is_signed)
         else:
             self._acknowledge(message, address, self._dialect.MAV_RESULT_UNSUPPORTED)
 
@@ -173,9 +176,11 @@ class MavlinkCamera(asyncio.DatagramProtocol):
         self._acknowledge(message, address, self._dialect.MAV_RESULT_ACCEPTED)
         self._send(tell(), address)
 
-    def _act(self, message: Any, address: Address, action: str) -> None:
+    def _act(self, message: Any, address: Address, action: str, *, is_signed: bool) -> None:
         """What changes something: only from those the configuration lets."""
-        if not self._may_command(message):
+        if self._settings.commands != "any" and not (
+            self._settings.commands == "signed" and is_signed
+        ):
             self._count("commands_refused")
             self._acknowledge(message, address, self._dialect.MAV_RESULT_DENIED)
             return
@@ -197,6 +202,7 @@ class MavlinkCamera(asyncio.DatagramProtocol):
     async def _ask_service(
         self, message: Any, address: Address, name: str, arguments: Mapping[str, Any]
     ) -> None:
+        await self._save_timestamps()
         by = f"mavlink {message.get_srcSystem()}/{message.get_srcComponent()}"
         try:
             answer = await self._gate.command(name, arguments, by)
@@ -208,11 +214,6 @@ class MavlinkCamera(asyncio.DatagramProtocol):
         if done:
             self._interval_s = float(arguments.get("interval_s", 0.0))
             self._send(self._capture_status(), address)
-
-    def _may_command(self, message: Any) -> bool:
-        if self._settings.commands == "signed":
-            return bool(message.get_signed())
-        return self._settings.commands == "any"
 
     def _acknowledge(self, message: Any, address: Address, result: int) -> None:
         self._send(
@@ -228,12 +229,16 @@ class MavlinkCamera(asyncio.DatagramProtocol):
     # What goes out by itself
 
     async def _live(self) -> None:
-        beat_s = -math.inf
+        beat_s, saved_s = -math.inf, time.monotonic()
         while True:
             now_s = time.monotonic()
             if now_s - beat_s >= HEARTBEAT_S:
                 beat_s = now_s
                 self._tell_all(self._heartbeat())
+            if now_s - saved_s >= SAVE_EVERY_S:
+                saved_s = now_s
+                await self._save_timestamps()
+            self._advance_clock()
             self._tell_captures()
             await asyncio.sleep(TICK_S)
 
@@ -256,11 +261,13 @@ class MavlinkCamera(asyncio.DatagramProtocol):
         return one.get("state") == "lost" or "mark_gps_ns" in one
 
     def _tell_all(self, message: Any) -> None:
-        for address in {*self._fixed, *self._peers}:
+        for address in {*self._fixed, *self._senders.peers}:
             self._send(message, address)
 
     def _send(self, message: Any, address: Address) -> None:
         if self._transport is not None and not self._transport.is_closing():
+            if self._signatures is not None:
+                self._mav.signing.timestamp = self._signatures.next_timestamp()
             self._transport.sendto(bytes(message.pack(self._mav)), address)
 
     # Messages
@@ -375,26 +382,39 @@ class MavlinkCamera(asyncio.DatagramProtocol):
             one["number"] & 0xFFFF,
         )
 
-    def _sign(self) -> None:
-        path = self._settings.signing_key
-        if path is None:
-            return
-        try:
-            key = bytes.fromhex(path.read_text("ascii").strip())
-        except (OSError, ValueError) as error:
-            raise ValueError(f"{path}: no signing key ({error}); 64 hexadecimal digits") from error
-        if len(key) != SIGNING_KEY_BYTES:
-            raise ValueError(f"{path}: a signing key has 64 hexadecimal digits")
-        signing = self._mav.signing
-        signing.secret_key = key
-        signing.link_id = 0
-        signing.timestamp = round((time.time() - 1_420_070_400) * 1e5)
-        signing.sign_outgoing = True
-        # Whoever is not signed may look: requests change nothing. What acts is checked again.
-        signing.allow_unsigned_callback = lambda _mav, _identity: True
+    def _sign(self) -> Signatures | None:
+        if self._settings.signing_key is None:
+            return None
+        signatures = Signatures(read_key(self._settings.signing_key), self._settings.signing_state)
+        self._mav.signing.secret_key = signatures.key
+        self._mav.signing.sign_outgoing = True
+        return signatures
 
-    def _count(self, name: str) -> None:
-        self.counts[name] = self.counts.get(name, 0) + 1
+    async def _save_timestamps(self) -> None:
+        """What was obeyed is durable before it is; a disk that hangs holds a command up shortly."""
+        if self._signatures is None or self._signatures.is_saved:
+            return
+        saving = asyncio.get_running_loop().run_in_executor(self._saver, self._signatures.save)
+        try:
+            await asyncio.wait_for(saving, SAVE_WITHIN_S)
+        except (OSError, TimeoutError) as error:
+            self._count("timestamps_not_saved")
+            reason = str(error) or f"the disk did not answer within {SAVE_WITHIN_S:g} s"
+            self._report(
+                f"the last timestamps of signed commands cannot be saved at "
+                f"{self._settings.signing_state}: {reason}. After a restart a recorded command "
+                "could be obeyed again; check that disk"
+            )
+
+    def _advance_clock(self) -> None:
+        """GPS time may only advance the signing clock; that of an emulated flight is not real."""
+        brief = self._state.brief()
+        unix_us = _utc_us(brief["status"].get("gps_ns"))
+        if self._signatures is not None and not brief["simulated"]:
+            self._signatures.advance(unix_us * 1000)
+
+    def _count(self, name: str, by: int = 1) -> None:
+        self.counts[name] = self.counts.get(name, 0) + by
 
 
 _ANGLES = ("roll", "pitch", "heading")

@@ -141,9 +141,13 @@ async def _camera(
     """The rig as a camera of the vehicle, where that is wanted and possible."""
     if settings.mavlink is None:
         return None
+
+    def report(sentence: str) -> None:
+        link.send(Told({"event": "signing-state", "sentence": sentence}))
+
     try:
         camera = MavlinkCamera(
-            settings.mavlink, state, gate, lambda: ground.rig, lambda: ground.height_m
+            settings.mavlink, state, gate, lambda: ground.rig, lambda: ground.height_m, report
         )
         await camera.begin()
     except (ImportError, OSError, ValueError) as error:

@@ -52,6 +52,18 @@ class MavlinkParser:
         """A framer for versions 1 and 2, signed or not; messages not in the dialect are none."""
         return MessageFramer(bytes((V1, V2)), self._size_of, self._fits)
 
+    def messages_of(self, datagram: bytes) -> list[bytes] | None:
+        """The checked messages of a datagram; None where it holds anything else."""
+        found, at = [], 0
+        while at < len(datagram):
+            size = self._size_of(datagram, at) if datagram[at] in (V1, V2) else 0
+            message = datagram[at : at + (size or 0)]
+            if not size or len(message) < size or not self._fits(message):
+                return None
+            found.append(message)
+            at += size
+        return found
+
     def parse(self, frame: bytes) -> Any:
         """The message of a checked frame; one of `errors` where its content makes no sense."""
         return self._parser.decode(bytearray(frame))

@@ -158,7 +158,7 @@ def test_no_parameter_is_too_odd(action: str, parameters: list[float]) -> None:
 def test_any_bytes_are_heard_without_harm(data: bytes) -> None:
     camera = _camera()
     camera.datagram_received(data, ("127.0.0.1", 1))
-    assert len(camera._peers) <= 1
+    assert len(camera._senders.peers) <= 1
 
 
 def test_damaged_messages_are_counted_and_the_next_is_understood() -> None:

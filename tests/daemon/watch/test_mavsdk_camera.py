@@ -28,7 +28,8 @@ class Flying:
 
     def __init__(self, **settings: Any) -> None:
         self.port = free_port()
-        self.settings = MavlinkCameraSection(connect=f"udpout:127.0.0.1:{self.port}", **settings)
+        connect = f"{settings.pop('scheme', 'udpout')}:127.0.0.1:{self.port}"
+        self.settings = MavlinkCameraSection(connect=connect, **settings)
         self.state = FlightState("syntopic test")
         self.state.apply(flown.mission())
         self.state.apply(flown.status("ready"))
