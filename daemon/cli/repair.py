@@ -25,7 +25,7 @@ def repair(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     from daemon.disk import durable, recovery
-    from daemon.disk.log_seals import seal_logs
+    from daemon.disk.log_seals import close_run, seal_logs
     from daemon.disk.mission import Mission
     from daemon.flight.recovery_match import seal_from_log
     from processing.rig import load_rig
@@ -37,8 +37,13 @@ def repair(
                 (folder.path / name).unlink(missing_ok=True)
             durable.sync_directory(folder.path)
         report = recovery.recover(folder, seal_from_log(load_rig(folder.rig_path)))
-        logs = seal_logs(folder)
+        chain = folder.open_chain()
+        logs = seal_logs(folder, chain)
+        is_closed = close_run(folder, chain, "repair")
+        chain.close()
     done = [*report.done, *(f"log {name}: sealed" for name in logs)]
+    if is_closed:
+        done.append("chain.jsonl: closed")
     if as_json:
         typer.echo(
             json.dumps(

@@ -3,19 +3,29 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 from rich.progress import Progress
+from rich.table import Table
+from rich.text import Text
 
-HELP = """Check every frame and record of a mission against its hash and the chain of records.
+if TYPE_CHECKING:
+    from daemon.disk.verification import VerifyReport
 
-The exit status is 0 when all is well, 1 when something is missing, altered or extra.
+HELP = """Check everything in a mission folder against its hashes and list what has no hash.
+
+The exit status is 0 when nothing is wrong, 1 when something is missing, altered or does not belong
+there, 2 when the command was given wrongly. Files that are not covered do not change it. A mission
+may be verified while it is flown.
 
 Example: `syntopic verify flights/demo/missions/20261121T101500Z-ultracam-x-mini`
 """
+SHOWN = 5
+"""So many names of files that are not covered are printed for each reason; --json has all."""
 
 
 def verify(
@@ -31,21 +41,40 @@ def verify(
         def show(done: int, total: int) -> None:
             progress.update(task, completed=done, total=total)
 
-        report = store.verify(Mission.open(mission), show)
+        report = store.verify(Mission.open(mission, looks_below=False), show)
     if as_json:
-        typer.echo(
-            json.dumps(
-                {
-                    "exposures": report.exposures,
-                    "frames": report.frames,
-                    "problems": list(report.problems),
-                }
-            )
-        )
+        typer.echo(json.dumps(asdict(report)))
     else:
-        console = Console()
-        for problem in report.problems:
-            console.print(f"[red]{problem}[/]")
-        verdict = "all well" if not report.problems else f"{len(report.problems)} problems"
-        console.print(f"{report.exposures} exposures, {report.frames} frames: {verdict}")
+        _print(report)
     raise typer.Exit(1 if report.problems else 0)
+
+
+def _print(report: VerifyReport) -> None:
+    from daemon.disk.verification import STATES
+
+    console = Console(soft_wrap=True)
+    table = Table("what", "files", "hash in", title="Covered", title_justify="left", box=None)
+    for covered in report.covered:
+        table.add_row(covered.what, str(covered.files), covered.by)
+    console.print(table)
+    if report.not_covered:
+        table = Table("why", "files", "names", title="Not covered", title_justify="left", box=None)
+        for one in report.not_covered:
+            more = ["..."] if len(one.files) > SHOWN else []
+            names = "\n".join(_printable(name) for name in [*one.files[:SHOWN], *more])
+            table.add_row(one.reason, str(len(one.files)), Text(names))
+        console.print(table)
+    for remark in report.remarks:
+        console.print(_printable(remark), markup=False, highlight=False)
+    for problem in report.problems:
+        console.print(_printable(problem), style="red", markup=False, highlight=False)
+    wrong = len(report.problems)
+    verdict = "nothing is wrong" if not wrong else f"{wrong} problem{'s' if wrong > 1 else ''}"
+    console.print(f"Mission: {STATES[report.state]}", highlight=False)
+    console.print(f"{report.exposures} exposures, {report.frames} frames: {verdict}")
+
+
+def _printable(text: str) -> str:
+    """File names may hold bytes that are no text, and control characters."""
+    shown = text.encode("utf-8", "backslashreplace").decode("utf-8")
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in shown)

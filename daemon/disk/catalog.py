@@ -46,6 +46,17 @@ class Row:
     flags: int
 
 
+@dataclass(frozen=True)
+class IndexedExposure:
+    """What the index says of an exposure's files: hash of its record, and of its frames by sensor.
+
+    `record_sha256` is empty until the exposure is sealed.
+    """
+
+    record_sha256: str
+    frames: Mapping[str, str]
+
+
 class Catalog:
     """A connection to `mission.db`. Safe to use from several threads, one statement at a time.
 
@@ -91,10 +102,14 @@ class Catalog:
         return cls(connection)
 
     @classmethod
-    def read(cls, path: Path) -> Catalog:
+    def read(cls, path: Path, *, is_settled: bool = False) -> Catalog:
         """Open for reading only, while another process writes or on a medium that is read-only.
 
         One of an older schema is read through a copy in memory, and left as it is.
+
+        Args:
+            path: the index.
+            is_settled: nobody writes it, so that no files are needed in its folder to share it.
 
         Raises:
             CatalogError: not there, damaged, or of a newer schema version.
@@ -102,9 +117,10 @@ class Catalog:
         if not path.is_file():
             raise CatalogError(f"{path}: no such index; syntopic repair builds it again")
         address = path.resolve().as_uri()
+        is_one_file = is_settled and not path.with_name(f"{path.name}-wal").exists()
         try:
             connection = sqlite3.connect(
-                f"{address}?mode=ro",
+                f"{address}?immutable=1" if is_one_file else f"{address}?mode=ro",
                 uri=True,
                 timeout=BUSY_TIMEOUT_S,
                 isolation_level=None,
@@ -221,6 +237,32 @@ class Catalog:
     def frames(self, number: int) -> dict[str, str]:
         """Sensor to SHA-256 of an exposure's frames."""
         return dict(self._read("SELECT sensor, sha256 FROM frames WHERE number = ?", (number,)))
+
+    def snapshot(self) -> dict[int, IndexedExposure]:
+        """All exposures by number as of one instant, while another process writes.
+
+        Raises:
+            CatalogError: damaged.
+        """
+        with self._lock:
+            try:
+                self._connection.execute("BEGIN")
+                exposures = self._connection.execute(
+                    "SELECT number, record_sha256 FROM exposures"
+                ).fetchall()
+                frames = self._connection.execute(
+                    "SELECT number, sensor, sha256 FROM frames"
+                ).fetchall()
+                self._connection.execute("COMMIT")
+            except sqlite3.Error as error:
+                raise CatalogError(f"mission.db: damaged ({error}); syntopic repair") from error
+        by_number: dict[int, dict[str, str]] = {number: {} for number, _ in exposures}
+        for number, sensor, sha256 in frames:
+            by_number.setdefault(number, {})[sensor] = sha256
+        return {
+            number: IndexedExposure(record_sha256 or "", by_number[number])
+            for number, record_sha256 in exposures
+        }
 
     def events(self) -> list[tuple[str, str, str]]:
         """Source, name and sentence of all events, in order."""

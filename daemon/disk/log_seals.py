@@ -1,34 +1,33 @@
-"""Which flight logs are final, and with what content: `log/seals.json`.
+"""Which flight logs are final, and with what content; and the line that ends a run.
 
-A log ends in the middle when the service is killed, so its end alone tells nothing. It is sealed
-when the flight ends in good order or when the next run begins; what is cut off later is seen.
+A log ends in the middle when the service is killed, so its end alone says nothing. It is sealed in
+`chain.jsonl` when the flight ends in good order or when the next run begins; what is cut off later
+is noticed. Missions of format 1 were sealed in `log/seals.json`, which is still read.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from contextlib import closing
 
 from daemon.disk import durable
+from daemon.disk.chain_file import ChainFile, LogSeal
 from daemon.disk.flight_log import logs_of
 from daemon.disk.level0_folder import hash_file
 from daemon.disk.mission import Mission
-from daemon.disk.records import Fields, RecordError, canonical_bytes, parse_record
+from daemon.disk.records import Fields, RecordError, parse_record, plain_name
 
 SEALS_FILE = "seals.json"
-SEALS_FORMAT = 1
+CHANGING_FILES = ("overrides.json",)
+"""Files that a running service may still replace; the closing line has their hashes."""
 
 
-@dataclass(frozen=True)
-class LogSeal:
-    """Size and hash of a log that nothing is added to any more."""
-
-    nbytes: int
-    sha256: str
-
-
-def seal_logs(mission: Mission) -> list[str]:
+def seal_logs(mission: Mission, chain: ChainFile | None = None) -> list[str]:
     """Seal every log that is not sealed yet; to be called while none is written.
+
+    Args:
+        mission: it must be held by the caller.
+        chain: its chain file; opened here if omitted.
 
     Returns:
         The names of those sealed now.
@@ -36,28 +35,48 @@ def seal_logs(mission: Mission) -> list[str]:
     Raises:
         OSError: the disk refused.
     """
+    if chain is None:
+        with closing(mission.open_chain()) as chain:
+            return seal_logs(mission, chain)
     try:
-        seals = dict(read_seals(mission))
+        earlier = read_seals(mission)
     except RecordError:
-        seals = {}  # a damaged list is made anew
-    new = [path for path in logs_of(mission.log_dir) if path.name not in seals]
-    if not new:
-        return []
+        earlier = {}
+    new = [
+        path
+        for path in logs_of(mission.log_dir)
+        if path.name not in chain.sealed_logs and plain_name(path.name)
+    ]
     for path in new:
         # A run that was killed leaves bytes that only the kernel has: a power cut after this would
         # take them from under their seal.
         durable.sync_file(path)
-    seals |= {path.name: LogSeal(path.stat().st_size, hash_file(path)) for path in new}
-    content = {
-        "format": SEALS_FORMAT,
-        "logs": {name: {"nbytes": s.nbytes, "sha256": s.sha256} for name, s in seals.items()},
-    }
-    durable.replace_file(mission.log_dir / SEALS_FILE, canonical_bytes(content))
-    return [path.name for path in new]
+        seal = earlier.get(path.name) or LogSeal(path.stat().st_size, hash_file(path))
+        chain.log_begun(path.name)
+        chain.log_sealed(path.name, seal)
+    return [path.name for path in new if path.name not in earlier]
+
+
+def close_run(mission: Mission, chain: ChainFile, by: str) -> bool:
+    """Write the closing line, after everything else of a run.
+
+    Args:
+        mission: it must be held by the caller.
+        chain: its chain file.
+        by: "landing" or "repair".
+
+    Returns:
+        Whether it was needed.
+
+    Raises:
+        OSError: the disk refused.
+    """
+    present = [name for name in CHANGING_FILES if (mission.path / name).is_file()]
+    return chain.close_run(by, {name: hash_file(mission.path / name) for name in present})
 
 
 def read_seals(mission: Mission) -> Mapping[str, LogSeal]:
-    """Seals by the log's name; none where there is no list.
+    """Seals of a mission of format 1 by the log's name; none where there is no list.
 
     Raises:
         RecordError: the list is damaged.
@@ -79,27 +98,3 @@ def read_seals(mission: Mission) -> Mapping[str, LogSeal]:
     if problems:
         raise RecordError(problems)
     return seals
-
-
-def check_logs(mission: Mission, step: Callable[[int], None]) -> list[str]:
-    """One sentence for each sealed log that is not as it was; `step` is told bytes read."""
-    try:
-        seals = read_seals(mission)
-    except RecordError as error:
-        return list(error.problems)
-    problems = []
-    for name, seal in seals.items():
-        path = mission.log_dir / name
-        try:
-            nbytes = path.stat().st_size
-            if nbytes < seal.nbytes:
-                problems.append(
-                    f"log {name}: was truncated; {seal.nbytes - nbytes} bytes are missing"
-                )
-            elif nbytes > seal.nbytes or hash_file(path, step) != seal.sha256:
-                problems.append(f"log {name}: was altered after it was sealed")
-        except FileNotFoundError:
-            problems.append(f"log {name}: is missing")
-        except OSError as error:
-            problems.append(f"log {name}: cannot be read ({error.strerror})")
-    return problems

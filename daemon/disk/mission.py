@@ -14,8 +14,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from daemon.disk import durable
+from daemon.disk.chain_file import CHAIN_FILE, ChainFile, first_line
 from daemon.disk.records import (
     RecordError,
     canonical_bytes,
@@ -28,7 +30,9 @@ from daemon.errors import DaemonError
 CURRENT_FILE = "current-mission.json"
 """In the root: which mission a restarted service continues; absent between flights."""
 
-MISSION_FORMAT = 1
+MISSION_FORMAT = 2
+"""From 2 on a mission is created with its chain file and the hash of its flight plan."""
+
 DISCARDED = ".discarded"
 """In L0: what recovery set aside because nobody was ever told that it is stored."""
 
@@ -90,9 +94,14 @@ class Mission:
             "service_sha256": sha256_hex(service_toml),
             "started_utc": _utc_text(started_utc),
             "started_gps_ns": None if started_gps_ns is None else str(started_gps_ns),
+            "plan": None
+            if plan is None
+            else {"file": f"plan{plan[0]}", "sha256": sha256_hex(plan[1])},
             **({"simulated": True} if simulated else {}),
         }
-        durable.create_file(part / "mission.json", [canonical_bytes(content)])
+        about = canonical_bytes(content)
+        durable.create_file(part / "mission.json", [about])
+        durable.create_file(part / CHAIN_FILE, [first_line(sha256_hex(about))], mode=0o644)
         durable.create_file(part / "rig.toml", [rig_toml])
         durable.create_file(part / "service.toml", [service_toml], mode=0o440)
         if plan is not None:
@@ -102,8 +111,13 @@ class Mission:
         return cls(root / mission_id, mission_id)
 
     @classmethod
-    def open(cls, path: Path) -> Mission:
+    def open(cls, path: Path, *, looks_below: bool = True) -> Mission:
         """A mission folder that exists, flown or laid out by hand.
+
+        Args:
+            path: the folder.
+            looks_below: refuse links and pipes in the folders below as well; without it the caller
+                does not follow them.
 
         Raises:
             MissionError: no such folder, one without exposures' folder L0, or one that holds
@@ -113,7 +127,7 @@ class Mission:
             raise MissionError(f"{path}: no such folder; give the path of a mission")
         if not (path / "L0").is_dir():
             raise MissionError(f"{path}: has no folder L0; a mission keeps its exposures there")
-        if (odd := _first_odd(path)) is not None:
+        if (odd := _first_odd(path, looks_below=looks_below)) is not None:
             raise MissionError(
                 f"{odd}: is a link, a pipe or a device; a mission holds plain files and folders: "
                 "put what it leads to in its place"
@@ -188,18 +202,43 @@ class Mission:
     @property
     def is_simulated(self) -> bool:
         """Whether mission.json says that the hardware is emulated; False where there is none."""
+        return self.about().get("simulated") is True
+
+    @property
+    def is_current(self) -> bool:
+        """Whether a restarted service would continue this mission."""
+        marker = self.path.resolve().parent / CURRENT_FILE
         try:
-            content = parse_record((self.path / "mission.json").read_bytes(), "mission.json")
+            return parse_record(marker.read_bytes(), CURRENT_FILE).get("mission") == self.id
         except (OSError, RecordError):
             return False
-        return content.get("simulated") is True
+
+    @property
+    def chain_path(self) -> Path:
+        return self.path / CHAIN_FILE
+
+    def about(self) -> dict[str, Any]:
+        """Content of mission.json; empty where there is none or it is damaged."""
+        try:
+            return parse_record((self.path / "mission.json").read_bytes(), "mission.json")
+        except (OSError, RecordError):
+            return {}
+
+    def open_chain(self) -> ChainFile:
+        """The chain file, to append to; only for the process that holds the mission.
+
+        Raises:
+            OSError: the disk refused.
+        """
+        is_expected = self.about().get("format") != 1
+        return ChainFile(self.path, self.genesis_sha256(), is_expected=is_expected)
 
     def numbers(self) -> list[int]:
         """Numbers of the exposures whose folder is there, ascending."""
         return sorted(
             int(entry.name)
             for entry in os.scandir(self.level0_root)
-            if entry.is_dir(follow_symlinks=False) and _EXPOSURE_FOLDER.fullmatch(entry.name)
+            if entry.is_dir(follow_symlinks=False) and is_exposure_name(entry.name)
         )
 
     def next_number(self) -> int:
@@ -263,7 +302,16 @@ def exposure_name(number: int) -> str:
     return f"{number:06d}"
 
 
-def _first_odd(folder: Path) -> str | None:
+def is_exposure_name(name: str) -> bool:
+    """Whether a folder of this name is an exposure's: `000000` and `0000001` are not."""
+    return (
+        _EXPOSURE_FOLDER.fullmatch(name) is not None
+        and int(name) > 0
+        and exposure_name(int(name)) == name
+    )
+
+
+def _first_odd(folder: Path, *, looks_below: bool) -> str | None:
     """The first entry below a folder that is neither plain file nor folder; None where none is."""
     waiting = [str(folder)]
     while waiting:
@@ -273,7 +321,7 @@ def _first_odd(folder: Path) -> str | None:
             continue  # a product folder that is being replaced
         for entry in entries:
             if entry.is_dir(follow_symlinks=False):
-                waiting.append(entry.path)
+                waiting += [entry.path] if looks_below else []
             elif not entry.is_file(follow_symlinks=False):
                 return entry.path
     return None

@@ -7,6 +7,7 @@ is stored but unsealed is sealed from the flight log. Running it twice changes n
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,8 +16,10 @@ from typing import Any
 from daemon.disk import durable, level2
 from daemon.disk.catalog import Catalog, CatalogError
 from daemon.disk.chain import ChainReport, Link, follow_chain
+from daemon.disk.chain_file import CHAIN_FILE, ChainFile
 from daemon.disk.flight_log import logs_of, read
 from daemon.disk.level0_folder import (
+    CAPTURE_FILE,
     EXPOSURE_FILE,
     SealedRecord,
     hash_file,
@@ -96,22 +99,29 @@ class _Recovery:
         self.done: list[str] = []
         self.problems: list[str] = []
         self.noticed: list[str] = []
+        self.removed: set[int] = set()
+        self.unsealed: set[int] = set()
+        self._altered: set[int] = set()
 
     def run(self) -> RecoveryReport:
         self._parts()
         self.done += level2.recover_level2(self.mission)
         sealed, captures = self._read_folders()
         chain = self._chain(sealed)
+        chain_file = self.mission.open_chain()
         catalog = self._index(sealed, captures, chain)
         try:
             indexed = [row.number for row in catalog.exposures()]
+            known = {*indexed, *chain_file.history.numbers}
+            self._chain_file(chain_file, sealed, captures, chain)
             self._index_products(catalog)
             log = self._triggers()
-            newly, lost = self._seal(catalog, captures, sealed, log)
+            newly, lost = self._seal(catalog, chain_file, captures, sealed, log, known)
             self._note(catalog)
         finally:
             catalog.close()
-        next_number = 1 + max([self.mission.next_number() - 1, *log.triggers, *indexed])
+            chain_file.close()
+        next_number = 1 + max([self.mission.next_number() - 1, *log.triggers, *known])
         return RecoveryReport(
             done=tuple(self.done),
             problems=tuple(self.problems),
@@ -200,17 +210,13 @@ class _Recovery:
         """The index, made to say what the folders say."""
         catalog = self._open_index()
         rows = {row.number: row for row in catalog.exposures()}
-        for number in sorted(set(rows) - set(self.mission.numbers())):
-            # The row stays: it is the last witness.
-            self.problems.append(
-                f"exposure {number}: the index calls it stored but its folder is gone; "
-                "it was removed by others"
-            )
-        self.problems += [
-            f"exposure {number}: was sealed but its record is gone; it is sealed anew"
-            for number in sorted(set(captures) - set(sealed))
+        # The row of an exposure whose folder is gone stays: it is a witness.
+        self.removed = set(rows) - set(self.mission.numbers())
+        self.unsealed = {
+            number
+            for number in set(captures) - set(sealed)
             if number in rows and rows[number].is_sealed
-        ]
+        }
         for number in sorted(set(captures) - set(rows)):
             catalog.add_stored(captures[number])
             self.done.append(f"exposure {number}: has its folder; taken into the index")
@@ -218,13 +224,53 @@ class _Recovery:
             row = rows.get(link.number)
             if row is not None and row.is_sealed:
                 if row.record_sha256 != link.sha256:
-                    self.problems.append(
-                        f"exposure {link.number}: its record was altered since it was sealed"
-                    )
+                    self._altered.add(link.number)
                 continue
             catalog.add_sealed(sealed[link.number].exposure, link.sha256)
             self.done.append(f"exposure {link.number}: is sealed; noted in the index")
         return catalog
+
+    def _chain_file(
+        self,
+        chain_file: ChainFile,
+        sealed: Mapping[int, SealedRecord],
+        captures: Mapping[int, Capture],
+        chain: ChainReport,
+    ) -> None:
+        """The chain file, completed by what became durable and was not noted in it."""
+        history = chain_file.history
+        self.problems += history.problems
+        if history.rebuilt_utc and chain_file.is_new:
+            self.problems.append(
+                f"{CHAIN_FILE}: is missing; written again from what is there, so that what was "
+                "removed before cannot be noticed"
+            )
+        if chain_file.cut_nbytes:
+            self.done.append(
+                f"{CHAIN_FILE}: {chain_file.cut_nbytes} bytes of an unfinished line were removed"
+            )
+        removed = self.removed | (history.numbers - set(self.mission.numbers()))
+        self.problems += [
+            f"exposure {number}: was stored but its folder is gone; it was removed by others"
+            for number in sorted(removed)
+        ]
+        unsealed = self.unsealed | (set(history.sealed) & (set(captures) - set(sealed)))
+        self.problems += [
+            f"exposure {number}: was sealed but its record is gone; it is sealed again"
+            for number in sorted(unsealed)
+        ]
+        for number in sorted(captures.keys() - history.stored.keys()):
+            chain_file.stored(number, hash_file(self.mission.level0(number) / CAPTURE_FILE))
+        for link in chain.order:
+            hashes = history.sealed.get(link.number, ())
+            if not hashes:
+                chain_file.sealed(link.number, link.sha256)
+            elif link.sha256 not in hashes:
+                self._altered.add(link.number)
+        self.problems += [
+            f"exposure {number}: its record was altered since it was sealed"
+            for number in sorted(self._altered)
+        ]
 
     def _index_products(self, catalog: Catalog) -> None:
         """Products the index does not know, as after the index was lost."""
@@ -280,20 +326,26 @@ class _Recovery:
     def _seal(
         self,
         catalog: Catalog,
+        chain_file: ChainFile,
         captures: Mapping[int, Capture],
         sealed: dict[int, SealedRecord],
         log: _Log,
+        known: AbstractSet[int],
     ) -> tuple[list[int], list[int]]:
-        """Seal what is stored but unsealed, and what was triggered and left nothing."""
+        """Seal what is stored but unsealed, and what was triggered and left nothing.
+
+        Of the exposures `known` to have been stored none is called lost: one whose folder is gone
+        was removed.
+        """
         waiting = {n: c for n, c in captures.items() if n not in sealed}
-        folders = set(self.mission.numbers())
-        lost = [number for number in sorted(log.triggers) if number not in folders]
+        there_or_removed = known | set(self.mission.numbers())
+        lost = [number for number in sorted(log.triggers) if number not in there_or_removed]
         for number in lost:
             waiting[number] = self._capture_of_lost(*log.triggers[number])
         if not waiting:
             return [], []
         records = _logged_around(self.mission.log_dir, waiting)
-        writer = Level0Writer(self.mission, catalog=catalog)
+        writer = Level0Writer(self.mission, catalog=catalog, chain=chain_file)
         newly = []
         try:
             for number in sorted(waiting):

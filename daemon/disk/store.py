@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from daemon.disk import direct, durable
 from daemon.disk.catalog import Catalog
+from daemon.disk.chain_file import ChainFile
 from daemon.disk.level0 import tiff_parts
 from daemon.disk.level0_folder import (
     CAPTURE_FILE,
@@ -61,9 +62,16 @@ class Level0Writer:
     """
 
     def __init__(
-        self, mission: Mission, *, catalog: Catalog | None = None, threads: int = 3
+        self,
+        mission: Mission,
+        *,
+        catalog: Catalog | None = None,
+        chain: ChainFile | None = None,
+        threads: int = 3,
     ) -> None:
         self._mission = mission
+        self._chain = chain or mission.open_chain()
+        self._owns_chain = chain is None
         self._catalog = catalog or Catalog.open(mission.catalog_path)
         self._owns_catalog = catalog is None
         self._pool = ThreadPoolExecutor(threads, thread_name_prefix="level0")
@@ -73,9 +81,10 @@ class Level0Writer:
 
     @property
     def unindexed(self) -> int:
-        """How many changes the index has refused so far; they are tried again with the next one.
+        """How many changes the index or the chain file has refused so far.
 
-        The folders are durable all the same, and recovery takes them into the index.
+        They are tried again with the next one. The folders are durable all the same, and recovery
+        takes them into both.
         """
         return len(self._unindexed)
 
@@ -112,13 +121,16 @@ class Level0Writer:
         try:
             frames = self._write_frames(part, capture, pixels)
             stored = replace(capture, frames=frames)
-            durable.create_file(part / CAPTURE_FILE, [capture_bytes(stored)])
+            data = capture_bytes(stored)
+            durable.create_file(part / CAPTURE_FILE, [data])
             durable.rename_directory(part, final)
         except OSError:
             # A disk that refused to write may refuse to clear, too; recovery sees to the rest.
             with suppress(OSError):
                 _withdraw(part, final)
             raise
+        capture_sha256 = sha256_hex(data)
+        self._commit(lambda: self._chain.stored(stored.number, capture_sha256))
         self._commit(lambda: self._catalog.add_stored(stored))
         return frames
 
@@ -165,6 +177,7 @@ class Level0Writer:
         self._undecided = None
         sha256 = sha256_hex(data)
         self._head_sha256 = sha256
+        self._commit(lambda: self._chain.sealed(final.number, sha256))
         self._commit(lambda: self._catalog.add_sealed(final, sha256))
         return sha256
 
@@ -173,8 +186,10 @@ class Level0Writer:
         self._commit(lambda: self._catalog.add_products(number, files, verdict))
 
     def close(self) -> None:
-        """Let go of threads and index; may be called twice."""
+        """Let go of threads, index and chain file; may be called twice."""
         self._pool.shutdown()
+        if self._owns_chain:
+            self._chain.close()
         if self._owns_catalog:
             self._catalog.close()
 
@@ -212,9 +227,9 @@ class Level0Writer:
         self._undecided = None
 
     def _commit(self, change: Callable[[], None]) -> None:
-        """Into the index, after what it refused earlier; the folder is durable already."""
+        """Into index or chain file, after what they refused; the folder is durable already."""
         self._unindexed.append(change)
-        with suppress(sqlite3.Error):
+        with suppress(sqlite3.Error, OSError):
             while self._unindexed:
                 self._unindexed[0]()
                 self._unindexed.popleft()

@@ -10,8 +10,9 @@ from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
+from daemon.disk.chain_file import ChainFile
 from daemon.disk.flight_log import FlightLog
-from daemon.disk.log_seals import seal_logs
+from daemon.disk.log_seals import close_run, seal_logs
 from daemon.disk.mission import Mission
 from daemon.disk.store import Level0Writer
 from daemon.errors import DaemonError
@@ -41,9 +42,12 @@ def main(link: Link, mission_path: Path, rings: tuple[FrameRing, ...]) -> None:
     """Write until told to stop."""
     mission = Mission.open(mission_path)
     memory = {ring.head: ring for ring in rings}
-    writer = Level0Writer(mission)
-    _seal_logs(mission)  # those of earlier runs; ours is not there yet
+    chain = mission.open_chain()
+    writer = Level0Writer(mission, chain=chain)
+    _seal_logs(mission, chain)  # those of earlier runs; ours is not there yet
     log = FlightLog.create(mission.log_dir, simulated=mission.is_simulated)
+    with suppress(OSError):  # recovery notes it if the disk refuses
+        chain.log_begun(log.path.name)
     synced = time.monotonic()
     refused = 0
     while not isinstance(order := link.receive(LOG_SYNC_INTERVAL_S), Stop):
@@ -66,22 +70,26 @@ def main(link: Link, mission_path: Path, rings: tuple[FrameRing, ...]) -> None:
             log.sync()
             synced = time.monotonic()
     log.close()
-    _seal_logs(mission)
+    _seal_logs(mission, chain)
+    if not writer.unindexed:
+        with suppress(OSError):  # `syntopic repair` closes it if the disk refuses
+            close_run(mission, chain, "landing")
     writer.close()
+    chain.close()
 
 
-def _seal_logs(mission: Mission) -> None:
+def _seal_logs(mission: Mission, chain: ChainFile) -> None:
     # A disk that refuses costs only that a later damage is not seen; the next start seals them.
     with suppress(OSError):
-        seal_logs(mission)
+        seal_logs(mission, chain)
 
 
 def _told_of_index(behind: int) -> Told:
     sentence = (
-        f"the index refused {behind} changes; what they tell of is safe, and they are tried again; "
-        "look at the disk"
+        f"index or chain.jsonl refused {behind} changes; what they tell of is safe, and they are "
+        "tried again; look at the disk"
         if behind
-        else "the index has taken what it had refused"
+        else "index and chain.jsonl have taken what they had refused"
     )
     return Told({"event": "index", "fault": behind > 0, "behind": behind, "sentence": sentence})
 

@@ -154,6 +154,13 @@ def fly(mission: Mission, numbers: Sequence[int]) -> None:
     writer.close()
 
 
+def cut_chain_before(mission: Mission, number: int) -> None:
+    """Cut the chain file before the first line that names an exposure, as a power cut may."""
+    lines = mission.chain_path.read_bytes().splitlines(keepends=True)
+    first = next(i for i, line in enumerate(lines) if f'"number":{number},'.encode() in line)
+    mission.chain_path.write_bytes(b"".join(lines[:first]))
+
+
 def mark_of(number: int) -> EventMark:
     """The receiver's mark of an exposure, as it would be logged."""
     return EventMark(

@@ -17,7 +17,7 @@ def test_a_new_mission_is_whole_and_is_the_current_one(tmp_path):
     assert mission.rig_path.read_text() == RIG_TOML
     assert mission.service_path.read_bytes() == b"# flown by a test\n"
     assert {p.name for p in mission.path.iterdir()} == {
-        "L0", "L2", "export", "log", "mission.json", "rig.toml", "service.toml",
+        "L0", "L2", "export", "log", "mission.json", "rig.toml", "service.toml", "chain.jsonl",
     }  # fmt: skip
     about = json.loads((mission.path / "mission.json").read_bytes())
     assert about["started_utc"] == "2026-11-21T10:15:00.000000Z"

@@ -24,6 +24,7 @@ from tests.daemon.small_camera import (
     BOOT_ID,
     SENSORS,
     complete_from_log,
+    cut_chain_before,
     final_record,
     fly,
     mark_of,
@@ -44,7 +45,8 @@ def store_unsealed(mission, number):
 
 
 def forget(mission, number):
-    """The index as it was before an exposure was committed."""
+    """Chain file and index as they were before an exposure was committed."""
+    cut_chain_before(mission, number)
     with sqlite3.connect(mission.catalog_path) as connection:
         for table in ("frames", "exposures"):
             connection.execute(f"DELETE FROM {table} WHERE number = ?", (number,))
@@ -164,7 +166,7 @@ def test_a_row_without_a_folder_is_told_as_a_problem(mission):
     shutil.rmtree(mission.level0(2))
     report = recover(mission, complete_from_log)
     assert report.problems == (
-        "exposure 2: the index calls it stored but its folder is gone; it was removed by others",
+        "exposure 2: was stored but its folder is gone; it was removed by others",
     )
     assert report.next_number == 3
     assert recover(mission, complete_from_log).problems == report.problems

@@ -288,7 +288,9 @@ def test_verification_finds_a_removed_exposure(mission):
     durable.remove_tree(mission.level0(2))
     problems = verify(mission).problems
     assert any("chain is broken before exposure 3" in problem for problem in problems)
-    assert any("exposure 2: is in the index but its folder is gone" in p for p in problems)
+    assert any(
+        "exposure 2: is in chain.jsonl and the index but its folder is gone" in p for p in problems
+    )
 
 
 def test_progress_ends_at_its_total(mission):
