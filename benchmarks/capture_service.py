@@ -16,8 +16,10 @@ from daemon.configuration import load
 from daemon.disk.mission import Mission
 from daemon.exposure import Exposure
 from daemon.service import service
-from daemon.service.departure import ProcessPlan, processes
+from daemon.service.departure import ProcessPlan, worker_process
+from daemon.service.messages import Ping, Pong, Stop, WorkerBuilt
 from daemon.service.pipeline_queue import PipelineQueue
+from daemon.service.processes import Link
 
 
 class Told(service.Service):
@@ -43,8 +45,16 @@ class NoPipeline(PipelineQueue):
             self.recycle(slots)
 
 
-def _without_worker(*arguments: Any) -> tuple[ProcessPlan, ...]:
-    return tuple(plan for plan in processes(*arguments) if plan.name != "worker")
+def idle_worker(link: Link, _settings: Any, _rings: Any) -> None:
+    """In the place of `daemon.service.worker.main`: it makes no image."""
+    link.send(WorkerBuilt())
+    while not isinstance(order := link.receive(timeout_s=1.0), Stop):
+        if isinstance(order, Ping):
+            link.send(Pong({}))
+
+
+def _idle_worker(*arguments: Any) -> ProcessPlan:
+    return worker_process(*arguments)._replace(target="benchmarks.capture_service:idle_worker")
 
 
 def _say(event: Mapping[str, Any]) -> None:
@@ -58,7 +68,7 @@ def main() -> None:
     configuration, rig = load(path)
     flown = Told(configuration, rig, path, _say)
     if "--pipeline" not in sys.argv[2:]:
-        vars(service)["processes"] = _without_worker
+        vars(service)["worker_process"] = _idle_worker
         vars(service)["PipelineQueue"] = NoPipeline
     sys.exit(asyncio.run(flown.run()))
 

@@ -23,8 +23,8 @@ from pydantic import (
     model_validator,
 )
 
+from daemon.configuration_problems import device_problems, dig, rig_problems
 from daemon.plan.reading import PlanError, read_plan
-from drivers import registry
 from processing.quality.report import Thresholds
 from processing.rig import Rig, RigError, find_rig
 
@@ -301,6 +301,18 @@ class Configuration(_Section):
     limits: LimitsSection = LimitsSection()
     watch: WatchSection | None = None
 
+    @property
+    def drivers(self) -> tuple[tuple[str, str], ...]:
+        """Kind and driver of every device."""
+        devices: dict[str, Sequence[DeviceSection]] = {
+            "head": self.head,
+            "thermometer": self.thermometer,
+            "navigator": self.navigator,
+            "pps": self.pps,
+        }
+        listed = [(kind, one.driver) for kind, many in devices.items() for one in many]
+        return (*listed, ("trigger", self.trigger.driver))
+
     @model_validator(mode="after")
     def _has_a_plan_to_follow(self) -> Configuration:
         if self.trigger.mode == "plan" and self.plan.file is None:
@@ -336,9 +348,9 @@ def load(path: Path) -> tuple[Configuration, Rig]:
 def from_mapping(content: Mapping[str, Any], path: Path) -> tuple[Configuration, Rig]:
     """Validate parsed TOML; `path` names the file in the sentences and anchors relative paths."""
     file = path.name
-    problems = _device_problems(content, file)
+    problems = device_problems(content, file, frozenset(TriggerSection.model_fields))
     rig: Rig | None = None
-    rig_name = _dig(content, "mission", "rig")
+    rig_name = dig(content, "mission", "rig")
     if isinstance(rig_name, str):
         try:
             rig = find_rig(_rig_path(rig_name, path))
@@ -350,14 +362,20 @@ def from_mapping(content: Mapping[str, Any], path: Path) -> tuple[Configuration,
     except ValidationError as error:
         problems += [_sentence(file, detail) for detail in error.errors()]
     if rig is not None:
-        problems += _rig_problems(content, rig, file)
-    plan_file = _dig(content, "plan", "file")
+        problems += rig_problems(content, rig, file)
+    radiometry = dig(content, "mission", "radiometry")
+    if isinstance(radiometry, str) and not (path.parent / radiometry).is_dir():
+        problems.append(
+            f"{file}: mission.radiometry is {radiometry!r}, and there is no such folder; give the "
+            "folder with a calibration of each sensor, or leave the key out"
+        )
+    plan_file = dig(content, "plan", "file")
     if isinstance(plan_file, str):
         try:
             read_plan(path.parent / plan_file)
         except PlanError as error:
             problems.append(f"{file}: plan.file: {error}")
-    model = _dig(content, "plan", "elevation")
+    model = dig(content, "plan", "elevation")
     if isinstance(model, str) and not (path.parent / model).is_file():
         problems.append(f"{file}: plan.elevation is {model!r}, and there is no such file")
     if problems or configuration is None or rig is None:
@@ -403,13 +421,6 @@ def _anchored(configuration: Configuration, folder: Path) -> Configuration:
     return configuration.model_copy(update={"mission": anchored, "plan": plan, "watch": watch})
 
 
-def _dig(content: Mapping[str, Any], *keys: str) -> Any:
-    value: Any = content
-    for key in keys:
-        value = value.get(key) if isinstance(value, Mapping) else None
-    return value
-
-
 def _sentence(file: str, detail: Any) -> str:
     key = _key(detail["loc"])
     message = str(detail["msg"]).removeprefix("Value error, ")
@@ -428,73 +439,3 @@ def _key(location: Sequence[int | str]) -> str:
     for part in location:
         key += f"[{part}]" if isinstance(part, int) else f".{part}" if key else part
     return key
-
-
-def _device_problems(content: Mapping[str, Any], file: str) -> list[str]:
-    """What the drivers say of the settings meant for them."""
-    own_keys = {
-        "head": {"driver", "sensor"},
-        "thermometer": {"driver", "name"},
-        "navigator": {"driver", "name"},
-        "pps": {"driver", "name"},
-        "trigger": set(TriggerSection.model_fields),
-    }
-    problems: list[str] = []
-    for kind, own in own_keys.items():
-        sections = content.get(kind)
-        listed = sections if isinstance(sections, list) else [sections]
-        for index, section in enumerate(listed):
-            if not isinstance(section, Mapping) or not isinstance(section.get("driver"), str):
-                continue
-            key = kind if kind == "trigger" else f"{kind}[{index}]"
-            settings = {name: value for name, value in section.items() if name not in own}
-            found = registry.problems(kind, section["driver"], settings)
-            problems += [f"{file}: {key}.{problem}" for problem in found]
-    return problems
-
-
-def _rig_problems(content: Mapping[str, Any], rig: Rig, file: str) -> list[str]:
-    """Whether the heads and the sensors of the rig belong together."""
-    heads = content.get("head")
-    given = [
-        head["sensor"]
-        for head in (heads if isinstance(heads, list) else [])
-        if isinstance(head, Mapping) and isinstance(head.get("sensor"), str)
-    ]
-    known = {sensor.name for sensor in rig.sensors}
-    problems = []
-    for index, name in enumerate(given):
-        if name not in known:
-            listed = ", ".join(sorted(known))
-            problems.append(f"{file}: head[{index}].sensor is {name!r}; {rig.name} has {listed}")
-        elif name in given[:index]:
-            problems.append(f"{file}: head[{index}].sensor is {name!r} for the second time")
-    return [*problems, *_serial_problems(content, rig, file), *_tdi_problems(content, rig, file)]
-
-
-def _serial_problems(content: Mapping[str, Any], rig: Rig, file: str) -> list[str]:
-    """Parts that the rig does not have."""
-    there = {"lens": [cone.name for cone in rig.cones], "probe": list(rig.probes)}
-    return [
-        f"{file}: serials.{kind}.{name} is of nothing {rig.name} has: {', '.join(names) or 'none'}"
-        for kind, names in there.items()
-        if isinstance(given := _dig(content, "serials", kind), Mapping)
-        for name in given
-        if name not in names
-    ]
-
-
-def _tdi_problems(content: Mapping[str, Any], rig: Rig, file: str) -> list[str]:
-    """TDI moves charge from row to row, and on a Bayer head from colour to colour."""
-    heads = content.get("head")
-    bayer = {s.name: s for s in rig.sensors if s.colour_filter_array != "none"}
-    return [
-        f"{file}: head[{index}].tdi_shifts is {head['tdi_shifts']}; {head['sensor']} is a Bayer "
-        f"head ({bayer[head['sensor']].colour_filter_array}), where moving charge would mix "
-        "colours: set 0 and expose shorter"
-        for index, head in enumerate(heads if isinstance(heads, list) else [])
-        if isinstance(head, Mapping)
-        and head.get("sensor") in bayer
-        and isinstance(head.get("tdi_shifts"), int)
-        and head["tdi_shifts"] > 0
-    ]

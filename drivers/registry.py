@@ -43,6 +43,18 @@ _PLACES: Final[Mapping[str, Mapping[str, str]]] = {
 }
 
 
+_EXTRAS: Final[Mapping[str, tuple[str, ...]]] = {
+    "aravis": ("aravis",),
+    "gige-action": ("aravis",),
+    "mavlink": ("mavlink",),
+}
+
+
+def extras_of(kind: str, driver_name: str) -> tuple[str, ...]:
+    """The optional libraries a driver needs, by their names in `drivers.extras`."""
+    return _EXTRAS.get(driver_name, ()) if driver_name in _PLACES.get(kind, {}) else ()
+
+
 def kinds() -> Mapping[str, tuple[str, ...]]:
     """The kinds of device, and the names of the drivers of each."""
     return {kind: tuple(places) for kind, places in _PLACES.items()}

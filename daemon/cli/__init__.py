@@ -42,6 +42,7 @@ from daemon.cli import (
 )
 from daemon.configuration import ConfigurationError
 from daemon.errors import DaemonError
+from drivers.extras import MissingExtraError, missing_module
 from processing.rig import RigError
 
 app = typer.Typer(
@@ -96,7 +97,16 @@ def main() -> NoReturn:
         for problem in error.problems:
             console.print(f"  {problem}", markup=False, highlight=False)
         sys.exit(2)
-    except DaemonError as error:
-        Console(stderr=True, soft_wrap=True).print(str(error), style="red", markup=False)
-        sys.exit(1)
+    except (DaemonError, MissingExtraError) as error:
+        _refuse(error)
+    except ImportError as error:
+        absent = missing_module(error)
+        if absent is None:
+            raise
+        _refuse(absent)
     sys.exit(0)
+
+
+def _refuse(error: Exception) -> NoReturn:
+    Console(stderr=True, soft_wrap=True).print(str(error), style="red", markup=False)
+    sys.exit(1)

@@ -2,31 +2,41 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
-import threading
-import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.tree import Tree
 
 from daemon.cli.find import find as find_devices
 from daemon.cli.find_heads import find_heads
 
-HELP = """Validate a configuration, open every device, and print what is well and what is not.
+if TYPE_CHECKING:
+    from daemon.configuration import Configuration
+    from daemon.service.findings import Finding
+    from processing.rig import Rig
 
-The exit status is 0 when all is well, 1 when a device is not, 2 when the configuration is refused.
+HELP = """Validate a configuration, build what `run` builds, and prove each device with one datum.
+
+Prerequisites, pipeline, kernels, page and arming are looked at with the functions that `run` uses.
+Nothing is fired without `--fire`: frames and event marks are then proven by one exposure. While the
+service runs, it is asked over its control socket, and nothing is opened. The exit status is 0 when
+all passes, 1 when something fails, 2 when the configuration is refused, and 3 when nothing fails
+and something is waited for, such as a receiver that searches.
 
 With `--find`, find out what speaks at serial ports, tcp://host:port, udpin://host:port (those
 given, or all serial ports and the usual addresses): protocol, speed, and the configuration for it.
 With `--find-heads`, which GigE Vision, USB3 Vision and V4L2 heads there are, and the same.
 
-Examples: `syntopic check flights/sim/service.toml`, `syntopic check --find`,
-`syntopic check --find /dev/ttyUSB0 tcp://10.0.0.5:3001`
+Examples: `syntopic check flights/sim/service.toml`, `syntopic check service.toml --fire --json`,
+`syntopic check --find`, `syntopic check --find /dev/ttyUSB0 tcp://10.0.0.5:3001`
 """
-BIND_TIMEOUT_S = 25.0
+COLOURS = {"pass": "green", "waiting": "yellow", "fail": "red", "not tried": "dim"}
 
 
 def check(
@@ -45,6 +55,9 @@ def check(
     listen_only: Annotated[
         bool, typer.Option("--listen-only", help="With --find, send nothing to any port.")
     ] = False,
+    fire: Annotated[
+        bool, typer.Option("--fire", help="Fire one exposure to prove frames and event marks.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     if find:
@@ -55,96 +68,68 @@ def check(
         raise typer.BadParameter(
             "give one service configuration, or --find and ports, or --find-heads"
         )
-    check_devices(Path(targets[0]), as_json=as_json)
+    check_flight(Path(targets[0]), fire=fire, as_json=as_json)
 
 
-def check_devices(config: Path, *, as_json: bool) -> None:
-    """Open every device of a configuration and say what is well and what is not."""
+def check_flight(config: Path, *, fire: bool, as_json: bool) -> None:
+    """Look at everything a flight with this configuration needs, and print it."""
     from daemon.configuration import load
+    from daemon.service.findings import EXIT_STATUS, Outcome, overall
 
     configuration, rig = load(config)
     console = Console(stderr=as_json)
-    with console.status("opening devices"):
-        findings = _open_all(configuration, rig)
-    well = all(finding["ok"] for finding in findings)
+    with console.status("looking at what a flight needs"):
+        findings = look(configuration, rig, config, fire=fire)
+    outcome = overall(findings)
     if as_json:
-        typer.echo(json.dumps({"rig": rig.name, "ok": well, "devices": findings}))
+        listed = [finding.as_json() for finding in findings]
+        typer.echo(json.dumps({"rig": rig.name, "outcome": outcome.value, "findings": listed}))
     else:
         _print_tree(console, config, rig.name, findings)
-        if well:
-            console.print(f"All well. Next: [bold]syntopic run {config}[/]")
+        if outcome is Outcome.PASS:
+            console.print(f"All passes. Next: [bold]syntopic run {config}[/]")
+        elif outcome is Outcome.WAITING:
+            console.print("[yellow]Waiting[/] for what is marked so; nothing fails.")
         else:
-            console.print("[bold red]Not ready[/]; see the cures above.")
-    raise typer.Exit(0 if well else 1)
+            console.print("[bold red]Not ready[/]; do as the sentences in red say.")
+    raise typer.Exit(EXIT_STATUS[outcome])
 
 
-def _open_all(configuration: Any, rig: Any) -> list[dict[str, Any]]:
-    """Bind every device at once, each in its own thread and each with a time-out."""
-    from daemon.service.capture import open_device
-    from daemon.service.devices import device_specs, frame_nbytes, serial_problem
-    from daemon.service.memory import FrameRing
+def look(configuration: Configuration, rig: Rig, config: Path, *, fire: bool) -> list[Finding]:
+    """All findings: of the running service where there is one, else of what `run` would build."""
+    from daemon.service.departure import interrupted_mission
+    from daemon.service.prerequisites import prerequisites
+    from daemon.service.resumption import resumption_finding
+    from daemon.service.trial import try_out
+    from daemon.watch.asking import ask_service
 
-    findings: list[dict[str, Any]] = []
-    threads: list[tuple[threading.Thread, dict[str, Any]]] = []
-    heads: dict[str, list[Any]] = {}
-    for spec in device_specs(configuration, rig):
-        finding: dict[str, Any] = {
-            "kind": spec.kind,
-            "name": spec.name,
-            "driver": spec.driver,
-            "ok": False,
-        }
-        memory = None
-        if spec.kind == "head":
-            memory = FrameRing.create(spec.name, 2, frame_nbytes(rig, spec.name))
-        device = open_device(spec, memory=memory, heads=heads)
-        if spec.kind == "head":
-            heads.setdefault(spec.output, []).append(device)
+    mission = interrupted_mission(configuration)
+    if mission is not None and mission.is_held():
+        return ask_service(configuration, mission)
+    findings = prerequisites(configuration, rig)
+    if any(finding.prevents for finding in findings):
+        return findings
+    if mission is not None:
+        finding, rig = resumption_finding(mission, configuration, rig, config)
         findings.append(finding)
-        thread = threading.Thread(target=_bind, args=(device, finding), daemon=True)
-        threads.append((thread, finding))
-        thread.start()
-    deadline = time.monotonic() + BIND_TIMEOUT_S
-    for thread, finding in threads:
-        thread.join(max(0.0, deadline - time.monotonic()))
-        if thread.is_alive():
-            finding["problem"] = (
-                f"no answer within {BIND_TIMEOUT_S:g} s while opening it; check cable and power"
-            )
-    for finding in findings:
-        if finding["kind"] == "head" and finding["ok"]:
-            problem = serial_problem(rig, finding["name"], finding["found"])
-            if problem is not None:
-                finding |= {"ok": False, "problem": problem}
-    return findings
+        if finding.prevents:
+            return findings
+    if configuration.watch is not None:
+        from daemon.watch.prerequisites import watch_findings
+
+        findings += watch_findings(configuration.watch)
+    return findings + asyncio.run(try_out(configuration, rig, fire=fire))
 
 
-def _bind(device: Any, finding: dict[str, Any]) -> None:
-    from drivers.contract import DeviceError
-
-    try:
-        finding["found"] = dict(device.bind())
-    except DeviceError as error:
-        finding["problem"] = str(error)
-        return
-    finally:
-        device.close()
-    finding["ok"] = True
-
-
-def _print_tree(
-    console: Console, config: Path, rig_name: str, findings: list[dict[str, Any]]
-) -> None:
-    tree = Tree(f"[bold]{config}[/] for {rig_name}: valid")
-    for kind in dict.fromkeys(finding["kind"] for finding in findings):
+def _print_tree(console: Console, config: Path, rig: str, findings: Sequence[Finding]) -> None:
+    tree = Tree(f"[bold]{config}[/] for {rig}: valid")
+    for kind in dict.fromkeys(finding.kind for finding in findings):
         branch = tree.add(kind)
         for finding in findings:
-            if finding["kind"] != kind:
+            if finding.kind != kind:
                 continue
-            label = f"{finding['name']} ({finding['driver']})"
-            if finding["ok"]:
-                told = ", ".join(f"{k} {v}" for k, v in finding.get("found", {}).items())
-                branch.add(f"[green]ok[/] {label}: {told}")
-            else:
-                branch.add(f"[red]not ok[/] {label}: {finding.get('problem', 'no answer')}")
+            outcome = finding.outcome.value
+            found = ", ".join(f"{key} {value}" for key, value in finding.found.items() if value)
+            label = ": ".join(filter(None, (finding.name, finding.sentence or found)))
+            branch.add(f"[{COLOURS[outcome]}]{outcome}[/] {escape(label)}")
     console.print(tree)

@@ -76,7 +76,7 @@ def replay(
             settings = WorkerSettings(
                 rig=str(folder.rig_path),
                 radiometry=radiometry,
-                mission=folder.path,
+                plan_file=folder.plan_path,
                 plan=plan,
                 processing=configuration.processing,
             )

@@ -15,8 +15,9 @@ import typer
 
 HELP = """Run the onboard service with a configuration, until SIGTERM or until the plan is flown.
 
-A service that was killed continues the same flight. Events are printed one a line, for people, or
-with --json-lines as one JSON object each, for programs.
+A service that was killed resumes the same mission with the rig it began with; where the configured
+rig differs, the sentence names the keys, and --new-mission begins another one. Events are printed
+one a line, for people, or with --json-lines as one JSON object each, for programs.
 
 Examples: `syntopic run service.toml`, `syntopic run service.toml --json-lines`
 """
@@ -31,9 +32,17 @@ def run(
         int | None,
         typer.Option(help="Land when this process, which started us, is gone.", metavar="PID"),
     ] = None,
+    new_mission: Annotated[
+        bool,
+        typer.Option(
+            "--new-mission", help="Seal and close an interrupted mission, and begin a new one."
+        ),
+    ] = False,
 ) -> None:
     from daemon.configuration import load
+    from daemon.service.departure import interrupted_mission
     from daemon.service.processes import die_with_parent
+    from daemon.service.resumption import close_interrupted
     from daemon.service.service import Service
 
     if parent is not None:
@@ -43,6 +52,8 @@ def run(
     while goes_on:
         # Read anew: a new mission may have another plan.
         configuration, rig = load(config)
+        if new_mission and (mission := interrupted_mission(configuration)) is not None:
+            show({"event": "closed", "id": mission.id, "recovery": close_interrupted(mission)})
         service = Service(configuration, rig, config, show)
         status = asyncio.run(service.run())
         goes_on = service.goes_on and status == 0

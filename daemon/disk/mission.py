@@ -32,7 +32,8 @@ CURRENT_FILE = "current-mission.json"
 
 MISSION_FORMAT = 2
 """From 2 on a mission is created with its chain file and the hash of its flight plan."""
-
+HELD_FILE = ".held"
+"""In a mission: locked by the process that flies it."""
 DISCARDED = ".discarded"
 """In L0: what recovery set aside because nobody was ever told that it is stored."""
 
@@ -267,6 +268,20 @@ class Mission:
             marker.unlink()
             durable.sync_directory(self.root)
 
+    def is_held(self) -> bool:
+        """Whether another process flies it now."""
+        try:
+            descriptor = os.open(self.path / HELD_FILE, os.O_RDONLY | os.O_CLOEXEC)
+        except FileNotFoundError:
+            return False
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        finally:
+            os.close(descriptor)
+        return False
+
     @contextmanager
     def held(self) -> Iterator[None]:
         """Keep other services out of the mission for as long as this process lives.
@@ -274,7 +289,7 @@ class Mission:
         Raises:
             MissionError: another process holds it.
         """
-        descriptor = os.open(self.path / ".held", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        descriptor = os.open(self.path / HELD_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         try:
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

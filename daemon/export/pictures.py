@@ -26,6 +26,7 @@ from daemon.exposure import Exposure
 from daemon.orientation.exterior import ExteriorOrientation, exposures_of
 from daemon.orientation.georeference import Georeference
 from daemon.orientation.inputs import orienting
+from drivers.extras import require
 from processing.geometry.orientation import BODY_FROM_CAMERA, ENU_FROM_NED, on_level_ground
 from processing.rig import Rig
 
@@ -162,13 +163,10 @@ def _shot(rig: Rig, picture: Picture, crs: str, *, simulated: bool) -> Shot:
 def _cog(
     picture: Picture, shot: Shot, georeference: Georeference, ground_m: float, final: Path
 ) -> None:
-    try:
-        from rasterio.io import MemoryFile
-        from rasterio.shutil import copy
-    except ImportError as error:
-        raise PictureError(
-            "a COG is written by rasterio; pip install 'syntopic[geotiff]'"
-        ) from error
+    require("geotiff")
+    from rasterio.io import MemoryFile
+    from rasterio.shutil import copy
+
     planes = _planes(picture.path)
     count, height, width = planes.shape
     part = final.with_name(final.name + ".part")

@@ -82,6 +82,9 @@ class Latches:
         elif kind in _RAISES:
             fault, device = _RAISES[kind]
             self.raise_fault(fault, sentence, device, sequence=sequence)
+        elif kind == "prerequisite":
+            fault = f"prerequisite {event.get('item')}"
+            self.raise_fault(fault, sentence, "service", sequence=sequence)
         elif kind == "lost":
             number, cause = event.get("number"), event.get("cause")
             said = f"Exposure {number}: {cause}"

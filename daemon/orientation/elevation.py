@@ -12,6 +12,7 @@ import numpy as np
 
 from daemon.errors import DaemonError
 from daemon.orientation.georeference import Georeference
+from drivers.extras import require
 from processing.geometry.terrain_rays import HeightModel
 
 MODEL_MAX_BYTES = 2_000_000_000
@@ -63,14 +64,9 @@ def _ascii(path: Path) -> HeightModel:
 
 
 def _geotiff(path: Path, georeference: Georeference) -> HeightModel:
-    try:
-        import rasterio
-    except ImportError as error:
-        raise ElevationError(
-            f"{path}: a GeoTIFF is read by rasterio; pip install 'syntopic[geotiff]', or give an "
-            "ESRI ASCII grid (.asc)"
-        ) from error
+    require("geotiff", "geodesy")
     import pyproj
+    import rasterio
 
     try:
         with rasterio.open(path) as raster:

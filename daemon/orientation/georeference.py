@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from daemon.errors import DaemonError
+from drivers.extras import require
 
 if TYPE_CHECKING:
     import pyproj
@@ -125,14 +126,9 @@ def import_proj() -> None:
     """Whether PROJ is here.
 
     Raises:
-        GeoreferenceError: pyproj is not installed.
+        MissingExtraError: pyproj is not installed.
     """
-    try:
-        import pyproj  # noqa: F401 - whether it can be
-    except ImportError as error:
-        raise GeoreferenceError(
-            "coordinate systems need pyproj; install the extra: pip install 'syntopic[geodesy]'"
-        ) from error
+    require("geodesy")
 
 
 def _refuse_unfit(crs: pyproj.CRS, name: str) -> None:

@@ -29,17 +29,22 @@ RADIOMETRY = "radiometry"
 _QUICKLOOK_BANDS = ("red", "green", "blue")
 
 
-def radiance_of(
-    rig: Rig, mission: Mission, radiometry: Path | None
-) -> dict[str, RadianceCalibration]:
-    """The radiance calibrations of a folder by sensor name, by default the mission's own.
+def radiance_folder(mission: Mission) -> Path | None:
+    """A mission's own radiance calibrations; None where it has none."""
+    own = mission.path / RADIOMETRY
+    return own if own.is_dir() else None
+
+
+def radiance_of(rig: Rig, folder: Path | None) -> dict[str, RadianceCalibration]:
+    """The radiance calibrations of a folder by sensor name.
 
     Raises:
-        CalibrationError: a file that cannot be used, or a folder that is told and not there.
+        CalibrationError: a file that cannot be used, or a folder that does not exist.
     """
-    if radiometry is not None and not radiometry.is_dir():
-        raise CalibrationError(f"{radiometry}: no such folder; give one with <sensor>.json")
-    folder = radiometry or mission.path / RADIOMETRY
+    if folder is None:
+        return {}
+    if not folder.is_dir():
+        raise CalibrationError(f"{folder}: no such folder; give one with <sensor>.json")
     return {
         sensor.name: load_radiance(folder / f"{sensor.name}.json")
         for sensor in rig.sensors

@@ -21,7 +21,7 @@ from daemon.disk.records import canonical_bytes
 from daemon.exposure import Exposure
 from daemon.orientation.in_flight import orientation_json
 from daemon.plan.reading import read_plan
-from daemon.products.bands import bands_made, radiance_of
+from daemon.products.bands import bands_made, radiance_folder, radiance_of
 from daemon.products.heads import heads_made
 from daemon.products.reports import FramesRead, Made
 from daemon.products.stitched import stitched_made
@@ -86,7 +86,7 @@ class Processor:
 def processor_for(
     rig: Rig, mission: Mission, processing: ProcessingSection, radiometry: Path | None
 ) -> Processor:
-    """What makes the images of this rig: stitched, head by head, or band by band.
+    """The processor of a mission: by its flight plan, and with its own calibrations by default.
 
     Args:
         radiometry: folder of calibrations; sensors without one are taken as ideal.
@@ -94,12 +94,35 @@ def processor_for(
     Raises:
         CalibrationError, ValueError: a calibration that does not fit, or a rig of no known kind.
     """
-    asked = asked_of(mission)
+    own = radiance_folder(mission)
+    return build_processor(rig, processing, radiometry, mission.plan_path, own_radiance=own)
+
+
+def build_processor(
+    rig: Rig,
+    processing: ProcessingSection,
+    radiometry: Path | None,
+    plan_file: Path | None,
+    *,
+    own_radiance: Path | None = None,
+) -> Processor:
+    """What makes the images of this rig: stitched, head by head, or band by band.
+
+    Args:
+        radiometry: folder of calibrations; sensors without one are taken as ideal.
+        plan_file: flight plan with the requirements exposures are judged by.
+        own_radiance: folder of radiance calibrations where `radiometry` is None.
+
+    Raises:
+        CalibrationError, ValueError: a calibration that does not fit, or a rig of no known kind.
+        PlanError: a plan that cannot be read.
+    """
+    asked = asked_of(plan_file)
     threads = processing.threads
     given: dict[str, Any] = processing.thresholds
     thresholds = replace(Thresholds(), **given)
     if rig.virtual_image is None and not looks_apart(rig):
-        radiance = radiance_of(rig, mission, radiometry)
+        radiance = radiance_of(rig, radiometry or own_radiance)
         pipeline = BandPipeline(rig, radiance, threads=threads, asked=asked)
         pipeline.thresholds = replace(pipeline.thresholds, **given)
         return Processor(pipeline, partial(bands_made, radiance))
@@ -166,12 +189,11 @@ def histograms_of(rig: Rig, frames: Mapping[str, NDArray[np.uint16]]) -> dict[st
     }
 
 
-def asked_of(mission: Mission) -> Asked:
-    """What the mission's plan asks of every exposure; nothing where there is none."""
-    path = mission.plan_path
-    if path is None:
+def asked_of(plan_file: Path | None) -> Asked:
+    """What a flight plan asks of every exposure; nothing where there is none."""
+    if plan_file is None:
         return Asked()
-    wanted = read_plan(path).specification
+    wanted = read_plan(plan_file).specification
     return Asked(
         forward_overlap=max(0.0, wanted.forward_overlap - wanted.overlap_tolerance),
         sidelap=max(0.0, wanted.sidelap - wanted.overlap_tolerance),

@@ -30,21 +30,26 @@ class ProcessPlan(NamedTuple):
     environment: Mapping[str, str]
 
 
-def open_mission(configuration: Configuration, rig: Rig, config_path: Path) -> tuple[Mission, bool]:
-    """The mission that was being flown, else a new one; and whether it goes on.
+def interrupted_mission(configuration: Configuration) -> Mission | None:
+    """The mission that was being flown when the service ended; None after an orderly end.
 
     Raises:
         MissionError: the marker of the mission being flown is damaged.
-        OSError: the disk refused.
     """
     root = configuration.mission.root
-    current = Mission.current(root) if root.is_dir() else None
-    if current is not None:
-        return current, True
+    return Mission.current(root) if root.is_dir() else None
+
+
+def create_mission(configuration: Configuration, rig: Rig, config_path: Path) -> Mission:
+    """A new mission, with copies of what it is flown by.
+
+    Raises:
+        OSError: the disk refused.
+    """
     rig_path = shipped_rigs().get(configuration.mission.rig, Path(configuration.mission.rig))
     plan_file = configuration.plan.file
-    created = Mission.create(
-        root,
+    return Mission.create(
+        configuration.mission.root,
         rig.name,
         rig_toml=rig_path.read_bytes(),
         service_toml=config_path.read_bytes(),
@@ -52,7 +57,6 @@ def open_mission(configuration: Configuration, rig: Rig, config_path: Path) -> t
         started_utc=datetime.now(UTC),
         simulated=configuration.mission.simulated,
     )
-    return created, False
 
 
 def identity(configuration: Configuration, rig: Rig, mission: Mission) -> Identity:
@@ -68,27 +72,47 @@ def identity(configuration: Configuration, rig: Rig, mission: Mission) -> Identi
     )
 
 
-def processes(configuration: Configuration, rig: Rig, mission: Mission) -> tuple[ProcessPlan, ...]:
-    """Writer, worker and capture, over one set of frame memory."""
-    rings = tuple(
+def frame_rings(configuration: Configuration, rig: Rig) -> tuple[FrameRing, ...]:
+    """The frame memory of every head, that the processes share."""
+    return tuple(
         FrameRing.create(
             head.sensor, configuration.limits.exposures_in_memory, frame_nbytes(rig, head.sensor)
         )
         for head in configuration.head
     )
+
+
+def worker_process(
+    configuration: Configuration, mission: Mission | None, rings: tuple[FrameRing, ...]
+) -> ProcessPlan:
+    """The pipeline worker, with rig and plan of the mission, or as configured before there is one.
+
+    It says whether the pipeline can be built, and waits for `Begin`.
+    """
+    plan_file = configuration.plan.file if mission is None else mission.plan_path
     worker = WorkerSettings(
-        rig=str(mission.rig_path),
+        rig=configuration.mission.rig if mission is None else str(mission.rig_path),
         radiometry=configuration.mission.radiometry,
-        mission=mission.path,
+        plan_file=plan_file,
         plan=configuration.plan,
         processing=configuration.processing,
     )
-    one, many = thread_counts(1), thread_counts(configuration.processing.threads)
+    many = thread_counts(configuration.processing.threads)
+    return ProcessPlan("worker", "daemon.service.worker:main", (worker, rings), many)
+
+
+def capture_process(
+    configuration: Configuration, rig: Rig, rings: tuple[FrameRing, ...]
+) -> ProcessPlan:
+    """The process of the devices."""
     specs = device_specs(configuration, rig)
-    return (
-        ProcessPlan("writer", "daemon.service.writer:main", (mission.path, rings), one),
-        ProcessPlan("worker", "daemon.service.worker:main", (worker, rings), many),
-        ProcessPlan("capture", "daemon.service.capture:main", (specs, rings), one),
+    return ProcessPlan("capture", "daemon.service.capture:main", (specs, rings), thread_counts(1))
+
+
+def writer_process(mission: Mission, rings: tuple[FrameRing, ...]) -> ProcessPlan:
+    """The process of the disk."""
+    return ProcessPlan(
+        "writer", "daemon.service.writer:main", (mission.path, rings), thread_counts(1)
     )
 
 

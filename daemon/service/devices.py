@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 
 from daemon.configuration import Configuration
 from daemon.service.messages import DeviceSpec
 from drivers.contract import CHUNK_ALLOWANCE_NBYTES
 from processing.rig import Rig
+
+_FRAME = re.compile(r"(\d+) x (\d+) (\S+)")
+"""How heads say what their frames are."""
 
 
 def device_specs(configuration: Configuration, rig: Rig) -> tuple[DeviceSpec, ...]:
@@ -44,6 +48,44 @@ def serial_problem(rig: Rig, head: str, found: Mapping[str, str]) -> str | None:
         f"head {head} has serial number {connected}, the calibration {rig.calibration_id} is of "
         f"{calibrated}; connect that head, or fly with a calibration of this one"
     )
+
+
+def bound_problem(rig: Rig, kind: str, name: str, found: Mapping[str, str]) -> str | None:
+    """A sentence where a device that answered cannot be flown with this rig: another head, another
+    frame, a trigger unit without an output for a cone.
+    """
+    if kind == "head":
+        return serial_problem(rig, name, found) or frame_problem(rig, name, found)
+    if kind == "trigger" and "unit" in found:
+        outputs = found.get("outputs", "").split()
+        without = [cone.name for cone in rig.cones if cone.name not in outputs]
+        if without:
+            return (
+                f"the trigger unit {found['unit']} has the outputs {', '.join(outputs) or 'none'} "
+                f"and none for cone {', '.join(without)}; wire the cone to an output of its name"
+            )
+    return None
+
+
+def frame_problem(rig: Rig, head: str, found: Mapping[str, str]) -> str | None:
+    """A sentence where a head's frames do not have the size or depth of the rig's sensor."""
+    told = _FRAME.match(found.get("frame", ""))
+    if told is None:
+        return None
+    sensor = rig.sensor(head)
+    width, height, pixel_format = int(told[1]), int(told[2]), told[3]
+    if (width, height) != (sensor.width_px, sensor.height_px):
+        return (
+            f"head {head} sends frames of {width} x {height} px, the rig has {sensor.width_px} x "
+            f"{sensor.height_px}; set width_px and height_px, or fly with the rig of this head"
+        )
+    depth = re.search(r"\d+", pixel_format)
+    if depth is not None and int(depth[0]) < sensor.bits:
+        return (
+            f"head {head} sends {pixel_format}, the rig's sensor has {sensor.bits} bits; set a "
+            "pixel_format of that depth"
+        )
+    return None
 
 
 def stated_serial_problems(configuration: Configuration, rig: Rig) -> list[str]:

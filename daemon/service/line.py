@@ -11,7 +11,6 @@ from pathlib import Path
 
 from daemon.configuration import Configuration
 from daemon.disk.guard import DiskGuard
-from daemon.disk.mission import Mission
 from daemon.flight.flight import Flight
 from daemon.flight.navigation import LATEST_ARRIVAL_NS
 from daemon.flight.triggering import DistanceTrigger, IntervalTrigger, Policy, pulse_delays_ns
@@ -42,10 +41,26 @@ class Order:
 
 
 class Line:
-    """Orders exposures of a flight until the planned number is reached."""
+    """Orders exposures of a flight until the planned number is reached.
+
+    Args:
+        configuration: when to expose.
+        rig: the camera.
+        flight: what is ordered is opened in it.
+        mission: a folder on the disk that exposures go to.
+        flown: exposures that were made before.
+        plan: flight plan to be steered by, where there is one.
+    """
 
     def __init__(
-        self, configuration: Configuration, rig: Rig, flight: Flight, mission: Path, flown: int
+        self,
+        configuration: Configuration,
+        rig: Rig,
+        flight: Flight,
+        mission: Path,
+        flown: int,
+        *,
+        plan: Path | None = None,
     ) -> None:
         self._configuration = configuration
         self._rig = rig
@@ -56,7 +71,7 @@ class Line:
         self.guard = DiskGuard(configuration.limits, exposure_nbytes, mission)
         self._last_ns: int | None = None
         self._exposure_ns = exposure_times_ns(configuration, rig)
-        self._steering = _steering(configuration, rig, mission)
+        self._steering = _steering(configuration, rig, plan)
         self._policy = _policy(configuration, rig)
         if configuration.trigger.mode == "plan" and self._steering is not None:
             self._policy = self._steering
@@ -188,9 +203,8 @@ class Line:
         return self._flight.order(now_ns, line.id, line.strip or line.id)
 
 
-def _steering(configuration: Configuration, rig: Rig, mission: Path) -> PlanTrigger | None:
-    """The plan of the mission, where it has one."""
-    path = Mission(mission, mission.name).plan_path
+def _steering(configuration: Configuration, rig: Rig, path: Path | None) -> PlanTrigger | None:
+    """The flight plan of a file, where there is one."""
     if path is None:
         return None
     plan, section = read_plan(path), configuration.plan

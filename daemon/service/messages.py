@@ -209,13 +209,23 @@ class WriteFailed:
 
 @dataclass(frozen=True)
 class WorkerSettings:
-    """What a pipeline worker needs to know."""
+    """What a pipeline worker needs to know before there is a mission.
+
+    `plan_file` is the flight plan whose requirements exposures are judged by.
+    """
 
     rig: str
     radiometry: Path | None
-    mission: Path
+    plan_file: Path | None
     plan: PlanSection
     processing: ProcessingSection
+
+
+@dataclass(frozen=True)
+class Begin:
+    """Load the kernels, then process for this mission; for none where only that is tried."""
+
+    mission: Path | None
 
 
 @dataclass(frozen=True)
@@ -239,6 +249,18 @@ class Settled:
 
 
 # From the worker
+
+
+@dataclass(frozen=True)
+class WorkerBuilt:
+    """The pipeline of this rig is built, its calibrations are read; `Begin` is waited for."""
+
+
+@dataclass(frozen=True)
+class WorkerRefused:
+    """No pipeline can be built; the sentence says why, and the cure. The process ends."""
+
+    sentence: str
 
 
 @dataclass(frozen=True)

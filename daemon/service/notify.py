@@ -15,6 +15,13 @@ class Notifier:
     def __init__(self, address: str | None = None) -> None:
         self._address = os.environ.get("NOTIFY_SOCKET") if address is None else address
 
+    @property
+    def restart(self) -> str:
+        """What starts the service again after a failure, in a sentence."""
+        if self._address:
+            return "systemd starts the service again, and the mission is resumed"
+        return "Start it again (syntopic run), and the mission is resumed"
+
     def ready(self, status: str) -> None:
         self._send(f"READY=1\nSTATUS={status}")
 

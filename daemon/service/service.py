@@ -27,17 +27,33 @@ from daemon.flight.latches import Latch, Latches, previous_faults, read_unhandle
 from daemon.flight.ledger import Ledger
 from daemon.flight.recovery_match import seal_from_log
 from daemon.service.commanding import audit_message, obey
-from daemon.service.departure import identity, open_mission, processes, watch_process
+from daemon.service.departure import (
+    capture_process,
+    frame_rings,
+    identity,
+    watch_process,
+    worker_process,
+    writer_process,
+)
 from daemon.service.desk import Desk
-from daemon.service.devices import serial_problem
+from daemon.service.devices import bound_problem
 from daemon.service.exposure_control import ExposureControl
 from daemon.service.hearing import Hearing
 from daemon.service.keeping import Keeping
 from daemon.service.line import Line, Order
-from daemon.service.messages import Bound, Command, Fire, Log, Pong, Told
+from daemon.service.messages import (
+    Begin,
+    Bound,
+    Command,
+    Fire,
+    Log,
+    Pong,
+    Told,
+)
 from daemon.service.notify import Notifier
 from daemon.service.pipeline_queue import PipelineQueue
 from daemon.service.preflight import AT_ONCE, Preflight
+from daemon.service.preparation import Preparation
 from daemon.service.supervisor import Supervisor
 from daemon.service.watching import NAME as WATCH
 from daemon.service.watching import Watching, status_event
@@ -81,6 +97,8 @@ class Service(Desk):
         self.stopping = asyncio.Event()
         self.changed = asyncio.Event()
         self.goes_on = False
+        self.preparation = Preparation(configuration, rig, config_path, self._event, self._fail)
+        self.desks: tuple[Desk, ...] = (self, self.preparation)
 
     async def run(self) -> int:
         """Fly until told to stop, or until the planned exposures are done.
@@ -94,7 +112,10 @@ class Service(Desk):
         for name in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(name, self.stopping.set)
         loop.add_signal_handler(signal.SIGPWR, self._power_fails)
-        mission, self.is_resumed = open_mission(self.configuration, self.rig, self.config_path)
+        mission = await self._prepare()
+        if mission is None:
+            await self.supervisor.end(("worker",))
+            return 0 if self.failure is None else 1
         with mission.held():
             self._start(mission)
             tasks = [
@@ -119,6 +140,22 @@ class Service(Desk):
         return 0 if self.failure is None else 1
 
     # Before the flight
+
+    async def _prepare(self) -> Mission | None:
+        """The mission, with its worker begun; None where the service ends before there is one."""
+        if not await self.preparation.look():
+            return None
+        interrupted, self.rig = self.preparation.interrupted, self.preparation.rig
+        self.is_resumed = interrupted is not None
+        self.rings = frame_rings(self.configuration, self.rig)
+        self.supervisor.spawn(*worker_process(self.configuration, interrupted, self.rings))
+        if interrupted is None:
+            # A mission that no image can be made of is not begun.
+            is_built = self._until(
+                lambda: self.preparation.is_built or self.stopping.is_set(), END_OF_WAITING_S
+            )
+            await is_built
+        return None if self.stopping.is_set() else self.preparation.mission()
 
     def _start(self, mission: Mission) -> None:
         self.mission = mission
@@ -145,7 +182,9 @@ class Service(Desk):
         )
         self.hearing = Hearing(self.flight, self._log, self._event, self._decided)
         flown = len(report.settled)
-        self.line = Line(self.configuration, self.rig, self.flight, mission.path, flown)
+        self.line = Line(
+            self.configuration, self.rig, self.flight, mission.path, flown, plan=mission.plan_path
+        )
         self.exposure = ExposureControl(
             self.configuration, self.rig, self.flight, self.supervisor.send, self._event
         )
@@ -157,8 +196,10 @@ class Service(Desk):
         )
         self.preflight.overridden = self._overridden
         self._tell_previous(mission)
-        for process in processes(self.configuration, self.rig, mission):
-            self.supervisor.spawn(*process)
+        self.desks += (self.hearing, self.keeping, self.pipeline)
+        self.supervisor.spawn(*writer_process(mission, self.rings))
+        self.supervisor.send("worker", Begin(mission.path))
+        self.supervisor.spawn(*capture_process(self.configuration, self.rig, self.rings))
         self._decided(
             Decision(
                 "begin",
@@ -171,8 +212,7 @@ class Service(Desk):
     # What the processes say
 
     def _hear(self, message: object) -> None:
-        desks: tuple[Desk, ...] = (self, self.hearing, self.keeping, self.pipeline)
-        if not any(desk.hear(message) for desk in desks):
+        if not any(desk.hear(message) for desk in self.desks):
             raise TypeError(f"a process said {type(message).__name__}, which nobody expects")
         self.changed.set()
 
@@ -198,14 +238,16 @@ class Service(Desk):
             if not self.stopping.is_set():
                 self.watching.died()
         elif not self.stopping.is_set():
-            self._fail(f"process {name} died; started again, the service goes on in this flight")
+            self._fail(
+                f"process {name} died, and the service ends; what was stored is safe. "
+                f"{self.notifier.restart}"
+            )
 
     def _on_bound(self, bound: Bound) -> None:
         self.hearing.hear(bound)
-        if bound.kind == "head":
-            problem = serial_problem(self.rig, bound.name, bound.found)
-            if problem is not None:
-                self._fail(problem)
+        problem = bound_problem(self.rig, bound.kind, bound.name, bound.found)
+        if problem is not None:
+            self._fail(problem)
 
     def _on_told(self, told: Told) -> None:
         """What the watch process and the writer have to say of themselves."""
@@ -417,7 +459,7 @@ class Service(Desk):
         if isinstance(error, BaseException):
             traceback.print_exception(error)
         told = f"{type(error).__name__}: {error}" if error else context.get("message")
-        self._fail(f"the service itself failed ({told}); it is started again; report this")
+        self._fail(f"the service itself failed ({told}); report this. {self.notifier.restart}")
 
     # Telling
 

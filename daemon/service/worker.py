@@ -23,16 +23,18 @@ from daemon.configuration import MountSection, PlanSection
 from daemon.disk import level2, store
 from daemon.disk.mission import Mission
 from daemon.disk.records import RecordError
+from daemon.errors import DaemonError
 from daemon.exposure import Exposure
 from daemon.orientation.exterior import exposure_of, mount_of
 from daemon.orientation.ground import Ground, ground_of
 from daemon.plan.overlaps import Overlaps, Surroundings
 from daemon.products.conditions import conditions_of
-from daemon.products.processor import Processor, histograms_of, make_products, processor_for
+from daemon.products.processor import Processor, build_processor, histograms_of, make_products
 from daemon.products.reports import Made
 from daemon.service.lanes import Lanes
 from daemon.service.memory import FrameRing
 from daemon.service.messages import (
+    Begin,
     FramesRead,
     Judged,
     Ping,
@@ -42,7 +44,9 @@ from daemon.service.messages import (
     ProcessFailed,
     Settled,
     Stop,
+    WorkerBuilt,
     WorkerReady,
+    WorkerRefused,
     WorkerSettings,
 )
 from daemon.service.processes import Link
@@ -60,10 +64,21 @@ def main(link: Link, settings: WorkerSettings, rings: tuple[FrameRing, ...]) -> 
     """Process until told to stop."""
     started = time.monotonic()
     settle_threads()
-    rig = find_rig(settings.rig)
-    mission = Mission.open(settings.mission)
-    processor = processor_for(rig, mission, settings.processing, settings.radiometry)
+    try:
+        processor = build(settings)
+    except (OSError, ValueError, ArithmeticError, MemoryError, DaemonError) as error:
+        link.send(WorkerRefused(f"no images can be made with this configuration: {error}"))
+        return
+    link.send(WorkerBuilt())
+    begin = _wait_for_begin(link)
+    if begin is None:
+        return
     processor.warm_up()
+    if begin.mission is None:
+        link.send(WorkerReady(time.monotonic() - started))
+        _wait_for_begin(link)
+        return
+    rig, mission = processor.rig, Mission.open(begin.mission)
     lanes = Lanes[Processor](processor, settings.processing.exposures_in_work)
     mount, _ = mount_of(mission)
     plan = settings.plan
@@ -87,6 +102,26 @@ def main(link: Link, settings: WorkerSettings, rings: tuple[FrameRing, ...]) -> 
             future.result()  # a fault of our own ends the process, and the service says so
     desk.settle_all()
     lanes.end()
+
+
+def build(settings: WorkerSettings) -> Processor:
+    """The pipeline of a configuration, with its calibrations.
+
+    Raises:
+        OSError, ValueError, DaemonError: it cannot be built; the sentence says why.
+    """
+    rig = find_rig(settings.rig)
+    return build_processor(rig, settings.processing, settings.radiometry, settings.plan_file)
+
+
+def _wait_for_begin(link: Link) -> Begin | None:
+    """The order to begin; None where the service ends before."""
+    while not isinstance(order := link.receive(timeout_s=1.0), Stop):
+        if isinstance(order, Begin):
+            return order
+        if isinstance(order, Ping):
+            link.send(Pong({}))
+    return None
 
 
 def settle_threads() -> None:

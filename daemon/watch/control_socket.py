@@ -33,6 +33,9 @@ SO_PEERGROUPS: Final = 59
 GROUPS_MAX: Final = 256
 """Python asks for 1024 bytes at most. Whoever is in more groups is taken by the first one alone."""
 LINE_MAX_BYTES: Final = 16_384
+ANSWER_MAX_BYTES: Final = 1_000_000
+STATE: Final = "state"
+"""Asks for what the service knows of itself; nothing is done, and nothing goes to the log."""
 IDLE_TIMEOUT_S: Final = 30.0
 ANSWER_TIMEOUT_S: Final = 10.0
 STRANGER_TIMEOUT_S: Final = 1.0
@@ -146,6 +149,9 @@ class ControlSocket:
         self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, caller: Caller
     ) -> None:
         while line := await asyncio.wait_for(reader.readline(), IDLE_TIMEOUT_S):
+            if _asks_for_state(line):
+                await _answer(writer, done=True, sentence="", **self._state_now())
+                continue
             done, sentence = await self._obey(line, caller)
             await _answer(writer, done=done, sentence=sentence)
 
@@ -162,6 +168,20 @@ class ControlSocket:
             self._state.acknowledge(str(arguments.get("fault")))
         return answer.done, answer.sentence
 
+    def _state_now(self) -> dict[str, Any]:
+        """What `ask` returns."""
+        brief = self._state.brief()
+        devices = [
+            {key: device.get(key) for key in ("kind", "name", "state", "sentence")}
+            for device in self._state.changed("devices", 0)
+        ]
+        return {
+            "phase": brief["phase"],
+            "missing": brief["status"].get("missing", []),
+            "devices": devices,
+            "faults": brief["faults"],
+        }
+
     @property
     def _group(self) -> str:
         try:
@@ -176,21 +196,39 @@ def give(path: Path, name: str, arguments: Mapping[str, Any]) -> tuple[bool, str
     Raises:
         ControlError: nobody listens, it may not be reached, or no answer came in time.
     """
-    request = json.dumps({"command": name, "arguments": dict(arguments)}).encode() + b"\n"
+    answer = _exchange(path, {"command": name, "arguments": dict(arguments)})
+    return bool(answer.get("done")), str(answer.get("sentence", ""))
+
+
+def ask(path: Path) -> Mapping[str, Any]:
+    """The state of the service: phase, devices, what is missing for arming, and faults.
+
+    Raises:
+        ControlError: as for `give`, or the caller may not ask.
+    """
+    answer = _exchange(path, {"command": STATE})
+    if not answer.get("done"):
+        raise ControlError(f"{path}: {answer.get('sentence')}")
+    return answer
+
+
+def _exchange(path: Path, asked: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Send a line and read the line that answers it."""
+    request = json.dumps(asked).encode() + b"\n"
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
             connection.settimeout(ANSWER_TIMEOUT_S)
             connection.connect(str(path))
             connection.sendall(request)
             with connection.makefile("rb") as answers:
-                answer = json.loads(answers.readline(LINE_MAX_BYTES))
+                answer = json.loads(answers.readline(ANSWER_MAX_BYTES))
     except PermissionError as error:
         raise ControlError(f"{path}: permission denied; ask for the group that commands") from error
     except (OSError, ValueError) as error:
         raise ControlError(
             f"{path}: no answer ({error}); does the service run, with [watch] control?"
         ) from error
-    return bool(answer.get("done")), str(answer.get("sentence", ""))
+    return answer if isinstance(answer, Mapping) else {}
 
 
 def _request(line: bytes) -> tuple[str, dict[str, Any]] | str:
@@ -209,8 +247,18 @@ def _request(line: bytes) -> tuple[str, dict[str, Any]] | str:
     return str(name), body.model_dump(exclude_none=True)
 
 
-async def _answer(writer: asyncio.StreamWriter, *, done: bool, sentence: str) -> None:
-    writer.write(json.dumps({"done": done, "sentence": sentence}).encode() + b"\n")
+def _asks_for_state(line: bytes) -> bool:
+    try:
+        asked = json.loads(line)
+    except (ValueError, RecursionError):
+        return False
+    return isinstance(asked, dict) and asked.get("command") == STATE
+
+
+async def _answer(
+    writer: asyncio.StreamWriter, *, done: bool, sentence: str, **state: object
+) -> None:
+    writer.write(json.dumps({"done": done, "sentence": sentence, **state}).encode() + b"\n")
     await asyncio.wait_for(writer.drain(), ANSWER_TIMEOUT_S)
 
 

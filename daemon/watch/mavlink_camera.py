@@ -22,6 +22,7 @@ from daemon.watch.mavlink_senders import Address, Senders
 from daemon.watch.mavlink_signatures import Signatures, read_key
 from daemon.watch.mavlink_wishes import ACTIONS, BY_IDENTITY, REQUESTS, whole, wish
 from daemon.watch.state import FlightState
+from drivers.extras import require
 from drivers.leap_seconds import leap_seconds_at
 from drivers.mavlink.library import MavlinkParser
 from processing.rig import Rig
@@ -460,6 +461,7 @@ def _disk_mb(path: str | None) -> tuple[float, float, float]:
 
 
 def _dialect() -> Any:
+    require("mavlink")
     from pymavlink.dialects.v20 import ardupilotmega
 
     return ardupilotmega

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
-import socket
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
@@ -20,6 +18,7 @@ from daemon.errors import DaemonError
 from daemon.exposure import navigation_from_json
 from daemon.orientation.exterior import mount_of
 from daemon.orientation.footprints import seen_from
+from daemon.service.findings import Outcome
 from daemon.service.messages import Answer, Ping, Pong, Stop, Told
 from daemon.service.processes import Link, ServiceGoneError
 from daemon.watch.api import WatchSettings, create_app
@@ -31,8 +30,10 @@ from daemon.watch.earlier import remember
 from daemon.watch.gate import Gate
 from daemon.watch.mavlink_camera import MavlinkCamera
 from daemon.watch.pictures import pictures_of
+from daemon.watch.prerequisites import WatchError, listen, watch_findings
 from daemon.watch.state import FlightState
 from daemon.watch.tokens import TokenError, Tokens, read_tokens
+from drivers.extras import MissingExtraError
 from processing.rig import Rig, RigError, load_rig
 
 BODY_MAX_BYTES = 64_000
@@ -40,7 +41,6 @@ GATHER_S = 10.0
 PING_S, PONG_WITHIN_S = 5.0, 10.0
 """So often a watcher is asked whether it still listens, and has so long to answer: what the kernel
 holds for one that stalls may be minutes of telemetry."""
-_log = logging.getLogger(__name__)
 
 
 def main(link: Link, settings: WatchSection) -> None:
@@ -52,10 +52,16 @@ async def _serve(link: Link, settings: WatchSection) -> None:
     ground = _Ground()
     state = FlightState(f"syntopic {version('syntopic')}", ground.seen_from, pictures_of)
     ground.state = state
+    failing = set()
+    for finding in watch_findings(settings, port=False):
+        if finding.outcome is Outcome.FAIL:
+            failing.add(finding.name)
+            link.send(Told(_absent(finding.name, finding.sentence)))
     gate = Gate(link.send)
     coverage = Coverage(state)
     watchers = WatchSettings(_tokens(settings.tokens), settings.open)
     app = create_app(state, gate, watchers, coverage)
+    certified = "certificate" not in failing
     server = _Server(
         uvicorn.Config(
             app,
@@ -67,27 +73,28 @@ async def _serve(link: Link, settings: WatchSection) -> None:
             ws_ping_interval=PING_S,
             ws_ping_timeout=PONG_WITHIN_S,
             timeout_graceful_shutdown=1,
-            ssl_certfile=settings.certificate,
-            ssl_keyfile=settings.key,
+            ssl_certfile=settings.certificate if certified else None,
+            ssl_keyfile=settings.key if certified else None,
         )
     )
-    listening = _listen(settings.host, settings.port)
-    port = settings.port if listening is None else int(listening.getsockname()[1])
-    if listening is None:
-        sentence = (
-            f"port {settings.port} of {settings.host} is taken; watching is not possible until "
-            "another is configured ([watch] port)"
-        )
-        link.send(Told(_absent("watch", sentence)))
-    else:
+    listening, port = None, settings.port
+    try:
+        listening = listen(settings.host, settings.port) if certified else None
+    except WatchError as error:
+        link.send(Told(_absent("watch", str(error))))
+    if listening is not None:
+        port = int(listening.getsockname()[1])
         told = {"host": settings.host, "port": port, "tls": settings.certificate is not None}
         link.send(Told({"event": "watching", **told}))
     ending = asyncio.Event()
     announcement = Announcement(state, settings, port)
     saying = asyncio.create_task(send(state, settings.udp_addresses, settings.udp_bytes_per_s))
     gathering = asyncio.create_task(_gather(coverage))
-    camera = await _camera(settings, state, gate, ground, link)
-    control = await _control(settings, state, gate, link)
+    camera = control = None
+    if "mavlink camera" not in failing:
+        camera = await _camera(settings, state, gate, ground, link)
+    if "control" not in failing:
+        control = await _control(settings, state, gate, link)
     loop = asyncio.get_running_loop()
     remembering: set[asyncio.Task[None]] = set()
 
@@ -150,7 +157,7 @@ async def _camera(
             settings.mavlink, state, gate, lambda: ground.rig, lambda: ground.height_m, report
         )
         await camera.begin()
-    except (ImportError, OSError, ValueError) as error:
+    except (MissingExtraError, OSError, ValueError) as error:
         sentence = f"no MAVLink camera: {error}; look at [watch.mavlink]"
         link.send(Told(_absent("mavlink camera", sentence)))
         return None
@@ -262,22 +269,8 @@ def _absent(device: str, sentence: str) -> dict[str, Any]:
     }
 
 
-def _listen(host: str, port: int) -> socket.socket | None:
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    listening = socket.socket(family, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
-    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        listening.bind((host, port))
-    except OSError:
-        listening.close()
-        return None
-    listening.listen(64)
-    return listening
-
-
 def _tokens(path: Path | None) -> Tokens:
     try:
         return read_tokens(path)
-    except TokenError as error:
-        _log.error("%s; nobody may command", error)
-        return Tokens({})
+    except TokenError:
+        return Tokens({})  # reported with the prerequisites

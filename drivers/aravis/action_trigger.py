@@ -23,6 +23,7 @@ class ActionTrigger(SoftwareTrigger):
     """
 
     kind: ClassVar = "trigger"
+    head_trigger_source: ClassVar = "action"
 
     scheduled = Setting(True, says="say when on the head's clock, instead of at once")
     lead_ms = Setting(50.0, minimum=1, maximum=1000, says="how long ahead commands are sent")

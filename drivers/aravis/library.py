@@ -6,7 +6,7 @@ import functools
 import threading
 from typing import Any, Final
 
-from drivers.contract import DeviceError
+from drivers.extras import missing
 
 OPENING: Final = threading.Lock()
 """Held while a head is opened and configured. Aravis 0.8.26 parses a head's description, and the
@@ -19,7 +19,7 @@ def aravis() -> Any:
     """The Aravis namespace of PyGObject.
 
     Raises:
-        DeviceError: it is not installed; the sentence says what to install.
+        MissingExtraError: it is not installed; the message has the command.
     """
     try:
         import gi
@@ -27,10 +27,7 @@ def aravis() -> Any:
         gi.require_version("Aravis", "0.8")
         from gi.repository import Aravis
     except (ImportError, ValueError) as error:
-        raise DeviceError(
-            f"Aravis cannot be loaded ({error}); install Debian's gir1.2-aravis-0.8 and this "
-            "package's extra aravis"
-        ) from error
+        raise missing("aravis", error) from error
     return Aravis
 
 

@@ -6,7 +6,7 @@ import functools
 import struct
 from typing import Any, Final
 
-from drivers.contract import DeviceError
+from drivers.extras import missing
 from drivers.message_framer import MessageFramer
 
 V1: Final = 0xFE
@@ -22,14 +22,12 @@ def dialect() -> Any:
     """The dialect with the most messages: ArduPilot's, which holds all common ones.
 
     Raises:
-        DeviceError: pymavlink is not installed.
+        MissingExtraError: pymavlink is not installed.
     """
     try:
         from pymavlink.dialects.v20 import ardupilotmega
     except ImportError as error:
-        raise DeviceError(
-            f"pymavlink cannot be loaded ({error}); install this package's extra mavlink"
-        ) from error
+        raise missing("mavlink", error) from error
     return ardupilotmega
 
 

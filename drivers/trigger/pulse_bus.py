@@ -59,6 +59,8 @@ class PulseBusTrigger(Configured):
     """
 
     kind: ClassVar = "trigger"
+    head_trigger_source: ClassVar = "line"
+    """The `trigger_source` that heads need for this trigger."""
 
     host = Setting("127.0.0.1", required=False, says="address of the unit")
     port = Setting(0, required=True, minimum=1, maximum=65535, says="TCP port of the unit")

@@ -26,6 +26,7 @@ class SoftwareTrigger(Configured):
 
     kind: ClassVar = "trigger"
     fires_heads: ClassVar = True
+    head_trigger_source: ClassVar = "software"
 
     timeout_s = Setting(2.0, minimum=0.1, maximum=10, says="longest wait for the heads to be asked")
 

@@ -251,8 +251,8 @@ def read_geotiff(path: Path, settings: SceneSettings) -> quilting.Picture:
         import rasterio
     except ImportError as error:
         raise SceneError(
-            f"{path}: reading a GeoTIFF needs rasterio; install the extra: pip install "
-            "'syntopic[geotiff]'"
+            f"{path}: GeoTIFF files need rasterio, which cannot be loaded ({error}). Run: pip "
+            "install 'syntopic[geotiff]'"
         ) from error
     try:
         with rasterio.open(path) as raster:

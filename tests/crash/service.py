@@ -21,6 +21,7 @@ from daemon.service.messages import (
     Process,
     ProcessFailed,
     Stop,
+    WorkerBuilt,
     WorkerReady,
 )
 from daemon.service.processes import Link
@@ -28,6 +29,7 @@ from daemon.service.processes import Link
 
 def idle_worker(link: Link, _settings: Any, _rings: Any) -> None:
     """In the place of `daemon.service.worker.main`."""
+    link.send(WorkerBuilt())
     link.send(WorkerReady(0.0))
     while not isinstance(order := link.receive(timeout_s=1.0), Stop):
         if isinstance(order, Ping):
@@ -38,15 +40,13 @@ def idle_worker(link: Link, _settings: Any, _rings: Any) -> None:
             link.send(ProcessFailed(number, f"exposure {number}: no pipeline flies here"))
 
 
-def _with_idle_worker(*arguments: Any) -> tuple[departure.ProcessPlan, ...]:
-    return tuple(
-        plan._replace(target="tests.crash.service:idle_worker") if plan.name == "worker" else plan
-        for plan in departure.processes(*arguments)
-    )
+def _with_idle_worker(*arguments: Any) -> departure.ProcessPlan:
+    plan = departure.worker_process(*arguments)
+    return plan._replace(target="tests.crash.service:idle_worker")
 
 
 if __name__ == "__main__":
-    vars(service)["processes"] = _with_idle_worker
+    vars(service)["worker_process"] = _with_idle_worker
     try:
         run(Path(sys.argv[1]), json_lines=True)
     except typer.Exit as ended:

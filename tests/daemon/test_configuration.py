@@ -84,7 +84,7 @@ def test_a_misspelt_key_is_refused_by_its_name() -> None:
 
 def test_two_heads_for_one_sensor_are_refused() -> None:
     content = copy.deepcopy(GOOD)
-    content["head"].append(dict(content["head"][0]))
+    content["head"].append(dict(content["head"][0], address="127.0.0.3"))
     (sentence,) = problems_of(content)
     assert "head[1].sensor" in sentence
 

@@ -153,7 +153,7 @@ def test_the_saturation_flag_is_raised_on_the_flight_frame_and_not_on_the_panel(
 @needs_recording
 def test_a_missing_reference_band_leaves_the_others_as_calibrated_and_says_so(processed):
     mission, rig, _ = processed
-    radiance = radiance_of(rig, mission, None)
+    radiance = radiance_of(rig, mission.path / "radiometry")
     pipeline = BandPipeline(rig, radiance)
     frames, exposure = load_level0(mission.level0(2), rig)
     del frames["G"]

@@ -149,14 +149,36 @@ def test_check_prints_a_tree_of_what_is_well_and_the_cure_of_what_is_not(
     well = syntopic("check", str(config), "--json")
     said = json.loads(well.stdout)
     assert well.returncode == 0, said
-    assert said["ok"] and len(said["devices"]) == 16
+    assert said["outcome"] == "pass"
+    kinds = [finding["kind"] for finding in said["findings"]]
+    assert kinds.count("head") == 13 and {"disk", "memory", "pipeline", "trigger"} <= set(kinds)
+    tried = {f["name"]: f["outcome"] for f in said["findings"] if f["kind"] == "stream"}
+    assert tried["position of gnss"] == "pass" and tried["frame of SU03"] == "not tried"
     present = devices.ready["heads"]["SU03"]["address"]
     config.write_text(text.replace(f'"{present}"', f'"{NOBODY}"'))
     ill = syntopic("check", str(config), "--json")
     said = json.loads(ill.stdout)
     assert ill.returncode == 1
-    (head,) = [device for device in said["devices"] if not device["ok"]]
-    assert NOBODY in head["problem"] and "check" in head["problem"]
+    (head,) = [finding for finding in said["findings"] if finding["outcome"] == "fail"]
+    assert head["name"] == "SU03" and NOBODY in head["sentence"] and "check" in head["sentence"]
+
+
+def test_check_fires_one_exposure_only_where_that_is_asked_for(
+    emulator: tuple[Emulator, Path],
+) -> None:
+    devices, folder = emulator
+    config = folder / "fire.toml"
+    config.write_text(service_toml(devices.ready, root="missions"))
+    done = syntopic("check", str(config), "--fire", "--json")
+    tried = {
+        finding["name"]: finding["outcome"]
+        for finding in json.loads(done.stdout)["findings"]
+        if finding["kind"] == "stream"
+    }
+    heads = devices.ready["heads"]
+    assert done.returncode == 0, done.stdout
+    assert all(tried[f"frame of {head}"] == "pass" for head in heads) and len(tried) == 15
+    assert tried["event mark of gnss"] == "pass"
 
 
 def test_a_process_that_dies_ends_the_service_with_a_sentence_and_the_flight_stays_open(

@@ -61,6 +61,6 @@ def test_check_finds_all_devices_of_a_rig_with_an_ascii_instrument_and_an_autopi
     finally:
         devices.end()
     assert done.returncode == 0, done.stdout
-    found = {device["name"]: device for device in json.loads(done.stdout)["devices"]}
-    assert found["probes"]["driver"] == "ascii-line"
+    found = {finding["name"]: finding for finding in json.loads(done.stdout)["findings"]}
+    assert found["probes"]["found"]["driver"] == "ascii-line"
     assert found["gnss"]["found"]["autopilot"] == "PX4"

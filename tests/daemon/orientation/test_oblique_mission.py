@@ -29,11 +29,13 @@ from daemon.replay.flight import Replayed
 from daemon.service import worker
 from daemon.service.memory import FrameRing
 from daemon.service.messages import (
+    Begin,
     FramesRead,
     Judged,
     Process,
     Processed,
     Stop,
+    WorkerBuilt,
     WorkerReady,
     WorkerSettings,
 )
@@ -126,11 +128,12 @@ def test_the_onboard_worker_makes_every_head_and_its_orientation_as_exposures_co
     exposure = replace(exposure, navigation=navigation)
     plan = PlanSection(ground_height_m=395.0)
     settings = WorkerSettings(
-        str(mission.rig_path), as_flown(mission, None)[1], mission.path, plan, ProcessingSection()
+        str(mission.rig_path), as_flown(mission, None)[1], None, plan, ProcessingSection()
     )
-    link = _Link(Process(exposure, dict.fromkeys(frames, 1)))
+    link = _Link(Begin(mission.path), Process(exposure, dict.fromkeys(frames, 1)))
     worker.main(link, settings, rings)
-    assert [type(said) for said in link.said] == [WorkerReady, FramesRead, Judged, Processed]
+    said = [type(message) for message in link.said]
+    assert said == [WorkerBuilt, WorkerReady, FramesRead, Judged, Processed]
     flown_folder, again = mission.level2(2), folder / "mission/L2/000002"
     for name in ("nadir.tif", "5.tif", "7.tif", "8.tif", "19.tif", "quicklook.jpg"):
         assert (flown_folder / name).read_bytes() == (again / name).read_bytes()

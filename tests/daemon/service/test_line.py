@@ -24,7 +24,8 @@ def make_line(tmp_path: Path, *, count: int, flown: int = 0, reserve: int = 0) -
     configuration, rig = from_mapping(content, tmp_path / "service.toml")
     flight = Flight(rig, {"SU00": ""}, IDENTITY, LIMITS, Ledger(heads=["SU00"]), flown + 1)
     flight.navigation(nav(0.0))
-    return Line(configuration, rig, flight, tmp_path, flown)
+    plan = next(iter(tmp_path.glob("plan.*")), None)
+    return Line(configuration, rig, flight, tmp_path, flown, plan=plan)
 
 
 def fly(line: Line) -> tuple[list[Order], list[str]]:

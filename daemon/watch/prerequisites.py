@@ -1,0 +1,135 @@
+"""What watching needs: its port, tokens, certificate, keys and addresses.
+
+Looked at by `syntopic check`, and by the watch process at its start, which reports the same
+sentences; the flight goes on without what fails here.
+"""
+
+from __future__ import annotations
+
+import grp
+import socket
+import ssl
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+
+from daemon.configuration import WatchSection
+from daemon.errors import DaemonError
+from daemon.service.findings import Finding, failed, passed
+from daemon.watch.tokens import TokenError, read_tokens
+
+KEY_DIGITS = 64
+
+
+class WatchError(DaemonError):
+    """Watching is not possible; the sentence says why, and what to do."""
+
+
+def watch_findings(settings: WatchSection, *, port: bool = True) -> Iterator[Finding]:
+    """What was found of each thing.
+
+    Args:
+        settings: `[watch]` of the configuration.
+        port: whether the port is tried, which holds it for a moment.
+    """
+    if port:
+        yield _port(settings)
+    yield from _tokens(settings.tokens)
+    yield from _certificate(settings)
+    yield from _control(settings)
+    yield from _signing_key(settings)
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """A listening TCP socket.
+
+    Raises:
+        WatchError: the address is taken, or none of this machine's.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    listening = socket.socket(family, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listening.bind((host, port))
+        listening.listen(64)
+    except OSError as error:
+        listening.close()
+        raise WatchError(
+            f"port {port} of {host} cannot be used ({error.strerror or error}); end the program "
+            "that holds it, or configure another ([watch] port). Nobody can watch"
+        ) from error
+    return listening
+
+
+def _port(settings: WatchSection) -> Finding:
+    name = f"{settings.host}:{settings.port}"
+    try:
+        listen(settings.host, settings.port).close()
+    except WatchError as error:
+        return failed("watch", name, str(error))
+    return passed("watch", name)
+
+
+def _tokens(path: Path | None) -> Iterator[Finding]:
+    if path is None:
+        return
+    try:
+        tokens = read_tokens(path)
+    except TokenError as error:
+        yield failed("watch", "tokens", f"{error}; nobody may command with a token")
+        return
+    if not path.exists():
+        sentence = f"nobody has a token yet; make one: syntopic token add NAME --file {path}"
+        yield passed("watch", "tokens", sentence)
+        return
+    yield passed("watch", "tokens", f"{len(tokens.holders)} holders")
+
+
+def _certificate(settings: WatchSection) -> Iterator[Finding]:
+    if settings.certificate is None or settings.key is None:
+        return
+    try:
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.load_cert_chain(settings.certificate, settings.key)
+    except (OSError, ValueError) as error:
+        yield failed(
+            "watch",
+            "certificate",
+            f"{settings.certificate} and {settings.key} cannot be loaded ({error}); give a PEM "
+            "certificate and its key. Nobody can watch",
+        )
+    else:
+        yield passed("watch", "certificate")
+
+
+def _control(settings: WatchSection) -> Iterator[Finding]:
+    path, group = settings.control, settings.control_group
+    if path is None:
+        return
+    if group is not None and not any(known.gr_name == group for known in grp.getgrall()):
+        sentence = f"there is no group {group!r}; [watch] control_group names one"
+        yield failed("watch", "control", sentence)
+    elif not path.parent.is_dir():
+        sentence = f"{path.parent} is no folder; [watch] control names a path in a folder"
+        yield failed("watch", "control", sentence)
+    elif path.exists() and not stat.S_ISSOCK(path.lstat().st_mode):
+        yield failed("watch", "control", f"{path} exists and is no socket; remove it")
+    else:
+        yield passed("watch", "control")
+
+
+def _signing_key(settings: WatchSection) -> Iterator[Finding]:
+    key = None if settings.mavlink is None else settings.mavlink.signing_key
+    if key is None:
+        return
+    try:
+        text = key.read_text("ascii").strip()
+        bytes.fromhex(text)
+        problem = "" if len(text) == KEY_DIGITS else f"{len(text)} digits"
+    except (OSError, ValueError) as error:
+        problem = str(error)
+    if problem:
+        sentence = f"{key}: no key of {KEY_DIGITS} hexadecimal digits ({problem})"
+        yield failed("watch", "mavlink camera", f"{sentence}. No MAVLink camera is announced")
+    else:
+        yield passed("watch", "mavlink camera")

@@ -1,0 +1,95 @@
+"""Optional libraries: what needs them, whether they are there, and the command that installs them.
+
+The names are those of `[project.optional-dependencies]`. Asking loads no library, except that the
+GObject introspection itself is loaded to ask for Aravis.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from drivers.contract import DeviceError
+
+
+@dataclass(frozen=True)
+class Extra:
+    """An optional dependency: what it is needed for, its modules, and its Debian packages."""
+
+    purpose: str
+    modules: tuple[str, ...]
+    packages: str = ""
+
+
+EXTRAS: Final[Mapping[str, Extra]] = {
+    "aravis": Extra(
+        "GigE Vision and USB3 Vision heads need Aravis",
+        ("gi",),
+        "gir1.2-aravis-0.8 libgirepository1.0-dev",
+    ),
+    "geotiff": Extra("GeoTIFF files need rasterio", ("rasterio",)),
+    "geodesy": Extra("coordinate systems need pyproj", ("pyproj",)),
+    "mavlink": Extra("MAVLink needs pymavlink", ("pymavlink",)),
+    "watch": Extra(
+        "the page, the API and telemetry need the packages of [watch]",
+        ("fastapi", "uvicorn", "websockets", "msgpack", "zeroconf", "prometheus_client"),
+    ),
+}
+
+
+class MissingExtraError(DeviceError):
+    """A library that is not installed; the message has the command that installs it."""
+
+
+def require(*names: str) -> None:
+    """Make sure that optional libraries can be loaded.
+
+    Args:
+        names: of EXTRAS.
+
+    Raises:
+        MissingExtraError: one cannot; the message has the command that installs it.
+    """
+    for name in names:
+        for module in EXTRAS[name].modules:
+            if not _is_there(module):
+                raise missing(name, f"no module {module}")
+        if name == "aravis":
+            _require_typelib()
+
+
+def missing(name: str, reason: object) -> MissingExtraError:
+    """The error that says how to install an extra, and why it is asked for."""
+    extra = EXTRAS[name]
+    sentence = f"{extra.purpose}, which cannot be loaded ({reason})"
+    if extra.modules[1:]:
+        sentence = f"{extra.purpose}, which cannot all be loaded ({reason})"
+    system = f" and the system library: sudo apt install {extra.packages}" if extra.packages else ""
+    return MissingExtraError(f"{sentence}. Run: pip install 'syntopic[{name}]'{system}")
+
+
+def missing_module(error: ImportError) -> MissingExtraError | None:
+    """The same error for an import that failed; None where the module belongs to no extra."""
+    module = (error.name or "").partition(".")[0]
+    for name, extra in EXTRAS.items():
+        if module in (*extra.modules, "starlette" if name == "watch" else ""):
+            return missing(name, error)
+    return None
+
+
+def _is_there(module: str) -> bool:
+    try:
+        return importlib.util.find_spec(module) is not None
+    except (ImportError, ValueError):
+        return False
+
+
+def _require_typelib() -> None:
+    """Aravis itself: a library of the system, described by a file beside it."""
+    try:
+        importlib.import_module("gi").require_version("Aravis", "0.8")
+    except (ImportError, ValueError) as error:
+        raise missing("aravis", error) from error
