@@ -185,6 +185,8 @@ class Comparison:
         state = self.clockwork.receiver.state(gps_ns)
         north_m = (navigation.latitude_deg - state.latitude_deg) * EARTH_M_PER_DEG
         east_m = (navigation.longitude_deg - state.longitude_deg) * EARTH_M_PER_DEG * 0.669
+        if navigation.height_m is None:
+            return math.inf
         return math.hypot(north_m, east_m, navigation.height_m - state.height_m)
 
     def _touched(self) -> set[int]:

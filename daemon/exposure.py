@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, cast, get_args
 
 from daemon.disk.records import Fields, RecordError, canonical_bytes
+from drivers.contract import Velocity
 
 TimeSource = Literal["event-mark", "pps", "interpolated", "host", "none"]
 RecordState = Literal["complete", "degraded", "lost"]
@@ -66,6 +67,8 @@ class NavigationRecord:
     Geographic coordinates in `crs` at the epoch of the observation, `height_m` above
     `height_reference`; heading from true north; velocity north, east, down. `gap_ns` is the span
     between the two samples used, or the distance to the nearest one where it was extrapolated.
+    What the receiver did not send is None. `sigma_source` and `leap_source` say where sigmas and
+    GPS time come from (`drivers.contract.NavSample`).
     """
 
     receiver: str
@@ -73,20 +76,22 @@ class NavigationRecord:
     method: Literal["interpolated", "extrapolated", "nearest"]
     gap_ns: int
     fix: str
-    satellites: int
+    satellites: int | None
     latitude_deg: float
     longitude_deg: float
-    height_m: float
-    horizontal_sigma_m: float
-    vertical_sigma_m: float
-    velocity_ned_mps: tuple[float, float, float]
-    speed_sigma_mps: float
+    height_m: float | None
+    horizontal_sigma_m: float | None
+    vertical_sigma_m: float | None
+    velocity_ned_mps: Velocity | None
+    speed_sigma_mps: float | None
     roll_rad: float | None = None
     pitch_rad: float | None = None
     heading_rad: float | None = None
     leap_seconds: int | None = None
     crs: str = "EPSG:4979"
     height_reference: Literal["ellipsoid", "geoid"] = "ellipsoid"
+    sigma_source: str = "receiver"
+    leap_source: str = "receiver"
 
 
 @dataclass(frozen=True)
@@ -234,6 +239,7 @@ def navigation_from_json(content: Mapping[str, Any]) -> NavigationRecord:
 
 def navigation_to_json(navigation: NavigationRecord) -> dict[str, Any]:
     """The navigation of an exposure as an object of JSON types."""
+    velocity = navigation.velocity_ned_mps
     return {
         "receiver": navigation.receiver,
         "gps_ns": _instant(navigation.gps_ns),
@@ -243,17 +249,19 @@ def navigation_to_json(navigation: NavigationRecord) -> dict[str, Any]:
         "satellites": navigation.satellites,
         "latitude_deg": float(navigation.latitude_deg),
         "longitude_deg": float(navigation.longitude_deg),
-        "height_m": float(navigation.height_m),
-        "horizontal_sigma_m": float(navigation.horizontal_sigma_m),
-        "vertical_sigma_m": float(navigation.vertical_sigma_m),
-        "velocity_ned_mps": [float(v) for v in navigation.velocity_ned_mps],
-        "speed_sigma_mps": float(navigation.speed_sigma_mps),
+        "height_m": _float(navigation.height_m),
+        "horizontal_sigma_m": _float(navigation.horizontal_sigma_m),
+        "vertical_sigma_m": _float(navigation.vertical_sigma_m),
+        "velocity_ned_mps": None if velocity is None else [_float(v) for v in velocity],
+        "speed_sigma_mps": _float(navigation.speed_sigma_mps),
         "roll_rad": _float(navigation.roll_rad),
         "pitch_rad": _float(navigation.pitch_rad),
         "heading_rad": _float(navigation.heading_rad),
         "leap_seconds": navigation.leap_seconds,
         "crs": navigation.crs,
         "height_reference": navigation.height_reference,
+        "sigma_source": navigation.sigma_source,
+        "leap_source": navigation.leap_source,
     }
 
 
@@ -378,20 +386,22 @@ def _navigation(fields: Fields) -> NavigationRecord:
         method=cast(Literal["interpolated", "extrapolated", "nearest"], method),
         gap_ns=fields.integer("gap_ns", 0),
         fix=fields.text("fix", "none"),
-        satellites=fields.integer("satellites", 0),
+        satellites=fields.integer_or_none("satellites"),
         latitude_deg=fields.number("latitude_deg"),
         longitude_deg=fields.number("longitude_deg"),
-        height_m=fields.number("height_m"),
-        horizontal_sigma_m=fields.number("horizontal_sigma_m"),
-        vertical_sigma_m=fields.number("vertical_sigma_m"),
-        velocity_ned_mps=fields.triple("velocity_ned_mps"),
-        speed_sigma_mps=fields.number("speed_sigma_mps"),
+        height_m=fields.number_or_none("height_m"),
+        horizontal_sigma_m=fields.number_or_none("horizontal_sigma_m"),
+        vertical_sigma_m=fields.number_or_none("vertical_sigma_m"),
+        velocity_ned_mps=fields.velocity("velocity_ned_mps"),
+        speed_sigma_mps=fields.number_or_none("speed_sigma_mps"),
         roll_rad=fields.number_or_none("roll_rad"),
         pitch_rad=fields.number_or_none("pitch_rad"),
         heading_rad=fields.number_or_none("heading_rad"),
         leap_seconds=fields.integer_or_none("leap_seconds", minimum=-1000),
         crs=fields.text("crs", "EPSG:4979"),
         height_reference=cast(Literal["ellipsoid", "geoid"], reference),
+        sigma_source=fields.text("sigma_source", "receiver"),
+        leap_source=fields.text("leap_source", "receiver"),
     )
     fields.refuse_unknown()
     return record

@@ -12,7 +12,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Final, Protocol
 
 
 class DeviceError(Exception):
@@ -89,31 +89,52 @@ class EventMark:
     mono_ns: int
 
 
+Velocity = tuple[float, float, float | None]
+"""North, east, down in m/s; down is None where the receiver does not send it."""
+
+POSITION_FIXES: Final = ("2d", "3d", "dead-reckoning")
+"""Fixes that come with a position; a "2d" fix has no height."""
+
+
 @dataclass(frozen=True)
 class NavSample:
     """Position, velocity and, where the receiver knows it, attitude at one GPS instant.
 
     Geographic coordinates in WGS 84, height above the ellipsoid; velocity north, east, down.
-    `fix` is the receiver's word: "none", "2d", "3d", "time", "dead-reckoning".
+    `fix` is the receiver's word: "none", "2d", "3d", "time", "dead-reckoning". What was not
+    received is None, never 0: latitude and longitude without a fix, height in a 2d fix or where
+    only a height above the geoid came, sigmas that nobody stated. `sigma_source` says where
+    `horizontal_sigma_m` comes from: "receiver", "dop" (dilution of precision times a configured
+    range error) or "none". `leap_source` is "receiver", or "table" where GPS time was computed from
+    UTC with our table of leap seconds: if the table is outdated, time is wrong by whole seconds.
     """
 
     receiver: str
     gps_ns: int
     mono_ns: int
     fix: str
-    satellites: int
-    latitude_deg: float
-    longitude_deg: float
-    height_m: float
-    horizontal_sigma_m: float
-    vertical_sigma_m: float
-    velocity_ned_mps: tuple[float, float, float]
-    speed_sigma_mps: float
+    satellites: int | None
+    latitude_deg: float | None
+    longitude_deg: float | None
+    height_m: float | None
+    horizontal_sigma_m: float | None
+    vertical_sigma_m: float | None
+    velocity_ned_mps: Velocity | None
+    speed_sigma_mps: float | None
     roll_rad: float | None
     pitch_rad: float | None
     heading_rad: float | None
     leap_seconds: int | None
     time_valid: bool
+    sigma_source: str = "receiver"
+    leap_source: str = "receiver"
+
+    @property
+    def position(self) -> tuple[float, float] | None:
+        """Latitude and longitude, degrees; None without a fix."""
+        if self.fix not in POSITION_FIXES or self.latitude_deg is None:
+            return None
+        return None if self.longitude_deg is None else (self.latitude_deg, self.longitude_deg)
 
 
 @dataclass(frozen=True)

@@ -53,6 +53,10 @@ class MessageDecoder:
         """Event marks in succession of the edge that is not the configured one."""
         self._gps_ns: int | None = None
         """GPS time of the last navigation epoch whose time could be trusted."""
+        self.fix: str | None = None
+        """The receiver's last word about its fix, as in NavSample; None before any."""
+        self.satellites: int | None = None
+        """Satellites in use; None where the receiver has not said."""
 
     @abstractmethod
     def on_message(self, message: bytes, mono_ns: int) -> list[Nav]:

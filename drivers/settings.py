@@ -119,6 +119,8 @@ class Configured:
             raise SettingsError(name, problems)
         self._name = name
         self.configured: Mapping[str, Any] = self._values(settings)
+        self.given = frozenset(settings)
+        """Names of the settings that were configured, not left at their defaults."""
 
     @property
     def name(self) -> str:

@@ -392,30 +392,33 @@ def _at_mark(
     if exposure.mark_gps_ns is None:
         return None
     there = [trajectory.at(exposure.mark_gps_ns + k * STEP_NS) for k in (-1, 0, 1)]
-    level = []
+    level, heights_m = [], []
     for one in there:
         if one is None or one.roll_rad is None or one.pitch_rad is None or one.heading_rad is None:
             return None
+        if one.height_m is None:
+            return None
+        heights_m.append(one.height_m)
         level.append(level_from_body(one.roll_rad, one.pitch_rad, one.heading_rad))
     before, here, after = there
     if before is None or here is None or after is None:
         return None
     if isinstance(system, LocalFrame):
-        at = (here.latitude_deg, here.longitude_deg, here.height_m)
+        at = (here.latitude_deg, here.longitude_deg, heights_m[1])
         position = system.from_geodetic(*(np.array(v) for v in at))
         grid = system.local_from_enu(here.latitude_deg, here.longitude_deg)
     else:
-        place = system.place(here.latitude_deg, here.longitude_deg, here.height_m)
+        place = system.place(here.latitude_deg, here.longitude_deg, heights_m[1])
         position = np.array([place.east_m, place.north_m, place.height_m])
         grid = grid_from_enu(place.azimuth_of_north_rad)
-    per_latitude, per_longitude = metres_per_degree(here.latitude_deg, here.height_m)
+    per_latitude, per_longitude = metres_per_degree(here.latitude_deg, heights_m[1])
     span_s = 2 * STEP_NS * 1e-9
     velocity = (
         np.array(
             [
                 (after.longitude_deg - before.longitude_deg) * per_longitude,
                 (after.latitude_deg - before.latitude_deg) * per_latitude,
-                after.height_m - before.height_m,
+                heights_m[2] - heights_m[0],
             ]
         )
         / span_s

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields
 from enum import Enum
 from typing import Any, Final, get_type_hints
 
@@ -31,6 +31,7 @@ from drivers.contract import (
     Record,
     TemperatureSample,
     TriggerPulse,
+    Velocity,
 )
 
 
@@ -205,7 +206,7 @@ _QUESTIONS: Final[Mapping[Any, Callable[[Fields, str], Any]]] = {
     float: Fields.number,
     float | None: Fields.number_or_none,
     bool: _flag,
-    tuple[float, float, float]: Fields.triple,
+    Velocity | None: Fields.velocity,
     Mapping[str, float | int | str]: Fields.scalars,
     FrameStatus: _status,
 }
@@ -218,7 +219,15 @@ def _reader(kind: type[Any]) -> Callable[[Fields], LoggedRecord]:
         name: next(_QUESTIONS[key] for key in (name, (name, hint), hint) if key in _QUESTIONS)
         for name, hint in get_type_hints(kind).items()
     }
-    return lambda fields: kind(**{name: ask(fields, name) for name, ask in asked.items()})
+    # A log of an earlier version lacks the fields that came later: those have defaults.
+    later = {one.name for one in fields(kind) if one.default is not MISSING}
+    return lambda given: kind(
+        **{
+            name: ask(given, name)
+            for name, ask in asked.items()
+            if name in given.content or name not in later
+        }
+    )
 
 
 _READERS: Final = {"trigger": _trigger} | {topic: _reader(kind) for topic, kind in _KINDS.items()}

@@ -197,21 +197,24 @@ class Fields:
             return ""
         return value
 
-    def triple(self, key: str) -> tuple[float, float, float]:
-        value = self._get(key, _REQUIRED)
+    def velocity(self, key: str) -> tuple[float, float, float | None] | None:
+        """North, east, down; null, also of down alone, where it is not known."""
+        value = self._get(key, None)
+        if value is None:
+            return None
         good = (
             isinstance(value, list)
             and len(value) == 3
             and all(
                 isinstance(v, int | float) and not isinstance(v, bool) and abs(v) < 1e300
-                for v in value
+                for v in (value[:2] if value[2] is None else value)
             )
         )
-        if good:
-            return (float(value[0]), float(value[1]), float(value[2]))
-        if key in self.content:
-            self.complain(key, "three numbers are needed")
-        return (0.0, 0.0, 0.0)
+        if not good:
+            self.complain(key, "three numbers are needed, of which the last may be null")
+            return None
+        down = None if value[2] is None else float(value[2])
+        return (float(value[0]), float(value[1]), down)
 
     def scalars(self, key: str) -> dict[str, float | int | str]:
         """A flat object of numbers and texts; empty where the key is absent."""

@@ -31,8 +31,8 @@ class Shot:
     """What is told of a picture.
 
     `height_m` is above the ellipsoid (EXIF 2.32 knows no such reference: `remark` says it);
-    `position_sigma_m` of zero is not known; angles are of the image's camera against the local
-    level (yaw from true north) and omega, phi, kappa against the grid `crs`.
+    `position_sigma_m` is None where it is not known; angles are of the image's camera against the
+    local level (yaw from true north) and omega, phi, kappa against the grid `crs`.
     """
 
     camera: str
@@ -42,7 +42,7 @@ class Shot:
     latitude_deg: float
     longitude_deg: float
     height_m: float
-    position_sigma_m: float
+    position_sigma_m: float | None
     f_mm: float
     pixel_um: float
     exposure_time_s: float | None
@@ -105,7 +105,7 @@ def exif_bytes(shot: Shot) -> bytes:
         (0x0012, _ASCII, _text("WGS-84")),
         (0x001D, _ASCII, _text(when.strftime("%Y:%m:%d"))),
     ]
-    if shot.position_sigma_m > 0.0:
+    if shot.position_sigma_m is not None:
         gps.append((0x001F, _RATIONAL, (_rational(shot.position_sigma_m),)))
     return _tiff(main, detail, gps)
 
@@ -121,7 +121,7 @@ def xmp_bytes(shot: Shot) -> bytes:
         "PerspectiveFocalLength": f"{shot.f_mm:.6f}",
         "PerspectiveFocalLengthUnits": "mm",
     }
-    if shot.position_sigma_m > 0.0:
+    if shot.position_sigma_m is not None:
         camera["GPSXYAccuracy"] = f"{shot.position_sigma_m:.4f}"
     own = {
         "GpsNanoseconds": str(shot.gps_ns),

@@ -32,7 +32,7 @@ GPS_EPOCH_UNIX_NS = 315_964_800_000_000_000
 NS = 1_000_000_000
 INFO, WARNING, ERROR = 2, 3, 4
 LEVELS = {"good": INFO, "usable": WARNING, "refly": ERROR}
-DIAGONAL_KNOWN = 2
+UNKNOWN_COVARIANCE, DIAGONAL_KNOWN = 0, 2
 
 _TIME = {
     "type": "object",
@@ -146,7 +146,7 @@ def _from_logs(mission: Mission) -> Iterator[_Told]:
                 record = record_of(message)
             except RecordError:
                 continue
-            if isinstance(record, NavSample) and record.time_valid:
+            if isinstance(record, NavSample) and record.time_valid and record.position:
                 # The earliest arrival is the nearest to the instant itself: tens of ms.
                 lag_ns = record.mono_ns - record.gps_ns
                 known_ns = lag_ns if mono_less_gps_ns is None else mono_less_gps_ns
@@ -202,17 +202,18 @@ def _said(level: int, name: str, sentence: str) -> tuple[str, str, dict[str, Any
 
 
 def _fix(sample: NavSample) -> dict[str, Any]:
-    horizontal = sample.horizontal_sigma_m**2 / 2
-    diagonal = (horizontal, horizontal, sample.vertical_sigma_m**2)
+    horizontal_m, vertical_m = sample.horizontal_sigma_m, sample.vertical_sigma_m
     covariance = [0.0] * 9
-    covariance[0::4] = diagonal
+    is_known = horizontal_m is not None and vertical_m is not None
+    if horizontal_m is not None and vertical_m is not None:
+        covariance[0::4] = (horizontal_m**2 / 2, horizontal_m**2 / 2, vertical_m**2)
     return {
         "frame_id": sample.receiver,
         "latitude": sample.latitude_deg,
         "longitude": sample.longitude_deg,
-        "altitude": sample.height_m,
+        **({} if sample.height_m is None else {"altitude": sample.height_m}),
         "position_covariance": covariance,
-        "position_covariance_type": DIAGONAL_KNOWN,
+        "position_covariance_type": DIAGONAL_KNOWN if is_known else UNKNOWN_COVARIANCE,
     }
 
 

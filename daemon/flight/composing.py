@@ -77,7 +77,7 @@ def compose(
     navigation: NavigationRecord | None = None
     if instant.gps_ns is not None:
         navigation = track.at(instant.gps_ns, stored.trigger_mono_ns)
-    if navigation is None:
+    if navigation is None or navigation.height_m is None or navigation.horizontal_sigma_m is None:
         flags |= Flag.GNSS
     return Exposure(
         number=stored.number,

@@ -50,26 +50,29 @@ class DistanceTrigger:
 
     def due(self, now_ns: int, last_fired_ns: int | None, nav: NavSample | None) -> int | None:
         """Host time at which the distance will be flown; None without a position."""
-        if nav is None or nav.fix == "none":
+        if nav is None or nav.position is None:
             return None
         if last_fired_ns is None or self._origin is None:
             return now_ns
+        if nav.velocity_ned_mps is None:
+            return None
         speed = math.hypot(*nav.velocity_ned_mps[:2])
         if speed < 1.0:
             return None
-        flown_m = _distance_m(self._origin, (nav.latitude_deg, nav.longitude_deg))
+        flown_m = _distance_m(self._origin, nav.position)
         left_ns = round((self.distance_m - flown_m) / speed * NANOSECONDS)
         return max(nav.mono_ns + left_ns, last_fired_ns + self.least_interval_ns)
 
     def fired(self, mono_ns: int, nav: NavSample | None) -> None:
         """Note where the exposure was, from the last position carried forward."""
-        if nav is None:
+        if nav is None or nav.position is None:
             return
         ahead_s = (mono_ns - nav.mono_ns) / NANOSECONDS
-        north_m, east_m = (v * ahead_s for v in nav.velocity_ned_mps[:2])
-        latitude = nav.latitude_deg + math.degrees(north_m / EARTH_RADIUS_M)
-        shrink = math.cos(math.radians(nav.latitude_deg))
-        longitude = nav.longitude_deg + math.degrees(east_m / (EARTH_RADIUS_M * shrink))
+        velocity = nav.velocity_ned_mps or (0.0, 0.0, None)
+        north_m, east_m = velocity[0] * ahead_s, velocity[1] * ahead_s
+        latitude = nav.position[0] + math.degrees(north_m / EARTH_RADIUS_M)
+        shrink = math.cos(math.radians(nav.position[0]))
+        longitude = nav.position[1] + math.degrees(east_m / (EARTH_RADIUS_M * shrink))
         self._origin = (latitude, longitude)
 
 

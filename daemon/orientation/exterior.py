@@ -61,8 +61,8 @@ class ExteriorOrientation:
     azimuth_of_north_rad: float
     scale: float
     method: str
-    horizontal_sigma_m: float
-    vertical_sigma_m: float
+    horizontal_sigma_m: float | None
+    vertical_sigma_m: float | None
 
     @property
     def name(self) -> str:
@@ -86,7 +86,7 @@ class Unoriented:
 
     exposure: int
     cone: str
-    why: Literal["no instant", "no navigation", "no attitude"]
+    why: Literal["no instant", "no navigation", "no height", "no attitude"]
 
 
 class Navigated(Protocol):
@@ -173,11 +173,15 @@ def orient(
         if there is None:
             yield Unoriented(exposure.number, cone.name, "no navigation")
             continue
+        if there.height_m is None:
+            yield Unoriented(exposure.number, cone.name, "no height")
+            continue
         if there.roll_rad is None or there.pitch_rad is None or there.heading_rad is None:
             yield Unoriented(exposure.number, cone.name, "no attitude")
             continue
         level_from_imu = level_from_body(there.roll_rad, there.pitch_rad, there.heading_rad)
-        yield _oriented(exposure, cone, rig, mount, there, level_from_imu, georeference)
+        antenna = (there, there.height_m)
+        yield _oriented(exposure, cone, rig, mount, antenna, level_from_imu, georeference)
 
 
 def _oriented(
@@ -185,19 +189,20 @@ def _oriented(
     cone: Cone,
     rig: Rig,
     mount: MountSection,
-    there: NavigationRecord,
+    antenna: tuple[NavigationRecord, float],
     level_from_imu: Array,
     georeference: Placing,
 ) -> ExteriorOrientation:
+    there, antenna_height_m = antenna
     roll, pitch, heading = (math.radians(angle) for angle in mount.boresight_deg)
     imu_from_body = level_from_body(roll, pitch, heading)
     # From the point the receiver speaks of to the projection centre, first in the body.
     lever_m = np.array(cone.position_mm) * 1e-3 - np.array(mount.antenna_m)
     north_m, east_m, down_m = level_from_imu @ imu_from_body @ lever_m
-    per_latitude, per_longitude = metres_per_degree(there.latitude_deg, there.height_m)
+    per_latitude, per_longitude = metres_per_degree(there.latitude_deg, antenna_height_m)
     latitude = there.latitude_deg + float(north_m) / per_latitude
     longitude = there.longitude_deg + float(east_m) / per_longitude
-    height = there.height_m - float(down_m)
+    height = antenna_height_m - float(down_m)
     place = georeference.place(latitude, longitude, height)
     is_master = cone.name == rig.image_cone_name
     return ExteriorOrientation(

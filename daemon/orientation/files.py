@@ -79,10 +79,15 @@ def csv_text(about: About, oriented: Sequence[ExteriorOrientation]) -> str:
                 *(f"{angle:.7f}" for angle in (omega, phi, kappa)),
                 *(f"{eo.latitude_deg:.10f}", f"{eo.longitude_deg:.10f}", f"{eo.height_m:.4f}"),
                 *(f"{eo.scale:.9f}", eo.method),
-                *(f"{eo.horizontal_sigma_m:.4f}", f"{eo.vertical_sigma_m:.4f}"),
+                *(_metres(eo.horizontal_sigma_m), _metres(eo.vertical_sigma_m)),
             ]
         )
     return text.getvalue()
+
+
+def _metres(value: float | None) -> str:
+    """Empty where it is not known."""
+    return "" if value is None else f"{value:.4f}"
 
 
 def patb_text(about: About, oriented: Sequence[ExteriorOrientation]) -> str:

@@ -69,11 +69,11 @@ def seen_from(
 ) -> list[tuple[float, float]] | None:
     """The corners (longitude, latitude) of the image taken there, before any georeferencing.
 
-    None without an attitude, and where the horizon is seen. The camera's own place on the aircraft
-    is left out: centimetres.
+    None without a height or an attitude, and where the horizon is seen. The camera's own place on
+    the aircraft is left out: centimetres.
     """
     n = navigation
-    if n.roll_rad is None or n.pitch_rad is None or n.heading_rad is None:
+    if n.height_m is None or n.roll_rad is None or n.pitch_rad is None or n.heading_rad is None:
         return None
     boresight = level_from_body(*(math.radians(angle) for angle in mount.boresight_deg))
     eo = ExteriorOrientation(

@@ -44,8 +44,11 @@ class Ground:
     def height_above_m(self, there: NavigationRecord) -> float | None:
         """Of the camera above the mean of the terrain it sees.
 
-        None without an attitude, and where the model does not know half of the footprint.
+        None without a height or an attitude, and where the model does not know half of the
+        footprint.
         """
+        if there.height_m is None:
+            return None
         own = self._system.place(there.latitude_deg, there.longitude_deg, there.height_m)
         # Heights of the model may count from the geoid, those of navigation do not.
         model_less_ellipsoid_m = own.height_m - there.height_m

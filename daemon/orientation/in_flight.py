@@ -85,14 +85,18 @@ class _Recorded:
         if there is None or abs(gps_ns - there.gps_ns) > CARRIED_MOST_NS:
             return None
         seconds = (gps_ns - there.gps_ns) * 1e-9
+        if there.velocity_ned_mps is None:
+            # Without a velocity it holds at its own instant only.
+            return there if gps_ns == there.gps_ns else None
         north, east, down = there.velocity_ned_mps
-        per_latitude, per_longitude = metres_per_degree(there.latitude_deg, there.height_m)
+        height_m = there.height_m
+        per_latitude, per_longitude = metres_per_degree(there.latitude_deg, height_m or 0.0)
         return replace(
             there,
             gps_ns=gps_ns,
             latitude_deg=there.latitude_deg + north * seconds / per_latitude,
             longitude_deg=there.longitude_deg + east * seconds / per_longitude,
-            height_m=there.height_m - down * seconds,
+            height_m=None if height_m is None else height_m - (down or 0.0) * seconds,
         )
 
 

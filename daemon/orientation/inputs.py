@@ -77,8 +77,12 @@ def orienting(
         mount = read_mount(mount_file)
     trajectory = trajectory_of(mission, exposures, trajectory_file, receiver)
     if crs is None:
-        first = trajectory.sample(0)
-        crs = utm_of(first.latitude_deg, first.longitude_deg)
+        first = trajectory.sample(0).position
+        if first is None:
+            raise OrientationError(
+                f"{trajectory.name}: no position in its first sample; give --crs"
+            )
+        crs = utm_of(*first)
     rig = load_rig(mission.rig_path)
     return Orienting(rig, mount, plan.ground_height_m, trajectory, crs, Georeference(crs))
 

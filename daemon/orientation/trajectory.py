@@ -21,7 +21,7 @@ from daemon.disk.mission import Mission
 from daemon.disk.records import sha256_hex
 from daemon.errors import DaemonError
 from daemon.exposure import NavigationRecord
-from daemon.flight.navigation import between, metres_per_degree
+from daemon.flight.navigation import EXTRAPOLATION_LIMIT_NS, around, metres_per_degree
 from drivers.contract import NavSample
 
 WEEK_NS = 604_800_000_000_000
@@ -54,9 +54,20 @@ class Trajectory:
     def at(self, gps_ns: int) -> NavigationRecord | None:
         """Navigation at an instant; None where no sample is within two seconds."""
         index = int(np.searchsorted(self.instants_ns, gps_ns, side="right"))
-        before = self.sample(index - 1) if index > 0 else None
-        after = self.sample(index) if index < len(self.instants_ns) else None
-        return between(before, after, gps_ns)
+        earlier = range(index - 1, -1, -1)
+        later = range(index, len(self.instants_ns))
+        near = [*self._near(earlier, gps_ns), *self._near(later, gps_ns)]
+        return around(near, gps_ns)
+
+    def _near(self, indices: range, gps_ns: int) -> Iterator[NavSample]:
+        """The samples within reach in one direction, as far as one with a height."""
+        for i in indices:
+            if abs(int(self.instants_ns[i]) - gps_ns) > EXTRAPOLATION_LIMIT_NS:
+                return
+            sample = self.sample(i)
+            yield sample
+            if sample.height_m is not None:
+                return
 
 
 def flown(mission: Mission, receiver: str | None = None) -> Trajectory:
@@ -74,7 +85,7 @@ def flown(mission: Mission, receiver: str | None = None) -> Trajectory:
         for message in read(path):
             if message.topic.startswith("navigation/"):
                 sample = record_of(message)
-                if isinstance(sample, NavSample) and sample.time_valid and _has_position(sample):
+                if isinstance(sample, NavSample) and sample.time_valid and sample.position:
                     found.setdefault(sample.receiver, []).append(sample)
     if receiver is None and found:
         receiver = max(found, key=lambda name: (_with_attitude(found[name]), len(found[name])))
@@ -211,24 +222,21 @@ def _sample(
         gps_ns=gps_ns,
         mono_ns=0,
         fix="3d",
-        satellites=0,
+        satellites=None,
         latitude_deg=place[0],
         longitude_deg=place[1],
         height_m=place[2],
-        horizontal_sigma_m=0.0,
-        vertical_sigma_m=0.0,
+        horizontal_sigma_m=None,
+        vertical_sigma_m=None,
         velocity_ned_mps=velocity,
-        speed_sigma_mps=0.0,
+        speed_sigma_mps=None,
         roll_rad=attitude[0],
         pitch_rad=attitude[1],
         heading_rad=attitude[2],
         leap_seconds=None,
         time_valid=True,
+        sigma_source="none",
     )
-
-
-def _has_position(sample: NavSample) -> bool:
-    return sample.fix in ("2d", "3d", "dead-reckoning")
 
 
 def _with_attitude(samples: Sequence[NavSample]) -> int:

@@ -109,13 +109,13 @@ class PlanTrigger:
         return self._known[1]
 
     def _find(self, nav: NavSample | None) -> OnLine | None:
-        if nav is None or nav.fix == "none":
+        if nav is None or nav.position is None or nav.velocity_ned_mps is None:
             return None
         north, east = nav.velocity_ned_mps[:2]
         speed_mps = math.hypot(north, east)
         if speed_mps < LEAST_SPEED_MPS:
             return None
-        at = self._plane.flat(Point(nav.latitude_deg, nav.longitude_deg))
+        at = self._plane.flat(Point(*nav.position))
         found = [
             self._on(line, ends, at, (east, north), nav.mono_ns)
             for line, ends in zip(self.plan.lines, self._ends, strict=True)

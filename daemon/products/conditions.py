@@ -38,11 +38,13 @@ def conditions_of(
     height_m = plan.height_above_ground_m
     crab_rad = None
     if navigation is not None:
-        north, east, _ = navigation.velocity_ned_mps
-        speed_mps = math.hypot(north, east)
-        height_m = navigation.height_m - plan.ground_height_m
+        if navigation.height_m is not None:
+            height_m = navigation.height_m - plan.ground_height_m
         if ground is not None and (above_m := ground.height_above_m(navigation)) is not None:
             height_m = above_m
+    if navigation is not None and navigation.velocity_ned_mps is not None:
+        north, east, _ = navigation.velocity_ned_mps
+        speed_mps = math.hypot(north, east)
         if navigation.heading_rad is not None and speed_mps > 1.0:
             crab = navigation.heading_rad - math.atan2(east, north)
             crab_rad = math.remainder(crab, 2 * math.pi)

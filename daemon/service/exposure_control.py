@@ -183,10 +183,11 @@ class ExposureControl:
         section, cone = self._section, self._cones[group]
         speed_mps, height_m = self._plan.ground_speed_mps, self._plan.height_above_ground_m
         crab_rad = 0.0
-        if position is not None and position.fix != "none":
+        if position is not None and position.height_m is not None:
+            height_m = position.height_m - self._plan.ground_height_m
+        if position is not None and position.velocity_ned_mps is not None:
             north, east = position.velocity_ned_mps[:2]
             speed_mps = math.hypot(north, east)
-            height_m = position.height_m - self._plan.ground_height_m
             if position.heading_rad is not None and speed_mps > 1.0:
                 crab_rad = math.remainder(position.heading_rad - math.atan2(east, north), math.tau)
         sensor = cone.sensors[0]

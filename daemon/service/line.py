@@ -178,7 +178,7 @@ class Line:
         """An exposure that is due: ordered now."""
         nav = self._position()
         speed_mps = self._configuration.plan.ground_speed_mps
-        if nav is not None:
+        if nav is not None and nav.velocity_ned_mps is not None:
             flown_mps = math.hypot(*nav.velocity_ned_mps[:2])
             speed_mps = flown_mps if flown_mps > 1.0 else speed_mps
         delays_ns = pulse_delays_ns(self._rig, speed_mps, self._exposure_ns)

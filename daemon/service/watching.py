@@ -120,7 +120,7 @@ def status_event(
             "latitude_deg": position.latitude_deg,
             "longitude_deg": position.longitude_deg,
             "height_m": position.height_m,
-            "velocity_ned_mps": list(position.velocity_ned_mps),
+            "velocity_ned_mps": position.velocity_ned_mps and list(position.velocity_ned_mps),
             "heading_rad": position.heading_rad,
             "fix": position.fix,
             "satellites": position.satellites,

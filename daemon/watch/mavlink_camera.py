@@ -33,6 +33,8 @@ SAVE_EVERY_S = 30.0
 SAVE_WITHIN_S = 1.0
 """How long a command waits for the disk that keeps the last timestamps."""
 GPS_EPOCH_UNIX_S = 315_964_800
+COORDINATE_UNKNOWN = 2**31 - 1
+"""INT32_MAX, as in MAVLink's other messages with a latitude."""
 UNKNOWN_ANGLE = (1.0, 0.0, 0.0, 0.0)
 VENDOR, FIRMWARE = "Syntopic", 1 << 24
 NAME_BYTES = 32
@@ -347,17 +349,16 @@ class MavlinkCamera(asyncio.DatagramProtocol):
     def _captured(self, one: Mapping[str, Any]) -> Any:
         place = one.get("place") or {}
         latitude, longitude = place.get("latitude_deg"), place.get("longitude_deg")
-        height_m = place.get("height_m") or 0.0
-        ground_m = self._ground_height_m() if place else None
-        above_m = 0.0 if ground_m is None else height_m - ground_m
+        height_m, ground_m = place.get("height_m"), self._ground_height_m()
+        above_m = None if height_m is None or ground_m is None else height_m - ground_m
         return self._mav.camera_image_captured_encode(
             self._boot_ms(),
             _utc_us(one.get("mark_gps_ns")),
             0,
-            round((latitude or 0.0) * 1e7),
-            round((longitude or 0.0) * 1e7),
-            round(height_m * 1000),
-            round(above_m * 1000),
+            _scaled(latitude, 1e7),
+            _scaled(longitude, 1e7),
+            _scaled(height_m, 1e3),
+            _scaled(above_m, 1e3),
             _quaternion(place),
             one["number"] - 1,
             0 if one.get("state") == "lost" else 1,
@@ -366,17 +367,19 @@ class MavlinkCamera(asyncio.DatagramProtocol):
 
     def _feedback(self, one: Mapping[str, Any]) -> Any:
         place = one.get("place") or {}
-        angles = [math.degrees(place.get(f"{name}_rad") or 0.0) for name in _ANGLES]
+        height_m, ground_m = place.get("height_m"), self._ground_height_m()
+        radians = [place.get(f"{name}_rad") for name in _ANGLES]
+        angles = [math.nan if angle is None else math.degrees(angle) for angle in radians]
         virtual = rig.virtual_image if (rig := self._rig()) is not None else None
         return self._mav.camera_feedback_encode(
             _utc_us(one.get("mark_gps_ns")),
             self._settings.system_id,
             0,
             (one["number"] - 1) & 0xFFFF,
-            round((place.get("latitude_deg") or 0.0) * 1e7),
-            round((place.get("longitude_deg") or 0.0) * 1e7),
-            place.get("height_m") or 0.0,
-            0.0,
+            _scaled(place.get("latitude_deg"), 1e7),
+            _scaled(place.get("longitude_deg"), 1e7),
+            math.nan if height_m is None else height_m,
+            math.nan if height_m is None or ground_m is None else height_m - ground_m,
             *angles,
             virtual.f_mm if virtual else 0.0,
             0,
@@ -432,6 +435,11 @@ def _utc_us(gps_ns: object) -> int:
     instant = int(gps_ns)
     leap_s = leap_seconds_at(instant - leap_seconds_at(instant) * 1_000_000_000)
     return (instant - leap_s * 1_000_000_000) // 1000 + GPS_EPOCH_UNIX_S * 1_000_000
+
+
+def _scaled(value: float | None, scale: float) -> int:
+    """A coordinate as MAVLink's integer; its largest one means that it is not known."""
+    return COORDINATE_UNKNOWN if value is None else round(value * scale)
 
 
 def _quaternion(place: Mapping[str, Any]) -> tuple[float, ...]:

@@ -12,13 +12,14 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any, Final
 
-from drivers.contract import NavSample
+from drivers.contract import NavSample, Velocity
 from drivers.gps_time import MAX_LEAP_SECONDS, SECOND_NS, UtcFields, utc_ns
 
 MAX_LINE: Final = 65_536
 """gpsd's own longest report, SKY of all constellations, stays below 20 kB."""
-UNKNOWN_SIGMA_M: Final = 10_000.0
-UNKNOWN_SIGMA_MPS: Final = 1_000.0
+SIGMA_MOST_M: Final = 10_000.0
+SIGMA_MOST_MPS: Final = 1_000.0
+"""A larger one means that the receiver does not know."""
 CURRENT_LEAP_SECONDS: Final = 18
 """Since 2017; only for samples that are marked as not valid in time."""
 ATTITUDE_SLACK_NS: Final = 1_000_000
@@ -57,7 +58,7 @@ class GpsdReports:
         self.release = ""
         self.devices: tuple[str, ...] = ()
         self._attitude: Mapping[str, Any] = {}
-        self._satellites = 0
+        self._satellites: int | None = None
         self._leap_seconds: int | None = None
 
     def feed(self, data: bytes, mono_ns: int) -> list[NavSample]:
@@ -144,8 +145,12 @@ class GpsdReports:
         fix = FIXES.get(int(mode), "3d")
         if _number(report, "status") in DEAD_RECKONING:
             fix = "dead-reckoning"
-        height = _number(report, "altHAE")
+        # In two dimensions the height is one that was held, not one that was measured.
+        height = _number(report, "altHAE") if mode >= 3 else None
+        if height is None and fix == "3d":
+            fix = "2d"
         velocity, speed_sigma = _velocity(report)
+        horizontal_m = _horizontal_sigma_m(report)
         leap_seconds = self._leap_seconds
         roll, pitch, heading = self._attitude_at(utc)
         self.counters["samples"] += 1
@@ -159,11 +164,9 @@ class GpsdReports:
                 satellites=self._satellites,
                 latitude_deg=latitude,
                 longitude_deg=longitude if longitude <= 180 else longitude - 360,
-                height_m=0.0 if height is None else height,
-                horizontal_sigma_m=_horizontal_sigma_m(report),
-                vertical_sigma_m=UNKNOWN_SIGMA_M
-                if height is None
-                else _sigma(report, "epv", UNKNOWN_SIGMA_M),
+                height_m=height,
+                horizontal_sigma_m=horizontal_m,
+                vertical_sigma_m=None if height is None else _sigma(report, "epv", SIGMA_MOST_M),
                 velocity_ned_mps=velocity,
                 speed_sigma_mps=speed_sigma,
                 roll_rad=roll,
@@ -171,6 +174,7 @@ class GpsdReports:
                 heading_rad=heading,
                 leap_seconds=leap_seconds,
                 time_valid=leap_seconds is not None,
+                sigma_source="none" if horizontal_m is None else "receiver",
             )
         ]
 
@@ -206,31 +210,31 @@ def _number(report: Mapping[str, Any], key: str) -> float | None:
     return number if math.isfinite(number) and abs(number) < 1e9 else None
 
 
-def _sigma(report: Mapping[str, Any], key: str, unknown: float) -> float:
+def _sigma(report: Mapping[str, Any], key: str, most: float) -> float | None:
     value = _number(report, key)
-    return value if value is not None and 0 < value < unknown else unknown
+    return value if value is not None and 0 < value < most else None
 
 
-def _horizontal_sigma_m(report: Mapping[str, Any]) -> float:
-    east, north = _number(report, "epx"), _number(report, "epy")
+def _horizontal_sigma_m(report: Mapping[str, Any]) -> float | None:
+    east, north = _sigma(report, "epx", SIGMA_MOST_M), _sigma(report, "epy", SIGMA_MOST_M)
     if _number(report, "eph") is not None or east is None or north is None:
-        return _sigma(report, "eph", UNKNOWN_SIGMA_M)
-    return min(math.hypot(east, north), UNKNOWN_SIGMA_M)
+        return _sigma(report, "eph", SIGMA_MOST_M)
+    return math.hypot(east, north)
 
 
-def _velocity(report: Mapping[str, Any]) -> tuple[tuple[float, float, float], float]:
-    """North, east, down in m/s, and sigma of the speed; zero and unknown where not reported."""
+def _velocity(report: Mapping[str, Any]) -> tuple[Velocity | None, float | None]:
+    """North, east, down in m/s, and sigma of the speed; None where not reported."""
     north, east, down = (_number(report, key) for key in ("velN", "velE", "velD"))
     speed, track, climb = (_number(report, key) for key in ("speed", "track", "climb"))
-    if speed is not None and track is not None:
-        north = speed * math.cos(track * _RADIAN)
-        east = speed * math.sin(track * _RADIAN)
+    if speed is not None and (track is not None or speed == 0):
+        # A speed of 0 has no course.
+        north = speed * math.cos((track or 0.0) * _RADIAN)
+        east = speed * math.sin((track or 0.0) * _RADIAN)
     if climb is not None:
         down = -climb
-    sigma = UNKNOWN_SIGMA_MPS
-    if north is not None and east is not None:
-        sigma = _sigma(report, "eps", UNKNOWN_SIGMA_MPS)
-    return (north or 0.0, east or 0.0, down or 0.0), sigma
+    if north is None or east is None:
+        return None, None
+    return (north, east, down), _sigma(report, "eps", SIGMA_MOST_MPS)
 
 
 def _utc_ns(text: object) -> int | None:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from drivers.contract import EventMark, NavSample
+from drivers.contract import POSITION_FIXES, EventMark, NavSample
 from drivers.mavlink.boot_clock import MS_NS, BootClock
 from drivers.mavlink.library import MavlinkParser
 from drivers.message_decoder import MessageDecoder, Nav
@@ -22,8 +22,6 @@ AUTOPILOT_INVALID: Final = 8
 """MAV_AUTOPILOT of whatever is on the bus and is none: cameras, gimbals, ground stations."""
 FIXES: Final = {0: "none", 1: "none", 2: "2d"}
 """By GPS_FIX_TYPE; every other one is a fix of position and height."""
-UNKNOWN_SIGMA: Final = 100.0
-"""Metres, or metres per second: where GPS_RAW_INT does not tell."""
 GPS_OLD_MS: Final = 5_000
 ATTITUDES_KEPT: Final = 256
 ATTITUDE_GAP_MS: Final = 500
@@ -31,6 +29,7 @@ ATTITUDE_GAP_MS: Final = 500
 COUNT_BITS: Final = 32
 
 Quaternion = tuple[float, float, float, float]
+Sigmas = tuple[float | None, float | None, float | None]
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,7 @@ class MavlinkDecoder(MessageDecoder):
         *,
         system: int = 0,
         mark_accuracy_ns: int = 1_000_000,
-        undulation_m: float = 0.0,
+        undulation_m: float | None = None,
     ) -> None:
         self._parser = MavlinkParser()
         super().__init__(
@@ -194,7 +193,10 @@ class MavlinkDecoder(MessageDecoder):
             self.counters["samples_without_time"] += 1
             return []
         self._gps_ns = gps_ns
-        fix, satellites, horizontal_m, vertical_m, speed_mps, undulation_m = self._quality()
+        fix, satellites, sigmas, undulation_m = self._quality()
+        has_position = fix in POSITION_FIXES
+        has_height = has_position and fix != "2d" and undulation_m is not None
+        horizontal_m, vertical_m, speed_mps = sigmas if has_position else (None, None, None)
         angles = self._angles_at(message.time_boot_ms)
         roll, pitch, heading = angles or (None, None, None)
         self.counters["samples"] += 1
@@ -205,42 +207,43 @@ class MavlinkDecoder(MessageDecoder):
                 mono_ns=mono_ns,
                 fix=fix,
                 satellites=satellites,
-                latitude_deg=latitude,
-                longitude_deg=longitude,
-                height_m=message.alt * 1e-3 + undulation_m,
+                latitude_deg=latitude if has_position else None,
+                longitude_deg=longitude if has_position else None,
+                height_m=message.alt * 1e-3 + (undulation_m or 0.0) if has_height else None,
                 horizontal_sigma_m=horizontal_m,
-                vertical_sigma_m=vertical_m,
-                velocity_ned_mps=(message.vx * 1e-2, message.vy * 1e-2, message.vz * 1e-2),
+                vertical_sigma_m=vertical_m if has_height else None,
+                velocity_ned_mps=(message.vx * 1e-2, message.vy * 1e-2, message.vz * 1e-2)
+                if has_position
+                else None,
                 speed_sigma_mps=speed_mps,
                 roll_rad=roll,
                 pitch_rad=pitch,
                 heading_rad=heading,
                 leap_seconds=self.leap_seconds,
                 time_valid=True,
+                sigma_source="none" if horizontal_m is None else "receiver",
             )
         ]
 
-    def _quality(self) -> tuple[str, int, float, float, float, float]:
+    def _quality(self) -> tuple[str, int | None, Sigmas, float | None]:
         """Fix, satellites, sigmas of place, height and speed, and the geoid's height."""
         if self._gps is None:
-            return "none", 0, UNKNOWN_SIGMA, UNKNOWN_SIGMA, UNKNOWN_SIGMA, self._undulation_m
+            return "none", None, (None, None, None), self._undulation_m
         heard_ms, gps = self._gps
-        if self._boot_ms - heard_ms > GPS_OLD_MS:
-            fix = "dead-reckoning"
-        else:
-            fix = FIXES.get(gps.fix_type, "3d")
-        sigmas = (
-            value * 1e-3 if value else UNKNOWN_SIGMA
-            for value in (gps.h_acc, gps.v_acc, gps.vel_acc)
-        )
-        horizontal_m, vertical_m, speed_mps = sigmas
-        # alt_ellipsoid is an extension: zero where the autopilot does not send it.
+        # Extensions: zero where the autopilot does not send them.
         undulation_m = (
             (gps.alt_ellipsoid - gps.alt) * 1e-3 if gps.alt_ellipsoid else self._undulation_m
         )
+        if self._boot_ms - heard_ms > GPS_OLD_MS:
+            # How well it is known by now nobody says.
+            return "dead-reckoning", None, (None, None, None), undulation_m
+        horizontal_m, vertical_m, speed_mps = (
+            value * 1e-3 if value else None for value in (gps.h_acc, gps.v_acc, gps.vel_acc)
+        )
         satellites = gps.satellites_visible
-        count = 0 if satellites == 0xFF else int(satellites)
-        return fix, count, horizontal_m, vertical_m, speed_mps, undulation_m
+        count = None if satellites == 0xFF else int(satellites)
+        fix = FIXES.get(gps.fix_type, "3d")
+        return fix, count, (horizontal_m, vertical_m, speed_mps), undulation_m
 
     def _angles_at(self, boot_ms: int) -> tuple[float, float, float] | None:
         before = next(((t, q) for t, q in reversed(self._attitudes) if t <= boot_ms), None)

@@ -74,7 +74,8 @@ class MavlinkNavigator(ListeningNavigator):
         0.0,
         minimum=-200,
         maximum=200,
-        says="geoid above ellipsoid, m, for autopilots that tell no ellipsoidal height",
+        says="geoid above ellipsoid, m, for autopilots that send no ellipsoidal height; "
+        "if neither is known, heights are absent",
     )
 
     decoder: MavlinkDecoder
@@ -104,7 +105,7 @@ class MavlinkNavigator(ListeningNavigator):
             self.name,
             system=self.system,
             mark_accuracy_ns=self.mark_accuracy_ns,
-            undulation_m=self.undulation_m,
+            undulation_m=self.undulation_m if "undulation_m" in self.given else None,
         )
 
     # The port for TIMESYNC

@@ -5,28 +5,41 @@ What its bytes mean is in `drivers.nmea.decoder`.
 
 from __future__ import annotations
 
-from typing import ClassVar
+import datetime
+from typing import ClassVar, Final
 
+from drivers.gps_time import GPS_EPOCH_DAY
 from drivers.nmea.decoder import NmeaDecoder
 from drivers.receiver import ListeningNavigator
 from drivers.settings import Setting
+
+NOT_BEFORE_DAY: Final = datetime.date(2020, 1, 1).toordinal() - GPS_EPOCH_DAY
+"""No flight was earlier: a receiver that says so lost count of the weeks (1024 of them)."""
 
 
 class NmeaNavigator(ListeningNavigator):
     """A receiver that sends NMEA 0183 sentences by itself.
 
-    Yields a NavSample for every epoch and an EventMark for every $PTNL,EVT. Velocity down is not
-    in NMEA and is 0; sigmas that are not sent are those of the settings.
+    Yields a NavSample for every epoch with a fix and an EventMark for every $PTNL,EVT. What a
+    receiver does not send is absent, as velocity down is as a rule; a sigma that is not sent is
+    computed from the dilution of precision, and the sample says so.
 
     Source: NMEA 0183 as published in gpsd's "NMEA Revealed"; Trimble's $PTNL,EVT.
     """
 
     kind: ClassVar = "navigator"
     protocol = "NMEA 0183"
-    required = ("RMC", "GGA")
+    required = ("RMC", "GGA", "GNS", "PTNL,GGK", "PUBX,00")
 
     range_error_m = Setting(
         5.0, minimum=0.001, maximum=1000, says="without GST, sigma is this times the HDOP"
+    )
+    undulation_m = Setting(
+        0.0,
+        minimum=-200,
+        maximum=200,
+        says="geoid above ellipsoid, m, for receivers that do not send it; if neither is known, "
+        "heights are absent",
     )
     speed_sigma_mps = Setting(
         0.5, minimum=0.001, maximum=100, says="sigma of velocity, which NMEA does not tell"
@@ -41,4 +54,6 @@ class NmeaNavigator(ListeningNavigator):
             range_error_m=self.range_error_m,
             speed_sigma_mps=self.speed_sigma_mps,
             mark_accuracy_ns=self.mark_accuracy_ns,
+            undulation_m=self.undulation_m if "undulation_m" in self.given else None,
+            not_before_day=NOT_BEFORE_DAY,
         )

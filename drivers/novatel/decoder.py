@@ -13,7 +13,7 @@ from collections import Counter
 from typing import Any, Final
 
 from drivers.ascii_numbers import decimal_number, whole_number
-from drivers.contract import EventMark, NavSample
+from drivers.contract import POSITION_FIXES, EventMark, NavSample, Velocity
 from drivers.gps_time import RECENT_NS, SECOND_NS, WEEK_NS
 from drivers.message_decoder import MessageDecoder, Nav
 from drivers.novatel.framing import Log, log_of, novatel_framer
@@ -56,8 +56,9 @@ GOOD_WORDS: Final = frozenset(
 )  # fmt: skip
 SAME_NS: Final = 1000
 """MARKxTIME and MARKxPVA of one edge lie closer; two edges never do."""
-UNKNOWN_SIGMA: Final = 100.0
-"""Metres, or metres per second: where no log with sigmas has come."""
+TIME_ONLY: Final = (1, "FIXEDPOS")
+HEIGHT_IS_FIXED: Final = (2, "FIXEDHEIGHT")
+"""Position types of BESTPOS whose position, or height, was set and not measured."""
 COUNT_BITS: Final = 32
 NO_COUNT: Final = 0
 """The logs have no count: ours, of what came, is no witness of what the receiver saw."""
@@ -83,8 +84,8 @@ class NovatelDecoder(MessageDecoder):
         self._sample_ns = -1
         self._inertial_ns: int | None = None
         self._velocity: tuple[int, tuple[float, float, float]] | None = None
-        self._satellites = 0
-        self._sigmas = (UNKNOWN_SIGMA, UNKNOWN_SIGMA, UNKNOWN_SIGMA)
+        self._satellites: int | None = None
+        self._sigmas: tuple[float | None, float | None, float | None] = (None, None, None)
         self._marks: dict[int, list[int]] = {}
         self._counts: Counter[int] = Counter()
 
@@ -152,13 +153,13 @@ class NovatelDecoder(MessageDecoder):
             return []
         speed_sigma = self._sigmas[2]
         self._sigmas = (math.hypot(values[6], values[7]), values[8], speed_sigma)
-        velocity = (0.0, 0.0, 0.0)
+        velocity: Velocity | None = None
         if self._velocity is not None and abs(gps_ns - self._velocity[0]) < SECOND_NS:
             velocity = self._velocity[1]
         return self._sample(
             gps_ns,
             mono_ns,
-            fix="3d" if values[0] in COMPUTED else "none",
+            fix=_fix(values[0], values[1]),
             place=(values[2], values[3], values[4] + values[5]),
             velocity=velocity,
             attitude=(None, None, None),
@@ -171,7 +172,7 @@ class NovatelDecoder(MessageDecoder):
         *,
         fix: str,
         place: tuple[float, float, float],
-        velocity: tuple[float, float, float],
+        velocity: Velocity | None,
         attitude: tuple[float | None, float | None, float | None],
     ) -> list[Nav]:
         valid = self._time_good and gps_ns >= WEEK_NS
@@ -181,12 +182,31 @@ class NovatelDecoder(MessageDecoder):
         if valid:
             self._gps_ns = gps_ns
         self.counters["samples"] += 1
+        has_position = fix in POSITION_FIXES
+        has_height = has_position and fix != "2d"
+        horizontal_m, vertical_m, speed_mps = self._sigmas if has_position else (None, None, None)
         return [
             NavSample(
-                self.receiver, gps_ns, mono_ns, fix, self._satellites, *place,
-                *self._sigmas[:2], velocity, self._sigmas[2], *attitude, self._leap, valid,
+                receiver=self.receiver,
+                gps_ns=gps_ns,
+                mono_ns=mono_ns,
+                fix=fix,
+                satellites=self._satellites,
+                latitude_deg=place[0] if has_position else None,
+                longitude_deg=place[1] if has_position else None,
+                height_m=place[2] if has_height else None,
+                horizontal_sigma_m=horizontal_m,
+                vertical_sigma_m=vertical_m if has_height else None,
+                velocity_ned_mps=velocity if has_position else None,
+                speed_sigma_mps=None if velocity is None else speed_mps,
+                roll_rad=attitude[0] if has_position else None,
+                pitch_rad=attitude[1] if has_position else None,
+                heading_rad=attitude[2] if has_position else None,
+                leap_seconds=self._leap,
+                time_valid=valid,
+                sigma_source="none" if horizontal_m is None else "receiver",
             )
-        ]  # fmt: skip
+        ]
 
     # Marks
 
@@ -213,6 +233,15 @@ class NovatelDecoder(MessageDecoder):
         return [
             EventMark(self.receiver, channel, gps_ns, accuracy_ns, count, NO_COUNT, valid, mono_ns)
         ]
+
+
+def _fix(status: object, kind: object) -> str:
+    """The fix of a BESTPOS, by its solution status and position type."""
+    if status not in COMPUTED:
+        return "none"
+    if kind in TIME_ONLY:
+        return "time"
+    return "2d" if kind in HEIGHT_IS_FIXED else "3d"
 
 
 def _values(name: str, body: bytes | list[str]) -> tuple[Any, ...]:

@@ -13,7 +13,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Final
 
-from drivers.contract import EventMark, NavSample
+from drivers.contract import POSITION_FIXES, EventMark, NavSample, Velocity
 from drivers.gps_time import MAX_LEAP_SECONDS, RECENT_NS
 from drivers.message_decoder import MessageDecoder, Nav
 from drivers.septentrio.blocks import INS_PART, Block, accuracies_m, block_of, number, sbf_framer
@@ -21,8 +21,6 @@ from drivers.septentrio.blocks import INS_PART, Block, accuracies_m, block_of, n
 FIXES: Final = {0: "none", 3: "time"}
 """By PVT mode; every other one is a fix of position and height."""
 MODE_2D: Final = 0x80
-UNKNOWN_SIGMA: Final = 100.0
-"""Metres, or metres per second: where no block with sigmas has come."""
 RANGE_ERROR_M: Final = 5.0
 """Times the dilution of precision where the receiver gives no sigma."""
 WEEK_AND_TOW_SET: Final = 0x03
@@ -39,6 +37,7 @@ EPOCH_KINDS: Final = frozenset(
 )
 
 Triple = tuple[float | None, float | None, float | None]
+Pair = tuple[float | None, float | None]
 
 
 @dataclass
@@ -79,7 +78,7 @@ class SbfDecoder(MessageDecoder):
         self._polarity = FALLING if edge == "falling" else RISING
         self._mark_accuracy_ns = mark_accuracy_ns
         self._time_good = True
-        self._satellites = 0
+        self._satellites: int | None = None
         self._bias_ns = 0
         self._inertial_ns: int | None = None
         self._epoch: _Epoch | None = None
@@ -124,7 +123,7 @@ class SbfDecoder(MessageDecoder):
         values = block.values
         if block.name == "PVTGeodetic":
             epoch.pvt = block
-            self._satellites = values[14] if values[14] != 255 else 0
+            self._satellites = values[14] if values[14] != 255 else None
             self._bias_ns = round((values[10] or 0.0) * 1e6)
         elif block.name == "DOP":
             epoch.hdop, epoch.vdop = (dop * 0.01 if dop else None for dop in values[3:5])
@@ -159,21 +158,21 @@ class SbfDecoder(MessageDecoder):
             return []
         has_fix = error == 0 and None not in (latitude, longitude, height)
         fix = FIXES.get(mode & 0x0F, "2d" if mode & MODE_2D else "3d") if has_fix else "none"
-        sigmas_m = epoch.sigmas_m or accuracies_m(block)
-        if sigmas_m is None:
-            sigmas_m = (
-                RANGE_ERROR_M * epoch.hdop if epoch.hdop else UNKNOWN_SIGMA,
-                RANGE_ERROR_M * epoch.vdop if epoch.vdop else UNKNOWN_SIGMA,
-            )
+        source = "receiver"
+        sigmas_m: Pair = epoch.sigmas_m or accuracies_m(block) or (None, None)
+        if sigmas_m == (None, None) and epoch.hdop:
+            source = "dop"
+            sigmas_m = RANGE_ERROR_M * epoch.hdop, epoch.vdop and RANGE_ERROR_M * epoch.vdop
         return self._sample(
             gps_ns,
             epoch.mono_ns,
             fix=fix,
-            place=(latitude, longitude, height) if has_fix else (0.0, 0.0, 0.0),
+            place=(latitude, longitude, height),
             velocity=(north, east, up),
             sigmas=(*sigmas_m, epoch.speed_sigma_mps),
             attitude=epoch.attitude,
             has_time=bias_ms is not None and has_fix,
+            sigma_source=source,
         )
 
     def _on_inertial(self, block: Block, rx_ns: int, mono_ns: int) -> list[Nav]:
@@ -186,14 +185,13 @@ class SbfDecoder(MessageDecoder):
         gps_ns = self._inertial_ns = rx_ns - self._bias_ns
         deviations = parts.get(0)
         accuracy = block.values[8]
+        sigmas_m: Pair = None, None
         if deviations is not None:
             sigmas_m = math.hypot(*deviations[:2]), deviations[2]
         elif accuracy != 0xFFFF:
             sigmas_m = accuracy * 0.01, accuracy * 0.01
-        else:
-            sigmas_m = UNKNOWN_SIGMA, UNKNOWN_SIGMA
         heading, pitch, roll = parts.get(1) or (None, None, None)
-        east, north, up = parts.get(3) or (0.0, 0.0, 0.0)
+        east, north, up = parts.get(3) or (None, None, None)
         speeds = parts.get(4)
         return self._sample(
             gps_ns,
@@ -213,15 +211,22 @@ class SbfDecoder(MessageDecoder):
         mono_ns: int,
         *,
         fix: str,
-        place: tuple[float, float, float],
+        place: Triple,
         velocity: Triple,
-        sigmas: tuple[float, float, float | None],
+        sigmas: Triple,
         attitude: Triple,
         has_time: bool,
+        sigma_source: str = "receiver",
     ) -> list[Nav]:
         latitude, longitude, height = place
-        if not (abs(latitude) <= math.pi / 2 and abs(longitude) <= 2 * math.pi):
+        if fix not in POSITION_FIXES or latitude is None or longitude is None:
+            latitude = longitude = None
+        elif not (abs(latitude) <= math.pi / 2 and abs(longitude) <= 2 * math.pi):
             raise ValueError("a position that is none")
+        has_position = latitude is not None
+        # In a 2d fix the height is one that the receiver was given, not one that it measured.
+        has_height = has_position and fix != "2d" and height is not None
+        horizontal_m, vertical_m, speed_sigma_mps = sigmas
         valid = has_time and self._time_good
         if valid:
             self._gps_ns = gps_ns
@@ -234,18 +239,19 @@ class SbfDecoder(MessageDecoder):
                 mono_ns=mono_ns,
                 fix=fix,
                 satellites=self._satellites,
-                latitude_deg=math.degrees(latitude),
-                longitude_deg=math.degrees(longitude),
-                height_m=height,
-                horizontal_sigma_m=sigmas[0],
-                vertical_sigma_m=sigmas[1],
-                velocity_ned_mps=(north or 0.0, east or 0.0, -up if up else 0.0),
-                speed_sigma_mps=UNKNOWN_SIGMA if sigmas[2] is None else sigmas[2],
+                latitude_deg=None if latitude is None else math.degrees(latitude),
+                longitude_deg=None if longitude is None else math.degrees(longitude),
+                height_m=height if has_height else None,
+                horizontal_sigma_m=horizontal_m if has_position else None,
+                vertical_sigma_m=vertical_m if has_height else None,
+                velocity_ned_mps=_ned(north, east, up) if has_position else None,
+                speed_sigma_mps=speed_sigma_mps if has_position else None,
                 roll_rad=attitude[0],
                 pitch_rad=attitude[1],
                 heading_rad=attitude[2],
                 leap_seconds=self._leap,
                 time_valid=valid,
+                sigma_source=sigma_source if horizontal_m is not None else "none",
             )
         ]
 
@@ -307,6 +313,12 @@ def _ins_parts(block: Block) -> dict[int, tuple[float, float, float]]:
             if first is not None and second is not None and third is not None:
                 parts[bit] = (first, second, third)
     return parts
+
+
+def _ned(north: float | None, east: float | None, up: float | None) -> Velocity | None:
+    if north is None or east is None:
+        return None
+    return north, east, None if up is None else -up
 
 
 def _attitude(roll: float | None, pitch: float | None, heading: float | None) -> Triple:

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from pyubx2 import UBXMessageError, UBXParseError, UBXReader, UBXStreamError, UBXTypeError
 
-from drivers.contract import EventMark, NavSample
+from drivers.contract import POSITION_FIXES, EventMark, NavSample
 from drivers.gps_time import (
     RECENT_NS,
     SECOND_NS,
@@ -43,6 +43,8 @@ TIME_BASE_UTC: Final = 2
 LEAP_SOURCE_DEFAULT: Final = 0
 """Of NAV-TIMELS: the firmware's own guess. 255, "unknown", is what an M8T says of received ones."""
 ATTITUDES_KEPT: Final = 64
+ACCURACY_UNKNOWN: Final = 0xFFFFFFFF
+"""What hAcc, vAcc and sAcc hold before the receiver can estimate them."""
 
 
 class UbxDecoder(MessageDecoder):
@@ -147,20 +149,25 @@ class UbxDecoder(MessageDecoder):
         self._without_attitude = message.iTOW if attitude is None else None
         roll, pitch, heading = attitude or (None, None, None)
         usable = bool(message.gnssFixOk) and not message.invalidLlh
+        fix = FIXES.get(message.fixType, "none") if usable else "none"
+        has_position = fix in POSITION_FIXES
+        # In a 2d fix the height is one that the receiver holds, not one that it measured.
+        has_height = has_position and fix != "2d"
+        velocity = (message.velN * 1e-3, message.velE * 1e-3, message.velD * 1e-3)
         self.counters["samples"] += 1
         return NavSample(
             receiver=self.receiver,
             gps_ns=gps_ns,
             mono_ns=mono_ns,
-            fix=FIXES.get(message.fixType, "none") if usable else "none",
+            fix=fix,
             satellites=int(message.numSV),
-            latitude_deg=float(message.lat),
-            longitude_deg=float(message.lon),
-            height_m=message.height * 1e-3,
-            horizontal_sigma_m=message.hAcc * 1e-3,
-            vertical_sigma_m=message.vAcc * 1e-3,
-            velocity_ned_mps=(message.velN * 1e-3, message.velE * 1e-3, message.velD * 1e-3),
-            speed_sigma_mps=message.sAcc * 1e-3,
+            latitude_deg=float(message.lat) if has_position else None,
+            longitude_deg=float(message.lon) if has_position else None,
+            height_m=message.height * 1e-3 if has_height else None,
+            horizontal_sigma_m=_accuracy(message.hAcc) if has_position else None,
+            vertical_sigma_m=_accuracy(message.vAcc) if has_height else None,
+            velocity_ned_mps=velocity if has_position else None,
+            speed_sigma_mps=_accuracy(message.sAcc) if has_position else None,
             roll_rad=roll,
             pitch_rad=pitch,
             heading_rad=heading,
@@ -245,3 +252,8 @@ class UbxDecoder(MessageDecoder):
                 mono_ns=mono_ns,
             )
         ]
+
+
+def _accuracy(value: int) -> float | None:
+    """Metres, or metres per second, of an accuracy in mm; None where the receiver states none."""
+    return None if value == ACCURACY_UNKNOWN else value * 1e-3

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from drivers.contract import DeviceError, NavSample
 from drivers.gps_time import SECOND_NS, UtcFields, utc_ns
 from drivers.gpsd.navigator import GpsdNavigator
-from drivers.gpsd.reports import MAX_LINE, UNKNOWN_SIGMA_M, GpsdReports
+from drivers.gpsd.reports import MAX_LINE, GpsdReports
 from drivers.ublox.decoder import UbxDecoder
 from tests.drivers.stand_ins import Notebook
 
@@ -116,11 +116,20 @@ def test_a_report_without_time_or_position_is_no_sample(change: dict[str, object
     assert reports.counters["reports_without_fix"] == 1
 
 
-def test_what_is_not_reported_is_told_as_unknown() -> None:
+@pytest.mark.trust
+def test_what_is_not_reported_is_absent() -> None:
     bare = {key: TPV[key] for key in ("class", "mode", "time", "lat", "lon")}
     (sample,) = samples(bare)
-    assert sample.horizontal_sigma_m == sample.vertical_sigma_m == UNKNOWN_SIGMA_M
-    assert sample.speed_sigma_mps == 1000.0
+    assert (sample.fix, sample.height_m, sample.satellites) == ("2d", None, None)
+    assert sample.horizontal_sigma_m is sample.vertical_sigma_m is None
+    assert sample.velocity_ned_mps is sample.speed_sigma_mps is None
+    assert sample.sigma_source == "none"
+
+
+@pytest.mark.trust
+def test_a_height_that_is_held_in_two_dimensions_is_absent() -> None:
+    (sample,) = samples({**TPV, "mode": 2})
+    assert (sample.fix, sample.height_m, sample.vertical_sigma_m) == ("2d", None, None)
 
 
 def test_only_the_device_asked_for_is_heard() -> None:

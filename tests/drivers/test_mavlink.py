@@ -223,7 +223,7 @@ def test_a_signed_message_is_read() -> None:
     bus = Bus()
     bus._packer.signing.secret_key = bytes(range(32))
     bus._packer.signing.sign_outgoing = True
-    (sample,) = samples(bus.heartbeat() + bus.system_time() + bus.position())
+    (sample,) = samples(bus.heartbeat() + bus.system_time() + bus.gps() + bus.position())
     assert sample.latitude_deg == pytest.approx(47.5)
 
 

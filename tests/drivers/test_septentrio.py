@@ -150,13 +150,13 @@ def test_without_covariances_sigma_is_half_of_what_the_solution_itself_says() ->
     dop = block(4001, struct.pack("<BB4H2f", 17, 0, 150, 60, 80, 120, 0.0, 0.0), tow_ms=1000)
     without = pvt(1000, accuracies=(0xFFFF, 0xFFFF)) + dop + pvt(1200)
     assert samples(without)[0].horizontal_sigma_m == pytest.approx(4.0)
-    assert samples(pvt(1000, revision=0) + pvt(1200))[0].horizontal_sigma_m == 100.0
+    assert samples(pvt(1000, revision=0) + pvt(1200))[0].horizontal_sigma_m is None
 
 
 def test_what_is_not_to_be_used_is_not_used() -> None:
     said = pvt(1000, error=1, latitude=UNKNOWN, height=UNKNOWN, bias_ms=UNKNOWN) + pvt(1200)
     none = samples(said)[0]
-    assert (none.fix, none.time_valid, none.latitude_deg) == ("none", False, 0.0)
+    assert (none.fix, none.time_valid, none.latitude_deg) == ("none", False, None)
     single_baseline = pvt(1000) + attitude(1000, roll=UNKNOWN) + pvt(1200)
     leaning = samples(single_baseline)[0]
     assert leaning.roll_rad is None

@@ -89,7 +89,7 @@ export function drawHoles(segments) {
 export function drawMap(choose) {
   track.setLatLngs(flight.track.map((point) => point.at));
   const position = flight.brief?.status?.position;
-  if (position) {
+  if (position?.latitude_deg != null) {
     here.setLatLng([position.latitude_deg, position.longitude_deg]).addTo(map);
     here.setStyle({ color: colour("--accent") });
   }

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from daemon.flight.navigation import Track, metres_per_degree
+from daemon.flight.navigation import Track, around, metres_per_degree
 from drivers.contract import NavSample
 
 NS = 1_000_000_000
@@ -125,3 +125,130 @@ def test_a_receiver_whose_time_steps_back_is_followed_and_a_late_message_is_not(
     north_m, _ = metres_per_degree(LATITUDE, HEIGHT)
     flown_m = (record.latitude_deg - LATITUDE) * north_m
     assert flown_m == pytest.approx(50.0 * 5.1 + 5.1**2, abs=0.01)
+
+
+def flat(t_s: float) -> NavSample:
+    """A sample of a fix in two dimensions."""
+    return replace(
+        sample(t_s), fix="2d", height_m=None, vertical_sigma_m=None, horizontal_sigma_m=None
+    )
+
+
+@pytest.mark.trust
+def test_a_height_that_was_not_received_is_taken_from_samples_that_have_one() -> None:
+    track = Track()
+    for tenth in range(0, 20, 2):
+        track.add(sample(tenth / 10) if tenth % 6 == 0 else flat(tenth / 10))
+    for hundredth in range(5, 175, 10):
+        record = track.at(GPS_NS + hundredth * 10_000_000)
+        assert record is not None
+        assert (record.height_m, record.fix) == (HEIGHT, "3d")
+
+
+@pytest.mark.trust
+def test_without_any_height_the_record_has_none_and_says_2d() -> None:
+    track = Track()
+    for tenth in range(0, 20, 2):
+        track.add(flat(tenth / 10))
+    record = track.at(GPS_NS + 500_000_000)
+    assert record is not None
+    assert (record.height_m, record.vertical_sigma_m, record.fix) == (None, None, "2d")
+    assert (record.horizontal_sigma_m, record.sigma_source) == (None, "none")
+
+
+@pytest.mark.trust
+def test_a_sample_without_a_position_is_no_support() -> None:
+    track = Track()
+    track.add(sample(0.0))
+    track.add(replace(sample(0.2), fix="none", latitude_deg=None, longitude_deg=None))
+    track.add(replace(sample(0.4), fix="none"))
+    track.add(replace(sample(0.6), fix="time"))
+    assert track.last == sample(0.0)
+
+
+@pytest.mark.trust
+@pytest.mark.parametrize("u", [0.0, 0.1, 0.5, 0.9])
+def test_a_record_is_never_better_than_its_worse_support(u: float) -> None:
+    good = replace(sample(0.0), horizontal_sigma_m=0.02, vertical_sigma_m=0.03, satellites=18)
+    for bad in (
+        replace(sample(0.2), fix="dead-reckoning", horizontal_sigma_m=9.0, vertical_sigma_m=20.0),
+        replace(sample(-0.2), fix="dead-reckoning", horizontal_sigma_m=9.0, vertical_sigma_m=20.0),
+    ):
+        before, after = sorted((good, bad), key=lambda s: s.gps_ns)
+        record = around((before, after), before.gps_ns + round(u * 200_000_000))
+        assert record is not None
+        assert record.horizontal_sigma_m is not None and record.horizontal_sigma_m >= 9.0
+        assert record.vertical_sigma_m is not None and record.vertical_sigma_m >= 20.0
+        assert (record.fix, record.satellites) == ("dead-reckoning", 12)
+    unknown = around((good, replace(sample(0.2), horizontal_sigma_m=None)), GPS_NS + 1000)
+    assert unknown is not None and unknown.horizontal_sigma_m is None
+
+
+@pytest.mark.trust
+def test_a_position_counts_by_its_sigma() -> None:
+    north_m, _ = metres_per_degree(LATITUDE, HEIGHT)
+    good = replace(sample(0.0), horizontal_sigma_m=0.02, vertical_sigma_m=0.03)
+    moved = replace(sample(0.2), horizontal_sigma_m=10.0, vertical_sigma_m=10.0)
+    assert moved.latitude_deg is not None
+    moved = replace(moved, latitude_deg=moved.latitude_deg + 8.0 / north_m, height_m=HEIGHT + 7.0)
+    record = around((good, moved), GPS_NS + 190_000_000)
+    assert record is not None and record.height_m is not None
+    flown_m = (record.latitude_deg - LATITUDE) * north_m
+    assert flown_m == pytest.approx(50.0 * 0.19 + 0.19**2, abs=0.02)
+    assert record.height_m == pytest.approx(HEIGHT, abs=0.02)
+
+
+@pytest.mark.trust
+def test_the_sigma_of_an_extrapolated_position_grows_with_the_way() -> None:
+    track = Track()
+    track.add(sample(0.0))
+    sigmas = []
+    for tenths in (0, 5, 10, 19):
+        record = track.at(GPS_NS + tenths * 100_000_000)
+        assert record is not None and record.horizontal_sigma_m is not None
+        sigmas.append(record.horizontal_sigma_m)
+    assert sigmas[0] == 0.5 and sigmas == sorted(set(sigmas)) and sigmas[-1] > 2.0
+    still = Track()
+    still.add(replace(sample(0.0), velocity_ned_mps=None))
+    record = still.at(GPS_NS + NS)
+    assert record is not None and (record.method, record.horizontal_sigma_m) == ("nearest", None)
+
+
+@pytest.mark.trust
+def test_a_sample_with_a_height_is_waited_for_two_seconds_at_most() -> None:
+    track = Track()
+    track.add(sample(0.0))
+    track.add(flat(0.5))
+    assert not track.reaches(GPS_NS + 300_000_000)
+    track.add(flat(2.2))
+    assert not track.reaches(GPS_NS + 300_000_000)
+    track.add(flat(2.4))
+    assert track.reaches(GPS_NS + 300_000_000)
+    bare = Track()
+    bare.add(flat(0.0))
+    bare.add(flat(0.5))
+    assert bare.reaches(GPS_NS + 300_000_000)
+
+
+@pytest.mark.trust
+def test_a_height_that_no_aircraft_could_have_climbed_is_passed_over() -> None:
+    track = Track()
+    for tenth in range(0, 10, 2):
+        velocity = (50.0 + tenth / 5, 0.0, None)
+        height = HEIGHT + (1500.0 if tenth == 4 else 0.0)
+        track.add(replace(sample(tenth / 10), velocity_ned_mps=velocity, height_m=height))
+    for tenth in range(1, 8):
+        record = track.at(GPS_NS + tenth * 100_000_000)
+        assert record is not None and record.height_m == pytest.approx(HEIGHT)
+
+
+@pytest.mark.trust
+def test_a_heading_known_at_one_end_only_is_not_carried_on() -> None:
+    track = Track()
+    track.add(replace(sample(0.0), roll_rad=None, pitch_rad=None, heading_rad=6.2))
+    track.add(replace(sample(0.2), roll_rad=None, pitch_rad=None, heading_rad=0.1))
+    track.add(replace(sample(0.4), roll_rad=None, pitch_rad=None, heading_rad=None))
+    between_both, after = track.at(GPS_NS + 100_000_000), track.at(GPS_NS + 300_000_000)
+    assert between_both is not None and after is not None
+    assert between_both.heading_rad == pytest.approx(0.5 * (6.2 + 0.1 + 2 * math.pi) % math.tau)
+    assert after.heading_rad is None
