@@ -126,7 +126,9 @@ class Exposure:
     `mark_gps_ns` is the instant of the rig's strobe, from the source `mark_source` says; `flags`
     is the bit set of `processing.quality.report.Flag` as far as capture knows it. `time_budget_ns`
     are the standard deviations that make up that of the least certain frame, by what they come
-    from. `previous_sha256` is the hash of the record sealed before this one.
+    from. `disks` are the ids of the disks on which its frames were durable when it was stored;
+    empty where the mission has one disk. `previous_sha256` is the hash of the record sealed before
+    this one.
     """
 
     number: int
@@ -152,6 +154,7 @@ class Exposure:
     simulated: bool = False
     state: RecordState = "complete"
     flags: int = 0
+    disks: tuple[str, ...] = ()
     previous_sha256: str = ""
 
     def frame(self, sensor: str) -> FrameRecord | None:
@@ -160,7 +163,7 @@ class Exposure:
 
 
 def to_json(exposure: Exposure) -> dict[str, Any]:
-    """The exposure as an object of JSON types, every key present."""
+    """The exposure as an object of JSON types; every key but `disks` is always present."""
     return {
         **_shared_json(exposure, "exposure"),
         "mark_gps_ns": _instant(exposure.mark_gps_ns),
@@ -174,6 +177,7 @@ def to_json(exposure: Exposure) -> dict[str, Any]:
         ],
         "navigation": navigation_to_json(exposure.navigation) if exposure.navigation else None,
         "state": exposure.state,
+        **({"disks": list(exposure.disks)} if exposure.disks else {}),
         "previous_sha256": exposure.previous_sha256,
     }
 
@@ -208,6 +212,7 @@ def from_json(content: Mapping[str, Any], file: str = "exposure.json") -> Exposu
         temperatures=tuple(_temperature(item) for item in fields.objects("temperatures")),
         navigation=_navigation(navigation) if navigation else None,
         state=cast(RecordState, fields.choice("state", RECORD_STATES, "complete")),
+        disks=fields.names("disks"),
         previous_sha256=fields.sha256("previous_sha256"),
     )
     _refuse_twice([t.probe for t in exposure.temperatures], "temperatures", fields)

@@ -15,7 +15,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import zstandard
 from lz4.frame import LZ4FrameDecompressor
@@ -58,6 +58,20 @@ _MESSAGE_HEADER = struct.Struct("<HIQQ")
 _log = logging.getLogger(__name__)
 
 
+class LogStream(Protocol):
+    """Where the bytes of a log go; `crc32` is that of all bytes so far."""
+
+    offset: int
+    crc32: int
+    is_closed: bool
+
+    def write(self, data: bytes) -> int: ...
+    def tell(self) -> int: ...
+    def flush(self) -> None: ...
+    def sync(self) -> None: ...
+    def close(self) -> None: ...
+
+
 class FlightLog:
     """Appends to one MCAP file, one per start of the service. Not for several threads.
 
@@ -66,7 +80,13 @@ class FlightLog:
     """
 
     def __init__(
-        self, path: Path, *, boot_id: str, software: str = "", simulated: bool = False
+        self,
+        path: Path,
+        *,
+        boot_id: str,
+        software: str = "",
+        simulated: bool = False,
+        stream: LogStream | None = None,
     ) -> None:
         self.path = path
         self.dropped = 0
@@ -74,7 +94,7 @@ class FlightLog:
         self._channels: dict[str, int] = {}
         self._schema: int | None = None
         self._sequence = 0
-        self._stream = _StraightStream(path)
+        self._stream: LogStream = stream or _StraightStream(path)
         self._synced_at = 0
         self._writer = Writer(
             self._stream,
@@ -108,7 +128,7 @@ class FlightLog:
             OSError: the disk refused.
         """
         durable.make_directories(log_dir)
-        path = log_dir / f"{datetime.now(UTC):%Y%m%dT%H%M%S.%fZ}.mcap"
+        path = log_dir / new_log_name()
         boot_id = boot_id or host_boot_id()
         log = cls(path, boot_id=boot_id, software=software, simulated=simulated)
         log.sync()
@@ -267,6 +287,11 @@ def read(path: Path) -> LogReader:
 def logs_of(log_dir: Path) -> list[Path]:
     """The logs of a mission in the order they were begun."""
     return sorted(log_dir.glob("*.mcap"))
+
+
+def new_log_name() -> str:
+    """The name of a log that begins now; names sort by time."""
+    return f"{datetime.now(UTC):%Y%m%dT%H%M%S.%fZ}.mcap"
 
 
 def host_boot_id() -> str:

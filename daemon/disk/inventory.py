@@ -20,6 +20,8 @@ _REASONS: tuple[tuple[str, str], ...] = (
     ("mission.db", "index, built again from the records; its rows are compared with them"),
     (".held", "lock, without content"),
     ("transfer.json", "notes of a transfer"),
+    ("disks.json", "which disks hold the mission; written again when a disk is dropped or joins"),
+    (".superseded/", "set aside when two copies of the mission were brought together"),
     (f"L0/{DISCARDED}/", "set aside by recovery; it was never stored"),
     ("L2/", "products, made again from Level-0 (syntopic process)"),
     ("L3/", "products, made again from Level-2 (syntopic develop)"),

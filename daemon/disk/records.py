@@ -256,6 +256,14 @@ class Fields:
         for index, item in enumerate(value):
             yield Fields(item, f"{self._key(key)}[{index}]", self.file, self.problems)
 
+    def names(self, key: str) -> tuple[str, ...]:
+        """A list of texts that are safe as file names; empty where the key is absent."""
+        value = self._get(key, [])
+        if isinstance(value, list) and all(isinstance(v, str) and plain_name(v) for v in value):
+            return tuple(value)
+        self.complain(key, "a list of names is needed")
+        return ()
+
     def refuse_unknown(self) -> None:
         for key in self.content:
             if key not in self.asked:

@@ -59,6 +59,8 @@ class Level0Writer:
     """Makes exposures durable. One per mission, after `daemon.disk.recovery` has seen the disk.
 
     Frames are written and hashed by `threads` threads, so that hashing hides behind the disk.
+    `step` is called after each file and before anything gets its final name; what it raises as
+    OSError ends the work as a refusal of the disk does.
     """
 
     def __init__(
@@ -68,6 +70,7 @@ class Level0Writer:
         catalog: Catalog | None = None,
         chain: ChainFile | None = None,
         threads: int = 3,
+        step: Callable[[], None] = lambda: None,
     ) -> None:
         self._mission = mission
         self._chain = chain or mission.open_chain()
@@ -78,6 +81,7 @@ class Level0Writer:
         self._head_sha256 = self._catalog.last_record_sha256() or mission.genesis_sha256()
         self._unindexed: deque[Callable[[], None]] = deque()
         self._undecided: int | None = None
+        self._step = step
 
     @property
     def unindexed(self) -> int:
@@ -96,7 +100,18 @@ class Level0Writer:
     def write(
         self, capture: Capture, pixels: Mapping[str, NDArray[np.uint16]]
     ) -> tuple[FrameRecord, ...]:
-        """Make an exposure's frames durable; on return the exposure is *stored*.
+        """Make an exposure's frames durable and note it; on return the exposure is *stored*.
+
+        Args and errors are those of `write_frames`.
+        """
+        frames = self.write_frames(capture, pixels)
+        self.note_stored(replace(capture, frames=frames))
+        return frames
+
+    def write_frames(
+        self, capture: Capture, pixels: Mapping[str, NDArray[np.uint16]]
+    ) -> tuple[FrameRecord, ...]:
+        """Make an exposure's frames durable, without a word in chain file and index.
 
         Args:
             capture: what is known by now; `file` and `sha256` of its frames are filled in here.
@@ -121,18 +136,30 @@ class Level0Writer:
         try:
             frames = self._write_frames(part, capture, pixels)
             stored = replace(capture, frames=frames)
-            data = capture_bytes(stored)
-            durable.create_file(part / CAPTURE_FILE, [data])
+            durable.create_file(part / CAPTURE_FILE, [capture_bytes(stored)])
+            self._step()
             durable.rename_directory(part, final)
         except OSError:
             # A disk that refused to write may refuse to clear, too; recovery sees to the rest.
             with suppress(OSError):
                 _withdraw(part, final)
             raise
-        capture_sha256 = sha256_hex(data)
-        self._commit(lambda: self._chain.stored(stored.number, capture_sha256))
-        self._commit(lambda: self._catalog.add_stored(stored))
         return frames
+
+    def note_stored(self, stored: Capture) -> None:
+        """Note in chain file and index that an exposure's frames are durable."""
+        sha256 = sha256_hex(capture_bytes(stored))
+        self._commit(lambda: self._chain.stored(stored.number, sha256))
+        self._commit(lambda: self._catalog.add_stored(stored))
+
+    def withdraw(self, number: int) -> None:
+        """Take back frames of which nothing was noted yet.
+
+        Raises:
+            OSError: the disk refused; recovery finds the exposure whole and keeps it.
+        """
+        final = self._mission.level0(number)
+        _withdraw(final.with_name(final.name + durable.PART_SUFFIX), final)
 
     def seal(self, exposure: Exposure) -> str:
         """Write the final record of a stored exposure, once; on return it is *sealed*.
@@ -158,7 +185,8 @@ class Level0Writer:
         self._decide()
         sealed = read_sealed(folder)
         if sealed is not None:
-            same = replace(exposure, previous_sha256=sealed.exposure.previous_sha256)
+            known = sealed.exposure
+            same = replace(exposure, previous_sha256=known.previous_sha256, disks=known.disks)
             if exposure_bytes(same) != exposure_bytes(sealed.exposure):
                 raise StoreError(
                     f"exposure {exposure.number} is sealed already, with other content"
@@ -172,6 +200,7 @@ class Level0Writer:
         self._check_frames(folder, exposure)
         final = replace(exposure, previous_sha256=self._head_sha256)
         data = exposure_bytes(final)
+        self._step()
         self._undecided = exposure.number
         durable.replace_file(folder / EXPOSURE_FILE, data, mode=0o444)
         self._undecided = None
@@ -197,11 +226,18 @@ class Level0Writer:
         self, part: Path, capture: Capture, pixels: Mapping[str, NDArray[np.uint16]]
     ) -> tuple[FrameRecord, ...]:
         tasks: list[Future[FrameRecord]] = [
-            self._pool.submit(_write_frame, part, capture, frame, pixels[frame.sensor])
+            self._pool.submit(self._write_frame, part, capture, frame, pixels[frame.sensor])
             for frame in capture.frames
         ]
         wait(tasks)
         return tuple(task.result() for task in tasks)
+
+    def _write_frame(
+        self, part: Path, capture: Capture, frame: FrameRecord, pixels: NDArray[np.uint16]
+    ) -> FrameRecord:
+        written = _write_frame(part, capture, frame, pixels)
+        self._step()
+        return written
 
     def _check_frames(self, folder: Path, exposure: Exposure) -> None:
         stored = read_capture(folder)

@@ -76,6 +76,7 @@ class _Open:
     strip_id: str = ""
     handed_to_disk: Capture | None = None
     stored: Capture | None = None
+    disks: tuple[str, ...] = ()
     foreseen: tuple[EventMark, Flag, Exposure] | None = None
     lost: str = ""
 
@@ -287,11 +288,16 @@ class Flight:
         if exposure is not None and not exposure.frames:
             self._lose(exposure, sentence)
 
-    def stored(self, number: int, frames: tuple[FrameRecord, ...]) -> None:
-        """The disk has the pixels."""
+    def stored(
+        self, number: int, frames: tuple[FrameRecord, ...], disks: tuple[str, ...] = ()
+    ) -> None:
+        """The pixels are durable; `disks` are the ids of the mirrored disks that have them."""
         exposure = self._open[number]
         assert exposure.handed_to_disk is not None
         exposure.stored = replace(exposure.handed_to_disk, frames=frames)
+        exposure.disks = disks
+        if len(disks) == 1:
+            exposure.flags |= Flag.NOT_MIRRORED
         self.ledger.stored(number)
 
     def not_stored(self, number: int, sentence: str) -> None:
@@ -425,7 +431,7 @@ class Flight:
         return record if state is None else replace(record, state=state)
 
     def _compose(self, exposure: _Open, stored: Capture, mark: EventMark | None) -> Exposure:
-        return compose(
+        record = compose(
             self.rig,
             stored,
             exposure.pulse,
@@ -434,6 +440,7 @@ class Flight:
             self.temperatures,
             exposure.told_flags,
         )
+        return replace(record, disks=exposure.disks)
 
 
 def _in_order(frames: Mapping[str, Frame], heads: Iterable[str]) -> dict[str, Frame]:

@@ -201,7 +201,9 @@ class _Run:
         if capture is None:
             return
         folder = self._mission.level0(decision.number)
-        self._flight.stored(decision.number, tuple(_on_disk(folder, f) for f in capture.frames))
+        frames = tuple(_on_disk(folder, frame) for frame in capture.frames)
+        disks = tuple(map(str, decision.detail.get("disks", ())))
+        self._flight.stored(decision.number, frames, disks)
 
     def _not_stored(self, decision: Decision) -> None:
         self._flight.not_stored(decision.number, str(decision.detail.get("sentence", "")))

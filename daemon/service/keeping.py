@@ -72,9 +72,11 @@ class Keeping(Desk):
         self._send("writer", Seal(exposure))
 
     def _on_stored(self, stored: Stored) -> None:
-        self._flight.stored(stored.number, stored.frames)
-        self._decide("stored", stored.number)
-        self._tell("stored", number=stored.number, duration_s=round(stored.duration_s, 4))
+        self._flight.stored(stored.number, stored.frames, stored.disks)
+        where = {"disks": list(stored.disks)} if stored.disks else {}
+        self._decide("stored", stored.number, where)
+        duration_s = round(stored.duration_s, 4)
+        self._tell("stored", number=stored.number, duration_s=duration_s, **where)
         self._pipeline.stored(stored.number)
 
     def _on_sealed(self, sealed: Sealed) -> None:

@@ -177,11 +177,15 @@ class NoteProducts:
 
 @dataclass(frozen=True)
 class Stored:
-    """The pixels are durable; `frames` now carry file and hash."""
+    """The pixels are durable; `frames` now carry file and hash.
+
+    `disks` are the ids of the disks that have them, empty where the mission has one disk.
+    """
 
     number: int
     frames: tuple[FrameRecord, ...]
     duration_s: float
+    disks: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

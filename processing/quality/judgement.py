@@ -80,6 +80,10 @@ _CAPTURE: Final[Mapping[Flag, tuple[Verdict, str]]] = {
         Verdict.GOOD,
         "The disk is nearly full; finish this line and change the disk.",
     ),
+    Flag.NOT_MIRRORED: (
+        Verdict.GOOD,
+        "This exposure is stored on one disk only; see which disk was dropped, and why.",
+    ),
     Flag.PROCESSING_BEHIND: (
         Verdict.GOOD,
         "Processing is behind capture; raw frames are safe and will be processed later.",

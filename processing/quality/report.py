@@ -48,6 +48,7 @@ class Flag(enum.IntFlag):
     SUN = 1 << 27
     GSD = 1 << 28
     FRAME_AMBIGUOUS = 1 << 29
+    NOT_MIRRORED = 1 << 30
 
 
 NO_FLAGS: Final = Flag(0)
