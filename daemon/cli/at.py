@@ -13,6 +13,7 @@ from rich.progress import Progress
 
 from daemon.cli.options import AsJson, AttitudeSigma, Crs, MountFile, PositionSigma, Trajectory
 from daemon.configuration import ConfigurationError
+from drivers.extras import require
 
 if TYPE_CHECKING:
     from processing.bundle.self_calibration import SetName
@@ -68,6 +69,7 @@ def at(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
+    require("geodesy")
     from daemon.adjusting.tables import ProjectError
     from daemon.adjusting.telling import print_report, report_of
     from daemon.cli.adjust import _peak_mib

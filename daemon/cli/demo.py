@@ -29,6 +29,7 @@ from daemon.cli.sim import (
     simulator_arguments,
 )
 from daemon.tables import light_table
+from drivers.extras import require
 from processing.rig import Rig, RigError, find_rig
 
 HELP = """Fly the first flight: an emulated rig is captured, stitched and judged.
@@ -64,6 +65,7 @@ def demo(
     out: Annotated[Path, typer.Option(help="Where flights are kept.")] = Path("flights"),
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
+    require("aravis", "watch", *(["mavlink"] if receiver == "mavlink" else []))
     console = Console(stderr=as_json)
     folder = out / f"demo-{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
     try:

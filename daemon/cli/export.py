@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from daemon.tables import light_table
+from drivers.extras import require
 
 ORIENTATION_HELP = """Exterior orientation of every cone of every exposure, at its own mid-exposure.
 
@@ -118,6 +119,8 @@ def pictures(
 
     if kind not in KINDS:
         raise PictureError(f"--as is {kind!r}; cog or jpeg is right")
+    if kind == "cog":
+        require("geotiff")
     folder = Mission.open(mission)
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("writing", total=len(only or folder.numbers()))

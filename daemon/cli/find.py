@@ -13,6 +13,7 @@ from rich.live import Live
 from rich.table import Table
 
 from daemon.tables import light_table
+from drivers.extras import MissingExtraError, require
 
 if TYPE_CHECKING:
     from drivers.detection.search import Found
@@ -29,6 +30,11 @@ def find(ports: Sequence[str], *, as_json: bool, ask: bool) -> NoReturn:
 
     names = list(ports) or usual_ports()
     console = Console(stderr=as_json)
+    try:
+        require("mavlink")
+    except MissingExtraError as error:
+        # Everything else is found without it.
+        console.print(str(error), style="yellow", markup=False, soft_wrap=True)
     progress = _Progress(names)
     with Live(console=console, get_renderable=progress.table, refresh_per_second=4, transient=True):
         found = search(names, ask=ask, tell=progress.tell)

@@ -27,7 +27,7 @@ def find_heads(*, as_json: bool) -> NoReturn:
             table.add_row(head["driver"], where, what["model"], what["serial"], formats)
         console.print(table)
         for problem in problems:
-            console.print(f"[yellow]{problem}[/]")
+            console.print(problem, style="yellow", markup=False, soft_wrap=True)
         if found:
             console.print("Next: paste this into the service configuration, and name the sensors.")
             console.print(f"\n{sections}\n", markup=False, highlight=False, soft_wrap=True)

@@ -12,6 +12,7 @@ from rich.console import Console
 
 from daemon.cli.options import AsJson, AttitudeSigma, Crs, MountFile, PositionSigma, Trajectory
 from daemon.tables import light_table
+from drivers.extras import require
 
 HELP = """Ground points from places measured in two or more oriented images, with their accuracy.
 
@@ -46,6 +47,7 @@ def intersect(
     out: Annotated[Path | None, typer.Option(help="Table of the points; must be new.")] = None,
     as_json: AsJson = False,
 ) -> None:
+    require("geodesy")
     from daemon.adjusting.tables import write_table
     from daemon.disk.mission import Mission
     from daemon.orientation.intersection import IntersectionError, Uncertain

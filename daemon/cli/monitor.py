@@ -18,6 +18,7 @@ from rich.text import Text
 from daemon.errors import DaemonError
 from daemon.tables import light_table
 from daemon.watch.state import PARTS, PICTURE_PARTS
+from drivers.extras import require
 
 HELP = """Watch a flight from a terminal: phase, ledger, faults, the last exposures.
 
@@ -87,6 +88,7 @@ def monitor(
 
 def find_services(within_s: float = FIND_S) -> list[Found]:
     """Services that announce themselves by multicast DNS on this network."""
+    require("watch")
     from zeroconf import ServiceBrowser, ServiceStateChange, Zeroconf
 
     names: set[str] = set()
@@ -186,6 +188,7 @@ def _duration(ns: float | None) -> str:
 
 def _records(url: str, token: str) -> Iterator[dict[str, Any] | None]:
     """Telemetry for ever; None when the link breaks, which is taken up again."""
+    require("watch")
     import msgpack
     from websockets.exceptions import ConnectionClosed, InvalidHandshake
     from websockets.sync.client import connect

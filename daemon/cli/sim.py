@@ -18,6 +18,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
+from drivers.extras import require
 from processing.rig import find_rig
 
 HELP = """Run the emulated devices of a rig until Ctrl-C.
@@ -97,6 +98,8 @@ def sim(
     scene: Annotated[Path | None, typer.Option(help="A GeoTIFF to fly over instead.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
+    if scene is not None:
+        require("geotiff")
     arguments = simulator_arguments(
         rig, out, seed=seed, dc=dc, displace=displace or [], packet_loss=packet_loss
     )

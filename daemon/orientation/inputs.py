@@ -23,6 +23,7 @@ from daemon.orientation.exterior import (
 )
 from daemon.orientation.georeference import Georeference, utm_of
 from daemon.orientation.trajectory import Trajectory, flown, read_trajectory
+from drivers.extras import require
 from processing.rig import Rig, load_rig
 
 
@@ -98,6 +99,7 @@ def trajectory_of(
     Raises:
         OrientationError: none of the exposures has a GPS time.
     """
+    require("geodesy")
     stamped = next((e.mark_gps_ns for e in exposures if e.mark_gps_ns is not None), None)
     if stamped is None:
         raise OrientationError(

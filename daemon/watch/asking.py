@@ -16,7 +16,7 @@ STATES = {"ready": Outcome.PASS, "found": Outcome.PASS}
 
 def ask_service(configuration: Configuration, mission: Mission) -> list[Finding]:
     """The findings of the service that flies a mission, over its control socket."""
-    runs = f"the service runs and flies mission {mission.id}"
+    runs = f"mission {mission.id} is held by another process, the running service"
     control = None if configuration.watch is None else configuration.watch.control
     if control is None:
         sentence = (
@@ -28,7 +28,10 @@ def ask_service(configuration: Configuration, mission: Mission) -> list[Finding]
         state = ask(control)
     except ControlError as error:
         return [failed("service", mission.id, f"{runs}, and does not answer: {error}")]
-    return [passed("service", mission.id, f"{runs}, phase {state.get('phase')}"), *_told(state)]
+    return [
+        passed("service", mission.id, f"the service flies, phase {state.get('phase')}"),
+        *_told(state),
+    ]
 
 
 def _told(state: Mapping[str, Any]) -> list[Finding]:
