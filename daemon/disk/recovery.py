@@ -154,10 +154,9 @@ class _Recovery:
             else:
                 self._set_aside(part, final.name)
         for number in self.mission.numbers():
-            unfinished = self.mission.level0(number) / f".{EXPOSURE_FILE}{durable.PART_SUFFIX}"
-            if unfinished.exists():
-                unfinished.unlink()
-                durable.sync_directory(unfinished.parent)
+            folder = self.mission.level0(number)
+            if durable.remove_parts(folder / EXPOSURE_FILE):
+                durable.sync_directory(folder)
                 self.done.append(f"exposure {number}: a record written half was removed")
 
     def _set_aside(self, part: Path, name: str) -> None:

@@ -154,7 +154,8 @@ def test_before_stored_is_said_every_byte_and_name_is_synced_in_order(mission, w
     ]
     trace.clear()
     writer.seal(final_record(load_level0_capture(final)))
-    temporary = final / ".exposure.json.part"
+    temporary = trace[0][1]
+    assert temporary.parent == final and temporary.suffix == durable.PART_SUFFIX
     assert trace == [
         ("fsync", temporary),
         ("rename", temporary, final / "exposure.json"),
