@@ -90,15 +90,21 @@ class MessageDecoder:
     def reset(self) -> None:
         """The line was opened anew: forget what was half received."""
         self._framer.reset()
+        self.fix = self.satellites = None
 
     def feed(self, data: bytes, mono_ns: int) -> list[Nav]:
         """Records that became whole with these bytes, stamped with their arrival."""
         records: list[Nav] = []
         for message in self._framer.feed(data):
             try:
-                records.extend(self.on_message(message, mono_ns))
+                made = self.on_message(message, mono_ns)
             except self.unreadable:
                 self.counters[self.bad_counter] += 1
+                continue
+            records.extend(made)
+            for record in made:
+                if isinstance(record, NavSample):
+                    self.fix, self.satellites = record.fix, record.satellites
         return records
 
     def near_navigation(self, gps_ns: int) -> bool:

@@ -13,6 +13,7 @@ from typing import Final
 from drivers.clock import Clock
 from drivers.contract import DeviceError
 from drivers.message_decoder import MessageDecoder
+from drivers.receiver_fix import FixWatch, fix_in_words
 from drivers.serial_device import (
     READ_STEP_S,
     PortOpener,
@@ -63,6 +64,7 @@ class ListeningNavigator(SerialDevice):
     ) -> None:
         super().__init__(name, settings, clock=clock, open_port=open_port)
         self.decoder = self.new_decoder()
+        self._fix = FixWatch(self.teller, self.clock, name)
 
     @abstractmethod
     def new_decoder(self) -> MessageDecoder:
@@ -81,9 +83,12 @@ class ListeningNavigator(SerialDevice):
                 pass
             came += self.counters["bytes"] - before
             if any(self.decoder.seen[message] for message in self.required):
-                heard = ", ".join(sorted(self.decoder.seen))
                 leap = self.decoder.leap_seconds
-                return {"messages": heard, "leap_seconds": "unknown" if leap is None else str(leap)}
+                return {
+                    "messages": ", ".join(sorted(self.decoder.seen)),
+                    "leap_seconds": "unknown" if leap is None else str(leap),
+                    "fix": fix_in_words(self.decoder.fix, self.decoder.satellites),
+                }
         if self.decoder.frames:
             raise DeviceError(
                 f"{self.name}: the receiver at {self.port} speaks {self.protocol} but sent no "
@@ -105,12 +110,14 @@ class ListeningNavigator(SerialDevice):
 
     def connected(self) -> None:
         self.decoder.reset()
+        self._fix.reopened()
 
     def step(self, line: SerialLine) -> Iterable[Sample]:
         frames, bad = self.decoder.frames, self.decoder.bad_messages
         other_edges = self.decoder.other_edges
         records = self.decoder.feed(line.read(READ_STEP_S), self.clock.mono_ns())
         self.heard(messages=self.decoder.frames - frames)
+        self._fix.follow(self.decoder.fix, self.decoder.satellites)
         if self.decoder.bad_messages > bad:
             self.teller.complain(
                 "checksum",

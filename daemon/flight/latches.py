@@ -20,6 +20,8 @@ DELIVERS = frozenset({"opened", "recovered"})
 IS_GONE = frozenset({"absent", "lost", "silent", "held-by-another"})
 """Names of device events after which a device delivers, or does not; others are complaints of one
 that does."""
+SEARCHES, FIXED = "searching", "fixed"
+"""Likewise, of a receiver that is open and has no fix yet, and that has one."""
 FILE_MAX_BYTES = 1_000_000
 
 

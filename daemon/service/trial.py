@@ -47,6 +47,7 @@ from drivers.contract import (
     PpsEdge,
     TemperatureSample,
 )
+from drivers.receiver_fix import fix_in_words, missing_for_flight
 from processing.rig import Rig
 
 BIND_WITHIN_S: Final = 25.0
@@ -57,7 +58,13 @@ KERNELS_WITHIN_S: Final = 120.0
 STEP_S: Final = 0.1
 WITHOUT_MARKS: Final = frozenset({"nmea", "gpsd", "mavlink"})
 """Drivers of receivers that have no event marks."""
-FIX_NEEDED: Final = "none"
+CURES: Final = {
+    "position": "wait, or check its antenna",
+    "usable time": "wait, or check its antenna",
+    "height": "wait for a fix in three dimensions; a receiver that sends no height above the "
+    "ellipsoid has to be set to send it, or the undulation has to be configured",
+}
+"""By what is missing (`drivers.receiver_fix.missing_for_flight`)."""
 
 
 class Trial(Desk):
@@ -280,14 +287,13 @@ class Trial(Desk):
                 spec.name, f"receiver {spec.name} answers and sends no position yet; it searches"
             )
             return Finding("stream", name, Outcome.WAITING, sentence)
-        if sample.fix == FIX_NEEDED or not sample.time_valid:
-            what = "position" if sample.fix == FIX_NEEDED else "usable time"
-            sentence = (
-                f"receiver {spec.name} has no {what} yet, {sample.satellites} satellites; wait, "
-                "or check its antenna"
-            )
+        state = fix_in_words(sample.fix, sample.satellites)
+        missing = missing_for_flight(sample)
+        if missing is not None:
+            sentence = f"receiver {spec.name} has no {missing} yet ({state}); {CURES[missing]}"
             return Finding("stream", name, Outcome.WAITING, sentence)
-        return passed("stream", name, f"{sample.fix}, {sample.satellites} satellites")
+        table = ", GPS time by our table of leap seconds" if sample.leap_source == "table" else ""
+        return passed("stream", name, state + table)
 
     def _mark(self, spec: DeviceSpec) -> Finding:
         name = f"event mark of {spec.name}"

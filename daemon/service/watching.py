@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from daemon.exposure import Exposure, navigation_to_json
-from daemon.flight.latches import DELIVERS, IS_GONE
+from daemon.flight.latches import DELIVERS, FIXED, IS_GONE, SEARCHES
 from daemon.service.departure import ProcessPlan
 from daemon.service.messages import Answer, Told
 from daemon.service.supervisor import Supervisor
@@ -84,12 +84,16 @@ class Watching:
         asyncio.get_running_loop().call_later(RESTART_S, self.start)
 
 
+_STATES = DELIVERS | IS_GONE | {SEARCHES, FIXED}
+"""Device events that say in which state it is from now on."""
+
+
 def _lasting(event: Mapping[str, Any]) -> str | None:
     """What an event says that stays true; its successor has the same name."""
     kind = event.get("event")
     if kind in ("mission", "exposure-settings"):
         return str(kind)
-    if kind == "bound" or (kind == "device" and event.get("name") in DELIVERS | IS_GONE):
+    if kind == "bound" or (kind == "device" and event.get("name") in _STATES):
         return f"{kind} {event.get('device')}"
     return None
 

@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from daemon.flight.latches import DELIVERS, IS_GONE, Latches
+from daemon.flight.latches import DELIVERS, FIXED, IS_GONE, SEARCHES, Latches
 from daemon.flight.phases import Phase
 from daemon.watch.pictures import Pictures
 
@@ -185,7 +185,9 @@ class FlightState:
         device["since_mono_ns"] = event.get("mono_ns")
         if event.get("name") in IS_GONE:
             device["state"] = "absent" if event.get("name") == "absent" else "lost"
-        elif event.get("name") in DELIVERS:
+        elif event.get("name") == SEARCHES:
+            device["state"] = "searching"
+        elif event.get("name") in DELIVERS or event.get("name") == FIXED:
             device["state"] = "ready"
 
     def _on_fault(self, event: Mapping[str, Any]) -> None:

@@ -5,6 +5,7 @@ Which ports are listened to, and how fast, is in `drivers.detection.search`.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -19,12 +20,14 @@ from drivers.nmea.navigator import NmeaNavigator
 from drivers.novatel.decoder import NovatelDecoder
 from drivers.novatel.navigator import NovatelNavigator
 from drivers.receiver import ListeningNavigator
+from drivers.receiver_fix import fix_in_words
 from drivers.septentrio.decoder import SbfDecoder
 from drivers.septentrio.navigator import SeptentrioNavigator
 from drivers.ublox.decoder import UbxDecoder
 from drivers.ublox.navigator import UbloxNavigator
 
 KEPT_TEXT_NBYTES: Final = 20_000
+_GPSD: Final = re.compile(rb'(^|\n)\{"class": ?"VERSION", ?"release":')
 FEW_MESSAGES: Final = 2
 """So many undamaged messages are no accident; one is, in enough noise."""
 
@@ -112,7 +115,7 @@ class Evidence:
         return self._text_speaker()
 
     def _text_speaker(self) -> Speaker | None:
-        if self._text.startswith(b'{"class":"VERSION"'):
+        if _GPSD.search(self._text):
             return Speaker("navigator", "gpsd", "gpsd", "its greeting")
         if not self.looks_like_text:
             return None
@@ -130,4 +133,6 @@ class Evidence:
 
 def _speaker(listener: _Listener, decoder: MessageDecoder, *, missing: str) -> Speaker:
     heard = ", ".join(sorted(decoder.seen)) or f"{decoder.frames} messages of no use here"
+    if decoder.fix is not None:
+        heard += f"; {fix_in_words(decoder.fix, decoder.satellites)}"
     return Speaker("navigator", listener.driver, listener.navigator.protocol, heard, missing)

@@ -154,8 +154,9 @@ class _Search:
         line = SerialLine(self._open_port(self._port, baudrate, "N"), lambda _: None)
         begun_ns = self._clock.mono_ns()
         try:
-            # What still lies there was heard at the speed before.
-            line.read(0.0)
+            if "://" not in self._port:
+                # What still lies there was heard at the speed before.
+                line.read(0.0)
             while True:
                 elapsed_s = (self._clock.mono_ns() - begun_ns) * 1e-9
                 if elapsed_s > LISTEN_S or evidence.is_certain(has_settled=elapsed_s > SETTLED_S):

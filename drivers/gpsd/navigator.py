@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 from drivers.clock import Clock
 from drivers.contract import DeviceError, NavSample
 from drivers.gpsd.reports import GpsdReports
+from drivers.receiver_fix import FixWatch, fix_in_words
 from drivers.serial_device import READ_STEP_S, PortOpener, SerialDevice, SerialLine
 from drivers.settings import Setting
 from drivers.tcp_port import SCHEME, TcpPort, open_tcp_port
@@ -61,6 +62,7 @@ class GpsdNavigator(SerialDevice):
         super().__init__(name, settings, clock=clock, open_port=open_port)
         self.reports = GpsdReports(name, self.device)
         self._is_watching = False
+        self._fix = FixWatch(self.teller, self.clock, name)
 
     @classmethod
     def contradictions(cls, values: Mapping[str, Any]) -> list[str]:
@@ -82,7 +84,12 @@ class GpsdNavigator(SerialDevice):
                 pass
             if reports.seen["TPV"] > before:
                 devices = ", ".join(reports.devices) or self.device
-                return {"release": reports.release, "devices": devices}
+                return {
+                    "release": reports.release,
+                    "devices": devices,
+                    "leap_seconds": reports.leap_seconds,
+                    "fix": fix_in_words(reports.fix, reports.satellites),
+                }
         if not reports.release:
             raise DeviceError(
                 f"{self.name}: what answers at {self.port} is no gpsd; check the port"
@@ -104,6 +111,7 @@ class GpsdNavigator(SerialDevice):
 
     def connected(self) -> None:
         self.reports.reset()
+        self._fix.reopened()
         self._is_watching = False
 
     def step(self, line: SerialLine) -> Iterable[NavSample]:
@@ -119,6 +127,7 @@ class GpsdNavigator(SerialDevice):
         samples = reports.feed(data, self.clock.mono_ns())
         # A gpsd that lives while its receiver is silent is silent as a navigator.
         self.heard(messages=reports.seen["TPV"] - told)
+        self._fix.follow(reports.fix, reports.satellites)
         if reports.bad_messages > bad:
             self.teller.complain(
                 "unreadable",
@@ -133,7 +142,8 @@ class GpsdNavigator(SerialDevice):
         return samples
 
     def statistics(self) -> Mapping[str, int]:
-        """Those of every serial device; samples, reports_without_fix, pps, other_devices."""
+        """Those of every serial device; samples, samples_by_leap_table, reports_without_fix, pps,
+        other_devices."""
         return {
             **self.counters,
             **self.reports.counters,

@@ -14,14 +14,13 @@ from typing import Any, Final
 
 from drivers.contract import NavSample, Velocity
 from drivers.gps_time import MAX_LEAP_SECONDS, SECOND_NS, UtcFields, utc_ns
+from drivers.leap_seconds import leap_seconds_at
 
 MAX_LINE: Final = 65_536
 """gpsd's own longest report, SKY of all constellations, stays below 20 kB."""
 SIGMA_MOST_M: Final = 10_000.0
 SIGMA_MOST_MPS: Final = 1_000.0
 """A larger one means that the receiver does not know."""
-CURRENT_LEAP_SECONDS: Final = 18
-"""Since 2017; only for samples that are marked as not valid in time."""
 ATTITUDE_SLACK_NS: Final = 1_000_000
 FIXES: Final = {2: "2d", 3: "3d"}
 DEAD_RECKONING: Final = (5, 6)
@@ -45,7 +44,9 @@ class GpsdReports:
         self._receiver = receiver
         self._device = device
         self.seen: Counter[str] = Counter()
-        self.counters: Counter[str] = Counter(samples=0, reports_without_fix=0, pps=0)
+        self.counters: Counter[str] = Counter(
+            samples=0, samples_by_leap_table=0, reports_without_fix=0, pps=0
+        )
         self.bad_messages = 0
         self.bad_bytes = 0
         self.error = ""
@@ -58,8 +59,16 @@ class GpsdReports:
         self.release = ""
         self.devices: tuple[str, ...] = ()
         self._attitude: Mapping[str, Any] = {}
-        self._satellites: int | None = None
         self._leap_seconds: int | None = None
+        self.fix: str | None = None
+        self.satellites: int | None = None
+
+    @property
+    def leap_seconds(self) -> str:
+        """Those in use, and where they come from, in words."""
+        if self._leap_seconds is not None:
+            return str(self._leap_seconds)
+        return "by our table, gpsd sends none" if self.counters["samples"] else "unknown"
 
     def feed(self, data: bytes, mono_ns: int) -> list[NavSample]:
         """The samples in these bytes and what was left of those before."""
@@ -114,11 +123,9 @@ class GpsdReports:
         used = _number(report, "uSat")
         satellites = report.get("satellites")
         if used is not None:
-            self._satellites = min(max(int(used), 0), 999)
+            self.satellites = min(max(int(used), 0), 999)
         elif isinstance(satellites, list):
-            self._satellites = sum(
-                isinstance(s, dict) and s.get("used") is True for s in satellites
-            )
+            self.satellites = sum(isinstance(s, dict) and s.get("used") is True for s in satellites)
 
     def _att(self, report: Mapping[str, Any]) -> None:
         self._attitude = report
@@ -136,6 +143,7 @@ class GpsdReports:
         mode = _number(report, "mode") or 0.0
         utc = _utc_ns(report.get("time"))
         latitude, longitude = _number(report, "lat"), _number(report, "lon")
+        self.fix = "none" if mode < 2 else self.fix
         if mode < 2 or utc is None or latitude is None or longitude is None:
             self.counters["reports_without_fix"] += 1
             return []
@@ -151,17 +159,20 @@ class GpsdReports:
             fix = "2d"
         velocity, speed_sigma = _velocity(report)
         horizontal_m = _horizontal_sigma_m(report)
-        leap_seconds = self._leap_seconds
+        # gpsd sends them only for receivers that decode them; with NMEA it never does.
+        is_by_table = self._leap_seconds is None
+        leap_seconds = leap_seconds_at(utc) if self._leap_seconds is None else self._leap_seconds
+        self.fix = fix
+        self.counters["samples_by_leap_table"] += is_by_table
         roll, pitch, heading = self._attitude_at(utc)
         self.counters["samples"] += 1
         return [
             NavSample(
                 receiver=self._receiver,
-                gps_ns=utc
-                + (CURRENT_LEAP_SECONDS if leap_seconds is None else leap_seconds) * SECOND_NS,
+                gps_ns=utc + leap_seconds * SECOND_NS,
                 mono_ns=mono_ns,
                 fix=fix,
-                satellites=self._satellites,
+                satellites=self.satellites,
                 latitude_deg=latitude,
                 longitude_deg=longitude if longitude <= 180 else longitude - 360,
                 height_m=height,
@@ -173,8 +184,9 @@ class GpsdReports:
                 pitch_rad=pitch,
                 heading_rad=heading,
                 leap_seconds=leap_seconds,
-                time_valid=leap_seconds is not None,
+                time_valid=True,
                 sigma_source="none" if horizontal_m is None else "receiver",
+                leap_source="table" if is_by_table else "receiver",
             )
         ]
 

@@ -140,6 +140,8 @@ class MavlinkDecoder(MessageDecoder):
 
     def _on_gps(self, message: Any, _mono_ns: int) -> list[Nav]:
         self._gps = (self._boot_ms, message)
+        self.fix = FIXES.get(message.fix_type, "3d")
+        self.satellites = None if message.satellites_visible == 0xFF else message.satellites_visible
         return []
 
     def _on_imu(self, message: Any, _mono_ns: int) -> list[Nav]:

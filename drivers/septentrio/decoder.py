@@ -100,6 +100,9 @@ class SbfDecoder(MessageDecoder):
             self._on_receiver_time(block)
         elif block.rx_ns is None:
             self.counters["blocks_without_time"] += 1
+            if block.name == "PVTGeodetic":
+                # Switched on a moment ago: it knows neither time nor place.
+                self.fix, self.satellites = "none", 0
             self.counters["marks_without_time"] += block.name == "ExtEvent"
         elif block.name == "ExtEvent":
             made = self._on_event(block, block.rx_ns, mono_ns)

@@ -4,12 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import shutil
 import socket
-import subprocess
 import threading
-import tty
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -22,6 +18,7 @@ from drivers.gps_time import SECOND_NS, UtcFields, utc_ns
 from drivers.gpsd.navigator import GpsdNavigator
 from drivers.gpsd.reports import MAX_LINE, GpsdReports
 from drivers.ublox.decoder import UbxDecoder
+from tests.drivers.real_gpsd import PROGRAM, RealGpsd, running_gpsd
 from tests.drivers.stand_ins import Notebook
 
 EXCERPT = Path(__file__).parent / "data" / "ublox-neo-m8l-excerpt.ubx"
@@ -80,12 +77,16 @@ def test_an_attitude_of_another_instant_is_not_taken() -> None:
     assert sample.roll_rad is sample.pitch_rad is sample.heading_rad is None
 
 
-def test_time_is_not_valid_until_gpsd_knows_the_leap_seconds() -> None:
+@pytest.mark.trust
+def test_without_leap_seconds_time_comes_from_the_table_and_says_so() -> None:
     before = {key: value for key, value in TPV.items() if key != "leapseconds"}
     first, second, third = samples(before, TPV, before)
-    assert (first.time_valid, first.leap_seconds) == (False, None)
-    assert (second.time_valid, third.time_valid) == (True, True)
+    assert [s.time_valid for s in (first, second, third)] == [True] * 3
+    assert [s.leap_source for s in (first, second, third)] == ["table", "receiver", "receiver"]
+    assert first.leap_seconds == 18
     assert first.gps_ns == second.gps_ns
+    (old,) = samples({**before, "time": "2016-12-31T23:59:59.000Z"})
+    assert old.leap_seconds == 17
 
 
 @pytest.mark.parametrize(
@@ -272,60 +273,23 @@ def test_an_address_that_is_none_is_refused(port: str) -> None:
 
 
 @pytest.fixture
-def real_gpsd() -> Iterator[tuple[str, int]]:
-    """The real gpsd on a pseudo-terminal; its address, and where the receiver's bytes go in."""
-    program = shutil.which("gpsd", path=f"{os.environ.get('PATH', '')}:/usr/sbin")
-    if program is None:
+def real_gpsd() -> Iterator[RealGpsd]:
+    """The real gpsd on a pseudo-terminal."""
+    if PROGRAM is None:
         pytest.skip("gpsd is absent; install Debian's gpsd")
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        port = str(listener.getsockname()[1])
-    master, slave = os.openpty()
-    tty.setraw(slave)
-    # gpsd gives up root before it opens the port.
-    Path(os.ttyname(slave)).chmod(0o666)
-    process = subprocess.Popen(
-        [program, "-N", "-n", "-b", "-S", port, os.ttyname(slave)],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    try:
-        yield f"127.0.0.1:{port}", master
-    finally:
-        process.terminate()
-        try:
-            process.wait(timeout=10)
-        finally:
-            os.close(master)
-            os.close(slave)
+    with running_gpsd() as gpsd:
+        yield gpsd
 
 
 @pytest.mark.peer
-def test_the_real_gpsd_says_what_our_own_decoder_reads(real_gpsd: tuple[str, int]) -> None:
-    address, receiver = real_gpsd
+def test_the_real_gpsd_says_what_our_own_decoder_reads(real_gpsd: RealGpsd) -> None:
     recorded = EXCERPT.read_bytes()
     own = [r for r in UbxDecoder("m8l").feed(recorded, 0) if isinstance(r, NavSample)]
-    ended = threading.Event()
-
-    def play() -> None:
-        # Again and again, slowly enough for the terminal's buffer, until the test has enough.
-        while not ended.is_set():
-            for at in range(0, len(recorded), 500):
-                if ended.wait(0.01):
-                    return
-                os.write(receiver, recorded[at : at + 500])
-
-    player = threading.Thread(target=play)
-    player.start()
-    try:
-        navigator = GpsdNavigator("gnss", {"port": address})
+    with real_gpsd.playing(recorded):
+        navigator = GpsdNavigator("gnss", {"port": real_gpsd.address})
         notebook = flown(navigator, len(own) + 2)
-    finally:
-        ended.set()
-        player.join(5)
     samples = [r for r in notebook.records if isinstance(r, NavSample)]
     found = [r for r in samples if r.time_valid]
-    if samples and all(r.leap_seconds is None for r in samples):
-        pytest.skip("this gpsd tells no leap seconds for the recording: its time is not trusted")
     # gpsd writes milliseconds: the same epoch is the one within one of them.
     pairs = [(f, o) for f in found for o in own if abs(f.gps_ns - o.gps_ns) < 1_000_000]
     assert len(pairs) == len(found) >= len(own) - 1

@@ -10,7 +10,7 @@ import { drawCharts, fitCharts } from "./charts.js";
 
 const MARKS = { good: "●", usable: "▲", refly: "■", lost: "✖" };
 const PHASE_CLASS = { flying: "good", armed: "good", ready: "caution", fault: "warning", idle: "caution" };
-const DEVICE_MARKS = { ready: "●", found: "○", unknown: "○", lost: "✖", absent: "✖" };
+const DEVICE_MARKS = { ready: "●", searching: "◌", found: "○", unknown: "○", lost: "✖", absent: "✖" };
 const KINDS = { head: "heads", navigator: "receivers", thermometer: "thermometers", trigger: "trigger", pps: "pulse per second" };
 const GRAVITY = { refly: 0, usable: 1, good: 2 };
 const ROWS_SHOWN = 300;
@@ -118,6 +118,8 @@ function deviceItem(device) {
       device.state === "ready" ? "ready" : `${device.state}. ${device.sentence}` }));
 }
 
+const isWaiting = (device) => device.state === "searching";
+
 // By kind; what is wrong is on top and open, what is well can be looked into.
 function drawDevices() {
   const kinds = Map.groupBy([...flight.devices.values()].sort((a, b) => a.name.localeCompare(b.name)),
@@ -128,8 +130,8 @@ function drawDevices() {
   by("devices").replaceChildren(...sorted.map(([kind, devices]) => {
     const wrong = ill(devices);
     const well = devices.length - wrong.length;
-    const room = element("details", { open: wrong.length > 0 || opened.has(kind), className: wrong.length ? "ill" : "well" },
-      element("summary", { textContent: `${wrong.length ? "✖" : "●"} ${kind}: ${well} of ${devices.length} ready` }),
+    const room = element("details", { open: wrong.length > 0 || opened.has(kind), className: !wrong.length ? "well" : wrong.every(isWaiting) ? "well waiting" : "ill" },
+      element("summary", { textContent: `${!wrong.length ? "●" : wrong.every(isWaiting) ? "◌" : "✖"} ${kind}: ${well} of ${devices.length} ready` }),
       element("ul", {}, ...wrong.map(deviceItem), ...devices.filter((one) => !wrong.includes(one)).map(deviceItem)));
     room.dataset.kind = kind;
     return element("li", {}, room);

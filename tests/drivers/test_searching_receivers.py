@@ -1,0 +1,189 @@
+"""A receiver without a fix is a receiver that searches: no damage, no fault, wherever it is met."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from daemon.watch.state import FlightState
+from drivers.detection.evidence import Evidence
+from drivers.detection.search import search
+from drivers.gpsd.navigator import GpsdNavigator
+from drivers.message_decoder import MessageDecoder
+from drivers.nmea.decoder import NmeaDecoder
+from drivers.nmea.navigator import NmeaNavigator
+from drivers.septentrio.decoder import SbfDecoder
+from drivers.ublox.decoder import UbxDecoder
+from tests.drivers import test_mavlink as mavlink
+from tests.drivers import test_septentrio as septentrio
+from tests.drivers.real_gpsd import PROGRAM, running_gpsd
+from tests.drivers.stand_ins import FakeClock, FakePort, Notebook
+from tests.drivers.test_gpsd import TPV, StubGpsd, flown, lines
+from tests.drivers.test_nmea import EXCERPT, epoch, sentence
+from tests.drivers.ubx_frames import nav_pvt
+
+pytestmark = pytest.mark.trust
+
+COLD = b"".join(
+    sentence(body)
+    for body in (
+        "GNRMC,,V,,,,,,,,,,N",
+        "GNVTG,,,,,,,,,N",
+        "GNGGA,,,,,,0,00,99.99,,,,,,",
+        "GNGSA,A,1,,,,,,,,,,,,,99.99,99.99,99.99",
+        "GPGSV,1,1,00",
+        "GNGLL,,,,,,V,N",
+        "GNGST,,,,,,,,",
+        "GNZDA,,,,,,",
+        "GNGNS,,,,,,NN,00,99.99,,,,",
+        "GNTXT,01,01,02,ANTSTATUS=OK",
+    )
+)
+CLOCK_ONLY = b"".join(
+    sentence(body)
+    for body in (
+        "GNRMC,100000.00,V,,,,,,,211126,,,N",
+        "GNGGA,100000.00,,,,,0,02,99.99,,,,,,",
+        "GNGLL,,,,,100000.00,V,N",
+    )
+)
+
+
+class Replayed:
+    """A line that gives one piece after another, a second apart, and ends the device at last."""
+
+    def __init__(self, *pieces: bytes) -> None:
+        self.clock = FakeClock()
+        self._pieces = list(pieces)
+        self.done: Callable[[], None] = lambda: None
+
+    def __call__(self, port: FakePort) -> bytes:
+        self.clock.now_ns += 10**9
+        if not self._pieces:
+            self.done()
+            return b""
+        return self._pieces.pop(0)
+
+    def navigator(self) -> NmeaNavigator:
+        navigator = NmeaNavigator(
+            "gnss", {"port": "a"}, clock=self.clock,
+            open_port=lambda path, baudrate, parity: FakePort(self.clock, self),
+        )  # fmt: skip
+        self.done = navigator.close
+        return navigator
+
+
+def run(*pieces: bytes) -> tuple[NmeaNavigator, Notebook]:
+    line = Replayed(*pieces)
+    navigator, notebook = line.navigator(), Notebook()
+    navigator.bind()
+    navigator.run(notebook)
+    return navigator, notebook
+
+
+@pytest.mark.parametrize(("said", "satellites"), [(COLD, 0), (CLOCK_ONLY, 2)])
+def test_a_receiver_that_was_switched_on_a_moment_ago_is_not_damaged(
+    said: bytes, satellites: int
+) -> None:
+    decoder = NmeaDecoder("gnss")
+    assert decoder.feed(said * 3, 0) == []
+    assert (decoder.bad_messages, decoder.bad_bytes) == (0, 0)
+    decoder.feed(sentence("GNZDA,100001.00,21,11,2026,00,00"), 0)
+    assert (decoder.fix, decoder.satellites, decoder.bad_messages) == ("none", satellites, 0)
+
+
+def test_it_binds_and_says_that_it_searches() -> None:
+    found = Replayed(COLD).navigator().bind()
+    assert found["fix"] == "searching, 0 satellites"
+
+
+def test_it_is_reported_once_as_searching_and_then_as_fixed() -> None:
+    times = [f"1000{n:02d}.00" for n in range(5)]
+    navigator, notebook = run(COLD, *[COLD] * 4, *[epoch(time) for time in times])
+    assert notebook.event_names == ["opened", "searching", "fixed"]
+    searching, fixed = notebook.events[1:]
+    assert not searching.is_fault and not fixed.is_fault
+    assert searching.sentence == (
+        "The receiver gnss is searching, 0 satellites. Wait; its antenna needs a clear view of "
+        "the sky."
+    )
+    assert fixed.sentence == "The receiver gnss has a fix: 3d, 17 satellites."
+    assert navigator.statistics()["bad_messages"] == 0
+
+
+def test_a_fix_lost_for_a_moment_is_no_news_and_for_longer_is() -> None:
+    void = sentence("GNRMC,,V,,,,,,,,,,N")
+    _, notebook = run(epoch("100000.00"), epoch("100001.00"), void, epoch("100003.00"))
+    assert notebook.event_names == ["opened"]
+    _, notebook = run(epoch("100000.00"), epoch("100001.00"), *[COLD] * 4)
+    assert notebook.event_names == ["opened", "searching"]
+
+
+@pytest.mark.parametrize(
+    ("decoder", "said", "satellites"),
+    [
+        (UbxDecoder("a"), nav_pvt(0, (2026, 11, 21, 10, 0, 0), fix_type=0, flags=0), 17),
+        (SbfDecoder("a"), septentrio.pvt(1000, error=1) + septentrio.pvt(1200, error=1), 17),
+        (SbfDecoder("a"), septentrio.pvt(0xFFFFFFFF, week=0xFFFF, error=1), 0),
+        (mavlink.MavlinkDecoder("a"), mavlink.Bus().heartbeat() + mavlink.Bus().gps(fix=1), 17),
+    ],
+)
+def test_every_decoder_knows_that_its_receiver_searches(
+    decoder: MessageDecoder, said: bytes, satellites: int
+) -> None:
+    decoder.feed(said, 0)
+    assert (decoder.fix, decoder.satellites, decoder.bad_messages) == ("none", satellites, 0)
+
+
+def test_a_gpsd_whose_receiver_searches_says_so() -> None:
+    nothing = {"class": "TPV", "device": "/dev/ttyACM0", "mode": 1}
+    sky = {"class": "SKY", "device": "/dev/ttyACM0", "uSat": 0, "satellites": []}
+    stub = StubGpsd(lines(sky, nothing), lines(nothing), lines(TPV, TPV))
+    try:
+        navigator = GpsdNavigator("gnss", {"port": stub.port})
+        assert navigator.bind()["fix"] == "searching, 0 satellites"
+        notebook = flown(navigator, 1)
+    finally:
+        stub.close()
+    assert {"searching", "fixed"} & set(notebook.event_names) == {"searching"}
+
+
+def test_looking_for_devices_finds_a_receiver_that_searches() -> None:
+    evidence = Evidence()
+    evidence.feed(COLD, 0)
+    speaker = evidence.speaker()
+    assert speaker is not None
+    assert (speaker.driver, speaker.missing) == ("nmea", "")
+    assert speaker.heard.endswith("; searching, 0 satellites")
+
+
+def test_the_page_shows_a_receiver_that_searches_as_such() -> None:
+    state = FlightState("syntopic test")
+    states = []
+    for name in ("opened", "searching", "fixed", "lost"):
+        state.apply({"event": "device", "device": "gnss", "name": name, "sentence": name})
+        (device,) = state.snapshot()["devices"]
+        states.append(device["state"])
+    assert states == ["ready", "searching", "ready", "lost"]
+
+
+def test_gpsd_is_found_at_its_address_by_its_greeting() -> None:
+    stub = StubGpsd(b"")
+    try:
+        (found,) = search([f"tcp://{stub.port}"])
+    finally:
+        stub.close()
+    assert found.speaker is not None and found.speaker.driver == "gpsd"
+
+
+@pytest.mark.peer
+@pytest.mark.skipif(PROGRAM is None, reason="gpsd is absent; install Debian's gpsd")
+def test_the_real_gpsd_with_an_nmea_receiver_gives_navigation_and_is_found() -> None:
+    with running_gpsd() as gpsd, gpsd.playing(EXCERPT.read_bytes()):
+        navigator = GpsdNavigator("gnss", {"port": gpsd.address})
+        notebook = flown(navigator, 5)
+        (found,) = search([f"tcp://{gpsd.address}"])
+    samples = [r for r in notebook.records if getattr(r, "fix", None)]
+    assert {(s.time_valid, s.leap_source, s.leap_seconds) for s in samples} == {(True, "table", 18)}
+    assert found.speaker is not None and found.speaker.driver == "gpsd"
