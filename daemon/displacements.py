@@ -31,12 +31,17 @@ def write_displacements(mission: Path) -> Mapping[str, Any]:
         `processing.mosaic.flight_validity.Step`; `exposures` used and `left_out`, by cone;
         `unreadable`, sentences about records that could not be read.
     """
-    records, unreadable = _records(mission)
-    content = _content(judge_flight(load_rig(mission / "rig.toml"), records), unreadable)
+    content = flight_displacements(mission)
     path = mission / DISPLACEMENTS_FILE
     path.parent.mkdir(exist_ok=True)
     replace_file(path, canonical_bytes(content))
     return content
+
+
+def flight_displacements(mission: Path) -> dict[str, Any]:
+    """What `write_displacements` writes; nothing is written."""
+    records, unreadable = _records(mission)
+    return _content(judge_flight(load_rig(mission / "rig.toml"), records), unreadable)
 
 
 def without_steps(exposures: Mapping[str, int]) -> str:
@@ -55,6 +60,8 @@ def without_steps(exposures: Mapping[str, int]) -> str:
 def _records(mission: Path) -> tuple[dict[int, StitchRecord], list[str]]:
     records, unreadable = {}, []
     for path in sorted(mission.glob("L2/[0-9]*/mosaic.json")):
+        if not path.parent.name.isdigit():
+            continue  # being written
         try:
             if path.stat().st_size > RECORD_MAX_BYTES:
                 raise StitchRecordError("mosaic.json is too large to be one")

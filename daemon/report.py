@@ -6,17 +6,35 @@ It draws what the records and quality reports say; nothing is computed here that
 from __future__ import annotations
 
 import base64
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jinja2
 
-from daemon.displacements import write_displacements
+from daemon.disk.durable import make_directories, replace_file
+from daemon.disk.level0_folder import read_sealed
+from daemon.disk.level2 import read_report
+from daemon.disk.mission import Mission
+from daemon.disk.walk import ExposureFailure, cause_of, walk
+from daemon.displacements import flight_displacements, write_displacements
+from daemon.errors import DaemonError
+from daemon.exposure import Exposure, to_json
 from processing.conditions import TIME_PARTS
 
+REPORT_FILE = "report.html"
+T = TypeVar("T")
+
 _GLYPHS = {"good": "●", "usable": "▲", "refly": "■", "lost": "✕"}
+
+
+@dataclass(frozen=True)
+class WrittenReport:
+    """The page, and what of exposures could not be read and is not in it."""
+
+    path: Path
+    failures: tuple[ExposureFailure, ...]
 
 
 def write_report(
@@ -24,18 +42,21 @@ def write_report(
     *,
     ledger: Mapping[str, Any] | None = None,
     geometry: Mapping[str, Any] | None = None,
-) -> Path:
-    """Write `report.html` into the mission's export folder.
+    out: Path | None = None,
+) -> WrittenReport:
+    """Write `report.html` into the mission's export folder, or into another one.
 
     Args:
         mission: the mission folder.
         ledger: the balance sheet, where the service just told it.
         geometry: comparison with an emulator's truth, where there is one.
-
-    Returns:
-        The path of the report.
+        out: another folder; nothing is written into the mission then.
     """
-    exposures = [_exposure(folder, mission) for folder in sorted((mission / "L0").glob("[0-9]*"))]
+    folder = Mission.open(mission)
+    read = walk(folder.numbers(), lambda number: _exposure(folder, number))
+    exposures = [exposure for exposure, _ in read.results.values()]
+    failures = [*read.failures, *(one for _, found in read.results.values() for one in found)]
+    judged = flight_displacements(mission) if out is not None else write_displacements(mission)
     loader = jinja2.FileSystemLoader(Path(__file__).parent / "templates")
     environment = jinja2.Environment(
         loader=loader, autoescape=True, undefined=jinja2.StrictUndefined
@@ -46,7 +67,8 @@ def write_report(
         simulated=any(exposure["record"].get("simulated") for exposure in exposures),
         displaced=_displaced(exposures),
         tested=len(_figure(exposures, "displacement_test")),
-        flight_says=write_displacements(mission)["sentences"],
+        flight_says=judged["sentences"],
+        unreadable=failures,
         ledger=ledger,
         geometry=geometry,
         plots=[
@@ -57,37 +79,41 @@ def write_report(
         glyphs=_GLYPHS,
         time_parts=TIME_PARTS,
     )
-    path = mission / "export" / "report.html"
-    path.parent.mkdir(exist_ok=True)
-    path.write_text(html, encoding="utf-8")
-    return path
+    path = (out or mission / "export") / REPORT_FILE
+    make_directories(path.parent)
+    replace_file(path, html.encode("utf-8"))
+    return WrittenReport(path, tuple(failures))
 
 
-def _exposure(folder: Path, mission: Path) -> dict[str, Any]:
-    level2 = mission / "L2" / folder.name
-    record = _json(folder / "exposure.json")
-    report = _json(level2 / "quality.json")
-    residuals = level2 / "residuals.svg"
-    quicklook = level2 / "quicklook.jpg"
-    return {
-        "number": int(folder.name),
+def _exposure(mission: Mission, number: int) -> tuple[dict[str, Any], list[ExposureFailure]]:
+    """What the page says of an exposure, and what of it cannot be read."""
+    level2 = mission.level2(number)
+    failures: list[ExposureFailure] = []
+
+    def readable(read: Callable[[], T], otherwise: T) -> T:
+        try:
+            return read()
+        except (OSError, DaemonError) as error:
+            failures.append(ExposureFailure(number, cause_of(error)))
+            return otherwise
+
+    sealed = readable(lambda: read_sealed(mission.level0(number)), None)
+    record = to_json(Exposure(number) if sealed is None else sealed.exposure)
+    state = "unknown" if sealed is None else sealed.exposure.state
+    report = readable(lambda: read_report(level2), None) or {}
+    told = {
+        "number": number,
         "record": record,
         "report": report,
-        "verdict": report.get("verdict", record.get("state", "unknown")),
+        "verdict": report.get("verdict", state),
         "figures": report.get("figures", {}),
         "findings": report.get("findings", []),
         "gps": _gps_text(record.get("mark_gps_ns")),
         "worst_time_sigma_ns": _worst_time_sigma(record),
-        "quicklook": _data_uri(quicklook, "image/jpeg"),
-        "residuals": _data_uri(residuals, "image/svg+xml"),
+        "quicklook": readable(lambda: _data_uri(level2 / "quicklook.jpg", "image/jpeg"), None),
+        "residuals": readable(lambda: _data_uri(level2 / "residuals.svg", "image/svg+xml"), None),
     }
-
-
-def _json(path: Path) -> dict[str, Any]:
-    if not path.exists():
-        return {}
-    content = json.loads(path.read_text(encoding="utf-8"))
-    return content if isinstance(content, dict) else {}
+    return told, failures
 
 
 def _data_uri(path: Path, kind: str) -> str | None:

@@ -178,9 +178,14 @@ def inertial_of_mission(
     local frame of a project that `syntopic at` wrote.
 
     Raises:
-        BoresightError: no exposure of the project has an instant and an attitude.
+        BoresightError: no exposure of the project has an instant and an attitude, or the record of
+            one cannot be read.
     """
-    exposures = {f"{e.number:06d}": e for e in exposures_of(mission)}
+    read = exposures_of(mission)
+    for failure in read.failures:
+        if f"{failure.exposure:06d}" in stations:
+            raise BoresightError(f"exposure {failure.exposure}: {failure.cause}")
+    exposures = {f"{number:06d}": exposure for number, exposure in read.results.items()}
     trajectory = trajectory_of(mission, exposures.values(), trajectory_file)
     place = system if isinstance(system, LocalFrame) else Georeference(system)
     kept, rows = [], []

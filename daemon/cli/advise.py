@@ -9,12 +9,14 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from daemon.cli.failures import end_walk
 from daemon.tables import light_table
 
 HELP = """Which segments of the plan must be flown again, from verdicts, overlaps and gaps.
 
 The plan is GeoJSON, KML or QGroundControl's .plan. The mission may still be flying. Written are a
-GeoJSON, a KML and a MAVLink mission of the segments. The exit status is 1 while there are any.
+GeoJSON, a KML and a MAVLink mission of the segments. The exit status is 1 while there are any. An
+exposure whose record cannot be read counts as not flown, and is listed at the end.
 
 Examples: `syntopic advise MISSION`, `syntopic advise MISSION --plan block.geojson`
 """
@@ -46,7 +48,8 @@ def advise(
     taken = flown.taken_of(folder, read.specification)
     advice = advisor.advise(read, taken, image_along_m=along_m, image_across_m=across_m)
     base_m = along_m * (1.0 - read.specification.forward_overlap)
-    simulated = any(exposure.simulated for exposure in exposures_of(folder))
+    read_records = exposures_of(folder)
+    simulated = any(exposure.simulated for exposure in read_records.results.values())
     out = folder.export_dir / "fly-again"
     texts = {
         "fly-again.geojson": writing.geojson(advice.segments, simulated=simulated),
@@ -73,6 +76,7 @@ def advise(
                         }
                         for one in advice.segments
                     ],
+                    "failures": [failure.as_json() for failure in read_records.failures],
                 }
             )
         )
@@ -92,4 +96,5 @@ def advise(
             else f"All of {advice.planned_m / 1000:.1f} km is well; nothing is to be flown again. "
             f"[bold]{out}[/] says so."
         )
+    end_walk(read_records.failures)
     raise typer.Exit(0 if advice.is_complete else 1)

@@ -11,7 +11,16 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from daemon.cli.options import AsJson, AttitudeSigma, Crs, MountFile, PositionSigma, Trajectory
+from daemon.cli.failures import end_walk
+from daemon.cli.options import (
+    AsJson,
+    AttitudeSigma,
+    Crs,
+    MountFile,
+    PositionSigma,
+    Trajectory,
+    held_for,
+)
 from daemon.configuration import ConfigurationError
 from drivers.extras import require
 
@@ -117,7 +126,10 @@ def at(
     block = block_of(
         folder, crs=crs, trajectory_file=trajectory, mount_file=mount, heads=head or ()
     )
-    with Progress(console=Console(stderr=True), transient=True) as progress:
+    with (
+        held_for(folder, results),
+        Progress(console=Console(stderr=True), transient=True) as progress,
+    ):
         task = progress.add_task("matching", total=len(block.names))
         tied = matched(block, asked.matching, lambda done: progress.update(task, completed=done))
         project = project_of(block, tied, asked, points_file=points, measured_file=measured)
@@ -131,17 +143,19 @@ def at(
             result = adjust(completed(project.network), project.settings, progress=show)
         except (NetworkError, DefectError) as error:
             raise TriangulationError(f"{folder.path}: {error}") from error
-    report = report_of(
-        result,
-        project.checks,
-        name=project.name,
-        seconds=time.perf_counter() - begun,
-        peak_mib=_peak_mib(),
-    )
-    report["triangulation"] = triangulation_of(block, tied, project, result)
-    write_triangulation(results, block, project, result, report)
+        report = report_of(
+            result,
+            project.checks,
+            name=project.name,
+            seconds=time.perf_counter() - begun,
+            peak_mib=_peak_mib(),
+        )
+        report["triangulation"] = triangulation_of(block, tied, project, result)
+        report["failures"] = [failure.as_json() for failure in block.failures]
+        write_triangulation(results, block, project, result, report)
     if as_json:
         typer.echo(json.dumps(report | {"folder": str(results)}))
+        end_walk(block.failures)
         return
     console = Console()
     short = report | {"rejected": [], "left_out": [], "control": {"count": 0}}
@@ -153,3 +167,4 @@ def at(
     )
     print_triangulation(console, report["triangulation"])
     console.print(f"Results: [bold]{results}[/], report {results / 'report.html'}", soft_wrap=True)
+    end_walk(block.failures)

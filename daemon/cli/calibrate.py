@@ -116,8 +116,10 @@ def validity(
     from daemon.disk.mission import Mission
     from daemon.displacements import DISPLACEMENTS_FILE, without_steps, write_displacements
 
-    folder = Mission.open(mission).path
-    told = write_displacements(folder)
+    held = Mission.open(mission)
+    folder = held.path
+    with held.held():
+        told = write_displacements(folder)
     path = folder / DISPLACEMENTS_FILE
     if as_json:
         typer.echo(json.dumps({**told, "written": str(path)}))

@@ -272,7 +272,7 @@ def _judge(
         "time_error_ns": geometry.get("time_error_ns"),
         "verdicts": [report["verdict"] for report in reports],
         "mission": str(mission),
-        "report": str(write_report(mission, ledger=ledger, geometry=geometry)),
+        "report": str(write_report(mission, ledger=ledger, geometry=geometry).path),
         "judged_s": round(time.monotonic() - started, 2),
     }
 

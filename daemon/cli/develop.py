@@ -4,21 +4,31 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 from rich.progress import Progress
 
+from daemon.cli.failures import end_walk
 from daemon.configuration import ConfigurationError
 from daemon.disk.mission import Mission
+from daemon.disk.publication import sweep
+from daemon.disk.walk import walk
 from daemon.tables import light_table
+
+if TYPE_CHECKING:
+    from daemon.products.level3 import Developed
 
 HELP = """Make Level-3 of a mission after landing: pansharpened RGB and CIR in 16 and 8 bits.
 
 One tone curve serves all exposures that have Level-2, so that neighbouring images match; it is made
 anew from all of them each time. An exposure's earlier images are replaced.
+
+An exposure that cannot be developed is listed at the end with its cause, is not in the tone curve,
+and makes the exit status 1; the others are done.
 
 Examples: `syntopic develop MISSION`, `syntopic develop MISSION --only 3 --image cir --bits 8`
 """
@@ -45,25 +55,26 @@ def develop(
     cv2.setNumThreads(threads)
     folder = Mission.open(mission)
     rig = load_rig(folder.rig_path)
-    rows = []
-    with Progress(console=Console(stderr=True), transient=True) as progress:
+    with folder.held(), Progress(console=Console(stderr=True), transient=True) as progress:
+        sweep(level3.level3_root(folder))
         task = progress.add_task("histograms", total=None)
-        tones = level3.mission_tones(
+        tones, unreadable = level3.mission_tones(
             folder, rig, lambda _, done, total: progress.update(task, completed=done, total=total)
         )
-        numbers = only or sorted(tones.scales)
-        progress.update(task, description="developing", total=len(numbers), completed=0)
-        for number in numbers:
-            if number not in tones.scales:
-                raise level3.Level3Error(
-                    f"exposure {number}: has no colour at Level-2; run syntopic process first"
-                )
+
+        def develop_one(number: int) -> tuple[level3.Developed, float]:
             started = time.monotonic()
             done = level3.develop(
                 folder, rig, number, tones, images=images, depths=depths, threads=threads
             )
-            rows.append((done, time.monotonic() - started))
-            progress.advance(task)
+            return done, time.monotonic() - started
+
+        known = {failure.exposure for failure in unreadable}
+        numbers = [number for number in only or sorted(tones.scales) if number not in known]
+        progress.update(task, description="developing", total=len(numbers), completed=0)
+        walked = walk(numbers, develop_one, lambda count: progress.update(task, completed=count))
+    rows = list(walked.results.values())
+    failures = (*unreadable, *walked.failures)
     if as_json:
         content = {
             "mission": str(folder.path),
@@ -78,9 +89,15 @@ def develop(
                 }
                 for done, seconds in rows
             ],
+            "failures": [failure.as_json() for failure in failures],
         }
         typer.echo(json.dumps(content))
-        return
+    else:
+        _show(rows, level3.level3_root(folder))
+    end_walk(failures)
+
+
+def _show(rows: Sequence[tuple[Developed, float]], root: Path) -> None:
     table = light_table("Level-3", (), ("exposure", "files", "MB", "s"))
     for done, seconds in rows:
         nbytes = sum(done.files.values())
@@ -92,4 +109,4 @@ def develop(
     for done, _ in rows:
         for sentence in done.left_out:
             console.print(f"Exposure {done.number}: {sentence}", style="yellow", markup=False)
-    console.print(f"Images are in [bold]{level3.level3_root(folder)}[/]")
+    console.print(f"Images are in [bold]{root}[/]")

@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
+from daemon.cli.failures import end_walk
 from daemon.tables import light_table
 from drivers.extras import require
 
@@ -44,6 +45,9 @@ Example: `syntopic export certificate MISSION`
 app = typer.Typer(
     help="""Write what others need into the mission's export folder.
 
+An exposure that cannot be read is listed at the end with its cause; the others are written, and the
+exit status is 1.
+
 Examples: `syntopic export raw MISSION`, `syntopic export orientation MISSION --crs EPSG:25833`
 """,
     rich_markup_mode="markdown",
@@ -68,16 +72,25 @@ def raw(
     from daemon.disk.mission import Mission
     from daemon.export.raw import export_raw
 
-    done = export_raw(Mission.open(mission))
+    folder = Mission.open(mission)
+    with folder.held():
+        done = export_raw(folder)
     if as_json:
-        told = {"folder": str(done.folder), "nbytes": done.nbytes, "events": done.events}
+        told = {
+            "folder": str(done.folder),
+            "nbytes": done.nbytes,
+            "events": done.events,
+            "failures": [failure.as_json() for failure in done.failures],
+        }
         typer.echo(json.dumps(told))
+        end_walk(done.failures)
         return
     console = Console()
     for name, nbytes in done.nbytes.items():
         console.print(f"{name}: {nbytes} bytes")
     console.print(f"events.csv: {done.events} exposures; frames.csv: every frame of theirs")
     console.print(f"They are in [bold]{done.folder}[/]", soft_wrap=True)
+    end_walk(done.failures)
 
 
 @app.command()
@@ -92,12 +105,17 @@ def foxglove(
     from daemon.disk.mission import Mission
     from daemon.export.foxglove import export_foxglove
 
-    done = export_foxglove(Mission.open(mission))
+    folder = Mission.open(mission)
+    with folder.held():
+        done = export_foxglove(folder)
     if as_json:
-        typer.echo(json.dumps({"file": str(done.file), "messages": done.messages}))
-        return
-    told = ", ".join(f"{topic} {count}" for topic, count in done.messages.items())
-    Console().print(f"{told or 'nothing'}; written to [bold]{done.file}[/]", soft_wrap=True)
+        failures = [failure.as_json() for failure in done.failures]
+        content = {"file": str(done.file), "messages": done.messages, "failures": failures}
+        typer.echo(json.dumps(content))
+    else:
+        told = ", ".join(f"{topic} {count}" for topic, count in done.messages.items())
+        Console().print(f"{told or 'nothing'}; written to [bold]{done.file}[/]", soft_wrap=True)
+    end_walk(done.failures)
 
 
 @app.command(help=PICTURES_HELP)
@@ -122,9 +140,9 @@ def pictures(
     if kind == "cog":
         require("geotiff")
     folder = Mission.open(mission)
-    with Progress(console=Console(stderr=True), transient=True) as progress:
+    with folder.held(), Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("writing", total=len(only or folder.numbers()))
-        files = export_pictures(
+        files, failures = export_pictures(
             folder,
             kind,
             crs=crs,
@@ -134,9 +152,15 @@ def pictures(
             progress=lambda count: progress.update(task, completed=count),
         )
     if as_json:
-        typer.echo(json.dumps({"folder": str(files[0].parent), "files": [f.name for f in files]}))
-        return
-    Console().print(f"{len(files)} pictures in [bold]{files[0].parent}[/]", soft_wrap=True)
+        content = {
+            "folder": str(files[0].parent),
+            "files": [f.name for f in files],
+            "failures": [failure.as_json() for failure in failures],
+        }
+        typer.echo(json.dumps(content))
+    else:
+        Console().print(f"{len(files)} pictures in [bold]{files[0].parent}[/]", soft_wrap=True)
+    end_walk(failures)
 
 
 @app.command(help=CERTIFICATE_HELP)
@@ -147,9 +171,12 @@ def certificate(
     from daemon.disk.mission import Mission
     from daemon.export.certificate import write_certificate
 
-    told, path = write_certificate(Mission.open(mission))
+    folder = Mission.open(mission)
+    with folder.held():
+        told, path, failures = write_certificate(folder)
     if as_json:
         typer.echo(json.dumps(told))
+        end_walk(failures)
         return
     console = Console()
     for camera in told["cameras"]:
@@ -161,6 +188,7 @@ def certificate(
             highlight=False,
         )
     console.print(f"Certificate: [bold]{path}[/]", soft_wrap=True)
+    end_walk(failures)
 
 
 @app.command(help=ORIENTATION_HELP)
@@ -187,7 +215,7 @@ def orientation(
     from daemon.export import orientation as orientation_export
 
     folder = Mission.open(mission)
-    with Progress(console=Console(stderr=True), transient=True) as progress:
+    with folder.held(), Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("orienting", total=len(folder.numbers()))
         done = orientation_export.export_orientation(
             folder,
@@ -200,6 +228,7 @@ def orientation(
         )
     if as_json:
         typer.echo(json.dumps(orientation_export.as_json(done)))
+        end_walk(done.failures)
         return
     console = Console()
     table = light_table(
@@ -226,3 +255,4 @@ def orientation(
         "about.txt first",
         soft_wrap=True,
     )
+    end_walk(done.failures)

@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from daemon.cli.failures import end_walk
 from daemon.cli.options import AsJson, AttitudeSigma, Crs, MountFile, PositionSigma, Trajectory
 from daemon.tables import light_table
 from drivers.extras import require
@@ -85,6 +86,7 @@ def intersect(
         )  # fmt: skip
     if as_json:
         typer.echo(json.dumps(asdict(done)))
+        end_walk(done.failures)
         return
     console = Console()
     columns = ("east m", "north m", "height m", "\u00b1 x", "\u00b1 y", "\u00b1 z", "rays")
@@ -101,3 +103,4 @@ def intersect(
         )
     if out is not None:
         console.print(f"Table: [bold]{out}[/]", soft_wrap=True)
+    end_walk(done.failures)

@@ -1,11 +1,14 @@
-"""Options that several commands have, said once."""
+"""Options that several commands have, and what follows from them."""
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from daemon.disk.mission import Mission
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
@@ -24,3 +27,13 @@ PositionSigma = Annotated[
 AttitudeSigma = Annotated[
     tuple[float, float, float], typer.Option(help="Roll, pitch, heading, mdeg.")
 ]
+
+
+def held_for(mission: Mission, target: Path) -> AbstractContextManager[None]:
+    """Hold the mission against other writers, if `target` is a place in it.
+
+    Raises:
+        MissionError: on entering, where another process holds it.
+    """
+    is_inside = target.resolve().is_relative_to(mission.path.resolve())
+    return mission.held() if is_inside else nullcontext()

@@ -5,15 +5,15 @@ from __future__ import annotations
 import json
 import os
 import time
-import tomllib
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from pydantic import ValidationError
 from rich.console import Console
 from rich.progress import Progress
 
+from daemon.cli.failures import end_walk
 from daemon.cli.level2_tables import print_reports
 from daemon.configuration import ConfigurationError, PlanSection, ProcessingSection
 from daemon.disk.mission import Mission
@@ -23,6 +23,9 @@ HELP = """Process the exposures of a mission folder again, Level-0 to Level-2.
 The folder may be a flight's, imported, or written by hand as docs/formats.md tells. Level-0 stays
 as it is; products are replaced. A rig without a virtual image gives one raster per
 band, or, where its heads look apart, an image of each head in strict perspective.
+
+An exposure that cannot be processed is listed at the end with its cause; the others are done. The
+exit status is then 1. Only one command at a time writes into a mission.
 
 Examples: `syntopic process MISSION`, `syntopic process MISSION --only 3 --method fixed`
 """
@@ -49,6 +52,8 @@ def process(
 ) -> None:
     os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
     from daemon.disk import store
+    from daemon.disk.level2 import recover_level2
+    from daemon.disk.walk import walk
     from daemon.orientation.exterior import mount_of
     from daemon.orientation.ground import ground_of
     from daemon.products.processor import processor_for
@@ -75,45 +80,49 @@ def process(
     mount, _ = mount_of(folder)
     overlaps = overlaps_of(folder, rig)
     ground = ground_of(rig, mount, plan)
-    reports = []
-    try:
-        processor = processor_for(rig, folder, processing, radiometry)
-        with Progress(console=Console(stderr=True), transient=True) as progress:
-            task = progress.add_task("compiling kernels", total=None)
+    with folder.held(), Progress(console=Console(stderr=True), transient=True) as progress:
+        recover_level2(folder)
+        task = progress.add_task("compiling kernels", total=None)
+        try:
+            processor = processor_for(rig, folder, processing, radiometry)
             processor.warm_up()
-            numbers = only or folder.numbers()
-            progress.update(task, description="processing", total=len(numbers))
-            for number in numbers:
-                started = time.monotonic()
-                frames, exposure = store.load_level0(folder.level0(number), rig)
-                report, _ = process_exposure(
-                    processor,
-                    folder,
-                    mount,
-                    plan,
-                    exposure,
-                    frames,
-                    surroundings=overlaps.of(number),
-                    ground=ground,
-                )
-                report["duration_s"] = round(time.monotonic() - started, 3)
-                reports.append(report)
-                progress.advance(task)
-    except CalibrationError as error:
-        raise ConfigurationError([str(error)]) from error
+        except CalibrationError as error:
+            raise ConfigurationError([str(error)]) from error
+
+        def process_one(number: int) -> dict[str, Any]:
+            started = time.monotonic()
+            frames, exposure = store.load_level0(folder.level0(number), rig)
+            report, _ = process_exposure(
+                processor,
+                folder,
+                mount,
+                plan,
+                exposure,
+                frames,
+                surroundings=overlaps.of(number),
+                ground=ground,
+            )
+            return {**report, "duration_s": round(time.monotonic() - started, 3)}
+
+        numbers = only or folder.numbers()
+        progress.update(task, description="processing", total=len(numbers))
+        done = walk(numbers, process_one, lambda count: progress.update(task, completed=count))
+    reports = list(done.results.values())
     if as_json:
-        typer.echo(json.dumps({"mission": str(folder.path), "exposures": reports}))
-        return
-    console = Console()
-    print_reports(console, f"Level-2 of {folder.id}", reports)
-    console.print(f"Products are in [bold]{folder.level2_root}[/]")
+        failures = [failure.as_json() for failure in done.failures]
+        content = {"mission": str(folder.path), "exposures": reports, "failures": failures}
+        typer.echo(json.dumps(content))
+    else:
+        console = Console()
+        if reports:
+            print_reports(console, f"Level-2 of {folder.id}", reports)
+        console.print(f"Products are in [bold]{folder.level2_root}[/]")
+    end_walk(done.failures)
 
 
 def flown_thresholds(folder: Mission) -> dict[str, float]:
     """Thresholds of the configuration that was flown, so that it is judged as in the air."""
-    if not folder.service_path.exists():
-        return {}
-    flown = tomllib.loads(folder.service_path.read_text(encoding="utf-8"))
+    flown = folder.flown_configuration()
     given = flown.get("processing", {}).get("thresholds", {})
     try:
         return ProcessingSection.model_validate({"thresholds": given}).thresholds
@@ -131,10 +140,11 @@ def as_flown(
 
     Only these two are read: devices that were there in the air need not be here.
     """
-    if not folder.service_path.exists():
-        return PlanSection.model_validate({}), radiometry
-    flown = tomllib.loads(folder.service_path.read_text(encoding="utf-8"))
-    plan = PlanSection.model_validate(flown.get("plan", {}))
+    flown = folder.flown_configuration()
+    try:
+        plan = PlanSection.model_validate(flown.get("plan", {}))
+    except ValidationError as error:
+        raise ConfigurationError([f"{folder.service_path}: plan: {error}"]) from error
     if elevation is not None:
         plan = plan.model_copy(update={"elevation": elevation})
     if plan.elevation is not None and not plan.elevation.is_file():

@@ -9,18 +9,27 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from daemon.cli.failures import end_walk
+from daemon.cli.options import held_for
+
 HELP = """Write the mission's report: one HTML file that needs nothing beside it.
 
 With --bundle also `export/support.zip`: configuration without secrets, records, verdicts, what
 devices and service said, versions. No pixels, no raw bytes, no positions.
 
-Examples: `syntopic report MISSION`, `syntopic report MISSION --bundle`
+With --out nothing is written into the mission; this also works while it is being flown. What cannot
+be read is listed in the report and at the end, and makes the exit status 1.
+
+Examples: `syntopic report MISSION --bundle`, `syntopic report MISSION --out FOLDER`
 """
 
 
 def report(
     mission: Annotated[Path, typer.Argument(help="Mission folder.")],
     bundle: Annotated[bool, typer.Option("--bundle", help="Also what support needs.")] = False,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder to write into (default: the mission's export).")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     from daemon.disk.mission import Mission
@@ -30,18 +39,23 @@ def report(
 
     folder = Mission.open(mission)
     console = Console(stderr=as_json, soft_wrap=True)
-    path = write_report(folder.path)
-    told: dict[str, object] = {"report": str(path)}
-    if bundle:
-        with console.status("checking every frame and record"):
-            verified = verify(folder)
-        written = write_bundle(folder, verified)
-        told |= {"bundle": str(written.path), "contents": written.contents}
+    with held_for(folder, out or folder.export_dir):
+        done = write_report(folder.path, out=out)
+        failures = [failure.as_json() for failure in done.failures]
+        told: dict[str, object] = {"report": str(done.path), "failures": failures}
+        if bundle:
+            with console.status("checking every frame and record"):
+                verified = verify(folder)
+            written = write_bundle(folder, verified, out=out)
+            told |= {"bundle": str(written.path), "contents": written.contents}
+    path = done.path
     if as_json:
         typer.echo(json.dumps(told))
+        end_walk(done.failures)
         return
     console.print(f"Report   [bold]{path}[/]")
     if bundle:
         console.print(f"Bundle   [bold]{written.path}[/], {written.path.stat().st_size} bytes:")
         for name, nbytes in written.contents.items():
             console.print(f"  {name}: {nbytes} bytes", highlight=False)
+    end_walk(done.failures)

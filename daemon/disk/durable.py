@@ -223,7 +223,8 @@ def remove_tree(path: Path) -> None:
             remove_tree(child)
         else:
             child.unlink(missing_ok=True)
-    path.rmdir()
+    with suppress(FileNotFoundError):  # somebody else removed it at the same time
+        path.rmdir()
 
 
 def sync_directory(path: Path) -> None:

@@ -6,12 +6,16 @@ reads. Which files belong to an exposure is the business of `daemon.disk.store`.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import struct
 import sys
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +66,42 @@ def tiff_parts(
     return [header, *(plane.data.cast("B") for plane in planes)]
 
 
+@dataclass(frozen=True)
+class Frame:
+    """A frame as it was read at once: pixels (height, width), hash of the file, ImageDescription.
+
+    `pixels` may be read-only; `description` is empty for a file of others.
+    """
+
+    pixels: NDArray[np.uint16]
+    sha256: str
+    description: Mapping[str, Any]
+
+
+def read_frame(path: Path, *, width_px: int, height_px: int) -> Frame:
+    """Read a frame's file once: what is hashed is what is decoded.
+
+    Raises:
+        RasterError: as `read_tiff`.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise RasterError(f"{path}: cannot be read ({error.strerror})") from error
+    with _first_page(path, BytesIO(data)) as page:
+        _refuse_other_pixels(page, path, page.shape, width_px, height_px)
+        text = page.description
+        if page.compression == 1 and page.is_final:
+            kind = np.dtype(np.uint16).newbyteorder(page.parent.byteorder)
+            words = np.frombuffer(data, kind, page.size, page.dataoffsets[0])
+            pixels = np.asarray(words, np.uint16).reshape(page.shape)
+        else:
+            pixels = page.asarray()
+    if pixels.shape != (height_px, width_px):
+        raise RasterError(f"{path.name}: its pixels end early")
+    return Frame(pixels, hashlib.sha256(data).hexdigest(), _described(text))
+
+
 def read_tiff(
     path: Path,
     *,
@@ -77,27 +117,38 @@ def read_tiff(
         RasterError: not a TIFF, damaged, not one plane of uint16, not of the size given, or one
             that would unpack to more than it says.
     """
+    with _first_page(path) as page:
+        shape = page.shape if plane is None else page.shape[1:]
+        if plane is not None and plane >= page.shape[0]:
+            shape = page.shape
+        _refuse_other_pixels(page, path, shape, width_px, height_px)
+        pixels: NDArray[np.uint16] = page.asarray()
+        pixels = pixels if plane is None else pixels[plane]
+    if pixels.shape != shape:
+        raise RasterError(f"{path.name}: its pixels end early")
+    return pixels
+
+
+def check_tiff(path: Path, *, width_px: int, height_px: int) -> None:
+    """Whether a raster of one or more planes can be read, without taking its pixels into memory.
+
+    Raises:
+        RasterError: as `read_tiff`.
+    """
+    with _first_page(path) as page:
+        _refuse_other_pixels(page, path, page.shape[-2:], width_px, height_px)
+
+
+@contextmanager
+def _first_page(path: Path, file: BytesIO | None = None) -> Iterator[Any]:
+    """The first page of a TIFF whose pixels may be unpacked; what tifffile raises is translated."""
     from tifffile import TiffFile
 
     try:
-        with TiffFile(path) as tiff:
+        with TiffFile(path if file is None else file) as tiff:
             page = tiff.pages[0]
-            shape = page.shape if plane is None else page.shape[1:]
-            if len(shape) != 2 or page.dtype != np.uint16 or (plane or 0) >= page.shape[0]:
-                raise RasterError(
-                    f"{path.name}: holds {page.dtype} of shape {page.shape}; "
-                    "a frame is one plane of 16-bit words"
-                )
-            found = (shape[1], shape[0])
-            wanted = (width_px or found[0], height_px or found[1])
-            if found != wanted:
-                raise RasterError(
-                    f"{path.name}: {found[0]} x {found[1]} px; the sensor has "
-                    f"{wanted[0]} x {wanted[1]} px"
-                )
             refuse_bomb(page, path)
-            pixels: NDArray[np.uint16] = page.asarray()
-            pixels = pixels if plane is None else pixels[plane]
+            yield page
     except OSError as error:
         reason = error.strerror or type(error).__name__
         raise RasterError(f"{path}: cannot be read ({reason})") from error
@@ -105,9 +156,26 @@ def read_tiff(
         raise
     except tiff_faults() as error:
         raise RasterError(f"{path.name}: not a usable TIFF ({error})") from error
-    if pixels.shape != (found[1], found[0]):
-        raise RasterError(f"{path.name}: its pixels end early")
-    return pixels
+
+
+def _refuse_other_pixels(
+    page: Any,
+    path: Path,
+    shape: tuple[int, ...],
+    width_px: int | None,
+    height_px: int | None,
+) -> None:
+    if len(shape) != 2 or page.dtype != np.uint16:
+        raise RasterError(
+            f"{path.name}: holds {page.dtype} of shape {page.shape}; "
+            "a frame is one plane of 16-bit words"
+        )
+    found = (shape[1], shape[0])
+    wanted = (width_px or found[0], height_px or found[1])
+    if found != wanted:
+        raise RasterError(
+            f"{path.name}: {found[0]} x {found[1]} px; the sensor has {wanted[0]} x {wanted[1]} px"
+        )
 
 
 def tiff_faults() -> tuple[type[Exception], ...]:
@@ -136,7 +204,8 @@ def refuse_bomb(page: Any, path: Path) -> None:
         RasterError: compressed otherwise than by Deflate; pixels that the file does not hold; parts
             that unpack to more than they may.
     """
-    file_nbytes = path.stat().st_size
+    file = page.parent.filehandle
+    file_nbytes = file.size
     ratio = 1 if page.compression == 1 else DEFLATE_MOST
     most = min(TIFF_MAX_BYTES, ratio * file_nbytes)
     if page.nbytes > most:
@@ -154,13 +223,12 @@ def refuse_bomb(page: Any, path: Path) -> None:
         raise RasterError(
             f"{path.name}: compression {int(page.compression)}; none or Deflate (8) is read"
         )
-    with path.open("rb") as file:
-        for offset, count in places:
-            file.seek(offset)
-            unpacked = zlib.decompressobj()
-            unpacked.decompress(file.read(count), part_nbytes)
-            if unpacked.unconsumed_tail and unpacked.decompress(unpacked.unconsumed_tail, 1):
-                raise RasterError(f"{path.name}: a part unpacks to more than its pixels")
+    for offset, count in places:
+        file.seek(offset)
+        unpacked = zlib.decompressobj()
+        unpacked.decompress(file.read(count), part_nbytes)
+        if unpacked.unconsumed_tail and unpacked.decompress(unpacked.unconsumed_tail, 1):
+            raise RasterError(f"{path.name}: a part unpacks to more than its pixels")
 
 
 def read_description(path: Path) -> dict[str, Any]:
@@ -169,11 +237,17 @@ def read_description(path: Path) -> dict[str, Any]:
 
     try:
         with TiffFile(path) as tiff:
-            text = tiff.pages[0].description
-        content = json.loads(text)
+            return _described(tiff.pages[0].description)
     except OSError:
         return {}
     except tiff_faults():
+        return {}
+
+
+def _described(text: str) -> dict[str, Any]:
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError):
         return {}
     return content if isinstance(content, dict) else {}
 

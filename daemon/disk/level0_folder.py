@@ -98,7 +98,7 @@ def load_level0(
     exposure = _record_or_defaults(folder)
     records = list(exposure.frames)
     if not records and exposure.state != "lost":
-        present = [s for s in rig.sensors if (folder / f"{s.name}.tif").is_file()]
+        present = [s for s in rig.sensors if (folder / f"{s.name}.tif").exists()]
         records = [_default_frame(sensor) for sensor in present]
     frames: dict[str, NDArray[np.uint16]] = {}
     kept: list[FrameRecord] = []
@@ -112,7 +112,7 @@ def load_level0(
             problems.append(f"{folder.name}: sensor {record.sensor!r}; rig {rig.name} has {known}")
             continue
         path = folder / (record.file or f"{record.sensor}.tif")
-        if not path.is_file():
+        if not path.exists():
             missing.setdefault(record.sensor, f"{path.name} is not in its folder")
             continue
         try:

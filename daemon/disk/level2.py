@@ -15,15 +15,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.disk import direct, durable
+from daemon.disk import direct
 from daemon.disk.level0 import tiff_parts
 from daemon.disk.mission import Mission
-from daemon.disk.records import RecordError, canonical_bytes, parse_record, plain_name
+from daemon.disk.publication import published, sweep
+from daemon.disk.records import Fields, RecordError, canonical_bytes, parse_record, plain_name
 from daemon.errors import DaemonError
 
-REPLACED_SUFFIX = ".replaced"
-"""Ends the name of an earlier result while a newer one takes its place."""
-
+VERDICTS = ("good", "usable", "refly")
 BAND_ORDER = ("red", "green", "blue", "nir")
 QUICKLOOK_QUALITY = 85
 THUMBNAIL_WIDTH_PX, THUMBNAIL_QUALITY = 200, 60
@@ -141,20 +140,40 @@ def write_folder(
     Raises:
         OSError: the disk refused; an earlier folder is still there.
     """
-    durable.make_directories(final.parent)
-    part = final.with_name(final.name + durable.PART_SUFFIX)
-    durable.remove_tree(part)
-    part.mkdir()
-    try:
-        files = {
+    with published(final) as part:
+        return {
             name: direct.create_file(part / name, parts, mode=0o644)
             for name, parts in contents.items()
         }
-        take_the_place_of(part, final)
-    except OSError:
-        durable.remove_tree(part)
-        raise
-    return files
+
+
+def read_report(folder: Path) -> dict[str, Any] | None:
+    """The quality.json of a product folder, None where there is none.
+
+    Raises:
+        RecordError: it is damaged: no JSON, or a verdict, finding or figure of a wrong type.
+    """
+    name = f"{folder.name}/quality.json"
+    try:
+        content = parse_record((folder / "quality.json").read_bytes(), name)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise RecordError([f"{name}: cannot be read ({error.strerror})"]) from error
+    problems: list[str] = []
+    fields = Fields(content, "", name, problems)
+    fields.choice("verdict", VERDICTS)
+    for finding in fields.objects("findings"):
+        finding.text("sentence")
+        finding.text("flag", "")
+        finding.choice("verdict", VERDICTS, "good")
+    figures = fields.object("figures")
+    for figure, value in (figures.content if figures else {}).items():
+        if not (value is None or isinstance(value, str | int | float)):
+            problems.append(f"{name}: figures.{figure} is {value!r}; a number or a text is needed")
+    if problems:
+        raise RecordError(problems)
+    return content
 
 
 def verdict_of(folder: Path) -> str | None:
@@ -168,35 +187,12 @@ def verdict_of(folder: Path) -> str | None:
 
 
 def recover_level2(mission: Mission) -> list[str]:
-    """Clear what an interrupted `write_level2` left; sentences say what was done."""
-    if not mission.level2_root.is_dir():
-        return []
-    done = []
-    for entry in sorted(mission.level2_root.iterdir()):
-        if entry.name.endswith(durable.PART_SUFFIX):
-            durable.remove_tree(entry)
-            done.append(f"L2/{entry.name}: unfinished products removed; process them again")
-        elif entry.name.endswith(REPLACED_SUFFIX):
-            final = entry.with_name(entry.name.removesuffix(REPLACED_SUFFIX))
-            if final.exists():
-                durable.remove_tree(entry)
-            else:
-                entry.rename(final)
-                done.append(f"L2/{final.name}: earlier products put back in their place")
-    if done:
-        durable.sync_directory(mission.level2_root)
-    return done
+    """Clear what an interrupted `write_level2` left; sentences say what was done.
 
-
-def take_the_place_of(part: Path, final: Path) -> None:
-    """Give a finished folder, whose files are durable, its name in place of an earlier one."""
-    replaced = final.with_name(final.name + REPLACED_SUFFIX)
-    durable.remove_tree(replaced)
-    if final.exists():
-        durable.sync_directory(part)
-        final.rename(replaced)
-    durable.rename_directory(part, final)
-    durable.remove_tree(replaced)
+    Args:
+        mission: it must be held by the caller (`Mission.held`).
+    """
+    return sweep(mission.level2_root)
 
 
 def _ordered(colour: Mapping[str, NDArray[np.uint16]]) -> list[str]:

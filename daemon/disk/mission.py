@@ -6,9 +6,9 @@ What is written into it, and how, is in `daemon.disk.store`, `daemon.disk.level2
 
 from __future__ import annotations
 
-import fcntl
 import os
 import re
+import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -25,23 +25,18 @@ from daemon.disk.records import (
     plain_name,
     sha256_hex,
 )
-from daemon.errors import DaemonError
+from daemon.disk.writer_lock import MissionError as MissionError
+from daemon.disk.writer_lock import is_locked, writer_lock
 
 CURRENT_FILE = "current-mission.json"
 """In the root: which mission a restarted service continues; absent between flights."""
 
 MISSION_FORMAT = 2
 """From 2 on a mission is created with its chain file and the hash of its flight plan."""
-HELD_FILE = ".held"
-"""In a mission: locked by the process that flies it."""
 DISCARDED = ".discarded"
 """In L0: what recovery set aside because nobody was ever told that it is stored."""
 
 _EXPOSURE_FOLDER = re.compile(r"[0-9]{6,12}")
-
-
-class MissionError(DaemonError):
-    """A mission folder that cannot be created, opened or used; the sentence says what to do."""
 
 
 @dataclass(frozen=True)
@@ -234,6 +229,21 @@ class Mission:
         is_expected = self.about().get("format") != 1
         return ChainFile(self.path, self.genesis_sha256(), is_expected=is_expected)
 
+    def flown_configuration(self) -> dict[str, Any]:
+        """The content of service.toml; empty for a mission without one.
+
+        Raises:
+            MissionError: it cannot be read.
+        """
+        try:
+            return tomllib.loads(self.service_path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return {}
+        except (OSError, ValueError) as error:
+            raise MissionError(
+                f"{self.service_path}: cannot be read ({error}); put a copy of what was flown there"
+            ) from error
+
     def numbers(self) -> list[int]:
         """Numbers of the exposures whose folder is there, ascending."""
         return sorted(
@@ -269,37 +279,20 @@ class Mission:
             durable.sync_directory(self.root)
 
     def is_held(self) -> bool:
-        """Whether another process flies it now."""
-        try:
-            descriptor = os.open(self.path / HELD_FILE, os.O_RDONLY | os.O_CLOEXEC)
-        except FileNotFoundError:
-            return False
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
-        finally:
-            os.close(descriptor)
-        return False
+        """Whether another process writes into it now: the service that flies it, or a command."""
+        return is_locked(self.path)
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Keep other services out of the mission for as long as this process lives.
+        """Keep other writers out of the mission until the block ends.
+
+        Whoever changes anything in a mission holds it; whoever only reads does not.
 
         Raises:
-            MissionError: another process holds it.
+            MissionError: another process holds it; the sentence names it.
         """
-        descriptor = os.open(self.path / HELD_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-        try:
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise MissionError(
-                    f"mission {self.id} is held by another process; stop that one first"
-                ) from error
+        with writer_lock(self.path):
             yield
-        finally:
-            os.close(descriptor)
 
     def _used_numbers(self) -> Iterator[int]:
         for folder in (self.level0_root, self.level0_root / DISCARDED, self.level2_root):
@@ -332,8 +325,8 @@ def _first_odd(folder: Path, *, looks_below: bool) -> str | None:
     while waiting:
         try:
             entries = list(os.scandir(waiting.pop()))
-        except FileNotFoundError:
-            continue  # a product folder that is being replaced
+        except OSError:
+            continue  # being replaced, or not to be read; whoever reads it says so
         for entry in entries:
             if entry.is_dir(follow_symlinks=False):
                 waiting += [entry.path] if looks_below else []

@@ -13,8 +13,8 @@ from typing import Any
 
 from daemon.disk.durable import make_directories, replace_file
 from daemon.disk.mission import Mission
+from daemon.disk.walk import ExposureFailure
 from daemon.errors import DaemonError
-from daemon.exposure import Exposure
 from daemon.orientation.exterior import exposures_of
 from processing.perspective import looks_apart, perspective_of
 from processing.rig import Rig, VirtualImage, load_rig
@@ -77,23 +77,28 @@ def certificate_of(rig: Rig) -> dict[str, Any]:
     }
 
 
-def write_certificate(mission: Mission) -> tuple[dict[str, Any], Path]:
-    """Write `export/certificate.json` and `certificate.html`; returns both content and page.
+def write_certificate(
+    mission: Mission,
+) -> tuple[dict[str, Any], Path, tuple[ExposureFailure, ...]]:
+    """Write `export/certificate.json` and `certificate.html`.
+
+    Returns:
+        The content, the page, and the exposures whose record cannot be read.
 
     Raises:
         CertificateError: as `certificate_of`.
     """
     told = certificate_of(load_rig(mission.rig_path))
-    exposures: list[Exposure] = list(exposures_of(mission))
+    exposures = exposures_of(mission)
     told["mission"] = mission.id
-    told["exposures"] = len(exposures)
-    told["simulated"] = any(e.simulated for e in exposures)
+    told["exposures"] = len(exposures.results)
+    told["simulated"] = any(e.simulated for e in exposures.results.values())
     make_directories(mission.export_dir)
     text = json.dumps(told, indent=1) + "\n"
     replace_file(mission.export_dir / "certificate.json", text.encode("utf-8"))
     page = mission.export_dir / "certificate.html"
     replace_file(page, _page(told).encode("utf-8"))
-    return told, page
+    return told, page, exposures.failures
 
 
 def _colour(image: VirtualImage) -> VirtualImage:

@@ -18,11 +18,13 @@ from mcap.writer import Writer
 
 from daemon.disk import durable
 from daemon.disk.flight_log import logs_of, read
+from daemon.disk.level2 import read_report
 from daemon.disk.log_records import record_of
 from daemon.disk.mission import Mission
 from daemon.disk.records import RecordError
+from daemon.disk.walk import ExposureFailure, walk
 from daemon.exposure import Exposure
-from daemon.orientation.exterior import exposures_of
+from daemon.orientation.exterior import exposure_of
 from daemon.service.commanding import AUDIT_TOPIC
 from drivers.contract import DeviceEvent, NavSample
 from drivers.leap_seconds import leap_seconds_at
@@ -87,10 +89,11 @@ _Told = tuple[int, str, str, dict[str, Any]]
 
 @dataclass(frozen=True)
 class FoxgloveExport:
-    """What was written: messages by topic."""
+    """What was written: messages by topic, and the exposures that could not be read."""
 
     file: Path
     messages: dict[str, int]
+    failures: tuple[ExposureFailure, ...] = ()
 
 
 def export_foxglove(mission: Mission) -> FoxgloveExport:
@@ -103,7 +106,9 @@ def export_foxglove(mission: Mission) -> FoxgloveExport:
     final = mission.export_dir / FILE_NAME
     part = final.with_name(FILE_NAME + durable.PART_SUFFIX)
     counts: dict[str, int] = {}
-    told = sorted([*_from_logs(mission), *_from_exposures(mission)], key=itemgetter(0))
+    read = walk(mission.numbers(), lambda number: _from_exposure(mission, number))
+    of_exposures = (message for messages in read.results.values() for message in messages)
+    told = sorted([*_from_logs(mission), *of_exposures], key=itemgetter(0))
     with part.open("wb") as file:
         writer = Writer(file)
         writer.start(profile="", library="syntopic")
@@ -124,7 +129,7 @@ def export_foxglove(mission: Mission) -> FoxgloveExport:
         writer.add_metadata("syntopic", {"mission": mission.id, **mark})
         writer.finish()
     part.replace(final)
-    return FoxgloveExport(final, counts)
+    return FoxgloveExport(final, counts, read.failures)
 
 
 def _register(writer: Writer, topic: str, schema: str) -> int:
@@ -161,28 +166,26 @@ def _from_logs(mission: Mission) -> Iterator[_Told]:
             yield (utc_ns(mono_ns - mono_less_gps_ns), *_said(level, name, sentence))
 
 
-def _from_exposures(mission: Mission) -> Iterator[_Told]:
-    """Thumbnails and findings of every exposure whose time is known."""
-    for exposure in exposures_of(mission):
-        if exposure.mark_gps_ns is None:
-            continue
-        at_ns = utc_ns(exposure.mark_gps_ns)
-        folder = mission.level2(exposure.number)
-        thumbnail = folder / "thumbnail.jpg"
-        if thumbnail.is_file():
-            data = base64.b64encode(thumbnail.read_bytes()).decode("ascii")
-            image = {"frame_id": "camera", "data": data, "format": "jpeg"}
-            yield (at_ns, "/thumbnail", "foxglove.CompressedImage", image)
-        yield (at_ns, *_of_exposure(exposure, folder))
+def _from_exposure(mission: Mission, number: int) -> list[_Told]:
+    """Thumbnail and findings of an exposure whose time is known."""
+    exposure = exposure_of(mission, number)
+    if exposure is None or exposure.mark_gps_ns is None:
+        return []
+    at_ns = utc_ns(exposure.mark_gps_ns)
+    folder = mission.level2(number)
+    messages: list[_Told] = [(at_ns, *_of_exposure(exposure, folder))]
+    thumbnail = folder / "thumbnail.jpg"
+    if thumbnail.exists():
+        data = base64.b64encode(thumbnail.read_bytes()).decode("ascii")
+        image = {"frame_id": "camera", "data": data, "format": "jpeg"}
+        messages.insert(0, (at_ns, "/thumbnail", "foxglove.CompressedImage", image))
+    return messages
 
 
 def _of_exposure(exposure: Exposure, folder: Path) -> tuple[str, str, dict[str, Any]]:
-    try:
-        quality = json.loads((folder / "quality.json").read_text("utf-8"))
-        verdict = str(quality["verdict"])
-        sentences = [str(finding["sentence"]) for finding in quality["findings"]]
-    except (OSError, ValueError, KeyError, TypeError):
-        verdict, sentences = "not processed", []
+    quality = read_report(folder) or {}
+    verdict = quality.get("verdict", "not processed")
+    sentences = [finding["sentence"] for finding in quality.get("findings", [])]
     where = f", line {exposure.line_id}" if exposure.line_id else ""
     told = f"exposure {exposure.number}{where}: {exposure.state}, {verdict}"
     return _said(LEVELS.get(verdict, WARNING), "exposures", " ".join([f"{told}.", *sentences]))

@@ -19,6 +19,7 @@ from daemon.configuration import MountSection
 from daemon.disk.level2 import verdict_of, write_folder
 from daemon.disk.mission import Mission
 from daemon.disk.records import plain_name, sha256_hex
+from daemon.disk.walk import ExposureFailure, walk
 from daemon.errors import DaemonError
 from daemon.exposure import Exposure
 from daemon.orientation import footprints
@@ -51,6 +52,7 @@ class OrientationSet:
 
     `change_m` and `change_deg` are the greatest differences of position and of any axis's
     direction against the in-flight orientation of the same images; None where there is none.
+    `failures` are exposures that could not be read, or not be placed in the coordinate system.
     """
 
     folder: Path
@@ -61,6 +63,7 @@ class OrientationSet:
     trajectory: str
     change_m: float | None
     change_deg: float | None
+    failures: tuple[ExposureFailure, ...]
 
 
 def export_orientation(
@@ -87,7 +90,8 @@ def export_orientation(
         OrientationError: no exposure could be oriented.
         TrajectoryError, GeoreferenceError, RecordError: as their modules say.
     """
-    exposures = list(exposures_of(mission))
+    read = exposures_of(mission)
+    exposures = list(read.results.values())
     means = orienting(
         mission,
         exposures,
@@ -97,14 +101,15 @@ def export_orientation(
         receiver=receiver,
     )
     rig, trajectory, georeference = means.rig, means.trajectory, means.georeference
-    found: list[ExteriorOrientation | Unoriented] = []
-    for done, exposure in enumerate(exposures, start=1):
-        found.extend(means.of(exposure))
-        progress(done)
+    done = walk(read.results, lambda number: list(means.of(read.results[number])), progress)
+    failures = (*read.failures, *done.failures)
+    found = [one for of_exposure in done.results.values() for one in of_exposure]
     oriented = tuple(one for one in found if isinstance(one, ExteriorOrientation))
     missing = tuple(one for one in found if isinstance(one, Unoriented))
     if not oriented:
-        reasons = ", ".join(sorted({one.why for one in missing}))
+        reasons = ", ".join(
+            [*sorted({one.why for one in missing}), *dict.fromkeys(one.cause for one in failures)]
+        )
         raise OrientationError(
             f"{mission.path}: nothing could be oriented ({reasons}). A receiver without attitude "
             "orients nothing; give --trajectory with one that has it"
@@ -157,6 +162,7 @@ def export_orientation(
         trajectory=trajectory.name,
         change_m=change_m,
         change_deg=change_deg,
+        failures=failures,
     )
 
 
@@ -183,6 +189,7 @@ def as_json(done: OrientationSet) -> Mapping[str, Any]:
         "missing": [
             {"exposure": one.exposure, "cone": one.cone, "why": one.why} for one in done.missing
         ],
+        "failures": [failure.as_json() for failure in done.failures],
     }
 
 

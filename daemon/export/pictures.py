@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.disk.durable import make_directories, replace_file, sync_directory, sync_file
-from daemon.disk.level0 import read_description
+from daemon.disk.level0 import read_description, refuse_bomb
 from daemon.disk.level2 import jpeg_bytes
 from daemon.disk.mission import Mission
+from daemon.disk.walk import ExposureFailure, walk
 from daemon.errors import DaemonError
 from daemon.export.exif import Shot, told, with_metadata
 from daemon.exposure import Exposure
@@ -66,26 +67,36 @@ def export_pictures(
     mount_file: Path | None = None,
     only: Sequence[int] = (),
     progress: Callable[[int], None] = lambda _done: None,
-) -> list[Path]:
-    """Write every raster of Level-2 as `kind` into `export/<kind>/`; returns the files.
+) -> tuple[list[Path], tuple[ExposureFailure, ...]]:
+    """Write every raster of Level-2 as `kind` into `export/<kind>/`.
+
+    Returns:
+        The files, and the exposures that could not be exported.
 
     Raises:
         PictureError: no Level-2, no orientation, or rasterio is missing.
         TrajectoryError, GeoreferenceError: as their modules say.
     """
-    exposures = [
-        e
-        for e in exposures_of(mission)
-        if e.mark_gps_ns is not None and (not only or e.number in only)
-    ]
+    read = exposures_of(mission)
+    exposures = {
+        number: exposure
+        for number, exposure in read.results.items()
+        if exposure.mark_gps_ns is not None and (not only or number in only)
+    }
+    unreadable = [f for f in read.failures if not only or f.exposure in only]
     means = orienting(
-        mission, exposures, crs=crs, trajectory_file=trajectory_file, mount_file=mount_file
+        mission,
+        list(exposures.values()),
+        crs=crs,
+        trajectory_file=trajectory_file,
+        mount_file=mount_file,
     )
     rig = means.rig
     folder = mission.export_dir / kind
     make_directories(folder)
-    written: list[Path] = []
-    for done, exposure in enumerate(exposures, 1):
+
+    def export_one(number: int) -> list[Path]:
+        exposure, written = exposures[number], []
         for picture in _pictures(mission, rig, exposure, means.oriented([exposure])):
             shot = _shot(rig, picture, means.crs, simulated=exposure.simulated)
             if kind == "cog":
@@ -95,13 +106,19 @@ def export_pictures(
                 final = folder / f"{picture.name}.jpg"
                 replace_file(final, with_metadata(_jpeg(picture.path), shot))
             written.append(final)
-        progress(done)
-    if not written:
+        return written
+
+    done = walk(exposures, export_one, progress)
+    files = [path for written in done.results.values() for path in written]
+    failures = (*unreadable, *done.failures)
+    if not files:
+        causes = "".join(f"; {cause}" for cause in dict.fromkeys(one.cause for one in failures))
         raise PictureError(
             f"{mission.path}: no exposure has both Level-2 and an orientation; run "
             "`syntopic process` first, and give --trajectory where no receiver knew the attitude"
+            f"{causes}"
         )
-    return written
+    return files, failures
 
 
 def _pictures(
@@ -222,9 +239,11 @@ def _ground_control(
 
 def _planes(path: Path) -> NDArray[np.uint16]:
     """(bands, h, w) uint16, the saturation bit taken out."""
-    import tifffile
+    from tifffile import TiffFile
 
-    planes = np.asarray(tifffile.imread(path))
+    with TiffFile(path) as tiff:
+        refuse_bomb(tiff.pages[0], path)
+        planes = np.asarray(tiff.pages[0].asarray())
     planes = planes if planes.ndim == 3 else planes[None]
     return np.asarray(planes & np.uint16(0xFFFE), np.uint16)
 

@@ -7,8 +7,6 @@ exposure, one row a frame. Nothing is decoded here.
 from __future__ import annotations
 
 import csv
-import json
-import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -17,6 +15,9 @@ from typing import Any, BinaryIO
 
 from daemon.disk.flight_log import logs_of, read
 from daemon.disk.mission import Mission
+from daemon.disk.walk import ExposureFailure
+from daemon.exposure import to_json
+from daemon.orientation.exterior import exposures_of
 
 NATIVE_ENDINGS = {
     "ublox": "ubx",
@@ -51,11 +52,15 @@ _WEEK_NS = 604_800_000_000_000
 
 @dataclass(frozen=True)
 class RawExport:
-    """What was written: bytes by file name, and how many exposures are in the event file."""
+    """What was written: bytes by file name, and how many exposures are in the event file.
+
+    Exposures whose record cannot be read are in `failures`, and in no file.
+    """
 
     folder: Path
     nbytes: dict[str, int]
     events: int
+    failures: tuple[ExposureFailure, ...] = ()
 
 
 def export_raw(mission: Mission) -> RawExport:
@@ -82,11 +87,12 @@ def export_raw(mission: Mission) -> RawExport:
                 if kind == "raw" and device in files:
                     files[device].write(message.payload)
                     nbytes[f"{device}.{endings[device]}"] += len(message.payload)
-    records = list(_records(mission))
+    sealed = exposures_of(mission)
+    records = [to_json(exposure) for exposure in sealed.results.values()]
     rows = [row for record in records for row in _event(record)]
     _write(folder / "events.csv", EVENT_COLUMNS, rows)
     _write(folder / "frames.csv", FRAME_COLUMNS, [f for record in records for f in _frames(record)])
-    return RawExport(folder, nbytes, len(rows))
+    return RawExport(folder, nbytes, len(rows), sealed.failures)
 
 
 def _write(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
@@ -98,20 +104,11 @@ def _write(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) ->
 
 def _receivers(mission: Mission) -> dict[str, str]:
     """Ending by name of every navigator the flight was configured with."""
-    if not mission.service_path.exists():
-        return {}
-    flown = tomllib.loads(mission.service_path.read_text(encoding="utf-8"))
+    flown = mission.flown_configuration()
     return {
         section["name"]: NATIVE_ENDINGS.get(section["driver"], "bin")
         for section in flown.get("navigator", [])
     }
-
-
-def _records(mission: Mission) -> Iterator[dict[str, Any]]:
-    for number in mission.numbers():
-        path = mission.level0(number) / "exposure.json"
-        if path.exists():
-            yield json.loads(path.read_text(encoding="utf-8"))
 
 
 def _event(record: Mapping[str, Any]) -> Iterator[tuple[Any, ...]]:

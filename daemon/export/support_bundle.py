@@ -38,14 +38,21 @@ class Bundle:
 
 
 def write_bundle(
-    mission: Mission, verified: VerifyReport | None = None, *, name: str = "support.zip"
+    mission: Mission,
+    verified: VerifyReport | None = None,
+    *,
+    name: str = "support.zip",
+    out: Path | None = None,
 ) -> Bundle:
     """Write `export/support.zip`, in place of an earlier one.
+
+    Args:
+        out: another folder to write it into.
 
     Raises:
         OSError: the disk refused.
     """
-    path = mission.export_dir / name
+    path = (out or mission.export_dir) / name
     durable.make_directories(path.parent)
     part = path.with_name(f".{path.name}{durable.PART_SUFFIX}")
     contents: dict[str, int] = {}

@@ -20,9 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.configuration import ConfigurationError, MountSection, PlanSection
+from daemon.disk.level0_folder import read_sealed
 from daemon.disk.mission import Mission
-from daemon.disk.records import parse_record
-from daemon.exposure import Exposure, NavigationRecord, from_json
+from daemon.disk.walk import Walked, walk
+from daemon.exposure import Exposure, NavigationRecord
 from daemon.flight.navigation import metres_per_degree
 from daemon.orientation.georeference import Place
 from processing.geometry.orientation import (
@@ -105,9 +106,7 @@ class Placing(Protocol):
 
 def mount_of(mission: Mission) -> tuple[MountSection, PlanSection]:
     """Mount and plan of the configuration that was flown; defaults where there is none."""
-    if not mission.service_path.exists():
-        return MountSection(), PlanSection()
-    flown = tomllib.loads(mission.service_path.read_text(encoding="utf-8"))
+    flown = mission.flown_configuration()
     try:
         return (
             MountSection.model_validate(flown.get("mount", {})),
@@ -131,12 +130,11 @@ def read_mount(path: Path) -> MountSection:
         raise ConfigurationError([f"{path}: {error}"]) from error
 
 
-def exposures_of(mission: Mission) -> Iterator[Exposure]:
-    """The sealed records of a mission, by number."""
-    for number in mission.numbers():
-        exposure = exposure_of(mission, number)
-        if exposure is not None:
-            yield exposure
+def exposures_of(mission: Mission) -> Walked[Exposure]:
+    """The sealed records of a mission by number, and those that cannot be read."""
+    read = walk(mission.numbers(), lambda number: exposure_of(mission, number))
+    sealed = {number: record for number, record in read.results.items() if record is not None}
+    return Walked(sealed, read.failures)
 
 
 def exposure_of(mission: Mission, number: int) -> Exposure | None:
@@ -145,11 +143,8 @@ def exposure_of(mission: Mission, number: int) -> Exposure | None:
     Raises:
         RecordError: it has one that cannot be read.
     """
-    path = mission.level0(number) / "exposure.json"
-    if not path.exists():
-        return None
-    name = f"L0/{path.parent.name}/exposure.json"
-    return from_json(parse_record(path.read_bytes(), name), name)
+    sealed = read_sealed(mission.level0(number))
+    return None if sealed is None else sealed.exposure
 
 
 def orient(

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from daemon.adjusting.tables import read_table
 from daemon.disk.mission import Mission
+from daemon.disk.walk import ExposureFailure
 from daemon.errors import DaemonError
 from daemon.orientation.exterior import ExteriorOrientation, exposures_of
 from daemon.orientation.inputs import orienting
@@ -78,12 +79,16 @@ class GroundPoint:
 
 @dataclass(frozen=True)
 class Intersected:
-    """Points found, names of those whose rays do not fix them, and the coordinate system."""
+    """Points found, names of those whose rays do not fix them, and the coordinate system.
+
+    `failures` are exposures whose record cannot be read.
+    """
 
     points: tuple[GroundPoint, ...]
     left_out: tuple[str, ...]
     crs: str
     height_system: str
+    failures: tuple[ExposureFailure, ...] = ()
 
 
 def intersect(
@@ -105,7 +110,8 @@ def intersect(
         IntersectionError: no oriented image, or images that are not there.
         daemon.adjusting.tables.ProjectError: the table is not as it should be.
     """
-    exposures = [e for e in exposures_of(mission) if e.mark_gps_ns is not None]
+    read = exposures_of(mission)
+    exposures = [e for e in read.results.values() if e.mark_gps_ns is not None]
     means = orienting(
         mission, exposures, crs=crs, trajectory_file=trajectory_file, mount_file=mount_file
     )
@@ -153,7 +159,7 @@ def intersect(
                 _triple(own), _triple(image), int(rays[k]),
             )
         )  # fmt: skip
-    return Intersected(tuple(told), tuple(lost), crs, georeference.height_system)
+    return Intersected(tuple(told), tuple(lost), crs, georeference.height_system, read.failures)
 
 
 def _network(

@@ -18,9 +18,11 @@ from numpy.typing import NDArray
 from daemon.adjusting.project import Checks, Project
 from daemon.adjusting.project_file import ProjectFile
 from daemon.adjusting.tables import Table, read_table
-from daemon.disk.level0 import read_description, read_tiff
+from daemon.disk.level0 import check_tiff, read_description, read_tiff
 from daemon.disk.mission import Mission
+from daemon.disk.walk import ExposureFailure, walk
 from daemon.errors import DaemonError
+from daemon.exposure import Exposure
 from daemon.orientation.exterior import ExteriorOrientation, exposures_of
 from daemon.orientation.inputs import orienting
 from daemon.orientation.local_frame import LocalFrame
@@ -77,7 +79,10 @@ class Asked:
 
 @dataclass(frozen=True)
 class Block:
-    """Images of one geometry, stitched or of heads, with a start orientation in a local frame."""
+    """Images of one geometry, stitched or of heads, with a start orientation in a local frame.
+
+    `failures` are exposures whose record or images cannot be read; they are not in the block.
+    """
 
     mission: Mission
     rig: Rig
@@ -88,6 +93,7 @@ class Block:
     station_m: Array
     rotation: Array
     ground_m: float
+    failures: tuple[ExposureFailure, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -131,16 +137,29 @@ def block_of(
     rig = load_rig(mission.rig_path)
     image = _common_image(rig, heads)
     files = [f"{name}.tif" for name in heads or ("pan",)]
-    exposures = [
-        e
-        for e in exposures_of(mission)
-        if e.mark_gps_ns is not None
-        and all((mission.level2(e.number) / file).exists() for file in files)
-    ]
+    read = exposures_of(mission)
+    candidates = {
+        number: exposure
+        for number, exposure in read.results.items()
+        if exposure.mark_gps_ns is not None
+        and all((mission.level2(number) / file).exists() for file in files)
+    }
+
+    def with_usable_images(number: int) -> Exposure:
+        for file in files:
+            check_tiff(
+                mission.level2(number) / file, width_px=image.width_px, height_px=image.height_px
+            )
+        return candidates[number]
+
+    usable = walk(candidates, with_usable_images)
+    exposures = list(usable.results.values())
+    failures = (*read.failures, *usable.failures)
     if len(exposures) < 2:
         raise TriangulationError(
             f"{mission.path}: {len(exposures)} sealed exposures with {', '.join(files)} and a "
             "time; a block takes two or more. Run `syntopic process` first"
+            + "".join(f"; exposure {one.exposure}: {one.cause}" for one in failures)
         )
     means = orienting(
         mission, exposures, crs=crs, trajectory_file=trajectory_file, mount_file=mount_file
@@ -165,7 +184,7 @@ def block_of(
     )
     return Block(
         mission, rig, image, tuple(oriented), means.crs, frame, station, rotation,
-        means.ground_height_m,
+        means.ground_height_m, failures,
     )  # fmt: skip
 
 

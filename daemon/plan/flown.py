@@ -24,7 +24,7 @@ def taken_of(mission: Mission, specification: Specification) -> list[Taken]:
     rig = load_rig(mission.rig_path)
     mount, plan = mount_of(mission)
     found = []
-    for exposure in exposures_of(mission):
+    for exposure in exposures_of(mission).results.values():
         if exposure.navigation is None:
             continue
         corners = seen_from(rig, mount, exposure.navigation, plan.ground_height_m)

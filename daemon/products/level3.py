@@ -18,9 +18,11 @@ from numpy.typing import NDArray
 from daemon.disk import durable
 from daemon.disk.level0 import read_description, refuse_bomb, tiff_faults
 from daemon.disk.level0_folder import exposure_of, read_capture, read_sealed
-from daemon.disk.level2 import BAND_ORDER, take_the_place_of
+from daemon.disk.level2 import BAND_ORDER
 from daemon.disk.mission import Mission, exposure_name
+from daemon.disk.publication import published
 from daemon.disk.records import canonical_bytes, sha256_hex
+from daemon.disk.walk import ExposureFailure, walk
 from daemon.errors import DaemonError
 from daemon.exposure import Exposure
 from processing.image.pansharpening import pansharpened
@@ -78,35 +80,53 @@ def level3_root(mission: Mission) -> Path:
     return mission.path / "L3"
 
 
-def mission_tones(mission: Mission, rig: Rig, progress: Progress | None = None) -> MissionTones:
+def mission_tones(
+    mission: Mission, rig: Rig, progress: Progress | None = None
+) -> tuple[MissionTones, tuple[ExposureFailure, ...]]:
     """The tone curve of all exposures that have Level-2, written to `L3/tone-curve.json`.
 
+    Returns:
+        The tones, and the exposures that could not be read: these are in no curve.
+
     Raises:
-        Level3Error: no exposure has colour at Level-2, or one cannot be read.
+        Level3Error: no exposure has colour at Level-2 that can be read.
         OSError: the disk refused.
     """
     numbers = _processed(mission)
-    scales = _scales(mission, rig, numbers)
+    colour = set(rig.colour_cones)
+    bands = {cone.sensors[0].name: cone.bands for cone in rig.cones if cone in colour}
     sums = {band: np.zeros(WORDS, np.int64) for band in BAND_ORDER}
-    for done, number in enumerate(numbers):
+    timed = walk(numbers, lambda number: _exposure_times_us(mission, bands, number))
+    scales = _scales(timed.results)
+
+    def count(number: int) -> None:
+        rasters = _colour(mission, number)
+        counts = {b: histogram(r, scales[number].get(b, 1.0)) for b, r in rasters.items()}
+        for band, counted in counts.items():
+            sums[band] += counted
+
+    def show(done: int) -> None:
         if progress is not None:
-            progress("histograms", done, len(numbers))
-        for band, raster in _colour(mission, number).items():
-            sums[band] += histogram(raster, scales[number].get(band, 1.0))
+            progress("histograms", done, len(scales))
+
+    counted = walk(scales, count, show)
+    scales = {number: scales[number] for number in counted.results}
+    failures = (*timed.failures, *counted.failures)
     try:
         curve = mission_curve(sums)
     except ValueError as error:
-        raise Level3Error(f"{mission.path}: {error}") from error
+        causes = "; ".join(f"exposure {one.exposure}: {one.cause}" for one in failures)
+        raise Level3Error(f"{mission.path}: {causes or error}") from error
     content = canonical_bytes(
         {
             "format": 1,
             "curve": curve_as_json(curve),
-            "exposures": [{"number": number, "scale": dict(scales[number])} for number in numbers],
+            "exposures": [{"number": number, "scale": dict(scales[number])} for number in scales],
         }
     )
     durable.make_directories(level3_root(mission))
     durable.replace_file(level3_root(mission) / CURVE_FILE, content)
-    return MissionTones(curve, sha256_hex(content), scales)
+    return MissionTones(curve, sha256_hex(content), scales), failures
 
 
 def develop(
@@ -140,12 +160,8 @@ def develop(
     except ValueError as error:
         raise Level3Error(f"exposure {number}: {error}; process it again") from error
     final = level3_root(mission) / exposure_name(number)
-    part = final.with_name(final.name + durable.PART_SUFFIX)
-    durable.make_directories(final.parent)
-    durable.remove_tree(part)
-    part.mkdir()
     files, left_out = {}, []
-    try:
+    with published(final) as part:
         for image in images:
             bands = IMAGES[image]
             if absent := [band for band in bands if band not in sharp]:
@@ -164,10 +180,6 @@ def develop(
                 }
                 planes = [sharp[band] for band in bands]
                 files[name] = _write(part / name, planes, tables, about, threads)
-        take_the_place_of(part, final)
-    except OSError:
-        durable.remove_tree(part)
-        raise
     return Developed(number, files, tuple(left_out))
 
 
@@ -224,7 +236,7 @@ def _tiles(
 
 
 def _processed(mission: Mission) -> list[int]:
-    numbers = [n for n in mission.numbers() if (mission.level2(n) / "rgbn.tif").is_file()]
+    numbers = [n for n in mission.numbers() if (mission.level2(n) / "rgbn.tif").exists()]
     if not numbers:
         raise Level3Error(
             f"{mission.path}: no exposure has colour at Level-2; run syntopic process first"
@@ -232,26 +244,30 @@ def _processed(mission: Mission) -> list[int]:
     return numbers
 
 
-def _scales(mission: Mission, rig: Rig, numbers: Sequence[int]) -> dict[int, dict[str, float]]:
+def _exposure_times_us(
+    mission: Mission, bands: Mapping[str, Sequence[str]], number: int
+) -> dict[str, float]:
+    """Exposure times of an exposure by band, as far as its record knows them."""
+    exposure = _record(mission, number)
+    if exposure is None:
+        return {}
+    return {
+        band: frame.exposure_time_us
+        for sensor, of_sensor in bands.items()
+        if (frame := exposure.frame(sensor)) is not None and frame.exposure_time_us
+        for band in of_sensor
+    }
+
+
+def _scales(times_us: Mapping[int, Mapping[str, float]]) -> dict[int, dict[str, float]]:
     """Median exposure time of the mission over that of each exposure, by band."""
-    times: dict[int, dict[str, float]] = {}
-    for number in numbers:
-        exposure = _record(mission, number)
-        times[number] = {
-            band: frame.exposure_time_us
-            for cone in rig.colour_cones
-            for band in cone.bands
-            if exposure is not None
-            and (frame := exposure.frame(cone.sensors[0].name)) is not None
-            and frame.exposure_time_us
-        }
     usual = {
-        band: float(np.median([told[band] for told in times.values() if band in told]))
-        for band in {band for told in times.values() for band in told}
+        band: float(np.median([told[band] for told in times_us.values() if band in told]))
+        for band in {band for told in times_us.values() for band in told}
     }
     return {
         number: {band: usual[band] / time for band, time in told.items()}
-        for number, told in times.items()
+        for number, told in times_us.items()
     }
 
 

@@ -22,10 +22,9 @@ from numpy.typing import NDArray
 from daemon.configuration import MountSection, PlanSection
 from daemon.disk import level2, store
 from daemon.disk.mission import Mission
-from daemon.disk.records import RecordError
 from daemon.errors import DaemonError
 from daemon.exposure import Exposure
-from daemon.orientation.exterior import exposure_of, mount_of
+from daemon.orientation.exterior import exposures_of, mount_of
 from daemon.orientation.ground import Ground, ground_of
 from daemon.plan.overlaps import Overlaps, Surroundings
 from daemon.products.conditions import conditions_of
@@ -137,14 +136,9 @@ def overlaps_of(mission: Mission, rig: Rig) -> Overlaps:
     """The footprints of what has been flown of a mission, as far as its records can be read."""
     mount, plan = mount_of(mission)
     overlaps = Overlaps(rig, mount, plan.ground_height_m)
-    for number in mission.numbers():
-        try:
-            exposure = exposure_of(mission, number)
-        except RecordError:
-            # Verification names it; no flight is given up for an overlap.
-            continue
-        if exposure is not None:
-            overlaps.add(exposure)
+    # Verification names what cannot be read; no flight is given up for an overlap.
+    for exposure in exposures_of(mission).results.values():
+        overlaps.add(exposure)
     return overlaps
 
 

@@ -74,6 +74,10 @@ class Disk:
             folder, name = self._place(path)
             moved = self._entries(folder)[name]
             self._name((folder, name, None), (*self._place(operation.target), moved))
+        elif operation.kind == "exchange":
+            (folder, name), (other, beside) = self._place(path), self._place(operation.target)
+            one, two = self._entries(folder)[name], self._entries(other)[beside]
+            self._name((folder, name, two), (other, beside, one))
         elif operation.kind == "unlink":
             self._name((*self._place(path), None))
         elif operation.kind == "sync":

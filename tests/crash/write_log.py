@@ -28,9 +28,9 @@ CALLS = (
 class Operation:
     """One change: what, where, and with which bytes.
 
-    `kind` is one of create, write, truncate, sync, mkdir, rename, unlink. `offset` is None for a
-    write at the file's own position; `size` is what a file was cut to; `is_new` tells whether a
-    file that is opened for creation must not have been there.
+    `kind` is one of create, write, truncate, sync, mkdir, rename, exchange, unlink. `offset` is
+    None for a write at the file's own position; `size` is what a file was cut to; `is_new` tells
+    whether a file that is opened for creation must not have been there.
     """
 
     kind: str
@@ -168,7 +168,8 @@ def _operations(call: str) -> Iterator[Operation]:
     elif name in ("mkdir", "mkdirat"):
         yield Operation("mkdir", names[0])
     elif name in ("rename", "renameat", "renameat2"):
-        yield Operation("rename", names[0], target=names[1])
+        kind = "exchange" if "RENAME_EXCHANGE" in arguments else "rename"
+        yield Operation(kind, names[0], target=names[1])
     elif name in ("unlink", "unlinkat", "rmdir"):
         yield Operation("unlink", names[0])
     else:

@@ -71,7 +71,7 @@ def test_a_mission_without_products_is_not_called_healthy(tmp_path: Path) -> Non
     assert "none; has the mission been processed?" in said.stdout
     assert "No sensor is seen to move" not in said.stdout
     assert "Whether a sensor of the camera was displaced is not known" in (
-        write_report(mission).read_text()
+        write_report(mission).path.read_text()
     )
 
 
@@ -85,5 +85,5 @@ def test_a_damaged_record_is_named_and_the_others_count(tmp_path: Path) -> None:
 
 
 def test_the_report_says_it_too(moved: Path) -> None:
-    html = write_report(moved).read_text()
+    html = write_report(moved).path.read_text()
     assert "The flight as a whole:" in html and "SU02 has been displaced by 0." in html

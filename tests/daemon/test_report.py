@@ -27,7 +27,7 @@ def test_the_report_shows_what_a_time_is_unsure_by_and_the_ledger_of_every_head(
     ledger = Ledger(SENSORS)
     ledger.trigger(1)
     ledger.frame(SENSORS[0], "duplicate")
-    page = write_report(mission.path, ledger=ledger.sheet().as_json()).read_text()
+    page = write_report(mission.path, ledger=ledger.sheet().as_json()).path.read_text()
     cells = re.findall(r"<td>(.*?)</td>", page.split("<h2>Time</h2>")[1].split("</table>")[0])
     assert cells == ["1", "pps", "24084", "–", "900", "24000", "1000", "1500", "–"]
     assert re.search(rf"<tr><td>{SENSORS[0]}</td><td>1</td><td>0</td><td>0</td><td>1</td>", page)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 import tifffile
 
+from daemon.disk import publication
 from daemon.disk.level2 import ProductError, recover_level2, write_level2
 from daemon.disk.records import RecordError
 from tests.daemon.small_camera import new_mission
@@ -115,26 +115,19 @@ def test_what_cannot_be_written_is_refused_before_the_disk_is_touched(mission, c
     assert list(mission.level2_root.iterdir()) == []
 
 
-def test_an_interruption_at_any_rename_leaves_the_old_or_the_new_result(mission, monkeypatch):
+def test_recovery_clears_what_an_interrupted_writer_left(mission, monkeypatch):
     _write(mission)
-    real = Path.rename
-    for stop_at in (1, 2):
-        calls = 0
 
-        def rename(path, target, stop_at=stop_at):
-            nonlocal calls
-            calls += 1
-            if calls == stop_at:
-                raise KeyboardInterrupt
-            return real(path, target)
+    def killed(*_folders):
+        raise KeyboardInterrupt
 
-        monkeypatch.setattr(Path, "rename", rename)
+    with monkeypatch.context() as patched:
+        patched.setattr(publication, "_take_name", killed)
+        patched.setattr(publication.durable, "remove_tree", killed)
         with pytest.raises(KeyboardInterrupt):
             _write(mission, report_json={"verdict": "refly"})
-        monkeypatch.setattr(Path, "rename", real)
-        done = recover_level2(mission)
-        assert len(done) >= 1
-        assert [p.name for p in mission.level2_root.iterdir()] == ["000007"]
-        report = json.loads((mission.level2(7) / "quality.json").read_bytes())
-        assert report["verdict"] == "good"
+    (done,) = recover_level2(mission)
+    assert done.startswith("L2/000007.") and done.endswith("its writer did not finish")
+    assert [p.name for p in mission.level2_root.iterdir()] == ["000007"]
+    assert json.loads((mission.level2(7) / "quality.json").read_bytes())["verdict"] == "good"
     assert recover_level2(mission) == []

@@ -102,7 +102,7 @@ def mission_at(path: Path, *, mount: str = "", samples: list[NavSample] = SAMPLE
 
 
 def master_of(mission: Mission, mount: MountSection | None = None) -> ExteriorOrientation:
-    exposure = next(exposures_of(mission))
+    exposure = exposures_of(mission).results[1]
     rig = load_rig(mission.rig_path)
     crs = Georeference(utm_of(PLAN.latitude_deg, PLAN.longitude_deg))
     found = orient(exposure, rig, mount or mount_of(mission)[0], flown(mission), crs)

@@ -14,7 +14,7 @@ from daemon.calibration.rig_text import rig_toml
 from daemon.cli import app
 from daemon.configuration import ConfigurationError
 from daemon.disk.level0 import read_description, tiff_parts
-from daemon.disk.mission import Mission
+from daemon.disk.mission import Mission, MissionError
 from daemon.products import level3
 from processing.rig import find_rig, load_rig, rig_from_mapping
 from tests.processing.image.test_pansharpening import box_means, scene
@@ -59,7 +59,8 @@ def mission(tmp_path):
 
 def developed(mission, numbers=(1, 2, 3), **wishes):
     rig = load_rig(mission.rig_path)
-    tones = level3.mission_tones(mission, rig)
+    tones, unreadable = level3.mission_tones(mission, rig)
+    assert unreadable == ()
     return tones, [level3.develop(mission, rig, n, tones, **wishes) for n in numbers]
 
 
@@ -109,7 +110,7 @@ def test_one_curve_serves_all_exposures_and_neighbours_match(mission):
 
 def test_wishes_are_followed_and_an_earlier_result_is_replaced(mission):
     developed(mission, numbers=(1,))
-    stale = mission.path / "L3" / "000001.part"
+    stale = mission.path / "L3" / "000001.0123abcd.part"
     stale.mkdir()
     (stale / "rgb-8.tif").write_bytes(b"half")
     developed(mission, numbers=(1,), images=("cir",), depths=(8,))
@@ -146,10 +147,51 @@ def test_level_2_that_is_missing_or_damaged_is_told_with_its_cure(mission):
     write_level2(mission, 3, pan[:270], {name: band[:100] for name, band in colour.items()})
     with pytest.raises(level3.Level3Error, match=r"exposure 3: red is uint16.*process it again"):
         developed(mission, numbers=(3,))
-    (mission.level2(3) / "rgbn.tif").write_bytes(b"II*\0")
-    with pytest.raises(level3.Level3Error, match=r"rgbn\.tif cannot be read"):
-        developed(mission)
     for number in (1, 2, 3):
         (mission.level2(number) / "rgbn.tif").unlink()
     with pytest.raises(level3.Level3Error, match="no exposure has colour"):
         developed(mission)
+
+
+@pytest.mark.trust
+@pytest.mark.parametrize(
+    ("damage", "cause"),
+    [
+        (lambda m: (m.level2(1) / "rgbn.tif").write_bytes(b"II*\0"), "rgbn.tif cannot be read"),
+        (lambda m: (m.level2(1) / "rgbn.tif").write_bytes(b""), "rgbn.tif cannot be read"),
+        (lambda m: truncate(m.level2(1) / "rgbn.tif"), "cannot be read"),
+        (lambda m: truncate(m.level2(1) / "pan.tif"), "cannot be read"),
+        (lambda m: as_folder(m.level2(1) / "rgbn.tif"), "Is a directory"),
+        (lambda m: as_folder(m.level2(1) / "pan.tif"), "Is a directory"),
+        (lambda m: (m.level0(1) / "exposure.json").write_text("{"), "not a JSON record"),
+        (lambda m: (m.level0(1) / "exposure.json").write_text('{"number": "1"}'), "whole number"),
+    ],
+)
+def test_the_command_goes_on_after_an_exposure_it_cannot_develop(mission, damage, cause):
+    damage(mission)
+    done = CliRunner().invoke(app, ["develop", str(mission.path), "--bits", "8", "--json"])
+    assert done.exit_code == 1
+    told = json.loads(done.stdout)
+    assert [row["exposure"] for row in told["exposures"]] == [2, 3]
+    (failure,) = told["failures"]
+    assert failure["exposure"] == 1 and cause in failure["cause"]
+    assert "1 exposure failed" in done.stderr and "1 " in done.stderr
+    assert sorted(p.name for p in (mission.path / "L3").iterdir()) == [
+        "000002", "000003", "tone-curve.json",
+    ]  # fmt: skip
+
+
+@pytest.mark.trust
+def test_develop_is_refused_while_another_process_writes_into_the_mission(mission):
+    with mission.held(), pytest.raises(MissionError, match=r"held by another process: `.*`, proc"):
+        CliRunner().invoke(app, ["develop", str(mission.path)], catch_exceptions=False)
+    assert not (mission.path / "L3").exists()
+
+
+def truncate(path):
+    path.write_bytes(path.read_bytes()[:5000])
+
+
+def as_folder(path):
+    path.unlink()
+    path.mkdir()
