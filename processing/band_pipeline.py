@@ -31,9 +31,12 @@ from processing.image.band_registration import (
     reference_image,
     register_to_reference,
 )
+from processing.quality.figures import valid_area_figures
 from processing.quality.judgement import judge
+from processing.quality.read_out import blank_unread
 from processing.quality.report import Figure, QualityReport, Thresholds
 from processing.quality.specification import Asked
+from processing.quality.valid_area import ValidArea, area_of, gap_cells, grid_of
 from processing.radiometry.radiance import RadianceCalibration, radiance_from_words, saturated_words
 from processing.rehearsal import plain_frames
 from processing.rig import Rig, Sensor, VirtualImage
@@ -69,7 +72,8 @@ class BandProduct:
     """The bands of one exposure on the raster of `image`.
 
     `bands` (H, W) float32 by band in the rig's order, NaN without data, in `units`. `masks` (H, W)
-    uint8: VALID and SATURATED bits. `registrations` are those of all bands but the reference.
+    uint8: VALID and SATURATED bits; `valid_area` says where they are valid, in a few numbers.
+    `registrations` are those of all bands but the reference.
     """
 
     image: VirtualImage
@@ -78,6 +82,7 @@ class BandProduct:
     masks: Mapping[str, Array]
     units: Mapping[str, str]
     registrations: tuple[RegisteredBand, ...]
+    valid_area: ValidArea
     report: QualityReport
     timings_s: Mapping[str, float] = field(default_factory=dict)
 
@@ -162,18 +167,22 @@ class BandPipeline:
         temperatures = usable_temperatures(self.rig, conditions, self.thresholds)
         seconds: dict[str, float] = {}
         began = time.perf_counter()
-        linear, saturated, units = {}, {}, {}
+        linear, saturated, read, units = {}, {}, {}, {}
         for name in (name for name in self._band_of if name in frames):
             sensor = self.rig.sensor(name)
             told = (heads or {}).get(name, FrameSettings())
             linear[name], units[name] = self._linear(sensor, frames[name], conditions, told)
             saturated[name] = saturated_words(sensor, frames[name])
+            read[name] = np.ones(frames[name].shape, np.uint8)
+            blank_unread(sensor, frames[name], read[name])
         if frames_read is not None:
             frames_read()
         seconds["radiometry"] = time.perf_counter() - began
         began = time.perf_counter()
         placements = band_placements(self.rig, temperatures.placing_c)
-        found = self._register(placements, linear, saturated)
+        found = self._register(
+            placements, linear, {name: saturated[name] | (read[name] == 0) for name in linear}
+        )
         seconds["registration"] = time.perf_counter() - began
         began = time.perf_counter()
         bands, masks = {}, {}
@@ -181,11 +190,13 @@ class BandPipeline:
             homography = found[name].band_from_reference if name in found else np.eye(3)
             at = raw_of_reference_pixels(self._image, placements[name], homography)
             band = self._band_of[name]
-            bands[band], masks[band] = _resampled(frame, saturated[name], at)
+            bands[band], masks[band] = _resampled(frame, saturated[name], read[name], at)
         seconds["resampling"] = time.perf_counter() - began
         missing = [name for name in self._band_of if name not in frames]
         figures = condition_figures(self.rig, conditions, temperatures)
         figures |= self._figures(found, saturated, masks, missing)
+        area = self._valid_area(masks)
+        figures |= valid_area_figures(area)
         report = judge(
             figures,
             capture_flags=conditions.flags,
@@ -203,8 +214,21 @@ class BandPipeline:
             masks=masks,
             units={self._band_of[name]: unit for name, unit in units.items()},
             registrations=tuple(found.values()),
+            valid_area=area,
             report=report,
             timings_s=seconds,
+        )
+
+    def _valid_area(self, masks: Mapping[str, Array]) -> ValidArea:
+        columns, rows = grid_of(self._image.width_px, self._image.height_px)
+        nothing = np.ones((rows, columns), np.bool_)
+        return area_of(
+            {
+                band: gap_cells(masks[band], columns, rows, saturated_bit=SATURATED)
+                if band in masks
+                else nothing
+                for band in self._band_of.values()
+            }
         )
 
     def _linear(
@@ -231,10 +255,10 @@ class BandPipeline:
         self,
         placements: Mapping[str, SensorPlacement],
         linear: Mapping[str, Array],
-        saturated: Mapping[str, Array],
+        unusable: Mapping[str, Array],
     ) -> dict[str, RegisteredBand]:
         """All bands but the reference, by sensor name."""
-        matching = {name: _for_matching(f, saturated[name]) for name, f in linear.items()}
+        matching = {name: _for_matching(f, unusable[name]) for name, f in linear.items()}
         found = {}
         for name in (name for name in linear if name != self._reference):
             if self._reference in matching:
@@ -278,15 +302,15 @@ class BandPipeline:
         return figures
 
 
-def _for_matching(frame: Array, saturated: Array) -> Array:
-    """A frame at a common level, saturated pixels not to be used."""
+def _for_matching(frame: Array, unusable: Array) -> Array:
+    """A frame at a common level, unusable pixels marked."""
     level = float(np.median(frame))
     scaled: Array = frame * np.float32(_MATCHING_LEVEL / level if level > 0.0 else 1.0)
-    scaled[saturated] = np.nan
+    scaled[unusable] = np.nan
     return scaled
 
 
-def _resampled(frame: Array, saturated: Array, at: Array) -> tuple[Array, Array]:
+def _resampled(frame: Array, saturated: Array, read: Array, at: Array) -> tuple[Array, Array]:
     """A band on the reference raster (cubic), and its mask."""
     height, width = frame.shape
     raster = cv2.remap(frame, at, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
@@ -298,6 +322,7 @@ def _resampled(frame: Array, saturated: Array, at: Array) -> tuple[Array, Array]
         & (at[..., 0] <= width - 1)
         & (at[..., 1] >= 0.0)
         & (at[..., 1] <= height - 1)
+        & (cv2.remap(read, at, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT) != 0)
     )
     mask = np.where(inside, np.uint8(VALID), np.uint8(0))
     mask[inside & (burnt > 0.0)] |= SATURATED

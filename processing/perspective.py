@@ -12,7 +12,7 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
@@ -30,9 +30,12 @@ from processing.conditions import (
 from processing.geometry.placement import nominal_placements, raw_from_vip_mm, vip_mm_from_px
 from processing.geometry.rotation import rotation_matrix
 from processing.image.sharpness import bright_level
+from processing.quality.figures import valid_area_figures
 from processing.quality.judgement import judge
+from processing.quality.read_out import blank_unread
 from processing.quality.report import QualityReport, Thresholds
 from processing.quality.specification import Asked
+from processing.quality.valid_area import ValidArea, area_of, gap_cells, grid_of
 from processing.radiometry.calibration import RadiometricCalibration
 from processing.radiometry.demosaic import BAYER_BANDS, demosaic, is_bayer
 from processing.radiometry.level1 import (
@@ -71,9 +74,13 @@ class HeadImage:
 
 @dataclass(frozen=True)
 class HeadsProduct:
-    """The images of one exposure by cone name, and what is thought of them."""
+    """The images of one exposure by cone name, and what is thought of them.
+
+    `valid_area` is that of the rig's image cone, whose image the plan counts.
+    """
 
     heads: Mapping[str, HeadImage]
+    valid_area: ValidArea
     report: QualityReport
     timings_s: Mapping[str, float] = field(default_factory=dict)
 
@@ -186,6 +193,7 @@ class HeadPipeline:
         known = temperatures.placing_c
         heads: dict[str, HeadImage] = {}
         level1: dict[str, Array] = {}
+        planes: dict[str, dict[str, Array]] = {}
         statistics: dict[str, FrameStatistics] = {}
         present = [cone for cone in self.rig.cones if cone.sensors[0].name in frames]
         for cone in present:
@@ -200,18 +208,35 @@ class HeadPipeline:
                 tdi_shifts=0,
                 out=level1[sensor.name],
             )
+            planes[cone.name] = _planes(cone, level1[sensor.name])
+            blank_unread(sensor, frames[sensor.name], *planes[cone.name].values())
             seconds["radiometry"] += time.perf_counter() - began
         if frames_read is not None:
             frames_read()
         for cone in present:
             began = time.perf_counter()
-            planes = _planes(cone, level1[cone.sensors[0].name])
             at = self._map(cone, known)
-            bands = {name: self._resampled(plane, at) for name, plane in planes.items()}
+            bands = {name: self._resampled(plane, at) for name, plane in planes[cone.name].items()}
             heads[cone.name] = HeadImage(cone.name, perspective_of(cone), bands)
             seconds["resampling"] += time.perf_counter() - began
-        report = self._judged(conditions, temperatures, level1, statistics)
-        return HeadsProduct(heads, report, seconds)
+        area = self._valid_area(heads)
+        report = self._judged(conditions, temperatures, level1, statistics, area)
+        return HeadsProduct(heads, area, report, seconds)
+
+    def _valid_area(self, heads: Mapping[str, HeadImage]) -> ValidArea:
+        cone = self.rig.cone(self.rig.image_cone_name)
+        image = perspective_of(cone)
+        columns, rows = grid_of(image.width_px, image.height_px)
+        nothing = np.ones((rows, columns), np.bool_)
+        made = heads[cone.name].bands if cone.name in heads else {}
+        return area_of(
+            {
+                band: gap_cells(made[band], columns, rows, saturated_bit=1)
+                if band in made
+                else nothing
+                for band in _bands(cone)
+            }
+        )
 
     def _judged(
         self,
@@ -219,9 +244,11 @@ class HeadPipeline:
         temperatures: Temperatures,
         level1: Mapping[str, Array],
         statistics: Mapping[str, FrameStatistics],
+        area: ValidArea,
     ) -> QualityReport:
         missing = [s.name for s in self.rig.sensors if s.name not in level1]
         figures = condition_figures(self.rig, conditions, temperatures)
+        figures |= valid_area_figures(area)
         figures |= {"method": "heads", "missing_sensors": ", ".join(missing) or None}
         if statistics:
             saturated = {name: seen.saturated_fraction for name, seen in statistics.items()}
@@ -274,6 +301,10 @@ def _planes(cone: Cone, level1: NDArray[np.uint16]) -> dict[str, NDArray[np.uint
     out = np.empty((3, *level1.shape), np.uint16)
     demosaic(level1, sensor.colour_filter_array, out=out)
     return dict(zip(BAYER_BANDS, out, strict=True))
+
+
+def _bands(cone: Cone) -> Sequence[str]:
+    return BAYER_BANDS if is_bayer(cone.sensors[0]) else cone.bands[:1]
 
 
 def _placement(cone: Cone, temperatures_c: Mapping[str, float]) -> Any:

@@ -33,7 +33,7 @@ from processing.image.colour import (
 )
 from processing.image.composition import ColourComposer, PanComposer, pan_cell_px
 from processing.image.quicklook import quicklook
-from processing.image.resampling import Interpolation
+from processing.image.resampling import SATURATED_SOURCE, Interpolation
 from processing.matching.tie_places import burnt_share
 from processing.matching.tie_points import TiePoints, match_tie_points
 from processing.mosaic.estimated_dc import EstimatedDc, estimate_dc
@@ -48,10 +48,12 @@ from processing.quality.figures import (
     estimated_dc_figures,
     frame_figures,
     stitching_figures,
+    valid_area_figures,
 )
 from processing.quality.judgement import judge
-from processing.quality.read_out import unread_figures
+from processing.quality.read_out import blank_unread, unread_figures
 from processing.quality.report import Figure
+from processing.quality.valid_area import Mask, area_of, gap_cells, grid_of
 from processing.radiometry.calibration import RadiometricCalibration
 from processing.radiometry.level1 import (
     FrameStatistics,
@@ -100,6 +102,7 @@ class Pipeline:
         self.settings = settings or Settings()
         pan = [sensor for cone in rig.pan_cones for sensor in cone.sensors]
         self._heads = colour_heads(rig)
+        self._grid = grid_of(rig.virtual_image.width_px, rig.virtual_image.height_px)
         self._pan = PanComposer(rig.virtual_image, pan, cell_px=pan_cell_px(rig))
         self._colour = ColourComposer(rig.virtual_image, self._heads)
         known = radiometry or {}
@@ -210,13 +213,16 @@ class Pipeline:
                 interpolation=settings.interpolation,
             )
         with clock.stage("colour"):
-            registrations, colour = self._register(mosaic, level1)
+            registrations, colour, gaps = self._register(mosaic, level1)
         with clock.stage("baselines"):
             baselines = self._baselines(tie_points, temperatures, conditions)
         with clock.stage("geometry"):
             geometry = self._geometry(mosaic, baselines) if settings.geometry else {}
         with clock.stage("quicklook"):
             picture = quicklook(image.pan, colour)
+        with clock.stage("valid_area"):
+            pan_gaps = gap_cells(image.source, *self._grid, saturated_bit=SATURATED_SOURCE)
+            area = area_of({"pan": pan_gaps, **gaps})
         with clock.stage("quality"):
             figures = condition_figures(rig, conditions, temperatures)
             figures |= unread | self._frame_figures(level1, statistics, start)
@@ -235,6 +241,7 @@ class Pipeline:
             figures |= projection_figures(rig, conditions, settings.relief_fraction)
             figures |= precision_figures(rig, mosaic, level1, temperatures.usable_c)
             figures |= self._whole_figures(image.source, frames, conditions)
+            figures |= valid_area_figures(area)
             report = judge(
                 figures,
                 capture_flags=conditions.flags,
@@ -252,6 +259,7 @@ class Pipeline:
             pan=image.pan,
             valid=image.source,
             colour=colour,
+            valid_area=area,
             counts_per_dn=level1_counts_per_dn(self._pan.sensors[0].bits),
             quicklook=picture,
             start=start,
@@ -294,6 +302,8 @@ class Pipeline:
                 out=out,
             )
             level1[name] = self._colour.leading(heads[name]) if name in heads else out
+            made = self._colour.planes(heads[name]) if name in heads else (out,)
+            blank_unread(corrector.sensor, frames[name], *made)
         return level1, statistics
 
     def _estimate_dc(
@@ -313,10 +323,16 @@ class Pipeline:
 
     def _register(
         self, mosaic: Mosaic, level1: Mapping[str, Array]
-    ) -> tuple[tuple[BandRegistration, ...], dict[str, Array]]:
-        """Green as the adjustment placed it, the other bands by their tie points with green."""
+    ) -> tuple[tuple[BandRegistration, ...], dict[str, Array], dict[str, Mask]]:
+        """Green as the adjustment placed it, the other bands by their tie points with green.
+
+        Returns:
+            How the bands were registered, their rasters, and their cells without valid pixels.
+        """
         registrations = []
         rasters: dict[str, Array] = {}
+        gaps: dict[str, Mask] = {}
+        columns, rows = self._grid
         green = None if self._green is None else self._green.sensor.name
         wished = self.settings.colour
         positions = None
@@ -326,6 +342,7 @@ class Pipeline:
             name, leading = head.sensor.name, head.leading
             if name not in level1:
                 rasters |= {band: self._colour.empty(band) for band in head.bands}
+                gaps |= {band: np.ones((rows, columns), np.bool_) for band in head.bands}
                 continue
             placement = mosaic.placements[name]
             homography = None
@@ -347,7 +364,10 @@ class Pipeline:
                 rasters[band] = self._colour.compose(
                     band, placement, homography, interpolation=self.settings.interpolation
                 )
-        return tuple(registrations), rasters
+                gaps[band] = gap_cells(
+                    self._colour.source, columns, rows, saturated_bit=SATURATED_SOURCE
+                )
+        return tuple(registrations), rasters, gaps
 
     def _baselines(
         self, tie_points: TiePoints, temperatures: Temperatures, conditions: Conditions

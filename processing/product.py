@@ -21,6 +21,7 @@ from processing.mosaic.stitching import Method
 from processing.mosaic.validity import Validity
 from processing.quality.report import QualityReport, Thresholds
 from processing.quality.specification import Asked
+from processing.quality.valid_area import ValidArea
 
 Array = NDArray[Any]
 
@@ -63,7 +64,7 @@ class Product:
     data. `valid` (H, W) uint8 is 0 without data, else 1 + the index into `sensors` of the sensor
     that contributes most; its highest bit marks saturation. `colour` holds the bands by name,
     (h, w) uint16 on the raster of `processing.image.lattice.colour_raster`. `quicklook` is (h, w,
-    3) uint8.
+    3) uint8. `valid_area` says the same as `valid`, and of every band, in a few numbers.
 
     `geometry` is keyed by method ("free", "fixed", "fixed-no-tdm"), then `<sensor>.vip` (n, 2),
     `<sensor>.raw` (n, 2), `<sensor>.weight` (n,): which raw pixel serves which VIP pixel.
@@ -81,6 +82,7 @@ class Product:
     pan: Array
     valid: Array
     colour: Mapping[str, Array]
+    valid_area: ValidArea
     counts_per_dn: float
     quicklook: Array
     start: Mapping[str, Any]

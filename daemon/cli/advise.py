@@ -12,7 +12,9 @@ from rich.console import Console
 from daemon.cli.failures import end_walk
 from daemon.tables import light_table
 
-HELP = """Which segments of the plan must be flown again, from verdicts, overlaps and gaps.
+HELP = """List the segments of the plan that must be flown again.
+
+A point is covered where as many images as the overlaps need hold valid pixels of it in every band.
 
 The plan is GeoJSON, KML or QGroundControl's .plan. The mission may still be flying. Written are a
 GeoJSON, a KML and a MAVLink mission of the segments. The exit status is 1 while there are any. An
@@ -35,6 +37,7 @@ def advise(
     from daemon.plan import advisor, flown, writing
     from daemon.plan.image_size import image_on_ground_m
     from daemon.plan.reading import PlanError, read_plan
+    from daemon.plan.relief import relief_or_reason
     from processing.rig import load_rig
 
     folder = Mission.open(mission)
@@ -46,7 +49,16 @@ def advise(
     rig = load_rig(folder.rig_path)
     along_m, across_m = image_on_ground_m(rig, section.height_above_ground_m)
     taken = flown.taken_of(folder, read.specification)
-    advice = advisor.advise(read, taken, image_along_m=along_m, image_across_m=across_m)
+    relief, level = relief_or_reason(section)
+    advice = advisor.advise(
+        read, taken, image_along_m=along_m, image_across_m=across_m, relief=relief
+    )
+    notes = [level] if level else []
+    if without := flown.without_valid_area(folder):
+        notes.append(
+            f"{without} of {len(taken)} exposures have no recorded valid area: they count whole, "
+            "except for heads that sent no image. Run syntopic process to compute it."
+        )
     base_m = along_m * (1.0 - read.specification.forward_overlap)
     read_records = exposures_of(folder)
     simulated = any(exposure.simulated for exposure in read_records.results.values())
@@ -67,12 +79,15 @@ def advise(
                     "exposures": len(taken),
                     "planned_m": advice.planned_m,
                     "well_m": advice.well_m,
+                    "hole_m2": round(advice.hole_m2, 1),
+                    "notes": notes,
                     "segments": [
                         {
                             "line": one.line.id,
                             "from_m": one.from_m,
                             "to_m": one.to_m,
                             "reasons": list(one.reasons),
+                            "holes": [writing.hole_json(hole) for hole in one.holes],
                         }
                         for one in advice.segments
                     ],
@@ -83,18 +98,22 @@ def advise(
     else:
         console = Console(soft_wrap=True)
         if advice.segments:
-            table = light_table("Fly again", ("line", "why"), ("from m", "to m"))
+            table = light_table("Fly again", ("line", "why"), ("from m", "to m", "ha"))
             for one in advice.segments:
                 why = "; ".join(one.reasons)
-                table.add_row(one.line.id, why, f"{one.from_m:.0f}", f"{one.to_m:.0f}")
+                numbers = f"{one.from_m:.0f}", f"{one.to_m:.0f}", f"{one.area_m2 / 1e4:.2f}"
+                table.add_row(one.line.id, why, *numbers)
             Console().print(table)
-        share = advice.well_m / advice.planned_m if advice.planned_m else 0.0
-        console.print(
-            f"{share:.1%} of {advice.planned_m / 1000:.1f} km is well, "
-            f"from {len(taken)} exposures. The segments are in [bold]{out}[/]"
-            if advice.segments
-            else f"All of {advice.planned_m / 1000:.1f} km is well; nothing is to be flown again. "
-            f"[bold]{out}[/] says so."
-        )
+        planned = f"{advice.planned_m / 1000:.1f} km"
+        if advice.segments:
+            console.print(
+                f"{advice.well_m / advice.planned_m:.1%} of {planned} is covered by {len(taken)} "
+                f"exposures; too few images see {advice.hole_m2 / 1e4:.2f} ha. The segments are in "
+                f"[bold]{out}[/]"
+            )
+        else:
+            console.print(f"All of {planned} is covered; nothing is to be flown again.")
+        for note in notes:
+            console.print(note)
     end_walk(read_records.failures)
     raise typer.Exit(0 if advice.is_complete else 1)

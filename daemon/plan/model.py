@@ -60,6 +60,11 @@ class Specification:
         """How many images of a line must see each point of it: 2 at 60 %, 5 at 80 %."""
         return max(1, math.floor(1.0 / (1.0 - self.forward_overlap) + 1e-9))
 
+    @property
+    def lines_on_every_point(self) -> int:
+        """From how many lines each point must be seen: 1 at 30 % sidelap, 2 at 60 %."""
+        return max(1, math.floor(1.0 / (1.0 - self.sidelap) + 1e-9))
+
 
 @dataclass(frozen=True)
 class Plan:

@@ -1,13 +1,14 @@
 """How much of an exposure earlier ones saw as well: the one before it, and the neighbouring line.
 
-Footprints on level ground; relief is left out. An exposure is compared with those of smaller
+Footprints on level ground, without the parts of heads that sent no image; the band with the least
+overlap counts. Relief is left out. An exposure is compared with those of smaller
 numbers only, so that the figures are the same whenever it is processed.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,8 +17,10 @@ from numpy.typing import NDArray
 from daemon.configuration import MountSection
 from daemon.exposure import Exposure
 from daemon.orientation.footprints import seen_from
-from daemon.plan.advisor import inside
+from daemon.plan.image_counts import Flags, gaps_of, image_shares, is_inside
 from daemon.plan.model import Plane, Point
+from processing.quality.nominal_area import nominal_area
+from processing.quality.valid_area import ValidArea
 from processing.rig import Rig
 
 SAMPLES = 41
@@ -53,6 +56,7 @@ class _Seen:
     corners: Array
     centre: Array
     ahead: Array
+    area: ValidArea
 
 
 class Overlaps:
@@ -85,6 +89,7 @@ class Overlaps:
             flat,
             flat.mean(axis=0),
             ahead / max(float(np.hypot(*ahead)), 1e-9),
+            nominal_area(self._rig, [sensor for sensor, _ in exposure.missing]),
         )
 
     def of(self, number: int) -> Surroundings:
@@ -94,7 +99,7 @@ class Overlaps:
             return Surroundings()
         before = (self._seen.get(number - back) for back in range(1, BEFORE + 1))
         last = next((one for one in before if one and one.line_id == this.line_id), None)
-        forward = None if last is None else _share(_samples(this.corners), [last])
+        forward = None if last is None else _share(this, _samples(this.corners), [last])
         return Surroundings(forward, self._sidelap(this))
 
     def _sidelap(self, this: _Seen) -> float | None:
@@ -129,7 +134,7 @@ class Overlaps:
         reaches = np.concatenate([image.corners @ this.ahead for image in images])
         rows = samples.mean(axis=1) @ this.ahead
         flown = (rows >= reaches.min()) & (rows <= reaches.max())
-        return _share(samples[flown], images) if flown.mean() >= LEAST_ROWS else None
+        return _share(this, samples[flown], images) if flown.mean() >= LEAST_ROWS else None
 
 
 def _samples(corners: Array) -> Array:
@@ -141,8 +146,18 @@ def _samples(corners: Array) -> Array:
     return np.asarray(behind + steps[:, None, None] * (ahead - behind))
 
 
-def _share(samples: Array, images: Iterable[_Seen]) -> float:
-    seen = np.zeros(samples.shape[:-1], dtype=np.bool_)
-    for image in images:
-        seen |= inside(image.corners, samples)
-    return float(seen.mean())
+def _share(this: _Seen, samples: Array, images: Sequence[_Seen]) -> float:
+    """The share of the samples of an image that it sees itself and one of the others does, too."""
+    bands = {band for one in (this, *images) for band in one.area.gaps}
+    shares = []
+    for band in bands or {""}:
+        others = np.logical_or.reduce([_sees(one, samples, band) for one in images])
+        shares.append(float((_sees(this, samples, band) & others).mean()))
+    return min(shares)
+
+
+def _sees(image: _Seen, samples: Array, band: str) -> Flags:
+    at = image_shares(image.corners, samples)
+    inside = is_inside(at)
+    gaps = gaps_of(image.area, at, inside).get(band)
+    return inside if gaps is None else inside & ~gaps

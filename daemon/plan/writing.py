@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 from xml.sax.saxutils import escape
 
-from daemon.plan.advisor import Segment
+from daemon.plan.advisor import Hole, Segment
 
 MAVLINK_WAYPOINT, MAVLINK_TRIGGER_DISTANCE = 16, 206
 FRAME_RELATIVE, FRAME_MISSION = 3, 2
@@ -16,6 +16,20 @@ HEADER_QGC = "QGC WPL 110"
 
 def segment_name(segment: Segment) -> str:
     return f"{segment.line.id}: {segment.from_m:.0f} m to {segment.to_m:.0f} m"
+
+
+def hole_json(hole: Hole) -> dict[str, Any]:
+    """A hole as the page draws it: places as latitude and longitude, degrees."""
+    return {
+        "area_m2": round(hole.area_m2, 1),
+        "images": hole.images,
+        "needed": hole.needed,
+        "bands": list(hole.bands),
+        "rings": [
+            [[round(p.latitude_deg, 8), round(p.longitude_deg, 8)] for p in ring]
+            for ring in hole.rings
+        ],
+    }
 
 
 def geojson(segments: Sequence[Segment], *, simulated: bool = False) -> str:
@@ -29,6 +43,7 @@ def geojson(segments: Sequence[Segment], *, simulated: bool = False) -> str:
                 "from_m": round(one.from_m, 1),
                 "to_m": round(one.to_m, 1),
                 "reasons": list(one.reasons),
+                "area_m2": round(one.area_m2, 1),
                 **({"simulated": True} if simulated else {}),
             },
             "geometry": {

@@ -67,7 +67,7 @@ def bands_made(
     """
     settings = {frame.sensor: _told(frame.settings) for frame in exposure.frames}
     product = pipeline.process(frames, conditions, settings, frames_read=frames_read)
-    report = report_json(product.report, exposure.number, product.timings_s)
+    report = report_json(product.report, exposure.number, product.timings_s, product.valid_area)
     report["reference"] = product.reference
     report["units"] = dict(product.units)
     report["bands"] = [_registration(band) for band in product.registrations]

@@ -31,7 +31,7 @@ def heads_made(
 ) -> Made:
     """Every head an image of its own (`daemon.products.processor`)."""
     product = pipeline.process(frames, conditions, frames_read=frames_read)
-    report = report_json(product.report, exposure.number, product.timings_s)
+    report = report_json(product.report, exposure.number, product.timings_s, product.valid_area)
     report["heads"] = list(product.heads)
     contents: Contents = {}
     for name, head in product.heads.items():

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeAlias
 
+from processing.quality import valid_area
 from processing.quality.report import QualityReport, as_json
+from processing.quality.valid_area import ValidArea
 
 Contents: TypeAlias = dict[str, Sequence[bytes | memoryview]]
 Made: TypeAlias = tuple[dict[str, Any], Contents]
@@ -16,8 +18,13 @@ FramesRead: TypeAlias = Callable[[], None] | None
 
 
 def report_json(
-    report: QualityReport, number: int, timings_s: Mapping[str, float]
+    report: QualityReport, number: int, timings_s: Mapping[str, float], area: ValidArea
 ) -> dict[str, Any]:
     """The content of quality.json, as far as it is the same for every rig."""
     timings = {stage: round(seconds, 4) for stage, seconds in timings_s.items()}
-    return {**as_json(report), "exposure": number, "timings_s": timings}
+    return {
+        **as_json(report),
+        "exposure": number,
+        "timings_s": timings,
+        "valid_area": valid_area.as_json(area),
+    }

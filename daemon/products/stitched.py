@@ -46,7 +46,7 @@ def stitched_made(
                 height_m=conditions.height_above_ground_m,
             )
         )
-    report = report_json(product.report, exposure.number, product.timings_s)
+    report = report_json(product.report, exposure.number, product.timings_s, product.valid_area)
     contents = level2.level2_contents(
         exposure.number,
         pan=product.pan,

@@ -1,39 +1,46 @@
-"""The plan of the mission being flown, and what of it is not well seen yet.
+"""The plan of the mission being flown, and what of it is not seen by enough images yet.
 
 Exposures are gathered from the state as they come, so that those it no longer keeps still count.
-What has to be flown again is `daemon.plan.advisor`'s to say.
+What has to be flown again is computed by `daemon.plan.advisor`.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from daemon.configuration import ConfigurationError
 from daemon.disk.mission import Mission
 from daemon.errors import DaemonError
 from daemon.orientation.exterior import mount_of
-from daemon.plan.advisor import Advice, Segment, Taken, advise
+from daemon.plan.advisor import Advice, LineAdvice, advise
+from daemon.plan.flown import NO_FOOTPRINT, area_and_cause
+from daemon.plan.image_counts import Taken
 from daemon.plan.image_size import image_on_ground_m
 from daemon.plan.model import Plan, Plane, PlannedLine, Point
 from daemon.plan.reading import read_plan
+from daemon.plan.relief import TerrainRelief, relief_or_reason
 from daemon.plan.steering import places_m
+from daemon.plan.writing import hole_json
 from daemon.watch.state import FlightState
-from processing.rig import RigError, load_rig
-
-Kind = Literal["hole", "to fly"]
+from processing.rig import Rig, RigError, load_rig
 
 
 @dataclass(frozen=True)
 class _Known:
+    rig: Rig
     plan: Plan
     along_m: float
     across_m: float
     height_m: float
+    ground_height_m: float
+    relief: TerrainRelief | None
+    level_because: str
+    lines: dict[str, LineAdvice] = field(default_factory=dict)
 
     @property
     def base_m(self) -> float:
@@ -61,10 +68,8 @@ class Coverage:
             return
         for one in self._state.changed("exposures", self._cursor):
             self._cursor = one["sequence"]
-            corners = one.get("footprint")
-            if corners:
-                places = tuple(Point(*place) for place in corners)
-                taken = Taken(one["number"], places, _objection(one))
+            if one.get("step") not in ("triggered", "stored"):
+                taken = _taken(one, self._known)
                 self._taken[one["number"]] = (str(one.get("line") or ""), taken)
 
     def plan_json(self) -> dict[str, Any] | None:
@@ -87,28 +92,47 @@ class Coverage:
             return None
         taken = [one for _, one in self._taken.values()]
         return partial(
-            advise, known.plan, taken, image_along_m=known.along_m, image_across_m=known.across_m
+            advise,
+            known.plan,
+            taken,
+            image_along_m=known.along_m,
+            image_across_m=known.across_m,
+            relief=known.relief,
+            rest=self._rest(known),
+            known=known.lines,
         )
 
-    def kind_of(self, segment: Segment) -> Kind:
-        """A hole lies where the line has been flown past, or has been left for another one."""
-        plane = Plane(segment.line.start)
-        east, north = plane.flat(segment.line.end)
-        length_m = math.hypot(east, north) or 1.0
-        flown_m = []
+    def notes(self) -> list[str]:
+        """What the advice assumes."""
+        known = self._known
+        return [known.level_because] if known is not None and known.level_because else []
+
+    def _rest(self, known: _Known) -> dict[str, tuple[float, float]]:
+        """By line, what is still to be flown: all of it, or what lies ahead on the line in work."""
+        flown: dict[str, list[Taken]] = {}
         latest = ""
         for latest, taken in (self._taken[number] for number in sorted(self._taken)):
-            if latest == segment.line.id:
-                x, y = plane.flat(_middle(taken.corners))
-                flown_m.append((x * east + y * north) / length_m)
-        if not flown_m:
-            return "to fly"
-        margin_m = self.distance_m / 2
-        if flown_m[-1] >= flown_m[0]:
-            is_passed = segment.to_m <= flown_m[-1] + margin_m
-        else:
-            is_passed = segment.from_m >= flown_m[-1] - margin_m
-        return "hole" if is_passed or latest != segment.line.id else "to fly"
+            flown.setdefault(latest, []).append(taken)
+        rest: dict[str, tuple[float, float]] = {}
+        for line in known.plan.lines:
+            plane = Plane(line.start)
+            east, north = plane.flat(line.end)
+            length_m = math.hypot(east, north)
+            if not length_m:
+                continue
+            placed = [one for one in flown.get(line.id, ()) if one.corners]
+            at_m = []
+            for one in placed:
+                x, y = plane.flat(_middle(one.corners))
+                at_m.append((x * east + y * north) / length_m)
+            margin_m = known.base_m / 2
+            if line.id not in flown:
+                rest[line.id] = (0.0, length_m)
+            elif line.id == latest and at_m:
+                ahead = (at_m[-1] + margin_m, length_m)
+                back = (0.0, at_m[-1] - margin_m)
+                rest[line.id] = ahead if at_m[-1] >= at_m[0] else back
+        return {line: (a, b) for line, (a, b) in rest.items() if a < b}
 
     @property
     def is_simulated(self) -> bool:
@@ -130,15 +154,18 @@ def advice_json(advice: Advice, coverage: Coverage) -> dict[str, Any]:
     return {
         "planned_m": round(advice.planned_m, 1),
         "well_m": round(advice.well_m, 1),
+        "hole_m2": round(advice.hole_m2, 1),
+        "notes": coverage.notes(),
         "segments": [
             {
                 "line": one.line.id,
                 "strip": one.line.strip or one.line.id,
-                "kind": coverage.kind_of(one),
+                "kind": one.kind,
                 "from_m": round(one.from_m, 1),
                 "to_m": round(one.to_m, 1),
                 "at": [list(one.start), list(one.end)],
                 "reasons": list(one.reasons),
+                "holes": [hole_json(hole) for hole in one.holes],
             }
             for one in advice.segments
         ],
@@ -155,7 +182,34 @@ def _known_of(path: Path) -> _Known | None:
     except (OSError, DaemonError, ConfigurationError, RigError):
         return None
     along_m, across_m = image_on_ground_m(rig, section.height_above_ground_m)
-    return _Known(plan, along_m, across_m, section.height_above_ground_m)
+    relief, level_because = relief_or_reason(section)
+    return _Known(
+        rig=rig,
+        plan=plan,
+        along_m=along_m,
+        across_m=across_m,
+        height_m=section.height_above_ground_m,
+        ground_height_m=section.ground_height_m,
+        relief=relief,
+        level_because=level_because,
+    )
+
+
+def _taken(one: Mapping[str, Any], known: _Known) -> Taken:
+    """An exposure as the advisor counts it; until it is judged, its missing heads alone decide."""
+    corners, place = one.get("footprint"), one.get("place") or {}
+    if not corners:
+        return Taken(one["number"], (), _objection(one) or NO_FOOTPRINT)
+    missing = [str(sensor) for sensor in one.get("missing") or ()]
+    area, cause = area_and_cause(known.rig, one.get("valid_area"), missing)
+    eye = None
+    if place.get("height_m") is not None:
+        eye = (
+            Point(place["latitude_deg"], place["longitude_deg"]),
+            place["height_m"] - known.ground_height_m,
+        )
+    places = tuple(Point(*corner) for corner in corners)
+    return Taken(one["number"], places, _objection(one), area=area, partly=cause, eye=eye)
 
 
 def _line_json(line: PlannedLine, known: _Known) -> dict[str, Any]:

@@ -184,7 +184,7 @@ def _brief_of(state: FlightState) -> dict[str, Any]:
     }
 
 
-_LEFT_OUT_FIRST = ("findings", "found", "footprint", "place", "figures", "recovery")
+_LEFT_OUT_FIRST = ("findings", "found", "valid_area", "footprint", "place", "figures", "recovery")
 
 
 def _datagram(kind: str, content: Mapping[str, Any]) -> bytes:

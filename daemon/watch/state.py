@@ -237,6 +237,8 @@ class FlightState:
         _judge(told, report)
         figures = report.get("figures", {})
         told["figures"] = {key: figures[key] for key in FIGURES_TOLD if key in figures}
+        if report.get("valid_area"):
+            told["valid_area"] = report["valid_area"]
 
     def _on_processed(self, event: Mapping[str, Any]) -> None:
         self._finish(event)

@@ -290,6 +290,16 @@ class ColourComposer:
         )
         return self._bands[band]
 
+    @property
+    def source(self) -> Array:
+        """Where the last composed band has data, (h, w) uint8, as in
+        `processing.image.resampling.resample`."""
+        return self._source
+
+    def planes(self, head: ColourHead) -> tuple[Array, ...]:
+        """The frames that the bands of a head are made of, once `leading` was called."""
+        return tuple(self._planes[head.sensor.name])
+
     def empty(self, band: str) -> Array:
         """The raster of a band whose frame is missing: no data."""
         self._bands[band][:] = 0

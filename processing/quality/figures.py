@@ -20,6 +20,7 @@ from processing.mosaic.estimated_dc import EstimatedDc, combined_dc
 from processing.mosaic.free import Mosaic
 from processing.mosaic.validity import Validity
 from processing.quality.report import Figure
+from processing.quality.valid_area import ValidArea
 from processing.radiometry.level1 import FrameStatistics
 from processing.rig import Rig, Sensor
 
@@ -89,6 +90,16 @@ def stitching_figures(
         figures[f"{band.band}_points"] = band.points
         figures[f"{band.band}_rms_px"] = band.rms_px
     return figures
+
+
+def valid_area_figures(area: ValidArea) -> dict[str, Figure]:
+    """The band with the smallest valid share, and that share; no band where all are whole."""
+    shares = {band: area.share(band) for band in area.gaps}
+    worst = min(shares, key=lambda band: shares[band], default=None)
+    return {
+        "valid_worst_fraction": 1.0 if worst is None else shares[worst],
+        "valid_worst_band": worst,
+    }
 
 
 def estimated_dc_figures(estimates: Sequence[EstimatedDc]) -> dict[str, Figure]:

@@ -147,13 +147,13 @@ def _frames(
 ) -> list[Finding]:
     findings = []
     if missing_sensors or capture_flags & Flag.FRAME_MISSING:
-        named = ", ".join(missing_sensors) or "a sensor"
+        heads = f"Head{'s' * (len(missing_sensors) > 1)} {', '.join(missing_sensors)}"
         findings.append(
             Finding(
                 Flag.FRAME_MISSING,
                 Verdict.USABLE,
-                f"No frame of {named}: that part has no data; check the head, fly again if the "
-                "neighbours do not cover it.",
+                f"{heads if missing_sensors else 'A head'} sent no image{_gap(figures)}. Check "
+                "power and cable.",
                 float(len(missing_sensors)) or None,
                 0.0,
             )
@@ -165,7 +165,7 @@ def _frames(
                 Flag.FRAME_CORRUPT,
                 Verdict.USABLE,
                 f"{unread:.0%} of {figures.get('unread_worst_sensor')} was not read out: it is "
-                "below black; check head and cable, fly again if the neighbours do not cover it.",
+                f"below black{_gap(figures)}. Check head and cable.",
                 unread,
                 t.unread_fraction,
             )
@@ -182,6 +182,14 @@ def _frames(
             )
         )
     return findings
+
+
+def _gap(figures: Mapping[str, Figure]) -> str:
+    """What of the image is missing, as the end of a sentence; coverage counts it."""
+    valid, band = _number(figures, "valid_worst_fraction"), figures.get("valid_worst_band")
+    if valid is None or not band:
+        return ""
+    return f"; {1.0 - valid:.0%} of {band} has no valid pixels, which coverage counts as a gap"
 
 
 def _time_and_temperature(

@@ -1,10 +1,14 @@
-"""Were the pixels of a frame read out at all? Without light a pixel still shows its black level."""
+"""Were the pixels of a frame read out at all? Without light a pixel still shows its black level.
+
+Pixels that were not read out are no data: they are left out of the image and of its valid area.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any, Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +20,10 @@ Array = NDArray[Any]
 _NOISES: Final = 10.0
 _STEP: Final = (32, 8)
 """Of the rows and columns looked at: lost lines are told by a few of their pixels."""
+_SHARE: Final = 1e-3
+"""Of the pixels looked at; fewer below black are defects, which calibration interpolates."""
+_RUN_PX: Final = 16
+"""Along a row: what a lost packet takes is longer, a cluster of defects is shorter."""
 
 
 def unread_figures(rig: Rig, frames: Mapping[str, Array]) -> dict[str, Figure]:
@@ -28,18 +36,44 @@ def unread_figures(rig: Rig, frames: Mapping[str, Array]) -> dict[str, Figure]:
         rig: the camera.
         frames: Level-0 frames by sensor name, (h, w) uint16, DN.
     """
-    shares = {}
-    for sensor in rig.sensors:
-        least = _least_dn(sensor)
-        if sensor.name in frames and least > 0:
-            seen = frames[sensor.name][:: _STEP[0], :: _STEP[1]]
-            shares[sensor.name] = float(np.count_nonzero(seen < least)) / seen.size
+    shares = {
+        sensor.name: share
+        for sensor in rig.sensors
+        if sensor.name in frames
+        and (share := _unread_share(sensor, frames[sensor.name])) is not None
+    }
     if not shares:
         return {}
     worst = max(shares, key=lambda name: shares[name])
     return {"unread_worst_fraction": shares[worst], "unread_worst_sensor": worst}
 
 
-def _least_dn(sensor: Sensor) -> int:
+def blank_unread(sensor: Sensor, frame: Array, *level1: Array) -> None:
+    """Write no data (0) into corrected frames where the raw frame was not read out.
+
+    Looks at every pixel only where a sample of them shows that lines are missing.
+
+    Args:
+        frame: Level-0, (h, w) uint16, DN.
+        level1: corrected frames of the same shape, changed in place.
+    """
+    if (_unread_share(sensor, frame) or 0.0) < _SHARE:
+        return
+    low = (frame < _least_word(sensor)).astype(np.uint8)
+    lost = cv2.morphologyEx(low, cv2.MORPH_OPEN, np.ones((1, _RUN_PX), np.uint8)) != 0
+    for corrected in level1:
+        corrected[lost] = 0
+
+
+def _unread_share(sensor: Sensor, frame: Array) -> float | None:
+    least = _least_word(sensor)
+    if least <= 0:
+        return None
+    seen = frame[:: _STEP[0], :: _STEP[1]]
+    return float(np.count_nonzero(seen < least)) / seen.size
+
+
+def _least_word(sensor: Sensor) -> int:
     noise_dn = sensor.read_noise_e / sensor.electrons_per_dn
-    return int(sensor.black_dn - _NOISES * max(noise_dn, 1.0))
+    least_dn = int(sensor.black_dn - _NOISES * max(noise_dn, 1.0))
+    return least_dn * sensor.words_per_dn

@@ -184,6 +184,8 @@ FIGURES: Final[Mapping[str, str]] = {
     "temperature_age_s": "age of the oldest temperature used",
     "valid_fraction": "share of virtual image pixels that hold data",
     "missing_sensors": "sensors without a frame, comma separated",
+    "valid_worst_fraction": "share of the image with valid pixels, of the band that has the least",
+    "valid_worst_band": "which band that is",
     "tilt_deg": "largest of roll and pitch",
     "crab_deg": "angle between the image's along axis and the track",
     "forward_overlap": "share of the ground seen that the image before it on the line saw, too",

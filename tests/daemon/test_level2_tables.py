@@ -12,7 +12,7 @@ from daemon.cli.level2_tables import print_reports
 def test_beneath_the_table_stands_why_an_exposure_is_not_good() -> None:
     findings = [
         {"verdict": "good", "sentence": "Simulated hardware: not a survey."},
-        {"verdict": "usable", "sentence": "No frame of SU10: that part has no data."},
+        {"verdict": "usable", "sentence": "Head SU10 sent no image."},
     ]
     report = {
         "exposure": 7,
@@ -23,6 +23,6 @@ def test_beneath_the_table_stands_why_an_exposure_is_not_good() -> None:
     }
     told = io.StringIO()
     print_reports(Console(file=told, width=100), "Level-2", [report])
-    assert "Exposure 7: No frame of SU10: that part has no data." in told.getvalue()
+    assert "Exposure 7: Head SU10 sent no image." in told.getvalue()
     assert "Simulated" not in told.getvalue()
     assert "0.000" not in told.getvalue(), "an unknown sigma0 is not a perfect one"

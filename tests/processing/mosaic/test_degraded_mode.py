@@ -10,6 +10,7 @@ import pytest
 
 from processing.matching.tie_points import TiePointSettings
 from processing.pipeline import Pipeline, Product, Settings
+from processing.quality.nominal_area import nominal_area
 from processing.quality.report import Flag, Verdict, as_json
 from processing.rig import Rig, find_rig
 from tests.processing.synthetic_exposure import Exposure, expose
@@ -125,6 +126,50 @@ def test_a_frame_that_was_read_out_in_part_is_told(
     assert made.report.flags & Flag.FRAME_CORRUPT and made.report.verdict is Verdict.USABLE
     assert number(made, "unread_worst_fraction") == pytest.approx(lost, abs=0.03)
     assert any(f"of {name} was not read out" in f.sentence for f in made.report.findings)
+
+
+@pytest.mark.trust
+@pytest.mark.parametrize("missing", [("SU02",), ("SU10", "SU30"), ("N",), ("G", "SU11")])
+def test_the_valid_area_is_that_of_the_pixels_and_what_calibration_says(
+    pipeline: Pipeline, exposure: Exposure, missing: tuple[str, ...]
+) -> None:
+    frames = {name: frame for name, frame in exposure.frames.items() if name not in missing}
+    made = pipeline.process(frames, conditions(RIG, exposure))
+    assert valid_shares(made) == pytest.approx(pixel_shares(made), abs=0.005)
+    nominal = nominal_area(RIG, missing)
+    for band in ("pan", "red", "green", "blue", "nir"):
+        differs = nominal.mask(band) != made.valid_area.mask(band)
+        assert differs.mean() < 0.02, band
+    worst = min(valid_shares(made).items(), key=lambda one: one[1])
+    assert number(made, "valid_worst_fraction") == pytest.approx(worst[1], abs=1e-9)
+    (finding,) = (f for f in made.report.findings if f.flag is Flag.FRAME_MISSING)
+    assert f"{1 - worst[1]:.0%} of {worst[0]} has no valid pixels" in finding.sentence
+
+
+@pytest.mark.trust
+@pytest.mark.parametrize(("name", "band"), [("SU02", "pan"), ("N", "nir"), ("R", "red")])
+def test_lines_that_were_not_read_out_are_no_data(
+    pipeline: Pipeline, exposure: Exposure, name: str, band: str
+) -> None:
+    frame = exposure.frames[name].copy()
+    frame[len(frame) // 2 :] = 0
+    without = {key: one for key, one in exposure.frames.items() if key != name}
+    gone = 1.0 - valid_shares(pipeline.process(without, conditions(RIG, exposure)))[band]
+    made = pipeline.process(without | {name: frame}, conditions(RIG, exposure))
+    half = 1.0 - valid_shares(made)[band]
+    # A seam stays in the middle of the overlap, so a PAN head takes a little more than its half.
+    assert 0.45 * gone < half < 0.7 * gone
+    assert valid_shares(made) == pytest.approx(pixel_shares(made), abs=0.005)
+
+
+def valid_shares(made: Product) -> dict[str, float]:
+    return {band: made.valid_area.share(band) for band in ("pan", "red", "green", "blue", "nir")}
+
+
+def pixel_shares(made: Product) -> dict[str, float]:
+    return {
+        name: float((band > 0).mean()) for name, band in {"pan": made.pan, **made.colour}.items()
+    }
 
 
 def _held(made: Product) -> list[str]:

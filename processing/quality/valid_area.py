@@ -1,0 +1,177 @@
+"""Which parts of an image hold valid pixels, band by band, in a few numbers.
+
+An image is divided into a grid of cells; what has no valid pixels is listed as boxes of cells. How
+the boxes lie on the ground is not asked here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+Mask: TypeAlias = NDArray[np.bool_]
+Box: TypeAlias = tuple[int, int, int, int]
+"""First column, first row, last column + 1, last row + 1, in cells; row 0 is the top of the
+image."""
+
+CELLS: Final = 240
+"""Along the longer side: a cell is 0.4 % of it."""
+SAMPLES: Final = 4
+"""Pixels looked at in each direction of a cell."""
+BURNT_WINDOW: Final = 5
+"""Saturated cells count where they are the majority of so many cells squared: a white roof is no
+gap, a burnt-out field is."""
+BOXES_MAX: Final = 24
+"""Of a band. A mask that needs more is described in cells twice, four times ... as large."""
+
+
+@dataclass(frozen=True)
+class ValidArea:
+    """The gaps of an image by band; a band that is not listed is valid everywhere.
+
+    `columns` and `rows` are the numbers of cells across and down the image.
+    """
+
+    columns: int
+    rows: int
+    gaps: Mapping[str, tuple[Box, ...]] = field(default_factory=dict)
+
+    def mask(self, band: str) -> Mask:
+        """Which cells are valid, (rows, columns)."""
+        valid = np.ones((self.rows, self.columns), np.bool_)
+        for left, top, right, bottom in self.gaps.get(band, ()):
+            valid[top:bottom, left:right] = False
+        return valid
+
+    def share(self, band: str) -> float:
+        """The valid share of a band, 0 to 1."""
+        return float(self.mask(band).mean())
+
+
+def grid_of(width_px: int, height_px: int) -> tuple[int, int]:
+    """Columns and rows of cells of an image; cells are square but for rounding."""
+    longer = max(width_px, height_px)
+    return max(1, round(CELLS * width_px / longer)), max(1, round(CELLS * height_px / longer))
+
+
+def gap_cells(raster: NDArray[Any], columns: int, rows: int, *, saturated_bit: int = 0) -> Mask:
+    """Which cells of an image hold no valid pixels, (rows, columns).
+
+    A cell is valid where at least half of its pixels are; gaps narrower than half a cell are not
+    seen. Sixteen pixels of a cell are looked at.
+
+    Args:
+        raster: (h, w) integers over the whole image; 0 is no data.
+        saturated_bit: the bit of a value that marks saturation; 0 where none does.
+    """
+    height, width = raster.shape
+    down = ((np.arange(rows * SAMPLES) + 0.5) * height / (rows * SAMPLES)).astype(np.int64)
+    across = ((np.arange(columns * SAMPLES) + 0.5) * width / (columns * SAMPLES)).astype(np.int64)
+    seen = raster[np.ix_(down, across)].reshape(rows, SAMPLES, columns, SAMPLES)
+    gaps: Mask = np.mean(seen != 0, axis=(1, 3)) < 0.5
+    if saturated_bit:
+        gaps |= _smoothed(np.mean(seen & saturated_bit != 0, axis=(1, 3)) >= 0.5)
+    return gaps
+
+
+def area_of(cells: Mapping[str, Mask]) -> ValidArea:
+    """The area by the gap cells of every band, all on one grid.
+
+    Raises:
+        ValueError: there is no band at all.
+    """
+    if not cells:
+        raise ValueError("no band, so there is no image to describe")
+    rows, columns = next(iter(cells.values())).shape
+    gaps = {band: boxes for band, one in cells.items() if (boxes := boxes_of(one))}
+    return ValidArea(columns, rows, gaps)
+
+
+def boxes_of(gaps: Mask, most: int = BOXES_MAX) -> tuple[Box, ...]:
+    """Boxes that cover the true cells of a grid and no others, at most so many.
+
+    Where more were needed, the grid is coarsened by twos, majority of cells.
+    """
+    scale, cells = 1, gaps
+    rows, columns = gaps.shape
+    while len(boxes := list(_boxes(cells))) > most:
+        scale *= 2
+        cells = _coarser(cells)
+    return tuple(
+        (left * scale, top * scale, min(right * scale, columns), min(bottom * scale, rows))
+        for left, top, right, bottom in boxes
+    )
+
+
+def as_json(area: ValidArea) -> dict[str, Any]:
+    """The area as `quality.json` and telemetry hold it."""
+    gaps = {band: [list(box) for box in boxes] for band, boxes in area.gaps.items()}
+    return {"columns": area.columns, "rows": area.rows, "gaps": gaps}
+
+
+def from_json(content: object) -> ValidArea | None:
+    """The area out of `quality.json`; None where it holds none that can be used."""
+    if not isinstance(content, Mapping):
+        return None
+    columns, rows, gaps = content.get("columns"), content.get("rows"), content.get("gaps")
+    if not isinstance(columns, int) or not isinstance(rows, int) or not isinstance(gaps, Mapping):
+        return None
+    if not (0 < columns <= CELLS and 0 < rows <= CELLS):
+        return None
+    found: dict[str, tuple[Box, ...]] = {}
+    for band, boxes in gaps.items():
+        if not isinstance(band, str) or not isinstance(boxes, list | tuple):
+            return None
+        if not all(_is_box(box, columns, rows) for box in boxes):
+            return None
+        found[band] = tuple((box[0], box[1], box[2], box[3]) for box in boxes)
+    return ValidArea(columns, rows, found)
+
+
+def _is_box(box: object, columns: int, rows: int) -> bool:
+    if not isinstance(box, list | tuple) or len(box) != 4:
+        return False
+    if not all(isinstance(value, int) for value in box):
+        return False
+    left, top, right, bottom = box
+    return bool(0 <= left < right <= columns and 0 <= top < bottom <= rows)
+
+
+def _smoothed(cells: Mask) -> Mask:
+    """The majority of the window around each cell; outside the image is not saturated."""
+    reach = BURNT_WINDOW // 2
+    padded = np.pad(cells.astype(np.int64), reach)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (BURNT_WINDOW, BURNT_WINDOW))
+    majority: Mask = windows.sum(axis=(2, 3)) * 2 > BURNT_WINDOW**2
+    return majority
+
+
+def _boxes(cells: Mask) -> list[Box]:
+    """Runs along the rows, those of successive rows joined where they are the same."""
+    boxes: list[Box] = []
+    open_runs: dict[tuple[int, int], int] = {}
+    for row in range(cells.shape[0] + 1):
+        runs = set(_runs(cells[row])) if row < cells.shape[0] else set()
+        for (left, right), top in list(open_runs.items()):
+            if (left, right) not in runs:
+                boxes.append((left, top, right, row))
+                del open_runs[left, right]
+        for run in runs:
+            open_runs.setdefault(run, row)
+    return sorted(boxes, key=lambda box: (box[1], box[0]))
+
+
+def _runs(row: Mask) -> list[tuple[int, int]]:
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], row.astype(np.int8), [0]])))
+    return [(int(a), int(b)) for a, b in zip(edges[0::2], edges[1::2], strict=True)]
+
+
+def _coarser(cells: Mask) -> Mask:
+    rows, columns = cells.shape
+    padded = np.pad(cells.astype(np.float64), ((0, rows % 2), (0, columns % 2)), mode="edge")
+    blocks = padded.reshape(-(-rows // 2), 2, -(-columns // 2), 2)
+    return np.asarray(blocks.mean(axis=(1, 3)) >= 0.5)
