@@ -343,7 +343,7 @@ class _Verification:
     def _closing(self) -> None:
         """Files that may change until a run ends."""
         closing = self.history.closing
-        if closing is None:
+        if closing is None or self.is_flown:
             if self.history.exists:
                 self.remarks.append(
                     f"{CHAIN_FILE} is open: if the newest exposures were removed together with its "

@@ -70,14 +70,17 @@ def small_rig() -> Rig:
     return rig_from_mapping(tomllib.loads(RIG_TOML), "small.toml")
 
 
-def new_mission(root: Path) -> Mission:
+FLOWN_UTC = datetime(2026, 11, 21, 10, 15, tzinfo=UTC)
+
+
+def new_mission(root: Path, started_utc: datetime = FLOWN_UTC) -> Mission:
     """A mission that has just begun."""
     return Mission.create(
         root,
         "small",
         rig_toml=RIG_TOML.encode(),
         service_toml=b"# flown by a test\n",
-        started_utc=datetime(2026, 11, 21, 10, 15, tzinfo=UTC),
+        started_utc=started_utc,
     )
 
 

@@ -1,0 +1,128 @@
+"""Verification in flight: `python -m tests.crash.verified_flight FOLDER VERIFICATIONS SEED`.
+
+Real writer processes fly one mission after another as fast as they can; some are killed and go on
+after recovery, the last of a mission lands. Meanwhile this process verifies the newest mission,
+over and over: nothing that a flight does may look like damage.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import signal
+import sys
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from daemon.disk.mission import CURRENT_FILE, Mission
+from daemon.disk.recovery import recover
+from daemon.disk.store import verify
+from daemon.flight.arming import Lack, note_override
+from daemon.flight.recovery_match import seal_from_log
+from tests.crash.flight import live
+from tests.daemon.small_camera import new_mission, small_rig
+
+EXPOSURES_PER_LIFE = 12
+"""Few, so that the missions stay small and there are many beginnings and ends."""
+
+
+@dataclass
+class Verified:
+    """How many verifications there were by state of the mission, and every problem they named."""
+
+    states: Counter[str] = field(default_factory=Counter)
+    problems: list[str] = field(default_factory=list)
+    exposures: int = 0
+
+    def add(self, path: Path) -> None:
+        """Verify a mission."""
+        report = verify(Mission.open(path, looks_below=False))
+        self.states[report.state] += 1
+        self.exposures += report.exposures
+        self.problems += [f"{path.name}: {problem}" for problem in report.problems]
+
+
+def verify_in_flight(root: Path, count: int, seed: int) -> Verified:
+    """Verify missions being flown `count` times, and each once more after it has landed."""
+    pilot = os.fork()
+    if not pilot:
+        os.setpgid(0, 0)
+        try:
+            _fly_for_ever(root, random.Random(seed))
+        finally:
+            os._exit(1)
+    told = Verified()
+    try:
+        newest: Path | None = None
+        while told.states["flown"] < count or told.states["ended"] < 2:
+            missions = _missions(root)
+            if newest is not None and missions[-1] != newest:
+                told.add(newest)
+            newest = missions[-1] if missions else None
+            if newest is not None and (root / CURRENT_FILE).exists():
+                told.add(newest)
+            assert os.waitpid(pilot, os.WNOHANG) == (0, 0), "the flight ended"
+    finally:
+        os.killpg(pilot, signal.SIGKILL)
+        os.waitpid(pilot, 0)
+    return told
+
+
+def _fly_for_ever(root: Path, rng: random.Random) -> None:
+    parent = os.getppid()
+    started_utc = datetime(2026, 11, 21, 10, 15, tzinfo=UTC)
+    while os.getppid() == parent:
+        started_utc += timedelta(seconds=1)  # so that ids are in order
+        mission = new_mission(root, started_utc)
+        for _ in range(rng.randrange(3)):
+            life = _life(mission, lands=False)
+            time.sleep(rng.uniform(0.0, 0.3))
+            note_override(mission.path, "test", [Lack("arming-time", "no time", "wait")])
+            os.kill(life, signal.SIGKILL)
+            os.waitpid(life, 0)
+        assert os.waitpid(_life(mission, lands=True), 0)[1] == 0
+        mission.close()
+        for older in _missions(root)[:-10]:
+            _remove(older)
+
+
+def _life(mission: Mission, *, lands: bool) -> int:
+    pid = os.fork()
+    if pid:
+        return pid
+    with mission.held():
+        first = recover(mission, seal_from_log(small_rig())).next_number
+        acks = os.open(os.devnull, os.O_WRONLY)
+        numbers = range(first, first + EXPOSURES_PER_LIFE)
+        live(mission, acks, numbers, lands=lands, keeps="handed over")
+    os._exit(0)
+
+
+def _missions(root: Path) -> list[Path]:
+    return sorted(path for path in root.glob("2*") if path.is_dir())
+
+
+def _remove(mission: Path) -> None:
+    """Out of sight first: a verification never looks at what is being removed."""
+    gone = mission.with_name(f".{mission.name}")
+    mission.rename(gone)
+    shutil.rmtree(gone)
+
+
+def main() -> None:
+    root = Path(sys.argv[1])
+    root.mkdir(parents=True, exist_ok=True)
+    started = time.monotonic()
+    told = verify_in_flight(root, int(sys.argv[2]), int(sys.argv[3]))
+    print(dict(told.states), f"{told.exposures} exposures, {time.monotonic() - started:.0f} s")
+    for problem, count in Counter(told.problems).most_common(20):
+        print(f"{count} x {problem}")
+    print(f"{len(told.problems)} false alarms")
+
+
+if __name__ == "__main__":
+    main()
