@@ -24,6 +24,8 @@ FIXES: Final = {0: "none", 1: "none", 2: "2d"}
 """By GPS_FIX_TYPE; every other one is a fix of position and height."""
 GPS_OLD_MS: Final = 5_000
 ATTITUDES_KEPT: Final = 256
+QUATERNION_OLD_MS: Final = 1_000
+"""After so long without ATTITUDE_QUATERNION, ATTITUDE is read."""
 ATTITUDE_GAP_MS: Final = 500
 """Between attitudes further apart nothing is interpolated."""
 COUNT_BITS: Final = 32
@@ -46,10 +48,11 @@ class Timesync:
 class MavlinkDecoder(MessageDecoder):
     """Decodes what an autopilot sends.
 
-    GLOBAL_POSITION_INT becomes a NavSample with the attitude of ATTITUDE_QUATERNION at its instant,
-    fix and accuracy of GPS_RAW_INT; CAMERA_TRIGGER becomes an EventMark. SYSTEM_TIME ties the
-    autopilot's clock to GPS time. HIGHRES_IMU is checked and counted. Messages of other systems on
-    the bus are counted and left alone. Nothing that is fed raises.
+    GLOBAL_POSITION_INT becomes a NavSample with the attitude of ATTITUDE_QUATERNION, or of ATTITUDE
+    where that does not come, at its instant, fix and accuracy of GPS_RAW_INT; CAMERA_TRIGGER
+    becomes an EventMark. SYSTEM_TIME ties the autopilot's clock to GPS time. HIGHRES_IMU is checked
+    and counted. Messages of other systems on the bus are counted and left alone. Nothing that is
+    fed raises.
     """
 
     def __init__(
@@ -84,10 +87,12 @@ class MavlinkDecoder(MessageDecoder):
         self._gps: tuple[int, Any] | None = None
         self._boot_ms = 0
         self._attitudes: deque[tuple[int, Quaternion]] = deque(maxlen=ATTITUDES_KEPT)
+        self._quaternion_ms: int | None = None
         self._held: tuple[Any, int] | None = None
         self._handlers: Mapping[str, Callable[[Any, int], list[Nav]]] = {
             "GLOBAL_POSITION_INT": self._on_position,
-            "ATTITUDE_QUATERNION": self._on_attitude,
+            "ATTITUDE_QUATERNION": self._on_quaternion,
+            "ATTITUDE": self._on_angles,
             "HIGHRES_IMU": self._on_imu,
             "GPS_RAW_INT": self._on_gps,
             "CAMERA_TRIGGER": self._on_trigger,
@@ -151,15 +156,28 @@ class MavlinkDecoder(MessageDecoder):
             raise ValueError("a measurement that is no number")
         return []
 
-    def _on_attitude(self, message: Any, _mono_ns: int) -> list[Nav]:
+    def _on_quaternion(self, message: Any, _mono_ns: int) -> list[Nav]:
         q = (message.q1, message.q2, message.q3, message.q4)
         norm = math.hypot(*q)
         if not 0.5 < norm < 2.0:
             raise ValueError("a quaternion that is no rotation")
-        self._at(message.time_boot_ms)
         w, x, y, z = (value / norm for value in q)
-        self._attitudes.append((message.time_boot_ms, (w, x, y, z)))
-        if self._held is not None and message.time_boot_ms >= self._held[0].time_boot_ms:
+        self._quaternion_ms = message.time_boot_ms
+        return self._on_attitude(message.time_boot_ms, (w, x, y, z))
+
+    def _on_angles(self, message: Any, _mono_ns: int) -> list[Nav]:
+        angles = (message.roll, message.pitch, message.yaw)
+        if not all(math.isfinite(angle) and abs(angle) <= math.tau for angle in angles):
+            raise ValueError("angles that are none")
+        last_ms = self._quaternion_ms
+        if last_ms is not None and 0 <= message.time_boot_ms - last_ms < QUATERNION_OLD_MS:
+            return []
+        return self._on_attitude(message.time_boot_ms, quaternion_of(*angles))
+
+    def _on_attitude(self, boot_ms: int, quaternion: Quaternion) -> list[Nav]:
+        self._at(boot_ms)
+        self._attitudes.append((boot_ms, quaternion))
+        if self._held is not None and boot_ms >= self._held[0].time_boot_ms:
             return self._release()
         return []
 
@@ -183,6 +201,7 @@ class MavlinkDecoder(MessageDecoder):
         """The autopilot's clock stands there; far behind what it was, it has restarted."""
         if boot_ms < self._boot_ms - 1000:
             self._attitudes.clear()
+            self._quaternion_ms = None
         self._boot_ms = boot_ms
 
     def _sample(self, message: Any, mono_ns: int) -> list[Nav]:
@@ -190,7 +209,8 @@ class MavlinkDecoder(MessageDecoder):
         if not (abs(latitude) <= 90 and abs(longitude) <= 180):
             raise ValueError("a position that is none")
         # Time since start is cut to milliseconds: half of one is added on the average.
-        gps_ns = self.clock.gps_ns(message.time_boot_ms * MS_NS + MS_NS // 2)
+        boot_ns = message.time_boot_ms * MS_NS + MS_NS // 2
+        gps_ns = self.clock.gps_ns(boot_ns)
         if gps_ns is None:
             self.counters["samples_without_time"] += 1
             return []
@@ -199,6 +219,13 @@ class MavlinkDecoder(MessageDecoder):
         has_position = fix in POSITION_FIXES
         has_height = has_position and fix != "2d" and undulation_m is not None
         horizontal_m, vertical_m, speed_mps = sigmas if has_position else (None, None, None)
+        # A time that is off by so much is a place that is off by the way flown meanwhile.
+        north, east, down = message.vx * 1e-2, message.vy * 1e-2, message.vz * 1e-2
+        time_sigma_s = self.clock.sigma_ns(boot_ns) * 1e-9
+        if horizontal_m is not None:
+            horizontal_m = math.hypot(horizontal_m, math.hypot(north, east) * time_sigma_s)
+        if vertical_m is not None:
+            vertical_m = math.hypot(vertical_m, down * time_sigma_s)
         angles = self._angles_at(message.time_boot_ms)
         roll, pitch, heading = angles or (None, None, None)
         self.counters["samples"] += 1
@@ -214,9 +241,7 @@ class MavlinkDecoder(MessageDecoder):
                 height_m=message.alt * 1e-3 + (undulation_m or 0.0) if has_height else None,
                 horizontal_sigma_m=horizontal_m,
                 vertical_sigma_m=vertical_m if has_height else None,
-                velocity_ned_mps=(message.vx * 1e-2, message.vy * 1e-2, message.vz * 1e-2)
-                if has_position
-                else None,
+                velocity_ned_mps=(north, east, down) if has_position else None,
                 speed_sigma_mps=speed_mps,
                 roll_rad=roll,
                 pitch_rad=pitch,
@@ -283,11 +308,12 @@ class MavlinkDecoder(MessageDecoder):
         return []
 
     def _on_trigger(self, message: Any, mono_ns: int) -> list[Nav]:
-        gps_ns = self.clock.gps_of_us(message.time_usec)
-        if gps_ns is None:
+        known = self.clock.gps_of_us(message.time_usec)
+        if known is None:
             self.counters["marks_without_time"] += 1
-            gps_ns, valid = message.time_usec * 1000, False
+            gps_ns, sigma_ns, valid = message.time_usec * 1000, self.clock.utc_sigma_ns, False
         else:
+            gps_ns, sigma_ns = known
             valid = self.near_navigation(gps_ns)
         self.counters["marks"] += 1
         return [
@@ -295,7 +321,7 @@ class MavlinkDecoder(MessageDecoder):
                 receiver=self.receiver,
                 channel=0,
                 gps_ns=gps_ns,
-                accuracy_ns=round(math.hypot(self._mark_accuracy_ns, self.clock.sigma_ns)),
+                accuracy_ns=round(math.hypot(self._mark_accuracy_ns, sigma_ns)),
                 count=int(message.seq),
                 count_bits=COUNT_BITS,
                 time_valid=valid,
@@ -315,6 +341,24 @@ def between(first: Quaternion, second: Quaternion, share: float) -> Quaternion:
     other = sign * math.sin(share * angle) / math.sin(angle)
     w, x, y, z = (one * a + other * b for a, b in zip(first, second, strict=True))
     return w, x, y, z
+
+
+def quaternion_of(roll: float, pitch: float, heading: float) -> Quaternion:
+    """The rotation from body to north, east, down of roll, pitch and heading, rad.
+
+    Example:
+        >>> quaternion_of(0.0, 0.0, 0.0)
+        (1.0, 0.0, 0.0, 0.0)
+    """
+    (cr, sr), (cp, sp), (ch, sh) = (
+        (math.cos(angle / 2), math.sin(angle / 2)) for angle in (roll, pitch, heading)
+    )
+    return (
+        cr * cp * ch + sr * sp * sh,
+        sr * cp * ch - cr * sp * sh,
+        cr * sp * ch + sr * cp * sh,
+        cr * cp * sh - sr * sp * ch,
+    )
 
 
 def angles_of(q: Quaternion) -> tuple[float, float, float]:

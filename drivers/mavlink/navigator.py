@@ -62,7 +62,9 @@ class MavlinkNavigator(ListeningNavigator):
     )
     request = Setting(True, says="ask the autopilot for messages that do not come")
     position_hz = Setting(10.0, minimum=0.1, maximum=400, says="rate of GLOBAL_POSITION_INT")
-    attitude_hz = Setting(50.0, minimum=0.1, maximum=1000, says="rate of ATTITUDE_QUATERNION")
+    attitude_hz = Setting(
+        50.0, minimum=0.1, maximum=1000, says="rate of ATTITUDE_QUATERNION or ATTITUDE"
+    )
     imu_hz = Setting(0.0, minimum=0, maximum=1000, says="rate of HIGHRES_IMU; 0: not asked for")
     timesync_hz = Setting(
         1.0, minimum=0, maximum=20, says="how often its clock is asked for (TIMESYNC); 0: never"
@@ -95,6 +97,7 @@ class MavlinkNavigator(ListeningNavigator):
         self._heartbeat_ns = 0
         self._ask_ns = 0
         self._seen_when_asked: dict[str, int] = {}
+        self._steps_reported = 0
         self._timesync_ns = 0
         self._asked_at_ns: set[int] = set()
         self._timesync_listener: TimesyncListener | None = None
@@ -154,6 +157,7 @@ class MavlinkNavigator(ListeningNavigator):
         self._talking = line
         self._tend(line)
         samples = [*super().step(line)]
+        self._report_steps()
         while self.decoder.timesyncs:
             timesync = self.decoder.timesyncs.popleft()
             samples += self._reading(timesync)
@@ -162,6 +166,23 @@ class MavlinkNavigator(ListeningNavigator):
         while self.decoder.refusals:
             self._on_refusal(*self.decoder.refusals.popleft())
         return samples
+
+    def _report_steps(self) -> None:
+        clock = self.decoder.clock
+        if clock.steps == self._steps_reported:
+            return
+        self._steps_reported = clock.steps
+        what = (
+            "started again"
+            if clock.last_step_ns is None
+            else f"set its UTC by {clock.last_step_ns * 1e-9:+.3f} s against its own clock"
+        )
+        self.teller.complain(
+            "receiver-stepped",
+            f"The autopilot {self.name} {what} ({clock.steps} so far). Its times are good to "
+            f"{clock.sigma_ns(clock.last_boot_ns) * 1e-6:.1f} ms now, and better after some "
+            "seconds. If it happens again: check its power and its GPS receiver.",
+        )
 
     def _reading(self, timesync: Timesync) -> list[ClockReading]:
         """The autopilot's clock, where this is the answer to what we asked; it is used once."""
@@ -215,6 +236,11 @@ class MavlinkNavigator(ListeningNavigator):
             "HIGHRES_IMU": self.imu_hz,
         }
         here = dialect()
+        quaternions = self.decoder.seen["ATTITUDE_QUATERNION"]
+        if self._seen_when_asked.get("ATTITUDE_QUATERNION") == quaternions:
+            wanted["ATTITUDE"] = self.attitude_hz
+            if self.decoder.seen["ATTITUDE"] > self._seen_when_asked.get("ATTITUDE", 0):
+                del wanted["ATTITUDE_QUATERNION"]
         for name, hertz in wanted.items():
             seen = self.decoder.seen[name]
             # Half of what is wanted is enough: a line that is full would not carry more.

@@ -20,6 +20,7 @@ from sim_hw.faults.catalogue import MARK, NAVIGATION
 from sim_hw.receivers.mavlink_messages import Listener, Received, by_number, message, messages_in
 from sim_hw.receivers.nmea_sentences import GEOID_UNDULATION_M, course_deg, longitude_deg, speed_mps
 from sim_hw.receivers.receiver import BOOT_NS, ReceiverAccuracy, ReceiverState
+from sim_hw.receivers.utc_jitter import UtcErrors, UtcJitter
 from sim_hw.world_clock import LEAP_SECONDS, NS_PER_S, DeviceClock, WorldClock, unix_ns_from_gps_ns
 
 FIXED_WING, PX4, ACTIVE = 1, 12, 4
@@ -41,12 +42,23 @@ DEFAULT_HZ = {
     "ATTITUDE_QUATERNION": 10.0,
     "HIGHRES_IMU": 0.0,
 }
+ANGLES_HZ = {
+    "ATTITUDE" if name == "ATTITUDE_QUATERNION" else name: hertz
+    for name, hertz in DEFAULT_HZ.items()
+}
 STREAMS = {
-    0: ("SYSTEM_TIME", "GPS_RAW_INT", "GLOBAL_POSITION_INT", "ATTITUDE_QUATERNION", "HIGHRES_IMU"),
+    0: (
+        "SYSTEM_TIME",
+        "GPS_RAW_INT",
+        "GLOBAL_POSITION_INT",
+        "ATTITUDE_QUATERNION",
+        "ATTITUDE",
+        "HIGHRES_IMU",
+    ),
     1: ("HIGHRES_IMU", "GPS_RAW_INT"),
     2: ("SYSTEM_TIME", "GPS_RAW_INT"),
     6: ("GLOBAL_POSITION_INT",),
-    10: ("ATTITUDE_QUATERNION",),
+    10: ("ATTITUDE_QUATERNION", "ATTITUDE"),
 }
 """By MAV_DATA_STREAM; 0 is all."""
 TRIGGER_LATENCY_NS = 4_000_000
@@ -60,7 +72,9 @@ class MavlinkAutopilot(LineDevice):
 
     Its own clock begins `boot_ns` before the world's and runs `drift_ppm` fast. Stamps of
     CAMERA_TRIGGER are of that clock, as PX4's are, or of UTC with `triggers_in_utc`. `mark` is the
-    strobe at its camera feedback input; every rising edge is told by CAMERA_TRIGGER.
+    strobe at its camera feedback input; every rising edge is told by CAMERA_TRIGGER. `utc_jitter`
+    is that of SYSTEM_TIME and of stamps in UTC; with `sends_angles` attitude comes as ATTITUDE, and
+    ATTITUDE_QUATERNION is denied.
     """
 
     def __init__(
@@ -74,6 +88,8 @@ class MavlinkAutopilot(LineDevice):
         boot_ns: int = 754 * NS_PER_S,
         drift_ppm: float = 3.0,
         triggers_in_utc: bool = False,
+        utc_jitter: UtcJitter | None = None,
+        sends_angles: bool = False,
         first_edge_count: int = 0,
         line: Line | None = None,
     ) -> None:
@@ -85,6 +101,8 @@ class MavlinkAutopilot(LineDevice):
         self._system = system
         self._device_clock = DeviceClock(boot_ns, drift_ppm)
         self._triggers_in_utc = triggers_in_utc
+        self.utc = UtcErrors(utc_jitter)
+        self._default_hz = ANGLES_HZ if sends_angles else DEFAULT_HZ
         self._listener = Listener()
         self._sequence = 0
         self._lock = threading.Lock()
@@ -95,8 +113,8 @@ class MavlinkAutopilot(LineDevice):
             "TRIG_INTERFACE": 1.0,
             "SYS_AUTOSTART": 2100.0,
         }
-        self._period_ns = _default_periods()
-        self._next_ns = dict.fromkeys(DEFAULT_HZ, clock.mono_ns_at_start)
+        self._period_ns = _periods(self._default_hz)
+        self._next_ns = dict.fromkeys(self._default_hz, clock.mono_ns_at_start)
         self._height_at_start_m: float | None = None
 
     def mark(self, gps_ns: int) -> None:
@@ -137,8 +155,8 @@ class MavlinkAutopilot(LineDevice):
             self._device_clock.offset_ns - self._device_clock.device_ns(elapsed_ns),
             self._device_clock.drift_ppm,
         )
-        self._period_ns = _default_periods()
-        self._next_ns = dict.fromkeys(DEFAULT_HZ, now_ns + BOOT_NS)
+        self._period_ns = _periods(self._default_hz)
+        self._next_ns = dict.fromkeys(self._default_hz, now_ns + BOOT_NS)
 
     # What it says by itself
 
@@ -182,6 +200,7 @@ class MavlinkAutopilot(LineDevice):
     def _trigger(self, gps_ns: int, number: int) -> bytes:
         if self._triggers_in_utc:
             stamp_ns = unix_ns_from_gps_ns(gps_ns, self._leap_seconds)
+            stamp_ns += self.utc.error_ns(self.boot_ns(gps_ns))
         else:
             stamp_ns = self.boot_ns(gps_ns)
         return self._say("CAMERA_TRIGGER", time_usec=stamp_ns // 1000, seq=number)
@@ -199,6 +218,7 @@ class MavlinkAutopilot(LineDevice):
             )
         if name == "SYSTEM_TIME":
             unix_ns = unix_ns_from_gps_ns(gps_ns, self._leap_seconds)
+            unix_ns += self.utc.error_ns(boot_ns)
             return self._say(
                 name, time_unix_usec=unix_ns // 1000, time_boot_ms=boot_ns // 1_000_000
             )
@@ -208,6 +228,13 @@ class MavlinkAutopilot(LineDevice):
         if name == "GLOBAL_POSITION_INT":
             return self._position(state, boot_ns)
         rates = self._body_rates(gps_ns)
+        if name == "ATTITUDE":
+            degrees = (state.roll_deg, state.pitch_deg, state.heading_deg)
+            roll, pitch, yaw = (math.remainder(math.radians(angle), math.tau) for angle in degrees)
+            spins = dict(zip(("rollspeed", "pitchspeed", "yawspeed"), rates, strict=True))
+            return self._say(
+                name, time_boot_ms=boot_ns // 1_000_000, roll=roll, pitch=pitch, yaw=yaw, **spins
+            )
         if name == "ATTITUDE_QUATERNION":
             q = quaternion(state)
             values = dict(zip(("q1", "q2", "q3", "q4"), q, strict=True))
@@ -301,7 +328,7 @@ class MavlinkAutopilot(LineDevice):
             return self._on_command(said, mono_ns)
         if said.name == "REQUEST_DATA_STREAM":
             hertz = values["req_message_rate"] if values["start_stop"] else 0
-            for name in STREAMS.get(values["req_stream_id"], ()):
+            for name in self._default_hz.keys() & set(STREAMS.get(values["req_stream_id"], ())):
                 self._set_period(name, round(NS_PER_S / hertz) if hertz else 0, mono_ns)
             return b""
         if said.name == "PARAM_REQUEST_LIST":
@@ -339,13 +366,15 @@ class MavlinkAutopilot(LineDevice):
         name = "" if named is None else named.name
         extra = b""
         if number == SET_MESSAGE_INTERVAL:
-            result = DENIED if name not in DEFAULT_HZ or not math.isfinite(second) else ACCEPTED
+            result = (
+                DENIED if name not in self._default_hz or not math.isfinite(second) else ACCEPTED
+            )
             if result == ACCEPTED:
-                default_ns = _default_periods()[name]
+                default_ns = _periods(self._default_hz)[name]
                 period_ns = default_ns if second == 0 else 0 if second < 0 else round(second * 1e3)
                 self._set_period(name, period_ns, mono_ns)
         elif number == GET_MESSAGE_INTERVAL:
-            result = ACCEPTED if name in DEFAULT_HZ else UNSUPPORTED
+            result = ACCEPTED if name in self._default_hz else UNSUPPORTED
             if named is not None and result == ACCEPTED:
                 period_us = self._period_ns[name] // 1000
                 extra = self._say(
@@ -353,7 +382,7 @@ class MavlinkAutopilot(LineDevice):
                 )
         elif number == REQUEST_MESSAGE and name == "AUTOPILOT_VERSION":
             result, extra = ACCEPTED, self._version()
-        elif number == REQUEST_MESSAGE and name in DEFAULT_HZ:
+        elif number == REQUEST_MESSAGE and name in self._default_hz:
             result, extra = ACCEPTED, self._stream(name, self._clock.gps_ns(mono_ns))
         else:
             result = UNSUPPORTED
@@ -380,8 +409,8 @@ class MavlinkAutopilot(LineDevice):
         self._next_ns[name] = mono_ns
 
 
-def _default_periods() -> dict[str, int]:
-    return {name: round(NS_PER_S / hertz) if hertz else 0 for name, hertz in DEFAULT_HZ.items()}
+def _periods(hertz: Mapping[str, float]) -> dict[str, int]:
+    return {name: round(NS_PER_S / each) if each else 0 for name, each in hertz.items()}
 
 
 Quaternion = tuple[float, float, float, float]

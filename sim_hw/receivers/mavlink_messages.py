@@ -29,6 +29,8 @@ DEFINITIONS = """
   uint16_t eph, uint16_t epv, uint16_t vel, uint16_t cog, uint8_t satellites_visible
   | int32_t alt_ellipsoid, uint32_t h_acc, uint32_t v_acc, uint32_t vel_acc, uint32_t hdg_acc,
   uint16_t yaw
+30 ATTITUDE uint32_t time_boot_ms, float roll, float pitch, float yaw, float rollspeed,
+  float pitchspeed, float yawspeed
 31 ATTITUDE_QUATERNION uint32_t time_boot_ms, float q1, float q2, float q3, float q4,
   float rollspeed, float pitchspeed, float yawspeed | float[4] repr_offset_q
 33 GLOBAL_POSITION_INT uint32_t time_boot_ms, int32_t lat, int32_t lon, int32_t alt,

@@ -19,7 +19,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from drivers.contract import ClockReading, DeviceError, EventMark, NavSample
 from drivers.gps_time import SECOND_NS, WEEK_NS
-from drivers.mavlink.boot_clock import GPS_EPOCH_UNIX_NS, BootClock
+from drivers.mavlink.boot_clock import GPS_EPOCH_UNIX_NS
 from drivers.mavlink.decoder import MavlinkDecoder, Timesync, angles_of, between
 from drivers.mavlink.navigator import MavlinkNavigator
 from drivers.message_decoder import Nav
@@ -106,7 +106,9 @@ def test_a_position_comes_out_in_si_units_at_its_gps_time(version: int) -> None:
     assert sample.velocity_ned_mps == pytest.approx((60.0, 3.0, -1.0))
     assert (sample.fix, sample.satellites, sample.leap_seconds) == ("3d", 17, 18)
     assert sample.height_m == pytest.approx(1000.0)
-    assert (sample.horizontal_sigma_m, sample.vertical_sigma_m) == (0.02, 0.03)
+    # One SYSTEM_TIME does not say how it scatters: some milliseconds, at 60 m/s.
+    assert 0.3 < sample.horizontal_sigma_m < 0.6
+    assert 0.03 < sample.vertical_sigma_m < 0.04
 
 
 def test_without_an_ellipsoidal_height_the_configured_undulation_is_added() -> None:
@@ -158,25 +160,8 @@ def test_a_trigger_in_utc_and_one_since_start_are_marks_at_gps_time() -> None:
     (since_start,) = marks(begun + bus.trigger(BOOT_MS * 1000 + 250_000, 8))
     assert abs(since_start.gps_ns - in_utc.gps_ns) <= 1_000_000
     assert (since_start.count, since_start.count_bits, since_start.time_valid) == (8, 32, True)
-    # A millisecond of the autopilot, and that to which SYSTEM_TIME is cut.
-    assert 1_000_000 < since_start.accuracy_ns < 1_100_000
-
-
-def test_the_boot_clock_narrows_with_every_system_time_and_its_sigma_is_honest() -> None:
-    clock = BootClock()
-    offset_ns = UNIX_US * 1000 - BOOT_MS * 1_000_000 + 345_678
-    sigmas = []
-    for n in range(40):
-        boot_ns = BOOT_MS * 1_000_000 + n * 1_003_700_123
-        clock.tell((boot_ns + offset_ns) // 1000, boot_ns // 1_000_000)
-        gps_ns = clock.gps_ns(boot_ns)
-        assert gps_ns is not None
-        true_ns = boot_ns + offset_ns - GPS_EPOCH_UNIX_NS + 18 * SECOND_NS
-        assert abs(gps_ns - true_ns) <= clock.sigma_ns * math.sqrt(3) + 1000
-        sigmas.append(clock.sigma_ns)
-    assert sigmas[0] == pytest.approx(289_000, rel=0.01)
-    assert max(sigmas[10:]) < 150_000
-    assert clock.steps == 0
+    # One SYSTEM_TIME does not say how it scatters.
+    assert 5_000_000 < since_start.accuracy_ns < 10_000_000
 
 
 def test_a_restart_of_the_autopilot_is_noticed_and_time_goes_on() -> None:
@@ -435,6 +420,7 @@ def test_it_says_that_it_is_there_and_asks_for_what_does_not_come() -> None:
     asked = [m for m in said if m.get_type() == "COMMAND_LONG"]
     assert {(m.command, m.target_system, m.target_component) for m in asked} == {(511, 1, 1)}
     assert {(m.param1, m.param2) for m in asked} == {
-        (2.0, 1e6), (24.0, 1e6), (33.0, 1e5), (31.0, 2e4),
+        (2.0, 1e6), (24.0, 1e6), (33.0, 1e5), (31.0, 2e4), (30.0, 2e4),
     }  # fmt: skip
-    assert len(asked) == 12, "every five seconds, while they do not come"
+    # Every five seconds, while they do not come; ATTITUDE once ATTITUDE_QUATERNION did not.
+    assert len(asked) == 14
