@@ -16,6 +16,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
+from daemon.disk import durable
 from daemon.disk.records import sha256_hex
 from daemon.errors import DaemonError
 
@@ -248,11 +249,9 @@ def _manifest(root: Path) -> dict[str, str]:
 
 
 def _write(path: Path, text: str) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    new = path.with_name(path.name + ".new")
-    new.write_text(text, "utf-8")
-    new.chmod(0o644)
-    new.replace(path)
+    with durable.new_file(path) as part:
+        part.write_text(text, "utf-8")
+        part.chmod(0o644)  # whatever the umask of the administrator
 
 
 def _run(step: Step) -> str:

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from daemon.disk.durable import new_file
 from daemon.errors import DaemonError
 
 _MOST_BYTES = 2_000_000_000
@@ -136,7 +137,7 @@ def write_table(
     path: Path, remark: str, columns: Sequence[str], rows: Iterable[Sequence[str | float]]
 ) -> None:
     """Write a table; numbers in their shortest exact form, NaN as an empty cell."""
-    with path.open("w", encoding="utf-8", newline="") as file:
+    with new_file(path) as part, part.open("w", encoding="utf-8", newline="") as file:
         for line in remark.splitlines():
             file.write(f"# {line}\n")
         file.write(",".join(columns) + "\n")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from daemon.adjusting.page import report_page
 from daemon.adjusting.project import ANGLES, SIGMAS, XYZ, Checks, Project
 from daemon.adjusting.project_file import ProjectFile
 from daemon.adjusting.tables import ProjectError, write_table
+from daemon.disk.durable import new_files
 from processing.bundle.adjust import Adjustment
 from processing.bundle.findings import exposures_of, image_residuals_mm
 from processing.bundle.network import INTERIOR, Network
@@ -22,6 +24,9 @@ from processing.bundle.rotations import omega_phi_kappa
 from processing.bundle.unknowns import State, starting_state
 
 Array = NDArray[np.float64]
+
+
+PROJECT_FILE = "project.toml"
 
 
 def write_project(
@@ -39,9 +44,28 @@ def write_project(
     Raises:
         ProjectError: the folder holds a project.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    if (folder / "project.toml").exists():
+    with new_project(folder) as part:
+        _write_project(part, file, network, checks, state)
+
+
+@contextmanager
+def new_project(folder: Path) -> Iterator[Path]:
+    """A folder to write a project's files into; they appear in `folder` when the block ends.
+
+    `project.toml` comes last: where it is, the project is complete.
+
+    Raises:
+        ProjectError: the folder holds a project.
+    """
+    if (folder / PROJECT_FILE).exists():
         raise ProjectError([f"{folder} holds a project already; give another folder"])
+    with new_files(folder, last=PROJECT_FILE) as part:
+        yield part
+
+
+def _write_project(
+    folder: Path, file: ProjectFile, network: Network, checks: Checks, state: State | None
+) -> None:
     state = state or starting_state(network)
     tables = {"images": "images.csv", "image_points": "image_points.csv"}
     tables |= {"exposures": "exposures.csv", "points": "points.csv"}
@@ -90,7 +114,7 @@ def write_project(
                 for a, own, sigma in zip(b.attitude, angles, b.sigma_rad, strict=True)
             ),
         )
-    (folder / "project.toml").write_text(_toml(file, network, state, tables), encoding="utf-8")
+    (folder / PROJECT_FILE).write_text(_toml(file, network, state, tables), encoding="utf-8")
 
 
 def write_results(
@@ -101,8 +125,16 @@ def write_results(
     Raises:
         ProjectError: the folder holds a project.
     """
+    with new_project(folder) as part:
+        fill_results(part, project, result, report)
+
+
+def fill_results(
+    folder: Path, project: Project, result: Adjustment, report: Mapping[str, Any]
+) -> None:
+    """As `write_results`, into the folder of `new_project`."""
     network = result.network
-    write_project(folder, project.file, network, project.checks, result.state)
+    _write_project(folder, project.file, network, project.checks, result.state)
     sigma = result.sigma0 * np.sqrt(np.clip(np.einsum("nii->ni", result.point_cofactor), 0.0, None))
     rays = np.bincount(
         network.image_points.point[result.weight > 0.0], minlength=len(network.points.names)

@@ -19,7 +19,7 @@ from typing import Any, Final
 import jinja2
 from scipy.stats import norm
 
-from daemon.disk.durable import create_file, make_directories, remove_tree, rename_directory
+from daemon.disk.durable import create_file, make_directories, new_files
 from daemon.disk.records import canonical_bytes
 from daemon.errors import DaemonError
 
@@ -237,18 +237,16 @@ def write_calibration(
         OSError: the disk refused.
     """
     refuse_existing(folder)
-    part = folder.with_name(folder.name + ".part")
-    remove_tree(part)
     content = {
         "calibration.json": canonical_bytes(calibration_json(report)),
         "report.html": report_html(report).encode("utf-8"),
         **(files or {}),
     }
-    make_directories(part)
-    for name, data in content.items():
-        make_directories((part / name).parent)
-        create_file(part / name, [data])
-    rename_directory(part, folder)
+    with new_files(folder, last="calibration.json") as part:
+        for name, data in content.items():
+            make_directories((part / name).parent)
+            create_file(part / name, [data])
+        refuse_existing(folder)
     return folder
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from daemon.calibration.rig_text import rig_toml
+from daemon.disk.durable import new_file
 from daemon.disk.mission import Mission
 from daemon.disk.store import read_sealed
 from daemon.errors import DaemonError
@@ -148,8 +149,8 @@ def write_rig(rig: Rig, path: Path, *, remark: str) -> None:
             f"{path.name} would not read back as it was meant; not written"
         )
     try:
-        with path.open("xb") as file:
-            file.write(text)
+        with new_file(path, replaces=False) as part:
+            part.write_bytes(text)
     except FileExistsError as error:
         raise ThermalCalibrationError(
             f"{path} exists; a calibration is never overwritten: give another name with --out"

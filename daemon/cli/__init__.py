@@ -6,6 +6,8 @@ are imported inside the commands that need them, so that the service stays light
 
 from __future__ import annotations
 
+import errno
+import os
 import sys
 from typing import NoReturn
 
@@ -26,6 +28,7 @@ from daemon.cli import (
     export,
     imports,
     install,
+    interruption,
     intersect,
     kernels,
     monitor,
@@ -84,6 +87,12 @@ app.add_typer(imports.app, name="import")
 app.add_typer(export.app, name="export")
 app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(token.app, name="token")
+interruption.make_interruptible(app)
+
+
+_ABOUT_DISKS = frozenset(
+    {errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENODEV}
+)
 
 
 def main() -> NoReturn:
@@ -104,7 +113,30 @@ def main() -> NoReturn:
         if absent is None:
             raise
         _refuse(absent)
+    except OSError as error:
+        _refuse(_disk_refusal(error))
+    except KeyboardInterrupt:
+        interruption.say(f"Interrupted: nothing was begun; {interruption.AGAIN}.")
+        sys.exit(interruption.STATUS)
     sys.exit(0)
+
+
+def _disk_refusal(error: OSError) -> DaemonError:
+    """The sentence of a call that the operating system refused.
+
+    Raises:
+        OSError: `error` itself, if it names no file: then it is not about a disk.
+    """
+    names = [
+        os.fsdecode(n) for n in (error.filename, error.filename2) if isinstance(n, str | bytes)
+    ]
+    if error.errno not in _ABOUT_DISKS and not names:
+        raise error
+    where = " to ".join(names) or "the disk"
+    return DaemonError(
+        f"{where}: {error.strerror}. Files that have their names are complete; remove the cause "
+        f"and {interruption.AGAIN}"
+    )
 
 
 def _refuse(error: Exception) -> NoReturn:

@@ -28,6 +28,7 @@ from daemon.cli.sim import (
     service_toml,
     simulator_arguments,
 )
+from daemon.disk.durable import replace_file
 from daemon.tables import light_table
 from drivers.extras import require
 from processing.rig import Rig, RigError, find_rig
@@ -111,16 +112,15 @@ def _fly(
         The mission folder, and the ledger's sheet.
     """
     config = folder / "service.toml"
-    config.write_text(
-        service_toml(
-            emulator.ready,
-            root="missions",
-            count=exposures,
-            baselines=True,
-            end_when_done=True,
-            watch_port=0,
-        )
+    text = service_toml(
+        emulator.ready,
+        root="missions",
+        count=exposures,
+        baselines=True,
+        end_when_done=True,
+        watch_port=0,
     )
+    replace_file(config, text.encode("utf-8"))
     log = (folder / "service.log").open("w")
     service = subprocess.Popen(
         [

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from daemon.disk.durable import replace_file
 from daemon.tables import light_table
 from processing.rig import Rig, find_rig, load_rig, shipped_rigs
 
@@ -70,7 +71,7 @@ def show(
     overlaps = topology.overlaps(rig) if rig.virtual_image else ()
     pitch_mm = rig.virtual_image.pitch_mm if rig.virtual_image else rig.sensors[0].pitch_mm
     if drawing is not None:
-        drawing.write_text(draw.focal_planes_svg(rig), encoding="utf-8")
+        replace_file(drawing, draw.focal_planes_svg(rig).encode("utf-8"))
     if as_json:
         typer.echo(
             json.dumps(

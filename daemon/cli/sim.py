@@ -18,6 +18,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
+from daemon.disk.durable import replace_file
 from drivers.extras import require
 from processing.rig import find_rig
 
@@ -116,7 +117,8 @@ def sim(
         console.print(f"[red]{error}[/]")
         raise typer.Exit(1) from error
     path = out / "service.toml"
-    path.write_text(service_toml(emulator.ready, root="missions", watch_port=8470))
+    text = service_toml(emulator.ready, root="missions", watch_port=8470)
+    replace_file(path, text.encode("utf-8"))
     if as_json:
         typer.echo(json.dumps(emulator.ready | {"configuration": str(path)}))
     else:

@@ -101,9 +101,8 @@ def new_files(folder: Path, *, last: str) -> Iterator[Path]:
     with _part_of(folder) as (part, _):
         yield part
         names = sorted((p.name for p in part.iterdir()), key=lambda name: (name == last, name))
-        for name in names:
-            sync_file(part / name)
-        sync_directory(part)
+        for path in (*part.rglob("*"), part):
+            sync_file(path)
         if not folder.exists():
             part.rename(folder)
         else:

@@ -173,9 +173,13 @@ class FileTree:
         try:
             durable.write_all(descriptor, [data])
             os.fsync(descriptor)
+            os.rename(part, name, src_dir_fd=self.descriptor, dst_dir_fd=self.descriptor)
+        except BaseException:
+            with suppress(OSError):
+                os.unlink(part, dir_fd=self.descriptor)
+            raise
         finally:
             os.close(descriptor)
-        os.rename(part, name, src_dir_fd=self.descriptor, dst_dir_fd=self.descriptor)
         os.fsync(self.descriptor)
 
     def unlink(self, name: str) -> None:

@@ -104,12 +104,11 @@ def export_foxglove(mission: Mission) -> FoxgloveExport:
     """
     durable.make_directories(mission.export_dir)
     final = mission.export_dir / FILE_NAME
-    part = final.with_name(FILE_NAME + durable.PART_SUFFIX)
     counts: dict[str, int] = {}
     read = walk(mission.numbers(), lambda number: _from_exposure(mission, number))
     of_exposures = (message for messages in read.results.values() for message in messages)
     told = sorted([*_from_logs(mission), *of_exposures], key=itemgetter(0))
-    with part.open("wb") as file:
+    with durable.new_file(final) as part, part.open("wb") as file:
         writer = Writer(file)
         writer.start(profile="", library="syntopic")
         channels: dict[str, int] = {}
@@ -128,7 +127,6 @@ def export_foxglove(mission: Mission) -> FoxgloveExport:
         mark = {"simulated": "true"} if mission.is_simulated else {}
         writer.add_metadata("syntopic", {"mission": mission.id, **mark})
         writer.finish()
-    part.replace(final)
     return FoxgloveExport(final, counts, read.failures)
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.disk.durable import make_directories, replace_file, sync_directory, sync_file
+from daemon.disk.durable import make_directories, new_file, replace_file
 from daemon.disk.level0 import read_description, refuse_bomb
 from daemon.disk.level2 import jpeg_bytes
 from daemon.disk.mission import Mission
@@ -186,7 +186,6 @@ def _cog(
 
     planes = _planes(picture.path)
     count, height, width = planes.shape
-    part = final.with_name(final.name + ".part")
     bands = read_description(picture.path).get("bands", [])
     with MemoryFile() as memory:
         with memory.open(
@@ -203,14 +202,11 @@ def _cog(
             raster.update_tags(**told(shot))
             for number, band in enumerate(bands[:count], 1):
                 raster.set_band_description(number, str(band))
-        with memory.open() as raster:
+        with memory.open() as raster, new_file(final) as part:
             copy(
                 raster, str(part), driver="COG", COMPRESS="DEFLATE", PREDICTOR="2", BLOCKSIZE="512",
                 OVERVIEW_RESAMPLING="AVERAGE",
             )  # fmt: skip
-    sync_file(part)
-    part.replace(final)
-    sync_directory(final.parent)
 
 
 def _ground_control(

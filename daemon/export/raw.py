@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from daemon.disk.durable import new_file
 from daemon.disk.flight_log import logs_of, read
 from daemon.disk.mission import Mission
 from daemon.disk.walk import ExposureFailure
@@ -78,7 +79,7 @@ def export_raw(mission: Mission) -> RawExport:
     nbytes = dict.fromkeys((f"{name}.{ending}" for name, ending in endings.items()), 0)
     with ExitStack() as stack:
         files: dict[str, BinaryIO] = {
-            name: stack.enter_context((folder / f"{name}.{ending}").open("wb"))
+            name: stack.enter_context(_new_binary(folder / f"{name}.{ending}"))
             for name, ending in endings.items()
         }
         for path in logs_of(mission.log_dir):
@@ -95,8 +96,14 @@ def export_raw(mission: Mission) -> RawExport:
     return RawExport(folder, nbytes, len(rows), sealed.failures)
 
 
+@contextmanager
+def _new_binary(path: Path) -> Iterator[BinaryIO]:
+    with new_file(path) as part, part.open("wb") as file:
+        yield file
+
+
 def _write(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with new_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(columns)
         writer.writerows(rows)

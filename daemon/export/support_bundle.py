@@ -54,9 +54,11 @@ def write_bundle(
     """
     path = (out or mission.export_dir) / name
     durable.make_directories(path.parent)
-    part = path.with_name(f".{path.name}{durable.PART_SUFFIX}")
     contents: dict[str, int] = {}
-    with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as bundle:
+    with (
+        durable.new_file(path) as part,
+        zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as bundle,
+    ):
 
         def put(name: str, text: str) -> None:
             bundle.writestr(name, text)
@@ -73,8 +75,6 @@ def write_bundle(
         put("events.json", json.dumps(_events(mission), indent=1))
         if verified is not None:
             put("verify.json", json.dumps({"problems": list(verified.problems)}, indent=1))
-    part.replace(path)
-    durable.sync_directory(path.parent)
     return Bundle(path, contents)
 
 

@@ -114,11 +114,8 @@ def import_rededge(
         rig, remark="A MicaSense RedEdge with the calibration its images carry.\n"
         "Lenses: Brown's distortion of the XMP, carried into eq. 5.1 by a fit.",
     )  # fmt: skip
-    part = out.with_name(f".{out.name}{durable.PART_SUFFIX}")
-    durable.make_directories(out.parent)
-    durable.remove_tree(part)
     frames, missing = 0, []
-    try:
+    with durable.new_files(out, last="rig.toml") as part:
         for name in ("L0", "L2", RADIOMETRY):
             durable.make_directories(part / name)
         durable.create_file(part / "rig.toml", [rig_bytes], mode=0o644)
@@ -132,10 +129,6 @@ def import_rededge(
             frames += _write_exposure(part, number, capture, rig, sha256_hex(rig_bytes))
             if progress is not None:
                 progress(number, len(captures))
-        durable.rename_directory(part, out)
-    except (OSError, DaemonError):
-        durable.remove_tree(part)
-        raise
     return Imported(Mission.open(out), len(captures), frames, fit, tuple(missing))
 
 

@@ -19,7 +19,7 @@ from rich.console import Console
 
 from daemon.adjusting.project import Project
 from daemon.adjusting.tables import ProjectError, write_table
-from daemon.adjusting.writing import write_results
+from daemon.adjusting.writing import fill_results, new_project
 from daemon.orientation.georeference import Georeference
 from daemon.orientation.local_frame import FRAME_FILE
 from daemon.orientation.triangulation import Block
@@ -109,9 +109,15 @@ def write_triangulation(
         raise ProjectError(
             [f"{folder} holds a triangulation already; give another folder with --out"]
         )
-    folder.mkdir(parents=True, exist_ok=True)
+    with new_project(folder) as part:
+        _fill(part, block, project, result, report)
+
+
+def _fill(
+    folder: Path, block: Block, project: Project, result: Adjustment, report: Mapping[str, Any]
+) -> None:
     (folder / "rig.toml").write_bytes(block.mission.rig_path.read_bytes())
-    write_results(folder, _named(project), result, report)
+    fill_results(folder, _named(project), result, report)
     frame = {"latitude_deg": block.frame.latitude_deg, "longitude_deg": block.frame.longitude_deg}
     (folder / FRAME_FILE).write_text(json.dumps(frame) + "\n", encoding="utf-8")
     georeference = Georeference(block.crs)

@@ -19,12 +19,19 @@ CALLS = (
 )
 
 
-def run_to_call(action: Callable[[], object], last: int | None, *, torn: bool = False) -> list[str]:
+def run_to_call(
+    action: Callable[[], object],
+    last: int | None,
+    *,
+    torn: bool = False,
+    by: signal.Signals = signal.SIGKILL,
+) -> list[str]:
     """Run `action` in a child process; the calls it made, nothing if it was killed.
 
     Args:
         action: what is to be killed; it must not need threads of this process.
         last: the number of the call before which the child is killed, from 1; None runs to the end.
+        by: the signal; after SIGINT `action` ends as it does on Ctrl-C.
         torn: if that call writes bytes, write half of them before the kill.
 
     Raises:
@@ -34,7 +41,7 @@ def run_to_call(action: Callable[[], object], last: int | None, *, torn: bool = 
     child = os.fork()
     if not child:
         os.close(reading)
-        _child(action, last, writing, torn=torn)
+        _child(action, last, writing, torn=torn, by=by)
     os.close(writing)
     said = b""
     while piece := os.read(reading, 65536):
@@ -48,7 +55,9 @@ def run_to_call(action: Callable[[], object], last: int | None, *, torn: bool = 
     return said.decode().split()
 
 
-def _child(action: Callable[[], object], last: int | None, writing: int, *, torn: bool) -> None:
+def _child(
+    action: Callable[[], object], last: int | None, writing: int, *, torn: bool, by: signal.Signals
+) -> None:
     write, kill, exit_now = os.write, os.kill, os._exit
     made: list[str] = []
 
@@ -61,13 +70,14 @@ def _child(action: Callable[[], object], last: int | None, writing: int, *, torn
                 if torn and name in WRITES:
                     data = arguments[1] if name == "write" else b"".join(arguments[1])
                     write(arguments[0], data[: len(data) // 2])
-                kill(os.getpid(), signal.SIGKILL)
+                kill(os.getpid(), by)
             return real(*arguments, **keywords)
 
         return call
 
     for name in CALLS:
         setattr(os, name, counted(name, getattr(os, name)))
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         action()
     except BaseException:  # noqa: BLE001 - whatever it raises is a finding
