@@ -23,6 +23,8 @@ SIGMA_MOST_MPS: Final = 1_000.0
 """A larger one means that the receiver does not know."""
 ATTITUDE_SLACK_NS: Final = 1_000_000
 FIXES: Final = {2: "2d", 3: "3d"}
+NOT_MEASURED: Final = {7: "time", 8: "none"}
+"""`status` of TPV: a surveyed position that only time is computed with, and a simulated one."""
 DEAD_RECKONING: Final = (5, 6)
 """`status` of TPV: dead reckoning, and together with GNSS."""
 _UTC: Final = re.compile(
@@ -143,8 +145,12 @@ class GpsdReports:
         mode = _number(report, "mode") or 0.0
         utc = _utc_ns(report.get("time"))
         latitude, longitude = _number(report, "lat"), _number(report, "lon")
-        self.fix = "none" if mode < 2 else self.fix
-        if mode < 2 or utc is None or latitude is None or longitude is None:
+        not_measured = NOT_MEASURED.get(int(_number(report, "status") or 0))
+        if mode < 2 or not_measured is not None:
+            self.fix = not_measured or "none"
+            self.counters["reports_without_fix"] += 1
+            return []
+        if utc is None or latitude is None or longitude is None:
             self.counters["reports_without_fix"] += 1
             return []
         if not (-90 <= latitude <= 90 and -180 <= longitude <= 360):

@@ -21,6 +21,7 @@ from drivers.nmea.epoch import SENTENCES, TIME_AT, Epoch
 from drivers.nmea.sentences import (
     fields_of,
     has_checksum,
+    is_proprietary,
     is_sentence,
     number,
     size_of,
@@ -87,6 +88,8 @@ class NmeaDecoder(MessageDecoder):
     def on_message(self, message: bytes, mono_ns: int) -> list[Nav]:
         if has_checksum(message):
             self._checked += 1
+        elif is_proprietary(message):
+            return []
         else:
             # A receiver that sends checksums sends them always: this one was damaged.
             self.counters["sentences_unchecked"] += 1

@@ -131,21 +131,27 @@ class Epoch:
             self.position, self.position_rank = position, rank
             self.resolution_deg = resolution
 
-    def _say(self, word: str) -> None:
-        self.fixes.add(word)
+    def _say(self, word: str) -> bool:
+        """Note a word about the fix; whether it comes with a position.
 
-    def _mode(self, status: str, mode: str) -> None:
-        """Status A or V, and the mode indicator where the version has one."""
-        self._say("none" if status != "A" else MODES.get(mode, "fix"))
+        Without one the other fields mean nothing: receivers fill them with what they like.
+        """
+        self.fixes.add(word)
+        return word not in ("none", "time")
+
+    def _mode(self, status: str, mode: str) -> bool:
+        """Status A or V, and the mode indicator where the version has one. See `_say`."""
+        return self._say("none" if status != "A" else MODES.get(mode, "fix"))
 
     # Sentences
 
     def _rmc(self, fields: Fields) -> None:
+        if not self._mode(fields[2], fields[12] if len(fields) > 12 else ""):
+            return
         self._place(fields[3:7], rank=2)
         speed, course = number_or_none(fields[7]), number_or_none(fields[8])
         if fields[9]:
             self.day = day_of(fields[9])
-        self._mode(fields[2], fields[12] if len(fields) > 12 else "")
         if speed is not None:
             self.speed_mps = speed * KNOT_MPS
         if course is not None:
@@ -154,23 +160,27 @@ class Epoch:
     def _gga(self, fields: Fields) -> None:
         quality = int(number(fields[6] or "0"))
         self._satellites(fields[7])
+        if not self._say(QUALITIES.get(quality, "fix")):
+            return
         self.hdop = dop_or_none(fields[8]) or self.hdop
         self._place(fields[2:6], rank=4)
         self._heights(fields[9:13:2], fields[10:13:2])
-        self._say(QUALITIES.get(quality, "fix"))
 
     def _gns(self, fields: Fields) -> None:
         modes = {MODES.get(mode, "fix") for mode in fields[6]}
         self._satellites(fields[7])
+        if not self._say(
+            next((word for word in ("fix", "dead-reckoning") if word in modes), "none")
+        ):
+            return
         self.hdop = dop_or_none(fields[8]) or self.hdop
         self._place(fields[2:6], rank=5)
         self._heights(fields[9:11])
-        self._say(next((word for word in ("fix", "dead-reckoning") if word in modes), "none"))
 
     def _gll(self, fields: Fields) -> None:
         # Older than version 2.3: neither time nor status.
-        self._place(fields[1:5], rank=1)
-        self._mode(fields[6], fields[7] if len(fields) > 7 else "")
+        if self._mode(fields[6], fields[7] if len(fields) > 7 else ""):
+            self._place(fields[1:5], rank=1)
 
     def _gst(self, fields: Fields) -> None:
         self._sigmas(*(number_or_none(text) for text in fields[6:9]))
@@ -226,8 +236,7 @@ class Epoch:
     def _pubx(self, fields: Fields) -> None:
         """PUBX,00: position and its accuracy."""
         word = PUBX_STATUS.get(fields[8], "none")
-        self._say(word)
-        if word in ("none", "time"):
+        if not self._say(word):
             return
         self._place(fields[3:7], rank=3)
         if word == "3d":
@@ -251,9 +260,10 @@ class Epoch:
         if fields[3]:
             month_day = fields[3]
             self.day = day_of(month_day[2:4] + month_day[:2] + month_day[4:])
-        self._place(fields[4:8], rank=6)
         self._satellites(fields[9])
-        self._say(GGK_QUALITIES.get(int(number(fields[8] or "0")), "fix"))
+        if not self._say(GGK_QUALITIES.get(int(number(fields[8] or "0")), "fix")):
+            return
+        self._place(fields[4:8], rank=6)
         if fields[11].startswith("EHT"):
             self.ellipsoidal_m = number_or_none(fields[11][3:])
 

@@ -25,7 +25,7 @@ _DATE: Final = re.compile(r"([0-9]{2})([0-9]{2})([0-9]{2})")
 _LINE: Final = re.compile(rb"\$[ -\"&-~]*")
 """A sentence holds no other `$`, `#` or `%`."""
 _BODY: Final = re.compile(rb"\$([^*]*)\*([0-9A-Fa-f]{2}) *[\r\n]{1,2}")
-_BARE: Final = re.compile(rb"\$[A-Z]{2}[A-Z]{3},[^*]*[\r\n]{1,2}")
+_BARE: Final = re.compile(rb"\$([A-OQ-Z][A-Z][A-Z]{3}|P[A-Z]{3,}),[^*]*[\r\n]{1,2}")
 
 
 def size_of(buffer: bytes, at: int) -> int | None:
@@ -58,6 +58,11 @@ def is_sentence(line: bytes) -> bool:
 def has_checksum(line: bytes) -> bool:
     """Whether a sentence ends with a checksum."""
     return b"*" in line
+
+
+def is_proprietary(line: bytes) -> bool:
+    """Whether a sentence is of a maker's own kind; some send those without a checksum."""
+    return line.startswith(b"$P")
 
 
 def fields_of(line: bytes) -> list[str]:

@@ -128,6 +128,14 @@ def test_what_is_not_reported_is_absent() -> None:
 
 
 @pytest.mark.trust
+@pytest.mark.parametrize(("status", "fix"), [(7, "time"), (8, "none")])
+def test_a_position_that_was_not_measured_is_none(status: int, fix: str) -> None:
+    reports = GpsdReports("gnss")
+    assert reports.feed(lines({**TPV, "status": status}), 0) == []
+    assert reports.fix == fix
+
+
+@pytest.mark.trust
 def test_a_height_that_is_held_in_two_dimensions_is_absent() -> None:
     (sample,) = samples({**TPV, "mode": 2})
     assert (sample.fix, sample.height_m, sample.vertical_sigma_m) == ("2d", None, None)

@@ -93,6 +93,22 @@ def test_a_receiver_that_was_switched_on_a_moment_ago_is_not_damaged(
     assert (decoder.fix, decoder.satellites, decoder.bad_messages) == ("none", satellites, 0)
 
 
+def test_what_a_receiver_without_a_fix_fills_in_is_not_read() -> None:
+    filled = (
+        "GPGGA,235946.005,8960.000000,N,00000.000000,E,0,0,,137.000,M,13.000,M,,",
+        "GPRMC,235946.005,V,8960.000000,N,00000.000000,E,0.000,0.00,050180,,,N",
+        "GPGGA,235947.005,0000.0000,N,00000.0000,E,0,00,,0.0,M,0.0,M,,0000",
+    )
+    decoder = NmeaDecoder("gnss")
+    proprietary = b"$POLYN,TIME,RESTART_OCCURRED\r\n"
+    assert decoder.feed(proprietary + b"".join(map(sentence, filled)), 0) == []
+    assert (decoder.bad_messages, decoder.bad_bytes, decoder.fix) == (0, 0, "none")
+    assert decoder.counters["sentences_unchecked"] == 0
+    damaged = proprietary.replace(b"POLYN", b"GPOLY")
+    decoder.feed(damaged, 0)
+    assert decoder.bad_messages == 1
+
+
 def test_it_binds_and_says_that_it_searches() -> None:
     found = Replayed(COLD).navigator().bind()
     assert found["fix"] == "searching, 0 satellites"
