@@ -23,7 +23,12 @@ from pydantic import (
     model_validator,
 )
 
-from daemon.configuration_problems import device_problems, dig, rig_problems
+from daemon.configuration_problems import (
+    device_problems,
+    dig,
+    mirror_problems,
+    rig_problems,
+)
 from daemon.plan.reading import PlanError, read_plan
 from processing.quality.report import Thresholds
 from processing.rig import Rig, RigError, find_rig
@@ -46,9 +51,13 @@ class _Section(BaseModel):
 
 
 class MissionSection(_Section):
-    """Where flights are kept and which camera flies."""
+    """Where flights are kept and which camera flies.
+
+    With `mirror`, a folder on another disk, everything is stored on both (docs/mirror.md).
+    """
 
     root: Path
+    mirror: Path | None = None
     rig: str
     radiometry: Path | None = None
     simulated: bool = False
@@ -281,6 +290,7 @@ class LimitsSection(_Section):
     exposures_in_memory: int = Field(default=3, ge=2, le=16)
     disk_reserve_bytes: int = Field(default=500_000_000, ge=0)
     disk_warn_exposures: int = Field(default=100, ge=0)
+    mirror_timeout_s: float = Field(default=2.0, gt=0)
     power_fail_s: float = Field(default=5.0, gt=0, le=60)
 
 
@@ -375,6 +385,15 @@ def from_mapping(content: Mapping[str, Any], path: Path) -> tuple[Configuration,
             read_plan(path.parent / plan_file)
         except PlanError as error:
             problems.append(f"{file}: plan.file: {error}")
+    if configuration is not None and rig is not None and configuration.mission.mirror is not None:
+        problems += mirror_problems(
+            path.parent / configuration.mission.root,
+            path.parent / configuration.mission.mirror,
+            configuration.limits.mirror_timeout_s,
+            configuration.limits.exposures_in_memory,
+            rig,
+            file,
+        )
     model = dig(content, "plan", "elevation")
     if isinstance(model, str) and not (path.parent / model).is_file():
         problems.append(f"{file}: plan.elevation is {model!r}, and there is no such file")
@@ -394,6 +413,7 @@ def _anchored(configuration: Configuration, folder: Path) -> Configuration:
     anchored = mission.model_copy(
         update={
             "root": folder / mission.root,
+            "mirror": None if mission.mirror is None else folder / mission.mirror,
             "radiometry": radiometry,
             "rig": _rig_path(mission.rig, folder / "service.toml"),
         }

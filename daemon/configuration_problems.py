@@ -7,6 +7,7 @@ in `daemon.configuration`.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from drivers import registry
@@ -179,6 +180,29 @@ def _serial_problems(content: Mapping[str, Any], rig: Rig, file: str) -> list[st
         for name in given
         if name not in names
     ]
+
+
+def mirror_problems(
+    root: Path, mirror: Path, timeout_s: float, exposures_in_memory: int, rig: Rig, file: str
+) -> list[str]:
+    """Whether the mirror is another place, and is given up before the memory for frames is full."""
+    problems = []
+    one, other = root.resolve(), mirror.resolve()
+    if one == other or one in other.parents or other in one.parents:
+        problems.append(
+            f"{file}: mission.mirror is {mirror}, which is mission.root, in it or around it; give "
+            "a folder on another disk"
+        )
+    # One exposure is being written when a disk stalls; the others find room in memory meanwhile.
+    bridged_s = (exposures_in_memory - 1) * rig.frame_interval_s
+    if timeout_s >= bridged_s:
+        enough = 2 + int(timeout_s / rig.frame_interval_s)
+        problems.append(
+            f"{file}: limits.mirror_timeout_s is {timeout_s:g}; memory for {exposures_in_memory} "
+            f"exposures bridges {bridged_s:g} s at one every {rig.frame_interval_s:g} s: give a "
+            f"shorter time, or set limits.exposures_in_memory to {enough}"
+        )
+    return problems
 
 
 def _tdi_problems(content: Mapping[str, Any], rig: Rig, file: str) -> list[str]:

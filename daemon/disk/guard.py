@@ -37,6 +37,11 @@ class Room:
         return self.exposures == 0
 
 
+def needed_nbytes(exposure_nbytes: int) -> int:
+    """What an exposure takes on the disk, its products included."""
+    return max(1, (1 + LEVEL2_SHARE) * exposure_nbytes)
+
+
 class DiskGuard:
     """Looks after the disk of a mission.
 
@@ -55,7 +60,7 @@ class DiskGuard:
         free_bytes: Callable[[Path], int] = durable.free_bytes,
     ) -> None:
         self._limits = limits
-        self._needed_nbytes = max(1, (1 + LEVEL2_SHARE) * exposure_nbytes)
+        self._needed_nbytes = needed_nbytes(exposure_nbytes)
         self._path = path
         self._free_bytes = free_bytes
         self._exposed_ns: deque[int] = deque(maxlen=RATE_OVER)

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -30,41 +30,36 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class OpenedMission:
-    """A mission to be flown.
+class FoundDisks:
+    """The disks of a mirrored mission, and the mission that is being flown on them.
 
-    `disks` are those of a mirrored mission, the leading one first, none where there is no mirror;
-    `findings` are sentences about disks that cannot be used, or not yet.
+    `disks` are in their order, the leading one first; `absent` are the labels of those that cannot
+    be used. `mission` is None where none is being flown. `findings` are sentences about
+    disks that cannot be used, `done` about what was brought together.
     """
 
-    mission: Mission
-    is_resumed: bool
-    disks: tuple[Disk, ...] = ()
+    disks: tuple[Disk, ...]
+    mission: Mission | None = None
+    absent: frozenset[str] = frozenset()
     findings: tuple[str, ...] = ()
+    done: tuple[str, ...] = ()
 
     def holding(self, number: int) -> tuple[str, ...]:
         """Ids of the disks that hold an exposure as the leading one does."""
-        ours = self.mission.level0(number) / CAPTURE_FILE
-        found = []
-        for disk in self.disks:
-            theirs = Mission(disk.root / self.mission.id, self.mission.id).level0(number)
-            with suppress(OSError):
-                if disk.id and (theirs / CAPTURE_FILE).read_bytes() == ours.read_bytes():
-                    found.append(disk.id)
-        return tuple(found)
+        assert self.mission is not None
+        ours = _capture_of(self.disks[0], self.mission, number)
+        return tuple(
+            disk.id
+            for disk in self.disks
+            if disk.id and ours is not None and _capture_of(disk, self.mission, number) == ours
+        )
 
 
-def open_mirrored(
-    roots: Mapping[str, Path],
-    create: Callable[[Path], Mission],
-    *,
-    timeout_s: float = LOOK_TIMEOUT_S,
-) -> OpenedMission:
-    """Find the mission being flown on any of the disks, else create one.
+def find_disks(roots: Mapping[str, Path], *, timeout_s: float = LOOK_TIMEOUT_S) -> FoundDisks:
+    """Look at the disks, and for a mission that is being flown on any of them.
 
     Args:
         roots: folders of missions, by what the configuration calls them, the preferred one first.
-        create: makes a new mission below a root.
         timeout_s: how long a disk may take to answer.
 
     Raises:
@@ -77,17 +72,19 @@ def open_mirrored(
     preferred = next(iter(roots))
     for label, root in roots.items():
         try:
-            looked = _within(timeout_s, lambda r=root, p=label == preferred: _look(r, p))  # type: ignore[misc]
+            looking = partial(_look, root, may_create=label == preferred)
+            identity, current = _within(timeout_s, looking)
         except (OSError, DaemonError) as error:
             refusals.append(error)
             findings.append(f"disk {label} ({root}) cannot be used: {error}")
             continue
-        disks[label] = Disk(label, root, looked[0])
-        if looked[1] is not None:
-            flying[label] = looked[1]
+        disks[label] = Disk(label, root, identity)
+        if current is not None:
+            flying[label] = current
     if not disks:
         raise refusals[0]
-    absent = tuple(Disk(label, root, "") for label, root in roots.items() if label not in disks)
+    away = tuple(Disk(label, root, "") for label, root in roots.items() if label not in disks)
+    absent = frozenset(disk.label for disk in away)
     for candidate in dict.fromkeys(mission.id for mission in flying.values()):
         copies = {
             label: Mission(disk.root / candidate, candidate)
@@ -95,27 +92,54 @@ def open_mirrored(
             if (disk.root / candidate / "L0").is_dir()
         }
         leading, finding = _leading(copies)
-        if finding:
-            findings.append(finding)
         if flying.get(leading) != copies[leading]:
             continue  # it was closed while the other disk was away
-        if not finding:
-            for label in copies:
-                if label != leading:
-                    findings += _pull_tail(copies[leading], copies[label])
-        disks[leading] = _named(disks[leading])
+        if finding:
+            findings.append(finding)
         order = (disks[leading], *(disk for label, disk in disks.items() if label != leading))
         mission = Mission.open(copies[leading].path)
-        return OpenedMission(mission, True, (*order, *absent), tuple(findings))
-    # A folder without an id is taken for a disk here and nowhere else: an empty mount point that is
-    # found while flying is none.
-    order = tuple(_named(disk) for disk in disks.values())
-    mission = create(order[0].root)
-    write_generations(mission.path, next_generation((), [order[0].id], 1))
-    return OpenedMission(mission, False, (*order, *absent), tuple(findings))
+        return FoundDisks((*order, *away), mission, absent, tuple(findings))
+    return FoundDisks((*disks.values(), *away), None, absent, tuple(findings))
 
 
-def _look(root: Path, may_create: bool) -> tuple[str, Mission | None]:
+def resume_mirrored(found: FoundDisks) -> FoundDisks:
+    """Bring together what an interrupted flight wrote to one disk only; before recovery.
+
+    Args:
+        found: disks on which a mission is being flown.
+
+    Raises:
+        OSError: the leading disk refused.
+    """
+    assert found.mission is not None
+    findings, done = list(found.findings), []
+    for disk in found.disks[1:]:
+        other = Mission(disk.root / found.mission.id, found.mission.id)
+        if disk.label not in found.absent and other.level0_root.is_dir():
+            done += _pull_tail(found.mission, other, findings)
+    disks = (_named(found.disks[0]), *found.disks[1:])
+    return replace(found, disks=disks, findings=tuple(findings), done=tuple(done))
+
+
+def begin_mirrored(found: FoundDisks, create: Callable[[Path], Mission]) -> FoundDisks:
+    """Begin a new mission on the first disk; the others join when they have it.
+
+    Args:
+        found: disks on which none is being flown.
+        create: makes a new mission below a root.
+
+    Raises:
+        OSError, MissionError: the disk refused.
+    """
+    # A folder without an id is taken for a disk here and nowhere else: an empty mount point that
+    # is found while flying is none.
+    disks = tuple(disk if disk.label in found.absent else _named(disk) for disk in found.disks)
+    mission = create(disks[0].root)
+    write_generations(mission.path, next_generation((), [disks[0].id], 1))
+    return replace(found, disks=disks, mission=mission)
+
+
+def _look(root: Path, *, may_create: bool) -> tuple[str, Mission | None]:
     """The disk's id, and the mission that is being flown on it."""
     if not may_create and not root.is_dir():
         raise MirrorError("there is no such folder; mount the disk or create the folder")
@@ -146,15 +170,28 @@ def _leading(copies: Mapping[str, Mission]) -> tuple[str, str]:
     return first, ""
 
 
-def _pull_tail(leading: Mission, other: Mission) -> list[str]:
+def _capture_of(disk: Disk, mission: Mission, number: int) -> bytes | None:
+    try:
+        folder = Mission(disk.root / mission.id, mission.id).level0(number)
+        return (folder / CAPTURE_FILE).read_bytes()
+    except OSError:
+        return None
+
+
+def _pull_tail(leading: Mission, other: Mission, findings: list[str]) -> list[str]:
     """Take over what only the other copy of the same generation has; sentences say what."""
-    ours, theirs = read_generations(leading.path), read_generations(other.path)
-    if not ours or not theirs or ours[-1].token != theirs[-1].token:
-        return []
+    try:
+        ours, theirs = read_generations(leading.path), read_generations(other.path)
+        if not ours or not theirs or ours[-1].token != theirs[-1].token:
+            return []
+        refuse_split(leading, other)
+    except (OSError, DaemonError):
+        return []  # it is reported, or is brought up to date as a whole
     try:
         return _within(PULL_TIMEOUT_S, lambda: pull_tail(leading, other))
     except (OSError, DaemonError) as error:
-        return [f"{other.path}: what only it has could not be read: {error}"]
+        findings.append(f"{other.path}: what only it has could not be read: {error}")
+        return []
 
 
 def pull_tail(leading: Mission, other: Mission) -> list[str]:

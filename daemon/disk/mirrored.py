@@ -80,6 +80,7 @@ class MirroredStorage:
         self._abandoned: list[MissionCopy] = []
         self._away: dict[str, ReturningDisk] = {}
         self._changes = 0
+        self._ends_mission = False
         self.is_storing = False
         self.dropped_count = 0
         leading = MissionCopy(disks[0], mission_id)
@@ -115,6 +116,23 @@ class MirroredStorage:
     def unindexed(self) -> int:
         """How many changes an index has refused so far."""
         return max(copy.writer.unindexed for copy in self._copies)
+
+    @property
+    def status(self) -> tuple[dict[str, Any], ...]:
+        """How each disk is, by label: plain JSON types."""
+        in_use: dict[str, dict[str, Any]] = {
+            disk.label: {
+                "disk": disk.label,
+                "path": str(disk.root),
+                "id": disk.id,
+                "state": "in use",
+                "exposures_to_copy": 0,
+                "sentence": "",
+            }
+            for disk in self.in_use
+        }
+        others = {label: away.status for label, away in self._away.items()}
+        return tuple((in_use | others)[label] for label in sorted(in_use | others, reverse=True))
 
     @property
     def away(self) -> Mapping[str, ReturningDisk]:
@@ -226,13 +244,17 @@ class MirroredStorage:
             raise DaemonError(f"disk {label} is in use; release it first")
         away.accept()
 
-    def close(self, *, ends_mission: bool = False) -> None:
-        """Close log and index on every disk; with `ends_mission` it is not resumed."""
+    def end_mission(self) -> None:
+        """Nobody is to go on with the mission once this is closed."""
+        self._ends_mission = True
+
+    def close(self) -> None:
+        """Close log and index on every disk in use."""
         for away in self._away.values():
             away.end()
         self._log.close()
         self._wait({copy: copy.lane.submit(copy.close) for copy in self._copies})
-        if ends_mission:
+        if self._ends_mission:
             self._wait({copy: copy.lane.submit(copy.mission.close) for copy in self._copies})
         for copy in self._copies:
             copy.lane.end(END_TIMEOUT_S)
@@ -342,12 +364,13 @@ class MirroredStorage:
                 f"disk {copy.disk} was dropped: {why}; storing goes on with {left}; check its "
                 "cable and power; it is brought up to date when it answers again"
             )
+            self._tell("disk-dropped", copy.disk, sentence)
         else:
             sentence = (
                 f"disk {copy.disk} is released ({why}) and may be unmounted; storing goes on with "
                 f"{left}"
             )
-        self._tell("disk-dropped" if is_fault else "disk-released", copy.disk, sentence)
+            self._tell("disk-released", copy.disk, sentence)
 
     def _join(self, away: ReturningDisk) -> None:
         """A disk that has everything is in use again."""

@@ -6,7 +6,7 @@ be called in its lane.
 
 from __future__ import annotations
 
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 
 from daemon.disk import durable
 from daemon.disk.chain_file import ChainFile
@@ -27,6 +27,7 @@ class MissionCopy:
         self.mission = Mission(disk.root / mission_id, mission_id)
         self.lane = DiskLane(disk, self._let_go)
         self.refusal: OSError | None = None
+        self._holding = ExitStack()
         self._writer: Level0Writer | None = None
         self._chain: ChainFile | None = None
         self._log: LogFile | None = None
@@ -42,7 +43,9 @@ class MissionCopy:
 
         Raises:
             OSError, CatalogError: it cannot be written.
+            MissionError: another process holds it.
         """
+        self._holding.enter_context(self.mission.held())
         durable.make_directories(self.mission.log_dir)
         chain = self._open_writer()
         with suppress(OSError):
@@ -54,10 +57,14 @@ class MissionCopy:
     def join(self, leading: MissionCopy, resync: Resync, log_name: str, offset: int) -> None:
         """Take over index and log of the leading copy; all else is here already.
 
+        The copy is held until it is let go of.
+
         Raises:
             OSError, CatalogError: a disk refused.
+            MissionError: another process holds the copy here.
             MirrorError: the chain of records here ends with another one.
         """
+        self._holding.enter_context(self.mission.held())
         resync.step = self.lane.step
         resync.copy_open_log(log_name, offset)
         resync.copy_chain_and_index()
@@ -120,3 +127,4 @@ class MissionCopy:
             self._writer.close()
         if self._chain is not None:
             self._chain.close()
+        self._holding.close()

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import Any
 
 from daemon.disk import durable
 from daemon.disk.disk_identity import Disk, give_disk_id, prove_writable, read_disk_id
@@ -95,6 +96,22 @@ class ReturningDisk:
         self._thread.start()
 
     @property
+    def status(self) -> dict[str, Any]:
+        """How the disk is: plain JSON types."""
+        if self._is_held:
+            state = "released"
+        else:
+            state = "dropped" if self.problem or self.resync is None else "catching up"
+        return {
+            "disk": self.disk.label,
+            "path": str(self.disk.root),
+            "id": self.disk.id,
+            "state": state,
+            "exposures_to_copy": self.waiting,
+            "sentence": self.problem,
+        }
+
+    @property
     def waiting(self) -> int:
         return 0 if self.resync is None else self.resync.waiting
 
@@ -145,15 +162,21 @@ class ReturningDisk:
         target = self.target
         history = read_generations(target.path) if target.path.is_dir() else ()
         self.resync = Resync(source, target, self._first_missing(history), self._step)
-        while not self._ended.is_set():
-            if self._source() != source:
-                raise MirrorError("another disk leads now")
-            changes = self._changes()
-            done = self.resync.run(self._open_log())
-            self.problem = ""
-            is_ready = not done and changes == self._changes() and not self._is_busy()
-            self.ready_at = changes if is_ready else None
-            self._ended.wait(PASS_S)
+        durable.make_directories(target.path)
+        with target.held():
+            while not self._ended.is_set():
+                self._copy(self.resync, source)
+                self._ended.wait(PASS_S)
+
+    def _copy(self, resync: Resync, source: Mission) -> None:
+        """Copy what is missing now, and see whether anything was."""
+        if self._source() != source:
+            raise MirrorError("another disk leads now")
+        changes = self._changes()
+        done = resync.run(self._open_log())
+        self.problem = ""
+        is_ready = not done and changes == self._changes() and not self._is_busy()
+        self.ready_at = changes if is_ready else None
 
     def _recognise(self) -> None:
         found = read_disk_id(self.disk.root)

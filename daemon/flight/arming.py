@@ -1,7 +1,7 @@
 """What a flight needs before it may begin, and what is missing of it, each with its cure.
 
 Pure: what is there is handed in. Who flies all the same is answered by `daemon.service.commanding`
-and recorded (`override_message`, `note_override`).
+and recorded (`override_message`, `override_note`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 from daemon.configuration import LimitsSection
-from daemon.disk import durable
 from daemon.disk.log_records import Message, loose_bytes
 from daemon.disk.records import RecordError, canonical_bytes, parse_record
 
@@ -84,14 +83,10 @@ def override_message(by: str, missing: Sequence[Lack], reason: str = "") -> Mess
     return Message(TOPIC, time.monotonic_ns(), loose_bytes(_override(by, missing, reason)))
 
 
-def note_override(mission: Path, by: str, missing: Sequence[Lack], *, reason: str = "") -> None:
-    """Write an override beside the mission's records.
-
-    Raises:
-        OSError: the disk refused.
-    """
+def override_note(mission: Path, by: str, missing: Sequence[Lack], *, reason: str = "") -> bytes:
+    """The content of `FILE` with an override added to those that are there."""
     noted = [*overrides_of(mission), _override(by, missing, reason)]
-    durable.replace_file(mission / FILE, canonical_bytes({"overrides": noted}))
+    return canonical_bytes({"overrides": noted})
 
 
 def overrides_of(mission: Path) -> list[dict[str, Any]]:

@@ -10,7 +10,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from daemon.disk import durable
 from daemon.disk.records import Fields, RecordError, canonical_bytes, parse_record
 
 FILE = "unhandled-faults.json"
@@ -81,6 +80,11 @@ class Latches:
         kind, sentence = event.get("event"), str(event.get("sentence", ""))
         if kind == "device":
             self._apply_device(event, sentence, sequence)
+        elif kind == "disk-dropped":
+            label = str(event.get("disk"))
+            self.raise_fault(f"disk {label}", sentence, f"disk {label}", sequence=sequence)
+        elif kind in ("disk-joined", "disk-released"):
+            self.pass_fault(f"disk {event.get('disk')}")
         elif kind in _RAISES:
             fault, device = _RAISES[kind]
             self.raise_fault(fault, sentence, device, sequence=sequence)
@@ -139,14 +143,10 @@ class Latches:
         return fault in self._latches
 
 
-def write_unhandled(root: Path, latches: Iterable[Latch]) -> None:
-    """Keep the faults nobody has acknowledged for the next start.
-
-    Raises:
-        OSError: the disk refused.
-    """
+def unhandled_note(latches: Iterable[Latch]) -> bytes:
+    """The content of `FILE`: the faults nobody has acknowledged, for the next start."""
     kept = [{key: getattr(latch, key) for key in _KEYS} for latch in latches]
-    durable.replace_file(root / FILE, canonical_bytes({"faults": kept}))
+    return canonical_bytes({"faults": kept})
 
 
 def read_unhandled(root: Path) -> tuple[Latch, ...]:
@@ -178,6 +178,7 @@ _RAISES: Mapping[object, tuple[str, str]] = {
     "fault": ("service", "service"),
     "ledger": ("ledger", "service"),
     "disk": ("disk", "disk"),
+    "mirror": ("mirror", "disk"),
     "not-written": ("disk", "disk"),
     "power": ("power", "power"),
     "override": ("override", "service"),

@@ -13,11 +13,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from daemon.configuration import Configuration
+from daemon.disk.mirror_start import FoundDisks, find_disks
 from daemon.disk.mission import Mission
 from daemon.flight.flight import Identity
 from daemon.service.devices import device_specs, frame_nbytes
 from daemon.service.memory import FrameRing
 from daemon.service.messages import WorkerSettings
+from daemon.service.storage import MirrorPlan
 from processing.rig import Rig, shipped_rigs
 
 
@@ -30,18 +32,36 @@ class ProcessPlan(NamedTuple):
     environment: Mapping[str, str]
 
 
+def disks_of(configuration: Configuration) -> FoundDisks | None:
+    """The disks of a mirrored configuration, and the mission being flown on them; else None.
+
+    Raises:
+        OSError, MissionError: no disk can be used.
+    """
+    mission = configuration.mission
+    if mission.mirror is None:
+        return None
+    return find_disks({"root": mission.root, "mirror": mission.mirror})
+
+
 def interrupted_mission(configuration: Configuration) -> Mission | None:
     """The mission that was being flown when the service ended; None after an orderly end.
 
     Raises:
         MissionError: the marker of the mission being flown is damaged.
+        OSError: no disk of a mirrored configuration can be used.
     """
+    found = disks_of(configuration)
+    if found is not None:
+        return found.mission
     root = configuration.mission.root
     return Mission.current(root) if root.is_dir() else None
 
 
-def create_mission(configuration: Configuration, rig: Rig, config_path: Path) -> Mission:
-    """A new mission, with copies of what it is flown by.
+def create_mission(
+    configuration: Configuration, rig: Rig, config_path: Path, root: Path | None = None
+) -> Mission:
+    """A new mission, with copies of what it is flown by; below `root` where that is given.
 
     Raises:
         OSError: the disk refused.
@@ -49,7 +69,7 @@ def create_mission(configuration: Configuration, rig: Rig, config_path: Path) ->
     rig_path = shipped_rigs().get(configuration.mission.rig, Path(configuration.mission.rig))
     plan_file = configuration.plan.file
     return Mission.create(
-        configuration.mission.root,
+        root or configuration.mission.root,
         rig.name,
         rig_toml=rig_path.read_bytes(),
         service_toml=config_path.read_bytes(),
@@ -109,11 +129,12 @@ def capture_process(
     return ProcessPlan("capture", "daemon.service.capture:main", (specs, rings), thread_counts(1))
 
 
-def writer_process(mission: Mission, rings: tuple[FrameRing, ...]) -> ProcessPlan:
-    """The process of the disk."""
-    return ProcessPlan(
-        "writer", "daemon.service.writer:main", (mission.path, rings), thread_counts(1)
-    )
+def writer_process(
+    mission: Mission, rings: tuple[FrameRing, ...], mirror: MirrorPlan | None = None
+) -> ProcessPlan:
+    """The process of the disk, or of both disks of a mirrored mission."""
+    arguments = (mission.path, rings, mirror)
+    return ProcessPlan("writer", "daemon.service.writer:main", arguments, thread_counts(1))
 
 
 def watch_process(configuration: Configuration) -> ProcessPlan | None:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from daemon.configuration import Configuration
+from daemon.disk import durable
 from daemon.disk.guard import DiskGuard
 from daemon.flight.flight import Flight
 from daemon.flight.navigation import LATEST_ARRIVAL_NS
@@ -61,6 +62,7 @@ class Line:
         flown: int,
         *,
         plan: Path | None = None,
+        free_bytes: Callable[[Path], int] = durable.free_bytes,
     ) -> None:
         self._configuration = configuration
         self._rig = rig
@@ -68,7 +70,7 @@ class Line:
         self._mission = mission
         self._ordered = flown
         exposure_nbytes = sum(frame_nbytes(rig, head.sensor) for head in configuration.head)
-        self.guard = DiskGuard(configuration.limits, exposure_nbytes, mission)
+        self.guard = DiskGuard(configuration.limits, exposure_nbytes, mission, free_bytes)
         self._last_ns: int | None = None
         self._exposure_ns = exposure_times_ns(configuration, rig)
         self._steering = _steering(configuration, rig, plan)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from daemon.configuration import PlanSection, ProcessingSection
+from daemon.disk.disk_identity import Disk
 from daemon.disk.log_records import Message
 from daemon.exposure import Capture, Exposure, FrameRecord
 from drivers.contract import TriggerPulse
@@ -172,7 +173,63 @@ class NoteProducts:
     verdict: str | None
 
 
+@dataclass(frozen=True)
+class WriteNote:
+    """Put a small file under a name below the root of every disk in use."""
+
+    name: str
+    data: bytes
+
+
+@dataclass(frozen=True)
+class EndMission:
+    """Nobody is to go on with the mission after `Stop`."""
+
+
+@dataclass(frozen=True)
+class DropDisk:
+    """Drop this disk where another is in use, and say why."""
+
+    disk: str
+    why: str
+
+
+@dataclass(frozen=True)
+class ReleaseDisk:
+    """Close everything on this disk, so that it can be unmounted."""
+
+    disk: str
+
+
+@dataclass(frozen=True)
+class AcceptDisk:
+    """Use whatever disk is at the place of this one, once it is up to date."""
+
+    disk: str
+
+
 # From the writer
+
+
+@dataclass(frozen=True)
+class DiskChanged:
+    """A disk was dropped, was released or has joined; `in_use` are those in use from now on.
+
+    `name` is the event's, `dropped_count` counts the faults of this run.
+    """
+
+    name: str
+    disk: Disk
+    sentence: str
+    in_use: tuple[Disk, ...]
+    dropped_count: int
+
+
+@dataclass(frozen=True)
+class DiskStatus:
+    """How each disk is: plain JSON types."""
+
+    disks: tuple[Mapping[str, Any], ...]
 
 
 @dataclass(frozen=True)
@@ -230,6 +287,13 @@ class Begin:
     """Load the kernels, then process for this mission; for none where only that is tried."""
 
     mission: Path | None
+
+
+@dataclass(frozen=True)
+class UseMission:
+    """Read and write the mission in this folder from now on: another disk leads."""
+
+    mission: Path
 
 
 @dataclass(frozen=True)

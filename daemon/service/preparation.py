@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
 from daemon.configuration import Configuration
+from daemon.disk.mirror_start import FoundDisks, begin_mirrored, resume_mirrored
 from daemon.disk.mission import Mission
-from daemon.service.departure import create_mission, interrupted_mission
+from daemon.service.departure import create_mission, disks_of, interrupted_mission
 from daemon.service.desk import Desk
 from daemon.service.findings import Outcome
 from daemon.service.hearing import Tell
@@ -27,7 +29,8 @@ class Preparation(Desk):
     """What happens before there is a mission.
 
     `rig` is the one that flies: the mission's own where one is resumed. `interrupted` is the
-    mission that is resumed, `is_built` whether the worker has its pipeline.
+    mission that is resumed, `disks` are those of a mirrored one, `is_built` says whether the worker
+    has its pipeline.
 
     Args:
         configuration: the one in force.
@@ -51,6 +54,7 @@ class Preparation(Desk):
         self._fail = fail
         self.rig = rig
         self.interrupted: Mission | None = None
+        self.disks: FoundDisks | None = None
         self.is_built = False
 
     async def look(self) -> bool:
@@ -58,8 +62,13 @@ class Preparation(Desk):
 
         Raises:
             MissionError: the marker of the mission being flown is damaged.
+            OSError: no disk of a mirrored configuration can be used.
         """
-        self.interrupted = interrupted_mission(self._configuration)
+        self.disks = await asyncio.to_thread(disks_of, self._configuration)
+        if self.disks is None:
+            self.interrupted = interrupted_mission(self._configuration)
+        else:
+            self.interrupted = self.disks.mission
         looks = LOOKS if self.interrupted is None else AFTER_RESTART
         findings = await asyncio.to_thread(prerequisites, self._configuration, self.rig, looks)
         for finding in findings:
@@ -73,10 +82,14 @@ class Preparation(Desk):
 
     def mission(self) -> Mission | None:
         """The mission that is resumed, else a new one; None where the disk refuses it."""
-        if self.interrupted is not None:
-            return self.interrupted
+        create = partial(create_mission, self._configuration, self.rig, self._config_path)
         try:
-            return create_mission(self._configuration, self.rig, self._config_path)
+            if self.disks is not None:
+                is_new = self.interrupted is None
+                found = self.disks
+                self.disks = begin_mirrored(found, create) if is_new else resume_mirrored(found)
+                return self.disks.mission
+            return create() if self.interrupted is None else self.interrupted
         except OSError as error:
             root = self._configuration.mission.root
             self._fail(f"no mission can be begun in {root} ({error}); check the disk")

@@ -12,7 +12,7 @@ import signal
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -20,10 +20,12 @@ from daemon.configuration import Configuration
 from daemon.disk import recovery
 from daemon.disk.log_records import LoggedTrigger, message_of
 from daemon.disk.mission import Mission
-from daemon.flight.arming import Lack, note_override, override_message
+from daemon.flight.arming import FILE as OVERRIDES
+from daemon.flight.arming import Lack, override_message, override_note
 from daemon.flight.decisions import Decision, tick
 from daemon.flight.flight import Flight
-from daemon.flight.latches import Latch, Latches, previous_faults, read_unhandled, write_unhandled
+from daemon.flight.latches import FILE as UNHANDLED
+from daemon.flight.latches import Latch, Latches, previous_faults, read_unhandled, unhandled_note
 from daemon.flight.ledger import Ledger
 from daemon.flight.recovery_match import seal_from_log
 from daemon.service.commanding import audit_message, obey
@@ -41,15 +43,8 @@ from daemon.service.exposure_control import ExposureControl
 from daemon.service.hearing import Hearing
 from daemon.service.keeping import Keeping
 from daemon.service.line import Line, Order
-from daemon.service.messages import (
-    Begin,
-    Bound,
-    Command,
-    Fire,
-    Log,
-    Pong,
-    Told,
-)
+from daemon.service.messages import Begin, Bound, Command, Fire, Log, Pong, Told, UseMission
+from daemon.service.mirror import Mirror
 from daemon.service.notify import Notifier
 from daemon.service.pipeline_queue import PipelineQueue
 from daemon.service.preflight import AT_ONCE, Preflight
@@ -97,6 +92,7 @@ class Service(Desk):
         self.stopping = asyncio.Event()
         self.changed = asyncio.Event()
         self.goes_on = False
+        self.holding = ExitStack()
         self.preparation = Preparation(configuration, rig, config_path, self._event, self._fail)
         self.desks: tuple[Desk, ...] = (self, self.preparation)
 
@@ -116,7 +112,8 @@ class Service(Desk):
         if mission is None:
             await self.supervisor.end(("worker",))
             return 0 if self.failure is None else 1
-        with mission.held():
+        with self.holding:
+            self.holding.enter_context(mission.held())
             self._start(mission)
             tasks = [
                 loop.create_task(self._keep_deadlines()),
@@ -133,7 +130,7 @@ class Service(Desk):
             self.flight.land()
             if left := self.flight.ledger.imbalances(has_landed=True):
                 self._event("ledger", fault=True, sentence=f"not settled: {'; '.join(left)}")
-        if self.failure is None:
+        if self.failure is None and not self.mirror.is_on:
             mission.close()
         self._event("ended", failure=self.failure, ledger=self.flight.ledger.sheet().as_json())
         await self.supervisor.end((WATCH,))
@@ -158,19 +155,22 @@ class Service(Desk):
         return None if self.stopping.is_set() else self.preparation.mission()
 
     def _start(self, mission: Mission) -> None:
-        self.mission = mission
         self.watching.start()
-        report = recovery.recover(mission, seal_from_log(self.rig))
-        self._event(
-            "mission",
-            id=mission.id,
-            path=str(mission.path),
-            rig=self.rig.name,
-            simulated=self.configuration.mission.simulated,
-            resumed=self.is_resumed,
-            recovery=list(report.sentences),
-            next_number=report.next_number,
+        self.mission = mission
+        disks, send = self.preparation.disks, self.supervisor.send
+        self.mirror = Mirror(
+            disks, mission, self.configuration, self.rig, send, self._event, self._lead
         )
+        report = recovery.recover(mission, self.mirror.naming_disks(seal_from_log(self.rig)))
+        self.about_mission = {
+            "rig": self.rig.name,
+            "simulated": self.configuration.mission.simulated,
+            "resumed": self.is_resumed,
+            "recovery": [*self.mirror.done, *report.sentences],
+            "next_number": report.next_number,
+        }
+        self._lead(mission)
+        self.mirror.tell_findings()
         heads = [head.sensor for head in self.configuration.head]
         self.flight = Flight(
             self.rig,
@@ -183,12 +183,13 @@ class Service(Desk):
         self.hearing = Hearing(self.flight, self._log, self._event, self._decided)
         flown = len(report.settled)
         self.line = Line(
-            self.configuration, self.rig, self.flight, mission.path, flown, plan=mission.plan_path
-        )
+            self.configuration, self.rig, self.flight, mission.path, flown,
+            plan=mission.plan_path, free_bytes=self.mirror.free_bytes,
+        )  # fmt: skip
         self.exposure = ExposureControl(
-            self.configuration, self.rig, self.flight, self.supervisor.send, self._event
+            self.configuration, self.rig, self.flight, send, self._event
         )
-        lanes, send = self.configuration.processing.exposures_in_work, self.supervisor.send
+        lanes = self.configuration.processing.exposures_in_work
         self.pipeline = PipelineQueue(lanes, send, self._event, self._decided, self.exposure.seen)
         self.keeping = Keeping(self.flight, self.pipeline, send, self._event, self._decided)
         self.preflight = Preflight(
@@ -196,9 +197,11 @@ class Service(Desk):
         )
         self.preflight.overridden = self._overridden
         self._tell_previous(mission)
-        self.desks += (self.hearing, self.keeping, self.pipeline)
-        self.supervisor.spawn(*writer_process(mission, self.rings))
-        self.supervisor.send("worker", Begin(mission.path))
+        self.desks += (self.hearing, self.keeping, self.pipeline, self.mirror)
+        if self.mirror.is_on:
+            self.holding.close()  # the writer holds each copy, and never waits here for a disk
+        self.supervisor.spawn(*writer_process(mission, self.rings, self.mirror.plan))
+        send("worker", Begin(mission.path))
         self.supervisor.spawn(*capture_process(self.configuration, self.rig, self.rings))
         self._decided(
             Decision(
@@ -208,6 +211,13 @@ class Service(Desk):
                 {"software": self.flight.identity.software, "resumed": self.is_resumed},
             )
         )
+
+    def _lead(self, mission: Mission) -> None:
+        """Products go into this folder from now on, and watchers read it: its disk leads."""
+        if mission != self.mission:
+            self.mission = mission
+            self.supervisor.send("worker", UseMission(mission.path))
+        self._event("mission", id=mission.id, path=str(mission.path), **self.about_mission)
 
     # What the processes say
 
@@ -228,7 +238,8 @@ class Service(Desk):
         told = "; ".join(map(str, missing)) + (f". Why: {reason}" if reason else "")
         self._event("override", by=by, sentence=f"{by} flies all the same: {told}")
         try:
-            note_override(self.mission.path, by, missing, reason=reason)
+            note = override_note(self.mission.path, by, missing, reason=reason)
+            self.mirror.keep_now(f"{self.mission.id}/{OVERRIDES}", note)
         except OSError as error:
             # The log has it too.
             self._event("disk", fault=True, sentence=f"the override is not noted: {error}")
@@ -313,6 +324,7 @@ class Service(Desk):
                 self.notifier.watchdog()
                 self.notifier.status(f"{len(self.flight.open_numbers)} exposures open")
             self._follow_phase()
+            self.mirror.look()
             if (warning := self.line.guard.warning()) is not None:
                 self._event("disk", fault=True, sentence=warning)
             self.watching.tell(self._status())
@@ -366,6 +378,7 @@ class Service(Desk):
             time_now=self.flight.clock.gps_at(now_ns),
             queue=len(self.pipeline),
             missing=list(map(str, self.preflight.lacks())),
+            disks=self.mirror.status,
         )
 
     def _follow_phase(self) -> None:
@@ -385,7 +398,7 @@ class Service(Desk):
             self.unhandled = unhandled
             # A disk that refuses has told so itself.
             with suppress(OSError):
-                await asyncio.to_thread(write_unhandled, self.mission.root, unhandled)
+                await self.mirror.keep(UNHANDLED, unhandled_note(unhandled))
 
     def _fire(self, order: Order) -> None:
         self.hearing.orders[order.number] = order
@@ -422,6 +435,7 @@ class Service(Desk):
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
+        self.mirror.land(ends_mission=self.failure is None)
         await self.supervisor.end(("capture", "worker", "writer"))
 
     def _power_fails(self) -> None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from daemon.disk.disk_identity import Disk
 from daemon.disk.flight_log import FlightLog
-from daemon.disk.log_seals import seal_logs
+from daemon.disk.log_seals import close_run, seal_logs
 from daemon.disk.mirrored import DiskEvent, MirroredStorage
 from daemon.disk.mission import Mission
 from daemon.disk.returning import ReturnSettings
@@ -59,9 +59,12 @@ class OneDisk:
 
     def __init__(self, mission: Mission) -> None:
         self._mission = mission
-        self._writer = Level0Writer(mission)
+        self._chain = mission.open_chain()
+        self._writer = Level0Writer(mission, chain=self._chain)
         self._seal_logs()  # those of earlier runs; ours is not there yet
         self.log = FlightLog.create(mission.log_dir, simulated=mission.is_simulated)
+        with suppress(OSError):  # recovery notes it if the disk refuses
+            self._chain.log_begun(self.log.path.name)
 
     @property
     def unindexed(self) -> int:
@@ -84,12 +87,16 @@ class OneDisk:
     def close(self) -> None:
         self.log.close()
         self._seal_logs()
+        if not self._writer.unindexed:
+            with suppress(OSError):  # `syntopic repair` closes it if the disk refuses
+                close_run(self._mission, self._chain, "landing")
         self._writer.close()
+        self._chain.close()
 
     def _seal_logs(self) -> None:
         # A disk that refuses costs only that a later damage is not seen; the next start seals them.
         with suppress(OSError):
-            seal_logs(self._mission)
+            seal_logs(self._mission, self._chain)
 
 
 def mirrored(

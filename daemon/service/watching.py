@@ -108,6 +108,7 @@ def status_event(
     time_now: GpsEstimate | None,
     queue: int,
     missing: Sequence[str],
+    disks: Sequence[Mapping[str, Any]] = (),
 ) -> dict[str, Any]:
     """What a watcher must not have wrong for longer than a second, as plain JSON types.
 
@@ -115,6 +116,7 @@ def status_event(
         time_now: GPS time at this moment, or None before anything told it.
         queue: exposures waiting for the pipeline.
         missing: what a flight needs and does not have, with its cure.
+        disks: those of a mirrored mission.
     """
     now_ns = time.monotonic_ns()
     where = None
@@ -144,6 +146,7 @@ def status_event(
         "in_holdover": time_now is not None and time_now.in_holdover,
         "queue": queue,
         "missing": list(missing),
+        **({"disks": [dict(disk) for disk in disks]} if disks else {}),
     }
 
 

@@ -43,6 +43,7 @@ from daemon.service.messages import (
     ProcessFailed,
     Settled,
     Stop,
+    UseMission,
     WorkerBuilt,
     WorkerReady,
     WorkerRefused,
@@ -95,6 +96,8 @@ def main(link: Link, settings: WorkerSettings, rings: tuple[FrameRing, ...]) -> 
             in_work.add(lanes.submit(partial(desk.process, order, surroundings)))
         elif isinstance(order, Settled):
             desk.settle(order)
+        elif isinstance(order, UseMission):
+            desk.mission = Mission(order.mission, order.mission.name)
         done = {future for future in in_work if future.done()}
         in_work -= done
         for future in done:
@@ -177,9 +180,12 @@ def report_unprocessed(
     return {**report, "exposure": exposure.number}
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Desk:
-    """What every exposure needs on its way through a lane."""
+    """What every exposure needs on its way through a lane.
+
+    `mission` changes where another disk leads; each exposure asks for it when it reads or writes.
+    """
 
     link: Link
     rig: Rig

@@ -15,6 +15,7 @@ import typer
 from daemon.cli.run import run
 from daemon.service import departure, service
 from daemon.service.messages import (
+    Begin,
     FramesRead,
     Ping,
     Pong,
@@ -30,10 +31,11 @@ from daemon.service.processes import Link
 def idle_worker(link: Link, _settings: Any, _rings: Any) -> None:
     """In the place of `daemon.service.worker.main`."""
     link.send(WorkerBuilt())
-    link.send(WorkerReady(0.0))
     while not isinstance(order := link.receive(timeout_s=1.0), Stop):
         if isinstance(order, Ping):
             link.send(Pong({}))
+        elif isinstance(order, Begin):
+            link.send(WorkerReady(0.0))
         elif isinstance(order, Process):
             number = order.exposure.number
             link.send(FramesRead(number))

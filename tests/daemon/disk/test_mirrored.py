@@ -16,7 +16,7 @@ from daemon.disk.flight_log import logs_of, read
 from daemon.disk.generations import read_generations
 from daemon.disk.level0_folder import read_sealed
 from daemon.disk.log_records import Message
-from daemon.disk.mirror_start import open_mirrored
+from daemon.disk.mirror_start import begin_mirrored, find_disks, resume_mirrored
 from daemon.disk.mirrored import DiskEvent, MirroredStorage
 from daemon.disk.mission import Mission
 from daemon.disk.returning import ReturnSettings
@@ -40,11 +40,16 @@ class Flown:
         self.start()
 
     def start(self) -> None:
-        self.opened = open_mirrored(self.roots, new_mission)
-        self.mission = self.opened.mission
+        self.found = find_disks(self.roots)
+        if self.found.mission is None:
+            self.found = begin_mirrored(self.found, new_mission)
+        else:
+            self.found = resume_mirrored(self.found)
+        assert self.found.mission is not None
+        self.mission = self.found.mission
         self.storage = MirroredStorage(
             self.mission.id,
-            self.opened.disks,
+            self.found.disks,
             stall_s=STALL_S,
             returns=ReturnSettings(LOOK_S, LOOK_S),
             emit=self.events.append,
@@ -93,7 +98,8 @@ def test_what_is_stored_is_on_both_disks_and_the_record_names_them(flown: Flown)
     ids = {give_disk_id(root) for root in flown.roots.values()}
     assert len(ids) == 2
     assert set(flown.expose(1)) == ids and set(flown.expose(2)) == ids
-    flown.storage.close(ends_mission=True)
+    flown.storage.end_mission()
+    flown.storage.close()
     for label in flown.roots:
         copy = flown.copy(label)
         assert verify(copy).problems == ()
@@ -180,7 +186,7 @@ def test_where_no_disk_takes_an_exposure_it_is_not_stored_and_both_stay_in_use(
 def test_what_the_last_disk_cannot_say_of_itself_is_not_acknowledged(flown: Flown) -> None:
     """The survivor takes the frames and refuses the new generation: nothing is called stored."""
     flown.expose(1)
-    state = flown.copy("root").path / ".disks.json.part"
+    state = flown.copy("root").path / ".disks.json"
     with refusing(flown.roots["mirror"]), refusing(state):
         with pytest.raises(OSError, match="Input/output"):
             flown.storage.write(capture_of(2), pixels_of(2))
@@ -198,7 +204,8 @@ def test_a_disk_that_returns_is_brought_up_to_date_and_joins(flown: Flown) -> No
     flown.joined()
     assert [disk.label for disk in flown.storage.in_use] == ["mirror", "root"]
     assert len(flown.expose(5)) == 2
-    flown.storage.close(ends_mission=True)
+    flown.storage.end_mission()
+    flown.storage.close()
     names = [event.name for event in flown.events]
     assert names == ["disk-joined", "disk-dropped", "disk-joined"]
     for label in flown.roots:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from daemon.configuration import LimitsSection
-from daemon.flight.arming import Lack, Readiness, lacks, note_override, overrides_of
+from daemon.flight.arming import FILE, Lack, Readiness, lacks, override_note, overrides_of
 from daemon.flight.event_table import entry_of
 
 ALL_THERE = Readiness(
@@ -64,8 +64,9 @@ def test_a_rig_without_receiver_and_probes_needs_neither() -> None:
 def test_an_override_is_kept_with_who_when_what_and_why(tmp_path: Path) -> None:
     assert overrides_of(tmp_path) == []
     missing = Lack("arming-device", "no head SU02", "check its cable")
-    note_override(tmp_path, "operator", [missing])
-    note_override(tmp_path, "uid 1000", [missing], reason="it is not needed")
+    (tmp_path / FILE).write_bytes(override_note(tmp_path, "operator", [missing]))
+    again = override_note(tmp_path, "uid 1000", [missing], reason="it is not needed")
+    (tmp_path / FILE).write_bytes(again)
     first, second = overrides_of(tmp_path)
     assert first["by"] == "operator"
     assert (second["by"], second["reason"]) == ("uid 1000", "it is not needed")

@@ -11,7 +11,7 @@ from daemon.flight.latches import (
     Latches,
     previous_faults,
     read_unhandled,
-    write_unhandled,
+    unhandled_note,
 )
 
 
@@ -29,12 +29,12 @@ def latches_of(*events: dict[str, Any]) -> Latches:
 def test_what_nobody_acknowledged_is_told_again_after_a_restart(tmp_path: Path) -> None:
     before = latches_of(device("lost"), {"event": "disk", "sentence": "full"})
     assert before.acknowledge("disk")
-    write_unhandled(tmp_path, before.unhandled())
+    (tmp_path / FILE).write_bytes(unhandled_note(before.unhandled()))
     after = latches_of(*previous_faults(read_unhandled(tmp_path)))
     (fault,) = after.listed()
     assert (fault["id"], fault["previous"], fault["stands"]) == ("device SU02", True, False)
     assert after.acknowledge("device SU02")
-    write_unhandled(tmp_path, after.unhandled())
+    (tmp_path / FILE).write_bytes(unhandled_note(after.unhandled()))
     assert read_unhandled(tmp_path) == ()
 
 
