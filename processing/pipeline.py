@@ -36,11 +36,14 @@ from processing.image.quicklook import quicklook
 from processing.image.resampling import SATURATED_SOURCE, Interpolation
 from processing.matching.tie_places import burnt_share
 from processing.matching.tie_points import TiePoints, match_tie_points
+from processing.mosaic.disturbance import disturbance_of
 from processing.mosaic.estimated_dc import EstimatedDc, estimate_dc
 from processing.mosaic.fixed import fixed_mosaic
 from processing.mosaic.free import Mosaic, MosaicSettings
+from processing.mosaic.layers import check_layers, layer_figures
 from processing.mosaic.mounting import check_platform, platform_figures
 from processing.mosaic.precision import precision_figures
+from processing.mosaic.slips import slip_figures
 from processing.mosaic.stitching import Method, stitch
 from processing.mosaic.validity import Validity
 from processing.product import Product, Settings
@@ -205,6 +208,20 @@ class Pipeline:
             tie_points, mosaic, validity = stitched.tie_points, stitched.image, stitched.validity
             estimated = self._estimate_dc(stitched.free, validity, temperatures)
             platform = check_platform(rig, stitched.free, tie_points, temperatures.usable_c)
+            layers = check_layers(
+                rig,
+                stitched.free,
+                temperatures.usable_c,
+                parallax_px=self._mosaic_settings(conditions).parallax_px,
+            )
+            disturbance = disturbance_of(
+                rig,
+                mosaic,
+                validity=validity,
+                estimated_dc=estimated,
+                layers=layers,
+                slips=stitched.slips,
+            )
         with clock.stage("composition"):
             image = self._pan.compose(
                 mosaic.placements,
@@ -239,7 +256,8 @@ class Pipeline:
             figures["resting_on_calibration"] = ", ".join(stitched.weak) or None
             figures |= estimated_dc_figures(estimated) | platform_figures(platform)
             figures |= projection_figures(rig, conditions, settings.relief_fraction)
-            figures |= precision_figures(rig, mosaic, level1, temperatures.usable_c)
+            figures |= layer_figures(layers) | slip_figures(rig, stitched.slips)
+            figures |= precision_figures(rig, mosaic, level1, temperatures.usable_c, disturbance)
             figures |= self._whole_figures(image.source, frames, conditions)
             figures |= valid_area_figures(area)
             report = judge(

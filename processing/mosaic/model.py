@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.bundle.rotations import exponential, skew
-from processing.geometry.placement import SensorPlacement
+from processing.geometry.placement import SensorPlacement, vip_mm_from_raw
 from processing.geometry.projective import (
     apply_projective,
     projective_jacobian,
     rotation_homography,
 )
 from processing.geometry.similarity import Similarity, apply_similarity
+from processing.matching.tie_points import TiePoints
 from processing.rig import Rig
 
 Array = NDArray[np.float64]
@@ -174,6 +175,20 @@ def vip_and_design(
             design[3, axis] = (by_x * arm_x + by_y * arm_y) * stretch
     design /= model.pitch_mm
     return vip_mm / model.pitch_mm, columns, design
+
+
+def residuals_px(
+    model: MosaicModel, placements: Mapping[str, SensorPlacement], tie_points: TiePoints
+) -> Array:
+    """Place of a less place of b in the VIP, (n, 2) px, of tie points, adjusted ones or others."""
+    residuals = np.full((len(tie_points), 2), np.nan)
+    for number, (a, b) in enumerate(tie_points.pairs):
+        rows = np.flatnonzero(tie_points.overlap == number)
+        apart = vip_mm_from_raw(placements[a], tie_points.raw_a[rows]) - vip_mm_from_raw(
+            placements[b], tie_points.raw_b[rows]
+        )
+        residuals[rows] = apart / model.pitch_mm
+    return residuals
 
 
 def _similarity(model: MosaicModel, start: SensorPlacement, values: Array) -> Similarity:

@@ -32,7 +32,7 @@ from processing.geometry.rotation import rotation_matrix
 from processing.image.colour import BandRegistration
 from processing.matching.tie_points import PAN_TO_PAN, TiePoints
 from processing.mosaic.free import Mosaic
-from processing.mosaic.model import further_turn, placement_at, vip_and_design
+from processing.mosaic.model import further_turn, placement_at, residuals_px, vip_and_design
 from processing.quality.report import Figure
 from processing.rig import Cone, Rig, Sensor
 
@@ -319,13 +319,7 @@ def _affine_shift(
 
 def _at_values(mosaic: Mosaic, tie_points: TiePoints, values: Array) -> Mosaic:
     placements = {n: placement_at(mosaic.model, p, values) for n, p in mosaic.start.items()}
-    residuals = np.full_like(mosaic.residuals_px, np.nan)
-    for number, (a, b) in enumerate(tie_points.pairs):
-        rows = np.flatnonzero(tie_points.overlap == number)
-        apart = vip_mm_from_raw(placements[a], tie_points.raw_a[rows]) - vip_mm_from_raw(
-            placements[b], tie_points.raw_b[rows]
-        )
-        residuals[rows] = apart / mosaic.model.pitch_mm
+    residuals = residuals_px(mosaic.model, placements, tie_points)
     return dataclasses.replace(mosaic, values=values, placements=placements, residuals_px=residuals)
 
 

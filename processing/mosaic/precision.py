@@ -8,7 +8,8 @@ which a common expansion hides in. Whether the calibration holds is judged in
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +30,24 @@ BLIND_SIGMA_K = 15.0
 """A probe that was read, one that others stand in for, and all of them where none was read."""
 
 
+@dataclass(frozen=True)
+class Disturbance:
+    """Covariance that the findings of an exposure add (`processing.mosaic.disturbance`).
+
+    `datum` (4, 4) is that of shift x, y (px), scale and rotation (px per mm) of the whole image;
+    `frames` (2,) the variance of a coordinate, px squared, of one sensor's pixels, by its name.
+    """
+
+    datum: Array = field(default_factory=lambda: np.zeros((4, 4)))
+    frames: Mapping[str, Array] = field(default_factory=dict)
+
+
 def precision_figures(
-    rig: Rig, mosaic: Mosaic, present: Collection[str], measured_c: Mapping[str, float]
+    rig: Rig,
+    mosaic: Mosaic,
+    present: Collection[str],
+    measured_c: Mapping[str, float],
+    disturbance: Disturbance | None = None,
 ) -> dict[str, Figure]:
     """How well centre and corners of the PAN sensors that are there are placed, in figures.
 
@@ -39,6 +56,7 @@ def precision_figures(
         mosaic: what the image was made with.
         present: sensors with a frame.
         measured_c: temperatures that were read, by probe name.
+        disturbance: what findings add; None is nothing.
     """
     by_sensor: dict[str, float] = {}
     for cone in rig.pan_cones:
@@ -47,7 +65,12 @@ def precision_figures(
                 right, low = sensor.width_px - 1.0, sensor.height_px - 1.0
                 points = [(right / 2, low / 2), (0, 0), (right, 0), (0, low), (right, low)]
                 sigma = placed_sigma_px(
-                    rig, mosaic, sensor.name, np.array(points, np.float64), measured_c
+                    rig,
+                    mosaic,
+                    sensor.name,
+                    np.array(points, np.float64),
+                    measured_c,
+                    disturbance,
                 )
                 by_sensor[sensor.name] = float(np.sqrt(np.mean(sigma**2)))
     if not by_sensor:
@@ -61,7 +84,12 @@ def precision_figures(
 
 
 def placed_sigma_px(
-    rig: Rig, mosaic: Mosaic, sensor: str, colrow: Array, measured_c: Mapping[str, float]
+    rig: Rig,
+    mosaic: Mosaic,
+    sensor: str,
+    colrow: Array,
+    measured_c: Mapping[str, float],
+    disturbance: Disturbance | None = None,
 ) -> Array:
     """Standard deviation (n, 2), px, of where raw pixels (n, 2) lie in the virtual image.
 
@@ -72,9 +100,12 @@ def placed_sigma_px(
     if held & {sensor, rig.cone_of(sensor).name} and not mosaic.supported:
         tie_points = tie_points * max(1.0, 1.0 / max(mosaic.sigma0, 1e-6))
     placed_mm = vip_mm_from_raw(mosaic.placements[sensor], colrow)
-    datum = _datum_design(placed_mm)
-    variance = np.sum((datum @ datum_covariance(rig, mosaic, measured_c)) * datum, axis=1)
-    return np.asarray(np.sqrt(tie_points**2 + variance.reshape(-1, 2)))
+    datum = datum_design(placed_mm)
+    disturbance = disturbance or Disturbance()
+    of_datum = datum_covariance(rig, mosaic, measured_c) + disturbance.datum
+    variance = np.sum((datum @ of_datum) * datum, axis=1).reshape(-1, 2)
+    variance = variance + disturbance.frames.get(sensor, np.zeros(2))
+    return np.asarray(np.sqrt(tie_points**2 + variance))
 
 
 def placed_covariance_px(
@@ -102,7 +133,7 @@ def placed_covariance_px(
         row = np.zeros((2 * len(colrow), len(model.names)))
         row[:, columns] = design.transpose(2, 1, 0).reshape(2 * len(colrow), len(columns))
         rows.append(row)
-        datum.append(_datum_design(vip_mm_from_raw(mosaic.placements[name], colrow)))
+        datum.append(datum_design(vip_mm_from_raw(mosaic.placements[name], colrow)))
     jacobian, similarity = np.concatenate(rows), np.concatenate(datum)
     return (
         jacobian @ mosaic.covariance @ jacobian.T,
@@ -114,41 +145,75 @@ def datum_covariance(rig: Rig, mosaic: Mosaic, measured_c: Mapping[str, float]) 
     """Covariance (4, 4) of the datum: shift x, y (px), scale and rotation (px per mm).
 
     The datum is the best similarity over the master sensors it rests on (eq. 6), so what their
-    places are off by, each on its own or all with their probe, carries over by that fit.
+    places are off by, each on its own or all with their probe, carries over by that fit. Of
+    converging heads the mean turn is held at the platform calibration: it is known as well as one
+    head's turn over the root of their number.
     """
-    candidates = datum_candidates(rig)
-    sensors = [s for s in candidates if s.name in mosaic.datum_sensors] or list(candidates)
-    place_mm = np.array([_place_mm(rig, mosaic, s) for s in sensors])
+    sensors, place_mm, fit = _datum_fit(rig, mosaic)
     own_um2 = np.array(
         [
             s.position_sigma_um**2 + (s.drift.sigma_um_per_k * sensor_dc(s, measured_c)) ** 2
             for s in sensors
         ]
     )
-    design = _datum_design(place_mm)
-    if len(sensors) == 1:
-        # Its own scale and rotation are held: known as its place is, at half of its height.
-        half_mm = sensors[0].height_px / 2.0 * sensors[0].pitch_mm
-        design = np.concatenate([design, _datum_design(place_mm + np.array([[0.0, half_mm]]))])
-        own_um2 = np.repeat(own_um2, 2)
-    fit = np.linalg.inv(design.T @ design) @ design.T
+    own_um2 = np.repeat(own_um2, len(place_mm) // len(sensors))
     covariance = fit @ (np.repeat(own_um2, 2)[:, None] * fit.T)
-    # um per kelvin; the principal distance takes part of an expansion back.
+    for probe, moved in _moved_um_per_kelvin(rig, sensors, place_mm).items():
+        unknown_k = UNKNOWN_SIGMA_K if measured_c else BLIND_SIGMA_K
+        sigma_k = PROBE_SIGMA_K if probe in measured_c else unknown_k
+        common = fit @ moved * sigma_k
+        covariance += np.outer(common, common)
+    if rig.master_cone is None:
+        sigmas = {
+            rig.cone_of(s.name).name: rig.cone_of(s.name).rotation_sigma_urad for s in sensors
+        }
+        variance = float(np.mean(np.square(list(sigmas.values())))) / len(sigmas)
+        f_um = mosaic.model.f_mm * 1e-3
+        covariance += np.diag([f_um**2, f_um**2, 0.0, 1e-6]) * variance
+    return np.asarray(covariance / (mosaic.model.pitch_mm * 1e3) ** 2)
+
+
+def datum_per_kelvin_px(rig: Rig, mosaic: Mosaic) -> Array:
+    """How one kelvin that no probe has read moves the datum, (4,): px, px, px per mm, px per mm."""
+    sensors, place_mm, fit = _datum_fit(rig, mosaic)
+    moved = sum(_moved_um_per_kelvin(rig, sensors, place_mm).values(), np.zeros(2 * len(place_mm)))
+    return np.asarray(fit @ moved / (mosaic.model.pitch_mm * 1e3))
+
+
+def _datum_fit(rig: Rig, mosaic: Mosaic) -> tuple[list[Sensor], Array, Array]:
+    """Sensors of the datum, places (m, 2) mm, and the fit (4, 2 m) of a similarity to them.
+
+    One sensor alone holds its own scale and rotation, which are known as its place is, at half of
+    its height: it has two places.
+    """
+    candidates = datum_candidates(rig)
+    sensors = [s for s in candidates if s.name in mosaic.datum_sensors] or list(candidates)
+    place_mm = np.array([_place_mm(rig, mosaic, s) for s in sensors])
+    if len(sensors) == 1:
+        half_mm = sensors[0].height_px / 2.0 * sensors[0].pitch_mm
+        place_mm = np.concatenate([place_mm, place_mm + np.array([[0.0, half_mm]])])
+    design = datum_design(place_mm)
+    return sensors, place_mm, np.linalg.inv(design.T @ design) @ design.T
+
+
+def _moved_um_per_kelvin(rig: Rig, sensors: Sequence[Sensor], place_mm: Array) -> dict[str, Array]:
+    """Where one kelvin takes the places of the datum, (2 m,) um, by probe.
+
+    The principal distance takes part of an expansion back.
+    """
     cones = [rig.cone_of(s.name) for s in sensors]
+    times = len(place_mm) // len(sensors)
+    result = {}
     for probe in dict.fromkeys([s.probe for s in sensors] + [cone.probe for cone in cones]):
         moved = np.zeros((len(place_mm), 2))
         for i, (s, cone) in enumerate(zip(sensors, cones, strict=True)):
-            if s.probe == probe:
-                moved[i] = (s.drift.x_um_per_k, s.drift.y_um_per_k)
-            if cone.probe == probe:
-                moved[i] -= cone.lens.f_ppm_per_k * 1e-3 * place_mm[i]
-        if len(sensors) == 1:
-            moved = np.repeat(moved, 2, axis=0)
-        unknown_k = UNKNOWN_SIGMA_K if measured_c else BLIND_SIGMA_K
-        sigma_k = PROBE_SIGMA_K if probe in measured_c else unknown_k
-        common = fit @ moved.reshape(-1) * sigma_k
-        covariance += np.outer(common, common)
-    return np.asarray(covariance / (mosaic.model.pitch_mm * 1e3) ** 2)
+            for k in range(i * times, (i + 1) * times):
+                if s.probe == probe:
+                    moved[k] += (s.drift.x_um_per_k, s.drift.y_um_per_k)
+                if cone.probe == probe:
+                    moved[k] -= cone.lens.f_ppm_per_k * 1e-3 * place_mm[i]
+        result[probe] = moved.reshape(-1)
+    return result
 
 
 def _place_mm(rig: Rig, mosaic: Mosaic, sensor: Sensor) -> tuple[float, float]:
@@ -161,7 +226,7 @@ def _place_mm(rig: Rig, mosaic: Mosaic, sensor: Sensor) -> tuple[float, float]:
     return float(x), float(y)
 
 
-def _datum_design(xy_mm: Array) -> Array:
+def datum_design(xy_mm: Array) -> Array:
     """How shift, scale and rotation move points: (2 n, 4), x and y of each in turn."""
     design = np.zeros((2 * len(xy_mm), 4))
     design[0::2, 0], design[1::2, 1] = 1.0, 1.0

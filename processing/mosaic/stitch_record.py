@@ -99,7 +99,7 @@ def stitch_record(
         first = mosaic.model.layers.get(cone.name)
         if first is None or any(name.startswith(f"{cone.name}.") for name in held):
             continue
-        rows.append(_layer_scale(mosaic, cone, first))
+        rows.append(layer_scale_design(mosaic, cone, first))
         names.append(f"{cone.name}.{LAYER_SCALE}")
     for cone in mosaic_cones(rig):
         turn = rotation_of_layer(rig, mosaic, cone)
@@ -197,7 +197,7 @@ def stitch_record_from_json(content: Mapping[str, Any]) -> StitchRecord:
         raise StitchRecordError(f"mosaic.json cannot be used: {error}") from error
 
 
-def _layer_scale(mosaic: Mosaic, cone: Cone, first: int) -> Array:
+def layer_scale_design(mosaic: Mosaic, cone: Cone, first: int) -> Array:
     """ln(local scale) of the correction of P at the middle of the cone's sensors, ppm per unknown.
 
     Half the divergence of P = I + p: (p11 + p22) / 2 - 3/2 (p31 x + p32 y), lengths in half sizes.

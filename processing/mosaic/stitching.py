@@ -8,18 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal
 
 from processing.geometry.placement import SensorPlacement
 from processing.matching.tie_points import TiePoints
 from processing.mosaic.fixed import fixed_mosaic
 from processing.mosaic.free import Mosaic, MosaicSettings, free_mosaic
+from processing.mosaic.model import residuals_px
 from processing.mosaic.mounting import verified_mosaic
 from processing.mosaic.pan_only import pan_only_mosaic
+from processing.mosaic.slips import Slip, find_slips, inside_slips, of_sensor, slip_of
 from processing.mosaic.support import contradicted_colour, supported_mosaic, weakly_placed
 from processing.mosaic.validity import Validity, judge_master, robust_datum
 from processing.rig import Rig
 
+SLIP_ROUNDS: Final = 4
 Method = Literal["free", "fixed", "pan-only"]
 
 
@@ -29,8 +32,9 @@ class Stitching:
 
     `tie_points` are those believed. `equal` has its datum over all master sensors, `free` over
     those in place, both by tie points alone; `image` is what the image is made with: `free`, or
-    supported by calibration because of the sensors `weak`. `validity` is None with the methods that
-    are there to be compared with.
+    supported by calibration because of the sensors `weak`. `slips` are shifted bands of frames,
+    whose tie points are not among those believed. `validity` is None with the methods that are
+    there to be compared with.
     """
 
     tie_points: TiePoints
@@ -39,6 +43,7 @@ class Stitching:
     image: Mosaic
     validity: Validity | None
     weak: tuple[str, ...]
+    slips: tuple[Slip, ...] = ()
 
 
 def stitch(
@@ -69,6 +74,7 @@ def stitch(
             mosaic = verified_mosaic(rig, mosaic, tie_points)
         return Stitching(tie_points, mosaic, mosaic, mosaic, None, ())
     mosaic = free_mosaic(rig, start, tie_points, settings=settings)
+    tie_points, mosaic, slips = _without_slips(rig, start, tie_points, mosaic, settings)
     validity = judge_master(rig, mosaic, temperatures_c)
     contradicted = contradicted_colour(rig, tie_points, mosaic, validity)
     if contradicted.any():
@@ -86,4 +92,32 @@ def stitch(
         image = supported_mosaic(
             rig, start, tie_points, robust, validity, temperatures_c, settings=settings
         )
-    return Stitching(tie_points, mosaic, robust, image, validity, weak)
+    return Stitching(tie_points, mosaic, robust, image, validity, weak, slips)
+
+
+def _without_slips(
+    rig: Rig,
+    start: Mapping[str, SensorPlacement],
+    tie_points: TiePoints,
+    mosaic: Mosaic,
+    settings: MosaicSettings,
+) -> tuple[TiePoints, Mosaic, tuple[Slip, ...]]:
+    """Leave out the tie points of shifted bands and adjust again.
+
+    An adjustment with a shifted band in it spreads the shift over healthy sensors and bends the
+    frame to meet it halfway. Its size and reach are measured with the frame itself left out.
+    """
+    slips: tuple[Slip, ...] = ()
+    for _ in range(SLIP_ROUNDS):
+        found = find_slips(rig, tie_points, mosaic.residuals_px)
+        if not found:
+            break
+        suspect = found[0].sensor
+        others = tie_points.only(~of_sensor(tie_points, suspect))
+        without = free_mosaic(rig, start, others, settings=settings)
+        seen = residuals_px(without.model, without.placements, tie_points)
+        slip = slip_of(rig, tie_points, seen, suspect) or found[0]
+        slips += (slip,)
+        tie_points = tie_points.only(~inside_slips(tie_points, (slip,)))
+        mosaic = free_mosaic(rig, start, tie_points, settings=settings)
+    return tie_points, mosaic, slips

@@ -155,7 +155,7 @@ def _displacement(validity: Validity | None) -> Mapping[str, Figure]:
         }
     if validity.displaced is not None:
         figures |= {
-            "displaced_sensor": validity.displaced.sensor,
+            "displaced_sensor": None if validity.several else validity.displaced.sensor,
             "displaced_alternatives": ", ".join(validity.alternatives) or None,
             "displaced_several": 1 if validity.several else None,
             "displacement_x_px": validity.displaced.dx_px,

@@ -278,7 +278,10 @@ def _stitching(
 ) -> list[Finding]:
     findings = []
     poorest = _number(figures, "tie_points_min_overlap")
-    if poorest is not None and poorest < t.tie_points_per_overlap:
+    slipped = str(figures.get("slip_sensor") or "none") in str(
+        figures.get("tie_points_min_overlap_name")
+    )
+    if poorest is not None and poorest < t.tie_points_per_overlap and not slipped:
         where = figures.get("tie_points_min_overlap_name") or "an overlap"
         total = _number(figures, "tie_points_pp") or 0.0
         too_few = total < t.tie_points_pp_refly
@@ -328,22 +331,9 @@ def _stitching(
         (t.sigma0_px, t.sigma0_refly_px),
         "The sensors do not fit together well; check exposure times and the mount of the heads.",
     )
-    platform = _number(figures, "platform_test")
-    if platform is not None and platform > 1.0:
-        moved = _number(figures, "platform_shift_px")
-        findings.append(
-            Finding(
-                Flag.CALIBRATION_EXPIRED,
-                Verdict.USABLE,
-                f"Head {figures.get('platform_shift_head')} sits {moved or 0.0:.2f} px off the "
-                "platform calibration; the image is corrected for it. Go on, and calibrate the "
-                "platform from this flight.",
-                platform,
-                1.0,
-            )
-        )
+    findings += _platform(figures) + _slip(figures, t)
     displaced = figures.get("displaced_sensor")
-    if displaced:
+    if displaced or figures.get("displaced_several"):
         size = math.hypot(
             _number(figures, "displacement_x_px") or 0.0,
             _number(figures, "displacement_y_px") or 0.0,
@@ -371,8 +361,68 @@ def _stitching(
                 f"Sensor {displaced} sits {size:.2f} px off its calibrated place, unless it is "
                 f"{alternatives}; the image fits together. Go on, and have the camera calibrated."
             )
-        findings.append(Finding(Flag.DISPLACED_SENSOR, Verdict.USABLE, sentence, size))
+        test = _number(figures, "displacement_test")
+        grave = test is None or test > t.displacement_verdict
+        verdict = Verdict.USABLE if grave else Verdict.GOOD
+        findings.append(Finding(Flag.DISPLACED_SENSOR, verdict, sentence, size))
     return findings
+
+
+def _platform(figures: Mapping[str, Figure]) -> list[Finding]:
+    """Mountings and layers that are not as the platform calibration has them."""
+    test = _number(figures, "platform_test")
+    if test is None or test <= 1.0:
+        return []
+    causes = figures.get("platform_causes")
+    of_slip = causes is not None and causes == figures.get("slip_cone")
+    of_temperature = figures.get("platform_master_changed") and figures.get("dc_disagreement")
+    if of_slip or of_temperature:
+        return []
+    moved = _number(figures, "platform_shift_px") or 0.0
+    scale = _number(figures, "common_scale_ppm") or 0.0
+    sentence = (
+        f"Head {figures.get('platform_shift_head')} sits {moved:.2f} px off the platform "
+        "calibration; the image is corrected for it. Go on, and calibrate the platform from this "
+        "flight."
+    )
+    if figures.get("platform_master_changed"):
+        sentence = (
+            f"The layers of the other cones do not fit the master cone (common scale {scale:+.0f} "
+            f"ppm; cause: cone {causes}"
+            + (f", or {other}" if (other := figures.get("platform_alternatives")) else "")
+            + "): its principal distance or mounting has changed, or the rig file is of another "
+            "camera. The whole image may be shifted or scaled; its stated accuracy says by how "
+            "much. Check the serial numbers, and process again with the right calibration."
+        )
+    elif causes:
+        sentence = (
+            f"Cone {causes} differs from the platform calibration in scale or rotation (by up to "
+            f"{moved:.2f} px); the image is corrected for it. Check that the rig file belongs to "
+            "this camera, and calibrate the platform from this flight."
+        )
+    return [Finding(Flag.CALIBRATION_EXPIRED, Verdict.USABLE, sentence, test, 1.0)]
+
+
+def _slip(figures: Mapping[str, Figure], t: Thresholds) -> list[Finding]:
+    """A band of a frame that was read out shifted."""
+    shift_px = _number(figures, "slip_px")
+    if shift_px is None:
+        return []
+    others = str(figures.get("slip_sensors") or "").split(", ")[1:]
+    also = f" Also shifted: {', '.join(dict.fromkeys(others))}." if others else ""
+    grave = shift_px >= t.slip_refly_px
+    return [
+        Finding(
+            Flag.FRAME_CORRUPT,
+            Verdict.REFLY if grave else Verdict.USABLE,
+            f"In the frame of {figures.get('slip_sensor')}, {figures.get('slip_axis')} "
+            f"{figures.get('slip_first')} to {figures.get('slip_last')} lie {shift_px:.1f} px off "
+            f"the rest: lines were lost or repeated in read-out.{also} Check the head and its "
+            "cable." + (" Fly this exposure again." if grave else ""),
+            shift_px,
+            t.slip_refly_px,
+        )
+    ]
 
 
 def _exposure(figures: Mapping[str, Figure], t: Thresholds) -> list[Finding]:

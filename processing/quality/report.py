@@ -114,6 +114,10 @@ class Thresholds:
     smear_px: float = 0.8
     smear_refly_px: float = 2.0
     sharpness: float = 0.27
+    displacement_verdict: float = 1.6
+    """Test statistic over its critical value (0.1 %) from which a displaced sensor changes the
+    verdict: of 100,000 healthy exposures one does. Below, the image is corrected and stays good."""
+    slip_refly_px: float = 0.5
     tilt_rad: float = math.radians(5.0)
     crab_rad: float = math.radians(5.0)
     valid_refly_fraction: float = 0.75
@@ -151,10 +155,24 @@ FIGURES: Final[Mapping[str, str]] = {
     "misread_k": "how much too high it reads then, K",
     "misread_sigma_k": "standard deviation of that",
     "relative_displacements": "pairs of sensors of one cone found displaced against each other",
-    "platform_test": "mountings of converging heads against the platform calibration: test "
-    "statistic over its critical value; above one is significant",
+    "platform_test": "mountings of converging heads, or scale and rotation of the layers of the "
+    "other cones, against the platform calibration: test statistic over its critical value; above "
+    "one is significant",
     "platform_shift_px": "how far the head that moved most went by it, PAN pixels at its middle",
     "platform_shift_head": "which head that is",
+    "platform_causes": "cones whose change explains the layers, comma separated; the master's name "
+    "where all others changed alike",
+    "platform_alternatives": "cones that explain them nearly as well",
+    "platform_master_changed": "1 where the master cone is among these: the image is not corrected",
+    "common_scale_ppm": "change of scale that all layers share against calibration and drift",
+    "common_scale_sigma_ppm": "standard deviation of that by calibration, drift and tie points",
+    "slip_sensor": "frame with a band of rows or columns that lies elsewhere than the rest",
+    "slip_cone": "the cone of that frame",
+    "slip_px": "by how much it is shifted, PAN pixels",
+    "slip_axis": "rows or columns",
+    "slip_first": "first row or column of the band, raw pixels",
+    "slip_last": "last row or column of the band",
+    "slip_sensors": "all frames with such a band, comma separated",
     "platform_residual_px": "largest shift an affine transformation still finds between heads",
     "projection_height_m": "height above ground a virtual camera projected its heads onto",
     "head_parallax_px": "parallax relief may leave between PAN heads after that, PAN pixels",

@@ -176,6 +176,7 @@ def _lens(table: Table) -> Lens:
     lens = Lens(
         f_mm=number("f_mm", positive=True),
         f_ppm_per_k=number("f_ppm_per_k", 0.0),
+        f_sigma_ppm=number("f_sigma_ppm", 20.0, positive=True),
         f_number=number("f_number", 5.6, positive=True),
         serial=table.text("serial", ""),
         dx0_mm=number("dx0_mm", 0.0),

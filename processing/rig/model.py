@@ -108,7 +108,7 @@ class Lens:
 
     The correction carries *measured* image coordinates to *ideal* ones: ideal = measured + delta,
     with what `residual_grid` adds. `f_ppm_per_k` is the drift of the principal distance against dC
-    of the cone's probe.
+    of the cone's probe, `f_sigma_ppm` the standard deviation of the calibrated principal distance.
     """
 
     f_mm: float
@@ -126,6 +126,7 @@ class Lens:
     b1: float
     b2: float
     residual_grid: LensGrid | None = None
+    f_sigma_ppm: float = 20.0
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,130 @@
+"""What the findings of an exposure add to its stated accuracy.
+
+The covariance of `processing.mosaic.precision` holds for a camera that is as calibrated. Where the
+report itself finds a displaced sensor, a wrong temperature, a changed master cone or a read-out
+slip, the image is as uncertain as that finding, and says so.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.mosaic.datum import datum_candidates
+from processing.mosaic.estimated_dc import EstimatedDc, combined_dc
+from processing.mosaic.free import Mosaic
+from processing.mosaic.layers import LayerCheck
+from processing.mosaic.precision import Disturbance, datum_design, datum_per_kelvin_px
+from processing.mosaic.slips import Slip
+from processing.mosaic.validity import Validity
+from processing.rig import Rig, Sensor
+
+Array = NDArray[np.float64]
+
+SCALE_SIGMAS: Final = 2.0
+"""A common change of scale within so many standard deviations of the calibration is no error."""
+LEAST_PX: Final = 0.02
+"""Displacements below are alike."""
+
+
+def disturbance_of(
+    rig: Rig,
+    mosaic: Mosaic,
+    *,
+    validity: Validity | None,
+    estimated_dc: Sequence[EstimatedDc],
+    layers: LayerCheck | None,
+    slips: Sequence[Slip],
+) -> Disturbance:
+    """Add up what the findings of one exposure may have done to the image.
+
+    Args:
+        rig: the camera.
+        mosaic: what the image was made with.
+        validity: of the master cone's sensors.
+        estimated_dc: temperatures by stitching against those of the probes.
+        layers: the other cones against the platform calibration.
+        slips: shifted bands of frames.
+    """
+    warmed = tuple(_wrong_temperature(rig, mosaic, estimated_dc))
+    # A wrong temperature changes the scale of all layers alike, too.
+    changed = () if warmed else tuple(_changed_master(mosaic, layers))
+    datum = np.zeros((4, 4))
+    for part in (*_other_datums(rig, mosaic, validity), *warmed, *changed):
+        datum += np.outer(part, part)
+    frames: dict[str, Array] = {}
+    for slip in slips:
+        shift = np.array([slip.dx_px, slip.dy_px])
+        frames[slip.sensor] = frames.get(slip.sensor, np.zeros(2)) + slip.share * shift**2
+    return Disturbance(datum, frames)
+
+
+def _other_datums(rig: Rig, mosaic: Mosaic, validity: Validity | None) -> Iterator[Array]:
+    """How far the datum would lie elsewhere on the master sensors that may be in place (eq. 6)."""
+    accused = None if validity is None else validity.displaced or validity.unproven
+    if validity is None or accused is None:
+        return
+    found = [s for s in datum_candidates(rig) if s.name in mosaic.model.sensors]
+    trusted: list[tuple[Sensor, ...]] = []
+    if validity.several:
+        trusted += itertools.combinations(found, 2)
+    else:
+        suspects = {accused.sensor, *validity.alternatives}
+        trusted += [tuple(s for s in found if s.name != suspect) for suspect in sorted(suspects)]
+    parts, weights = [], []
+    for sensors in trusted:
+        if len(sensors) < 2:
+            continue
+        others = [s for s in found if s not in sensors]
+        part, *_ = np.linalg.lstsq(_places(sensors), _moved_px(mosaic, sensors), rcond=None)
+        left = (_moved_px(mosaic, others) - _places(others) @ part).reshape(-1, 2)
+        parts.append(part)
+        # Of several explanations the smaller displacements are the likelier ones.
+        weights.append(float(np.prod(1.0 / (np.sum(left**2, axis=1) + LEAST_PX**2))))
+    for part, weight in zip(parts, weights, strict=True):
+        yield part * np.sqrt(weight / sum(weights))
+
+
+def _places(sensors: Sequence[Sensor]) -> Array:
+    return datum_design(np.array([[s.x_mm, s.y_mm] for s in sensors]))
+
+
+def _moved_px(mosaic: Mosaic, sensors: Sequence[Sensor]) -> Array:
+    """Corrections of x and y against calibration and drift, (2 m,) px."""
+    first = [mosaic.model.sensors[s.name] for s in sensors]
+    return np.concatenate([mosaic.values[i : i + 2] / mosaic.model.pitch_mm for i in first])
+
+
+def _wrong_temperature(
+    rig: Rig, mosaic: Mosaic, estimated_dc: Sequence[EstimatedDc]
+) -> Iterator[Array]:
+    """What the difference between probes and stitching does to the master cone."""
+    off = [e for e in estimated_dc if e.disagrees]
+    if not off:
+        return
+    own = [e for e in off if e.cone == rig.master_cone]
+    # Probes of other cones move layers that are stitched anyway; all of them alike, all cones.
+    if not own and len(off) < sum(e.estimated_k is not None for e in estimated_dc):
+        return
+    combined = combined_dc(own or off)
+    measured = [e.measured_k for e in own or off if e.measured_k is not None]
+    if combined is not None and measured:
+        yield datum_per_kelvin_px(rig, mosaic) * (combined[0] - float(np.mean(measured)))
+
+
+def _changed_master(mosaic: Mosaic, layers: LayerCheck | None) -> Iterator[Array]:
+    """The change all other layers share is the master's own."""
+    if layers is None:
+        return
+    scale_ppm, by_x, by_y, by_z = layers.common
+    per_mm = 1e-6 / mosaic.model.pitch_mm
+    if layers.master_changed:
+        f_px = mosaic.model.f_mm * per_mm
+        yield np.array([-f_px * by_y, f_px * by_x, scale_ppm * per_mm, by_z * per_mm])
+    elif not layers.changed:
+        beyond = scale_ppm**2 - (SCALE_SIGMAS * layers.common_sigmas[0]) ** 2
+        yield np.array([0.0, 0.0, np.sqrt(max(beyond, 0.0)) * per_mm, 0.0])

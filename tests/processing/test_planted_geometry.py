@@ -1,0 +1,120 @@
+"""Wrong geometry that once went as `good`: each is rendered, and named with its size.
+
+The stated sigma covers the error, and is at most three times as large.
+"""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.processing.planted import Outcome, Planted, moved, rendered, slipped, turned, with_f
+
+pytestmark = [pytest.mark.trust, pytest.mark.timeout(300)]
+
+
+@pytest.fixture(scope="module")
+def healthy() -> Planted:
+    return rendered("ultracam-x-mini")
+
+
+def assert_covered(outcome: Outcome) -> None:
+    """The error lies within two stated sigmas, and the sigma states something."""
+    assert outcome.true_sigma_px < 2.0 * outcome.stated_sigma_px, outcome.stated_sigma_px
+    assert outcome.stated_sigma_px < 3.0 * outcome.true_sigma_px, outcome.true_sigma_px
+
+
+def test_a_healthy_exposure_raises_nothing(healthy: Planted) -> None:
+    outcome = healthy.outcome()
+    assert outcome.verdict == "good" and outcome.flags == set(), outcome.sentences
+    assert_covered(outcome)
+    assert outcome.figure("platform_test") < 0.5 and outcome.figure("slip_sensor") is None
+
+
+@pytest.mark.parametrize("ppm", [1000.0, -300.0])
+def test_the_masters_principal_distance_is_accused_and_widens_the_sigma(
+    healthy: Planted, ppm: float
+) -> None:
+    outcome = healthy.with_cone("0", with_f(1.0 + ppm * 1e-6)).outcome()
+    assert "CALIBRATION_EXPIRED" in outcome.flags and outcome.verdict == "usable"
+    assert (
+        outcome.figure("platform_causes") == "0" and "not fit the master cone" in outcome.sentences
+    )
+    assert outcome.figure("common_scale_ppm") == pytest.approx(-ppm, abs=60.0)
+    assert_covered(outcome)
+
+
+def test_below_its_detection_limit_a_principal_distance_widens_the_sigma(healthy: Planted) -> None:
+    outcome = healthy.with_cone("0", with_f(1.0001)).outcome()
+    assert outcome.verdict == "good"
+    assert outcome.true_sigma_px > 0.08
+    assert_covered(outcome)
+
+
+def test_the_principal_distance_of_another_cone_is_corrected_and_named(healthy: Planted) -> None:
+    outcome = healthy.with_cone("2", with_f(1.001)).outcome()
+    assert outcome.figure("platform_causes") == "2" and "corrected" in outcome.sentences
+    assert_covered(outcome)
+    assert outcome.inner_px < 0.02
+
+
+@pytest.mark.parametrize(
+    ("sensor", "axis", "first", "by", "length", "shift_px"),
+    [
+        ("SU11", "rows", 300, 4, 84, 4.0),
+        ("SU21", "rows", 100, 2, 40, 2.0),
+        ("SU00", "rows", 416, 1, None, 1.0),
+        ("SU02", "columns", 900, 1, None, 1.0),
+        ("SU30", "rows", 416, 1, None, 1.0),
+        ("SU30", "columns", 600, 1, None, 1.0),
+        ("G", "rows", 300, 1, None, 3.0),
+    ],
+)
+def test_a_read_out_slip_is_found_named_and_measured(
+    healthy: Planted,
+    sensor: str,
+    axis: str,
+    first: int,
+    by: int,
+    length: int | None,
+    shift_px: float,
+) -> None:
+    outcome = healthy.with_frame(sensor, slipped(axis, first, by, length)).outcome()
+    assert outcome.verdict == "refly" and "FRAME_CORRUPT" in outcome.flags
+    assert outcome.figure("slip_sensor") == sensor and outcome.figure("slip_axis") == axis
+    assert outcome.figure("slip_px") == pytest.approx(shift_px, rel=0.5)
+    assert outcome.figure("slip_first") <= first + 25
+    # Nobody else is accused, and what is not in the band is in its place.
+    assert "DISPLACED_SENSOR" not in outcome.flags, outcome.sentences
+    assert "CALIBRATION_EXPIRED" not in outcome.flags, outcome.sentences
+    assert outcome.inner_px < 0.03
+    if sensor != "G":
+        share = (outcome.figure("slip_last") - outcome.figure("slip_first")) / 832
+        assert outcome.figure("stitched_sigma_worst_px") > 0.4 * share * shift_px
+
+
+@pytest.mark.parametrize("off_k", [4.0, -28.0])
+def test_all_probes_that_misread_alike_widen_the_sigma(healthy: Planted, off_k: float) -> None:
+    outcome = healthy.with_probes(off_k).outcome()
+    assert "DC_DISAGREEMENT" in outcome.flags and "CALIBRATION_EXPIRED" not in outcome.flags
+    assert_covered(outcome)
+
+
+@pytest.mark.parametrize("moves", [((1.0, 0.5), (-0.4, 1.2)), ((0.3, 0.5), (-0.4, 0.2))])
+def test_two_moved_master_sensors_accuse_no_single_one(
+    healthy: Planted, moves: tuple[tuple[float, float], tuple[float, float]]
+) -> None:
+    first, second = moves
+    planted = healthy.with_sensor("SU00", moved(*first)).with_sensor("SU01", moved(*second))
+    outcome = planted.outcome()
+    assert "DISPLACED_SENSOR" in outcome.flags
+    assert (
+        outcome.figure("displaced_sensor") is None and "More than one sensor" in outcome.sentences
+    )
+    assert_covered(outcome)
+
+
+@pytest.mark.parametrize("angle", ["x_rad", "y_rad", "z_rad"])
+def test_a_turned_cone_is_corrected_and_named(healthy: Planted, angle: str) -> None:
+    outcome = healthy.with_cone("2", turned(**{angle: 3e-4})).outcome()
+    assert outcome.figure("platform_causes") == "2" and "CALIBRATION_EXPIRED" in outcome.flags
+    assert_covered(outcome)
