@@ -39,9 +39,8 @@ class SlipSettings:
     A band holds at least two bins of `bin_points` tie points; the mean of their medians differs
     from the median of the rest of the frame by more than `limit` standard deviations of
     independent points, and by more than `least_px`. The second is what decides on ground where
-    neighbouring points err alike: over relief, trees, clouds and moving vehicles (docs/validity.md).
-    All of a band moves: `least_share` of its points have its shift, of
-    vehicles on a road fewer.
+    neighbouring points err alike: relief, trees, clouds, vehicles (docs/validity.md). All of a band
+    moves: `least_share` of its points have its shift, of vehicles on a road fewer.
     """
 
     bin_points: int = 7
