@@ -90,11 +90,14 @@ class Track:
         """
         if not self._samples or self._from_the_past or self._samples[-1].gps_ns < gps_ns:
             return False
-        near = [s for s in self._samples if abs(s.gps_ns - gps_ns) <= EXTRAPOLATION_LIMIT_NS]
-        has_height = any(s.height_m is not None and s.gps_ns < gps_ns for s in near)
-        is_late = self._samples[-1].gps_ns - gps_ns >= EXTRAPOLATION_LIMIT_NS
-        follows = any(s.height_m is not None and s.gps_ns >= gps_ns for s in near)
-        return follows or is_late or not has_height
+        if self._samples[-1].gps_ns - gps_ns >= EXTRAPOLATION_LIMIT_NS:
+            return True
+        for sample in reversed(self._samples):
+            if sample.gps_ns < gps_ns - EXTRAPOLATION_LIMIT_NS:
+                break
+            if sample.height_m is not None:
+                return sample.gps_ns >= gps_ns
+        return True
 
     def at(self, gps_ns: int, mono_ns: int | None = None) -> NavigationRecord | None:
         """Navigation at an instant; None where no sample is within two seconds.

@@ -249,6 +249,7 @@ class MavlinkDecoder(MessageDecoder):
                 leap_seconds=self.leap_seconds,
                 time_valid=True,
                 sigma_source="none" if horizontal_m is None else "receiver",
+                leap_source="table",
             )
         ]
 

@@ -106,6 +106,7 @@ def test_a_position_comes_out_in_si_units_at_its_gps_time(version: int) -> None:
     assert sample.velocity_ned_mps == pytest.approx((60.0, 3.0, -1.0))
     assert (sample.fix, sample.satellites, sample.leap_seconds) == ("3d", 17, 18)
     assert sample.height_m == pytest.approx(1000.0)
+    assert (sample.leap_source, sample.sigma_source) == ("table", "receiver")
     # One SYSTEM_TIME does not say how it scatters: some milliseconds, at 60 m/s.
     assert 0.3 < sample.horizontal_sigma_m < 0.6
     assert 0.03 < sample.vertical_sigma_m < 0.04
