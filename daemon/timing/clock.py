@@ -38,6 +38,8 @@ UNUSUAL: Final = 1.7
 RESIDUALS_KEPT: Final = 64
 BELIEF: Final = 4.0
 """How many readings the stated sigma of a pulse's host time weighs against what is seen."""
+SCATTER_USUAL: Final = 2.0
+"""Edges that scatter by up to so many times what is stated are as they should be."""
 PPS_HOLDOVER_NS: Final = 5 * SECOND_NS
 MARK_HOLDOVER_NS: Final = 10 * SECOND_NS
 MARKS_MISSED: Final = 3
@@ -254,7 +256,7 @@ class HostClock:
         found = []
         pps = self._through_pps(mono_ns)
         if pps is not None:
-            sigma_ns = math.hypot(pps.sigma_ns, self._pps_sigma_ns)
+            sigma_ns = math.hypot(pps.sigma_ns, self._pps_hidden_ns())
             found.append(self._told_as(pps, sigma_ns, "pps", mono_ns))
         marks = self._marks.at(mono_ns)
         if marks is not None:
@@ -277,7 +279,7 @@ class HostClock:
             found.append(self._told_as(marks, marks.sigma_ns, "marks", mono_ns))
         pps = self._through_pps(mono_ns)
         if pps is not None:
-            hidden_ns = math.hypot(self.round_trips.hidden_ns, self._pps_sigma_ns)
+            hidden_ns = math.hypot(self.round_trips.hidden_ns, self._pps_hidden_ns())
             late_ns, spread_ns = self._lateness.estimate(hidden_ns, reading_ns)
             shifted = Estimate(pps.to_ns + round(late_ns), 0.0, pps.away_ns)
             sigma_ns = math.hypot(pps.sigma_ns, spread_ns)
@@ -292,7 +294,7 @@ class HostClock:
             return COARSE_SIGMA_NS
         if source == "pps":
             estimate = self._through_pps(mono_ns)
-            own_ns = self._pps_sigma_ns
+            own_ns = self._pps_hidden_ns()
         else:
             estimate, own_ns = self._marks.at(mono_ns), 0.0
         return 0 if estimate is None else round(math.hypot(estimate.sigma_ns, own_ns))
@@ -365,6 +367,10 @@ class HostClock:
         least = min(mono - gps for gps, mono in self._messages)
         centre = (ARRIVAL_MIN_NS + ARRIVAL_MAX_NS) // 2
         return GpsEstimate(mono_ns - least + centre, COARSE_SIGMA_NS, True, "messages")
+
+    def _pps_hidden_ns(self) -> float:
+        """What all edges may be late by alike: as stated, or more where they scatter by more."""
+        return self._pps_sigma_ns * max(1.0, self._pps.reading_scale() / SCATTER_USUAL)
 
     def _through_pps(self, mono_ns: int) -> Estimate | None:
         if self._second is None:

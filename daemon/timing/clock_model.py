@@ -8,6 +8,8 @@ what the pairs were made of.
 from __future__ import annotations
 
 import math
+import statistics
+from collections import deque
 from collections.abc import Hashable
 from dataclasses import dataclass
 from itertools import pairwise
@@ -46,6 +48,13 @@ GATE_SHARE: Final = 4
 STEP_PAIRS: Final = 3
 """So many pairs held back that agree with each other are no outliers: the clock has stepped."""
 ROUNDS: Final = 3
+RECENT: Final = 24
+SCATTER_FROM: Final = 8
+SCATTER_LARGE: Final = 4.0
+"""Where neighbours scatter by so many times their stated sigmas, these are multiplied: the grid of
+scales ends at eight, and pairs would be held back as outliers of each other for ever."""
+WANDER_ALLOWED: Final = 200.0
+"""What the rate may have wandered between neighbours, ns per s^1.5."""
 GRID_PRIOR: Final[Array] = (
     -0.5 * ((np.log10(GRID_WANDER) - WANDER_USUAL) / WANDER_DECADES) ** 2
     - 0.5 * (np.log(GRID_SCALE) / SCALE_SPREAD) ** 2
@@ -84,6 +93,8 @@ class ClockModel:
         self._memory = memory
         self._pairs: list[Pair] = []
         self._held: list[Pair] = []
+        self._recent: deque[Pair] = deque(maxlen=RECENT)
+        self._factor = 1.0
         self._fit: _Fit | None = None
         self._gate: _Fit | None = None
         self._since_gate = 0
@@ -105,10 +116,14 @@ class ClockModel:
         Where several in succession are held back and agree, the clock has stepped: what was known
         is dropped, and they are the new beginning.
         """
+        self._recent.append(pair)
+        self._look_at_scatter()
+        if pair in self._pairs:
+            return True
         if len(self._pairs) >= 2 and not self._fits(pair):
             self._held.append(pair)
             self.outliers += 1
-            if len(self._held) >= STEP_PAIRS and _agree(self._held[-STEP_PAIRS:]):
+            if len(self._held) >= STEP_PAIRS and _agree(self._held[-STEP_PAIRS:], self._factor):
                 self._step()
                 return True
             del self._held[:-STEP_PAIRS]
@@ -125,24 +140,30 @@ class ClockModel:
             self._pairs = kept
             self._fit = self._gate = None
         self._held = [pair for pair in self._held if pair.key != key]
+        self._recent = deque((pair for pair in self._recent if pair.key != key), RECENT)
 
     def clear(self) -> None:
         """Forget everything."""
         self._pairs.clear()
         self._held.clear()
+        self._recent.clear()
+        self._factor = 1.0
         self._fit = self._gate = None
 
     def at(self, from_ns: int, *, reading_sigma_ns: float = 0.0) -> Estimate | None:
         """The other clock at an instant; None before the first pair.
 
         With `reading_sigma_ns` the instant itself was read like the pairs were, with that stated
-        sigma: what was learned of such sigmas is applied to it.
+        sigma: what was learned of such sigmas is applied to it. From a pair on that is held back,
+        what it is off by is part of the sigma: it may be the first one after a step.
         """
         if not self._pairs:
             return None
-        if self._fit is None:
-            self._fit = _Fit(self._pairs)
-        to_ns, sigma_ns = self._fit.at(from_ns, reading_sigma_ns)
+        fit = self._fitted()
+        to_ns, sigma_ns = fit.at(from_ns, self._factor * reading_sigma_ns)
+        if self._held and from_ns >= self._held[0].from_ns:
+            last = self._held[-1]
+            sigma_ns = math.hypot(sigma_ns, last.to_ns - fit.at(last.from_ns, 0.0)[0])
         away_ns = min(abs(pair.from_ns - from_ns) for pair in self._pairs)
         return Estimate(to_ns, sigma_ns, away_ns)
 
@@ -150,17 +171,35 @@ class ClockModel:
         """By which factor sigmas of readings were found too small."""
         if not self._pairs:
             return 1.0
+        return self._factor * self._fitted().reading_scale()
+
+    def _fitted(self) -> _Fit:
         if self._fit is None:
-            self._fit = _Fit(self._pairs)
-        return self._fit.reading_scale()
+            self._fit = _Fit(self._pairs, self._factor)
+        return self._fit
+
+    def _look_at_scatter(self) -> None:
+        """Whether sigmas are stated far too small; then all recent pairs are used, with larger."""
+        factor = _scatter_of(sorted(self._recent, key=lambda pair: pair.from_ns))
+        factor = factor if factor > SCATTER_LARGE else 1.0
+        if 0.5 < factor / self._factor < 2.0:
+            return
+        self._factor = factor
+        self._fit = self._gate = None
+        if factor > 1.0:
+            self._held.clear()
+            for pair in self._recent:
+                if pair not in self._pairs:
+                    self._insert(pair)
 
     def _fits(self, pair: Pair) -> bool:
         """Whether a pair may be one, by a fit that may be a few pairs old: it then coasts."""
         if self._gate is None or self._since_gate > len(self._pairs) // GATE_SHARE:
-            self._gate = self._fit or _Fit(self._pairs)
+            self._gate = self._fit or _Fit(self._pairs, self._factor)
             self._since_gate = 0
-        to_ns, sigma_ns = self._gate.at(pair.from_ns, pair.sigma_ns)
-        return abs(pair.to_ns - to_ns) <= OUTLIER * 1.5 * max(sigma_ns, pair.sigma_ns)
+        stated_ns = self._factor * pair.sigma_ns
+        to_ns, sigma_ns = self._gate.at(pair.from_ns, stated_ns)
+        return abs(pair.to_ns - to_ns) <= OUTLIER * 1.5 * max(sigma_ns, stated_ns)
 
     def _step(self) -> None:
         expected = self.at(self._held[-1].from_ns)
@@ -169,6 +208,7 @@ class ClockModel:
         self.last_step_ns = self._held[-1].to_ns - expected.to_ns
         self._pairs = sorted(self._held[-STEP_PAIRS:], key=lambda pair: pair.from_ns)
         self._held.clear()
+        self._recent = deque(self._pairs, RECENT)
         self._fit = self._gate = None
 
     def _insert(self, pair: Pair) -> None:
@@ -197,12 +237,36 @@ def _most_dispensable(pairs: list[Pair]) -> int:
     return best
 
 
-def _agree(pairs: list[Pair]) -> bool:
+def _scatter_of(pairs: list[Pair]) -> float:
+    """By how much neighbours scatter more than their sigmas say; 1 where there are few."""
+    ratios = []
+    for before, pair, after in zip(pairs, pairs[1:], pairs[2:], strict=False):
+        span_ns = after.from_ns - before.from_ns
+        if span_ns <= 0:
+            continue
+        share = (pair.from_ns - before.from_ns) / span_ns
+        off, end = (
+            (other.to_ns - before.to_ns) - (other.from_ns - before.from_ns)
+            for other in (pair, after)
+        )
+        sigma = math.hypot(
+            pair.sigma_ns,
+            (1 - share) * before.sigma_ns,
+            share * after.sigma_ns,
+            WANDER_ALLOWED * (span_ns * 1e-9) ** 1.5,
+            1.0,
+        )
+        ratios.append(abs(off - share * end) / sigma)
+    # The median of a normal variable's size is 0.6745 sigma.
+    return statistics.median(ratios) / 0.6745 if len(ratios) >= SCATTER_FROM else 1.0
+
+
+def _agree(pairs: list[Pair], factor: float) -> bool:
     """Whether pairs lie on one line of a rate a clock can have."""
     for before, after in pairwise(sorted(pairs, key=lambda pair: pair.from_ns)):
         apart_s = (after.from_ns - before.from_ns) * 1e-9
         moved = (after.to_ns - before.to_ns) - (after.from_ns - before.from_ns)
-        tolerance = 8.0 * (before.sigma_ns + after.sigma_ns) + RATE_SIGMA * 5 * apart_s
+        tolerance = 8.0 * factor * (before.sigma_ns + after.sigma_ns) + RATE_SIGMA * 5 * apart_s
         if abs(moved) > min(tolerance, 1e8):
             return False
     return True
@@ -218,13 +282,13 @@ class _Fit:
     eigen-decomposition serves the whole grid.
     """
 
-    def __init__(self, pairs: list[Pair]) -> None:
+    def __init__(self, pairs: list[Pair], factor: float) -> None:
         last = pairs[-1]
         self._from_ns, self._to_ns = last.from_ns, last.to_ns
         self._u = np.array([(p.from_ns - last.from_ns) * 1e-9 for p in pairs])
         z = [(p.to_ns - last.to_ns) - (p.from_ns - last.from_ns) for p in pairs]
         self._z = np.array(z, dtype=np.float64)
-        stated = np.array([max(p.sigma_ns, 1.0) for p in pairs])
+        stated = np.array([max(factor * p.sigma_ns, 1.0) for p in pairs])
         self._stated = stated
         self._sigma = stated
         self._start = float(self._u[0])
