@@ -6,15 +6,20 @@ What its bytes mean is in `drivers.nmea.decoder`.
 from __future__ import annotations
 
 import datetime
+from collections.abc import Iterable
 from typing import ClassVar, Final
 
 from drivers.gps_time import GPS_EPOCH_DAY
 from drivers.nmea.decoder import NmeaDecoder
 from drivers.receiver import ListeningNavigator
+from drivers.serial_device import Sample, SerialLine
 from drivers.settings import Setting
 
 NOT_BEFORE_DAY: Final = datetime.date(2020, 1, 1).toordinal() - GPS_EPOCH_DAY
 """No flight was earlier: a receiver that says so lost count of the weeks (1024 of them)."""
+
+UNDATED_MOST: Final = 5
+"""So many positions before the first date are normal: it comes once a second."""
 
 
 class NmeaNavigator(ListeningNavigator):
@@ -57,3 +62,20 @@ class NmeaNavigator(ListeningNavigator):
             undulation_m=self.undulation_m if "undulation_m" in self.given else None,
             not_before_day=NOT_BEFORE_DAY,
         )
+
+    def step(self, line: SerialLine) -> Iterable[Sample]:
+        records = super().step(line)
+        counters = self.decoder.counters
+        if counters["samples_without_date"] >= UNDATED_MOST and not counters["samples"]:
+            self.teller.complain(
+                "no-date",
+                f"The receiver {self.name} at {self.port} sends positions and no date. Switch on "
+                "RMC or ZDA.",
+            )
+        if counters["dates_rolled_over"]:
+            self.teller.complain(
+                "rolled-over",
+                f"The receiver {self.name} at {self.port} sends dates of 1024 weeks ago; they are "
+                "corrected. Update its firmware.",
+            )
+        return records

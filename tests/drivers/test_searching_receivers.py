@@ -136,6 +136,20 @@ def test_a_fix_lost_for_a_moment_is_no_news_and_for_longer_is() -> None:
     assert notebook.event_names == ["opened", "searching"]
 
 
+def test_a_receiver_that_sends_no_date_or_an_old_one_is_reported_as_such() -> None:
+    undated = [sentence(epoch_gga(f"1000{n:02d}.00")) for n in range(9)]
+    _, notebook = run(*undated)
+    assert notebook.event_names == ["opened", "no-date"]
+    old = [epoch(f"1000{n:02d}.00", "070407") for n in range(4)]
+    _, notebook = run(*old)
+    assert notebook.event_names == ["opened", "rolled-over"]
+    assert run(*[epoch(f"1000{n:02d}.00") for n in range(9)])[1].event_names == ["opened"]
+
+
+def epoch_gga(time: str) -> str:
+    return f"GPGGA,{time},4730.0,N,00830.0,E,1,12,0.8,952.5,M,47.5,M,,"
+
+
 @pytest.mark.parametrize(
     ("decoder", "said", "satellites"),
     [
