@@ -20,6 +20,7 @@ from typing import Any, cast
 import numpy as np
 
 from daemon.measuring import machine
+from processing.conditions import for_sensors
 from processing.pipeline import Conditions, Pipeline, Product, Settings
 from processing.quality.report import Flag
 from processing.radiometry.calibration import load_radiometry
@@ -140,8 +141,10 @@ def fly(exposures: int) -> list[Point]:
                 read[STUCK_PROBE] = stuck_c
             conditions = Conditions(
                 temperatures_c=read,
-                exposure_time_s={name: t * 1e-6 for name, t in plan.exposure_time_us.items()},
-                tdi_shifts=plan.tdi_shifts,
+                exposure_time_s=for_sensors(
+                    rig, {name: t * 1e-6 for name, t in plan.exposure_time_us.items()}
+                ),
+                tdi_shifts=for_sensors(rig, plan.tdi_shifts),
                 ground_speed_mps=plan.ground_speed_mps,
                 height_above_ground_m=plan.height_above_ground_m,
             )

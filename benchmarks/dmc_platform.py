@@ -18,7 +18,7 @@ from scipy.stats import chi2
 
 from benchmarks import rendered
 from benchmarks.stitching_trials import same_ground, world_and_rig
-from processing.conditions import Conditions
+from processing.conditions import Conditions, for_sensors
 from processing.geometry.placement import nominal_placements, raw_from_vip_mm
 from processing.geometry.rotation import rotation_matrix
 from processing.geometry.topology import overlaps
@@ -64,7 +64,7 @@ def trial(name: str, seed: int) -> Trial:
         pitch_rad=pose.pitch_rad,
     )
     start = nominal_placements(
-        rig, probes, world.plan.tdi_shifts, ground=ground_plane(rig, conditions)
+        rig, probes, for_sensors(rig, world.plan.tdi_shifts), ground=ground_plane(rig, conditions)
     )
     random = np.random.default_rng([seed, 11])
     names = tuple(s.name for s in rig.sensors)

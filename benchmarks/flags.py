@@ -283,7 +283,7 @@ def _stuck(told: Conditions) -> Conditions:
 
 def _turning(told: Conditions) -> Conditions:
     """A pitch rate that smears by twice the threshold during the exposure of PAN."""
-    time_s = told.exposure_time_s["0"]
+    time_s = told.exposure_time_s["SU00"]
     rate = 2.0 * THRESHOLDS.smear_px / (time_s * 100.5 / 7.2e-3)
     return replace(told, angular_rate_rad_per_s=(0.0, rate, 0.0))
 

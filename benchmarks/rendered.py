@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.conditions import for_sensors
 from processing.pipeline import Conditions, Pipeline, Product
 from processing.radiometry.calibration import RadiometricCalibration
 from processing.rig import shipped_rigs
@@ -100,8 +101,10 @@ def conditions_of(exposure: Exposure, *, seed: int) -> Conditions:
     return Conditions(
         temperatures_c=snapshots.probe_readings(world, mark, seed=seed),
         temperature_age_s=dict.fromkeys(world.rig.probes, float(noise.uniform(0.0, 2.0))),
-        exposure_time_s={name: us * 1e-6 for name, us in world.plan.exposure_time_us.items()},
-        tdi_shifts=world.plan.tdi_shifts,
+        exposure_time_s=for_sensors(
+            world.rig, {name: us * 1e-6 for name, us in world.plan.exposure_time_us.items()}
+        ),
+        tdi_shifts=for_sensors(world.rig, world.plan.tdi_shifts),
         ground_speed_mps=speed + float(noise.normal(0.0, 0.05)),
         height_above_ground_m=world.plan.height_above_ground_m,
         roll_rad=pose.roll_rad + float(noise.normal(0.0, ATTITUDE_SIGMA_RAD)),

@@ -287,8 +287,7 @@ def seams_of(
     for name in product.sensors:
         head = heads[name]
         composer = PanComposer(world.image, [head.sensor], cell_px=pan_cell_px(world.rig))
-        cone = head.cone.name
-        look = Look(0, conditions.exposure_time_s[cone] * 1e6, conditions.tdi_shifts[cone])
+        look = Look(0, conditions.exposure_time_s[name] * 1e6, conditions.tdi_shifts[name])
         level1_of(head, frames[name], look, conditions, composer.frame(name))
         alone = composer.compose(
             product.mosaic.placements, [name], feather_px=16, interpolation="cubic"

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks import rendered
-from processing.conditions import Conditions, parallax_px
+from processing.conditions import Conditions, for_sensors, parallax_px
 from processing.geometry.placement import (
     nominal_placements,
     raw_from_vip_mm,
@@ -174,7 +174,7 @@ def drawn_trial(
     flight = world.flight.beginning_first_line_at(world.flight.distance_flown_m(first_ns))
     looks = {s.name: look_of(world, cone, first_ns) for cone in rig.cones for s in cone.sensors}
     probes = probe_readings(world, first_ns, seed=seed)
-    start = nominal_placements(rig, probes, world.plan.tdi_shifts)
+    start = nominal_placements(rig, probes, for_sensors(rig, world.plan.tdi_shifts))
     random = np.random.default_rng([seed, 5])
     names = tuple(sensor.name for sensor in rig.sensors)
     trials = int(errors.trial.max()) + 1
@@ -223,7 +223,7 @@ def mosaic_settings(world: World) -> MosaicSettings:
     plan = Conditions(
         temperatures_c={},
         exposure_time_s={},
-        tdi_shifts=world.plan.tdi_shifts,
+        tdi_shifts=for_sensors(world.rig, world.plan.tdi_shifts),
         ground_speed_mps=world.plan.ground_speed_mps,
         height_above_ground_m=world.plan.height_above_ground_m,
     )

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.measuring import machine
-from processing.conditions import Conditions, parallax_px
+from processing.conditions import Conditions, for_sensors, parallax_px
 from processing.geometry.placement import (
     SensorPlacement,
     nominal_placements,
@@ -152,7 +152,7 @@ def fly(world: World, exposures: int, seed: int) -> dict[str, Residuals]:
             + rng.normal(0, PROBE_SIGMA_C)
             for p in rig.probes
         }
-        start = nominal_placements(rig, probes, plan.tdi_shifts)
+        start = nominal_placements(rig, probes, for_sensors(rig, plan.tdi_shifts))
         points = tie_points(world, flight, looks, start, rng)
         mosaics = {
             "experiment": pan_only_mosaic(rig, start, points, settings=settings),
@@ -178,8 +178,10 @@ def _conditions(world: World, probes: Mapping[str, float]) -> Conditions:
     plan = world.plan
     return Conditions(
         temperatures_c=dict(probes),
-        exposure_time_s={name: t * 1e-6 for name, t in plan.exposure_time_us.items()},
-        tdi_shifts=plan.tdi_shifts,
+        exposure_time_s=for_sensors(
+            world.rig, {name: t * 1e-6 for name, t in plan.exposure_time_us.items()}
+        ),
+        tdi_shifts=for_sensors(world.rig, plan.tdi_shifts),
         ground_speed_mps=plan.ground_speed_mps,
         height_above_ground_m=plan.height_above_ground_m,
     )

@@ -29,6 +29,7 @@ from processing.calibration.platform import (
     PlatformCalibration,
     calibrate_platform,
 )
+from processing.conditions import for_sensors
 from processing.geometry.placement import nominal_placements
 from processing.matching.tie_points import PAN_TO_COLOUR, TiePoints
 from processing.mosaic.free import free_mosaic
@@ -58,7 +59,7 @@ def flown(name: str, seed: int, exposures: int) -> tuple[World, PlatformCalibrat
     for mark_ns in marks_of_lines(world, flight, first_ns, exposures, LINES):
         looks = {cone.name: look_of(world, cone, mark_ns) for cone in rig.cones}
         probes = probe_readings(world, mark_ns, seed=seed * 1000 + len(records))
-        start = nominal_placements(rig, probes, world.plan.tdi_shifts)
+        start = nominal_placements(rig, probes, for_sensors(rig, world.plan.tdi_shifts))
         points = tie_points(
             world,
             flight,

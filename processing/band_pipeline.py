@@ -138,7 +138,7 @@ class BandPipeline:
 
     def warm_up(self) -> None:
         """Compile every kernel a flight will need, from the cache where there is one."""
-        exposure_time_s = {cone.name: 0.001 for cone in self.rig.cones}
+        exposure_time_s = {sensor.name: 0.001 for sensor in self.rig.sensors}
         self.process(plain_frames(self.rig), Conditions(exposure_time_s=exposure_time_s))
 
     def process(
@@ -240,12 +240,11 @@ class BandPipeline:
             black = sensor.black_dn * sensor.words_per_dn if told.black is None else told.black
             dn = (np.asarray(words, np.float32) - np.float32(black)) / sensor.words_per_dn
             return dn.astype(np.float32), SIGNAL_UNIT
-        cone = self.rig.cone_of(sensor.name).name
         radiance = radiance_from_words(
             sensor,
             calibration,
             words,
-            exposure_time_s=conditions.exposure_time_s.get(cone, 0.0),
+            exposure_time_s=conditions.exposure_time_s.get(sensor.name, 0.0),
             gain=told.gain,
             black=told.black,
         )

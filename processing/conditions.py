@@ -7,8 +7,10 @@ Smear, parallax, ground sampling distance and dC are computed here; they become 
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import numpy as np
 
@@ -18,6 +20,8 @@ from processing.quality.probe_health import bridge_by_others
 from processing.quality.report import NO_FLAGS, Figure, Flag, Thresholds
 from processing.rig import Cone, Rig
 
+T = TypeVar("T")
+
 TIME_PARTS = ("receiver", "clock", "trigger", "delay", "head")
 
 
@@ -25,6 +29,7 @@ TIME_PARTS = ("receiver", "clock", "trigger", "delay", "head")
 class Conditions:
     """The circumstances of one exposure; None or an absent key is "not known".
 
+    Temperatures are by probe; exposure times and TDI counts are those of each frame, by sensor.
     Angles and rates are of the body (x forward, y right, z down); `crab_rad` is the angle from the
     track to the body's x axis. `time_budget_ns` are the parts of `time_sigma_ns`: receiver, clock,
     trigger, delay, head. Overlaps are with the image before it on the line and with the
@@ -93,6 +98,39 @@ def usable_temperatures(rig: Rig, conditions: Conditions, thresholds: Thresholds
     return Temperatures(usable, tuple(missing), tuple(out_of_range), bridged)
 
 
+def by_sensor_of(cone: Cone, of_frames: Mapping[str, T]) -> dict[str, T]:
+    """What is known of a cone's frames, by sensor name."""
+    names = [sensor.name for sensor in cone.sensors]
+    return {name: of_frames[name] for name in names if name in of_frames}
+
+
+def for_sensors(rig: Rig, of_cones: Mapping[str, T]) -> dict[str, T]:
+    """The same value for each sensor of a cone: by sensor name, from values by cone name."""
+    return {
+        sensor.name: of_cones[cone.name]
+        for cone in rig.cones
+        for sensor in cone.sensors
+        if cone.name in of_cones
+    }
+
+
+def exposure_scales(rig: Rig, exposure_time_s: Mapping[str, float]) -> dict[str, float]:
+    """What the signal of each frame is multiplied by, so that all frames of a cone compare.
+
+    The median exposure time of the frames of its cone over its own: exactly 1 where the frames of
+    a cone were exposed alike, and for a frame whose exposure time is not known.
+
+    Args:
+        exposure_time_s: positive, by sensor name.
+    """
+    scales = {}
+    for cone in rig.cones:
+        times_s = by_sensor_of(cone, exposure_time_s)
+        for name, time_s in times_s.items():
+            scales[name] = statistics.median_low(times_s.values()) / time_s
+    return scales
+
+
 def condition_figures(
     rig: Rig, conditions: Conditions, temperatures: Temperatures
 ) -> dict[str, Figure]:
@@ -111,7 +149,8 @@ def condition_figures(
     figures["sidelap"] = conditions.sidelap
     sun = conditions.sun_elevation_rad
     figures["sun_deg"] = None if sun is None else math.degrees(sun)
-    figures["tdi_shifts"] = conditions.tdi_shifts.get(rig.reference_cone)
+    shifts = by_sensor_of(rig.cone(rig.reference_cone), conditions.tdi_shifts)
+    figures["tdi_shifts"] = max(shifts.values(), default=None)
     return figures
 
 
@@ -178,7 +217,8 @@ def _smears(rig: Rig, conditions: Conditions) -> dict[str, Figure]:
             "smear_across_px": None,
             "smear_worst_head": worst,
         }
-    smears = [_smear(rig, cone, conditions) for cone in rig.pan_cones]
+    sensors = [sensor.name for cone in rig.pan_cones for sensor in cone.sensors]
+    smears = [_smear(rig, sensor, conditions) for sensor in sensors]
     return {
         name: max((s[k] for s in smears if s is not None), default=None)
         for k, name in enumerate(("smear_along_px", "smear_across_px"))
@@ -191,7 +231,7 @@ def head_smear_px(cone: Cone, conditions: Conditions) -> float | None:
     A head that looks aslant has the ground nearest, and so the longest way, at one edge: all
     corners count and the middle. None where speed, height or exposure time are not known.
     """
-    time_s = conditions.exposure_time_s.get(cone.name)
+    time_s = conditions.exposure_time_s.get(cone.sensors[0].name)
     speed_mps, height_m = conditions.ground_speed_mps, conditions.height_above_ground_m
     if time_s is None or speed_mps is None or height_m is None or height_m <= 0:
         return None
@@ -209,12 +249,12 @@ def head_smear_px(cone: Cone, conditions: Conditions) -> float | None:
     return float(np.hypot(away[:, 0], away[:, 1]).max(initial=0.0)) / sensor.pitch_mm
 
 
-def _smear(rig: Rig, cone: Cone, conditions: Conditions) -> tuple[float, float] | None:
-    """Motion in pixels along and across track that the cone's TDI leaves (DESIGN 5.11).
+def _smear(rig: Rig, sensor: str, conditions: Conditions) -> tuple[float, float] | None:
+    """Motion in pixels along and across track that the sensor's TDI leaves (DESIGN 5.11).
 
     Rotation adds to translation by absolute value: the worst place of the image counts.
     """
-    time_s = conditions.exposure_time_s.get(cone.name)
+    time_s = conditions.exposure_time_s.get(sensor)
     gsd_m = ground_sampling_distance_m(rig, conditions)
     image = rig.virtual_image
     if time_s is None or image is None:
@@ -225,7 +265,7 @@ def _smear(rig: Rig, cone: Cone, conditions: Conditions) -> tuple[float, float] 
         known = True
         moved_px = conditions.ground_speed_mps * time_s / gsd_m
         crab = conditions.crab_rad or 0.0
-        along = abs(moved_px * math.cos(crab) - conditions.tdi_shifts.get(cone.name, 0))
+        along = abs(moved_px * math.cos(crab) - conditions.tdi_shifts.get(sensor, 0))
         across = abs(moved_px * math.sin(crab))
     if conditions.angular_rate_rad_per_s is not None:
         known = True

@@ -204,7 +204,7 @@ class HeadPipeline:
                 self._correctors[sensor.name],
                 np.ascontiguousarray(frames[sensor.name]),
                 temperature_c=known.get(sensor.probe),
-                exposure_time_s=conditions.exposure_time_s.get(cone.name, 0.0),
+                exposure_time_s=conditions.exposure_time_s.get(sensor.name, 0.0),
                 tdi_shifts=0,
                 out=level1[sensor.name],
             )

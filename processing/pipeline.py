@@ -19,6 +19,7 @@ from processing.conditions import (
     Conditions,
     Temperatures,
     condition_figures,
+    exposure_scales,
     parallax_px,
     usable_temperatures,
 )
@@ -141,8 +142,8 @@ class Pipeline:
         frames = rehearsal_frames(self.rig)
         conditions = Conditions(
             temperatures_c=dict.fromkeys(self.rig.probes, 20.0),
-            exposure_time_s={cone.name: 0.005 for cone in self.rig.cones},
-            tdi_shifts={cone.name: 1 for cone in self.rig.cones},
+            exposure_time_s={sensor.name: 0.005 for sensor in self.rig.sensors},
+            tdi_shifts={sensor.name: 1 for sensor in self.rig.sensors},
         )
         settings = self.settings
         try:
@@ -306,17 +307,18 @@ class Pipeline:
         heads = {head.sensor.name: head for head in self._heads}
         places |= {name: self._colour.frame(head) for name, head in heads.items()}
         level1, statistics = {}, {}
+        scales = exposure_scales(self.rig, conditions.exposure_time_s)
         for name, out in places.items():
             if name not in frames:
                 continue
             corrector = self._correctors[name]
-            cone = self.rig.cone_of(name).name
             statistics[name] = level1_from_level0(
                 corrector,
                 np.ascontiguousarray(frames[name]),
                 temperature_c=temperatures.placing_c.get(corrector.sensor.probe),
-                exposure_time_s=conditions.exposure_time_s.get(cone, 0.0),
-                tdi_shifts=conditions.tdi_shifts.get(cone, 0),
+                exposure_time_s=conditions.exposure_time_s.get(name, 0.0),
+                tdi_shifts=conditions.tdi_shifts.get(name, 0),
+                scale=scales.get(name, 1.0),
                 out=out,
             )
             level1[name] = self._colour.leading(heads[name]) if name in heads else out

@@ -24,8 +24,9 @@ The folder may be a flight's, imported, or written by hand as docs/formats.md te
 as it is; products are replaced. A rig without a virtual image gives one raster per
 band, or, where its heads look apart, an image of each head in strict perspective.
 
-An exposure that cannot be processed is listed at the end with its cause; the others are done. The
-exit status is then 1. Only one command at a time writes into a mission.
+Every frame is compared with the hash in its record, and record, file and rig with each other
+(docs/formats.md). An exposure that cannot be processed is listed at the end with its cause; the
+others are done. The exit status is then 1. Only one command at a time writes into a mission.
 
 Examples: `syntopic process MISSION`, `syntopic process MISSION --only 3 --method fixed`
 """
@@ -38,6 +39,10 @@ def process(
     ] = None,
     method: Annotated[str, typer.Option(help="free or fixed.")] = "free",
     interpolation: Annotated[str, typer.Option(help="bilinear, cubic or lanczos.")] = "cubic",
+    rig_file: Annotated[
+        Path | None,
+        typer.Option("--rig", help="Rig file of another calibration than the one flown."),
+    ] = None,
     radiometry: Annotated[
         Path | None, typer.Option(help="Folder of radiometric calibrations.")
     ] = None,
@@ -53,6 +58,7 @@ def process(
     os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
     from daemon.disk import store
     from daemon.disk.level2 import recover_level2
+    from daemon.disk.records import sha256_hex
     from daemon.disk.walk import walk
     from daemon.orientation.exterior import mount_of
     from daemon.orientation.ground import ground_of
@@ -66,7 +72,8 @@ def process(
             ["--method is free or fixed, --interpolation is bilinear, cubic or lanczos"]
         )
     folder = Mission.open(mission)
-    rig = load_rig(folder.rig_path)
+    rig = load_rig(rig_file or folder.rig_path)
+    calibration_sha256 = "" if rig_file else sha256_hex(folder.rig_path.read_bytes())
     plan, radiometry = as_flown(folder, radiometry, elevation)
     processing = ProcessingSection.model_validate(
         {
@@ -91,7 +98,9 @@ def process(
 
         def process_one(number: int) -> dict[str, Any]:
             started = time.monotonic()
-            frames, exposure = store.load_level0(folder.level0(number), rig)
+            frames, exposure = store.load_level0(
+                folder.level0(number), rig, calibration_sha256=calibration_sha256
+            )
             report, _ = process_exposure(
                 processor,
                 folder,

@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.disk.level0 import RasterError, read_tiff
+from daemon.disk.frame_checks import mismatches
+from daemon.disk.level0 import RasterError, read_frame
 from daemon.disk.records import RECORD_MAX_BYTES, RecordError, parse_record, sha256_hex
 from daemon.exposure import (
     Capture,
@@ -75,9 +76,12 @@ def exposure_of(capture: Capture) -> Exposure:
 
 
 def load_level0(
-    folder: Path, rig: Rig, *, check_hashes: bool = False
+    folder: Path, rig: Rig, *, calibration_sha256: str = ""
 ) -> tuple[dict[str, NDArray[np.uint16]], Exposure]:
     """Read the frames of an exposure, flown or laid out by hand, for a rig.
+
+    Each file is read once and hashed as it is read; it is compared with its record and with the
+    rig (`daemon.disk.frame_checks`).
 
     What the record does not say is filled in: without `frames` every `<sensor>.tif` of the rig is
     taken; sensors without a file are listed as missing.
@@ -85,7 +89,7 @@ def load_level0(
     Args:
         folder: such as `L0/000001`.
         rig: names the sensors and their sizes.
-        check_hashes: refuse a frame that differs from the hash in the record.
+        calibration_sha256: hash of the rig file; refuse an exposure whose record names another.
 
     Returns:
         Pixels by sensor, shape (height, width), and the exposure.
@@ -104,6 +108,13 @@ def load_level0(
     kept: list[FrameRecord] = []
     missing = dict(exposure.missing)
     problems: list[str] = []
+    if calibration_sha256 and exposure.calibration_sha256 not in ("", calibration_sha256):
+        problems.append(
+            f"{folder.name}: was flown with calibration {exposure.calibration_id or '(unnamed)'}, "
+            f"SHA-256 {exposure.calibration_sha256[:12]}...; the mission's rig file has "
+            f"{calibration_sha256[:12]}...: put the rig file of the flight back, or choose another "
+            "calibration with --rig"
+        )
     sensors = {sensor.name: sensor for sensor in rig.sensors}
     for record in records:
         sensor = sensors.get(record.sensor)
@@ -116,14 +127,15 @@ def load_level0(
             missing.setdefault(record.sensor, f"{path.name} is not in its folder")
             continue
         try:
-            frames[record.sensor] = read_tiff(
-                path, width_px=sensor.width_px, height_px=sensor.height_px
-            )
+            frame = read_frame(path, width_px=sensor.width_px, height_px=sensor.height_px)
         except RasterError as error:
             problems.append(f"{folder.name}: {error}")
             continue
-        if check_hashes and record.sha256 and hash_file(path) != record.sha256:
-            problems.append(f"{folder.name}/{path.name}: differs from what was stored")
+        problems += [
+            f"{folder.name}/{path.name}: {problem}"
+            for problem in mismatches(exposure.number, record, sensor, frame)
+        ]
+        frames[record.sensor] = frame.pixels
         height_px, width_px = frames[record.sensor].shape
         kept.append(replace(record, file=path.name, width_px=width_px, height_px=height_px))
     if problems:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import datetime
 import math
+import statistics
 
 from daemon.configuration import PlanSection
+from daemon.disk.frame_checks import tdi_shifts
 from daemon.exposure import Exposure
 from daemon.orientation.ground import Ground
 from daemon.plan.overlaps import Surroundings
 from drivers.leap_seconds import leap_seconds_at
+from processing.conditions import by_sensor_of
 from processing.geometry.sun import sun_elevation_rad
 from processing.pipeline import Conditions
 from processing.quality.report import Flag
@@ -32,6 +35,9 @@ def conditions_of(
 
     `flags` are added to those the record holds; `surroundings` are its overlaps, where known, and
     `ground` is the height model under it.
+
+    Raises:
+        RecordError: an exposure time or a TDI count that cannot be.
     """
     navigation = exposure.navigation
     speed_mps = plan.ground_speed_mps
@@ -48,19 +54,16 @@ def conditions_of(
         if navigation.heading_rad is not None and speed_mps > 1.0:
             crab = navigation.heading_rad - math.atan2(east, north)
             crab_rad = math.remainder(crab, 2 * math.pi)
-    exposure_time_s = {}
-    tdi_shifts = {}
-    for frame in exposure.frames:
-        cone = rig.cone_of(frame.sensor).name
-        if frame.exposure_time_us is not None:
-            exposure_time_s[cone] = frame.exposure_time_us * 1e-6
-        tdi_shifts[cone] = int(frame.settings.get("TdiShifts", 0))
     sigmas_ns = [f.time_sigma_ns for f in exposure.frames if f.time_sigma_ns is not None]
     return Conditions(
         temperatures_c={t.probe: t.value_c for t in exposure.temperatures},
         temperature_age_s={t.probe: t.age_ns * 1e-9 for t in exposure.temperatures},
-        exposure_time_s=exposure_time_s,
-        tdi_shifts=tdi_shifts,
+        exposure_time_s={
+            frame.sensor: frame.exposure_time_us * 1e-6
+            for frame in exposure.frames
+            if frame.exposure_time_us is not None
+        },
+        tdi_shifts=_tdi_shifts(exposure, rig),
         ground_speed_mps=speed_mps,
         height_above_ground_m=height_m,
         roll_rad=navigation.roll_rad if navigation else None,
@@ -72,9 +75,24 @@ def conditions_of(
         forward_overlap=surroundings.forward_overlap if surroundings else None,
         sidelap=surroundings.sidelap if surroundings else None,
         sun_elevation_rad=_sun_elevation_rad(exposure),
-        capture_flags=Flag(exposure.flags) | flags | _calibration_flag(exposure, rig),
+        capture_flags=capture_flags(exposure, rig) | flags,
         simulated=exposure.simulated,
     )
+
+
+def _tdi_shifts(exposure: Exposure, rig: Rig) -> dict[str, int]:
+    """By sensor; one without a frame is placed as the others of its cone."""
+    found = {f.sensor: tdi_shifts(f, rig.sensor(f.sensor)) for f in exposure.frames}
+    for cone in rig.cones:
+        if of_cone := by_sensor_of(cone, found):
+            usual = statistics.median_low(of_cone.values())
+            found |= {sensor.name: usual for sensor in cone.sensors if sensor.name not in of_cone}
+    return found
+
+
+def capture_flags(exposure: Exposure, rig: Rig) -> Flag:
+    """What capture found of an exposure, and whether its calibration was too old."""
+    return Flag(exposure.flags) | _calibration_flag(exposure, rig)
 
 
 def _calibration_flag(exposure: Exposure, rig: Rig) -> Flag:

@@ -27,7 +27,7 @@ from daemon.exposure import Exposure
 from daemon.orientation.exterior import exposures_of, mount_of
 from daemon.orientation.ground import Ground, ground_of
 from daemon.plan.overlaps import Overlaps, Surroundings
-from daemon.products.conditions import conditions_of
+from daemon.products.conditions import capture_flags, conditions_of
 from daemon.products.processor import Processor, build_processor, histograms_of, make_products
 from daemon.products.reports import Made
 from daemon.service.lanes import Lanes
@@ -170,13 +170,13 @@ def process_exposure(
     return report, level2.write_folder(mission.level2(exposure.number), contents)
 
 
-def report_unprocessed(
-    rig: Rig, plan: PlanSection, exposure: Exposure, flags: Flag
-) -> dict[str, Any]:
+def report_unprocessed(rig: Rig, exposure: Exposure, flags: Flag) -> dict[str, Any]:
     """The quality report of an exposure that has no image: what capture knows of it."""
-    conditions = conditions_of(exposure, rig, plan, flags | Flag.NOT_PROCESSED)
+    known = capture_flags(exposure, rig) | flags | Flag.NOT_PROCESSED
+    if exposure.simulated:
+        known |= Flag.SIMULATED
     missing = [sensor for sensor, _ in exposure.missing]
-    report = as_json(judge({}, capture_flags=conditions.flags, missing_sensors=missing))
+    report = as_json(judge({}, capture_flags=known, missing_sensors=missing))
     return {**report, "exposure": exposure.number}
 
 
@@ -252,7 +252,7 @@ class _Desk:
                 f"exposure {exposure.number} was stored but not processed: {error}; "
                 f"run syntopic process {self.mission.path} after landing"
             )
-            report = report_unprocessed(self.rig, self.plan, exposure, flags)
+            report = report_unprocessed(self.rig, exposure, flags)
             self.link.send(ProcessFailed(exposure.number, sentence, report))
             return
         finally:

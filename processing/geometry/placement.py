@@ -63,7 +63,7 @@ def nominal_placements(
         temperatures_c: temperature by probe name. A probe without one leaves its sensors at their
             calibration temperature; saying so is the caller's
             (`processing.geometry.drift.missing_probes`).
-        tdi_shifts: N by cone name; a cone without one has none.
+        tdi_shifts: N of each frame by sensor name; a sensor without one has none.
         use_drift: False ignores the temperatures (places and principal distances as calibrated).
         ground: what a virtual camera projects onto; None takes its projection centres as one.
 
@@ -71,8 +71,10 @@ def nominal_placements(
         One placement per sensor of the rig, by sensor name, in file order.
 
     Raises:
-        ValueError: the rig has no virtual image.
+        ValueError: the rig has no virtual image, or `tdi_shifts` names what is no sensor of it.
     """
+    if unknown := tdi_shifts.keys() - {sensor.name for sensor in rig.sensors}:
+        raise ValueError(f"tdi_shifts names {min(unknown)!r}; rig {rig.name} has no such sensor")
     if rig.virtual_image is None:
         raise ValueError(f"rig {rig.name} has no [virtual_image]; nothing can be placed in it")
     known = temperatures_c if use_drift else {}
@@ -89,7 +91,7 @@ def nominal_placements(
                 layer=layer,
                 physical=physical,
                 f_ratio=f_ratio,
-                tdi_shifts=tdi_shifts.get(cone.name, 0),
+                tdi_shifts=tdi_shifts.get(sensor.name, 0),
             )
     return placements
 

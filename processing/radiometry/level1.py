@@ -134,6 +134,7 @@ def level1_from_level0(
     exposure_time_s: float,
     tdi_shifts: int,
     out: Array,
+    scale: float = 1.0,
 ) -> FrameStatistics:
     """Fill `out` with the Level-1 words of a raw frame.
 
@@ -145,6 +146,8 @@ def level1_from_level0(
         raw: the frame, (height, width) uint16, DN.
         temperature_c: of the sensor; None takes the calibration's reference temperature.
         out: (height, width) uint16, contiguous; overwritten.
+        scale: multiplies the signal, after the offset was taken off. What it carries beyond the
+            range of words counts as saturated.
 
     Raises:
         ValueError: `raw` or `out` is not a uint16 frame of the sensor's size.
@@ -161,7 +164,7 @@ def level1_from_level0(
     dark_time_s = exposure_time_s * 2.0 ** min(max(warmth / corrector.doubling_k, -30.0), 30.0)
     offset_dn = corrector.least_bias_dn + corrector.least_dark_dn_per_s * dark_time_s
     counts = level1_counts_per_dn(sensor.bits)
-    by_gain = 0.5 * counts / max(1.0 + corrector.response_per_k * warmth, 0.5)
+    by_gain = scale * 0.5 * counts / max(1.0 + corrector.response_per_k * warmth, 0.5)
     bands = (sensor.height_px + _BAND_ROWS - 1) // _BAND_ROWS
     sums = np.zeros((bands, 2), np.float64)
     if corrector.bias is None or corrector.dark is None or corrector.response is None:

@@ -76,6 +76,27 @@ def frame(pixel_type: str, shape: tuple[int, int]) -> Callable[[Path], None]:
     return write
 
 
+def flip(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[-1] ^= 1
+    path.unlink()
+    path.write_bytes(data)
+
+
+def tdi_as_text(path: Path) -> None:
+    text(path.read_text().replace('"TdiShifts":0', '"TdiShifts":"many"'))(path)
+
+
+def text_with(key: str, value: str) -> Callable[[Path], None]:
+    """The record with another value of the same length behind a key."""
+
+    def write(path: Path) -> None:
+        before, _, behind = path.read_text().partition(key)
+        text(f"{before}{key}{value}{behind[len(value) :]}")(path)
+
+    return write
+
+
 DAMAGES = {
     "truncated TIFF": ("L0/{}/LEFT.tif", truncate, "LEFT.tif"),
     "empty TIFF": ("L0/{}/LEFT.tif", empty, "LEFT.tif: not a usable TIFF"),
@@ -92,6 +113,13 @@ DAMAGES = {
     "record without permission": ("L0/{}/exposure.json", forbid, "Permission denied"),
     "folder instead of a record": ("L0/{}/exposure.json", as_folder, "Is a directory"),
     "exposure without permission": ("L0/{}", forbid, "Permission denied"),
+    "frame altered in one bit": ("L0/{}/LEFT.tif", flip, "LEFT.tif: was altered after it was"),
+    "TDI count is a text": ("L0/{}/exposure.json", tdi_as_text, "TdiShifts is 'many'"),
+    "record of another calibration": (
+        "L0/{}/exposure.json",
+        text_with('"calibration_sha256":"', "0" * 64),
+        "was flown with calibration diverging-1",
+    ),
 }
 
 

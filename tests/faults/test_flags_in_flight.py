@@ -10,7 +10,7 @@ from pathlib import Path
 
 from benchmarks.fast_flight import FastFlight
 from benchmarks.pairing import SMALL_RIG, shortcomings
-from daemon.configuration import LimitsSection, PlanSection
+from daemon.configuration import LimitsSection
 from daemon.service.worker import report_unprocessed
 from processing.quality.report import Flag
 from sim_hw.faults.plan import Planned
@@ -72,8 +72,7 @@ def test_each_exposure_is_flagged_with_what_hit_it_and_with_nothing_else(tmp_pat
     score = flight.fly()
     assert not shortcomings(score), score.examples
     reports = {
-        record.number: report_unprocessed(flight.rig, PlanSection(), record, Flag(0))
-        for record in flight.records
+        record.number: report_unprocessed(flight.rig, record, Flag(0)) for record in flight.records
     }
     flags = {number: Flag(report["flag_bits"]) & ~NO_IMAGE for number, report in reports.items()}
     assert {number: found for number, found in flags.items() if found} == FLAGGED

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.conditions import Conditions
+from processing.conditions import Conditions, for_sensors
 from processing.rig import shipped_rigs
 from sim_hw.seeding import random_stream
 from sim_hw.world.electronics import Electronics, SensorTruth, true_sensor
@@ -105,8 +105,10 @@ def expose(
             probe: world.temperature_c(probe, mark_ns) + noise.normal(0, 0.1)
             for probe in world.rig.probes
         },
-        exposure_time_s={name: t * 1e-6 for name, t in plan.exposure_time_us.items()},
-        tdi_shifts=plan.tdi_shifts,
+        exposure_time_s=for_sensors(
+            rig, {name: t * 1e-6 for name, t in plan.exposure_time_us.items()}
+        ),
+        tdi_shifts=for_sensors(rig, plan.tdi_shifts),
         ground_speed_mps=plan.ground_speed_mps,
         height_above_ground_m=plan.height_above_ground_m,
     )

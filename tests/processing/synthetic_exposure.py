@@ -62,8 +62,9 @@ def expose(
     other = texture(shape, rng, cutoff=0.35)
     temperatures = dict.fromkeys(rig.probes, 20.0 + dc_k)
     shifts = {
-        cone.name: tdi_shifts if cone.role == "pan" else tdi_shifts // image.colour_ratio
+        sensor.name: tdi_shifts if cone.role == "pan" else tdi_shifts // image.colour_ratio
         for cone in rig.cones
+        for sensor in cone.sensors
     }
     placements = nominal_placements(true_rig, temperatures, shifts)
     frames = {}

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 
 from processing.conditions import (
     Conditions,
     condition_figures,
+    exposure_scales,
     parallax_px,
     usable_temperatures,
 )
+from processing.geometry.placement import nominal_placements
 from processing.quality.report import Figure, Flag, Thresholds
 from processing.rig import Rig, find_rig
 
@@ -35,8 +38,8 @@ def test_tdi_takes_its_shifts_off_the_smear_along_track(rig: Rig) -> None:
     conditions = Conditions(
         height_above_ground_m=1000.0,
         ground_speed_mps=70.0,
-        exposure_time_s={cone.name: 0.008 for cone in rig.cones},
-        tdi_shifts={cone.name: 8 for cone in rig.pan_cones},
+        exposure_time_s={sensor.name: 0.008 for sensor in rig.sensors},
+        tdi_shifts={sensor.name: 8 for cone in rig.pan_cones for sensor in cone.sensors},
         crab_rad=math.radians(3.0),
     )
     found = figures(rig, conditions)
@@ -48,7 +51,7 @@ def test_tdi_takes_its_shifts_off_the_smear_along_track(rig: Rig) -> None:
 
 def test_angular_rates_smear_by_focal_length_over_pitch(rig: Rig) -> None:
     conditions = Conditions(
-        exposure_time_s={cone.name: 0.01 for cone in rig.cones},
+        exposure_time_s={sensor.name: 0.01 for sensor in rig.sensors},
         angular_rate_rad_per_s=(0.02, -0.01, 0.0),
     )
     found = figures(rig, conditions)
@@ -87,3 +90,35 @@ def test_dc_is_told_per_cone_and_as_the_mean_of_the_pan_cones(rig: Rig) -> None:
 def test_simulated_hardware_raises_its_flag() -> None:
     conditions = Conditions(capture_flags=Flag.MARK_MISSING, simulated=True)
     assert conditions.flags == Flag.MARK_MISSING | Flag.SIMULATED
+
+
+def test_the_frames_of_a_cone_are_brought_to_its_median_exposure_time() -> None:
+    rig = find_rig("ultracam-x-mini")
+    times_s = {sensor.name: 0.004 for sensor in rig.sensors}
+    assert set(exposure_scales(rig, times_s).values()) == {1.0}
+    scales = exposure_scales(rig, times_s | {"SU01": 0.002, "R": 0.001})
+    assert scales["SU01"] == 2.0
+    # Cones are compared with nobody: red is alone in its cone.
+    assert {name for name, scale in scales.items() if scale != 1.0} == {"SU01"}
+    assert "SU30" not in exposure_scales(rig, {"SU01": 0.002})
+
+
+def test_smear_is_that_of_the_frame_that_moved_most() -> None:
+    rig = find_rig("ultracam-x-mini")
+    conditions = Conditions(
+        exposure_time_s={sensor.name: 0.008 for sensor in rig.sensors},
+        tdi_shifts={sensor.name: 8 for cone in rig.pan_cones for sensor in cone.sensors},
+        ground_speed_mps=64.0,
+        height_above_ground_m=600.0,
+    )
+    usual = figures(rig, conditions)["smear_along_px"]
+    shifts = {**conditions.tdi_shifts, "SU03": 2}
+    worst = figures(rig, replace(conditions, tdi_shifts=shifts))["smear_along_px"]
+    assert isinstance(usual, float) and isinstance(worst, float)
+    assert abs(worst - usual) == pytest.approx(6.0)
+
+
+def test_a_tdi_count_of_what_is_no_sensor_is_refused() -> None:
+    rig = find_rig("ultracam-x-mini")
+    with pytest.raises(ValueError, match="tdi_shifts names '0'; rig ultracam-x-mini has no such"):
+        nominal_placements(rig, {}, {"0": 8})

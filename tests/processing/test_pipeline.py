@@ -13,12 +13,14 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from processing.compiled import kernels, variants
+from processing.conditions import usable_temperatures
 from processing.geometry.placement import nominal_placements, vip_mm_from_raw, vip_px_from_mm
 from processing.image.lattice import colour_raster
 from processing.mosaic.drawing import residuals_svg
 from processing.mosaic.residual_vectors import residual_vectors
 from processing.pipeline import Conditions, Pipeline, Product, Settings
 from processing.quality.report import FIGURES, Flag, Verdict, as_json
+from processing.radiometry.level1 import exposed_rows, level1_counts_per_dn
 from processing.rig import Rig, find_rig
 from tests.processing.synthetic_exposure import Exposure, expose
 
@@ -49,7 +51,7 @@ def conditions(rig: Rig, exposure: Exposure) -> Conditions:
     return Conditions(
         temperatures_c=exposure.temperatures_c,
         temperature_age_s=dict.fromkeys(exposure.temperatures_c, 1.0),
-        exposure_time_s={cone.name: 0.004 for cone in rig.cones},
+        exposure_time_s={sensor.name: 0.004 for sensor in rig.sensors},
         tdi_shifts=exposure.tdi_shifts,
         ground_speed_mps=64.0,
         height_above_ground_m=600.0,
@@ -324,3 +326,32 @@ def test_a_frame_of_another_size_is_refused(
 def test_a_rig_that_cannot_be_composed_is_refused(rig: Rig) -> None:
     with pytest.raises(ValueError, match="no virtual image"):
         Pipeline(replace(rig, virtual_image=None))
+
+
+@pytest.mark.trust
+def test_each_frame_is_corrected_with_its_own_exposure_time_and_tdi(
+    pipeline: Pipeline, rig: Rig, exposure: Exposure
+) -> None:
+    usual = conditions(rig, exposure)
+    temperatures = usable_temperatures(rig, usual, pipeline.settings.thresholds)
+    before, _ = pipeline._correct(exposure.frames, usual, temperatures)
+    before = {name: words.copy() for name, words in before.items()}
+    short = exposure.frames["SU01"].astype(np.float64)
+    black = rig.sensor("SU01").black_dn
+    frames = {**exposure.frames, "SU01": np.rint((short - black) / 2 + black).astype(np.uint16)}
+    deviating = replace(
+        usual,
+        exposure_time_s={**usual.exposure_time_s, "SU01": 0.002},
+        tdi_shifts={**usual.tdi_shifts, "SU01": 9},
+    )
+    after, _ = pipeline._correct(frames, deviating, temperatures)
+    for name, words in after.items():
+        if name != "SU01":
+            assert np.array_equal(words, before[name]), name
+    rows = exposed_rows(rig.sensor("SU01"), 9)
+    assert not after["SU01"][: rows[0]].any()  # entering rows of nine shifts, not of six
+    seen = np.s_[rows[0] : rows[1] + 1]
+    half_a_dn = level1_counts_per_dn(rig.sensor("SU01").bits) * 1.01
+    apart = after["SU01"][seen].astype(int) - before["SU01"][seen].astype(int)
+    assert np.abs(apart).max() <= half_a_dn + 2
+    assert abs(apart.mean()) < 1.0

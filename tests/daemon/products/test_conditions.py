@@ -10,7 +10,8 @@ import pytest
 
 from daemon.calibration.rig_text import rig_toml
 from daemon.configuration import PlanSection
-from daemon.exposure import Exposure
+from daemon.disk.records import RecordError
+from daemon.exposure import Exposure, FrameRecord, from_json
 from daemon.products.conditions import conditions_of
 from daemon.service.worker import report_unprocessed
 from processing.quality.judgement import judge
@@ -58,7 +59,7 @@ def test_an_expired_calibration_makes_an_exposure_usable_and_says_what_to_do() -
 
 
 def test_an_exposure_that_could_not_be_processed_is_judged_all_the_same() -> None:
-    report = report_unprocessed(RIG, PlanSection(), flown_after(9000), Flag(0))
+    report = report_unprocessed(RIG, flown_after(9000), Flag(0))
     assert {"NOT_PROCESSED", "CALIBRATION_EXPIRED"} <= set(report["flags"])
     assert report["verdict"] == "usable"
     assert any("process it on the ground" in f["sentence"] for f in report["findings"])
@@ -76,3 +77,31 @@ def test_a_date_that_is_none_is_refused() -> None:
         rig_from_mapping(content, "rig.toml")
     assert len(refusal.value.problems) == 2
     assert "YYYY-MM-DD" in str(refusal.value)
+
+
+def frame(sensor: str, time_us: float | None, shifts: float | str) -> FrameRecord:
+    known = from_json({"number": 1, "frames": [{"sensor": sensor}]}).frames[0]
+    return replace(known, exposure_time_us=time_us, settings={"TdiShifts": shifts})
+
+
+@pytest.mark.trust
+def test_exposure_time_and_tdi_are_those_of_each_frame() -> None:
+    frames = (frame("SU00", 4000.0, 12), frame("SU01", 2000.0, 6), frame("SU10", None, 0))
+    found = conditions_of(Exposure(1, frames=frames), RIG, PlanSection(), Flag(0))
+    assert found.exposure_time_s == {"SU00": 0.004, "SU01": 0.002}
+    assert (found.tdi_shifts["SU00"], found.tdi_shifts["SU01"], found.tdi_shifts["SU10"]) == (
+        12, 6, 0,
+    )  # fmt: skip
+    # A sensor without a frame is placed as those of its cone that have one.
+    assert found.tdi_shifts["SU02"] == 6 and "R" not in found.tdi_shifts
+
+
+@pytest.mark.trust
+@pytest.mark.parametrize(("time_us", "shifts"), [(4000.0, "many"), (4000.0, -1), (-1.0, 12)])
+def test_impossible_settings_of_a_head_are_an_error_of_the_exposure_and_are_judged(
+    time_us: float, shifts: float | str
+) -> None:
+    exposure = Exposure(1, frames=(frame("SU00", time_us, shifts),))
+    with pytest.raises(RecordError, match="SU00: "):
+        conditions_of(exposure, RIG, PlanSection(), Flag(0))
+    assert "NOT_PROCESSED" in report_unprocessed(RIG, exposure, Flag(0))["flags"]

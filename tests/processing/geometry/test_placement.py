@@ -38,7 +38,7 @@ def test_every_sensor_falls_where_the_oracle_puts_it(
     placements = nominal_placements(
         rig,
         dict.fromkeys(rig.probes, temperature_c),
-        {cone.name: tdi for cone in rig.cones},
+        {sensor.name: tdi for sensor in rig.sensors},
     )
     rng = np.random.default_rng(2)
     for cone in rig.cones:
@@ -68,7 +68,9 @@ def test_raw_pixels_come_back_from_the_virtual_image_to_a_millionth_of_a_pixel()
     for name in ("ultracam-x", "ultracam-x-mini"):
         rig = find_rig(name)
         placements = nominal_placements(
-            rig, dict.fromkeys(rig.probes, 45.0), dict.fromkeys("0123", 9)
+            rig,
+            dict.fromkeys(rig.probes, 45.0),
+            {sensor.name: 9 for cone in rig.pan_cones for sensor in cone.sensors},
         )
         rng = np.random.default_rng(4)
         for placement in placements.values():
@@ -89,7 +91,7 @@ def test_a_skewed_sensor_falls_where_the_oracle_puts_it_and_comes_back() -> None
     rig = dataclasses.replace(straight, cones=(cone, *straight.cones[1:]))
     assert rig.virtual_image is not None
     warm = dict.fromkeys(rig.probes, 41.0)
-    start = nominal_placements(rig, warm, {cone.name: 12})[skewed.name]
+    start = nominal_placements(rig, warm, {skewed.name: 12})[skewed.name]
     raw = np.random.default_rng(6).uniform(-30, (1277, 861), (200, 2))
     found = vip_mm_from_raw(start, raw)
     truth = oracle.vip_px_of_raw(rig, cone, skewed, raw, 41.0, 12)
@@ -100,7 +102,7 @@ def test_a_skewed_sensor_falls_where_the_oracle_puts_it_and_comes_back() -> None
 def test_tdi_moves_the_row_origin_by_half_the_shifts_towards_where_the_charge_came_from() -> None:
     rig = find_rig("ultracam-x-mini")
     still = nominal_placements(rig, {}, {})["SU00"]
-    moved = nominal_placements(rig, {}, {"0": 10})["SU00"]
+    moved = nominal_placements(rig, {}, {"SU00": 10})["SU00"]
     row_100 = sensor_mm_from_raw(moved, np.array([[0.0, 100.0]]))
     row_95 = sensor_mm_from_raw(still, np.array([[0.0, 95.0]]))
     np.testing.assert_array_equal(row_100, row_95)

@@ -51,7 +51,7 @@ def scene() -> tuple[
         black = rig.sensor(name).black_dn
         words = np.clip((raw.astype(np.float64) - black) * 8.0, 2, 65534).astype(np.uint16)
         words &= 0xFFFE
-        words[: exposure.tdi_shifts[rig.cone_of(name).name]] = 0
+        words[: exposure.tdi_shifts[name]] = 0
         frames[name] = words
     start = nominal_placements(rig, exposure.temperatures_c, exposure.tdi_shifts)
     truth = nominal_placements(exposure.true_rig, exposure.temperatures_c, exposure.tdi_shifts)
