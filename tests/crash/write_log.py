@@ -127,6 +127,7 @@ def run_ill(
 _LINE = re.compile(r"(\d+)\.(\d{9}) (.*) <(\d+)\.(\d{9})>")
 _CALL = re.compile(r"(\w+)\((.*)\)\s+= (-?\d+)(?:<([^>]*)>)?.*")
 _FD = re.compile(r"(?:-?\d+|AT_FDCWD)<((?:\\x[0-9a-f]{2})*)>(?:\(deleted\))?")
+_DELETED = re.compile(r"-?\d+<(?:\\x[0-9a-f]{2})*>\(deleted\)")
 _TEXT = re.compile(r'"((?:\\x[0-9a-f]{2})*)"')
 
 
@@ -155,6 +156,8 @@ def _operations(call: str) -> Iterator[Operation]:
         if "O_CREAT" in arguments or "O_TRUNC" in arguments or name == "creat":
             empties = "O_TRUNC" in arguments or name == "creat"
             yield Operation("create", _plain(found[4]).decode(), empties=empties)
+    elif _DELETED.match(arguments):
+        return  # a file that has no name any more is in no state of the disk
     elif name in ("write", "writev"):
         yield Operation("write", descriptors[0], data=b"".join(texts)[:result])
     elif name in ("pwrite64", "pwritev", "pwritev2"):
