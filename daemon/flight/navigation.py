@@ -119,7 +119,8 @@ def around(samples: Iterable[NavSample], gps_ns: int) -> NavigationRecord | None
     """Navigation at an instant from the best of the samples near it; None without any.
 
     Samples with a height are preferred to those without: two of them around the instant, then any
-    two, then the nearest one. What lies further than two seconds apart, or away, is not used.
+    two, then the nearest one. What lies further than two seconds apart, or away, is not used. A
+    height that the chosen ones do not have is carried on from the nearest sample with one.
 
     Args:
         samples: in any order; those without a position are left out.
@@ -127,18 +128,37 @@ def around(samples: Iterable[NavSample], gps_ns: int) -> NavigationRecord | None
     """
     usable = [s for s in samples if s.position is not None]
     full = [s for s in usable if s.height_m is not None]
-    for chosen in (full, usable):
-        before = max((s for s in chosen if s.gps_ns <= gps_ns), key=_instant, default=None)
-        after = min((s for s in chosen if s.gps_ns > gps_ns), key=_instant, default=None)
-        if before is None or after is None:
-            continue
-        if after.gps_ns - before.gps_ns <= EXTRAPOLATION_LIMIT_NS:
-            return _interpolated(before, after, gps_ns)
-    for chosen in (full, usable):
-        nearest = min(chosen, key=lambda sample: abs(sample.gps_ns - gps_ns), default=None)
-        if nearest is not None and abs(nearest.gps_ns - gps_ns) <= EXTRAPOLATION_LIMIT_NS:
-            return _extrapolated(nearest, gps_ns)
-    return None
+    nearest = _nearest(full, gps_ns)
+    chosen = _around(full, gps_ns) or _around(usable, gps_ns)
+    if chosen is None:
+        alone = nearest or _nearest(usable, gps_ns)
+        return None if alone is None else _extrapolated(alone, gps_ns)
+    record = _interpolated(*chosen, gps_ns)
+    if record.height_m is not None or nearest is None:
+        return record
+    above = _extrapolated(nearest, gps_ns)
+    return replace(
+        record,
+        height_m=above.height_m,
+        vertical_sigma_m=above.vertical_sigma_m,
+        gap_ns=max(record.gap_ns, above.gap_ns),
+    )
+
+
+def _around(samples: Sequence[NavSample], gps_ns: int) -> tuple[NavSample, NavSample] | None:
+    """The last one before and the first one after an instant, two seconds apart at most."""
+    before = max((s for s in samples if s.gps_ns <= gps_ns), key=_instant, default=None)
+    after = min((s for s in samples if s.gps_ns > gps_ns), key=_instant, default=None)
+    if before is None or after is None or after.gps_ns - before.gps_ns > EXTRAPOLATION_LIMIT_NS:
+        return None
+    return before, after
+
+
+def _nearest(samples: Sequence[NavSample], gps_ns: int) -> NavSample | None:
+    """The nearest one to an instant, two seconds away at most."""
+    found = min(samples, key=lambda sample: abs(sample.gps_ns - gps_ns), default=None)
+    is_far = found is None or abs(found.gps_ns - gps_ns) > EXTRAPOLATION_LIMIT_NS
+    return None if is_far else found
 
 
 def metres_per_degree(latitude_deg: float, height_m: float) -> tuple[float, float]:

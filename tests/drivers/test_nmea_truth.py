@@ -259,3 +259,16 @@ def test_other_sentences_say_the_same_as_gga() -> None:
     (garmin, *_) = decode(zda, gns, "PGRME,3.0,M,6.745,M,7.0,M", rmc(10))
     assert garmin.horizontal_sigma_m == pytest.approx(3.0 / math.sqrt(math.log(2)))
     assert garmin.vertical_sigma_m == pytest.approx(10.0, rel=1e-4)
+
+
+def test_a_ggk_without_a_fix_is_none_whatever_its_satellites() -> None:
+    ggk = "PTNL,GGK,100000.00,112126,4730.00000,N,00830.00000,E,{},12,1.0,EHT1000.0,M"
+    assert decode(ggk.format(0), ggk.format(0).replace("100000", "100001")) == []
+    assert len(decode(ggk.format(3), ggk.format(3).replace("100000", "100001"))) == 2
+
+
+def test_both_sides_of_the_date_line_are_one_place() -> None:
+    east = gga(0, place="4730.00000000,N,18000.00000000,E")
+    west = rmc(0).replace("00830.00000000,E", "17959.99999990,W")
+    (sample, *_) = decode(west, east, rmc(10))
+    assert sample.longitude_deg == 180.0

@@ -252,3 +252,24 @@ def test_a_heading_known_at_one_end_only_is_not_carried_on() -> None:
     assert between_both is not None and after is not None
     assert between_both.heading_rad == pytest.approx(0.5 * (6.2 + 0.1 + 2 * math.pi) % math.tau)
     assert after.heading_rad is None
+
+
+@pytest.mark.trust
+def test_at_the_instant_of_a_sample_the_record_has_its_height() -> None:
+    track = Track()
+    for tenth, height in ((0, HEIGHT), (2, HEIGHT + 3.0), (4, HEIGHT)):
+        track.add(replace(sample(tenth / 10), height_m=height, vertical_sigma_m=9.0))
+    for tenth, height in ((0, HEIGHT), (2, HEIGHT + 3.0), (4, HEIGHT)):
+        velocity = (50.0, 0.0, None)
+        bare = [replace(s, velocity_ned_mps=velocity) for s in track._samples]
+        record = around(bare, GPS_NS + tenth * NS // 10)
+        assert record is not None
+        assert (record.height_m, record.vertical_sigma_m) == (pytest.approx(height), 9.0)
+
+
+@pytest.mark.trust
+def test_samples_exactly_two_seconds_apart_are_still_bridged() -> None:
+    record = around((sample(0.0), sample(2.0)), GPS_NS + NS)
+    assert record is not None and (record.method, record.gap_ns) == ("interpolated", 2 * NS)
+    late = around((sample(0.0), sample(2.001)), GPS_NS + NS)
+    assert late is not None and late.method == "extrapolated"
