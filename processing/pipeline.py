@@ -35,6 +35,12 @@ from processing.image.colour import (
 from processing.image.composition import ColourComposer, PanComposer, pan_cell_px
 from processing.image.quicklook import quicklook
 from processing.image.resampling import SATURATED_SOURCE, Interpolation
+from processing.matching.content import (
+    LEAST_TEXTURED,
+    check_content,
+    content_figures,
+    moved_placements,
+)
 from processing.matching.tie_places import burnt_share
 from processing.matching.tie_points import TiePoints, match_tie_points
 from processing.mosaic.disturbance import disturbance_of
@@ -196,6 +202,10 @@ class Pipeline:
             frames_read()
         with clock.stage("tie_points"):
             tie_points = match_tie_points(rig, start, level1, settings=settings.tie_points)
+            content = check_content(rig, start, level1, tie_points, settings=settings.tie_points)
+            if content.shifted_px:
+                elsewhere = moved_placements(start, content, self._pan.image.pitch_mm)
+                tie_points = match_tie_points(rig, elsewhere, level1, settings=settings.tie_points)
         with clock.stage("mosaic"):
             stitched = stitch(
                 rig,
@@ -257,6 +267,7 @@ class Pipeline:
             figures["resting_on_calibration"] = ", ".join(stitched.weak) or None
             figures |= estimated_dc_figures(estimated) | platform_figures(platform)
             figures |= projection_figures(rig, conditions, settings.relief_fraction)
+            figures |= content_figures(content)
             figures |= layer_figures(layers) | slip_figures(rig, stitched.slips)
             figures |= precision_figures(rig, mosaic, level1, temperatures.usable_c, disturbance)
             figures |= self._whole_figures(image.source, frames, conditions)
@@ -267,6 +278,9 @@ class Pipeline:
                 missing_sensors=self._missing(frames),
                 missing_probes=temperatures.missing,
                 probes_out_of_range=temperatures.out_of_range,
+                mismatched_bands=[
+                    r.band for r in registrations if r.textured >= LEAST_TEXTURED and r.points == 0
+                ],
                 nominal_bands=[
                     r.band for r in registrations if not r.registered and r.sensor in level1
                 ],

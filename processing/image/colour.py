@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from processing.geometry.placement import SensorPlacement, raw_from_vip_mm, vip_mm_from_raw
 from processing.geometry.projective import apply_projective
 from processing.matching.patches import INTERPOLATION, MARGIN_PX, match_patches, select_features
+from processing.matching.texture import has_texture
 from processing.radiometry.demosaic import BAYER_BANDS, is_bayer
 from processing.radiometry.level1 import exposed_rows
 from processing.rig import Rig, Sensor
@@ -88,7 +89,8 @@ class BandRegistration:
 
     `band_from_green` (3, 3) carries a VIP point in mm to where the band's own placement has it.
     Where too few points were found it is the identity: the band lies as calibrated, and
-    `registered` is False. `rms_px` is the residual length per point, colour pixels.
+    `registered` is False; `textured` counts the positions that were tried there and where the band
+    has texture well above noise. `rms_px` is the residual length per point, colour pixels.
     """
 
     band: str
@@ -97,11 +99,12 @@ class BandRegistration:
     points: int
     rms_px: float | None
     registered: bool
+    textured: int = 0
 
 
-def nominal_registration(band: str, sensor: str) -> BandRegistration:
+def nominal_registration(band: str, sensor: str, *, textured: int = 0) -> BandRegistration:
     """A band that lies as calibrated."""
-    return BandRegistration(band, sensor, np.eye(3), 0, None, registered=False)
+    return BandRegistration(band, sensor, np.eye(3), 0, None, registered=False, textured=textured)
 
 
 def register_band(
@@ -124,7 +127,10 @@ def register_band(
     """
     raw_green, raw_band, sigma = _match(green, other, green_frame, band_frame, positions, settings)
     if len(sigma) < settings.min_points:
-        return nominal_registration(band, other.sensor.name)
+        expected = raw_from_vip_mm(other, vip_mm_from_raw(green, positions.astype(np.float64)))
+        at = np.rint(expected[np.isfinite(expected).all(axis=1)]).astype(np.int64)
+        rough = has_texture(band_frame, other.sensor, at, settings.window_px)
+        return nominal_registration(band, other.sensor.name, textured=int(np.count_nonzero(rough)))
     source = vip_mm_from_raw(green, raw_green)
     target = vip_mm_from_raw(other, raw_band)
     unit_mm = other.sensor.pitch_mm * _magnification(other, raw_band)

@@ -104,6 +104,7 @@ def judge(
     missing_probes: Sequence[str] = (),
     probes_out_of_range: Sequence[str] = (),
     nominal_bands: Sequence[str] = (),
+    mismatched_bands: Sequence[str] = (),
     thresholds: Thresholds | None = None,
     asked: Asked | None = None,
 ) -> QualityReport:
@@ -118,6 +119,7 @@ def judge(
         missing_probes: probes that gave no temperature.
         probes_out_of_range: probes whose temperature cannot be.
         nominal_bands: colours placed by calibration because too few tie points were found.
+        mismatched_bands: those of them that have texture that does not match that of green.
         asked: what the project asks for, where it does.
     """
     t = thresholds or Thresholds()
@@ -126,7 +128,8 @@ def judge(
     ]
     findings += _frames(figures, capture_flags, missing_sensors, t)
     findings += _time_and_temperature(figures, missing_probes, probes_out_of_range, t)
-    findings += _stitching(figures, nominal_bands, t)
+    findings += _content(figures, mismatched_bands)
+    findings += _stitching(figures, [b for b in nominal_bands if b not in mismatched_bands], t)
     findings += _exposure(figures, t)
     findings += _attitude(figures, t)
     broken = list(asked_findings(figures, asked or Asked()))
@@ -281,7 +284,8 @@ def _stitching(
     slipped = str(figures.get("slip_sensor") or "none") in str(
         figures.get("tie_points_min_overlap_name")
     )
-    if poorest is not None and poorest < t.tie_points_per_overlap and not slipped:
+    explained = slipped or bool(figures.get("mismatched_sensors"))
+    if poorest is not None and poorest < t.tie_points_per_overlap and not explained:
         where = figures.get("tie_points_min_overlap_name") or "an overlap"
         total = _number(figures, "tie_points_pp") or 0.0
         too_few = total < t.tie_points_pp_refly
@@ -304,7 +308,9 @@ def _stitching(
                 float(t.tie_points_per_overlap),
             )
         )
-    resting = figures.get("resting_on_calibration")
+    elsewhere = str(figures.get("mismatched_sensors") or "").split(", ")
+    weak = str(figures.get("resting_on_calibration") or "").split(", ")
+    resting = ", ".join(name for name in weak if name and name not in elsewhere)
     if resting:
         findings.append(
             Finding(
@@ -401,6 +407,24 @@ def _platform(figures: Mapping[str, Figure]) -> list[Finding]:
             "this camera, and calibrate the platform from this flight."
         )
     return [Finding(Flag.CALIBRATION_EXPIRED, Verdict.USABLE, sentence, test, 1.0)]
+
+
+def _content(figures: Mapping[str, Figure], bands: Sequence[str]) -> list[Finding]:
+    """Frames with texture that show other ground than their neighbours."""
+    frames = figures.get("mismatched_sensors")
+    named = ", ".join([*([str(frames)] if frames else []), *bands])
+    if not named:
+        return []
+    return [
+        Finding(
+            Flag.FRAME_CORRUPT,
+            Verdict.REFLY,
+            f"The frame of {named} shows other ground than its neighbours although it has texture: "
+            "frames swapped, of another exposure, turned or mirrored, or the head has moved. "
+            "Check cables and serial numbers of the heads. Fly this exposure again.",
+            _number(figures, "mismatched_positions"),
+        )
+    ]
 
 
 def _slip(figures: Mapping[str, Figure], t: Thresholds) -> list[Finding]:
