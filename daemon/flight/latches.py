@@ -94,16 +94,28 @@ class Latches:
         elif kind == "lost":
             number, cause = event.get("number"), event.get("cause")
             said = f"Exposure {number}: {cause}"
-            self.raise_fault(f"exposure {number}", said, "exposures", sequence=sequence)
+            fault = f"exposure {number}"
+            self.raise_fault(fault, said, "exposures", sequence=sequence)
+            self.pass_fault(fault)  # it happened; nothing stands
         elif kind == "ready":
             for absent in event.get("absent", []):
                 said = f"Flying without {absent}; look at it."
                 self.raise_fault(f"absent {absent}", said, str(absent), sequence=sequence)
-        elif kind == "status" and event.get("exposures_left"):
-            self.pass_fault("disk")
+        elif kind == "status":
+            if event.get("exposures_left"):
+                self.pass_fault("disk")
+            self._pass_absent(event)
         elif kind == "previous-fault":
             latch = _latch(event)
             self.add_previous([latch] if latch else [], sequence=sequence)
+
+    def _pass_absent(self, event: Mapping[str, Any]) -> None:
+        """What was absent when the service became ready, and is there now."""
+        if isinstance(absent := event.get("absent"), list):
+            still = {f"absent {one}" for one in absent}
+            for fault in [f for f in self._latches if f.startswith("absent ")]:
+                if fault not in still and self._latches[fault].stands:
+                    self.pass_fault(fault)
 
     def _apply_device(self, event: Mapping[str, Any], sentence: str, sequence: int) -> None:
         device, name = str(event.get("device")), event.get("name")

@@ -32,6 +32,7 @@ class Arming(Protocol):
     """What a flight needs; `daemon.service.preflight.Preflight`."""
 
     def lacks(self) -> Sequence[Lack]: ...
+    def arm(self) -> None: ...
     def override(self, by: str, missing: Sequence[Lack], reason: str = "") -> None: ...
 
 
@@ -170,6 +171,7 @@ def _not_armed(command: Command, flight: Commanded) -> Answer | None:
     if missing:
         reason = str(command.arguments.get("reason", ""))
         flight.preflight.override(command.by, missing, reason)
+    flight.preflight.arm()
     return None
 
 

@@ -67,6 +67,7 @@ class Hearing(Desk):
         self.active: set[str] = set()
         self.has_trigger = False
         self.serials: dict[str, str] = {}
+        self._navigators: set[str] = set()
         self.orders: dict[int, Order] = {}
 
     def tell_of_time(self, now_ns: int) -> None:
@@ -128,6 +129,8 @@ class Hearing(Desk):
         if event.name in DELIVERS:
             self.active.add(event.device)
             self._flight.absent_heads.discard(event.device)
+            if event.device in self._navigators:
+                self._flight.clock.receiver_recovered()
         elif event.name in IS_GONE:
             self.active.discard(event.device)
             if event.name in _LEAVES:
@@ -137,6 +140,8 @@ class Hearing(Desk):
         self._tell("bound", kind=bound.kind, device=bound.name, found=dict(bound.found))
         if bound.kind == "trigger":
             self.has_trigger = True
+        elif bound.kind == "navigator":
+            self._navigators.add(bound.name)
         elif bound.kind == "head":
             self.serials[bound.name] = bound.found.get("serial", "")
 

@@ -46,6 +46,7 @@ class Preflight:
         self._pipeline = pipeline
         self._machine = StateMachine()
         self.accepted: frozenset[str] = frozenset()
+        self._is_armed = False
         self.overridden: Callable[[str, Sequence[Lack], str], None] = lambda *_: None
         """Told of who flies without what."""
 
@@ -58,6 +59,10 @@ class Preflight:
         there = self._look(time.monotonic_ns())
         missing = lacks(there, self._configuration.limits)
         return tuple(lack for lack in missing if lack.name not in self.accepted)
+
+    def arm(self) -> None:
+        """Somebody armed, by a command; it holds while nothing is missing."""
+        self._is_armed = True
 
     def override(self, by: str, missing: Sequence[Lack], reason: str = "") -> None:
         """Somebody flies without."""
@@ -72,9 +77,11 @@ class Preflight:
         has_failed: bool,
     ) -> list[Phase]:
         """The phases entered since the last time of asking."""
+        if self._line.runs:
+            self._is_armed = True  # by the configuration, or by the command that started it
         facts = Facts(
             is_prepared=is_prepared,
-            is_armed=is_prepared and not self.lacks(),
+            is_armed=self._is_armed and is_prepared and not self.lacks(),
             runs=self._line.runs and not self._line.is_flown,
             has_landed=has_landed,
             has_failed=has_failed,

@@ -109,6 +109,7 @@ def status_event(
     queue: int,
     missing: Sequence[str],
     disks: Sequence[Mapping[str, Any]] = (),
+    absent: Sequence[str] = (),
 ) -> dict[str, Any]:
     """What a watcher must not have wrong for longer than a second, as plain JSON types.
 
@@ -117,6 +118,7 @@ def status_event(
         queue: exposures waiting for the pipeline.
         missing: what a flight needs and does not have, with its cure.
         disks: those of a mirrored mission.
+        absent: devices and data that are not there, in words.
     """
     now_ns = time.monotonic_ns()
     where = None
@@ -147,6 +149,7 @@ def status_event(
         "queue": queue,
         "missing": list(missing),
         **({"disks": [dict(disk) for disk in disks]} if disks else {}),
+        "absent": list(absent),
     }
 
 

@@ -159,6 +159,7 @@ class HostClock:
         self.is_doubtful = False
         self._last_mark_ns: int | None = None
         self._pulses_since_mark = 0
+        self._awaits_mark = False
         self._told: dict[str, bool] = {}
         self._events: list[ClockEvent] = []
         self._steps_told = 0
@@ -221,6 +222,12 @@ class HostClock:
         self._marks.add(Pair(mono_ns, gps_ns, reading, key))
         self._last_mark_ns = max(mono_ns, self._last_mark_ns or mono_ns)
         self._pulses_since_mark = 0
+        self._awaits_mark = False
+
+    def receiver_recovered(self) -> None:
+        """The receiver delivers again: that its marks are missing is not known any more."""
+        self._pulses_since_mark = 0
+        self._awaits_mark = True
 
     def mark_withdrawn(self, key: Hashable) -> None:
         """A mark was another pulse's after all."""
@@ -322,7 +329,9 @@ class HostClock:
             has_marks and silent and mono_ns - (self._last_mark_ns or 0) > MARK_HOLDOVER_NS,
             "no event mark for {0:.0f} s: times are interpolated, good to {1:.3g} ms now; check "
             "the strobe cable and that the receiver sends its marks",
-            "event marks are back",
+            "the receiver delivers again; the next exposure shows whether its event marks do"
+            if self._awaits_mark
+            else "event marks are back",
             mono_ns,
         )
         told += self._alarm(

@@ -169,7 +169,7 @@ def test_a_flight_is_flown_from_the_page(
         browser.wait_for("document.querySelector('#link')?.innerText === 'linked'", 60)
         assert browser.text("#simulated") == "SIMULATED"
         service.wait_for(lambda e: e["event"] == "ready", READY_WITHIN_S)
-        browser.wait_for("document.querySelector('#phase').innerText === 'armed'", 10)
+        browser.wait_for("document.querySelector('#phase').innerText === 'ready'", 10)
 
         refused = browser.evaluate(
             "fetch('/api/v1/commands/start', {method: 'POST'}).then((answer) => answer.status)"
@@ -323,7 +323,7 @@ def test_a_mission_of_waypoints_is_exposed_and_a_head_that_goes_is_seen_and_ackn
             browser.open(f"http://{told['host']}:{told['port']}/")
             browser.wait_for("document.querySelector('#link')?.innerText === 'linked'", 60)
             service.wait_for(lambda e: e["event"] == "ready", READY_WITHIN_S)
-            browser.wait_for("document.querySelector('#phase').innerText === 'armed'", 30)
+            browser.wait_for("document.querySelector('#phase').innerText === 'ready'", 30)
             fly_mission(emulator.ready, port, service)
             emulator.process.kill()
             fault = service.wait_for(

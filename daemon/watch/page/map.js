@@ -75,11 +75,15 @@ export function drawPlan(told) {
   }
 }
 
-// Parts of lines that were flown and are not well seen.
+// The ground that too few images see, and the parts of lines to be flown again for it.
 export function drawHoles(segments) {
   holes.clearLayers();
   for (const one of segments) {
     if (one.kind !== "hole") continue;
+    for (const ring of one.holes.flatMap((hole) => hole.rings)) {
+      L.polygon(ring, { color: colour("--warning"), weight: 1, fillOpacity: 0.6, className: "hole-area", interactive: false })
+        .addTo(holes);
+    }
     L.polyline(one.at, { color: colour("--warning"), weight: 12, opacity: 0.55, dashArray: "2 6", lineCap: "butt" })
       .bindTooltip(`✖ ${one.line}`,
         { permanent: true, direction: "right", className: "hole-label" }).addTo(holes);

@@ -9,7 +9,8 @@ import { forgetImage, prepareImage, showImage } from "./image.js";
 import { drawCharts, fitCharts } from "./charts.js";
 
 const MARKS = { good: "●", usable: "▲", refly: "■", lost: "✖" };
-const PHASE_CLASS = { flying: "good", armed: "good", ready: "caution", fault: "warning", idle: "caution" };
+const PHASE_CLASS = { flying: "good", armed: "good", fault: "warning", idle: "caution" };
+const POSITION_HOLDS_S = 5;
 const DEVICE_MARKS = { ready: "●", searching: "◌", found: "○", unknown: "○", lost: "✖", absent: "✖" };
 const KINDS = { head: "heads", navigator: "receivers", thermometer: "thermometers", trigger: "trigger", pps: "pulse per second" };
 const GRAVITY = { refly: 0, usable: 1, good: 2 };
@@ -37,20 +38,28 @@ function element(name, properties = {}, ...children) {
   return made;
 }
 
+// A position of some seconds ago is not where the camera is now.
+function presentPosition() {
+  const position = flight.brief.status?.position;
+  return position && (position.age_s ?? 0) <= POSITION_HOLDS_S ? position : null;
+}
+
 function drawHead() {
   const brief = flight.brief;
   const status = brief.status || {};
   const phase = by("phase");
-  phase.textContent = brief.phase;
-  phase.className = `chip ${PHASE_CLASS[brief.phase] || ""}`;
+  const isBlocked = brief.phase === "ready" && status.missing?.length > 0;
+  phase.textContent = isBlocked ? "not ready" : brief.phase;
+  phase.className = `chip ${isBlocked ? "caution" : PHASE_CLASS[brief.phase] || ""}`;
   by("simulated").hidden = !brief.simulated;
   by("recovery").replaceChildren(...(brief.mission.recovery || []).map((one) =>
     element("li", { textContent: `At the restart: ${one}` })));
   document.title = `${brief.simulated ? "SIMULATED · " : ""}${brief.mission.rig || ""} · Syntopic`;
   text("left", status.exposures_left);
   text("sigma", duration(status.clock_sigma_ns));
-  text("satellites", status.position?.satellites);
-  const velocity = status.position?.velocity_ned_mps;
+  const position = presentPosition();
+  text("satellites", position?.satellites);
+  const velocity = position?.velocity_ned_mps;
   text("speed", velocity && `${Math.hypot(velocity[0], velocity[1]).toFixed(1)} m/s`);
   text("triggers", status.ledger?.triggers?.triggers);
   text("lost", status.ledger?.triggers?.lost);
@@ -59,7 +68,7 @@ function drawHead() {
   const temperatures = Object.entries(status.temperatures_c || {});
   by("temperatures").replaceChildren(...temperatures.map(([probe, value]) => element("div", {},
     element("dt", { textContent: probe }),
-    element("dd", { textContent: value == null ? "open" : `${value.toFixed(2)} °C` }))));
+    element("dd", { textContent: value == null ? "no reading" : `${value.toFixed(2)} °C` }))));
 }
 
 function last(isIt) {
@@ -79,7 +88,7 @@ function drawVerdict() {
   room.querySelector(".mark").textContent = MARKS[word] || "·";
   room.querySelector(".word").textContent = word;
   room.querySelector(".which").textContent = which;
-  const lost = { verdict: "lost", sentence: judged?.sentence || "Its frames are not to be had; fly its place again." };
+  const lost = { verdict: "lost", sentence: judged?.sentence || "Its frames are lost. If its ground is not seen often enough, the table of re-flights lists it." };
   const findings = (word === "lost" ? [lost] : [...(judged?.findings || [])]).sort((a, b) => GRAVITY[a.verdict] - GRAVITY[b.verdict]);
   by("findings").replaceChildren(...findings.map((finding) =>
     element("li", { textContent: `${MARKS[finding.verdict] || ""} ${finding.sentence}`, className: finding.verdict })));
@@ -214,14 +223,28 @@ prepareImage(() => chosen != null && showImage(chosen));
 
 let isLive = false;
 
+// What the lamp of the link says: a service that landed ended by itself, and that is no fault.
+function linkState(isLinked) {
+  if (isLinked) return { word: "linked", style: "good" };
+  if (!flight.brief) return { word: "connecting", style: "caution" };
+  const at = new Date().toLocaleTimeString("en-GB");
+  return flight.brief.phase === "landed"
+    ? { word: "ended", style: "", title: "LANDED", sentence: `Landed. The service ended ${at}. Values are those at its end.` }
+    : { word: "no link", style: "warning", title: "NO LINK", sentence: `✖ Connection lost ${at}. Values are frozen.` };
+}
+
 listen((isLinked) => {
   const link = by("link");
-  link.textContent = isLinked ? "linked" : "no link";
-  link.className = `chip ${isLinked ? "good" : "warning"}`;
+  const state = linkState(isLinked);
+  if (isLinked || isLive || !flight.brief) {
+    link.textContent = state.word;
+    link.className = `chip ${state.style}`;
+  }
   document.body.classList.toggle("stale", !isLinked);
   if (!isLinked && isLive) {
-    by("stale").textContent = `✖ NO LINK since ${new Date().toLocaleTimeString("en-GB")}: what is shown is of then.`;
-    document.title = `NO LINK · ${document.title}`;
+    by("stale").textContent = state.sentence;
+    by("stale").classList.toggle("ended", state.title === "LANDED");
+    document.title = `${state.title} · ${document.title}`;
   }
   by("stale").hidden = isLinked || !(isLive || flight.brief);
   isLive = isLinked;

@@ -13,9 +13,19 @@ let hasPlan = false;
 let asked = 0;
 let waits = null;
 
+const areaOf = (one) => one.holes.reduce((sum, hole) => sum + hole.area_m2, 0);
+
+// What is wrong in a segment: bands that some ground lacks, and by how many images it is seen.
+function lacksOf(one) {
+  const words = one.holes.map((hole) =>
+    `${hole.bands.length ? `${hole.bands.join(", ")}: ` : ""}${hole.images} of ${hole.needed} images`);
+  return [...new Set(words)];
+}
+
 function row(one) {
   const made = document.createElement("tr");
-  for (const text of [one.line, one.from_m.toFixed(0), one.to_m.toFixed(0), `✖ ${one.reasons.join("; ")}`]) {
+  for (const text of [one.line, one.from_m.toFixed(0), one.to_m.toFixed(0),
+    (areaOf(one) / 1e4).toFixed(2), `✖ ${[...lacksOf(one), ...one.reasons].join("; ")}`]) {
     const cell = document.createElement("td");
     cell.textContent = text;
     made.append(cell);
@@ -29,8 +39,12 @@ async function advise() {
   if (!advice?.segments) return;
   const holes = advice.segments.filter((one) => one.kind === "hole");
   const share = advice.planned_m ? 100 * advice.well_m / advice.planned_m : 0;
-  well.textContent = `${share.toFixed(0)} % of ${(advice.planned_m / 1000).toFixed(1)} km is well seen; ` +
-    (holes.length ? `${holes.length} ${holes.length === 1 ? "hole" : "holes"} behind:` : "no hole behind.");
+  well.textContent = [
+    `${share.toFixed(0)} % of ${(advice.planned_m / 1000).toFixed(1)} km covered`,
+    holes.length ? `${holes.length} ${holes.length === 1 ? "gap" : "gaps"} to re-fly, ${(advice.hole_m2 / 1e4).toFixed(2)} ha`
+      : "no gap to re-fly",
+    ...advice.notes,
+  ].join(". ");
   rows.replaceChildren(...holes.map(row));
   rows.closest(".scroll").hidden = !holes.length;
   drawHoles(holes);

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from daemon.flight.latches import (
     FILE,
     KEPT,
@@ -65,3 +67,23 @@ def test_a_damaged_file_of_faults_hinders_no_start(tmp_path: Path) -> None:
 def test_they_never_grow_beyond_their_bounds() -> None:
     latches = latches_of(*({"event": "lost", "number": n, "cause": "x"} for n in range(KEPT + 50)))
     assert len(latches.listed()) == KEPT
+
+
+@pytest.mark.trust
+def test_what_happened_once_does_not_stand() -> None:
+    (fault,) = latches_of({"event": "lost", "number": 7, "cause": "no frame came"}).listed()
+    assert (fault["id"], fault["stands"], fault["acknowledged"]) == ("exposure 7", False, False)
+
+
+@pytest.mark.trust
+def test_what_was_absent_stands_until_the_status_no_longer_names_it() -> None:
+    latches = latches_of(
+        {"event": "ready", "absent": ["head SU02", "trigger"]},
+        {"event": "status", "absent": ["trigger"]},
+    )
+    assert {one["id"]: one["stands"] for one in latches.listed()} == {
+        "absent head SU02": False,
+        "absent trigger": True,
+    }
+    latches.apply({"event": "status"})  # one that does not say changes nothing
+    assert [one["id"] for one in latches.listed() if one["stands"]] == ["absent trigger"]

@@ -37,6 +37,7 @@ class FakeService:
     missing: list[Lack] = field(default_factory=list)
     landed: bool = False
     overrides: list[tuple[str, list[str], str]] = field(default_factory=list)
+    armed: int = 0
     faults: set[str] = field(default_factory=set)
     exposed: list[tuple[str, dict[str, Any]]] = field(default_factory=list)
     goes_on: bool = False
@@ -47,6 +48,9 @@ class FakeService:
 
     def lacks(self) -> Sequence[Lack]:
         return self.missing
+
+    def arm(self) -> None:
+        self.armed += 1
 
     def override(self, by: str, missing: Sequence[Lack], reason: str = "") -> None:
         self.overrides.append((by, [lack.name for lack in missing], reason))
@@ -114,8 +118,9 @@ def test_a_camera_that_is_not_ready_is_not_armed_unless_somebody_takes_it_upon_t
     done, sentence = give(lacking, name, **how)
     assert not done
     assert "no head SU02 (check its cable); override to fly without" in sentence
-    assert lacking.overrides == []
+    assert (lacking.overrides, lacking.armed) == ([], 0)
     assert give(lacking, name, override=True, reason="no need of it", **how)[0]
+    assert lacking.armed == 1
     assert lacking.overrides == [("operator", ["arming-device"], "no need of it")]
     done, sentence = give(FakeService(line=FakeLine(is_flown=True)), name, **how)
     assert (done, "is flown" in sentence) == (False, True)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import random
 
+import pytest
+
 from daemon.timing.clock import HostClock
 
 NS = 1_000_000_000
@@ -174,3 +176,28 @@ def test_two_edges_of_one_second_are_one() -> None:
         )
     estimate = clock.gps_at(4 * NS)
     assert estimate is not None and abs(estimate.gps_ns - OFFSET_NS - 4 * NS) < 10_000
+
+
+@pytest.mark.trust
+def test_a_receiver_that_is_back_leaves_no_standing_warning_about_its_marks() -> None:
+    """Whether its marks come is not known before the next exposure; then it is."""
+    clock = HostClock()
+    for number in range(6):
+        clock.mark_matched(OFFSET_NS + number * NS, number * NS, 50_000, key=number)
+
+    def expose(times: int) -> None:
+        for _ in range(times):
+            clock.pulse_given(50_000)
+
+    expose(3)
+    (missing,) = clock.events(20 * NS)
+    assert (missing.name, missing.is_fault) == ("mark-holdover", True)
+    clock.receiver_recovered()
+    (passed,) = clock.events(21 * NS)
+    assert (passed.name, passed.is_fault) == ("mark-holdover", False)
+    assert "the next exposure shows" in passed.sentence
+    expose(3)
+    assert [event.is_fault for event in clock.events(30 * NS)] == [True]
+    clock.mark_matched(OFFSET_NS + 31 * NS, 31 * NS, 50_000, key=31)
+    (back,) = clock.events(31 * NS)
+    assert (back.is_fault, back.sentence) == (False, "event marks are back")

@@ -142,14 +142,16 @@ def test_the_planned_line_is_on_the_map_with_the_holes_in_what_was_flown(
         for event in flown.exposure(number, "good", line="A1", north_m=north_m):
             service.tell(event)
     browser.wait_for("document.querySelectorAll('#segments tr').length === 1", WITHIN_S)
-    line, from_m, to_m, why = browser.evaluate(
+    line, from_m, to_m, hectares, why = browser.evaluate(
         "[...document.querySelectorAll('#segments td')].map((cell) => cell.innerText)"
     )
     assert line == "A1"
     assert 300 <= int(from_m) <= 400
     assert 560 <= int(to_m) <= 660
-    assert "✖ not seen often enough" in why
-    assert "1 hole behind" in browser.text("#well")
+    assert float(hectares) > 0.5
+    assert "of 2 images" in why
+    assert "1 gap to re-fly" in browser.text("#well")
+    assert browser.evaluate("document.querySelectorAll('#map .hole-area').length") >= 1
     assert "A1" in browser.text(".hole-label")
     told = browser.evaluate(
         "fetch('/api/v1/advice/fly-again.geojson').then((answer) => answer.json())"
@@ -319,6 +321,66 @@ def test_axe_finds_nothing_serious(browser: Browser, tmp_path: Path) -> None:
         assert grave == [], f"theme {theme or 'light'}"
 
 
+@pytest.mark.trust
+def test_a_head_that_sends_no_image_draws_its_hole_on_the_map(
+    service: Service, browser: Browser
+) -> None:
+    pieces = browser.evaluate("document.querySelectorAll('#map .hole-area').length")
+    for number, north_m in enumerate((816, 884, 952, 1020), start=20):
+        for event in flown.exposure(number, "usable", line="A1", north_m=north_m):
+            service.tell(event | ({"missing": ["SU00"]} if event["event"] == "sealed" else {}))
+    browser.wait_for(f"document.querySelectorAll('#map .hole-area').length > {pieces}", WITHIN_S)
+    browser.wait_for("document.querySelector('#segments').innerText.includes('SU00')", WITHIN_S)
+    assert "pan: " in browser.text("#segments")
+    assert "of 2 images" in browser.text("#segments")
+    assert "exposures 20 to 23: no image of SU00" in browser.text("#segments")
+    keep_picture(browser, "hole")
+
+
+@pytest.mark.trust
+def test_the_lamp_of_the_phase_shows_what_holds(service: Service, browser: Browser) -> None:
+    lamp = (
+        "((one) => `${one.innerText}, ${one.className.trim()}`)(document.querySelector('#phase'))"
+    )
+    for phase, missing, shown in (
+        ("idle", [], "idle, chip caution"),
+        ("ready", ["no head SU02 (check its cable)"], "not ready, chip caution"),
+        ("ready", [], "ready, chip"),
+        ("armed", [], "armed, chip good"),
+        ("flying", [], "flying, chip good"),
+    ):
+        service.tell(flown.status(phase, triggers=3) | {"missing": missing})
+        browser.wait_for(f"{lamp} === '{shown}'", WITHIN_S)
+
+
+@pytest.mark.trust
+def test_a_position_that_is_old_is_not_shown_as_the_present_one(
+    service: Service, browser: Browser
+) -> None:
+    here = {"latitude_deg": 47.07, "longitude_deg": 15.43, "satellites": 14}
+    here |= {"velocity_ned_mps": [55.0, 0.0, 0.0]}
+    for age_s, shown in ((0.2, ["14", "55.0 m/s"]), (6.0, ["–", "–"])):
+        service.tell(flown.status(triggers=3) | {"position": here | {"age_s": age_s}})
+        browser.wait_for(f"document.querySelector('#satellites').innerText === '{shown[0]}'", 30)
+        assert browser.text("#speed") == shown[1]
+
+
+@pytest.mark.trust
+def test_what_was_absent_at_the_start_and_came_stands_no_longer(
+    service: Service, browser: Browser
+) -> None:
+    service.tell({"event": "ready", "mono_ns": "1", "absent": ["trigger", "head SU02"]})
+    standing = (
+        "[...document.querySelectorAll('#faults li.stands')].map((one) => one.dataset.fault)"
+        ".filter((fault) => fault.startsWith('absent')).sort().join()"
+    )
+    browser.wait_for(f"{standing} === 'absent head SU02,absent trigger'", WITHIN_S)
+    service.tell(flown.status("flying", triggers=3) | {"absent": ["trigger"]})
+    browser.wait_for(f"{standing} === 'absent trigger'", WITHIN_S)
+    service.tell(flown.status("flying", triggers=3) | {"absent": []})
+    browser.wait_for(f"{standing} === ''", WITHIN_S)
+
+
 def test_what_is_shown_without_a_link_is_marked_and_forgotten_when_another_flight_is_watched(
     folder: Path, browser: Browser, tmp_path: Path
 ) -> None:
@@ -337,7 +399,9 @@ def test_what_is_shown_without_a_link_is_marked_and_forgotten_when_another_fligh
         assert "REFLY" in browser.text("#verdict").upper()
     finally:
         closed.end()
-    browser.wait_for("document.querySelector('#stale').innerText.includes('NO LINK')", WITHIN_S)
+    browser.wait_for(
+        "document.querySelector('#stale').innerText.includes('Connection lost')", WITHIN_S
+    )
     (tmp_path / "another").mkdir()
     another = Service(tmp_path / "another", port=int(closed.address.rstrip("/").split(":")[-1]))
     try:
@@ -363,7 +427,9 @@ def test_the_api_is_told_in_words_and_by_nobody_else(service: Service, browser: 
     browser.wait_for("document.querySelectorAll('#routes section').length > 10", WITHIN_S)
     assert browser.text("#simulated") == "SIMULATED"
     assert "interval_s in the body: number, > 0, ≤ 3600; for interval" in browser.text("#routes")
-    outside = [url for url in browser.requested if not url.startswith(("data:", service.address))]
+    outside = [
+        url for url in browser.requested if not url.startswith(("data:", "http://127.0.0.1:"))
+    ]
     assert outside == []
 
 
@@ -391,3 +457,32 @@ def keep_picture(browser: Browser, name: str) -> None:
         for theme in ("dark", ""):
             browser.evaluate(f"document.documentElement.dataset.theme = '{theme}'")
             browser.picture(Path(keep) / f"{name}-{theme or 'light'}.png")
+
+
+@pytest.mark.trust
+@pytest.mark.parametrize("has_landed", [True, False])
+def test_a_landing_ends_in_no_alarm_and_a_lost_service_does(
+    folder: Path, tmp_path: Path, has_landed: bool
+) -> None:
+    service = Service(tmp_path)
+    service.tell(flown.mission(str(folder / "mission")))
+    service.tell(flown.status("flying"))
+    with Browser(tmp_path / "profile") as browser:
+        browser.open(service.address)
+        browser.wait_for("document.querySelector('#phase')?.innerText === 'flying'", WITHIN_S)
+        if has_landed:
+            service.tell({"event": "phase", "mono_ns": "1", "phase": "landed"})
+            browser.wait_for("document.querySelector('#phase').innerText === 'landed'", WITHIN_S)
+        service.end()
+        browser.wait_for("document.body.classList.contains('stale')", WITHIN_S)
+        lamp, bar = browser.text("#link"), browser.text("#stale")
+        style = browser.evaluate("document.querySelector('#link').className.trim()")
+        if has_landed:
+            assert (lamp, style) == ("ended", "chip")
+            assert bar.startswith("Landed. The service ended ")
+        else:
+            assert (lamp, style) == ("no link", "chip warning")
+            assert "Connection lost" in bar
+        browser.evaluate("new Promise((resolve) => setTimeout(resolve, 1500))")
+        assert (browser.text("#link"), browser.text("#stale")) == (lamp, bar)
+        keep_picture(browser, "landed" if has_landed else "lost-link")
