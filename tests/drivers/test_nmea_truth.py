@@ -272,3 +272,12 @@ def test_both_sides_of_the_date_line_are_one_place() -> None:
     west = rmc(0).replace("00830.00000000,E", "17959.99999990,W")
     (sample, *_) = decode(west, east, rmc(10))
     assert sample.longitude_deg == 180.0
+
+
+def test_gbs_gives_sigmas_where_no_gst_came() -> None:
+    gbs = "GNGBS,100000.00,3.0,4.0,9.0,,,,"
+    (sample, *_) = decode(rmc(0), gga(0), gbs, rmc(10))
+    assert (sample.horizontal_sigma_m, sample.vertical_sigma_m) == (5.0, 9.0)
+    assert sample.sigma_source == "receiver"
+    (sample, *_) = decode(rmc(0), gga(0), gst(0), gbs, rmc(10))
+    assert (sample.horizontal_sigma_m, sample.vertical_sigma_m) == (0.05, 0.09)

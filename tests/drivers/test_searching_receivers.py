@@ -13,6 +13,7 @@ from drivers.gpsd.navigator import GpsdNavigator
 from drivers.message_decoder import MessageDecoder
 from drivers.nmea.decoder import NmeaDecoder
 from drivers.nmea.navigator import NmeaNavigator
+from drivers.receiver_fix import fix_in_words
 from drivers.septentrio.decoder import SbfDecoder
 from drivers.ublox.decoder import UbxDecoder
 from tests.drivers import test_mavlink as mavlink
@@ -107,6 +108,20 @@ def test_what_a_receiver_without_a_fix_fills_in_is_not_read() -> None:
     damaged = proprietary.replace(b"POLYN", b"GPOLY")
     decoder.feed(damaged, 0)
     assert decoder.bad_messages == 1
+
+
+@pytest.mark.parametrize(
+    ("fix", "satellites", "words"),
+    [
+        ("none", 0, "searching, 0 satellites"),
+        ("time", 1, "searching, 1 satellite"),
+        (None, None, "searching"),
+        ("3d", 9, "3d, 9 satellites"),
+        ("dead-reckoning", None, "dead-reckoning"),
+    ],
+)
+def test_a_fix_in_words(fix: str | None, satellites: int | None, words: str) -> None:
+    assert fix_in_words(fix, satellites) == words
 
 
 def test_it_binds_and_says_that_it_searches() -> None:

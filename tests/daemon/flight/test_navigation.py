@@ -273,3 +273,14 @@ def test_samples_exactly_two_seconds_apart_are_still_bridged() -> None:
     assert record is not None and (record.method, record.gap_ns) == ("interpolated", 2 * NS)
     late = around((sample(0.0), sample(2.001)), GPS_NS + NS)
     assert late is not None and late.method == "extrapolated"
+
+
+@pytest.mark.trust
+def test_positions_without_velocities_contradict_nothing() -> None:
+    track = Track()
+    for tenth in range(0, 10, 2):
+        track.add(replace(sample(tenth / 10), velocity_ned_mps=None))
+    record = track.at(GPS_NS + 100_000_000, 100_000_000)
+    assert record is not None and record.method == "interpolated"
+    north_m, _ = metres_per_degree(LATITUDE, HEIGHT)
+    assert (record.latitude_deg - LATITUDE) * north_m == pytest.approx(5.01, abs=0.05)
