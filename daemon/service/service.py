@@ -432,8 +432,10 @@ class Service(Desk):
             if left_s <= 0:
                 return False
             self.changed.clear()
+            # `wait_for` of Python 3.11 loses a cancellation that comes with the event.
             with suppress(TimeoutError):
-                await asyncio.wait_for(self.changed.wait(), min(left_s, PING_S))
+                async with asyncio.timeout(min(left_s, PING_S)):
+                    await self.changed.wait()
         return True
 
     # After the flight

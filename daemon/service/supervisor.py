@@ -56,7 +56,7 @@ class Supervisor:
         try:
             child.send(message)
         except OSError:
-            self._lost(child)
+            self._receive(child)  # what it said before it ended, and then that it did
 
     def tell(self, name: str, message: object) -> bool:
         """Tell a child something unless that would take time; False where it was dropped."""

@@ -65,6 +65,8 @@ CURES: Final = {
     "ellipsoid has to be set to send it, or the undulation has to be configured",
 }
 """By what is missing (`drivers.receiver_fix.missing_for_flight`)."""
+WAITED_FOR: Final = frozenset({"arming-time", "arming-navigation", "arming-kernels"})
+"""What comes by itself where nothing else fails."""
 
 
 class Trial(Desk):
@@ -105,7 +107,6 @@ class Trial(Desk):
         self._bound: dict[str, Mapping[str, str]] = {}
         self._unbound: dict[str, str] = {}
         self._refusal = ""
-        self._is_built = False
         self._data: dict[str, Any] = {}
         """The last datum of each stream, by kind and name."""
         self._complaints: dict[str, str] = {}
@@ -120,7 +121,6 @@ class Trial(Desk):
         rings = frame_rings(self._configuration, self._rig)
         try:
             self._supervisor.spawn(*worker_process(self._configuration, None, rings))
-            self._supervisor.send("worker", Begin(None))
             self._supervisor.spawn(*capture_process(self._configuration, self._rig, rings))
             await self._until(lambda: all(map(self._has_answered, self._specs)), BIND_WITHIN_S)
             if self._fire and "trigger" in self._bound:
@@ -160,7 +160,7 @@ class Trial(Desk):
         self._unbound[unbound.name] = unbound.sentence
 
     def _on_built(self, _built: WorkerBuilt) -> None:
-        self._is_built = True
+        self._supervisor.send("worker", Begin(None))
 
     def _on_refused(self, refused: WorkerRefused) -> None:
         self._refusal = refused.sentence
@@ -210,7 +210,8 @@ class Trial(Desk):
         while not is_so() and time.monotonic() < deadline:
             self._changed.clear()
             with suppress(TimeoutError):
-                await asyncio.wait_for(self._changed.wait(), STEP_S)
+                async with asyncio.timeout(STEP_S):
+                    await self._changed.wait()
 
     # What was found
 
@@ -222,7 +223,9 @@ class Trial(Desk):
 
     def _is_proven(self) -> bool:
         """Whether nothing is left that more time could prove."""
-        waits = {"arming-time", "arming-navigation", "arming-temperature"}
+        bound = {spec.kind for spec in self._specs if spec.name in self._bound}
+        waits = {"arming-time", "arming-navigation"} if "navigator" in bound else set()
+        waits |= {"arming-temperature"} if "thermometer" in bound else set()
         if any(lack.name in waits for lack in self._preflight.lacks()):
             return False
         return not any(f.outcome is not Outcome.PASS for f in self._streams(is_over=False))
@@ -231,13 +234,14 @@ class Trial(Desk):
         for spec in self._specs:
             yield self._device(spec)
         yield from self._streams(is_over=True)
-        yield self._worker()
-        seen = {"arming-device", "arming-kernels"}
+        if self._refusal:
+            yield failed("pipeline", "worker", self._refusal, prevents=True)
+        elif self._pipeline.is_ready:
+            yield passed("pipeline", "worker")
         for lack in self._preflight.lacks():
-            if lack.name in seen:
-                continue
-            is_searching = lack.name in ("arming-time", "arming-navigation")
-            outcome = Outcome.WAITING if is_searching else Outcome.FAIL
+            if lack.name == "arming-device" or (lack.name == "arming-kernels" and self._refusal):
+                continue  # the device or the pipeline itself is among the findings
+            outcome = Outcome.WAITING if lack.name in WAITED_FOR else Outcome.FAIL
             yield Finding("arming", lack.name.removeprefix("arming-"), outcome, str(lack))
 
     def _device(self, spec: DeviceSpec) -> Finding:
@@ -250,17 +254,6 @@ class Trial(Desk):
             return Finding(spec.kind, spec.name, Outcome.PASS, found=told)
         late = f"no answer within {BIND_WITHIN_S:g} s while opening it; check its power and cable"
         return failed(spec.kind, spec.name, self._unbound.get(spec.name, late))
-
-    def _worker(self) -> Finding:
-        if self._refusal:
-            return failed("pipeline", "worker", self._refusal, prevents=True)
-        if self._pipeline.is_ready:
-            return passed("pipeline", "worker")
-        sentence = (
-            f"kernels are not loaded after {KERNELS_WITHIN_S:g} s, they are being compiled; wait, "
-            "or run syntopic kernels on the ground"
-        )
-        return Finding("pipeline", "kernels", Outcome.WAITING, sentence)
 
     def _streams(self, *, is_over: bool) -> Iterator[Finding]:
         """One datum of each stream of the devices that answered."""

@@ -62,12 +62,11 @@ def listen(host: str, port: int) -> socket.socket:
 
 
 def _port(settings: WatchSection) -> Finding:
-    name = f"{settings.host}:{settings.port}"
     try:
         listen(settings.host, settings.port).close()
     except WatchError as error:
-        return failed("watch", name, str(error))
-    return passed("watch", name)
+        return failed("watch", "watch", str(error))
+    return passed("watch", "watch", f"{settings.host}:{settings.port}")
 
 
 def _tokens(path: Path | None) -> Iterator[Finding]:
