@@ -327,9 +327,8 @@ class Service(Desk):
             self.mirror.look()
             if (warning := self.line.guard.warning()) is not None:
                 self._event("disk", fault=True, sentence=warning)
-            status = self._status()
+            self.watching.tell(status := self._status())
             self.latches.apply(status)
-            self.watching.tell(status)
             await self._keep_unhandled()
             await asyncio.sleep(PING_S)
 
@@ -376,21 +375,14 @@ class Service(Desk):
             ledger=sheet.as_json(),
             exposures_left=self.line.guard.look().exposures,
             position=self.flight.track.last,
-            temperatures_c=self._temperatures_c(now_ns),
+            temperatures=self.flight.temperatures.at(now_ns),
+            temperature_stale_s=self.configuration.limits.temperature_stale_s,
             time_now=self.flight.clock.gps_at(now_ns),
             queue=len(self.pipeline),
             missing=list(map(str, self.preflight.lacks())),
             disks=self.mirror.status,
             absent=self.absent() if self.is_ready else (),
         )
-
-    def _temperatures_c(self, now_ns: int) -> dict[str, float | None]:
-        """By probe; None where the last reading is too old to be shown as the present one."""
-        oldest_ns = self.configuration.limits.temperature_stale_s * 1e9
-        return {
-            t.probe: t.value_c if t.age_ns <= oldest_ns else None
-            for t in self.flight.temperatures.at(now_ns)
-        }
 
     def _follow_phase(self) -> None:
         entered = self.preflight.follow(
@@ -401,9 +393,8 @@ class Service(Desk):
         for phase in entered:
             self._event("phase", phase=phase.value)
         if entered:
-            status = self._status()
+            self.watching.tell(status := self._status())
             self.latches.apply(status)
-            self.watching.tell(status)
 
     async def _keep_unhandled(self) -> None:
         """What nobody has acknowledged is there when the service starts next."""

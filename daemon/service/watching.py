@@ -9,10 +9,10 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-from daemon.exposure import Exposure, navigation_to_json
+from daemon.exposure import Exposure, TemperatureRecord, navigation_to_json
 from daemon.flight.latches import DELIVERS, FIXED, IS_GONE, SEARCHES
 from daemon.service.departure import ProcessPlan
 from daemon.service.messages import Answer, Told
@@ -104,7 +104,8 @@ def status_event(
     ledger: Mapping[str, Any],
     exposures_left: int,
     position: NavSample | None,
-    temperatures_c: Mapping[str, float | None],
+    temperatures: Iterable[TemperatureRecord],
+    temperature_stale_s: float,
     time_now: GpsEstimate | None,
     queue: int,
     missing: Sequence[str],
@@ -141,7 +142,7 @@ def status_event(
         "ledger": {key: value for key, value in ledger.items() if key != "heads"},
         "exposures_left": exposures_left,
         "position": where,
-        "temperatures_c": dict(temperatures_c),
+        "temperatures_c": present_temperatures_c(temperatures, temperature_stale_s),
         "clock_sigma_ns": None if time_now is None else time_now.sigma_ns,
         "gps_ns": None if time_now is None else str(time_now.gps_ns),
         "clock_source": None if time_now is None else time_now.source,
@@ -151,6 +152,13 @@ def status_event(
         **({"disks": [dict(disk) for disk in disks]} if disks else {}),
         "absent": list(absent),
     }
+
+
+def present_temperatures_c(
+    readings: Iterable[TemperatureRecord], stale_s: float
+) -> dict[str, float | None]:
+    """By probe; None where the last reading is too old to be shown as the present one."""
+    return {t.probe: t.value_c if t.age_ns * 1e-9 <= stale_s else None for t in readings}
 
 
 def summary(exposure: Exposure) -> dict[str, Any]:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from typing import Any, cast
 
+import pytest
+
+from daemon.exposure import TemperatureRecord
 from daemon.service.departure import ProcessPlan
 from daemon.service.messages import Told
 from daemon.service.supervisor import Supervisor
-from daemon.service.watching import HELD_MOST, Watching
+from daemon.service.watching import HELD_MOST, Watching, present_temperatures_c
 
 PLAN = ProcessPlan("watch", "nothing:main", (), {})
 
@@ -70,3 +73,12 @@ def test_a_process_started_anew_is_told_what_still_holds() -> None:
     seen.tell({"event": "exposure-settings", "number": 7})
     seen.start()
     assert line.told == [1, 2, 6, 7]
+
+
+@pytest.mark.trust
+def test_a_temperature_that_is_old_is_not_told_as_the_present_one() -> None:
+    readings = [
+        TemperatureRecord("0", 21.5, 9_000_000_000),
+        TemperatureRecord("1", 22.5, 11 * 10**9),
+    ]
+    assert present_temperatures_c(readings, 10.0) == {"0": 21.5, "1": None}
