@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 
 import jinja2
 
+from daemon.configuration import ConfigurationError
 from daemon.disk.durable import make_directories, replace_file
 from daemon.disk.level0_folder import read_sealed
 from daemon.disk.level2 import read_report
@@ -21,7 +22,9 @@ from daemon.disk.walk import ExposureFailure, cause_of, walk
 from daemon.displacements import flight_displacements, write_displacements
 from daemon.errors import DaemonError
 from daemon.exposure import Exposure, to_json
+from daemon.plan.mission_advice import coverage_of
 from processing.conditions import TIME_PARTS
+from processing.rig import RigError
 
 REPORT_FILE = "report.html"
 T = TypeVar("T")
@@ -63,6 +66,7 @@ def write_report(
     )
     html = environment.get_template("report.html").render(
         mission=mission.name,
+        coverage=_coverage(mission),
         exposures=exposures,
         simulated=any(exposure["record"].get("simulated") for exposure in exposures),
         displaced=_displaced(exposures),
@@ -83,6 +87,14 @@ def write_report(
     make_directories(path.parent)
     replace_file(path, html.encode("utf-8"))
     return WrittenReport(path, tuple(failures))
+
+
+def _coverage(mission: Path) -> dict[str, Any] | None:
+    """What of the plan is seen often enough; None without a plan, or one that cannot be used."""
+    try:
+        return coverage_of(Mission.open(mission))
+    except (OSError, DaemonError, ConfigurationError, RigError):
+        return None
 
 
 def _exposure(mission: Mission, number: int) -> tuple[dict[str, Any], list[ExposureFailure]]:

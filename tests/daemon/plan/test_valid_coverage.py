@@ -21,6 +21,7 @@ from typer.testing import CliRunner
 from daemon.cli import app
 from daemon.exposure import Exposure, NavigationRecord, exposure_bytes
 from daemon.plan.model import Plane, Point
+from daemon.report import write_report
 from daemon.service.watching import summary
 from daemon.watch.coverage import Coverage, advice_json
 from daemon.watch.process import _Ground
@@ -363,3 +364,13 @@ def test_in_flight_the_hole_is_known_while_it_is_flown_and_only_what_is_behind(
             assert [one["kind"] for one in advice["segments"]][-1] == "to fly"
     assert holes[0]["reasons"] == ["exposures 4 to 8: no image of SU00"]
     assert all(len(ring) == 4 for hole in holes[0]["holes"] for ring in hole["rings"])
+
+
+def test_the_report_lists_and_draws_the_hole(tmp_path: Path) -> None:
+    mission = mission_of(tmp_path, line(dict.fromkeys(range(5, 10), ("SU00",))))
+    page = write_report(mission).path.read_text()
+    told = advised(mission)
+    assert f"too few images see {told['hole_m2'] / 1e4:.2f} ha" in page
+    assert "exposures 5 to 9: no image of SU00" in page
+    drawn = sum(len(hole["rings"]) for hole in told["segments"][0]["holes"])
+    assert page.count('fill="#b3261e"') == drawn > 0
