@@ -115,6 +115,9 @@ class Resync:
         """Put the source's chain file and index, as they are now, in place of the target's.
 
         Nothing may be added to the source's meanwhile.
+
+        Raises:
+            OSError, MirrorError: a disk refused.
         """
         chain = self._source.chain_path.read_bytes()
         durable.replace_file(self._target.chain_path, chain)
@@ -122,11 +125,14 @@ class Resync:
         part = final.with_name(f".{final.name}{durable.PART_SUFFIX}")
         part.unlink(missing_ok=True)
         address = f"{self._source.catalog_path.resolve().as_uri()}?mode=ro"
-        with (
-            closing(sqlite3.connect(address, uri=True)) as reading,
-            closing(sqlite3.connect(part)) as writing,
-        ):
-            reading.backup(writing)
+        try:
+            with (
+                closing(sqlite3.connect(address, uri=True)) as reading,
+                closing(sqlite3.connect(part)) as writing,
+            ):
+                reading.backup(writing)
+        except sqlite3.Error as error:
+            raise MirrorError(f"the index cannot be copied to {final} ({error})") from error
         durable.sync_file(part)
         for ending in ("-wal", "-shm"):
             final.with_name(final.name + ending).unlink(missing_ok=True)
