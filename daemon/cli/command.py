@@ -12,14 +12,15 @@ from rich.console import Console
 HELP = """Give a running service a command.
 
 Commands are those of the API (docs/watching.md): arm, start, stop, trigger, interval, distance,
-land, acknowledge, exposure, new-mission. They go over the service's Unix socket (`[watch] control`)
-and need no token: the machine knows who you are, and your group decides. The exit status is 1 where
-the service refuses.
+land, acknowledge, exposure, new-mission, release-disk, accept-disk. They go over the service's Unix
+socket (`[watch] control`) and need no token: the machine knows who you are, and your group decides.
+The exit status is 1 where the service refuses.
 
 Examples: `syntopic command start`,
 `syntopic command arm --override --set reason="probe 3 is known to be broken"`,
 `syntopic command interval --set interval_s=2.5 --set count=40`,
-`syntopic command acknowledge --set fault="device SU02"`
+`syntopic command acknowledge --set fault="device SU02"`,
+`syntopic command release-disk --set disk=mirror`
 """
 DEFAULT_SOCKET = Path("/run/syntopic/control.sock")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -15,23 +16,34 @@ A lost or damaged index is built again from the records, what was stored is seal
 log, and what was never whole is set aside. Level-0 is not touched. The exit status is 1 when
 something cannot be put right. With --rebuild the index is made anew even if it looks well.
 
-Example: `syntopic repair MISSION`
+With --mirror two copies of a mission are brought together: the one that leads is repaired, the
+other one is brought up to date with it. What differs there is set aside, nothing is overwritten.
+
+Examples: `syntopic repair MISSION`, `syntopic repair MISSION --mirror /mnt/b/MISSION`
 """
 
 
 def repair(
     mission: Annotated[Path, typer.Argument(help="Mission folder.")],
     rebuild: Annotated[bool, typer.Option("--rebuild", help="Make the index anew.")] = False,
+    mirror: Annotated[
+        Path | None, typer.Option("--mirror", help="Folder of the mission's other copy.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from daemon.disk import durable, recovery
+    from daemon.disk import durable, mirror_repair, recovery
     from daemon.disk.log_seals import close_run, seal_logs
     from daemon.disk.mission import Mission
     from daemon.flight.recovery_match import seal_from_log
     from processing.rig import load_rig
 
-    folder = Mission.open(mission)
-    with folder.held():
+    folder, other = Mission.open(mission), None if mirror is None else Mission.open(mirror)
+    if other is not None:
+        folder, other = mirror_repair.leading_first(folder, other)
+    brought: list[str] = []
+    with folder.held(), nullcontext() if other is None else other.held():
+        if other is not None:
+            brought += mirror_repair.before_recovery(folder, other)
         if rebuild:
             for name in ("mission.db", "mission.db-wal", "mission.db-shm"):
                 (folder.path / name).unlink(missing_ok=True)
@@ -41,7 +53,9 @@ def repair(
         logs = seal_logs(folder, chain)
         is_closed = close_run(folder, chain, "repair")
         chain.close()
-    done = [*report.done, *(f"log {name}: sealed" for name in logs)]
+        if other is not None:
+            brought += mirror_repair.after_recovery(folder, other)
+    done = [*report.done, *brought, *(f"log {name}: sealed" for name in logs)]
     if is_closed:
         done.append("chain.jsonl: closed")
     if as_json:

@@ -42,6 +42,13 @@ class Exposing(Protocol):
     def command(self, wanted: Mapping[str, Any], by: str) -> str | None: ...
 
 
+class Disks(Protocol):
+    """The disks of the mission; `daemon.service.mirror.Mirror`."""
+
+    def release(self, label: str) -> str | None: ...
+    def accept(self, label: str) -> str | None: ...
+
+
 class Commanded(Protocol):
     """The service commands act on."""
 
@@ -53,6 +60,8 @@ class Commanded(Protocol):
     def preflight(self) -> Arming: ...
     @property
     def exposure(self) -> Exposing: ...
+    @property
+    def mirror(self) -> Disks: ...
     def acknowledge(self, fault: str) -> bool: ...
     def land(self, *, again: bool = False) -> None: ...
 
@@ -155,6 +164,22 @@ def _acknowledge(command: Command, flight: Commanded) -> Answer:
     return _yes(command, f"noted that {command.by} has seen {fault}")
 
 
+def _release_disk(command: Command, flight: Commanded) -> Answer:
+    label = str(command.arguments.get("disk", ""))
+    refusal = flight.mirror.release(label)
+    if refusal is not None:
+        return _no(command, refusal)
+    return _yes(command, f"disk {label} is being released; unmount it when the events say so")
+
+
+def _accept_disk(command: Command, flight: Commanded) -> Answer:
+    label = str(command.arguments.get("disk", ""))
+    refusal = flight.mirror.accept(label)
+    if refusal is not None:
+        return _no(command, refusal)
+    return _yes(command, f"the disk that is at the place of {label} is brought up to date and used")
+
+
 def _not_armed(command: Command, flight: Commanded) -> Answer | None:
     """The refusal, where the camera is not ready to fly and nobody takes that upon them."""
     if flight.line.is_flown:
@@ -198,4 +223,6 @@ _COMMANDS: Mapping[str, Callable[[Command, Commanded], Answer]] = {
     "acknowledge": _acknowledge,
     "new-mission": _new_mission,
     "exposure": _exposure,
+    "release-disk": _release_disk,
+    "accept-disk": _accept_disk,
 }

@@ -72,6 +72,9 @@ class CommandBody(BaseModel):
     fault: str | None = Field(default=None, max_length=200, description="which, for acknowledge")
     override: bool = Field(default=False, description="start although something is missing")
     reason: str | None = Field(default=None, max_length=200, description="why, for override")
+    disk: Literal["root", "mirror"] | None = Field(
+        default=None, description="for release-disk and accept-disk"
+    )
     interval_s: float | None = Field(default=None, gt=0, le=3600, description="for interval")
     count: int = Field(default=0, ge=0, le=10**6, description="for interval; 0: until stopped")
     distance_m: float | None = Field(default=None, gt=0, le=10**5, description="for distance")
@@ -111,6 +114,8 @@ CommandName = Literal[
     "acknowledge",
     "new-mission",
     "exposure",
+    "release-disk",
+    "accept-disk",
 ]
 
 

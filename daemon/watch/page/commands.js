@@ -64,11 +64,17 @@ export async function command(name, body = {}) {
 const GRAVE = {
   land: "Land: no more exposures, the service ends. Go on?",
   "new-mission": "New mission: this one is closed, the next begins with its configuration. Go on?",
+  "release-disk": "Release disk: exposures are stored on the other disk alone from now on. Go on?",
+  "accept-disk": "Accept disk: this mission is copied to the disk that is mounted there now. Go on?",
 };
+
+// A command that is confirmed first where it is grave.
+export function askCommand(name, body = {}) {
+  if (!GRAVE[name] || confirm(GRAVE[name])) command(name, body);
+}
 
 for (const button of document.querySelectorAll("[data-command]")) {
   button.addEventListener("click", () => {
-    const name = button.dataset.command;
-    if (!GRAVE[name] || confirm(GRAVE[name])) command(name);
+    askCommand(button.dataset.command);
   });
 }

@@ -1,7 +1,7 @@
 // The operator's page: what came by telemetry, put where an operator looks for it.
 
 import { flight, listen, onChange } from "./state.js";
-import { ask, command } from "./commands.js";
+import { ask, askCommand, command } from "./commands.js";
 import { drawMap } from "./map.js";
 import { drawExposure } from "./exposure.js";
 import { followPlan } from "./plan.js";
@@ -65,10 +65,33 @@ function drawHead() {
   text("lost", status.ledger?.triggers?.lost);
   const missing = brief.phase === "ready" || brief.phase === "armed" ? status.missing || [] : [];
   by("missing").replaceChildren(...missing.map((one) => element("li", { textContent: `Missing: ${one}` })));
+  drawDisks(status.disks || []);
   const temperatures = Object.entries(status.temperatures_c || {});
   by("temperatures").replaceChildren(...temperatures.map(([probe, value]) => element("div", {},
     element("dt", { textContent: probe }),
     element("dd", { textContent: value == null ? "no reading" : `${value.toFixed(2)} °C` }))));
+}
+
+// The disks of a mirrored mission, each with the command that changes it.
+function drawDisks(disks) {
+  by("disks-room").hidden = !disks.length;
+  const shown = JSON.stringify(disks);
+  if (by("disks").dataset.shown === shown) return;
+  by("disks").dataset.shown = shown;
+  by("disks").replaceChildren(...disks.map((disk) => {
+    const isUsed = disk.state === "in use";
+    const details = [disk.state];
+    if (isUsed && disk.exposures_left != null) details.push(`room for ${disk.exposures_left} exposures`);
+    if (disk.exposures_to_copy) details.push(`${disk.exposures_to_copy} exposures to copy`);
+    if (disk.sentence) details.push(disk.sentence);
+    const name = isUsed ? "release-disk" : "accept-disk";
+    const button = element("button", { type: "button", textContent: isUsed ? "Release disk" : "Accept disk" });
+    button.addEventListener("click", () => askCommand(name, { disk: disk.disk }));
+    return element("li", { className: isUsed ? "ready" : "lost" },
+      element("span", { textContent: isUsed ? "●" : "✖", ariaHidden: "true" }),
+      element("span", { textContent: `${disk.disk} ${disk.path}` }),
+      element("span", { className: "said", textContent: details.join(", ") }), button);
+  }));
 }
 
 function last(isIt) {

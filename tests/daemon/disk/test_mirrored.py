@@ -19,10 +19,17 @@ from daemon.disk.log_records import Message
 from daemon.disk.mirror_start import begin_mirrored, find_disks, resume_mirrored
 from daemon.disk.mirrored import DiskEvent, MirroredStorage
 from daemon.disk.mission import Mission
+from daemon.disk.recovery import recover
 from daemon.disk.returning import ReturnSettings
 from daemon.disk.store import verify
 from tests.daemon.disk.faulty_disk import refusing, stalling
-from tests.daemon.small_camera import capture_of, final_record, new_mission, pixels_of
+from tests.daemon.small_camera import (
+    capture_of,
+    complete_from_log,
+    final_record,
+    new_mission,
+    pixels_of,
+)
 
 pytestmark = pytest.mark.trust
 
@@ -47,6 +54,7 @@ class Flown:
             self.found = resume_mirrored(self.found)
         assert self.found.mission is not None
         self.mission = self.found.mission
+        recover(self.mission, complete_from_log)
         self.storage = MirroredStorage(
             self.mission.id,
             self.found.disks,

@@ -62,6 +62,18 @@ class FakeService:
     def exposure(self) -> FakeService:
         return self
 
+    @property
+    def mirror(self) -> FakeService:
+        return self
+
+    def release(self, label: str) -> str | None:
+        self.line.done.append(f"release {label}")
+        return None if label == "mirror" else f"there is no disk {label!r}"
+
+    def accept(self, label: str) -> str | None:
+        self.line.done.append(f"accept {label}")
+        return None if label == "mirror" else f"there is no disk {label!r}"
+
     def command(self, wanted: Mapping[str, Any], by: str) -> str | None:
         if wanted.get("gain_db", 0) > 12:
             return "gain_db is too much"
@@ -194,3 +206,12 @@ def test_each_command_is_written_down_with_who_gave_it() -> None:
         "done": True,
         "sentence": "the line runs",
     }
+
+
+def test_a_disk_is_released_and_accepted_by_its_name() -> None:
+    service = FakeService()
+    assert give(service, "release-disk", disk="mirror")[0]
+    assert give(service, "accept-disk", disk="mirror")[0]
+    assert give(service, "release-disk") == (False, "there is no disk ''")
+    assert give(service, "accept-disk", disk="other") == (False, "there is no disk 'other'")
+    assert service.line.done == ["release mirror", "accept mirror", "release ", "accept other"]
