@@ -7,6 +7,7 @@ Reads Level-2, writes `L3/`. The mathematics is in `processing.image.pansharpeni
 from __future__ import annotations
 
 import os
+import statistics
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +26,7 @@ from daemon.disk.records import canonical_bytes, sha256_hex
 from daemon.disk.walk import ExposureFailure, walk
 from daemon.errors import DaemonError
 from daemon.exposure import Exposure
+from processing.conditions import by_sensor_of
 from processing.image.pansharpening import pansharpened
 from processing.radiometry.tone_curve import (
     WORDS,
@@ -93,10 +95,8 @@ def mission_tones(
         OSError: the disk refused.
     """
     numbers = _processed(mission)
-    colour = set(rig.colour_cones)
-    bands = {cone.sensors[0].name: cone.bands for cone in rig.cones if cone in colour}
     sums = {band: np.zeros(WORDS, np.int64) for band in BAND_ORDER}
-    timed = walk(numbers, lambda number: _exposure_times_us(mission, bands, number))
+    timed = walk(numbers, lambda number: _exposure_times_us(mission, rig, number))
     scales = _scales(timed.results)
 
     def count(number: int) -> None:
@@ -244,18 +244,20 @@ def _processed(mission: Mission) -> list[int]:
     return numbers
 
 
-def _exposure_times_us(
-    mission: Mission, bands: Mapping[str, Sequence[str]], number: int
-) -> dict[str, float]:
-    """Exposure times of an exposure by band, as far as its record knows them."""
+def _exposure_times_us(mission: Mission, rig: Rig, number: int) -> dict[str, float]:
+    """What the bands of an exposure were exposed for, as far as its record knows it.
+
+    Level-2 holds the frames of a cone brought to its median exposure time.
+    """
     exposure = _record(mission, number)
     if exposure is None:
         return {}
+    times_us = {f.sensor: f.exposure_time_us for f in exposure.frames if f.exposure_time_us}
     return {
-        band: frame.exposure_time_us
-        for sensor, of_sensor in bands.items()
-        if (frame := exposure.frame(sensor)) is not None and frame.exposure_time_us
-        for band in of_sensor
+        band: statistics.median_low(of_cone.values())
+        for cone in rig.colour_cones
+        if (of_cone := by_sensor_of(cone, times_us))
+        for band in cone.bands
     }
 
 

@@ -330,3 +330,15 @@ def test_a_killed_holder_holds_nothing(flown: Mission, tmp_path: Path) -> None:
     holder.wait()
     with mission.held():
         pass
+
+
+def test_verify_names_every_damaged_exposure_and_goes_on(damaged: Mission) -> None:
+    done = syntopic("verify", str(damaged.path), "--json")
+    assert done.returncode == 1 and "Traceback" not in done.stderr, done.stderr
+    problems = json.loads(done.stdout)["problems"]
+    for index, what in enumerate(DAMAGES):
+        number = 2 * index + 2
+        assert any(re.search(rf"\b0*{number}\b", problem) for problem in problems), what
+    healthy = range(1, 2 * len(DAMAGES) + 2, 2)
+    frames = {f"{number:06d}, LEFT.tif" for number in healthy}
+    assert not [p for p in problems if any(frame in p for frame in frames)]

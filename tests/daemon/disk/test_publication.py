@@ -19,7 +19,8 @@ from daemon.disk import publication
 from daemon.disk.level2 import write_folder
 from daemon.disk.publication import published, sweep
 
-ROUNDS = int(os.environ.get("SYNTOPIC_PUBLICATION_ROUNDS", "60"))
+ROUNDS = 60
+SOAK_ROUNDS = int(os.environ.get("SYNTOPIC_PUBLICATION_ROUNDS", "1000"))
 FILES = tuple(f"{k:02d}.json" for k in range(11))
 
 WRITERS = """
@@ -80,6 +81,18 @@ def written(final: Path) -> str:
 @pytest.mark.trust
 @pytest.mark.parametrize("how", ["exchange", "renames"])
 def test_two_writers_killed_at_any_instant_leave_one_complete_set(tmp_path, how):
+    kill_writers(tmp_path, how, ROUNDS)
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("how", ["exchange", "renames"])
+def test_a_thousand_rounds_of_kills_leave_one_complete_set_each(tmp_path, how):
+    kill_writers(tmp_path, how, SOAK_ROUNDS)
+
+
+def kill_writers(tmp_path, how, rounds):
+    """Two processes publish under one name until each is killed, so many times."""
     rng = random.Random(20261122)
     final = tmp_path / "L2" / "000001"
     program = subprocess.Popen(
@@ -89,7 +102,7 @@ def test_two_writers_killed_at_any_instant_leave_one_complete_set(tmp_path, how)
     assert program.stdin is not None and program.stdout is not None
     write_folder(final, {name: [b"first 0"] for name in FILES})
     found = set()
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         program.stdin.write("a b\n")
         program.stdin.flush()
         writers = [int(pid) for pid in program.stdout.readline().split()]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from typer.testing import CliRunner
 from daemon.adjusting.project import read_project
 from daemon.cli import app
 from daemon.disk.level0 import tiff_parts
+from daemon.disk.mission import Mission, MissionError
 from daemon.orientation.local_frame import LocalFrame
 from processing.rig import shipped_rigs
 from sim_hw.exposures import EPOCH_GPS_NS, FIRST_AFTER_S
@@ -172,3 +174,36 @@ def test_a_triangulated_block_tells_the_boresight(flown, told, tmp_path: Path) -
     assert found["lever arm", "down"]["sigma"] is None
     up = found["position shift", "up"]
     assert abs(up["value"]) < 4.5 * up["sigma"]
+
+
+@pytest.mark.trust
+def test_images_and_records_that_cannot_be_read_are_left_out_and_listed(flown, tmp_path) -> None:
+    mission = tmp_path / "mission"
+    shutil.copytree(flown[0] / "mission", mission)
+    for number in (7, 8):
+        shutil.rmtree(mission / f"L0/{number:06d}")
+    image = mission / "L2/000003/pan.tif"
+    image.write_bytes(image.read_bytes()[:-2])
+    image = mission / "L2/000004/pan.tif"
+    image.unlink()
+    image.mkdir()
+    (mission / "L0/000006/exposure.json").write_text('{"number": "6"}')
+    where = ["--trajectory", str(flown[0] / "trajectory.csv"), "--json"]
+    done = RUN.invoke(app, ["at", str(mission), *where])
+    assert done.exit_code == 1, done.output
+    report = json.loads(done.stdout)
+    assert report["triangulation"]["exposures"] == 3
+    causes = {failure["exposure"]: failure["cause"] for failure in report["failures"]}
+    assert set(causes) == {3, 4, 6}
+    assert "pixels" in causes[3] and "Is a directory" in causes[4] and "number" in causes[6]
+    assert "3 exposures failed" in done.stderr
+    exterior = (Path(report["folder"]) / "exterior.csv").read_text()
+    assert "000005" in exterior and "000003" not in exterior
+
+
+@pytest.mark.trust
+def test_a_block_is_not_begun_while_another_process_writes_into_the_mission(flown) -> None:
+    mission = Mission.open(flown[0] / "mission")
+    command = ["at", str(mission.path), "--trajectory", str(flown[0] / "trajectory.csv")]
+    with mission.held(), pytest.raises(MissionError, match="is held by another process"):
+        RUN.invoke(app, command, catch_exceptions=False)
