@@ -7,6 +7,7 @@ Both go through `prerequisites`, so that they cannot disagree. What devices say 
 from __future__ import annotations
 
 import datetime
+import errno
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -15,9 +16,10 @@ from typing import Final, TypeAlias
 
 from daemon.configuration import Configuration
 from daemon.disk import durable
+from daemon.disk.disk_identity import same_file_system
 from daemon.disk.guard import LEVEL2_SHARE
 from daemon.service.devices import frame_nbytes
-from daemon.service.findings import Finding, failed, passed
+from daemon.service.findings import Finding, Outcome, failed, passed
 from drivers import registry
 from drivers.extras import MissingExtraError, require
 from processing.rig import Rig
@@ -98,10 +100,33 @@ def calibration(configuration: Configuration, rig: Rig) -> Iterator[Finding]:
         yield passed("calibration", name, date=rig.calibration_date)
 
 
-def storage(configuration: Configuration, rig: Rig) -> Iterator[Finding]:
-    """The root of missions: there or creatable, and writable."""
-    root = configuration.mission.root
+def storage(configuration: Configuration, _rig: Rig) -> Iterator[Finding]:
+    """The root of missions and its mirror: there or creatable, and writable.
+
+    Of two disks one is enough for a flight.
+    """
+    root, mirror = configuration.mission.root, configuration.mission.mirror
+    if mirror is None:
+        yield _writable("root", root, prevents=True)
+        return
+    findings = [_writable("root", root), _writable("mirror", mirror)]
+    if all(finding.outcome is Outcome.FAIL for finding in findings):
+        findings = [_writable("root", root, prevents=True)]
+    yield from findings
+    if same_file_system(root, mirror):
+        yield passed(
+            "disk",
+            "mirror",
+            f"caution: {mirror} lies on the same file system as {root}; one fault takes both: "
+            "mount another disk there",
+        )
+
+
+def _writable(key: str, root: Path, *, prevents: bool = False) -> Finding:
     try:
+        if key == "mirror" and not root.is_dir():
+            # A folder made here would lie below a mount point, on the wrong disk.
+            raise NotADirectoryError(errno.ENOENT, "there is no such folder")
         durable.make_directories(root)
         probe = root / f".check-{os.getpid()}{durable.PART_SUFFIX}"
         probe.unlink(missing_ok=True)
@@ -110,15 +135,14 @@ def storage(configuration: Configuration, rig: Rig) -> Iterator[Finding]:
         finally:
             probe.unlink(missing_ok=True)
     except OSError as error:
-        yield failed(
+        return failed(
             "disk",
             str(root),
-            f"mission.root {root} cannot be written ({error.strerror or error}); mount the disk, "
+            f"mission.{key} {root} cannot be written ({error.strerror or error}); mount the disk, "
             "free it, or give the user of the service the right to write there",
-            prevents=True,
+            prevents=prevents,
         )
-        return
-    yield passed("disk", str(root), free_gb=f"{durable.free_bytes(root) / 1e9:.1f}")
+    return passed("disk", str(root), free_gb=f"{durable.free_bytes(root) / 1e9:.1f}")
 
 
 def memory(configuration: Configuration, rig: Rig) -> Iterator[Finding]:
