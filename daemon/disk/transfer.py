@@ -275,7 +275,7 @@ class _Copying:
             if file.name in ours or file.name in LEFT_OUT:
                 continue
             whole = _name_of_part(file.name)
-            if whole in ours or whole in self._noted:
+            if whole in self._noted:
                 unfinished.append(file.name)
             elif file.name not in self._noted:
                 raise TransferError(
