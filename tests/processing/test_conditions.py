@@ -101,6 +101,7 @@ def test_the_frames_of_a_cone_are_brought_to_its_median_exposure_time() -> None:
     # Cones are compared with nobody: red is alone in its cone.
     assert {name for name, scale in scales.items() if scale != 1.0} == {"SU01"}
     assert "SU30" not in exposure_scales(rig, {"SU01": 0.002})
+    assert exposure_scales(rig, {"SU00": 0.004, "SU01": 0.002})["SU00"] == 0.5
 
 
 def test_smear_is_that_of_the_frame_that_moved_most() -> None:
