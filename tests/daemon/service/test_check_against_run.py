@@ -301,7 +301,8 @@ def test_there_are_at_least_sixty_faults() -> None:
 
 def _is_named(sentences: frozenset[str], *, by: frozenset[str]) -> bool:
     """Whether each sentence is among the others, or within one of them, or around it."""
-    return all(any(one in other or other in one for other in by) for one in sentences)
+    named = [other for other in by if other]
+    return all(one and any(one in other or other in one for other in named) for one in sentences)
 
 
 AGREED: dict[str, Callable[[Said, Said], bool]] = {

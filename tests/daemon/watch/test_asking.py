@@ -30,10 +30,20 @@ def flying() -> Service:
     """A service that has one head, has lost another, and waits for its receiver."""
     service = Service()
     device = {"event": "device", "device": "SUB", "fault": True, "name": "lost", "sentence": "gone"}
+    passed_by = {
+        "event": "device",
+        "device": "SUA",
+        "fault": True,
+        "name": "lost",
+        "sentence": "was",
+    }
+    back = {"event": "device", "device": "SUA", "fault": False, "name": "opened", "sentence": "is"}
     for event in (
         {"event": "bound", "kind": "head", "device": "SUA", "found": {}},
         {"event": "bound", "kind": "head", "device": "SUB", "found": {}},
         device,
+        passed_by,
+        back,
         {"event": "phase", "phase": "ready"},
         {"event": "status", "missing": ["no position (wait)"]},
     ):
@@ -56,6 +66,8 @@ def test_the_running_service_is_asked_over_its_control_socket(planted: Planted) 
     assert told["head", "SUA"][0] is Outcome.PASS
     assert told["head", "SUB"] == (Outcome.FAIL, "gone")
     assert told["arming", "missing"] == (Outcome.WAITING, "no position (wait)")
+    assert told["fault", "SUB"] == (Outcome.FAIL, "gone")
+    assert ("fault", "SUA") not in told, "it has passed"
     assert not service.commands, "asking is no command, and nothing goes to the log"
     assert overall(found) is Outcome.FAIL
 
