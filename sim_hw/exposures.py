@@ -18,6 +18,7 @@ import tifffile
 from processing.rig import RigError
 from sim_hw.__main__ import displacement, rig_file
 from sim_hw.seeding import random_stream
+from sim_hw.whole_file import whole_file
 from sim_hw.world import laboratory
 from sim_hw.world.electronics import Electronics, true_sensor
 from sim_hw.world.grounds import GROUNDS
@@ -83,20 +84,19 @@ def write_exposures(world: World, out: Path, *, count: int, scenes: Path, lines:
                     random=random_stream(seed, "noise", sensor.name, k + 1),
                 )
                 path = mission / "L0" / f"{k + 1:06d}" / f"{sensor.name}.tif"
-                tifffile.imwrite(path, frame)
+                with whole_file(path) as part:
+                    tifffile.imwrite(part, frame)
                 looks[k][sensor.name] = look
                 if truth is not None:
                     truth.add(Taken(sensor.name, k + 1, look), flight)
             print(sensor.name, file=sys.stderr, flush=True)
     for k, mark_ns in enumerate(marks):
         path = mission / "L0" / f"{k + 1:06d}" / "exposure.json"
-        path.write_text(
-            json.dumps(
-                _record(world, k + 1, mark_ns, looks[k]) | {"line_id": f"line {k // count + 1}"},
-                indent=1,
-            )
-        )
-    (out / "ready.json").write_text(json.dumps({"exposures": len(marks)}))
+        record = _record(world, k + 1, mark_ns, looks[k]) | {"line_id": f"line {k // count + 1}"}
+        with whole_file(path) as part:
+            part.write_text(json.dumps(record, indent=1))
+    with whole_file(out / "ready.json") as part:
+        part.write_text(json.dumps({"exposures": len(marks)}))
     return mission
 
 
@@ -137,7 +137,8 @@ def _write_plan(world: World, mission: Path, radiometry: Path) -> None:
         "[mission]\n"
         f"radiometry = {json.dumps(str(radiometry.resolve()))}\n"
     )
-    (mission / "service.toml").write_text(text, encoding="utf-8")
+    with whole_file(mission / "service.toml") as part:
+        part.write_text(text, encoding="utf-8")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

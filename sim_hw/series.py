@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from processing.rig import Rig, RigError, load_rig, shipped_rigs
+from sim_hw.whole_file import whole_file
 
 DATE: Final = "2026-11-21"
 """The same of every series: the same call writes the same bytes."""
@@ -75,4 +76,5 @@ def write_list(
         **content,
         "images": images,
     }
-    (series / "series.json").write_text(json.dumps(told, indent=1))
+    with whole_file(series / "series.json") as part:
+        part.write_text(json.dumps(told, indent=1))

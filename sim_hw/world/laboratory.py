@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from processing.rig import Sensor
 from sim_hw.seeding import random_stream
+from sim_hw.whole_file import whole_file
 from sim_hw.world import electronics
 from sim_hw.world.electronics import Map, SensorTruth
 
@@ -97,14 +98,13 @@ def _without_gaps(flat: Map) -> Map:
 def write_rig(rig_file: Path, folder: Path) -> None:
     """Put the rig file, which holds the geometric calibration, into the calibration folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(rig_file, folder / "rig.toml")
+    with whole_file(folder / "rig.toml") as part:
+        shutil.copyfile(rig_file, part)
 
 
 def write_radiometry(folder: Path, sensor: Sensor, radiometry: Radiometry) -> None:
     """Write `radiometry/<sensor>.npz`."""
     (folder / "radiometry").mkdir(parents=True, exist_ok=True)
     path = folder / "radiometry" / f"{sensor.name}.npz"
-    work = path.with_suffix(".part")
-    with work.open("wb") as file:
+    with whole_file(path) as part, part.open("wb") as file:
         np.savez(file, **radiometry.arrays())
-    work.replace(path)

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from sim_hw.seeding import random_stream
+from sim_hw.whole_file import whole_file
 from sim_hw.world.flight import Flight, path_point
 from sim_hw.world.world import World
 
@@ -77,7 +78,7 @@ def write_trajectory(
         attitude_deg: sigma of roll, pitch, heading.
     """
     random = random_stream(seed, "post-processed")
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with whole_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(COLUMNS)
         for mark in marks:

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from sim_hw.seeding import random_stream
+from sim_hw.whole_file import whole_file
 from sim_hw.world import camera
 from sim_hw.world.flight import Flight
 from sim_hw.world.snapshots import look_of
@@ -80,7 +81,7 @@ def _master_mark(world: World, mark_gps_ns: int) -> int:
 
 
 def _write(path: Path, columns: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with whole_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
         writer.writerows(rows)

@@ -6,7 +6,6 @@ Nobody but the judge and tests may read these files. How they are compared is in
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.rig import Cone, Sensor
+from sim_hw.whole_file import whole_file
 from sim_hw.world import camera
 from sim_hw.world.flight import Flight
 from sim_hw.world.rendering import Look, content_rows, grid_axis, sensor_directions
@@ -110,10 +110,8 @@ class TruthWriter:
         del self._touched_s[count]
         content = exposure_truth(self._world, flight, taken)
         path = self._folder / f"{count:06d}.npz"
-        work = path.with_suffix(".part")
-        with work.open("wb") as file:
+        with whole_file(path) as part, part.open("wb") as file:
             np.savez(file, **content)
-        work.replace(path)
 
 
 def exposure_truth(world: World, flight: Flight, taken: Mapping[str, Taken]) -> dict[str, Any]:
@@ -245,9 +243,5 @@ def world_of(folder: Path) -> World:
 
 
 def _write_atomically(path: Path, content: bytes) -> None:
-    work = path.with_suffix(".part")
-    with work.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    work.replace(path)
+    with whole_file(path) as part:
+        part.write_bytes(content)
