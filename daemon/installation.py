@@ -27,6 +27,10 @@ USER = "syntopic"
 
 TARGETS = {
     "syntopic.service": PurePosixPath("/etc/systemd/system/syntopic.service"),
+    "syntopic-disk-health.service": PurePosixPath(
+        "/etc/systemd/system/syntopic-disk-health.service"
+    ),
+    "syntopic-disk-health.timer": PurePosixPath("/etc/systemd/system/syntopic-disk-health.timer"),
     "sysusers.conf": PurePosixPath("/etc/sysusers.d/syntopic.conf"),
     "tmpfiles.conf": PurePosixPath("/etc/tmpfiles.d/syntopic.conf"),
     "sysctl.conf": PurePosixPath("/etc/sysctl.d/60-syntopic.conf"),
@@ -40,6 +44,7 @@ HIDDEN_FROM_SERVICE = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
 """What ProtectHome= and PrivateTmp= of the unit hide."""
 
 COMMAND_IN_TEMPLATE = "/opt/syntopic/bin/syntopic run /etc/syntopic/service.toml"
+HEALTH_IN_TEMPLATE = "/opt/syntopic/bin/syntopic disk-health"
 COMMAND_TIMEOUT_S = 60.0
 KERNELS_TIMEOUT_S = 900.0
 
@@ -86,13 +91,19 @@ def templates_dir() -> Path:
     raise InstallationError(f"the unit files are neither in {beside} nor in {installed}")
 
 
-def contents(command: Path, configuration: PurePosixPath, missions: Path | None) -> dict[str, str]:
+def contents(
+    command: Path,
+    configuration: PurePosixPath,
+    missions: Path | None,
+    mirror: Path | None = None,
+) -> dict[str, str]:
     """Text by absolute target path.
 
     Args:
         command: the installed `syntopic`.
         configuration: what the service will run with.
         missions: where missions are kept, where that is known.
+        mirror: where they are mirrored; it may be missing when the service starts.
 
     Raises:
         InstallationError: the hardened service could not see the command or the configuration.
@@ -108,8 +119,17 @@ def contents(command: Path, configuration: PurePosixPath, missions: Path | None)
     texts = {str(to): (folder / name).read_text("utf-8") for name, to in TARGETS.items()}
     unit = str(TARGETS["syntopic.service"])
     texts[unit] = texts[unit].replace(COMMAND_IN_TEMPLATE, f"{command} run {configuration}")
-    if missions is not None and not missions.is_relative_to(STATE_FOLDER):
-        texts[str(DROP_IN)] = f"[Service]\nReadWritePaths={missions}\n"
+    health = str(TARGETS["syntopic-disk-health.service"])
+    texts[health] = texts[health].replace(HEALTH_IN_TEMPLATE, f"{command} disk-health")
+    # Of two disks either may be missing at the start.
+    optional = "" if mirror is None else "-"
+    writable = [
+        f"ReadWritePaths={optional}{folder}\n"
+        for folder in (missions, mirror)
+        if folder is not None and not folder.is_relative_to(STATE_FOLDER)
+    ]
+    if writable:
+        texts[str(DROP_IN)] = "".join(("[Service]\n", *writable))
     return texts
 
 

@@ -24,6 +24,7 @@ from daemon.cli import (
     command,
     demo,
     develop,
+    disk_health,
     explain,
     export,
     imports,
@@ -80,6 +81,7 @@ app.command(name="kernels", help=kernels.HELP)(kernels.kernels)
 app.command(name="advise", help=advise.HELP)(advise.advise)
 app.command(name="orient", help=export.ORIENTATION_HELP)(export.orientation)
 app.command(name="intersect", help=intersect.HELP)(intersect.intersect)
+app.command(name="disk-health", help=disk_health.HELP)(disk_health.disk_health)
 app.command(name="install", help=install.HELP)(install.install)
 app.command(name="uninstall", help=install.UNINSTALL_HELP)(install.uninstall)
 app.add_typer(rigs.app, name="rigs")

@@ -44,13 +44,14 @@ def install(
 
     command = Path(sys.argv[0]).absolute()
     configuration = PurePosixPath(config.absolute())
-    rig, missions = None, None
+    rig, missions, mirror = None, None, None
     if config.exists():
         loaded, _ = load(config)
         rig, missions = loaded.mission.rig, loaded.mission.root
+        mirror = loaded.mission.mirror
     console = Console(stderr=True)
     done = installation.install(
-        installation.contents(command, configuration, missions),
+        installation.contents(command, configuration, missions, mirror),
         installation.steps(command, rig),
         root=root,
         tell=lambda line: console.print(line, style="dim", highlight=False),

@@ -83,6 +83,12 @@ class Latches:
         elif kind == "disk-dropped":
             label = str(event.get("disk"))
             self.raise_fault(f"disk {label}", sentence, f"disk {label}", sequence=sequence)
+        elif kind == "disk-health":
+            fault = f"health of disk {event.get('disk')}"
+            if event.get("fault"):
+                self.raise_fault(fault, sentence, fault, sequence=sequence)
+            else:
+                self.pass_fault(fault)
         elif kind in ("disk-joined", "disk-released"):
             self.pass_fault(f"disk {event.get('disk')}")
         elif kind in _RAISES:

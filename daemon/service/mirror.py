@@ -7,6 +7,7 @@ What is written, and when a disk is dropped, is decided in the writer process
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from daemon.configuration import Configuration
 from daemon.disk import durable
 from daemon.disk.disk_identity import Disk, same_file_system
 from daemon.disk.guard import needed_nbytes
+from daemon.disk.health import DiskHealth, read_health
 from daemon.disk.log_records import LoggedRecord
 from daemon.disk.mirror_start import FoundDisks
 from daemon.disk.mission import Mission
@@ -37,6 +39,7 @@ from daemon.service.storage import MirrorPlan
 from processing.quality.report import Flag
 from processing.rig import Rig
 
+HEALTH_EVERY_S = 10.0
 ROOM_EXPOSURES = 10
 """A disk that returns has room for so many more."""
 
@@ -76,6 +79,8 @@ class Mirror(Desk):
         self._status: Sequence[Mapping[str, Any]] = ()
         self._full: set[str] = set()
         self._has_landed = False
+        self._health: dict[str, DiskHealth] = {}
+        self._look_after_s = 0.0
 
     @property
     def is_on(self) -> bool:
@@ -95,7 +100,17 @@ class Mirror(Desk):
         """The disks as the page shows them, plain JSON types; none where there is one disk."""
         # A disk that was dropped is not asked: it may hang.
         left = {disk.label: self._left(_free_nbytes(disk.root)) for disk in self._in_use}
-        return [{**one, "exposures_left": left.get(one["disk"])} for one in self._status]
+        shown = self._status
+        if not self._disks and "root" in self._health:
+            shown = [{"disk": "root", "path": str(self._mission.root), "state": "in use"}]
+        return [
+            {
+                **one,
+                **({"exposures_left": left[one["disk"]]} if one["disk"] in left else {}),
+                **_health_json(self._health.get(one["disk"])),
+            }
+            for one in shown
+        ]
 
     def free_bytes(self, path: Path) -> int:
         """What may still be put on every disk in use, for `daemon.disk.guard`."""
@@ -105,6 +120,34 @@ class Mirror(Desk):
         return min((nbytes for nbytes in free if nbytes is not None), default=0)
 
     def look(self) -> None:
+        """See whether a disk is full, and how the disks are."""
+        self._look_at_health()
+        self._drop_full()
+
+    def _look_at_health(self) -> None:
+        """Say of each disk in use when it is no longer well, or well again."""
+        if time.monotonic() < self._look_after_s:
+            return
+        self._look_after_s = time.monotonic() + HEALTH_EVERY_S
+        roots = {disk.label: disk.root for disk in self._in_use} or {"root": self._mission.root}
+        for label, root in roots.items():
+            try:
+                found = read_health(root)
+            except OSError:
+                continue  # the disk itself is gone, which is said elsewhere
+            before = self._health.pop(label, DiskHealth())
+            if found is not None:
+                self._health[label] = found
+            problems = () if found is None else found.problems
+            if problems and problems != before.problems:
+                told = "; ".join(problems)
+                sentence = f"disk {label} ({root}): {told}"
+                self._tell("disk-health", fault=True, disk=label, sentence=sentence)
+            elif before.problems and not problems:
+                sentence = f"disk {label} ({root}) is well again"
+                self._tell("disk-health", fault=False, disk=label, sentence=sentence)
+
+    def _drop_full(self) -> None:
         """Drop a disk that has no room for the next exposure where another has."""
         left = {disk.label: self._left(_free_nbytes(disk.root)) for disk in self._in_use}
         full = {label for label, count in left.items() if count == 0}
@@ -232,3 +275,14 @@ def _free_nbytes(root: Path) -> int | None:
         return durable.free_bytes(root)
     except OSError:
         return None
+
+
+def _health_json(health: DiskHealth | None) -> dict[str, Any]:
+    if health is None:
+        return {}
+    return {
+        "temperature_c": health.temperature_c,
+        "wear_percent": health.wear_percent,
+        "healthy": not health.problems,
+        "problems": list(health.problems),
+    }

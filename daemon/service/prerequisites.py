@@ -18,6 +18,7 @@ from daemon.configuration import Configuration
 from daemon.disk import durable
 from daemon.disk.disk_identity import same_file_system
 from daemon.disk.guard import LEVEL2_SHARE
+from daemon.disk.health import read_health
 from daemon.service.devices import frame_nbytes
 from daemon.service.findings import Finding, Outcome, failed, passed
 from drivers import registry
@@ -145,6 +146,28 @@ def _writable(key: str, root: Path, *, prevents: bool = False) -> Finding:
     return passed("disk", str(root), free_gb=f"{durable.free_bytes(root) / 1e9:.1f}")
 
 
+def disk_health(configuration: Configuration, _rig: Rig) -> Iterator[Finding]:
+    """What the disks state of themselves, where the helper reads it."""
+    mission = configuration.mission
+    for key, root in (("root", mission.root), ("mirror", mission.mirror)):
+        if root is None:
+            continue
+        name = f"health of {key}"
+        try:
+            found = read_health(root)
+        except OSError:
+            continue  # `storage` says what is wrong with it
+        if found is None:
+            sentence = "not read; run: sudo systemctl enable --now syntopic-disk-health.timer"
+            yield Finding("disk", name, Outcome.NOT_TRIED, sentence)
+        elif found.problems:
+            yield failed("disk", name, f"disk of {root}: {'; '.join(found.problems)}")
+        else:
+            stated = {"temperature_c": found.temperature_c, "wear_percent": found.wear_percent}
+            numbers = {k: f"{value:g}" for k, value in stated.items() if value is not None}
+            yield passed("disk", name, model=found.model, serial=found.serial, **numbers)
+
+
 def memory(configuration: Configuration, rig: Rig) -> Iterator[Finding]:
     """Memory for the frames of the exposures that are held at a time."""
     depth = configuration.limits.exposures_in_memory
@@ -195,7 +218,7 @@ def pace(configuration: Configuration, rig: Rig) -> Iterator[Finding]:
         yield passed("disk", "pace", told)
 
 
-LOOKS: Final[Sequence[Look]] = (libraries, calibration, storage, memory, pace)
+LOOKS: Final[Sequence[Look]] = (libraries, calibration, storage, disk_health, memory, pace)
 """Every prerequisite, in the order they are looked at."""
 AFTER_RESTART: Final[Sequence[Look]] = (libraries, calibration, storage, memory)
 """Those of a flight that is resumed: nothing is measured while exposures are waited for."""

@@ -5,7 +5,7 @@ Made anew from the state at each scrape; nothing is counted twice.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from prometheus_client import CollectorRegistry, generate_latest
@@ -94,12 +94,31 @@ class _Flight(Collector):
             "syntopic_ledger_balanced", "1 while the ledger balances.", value=balanced
         )
 
+    def _disks(self, disks: Sequence[Mapping[str, Any]]) -> Iterator[Metric]:
+        """What is known of each disk; nothing where the mission has one of which nothing is."""
+        figures = {
+            "syntopic_disk_in_use": ("1 while a disk is in use.", "state"),
+            "syntopic_disk_healthy": ("1 while a disk states no problem.", "healthy"),
+            "syntopic_disk_temperature_celsius": ("Temperature of a disk.", "temperature_c"),
+            "syntopic_disk_wear_percent": ("Endurance of a disk that is used.", "wear_percent"),
+        }
+        for name, (what, key) in figures.items():
+            gauge = GaugeMetricFamily(name, what, labels=["disk"])
+            for disk in disks:
+                value = disk.get(key)
+                if value is not None:
+                    number = float(value == "in use") if key == "state" else float(value)
+                    gauge.add_metric([str(disk["disk"])], number)
+            if gauge.samples:
+                yield gauge
+
     def _gauges(self, status: Mapping[str, Any]) -> Iterator[Metric]:
         left = status.get("exposures_left")
         if left is not None:
             yield GaugeMetricFamily(
                 "syntopic_disk_exposures_left", "Exposures the disk still holds.", value=left
             )
+        yield from self._disks(status.get("disks") or [])
         sigma_ns = status.get("clock_sigma_ns")
         if sigma_ns is not None:
             yield GaugeMetricFamily(

@@ -42,6 +42,10 @@ def systemd_analyze() -> str:
     return program
 
 
+HELPER_EXPOSURE_MAX = 5.0
+"""It runs as root and sends commands to disks."""
+
+
 def test_an_image_gets_every_file_and_a_note_of_them(tmp_path: Path) -> None:
     written = lay_out(tmp_path)
     assert sorted(written) == sorted(map(str, TARGETS.values()))
@@ -62,6 +66,34 @@ def test_missions_on_a_disk_of_their_own_are_let_through_the_hardening(tmp_path:
     drop_in = (tmp_path / str(DROP_IN).lstrip("/")).read_text()
     assert drop_in == "[Service]\nReadWritePaths=/data/flights\n"
     assert str(DROP_IN) not in contents(COMMAND, CONFIGURATION, Path("/var/lib/syntopic/flights"))
+
+
+def test_a_mirror_is_let_through_the_hardening_and_may_be_missing_at_the_start() -> None:
+    texts = contents(COMMAND, CONFIGURATION, Path("/a/flights"), Path("/b/flights"))
+    assert texts[str(DROP_IN)] == (
+        "[Service]\nReadWritePaths=-/a/flights\nReadWritePaths=-/b/flights\n"
+    )
+    at_home = contents(COMMAND, CONFIGURATION, Path("/var/lib/syntopic/flights"), Path("/b"))
+    assert at_home[str(DROP_IN)] == "[Service]\nReadWritePaths=-/b\n"
+
+
+def test_the_helper_that_asks_the_disks_is_valid_and_closed_to_all_else(tmp_path: Path) -> None:
+    program = systemd_analyze()
+    name = "syntopic-disk-health.service"
+    unit = tmp_path / name
+    text = contents(COMMAND, CONFIGURATION, None)[str(TARGETS[name])]
+    assert f"ExecStart={COMMAND} disk-health" in text
+    unit.write_text(text)
+    judged = subprocess.run(
+        [program, "security", "--offline=true", str(unit)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    found = re.search(rf"Overall exposure level for {re.escape(name)}: ([0-9.]+)", judged.stdout)
+    assert found, judged.stdout + judged.stderr
+    assert float(found.group(1)) <= HELPER_EXPOSURE_MAX
 
 
 @pytest.mark.parametrize("path", ["/home/pilot/venv/bin/syntopic", "/root/syn/bin/syntopic"])

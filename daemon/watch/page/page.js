@@ -83,14 +83,20 @@ function drawDisks(disks) {
     const details = [disk.state];
     if (isUsed && disk.exposures_left != null) details.push(`room for ${disk.exposures_left} exposures`);
     if (disk.exposures_to_copy) details.push(`${disk.exposures_to_copy} exposures to copy`);
+    if (disk.temperature_c != null) details.push(`${disk.temperature_c} °C`);
+    if (disk.wear_percent != null) details.push(`${disk.wear_percent} % worn`);
+    if (disk.problems) details.push(...disk.problems);
     if (disk.sentence) details.push(disk.sentence);
+    const item = element("li", { className: isUsed && disk.healthy !== false ? "ready" : "lost" },
+      element("span", { textContent: isUsed ? "●" : "✖", ariaHidden: "true" }),
+      element("span", { textContent: `${disk.disk} ${disk.path}` }),
+      element("span", { className: "said", textContent: details.join(", ") }));
+    if (disks.length < 2) return item;
     const name = isUsed ? "release-disk" : "accept-disk";
     const button = element("button", { type: "button", textContent: isUsed ? "Release disk" : "Accept disk" });
     button.addEventListener("click", () => askCommand(name, { disk: disk.disk }));
-    return element("li", { className: isUsed ? "ready" : "lost" },
-      element("span", { textContent: isUsed ? "●" : "✖", ariaHidden: "true" }),
-      element("span", { textContent: `${disk.disk} ${disk.path}` }),
-      element("span", { className: "said", textContent: details.join(", ") }), button);
+    item.append(button);
+    return item;
   }));
 }
 

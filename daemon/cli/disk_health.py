@@ -1,0 +1,34 @@
+"""`syntopic disk-health`: ask the disks how they are, for the service that may not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+HELP = """Read the health of every disk with smartctl, as root, and leave it for the service.
+
+A timer runs this every two minutes (syntopic-disk-health.timer). The exit status is 1 when no disk
+could be asked; the service then says so.
+
+Examples: `syntopic disk-health`, `syntopic disk-health --out /tmp/disks.json`
+"""
+
+
+def disk_health(
+    out: Annotated[Path | None, typer.Option(help="File to write (default: in /run).")] = None,
+) -> None:
+    from daemon.disk import health
+
+    path = out or health.REPORT
+    try:
+        report = health.collect()
+    except health.HealthError as error:
+        health.write_report(path, health.failed_report(error))
+        raise
+    health.write_report(path, report)
+    for name, stated in report["disks"].items():
+        found = health.health_of(stated)
+        verdict = "; ".join(found.problems) or "healthy"
+        typer.echo(f"{name} {found.model} {found.serial}: {verdict}")
