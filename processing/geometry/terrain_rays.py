@@ -72,12 +72,10 @@ def on_terrain(
     top, bottom = float(np.nanmax(model.height_m)), float(np.nanmin(model.height_m))
     down = unit[:, 2] < -1e-6
     with np.errstate(divide="ignore", invalid="ignore"):
+        # Above all ground; the sphere only falls away below.
         first = np.where(down, np.maximum((top - centre_m[2]) / unit[:, 2], 0.0), np.nan)
         # The sphere falls away by at most this over the longest ray that is followed.
         last = np.where(down, 1.05 * (bottom - 100.0 - centre_m[2]) / unit[:, 2], np.nan)
-    if earth_radius_m is not None:
-        across = np.hypot(unit[:, 0], unit[:, 1])
-        first = np.maximum(first - (first * across) ** 2 / (2.0 * earth_radius_m) * 4.0, 0.0)
     step = min(abs(model.step_x_m), abs(model.step_y_m)) / 2.0
 
     def above(distance: Array) -> Array:

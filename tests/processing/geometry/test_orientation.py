@@ -102,3 +102,36 @@ def test_rays_meet_level_ground_and_those_above_the_horizon_do_not() -> None:
     assert ground == pytest.approx(np.array([[100, 200, 100], [200, 200, 100], [100, 0, 100]]))
     up = on_level_ground(centre, looking(0, 95, 0), np.zeros((1, 2)), 100.0, 100.0)
     assert np.isnan(up).all()
+
+
+def test_rays_just_below_the_horizon_and_just_above_the_ground_meet_it() -> None:
+    centre = np.array([0.0, 0.0, 1000.5])
+    rays = np.array([[50.0, 0.0]])
+    # Half a metre above the ground, a principal distance of 0.9 mm: the reach is 0.5 / 0.9.
+    ground = on_level_ground(centre, np.eye(3), rays, 0.9, 1000.0)
+    assert ground[0] == pytest.approx([50.0 * 0.5 / 0.9, 0.0, 1000.0])
+    below = on_level_ground(centre, np.eye(3), rays, 0.9, 1001.0)
+    assert np.isnan(below).all(), "the plane lies above the camera"
+
+
+def test_upward_rays_have_no_level_ground_even_below_the_plane() -> None:
+    centre = np.zeros(3)
+    upward = looking(0, 180, 0)
+    assert np.isnan(on_level_ground(centre, upward, np.zeros((1, 2)), 0.9, 100.0)).all()
+    steep = on_level_ground(centre, upward, np.zeros((1, 2)), 0.5, 100.0)
+    assert np.isnan(steep).all()
+
+
+@pytest.mark.parametrize("beyond", [1.0 + 1e-12, -1.0 - 1e-12])
+def test_rounding_beyond_one_gives_a_right_angle(beyond: float) -> None:
+    quarter = math.copysign(math.pi / 2, beyond)
+    about_y = np.array([[0.0, 0.0, beyond], [0.0, 1.0, 0.0], [-beyond, 0.0, 0.0]])
+    assert omega_phi_kappa(about_y) == pytest.approx((0.0, quarter, 0.0))
+    about_x = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -beyond], [0.0, beyond, 0.0]])
+    assert phi_omega_kappa(about_x) == pytest.approx((0.0, quarter, 0.0))
+
+
+def test_east_turns_to_the_south_of_a_grid_whose_north_is_turned() -> None:
+    assert grid_from_enu(0.3) @ grid_from_enu(0.3).T == pytest.approx(np.eye(3))
+    east = grid_from_enu(0.1) @ np.array([1.0, 0.0, 0.0])
+    assert east == pytest.approx([math.cos(0.1), -math.sin(0.1), 0.0])
