@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import sqlite3
 import threading
+from types import SimpleNamespace
 
 import pytest
 
-from daemon.disk.catalog import Catalog, CatalogError
-from tests.daemon.small_camera import capture_of, final_record
+from daemon.disk import catalog as catalog_module
+from daemon.disk.catalog import Catalog, CatalogBusyError, CatalogError, IndexedExposure
+from tests.daemon.small_camera import SENSORS, capture_of, final_record
 
 
 @pytest.fixture
@@ -102,3 +104,147 @@ def test_an_index_of_another_version_is_refused(path):
     for attempt in (Catalog.open, Catalog.read):
         with pytest.raises(CatalogError, match="schema 99; this version reads 2 at most"):
             attempt(path)
+
+
+def in_another_thread(function):
+    results = []
+    thread = threading.Thread(target=lambda: results.append(function()))
+    thread.start()
+    thread.join(timeout=10)
+    return results
+
+
+def one_exposure(path):
+    catalog = Catalog.open(path)
+    catalog.add_stored(capture_of(1))
+    catalog.close()
+
+
+def test_a_connection_serves_every_thread_and_waits_10_s_for_another_process(path):
+    writer = Catalog.open(path)
+    assert in_another_thread(lambda: writer.add_stored(capture_of(1))) == [None]
+    reader = Catalog.read(path)
+    for catalog in (writer, reader):
+        assert [[row.number for row in rows] for rows in in_another_thread(catalog.exposures)] == [
+            [1]
+        ]
+        assert catalog._connection.execute("PRAGMA busy_timeout").fetchone() == (10_000,)
+        catalog.close()
+
+
+def test_a_reader_follows_later_commits_where_nobody_says_that_it_is_settled(path):
+    one_exposure(path)
+    reader = Catalog.read(path)
+    writer = Catalog.open(path)
+    writer.add_stored(capture_of(2))
+    assert [row.number for row in reader.exposures()] == [1, 2]
+    reader.close()
+    writer.close()
+
+
+def test_a_settled_index_is_read_without_files_beside_it(path):
+    one_exposure(path)
+    reader = Catalog.read(path, is_settled=True)
+    assert [row.number for row in reader.exposures()] == [1]
+    assert [entry.name for entry in path.parent.iterdir()] == [path.name]
+    reader.close()
+
+
+def test_a_settled_index_with_a_log_is_read_with_what_the_log_holds(path):
+    writer = Catalog.open(path)
+    writer.add_stored(capture_of(1))
+    reader = Catalog.read(path, is_settled=True)
+    assert [row.number for row in reader.exposures()] == [1]
+    reader.close()
+    writer.close()
+
+
+def test_an_index_whose_log_cannot_be_joined_is_read_as_one_file(path, monkeypatch):
+    """As on a medium that is read-only: the index is opened as an address, for every thread."""
+    one_exposure(path)
+    connect, addresses = sqlite3.connect, []
+
+    def cannot_join(*_arguments, **_options):
+        raise sqlite3.OperationalError("unable to open database file")
+
+    def stand_in(address, **options):
+        addresses.append((address.rsplit("?")[1], options["uri"]))
+        if "mode=ro" not in address:
+            return connect(address, **options)
+        return SimpleNamespace(execute=cannot_join, close=lambda: None)
+
+    monkeypatch.setattr(sqlite3, "connect", stand_in)
+    reader = Catalog.read(path)
+    assert addresses == [("mode=ro", True), ("immutable=1", True)]
+    assert [[r.number for r in rows] for rows in in_another_thread(reader.exposures)] == [[1]]
+    reader.close()
+
+
+def test_an_empty_file_is_no_index(path):
+    path.touch()
+    with pytest.raises(CatalogError, match="schema 0; this version reads 2 at most"):
+        Catalog.read(path)
+
+
+def test_a_snapshot_names_the_record_and_the_frames_of_every_exposure(path):
+    catalog = Catalog.open(path)
+    for number in (1, 2):
+        catalog.add_stored(capture_of(number))
+    catalog.add_sealed(final_record(capture_of(1)), "a" * 64)
+    snapshot = catalog.snapshot()
+    assert {n: one.record_sha256 for n, one in snapshot.items()} == {1: "a" * 64, 2: ""}
+    assert {tuple(sorted(one.frames)) for one in snapshot.values()} == {tuple(sorted(SENSORS))}
+    assert snapshot[2] == IndexedExposure("", catalog.frames(2))
+    catalog.close()
+
+
+class HeldIndex:
+    """A connection that answers with one error, and the clock by which its opener waits."""
+
+    def __init__(self, code):
+        self.error = sqlite3.OperationalError("database is locked")
+        if code is not None:
+            self.error.sqlite_errorcode = code
+        self.now_ms = 50_000
+        self.attempts = 0
+
+    def execute(self, _statement):
+        self.attempts += 1
+        raise self.error
+
+    def close(self):
+        pass
+
+    def monotonic(self):
+        return self.now_ms / 1000
+
+    def sleep(self, seconds):
+        self.now_ms += round(1000 * seconds)
+
+
+SQLITE_BUSY_SNAPSHOT, SQLITE_LOCKED_SHAREDCACHE = 517, 262
+
+
+@pytest.mark.parametrize(
+    "code",
+    [sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED, SQLITE_BUSY_SNAPSHOT, SQLITE_LOCKED_SHAREDCACHE],
+)
+def test_a_held_index_is_asked_again_every_10_ms_until_more_than_10_s_are_over(
+    path, monkeypatch, code
+):
+    held = HeldIndex(code)
+    monkeypatch.setattr(sqlite3, "connect", lambda *_, **__: held)
+    monkeypatch.setattr(catalog_module, "time", held)
+    with pytest.raises(CatalogBusyError, match="held by another process for 10 s"):
+        Catalog.open(path)
+    assert (held.now_ms, held.attempts) == (60_010, 1002)
+
+
+@pytest.mark.parametrize("code", [sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CORRUPT, 0, None])
+def test_an_index_that_fails_otherwise_is_damaged_at_once(path, monkeypatch, code):
+    held = HeldIndex(code)
+    monkeypatch.setattr(sqlite3, "connect", lambda *_, **__: held)
+    monkeypatch.setattr(catalog_module, "time", held)
+    with pytest.raises(CatalogError, match="damaged"):
+        Catalog.open(path)
+    assert (held.now_ms, held.attempts) == (50_000, 1)

@@ -75,6 +75,18 @@ def test_a_flight_goes_on_with_an_index_of_the_first_schema(mission):
     assert not list(mission.path.glob("*.damaged*"))
 
 
+def test_an_old_index_is_read_from_any_thread(mission):
+    fly(mission, [1, 2])
+    make_old(mission.catalog_path)
+    reader = Catalog.read(mission.catalog_path)
+    numbers: list[int] = []
+    thread = threading.Thread(target=lambda: numbers.extend(r.number for r in reader.exposures()))
+    thread.start()
+    thread.join(timeout=10)
+    assert numbers == [1, 2]
+    reader.close()
+
+
 def test_an_old_index_is_read_without_being_changed(mission):
     fly(mission, [1, 2])
     make_old(mission.catalog_path)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from daemon.configuration import LimitsSection
-from daemon.disk.guard import DiskGuard
+from daemon.disk.guard import DiskGuard, needed_nbytes
 from processing.quality.report import Flag
 from tests.daemon.flight.test_flight import flight
 
@@ -43,6 +43,34 @@ def test_the_time_left_follows_the_rate_of_the_last_exposures() -> None:
     for second in (0, 1000, 1002, 1004, 1006, 1008, 1010, 1012, 1014, 1016):
         watched.exposed(second * 10**9)
     assert watched.look().seconds == pytest.approx(240.0)
+
+
+def test_an_exposure_needs_its_frames_and_twice_as_much_for_products() -> None:
+    assert [needed_nbytes(n) for n in (0, 1, 10, NBYTES)] == [1, 3, 30, 3 * NBYTES]
+
+
+def test_the_rate_is_known_from_the_second_exposure_and_follows_the_last_nine() -> None:
+    watched, _ = guard(RESERVE + 10 * NEEDED)
+    watched.exposed(5 * 10**9)
+    assert watched.look().seconds is None
+    watched.exposed(8 * 10**9)
+    assert watched.look().seconds == pytest.approx(30.0, abs=1e-9)
+    for second in range(100, 108):
+        watched.exposed(second * 10**9)
+    # Of nine exposures the oldest is the one at 8 s: eight intervals over 99 s.
+    assert watched.look().seconds == pytest.approx(10 * 99 / 8, abs=1e-9)
+    watched.exposed(108 * 10**9)
+    assert watched.look().seconds == pytest.approx(10.0, abs=1e-9)
+
+
+def test_a_disk_that_is_low_from_the_start_warns_with_the_minutes_left() -> None:
+    watched, _ = guard(RESERVE + 90 * NEEDED)
+    for second in (0, 2):
+        watched.exposed(second * 10**9)
+    assert watched.warning() == (
+        "the disk is low: room for 90 exposures, 3 min at this rate; finish this line and "
+        "change the disk, or free /disk"
+    )
 
 
 def test_low_is_told_once_and_again_after_there_was_room() -> None:

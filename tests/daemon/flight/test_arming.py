@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,15 @@ from typing import Any
 import pytest
 
 from daemon.configuration import LimitsSection
-from daemon.flight.arming import FILE, Lack, Readiness, lacks, override_note, overrides_of
+from daemon.flight.arming import (
+    FILE,
+    Lack,
+    Readiness,
+    lacks,
+    override_message,
+    override_note,
+    overrides_of,
+)
 from daemon.flight.event_table import entry_of
 
 ALL_THERE = Readiness(
@@ -59,6 +68,43 @@ def test_each_thing_that_is_missing_is_named_with_its_cure(
 def test_a_rig_without_receiver_and_probes_needs_neither() -> None:
     bare = replace(ALL_THERE, wants_time=False, has_time=False, position_age_s=None, probes_c={})
     assert lacks(bare, LimitsSection()) == ()
+
+
+@pytest.mark.parametrize(
+    ("left", "wanted", "is_enough"),
+    [(400, 400, True), (399, 400, False), (1, 0, True), (0, 0, False), (1, 1, True)],
+)
+def test_the_disk_must_take_what_the_plan_asks_for_and_one_exposure_at_least(
+    left: int, wanted: int, is_enough: bool
+) -> None:
+    there = replace(ALL_THERE, exposures_left=left, exposures_wanted=wanted)
+    assert (lacks(there, LimitsSection()) == ()) is is_enough
+
+
+@pytest.mark.parametrize(
+    ("change", "is_stale"),
+    [
+        ({"position_age_s": 4.0}, False),
+        ({"position_age_s": 4.001}, True),
+        ({"probes_c": {"0": (21.0, 7.0)}}, False),
+        ({"probes_c": {"0": (21.0, 7.001)}}, True),
+        ({"probes_c": {"0": (0.0, 7.0)}}, False),
+    ],
+)
+def test_what_is_as_old_as_its_limit_is_fresh(change: dict[str, Any], is_stale: bool) -> None:
+    limits = LimitsSection(navigation_stale_s=4.0, temperature_stale_s=7.0)
+    assert (lacks(replace(ALL_THERE, **change), limits) != ()) is is_stale
+
+
+def test_an_override_is_in_the_flight_log_and_a_damaged_note_counts_as_none(tmp_path: Path) -> None:
+    lack = Lack("arming-device", "no head SU02", "check its cable")
+    assert lack.may_be_overridden
+    content = json.loads(override_message("operator", [lack], "training").payload)
+    assert (content["by"], content["reason"]) == ("operator", "training")
+    assert "reason" not in json.loads(override_message("operator", [lack]).payload)
+    for note in (b"{", b"{}", b'{"overrides": null}', b'{"overrides": [7]}'):
+        (tmp_path / FILE).write_bytes(note)
+        assert overrides_of(tmp_path) == []
 
 
 def test_an_override_is_kept_with_who_when_what_and_why(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import pytest
 from daemon.flight.latches import (
     FILE,
     KEPT,
+    Latch,
     Latches,
     previous_faults,
     read_unhandled,
@@ -66,7 +67,69 @@ def test_a_damaged_file_of_faults_hinders_no_start(tmp_path: Path) -> None:
 
 def test_they_never_grow_beyond_their_bounds() -> None:
     latches = latches_of(*({"event": "lost", "number": n, "cause": "x"} for n in range(KEPT + 50)))
-    assert len(latches.listed()) == KEPT
+    assert len(latches.listed()) == KEPT == 200
+    assert latches.listed()[0]["id"] == "exposure 249", "the newest first"
+    assert latches.listed()[-1]["id"] == "exposure 50", "the oldest are forgotten"
+
+
+def test_a_file_of_faults_is_read_to_its_bounds(tmp_path: Path) -> None:
+    faults = [Latch(f"fault {n}", "service", "look") for n in range(KEPT + 1)]
+    content = unhandled_note(faults)
+    (tmp_path / FILE).write_bytes(content)
+    assert [one.id for one in read_unhandled(tmp_path)] == [one.id for one in faults[:200]]
+    (tmp_path / FILE).write_bytes(content.ljust(1_000_000))
+    assert len(read_unhandled(tmp_path)) == 200
+    (tmp_path / FILE).write_bytes(content.ljust(1_000_001))
+    assert read_unhandled(tmp_path) == ()
+
+
+def test_a_fault_that_was_just_raised_stands_once_and_nobody_has_seen_it() -> None:
+    latches = Latches()
+    latches.raise_fault("power", "low", "power")
+    latches.apply({"event": "disk", "sentence": "full"})
+    latches.add_previous([Latch("mirror", "disk", "slow", acknowledged=True)])
+    power, disk, mirror = latches.unhandled()
+    assert power == Latch("power", "power", "low", True, False, 1, 0, False)
+    assert disk == Latch("disk", "disk", "full", True, False, 1, 0, False)
+    assert mirror == Latch("mirror", "disk", "slow", False, False, 1, 0, True)
+    assert "power" in latches and "clock" not in latches
+    assert not latches.acknowledge("clock")
+    latches.pass_fault("clock")
+    assert len(latches.listed()) == 3
+
+
+@pytest.mark.parametrize(("left", "stands"), [(0, True), (1, False), (None, True)])
+def test_a_disk_fault_passes_when_the_disk_takes_an_exposure_again(
+    left: int | None, stands: bool
+) -> None:
+    latches = latches_of(
+        {"event": "disk", "sentence": "full"}, {"event": "status", "exposures_left": left}
+    )
+    assert [one["stands"] for one in latches.listed()] == [stands]
+
+
+def test_a_fault_that_was_seen_leaves_the_list_when_it_passes_and_stays_while_it_stands() -> None:
+    latches = latches_of(device("lost"))
+    assert latches.acknowledge("device SU02")
+    assert [(one["stands"], one["acknowledged"]) for one in latches.listed()] == [(True, True)]
+    assert latches.unhandled() == ()
+    latches.apply(device("recovered", fault=False))
+    assert latches.listed() == []
+
+
+def test_a_disk_that_was_dropped_passes_when_it_joins_again() -> None:
+    for cure in ("disk-joined", "disk-released"):
+        latches = latches_of({"event": "disk-dropped", "disk": "B", "sentence": "gone"})
+        assert latches.listed()[0]["stands"]
+        latches.apply({"event": cure, "disk": "B"})
+        assert [(one["id"], one["stands"]) for one in latches.listed()] == [("disk B", False)]
+
+
+def test_a_clock_that_stepped_does_not_stand() -> None:
+    (fault,) = latches_of(device("clock-stepped", of="clock")).listed()
+    assert (fault["id"], fault["stands"]) == ("clock clock-stepped", False)
+    (fault,) = latches_of(device("pps-holdover", of="clock")).listed()
+    assert fault["stands"]
 
 
 @pytest.mark.trust

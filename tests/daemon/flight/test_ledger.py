@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
 from daemon.exposure import Exposure
-from daemon.flight.ledger import CAUSES, Ledger, LedgerError
+from daemon.flight.ledger import CAUSES, Ledger, LedgerError, Receipts
 from daemon.flight.transitions import TRANSITIONS, Standing, State, Step, Storage, after
 from tests.daemon.small_camera import SENSORS, capture_of, final_record
 
@@ -205,3 +205,122 @@ def test_after_landing_nothing_may_be_open_or_pending():
     ledger.mark("spurious")
     ledger.settle(1, "complete")
     assert ledger.imbalances(has_landed=True) == []
+
+
+def test_every_count_of_a_sheet_is_exact():
+    ledger = Ledger(["SU00", "SU01"])
+    assert Receipts("SU00") == Receipts("SU00", 0, 0, 0, 0, 0, 0, 0, 0)
+    assert ledger.sheet().heads == (Receipts("SU00"), Receipts("SU01"))
+    for number in range(1, 8):
+        ledger.trigger(number)
+    counts = {"used": 2, "late": 3, "duplicate": 4, "corrupt": 5, "spurious": 6}
+    for cause, count in counts.items():
+        for _ in range(count):
+            ledger.frame("SU00", "pending")
+            ledger.frame("SU00", cause)
+            ledger.mark(cause)
+    ledger.frame("SU00", "pending")
+    ledger.settle(1, "complete")
+    for number in (2, 3, 4):
+        ledger.settle(number, "degraded", {"SU01": "no frame", "mark": "none came"})
+    ledger.settle(5, "lost", {"exposure": "no pulse"})
+    for number in (1, 2, 3):
+        ledger.stored(number)
+    for number in (1, 5):
+        ledger.sealed(number)
+    sheet = ledger.sheet()
+    assert (sheet.triggers, sheet.open, sheet.complete, sheet.degraded, sheet.lost) == (
+        *(7, 2, 1, 3, 1),
+    )
+    # Stored are two that wait and one that is sealed; the lost one is sealed without pixels.
+    assert (sheet.stored, sheet.sealed) == (3, 2)
+    assert sheet.heads[0] == Receipts("SU00", 21, 2, 3, 4, 5, 6, pending=1, missing=0)
+    assert sheet.heads[1] == Receipts("SU01", missing=3)
+    assert sheet.frames == Receipts("frames", 21, 2, 3, 4, 5, 6, pending=1, missing=3)
+    assert sheet.marks == Receipts("marks", 20, 2, 3, 4, 5, 6, pending=0, missing=3)
+    assert (ledger.open_numbers(), ledger.unsealed_numbers()) == ([6, 7], [2, 3, 4, 6, 7])
+    # SU00 has four exposures and three undecided ones; SU01 one exposure, and no frame at all.
+    assert sheet.imbalances == (
+        "SU00: 2 frames used, but 4 exposures have one and 3 are open or lost",
+        "SU01: 0 frames used, but 1 exposures have one and 3 are open or lost",
+    )
+
+
+@pytest.mark.parametrize(("used", "balances"), [(1, False), (2, True), (5, True), (6, False)])
+def test_used_frames_lie_between_whole_exposures_and_those_with_the_undecided(used, balances):
+    ledger = Ledger(["SU00"])
+    for number in (1, 2, 3, 4, 5):
+        ledger.trigger(number)
+    for _ in range(used):
+        ledger.frame("SU00", "used")
+    for number in (1, 2):
+        ledger.settle(number, "complete")
+    ledger.settle(3, "lost", {"exposure": "no pulse"})
+    assert (ledger.imbalances() == []) is balances
+
+
+def test_marks_are_as_many_as_triggers_at_most():
+    ledger = Ledger()
+    ledger.trigger(1)
+    ledger.mark("used")
+    assert ledger.imbalances() == []
+    ledger.mark("used")
+    assert ledger.imbalances() == ["marks: 2 used for 1 triggers"]
+
+
+def test_an_exposure_judged_worse_names_its_last_causes_alone():
+    ledger = Ledger(["SU00", "SU01"])
+    ledger.trigger(1)
+    ledger.settle(1, "degraded", {"SU00": "late"})
+    ledger.settle(1, "degraded", {"SU01": "late", "SU00": "late"})
+    assert [head.missing for head in ledger.sheet().heads] == [1, 1]
+    ledger.settle(1, "lost", {"exposure": "the disk refused"})
+    assert [head.missing for head in ledger.sheet().heads] == [0, 0]
+
+
+@pytest.mark.parametrize(
+    ("state", "causes", "message"),
+    [
+        ("complete", {"SU00": "late"}, "is complete but lacks SU00"),
+        ("degraded", {}, "is degraded; say what it lacks"),
+        ("lost", {}, "is lost; say what it lacks"),
+        ("open", {}, "settled means complete, degraded or lost"),
+        ("gone", {}, "settled means complete, degraded or lost"),
+    ],
+)
+def test_a_judgement_and_its_causes_fit_each_other(state, causes, message):
+    ledger = Ledger(["SU00"])
+    ledger.trigger(1)
+    with pytest.raises(LedgerError, match=f"exposure 1: {message}"):
+        ledger.settle(1, state, causes)
+    assert ledger.open_numbers() == [1]
+
+
+def test_a_number_is_triggered_once_and_an_unknown_one_is_refused():
+    ledger = Ledger()
+    ledger.trigger(1)
+    with pytest.raises(LedgerError, match="exposure 1 was triggered already"):
+        ledger.trigger(1)
+    with pytest.raises(LedgerError, match="exposure 2 was never triggered"):
+        ledger.standing(2)
+    with pytest.raises(LedgerError, match="SU00: cause 'odd'; it is one of pending, used, late"):
+        ledger.frame("SU00", "odd")
+    assert ledger.sheet().triggers == 1
+
+
+def test_a_sheet_carries_on_what_is_in_no_record_and_nothing_else():
+    line = {"name": "SU00", "used": 9, "late": 1, "duplicate": True, "corrupt": 0, "spurious": 2}
+    sheet = {"heads": (line,), "marks": {"used": 9, "late": 4, "spurious": "2"}}
+    resumed = Ledger.resume([], sheet=sheet).sheet()
+    assert resumed.heads == (Receipts("SU00", received=3, late=1, spurious=2),)
+    assert resumed.marks == Receipts("marks", received=4, late=4)
+
+
+def test_a_record_that_names_no_cause_is_resumed_with_one():
+    records = [
+        replace(Exposure(number=1), state="lost", missing=()),
+        replace(Exposure(number=2), state="complete", missing=(("SU00", "late"),)),
+    ]
+    sheet = Ledger.resume(records, heads=["SU00"]).sheet()
+    assert (sheet.complete, sheet.degraded, sheet.lost, sheet.stored) == (0, 1, 1, 1)
+    assert sheet.heads[0].missing == 1

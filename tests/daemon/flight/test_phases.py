@@ -28,6 +28,17 @@ def test_a_whole_flight_goes_through_every_phase_but_fault() -> None:
     assert entered == [Phase.READY, Phase.ARMED, Phase.FLYING, Phase.ARMED, Phase.LANDED]
 
 
+def test_nothing_is_a_fact_until_it_is_stated() -> None:
+    assert Facts() == Facts(False, False, False, False, False)
+    machine = StateMachine()
+    assert machine.follow(Facts()) == []
+    assert machine.follow(Facts(is_prepared=True)) == [Phase.READY]
+    assert machine.follow(Facts(is_armed=True)) == [Phase.ARMED]
+    assert machine.follow(Facts(runs=True)) == [Phase.FLYING]
+    assert machine.follow(Facts(has_landed=True)) == [Phase.LANDED]
+    assert machine.follow(Facts(has_failed=True)) == [Phase.FAULT]
+
+
 def test_a_line_that_runs_at_once_is_armed_first() -> None:
     facts = Facts(is_prepared=True, is_armed=True, runs=True)
     assert StateMachine().follow(facts) == [Phase.READY, Phase.ARMED, Phase.FLYING]
