@@ -275,3 +275,11 @@ def give_disk_id_of(tmp_path: Path, root: Path) -> str:
     # The name of the target decides what is refused, so that the move itself is not.
     os.system(f"mv {root} {pulled} && mkdir {root}")
     return give_disk_id(pulled)
+
+
+def test_a_disk_without_room_does_not_return(flown: Flown) -> None:
+    flown.storage._returns = ReturnSettings(LOOK_S, LOOK_S, room_nbytes=1 << 62)
+    with refusing(flown.roots["mirror"]):
+        flown.expose(1)
+    flown.until(lambda: any("GB are needed" in p for p in flown.problems()), "said")
+    assert len(flown.storage.in_use) == 1 and flown.copy("mirror").numbers() == []
