@@ -6,11 +6,13 @@ What the bytes mean is in the driver of each device, which says it in `step` and
 from __future__ import annotations
 
 import errno
+import fcntl
 import termios
 import threading
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from typing import Any, Final, Protocol
 
 import serial
@@ -27,6 +29,7 @@ from drivers.contract import (
     TemperatureSample,
 )
 from drivers.device import DeviceDriver
+from drivers.port_holder import held_sentence, holders, is_pseudo_terminal, other_holders
 from drivers.settings import Setting
 from drivers.tcp_port import SCHEME, open_tcp_port
 from drivers.udp_port import LISTEN_SCHEME, SPEAK_SCHEME, Sender, UdpPort, open_udp_port
@@ -135,15 +138,18 @@ def open_serial_port(path: str, baudrate: int, parity: str) -> Port:
     Addresses are tcp://host:port, udpin://host:port (listens; with ?from=ADDRESS to that sender
     only) and udpout://host:port (speaks).
 
+    A port that another program has open is not used: each would get a part of the bytes.
+
     Raises:
-        DeviceError: it cannot be opened; the sentence says why and what to do.
+        DeviceError: it cannot be opened, or another program holds it; the sentence says why, which
+            program as far as it can be known, and what to do.
     """
     if path.startswith(SCHEME):
         return open_tcp_port(path)
     if path.startswith((LISTEN_SCHEME, SPEAK_SCHEME)):
         return open_udp_port(path)
     try:
-        return serial.Serial(
+        port = serial.Serial(
             path,
             baudrate=baudrate,
             parity=parity,
@@ -159,11 +165,30 @@ def open_serial_port(path: str, baudrate: int, parity: str) -> Port:
             cure = "there is no such port; check the cable and the port's name"
         elif number in (errno.EACCES, errno.EPERM):
             cure = "permission denied; add the service's user to the group dialout"
-        elif "lock" in str(error):
-            cure = "another program holds it; end that program"
+        elif number == errno.EBUSY or "lock" in str(error):
+            cure = held_sentence(path, holders(path))
         else:
             cure = f"{_reason(error)}; check the cable, the port's name and its settings"
         raise DeviceError(f"port {path} cannot be opened: {cure}") from error
+    if others := other_holders(path):
+        port.close()
+        raise DeviceError(f"port {path} cannot be opened: {held_sentence(path, others)}")
+    if not is_pseudo_terminal(path):
+        _keep_others_out(port)
+    return port
+
+
+def _keep_others_out(port: serial.Serial) -> None:
+    """Have the kernel refuse the port to programs that do not look at locks, such as gpsd."""
+    # A driver without terminal settings refuses; the lock is there all the same.
+    with suppress(OSError):
+        fcntl.ioctl(port.fileno(), termios.TIOCEXCL)
+
+
+def _shared_sentence(path: str) -> str:
+    """Who else reads a port by now, as a sentence to be appended; empty where nobody is seen."""
+    others = [] if "://" in path else other_holders(path)
+    return f" The port is shared: {held_sentence(path, others)}." if others else ""
 
 
 def _reason(error: BaseException) -> str:
@@ -320,7 +345,7 @@ class SerialDevice(DeviceDriver):
                 self._state = LifeCycle.INACTIVE
                 self._tell_lost(
                     f"The {self.what} {self.name} at {self.port} was lost ({error}). Check cable "
-                    "and power; it is opened again by itself."
+                    f"and power; it is opened again by itself.{_shared_sentence(self.port)}"
                 )
                 return
             if self.clock.mono_ns() - self._heard_ns >= silence_ns:
@@ -344,7 +369,8 @@ class SerialDevice(DeviceDriver):
         self.teller.tell(
             "silent",
             f"The {self.what} {self.name} at {self.port} has said nothing understandable for "
-            f"{self.silence_s:g} s. {self.silence_cure}; the port is opened anew by itself.",
+            f"{self.silence_s:g} s. {self.silence_cure}; the port is opened anew by itself."
+            f"{_shared_sentence(self.port)}",
             fault=True,
         )
 

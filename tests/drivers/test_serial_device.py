@@ -184,7 +184,7 @@ def test_a_port_that_another_program_holds_is_refused() -> None:
     master, slave = os.openpty()
     try:
         first = open_serial_port(os.ttyname(slave), 9600, "N")
-        with pytest.raises(DeviceError, match="another program holds it"):
+        with pytest.raises(DeviceError, match="this program has it open already"):
             open_serial_port(os.ttyname(slave), 9600, "N")
         first.close()
     finally:
