@@ -114,16 +114,21 @@ def new_files(folder: Path, *, last: str) -> Iterator[Path]:
     sync_directory(folder.parent)
 
 
+def is_part_of(part: str, name: str) -> bool:
+    """Whether `part` is the name of an unfinished file that is to be called `name`."""
+    pattern = rf"\.{re.escape(name)}(\.[0-9a-f]{{8}})?{re.escape(PART_SUFFIX)}"
+    return re.fullmatch(pattern, part) is not None
+
+
 def remove_parts(path: Path) -> bool:
     """Remove what killed writers left of a file or a set; what a living writer holds stays.
 
     Returns:
         Whether anything was removed.
     """
-    pattern = re.compile(rf"\.{re.escape(path.name)}(\.[0-9a-f]{{8}})?{re.escape(PART_SUFFIX)}")
     removed = False
     for part in list(path.parent.iterdir()):
-        if pattern.fullmatch(part.name):
+        if is_part_of(part.name, path.name):
             with suppress(OSError):  # its writer lives, or has just finished
                 descriptor = os.open(part, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
                 try:

@@ -187,11 +187,10 @@ def _check_names(expected: Expected, found: FoundExposure, frames: Sequence[Fram
     """Level-0 is immutable: what no record names was added later."""
     named = {EXPOSURE_FILE, CAPTURE_FILE}
     named |= {frame.file or f"{frame.sensor}.tif" for frame in frames}
-    being_sealed = f".{EXPOSURE_FILE}{durable.PART_SUFFIX}"
     for name in expected.names:
         if name in named:
             continue
-        if name == being_sealed and expected.is_flown:
+        if durable.is_part_of(name, EXPOSURE_FILE) and expected.is_flown:
             found.not_covered[name] = UNFINISHED
         elif not expected.is_chained and not frames:
             found.not_covered[name] = "frame without a hash in its record"

@@ -18,10 +18,11 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+from daemon.disk import durable
 from daemon.disk.mission import CURRENT_FILE, Mission
 from daemon.disk.recovery import recover
 from daemon.disk.store import verify
-from daemon.flight.arming import Lack, note_override
+from daemon.flight.arming import FILE, Lack, override_note
 from daemon.flight.recovery_match import seal_from_log
 from tests.crash.flight import live
 from tests.daemon.small_camera import new_mission, small_rig
@@ -81,7 +82,8 @@ def _fly_for_ever(root: Path, rng: random.Random) -> None:
         for _ in range(rng.randrange(3)):
             life = _life(mission, lands=False)
             time.sleep(rng.uniform(0.0, 0.3))
-            note_override(mission.path, "test", [Lack("arming-time", "no time", "wait")])
+            note = override_note(mission.path, "test", [Lack("arming-time", "no time", "wait")])
+            durable.replace_file(mission.path / FILE, note)
             os.kill(life, signal.SIGKILL)
             os.waitpid(life, 0)
         assert os.waitpid(_life(mission, lands=True), 0)[1] == 0

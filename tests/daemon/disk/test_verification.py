@@ -319,7 +319,7 @@ def test_what_is_unfinished_is_wrong_only_after_the_flight(mission: Mission) -> 
     mission.chain_path.write_bytes(b"".join(lines[:-2]) + b'{"entry":{"kind":"st')
     (mission.level0_root / "000005.part").mkdir()
     (mission.level0_root / "000005.part" / "SU00.tif").touch()
-    (mission.level0(4) / ".exposure.json.part").touch()
+    (mission.level0(4) / ".exposure.json.0123abcd.part").touch()
     problems = " ".join(verify(mission).problems)
     assert "L0/000005.part" in problems
     assert "chain.jsonl: its last line is not whole" in problems
