@@ -62,8 +62,11 @@ from processing.quality.figures import (
 )
 from processing.quality.judgement import judge
 from processing.quality.read_out import blank_unread, unread_figures
+from processing.quality.relative_sharpness import relative_sharpness_figures
 from processing.quality.report import Figure
+from processing.quality.uniformity import signal_steps, step_figures
 from processing.quality.valid_area import Mask, area_of, gap_cells, grid_of
+from processing.quality.words import word_figures
 from processing.radiometry.calibration import RadiometricCalibration
 from processing.radiometry.level1 import (
     FrameStatistics,
@@ -197,7 +200,7 @@ class Pipeline:
         )
         with clock.stage("radiometry"):
             level1, statistics = self._correct(frames, conditions, temperatures)
-            unread = unread_figures(rig, frames)
+            unread = unread_figures(rig, frames) | word_figures(rig, frames)
         if frames_read is not None:
             frames_read()
         with clock.stage("tie_points"):
@@ -268,6 +271,13 @@ class Pipeline:
             figures |= estimated_dc_figures(estimated) | platform_figures(platform)
             figures |= projection_figures(rig, conditions, settings.relief_fraction)
             figures |= content_figures(content)
+            figures |= relative_sharpness_figures(rig, start, level1)
+            exposed = {
+                s.name: exposed_rows(s, start[s.name].tdi_shifts)
+                for s in rig.sensors
+                if s.name in start
+            }
+            figures |= step_figures(signal_steps(rig.sensors, level1, exposed))
             figures |= layer_figures(layers) | slip_figures(rig, stitched.slips)
             figures |= precision_figures(rig, mosaic, level1, temperatures.usable_c, disturbance)
             figures |= self._whole_figures(image.source, frames, conditions)

@@ -28,6 +28,8 @@ UNUSABLE: Final = -1.0
 ALONE: Final = -3.0
 """Covered by this frame and no other: not measured, since there is nothing to compare it with."""
 
+OUTLIER: Final = 0.08
+"""A calibrated head's gain is within a percent of the others'; so far off, its exposure is not."""
 _BLOCK_PX: Final = 8
 _COARSE: Final = 8
 _MIN_SAMPLES: Final = 30
@@ -71,6 +73,20 @@ class Balance:
     gains: Mapping[str, float]
     pairs: tuple[PairBalance, ...]
     offsets: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def outlier(self) -> tuple[str, float] | None:
+        """The sensor whose gain is farthest from the median, and its signal over that of the rest.
+
+        None where no gain is more than `OUTLIER` off.
+        """
+        if len(self.gains) < 2:
+            return None
+        logs = {name: float(np.log(gain)) for name, gain in self.gains.items()}
+        middle = float(np.median(list(logs.values())))
+        name = max(logs, key=lambda n: abs(logs[n] - middle))
+        off = logs[name] - middle
+        return (name, float(np.exp(-off))) if abs(off) > np.log1p(OUTLIER) else None
 
     @property
     def spread(self) -> float:
@@ -155,6 +171,10 @@ def balance_gains(names: Sequence[str], means: Array) -> Balance:
         ]
         change, offsets = _gains_and_offsets(len(names), steps, wide)
         logs = logs + change
+    # A head that is far off does not draw the level of the others with it.
+    off = logs - np.median(logs)
+    if len(logs) > 2 and np.abs(off).max() > np.log1p(OUTLIER):
+        logs = off
     gains = np.exp(logs).tolist()
     return Balance(
         dict(zip(names, gains, strict=True)),

@@ -116,6 +116,11 @@ def pan_searches(
     return result
 
 
+def overlap_pixels(placement: SensorPlacement, overlap: Overlap) -> tuple[int, int, int, int]:
+    """First and last column, first and last row of a sensor's usable pixels in an overlap."""
+    return _shrunk(_raw_area(placement, overlap.rectangle), usable_pixels(placement), 0)
+
+
 def _seen_searches(
     placements: Mapping[str, SensorPlacement],
     frames: Mapping[str, Frame],

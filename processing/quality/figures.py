@@ -83,6 +83,8 @@ def stitching_figures(
         "outliers": int(np.count_nonzero(mosaic.outliers)),
         "undetermined": ", ".join(unknowns) or None,
         "balance_spread": balance.spread,
+        "gain_outlier": None if balance.outlier is None else balance.outlier[0],
+        "gain_outlier_signal": None if balance.outlier is None else balance.outlier[1],
     }
     figures |= _tie_point_counts(rig, tie_points, mosaic, present)
     figures |= _displacement(validity)

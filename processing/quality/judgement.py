@@ -130,7 +130,7 @@ def judge(
     findings += _time_and_temperature(figures, missing_probes, probes_out_of_range, t)
     findings += _content(figures, mismatched_bands)
     findings += _stitching(figures, [b for b in nominal_bands if b not in mismatched_bands], t)
-    findings += _exposure(figures, t)
+    findings += _signal(figures) + _exposure(figures, t)
     findings += _attitude(figures, t)
     broken = list(asked_findings(figures, asked or Asked()))
     findings = [f for f in findings if f.flag not in {b.flag for b in broken}] + broken
@@ -447,6 +447,63 @@ def _slip(figures: Mapping[str, Figure], t: Thresholds) -> list[Finding]:
             t.slip_refly_px,
         )
     ]
+
+
+def _signal(figures: Mapping[str, Figure]) -> list[Finding]:
+    """Signal that a head, its read-out or the format of its words has changed."""
+    findings = []
+    words = figures.get("word_format")
+    if words:
+        findings.append(
+            Finding(
+                Flag.FRAME_CORRUPT,
+                Verdict.REFLY,
+                f"The words of {figures.get('word_format_sensors')} are {words}, not as the rig "
+                "file says: set the pixel format of the head, or `bits` and `justified` in the rig "
+                "file. The pixels stored are good; process them again with the right rig file.",
+            )
+        )
+    step = _number(figures, "signal_step")
+    if step is not None:
+        lines = _number(figures, "signal_step_lines") or 1.0
+        where = f"{figures.get('signal_step_axis')} of {figures.get('signal_step_sensor')}"
+        sentence = (
+            f"The signal changes by {step:+.0%} after line {figures.get('signal_step_at')} of the "
+            f"{where}: gain or offset changed during read-out. Radiometry of this frame is wrong. "
+            "Check the head."
+        )
+        if lines > 2.0:
+            sentence = (
+                f"The {where} show banding of {abs(step):.0%} in {lines:.0f} lines: check power "
+                "supply and cable of the head. Radiometry of this frame is wrong."
+            )
+        findings.append(Finding(Flag.FRAME_CORRUPT, Verdict.USABLE, sentence, step))
+    outlier, signal = figures.get("gain_outlier"), _number(figures, "gain_outlier_signal")
+    if outlier and signal is not None:
+        findings.append(
+            Finding(
+                Flag.UNDEREXPOSED if signal < 1.0 else Flag.OVEREXPOSED,
+                Verdict.USABLE,
+                f"Head {outlier} shows {signal:.2f} times the signal of the others in the "
+                "overlaps: its exposure time, aperture or gain is not what the record says. The "
+                "image is balanced to the other heads; its noise differs there. Check the head's "
+                "settings.",
+                signal,
+                1.0,
+            )
+        )
+    blurred, ratio = figures.get("blurred_sensor"), _number(figures, "blurred_ratio")
+    if blurred and ratio is not None:
+        findings.append(
+            Finding(
+                Flag.BLUR,
+                Verdict.USABLE,
+                f"Head {blurred} shows {ratio:.0%} of its neighbours' fine detail on the same "
+                "ground: out of focus, dew or smear. Check its lens.",
+                ratio,
+            )
+        )
+    return findings
 
 
 def _exposure(figures: Mapping[str, Figure], t: Thresholds) -> list[Finding]:

@@ -1,0 +1,72 @@
+"""Sharpness of PAN heads against each other, where two of them see the same ground.
+
+The figure over a whole frame depends on what lies below; in an overlap both heads have the same
+ground, so that a head out of focus, with dew or with smear of its own shows less of it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.geometry.placement import SensorPlacement
+from processing.geometry.topology import overlaps
+from processing.image.sharpness import sharpness
+from processing.matching.tie_places import overlap_pixels
+from processing.quality.report import Figure
+from processing.rig import Rig
+
+Array = NDArray[Any]
+
+SMOOTH: Final = 0.25
+"""The share of the finest detail of a surface without any (`processing.image.sharpness`)."""
+LEAST_RATIO: Final = 0.6
+"""Of its neighbours' fine detail. Lenses differ by a tenth from axis to corner."""
+LEAST_DETAIL: Final = 0.05
+"""Beyond a smooth surface, that the sharper head shows: below, there is nothing to compare."""
+
+
+def relative_sharpness_figures(
+    rig: Rig, placements: Mapping[str, SensorPlacement], frames: Mapping[str, Array]
+) -> dict[str, Figure]:
+    """The PAN head that shows least of its neighbours' fine detail, if it is clearly less.
+
+    Args:
+        rig: the camera.
+        placements: where the sensors lie, by name.
+        frames: Level-1 words by sensor name, (h, w) uint16.
+    """
+    ratios: dict[str, list[float]] = {}
+    for overlap in overlaps(rig):
+        a, b = overlap.sensor_a, overlap.sensor_b
+        if a not in frames or b not in frames:
+            continue
+        shares = []
+        for name in (a, b):
+            left, right, top, low = overlap_pixels(placements[name], overlap)
+            part = np.ascontiguousarray(frames[name][top : low + 1, left : right + 1])
+            shares.append(sharpness(rig.sensor(name), part, (0, len(part) - 1)))
+        for of_a, of_b in zip(*shares, strict=True):
+            if of_a is None or of_b is None:
+                continue
+            detail_a, detail_b = max(of_a - SMOOTH, 1e-3), max(of_b - SMOOTH, 1e-3)
+            if max(detail_a, detail_b) > LEAST_DETAIL:
+                ratios.setdefault(a, []).append(detail_a / detail_b)
+                ratios.setdefault(b, []).append(detail_b / detail_a)
+    # Blurred is who is so against most neighbours; along one direction is enough.
+    worst = {name: _typical(found) for name, found in ratios.items()}
+    if not worst:
+        return {}
+    name = min(worst, key=lambda n: worst[n])
+    if worst[name] >= LEAST_RATIO:
+        return {"blurred_sensor": None, "blurred_ratio": None}
+    return {"blurred_sensor": name, "blurred_ratio": worst[name]}
+
+
+def _typical(found: list[float]) -> float:
+    """The lower quartile of ratios: half of the directions of half of the neighbours."""
+    return math.exp(float(np.quantile(np.log(found), 0.25)))

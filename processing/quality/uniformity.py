@@ -1,0 +1,161 @@
+"""Steps of signal along whole rows or columns of a frame: the read-out makes them, ground does not.
+
+A gain or an offset that changes from one line on, or banding, moves every part of two neighbouring
+lines alike. An edge on the ground would have to run along one line of pixels over the frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from processing.quality.report import Figure
+from processing.radiometry.level1 import level1_counts_per_dn
+from processing.rig import Sensor
+
+Array = NDArray[Any]
+
+BUNDLE_PX: Final = 32
+BUNDLES: Final = 39
+"""So many bundles of pixels of a line are averaged, or as many as fit in it."""
+QUANTILE: Final = 0.2
+"""A step holds in all but this share of the bundles of a line."""
+LEAST_BUNDLES: Final = 16
+LEAST_STEP: Final = 0.055
+BANDING_STEP: Final = 0.03
+BANDING_LINES: Final = 16
+"""Of the signal: of one line, and of so many lines of a frame. Edges of clouds reach 0.046."""
+MOST_FRAMES: Final = 2
+"""Steps in more frames of one exposure are rows of plants or roofs along the track."""
+LEAST_STEP_DN: Final = 6.0
+SIGMAS: Final = 8.0
+_SPREAD_OF_MEDIAN: Final = 1.4826
+
+
+@dataclass(frozen=True)
+class SignalStep:
+    """Between line `at` and the next along `axis` the signal changes by `relative` of itself.
+
+    `lines` counts the lines of the frame where it steps: more than a few are banding.
+    """
+
+    sensor: str
+    axis: Literal["rows", "columns"]
+    at: int
+    relative: float
+    lines: int
+
+
+def signal_steps(
+    sensors: Sequence[Sensor],
+    frames: Mapping[str, Array],
+    rows: Mapping[str, tuple[int, int]],
+) -> tuple[SignalStep, ...]:
+    """Search frames for steps along whole lines.
+
+    Args:
+        sensors: those to look at.
+        frames: Level-1 words by sensor name, (h, w) uint16.
+        rows: first and last exposed row by sensor name.
+
+    Returns:
+        The largest step of each frame and axis that has one, the largest first; none where more
+        than `MOST_FRAMES` frames have one.
+    """
+    found = []
+    for sensor in sensors:
+        if sensor.name not in frames:
+            continue
+        first, last = rows[sensor.name]
+        frame = frames[sensor.name][first : last + 1]
+        by_row, by_column = _line_means(frame)
+        least = LEAST_STEP_DN * level1_counts_per_dn(sensor.bits)
+        axes: tuple[tuple[Literal["rows", "columns"], Array, int], ...] = (
+            ("rows", by_row, first),
+            ("columns", by_column, 0),
+        )
+        for axis, means, offset in axes:
+            step = _largest(sensor.name, axis, means, offset, least)
+            if step is not None:
+                found.append(step)
+    if len({step.sensor for step in found}) > MOST_FRAMES:
+        return ()
+    return tuple(sorted(found, key=lambda step: -abs(step.relative)))
+
+
+def step_figures(steps: Sequence[SignalStep]) -> dict[str, Figure]:
+    """The largest step in figures of the quality report."""
+    worst = steps[0] if steps else None
+    return {
+        "signal_step": None if worst is None else worst.relative,
+        "signal_step_sensor": None if worst is None else worst.sensor,
+        "signal_step_axis": None if worst is None else worst.axis,
+        "signal_step_at": None if worst is None else worst.at,
+        "signal_step_lines": None if worst is None else worst.lines,
+    }
+
+
+def _line_means(frame: Array) -> tuple[Array, Array]:
+    """Means of bundles along every row (bundles, rows), and along every column."""
+    height, width = frame.shape
+    by_row = np.zeros((height, min(BUNDLES, width // BUNDLE_PX)), np.float32)
+    by_column = np.zeros((min(BUNDLES, height // BUNDLE_PX), width), np.float32)
+    if by_row.size and by_column.size:
+        _sum_lines(frame, by_row, by_column)
+    return by_row.T / BUNDLE_PX, by_column / BUNDLE_PX
+
+
+def _largest(
+    sensor: str,
+    axis: Literal["rows", "columns"],
+    means: Array,
+    offset: int,
+    least_counts: float,
+) -> SignalStep | None:
+    if len(means) < LEAST_BUNDLES:
+        return None
+    signal = 0.5 * (means[:, 1:] + means[:, :-1])
+    change = np.diff(means, axis=1)
+    bright = np.median(signal, axis=0)
+    relative = change / np.maximum(signal, 1.0)
+    low, high = np.quantile(relative, (QUANTILE, 1.0 - QUANTILE), axis=0)
+    # What nearly all bundles of a line share; nothing where they differ in sign.
+    common = np.where(low > 0.0, low, np.where(high < 0.0, high, 0.0))
+    middle = np.median(relative, axis=0)
+    spread = _SPREAD_OF_MEDIAN * float(np.median(np.abs(middle - np.median(middle))))
+    noise = np.maximum(SIGMAS * spread, least_counts / np.maximum(bright, 1.0))
+    shared = np.abs(middle) * (np.abs(common) > 0.5 * np.abs(middle))
+    steps = shared > np.maximum(BANDING_STEP, noise)
+    if np.count_nonzero(steps) < BANDING_LINES:
+        steps = shared > np.maximum(LEAST_STEP, noise)
+    if not steps.any():
+        return None
+    at = int(np.argmax(np.where(steps, np.abs(middle), 0.0)))
+    count = int(np.count_nonzero(steps))
+    return SignalStep(sensor, axis, at + offset, float(middle[at]), count)
+
+
+@njit(cache=True, parallel=True, nogil=True)
+def _sum_lines(frame, by_row, by_column):
+    height, width = frame.shape
+    blocks, bundles = by_column.shape[0], by_row.shape[1]
+    tall, wide = height // blocks, width // bundles
+    for block in prange(blocks):
+        first = block * tall
+        last = height if block == blocks - 1 else first + tall
+        sums = by_column[block]
+        for r in range(first, last):
+            line = frame[r]
+            for k in range(bundles):
+                total = np.int64(0)
+                for c in range(k * wide, k * wide + BUNDLE_PX):
+                    total += line[c]
+                by_row[r, k] = total
+            if r < first + BUNDLE_PX:
+                for c in range(width):
+                    sums[c] += np.float32(line[c])
