@@ -171,10 +171,11 @@ def balance_gains(names: Sequence[str], means: Array) -> Balance:
         ]
         change, offsets = _gains_and_offsets(len(names), steps, wide)
         logs = logs + change
-    # A head that is far off does not draw the level of the others with it.
+    # One head that is far off does not draw the level of the others with it.
     off = logs - np.median(logs)
-    if len(logs) > 2 and np.abs(off).max() > np.log1p(OUTLIER):
-        logs = off
+    if len(logs) > 2 and np.count_nonzero(np.abs(off) > np.log1p(OUTLIER)) == 1:
+        tied = {name for pair in pairs for name in (pair.sensor_a, pair.sensor_b)}
+        logs = np.where([name in tied for name in names], off, 0.0)
     gains = np.exp(logs).tolist()
     return Balance(
         dict(zip(names, gains, strict=True)),

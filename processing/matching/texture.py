@@ -1,4 +1,7 @@
-"""Texture of windows of a frame against the noise that its light and read-out explain."""
+"""Texture of windows of a frame against the noise that its light and read-out explain.
+
+Differences of near pixels count, not the spread of grey values: shading matches nowhere.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +13,15 @@ from numpy.typing import NDArray
 from processing.radiometry.level1 import level1_counts_per_dn
 from processing.rig import Sensor
 
-TEXTURE_OVER_NOISE: Final = 4.0
-"""Standard deviation of a window over that of photons and read-out."""
+TEXTURE_OVER_NOISE: Final = 3.0
+"""Mean square of the differences of pixels `APART_PX` apart over that of photons and read-out."""
+APART_PX: Final = 2
 
 
 def has_texture(
     frame: NDArray[Any], sensor: Sensor, at: NDArray[np.int64], window_px: int
 ) -> NDArray[np.bool_]:
-    """Tell windows whose grey values vary clearly more than noise makes them.
+    """Tell windows whose near pixels differ clearly more than noise makes them.
 
     Args:
         frame: Level-1 words, (h, w) uint16.
@@ -26,7 +30,7 @@ def has_texture(
         window_px: side of a window, pixels.
 
     Returns:
-        True where the standard deviation is `TEXTURE_OVER_NOISE` times that of noise, (n,).
+        True where the mean squared difference is `TEXTURE_OVER_NOISE` times that of noise, (n,).
     """
     per_dn = level1_counts_per_dn(sensor.bits)
     half = window_px // 2
@@ -35,9 +39,12 @@ def has_texture(
         rows = slice(max(row - half, 0), max(row + half + 1, 0))
         columns = slice(max(column - half, 0), max(column + half + 1, 0))
         window = frame[rows, columns].astype(np.float32)
-        if window.size:
+        if min(window.shape) > APART_PX:
             photons = float(window.mean()) / per_dn / sensor.electrons_per_dn
             read_dn = sensor.read_noise_e / sensor.electrons_per_dn
-            noise_dn = np.sqrt(max(photons, 0.0) + read_dn**2)
-            result[i] = float(window.std()) / per_dn > TEXTURE_OVER_NOISE * noise_dn
+            noise_dn2 = 2.0 * (max(photons, 0.0) + read_dn**2)
+            across = np.mean((window[:, APART_PX:] - window[:, :-APART_PX]) ** 2)
+            along = np.mean((window[APART_PX:] - window[:-APART_PX]) ** 2)
+            seen_dn2 = 0.5 * float(across + along) / per_dn**2
+            result[i] = seen_dn2 > TEXTURE_OVER_NOISE * noise_dn2
     return result
