@@ -11,18 +11,15 @@ from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
+from processing.image.line_means import line_means
 from processing.quality.report import Figure
 from processing.radiometry.level1 import level1_counts_per_dn
 from processing.rig import Sensor
 
 Array = NDArray[Any]
 
-BUNDLE_PX: Final = 32
-BUNDLES: Final = 39
-"""So many bundles of pixels of a line are averaged, or as many as fit in it."""
 QUANTILE: Final = 0.2
 """A step holds in all but this share of the bundles of a line."""
 LEAST_BUNDLES: Final = 16
@@ -73,7 +70,7 @@ def signal_steps(
             continue
         first, last = rows[sensor.name]
         frame = frames[sensor.name][first : last + 1]
-        by_row, by_column = _line_means(frame)
+        by_row, by_column = line_means(frame)
         least = LEAST_STEP_DN * level1_counts_per_dn(sensor.bits)
         axes: tuple[tuple[Literal["rows", "columns"], Array, int], ...] = (
             ("rows", by_row, first),
@@ -98,16 +95,6 @@ def step_figures(steps: Sequence[SignalStep]) -> dict[str, Figure]:
         "signal_step_at": None if worst is None else worst.at,
         "signal_step_lines": None if worst is None else worst.lines,
     }
-
-
-def _line_means(frame: Array) -> tuple[Array, Array]:
-    """Means of bundles along every row (bundles, rows), and along every column."""
-    height, width = frame.shape
-    by_row = np.zeros((height, min(BUNDLES, width // BUNDLE_PX)), np.float32)
-    by_column = np.zeros((min(BUNDLES, height // BUNDLE_PX), width), np.float32)
-    if by_row.size and by_column.size:
-        _sum_lines(frame, by_row, by_column)
-    return by_row.T / BUNDLE_PX, by_column / BUNDLE_PX
 
 
 def _largest(
@@ -138,24 +125,3 @@ def _largest(
     at = int(np.argmax(np.where(steps, np.abs(middle), 0.0)))
     count = int(np.count_nonzero(steps))
     return SignalStep(sensor, axis, at + offset, float(middle[at]), count)
-
-
-@njit(cache=True, parallel=True, nogil=True)
-def _sum_lines(frame, by_row, by_column):
-    height, width = frame.shape
-    blocks, bundles = by_column.shape[0], by_row.shape[1]
-    tall, wide = height // blocks, width // bundles
-    for block in prange(blocks):
-        first = block * tall
-        last = height if block == blocks - 1 else first + tall
-        sums = by_column[block]
-        for r in range(first, last):
-            line = frame[r]
-            for k in range(bundles):
-                total = np.int64(0)
-                for c in range(k * wide, k * wide + BUNDLE_PX):
-                    total += line[c]
-                by_row[r, k] = total
-            if r < first + BUNDLE_PX:
-                for c in range(width):
-                    sums[c] += np.float32(line[c])
