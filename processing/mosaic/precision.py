@@ -199,7 +199,8 @@ def _datum_fit(rig: Rig, mosaic: Mosaic) -> tuple[list[Sensor], Array, Array]:
 def _moved_um_per_kelvin(rig: Rig, sensors: Sequence[Sensor], place_mm: Array) -> dict[str, Array]:
     """Where one kelvin takes the places of the datum, (2 m,) um, by probe.
 
-    The principal distance takes part of an expansion back.
+    The principal distance takes part of an expansion back. The second place of a sensor alone
+    takes part in its own scale and rotation.
     """
     cones = [rig.cone_of(s.name) for s in sensors]
     times = len(place_mm) // len(sensors)
@@ -209,9 +210,12 @@ def _moved_um_per_kelvin(rig: Rig, sensors: Sequence[Sensor], place_mm: Array) -
         for i, (s, cone) in enumerate(zip(sensors, cones, strict=True)):
             for k in range(i * times, (i + 1) * times):
                 if s.probe == probe:
+                    x, y = place_mm[k] - place_mm[i * times]
+                    scale, turn = s.drift.scale_ppm_per_k * 1e-3, s.drift.rotation_urad_per_k * 1e-3
                     moved[k] += (s.drift.x_um_per_k, s.drift.y_um_per_k)
+                    moved[k] += (scale * x - turn * y, scale * y + turn * x)
                 if cone.probe == probe:
-                    moved[k] -= cone.lens.f_ppm_per_k * 1e-3 * place_mm[i]
+                    moved[k] -= cone.lens.f_ppm_per_k * 1e-3 * place_mm[k]
         result[probe] = moved.reshape(-1)
     return result
 
