@@ -170,7 +170,7 @@ def test_a_kelvin_moves_the_datum_as_it_moves_calibrated_placements(name: str) -
 def test_one_sensor_alone_knows_scale_and_rotation_by_its_half_height() -> None:
     rig, mosaic = mosaic_of("ultracam-l-mini")
     (sensor,) = rig.master_sensors
-    read = {p: sensor.calibration_c for p in rig.probes}
+    read = dict.fromkeys(rig.probes, sensor.calibration_c)
     still = dataclasses.replace(
         sensor, drift=dataclasses.replace(sensor.drift, x_um_per_k=0.0, y_um_per_k=0.0)
     )
