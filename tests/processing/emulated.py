@@ -106,9 +106,9 @@ def expose(
             for probe in world.rig.probes
         },
         exposure_time_s=for_sensors(
-            rig, {name: t * 1e-6 for name, t in plan.exposure_time_us.items()}
+            world.rig, {name: t * 1e-6 for name, t in plan.exposure_time_us.items()}
         ),
-        tdi_shifts=for_sensors(rig, plan.tdi_shifts),
+        tdi_shifts=for_sensors(world.rig, plan.tdi_shifts),
         ground_speed_mps=plan.ground_speed_mps,
         height_above_ground_m=plan.height_above_ground_m,
     )

@@ -1,0 +1,199 @@
+"""What each finding of an exposure adds to the stated accuracy, by numbers."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from processing.geometry.projective import apply_projective, rotation_homography
+from processing.geometry.rotation import rotation_matrix
+from processing.geometry.similarity import fit_similarity
+from processing.mosaic.disturbance import LEAST_PX, disturbance_of
+from processing.mosaic.estimated_dc import EstimatedDc
+from processing.mosaic.free import Mosaic
+from processing.mosaic.layers import LayerCheck
+from processing.mosaic.precision import Disturbance, datum_per_kelvin_px
+from processing.mosaic.slips import Slip
+from processing.mosaic.validity import Displacement, Validity
+from processing.rig import Rig
+from tests.processing.mosaic.test_precision import mosaic_of
+
+Array = NDArray[np.float64]
+
+
+def found(
+    rig: Rig,
+    mosaic: Mosaic,
+    *,
+    validity: Validity | None = None,
+    estimated_dc: tuple[EstimatedDc, ...] = (),
+    layers: LayerCheck | None = None,
+    slips: tuple[Slip, ...] = (),
+) -> Disturbance:
+    return disturbance_of(
+        rig, mosaic, validity=validity, estimated_dc=estimated_dc, layers=layers, slips=slips
+    )
+
+
+def estimate(cone: str, k: float | None, measured: float | None, *, off: bool) -> EstimatedDc:
+    return EstimatedDc(cone, k, None if k is None else 0.5, measured, 10.0, 3.0, off)
+
+
+def test_nothing_found_adds_nothing() -> None:
+    rig, mosaic = mosaic_of("ultracam-x-mini")
+    nothing = found(rig, mosaic)
+    assert not nothing.datum.any() and nothing.datum.shape == (4, 4) and not nothing.frames
+
+
+def test_a_slip_adds_the_variance_of_its_share_of_the_frame() -> None:
+    rig, mosaic = mosaic_of("ultracam-x-mini")
+    slips = (
+        Slip("SU10", "rows", 0, 83, 3.0, -4.0, 0.1, 30.0, 50),
+        Slip("SU10", "rows", 400, 649, 1.0, 2.0, 0.3, 30.0, 50),
+        Slip("SU20", "columns", 0, 99, -2.0, 0.0, 0.5, 30.0, 50),
+    )
+    frames = found(rig, mosaic, slips=slips).frames
+    assert set(frames) == {"SU10", "SU20"}
+    assert frames["SU10"] == pytest.approx([0.1 * 9.0 + 0.3, 0.1 * 16.0 + 0.3 * 4.0])
+    assert frames["SU20"] == pytest.approx([2.0, 0.0])
+
+
+def test_a_wrong_probe_of_the_master_moves_the_datum_by_its_error() -> None:
+    rig, mosaic = mosaic_of("ultracam-x-mini")
+    per_k = datum_per_kelvin_px(rig, mosaic)
+    wrong = (estimate("0", 8.0, 5.0, off=True), estimate("1", 7.0, 7.0, off=False))
+    datum = found(rig, mosaic, estimated_dc=wrong).datum
+    np.testing.assert_allclose(datum, 9.0 * np.outer(per_k, per_k), rtol=1e-9)
+    unread = (estimate("0", 8.0, None, off=True),)
+    assert not found(rig, mosaic, estimated_dc=unread).datum.any()
+
+
+def test_probes_of_other_cones_count_only_where_all_of_them_are_off() -> None:
+    rig, mosaic = mosaic_of("ultracam-x-mini")
+    per_k = datum_per_kelvin_px(rig, mosaic)
+    one = estimate("1", 9.0, 4.0, off=True)
+    healthy = estimate("2", 4.0, 4.0, off=False)
+    assert not found(rig, mosaic, estimated_dc=(one, healthy)).datum.any()
+    both = (one, estimate("2", 7.0, 6.0, off=True), estimate("3", None, 4.0, off=False))
+    # The mean of the estimates less the mean of the readings: 8 - 5.
+    datum = found(rig, mosaic, estimated_dc=both).datum
+    np.testing.assert_allclose(datum, 9.0 * np.outer(per_k, per_k), rtol=1e-9)
+
+
+def check(common: tuple[float, ...], *, changed: bool, causes: tuple[str, ...] = ()) -> LayerCheck:
+    sigmas = np.array([10.0, 5.0, 5.0, 5.0])
+    statistic = 20.0 if changed else 3.0
+    return LayerCheck("0", (), statistic, 10.0, np.array(common), sigmas, causes, ())
+
+
+def test_a_changed_master_moves_the_image_as_its_rotation_does() -> None:
+    rig, mosaic = mosaic_of("ultracam-x-mini")
+    f, pitch = mosaic.model.f_mm, mosaic.model.pitch_mm
+    angles = np.array([4.0, -7.0, 11.0])
+    datum = found(rig, mosaic, layers=check((30.0, *angles), changed=True, causes=("0",))).datum
+    near = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
+    turned = rotation_homography(rotation_matrix(*angles * 1e-6), f, f)
+    fit = fit_similarity(near, apply_projective(turned, near))
+    part = np.array([fit.x_mm, fit.y_mm, 30e-6, fit.rotation_rad]) / pitch
+    np.testing.assert_allclose(datum, np.outer(part, part), rtol=1e-3)
+
+
+def test_a_common_scale_counts_beyond_two_standard_deviations() -> None:
+    rig, mosaic = mosaic_of("ultracam-x-mini")
+    for scale, beyond in ((19.0, 0.0), (-29.0, 29.0**2 - 400.0)):
+        datum = found(rig, mosaic, layers=check((scale, 4.0, 5.0, 6.0), changed=False)).datum
+        expected = np.diag([0.0, 0.0, beyond, 0.0]) * (1e-6 / mosaic.model.pitch_mm) ** 2
+        np.testing.assert_allclose(datum, expected, rtol=1e-9, atol=1e-18)
+    other = check((90.0, 4.0, 5.0, 6.0), changed=True, causes=("2",))
+    assert not found(rig, mosaic, layers=other).datum.any()
+
+
+def test_a_wrong_temperature_explains_a_common_scale() -> None:
+    rig, mosaic = mosaic_of("ultracam-x-mini")
+    wrong = (estimate("0", 8.0, 5.0, off=True),)
+    alone = found(rig, mosaic, estimated_dc=wrong).datum
+    both = found(
+        rig, mosaic, estimated_dc=wrong, layers=check((90.0, 0.0, 0.0, 0.0), changed=False)
+    ).datum
+    np.testing.assert_array_equal(both, alone)
+
+
+def displaced_mosaic(moved_px: dict[str, tuple[float, float]]) -> tuple[Rig, Mosaic]:
+    """A mosaic whose datum was fitted over all four master sensors, some of them displaced."""
+    rig, mosaic = mosaic_of("ultracam-x-mini")
+    pitch = mosaic.model.pitch_mm
+    sensors = rig.master_sensors
+    place = np.array([[s.x_mm, s.y_mm] for s in sensors])
+    moved = np.array([moved_px.get(s.name, (0.0, 0.0)) for s in sensors]) * pitch
+    fit = fit_similarity(place, place + moved)
+    z = (place[:, 0] + 1j * place[:, 1]) * (fit.scale * np.exp(1j * fit.rotation_rad) - 1.0)
+    left = moved - np.column_stack([z.real + fit.x_mm, z.imag + fit.y_mm])
+    values = mosaic.values.copy()
+    for s, (x, y) in zip(sensors, left, strict=True):
+        values[mosaic.model.sensors[s.name]] = x
+        values[mosaic.model.sensors[s.name] + 1] = y
+    return rig, dataclasses.replace(mosaic, values=values)
+
+
+def judged(sensor: str, alternatives: tuple[str, ...] = (), *, several: bool = False) -> Validity:
+    displaced = Displacement(sensor, 3.0, 4.0, 0.1, 0.1, 900.0)
+    return Validity(
+        {}, (), 900.0, 4, 20.0, (displaced,), 15.0, displaced, alternatives, several, ()
+    )
+
+
+def refit(rig: Rig, mosaic: Mosaic, trusted: tuple[str, ...]) -> tuple[Array, Array]:
+    """The datum that rests on some sensors (px, px per mm), and where it leaves all, px."""
+    pitch = mosaic.model.pitch_mm
+    place = np.array([[s.x_mm, s.y_mm] for s in rig.master_sensors])
+    first = [mosaic.model.sensors[s.name] for s in rig.master_sensors]
+    moved = np.array([mosaic.values[i : i + 2] for i in first])
+    use = np.array([s.name in trusted for s in rig.master_sensors])
+    fit = fit_similarity(place[use], (place + moved)[use])
+    z = (place[:, 0] + 1j * place[:, 1]) * (fit.scale * np.exp(1j * fit.rotation_rad) - 1.0)
+    part = np.array([fit.x_mm, fit.y_mm, fit.scale - 1.0, fit.rotation_rad]) / pitch
+    left = (moved - np.column_stack([z.real + fit.x_mm, z.imag + fit.y_mm])) / pitch
+    return part, left[~use]
+
+
+MASTER = ("SU00", "SU01", "SU02", "SU03")
+
+
+def test_a_displaced_sensor_drags_the_datum_by_what_the_other_three_say() -> None:
+    rig, mosaic = displaced_mosaic({"SU00": (3.0, -2.0)})
+    part, left = refit(rig, mosaic, MASTER[1:])
+    np.testing.assert_allclose(left, [[3.0, -2.0]], atol=1e-3)
+    datum = found(rig, mosaic, validity=judged("SU00")).datum
+    np.testing.assert_allclose(datum, np.outer(part, part), rtol=5e-3, atol=1e-9)
+    unproven = dataclasses.replace(
+        judged("SU00"), displaced=None, unproven=judged("SU00").displaced
+    )
+    np.testing.assert_array_equal(found(rig, mosaic, validity=unproven).datum, datum)
+    healthy = dataclasses.replace(judged("SU00"), displaced=None)
+    assert not found(rig, mosaic, validity=healthy).datum.any()
+
+
+def mixed(parts: list[tuple[Array, Array]]) -> Array:
+    """The mean over explanations, the smaller displacement the likelier."""
+    weights = [np.prod([1.0 / (x * x + y * y + LEAST_PX**2) for x, y in left]) for _, left in parts]
+    every = [w * np.outer(part, part) for w, (part, _) in zip(weights, parts, strict=True)]
+    return np.asarray(sum(every) / sum(weights))
+
+
+def test_of_several_suspects_each_datum_counts_with_its_likelihood() -> None:
+    assert LEAST_PX == 0.02
+    rig, mosaic = displaced_mosaic({"SU00": (0.05, -0.02), "SU03": (0.01, 0.03)})
+    datum = found(rig, mosaic, validity=judged("SU00", ("SU03",))).datum
+    expected = mixed([refit(rig, mosaic, MASTER[1:]), refit(rig, mosaic, MASTER[:3])])
+    np.testing.assert_allclose(datum, expected, rtol=2e-3, atol=1e-12)
+
+
+def test_where_several_moved_any_two_may_be_in_place() -> None:
+    rig, mosaic = displaced_mosaic({"SU00": (0.5, -0.2), "SU03": (0.1, 0.4)})
+    datum = found(rig, mosaic, validity=judged("SU00", several=True)).datum
+    pairs = [(a, b) for i, a in enumerate(MASTER) for b in MASTER[i + 1 :]]
+    expected = mixed([refit(rig, mosaic, pair) for pair in pairs])
+    np.testing.assert_allclose(datum, expected, rtol=5e-3, atol=1e-9)
