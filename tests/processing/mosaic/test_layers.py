@@ -144,6 +144,20 @@ def test_the_one_cone_that_changed_is_the_cause_and_a_common_change_the_masters(
         np.testing.assert_allclose(check.common, change, atol=1.0)
 
 
+@pytest.mark.parametrize(("chi_square", "alternatives"), [(5.7, ("0",)), (6.1, ())])
+def test_what_is_less_than_19_times_less_likely_is_an_alternative(
+    chi_square: float, alternatives: tuple[str, ...]
+) -> None:
+    """2 ln 19 is 5.89: by so much the master's change may explain the misfit worse."""
+    rig, mosaic = planted("ultracam-l-mini", {"1": np.array([0.0, 0.0, 0.0, 9000.0])})
+    loose = dataclasses.replace(rig.cone("RGB"), rotation_sigma_urad=9000.0 / chi_square**0.5)
+    rig = dataclasses.replace(rig, cones=tuple(loose if c.name == "RGB" else c for c in rig.cones))
+    check = check_layers(rig, mosaic, read(rig))
+    assert check is not None and check.causes == ("1",)
+    assert check.alternatives == alternatives
+    assert check.master_changed == bool(alternatives)
+
+
 def test_two_changed_cones_are_both_named() -> None:
     change = np.array([0.0, 600.0, -900.0, 300.0])
     rig, mosaic = planted("ultracam-x-mini", {"1": change, "3": -change})
