@@ -48,7 +48,63 @@ MOST_TEST_FILES = 8
 """So many of the nearest test files run, nearest first."""
 SLOWEST_S = 300
 NOTICED_GOAL = 0.9
-EQUIVALENT: dict[str, str] = {}
+_ANY_SIZE = "numpy takes any negative size as the one to be computed"
+_SAME_LENGTHS = "both sequences are made of the same one just above"
+_OVERWRITTEN = "every reader comes after the first look has written it"
+EQUIVALENT: dict[str, str] = {
+    "processing/geometry/terrain_rays.py: "
+    "over = point[:, 2] - model.at(point[:, :2]): 2 -> 3": "heights are read at columns 0 and 1",
+    "processing/geometry/terrain_rays.py: "
+    "middle = np.where(good, (near + far) / 2.0, 0.0): 0.0 -> 1.0": "only good rays are taken over",
+    "processing/geometry/terrain_rays.py: "
+    "under = above(middle) <= 0.0: <= -> <": "the bisection converges to the same point",
+    "processing/geometry/terrain_rays.py: "
+    "_HALVINGS: Final = 30: 30 -> 60": "30 halvings of any step are below a micrometre",
+    "processing/geometry/terrain_rays.py: "
+    "first = np.where(down, np.maximum((top - centre_m[2]) / unit[:, 2], 0.0), np.nan): / -> *": (
+        "the search starts earlier, still above all ground"
+    ),
+    "processing/mosaic/precision.py: "
+    "variance = np.sum((datum @ of_datum) * datum, axis=1).reshape(-1, 2): 1 -> 2": _ANY_SIZE,
+    "processing/mosaic/precision.py: result[probe] = moved.reshape(-1): 1 -> 2": _ANY_SIZE,
+    "processing/mosaic/precision.py: "
+    "for i, (s, cone) in enumerate(zip(sensors, cones, strict=True)):: True -> False": (
+        _SAME_LENGTHS
+    ),
+    "processing/mosaic/disturbance.py: "
+    "left = (_moved_px(mosaic, others) - _places(others) @ part).reshape(-1, 2): 1 -> 2": _ANY_SIZE,
+    "processing/mosaic/disturbance.py: "
+    "for part, weight in zip(parts, weights, strict=True):: True -> False": _SAME_LENGTHS,
+    "processing/mosaic/disturbance.py: "
+    "weights.append(float(np.prod(1.0 / (np.sum(left**2, axis=1) + LEAST_PX**2)))): 1.0 -> 1.5": (
+        "only ratios of weights count, and all are products of equally many factors"
+    ),
+    "processing/mosaic/weights.py: misclosure=(b - a).T.reshape(-1),: 1 -> 2": _ANY_SIZE,
+    "processing/mosaic/weights.py: misclosure=-group.difference.T.reshape(-1),: 1 -> 2": _ANY_SIZE,
+    "processing/mosaic/weights.py: "
+    "typical[kind] = float(np.median(sigmas)) if len(sigmas) else 1.0: 1.0 -> 1.5": (
+        "a class without points divides nothing by it"
+    ),
+    "processing/mosaic/weights.py: "
+    "every = [n.ravel() for n, g in zip(normalised, groups, strict=True) if g.kind == kind]: "
+    "True -> False": _SAME_LENGTHS,
+    "processing/mosaic/weights.py: "
+    "for w, group in zip(normalised, groups, strict=True):: True -> False": _SAME_LENGTHS,
+    "processing/mosaic/slips.py: "
+    "for (band, sign), (every, _) in zip(banded, own, strict=True):: True -> False": (
+        "both sequences have the two sides of a pair"
+    ),
+} | {
+    f"processing/mosaic/weights.py: {name} = field(default_factory=lambda: "
+    f"np.empty({shape})): {change}": _OVERWRITTEN
+    for name, shape, change in (
+        ("difference: Array", "(0, 2)", "0 -> 1"),
+        ("difference: Array", "(0, 2)", "2 -> 3"),
+        ("redundancy: Array", "(0, 2)", "0 -> 1"),
+        ("redundancy: Array", "(0, 2)", "2 -> 3"),
+        ("factor: Array", "0", "0 -> 1"),
+    )
+}
 """Mutation as printed, without its line -> why no outcome differs."""
 
 

@@ -7,13 +7,25 @@ import dataclasses
 import numpy as np
 import pytest
 
-from processing.geometry.placement import nominal_placements, raw_from_vip_mm, vip_mm_from_px
+from processing.geometry.placement import (
+    SensorPlacement,
+    nominal_placements,
+    raw_from_vip_mm,
+    vip_mm_from_px,
+    vip_mm_from_raw,
+)
 from processing.geometry.topology import (
+    Rectangle,
+    _is_upright,
     colour_coverage,
     colour_ratio,
     corners,
     counts,
+    footprint,
+    intersection,
+    outline,
     overlaps,
+    seen_by_both,
 )
 from processing.mosaic.free import free_mosaic
 from processing.rig import Rig, Sensor, find_rig, load_rig, shipped_rigs
@@ -231,3 +243,65 @@ def test_a_ratio_that_is_not_whole_is_not_rounded() -> None:
         for c in rig.cones
     )
     assert colour_ratio(dataclasses.replace(rig, cones=cones)) is None
+
+
+BOX = Rectangle(-2.0, 1.0, 3.0, 5.0)
+
+
+def test_a_rectangle_contains_its_border() -> None:
+    inside = [[-2.0, 1.0], [3.0, 5.0], [-2.0, 5.0], [3.0, 1.0], [0.0, 2.0]]
+    outside = [[-2.01, 2.0], [3.01, 2.0], [0.0, 0.99], [0.0, 5.01]]
+    assert BOX.contains(np.array(inside + outside)).tolist() == [True] * 5 + [False] * 4
+    assert (BOX.width_mm, BOX.height_mm, BOX.empty) == (5.0, 4.0, False)
+    for other in (Rectangle(3.0, 0.0, 9.0, 9.0), Rectangle(0.0, 5.0, 9.0, 9.0)):
+        assert intersection(BOX, other).empty, "a common border has no area"
+    assert intersection(BOX, Rectangle(2.0, -1.0, 9.0, 4.0)) == Rectangle(2.0, 1.0, 3.0, 4.0)
+
+
+def test_footprints_and_outlines_reach_half_a_pixel_beyond_the_outer_pixels() -> None:
+    rig = side_by_side_rig()
+    for placement in nominal_placements(rig, {}, {}).values():
+        w, h = placement.sensor.width_px, placement.sensor.height_px
+        corners_px = raw_from_vip_mm(placement, outline(placement))
+        expected = [[-0.5, -0.5], [w - 0.5, -0.5], [w - 0.5, h - 0.5], [-0.5, h - 0.5]]
+        np.testing.assert_allclose(corners_px, expected, atol=1e-5)
+        box = footprint(placement)
+        middle_x, middle_y = vip_mm_from_raw(placement, np.array([[w - 1, h - 1]]) / 2.0)[0]
+        sides = np.array(
+            [
+                [box.x_min_mm, middle_y],
+                [box.x_max_mm, middle_y],
+                [middle_x, box.y_max_mm],
+                [middle_x, box.y_min_mm],
+            ]
+        )
+        found = raw_from_vip_mm(placement, sides)
+        assert found[:2, 0] == pytest.approx([-0.5, w - 0.5], abs=0.05)
+        assert found[2:, 1] == pytest.approx([-0.5, h - 0.5], abs=0.05)
+
+
+def turned(placement: SensorPlacement, angle_deg: float, x_mm: float) -> SensorPlacement:
+    c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    layer = np.array([[c, -s, x_mm], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return dataclasses.replace(placement, layer=layer)
+
+
+def test_a_tilted_sensor_shares_the_box_around_what_both_see() -> None:
+    plain = nominal_placements(find_rig("ultracam-x-mini"), {}, {})["SU30"]
+    upright, quarter = turned(plain, 0.0, 0.0), turned(plain, 90.0, 0.0)
+    box = footprint(upright)
+    common = seen_by_both(upright, quarter)
+    # A sensor turned by 90 degrees about the middle: a square of its height, to its own offset.
+    side = min(box.width_mm, box.height_mm)
+    assert common.width_mm == pytest.approx(side, abs=0.05)
+    assert common.height_mm == pytest.approx(side, abs=0.05)
+    tilted = seen_by_both(upright, turned(plain, 45.0, 0.0))
+    # The diamond's corners along y are cut by the sensor's upper and lower sides.
+    assert tilted.height_mm == pytest.approx(box.height_mm, rel=0.02)
+    reach = (box.width_mm + box.height_mm) / 2.0**0.5
+    assert tilted.width_mm == pytest.approx(min(reach, box.width_mm), rel=0.02)
+    assert seen_by_both(upright, turned(plain, 45.0, 100.0)) == Rectangle(0.0, 0.0, 0.0, 0.0)
+    # Askew by 1 % of the smaller side still counts as upright.
+    for share, is_upright in ((0.9, True), (1.1, False)):
+        angle = np.degrees(share * 0.01 * min(box.width_mm, box.height_mm) / box.width_mm)
+        assert _is_upright(turned(plain, angle, 0.0)) is is_upright
