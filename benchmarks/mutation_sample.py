@@ -90,6 +90,10 @@ EQUIVALENT: dict[str, str] = {
     "True -> False": _SAME_LENGTHS,
     "processing/mosaic/weights.py: "
     "for w, group in zip(normalised, groups, strict=True):: True -> False": _SAME_LENGTHS,
+    "processing/geometry/topology.py: _RIGS: Final = 8: 8 -> 9": "size of a cache",
+    "processing/geometry/topology.py: whole = round(exact or 0.0): 0.0 -> 1.0": (
+        "without an exact ratio the result is None whatever is rounded"
+    ),
     "processing/mosaic/slips.py: "
     "for (band, sign), (every, _) in zip(banded, own, strict=True):: True -> False": (
         "both sequences have the two sides of a pair"

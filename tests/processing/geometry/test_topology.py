@@ -16,7 +16,9 @@ from processing.geometry.placement import (
 )
 from processing.geometry.topology import (
     Rectangle,
+    _is_strip,
     _is_upright,
+    _sees,
     colour_coverage,
     colour_ratio,
     corners,
@@ -305,3 +307,30 @@ def test_a_tilted_sensor_shares_the_box_around_what_both_see() -> None:
     for share, is_upright in ((0.9, True), (1.1, False)):
         angle = np.degrees(share * 0.01 * min(box.width_mm, box.height_mm) / box.width_mm)
         assert _is_upright(turned(plain, angle, 0.0)) is is_upright
+
+
+def test_a_sensor_sees_from_its_first_pixel_centre_to_its_last() -> None:
+    placement = nominal_placements(side_by_side_rig(), {}, {})["SU00"]
+    last = np.array([placement.sensor.width_px - 1.0, placement.sensor.height_px - 1.0])
+    inside, outside = [[0.1, 0.1], last - 0.1], [[-0.1, 5.0], [5.0, -0.1]]
+    outside += [[last[0] + 0.1, 5.0], [5.0, last[1] + 0.1]]
+    for at, seen in [*((p, True) for p in inside), *((p, False) for p in outside)]:
+        assert _sees(placement, vip_mm_from_raw(placement, np.array([at]))) is seen, at
+
+
+def test_a_strip_is_longer_than_half_of_the_smaller_sensor() -> None:
+    sensor, larger = Rectangle(0.0, 0.0, 8.0, 4.0), Rectangle(0.0, 0.0, 10.0, 6.0)
+    for width, height, strip in ((4.0, 2.0, False), (4.1, 0.1, True), (0.1, 2.1, True)):
+        common = Rectangle(0.0, 0.0, width, height)
+        assert _is_strip(common, sensor, larger) is strip
+        assert _is_strip(common, larger, sensor) is strip
+
+
+def test_converging_heads_have_three_constraints_in_common() -> None:
+    rig = find_rig("dmc-mini")
+    found = counts(rig)
+    heads = len(rig.pan_cones)
+    assert found.common_constraints == 3
+    assert found.parameters - sum(c.parameters for c in found.cones) == 0
+    assert [c.parameters for c in found.cones][:heads] == [3] * heads
+    assert found.constraints == 3 and found.unknowns == found.parameters - 3

@@ -256,3 +256,18 @@ def test_residuals_are_as_sure_as_their_class_and_their_own_match() -> None:
     np.testing.assert_allclose(slips._sigma_px(tie_points, residuals), true, rtol=0.06)
     still = slips._sigma_px(tie_points, residuals * 1e-3)
     assert still == pytest.approx(np.full(4000, LEAST_SIGMA_PX)) and LEAST_SIGMA_PX == 0.02
+
+
+@pytest.mark.parametrize(("first", "last"), [(0, 299), (500, HEIGHT)])
+def test_the_other_part_begins_where_the_found_band_ends(first: int, last: int) -> None:
+    tie_points, residuals = points(1200)
+    moved = shifted(tie_points, residuals, 1, 0, HEIGHT, (4.0, 1.0))
+    moved = shifted(tie_points, moved, 1, first, last, (-4.0, -1.0))
+    (band,) = find_slips(MINI, tie_points, moved, sensors=("SU00",))
+    other = slip_of(MINI, tie_points, moved, "SU00")
+    assert other is not None
+    ends = (band.last + 1, HEIGHT - 1) if first == 0 else (0, band.first - 1)
+    assert (other.first, other.last) == ends
+    assert (other.dx_px, other.dy_px) == (-band.dx_px, -band.dy_px)
+    inside = int(inside_slips(tie_points, (band,)).sum())
+    assert other.points == 1200 - inside
