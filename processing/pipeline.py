@@ -234,6 +234,7 @@ class Pipeline:
                 validity=validity,
                 estimated_dc=estimated,
                 layers=layers,
+                platform=platform,
                 slips=stitched.slips,
             )
         with clock.stage("composition"):

@@ -18,6 +18,7 @@ from processing.mosaic.datum import datum_candidates
 from processing.mosaic.estimated_dc import EstimatedDc, combined_dc
 from processing.mosaic.free import Mosaic
 from processing.mosaic.layers import LayerCheck
+from processing.mosaic.mounting import PlatformCheck
 from processing.mosaic.precision import Disturbance, datum_design, datum_per_kelvin_px
 from processing.mosaic.slips import Slip
 from processing.mosaic.validity import Validity
@@ -27,6 +28,8 @@ Array = NDArray[np.float64]
 
 SCALE_SIGMAS: Final = 2.0
 """A common change of scale within so many standard deviations of the calibration is no error."""
+HEAD_SCALE_PPM: Final = 50.0
+"""Of a converging head; healthy ones reach half of it."""
 LEAST_PX: Final = 0.02
 """Displacements below are alike."""
 
@@ -38,6 +41,7 @@ def disturbance_of(
     validity: Validity | None,
     estimated_dc: Sequence[EstimatedDc],
     layers: LayerCheck | None,
+    platform: PlatformCheck | None,
     slips: Sequence[Slip],
 ) -> Disturbance:
     """Add up what the findings of one exposure may have done to the image.
@@ -48,19 +52,38 @@ def disturbance_of(
         validity: of the master cone's sensors.
         estimated_dc: temperatures by stitching against those of the probes.
         layers: the other cones against the platform calibration.
+        platform: the mountings of converging heads against it.
         slips: shifted bands of frames.
     """
     warmed = tuple(_wrong_temperature(rig, mosaic, estimated_dc))
     # A wrong temperature changes the scale of all layers alike, too.
     changed = () if warmed else tuple(_changed_master(mosaic, layers))
     datum = np.zeros((4, 4))
-    for part in (*_other_datums(rig, mosaic, validity), *warmed, *changed):
+    turned = _turned_head(mosaic, platform)
+    for part in (*_other_datums(rig, mosaic, validity), *warmed, *changed, *turned):
         datum += np.outer(part, part)
     frames: dict[str, Array] = {}
     for slip in slips:
         shift = np.array([slip.dx_px, slip.dy_px])
-        frames[slip.sensor] = frames.get(slip.sensor, np.zeros(2)) + slip.share * shift**2
+        for name in (slip.sensor, *slip.alternatives):
+            frames[name] = frames.get(name, np.zeros(2)) + slip.share * shift**2
+    if platform is not None and abs(platform.scaled.scale_ppm) > HEAD_SCALE_PPM:
+        head = platform.scaled
+        for sensor in rig.cone(head.cone).sensors:
+            # Even pixels of a side have a third of its square half length.
+            reach = np.array([sensor.width_px, sensor.height_px]) / 2.0 * head.scale_ppm * 1e-6
+            frames[sensor.name] = frames.get(sensor.name, np.zeros(2)) + reach**2 / 3.0
     return Disturbance(datum, frames)
+
+
+def _turned_head(mosaic: Mosaic, platform: PlatformCheck | None) -> Iterator[Array]:
+    """What one head that turned does to the mean of all, which is the datum."""
+    if platform is None or not platform.expired:
+        return
+    by_x, by_y, by_z = np.array(platform.farthest.turn_rad) / (len(platform.heads) - 1)
+    pitch_mm = mosaic.model.pitch_mm
+    f_px = mosaic.model.f_mm / pitch_mm
+    yield np.array([-f_px * by_y, f_px * by_x, 0.0, by_z / pitch_mm])
 
 
 def _other_datums(rig: Rig, mosaic: Mosaic, validity: Validity | None) -> Iterator[Array]:

@@ -42,6 +42,7 @@ FAMILY_ALPHA: Final = 0.001
 """Probability of calling a healthy platform expired."""
 LEAST_SHIFT_PX: Final = 0.01
 LEAST_POINTS: Final = 24
+SCALED_PPM: Final = 100.0
 _ROUNDS: Final = 12
 
 
@@ -68,6 +69,11 @@ class Mounting:
     affine: Array
     points: int
 
+    @property
+    def scale_ppm(self) -> float:
+        """By how much the head's scale differs from its neighbours'."""
+        return float(np.trace(self.affine)) * 0.5e6
+
 
 @dataclass(frozen=True)
 class PlatformCheck:
@@ -88,6 +94,11 @@ class PlatformCheck:
     @property
     def expired(self) -> bool:
         return self.freedom > 0 and self.statistic > self.limit
+
+    @property
+    def scaled(self) -> Mounting:
+        """The head whose scale differs most from its neighbours'."""
+        return max(self.heads, key=lambda head: abs(head.scale_ppm))
 
     @property
     def farthest(self) -> Mounting:
@@ -123,6 +134,20 @@ def verified_mosaic(rig: Rig, mosaic: Mosaic, tie_points: TiePoints) -> Mosaic:
             values[at] -= values[at].mean() - mosaic.values[at].mean()
         mosaic = _at_values(mosaic, tie_points, values)
     return mosaic
+
+
+def has_scaled_head(rig: Rig, mosaic: Mosaic, tie_points: TiePoints) -> bool:
+    """Whether a converging head differs from its neighbours in scale, along both axes alike.
+
+    That is a principal distance; lines lost in read-out change one axis.
+    """
+    for name in mosaic.model.mountings:
+        _, _, affine, points = _affine_shift(rig, mosaic, tie_points, name)
+        along, across = affine[0, 0], affine[1, 1]
+        least = min(abs(along), abs(across))
+        if points >= LEAST_POINTS and along * across > 0.0 and least > SCALED_PPM * 1e-6:
+            return True
+    return False
 
 
 def check_platform(
@@ -173,13 +198,15 @@ def platform_figures(check: PlatformCheck | None) -> dict[str, Figure]:
     """The check in figures of the quality report."""
     if check is None:
         return {}
-    farthest = check.farthest
+    farthest, scaled = check.farthest, check.scaled
     residuals = [math.hypot(*head.residual_px) for head in check.heads]
     return {
         "platform_test": check.statistic / check.limit,
         "platform_shift_px": math.hypot(*farthest.shift_px),
         "platform_shift_head": farthest.cone,
         "platform_residual_px": max(residuals),
+        "platform_scale_ppm": scaled.scale_ppm,
+        "platform_scale_head": scaled.cone,
     }
 
 

@@ -28,6 +28,7 @@ _MEDIAN_LOSS: Final = 1.2533
 LEAST_SIGMA_PX: Final = 0.02
 ALIKE_SHARE: Final = 0.3
 """A point of a band has its shift within this share of it and three standard deviations."""
+ALTERNATIVE_GAIN: Final = 0.8
 ROBUST_LIMIT: Final = 12.0
 """Normalised residual above which a tie point counts as a blunder whatever its size."""
 
@@ -59,7 +60,8 @@ class Slip:
 
     The band reaches from pixel `first` to `last` along `axis`; `dx_px`, `dy_px` are its shift
     against the rest in the VIP (x right, y up), PAN pixels, `share` its part of the frame, `score`
-    the shift over its standard deviation, `points` the tie points in the band.
+    the shift over its standard deviation, `points` the tie points in the band. `alternatives` are
+    frames that see the same tie points and explain them nearly as well.
     """
 
     sensor: str
@@ -71,6 +73,7 @@ class Slip:
     share: float
     score: float
     points: int
+    alternatives: tuple[str, ...] = ()
 
     @property
     def length_px(self) -> float:
@@ -118,7 +121,7 @@ def find_slips(
         if gain <= 0.0:
             break
         if slip.sensor not in {cause.sensor for cause in causes}:
-            causes.append(slip)
+            causes.append(replace(slip, alternatives=_alternatives(tie_points, slip, gain, found)))
         for side, sign in _sides(tie_points, slip):
             residuals[side] -= sign * np.array([slip.dx_px, slip.dy_px])
     return tuple(causes)
@@ -186,8 +189,23 @@ def slip_figures(rig: Rig, slips: Sequence[Slip]) -> dict[str, Figure]:
         "slip_axis": None if worst is None else worst.axis,
         "slip_first": None if worst is None else worst.first,
         "slip_last": None if worst is None else worst.last,
+        "slip_alternatives": None if worst is None else ", ".join(worst.alternatives) or None,
         "slip_sensors": ", ".join(slip.sensor for slip in slips) or None,
     }
+
+
+def _alternatives(
+    tie_points: TiePoints, slip: Slip, gain: float, found: Sequence[tuple[Slip, float]]
+) -> tuple[str, ...]:
+    """Frames whose band explains nearly as much with the same tie points."""
+    own = inside_slips(tie_points, (slip,))
+    return tuple(
+        other.sensor
+        for other, explained in found
+        if other.sensor != slip.sensor
+        and explained > ALTERNATIVE_GAIN * gain
+        and np.mean(own[inside_slips(tie_points, (other,))]) > 0.5
+    )
 
 
 def _sigma_px(tie_points: TiePoints, residuals_px: Array) -> Array:
@@ -269,13 +287,20 @@ def _worst(
         if scores[at_bin] > settings.limit and reach[at_bin] > settings.least_px(width * per):
             first, last = _grown(medians, shifts[at_bin], level, at_bin, at_bin + width)
             band = slice(first * per, last * per)
-            dx, dy = np.median(residuals[band], axis=0) - _level_outside(residuals, band)
-            explained = _explained(residuals[band] - level, sigma[band], np.array([dx, dy]))
+            outside = _level_outside(residuals, band)
+            dx, dy = np.median(residuals[band], axis=0) - outside
+            shift = np.tile(outside - level, (len(residuals), 1))
+            shift[band] += dx, dy
+            explained = _explained(residuals - level, sigma, shift)
+            # A wrong scale or rotation is a ramp, which a band only seems to be.
+            ramp = _explained(residuals - level, sigma, _ramp(at, residuals - level))
+            explained = explained if explained > ramp else 0.0
             large = max(abs(dx), abs(dy)) > settings.least_px(band.stop - band.start)
-            off = np.abs(residuals[band] - level - (dx, dy)).max(axis=1)
+            off = np.abs(residuals[band] - outside - (dx, dy)).max(axis=1)
             near = off < ALIKE_SHARE * math.hypot(dx, dy) + 3.0 * sigma[band]
             if (
                 large
+                and explained > 0.0
                 and np.mean(near) > settings.least_share
                 and (best is None or explained > best[1])
             ):
@@ -308,6 +333,15 @@ def _grown(medians: Array, shift: Array, level: Array, first: int, last: int) ->
 def _level_outside(residuals: Array, band: slice) -> Array:
     outside = np.concatenate([residuals[: band.start], residuals[band.stop :]])
     return np.asarray(np.median(outside, axis=0))
+
+
+def _ramp(at: Array, residuals: Array) -> Array:
+    """Residuals (n, 2) that grow evenly along the axis, by the medians of both outer thirds."""
+    third = max(len(at) // 3, 1)
+    low, high = np.median(residuals[:third], axis=0), np.median(residuals[-third:], axis=0)
+    first, last = float(np.median(at[:third])), float(np.median(at[-third:]))
+    along = (at - first) / max(last - first, 1.0)
+    return np.asarray(low + along[:, None] * (high - low))
 
 
 def _explained(residuals: Array, sigma: Array, shift: Array) -> float:

@@ -7,7 +7,7 @@ its own (`processing.mosaic.free`, `processing.mosaic.validity`, `processing.mos
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 from processing.geometry.placement import SensorPlacement
@@ -15,7 +15,7 @@ from processing.matching.tie_points import TiePoints
 from processing.mosaic.fixed import fixed_mosaic
 from processing.mosaic.free import Mosaic, MosaicSettings, free_mosaic
 from processing.mosaic.model import residuals_px
-from processing.mosaic.mounting import verified_mosaic
+from processing.mosaic.mounting import has_scaled_head, verified_mosaic
 from processing.mosaic.pan_only import pan_only_mosaic
 from processing.mosaic.slips import Slip, find_slips, inside_slips, of_sensor, slip_of
 from processing.mosaic.support import contradicted_colour, supported_mosaic, weakly_placed
@@ -108,6 +108,8 @@ def _without_slips(
     frame to meet it halfway. Its size and reach are measured with the frame itself left out.
     """
     slips: tuple[Slip, ...] = ()
+    if has_scaled_head(rig, mosaic, tie_points):
+        return tie_points, mosaic, slips
     for _ in range(SLIP_ROUNDS):
         found = find_slips(rig, tie_points, mosaic.residuals_px)
         if not found:
@@ -117,6 +119,7 @@ def _without_slips(
         without = free_mosaic(rig, start, others, settings=settings)
         seen = residuals_px(without.model, without.placements, tie_points)
         slip = slip_of(rig, tie_points, seen, suspect) or found[0]
+        slip = replace(slip, alternatives=found[0].alternatives)
         slips += (slip,)
         tie_points = tie_points.only(~inside_slips(tie_points, (slip,)))
         mosaic = free_mosaic(rig, start, tie_points, settings=settings)

@@ -130,7 +130,8 @@ def judge(
     findings += _time_and_temperature(figures, missing_probes, probes_out_of_range, t)
     findings += _content(figures, mismatched_bands)
     findings += _stitching(figures, [b for b in nominal_bands if b not in mismatched_bands], t)
-    findings += _signal(figures) + _exposure(figures, t)
+    findings += [] if figures.get("mismatched_sensors") else _signal(figures)
+    findings += _exposure(figures, t)
     findings += _attitude(figures, t)
     broken = list(asked_findings(figures, asked or Asked()))
     findings = [f for f in findings if f.flag not in {b.flag for b in broken}] + broken
@@ -311,7 +312,7 @@ def _stitching(
     elsewhere = str(figures.get("mismatched_sensors") or "").split(", ")
     weak = str(figures.get("resting_on_calibration") or "").split(", ")
     resting = ", ".join(name for name in weak if name and name not in elsewhere)
-    if resting:
+    if resting and not figures.get("slip_sensor"):
         findings.append(
             Finding(
                 Flag.TIE_POINTS,
@@ -337,7 +338,7 @@ def _stitching(
         (t.sigma0_px, t.sigma0_refly_px),
         "The sensors do not fit together well; check exposure times and the mount of the heads.",
     )
-    findings += _platform(figures) + _slip(figures, t)
+    findings += _platform(figures) + _head_scale(figures, t) + _slip(figures, t)
     displaced = figures.get("displaced_sensor")
     if displaced or figures.get("displaced_several"):
         size = math.hypot(
@@ -409,6 +410,25 @@ def _platform(figures: Mapping[str, Figure]) -> list[Finding]:
     return [Finding(Flag.CALIBRATION_EXPIRED, Verdict.USABLE, sentence, test, 1.0)]
 
 
+def _head_scale(figures: Mapping[str, Figure], t: Thresholds) -> list[Finding]:
+    """A converging head whose scale does not fit: rotations cannot correct that."""
+    scale_ppm = _number(figures, "platform_scale_ppm")
+    if scale_ppm is None or abs(scale_ppm) <= t.head_scale_ppm:
+        return []
+    return [
+        Finding(
+            Flag.CALIBRATION_EXPIRED,
+            Verdict.USABLE,
+            f"The scale of head {figures.get('platform_scale_head')} differs by {scale_ppm:+.0f} "
+            "ppm from its neighbours': its principal distance is not as calibrated. The image is "
+            "not corrected for it; its stated accuracy includes it. Check the serial numbers, and "
+            "calibrate the head.",
+            scale_ppm,
+            t.head_scale_ppm,
+        )
+    ]
+
+
 def _content(figures: Mapping[str, Figure], bands: Sequence[str]) -> list[Finding]:
     """Frames with texture that show other ground than their neighbours."""
     frames = figures.get("mismatched_sensors")
@@ -434,12 +454,14 @@ def _slip(figures: Mapping[str, Figure], t: Thresholds) -> list[Finding]:
         return []
     others = str(figures.get("slip_sensors") or "").split(", ")[1:]
     also = f" Also shifted: {', '.join(dict.fromkeys(others))}." if others else ""
+    alternatives = figures.get("slip_alternatives")
+    instead = f" (or {alternatives}, which sees the same ground)" if alternatives else ""
     grave = shift_px >= t.slip_refly_px
     return [
         Finding(
             Flag.FRAME_CORRUPT,
             Verdict.REFLY if grave else Verdict.USABLE,
-            f"In the frame of {figures.get('slip_sensor')}, {figures.get('slip_axis')} "
+            f"In the frame of {figures.get('slip_sensor')}{instead}, {figures.get('slip_axis')} "
             f"{figures.get('slip_first')} to {figures.get('slip_last')} lie {shift_px:.1f} px off "
             f"the rest: lines were lost or repeated in read-out.{also} Check the head and its "
             "cable." + (" Fly this exposure again." if grave else ""),

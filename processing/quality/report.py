@@ -118,6 +118,8 @@ class Thresholds:
     """Test statistic over its critical value (0.1 %) from which a displaced sensor changes the
     verdict: of 100,000 healthy exposures one does. Below, the image is corrected and stays good."""
     slip_refly_px: float = 0.5
+    head_scale_ppm: float = 150.0
+    """Of converging heads: calibrated principal distances agree to a tenth of it."""
     tilt_rad: float = math.radians(5.0)
     crab_rad: float = math.radians(5.0)
     valid_refly_fraction: float = 0.75
@@ -171,6 +173,7 @@ FIGURES: Final[Mapping[str, str]] = {
     "shifted_sensors": "frames found farther from their calibrated place than points are sought",
     "shifted_px": "how far the farthest of them was, PAN pixels",
     "slip_sensor": "frame with a band of rows or columns that lies elsewhere than the rest",
+    "slip_alternatives": "frames that explain the same tie points nearly as well",
     "slip_cone": "the cone of that frame",
     "slip_px": "by how much it is shifted, PAN pixels",
     "slip_axis": "rows or columns",
@@ -178,6 +181,9 @@ FIGURES: Final[Mapping[str, str]] = {
     "slip_last": "last row or column of the band",
     "slip_sensors": "all frames with such a band, comma separated",
     "platform_residual_px": "largest shift an affine transformation still finds between heads",
+    "platform_scale_ppm": "largest difference of scale between a converging head and its "
+    "neighbours that its rotation does not explain",
+    "platform_scale_head": "which head that is",
     "projection_height_m": "height above ground a virtual camera projected its heads onto",
     "head_parallax_px": "parallax relief may leave between PAN heads after that, PAN pixels",
     "undetermined": "sensors and cones the tie points did not place, held at calibration and TDM",

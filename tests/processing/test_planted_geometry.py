@@ -118,3 +118,65 @@ def test_a_turned_cone_is_corrected_and_named(healthy: Planted, angle: str) -> N
     outcome = healthy.with_cone("2", turned(**{angle: 3e-4})).outcome()
     assert outcome.figure("platform_causes") == "2" and "CALIBRATION_EXPIRED" in outcome.flags
     assert_covered(outcome)
+
+
+@pytest.fixture(scope="module")
+def two_cones() -> Planted:
+    return rendered("ultracam-l-mini", seed=21, dc_k=6.0)
+
+
+@pytest.fixture(scope="module")
+def converging() -> Planted:
+    return rendered("dmc-mini", seed=21, dc_k=6.0)
+
+
+def test_healthy_exposures_of_other_rigs_raise_nothing(
+    two_cones: Planted, converging: Planted
+) -> None:
+    for planted in (two_cones, converging):
+        outcome = planted.outcome()
+        assert outcome.verdict == "good" and outcome.flags == set(), outcome.sentences
+        assert_covered(outcome)
+
+
+def test_a_master_of_one_sensor_with_a_wrong_principal_distance_is_named(
+    two_cones: Planted,
+) -> None:
+    outcome = two_cones.with_cone("0", with_f(1.001)).outcome()
+    assert outcome.figure("platform_causes") == "0"
+    assert_covered(outcome)
+
+
+def test_a_slip_that_two_frames_explain_alike_names_both(two_cones: Planted) -> None:
+    outcome = two_cones.with_frame("SU10", slipped("columns", 400, 2, 80)).outcome()
+    assert outcome.verdict == "refly"
+    named = {outcome.figure("slip_sensor"), outcome.figure("slip_alternatives")}
+    assert named == {"SU10", "RGB"} and " (or " in outcome.sentences
+
+
+@pytest.mark.parametrize("head", ["1", "2"])
+def test_a_converging_head_with_a_wrong_principal_distance_is_not_called_corrected(
+    converging: Planted, head: str
+) -> None:
+    outcome = converging.with_cone(head, with_f(1.001)).outcome()
+    assert outcome.verdict != "good" and "CALIBRATION_EXPIRED" in outcome.flags
+    assert "not corrected" in outcome.sentences and outcome.figure("slip_sensor") is None
+    assert_covered(outcome)
+
+
+def test_a_converging_head_that_turned_widens_the_sigma_by_the_mean(converging: Planted) -> None:
+    outcome = converging.with_cone("2", turned(x_rad=8e-4)).outcome()
+    assert "CALIBRATION_EXPIRED" in outcome.flags and outcome.figure("platform_shift_head") == "2"
+    assert outcome.inner_px < 0.02
+    assert_covered(outcome)
+
+
+@pytest.mark.parametrize(
+    ("axis", "first", "by", "length"), [("rows", 300, 1, None), ("columns", 400, 2, 80)]
+)
+def test_slips_of_converging_heads_are_named(
+    converging: Planted, axis: str, first: int, by: int, length: int | None
+) -> None:
+    outcome = converging.with_frame("P2", slipped(axis, first, by, length)).outcome()
+    assert outcome.verdict == "refly" and outcome.figure("slip_sensor") == "P2"
+    assert "CALIBRATION_EXPIRED" not in outcome.flags, outcome.sentences
