@@ -52,6 +52,36 @@ _ANY_SIZE = "numpy takes any negative size as the one to be computed"
 _SAME_LENGTHS = "both sequences are made of the same one just above"
 _OVERWRITTEN = "every reader comes after the first look has written it"
 EQUIVALENT: dict[str, str] = {
+    "daemon/disk/catalog.py: elif version < SCHEMA_VERSION:: < -> <=": (
+        "the same version was handled two branches above"
+    ),
+    'daemon/disk/catalog.py: code = getattr(error, "sqlite_errorcode", 0) & 0xFF: 0 -> 1': (
+        "neither 0 nor 1 (SQLITE_ERROR) is busy or locked"
+    ),
+    "daemon/flight/ledger.py: self._in_storage[Storage.VOLATILE] += 1: += -> -=": (
+        "the number of volatile exposures is never read"
+    ),
+    "daemon/flight/ledger.py: self._in_storage[Storage.VOLATILE] += 1: 1 -> 2": (
+        "the number of volatile exposures is never read"
+    ),
+    "daemon/timing/clock.py: COARSE_SIGMA_NS: Final = round((ARRIVAL_MAX_NS - ARRIVAL_MIN_NS)"
+    " / math.sqrt(12)): - -> +": "ARRIVAL_MIN_NS is 0",
+    "daemon/timing/clock.py: second = math.ceil((max(behind) + ARRIVAL_MIN_NS) / SECOND_NS): "
+    "+ -> -": "ARRIVAL_MIN_NS is 0",
+    "daemon/timing/clock.py: (r, min(1.0, limit * s / max(abs(r - middle), 1e-9)) / s**2): "
+    "1e-9 -> 1.5000000000000002e-09": (
+        "limit * s is 4 at least, so that a residual below 4 ns counts in full either way"
+    ),
+    "drivers/gps_time.py: leap = (difference + SECOND_NS // 2) // SECOND_NS: 2 -> 3": (
+        "within the slack of 1 ms both round alike, beyond it both give None"
+    ),
+    "drivers/septentrio/decoder.py: count=self._counts[channel] % (1 << COUNT_BITS),: 1 -> 2": (
+        "no flight has 2**32 marks"
+    ),
+    "drivers/gps_time.py: offset = (itow_ms * 1_000_000 - near_gps_ns + WEEK_NS // 2) % WEEK_NS"
+    " - WEEK_NS // 2: + -> -": "modulo a week, half a week more is half a week less",
+    "drivers/gps_time.py: difference = (itow_ms * 1_000_000 - utc + WEEK_NS // 2) % WEEK_NS"
+    " - WEEK_NS // 2: + -> -": "modulo a week, half a week more is half a week less",
     "processing/geometry/terrain_rays.py: "
     "over = point[:, 2] - model.at(point[:, :2]): 2 -> 3": "heights are read at columns 0 and 1",
     "processing/geometry/terrain_rays.py: "

@@ -88,6 +88,7 @@ def test_a_fault_that_was_just_raised_stands_once_and_nobody_has_seen_it() -> No
     latches.raise_fault("power", "low", "power")
     latches.apply({"event": "disk", "sentence": "full"})
     latches.add_previous([Latch("mirror", "disk", "slow", acknowledged=True)])
+    assert Latch("a", "b", "c") == Latch("a", "b", "c", True, False, 1, 0, False)
     power, disk, mirror = latches.unhandled()
     assert power == Latch("power", "power", "low", True, False, 1, 0, False)
     assert disk == Latch("disk", "disk", "full", True, False, 1, 0, False)
