@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
+from processing.geometry.projective import rotation_homography
+from processing.geometry.rotation import rotation_matrix
 from processing.mosaic.free import free_mosaic, vip_precision_px
-from processing.mosaic.support import SupportSettings, supported_mosaic
+from processing.mosaic.support import (
+    SupportSettings,
+    _layer_covariance,
+    _probe_covariance,
+    _sensor_variance,
+    supported_mosaic,
+)
 from processing.mosaic.validity import judge_master
 from processing.rig import find_rig
-from tests.processing.synthetic import make_truth, tie_points_of
+from tests.processing.synthetic import make_truth, no_tie_points, tie_points_of
 
 MINI = find_rig("ultracam-x-mini")
 
@@ -36,3 +46,57 @@ def test_an_image_without_its_master_cone_lies_as_surely_as_the_platform_says(no
     turned_px = SupportSettings().rotation_rad * cone.lens.f_mm / sensor.pitch_mm
     stated = vip_precision_px(image, "SU30", middle)[0]
     assert stated == pytest.approx(np.full(2, turned_px / np.sqrt(3.0)), rel=0.1)
+
+
+def test_a_sensor_is_known_as_well_as_its_calibration_and_its_corners_as_its_place() -> None:
+    sensor = MINI.sensor("SU10")
+    read = {sensor.probe: sensor.calibration_c + 7.0}
+    place_mm = math.hypot(sensor.position_sigma_um, 7.0 * sensor.drift.sigma_um_per_k) * 1e-3
+    half_mm = math.hypot(sensor.width_px, sensor.height_px) * sensor.pitch_mm / 2.0
+    x, y, rotation, scale = np.sqrt(_sensor_variance(sensor, read))
+    assert (x, y) == pytest.approx((place_mm, place_mm))
+    # Half a diagonal away, rotation and scale move a point as much as the place is uncertain.
+    assert (rotation * half_mm, scale * half_mm) == pytest.approx((place_mm, place_mm))
+    cold = np.sqrt(_sensor_variance(sensor, {}))[0]
+    assert cold == pytest.approx(sensor.position_sigma_um * 1e-3)
+
+
+def test_a_rotated_cone_moves_its_layer_as_its_homography_does() -> None:
+    truth = make_truth(MINI, np.random.default_rng(1))
+    mosaic = free_mosaic(MINI, truth.start, no_tie_points(MINI))
+    settings = SupportSettings(
+        rotation_rad=1e-5, floor_px=0.05, colour_floor_px=0.3, colour_shift_px=3.0
+    )
+    f, half = MINI.cone("1").lens.f_mm, mosaic.model.half_size_mm
+    norm = np.diag([1.0 / half, 1.0 / half, 1.0])
+    expected = np.zeros((8, 8))
+    for axis in np.eye(3) * 1e-5:
+        turned = norm @ rotation_homography(rotation_matrix(*axis), f, f) @ np.linalg.inv(norm)
+        expected += np.outer(*[(turned - np.eye(3)).ravel()[:8]] * 2)
+    pixel = mosaic.model.pitch_mm / half
+    pan = _layer_covariance(mosaic, MINI.cone("1"), settings)
+    floor = np.diag([(0.05 * pixel) ** 2] * 8)
+    np.testing.assert_allclose(pan, expected + floor, rtol=1e-3, atol=1e-14)
+    colour = _layer_covariance(mosaic, MINI.cone("G"), settings)
+    own = np.array([0.3, 0.3, 3.0, 0.3, 0.3, 3.0, 0.3, 0.3]) * pixel
+    turned_only = _layer_covariance(
+        mosaic,
+        MINI.cone("G"),
+        SupportSettings(rotation_rad=1e-5, colour_floor_px=0.0, colour_shift_px=0.0),
+    )
+    np.testing.assert_allclose(colour - turned_only, np.diag(own**2), rtol=1e-6, atol=1e-16)
+
+
+@pytest.mark.parametrize(("read", "sigma_k"), [(("0", "1"), 0.1), (("1",), 2.0), ((), 15.0)])
+def test_a_probe_moves_all_its_sensors_together(read: tuple[str, ...], sigma_k: float) -> None:
+    truth = make_truth(MINI, np.random.default_rng(1))
+    mosaic = free_mosaic(MINI, truth.start, no_tie_points(MINI))
+    sensors = MINI.master_sensors
+    found = _probe_covariance(mosaic, sensors, dict.fromkeys(read, 25.0), SupportSettings())
+    moved = np.zeros(len(mosaic.model.names))
+    for s in sensors:
+        first, drift = mosaic.model.sensors[s.name], s.drift
+        moved[first : first + 2] = drift.x_um_per_k * 1e-3, drift.y_um_per_k * 1e-3
+        moved[first + 2] = drift.rotation_urad_per_k * 1e-6
+        moved[first + 3] = drift.scale_ppm_per_k * 1e-6
+    np.testing.assert_allclose(found, np.outer(moved, moved) * sigma_k**2, rtol=1e-9)
