@@ -276,3 +276,14 @@ def test_the_recorded_m8t_knows_18_leap_seconds() -> None:
     decoder = UbxDecoder("m8t")
     assert decoder.feed(recorded, 0) == []
     assert decoder.leap_seconds == 18
+
+
+def test_a_mark_in_utc_without_leap_seconds_keeps_its_time_and_is_counted() -> None:
+    decoder = UbxDecoder("gnss")
+    (mark,) = decoder.feed(tim_tm2(WEEK, 1000, 7, base=UTC), 77)
+    assert mark.gps_ns == WEEK * WEEK_NS + 1_000_000_007
+    decoder.feed(tim_tm2(WEEK, 2000, 7) + tim_tm2(WEEK, 3000, 7, rising=False, falling=True), 77)
+    assert (decoder.counters["marks"], decoder.counters["marks_other_edge"]) == (2, 1)
+    assert decoder.other_edges == 1
+    decoder.feed(tim_tm2(WEEK, 4000, 7), 77)
+    assert decoder.other_edges == 0

@@ -133,3 +133,30 @@ def test_recorded_frames_are_those_that_pyubx2_finds(path: Path) -> None:
     framer = UbxFramer(LENGTHS)
     assert framer.feed(recorded) == theirs
     assert framer.bad_frames == 0
+
+
+@pytest.mark.parametrize(("size", "is_one"), [(8192, True), (8193, False)])
+def test_a_payload_is_at_most_8192_bytes(size: int, is_one: bool) -> None:
+    framer = UbxFramer()
+    assert len(framer.feed(frame(0x10, 0x02, bytes(size)))) == is_one
+    assert (framer.frames, framer.frame_bytes) == ((1, size + 8) if is_one else (0, 0))
+
+
+def test_every_class_of_a_receiver_is_one_and_no_other() -> None:
+    classes = [c for c in range(256) if UbxFramer().feed(frame(c, 0x70, b"x"))]
+    assert classes == [
+        *(0x01, 0x02, 0x04, 0x05, 0x06, 0x09, 0x0A, 0x0B, 0x0D, 0x10, 0x13, 0x21, 0x27, 0x28, 0x29)
+    ]
+
+
+def test_bytes_are_counted_by_what_they_were() -> None:
+    framer = UbxFramer()
+    assert framer.feed(b"ab\x80" + nav_eoe(1) + b"\xb5\x62\xff" + nav_eoe(2) + b"\xb5") == [
+        *(nav_eoe(1), nav_eoe(2))
+    ]
+    size = len(nav_eoe(1))
+    assert (framer.frames, framer.frame_bytes, framer.bad_frames) == (2, 2 * size, 0)
+    # Of the sync without a frame 0x62 is printable.
+    assert (framer.other_bytes, framer.bad_bytes, framer.pending) == (3, 3, 1)
+    framer.reset()
+    assert (framer.bad_bytes, framer.pending) == (4, 0)

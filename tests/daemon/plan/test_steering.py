@@ -136,3 +136,95 @@ def test_without_position_or_without_motion_nothing_is_due() -> None:
     assert steering.due(0, None, still) is None
     assert steering.due(0, None, replace(any_sample(0.0), fix="none")) is None
     assert steering.line_of(0, None) is None
+
+
+def at(
+    east_m: float, north_m: float, speed_mps: float = SPEED_MPS, course_deg: float = 0.0
+) -> NavSample:
+    place = PLANE.place(east_m, north_m)
+    course = math.radians(course_deg)
+    return replace(
+        any_sample(0.0),
+        mono_ns=0,
+        latitude_deg=place.latitude_deg,
+        longitude_deg=place.longitude_deg,
+        velocity_ned_mps=(speed_mps * math.cos(course), speed_mps * math.sin(course), 0.0),
+    )
+
+
+@pytest.mark.parametrize(
+    ("sample", "is_on"),
+    [
+        (at(79.9, 500.0), True),
+        (at(80.1, 500.0), False),
+        (at(-79.9, 500.0), True),
+        (at(-80.1, 500.0), False),
+        (at(0.0, 500.0, course_deg=19.9), True),
+        (at(0.0, 500.0, course_deg=20.1), False),
+        (at(0.0, 500.0, course_deg=199.9), True),
+        (at(0.0, 500.0, speed_mps=0.99), False),
+        (at(0.0, 500.0, speed_mps=1.01), True),
+        (at(0.0, 1099.9), True),
+        (at(0.0, 1100.1), False),
+        (at(0.0, -5000.0), True),
+    ],
+)
+def test_a_line_is_flown_within_its_corridor_and_course(sample: NavSample, is_on: bool) -> None:
+    assert (trigger(line("7", 0.0)).on_line(sample) is not None) is is_on
+
+
+@pytest.mark.parametrize(
+    ("course_deg", "along_m", "across_m"), [(0, 400.0, 30.0), (180, 600.0, -30.0)]
+)
+def test_a_place_on_a_line_is_counted_in_flight_direction(
+    course_deg: float, along_m: float, across_m: float
+) -> None:
+    here = trigger(line("7", 100.0)).on_line(at(130.0, 400.0, course_deg=course_deg))
+    assert here is not None
+    assert (here.along_m, here.across_m, here.length_m) == pytest.approx(
+        (along_m, across_m, 1000.0), abs=1e-6
+    )
+    assert (here.speed_mps, here.is_reversed) == (pytest.approx(SPEED_MPS), course_deg == 180)
+    assert here.along_at_m(2 * NS) == pytest.approx(along_m + 2 * SPEED_MPS)
+
+
+@pytest.mark.parametrize(
+    ("north_m", "name"), [(-49.9, "7"), (-50.1, None), (1049.9, "7"), (1050.1, None)]
+)
+def test_an_exposure_is_of_a_line_up_to_half_a_distance_beyond_its_ends(
+    north_m: float, name: str | None
+) -> None:
+    found = trigger(line("7", 0.0)).line_of(0, at(0.0, north_m))
+    assert (found.id if found else None) == name
+
+
+@pytest.mark.parametrize(("north_m", "next_m"), [(224.9, 200.0), (225.1, 300.0)])
+def test_a_place_is_exposed_late_by_a_quarter_of_the_distance_at_most(
+    north_m: float, next_m: float
+) -> None:
+    steering = trigger(line("7", 0.0))
+    due_ns = steering.due(0, None, at(0.0, north_m))
+    assert due_ns == pytest.approx((next_m - north_m) / SPEED_MPS * NS, abs=1e3)
+
+
+@pytest.mark.parametrize(("north_m", "next_m"), [(175.1, 300.0), (174.9, 200.0)])
+def test_an_exposure_counts_for_a_place_from_a_quarter_of_the_distance_on(
+    north_m: float, next_m: float
+) -> None:
+    steering = trigger(line("7", 0.0))
+    sample = at(0.0, north_m)
+    steering.fired(0, sample)
+    due_ns = steering.due(0, None, sample)
+    assert due_ns == pytest.approx((next_m - north_m) / SPEED_MPS * NS, abs=1e3)
+
+
+def test_of_lines_that_overlap_the_one_that_is_flown_goes_before_the_one_ahead() -> None:
+    near, ahead = (
+        line("near", 50.0),
+        PlannedLine("ahead", PLANE.place(0, 600), PLANE.place(0, 1600)),
+    )
+    for lines in ((near, ahead), (ahead, near)):
+        here = trigger(*lines).on_line(at(0.0, 500.0))
+        assert here is not None and here.line.id == "near"
+        here = trigger(*lines).on_line(at(0.0, 700.0))
+        assert here is not None and here.line.id == "ahead"
