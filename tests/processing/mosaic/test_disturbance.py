@@ -34,7 +34,13 @@ def found(
     slips: tuple[Slip, ...] = (),
 ) -> Disturbance:
     return disturbance_of(
-        rig, mosaic, validity=validity, estimated_dc=estimated_dc, layers=layers, slips=slips
+        rig,
+        mosaic,
+        validity=validity,
+        estimated_dc=estimated_dc,
+        layers=layers,
+        platform=None,
+        slips=slips,
     )
 
 

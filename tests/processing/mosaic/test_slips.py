@@ -241,6 +241,7 @@ def test_figures_name_the_first_slip_and_all_frames() -> None:
         "slip_axis": "rows",
         "slip_first": 100,
         "slip_last": 200,
+        "slip_alternatives": None,
         "slip_sensors": "SU00, SU10",
     }
     assert set(slip_figures(MINI, ()).values()) == {None}
