@@ -434,10 +434,10 @@ def configuration(rig: Rig, exposures: int) -> Configuration:
             {
                 "sensor": sensor.name,
                 "driver": "aravis",
-                "address": "127.0.0.2",
+                "address": f"127.0.0.{number}",
                 "exposure_time_us": EXPOSURE_NS / 1000,
             }
-            for sensor in rig.sensors
+            for number, sensor in enumerate(rig.sensors, start=2)
         ],
     }
     return from_mapping(content, Path("service.toml"))[0]
