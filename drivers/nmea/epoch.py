@@ -183,11 +183,11 @@ class Epoch:
             self._place(fields[1:5], rank=1)
 
     def _gst(self, fields: Fields) -> None:
-        self._sigmas(*(number_or_none(text) for text in fields[6:9]))
+        self._sigmas(*(number_or_none(fields[n]) for n in (6, 7, 8)))
 
     def _gbs(self, fields: Fields) -> None:
         if self.horizontal_sigma_m is None:
-            self._sigmas(*(number_or_none(text) for text in fields[2:5]))
+            self._sigmas(*(number_or_none(fields[n]) for n in (2, 3, 4)))
 
     def _zda(self, fields: Fields) -> None:
         if all(fields[2:5]):

@@ -59,6 +59,7 @@ def test_capture_alone_loses_nothing_and_says_what_it_took(tmp_path: Path) -> No
     assert told["frames_exposed"] == told["frames_sent"] == 4 * 5
     assert told["looked_at"] == 4
     assert told["read_whole"] == 1
-    assert set(told["cpu_s"]) == {"service", "writer", "capture", "heads 1", "heads 2"}
+    processes = {"service", "writer", "capture", "worker", "heads 1", "heads 2"}
+    assert set(told["cpu_s"]) == processes
     assert told["cpu_s"]["capture"] > 0
     assert list(tmp_path.glob("syntopic-capture-*")) == [], "nothing is left"

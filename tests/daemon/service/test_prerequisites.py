@@ -119,4 +119,5 @@ def test_what_prevents_ends_the_looking_and_a_restart_measures_nothing(planted: 
 
     found = prerequisites.prerequisites(configuration, rig, (prevents, never))
     assert [one.name for one in found] == ["b"]
-    assert set(LOOKS) - set(AFTER_RESTART) == {prerequisites.pace}
+    # The health of disks is watched in flight anyway.
+    assert set(LOOKS) - set(AFTER_RESTART) == {prerequisites.pace, prerequisites.disk_health}
