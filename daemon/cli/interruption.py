@@ -41,7 +41,9 @@ SENTENCES = {
     "kernels": f"the kernels compiled so far are kept; {AGAIN} to compile the others",
     "install": f"every file written so far is complete; {AGAIN} to finish",
     "uninstall": f"every file left is complete; {AGAIN} to finish",
-    **dict.fromkeys(("explain", "check", "verify", "replay", "advise", "disk-health"), _NOTHING_WRITTEN),
+    **dict.fromkeys(
+        ("explain", "check", "verify", "replay", "advise", "disk-health"), _NOTHING_WRITTEN
+    ),
     **dict.fromkeys(("bench", "rigs", "token list"), _NOTHING_WRITTEN),
     "token": (
         "the token file is complete; run `syntopic token list` to see whether it was changed"
