@@ -130,6 +130,7 @@ def judge(
     findings += _time_and_temperature(figures, missing_probes, probes_out_of_range, t)
     findings += _content(figures, mismatched_bands)
     findings += _stitching(figures, [b for b in nominal_bands if b not in mismatched_bands], t)
+    findings += _words(figures)
     findings += [] if figures.get("mismatched_sensors") else _signal(figures)
     findings += _exposure(figures, t)
     findings += _attitude(figures, t)
@@ -431,8 +432,9 @@ def _head_scale(figures: Mapping[str, Figure], t: Thresholds) -> list[Finding]:
 
 def _content(figures: Mapping[str, Figure], bands: Sequence[str]) -> list[Finding]:
     """Frames with texture that show other ground than their neighbours."""
-    frames = figures.get("mismatched_sensors")
-    named = ", ".join([*([str(frames)] if frames else []), *bands])
+    misread = str(figures.get("word_format_sensors") or "").split(", ")
+    frames = str(figures.get("mismatched_sensors") or "").split(", ")
+    named = ", ".join([*(f for f in frames if f and f not in misread), *bands])
     if not named:
         return []
     return [
@@ -471,20 +473,25 @@ def _slip(figures: Mapping[str, Figure], t: Thresholds) -> list[Finding]:
     ]
 
 
-def _signal(figures: Mapping[str, Figure]) -> list[Finding]:
-    """Signal that a head, its read-out or the format of its words has changed."""
-    findings = []
+def _words(figures: Mapping[str, Figure]) -> list[Finding]:
+    """Words that have another format than the rig file says."""
     words = figures.get("word_format")
-    if words:
-        findings.append(
-            Finding(
-                Flag.FRAME_CORRUPT,
-                Verdict.REFLY,
-                f"The words of {figures.get('word_format_sensors')} are {words}, not as the rig "
-                "file says: set the pixel format of the head, or `bits` and `justified` in the rig "
-                "file. The pixels stored are good; process them again with the right rig file.",
-            )
+    if not words:
+        return []
+    return [
+        Finding(
+            Flag.FRAME_CORRUPT,
+            Verdict.REFLY,
+            f"The words of {figures.get('word_format_sensors')} are {words}, not as the rig "
+            "file says: set the pixel format of the head, or `bits` and `justified` in the rig "
+            "file. The pixels stored are good; process them again with the right rig file.",
         )
+    ]
+
+
+def _signal(figures: Mapping[str, Figure]) -> list[Finding]:
+    """Signal that a head or its read-out has changed."""
+    findings = []
     step = _number(figures, "signal_step")
     if step is not None:
         lines = _number(figures, "signal_step_lines") or 1.0
