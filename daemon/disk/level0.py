@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from daemon.disk.records import canonical_bytes
 from daemon.errors import DaemonError
+from drivers.tiff_layout import layout_problem
 
 PIXEL_ALIGNMENT = 4096
 """Pixels start on a page, so that a file can be mapped and read with aligned words."""
@@ -146,6 +147,8 @@ def _first_page(path: Path, file: BytesIO | None = None) -> Iterator[Any]:
 
     try:
         with TiffFile(path if file is None else file) as tiff:
+            if problem := layout_problem(tiff):
+                raise RasterError(f"{path.name}: {problem}")
             page = tiff.pages[0]
             refuse_bomb(page, path)
             yield page

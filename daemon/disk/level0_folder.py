@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.disk.frame_checks import mismatches
+from daemon.disk.frame_files import frame_files, other_spelling
 from daemon.disk.level0 import RasterError, read_frame
 from daemon.disk.records import RECORD_MAX_BYTES, RecordError, parse_record, sha256_hex
 from daemon.exposure import (
@@ -83,8 +84,8 @@ def load_level0(
     Each file is read once and hashed as it is read; it is compared with its record and with the
     rig (`daemon.disk.frame_checks`).
 
-    What the record does not say is filled in: without `frames` every `<sensor>.tif` of the rig is
-    taken; sensors without a file are listed as missing.
+    What the record does not say is filled in: without `frames` the TIFF of each sensor is
+    taken (`daemon.disk.frame_files`); sensors without a file are listed as missing.
 
     Args:
         folder: such as `L0/000001`.
@@ -102,8 +103,8 @@ def load_level0(
     exposure = _record_or_defaults(folder)
     records = list(exposure.frames)
     if not records and exposure.state != "lost":
-        present = [s for s in rig.sensors if (folder / f"{s.name}.tif").exists()]
-        records = [_default_frame(sensor) for sensor in present]
+        files = frame_files(folder, [sensor.name for sensor in rig.sensors])
+        records = [_default_frame(rig.sensor(name), file) for name, file in files.items()]
     frames: dict[str, NDArray[np.uint16]] = {}
     kept: list[FrameRecord] = []
     missing = dict(exposure.missing)
@@ -124,6 +125,10 @@ def load_level0(
             continue
         path = folder / (record.file or f"{record.sensor}.tif")
         if not path.exists():
+            if other := other_spelling(path):
+                problems.append(
+                    f"{folder.name}/{other}: the record names it {path.name}; rename it"
+                )
             missing.setdefault(record.sensor, f"{path.name} is not in its folder")
             continue
         try:
@@ -172,11 +177,11 @@ def _record_or_defaults(folder: Path) -> Exposure:
     return Exposure(number=int(folder.name) if folder.name.isdigit() and int(folder.name) else 1)
 
 
-def _default_frame(sensor: Sensor) -> FrameRecord:
+def _default_frame(sensor: Sensor, file: str) -> FrameRecord:
     return FrameRecord(
         sensor=sensor.name,
         head_serial=sensor.serial,
-        file=f"{sensor.name}.tif",
+        file=file,
         sha256="",
         width_px=sensor.width_px,
         height_px=sensor.height_px,

@@ -28,6 +28,7 @@ from daemon.disk.records import canonical_bytes, sha256_hex
 from daemon.errors import DaemonError
 from daemon.exposure import Exposure, FrameRecord, exposure_bytes
 from daemon.importers.xmp import Xmp, XmpError, read_xmp
+from drivers.tiff_layout import layout_problem
 from processing.geometry.brown import Brown, lens_from_brown
 from processing.radiometry.radiance import RadianceCalibration, radiance_as_json
 from processing.rig import Cone, Rig, find_rig
@@ -166,6 +167,8 @@ def read_image(path: Path) -> tuple[RedEdgeImage, NDArray[np.uint16]]:
         if path.stat().st_size > _MAX_FILE_BYTES:
             raise ImagesError([f"{path.name}: larger than {_MAX_FILE_BYTES} bytes; no image"])
         with TiffFile(path) as tiff:
+            if problem := layout_problem(tiff):
+                raise ImagesError([f"{path.name}: {problem}"])
             page = tiff.pages[0]
             tags = {code: page.tags[code].value for code in (_XMP, _EXIF) if code in page.tags}
             tags |= {c: page.tags[c].value for c in (_GPS, _BLACK_LEVEL) if c in page.tags}

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from drivers.tiff_layout import layout_problem
+
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
@@ -74,6 +76,8 @@ def read_frame(path: Path, *, room_nbytes: int) -> FrameFile:
 
     try:
         with TiffFile(path) as tiff:
+            if problem := layout_problem(tiff):
+                raise FrameFileError(problem)
             page = tiff.pages[0]
             shape, dtype = page.shape, page.dtype
             if len(shape) != 2 or str(dtype) != "uint16":

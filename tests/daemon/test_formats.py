@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from daemon.disk.mission import Mission
-from daemon.disk.records import parse_record
+from daemon.disk.records import RecordError, parse_record
 from daemon.disk.store import load_level0, verify
 from daemon.exposure import Exposure, NavigationRecord, capture_bytes, from_json, to_json
 from processing.quality.report import FIGURES, Flag, Thresholds
@@ -78,6 +78,18 @@ def test_a_listed_frame_without_its_file_is_a_missing_frame(by_hand):
     frames, exposure = load_level0(by_hand.level0(1), load_rig(by_hand.rig_path))
     assert "G" not in frames
     assert exposure.missing == (("G", "G.tif is not in its folder"),)
+
+
+@pytest.mark.trust
+def test_a_frame_with_another_suffix_is_taken_or_its_name_corrected(by_hand):
+    folder, rig = by_hand.level0(1), load_rig(by_hand.rig_path)
+    (folder / "SU30.tif").rename(folder / "SU30.TIF")
+    with pytest.raises(RecordError, match=r"SU30\.TIF: the record names it SU30\.tif; rename"):
+        load_level0(folder, rig)
+    (folder / "exposure.json").unlink()
+    frames, exposure = load_level0(folder, rig)
+    assert exposure.state == "complete" and exposure.frame("SU30").file == "SU30.TIF"
+    assert len(frames) == 13
 
 
 def test_every_key_of_the_records_is_named(page):
