@@ -3,23 +3,27 @@
 Draws mutations by seed from the modules that decide truth, applies each to a copy of the tree, and
 runs the tests nearest to the module: those that import it, the one of its name first. A mutation
 that they do not notice is listed. Names in `EQUIVALENT` are changes that alter no outcome.
+
+`--only` and `--skip` run a part of the same draw. With `--record` a run that was stopped goes on
+where it stood.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
+import hashlib
 import json
 import os
-import random
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from benchmarks.mutations import Mutation, mutations
@@ -46,7 +50,11 @@ NOT_DECIDING = ("drawing.py", "findings.py")
 """Pictures and sentences: no decision rests on them."""
 MOST_TEST_FILES = 8
 """So many of the nearest test files run, nearest first."""
-SLOWEST_S = 300
+SLOWEST_S = 600
+"""So long may one test file take without a mutation."""
+TIME_FACTOR = 3
+LEAST_LIMIT_S = 20.0
+"""A mutation has this many times what the file takes without it, and no less than so long."""
 NOTICED_GOAL = 0.9
 _ANY_SIZE = "numpy takes any negative size as the one to be computed"
 _SAME_LENGTHS = "both sequences are made of the same one just above"
@@ -148,6 +156,7 @@ class Outcome:
 
     module: str
     line: int
+    column: int
     before: str
     after: str
     source: str
@@ -166,38 +175,59 @@ def main() -> None:
     )
     parser.add_argument("--count", type=int, default=300, help="mutations to draw (default: 300)")
     parser.add_argument("--seed", type=int, default=1, help="seed of the draw (default: 1)")
-    parser.add_argument("--skip", type=int, default=0, help="leave out the first ones of the draw")
     parser.add_argument("--only", default="", help="only modules whose path contains this")
-    parser.add_argument("--record", type=Path, help="append each outcome as a line of JSON")
+    parser.add_argument("--skip", default="", help="leave out modules whose path contains this")
+    parser.add_argument("--record", type=Path, help="append outcomes as lines of JSON, and resume")
     parser.add_argument("--json", action="store_true", help="print one JSON object at the end")
     options = parser.parse_args()
-    drawn = draw(options.count, options.seed, options.only)[options.skip :]
+    drawn = [
+        (module, mutation)
+        for module, mutation in draw(options.count, options.seed)
+        if options.only in module and not (options.skip and options.skip in module)
+    ]
+    known = _recorded(options.record)
     outcomes = []
     with tempfile.TemporaryDirectory(prefix="syntopic-mutations-") as folder:
-        tree = _copy_tree(Path(folder))
-        importers = _importers()
-        for number, (module, mutation) in enumerate(drawn, 1 + options.skip):
-            outcome = _try(tree, module, mutation, nearest_tests(module, importers))
+        tests = NearestTests(Path(folder))
+        for number, (module, mutation) in enumerate(drawn, 1):
+            source = (ROOT / module).read_text()
+            outcome = known.get(_key(module, mutation, source))
+            if outcome is None:
+                outcome = _try(tests, module, mutation, source)
+                if options.record:
+                    with options.record.open("a") as record:
+                        record.write(json.dumps(asdict(outcome)) + "\n")
+            if outcome.outcome == "survived" and outcome.name in EQUIVALENT:
+                outcome = replace(outcome, outcome="equivalent")
             outcomes.append(outcome)
             if not options.json:
-                progress = f"{number}/{options.skip + len(drawn)}"
-                print(f"{progress} {outcome.outcome:9} {outcome.name}", flush=True)
-            if options.record:
-                with options.record.open("a") as record:
-                    record.write(json.dumps(asdict(outcome)) + "\n")
+                print(f"{number}/{len(drawn)} {outcome.outcome:9} {outcome.name}", flush=True)
     _print(outcomes, options.seed, as_json=options.json)
 
 
-def draw(count: int, seed: int, only: str = "") -> list[tuple[str, Mutation]]:
-    """Draw mutations, every place of every deciding module with the same probability."""
+def draw(count: int, seed: int) -> list[tuple[str, Mutation]]:
+    """Draw mutations, every place of every deciding module with the same probability.
+
+    Each place has a rank that depends on the seed, its module and its text alone, and those of the
+    lowest ranks are drawn: a change of one module changes nothing in what is drawn of others.
+    """
     modules = sorted(
         str(path.relative_to(ROOT))
         for pattern in DECIDING
         for path in ROOT.glob(pattern)
-        if path.name not in NOT_DECIDING and only in str(path)
+        if path.name not in NOT_DECIDING
     )
-    places = [(m, place) for m in modules for place in mutations((ROOT / m).read_text())]
-    return random.Random(seed).sample(places, min(count, len(places)))
+    ranked = []
+    for module in modules:
+        source = (ROOT / module).read_text()
+        repeated: Counter[str] = Counter()
+        for place in mutations(source):
+            name = "\0".join((str(seed), module, _line(source, place), place.before, place.after))
+            rank = hashlib.sha256(f"{name}\0{repeated[name]}".encode()).digest()
+            repeated[name] += 1
+            ranked.append((rank, module, place))
+    ranked.sort(key=lambda each: each[0])
+    return [(module, place) for _, module, place in ranked[:count]]
 
 
 def nearest_tests(module: str, importers: dict[str, set[str]]) -> list[str]:
@@ -238,7 +268,7 @@ def _importers() -> dict[str, set[str]]:
 
 def _copy_tree(folder: Path) -> Path:
     tree = folder / "tree"
-    tree.mkdir()
+    tree.mkdir(parents=True)
     for name in COPIED:
         shutil.copytree(ROOT / name, tree / name)
     for name in ("pyproject.toml", "README.md", "CHANGELOG.md", "Makefile", "requirements.lock"):
@@ -249,54 +279,95 @@ def _copy_tree(folder: Path) -> Path:
     return tree
 
 
-def _try(tree: Path, module: str, mutation: Mutation, tests: Sequence[str]) -> Outcome:
-    path = tree / module
-    source = (ROOT / module).read_text()
+def _try(tests: NearestTests, module: str, mutation: Mutation, source: str) -> Outcome:
+    path = tests.tree / module
+    nearest = tests.of(module)
     started = time.monotonic()
     try:
         path.write_text(mutation.apply(source))
-        outcome = _run(tree, tests) if tests else "no tests"
+        outcome = tests.judge(nearest) if nearest else "no tests"
     finally:
         path.write_text(source)
-    result = Outcome(
-        module,
-        mutation.line,
-        mutation.before,
-        mutation.after,
-        source.splitlines()[mutation.line - 1].strip(),
-        outcome,
-        len(tests),
-        round(time.monotonic() - started, 1),
-    )
-    if outcome == "survived" and result.name in EQUIVALENT:
-        return Outcome(**{**asdict(result), "outcome": "equivalent"})
-    return result
+    seconds = round(time.monotonic() - started, 1)
+    return Outcome(*_key(module, mutation, source), outcome, len(nearest), seconds)
 
 
-def _run(tree: Path, tests: Sequence[str]) -> str:
-    """Run the nearest tests, the nearest first, until one of them fails."""
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider"]
+class NearestTests:
+    """The test files nearest to each module, run in a copy of the tree that mutations change.
+
+    Another copy stays unchanged; it shows which files pass without a mutation, and how fast.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.tree, self._unchanged = _copy_tree(folder / "a"), _copy_tree(folder / "b")
+        self._importers = _importers()
+        self._seconds: dict[str, float | None] = {}
+
+    def of(self, module: str) -> list[str]:
+        return nearest_tests(module, self._importers)
+
+    def judge(self, tests: Sequence[str]) -> str:
+        """Run test files on the changed tree until one of them fails."""
+        for test in tests:
+            plain_s = self._plain_seconds(test)
+            if plain_s is None:
+                continue
+            passed = _passes(self.tree, test, max(LEAST_LIMIT_S, TIME_FACTOR * plain_s))
+            if not passed:
+                return "timeout" if passed is None else "noticed"
+        return "survived"
+
+    def _plain_seconds(self, test: str) -> float | None:
+        """How long a test file takes without a mutation; None where it does not pass."""
+        if test not in self._seconds:
+            started = time.monotonic()
+            passed = _passes(self._unchanged, test, SLOWEST_S)
+            self._seconds[test] = time.monotonic() - started if passed else None
+            if not passed:
+                print(f"left out, fails without a mutation: {test}", file=sys.stderr, flush=True)
+        return self._seconds[test]
+
+
+def _passes(tree: Path, test: str, limit_s: float) -> bool | None:
+    """Whether a test file passes; None where it exceeds the time limit."""
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", test]
     environment = os.environ | {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
-    started = time.monotonic()
-    for test in tests:
-        left_s = SLOWEST_S - (time.monotonic() - started)
-        if left_s <= 0:
-            break
+    with subprocess.Popen(
+        command,
+        cwd=tree,
+        env=environment,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    ) as ran:
         try:
-            ran = subprocess.run(
-                [*command, test],
-                cwd=tree,
-                env=environment,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-                timeout=left_s,
-                check=False,
-            )
+            return ran.wait(limit_s) in (0, 5)
         except subprocess.TimeoutExpired:
-            return "timeout"
-        if ran.returncode not in (0, 5):
-            return "noticed"
-    return "survived"
+            # Processes that the tests started end with them.
+            os.killpg(ran.pid, signal.SIGKILL)
+            return None
+
+
+def _line(source: str, mutation: Mutation) -> str:
+    return source.splitlines()[mutation.line - 1].strip()
+
+
+_Key = tuple[str, int, int, str, str, str]
+
+
+def _key(module: str, mutation: Mutation, source: str) -> _Key:
+    """The first fields of an outcome: they name a mutation of this state of the module."""
+    before = source.encode()[: mutation.start]
+    column = mutation.start - (before.rfind(b"\n") + 1)
+    line = _line(source, mutation)
+    return module, mutation.line, column, mutation.before, mutation.after, line
+
+
+def _recorded(record: Path | None) -> dict[_Key, Outcome]:
+    """Outcomes of an earlier run."""
+    lines = record.read_text().splitlines() if record and record.exists() else []
+    outcomes = [Outcome(**json.loads(line)) for line in lines]
+    return {(o.module, o.line, o.column, o.before, o.after, o.source): o for o in outcomes}
 
 
 def _print(outcomes: Sequence[Outcome], seed: int, *, as_json: bool) -> None:
