@@ -10,6 +10,7 @@ from __future__ import annotations
 import ipaddress
 import socket
 import time
+import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
@@ -25,6 +26,9 @@ NEW_PORT_AFTER_S: Final = 2.0
 """A sender that was silent for so long may come back from another port: it was restarted."""
 
 Address = tuple[str, int]
+
+listening: Final[weakref.WeakSet[socket.socket]] = weakref.WeakSet()
+"""The sockets of this process that listen here; from before they are bound."""
 
 
 @dataclass
@@ -154,6 +158,7 @@ def open_udp_port(address: str) -> UdpPort:
     udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         if is_listening:
+            listening.add(udp)
             udp.bind(place)
             return UdpPort(udp, Sender(only_from, is_configured=only_from is not None))
         udp.connect(place)

@@ -187,6 +187,10 @@ class Flight:
         self.idle_slots.append((frame.head, frame.slot))
         return cause
 
+    def has_pulse_of(self, frame: Frame) -> bool:
+        """Whether the pulse of a frame is known, so that one given just now cannot be its own."""
+        return self._matcher.has_pulse_of(frame)
+
     def _read_latch(self, frame: Frame) -> None:
         at_ns, mono_ns = frame.device_clock_ns, frame.device_clock_mono_ns
         if at_ns is not None and mono_ns is not None and frame.latch_sigma_ns is not None:

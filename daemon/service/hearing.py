@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Final, Protocol
 
 from daemon.disk.log_records import LoggedTrigger
 from daemon.flight.decisions import Decision
@@ -30,6 +30,8 @@ from drivers.contract import (
     TemperatureSample,
 )
 
+EARLY_FRAME_LIMIT_NS: Final = 12_000_000_000
+"""So long a frame waits for the answer to a trigger; a trigger answers within ten seconds."""
 _LEAVES = frozenset({"lost", "absent"})
 """Heads are not waited for from then on."""
 
@@ -69,9 +71,12 @@ class Hearing(Desk):
         self.serials: dict[str, str] = {}
         self._navigators: set[str] = set()
         self.orders: dict[int, Order] = {}
+        self._early: list[Frame] = []
 
     def tell_of_time(self, now_ns: int) -> None:
         """What became of marks, and of the clocks, since the last time of asking."""
+        if self._early and now_ns - self._early[0].mono_ns > EARLY_FRAME_LIMIT_NS:
+            self._match_early_frames()
         for mark, cause in self._flight.resolved_marks:
             self._tell("mark", count=mark.count, cause=cause.value)
         self._flight.resolved_marks.clear()
@@ -87,6 +92,19 @@ class Hearing(Desk):
             )
 
     def _on_frame(self, frame: Frame) -> None:
+        if self.orders and not self._flight.has_pulse_of(frame):
+            # A software trigger answers once all heads were asked: a frame may be there before.
+            self._early.append(frame)
+        else:
+            self._match(frame)
+
+    def _match_early_frames(self) -> None:
+        """Match the frames that came before the answer to their trigger."""
+        early, self._early = self._early, []
+        for frame in early:
+            self._match(frame)
+
+    def _match(self, frame: Frame) -> None:
         cause = self._flight.frame(frame)
         if cause is not Cause.USED:
             self._tell("frame", head=frame.head, cause=cause.value)
@@ -153,7 +171,12 @@ class Hearing(Desk):
         self._tell("device", device=unbound.name, name="absent", fault=True, sentence=sentence)
 
     def _on_fired(self, fired: Fired) -> None:
-        order = self.orders.pop(fired.sequence)
+        self._answered(fired, self.orders.pop(fired.sequence))
+        early, self._early = self._early, []
+        for frame in early:
+            self._on_frame(frame)
+
+    def _answered(self, fired: Fired, order: Order) -> None:
         if fired.pulse is None:
             self._flight.not_fired(fired.sequence, fired.sentence)
             said = {"sentence": fired.sentence}

@@ -56,8 +56,9 @@ DATA_WITHIN_S: Final = 10.0
 KERNELS_WITHIN_S: Final = 120.0
 """Loading takes seconds; compiling may take minutes, and is not waited for."""
 STEP_S: Final = 0.1
-WITHOUT_MARKS: Final = frozenset({"nmea", "gpsd", "mavlink"})
+WITHOUT_MARKS: Final = frozenset({"gpsd"})
 """Drivers of receivers that have no event marks."""
+MARK_CURE: Final = "check the strobe cable, and that the receiver is set to send its marks"
 CURES: Final = {
     "position": "wait, or check its antenna",
     "usable time": "wait, or check its antenna",
@@ -296,7 +297,7 @@ class Trial(Desk):
         if f"mark {spec.name}" in self._data:
             return passed("stream", name)
         sentence = f"receiver {spec.name} gave no event mark of the exposure"
-        return failed("stream", name, f"{sentence}; check the strobe cable")
+        return failed("stream", name, f"{sentence}; {MARK_CURE}")
 
     def _frame(self, head: str) -> Finding:
         name = f"frame of {head}"

@@ -140,6 +140,12 @@ class Matcher:
         head.arrivals_ns.append(frame.mono_ns - self._start_ns(frame, pulse))
         return Match(number, Cause.USED)
 
+    def has_pulse_of(self, frame: Frame) -> bool:
+        """Whether the frame's own time says which pulse it is of."""
+        if start_of_exposure_mono_ns(frame) is None:
+            return False
+        return self._pulse_of(frame)[0] is not None
+
     def _pulse_of(self, frame: Frame) -> tuple[int | None, tuple[int, ...]]:
         """The pulse of a frame, or None and those it may be of."""
         possible = [pulse for pulse in self._pulses.values() if self._arrives(frame, pulse)]

@@ -10,6 +10,8 @@ import hashlib
 import hmac
 import json
 import logging
+import os
+import shlex
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +20,8 @@ from typing import Any, Final
 from daemon.disk import durable
 
 KEY_BYTES: Final = 32
+KEY_TEXT_MAX: Final = 4096
+OPEN_TO_EVERYBODY: Final = 0o007
 SIGNATURE_BYTES: Final = 6
 TRAILER_BYTES: Final = 13
 """Link id, timestamp and signature."""
@@ -151,14 +155,21 @@ def read_key(path: Path) -> bytes:
     """The signing key of a file.
 
     Raises:
-        ValueError: it cannot be read or is no key.
+        ValueError: it cannot be read, is no key, or is open to everybody on this computer.
     """
     try:
-        key = bytes.fromhex(path.read_text("ascii").strip())
+        with path.open("rb") as file:
+            is_open = os.fstat(file.fileno()).st_mode & OPEN_TO_EVERYBODY
+            key = bytes.fromhex(file.read(KEY_TEXT_MAX).decode("ascii").strip())
     except (OSError, ValueError) as error:
         raise ValueError(f"{path}: no signing key ({error}); 64 hexadecimal digits") from error
     if len(key) != KEY_BYTES:
         raise ValueError(f"{path}: a signing key has 64 hexadecimal digits")
+    if is_open:
+        raise ValueError(
+            f"{path}: everybody on this computer may read or change the signing key; run: chmod "
+            f"600 {shlex.quote(str(path))}, and use a new key if others could log in"
+        )
     return key
 
 

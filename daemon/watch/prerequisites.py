@@ -16,9 +16,8 @@ from pathlib import Path
 from daemon.configuration import WatchSection
 from daemon.errors import DaemonError
 from daemon.service.findings import Finding, failed, passed
+from daemon.watch.mavlink_signatures import read_key
 from daemon.watch.tokens import TokenError, read_tokens
-
-KEY_DIGITS = 64
 
 
 class WatchError(DaemonError):
@@ -122,13 +121,8 @@ def _signing_key(settings: WatchSection) -> Iterator[Finding]:
     if key is None:
         return
     try:
-        text = key.read_text("ascii").strip()
-        bytes.fromhex(text)
-        problem = "" if len(text) == KEY_DIGITS else f"{len(text)} digits"
-    except (OSError, ValueError) as error:
-        problem = str(error)
-    if problem:
-        sentence = f"{key}: no key of {KEY_DIGITS} hexadecimal digits ({problem})"
-        yield failed("watch", "mavlink camera", f"{sentence}. No MAVLink camera is announced")
+        read_key(key)
+    except ValueError as error:
+        yield failed("watch", "mavlink camera", f"{error}. No MAVLink camera is announced")
     else:
         yield passed("watch", "mavlink camera")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import gc
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -14,7 +15,9 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from drivers.aravis.formats import packing_of, unsuitable
-from drivers.aravis.library import aravis, aravis_error
+from drivers.aravis.gvcp import GVCP_PORT, is_ip_address
+from drivers.aravis.library import aravis, aravis_error, inet_address
+from drivers.aravis.senders import ControlSenders, NewSockets, interface_towards
 from drivers.aravis.settings import AravisSettings
 from drivers.contract import DeviceError
 from drivers.pixels import Packing
@@ -65,15 +68,59 @@ class AravisCamera:
 
     def __init__(self, head: str, settings: AravisSettings) -> None:
         self._who = f"{head} at {settings.address}"
+        self.chunk_parser: Any = None
+        self._control: ControlSenders | None = None
+        try:
+            self._open_and_configure(settings)
+        except (DeviceError, aravis_error()):
+            self.release()
+            raise
+
+    def _open_and_configure(self, settings: AravisSettings) -> None:
+        address = settings.address
+        self._camera: Any = None
+        if not is_ip_address(address):
+            self._camera = self._opened("", address)
+            if not self._camera.is_gv_device():
+                self._configure_all(settings)
+                return
+            # Again by its address, which can be held to.
+            address = self.ip_address
+            self._camera = None
+            gc.collect()
+        interface = self._interface(address)
+        with NewSockets(interface, address) as sockets:
+            self._camera = self._opened(interface, address)
+            self._control = ControlSenders(sockets.take(), address, GVCP_PORT)
+            self._configure_all(settings)
+
+    def _interface(self, address: str) -> str:
+        try:
+            return interface_towards(address)
+        except OSError as error:
+            raise DeviceError(
+                f"{self._who}: no interface of this computer reaches it ({error}); check the "
+                "network's settings and cable"
+            ) from None
+
+    def _opened(self, interface: str, address: str) -> Any:
         library, failed = aravis(), aravis_error()
         try:
-            self._camera: Any = library.Camera.new(settings.address)
+            if not interface:
+                return library.Camera.new(address)
+            # Not by name: Aravis would take the address from whatever has answered its discovery.
+            gio = inet_address()
+            device = library.GvDevice.new(
+                gio.new_from_string(interface), gio.new_from_string(address)
+            )
+            return library.Camera.new_with_device(device)
         except failed as error:
             raise DeviceError(
                 f"{self._who}: the head cannot be opened ({_said(error)}); check power, cable and "
                 "address"
             ) from None
-        self.chunk_parser: Any = None
+
+    def _configure_all(self, settings: AravisSettings) -> None:
         if self._camera.is_gv_device() and not self._camera.get_device().is_controller():
             raise HeldByAnotherError(
                 f"{self._who}: another program controls the head; end that program"
@@ -116,6 +163,31 @@ class AravisCamera:
     def release(self) -> None:
         """Let go of the head: the last reference gives control back."""
         self._camera = self.chunk_parser = None
+        if self._control is not None:
+            self._control.close()
+            self._control = None
+
+    @property
+    def ip_address(self) -> str:
+        """Address of a GigE Vision head, also where it was opened by its name."""
+        return str(self._camera.get_device().get_device_address().get_address().to_string())
+
+    @property
+    def stream_source_port(self) -> int:
+        """The UDP port that the head says it sends its stream from; 0 where it does not say."""
+        try:
+            return int(self._camera.get_device().get_integer_feature_value("ArvGevSCSP")) & 0xFFFF
+        except aravis_error():
+            return 0
+
+    def fire_test_packet(self) -> None:
+        """Let the head send a test packet to the stream's port; some heads cannot."""
+        with contextlib.suppress(aravis_error()):
+            self._camera.get_device().execute_command("ArvGevSCPSFireTestPacket")
+
+    def other_senders(self) -> int:
+        """Datagrams of others that came to the control socket; they were dropped."""
+        return 0 if self._control is None else self._control.others()
 
     def adjust(self, exposure_time_us: float, gain_db: float, tdi_shifts: int) -> None:
         """Write exposure settings while the head runs; those it has not are left out.

@@ -13,8 +13,10 @@ privilege).
 from __future__ import annotations
 
 import ipaddress
+import secrets
 import socket
 import struct
+import time
 from dataclasses import dataclass
 from typing import Final
 
@@ -24,11 +26,12 @@ HEARTBEAT_TIMEOUT: Final = 0x0938
 DEFAULT_HEARTBEAT_S: Final = 3.0
 KEY: Final = 0x42
 ACK_REQUIRED: Final = 0x01
-REQUEST_ID: Final = 1
+REQUEST_IDS: Final = 0xFFFF
+PENDING_ACK: Final = 0x0089
+PENDING_MAX_S: Final = 2.0
+"""How long a head that says that it needs more time is waited for, however often it says so."""
 READREG_CMD: Final = 0x0080
-READREG_ACK: Final = 0x0081
 ACTION_CMD: Final = 0x0100
-ACTION_ACK: Final = 0x0101
 SCHEDULED: Final = 0x80
 SUCCESS: Final = 0x0000
 ACTION_LATE: Final = 0x8016
@@ -92,37 +95,50 @@ def send_action(
     if device_ns is not None:
         flags |= SCHEDULED
         body += struct.pack(">Q", device_ns)
-    command = struct.pack(">BBHHH", KEY, flags, ACTION_CMD, len(body), REQUEST_ID) + body
-    answer = _ask(address, command, timeout_s)
-    if answer is None or len(answer) < 8:
-        return None
-    status, acknowledged, _, answered_id = struct.unpack_from(">HHHH", answer)
-    if acknowledged != ACTION_ACK or answered_id != REQUEST_ID:
-        return None
-    return int(status)
+    answer = _ask(address, ACTION_CMD, body, flags=flags, timeout_s=timeout_s)
+    return None if answer is None else answer[0]
 
 
-def _ask(address: str, command: bytes, timeout_s: float) -> bytes | None:
-    """Send a command and wait for what comes back; None for silence or an unreachable head."""
+def _ask(
+    address: str, command: int, body: bytes, *, timeout_s: float, flags: int = ACK_REQUIRED
+) -> tuple[int, bytes] | None:
+    """Status and body of the answer to a command; None for silence or an unreachable head.
+
+    Only the head's own answer counts: the kernel drops what comes from elsewhere, and the answer
+    has to carry the number of the request, which nobody else can know.
+    """
+    request_id = 1 + secrets.randbelow(REQUEST_IDS)
+    now_s = time.monotonic()
+    until_s, latest_s = now_s + timeout_s, now_s + timeout_s + PENDING_MAX_S
     try:
         # A fresh port for every question: an answer to an older one cannot be mistaken for it.
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as channel:
-            channel.settimeout(timeout_s)
             channel.connect((address, GVCP_PORT))
-            channel.send(command)
-            return channel.recv(576)
+            channel.send(struct.pack(">BBHHH", KEY, flags, command, len(body), request_id) + body)
+            while (left_s := until_s - time.monotonic()) > 0:
+                channel.settimeout(left_s)
+                answer = channel.recv(576)
+                if len(answer) < 8:
+                    continue
+                status, acknowledged, _, answered_id = struct.unpack_from(">HHHH", answer)
+                if answered_id != request_id:
+                    continue
+                if acknowledged == command + 1:
+                    return int(status), answer[8:]
+                if acknowledged == PENDING_ACK and len(answer) >= 12:
+                    (more_ms,) = struct.unpack_from(">H", answer, 10)
+                    until_s = min(time.monotonic() + more_ms * 1e-3, latest_s)
     except OSError:
         return None
+    return None
 
 
 def _read_register(address: str, register: int, timeout_s: float) -> tuple[int, int] | None:
     """Status and value of a register; None where no fitting answer came."""
-    question = struct.pack(">BBHHHI", KEY, ACK_REQUIRED, READREG_CMD, 4, REQUEST_ID, register)
-    answer = _ask(address, question, timeout_s)
-    if answer is None or len(answer) < 8:
+    answer = _ask(address, READREG_CMD, struct.pack(">I", register), timeout_s=timeout_s)
+    if answer is None:
         return None
-    status, command, _, answered_id = struct.unpack_from(">HHHH", answer)
-    if command != READREG_ACK or answered_id != REQUEST_ID:
-        return None
-    value = struct.unpack_from(">I", answer, 8)[0] if len(answer) >= 12 else 0
-    return (status, value) if status != 0 or len(answer) >= 12 else None
+    status, body = answer
+    if len(body) < 4:
+        return (status, 0) if status != 0 else None
+    return status, int(struct.unpack_from(">I", body)[0])

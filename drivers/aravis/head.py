@@ -79,6 +79,7 @@ class AravisHead(AravisSettings, HeadDevice):
     kind: ClassVar = "head"
     counted: ClassVar = (
         *("frames", "frames_incomplete", "frames_corrupt", "underruns", "opened", "latches"),
+        "other_senders",
     )
 
     def __init__(
@@ -419,10 +420,29 @@ class AravisHead(AravisSettings, HeadDevice):
         return True
 
     def _count(self, session: _Session) -> None:
-        before = self._of_stream["underruns"]
-        self._of_stream = session.stream.counted()
-        if self._of_stream["underruns"] > before:
+        before, now = self._of_stream, session.stream.counted()
+        now["other_senders"] += session.camera.other_senders()
+        self._of_stream = now
+        if now["underruns"] > before["underruns"]:
             self._complain_of_underrun()
+        if now["other_senders"] > before["other_senders"]:
+            self._complain_of_others(session, now["other_senders"])
+        if session.stream.restart_if_behind():
+            self.teller.complain(
+                "stream-restarted",
+                f"The head {self.name} numbered its frames out of order, so that they were dropped "
+                "as old. The stream was restarted; one exposure may miss its frame. Check the "
+                "head's power supply and firmware.",
+            )
+
+    def _complain_of_others(self, session: _Session, count: int) -> None:
+        details = session.stream.others or f"only {self.address} is accepted"
+        self.teller.complain(
+            "other-sender",
+            f"{count} datagrams of other senders came to the ports of head {self.name} and were "
+            f"dropped, {details}. Disconnect the other sender, or give the heads a network of "
+            "their own.",
+        )
 
     # Letting go
 

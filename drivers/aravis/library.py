@@ -39,3 +39,11 @@ def aravis_error() -> type[Exception]:
 
     error: type[Exception] = GLib.Error
     return error
+
+
+def inet_address() -> Any:
+    """The class of GLib for IP addresses."""
+    aravis()
+    from gi.repository import Gio
+
+    return Gio.InetAddress

@@ -6,11 +6,7 @@ Slots and Aravis' buffers are paired here; when a stream is made and dropped is 
 
 from __future__ import annotations
 
-import contextlib
 import gc
-import os
-import socket
-import stat
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -19,6 +15,12 @@ from typing import Any, Final
 
 from drivers.aravis.camera import AravisCamera
 from drivers.aravis.library import aravis, aravis_error
+from drivers.aravis.senders import (
+    StreamSenders,
+    hold_packet_sockets,
+    interface_towards,
+    socket_inodes,
+)
 from drivers.aravis.settings import AravisSettings
 from drivers.contract import DeviceError, FrameMemory
 from drivers.pixels import Packing, bytes_at, packed_nbytes, unpack, words_at
@@ -114,7 +116,11 @@ class FrameStream:
                 f"{settings.name} at {settings.address}: the stream cannot be made; check that no "
                 "other program holds the head"
             )
+        self._senders: StreamSenders | None = None
+        self._ignored = 0
+        self._restarts = 0
         if camera.raw.is_gv_device():
+            self._hold_to_the_head(camera, settings)
             self._tune(settings)
         for slot in free:
             self.lend(slot)
@@ -131,6 +137,8 @@ class FrameStream:
         reason = str(buffer.get_status().value_nick)
         # Aravis complains on stderr when asked for the size of a frame that it gave up.
         whole = reason == "success"
+        if whole:
+            self._ignored = self._ignored_packets()
         parser = self._parser if whole and buffer.has_chunks() else None
         return ReceivedFrame(
             slot=self._slots[hash(buffer)],
@@ -157,12 +165,39 @@ class FrameStream:
         unpack(self._packing, packed, words_at(address, self._pixel_count))
 
     def counted(self) -> Counter[str]:
-        """What Aravis has counted of this stream, and `underruns` in frames."""
+        """What Aravis has counted of this stream, and `underruns` in frames.
+
+        `other_senders` are datagrams of others, which were dropped.
+        """
         found: Counter[str] = Counter()
         for theirs, ours in INFOS.items():
-            found[ours] = int(self._stream.get_info_uint64_by_name(theirs))
+            found[ours] = self._info(theirs)
         found["underruns"] = -(-found["underrun_packets"] // self._packets_per_frame)
+        found["stream_restarts"] = self._restarts
+        if self._senders is not None:
+            found["other_senders"] = self._senders.look(found["received_packets"])
         return found
+
+    @property
+    def others(self) -> str:
+        """Who sent last without being the head, and who is accepted."""
+        if self._senders is None or not self._senders.last_other:
+            return ""
+        return f"the last from {self._senders.last_other}; only {self._senders.source} is accepted"
+
+    def restart_if_behind(self) -> bool:
+        """Begin again where Aravis takes the head's frames for old ones and drops them.
+
+        Aravis drops up to 100 frames after a block number that was too large, or once the head
+        counts from 1 again. A whole frame of ignored packets, and none delivered since, means that.
+        """
+        if self._ignored_packets() - self._ignored < self._packets_per_frame:
+            return False
+        self._stream.stop_thread(False)
+        self._stream.start_thread()
+        self._ignored = self._ignored_packets()
+        self._restarts += 1
+        return True
 
     def drop(self) -> None:
         """End the stream. When this returns Aravis writes into no slot any more."""
@@ -174,9 +209,32 @@ class FrameStream:
         left = weak()
         if left is not None:
             left.stop_thread(False)
+        if self._senders is not None:
+            self._senders.close()
         self._parser = None
         self._buffers.clear()
         self._slots.clear()
+
+    def _info(self, name: str) -> int:
+        return int(self._stream.get_info_uint64_by_name(name))
+
+    def _ignored_packets(self) -> int:
+        """Packets that Aravis dropped although there was a buffer for them."""
+        return self._info("n_ignored_packets") - self._info("n_underruns")
+
+    def _hold_to_the_head(self, camera: AravisCamera, settings: AravisSettings) -> None:
+        """Let only the head's datagrams reach Aravis, and begin after those that came before."""
+        stream, address = self._stream, camera.ip_address
+        stream.stop_thread(False)
+        port = int(stream.get_port())
+        self._senders = StreamSenders(
+            port, address, camera.stream_source_port, camera.fire_test_packet
+        )
+        known = socket_inodes()
+        stream.start_thread()
+        if settings.packet_socket:
+            source = address, self._senders.source_port
+            hold_packet_sockets(known, source, (interface_towards(address), port))
 
     def _tune(self, settings: AravisSettings) -> None:
         library, stream = aravis(), self._stream
@@ -184,7 +242,8 @@ class FrameStream:
         stream.set_property("socket-buffer", library.GvStreamSocketBuffer.FIXED)
         stream.set_property("socket-buffer-size", socket_nbytes)
         # Aravis widens its socket only once a first frame has begun, and loses that one.
-        widen_receive_buffer(int(stream.get_port()), socket_nbytes)
+        if self._senders is not None:
+            self._senders.widen(socket_nbytes)
         stream.set_property("packet-resend", library.GvStreamPacketResend.ALWAYS)
         stream.set_property("packet-request-ratio", 1.0)
         stream.set_property("packet-timeout", round(settings.packet_timeout_ms * 1e3))
@@ -197,18 +256,6 @@ def receive_buffer_limit() -> int:
         return int(Path("/proc/sys/net/core/rmem_max").read_text(encoding="ascii"))
     except (OSError, ValueError):
         return 212_992
-
-
-def widen_receive_buffer(port: int, nbytes: int) -> None:
-    """Set the receive buffer of this process's UDP socket that is bound to `port`."""
-    for entry in Path("/proc/self/fd").iterdir():
-        # Another thread may close a descriptor while this looks at it.
-        with contextlib.suppress(OSError, ValueError):
-            if not stat.S_ISSOCK(entry.stat().st_mode):
-                continue
-            with socket.socket(fileno=os.dup(int(entry.name))) as found:
-                if found.family == socket.AF_INET and found.getsockname()[1] == port:
-                    found.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, nbytes)
 
 
 def _chunk(parser: Any, method: str, buffer: Any, name: str) -> Any:

@@ -248,6 +248,7 @@ FAULTS = (
     Fault("certificate damaged", "degraded", "cannot be loaded", many(file("c.pem", b"no", ""), added(WATCH + 'certificate = "c.pem"\nkey = "c.pem"'))),
     Fault("no such group", "degraded", "no group", added(WATCH + 'control = "c.sock"\ncontrol_group = "nobody-has-it"')),
     Fault("control is no socket", "degraded", "no socket", file("c.sock", b"", WATCH + 'control = "c.sock"')),
+    Fault("signing key open to everybody", "degraded", "chmod 600", file("k", b"00" * 32, WATCH + '[watch.mavlink]\nconnect = "udpout:127.0.0.1:9"\nsigning_key = "k"', 0o604)),
     Fault("signing key damaged", "degraded", "hexadecimal", file("k", b"abc", WATCH + '[watch.mavlink]\nconnect = "udpout:127.0.0.1:9"\nsigning_key = "k"')),
     Fault("interrupted, the rig changed", "degraded", "f_mm (100.0 in the mission, 101.5 now)", interrupted(changed("f_mm = 100.0", "f_mm = 101.5"))),
     # What comes by itself

@@ -10,24 +10,51 @@ import pytest
 
 from daemon.configuration import from_mapping
 from daemon.service.findings import Finding, Outcome
+from daemon.service.messages import DeviceSpec
 from daemon.service.trial import Trial
 from drivers.contract import DeviceEvent
 from drivers.receiver_fix import fix_in_words
-from tests.daemon.flight.test_flight import nav
+from tests.daemon.flight.test_flight import mark, nav, pulse
 from tests.daemon.test_configuration import GOOD
 
 pytestmark = pytest.mark.trust
 
 
-def found(tmp_path: Path, *heard: object) -> Finding:
-    """What check finds of the navigator's stream after these messages."""
+def tried(tmp_path: Path, driver: str, *heard: object) -> tuple[Trial, DeviceSpec]:
     content = copy.deepcopy(GOOD)
-    content["navigator"] = [{"name": "gnss", "driver": "gpsd"}]
-    trial = Trial(*from_mapping(content, tmp_path / "service.toml"), fire=False)
+    port = {} if driver == "gpsd" else {"port": "/dev/ttyS0"}
+    content["navigator"] = [{"name": "gnss", "driver": driver, **port}]
+    trial = Trial(*from_mapping(content, tmp_path / "service.toml"), fire=True)
     for message in heard:
         trial._hear(message)
     (spec,) = (spec for spec in trial._specs if spec.kind == "navigator")
+    return trial, spec
+
+
+def found(tmp_path: Path, *heard: object) -> Finding:
+    """What check finds of the navigator's stream after these messages."""
+    trial, spec = tried(tmp_path, "gpsd", *heard)
     return trial._navigation(spec)
+
+
+@pytest.mark.parametrize("driver", ["nmea", "mavlink", "ublox", "novatel", "septentrio"])
+def test_the_event_mark_of_every_receiver_that_can_give_one_is_proven(
+    tmp_path: Path, driver: str
+) -> None:
+    trial, spec = tried(tmp_path, driver, mark(pulse(1, 0.0)))
+    assert trial._mark(spec).outcome is Outcome.PASS
+    trial, spec = tried(tmp_path, driver)
+    finding = trial._mark(spec)
+    assert finding.outcome is Outcome.FAIL
+    assert finding.sentence == (
+        "receiver gnss gave no event mark of the exposure; check the strobe cable, and that the "
+        "receiver is set to send its marks"
+    )
+
+
+def test_gpsd_has_no_event_marks_to_prove(tmp_path: Path) -> None:
+    trial, spec = tried(tmp_path, "gpsd")
+    assert trial._mark(spec).outcome is Outcome.NOT_TRIED
 
 
 def test_a_position_with_height_and_time_passes_and_names_the_leap_table(tmp_path: Path) -> None:

@@ -89,6 +89,7 @@ class Station:
 @contextmanager
 def flight(tmp_path: Path, **settings: Any) -> Iterator[Flying]:
     (tmp_path / "key").write_text(KEY.hex())
+    (tmp_path / "key").chmod(0o600)
     given = {"scheme": "udpin", "commands": "signed", "signing_key": tmp_path / "key",
              "signing_state": tmp_path / "state" / "signing.json"}  # fmt: skip
     flying = Flying(**{**given, **settings})

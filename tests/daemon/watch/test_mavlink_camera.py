@@ -19,6 +19,7 @@ from pydantic import ValidationError
 from daemon.configuration import MavlinkCameraSection
 from daemon.watch.gate import Gate
 from daemon.watch.mavlink_camera import MavlinkCamera
+from daemon.watch.mavlink_signatures import read_key
 from daemon.watch.mavlink_wishes import wish
 from daemon.watch.state import FlightState
 from processing.rig import load_rig, shipped_rigs
@@ -75,6 +76,7 @@ class Station:
 def key_file(tmp_path: Path) -> Path:
     path = tmp_path / "key"
     path.write_text(KEY.hex() + "\n")
+    path.chmod(0o600)
     return path
 
 
@@ -191,6 +193,22 @@ def test_a_key_that_is_none_is_refused(tmp_path: Path) -> None:
     section = MavlinkCameraSection(commands="signed", signing_key=tmp_path / "key")
     with pytest.raises(ValueError, match="signing key"):
         MavlinkCamera(section, FlightState("x"), Gate(lambda _: None), lambda: RIG)
+
+
+@pytest.mark.trust
+@pytest.mark.parametrize("mode", [0o604, 0o602, 0o644, 0o666])
+def test_a_key_that_everybody_may_read_or_change_is_refused_with_the_command(
+    tmp_path: Path, mode: int
+) -> None:
+    path = tmp_path / "the key"
+    path.write_text(KEY.hex())
+    path.chmod(mode)
+    section = MavlinkCameraSection(commands="signed", signing_key=path)
+    with pytest.raises(ValueError, match=f"chmod 600 '{path}'"):
+        MavlinkCamera(section, FlightState("x"), Gate(lambda _: None), lambda: RIG)
+    for closed in (0o600, 0o640):
+        path.chmod(closed)
+        assert read_key(path) == KEY
 
 
 def _camera() -> MavlinkCamera:
