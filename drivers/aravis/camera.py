@@ -16,8 +16,9 @@ from typing import Any, Final
 
 from drivers.aravis.formats import packing_of, unsuitable
 from drivers.aravis.gvcp import GVCP_PORT, is_ip_address
-from drivers.aravis.library import aravis, aravis_error, inet_address
-from drivers.aravis.senders import ControlSenders, NewSockets, interface_towards
+from drivers.aravis.library import aravis, aravis_error, said
+from drivers.aravis.opening import interface_of, opened
+from drivers.aravis.senders import ControlSenders, NewSockets
 from drivers.aravis.settings import AravisSettings
 from drivers.contract import DeviceError
 from drivers.pixels import Packing
@@ -80,7 +81,7 @@ class AravisCamera:
         address = settings.address
         self._camera: Any = None
         if not is_ip_address(address):
-            self._camera = self._opened("", address)
+            self._camera = opened(self._who, "", address)
             if not self._camera.is_gv_device():
                 self._configure_all(settings)
                 return
@@ -88,37 +89,11 @@ class AravisCamera:
             address = self.ip_address
             self._camera = None
             gc.collect()
-        interface = self._interface(address)
+        interface = interface_of(self._who, address)
         with NewSockets(interface, address) as sockets:
-            self._camera = self._opened(interface, address)
+            self._camera = opened(self._who, interface, address)
             self._control = ControlSenders(sockets.take(), address, GVCP_PORT)
             self._configure_all(settings)
-
-    def _interface(self, address: str) -> str:
-        try:
-            return interface_towards(address)
-        except OSError as error:
-            raise DeviceError(
-                f"{self._who}: no interface of this computer reaches it ({error}); check the "
-                "network's settings and cable"
-            ) from None
-
-    def _opened(self, interface: str, address: str) -> Any:
-        library, failed = aravis(), aravis_error()
-        try:
-            if not interface:
-                return library.Camera.new(address)
-            # Not by name: Aravis would take the address from whatever has answered its discovery.
-            gio = inet_address()
-            device = library.GvDevice.new(
-                gio.new_from_string(interface), gio.new_from_string(address)
-            )
-            return library.Camera.new_with_device(device)
-        except failed as error:
-            raise DeviceError(
-                f"{self._who}: the head cannot be opened ({_said(error)}); check power, cable and "
-                "address"
-            ) from None
 
     def _configure_all(self, settings: AravisSettings) -> None:
         if self._camera.is_gv_device() and not self._camera.get_device().is_controller():
@@ -208,7 +183,7 @@ class AravisCamera:
         except aravis_error() as error:
             raise DeviceError(
                 f"{self._who}: {exposure_time_us:g} us, {gain_db:g} dB, {tdi_shifts} TDI shifts "
-                f"are refused ({_said(error)}); choose settings within the head's bounds"
+                f"are refused ({said(error)}); choose settings within the head's bounds"
             ) from None
 
     def settings_of(self, exposure_us: float | None) -> Mapping[str, float | int | str]:
@@ -292,7 +267,7 @@ class AravisCamera:
             try:
                 action()
             except failed as error:
-                refusals.append(f"{key} = {value!r} is refused ({_said(error)}); {cure}")
+                refusals.append(f"{key} = {value!r} is refused ({said(error)}); {cure}")
 
         # A head that a killed controller left running would refuse the rest.
         write("acquisition", "stop", camera.stop_acquisition, "switch the head off and on")
@@ -514,7 +489,3 @@ class AravisCamera:
 def _region(camera: Any) -> tuple[int, int, int, int]:
     region = camera.get_region()
     return tuple(region)
-
-
-def _said(error: Exception) -> str:
-    return str(getattr(error, "message", error))

@@ -47,3 +47,8 @@ def inet_address() -> Any:
     from gi.repository import Gio
 
     return Gio.InetAddress
+
+
+def said(error: Exception) -> str:
+    """The words of what Aravis raised."""
+    return str(getattr(error, "message", error))
