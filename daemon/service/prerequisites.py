@@ -21,6 +21,7 @@ from daemon.disk.guard import LEVEL2_SHARE
 from daemon.disk.health import read_health
 from daemon.service.devices import frame_nbytes
 from daemon.service.findings import Finding, Outcome, failed, passed
+from daemon.service.head_network import head_network
 from drivers import registry
 from drivers.extras import MissingExtraError, require
 from processing.rig import Rig
@@ -218,9 +219,17 @@ def pace(configuration: Configuration, rig: Rig) -> Iterator[Finding]:
         yield passed("disk", "pace", told)
 
 
-LOOKS: Final[Sequence[Look]] = (libraries, calibration, storage, disk_health, memory, pace)
+LOOKS: Final[Sequence[Look]] = (
+    libraries,
+    calibration,
+    storage,
+    disk_health,
+    memory,
+    head_network,
+    pace,
+)
 """Every prerequisite, in the order they are looked at."""
-AFTER_RESTART: Final[Sequence[Look]] = (libraries, calibration, storage, memory)
+AFTER_RESTART: Final[Sequence[Look]] = (libraries, calibration, storage, memory, head_network)
 """Those of a flight that is resumed: nothing is measured while exposures are waited for."""
 
 
