@@ -90,6 +90,12 @@ EQUIVALENT: dict[str, str] = {
     " - WEEK_NS // 2: + -> -": "modulo a week, half a week more is half a week less",
     "drivers/gps_time.py: difference = (itow_ms * 1_000_000 - utc + WEEK_NS // 2) % WEEK_NS"
     " - WEEK_NS // 2: + -> -": "modulo a week, half a week more is half a week less",
+    "daemon/disk/transfer_removal.py: source.replace(MARK_FILE, json.dumps(mark, indent=1)"
+    '.encode("utf-8", "replace") + b"\\n"): 1 -> 2': "layout of a file that is read as JSON",
+    "daemon/disk/resync.py: repetition = 1: 1 -> 2": "any free name will do",
+    "drivers/ublox/framing.py: return end - at if end <= len(buffer) else 0: - -> +": (
+        "only whether it is zero is read"
+    ),
     "processing/geometry/terrain_rays.py: "
     "over = point[:, 2] - model.at(point[:, :2]): 2 -> 3": "heights are read at columns 0 and 1",
     "processing/geometry/terrain_rays.py: "

@@ -10,6 +10,7 @@ import hashlib
 import json
 import math
 import re
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -21,6 +22,7 @@ RECORD_MAX_BYTES = 4_000_000
 """No record of ours comes near this; more is refused unread."""
 
 EXACT_INTEGER_LIMIT = 2**53
+_LARGEST = sys.float_info.max
 """Larger integers do not survive a JSON reader that knows only doubles."""
 
 _INSTANT = re.compile(r"-?(0|[1-9][0-9]{0,18})")
@@ -117,7 +119,7 @@ class Fields:
     def integer(self, key: str, default: int = _REQUIRED, *, minimum: int = 0) -> int:
         value = self.integer_or_none(key, default, minimum=minimum)
         if value is None:
-            if key in self.content and self.content[key] is None:
+            if self.content.get(key, _REQUIRED) is None:
                 self.complain(key, "a whole number is needed")
             return 0
         return value
@@ -139,7 +141,7 @@ class Fields:
     def number(self, key: str, default: float = _REQUIRED) -> float:
         value = self.number_or_none(key, default)
         if value is None:
-            if key in self.content and self.content[key] is None:
+            if self.content.get(key, _REQUIRED) is None:
                 self.complain(key, "a number is needed")
             return 0.0
         return value
@@ -178,7 +180,7 @@ class Fields:
         value = self._get(key, default)
         if isinstance(value, str) and value in allowed:
             return value
-        if value is not None:
+        if key in self.content:
             self.complain(key, f"it is one of {', '.join(allowed)}")
         return allowed[0]
 
@@ -227,7 +229,7 @@ class Fields:
             usable = isinstance(item, str) or (
                 isinstance(item, int | float)
                 and not isinstance(item, bool)
-                and abs(item) <= (EXACT_INTEGER_LIMIT if isinstance(item, int) else 1.8e308)
+                and abs(item) <= (EXACT_INTEGER_LIMIT if isinstance(item, int) else _LARGEST)
             )
             if usable:
                 found[inner] = item

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daemon.disk.records import RecordError, canonical_bytes, parse_record, plain_name
+from daemon.disk.records import Fields, RecordError, canonical_bytes, parse_record, plain_name
 
 scalars = (
     st.none()
@@ -89,3 +89,105 @@ def test_no_bytes_raise_anything_but_a_record_error(data):
 @pytest.mark.parametrize("name", ["", ".", "..", "a/b", "a\0", "a..b", ".hidden", "é", "a" * 65])
 def test_a_name_that_could_leave_its_folder_is_not_plain(name):
     assert not plain_name(name)
+
+
+ABSENT = object()
+READERS = {
+    "integer": lambda fields: fields.integer("k"),
+    "integer from 3": lambda fields: fields.integer("k", 7, minimum=3),
+    "integer or none": lambda fields: fields.integer_or_none("k"),
+    "number": lambda fields: fields.number("k"),
+    "number or none": lambda fields: fields.number_or_none("k", 7.0),
+    "instant": lambda fields: fields.instant("k"),
+    "instant, 7": lambda fields: fields.instant("k", 7),
+    "text": lambda fields: fields.text("k"),
+    "name": lambda fields: fields.name("k", "n"),
+    "choice": lambda fields: fields.choice("k", ("a", "b")),
+    "choice, b": lambda fields: fields.choice("k", ("a", "b"), "b"),
+    "flag": lambda fields: fields.flag("k", default=True),
+    "sha256": lambda fields: fields.sha256("k"),
+    "velocity": lambda fields: fields.velocity("k"),
+    "scalars": lambda fields: fields.scalars("k"),
+    "names": lambda fields: fields.names("k"),
+}
+INFINITE = json.loads("1e999")
+
+
+@pytest.mark.parametrize(
+    ("reader", "value", "read", "complaints"),
+    [
+        ("integer", ABSENT, 0, 1),
+        ("integer", None, 0, 1),
+        ("integer", 1.5, 0, 1),
+        ("integer", True, 0, 1),
+        ("integer", 0, 0, 0),
+        ("integer", -1, 0, 1),
+        ("integer", 2**53, 2**53, 0),
+        ("integer", 2**53 + 1, 0, 1),
+        ("integer from 3", ABSENT, 7, 0),
+        ("integer from 3", 2, 7, 1),
+        ("integer from 3", 3, 3, 0),
+        ("integer or none", ABSENT, None, 0),
+        ("integer or none", None, None, 0),
+        ("number", ABSENT, 0.0, 1),
+        ("number", None, 0.0, 1),
+        ("number", "1", 0.0, 1),
+        ("number", False, 0.0, 1),
+        ("number", INFINITE, 0.0, 1),
+        ("number", 10**400, 0.0, 1),
+        ("number", -2.5, -2.5, 0),
+        ("number or none", ABSENT, 7.0, 0),
+        ("number or none", None, None, 0),
+        ("number or none", [], 7.0, 1),
+        ("instant", ABSENT, None, 0),
+        ("instant", None, None, 0),
+        ("instant", "12", 12, 0),
+        ("instant", 12, None, 1),
+        ("instant", str(2**63 - 1), 2**63 - 1, 0),
+        ("instant", str(2**63), None, 1),
+        ("instant, 7", ABSENT, 7, 0),
+        ("instant, 7", None, None, 0),
+        ("instant, 7", "x", 7, 1),
+        ("text", ABSENT, "", 1),
+        ("text", None, "", 1),
+        ("text", "x" * 10_000, "x" * 10_000, 0),
+        ("text", "x" * 10_001, "", 1),
+        ("name", ABSENT, "n", 0),
+        ("name", "a/b", "", 1),
+        ("choice", ABSENT, "a", 1),
+        ("choice", None, "a", 1),
+        ("choice", "c", "a", 1),
+        ("choice", "b", "b", 0),
+        ("choice, b", ABSENT, "b", 0),
+        ("choice, b", None, "a", 1),
+        ("flag", ABSENT, True, 0),
+        ("flag", None, True, 1),
+        ("flag", False, False, 0),
+        ("sha256", ABSENT, "", 0),
+        ("sha256", "A" * 64, "", 1),
+        ("sha256", "a" * 64, "a" * 64, 0),
+        ("velocity", None, None, 0),
+        ("velocity", [1, 2, None], (1.0, 2.0, None), 0),
+        ("velocity", [1, 2, 3], (1.0, 2.0, 3.0), 0),
+        ("velocity", [1, None, 3], None, 1),
+        ("velocity", [1, 2], None, 1),
+        ("velocity", [1, 2, True], None, 1),
+        ("velocity", [1, INFINITE, 3], None, 1),
+        ("scalars", ABSENT, {}, 0),
+        ("scalars", None, {}, 1),
+        ("scalars", {"a": 1, "b": "x", "c": 1.5}, {"a": 1, "b": "x", "c": 1.5}, 0),
+        ("scalars", {"a": True, "b": [], "c": INFINITE, "d": 2**53 + 1}, {}, 4),
+        ("names", ABSENT, (), 0),
+        ("names", ["a", "b.c"], ("a", "b.c"), 0),
+        ("names", ["a", ".."], (), 1),
+        ("names", "a", (), 1),
+    ],
+)
+def test_a_value_of_another_type_or_beyond_limits_is_named_once(reader, value, read, complaints):
+    problems = []
+    fields = Fields({} if value is ABSENT else {"k": value}, "path", "x.json", problems)
+    assert READERS[reader](fields) == read
+    assert len(problems) == complaints
+    assert all(problem.startswith("x.json: path.k") for problem in problems)
+    fields.refuse_unknown()
+    assert len(problems) == complaints

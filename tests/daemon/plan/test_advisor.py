@@ -171,3 +171,34 @@ def test_a_line_that_was_never_flown_is_flown_whole() -> None:
     plan = block(2)
     only_first = [one for one in fly(plan) if one.number <= 11]
     assert advised(plan, only_first)["2"] == [(0.0, pytest.approx(LINE_M))]
+
+
+def test_only_lines_for_which_something_changed_are_looked_at_again():
+    plan = block(lines=2)
+    first, second = (line.id for line in plan.lines)
+    taken, known = fly(plan), {}
+
+    def look(rest, exposures=taken):
+        advise(
+            plan,
+            exposures,
+            image_along_m=ALONG_M,
+            image_across_m=ACROSS_M,
+            rest=rest,
+            known=known,
+        )
+        return dict(known)
+
+    def kept(before, after):
+        return {line for line in after if after[line] is before.get(line)}
+
+    begun = look({first: (100.0, 300.0)})
+    assert set(begun) == {first, second}
+    equal = look({first: tuple(map(float, (100, 300)))})
+    assert kept(begun, equal) == {first, second}
+    moved = look({first: (100.0, 400.0)})
+    assert kept(equal, moved) == {second}
+    flown = look({})
+    assert kept(moved, flown) == {second}
+    unplaced = look({}, [*taken, Taken(len(taken) + 1, ())])
+    assert kept(flown, unplaced) == set()

@@ -133,3 +133,7 @@ def test_edges_that_scatter_may_all_be_late_by_as_much() -> None:
                 errors.append(found.gps_ns - GPS_NS - (second + 0.5) * NS)
                 sigmas.append(float(found.sigma_ns))
     assert_true(errors, sigmas)
+
+
+def test_a_clock_without_readings_scales_nothing_and_knows_no_instant() -> None:
+    assert ClockModel().reading_scale() == 1.0
