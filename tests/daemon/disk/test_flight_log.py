@@ -165,6 +165,15 @@ def test_a_bit_that_turned_on_the_disk_is_seen_at_the_next_checkpoint(log):
     assert reader.bad_checkpoints == 1
 
 
+def test_a_checkpoint_that_cannot_be_read_is_counted_as_bad(log):
+    log.sync()
+    data = log.path.read_bytes()
+    log.path.write_bytes(data.replace(b'{"crc32"', b'["crc32"'))
+    reader = read(log.path)
+    assert list(reader) == []
+    assert reader.bad_checkpoints == 1
+
+
 def test_a_disk_that_refuses_costs_messages_and_the_log_says_how_many(log, monkeypatch):
     log.append("service/a", 1, {"n": 1})
     with monkeypatch.context() as patch:
