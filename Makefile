@@ -4,7 +4,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: setup demo test test-v4l2 check audit bench soak clean
+.PHONY: setup demo test test-v4l2 check audit bench attack soak clean
 
 setup: .venv/ready .venv/kernels
 
@@ -46,6 +46,10 @@ audit: setup
 
 bench: setup
 	$(BIN)/python -m benchmarks.mini
+
+# The long form of what `make test` has in short.
+attack: setup
+	SYNTOPIC_ATTACKED_EXPOSURES=32 $(BIN)/python -m pytest -m attack --timeout=900 -s
 
 soak: setup
 	$(BIN)/python -m pytest -m soak --timeout=7200

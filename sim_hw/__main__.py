@@ -55,6 +55,7 @@ def parser() -> argparse.ArgumentParser:
     add("--scene", help="a GeoTIFF to fly over instead of the shipped photographs")
     add("--ground", choices=list(GROUNDS), default="landscape", help="what is flown over")
     add("--still", action="store_true", help="render one exposure, and send it for every pulse")
+    add("--digests", action="store_true", help="write the SHA-256 of every frame to OUT/sent")
     add("--scene-cache", type=Path, help="folder where built scenes are kept (default: OUT/scenes)")
     add("--processes", type=int, default=2, help="worker processes that render")
     add("--parent", type=int, metavar="PID", help="end when this process, which started us, does")
@@ -118,6 +119,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         receiver=given.receiver,
         has_pps=given.pps,
         is_still=given.still,
+        has_digests=given.digests,
         probe=given.probe,
     )
     return simulate(settings, world, clock)

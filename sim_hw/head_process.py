@@ -6,6 +6,8 @@ settings of the world. The main process is in `simulator`.
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 import signal
 import threading
@@ -66,6 +68,8 @@ class WorkerPlan:
     calibration: Path
     heads: tuple[HeadPlan, ...]
     is_still: bool = False
+    sent: Path | None = None
+    """Where the digests of frames are written, `SENSOR.jsonl`."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +136,9 @@ class RenderedHead:
         clock: WorldClock,
         plan: HeadPlan,
         report: Callable[[Taken], None],
+        sent: Path | None = None,
     ) -> None:
+        self._sent = None if sent is None else sent / f"{plan.sensor}.jsonl"
         self._world = world
         self._scene = scene
         self._line = line
@@ -185,8 +191,19 @@ class RenderedHead:
         if request.pulse_count != NO_PULSE:
             self._report(Taken(self.sensor.name, request.pulse_count, look))
         if self._still is None:
-            return self.frame(look, gain_db=request.gain_db, number=request.start_mono_ns)
-        return self._held_still(look, request.gain_db)
+            pixels = self.frame(look, gain_db=request.gain_db, number=request.start_mono_ns)
+        else:
+            pixels = self._held_still(look, request.gain_db)
+        self._write_digest(request.pulse_count, pixels)
+        return pixels
+
+    def _write_digest(self, pulse_count: int, pixels: NDArray[np.uint16]) -> None:
+        """Note what is sent, for whoever compares it with what was stored."""
+        if self._sent is None:
+            return
+        digest = hashlib.sha256(pixels.tobytes()).hexdigest()
+        with self._sent.open("a") as file:
+            file.write(json.dumps({"pulse": pulse_count, "sha256": digest}) + "\n")
 
     def hold_still(self) -> None:
         """From now on show the same ground in the same light: nothing is rendered any more."""
@@ -257,7 +274,11 @@ def _open(
     world = World(plan.settings)
     scene = open_scene(world.scene_settings, plan.scene_cache)
     line = FirstLine(world.flight, first_line_m)
-    heads = [RenderedHead(world, scene, line, plan.clock, head, say) for head in plan.heads]
+    if plan.sent is not None:
+        plan.sent.mkdir(parents=True, exist_ok=True)
+    heads = [
+        RenderedHead(world, scene, line, plan.clock, head, say, plan.sent) for head in plan.heads
+    ]
     for head in heads:
         radiometry = laboratory.measure(head.sensor, head.truth, plan.settings.seed)
         laboratory.write_radiometry(plan.calibration, head.sensor, radiometry)

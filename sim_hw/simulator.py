@@ -75,6 +75,7 @@ class SimulatorSettings:
     probe: str = "modbus"
     has_pps: bool = False
     is_still: bool = False
+    has_digests: bool = False
 
 
 class Simulator:
@@ -246,6 +247,7 @@ class Simulator:
                     for s in group
                 ),
                 is_still=self._settings.is_still,
+                sent=self._settings.out / "sent" if self._settings.has_digests else None,
             )
             ours, theirs = self._context.Pipe()
             worker = self._context.Process(

@@ -7,6 +7,7 @@ from typing import Any, NoReturn
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 
 from daemon.tables import light_table
 
@@ -24,7 +25,8 @@ def find_heads(*, as_json: bool) -> NoReturn:
             settings, what = head["settings"], head["found"]
             where = settings.get("address") or settings.get("device", "")
             formats = ", ".join(what.get("formats", [])[:6])
-            table.add_row(head["driver"], where, what["model"], what["serial"], formats)
+            cells = (head["driver"], where, what["model"], what["serial"], formats)
+            table.add_row(*map(escape, cells))
         console.print(table)
         for problem in problems:
             console.print(problem, style="yellow", markup=False, soft_wrap=True)

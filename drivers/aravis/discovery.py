@@ -11,7 +11,10 @@ from drivers.aravis.library import OPENING, aravis
 
 @dataclass(frozen=True)
 class FoundHead:
-    """A head that answered. `address` is what the driver's setting wants."""
+    """A head that answered, or somebody who says so: anybody on the network can.
+
+    `address` is what the driver's setting wants. Characters that cannot be printed are "?".
+    """
 
     address: str
     vendor: str
@@ -39,14 +42,18 @@ def heads() -> list[FoundHead]:
             address = library.get_device_address(index) if protocol == "GigEVision" else name
             found.append(
                 FoundHead(
-                    str(address or name or ""),
-                    str(library.get_device_vendor(index) or ""),
-                    str(library.get_device_model(index) or ""),
-                    str(library.get_device_serial_nbr(index) or ""),
+                    _printable(address or name),
+                    _printable(library.get_device_vendor(index)),
+                    _printable(library.get_device_model(index)),
+                    _printable(library.get_device_serial_nbr(index)),
                     protocol,
                 )
             )
     return sorted(found, key=_by_address)
+
+
+def _printable(text: str | None) -> str:
+    return "".join(c if c.isprintable() else "?" for c in text or "")
 
 
 def _by_address(head: FoundHead) -> tuple[bool, int, str]:

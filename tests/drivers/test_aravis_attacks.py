@@ -15,23 +15,31 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from daemon.cli import app
+from daemon.cli.find_heads import found_heads
 from drivers.aravis import gvcp
-from drivers.contract import FrameStatus
+from drivers.aravis.senders import NewSockets
+from drivers.contract import DeviceError, FrameStatus
+from drivers.udp_port import open_udp_port
 from sim_hw.faults.plan import Planned
 from sim_hw.gige import features
 from sim_hw.gige.gvsp import PAYLOAD_IMAGE
 from sim_hw.gige.head import FrameSize, GigeHead, HeadIdentity, Pacing, WireFaults
-from tests.drivers.test_aravis_head import PATTERN, SHAPE, Pair, flying
+from sim_hw.world_clock import DeviceClock
+from tests.daemon.watch.test_mavsdk_camera import free_port
+from tests.drivers.test_aravis_head import NETWORK, PATTERN, SHAPE, Pair, flying
 
 pytest.importorskip("gi", reason="needs PyGObject (extra aravis) and gir1.2-aravis-0.8")
-pytestmark = [pytest.mark.timeout(240), pytest.mark.trust]
+pytestmark = [pytest.mark.timeout(240), pytest.mark.trust, pytest.mark.attack]
 
-STRANGER = "127.77.66.6"
+HEAD = f"{NETWORK}.1"
+STRANGER = f"{NETWORK}.66"
 MONO16 = 0x0110_0007
 FORGED = np.full(SHAPE, 0x0ABC, np.uint16)
 AHEAD = 30
-CONTROL_ADDRESS = "127.77.66.9"
+CONTROL_ADDRESS = f"{NETWORK}.99"
 
 
 def has_packet_sockets() -> bool:
@@ -113,7 +121,7 @@ def test_forged_frames_and_block_numbers_of_another_address_cost_nothing(
         sent = fly_attacked(pair, attacker)
         wait_counted(pair, "other_senders", sent)
         source = "{}:{}".format(*attacker.getsockname())
-        accepted = f"127.77.9.1:{pair.emulated._stream_port}"
+        accepted = f"{HEAD}:{pair.emulated._stream_port}"
     assert_unharmed(pair)
     assert pair.driver.statistics()["other_senders"] == sent
     (event,) = [e for e in pair.events if e.name == "other-sender"]
@@ -123,7 +131,7 @@ def test_forged_frames_and_block_numbers_of_another_address_cost_nothing(
 
 
 def test_another_port_of_the_heads_address_is_another_sender() -> None:
-    with flying() as (pair,), stranger("127.77.9.1") as attacker:
+    with flying() as (pair,), stranger(HEAD) as attacker:
         sent = fly_attacked(pair, attacker)
         wait_counted(pair, "other_senders", sent)
     assert_unharmed(pair)
@@ -131,7 +139,7 @@ def test_another_port_of_the_heads_address_is_another_sender() -> None:
 
 @pytest.mark.skipif(not has_packet_sockets(), reason="packet sockets need CAP_NET_RAW")
 def test_a_packet_socket_takes_the_heads_port_only() -> None:
-    with flying(packet_socket=True) as (pair,), stranger("127.77.9.1") as attacker:
+    with flying(packet_socket=True) as (pair,), stranger(HEAD) as attacker:
         fly_attacked(pair, attacker)
     assert_unharmed(pair)
 
@@ -155,7 +163,7 @@ def test_a_head_that_does_not_say_its_port_is_held_to_the_first(
 ) -> None:
     with head_that_says(0, monkeypatch) as pair, stranger() as attacker:
         fly_attacked(pair, attacker, 3)
-        with stranger("127.77.9.1") as other_port:
+        with stranger(HEAD) as other_port:
             for number in range(4, 7):
                 other_port.sendto(packet(number + AHEAD, 3, 1), stream_of(pair))
                 for datagram in forged_frame(number, 8000):
@@ -206,8 +214,9 @@ def forged_answers() -> list[bytes]:
     ] + [acknowledgement(0x0089, n, struct.pack(">HH", 0, 65_535)) for n in range(1, 20)]
 
 
-def test_forged_answers_to_control_commands_change_nothing() -> None:
-    with flying(latch_interval_s=0.5) as (pair,), stranger() as attacker:
+@pytest.mark.parametrize("address", [STRANGER, HEAD], ids=["another", "another port"])
+def test_forged_answers_to_control_commands_change_nothing(address: str) -> None:
+    with flying(latch_interval_s=0.5) as (pair,), stranger(address) as attacker:
         control = pair.emulated._control.controller
         assert control is not None
         over = threading.Event()
@@ -255,6 +264,41 @@ def test_pending_acknowledgements_of_others_do_not_keep_a_lost_head_away() -> No
         finally:
             over.set()
             thread.join()
+
+
+def heard_by(udp: socket.socket) -> set[str]:
+    """Who of head and stranger gets through to a socket."""
+    udp.settimeout(0.2)
+    for address in (HEAD, STRANGER):
+        with stranger(address) as sender:
+            sender.sendto(b"?", ("127.0.0.1", udp.getsockname()[1]))
+    found = set()
+    with contextlib.suppress(TimeoutError):
+        while True:
+            found.add(udp.recvfrom(10)[1][0])
+    return found
+
+
+def test_a_socket_is_held_to_the_head_as_soon_as_aravis_binds_it() -> None:
+    """Aravis makes and uses sockets within one call; ours and those of others stay as they are."""
+    with contextlib.ExitStack() as stack:
+        before = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        before.bind(("127.0.0.1", 0))
+        sockets = stack.enter_context(NewSockets("127.0.0.1", HEAD))
+        elsewhere = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        elsewhere.bind(("127.0.0.2", 0))
+        receiver = open_udp_port(f"udpin://127.0.0.1:{free_port()}")
+        stack.callback(receiver.close)
+        made = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        made.bind(("127.0.0.1", 0))
+        pause = threading.Event()
+        pause.wait(0.2)
+        assert heard_by(made) == {HEAD}
+        assert heard_by(before) == heard_by(receiver._socket) == {HEAD, STRANGER}
+        with sockets.take() as taken:
+            assert taken.getsockname() == made.getsockname()
+        with pytest.raises(DeviceError, match="control socket"):
+            sockets.take()
 
 
 @contextlib.contextmanager
@@ -305,26 +349,41 @@ def test_a_head_may_ask_for_more_time_but_not_without_end(
         assert 0.5 < time.monotonic() - began < 5
 
 
-def test_who_answers_discovery_in_a_heads_name_is_not_opened() -> None:
-    from daemon.cli.find_heads import found_heads
-
-    impostor = GigeHead(
-        HeadIdentity("127.77.66.7", "EVIL", "Head", "Peer", "127.77.9.1"),
+@contextlib.contextmanager
+def impostor(serial: str, model: str, user_id: str) -> Iterator[None]:
+    """Another head, with an identity of the attacker's choice."""
+    head = GigeHead(
+        HeadIdentity(f"{NETWORK}.77", serial, model, "Peer", user_id),
         FrameSize(SHAPE[1], SHAPE[0]),
         lambda _request: FORGED,
         lambda _mono_ns: 0.0,
-        Pair(0, WireFaults(), {}).clock,
+        DeviceClock(),
         WireFaults(),
         Pacing.for_receive_buffer(4 << 20),
     )
-    impostor.start()
+    head.start()
     try:
+        yield
+    finally:
+        head.close()
+
+
+def test_what_answers_discovery_prints_no_markup_and_no_control_sequences() -> None:
+    with impostor("[/x]", "\x1b[31mA\u202e\r[bold]", ""):
+        shown = CliRunner().invoke(app, ["check", "--find-heads"], env={"COLUMNS": "200"})
+    assert shown.exit_code == 0, shown.exception
+    assert "[/x]" in shown.stdout
+    assert "?[31mA" in shown.stdout
+    assert "[bold]" in shown.stdout
+    assert not [c for c in shown.stdout if not c.isprintable() and c != "\n"]
+
+
+def test_who_answers_discovery_in_a_heads_name_is_not_opened() -> None:
+    with impostor("EVIL", "Head", HEAD):
         found, _ = found_heads()
         assert "EVIL" in [head["settings"]["serial"] for head in found]
         with flying() as (pair,):
             pair.pulse(1)
             pair.wait_frames(1)
             assert pair.driver.bind()["serial"] == "E-0"
-    finally:
-        impostor.close()
     assert_unharmed(pair, 1)

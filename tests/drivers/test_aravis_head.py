@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mmap
+import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -37,6 +38,8 @@ from sim_hw.world_clock import DeviceClock
 pytest.importorskip("gi", reason="needs PyGObject (extra aravis) and gir1.2-aravis-0.8")
 pytestmark = pytest.mark.timeout(240)
 
+NETWORK = f"127.{1 + os.getpid() % 250}.77"
+"""Addresses of this process's own: other tests have heads, too."""
 SHAPE = (240, 320)
 PATTERN = np.random.default_rng(3).integers(0, 4096, SHAPE, dtype=np.uint16)
 WITHIN_S = 40.0
@@ -78,7 +81,7 @@ class Pair:
     def __init__(self, number: int, faults: WireFaults, section: dict[str, object]) -> None:
         self.clock = DeviceClock(offset_ns=number * 10**12, drift_ppm=15.0 * number)
         self.starts_ns: list[int] = []
-        address = f"127.77.9.{number + 1}"
+        address = f"{NETWORK}.{number + 1}"
         self.emulated = GigeHead(
             HeadIdentity(address, f"E-{number}", "Head", "Peer", f"SU0{number}"),
             FrameSize(SHAPE[1], SHAPE[0]),

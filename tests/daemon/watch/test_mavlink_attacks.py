@@ -33,7 +33,7 @@ from tests.daemon.watch.test_mavsdk_camera import Flying, wait_for
 dialect = pytest.importorskip(
     "pymavlink.dialects.v20.ardupilotmega", reason="pip install 'syntopic[mavlink]'"
 )
-pytestmark = pytest.mark.trust
+pytestmark = [pytest.mark.trust, pytest.mark.attack]
 KEY = bytes(range(32))
 NOW_NS = SIGNING_EPOCH_UNIX_NS + 400_000_000 * 1_000_000_000
 NOW = 400_000_000 * TICKS_PER_S
