@@ -1,0 +1,109 @@
+"""The head with the least of its neighbours' fine detail, from shares given by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from processing.geometry.placement import nominal_placements
+from processing.geometry.topology import overlaps
+from processing.matching.tie_places import overlap_pixels
+from processing.quality import relative_sharpness
+from processing.quality.relative_sharpness import _typical, relative_sharpness_figures
+from processing.rig import Sensor, find_rig
+
+MINI = find_rig("ultracam-x-mini")
+PLACEMENTS = nominal_placements(MINI, {}, {})
+PAN = [s for cone in MINI.pan_cones for s in cone.sensors]
+Shares = dict[str, tuple[float | None, float | None]]
+
+
+def figures(
+    monkeypatch: pytest.MonkeyPatch, shares: Shares, *, without: tuple[str, ...] = ()
+) -> dict[str, object]:
+    """Figures where these sensors have these shares of fine detail and all others 0.45."""
+
+    def sharpness(sensor: Sensor, *_: object) -> tuple[float | None, float | None]:
+        return shares.get(sensor.name, (0.45, 0.45))
+
+    monkeypatch.setattr(relative_sharpness, "sharpness", sharpness)
+    frames = {
+        s.name: np.zeros((s.height_px, s.width_px), np.uint16) for s in PAN if s.name not in without
+    }
+    return dict(relative_sharpness_figures(MINI, PLACEMENTS, frames))
+
+
+@pytest.mark.parametrize("share", [(0.37, 0.37), (0.37, 0.45), (0.45, 0.37)])
+def test_a_head_with_three_fifths_of_the_detail_is_in_order(
+    monkeypatch: pytest.MonkeyPatch, share: tuple[float, float]
+) -> None:
+    """0.25 is a surface without detail: 0.12 of 0.2, and 0.116 of 0.2; one direction is enough."""
+    assert figures(monkeypatch, {"SU10": share}) == {"blurred_sensor": None, "blurred_ratio": None}
+    less = tuple(0.366 if value == 0.37 else value for value in share)
+    found = figures(monkeypatch, {"SU10": (less[0], less[1])})
+    assert found == {"blurred_sensor": "SU10", "blurred_ratio": pytest.approx(0.58)}
+
+
+def test_a_head_at_the_limit_is_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(relative_sharpness, "LEAST_RATIO", 0.5)
+    monkeypatch.setattr(relative_sharpness, "_typical", lambda found: 0.5)
+    assert figures(monkeypatch, {})["blurred_sensor"] is None
+
+
+def test_no_detail_at_all_is_a_thousandth(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = figures(monkeypatch, {"SU10": (0.1, 0.25)})
+    assert found == {"blurred_sensor": "SU10", "blurred_ratio": pytest.approx(0.001 / 0.2)}
+
+
+@pytest.mark.parametrize(("sharper", "found"), [(0.299, False), (0.301, True)])
+def test_ground_without_detail_is_not_compared(
+    monkeypatch: pytest.MonkeyPatch, sharper: float, found: bool
+) -> None:
+    shares: Shares = {s.name: (sharper, sharper) for s in PAN}
+    shares["SU10"] = (0.26, 0.26)
+    made = figures(monkeypatch, shares)
+    assert made.get("blurred_sensor") == ("SU10" if found else None) and bool(made) == found
+
+
+def test_directions_and_heads_without_a_share_are_not_compared(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert figures(monkeypatch, {s.name: (None, None) for s in PAN}) == {}
+    one: Shares = {s.name: (None, 0.45) for s in PAN} | {"SU10": (0.3, 0.3)}
+    assert figures(monkeypatch, one)["blurred_ratio"] == pytest.approx(0.25)
+    one |= {"SU10": (0.3, None)}
+    assert figures(monkeypatch, one)["blurred_sensor"] is None
+    neighbours = {o.sensor_b if o.sensor_a == "SU10" else o.sensor_a for o in overlaps(MINI)}
+    assert neighbours
+    assert figures(monkeypatch, {"SU10": (0.3, 0.3)}, without=("SU10",)) == {
+        "blurred_sensor": None,
+        "blurred_ratio": None,
+    }
+
+
+def test_pixels_of_the_overlap_are_compared(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: dict[str, list[NDArray[np.uint16]]] = {}
+
+    def sharpness(sensor: Sensor, part: NDArray[np.uint16], rows: tuple[int, int]) -> object:
+        assert rows == (0, len(part) - 1)
+        seen.setdefault(sensor.name, []).append(part)
+        return 0.45, 0.45
+
+    monkeypatch.setattr(relative_sharpness, "sharpness", sharpness)
+    frames = {}
+    for s in PAN:
+        row, column = np.mgrid[0 : s.height_px, 0 : s.width_px]
+        frames[s.name] = (row * 37 + column).astype(np.uint16)
+    relative_sharpness_figures(MINI, PLACEMENTS, frames)
+    for overlap in overlaps(MINI):
+        for name in (overlap.sensor_a, overlap.sensor_b):
+            left, right, top, low = overlap_pixels(PLACEMENTS[name], overlap)
+            part = seen[name].pop(0)
+            assert part.shape == (low - top + 1, right - left + 1)
+            assert part[0, 0] == top * 37 + left and part[-1, -1] == low * 37 + right
+
+
+def test_the_typical_ratio_is_the_lower_quartile_of_its_logarithm() -> None:
+    assert _typical([0.1, 0.2, 0.4, 0.8, 1.6]) == pytest.approx(0.2)
+    assert _typical([0.8, 0.1, 0.4, 0.2]) == pytest.approx(0.1**0.25 * 0.2**0.75)
