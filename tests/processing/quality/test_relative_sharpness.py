@@ -51,9 +51,10 @@ def test_a_head_at_the_limit_is_in_order(monkeypatch: pytest.MonkeyPatch) -> Non
     assert figures(monkeypatch, {})["blurred_sensor"] is None
 
 
-def test_no_detail_at_all_is_a_thousandth(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = figures(monkeypatch, {"SU10": (0.1, 0.25)})
-    assert found == {"blurred_sensor": "SU10", "blurred_ratio": pytest.approx(0.001 / 0.2)}
+@pytest.mark.parametrize("sensor", ["SU00", "SU10", "SU30"])
+def test_no_detail_at_all_is_a_thousandth(monkeypatch: pytest.MonkeyPatch, sensor: str) -> None:
+    found = figures(monkeypatch, {sensor: (0.1, 0.25)})
+    assert found == {"blurred_sensor": sensor, "blurred_ratio": pytest.approx(0.001 / 0.2)}
 
 
 @pytest.mark.parametrize(("sharper", "found"), [(0.299, False), (0.301, True)])

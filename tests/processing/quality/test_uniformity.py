@@ -94,6 +94,12 @@ def test_a_step_exceeds_eight_standard_deviations_of_lines(
     assert (largest(means(changes)) is not None) == found
 
 
+def test_a_slope_over_the_frame_is_no_noise() -> None:
+    changes = np.full(LINES - 1, 0.02)
+    changes[40] = 0.07
+    assert largest(means(changes)) == SignalStep("SU00", "rows", 40, pytest.approx(0.07), 1)
+
+
 def test_a_step_exceeds_the_least_counts() -> None:
     made = means(one_step(0.1), level=400.0)
     bright = float(np.median(made[:, 40:42]))
