@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import ast
 import hashlib
+import itertools
 import json
 import os
 import shutil
@@ -233,7 +234,9 @@ def draw(count: int, seed: int) -> list[tuple[str, Mutation]]:
             repeated[name] += 1
             ranked.append((rank, module, place))
     ranked.sort(key=lambda each: each[0])
-    return [(module, place) for _, module, place in ranked[:count]]
+    sources = {module: (ROOT / module).read_text() for module in modules}
+    drawn = ((m, place) for _, m, place in ranked if place.parses(sources[m]))
+    return list(itertools.islice(drawn, count))
 
 
 def nearest_tests(module: str, importers: dict[str, set[str]]) -> list[str]:

@@ -53,6 +53,14 @@ class Mutation:
         encoded = source.encode()
         return (encoded[: self.start] + self.after.encode() + encoded[self.stop :]).decode()
 
+    def parses(self, source: str) -> bool:
+        """Whether the changed file is Python at all."""
+        try:
+            ast.parse(self.apply(source))
+        except SyntaxError:
+            return False
+        return True
+
 
 def mutations(source: str) -> list[Mutation]:
     """List every mutation of a file, in the order of its text.
@@ -64,7 +72,7 @@ def mutations(source: str) -> list[Mutation]:
         source: the file's text; it parses.
 
     Returns:
-        Mutations whose result parses as well.
+        Mutations; a few of them may not parse.
     """
     encoded = source.encode()
     starts = [0]
@@ -83,7 +91,7 @@ def mutations(source: str) -> list[Mutation]:
                 stop = start + len(before.encode())
             text = encoded[start:stop].decode()
             found.append(Mutation(first[0], start, stop, text, after.replace("\0", text)))
-    return [m for m in sorted(found, key=lambda m: (m.start, m.after)) if _parses(m.apply(source))]
+    return sorted(found, key=lambda m: (m.start, m.after))
 
 
 _Place = tuple[int, int]
@@ -161,11 +169,3 @@ def _start(node: ast.expr | ast.UnaryOp) -> _Place:
 def _end(node: ast.expr) -> _Place:
     assert node.end_lineno is not None and node.end_col_offset is not None
     return node.end_lineno, node.end_col_offset
-
-
-def _parses(source: str) -> bool:
-    try:
-        ast.parse(source)
-    except SyntaxError:
-        return False
-    return True
