@@ -51,6 +51,8 @@ NOT_DECIDING = ("drawing.py", "findings.py")
 """Pictures and sentences: no decision rests on them."""
 MOST_TEST_FILES = 8
 """So many of the nearest test files run, nearest first."""
+WATCHED = "processing/"
+"""Of these modules only test files count that execute the changed line; others run in threads."""
 SLOWEST_S = 600
 """So long may one test file take without a mutation."""
 TIME_FACTOR = 3
@@ -257,7 +259,7 @@ def nearest_tests(module: str, importers: dict[str, set[str]]) -> list[str]:
         if driver and driver.removesuffix(".py") in p.stem
     }
     candidates = {t for t in direct | of_folder | of_driver if "/system/" not in t}
-    return sorted(candidates, key=distance)[:MOST_TEST_FILES]
+    return sorted(candidates, key=distance)
 
 
 def _importers() -> dict[str, set[str]]:
@@ -290,57 +292,93 @@ def _copy_tree(folder: Path) -> Path:
 
 def _try(tests: NearestTests, module: str, mutation: Mutation, source: str) -> Outcome:
     path = tests.tree / module
-    nearest = tests.of(module)
     started = time.monotonic()
     try:
         path.write_text(mutation.apply(source))
-        outcome = tests.judge(nearest) if nearest else "no tests"
+        outcome, ran = tests.judge(module, _statement(source, mutation.line))
     finally:
         path.write_text(source)
     seconds = round(time.monotonic() - started, 1)
-    return Outcome(*_key(module, mutation, source), outcome, len(nearest), seconds)
+    return Outcome(*_key(module, mutation, source), outcome, ran, seconds)
+
+
+@dataclass(frozen=True)
+class PlainRun:
+    """A test file without a mutation: how long it takes, which lines it executes where watched."""
+
+    seconds: float
+    executed: dict[str, list[int]]
 
 
 class NearestTests:
     """The test files nearest to each module, run in a copy of the tree that mutations change.
 
-    Another copy stays unchanged; it shows which files pass without a mutation, and how fast.
+    Another copy stays unchanged; it shows which files pass without a mutation, how fast, and which
+    of them execute a line of `processing` at all.
     """
 
     def __init__(self, folder: Path) -> None:
         self.tree, self._unchanged = _copy_tree(folder / "a"), _copy_tree(folder / "b")
         self._importers = _importers()
-        self._seconds: dict[str, float | None] = {}
+        self._plain: dict[str, PlainRun | None] = {}
 
-    def of(self, module: str) -> list[str]:
-        return nearest_tests(module, self._importers)
+    def judge(self, module: str, lines: range) -> tuple[str, int]:
+        """Run test files on the changed tree until one of them fails.
 
-    def judge(self, tests: Sequence[str]) -> str:
-        """Run test files on the changed tree until one of them fails."""
-        for test in tests:
-            plain_s = self._plain_seconds(test)
-            if plain_s is None:
+        Args:
+            module: what was changed.
+            lines: of the statement that was changed.
+
+        Returns:
+            The outcome, and how many test files it took.
+        """
+        ran = 0
+        for test in nearest_tests(module, self._importers):
+            plain = self._plain_run(test)
+            if plain is None or (
+                module.startswith(WATCHED) and not set(lines) & set(plain.executed.get(module, ()))
+            ):
                 continue
-            passed = _passes(self.tree, test, max(LEAST_LIMIT_S, TIME_FACTOR * plain_s))
+            ran += 1
+            passed = _passes(self.tree, test, max(LEAST_LIMIT_S, TIME_FACTOR * plain.seconds))
             if not passed:
-                return "timeout" if passed is None else "noticed"
-        return "survived"
+                return "timeout" if passed is None else "noticed", ran
+            if ran == MOST_TEST_FILES:
+                break
+        return "survived" if ran else "no tests", ran
 
-    def _plain_seconds(self, test: str) -> float | None:
-        """How long a test file takes without a mutation; None where it does not pass."""
-        if test not in self._seconds:
+    def _plain_run(self, test: str) -> PlainRun | None:
+        if test not in self._plain:
+            found = self._unchanged / "executed-lines.json"
             started = time.monotonic()
-            passed = _passes(self._unchanged, test, SLOWEST_S)
-            self._seconds[test] = time.monotonic() - started if passed else None
+            passed = _passes(self._unchanged, test, SLOWEST_S, executed_lines=found)
+            seconds = time.monotonic() - started
+            executed = json.loads(found.read_text()) if passed else {}
+            self._plain[test] = PlainRun(seconds, executed) if passed else None
             if not passed:
                 print(f"left out, fails without a mutation: {test}", file=sys.stderr, flush=True)
-        return self._seconds[test]
+        return self._plain[test]
 
 
-def _passes(tree: Path, test: str, limit_s: float) -> bool | None:
+def _statement(source: str, line: int) -> range:
+    """Lines of the smallest statement that a line belongs to."""
+    spans = [
+        range(node.lineno, node.end_lineno + 1)
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.stmt) and node.end_lineno is not None
+    ]
+    return min((span for span in spans if line in span), key=len)
+
+
+def _passes(
+    tree: Path, test: str, limit_s: float, *, executed_lines: Path | None = None
+) -> bool | None:
     """Whether a test file passes; None where it exceeds the time limit."""
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", test]
     environment = os.environ | {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
+    if executed_lines is not None:
+        command += ["-p", "benchmarks.executed_lines"]
+        environment |= {"EXECUTED_LINES": str(executed_lines), "WATCHED": str(tree / WATCHED)}
     with subprocess.Popen(
         command,
         cwd=tree,
