@@ -11,7 +11,12 @@ import pytest
 from daemon.calibration.rig_text import rig_toml
 from processing.geometry.lens import ideal_from_measured, measured_from_ideal
 from processing.geometry.placement import vip_mm_from_px
-from processing.geometry.residual_grid import ResidualGrid, fit_residual_grid, grid_of_lens
+from processing.geometry.residual_grid import (
+    ResidualGrid,
+    fit_residual_grid,
+    grid_of_lens,
+    left_by_halves,
+)
 from processing.perspective import perspective_of, raw_of_perspective
 from processing.rig import Cone, LensGrid, Rig, RigError, find_rig, rig_from_mapping
 from sim_hw.world.camera import true_camera, undistorted
@@ -96,3 +101,12 @@ def test_a_rig_file_holds_the_grid_and_names_what_is_wrong_in_one() -> None:
         rig_from_mapping(content, "rig.toml")
     assert "lens.residual_grid.x_mm" in str(told.value) and "equal steps" in str(told.value)
     assert "lens.residual_grid.dy_um" in str(told.value) and "13 lists" in str(told.value)
+
+
+def test_halves_that_differ_leave_their_difference() -> None:
+    """Every other residual is 1 um, the others -1 um: either half says nothing of the other."""
+    at = np.random.default_rng(1).uniform(-1.0, 1.0, (200, 2)) * HALF_MM
+    sign = np.where(np.arange(200) % 2, -1.0, 1.0)
+    residual = sign[:, None] * [1e-3, -5e-4]
+    left = left_by_halves(at, residual, half_mm=HALF_MM, nodes=(5, 4))
+    np.testing.assert_allclose(left, 2.0 * residual, atol=1e-7)
