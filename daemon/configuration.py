@@ -6,6 +6,8 @@ Settings of a device are the business of its driver; here they are only checked 
 
 from __future__ import annotations
 
+import ipaddress
+import re
 import stat
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -252,6 +254,8 @@ class WatchSection(_Section):
     mavlink: MavlinkCameraSection | None = None
     control: Path | None = None
     control_group: str | None = None
+    hosts: tuple[str, ...] = Field(default=(), max_length=16)
+    proxies: tuple[str, ...] = Field(default=(), max_length=8)
 
     @property
     def udp_addresses(self) -> dict[str, tuple[str, int]]:
@@ -265,6 +269,24 @@ class WatchSection(_Section):
             if not host or not port.isdecimal() or not 0 < int(port) < 65536:
                 raise ValueError(f"udp has {text!r}; write HOST:PORT")
         return self
+
+    @field_validator("hosts")
+    @classmethod
+    def _are_names(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        for name in names:
+            if not re.fullmatch(r"[A-Za-z0-9]([A-Za-z0-9.\-]{0,251}[A-Za-z0-9])?", name):
+                raise ValueError(f"hosts has {name!r}; write a host name without scheme and port")
+        return names
+
+    @field_validator("proxies")
+    @classmethod
+    def _are_addresses(cls, addresses: tuple[str, ...]) -> tuple[str, ...]:
+        for address in addresses:
+            try:
+                ipaddress.ip_address(address)
+            except ValueError:
+                raise ValueError(f"proxies has {address!r}; write an IP address") from None
+        return addresses
 
     @model_validator(mode="after")
     def _is_safe(self) -> WatchSection:

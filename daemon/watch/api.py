@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import re
 import time
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
@@ -21,13 +20,17 @@ from fastapi import Path as PathParameter
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import FileResponse, JSONResponse, PlainTextResponse
 from fastapi.staticfiles import StaticFiles
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel
 from starlette.exceptions import HTTPException as StarletteHTTPException
+from starlette.requests import HTTPConnection
 from starlette.websockets import WebSocketDisconnect
 
 from daemon.disk.mission import exposure_name
+from daemon.watch.bodies import DOCUMENTED, command_body
+from daemon.watch.connections import WATCHERS_MAX, Connection, Connections, Use, source_of
 from daemon.watch.coverage import Coverage
 from daemon.watch.gate import Gate, NoAnswerError
+from daemon.watch.guard import CONNECTION, bearer
 from daemon.watch.metrics import exposition
 from daemon.watch.planned import add_plan
 from daemon.watch.state import EXPOSURES_KEPT, PARTS, PICTURE_PARTS, FlightState
@@ -40,7 +43,6 @@ TELEMETRY_TICK_S = 0.05
 SEND_TIMEOUT_S = 5.0
 """A watcher that does not take a record in this time is let go."""
 
-WATCHERS_MAX = 64
 IMAGES = {
     "quicklook.jpg": "image/jpeg",
     "thumbnail.jpg": "image/jpeg",
@@ -62,29 +64,6 @@ class Problem(BaseModel):
     title: str
     status: int
     detail: str = ""
-
-
-class CommandBody(BaseModel):
-    """What a command may carry besides its name."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    fault: str | None = Field(default=None, max_length=200, description="which, for acknowledge")
-    override: bool = Field(default=False, description="start although something is missing")
-    reason: str | None = Field(default=None, max_length=200, description="why, for override")
-    disk: Literal["root", "mirror"] | None = Field(
-        default=None, description="for release-disk and accept-disk"
-    )
-    interval_s: float | None = Field(default=None, gt=0, le=3600, description="for interval")
-    count: int = Field(default=0, ge=0, le=10**6, description="for interval; 0: until stopped")
-    distance_m: float | None = Field(default=None, gt=0, le=10**5, description="for distance")
-    control: Literal["manual", "automatic"] | None = Field(default=None, description="for exposure")
-    exposure_time_us: float | None = Field(default=None, gt=0, le=60e6, description="for exposure")
-    gain_db: float | None = Field(default=None, ge=0, le=60, description="for exposure")
-    tdi_shifts: int | None = Field(default=None, ge=0, le=1000, description="for exposure")
-    of: str | None = Field(
-        default=None, max_length=40, description="for exposure: pan, or a cone; else all"
-    )
 
 
 class Outcome(BaseModel):
@@ -131,7 +110,11 @@ class WatchSettings:
 
 
 def create_app(
-    state: FlightState, gate: Gate, settings: WatchSettings, coverage: Coverage | None = None
+    state: FlightState,
+    gate: Gate,
+    settings: WatchSettings,
+    coverage: Coverage | None = None,
+    connections: Connections | None = None,
 ) -> FastAPI:
     """The application; it has no state of its own but who is connected."""
     app = FastAPI(
@@ -145,7 +128,7 @@ def create_app(
     app.middleware("http")(_harden)
     app.add_exception_handler(StarletteHTTPException, _http_problem)
     app.add_exception_handler(RequestValidationError, _validation_problem)
-    doors = _Doors(settings)
+    doors = _Doors(settings, connections or Connections())
     _add_state(app, state, doors)
     _add_products(app, state, doors)
     _add_commands(app, state, gate, doors)
@@ -158,28 +141,25 @@ def create_app(
 class _Doors:
     """Checks tokens; a door is a dependency of a route."""
 
-    def __init__(self, settings: WatchSettings) -> None:
+    def __init__(self, settings: WatchSettings, connections: Connections) -> None:
         self._settings = settings
         self._attempts = Attempts()
-        self.watchers = 0
+        self.connections = connections
 
     def watch(self, request: Request) -> Holder:
         if self._settings.is_open:
             return Holder("anybody", "watch")
-        return self.admit(_bearer(request), _address(request), "watch")
+        return self.admit(_bearer(request), request, "watch")
 
     def command(self, request: Request) -> Holder:
-        return self.admit(_bearer(request), _address(request), "command")
+        return self.admit(_bearer(request), request, "command")
 
-    def admit(self, token: str | None, address: str, role: Role) -> Holder:
-        """Who comes with this token.
+    def admit(self, token: str | None, asking: HTTPConnection, role: Role) -> Holder:
+        """Who comes with this token. A valid one is admitted, however many wrong ones came before.
 
         Raises:
             HTTPException: 401, 403, or 429 after too many wrong tokens.
         """
-        now_s = time.monotonic()
-        if self._attempts.is_blocked(address, now_s):
-            raise HTTPException(429, "too many wrong tokens; wait a minute")
         if token is None:
             raise HTTPException(
                 401,
@@ -188,19 +168,25 @@ class _Doors:
             )
         holder = self._settings.tokens.holder_of(token)
         if holder is None:
-            self._attempts.failed(address, now_s)
+            source, now_s = source_of(_address(asking)), time.monotonic()
+            if self._attempts.is_blocked(source, now_s):
+                raise HTTPException(429, "too many wrong tokens from this address; wait a minute")
+            self._attempts.failed(source, now_s)
             raise HTTPException(401, "this token is not known", {"WWW-Authenticate": "Bearer"})
+        connection = _connection(asking)
+        if connection is not None:
+            connection.is_known = True
         if role == "command" and holder.role != "command":
             raise HTTPException(403, f"{holder.name} may watch, not command")
         return holder
 
-    def may_watch(self, token: str | None, address: str) -> bool:
-        if self._settings.is_open:
+    def may_watch(self, token: str | None, asking: HTTPConnection) -> bool:
+        if self._settings.is_open and token is None:
             return True
         try:
-            self.admit(token, address, "watch")
+            self.admit(token, asking, "watch")
         except HTTPException:
-            return False
+            return self._settings.is_open
         return True
 
 
@@ -299,15 +285,15 @@ def _add_products(app: FastAPI, state: FlightState, doors: _Doors) -> None:
 def _add_commands(app: FastAPI, state: FlightState, gate: Gate, doors: _Doors) -> None:
     somebody_who_may = Depends(doors.command)
 
-    @app.post("/api/v1/commands/{name}", tags=["commands"])
+    @app.post("/api/v1/commands/{name}", tags=["commands"], openapi_extra=DOCUMENTED)
     async def command(
-        name: CommandName, body: CommandBody | None = None, holder: Holder = somebody_who_may
+        name: CommandName, request: Request, holder: Holder = somebody_who_may
     ) -> Outcome:
         """arm, start or stop the line, trigger, land, acknowledge, expose otherwise. Needs a token.
 
         Every command is answered by the service and written into the flight log.
         """
-        given = body or CommandBody()
+        given = await command_body(request)
         if name == "acknowledge":
             if given.fault is None:
                 raise HTTPException(409, "acknowledge needs the fault's id")
@@ -332,16 +318,17 @@ def _add_telemetry(app: FastAPI, state: FlightState, doors: _Doors) -> None:
         bytes_per_s: float = math.inf,
     ) -> None:
         """Records as in docs/telemetry.md, from the whole state on, until the watcher goes."""
-        address = socket.client.host if socket.client else ""
         token = socket.query_params.get("token")
-        if not doors.may_watch(token, address):
+        if not doors.may_watch(token, socket):
             await socket.close(1008, "a token is needed")
             return
-        if doors.watchers >= WATCHERS_MAX:
-            await socket.close(1013, "too many watchers")
+        connection = _connection(socket)
+        if not doors.connections.may_watch(connection):
+            await socket.close(1013, f"too many watchers: {WATCHERS_MAX}")
             return
+        if connection is not None:
+            connection.enter(Use.WATCHER)
         await socket.accept()
-        doors.watchers += 1
         # Over JSON pictures are fetched, not told.
         parts = PARTS if form == "json" else (*PARTS, *PICTURE_PARTS)
         told = Subscription(max(bytes_per_s, LEAST_BYTES_PER_S), parts)
@@ -356,7 +343,6 @@ def _add_telemetry(app: FastAPI, state: FlightState, doors: _Doors) -> None:
             pass  # it stalled or went; nothing is kept for it
         finally:
             gone.cancel()
-            doors.watchers -= 1
             with suppress(RuntimeError, WebSocketDisconnect):
                 await socket.close()
 
@@ -421,7 +407,10 @@ def _title(status: int) -> str:
         403: "Not allowed",
         404: "Not found",
         405: "No such method",
+        408: "Too slow",
         409: "Not possible now",
+        413: "Too large",
+        415: "Not JSON",
         422: "Not understood",
         429: "Too many attempts",
         504: "No answer",
@@ -430,9 +419,14 @@ def _title(status: int) -> str:
 
 
 def _bearer(request: Request) -> str | None:
-    found = re.fullmatch(r"[Bb]earer +(\S{1,200})", request.headers.get("Authorization", ""))
-    return found.group(1) if found else None
+    return bearer(request.scope["headers"])
 
 
-def _address(request: Request) -> str:
-    return request.client.host if request.client else ""
+def _address(asking: HTTPConnection) -> str:
+    return asking.client.host if asking.client else ""
+
+
+def _connection(asking: HTTPConnection) -> Connection | None:
+    """The TCP connection it came on; None in tests without a server."""
+    found = asking.scope.get("state", {}).get(CONNECTION)
+    return found if isinstance(found, Connection) else None

@@ -24,7 +24,8 @@ from typing import Any, Final, get_args
 from pydantic import ValidationError
 
 from daemon.errors import DaemonError
-from daemon.watch.api import CommandBody, CommandName
+from daemon.watch.api import CommandName
+from daemon.watch.bodies import CommandBody
 from daemon.watch.gate import Gate, NoAnswerError
 from daemon.watch.state import FlightState
 

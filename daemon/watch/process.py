@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
@@ -10,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import uvicorn
+from fastapi import FastAPI
+from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
 from daemon.configuration import ConfigurationError, MountSection, WatchSection
 from daemon.disk.mission import Mission
@@ -22,21 +25,24 @@ from daemon.service.findings import Outcome
 from daemon.service.messages import Answer, Ping, Pong, Stop, Told
 from daemon.service.processes import Link, ServiceGoneError
 from daemon.watch.api import WatchSettings, create_app
+from daemon.watch.confinement import confine
+from daemon.watch.connections import Connections, ListeningSocket
 from daemon.watch.control_socket import ControlError, ControlSocket
 from daemon.watch.coverage import Coverage
 from daemon.watch.datagrams import send
 from daemon.watch.discovery import Announcement
 from daemon.watch.earlier import remember
 from daemon.watch.gate import Gate
+from daemon.watch.guard import Application, Guard, Occupancy
 from daemon.watch.mavlink_camera import MavlinkCamera
 from daemon.watch.pictures import pictures_of
 from daemon.watch.prerequisites import WatchError, listen, watch_findings
+from daemon.watch.protocols import MESSAGE_MAX_BYTES, FewLines, LimitedHttp, LimitedWebSocket
 from daemon.watch.state import FlightState
 from daemon.watch.tokens import TokenError, Tokens, read_tokens
 from drivers.extras import MissingExtraError
 from processing.rig import Rig, RigError, load_rig
 
-BODY_MAX_BYTES = 64_000
 GATHER_S = 10.0
 PING_S, PONG_WITHIN_S = 5.0, 10.0
 """So often a watcher is asked whether it still listens, and has so long to answer: what the kernel
@@ -45,6 +51,8 @@ holds for one that stalls may be minutes of telemetry."""
 
 def main(link: Link, settings: WatchSection) -> None:
     """Serve watchers until told to stop."""
+    confine()
+    logging.getLogger("uvicorn.error").addFilter(FewLines())
     asyncio.run(_serve(link, settings))
 
 
@@ -60,16 +68,20 @@ async def _serve(link: Link, settings: WatchSection) -> None:
     gate = Gate(link.send)
     coverage = Coverage(state)
     watchers = WatchSettings(_tokens(settings.tokens), settings.open)
-    app = create_app(state, gate, watchers, coverage)
+    connections = Connections(settings.proxies)
+    app = create_app(state, gate, watchers, coverage, connections)
     certified = "certificate" not in failing
     server = _Server(
         uvicorn.Config(
-            app,
+            _guarded(app, settings, watchers.tokens, connections),
             log_level="warning",
             access_log=False,
             lifespan="off",
-            ws="websockets-sansio",
-            ws_max_size=BODY_MAX_BYTES,
+            http=LimitedHttp,
+            ws=LimitedWebSocket,
+            ws_max_size=MESSAGE_MAX_BYTES,
+            proxy_headers=False,
+            server_header=False,
             ws_ping_interval=PING_S,
             ws_ping_timeout=PONG_WITHIN_S,
             timeout_graceful_shutdown=1,
@@ -83,6 +95,7 @@ async def _serve(link: Link, settings: WatchSection) -> None:
     except WatchError as error:
         link.send(Told(_absent("watch", str(error))))
     if listening is not None:
+        listening = ListeningSocket(listening, connections)
         port = int(listening.getsockname()[1])
         told = {"host": settings.host, "port": port, "tls": settings.certificate is not None}
         link.send(Told({"event": "watching", **told}))
@@ -90,6 +103,7 @@ async def _serve(link: Link, settings: WatchSection) -> None:
     announcement = Announcement(state, settings, port)
     saying = asyncio.create_task(send(state, settings.udp_addresses, settings.udp_bytes_per_s))
     gathering = asyncio.create_task(_gather(coverage))
+    sweeping = asyncio.create_task(connections.keep_sweeping())
     camera = control = None
     if "mavlink camera" not in failing:
         camera = await _camera(settings, state, gate, ground, link)
@@ -114,6 +128,7 @@ async def _serve(link: Link, settings: WatchSection) -> None:
         server.should_exit = True
         saying.cancel()
         gathering.cancel()
+        sweeping.cancel()
         for task in remembering:
             task.cancel()
         if camera is not None:
@@ -125,6 +140,20 @@ async def _serve(link: Link, settings: WatchSection) -> None:
         if serving is not None:
             with suppress(TimeoutError):
                 await asyncio.wait_for(serving, 3.0)
+
+
+def _guarded(
+    app: FastAPI, settings: WatchSection, tokens: Tokens, connections: Connections
+) -> Application:
+    """The application behind what every request passes first, outermost last."""
+
+    def is_known(token: str) -> bool:
+        return tokens.holder_of(token) is not None
+
+    guarded: Any = Guard(app, connections, settings.hosts, is_known)
+    if settings.proxies:
+        guarded = ProxyHeadersMiddleware(guarded, list(settings.proxies))
+    return Occupancy(guarded, connections)
 
 
 class _Server(uvicorn.Server):

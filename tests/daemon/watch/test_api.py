@@ -107,12 +107,16 @@ def test_nobody_commands_without_a_token_that_may(camera: Camera, client: TestCl
     assert [(c.name, c.by) for c in camera.commands] == [("start", "operator")]
 
 
-def test_guessing_is_stopped(camera: Camera, client: TestClient) -> None:
+def test_guessing_is_stopped_and_keeps_no_valid_token_out(
+    camera: Camera, client: TestClient
+) -> None:
     for _ in range(5):
         client.post("/api/v1/commands/start", headers=bearer("guess"))
-    blocked = client.post("/api/v1/commands/start", headers=bearer(camera.operator))
+    blocked = client.post("/api/v1/commands/start", headers=bearer("guess"))
     assert blocked.status_code == 429
     assert camera.commands == []
+    stop = client.post("/api/v1/commands/stop", headers=bearer(camera.operator))
+    assert stop.status_code == 200
     assert client.get("/api/v1/brief").status_code == 200  # watching goes on
 
 

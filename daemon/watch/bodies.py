@@ -1,0 +1,114 @@
+"""The body of a command: read when its sender is known, bounded, and parsed off the event loop."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncIterator
+from typing import Any, Literal
+
+from fastapi import HTTPException, Request
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+BODY_MAX_BYTES = 16_384
+BODY_MAX_S = 5.0
+"""From the end of the header to the end of the body."""
+
+
+class CommandBody(BaseModel):
+    """What a command may carry besides its name."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    fault: str | None = Field(default=None, max_length=200, description="which, for acknowledge")
+    override: bool = Field(default=False, description="start although something is missing")
+    reason: str | None = Field(default=None, max_length=200, description="why, for override")
+    disk: Literal["root", "mirror"] | None = Field(
+        default=None, description="for release-disk and accept-disk"
+    )
+    interval_s: float | None = Field(default=None, gt=0, le=3600, description="for interval")
+    count: int = Field(default=0, ge=0, le=10**6, description="for interval; 0: until stopped")
+    distance_m: float | None = Field(default=None, gt=0, le=10**5, description="for distance")
+    control: Literal["manual", "automatic"] | None = Field(default=None, description="for exposure")
+    exposure_time_us: float | None = Field(default=None, gt=0, le=60e6, description="for exposure")
+    gain_db: float | None = Field(default=None, ge=0, le=60, description="for exposure")
+    tdi_shifts: int | None = Field(default=None, ge=0, le=1000, description="for exposure")
+    of: str | None = Field(
+        default=None, max_length=40, description="for exposure: pan, or a cone; else all"
+    )
+
+
+DOCUMENTED = {
+    "requestBody": {
+        "required": False,
+        "content": {"application/json": {"schema": CommandBody.model_json_schema()}},
+    }
+}
+"""For the API's document: the route reads its body itself."""
+
+
+async def command_body(request: Request) -> CommandBody:
+    """What the body of a command says.
+
+    Raises:
+        HTTPException: 408, 413, 415 or 422, with a sentence.
+    """
+    body = await _read(request.stream())
+    if not body:
+        return CommandBody()
+    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if kind != "application/json":
+        raise HTTPException(415, "the body of a command is application/json")
+    try:
+        return await asyncio.to_thread(parsed, body)
+    except ValueError as error:
+        raise HTTPException(422, str(error)) from error
+
+
+def parsed(body: bytes) -> CommandBody:
+    """A command's body from JSON.
+
+    Raises:
+        ValueError: it is not strict JSON, nested too deeply, or says what a command cannot.
+    """
+    try:
+        found = json.loads(
+            body.decode("utf-8"), object_pairs_hook=_once, parse_constant=_no_constant
+        )
+    except RecursionError:
+        raise ValueError("the body is nested too deeply") from None
+    except ValueError as error:
+        raise ValueError(f"the body is not JSON: {error}") from error
+    if found is None:
+        return CommandBody()
+    try:
+        return CommandBody.model_validate_json(json.dumps(found))
+    except ValidationError as error:
+        sentences = [f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()]
+        raise ValueError("; ".join(sentences)) from error
+
+
+async def _read(pieces: AsyncIterator[bytes]) -> bytes:
+    read = bytearray()
+    try:
+        async with asyncio.timeout(BODY_MAX_S):
+            async for piece in pieces:
+                read += piece
+                if len(read) > BODY_MAX_BYTES:
+                    raise HTTPException(413, f"at most {BODY_MAX_BYTES} bytes are read")
+    except TimeoutError:
+        raise HTTPException(
+            408, f"the body did not come within {BODY_MAX_S:.0f} s", {"Connection": "close"}
+        ) from None
+    return bytes(read)
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        raise ValueError("a key is given twice")
+    return found
+
+
+def _no_constant(text: str) -> Any:
+    raise ValueError(f"{text} is not a number")

@@ -1,0 +1,36 @@
+"""Bounds of the page's process: what reaches it from the network costs no other process.
+
+A unit's limits hold for all processes of the service; these hold for the one that strangers can
+reach. When it exceeds them it ends and is started again; the flight goes on.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+from contextlib import suppress
+from pathlib import Path
+
+MEMORY_MAX_BYTES = 1_000_000_000
+"""Private memory, RLIMIT_DATA."""
+FILES_MAX = 1024
+NICENESS = 5
+OOM_SCORE = 900
+"""Of 1000: the kernel ends this process before any other of the service."""
+
+
+def confine() -> None:
+    """Bound this process; what the machine does not permit is left out."""
+    for kind, most in (
+        (resource.RLIMIT_DATA, MEMORY_MAX_BYTES),
+        (resource.RLIMIT_NOFILE, FILES_MAX),
+        (resource.RLIMIT_CORE, 0),
+    ):
+        _, hard = resource.getrlimit(kind)
+        most = most if hard == resource.RLIM_INFINITY else min(most, hard)
+        with suppress(OSError, ValueError):
+            resource.setrlimit(kind, (most, most))
+    with suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
+    with suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text(str(OOM_SCORE), "ascii")
