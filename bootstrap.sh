@@ -50,6 +50,6 @@ fi
 }
 [ -x .venv/bin/python ] || "$PYTHON" -m venv .venv
 echo "Installing Python packages into .venv (a few minutes the first time)"
-.venv/bin/python -m pip install -q --disable-pip-version-check -r requirements.lock
+.venv/bin/python -m pip install -q --disable-pip-version-check --require-hashes -r requirements.lock
 .venv/bin/python -m pip install -q --disable-pip-version-check --no-deps --no-build-isolation -e .
 echo "Ready: .venv/bin/syntopic --help"

@@ -53,8 +53,11 @@ IMAGES = {
 }
 CONTENT_SECURITY_POLICY = (
     "default-src 'self'; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'; "
-    "connect-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+    "connect-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'; "
+    "object-src 'none'; require-trusted-types-for 'script'; trusted-types default"
 )
+PRODUCT_POLICY = "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:"
+"""Of a file from a mission: whatever it holds, it is a picture and no page."""
 
 
 class Problem(BaseModel):
@@ -279,7 +282,8 @@ def _add_products(app: FastAPI, state: FlightState, doors: _Doors) -> None:
         path = Path(state.mission_path) / "L2" / exposure_name(number) / product
         if not path.is_file():
             raise HTTPException(404, f"exposure {number} has no {product} (yet)")
-        return FileResponse(path, media_type=IMAGES[product])
+        policy = {"Content-Security-Policy": PRODUCT_POLICY}
+        return FileResponse(path, media_type=IMAGES[product], headers=policy)
 
 
 def _add_commands(app: FastAPI, state: FlightState, gate: Gate, doors: _Doors) -> None:
@@ -378,7 +382,9 @@ async def _harden(
     request: Request, call_next: Callable[[Request], Awaitable[Response]]
 ) -> Response:
     response = await call_next(request)
-    response.headers["Content-Security-Policy"] = CONTENT_SECURITY_POLICY
+    response.headers.setdefault("Content-Security-Policy", CONTENT_SECURITY_POLICY)
+    response.headers["Cross-Origin-Resource-Policy"] = "same-origin"
+    response.headers["Cross-Origin-Opener-Policy"] = "same-origin"
     response.headers["X-Content-Type-Options"] = "nosniff"
     response.headers["Referrer-Policy"] = "no-referrer"
     response.headers["Cache-Control"] = "no-cache"

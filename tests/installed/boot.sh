@@ -35,7 +35,7 @@ export LD_LIBRARY_PATH=/opt/python/lib PYTHONPATH=/opt/repository:/opt/packages 
 exec /opt/python/bin/python3 -m daemon "\$@"
 SH
 chmod 755 /opt/syntopic/bin/syntopic
-cp "$REPOSITORY/systemd/syntopic.service" /etc/systemd/system/
+cp "$REPOSITORY"/systemd/*.service /etc/systemd/system/
 cp "$REPOSITORY"/tests/installed/units/*.service /etc/systemd/system/
 cp "$REPOSITORY/tests/installed/units/flight.conf" /etc/systemd/system/syntopic.service.d/
 printf '[Unit]\nDefaultDependencies=no\nWants=flight.service\n' >/etc/systemd/system/flight.target

@@ -21,6 +21,14 @@ said user "$(ps -o user= -p "$pid")"
 for word in NoNewPrivs Seccomp CapEff; do
     said $word "$(sed -n "s/^$word:[[:space:]]*//p" "/proc/$pid/status")"
 done
+said oom_policy "$(systemctl show -P OOMPolicy syntopic.service)"
+# The page's process is the one that the kernel would end first; the flight goes on without it.
+page=$(grep -lx 900 /proc/[0-9]*/oom_score_adj | cut -d/ -f3)
+said page_user "$(ps -o user= -p "$page")"
+kill -9 "$page"
+said page_killed $?
+systemctl start syntopic-disk-health.service
+said health "$(grep -c '"disks"' /run/syntopic-health/disks.json)"
 for second in $(seq 300); do
     systemctl is-active -q syntopic.service || break
     sleep 1

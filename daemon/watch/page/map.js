@@ -5,6 +5,9 @@ import { flight } from "./state.js";
 const COLOURS = { good: "--good", usable: "--caution", refly: "--warning", lost: "--warning" };
 const DASHES = { good: null, usable: "6 3", refly: "2 4", lost: "1 7" };
 
+// A string would be taken for HTML.
+const label = (words) => document.createTextNode(words);
+
 const map = L.map("map", { zoomControl: true, attributionControl: false, zoomSnap: 0.25 });
 map.setView([0, 0], 2);
 L.control.scale({ imperial: false }).addTo(map);
@@ -62,7 +65,7 @@ export function drawPlan(told) {
   for (const line of lines) {
     L.polyline(line.at, { color: colour("--soft"), weight: 2, dashArray: "8 6", interactive: false }).addTo(plan);
     L.circleMarker(line.at[0], { radius: 2, color: colour("--soft"), interactive: false })
-      .bindTooltip(line.id, { permanent: true, direction: behind(line.at), className: "line-label" }).addTo(plan);
+      .bindTooltip(label(line.id), { permanent: true, direction: behind(line.at), className: "line-label" }).addTo(plan);
     if (line.places_m.length > 200) continue;
     const [[lat0, lon0], [lat1, lon1]] = line.at;
     const scale = Math.cos(lat0 * Math.PI / 180);
@@ -85,7 +88,7 @@ export function drawHoles(segments) {
         .addTo(holes);
     }
     L.polyline(one.at, { color: colour("--warning"), weight: 12, opacity: 0.55, dashArray: "2 6", lineCap: "butt" })
-      .bindTooltip(`✖ ${one.line}`,
+      .bindTooltip(label(`✖ ${one.line}`),
         { permanent: true, direction: "right", className: "hole-label" }).addTo(holes);
   }
 }
@@ -103,7 +106,7 @@ export function drawMap(choose) {
     if (!drawn) {
       drawn = L.polygon(one.footprint, { interactive: true }).addTo(map);
       drawn.on("click", () => choose(one.number));
-      drawn.bindTooltip(() => `${one.number}: ${flight.exposures.get(one.number)?.verdict || one.step}`);
+      drawn.bindTooltip(() => label(`${one.number}: ${flight.exposures.get(one.number)?.verdict || one.step}`));
       // By keyboard the table of exposures does the same; nobody steps through a thousand footprints.
       drawn.getElement().setAttribute("tabindex", "-1");
       footprints.set(one.number, drawn);

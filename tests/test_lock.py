@@ -1,0 +1,63 @@
+"""Every pinned package has hashes, and the installation insists on them."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+LOCK = ROOT / "requirements.lock"
+
+pytestmark = pytest.mark.trust
+
+
+def requirements() -> list[str]:
+    """Each requirement with its continuation lines."""
+    text = re.sub(r" *#.*", "", LOCK.read_text("utf-8"))
+    return [line for line in text.replace("\\\n", " ").splitlines() if line.strip()]
+
+
+def test_every_package_has_a_version_and_hashes() -> None:
+    assert len(requirements()) > 60
+    for line in requirements():
+        assert re.match(r"[A-Za-z0-9._-]+==\S+", line), line
+        assert re.search(r"--hash=sha256:[0-9a-f]{64}", line), line
+
+
+@pytest.mark.parametrize("where", ["bootstrap.sh", "docs/installation.md"])
+def test_installing_insists_on_hashes(where: str) -> None:
+    lines = [one for one in (ROOT / where).read_text("utf-8").splitlines() if LOCK.name in one]
+    installing = [one for one in lines if "pip install" in one]
+    assert installing
+    assert all("--require-hashes" in one for one in installing)
+
+
+def test_a_file_that_was_exchanged_is_refused(tmp_path: Path) -> None:
+    wheel = tmp_path / "planted-1.0-py3-none-any.whl"
+    with zipfile.ZipFile(wheel, "w") as archive:
+        archive.writestr("planted.py", "")
+        archive.writestr("planted-1.0.dist-info/METADATA", "Name: planted\nVersion: 1.0\n")
+        archive.writestr("planted-1.0.dist-info/WHEEL", "Wheel-Version: 1.0\n")
+        archive.writestr("planted-1.0.dist-info/RECORD", "")
+    lock = tmp_path / "requirements.lock"
+    for content, is_accepted in ((wheel.read_bytes(), True), (b"another file", False)):
+        lock.write_text(f"planted==1.0 --hash=sha256:{hashlib.sha256(content).hexdigest()}\n")
+        tried = subprocess.run(
+            [
+                *(sys.executable, "-m", "pip", "download", "-q", "--no-index", "--no-deps"),
+                *("--require-hashes", "--find-links", str(tmp_path), "-d", str(tmp_path / "out")),
+                *("-r", str(lock)),
+            ],
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+        assert (tried.returncode == 0) == is_accepted, tried.stderr
+    assert "DO NOT MATCH THE HASHES" in tried.stderr
