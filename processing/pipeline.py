@@ -312,6 +312,7 @@ class Pipeline:
             equal_datum=stitched.equal,
             free=stitched.free,
             validity=validity,
+            disturbance=disturbance,
             estimated_dc=estimated,
             platform=platform,
             ground=ground,

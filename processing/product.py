@@ -17,6 +17,7 @@ from processing.matching.tie_points import TiePoints, TiePointSettings
 from processing.mosaic.estimated_dc import EstimatedDc
 from processing.mosaic.free import Mosaic, MosaicSettings
 from processing.mosaic.mounting import PlatformCheck
+from processing.mosaic.precision import Disturbance
 from processing.mosaic.stitching import Method
 from processing.mosaic.validity import Validity
 from processing.quality.report import QualityReport, Thresholds
@@ -74,6 +75,7 @@ class Product:
     where calibration had to support them; `equal_datum` that whose datum rests on all master
     sensors alike, which is `free` unless one was found displaced. `estimated_dc` is dC by
     stitching, cone by cone (none with the fixed method), `temperatures` what the placing used.
+    `disturbance` is what the findings of the exposure add to its stated covariance.
     Of converging heads `platform` holds how they are mounted and whether as calibrated, `ground`
     the plane they were projected onto.
     """
@@ -91,6 +93,7 @@ class Product:
     equal_datum: Mosaic
     free: Mosaic
     validity: Validity | None
+    disturbance: Disturbance
     estimated_dc: tuple[EstimatedDc, ...]
     platform: PlatformCheck | None
     ground: GroundPlane | None

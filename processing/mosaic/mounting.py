@@ -38,8 +38,8 @@ from processing.rig import Cone, Rig, Sensor
 
 Array = NDArray[np.float64]
 
-FAMILY_ALPHA: Final = 0.001
-"""Probability of calling a healthy platform expired."""
+FAMILY_ALPHA: Final = 1e-5
+"""Probability of calling a healthy platform expired: it changes the verdict."""
 LEAST_SHIFT_PX: Final = 0.01
 LEAST_POINTS: Final = 24
 SCALED_PPM: Final = 100.0

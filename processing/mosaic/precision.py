@@ -100,7 +100,7 @@ def placed_sigma_px(
     if held & {sensor, rig.cone_of(sensor).name} and not mosaic.supported:
         tie_points = tie_points * max(1.0, 1.0 / max(mosaic.sigma0, 1e-6))
     placed_mm = vip_mm_from_raw(mosaic.placements[sensor], colrow)
-    datum = datum_design(placed_mm)
+    datum = moved_datum_design(rig, mosaic, placed_mm)
     disturbance = disturbance or Disturbance()
     of_datum = datum_covariance(rig, mosaic, measured_c) + disturbance.datum
     variance = np.sum((datum @ of_datum) * datum, axis=1).reshape(-1, 2)
@@ -133,7 +133,9 @@ def placed_covariance_px(
         row = np.zeros((2 * len(colrow), len(model.names)))
         row[:, columns] = design.transpose(2, 1, 0).reshape(2 * len(colrow), len(columns))
         rows.append(row)
-        datum.append(datum_design(vip_mm_from_raw(mosaic.placements[name], colrow)))
+        datum.append(
+            moved_datum_design(rig, mosaic, vip_mm_from_raw(mosaic.placements[name], colrow))
+        )
     jacobian, similarity = np.concatenate(rows), np.concatenate(datum)
     return (
         jacobian @ mosaic.covariance @ jacobian.T,
@@ -228,6 +230,21 @@ def _place_mm(rig: Rig, mosaic: Mosaic, sensor: Sensor) -> tuple[float, float]:
     middle = np.array([[(sensor.width_px - 1) / 2.0, (sensor.height_px - 1) / 2.0]])
     x, y = vip_mm_from_raw(mosaic.start[sensor.name], middle)[0]
     return float(x), float(y)
+
+
+def moved_datum_design(rig: Rig, mosaic: Mosaic, xy_mm: Array) -> Array:
+    """How the datum moves points of the image: (2 n, 4), x and y of each in turn.
+
+    Of converging heads it is a rotation of the virtual camera: its shift grows towards the edges.
+    """
+    design = datum_design(xy_mm)
+    if rig.master_cone is None:
+        x, y = xy_mm.T / mosaic.model.f_mm
+        design[0::2, 0] += x * x
+        design[1::2, 0] += x * y
+        design[0::2, 1] += x * y
+        design[1::2, 1] += y * y
+    return design
 
 
 def datum_design(xy_mm: Array) -> Array:

@@ -19,6 +19,7 @@ from processing.mosaic.precision import (
     datum_covariance,
     datum_design,
     datum_per_kelvin_px,
+    moved_datum_design,
     placed_covariance_px,
     placed_sigma_px,
     precision_figures,
@@ -222,6 +223,22 @@ def test_the_datum_design_is_the_derivative_of_a_similarity() -> None:
     turned = xy + shift + scale * xy + turn * np.column_stack([-xy[:, 1], xy[:, 0]])
     moved = datum_design(xy) @ np.array([*shift, scale, turn])
     np.testing.assert_allclose(moved, (turned - xy).ravel(), rtol=1e-9)
+
+
+def test_of_converging_heads_the_datum_is_a_rotation_of_the_virtual_camera() -> None:
+    rig = find_rig("dmc-mini")
+    mosaic = free_mosaic(rig, nominal_placements(rig, {}, {}), no_tie_points(rig))
+    f = mosaic.model.f_mm
+    xy = np.array([[19.0, -10.0], [-15.0, 8.0]])
+    by_x, by_y, by_z = 3e-5, -2e-5, 1e-5
+    rays = np.column_stack([xy, [-f, -f]])
+    turned = rays + np.cross([by_x, by_y, by_z], rays)
+    expected = turned[:, :2] * (-f / turned[:, 2:]) - xy
+    datum = np.array([-f * by_y, f * by_x, 0.0, by_z])
+    moved = moved_datum_design(rig, mosaic, xy) @ datum
+    np.testing.assert_allclose(moved, expected.ravel(), rtol=1e-3)
+    master, placed = mosaic_of("ultracam-x-mini")
+    np.testing.assert_array_equal(moved_datum_design(master, placed, xy), datum_design(xy))
 
 
 def test_findings_add_their_variance_to_the_placed_pixels() -> None:

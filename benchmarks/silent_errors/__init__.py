@@ -1,0 +1,1 @@
+"""Random search for wrong inputs whose images pass as good."""

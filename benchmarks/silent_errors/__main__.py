@@ -1,0 +1,152 @@
+"""`python -m benchmarks.silent_errors`: do wrong inputs pass as good images?
+
+Plants wrong inputs of sizes from 0.5 to 4 times their published detection limit, by seed, processes
+them as `syntopic process` does and holds image and report against the emulator's truth. With
+`--clean` it renders healthy exposures over hard scenes instead and counts false alarms.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from benchmarks.silent_errors.cases import WIDEST, Case, by_exposure, draw, run
+from benchmarks.silent_errors.clean import clean_rows, clean_summary
+from benchmarks.silent_errors.exposures import RIGS
+from benchmarks.silent_errors.limits import LIMITS, table
+from daemon.measuring import machine
+
+Row = dict[str, Any]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.silent_errors")
+    add = parser.add_argument
+    add("--count", type=int, default=150, help="Wrong inputs to draw (default: 150).")
+    add("--seed", type=int, default=1, help="Seed for all random generators (default: 1).")
+    add("--rig", action="append", choices=RIGS, help="Only this rig; repeat.")
+    add("--kind", action="append", choices=sorted(LIMITS), help="Only this kind; repeat.")
+    add("--jobs", type=int, default=1, help="Processes (default: 1).")
+    add("--results", type=Path, help="File of results, one JSON object a line; it is continued.")
+    add("--clean", type=int, default=0, help="Healthy exposures to render instead.")
+    add("--json", action="store_true", help="Print one JSON object.")
+    add("--limits", action="store_true", help="Print the published detection limits.")
+    given = parser.parse_args()
+    if given.limits:
+        print(table())
+        return
+    if given.clean:
+        found = list(clean_rows(given.clean, given.seed, given.results))
+        print(
+            json.dumps({"machine": machine(), "clean": found})
+            if given.json
+            else clean_summary(found)
+        )
+        sys.exit(1 if any(row["alarm"] for row in found) else 0)
+    cases = draw(given.count, given.seed, rigs=given.rig or (), kinds=given.kind or ())
+    rows = list(results(cases, given.results, given.jobs))
+    if given.json:
+        print(json.dumps({"machine": machine(), "cases": rows}))
+    else:
+        print(summary(rows))
+    sys.exit(1 if any(row["result"] in ("silent", "misled") for row in rows) else 0)
+
+
+def results(cases: Sequence[Case], file: Path | None, jobs: int) -> Iterable[Row]:
+    """Outcomes by case; those that are in the file already are not run again."""
+    known = {row["number"]: row for row in _read(file)}
+    left = [case for case in by_exposure(cases) if case.number not in known]
+    yield from (known[case.number] for case in cases if case.number in known)
+    if jobs > 1:
+        with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+            for outcome in pool.map(run, left, chunksize=8):
+                yield _write(file, asdict(outcome))
+    else:
+        for case in left:
+            yield _write(file, asdict(run(case)))
+
+
+def _read(file: Path | None) -> list[Row]:
+    if file is None or not file.exists():
+        return []
+    return [json.loads(line) for line in file.read_text().splitlines() if line]
+
+
+def _write(file: Path | None, row: Row) -> Row:
+    if file is not None:
+        with file.open("a") as out:
+            out.write(json.dumps(row) + "\n")
+    print(f"{row['number']} {row['rig']} {row['says']}: {row['result']}", file=sys.stderr)
+    return row
+
+
+def summary(rows: Sequence[Row]) -> str:
+    """Markdown: a line for each kind, the cases that are wrong, and the sigmas of all."""
+    lines = [
+        "| kind | drawn | above the limit | of these found | right | silent | misled "
+        "| largest error over sigma |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for kind in LIMITS:
+        of_kind = [row for row in rows if row["kind"] == kind]
+        if not of_kind:
+            continue
+        above = [row for row in of_kind if row["above"]]
+        counts = [
+            len(of_kind),
+            len(above),
+            *(sum(r["result"] == what for r in above) for what in ("found", "right")),
+            *(sum(r["result"] == what for r in of_kind) for what in ("silent", "misled")),
+        ]
+        good = [r["over_sigma"] for r in of_kind if r["over_sigma"] is not None]
+        worst = f"{max(good):.2f}" if good else "–"
+        lines.append(f"| `{kind}` | " + " | ".join(map(str, counts)) + f" | {worst} |")
+    lines += ["", *_wrong(rows), "", *_sigmas(rows)]
+    return "\n".join(lines)
+
+
+def _wrong(rows: Iterable[Row]) -> list[str]:
+    return [
+        f"{row['result']}: {row['number']} {row['kind']} {row['rig']} {row['says']} "
+        f"({row['share']:.2f} of the limit): {row['verdict']} {row['flags']} {row['named']}, "
+        f"error/sigma {row['over_sigma'] or 0:.2f} ({row['error_px'] or 0:.3f} px), band "
+        f"{row['band_px']:.2f} px, radiance {row['radiance']:.1%} of {row['radiance_of']}, "
+        f"detail {row['detail']:.0%}"
+        for row in rows
+        if row["result"] in ("silent", "misled")
+    ]
+
+
+def _sigmas(rows: Sequence[Row]) -> list[str]:
+    """Normalised errors of flagged and unflagged images against the 99.9 % points of chi-square."""
+    lines = []
+    for says, flagged in (("without a flag", False), ("with a flag", True)):
+        some = [r for r in rows if r["rank"] and bool(r["flags"]) == flagged]
+        if not some:
+            continue
+        rank = sum(r["rank"] for r in some)
+        mean = sum(r["squares"] for r in some) / rank
+        low, high = (float(chi2.ppf(p, rank)) / rank for p in (0.0005, 0.9995))
+        true = float(np.sqrt(np.mean([r["error_px"] ** 2 for r in some])))
+        stated = float(np.sqrt(np.mean([r["stated_px"] ** 2 for r in some])))
+        wide = sum(r["stated_px"] > WIDEST * r["error_px"] for r in some)
+        lines.append(
+            f"{says}: {len(some)} images, mean square of normalised errors {mean:.3f} "
+            f"(rank {rank}, {low:.3f} .. {high:.3f}); {true:.3f} px true, {stated:.3f} stated; "
+            f"{wide} state more than {WIDEST:g} times their error"
+        )
+    return lines
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,205 @@
+"""Cases of the search: drawn by seed, run through the pipeline, and judged."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.silent_errors.exposures import again, healthy
+from benchmarks.silent_errors.faults import FAULTS
+from benchmarks.silent_errors.limits import LIMITS
+from benchmarks.silent_errors.truth import Found, compare, detail_of
+from processing.quality.report import Figure, QualityReport, Verdict
+
+EXPOSURES: Final = 2
+"""Healthy exposures of a rig, over other ground and at other temperatures."""
+SMALLEST, LARGEST = 0.5, 4.0
+COVERED: Final = 2.15
+"""True RMS error over stated sigma: the 99.9 % point of the datum's four parameters."""
+RADIANCE: Final = 0.08
+"""What the radiance of a region of a good image may be off by (docs/validity.md)."""
+BAND_PX: Final = 0.5
+DETAIL: Final = 0.5
+"""Of the fine detail of the same image without a fault."""
+WIDEST: Final = 3.0
+"""Stated sigma over true error, above which a widened sigma states nothing."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One wrong input: kind, rig, exposure, size as a share of the published limit."""
+
+    number: int
+    kind: str
+    rig: str
+    exposure: int
+    share: float
+    seed: int
+
+    @property
+    def size(self) -> float:
+        return self.share * LIMITS[self.kind].by_rig[self.rig]
+
+    @property
+    def above(self) -> bool:
+        """Whether it is to be found: sizes of counted things are at least one."""
+        return self.share >= 1.0 or not LIMITS[self.kind].unit
+
+
+def draw(
+    count: int, seed: int, *, rigs: Sequence[str] = (), kinds: Sequence[str] = ()
+) -> list[Case]:
+    """Cases by seed: every kind with every rig that has it in turn, all else by chance."""
+    random = np.random.default_rng([seed, 23])
+    pairs = [(kind, rig) for kind, limit in LIMITS.items() for rig in limit.by_rig]
+    order = [pairs[i] for i in random.permutation(len(pairs))]
+    every = itertools.islice(itertools.cycle(order), count)
+    cases = [
+        Case(
+            number=number,
+            kind=kind,
+            rig=rig,
+            exposure=int(random.integers(0, EXPOSURES)),
+            share=float(SMALLEST * (LARGEST / SMALLEST) ** random.uniform()),
+            seed=seed * 100_000 + number,
+        )
+        for number, (kind, rig) in enumerate(every)
+    ]
+    return [c for c in cases if (not rigs or c.rig in rigs) and (not kinds or c.kind in kinds)]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a case, ready for JSON.
+
+    `result` is `found`, `right` (nothing is said, and the image is right), `covered` (below the
+    limit, the image is within what is stated), `silent` (wrong beyond what is stated, and good) or
+    `misled` (found, but only the innocent are named).
+    """
+
+    number: int
+    kind: str
+    rig: str
+    share: float
+    size: float
+    says: str
+    above: bool
+    verdict: str
+    flags: str
+    named: dict[str, str]
+    result: str
+    error_px: float | None
+    stated_px: float | None
+    over_sigma: float | None
+    worst: float | None
+    squares: float | None
+    rank: int
+    band_px: float
+    radiance: float
+    radiance_of: str
+    detail: float
+
+
+def run(case: Case) -> Outcome:
+    """Plant, process and judge one case."""
+    planted = again(case.rig, case.exposure, case.seed)
+    fault = FAULTS[case.kind](planted, case.size, np.random.default_rng([case.seed, 29]))
+    product = fault.planted.process()
+    report = product.report
+    found = compare(fault.planted, product, clean_detail(case.rig, case.exposure))
+    over = None
+    if found.error_px is not None and found.stated_px:
+        over = found.error_px / found.stated_px
+    named = accused(report)
+    result = _result(case, report, found, over, named, fault.culprits)
+    whitened = found.normalised
+    return Outcome(
+        number=case.number,
+        kind=case.kind,
+        rig=case.rig,
+        share=case.share,
+        size=case.size,
+        says=fault.says,
+        above=case.above,
+        verdict=report.verdict.value,
+        flags=", ".join(str(flag.name) for flag in report.flags),
+        named={what: ", ".join(sorted(names)) for what, names in named.items()},
+        result=result,
+        over_sigma=over,
+        squares=None if whitened is None else float(np.sum(whitened.whitened**2)),
+        rank=0 if whitened is None else len(whitened.whitened),
+        **{
+            f.name: getattr(found, f.name)
+            for f in dataclasses.fields(found)
+            if f.name != "normalised"
+        },
+    )
+
+
+def _result(
+    case: Case,
+    report: QualityReport,
+    found: Found,
+    over: float | None,
+    named: Mapping[str, frozenset[str]],
+    culprits: frozenset[str],
+) -> str:
+    if any(not (names & culprits) for names in named.values()):
+        return "misled"
+    if report.verdict is not Verdict.GOOD:
+        return "found"
+    placed = over is None or over <= COVERED
+    shown = found.radiance <= RADIANCE and found.band_px <= BAND_PX and found.detail >= DETAIL
+    if placed and shown:
+        return "right" if case.above else "covered"
+    return "silent"
+
+
+def accused(report: QualityReport) -> dict[str, frozenset[str]]:
+    """Who is named as a cause, by what he is accused of; alternatives among them."""
+    raised = {flag.name for flag in report.flags}
+    figures = report.figures
+    # Of frames of other ground, signal and sharpness are not judged.
+    signal = {} if figures.get("mismatched_sensors") else figures
+    found = {
+        "displaced": _names(figures, "displaced_sensor", "displaced_alternatives"),
+        "slip": _names(figures, "slip_sensors", "slip_alternatives"),
+        "gain": _names(signal, "gain_outlier"),
+        "blur": _names(signal, "blurred_sensor"),
+        "step": _names(signal, "signal_step_sensor"),
+        "ground": _names(figures, "mismatched_sensors"),
+        "words": _names(figures, "word_format_sensors"),
+        "temperature": _names(figures, "dc_disagreement"),
+        "misread": _names(figures, "misread_probe"),
+    }
+    if "CALIBRATION_EXPIRED" in raised:
+        causes = _names(figures, "platform_causes", "platform_alternatives")
+        found["platform"] = causes or _names(figures, "platform_shift_head")
+    return {what: names for what, names in found.items() if names}
+
+
+def _names(figures: Mapping[str, Figure], *keys: str) -> frozenset[str]:
+    if not figures.get(keys[0]):
+        return frozenset()
+    return frozenset(
+        name for key in keys for name in str(figures.get(key) or "").split(", ") if name
+    )
+
+
+@cache
+def clean_detail(rig: str, number: int) -> Mapping[str, NDArray[Any]]:
+    """Fine detail of the image of a healthy exposure."""
+    planted = healthy(rig, number)
+    return detail_of(planted, planted.process())
+
+
+def by_exposure(cases: Sequence[Case]) -> Iterator[Case]:
+    """The cases, those of one exposure together: it is rendered once."""
+    yield from sorted(cases, key=lambda c: (c.rig, c.exposure, c.number))

@@ -1,0 +1,119 @@
+"""False alarms of healthy exposures: rendered over hard scenes, and drawn without rendering.
+
+Each light serves several exposures, each with noise and calibration errors of its own. What a scene
+itself does to an image (water without texture, haze) is expected; whoever is accused is innocent.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from scipy.stats import chi2
+
+from benchmarks.flags import CALM_PX, true_smear_px
+from benchmarks.silent_errors.cases import accused
+from benchmarks.silent_errors.exposures import again, world_of
+from benchmarks.silent_errors.limits import DMC, L, X
+from benchmarks.silent_errors.scenes import SCENES
+from benchmarks.silent_errors.truth import compare
+from processing.quality.report import Verdict
+
+Row = dict[str, Any]
+
+DRAWS: Final = 10
+"""Exposures of one light."""
+FIRST: Final = 100
+RIGS: Final = (X, X, X, L, DMC)
+"""Each light's rig in turn."""
+
+
+def clean_rows(count: int, seed: int, file: Path | None) -> Iterator[Row]:
+    """Healthy exposures by seed; those that are in the file already are not rendered again."""
+    known = {}
+    if file is not None and file.exists():
+        known = {row["number"]: row for row in map(json.loads, file.read_text().splitlines())}
+    for number in range(count):
+        if number in known:
+            yield known[number]
+            continue
+        row = _clean(number, seed)
+        if file is not None:
+            with file.open("a") as out:
+                out.write(json.dumps(row) + "\n")
+        print(f"{number} {row['rig']} {row['scene']}: {row['alarm'] or 'none'}", file=sys.stderr)
+        yield row
+
+
+def _clean(number: int, seed: int) -> Row:
+    light = number // DRAWS
+    rig = RIGS[light % len(RIGS)]
+    scene = list(SCENES)[light // len(RIGS) % len(SCENES)]
+    place = _calm(rig, scene, FIRST + 10 * light)
+    planted = again(rig, place, seed * 1_000_000 + number, scene=scene)
+    product = planted.process()
+    report = product.report
+    found = compare(planted, product, {})
+    changing = [f.flag for f in report.findings if f.verdict is not Verdict.GOOD]
+    unexpected = [str(f.name) for f in changing if not f & SCENES[scene].expected]
+    named = {what: ", ".join(sorted(names)) for what, names in accused(report).items()}
+    accusing = [f"{what} {names}" for what, names in named.items() if changing]
+    return {
+        "number": number,
+        "rig": rig,
+        "scene": scene,
+        "light": place,
+        "verdict": report.verdict.value,
+        "flags": ", ".join(str(flag.name) for flag in report.flags),
+        "alarm": "; ".join([*unexpected, *accusing]),
+        "error_px": found.error_px,
+        "stated_px": found.stated_px,
+        "squares": None
+        if found.normalised is None
+        else float(np.sum(found.normalised.whitened**2)),
+        "rank": 0 if found.normalised is None else len(found.normalised.whitened),
+    }
+
+
+def _calm(rig: str, scene: str, first: int) -> int:
+    """The first exposure from `first` on without true smear: the mount's tremor smears some."""
+    for number in range(first, first + 10):
+        if true_smear_px(world_of(rig, number, scene), 0) < CALM_PX:
+            return number
+    return first
+
+
+def clean_summary(rows: Sequence[Row]) -> str:
+    """Markdown: false alarms by scene, and normalised errors against chi-square."""
+    lines = [
+        "| scene | exposures | false alarms | mean square of normalised errors | 99.9 % interval "
+        "| true px | stated px |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for scene in (*SCENES, "all", "all without a flag"):
+        some = [r for r in rows if r["scene"] == scene or scene.startswith("all")]
+        if scene == "all without a flag":
+            some = [r for r in some if not r["flags"]]
+        placed = [r for r in some if r["rank"]]
+        if not placed:
+            continue
+        rank = sum(r["rank"] for r in placed)
+        low, high = (float(chi2.ppf(p, rank)) / rank for p in (0.0005, 0.9995))
+        mean = sum(r["squares"] for r in placed) / rank
+        true, stated = (
+            float(np.sqrt(np.mean([r[key] ** 2 for r in placed])))
+            for key in ("error_px", "stated_px")
+        )
+        alarms = sum(bool(r["alarm"]) for r in some)
+        lines.append(
+            f"| {scene} | {len(some)} | {alarms} | {mean:.3f} | {low:.3f} .. {high:.3f} "
+            f"| {true:.3f} | {stated:.3f} |"
+        )
+    alarmed = Counter(f"{r['rig']} {r['scene']} {r['light']}: {r['alarm']}" for r in rows)
+    lines += [f"{n} x {says}" for says, n in alarmed.items() if not says.endswith(": ")]
+    return "\n".join(lines)

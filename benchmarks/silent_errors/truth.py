@@ -1,0 +1,303 @@
+"""What an image is really off by, in place and in radiance, against what its report states.
+
+Truth is the emulator's: its exact mapping of every raw pixel, and the radiance that fell on it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.honest_uncertainty import Held, held
+from benchmarks.silent_errors.exposures import Planted
+from processing.geometry.placement import vip_mm_from_raw, vip_px_from_mm
+from processing.geometry.projective import apply_projective
+from processing.mosaic.precision import moved_datum_design, placed_covariance_px
+from processing.perspective import HeadsProduct
+from processing.pipeline import Product
+from processing.radiometry.demosaic import BAYER_BANDS, is_bayer
+from processing.rig import Sensor
+from sim_hw.judge import on_sensor, true_positions
+
+Array = NDArray[Any]
+
+BLOCKS: Final = 8
+"""Regions of a frame along each side whose radiance is compared."""
+LEAST_PIXELS: Final = 12
+CHECK: Final = (5, 5)
+DARK: Final = 0.02
+"""Radiance below which a relative error says nothing."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """Errors of one image, and what is stated of it.
+
+    `error_px` is the RMS of a coordinate over the image, `stated_px` the report's sigma, `worst`
+    the RMS error of the worst PAN sensor over its own stated sigma, `normalised` the errors of
+    check points against the stated covariance. `band_px` is the largest RMS error of a colour band,
+    colour pixels. `radiance` is the largest relative error of a region, `radiance_of` its sensor;
+    `detail` the least share of the fine detail of a sensor that the image of the same exposure
+    without a fault shows.
+    """
+
+    error_px: float | None
+    stated_px: float | None
+    worst: float | None
+    normalised: Held | None
+    band_px: float
+    radiance: float
+    radiance_of: str
+    detail: float
+
+
+def compare(planted: Planted, product: Product | HeadsProduct, clean: Mapping[str, Array]) -> Found:
+    """Hold an image against the truth.
+
+    Args:
+        planted: what it was made of.
+        product: the image and its report.
+        clean: fine detail by sensor (`detail_of`) of the exposure without a fault.
+    """
+    regions = _radiance(planted, product)
+    worst = max(regions, key=lambda name: regions[name], default="")
+    detail = detail_of(planted, product)
+    shares = [share for name in detail if (share := _share(detail[name], clean.get(name)))]
+    if isinstance(product, HeadsProduct):
+        return Found(None, None, None, None, 0.0, regions.get(worst, 0.0), worst, min(shares))
+    errors = _errors(planted, product)
+    every = np.concatenate(list(errors.values()))
+    stated = product.report.figures["stitched_sigma_px"]
+    points = _check_points(planted, product)
+    return Found(
+        error_px=float(np.sqrt(np.mean(every**2))),
+        stated_px=None if stated is None else float(stated),
+        worst=_worst(errors, product),
+        normalised=_normalised(planted, product, points),
+        band_px=max(_bands(planted, product).values(), default=0.0),
+        radiance=regions.get(worst, 0.0),
+        radiance_of=worst,
+        detail=min(shares, default=1.0),
+    )
+
+
+def _errors(planted: Planted, product: Product) -> dict[str, Array]:
+    """Truth minus place of the pixels behind the image, (n, 2) px, by PAN sensor."""
+    truth, geometry = planted.snapshot.truth, product.geometry[product.mosaic.method]
+    found = {}
+    for name in truth["pan_sensors"].tolist():
+        if f"{name}.vip" not in geometry or name in planted.elsewhere:
+            continue
+        used = geometry[f"{name}.weight"] > 0
+        vip, raw = (
+            np.asarray(geometry[f"{name}.{what}"][used], np.float64) for what in ("vip", "raw")
+        )
+        inside = on_sensor(truth, name, raw)
+        raw, vip = raw[inside], vip[inside]
+        found[name] = _true(planted, name, raw) - vip
+    return found or {"": np.zeros((1, 2))}
+
+
+def _true(planted: Planted, name: str, raw: Array) -> Array:
+    """Where the content of raw pixels belongs in the virtual image."""
+    content = planted.content.get(name)
+    return true_positions(planted.snapshot.truth, name, raw if content is None else content(raw))
+
+
+def _worst(errors: Mapping[str, Array], product: Product) -> float | None:
+    stated = product.report.figures["stitched_sigma_worst_px"]
+    if not isinstance(stated, float):
+        return None
+    return max(float(np.sqrt(np.mean(e**2))) for e in errors.values()) / stated
+
+
+def _check_points(planted: Planted, product: Product) -> dict[str, Array]:
+    points = {}
+    for cone in planted.rig.pan_cones:
+        for s in cone.sensors:
+            if s.name in product.mosaic.placements and s.name not in planted.elsewhere:
+                columns = np.linspace(0.03, 0.97, CHECK[0]) * (s.width_px - 1)
+                rows = np.linspace(0.03, 0.97, CHECK[1]) * (s.height_px - 1)
+                points[s.name] = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+    return points
+
+
+def _normalised(planted: Planted, product: Product, points: Mapping[str, Array]) -> Held | None:
+    """Errors of check points against the covariance stated for them, findings included."""
+    if not points or product.mosaic.redundancy <= 0:
+        return None
+    image, mosaic = planted.world.image, product.mosaic
+    error, designs, own = [], [], []
+    for name, raw in points.items():
+        mm = vip_mm_from_raw(mosaic.placements[name], raw)
+        off = vip_px_from_mm(image, mm) - _true(planted, name, raw)
+        error.append((off * (1.0, -1.0)).reshape(-1))
+        designs.append(moved_datum_design(planted.rig, mosaic, mm))
+        own.append(np.tile(product.disturbance.frames.get(name, np.zeros(2)), len(raw)))
+    tie, datum = placed_covariance_px(planted.rig, mosaic, points, product.temperatures.usable_c)
+    design = np.concatenate(designs)
+    added = design @ product.disturbance.datum @ design.T + np.diag(np.concatenate(own))
+    return held(np.concatenate(error), tie + datum + added)
+
+
+def _bands(planted: Planted, product: Product) -> dict[str, float]:
+    """RMS error of a coordinate of every colour head, colour pixels."""
+    image, truth = planted.world.image, planted.snapshot.truth
+    found = {}
+    homographies = {
+        r.sensor: np.linalg.inv(r.band_from_green) for r in product.bands if r.registered
+    }
+    for cone in planted.rig.cones:
+        name = cone.sensors[0].name
+        if cone.role != "colour" or name not in planted.frames or name in planted.elsewhere:
+            continue
+        raw = _grid(cone.sensors[0], 32)
+        mm = vip_mm_from_raw(product.mosaic.placements[name], raw)
+        vip = vip_px_from_mm(image, apply_projective(homographies.get(name, np.eye(3)), mm))
+        inside = ((vip >= 0.0) & (vip <= (image.width_px - 1, image.height_px - 1))).all(axis=1)
+        inside &= on_sensor(truth, name, raw)
+        off = _true(planted, name, raw[inside]) - vip[inside]
+        found[name] = float(np.sqrt(np.mean(off**2))) / image.colour_ratio
+    return found
+
+
+def _grid(sensor: Sensor, step: int) -> Array:
+    columns, rows = (
+        np.arange(step // 2, size, step, dtype=np.float64)
+        for size in (sensor.width_px, sensor.height_px)
+    )
+    return np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+
+
+def _radiance(planted: Planted, product: Product | HeadsProduct) -> dict[str, float]:
+    """The largest relative error of the radiance of a region of a frame, by sensor.
+
+    The image's own level (one factor for all PAN, one for each rig of heads' band) is free.
+    """
+    samples = (
+        _of_heads(planted, product)
+        if isinstance(product, HeadsProduct)
+        else {**_of_pan(planted, product), **_of_colour(planted, product)}
+    )
+    found = {}
+    for name, (raw, shown, true) in samples.items():
+        sensor = planted.rig.sensor(name)
+        block = (raw[:, 1] * BLOCKS // sensor.height_px).astype(int) * BLOCKS
+        block += (raw[:, 0] * BLOCKS // sensor.width_px).astype(int)
+        pixels = np.bincount(block, minlength=BLOCKS**2)
+        of_true = np.bincount(block, true, BLOCKS**2)
+        of_shown = np.bincount(block, shown, BLOCKS**2)
+        enough = (pixels >= LEAST_PIXELS) & (of_true > DARK * pixels * np.median(true) * 10)
+        if enough.any():
+            ratio = of_shown[enough] / of_true[enough]
+            found[name] = float(np.max(np.abs(ratio - 1.0)))
+    return found
+
+
+Samples = dict[str, tuple[Array, Array, Array]]
+
+
+def _of_pan(planted: Planted, product: Product) -> Samples:
+    geometry = product.geometry[product.mosaic.method]
+    found: Samples = {}
+    for name in planted.snapshot.truth["pan_sensors"].tolist():
+        if f"{name}.vip" not in geometry:
+            continue
+        used = geometry[f"{name}.weight"] > 0.5
+        vip = geometry[f"{name}.vip"][used].astype(int)
+        raw = geometry[f"{name}.raw"][used]
+        shown = product.pan[vip[:, 1], vip[:, 0]] / product.counts_per_dn
+        found[name] = _compared(planted, name, raw, shown)
+    return found
+
+
+def _of_colour(planted: Planted, product: Product) -> Samples:
+    image, truth = planted.world.image, planted.snapshot.truth
+    found: Samples = {}
+    for cone in planted.rig.cones:
+        sensor = cone.sensors[0]
+        if cone.role != "colour" or sensor.name not in planted.frames:
+            continue
+        raw = _grid(sensor, 7)
+        band = cone.bands[0]
+        if is_bayer(sensor):
+            raw, band = raw[_green_sites(sensor, raw)], BAYER_BANDS[1]
+        raw = raw[on_sensor(truth, sensor.name, raw)]
+        vip = true_positions(truth, sensor.name, raw)
+        at = np.rint((vip + 0.5) / image.colour_ratio - 0.5).astype(int)
+        shape = product.colour[band].shape
+        inside = (at >= 0).all(axis=1) & (at[:, 0] < shape[1]) & (at[:, 1] < shape[0])
+        at, raw = at[inside], raw[inside]
+        shown = product.colour[band][at[:, 1], at[:, 0]] / product.counts_per_dn
+        found[sensor.name] = _compared(planted, sensor.name, raw, shown)
+    return found
+
+
+def _of_heads(planted: Planted, product: HeadsProduct) -> Samples:
+    """Green of every head at the raw pixels nearby: its perspective moves pixels but little."""
+    found: Samples = {}
+    for name, head in product.heads.items():
+        sensor = planted.rig.cone(name).sensors[0]
+        raw = _grid(sensor, 7)
+        raw = raw[_green_sites(sensor, raw)]
+        at = raw.astype(int)
+        shown = head.bands[BAYER_BANDS[1]][at[:, 1], at[:, 0]] / 8.0
+        found[sensor.name] = _compared(planted, sensor.name, raw, shown)
+    return found
+
+
+def _green_sites(sensor: Sensor, raw: Array) -> Array:
+    letters = sensor.colour_filter_array
+    at = raw.astype(int)
+    green = np.array([letter == "G" for letter in letters])
+    return np.asarray(green[(at[:, 1] % 2) * 2 + at[:, 0] % 2])
+
+
+def _compared(planted: Planted, name: str, raw: Array, shown: Array) -> tuple[Array, Array, Array]:
+    """Raw pixels with data, what the image shows there (DN) and what it should show."""
+    cone, sensor = planted.world.rig.cone_of(name), planted.rig.sensor(name)
+    look = planted.snapshot.looks[name]
+    seconds = look.exposure_time_us * 1e-6
+    factor = planted.world.electrons_per_radiance_s(cone) * seconds / sensor.electrons_per_dn
+    at = np.clip(np.rint(raw).astype(int), 0, (sensor.width_px - 1, sensor.height_px - 1))
+    true = planted.snapshot.light[name][at[:, 1], at[:, 0]] * factor
+    good = (shown > 0) & (true < 0.9 * (sensor.full_scale_dn - sensor.black_dn))
+    return raw[good], shown[good].astype(np.float64), true[good].astype(np.float64)
+
+
+def detail_of(planted: Planted, product: Product | HeadsProduct) -> dict[str, Array]:
+    """Fine detail of the image, by sensor: differences of neighbouring pixels."""
+    if isinstance(product, HeadsProduct):
+        return {n: _differences(h.bands[BAYER_BANDS[1]]) for n, h in product.heads.items()}
+    found = {}
+    truth = planted.snapshot.truth
+    for name in truth["pan_sensors"].tolist():
+        columns, rows = (truth[f"{name}.vip_{what}"] for what in ("column", "row"))
+        top, low = (int(rows[1:-1, 1:-1].min()), int(rows[1:-1, 1:-1].max()))
+        left, right = (int(columns[1:-1, 1:-1].min()), int(columns[1:-1, 1:-1].max()))
+        found[name] = _differences(product.pan[max(top, 0) : low, max(left, 0) : right])
+    for cone in planted.rig.cones:
+        if cone.role == "colour":
+            found[cone.name] = _differences(product.colour[cone.bands[0]])
+    return found
+
+
+def _differences(picture: Array) -> Array:
+    """Median absolute second difference over a frame's quarters, (2, 2, 2): by axis and place."""
+    values = picture.astype(np.float32)
+    half = (values.shape[0] // 2, values.shape[1] // 2)
+    found = np.zeros((2, 2, 2))
+    for i in (0, 1):
+        for j in (0, 1):
+            part = values[i * half[0] : (i + 1) * half[0], j * half[1] : (j + 1) * half[1]]
+            for axis in (0, 1):
+                found[axis, i, j] = np.mean(np.abs(np.diff(part, 2, axis=axis)))
+    return found
+
+
+def _share(of: Array, clean: Array | None) -> float | None:
+    return None if clean is None else float(np.min(of / np.maximum(clean, 1e-6)))
