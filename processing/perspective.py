@@ -32,10 +32,12 @@ from processing.geometry.rotation import rotation_matrix
 from processing.image.sharpness import bright_level
 from processing.quality.figures import valid_area_figures
 from processing.quality.judgement import judge
-from processing.quality.read_out import blank_unread
-from processing.quality.report import QualityReport, Thresholds
+from processing.quality.read_out import blank_unread, unread_figures
+from processing.quality.report import Figure, QualityReport, Thresholds
 from processing.quality.specification import Asked
+from processing.quality.uniformity import signal_steps, step_figures
 from processing.quality.valid_area import ValidArea, area_of, gap_cells, grid_of
+from processing.quality.words import word_figures
 from processing.radiometry.calibration import RadiometricCalibration
 from processing.radiometry.demosaic import BAYER_BANDS, demosaic, is_bayer
 from processing.radiometry.level1 import (
@@ -211,6 +213,7 @@ class HeadPipeline:
             planes[cone.name] = _planes(cone, level1[sensor.name])
             blank_unread(sensor, frames[sensor.name], *planes[cone.name].values())
             seconds["radiometry"] += time.perf_counter() - began
+        seen = {**unread_figures(self.rig, frames), **word_figures(self.rig, frames)}
         if frames_read is not None:
             frames_read()
         for cone in present:
@@ -220,7 +223,8 @@ class HeadPipeline:
             heads[cone.name] = HeadImage(cone.name, perspective_of(cone), bands)
             seconds["resampling"] += time.perf_counter() - began
         area = self._valid_area(heads)
-        report = self._judged(conditions, temperatures, level1, statistics, area)
+        seen |= self._step_figures(planes)
+        report = self._judged(conditions, temperatures, level1, statistics, area, seen)
         return HeadsProduct(heads, area, report, seconds)
 
     def _valid_area(self, heads: Mapping[str, HeadImage]) -> ValidArea:
@@ -245,10 +249,11 @@ class HeadPipeline:
         level1: Mapping[str, Array],
         statistics: Mapping[str, FrameStatistics],
         area: ValidArea,
+        seen: Mapping[str, Figure],
     ) -> QualityReport:
         missing = [s.name for s in self.rig.sensors if s.name not in level1]
         figures = condition_figures(self.rig, conditions, temperatures)
-        figures |= valid_area_figures(area)
+        figures |= {**valid_area_figures(area), **seen}
         figures |= {"method": "heads", "missing_sensors": ", ".join(missing) or None}
         if statistics:
             saturated = {name: seen.saturated_fraction for name, seen in statistics.items()}
@@ -271,6 +276,15 @@ class HeadPipeline:
             thresholds=self._thresholds,
             asked=self._asked,
         )
+
+    def _step_figures(self, planes: Mapping[str, Mapping[str, Array]]) -> dict[str, Figure]:
+        """Steps of the signal in green, or in the one band of a head."""
+        leading, rows = {}, {}
+        for name, bands in planes.items():
+            sensor = self.rig.cone(name).sensors[0]
+            leading[sensor.name] = bands.get("green", next(iter(bands.values())))
+            rows[sensor.name] = (0, sensor.height_px - 1)
+        return step_figures(signal_steps(self.rig.sensors, leading, rows))
 
     def _map(self, cone: Cone, known: Mapping[str, float]) -> Array:
         """(h, w, 2) float32: where in the raw frame each pixel is; kept while temperatures stay."""

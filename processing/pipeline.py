@@ -236,6 +236,7 @@ class Pipeline:
                 layers=layers,
                 platform=platform,
                 slips=stitched.slips,
+                stale_s=self._stale_s(conditions),
             )
         with clock.stage("composition"):
             image = self._pan.compose(
@@ -481,6 +482,11 @@ class Pipeline:
             "missing_sensors": ", ".join(self._missing(frames)) or None,
             "parallax_px": parallax_px(self.rig, conditions, self.settings.relief_fraction),
         }
+
+    def _stale_s(self, conditions: Conditions) -> float:
+        """Age of the oldest temperature where it is too old, else zero."""
+        age_s = max(conditions.temperature_age_s.values(), default=0.0)
+        return age_s if age_s > self.settings.thresholds.temperature_age_s else 0.0
 
     def _missing(self, frames: Mapping[str, Array]) -> Sequence[str]:
         return [sensor.name for sensor in self.rig.sensors if sensor.name not in frames]

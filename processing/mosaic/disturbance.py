@@ -28,8 +28,14 @@ Array = NDArray[np.float64]
 
 SCALE_SIGMAS: Final = 2.0
 """A common change of scale within so many standard deviations of the calibration is no error."""
+ALONE_SIGMAS: Final = 1.0
+"""The same where the master cone has one sensor: nothing else shows a wrong scale of it."""
+STALE_K_PER_S: Final = 0.02
+"""How fast temperatures change that were read too long ago."""
 HEAD_SCALE_PPM: Final = 50.0
 """Of a converging head; healthy ones reach half of it."""
+BENT_SHARE: Final = 0.5
+"""Of the misfit of a head with another scale that its neighbours take."""
 LEAST_PX: Final = 0.02
 """Displacements below are alike."""
 
@@ -43,6 +49,7 @@ def disturbance_of(
     layers: LayerCheck | None,
     platform: PlatformCheck | None,
     slips: Sequence[Slip],
+    stale_s: float = 0.0,
 ) -> Disturbance:
     """Add up what the findings of one exposure may have done to the image.
 
@@ -54,12 +61,13 @@ def disturbance_of(
         layers: the other cones against the platform calibration.
         platform: the mountings of converging heads against it.
         slips: shifted bands of frames.
+        stale_s: age of the temperatures where they are too old, else zero.
     """
     warmed = tuple(_wrong_temperature(rig, mosaic, estimated_dc))
     # A wrong temperature changes the scale of all layers alike, too.
-    changed = () if warmed else tuple(_changed_master(mosaic, layers))
+    changed = () if warmed else tuple(_changed_master(rig, mosaic, layers))
     datum = np.zeros((4, 4))
-    turned = _turned_head(mosaic, platform)
+    turned = [*_turned_heads(mosaic, platform), *_stale(rig, mosaic, stale_s)]
     for part in (*_other_datums(rig, mosaic, validity), *warmed, *changed, *turned):
         datum += np.outer(part, part)
     frames: dict[str, Array] = {}
@@ -68,22 +76,31 @@ def disturbance_of(
         for name in (slip.sensor, *slip.alternatives):
             frames[name] = frames.get(name, np.zeros(2)) + slip.share * shift**2
     if platform is not None and abs(platform.scaled.scale_ppm) > HEAD_SCALE_PPM:
-        head = platform.scaled
-        for sensor in rig.cone(head.cone).sensors:
-            # Even pixels of a side have a third of its square half length.
-            reach = np.array([sensor.width_px, sensor.height_px]) / 2.0 * head.scale_ppm * 1e-6
-            frames[sensor.name] = frames.get(sensor.name, np.zeros(2)) + reach**2 / 3.0
+        for head in platform.heads:
+            for sensor in rig.cone(head.cone).sensors:
+                # Even pixels of a side have a third of its square half length. The adjustment
+                # bends the other heads towards the one that does not fit.
+                ppm = platform.scaled.scale_ppm * (1.0 if head == platform.scaled else BENT_SHARE)
+                reach = np.array([sensor.width_px, sensor.height_px]) / 2.0 * ppm * 1e-6
+                frames[sensor.name] = frames.get(sensor.name, np.zeros(2)) + reach**2 / 3.0
     return Disturbance(datum, frames)
 
 
-def _turned_head(mosaic: Mosaic, platform: PlatformCheck | None) -> Iterator[Array]:
-    """What one head that turned does to the mean of all, which is the datum."""
+def _turned_heads(mosaic: Mosaic, platform: PlatformCheck | None) -> Iterator[Array]:
+    """What heads that turned do to the mean of all, which is the datum; each on its own."""
     if platform is None or not platform.expired:
         return
-    by_x, by_y, by_z = np.array(platform.farthest.turn_rad) / (len(platform.heads) - 1)
     pitch_mm = mosaic.model.pitch_mm
     f_px = mosaic.model.f_mm / pitch_mm
-    yield np.array([-f_px * by_y, f_px * by_x, 0.0, by_z / pitch_mm])
+    for head in platform.heads:
+        by_x, by_y, by_z = np.array(head.turn_rad) / (len(platform.heads) - 1)
+        yield np.array([-f_px * by_y, f_px * by_x, 0.0, by_z / pitch_mm])
+
+
+def _stale(rig: Rig, mosaic: Mosaic, stale_s: float) -> Iterator[Array]:
+    """What temperatures that were read long ago may do to the master cone."""
+    if stale_s > 0.0:
+        yield datum_per_kelvin_px(rig, mosaic) * STALE_K_PER_S * stale_s
 
 
 def _other_datums(rig: Rig, mosaic: Mosaic, validity: Validity | None) -> Iterator[Array]:
@@ -139,15 +156,28 @@ def _wrong_temperature(
         yield datum_per_kelvin_px(rig, mosaic) * (combined[0] - float(np.mean(measured)))
 
 
-def _changed_master(mosaic: Mosaic, layers: LayerCheck | None) -> Iterator[Array]:
-    """The change all other layers share is the master's own."""
+def _changed_master(rig: Rig, mosaic: Mosaic, layers: LayerCheck | None) -> Iterator[Array]:
+    """The change all other layers share is the master's own.
+
+    Where several cones are not as calibrated, the master's scale is known no better than theirs;
+    so is the place of a single master sensor. That of several is judged by themselves.
+    """
     if layers is None:
         return
-    scale_ppm, by_x, by_y, by_z = layers.common
+    alone = len(rig.master_sensors) == 1
     per_mm = 1e-6 / mosaic.model.pitch_mm
+    f_px = mosaic.model.f_mm * per_mm
+
+    def moved(scale_ppm: float, by_x: float, by_y: float, by_z: float) -> Array:
+        return np.array([-f_px * by_y, f_px * by_x, scale_ppm * per_mm, by_z * per_mm])
+
     if layers.master_changed:
-        f_px = mosaic.model.f_mm * per_mm
-        yield np.array([-f_px * by_y, f_px * by_x, scale_ppm * per_mm, by_z * per_mm])
+        yield moved(*layers.common)
+    elif len(layers.causes) > 1:
+        changes = np.sqrt(np.mean([layer.values**2 for layer in layers.layers], axis=0))
+        for quantity in np.diag(changes)[: 3 if alone else 1]:
+            yield moved(*quantity)
     elif not layers.changed:
-        beyond = scale_ppm**2 - (SCALE_SIGMAS * layers.common_sigmas[0]) ** 2
-        yield np.array([0.0, 0.0, np.sqrt(max(beyond, 0.0)) * per_mm, 0.0])
+        within = (ALONE_SIGMAS if alone else SCALE_SIGMAS) * layers.common_sigmas[0]
+        beyond = layers.common[0] ** 2 - within**2
+        yield moved(np.sqrt(max(beyond, 0.0)), 0.0, 0.0, 0.0)

@@ -131,7 +131,7 @@ def judge(
     findings += _content(figures, mismatched_bands)
     findings += _stitching(figures, [b for b in nominal_bands if b not in mismatched_bands], t)
     findings += _words(figures)
-    findings += [] if figures.get("mismatched_sensors") else _signal(figures)
+    findings += [] if figures.get("mismatched_sensors") else _signal(figures, t)
     findings += _exposure(figures, t)
     findings += _attitude(figures, t)
     broken = list(asked_findings(figures, asked or Asked()))
@@ -339,7 +339,8 @@ def _stitching(
         (t.sigma0_px, t.sigma0_refly_px),
         "The sensors do not fit together well; check exposure times and the mount of the heads.",
     )
-    findings += _platform(figures) + _head_scale(figures, t) + _slip(figures, t)
+    findings += _head_scale(figures, t) or _platform(figures)
+    findings += _slip(figures, t)
     displaced = figures.get("displaced_sensor")
     if displaced or figures.get("displaced_several"):
         size = math.hypot(
@@ -489,11 +490,14 @@ def _words(figures: Mapping[str, Figure]) -> list[Finding]:
     ]
 
 
-def _signal(figures: Mapping[str, Figure]) -> list[Finding]:
+def _signal(figures: Mapping[str, Figure], t: Thresholds) -> list[Finding]:
     """Signal that a head or its read-out has changed."""
     findings = []
     step = _number(figures, "signal_step")
-    if step is not None:
+    # Lines that were not read out are a step, too.
+    unread = _number(figures, "unread_worst_fraction") or 0.0
+    unread_sensor = figures.get("unread_worst_sensor") if unread > t.unread_fraction else None
+    if step is not None and figures.get("signal_step_sensor") != unread_sensor:
         lines = _number(figures, "signal_step_lines") or 1.0
         where = f"{figures.get('signal_step_axis')} of {figures.get('signal_step_sensor')}"
         sentence = (

@@ -9,6 +9,7 @@ import pytest
 
 from processing.conditions import Conditions
 from processing.perspective import HeadPipeline, looks_apart, perspective_of, raw_of_perspective
+from processing.quality.report import QualityReport
 from processing.rig import Cone, Rig, find_rig
 from sim_hw.world.camera import true_camera, undistorted
 
@@ -106,3 +107,36 @@ def test_a_missing_frame_leaves_the_other_heads_and_says_so() -> None:
     assert product.report.verdict.value != "good"
     for head in product.heads.values():
         assert list(head.bands) == ["red", "green", "blue"]
+
+
+def _lit_heads(rig: Rig) -> dict[str, np.ndarray]:
+    """Frames of even ground with noise, by sensor name."""
+    random = np.random.default_rng(3)
+    return {
+        s.name: (900.0 + random.normal(0.0, 12.0, (s.height_px, s.width_px))).astype(np.uint16)
+        for s in rig.sensors
+    }
+
+
+@pytest.mark.trust
+def test_wrong_words_steps_and_unread_lines_of_a_head_are_named() -> None:
+    rig = find_rig("midas-mini")
+    pipeline, healthy = HeadPipeline(rig, threads=1), _lit_heads(rig)
+    assert pipeline.process(healthy, Conditions()).report.verdict.value == "good"
+
+    def report(change: np.ndarray) -> QualityReport:
+        return pipeline.process({**healthy, "8": change}, Conditions()).report
+
+    swapped = report(healthy["8"].byteswap())
+    assert swapped.verdict.value == "refly" and swapped.figures["word_format_sensors"] == "8"
+    stepped = healthy["8"].copy()
+    stepped[500:] += np.uint16(90)
+    step = report(stepped)
+    assert step.verdict.value == "usable" and step.figures["signal_step_sensor"] == "8"
+    assert abs(step.figures["signal_step_at"] - 499) <= 1
+    cut = healthy["8"].copy()
+    cut[-30:] = 0
+    unread = report(cut)
+    assert unread.verdict.value == "usable" and unread.figures["unread_worst_sensor"] == "8"
+    sentences = " ".join(finding.sentence for finding in unread.findings)
+    assert "was not read out" in sentences and "signal changes" not in sentences

@@ -14,7 +14,8 @@ from processing.geometry.similarity import fit_similarity
 from processing.mosaic.disturbance import LEAST_PX, disturbance_of
 from processing.mosaic.estimated_dc import EstimatedDc
 from processing.mosaic.free import Mosaic
-from processing.mosaic.layers import LayerCheck
+from processing.mosaic.layers import LayerChange, LayerCheck
+from processing.mosaic.mounting import Mounting, PlatformCheck
 from processing.mosaic.precision import Disturbance, datum_per_kelvin_px
 from processing.mosaic.slips import Slip
 from processing.mosaic.validity import Displacement, Validity
@@ -32,6 +33,8 @@ def found(
     estimated_dc: tuple[EstimatedDc, ...] = (),
     layers: LayerCheck | None = None,
     slips: tuple[Slip, ...] = (),
+    platform: PlatformCheck | None = None,
+    stale_s: float = 0.0,
 ) -> Disturbance:
     return disturbance_of(
         rig,
@@ -39,8 +42,9 @@ def found(
         validity=validity,
         estimated_dc=estimated_dc,
         layers=layers,
-        platform=None,
+        platform=platform,
         slips=slips,
+        stale_s=stale_s,
     )
 
 
@@ -115,6 +119,61 @@ def test_a_common_scale_counts_beyond_two_standard_deviations() -> None:
         np.testing.assert_allclose(datum, expected, rtol=1e-9, atol=1e-18)
     other = check((90.0, 4.0, 5.0, 6.0), changed=True, causes=("2",))
     assert not found(rig, mosaic, layers=other).datum.any()
+
+
+def test_a_common_scale_counts_beyond_one_where_the_master_is_one_sensor() -> None:
+    rig, mosaic = mosaic_of("ultracam-l-mini")
+    datum = found(rig, mosaic, layers=check((19.0, 4.0, 5.0, 6.0), changed=False)).datum
+    expected = np.diag([0.0, 0.0, 19.0**2 - 10.0**2, 0.0]) * (1e-6 / mosaic.model.pitch_mm) ** 2
+    np.testing.assert_allclose(datum, expected, rtol=1e-9, atol=1e-18)
+
+
+@pytest.mark.parametrize(("name", "alone"), [("ultracam-x-mini", False), ("ultracam-l-mini", True)])
+def test_where_several_cones_changed_the_master_is_known_no_better(name: str, alone: bool) -> None:
+    rig, mosaic = mosaic_of(name)
+    changes = [np.array([300.0, 40.0, -50.0, 9.0]), np.array([-400.0, 0.0, 70.0, 8.0])]
+    layers = dataclasses.replace(
+        check((0.0, 0.0, 0.0, 0.0), changed=True, causes=("1", "RGB")),
+        layers=tuple(LayerChange(n, v, v, 1.0) for n, v in zip("12", changes, strict=True)),
+    )
+    datum = found(rig, mosaic, layers=layers).datum
+    per_mm = 1e-6 / mosaic.model.pitch_mm
+    f_px = mosaic.model.f_mm * per_mm
+    shifts = np.array([(50.0**2 + 70.0**2) / 2.0, 40.0**2 / 2.0]) * f_px**2 * alone
+    scale = (300.0**2 + 400.0**2) / 2.0 * per_mm**2
+    np.testing.assert_allclose(datum, np.diag([*shifts, scale, 0.0]), rtol=1e-9)
+
+
+def test_old_temperatures_move_the_datum_by_their_age() -> None:
+    rig, mosaic = mosaic_of("ultracam-x-mini")
+    per_k = datum_per_kelvin_px(rig, mosaic)
+    datum = found(rig, mosaic, stale_s=100.0).datum
+    np.testing.assert_allclose(datum, 4.0 * np.outer(per_k, per_k), rtol=1e-9)
+
+
+def _head(name: str, turn: tuple[float, float, float], ppm: float) -> Mounting:
+    none, zero = np.zeros((3, 3)), (0.0, 0.0)
+    affine = np.eye(2) * ppm * 1e-6
+    return Mounting(
+        name, (0.0, 0.0, 0.0), none, turn, (0.0, 0.0, 0.0), zero, zero, zero, affine, 90
+    )
+
+
+def test_heads_that_turned_move_the_mean_and_one_with_another_scale_bends_all() -> None:
+    rig, mosaic = mosaic_of("dmc-mini")
+    heads = (_head("1", (3e-5, 0.0, 0.0), 20.0), _head("2", (0.0, -6e-5, 9e-5), -300.0))
+    expired = PlatformCheck(heads, np.zeros((6, 6)), 50.0, 3, 20.0)
+    disturbed = found(rig, mosaic, platform=expired)
+    f_px, pitch = mosaic.model.f_mm / mosaic.model.pitch_mm, mosaic.model.pitch_mm
+    first = np.array([0.0, 3e-5 * f_px, 0.0, 0.0])
+    second = np.array([6e-5 * f_px, 0.0, 0.0, 9e-5 / pitch])
+    expected = np.outer(first, first) + np.outer(second, second)
+    np.testing.assert_allclose(disturbed.datum, expected, rtol=1e-9)
+    half = np.array([1792.0, 1024.0]) / 2.0 * 300e-6
+    np.testing.assert_allclose(disturbed.frames["P2"], half**2 / 3.0, rtol=1e-9)
+    np.testing.assert_allclose(disturbed.frames["P1"], half**2 / 12.0, rtol=1e-9)
+    fits = PlatformCheck((heads[0], _head("2", (0.0, 0.0, 0.0), 49.0)), np.eye(6), 1.0, 3, 20.0)
+    assert not found(rig, mosaic, platform=fits).frames
 
 
 def test_a_wrong_temperature_explains_a_common_scale() -> None:
