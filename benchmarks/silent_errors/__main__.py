@@ -2,7 +2,8 @@
 
 Plants wrong inputs of sizes from 0.5 to 4 times their published detection limit, by seed, processes
 them as `syntopic process` does and holds image and report against the emulator's truth. With
-`--clean` it renders healthy exposures over hard scenes instead and counts false alarms.
+`--clean` it renders healthy exposures over hard scenes instead and counts false alarms, with
+`--drawn` it draws their adjustments without rendering.
 """
 
 from __future__ import annotations
@@ -15,18 +16,22 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from scipy.stats import chi2
 
 from benchmarks.silent_errors.cases import WIDEST, Case, by_exposure, draw, run
 from benchmarks.silent_errors.clean import clean_rows, clean_summary
+from benchmarks.silent_errors.drawn import false_alarms
 from benchmarks.silent_errors.exposures import RIGS
 from benchmarks.silent_errors.limits import LIMITS, table
 from daemon.measuring import machine
 
 Row = dict[str, Any]
+
+MOST_ALARMS: Final = 3e-4
+"""Share of drawn healthy exposures whose verdict may change."""
 
 
 def main() -> None:
@@ -39,6 +44,7 @@ def main() -> None:
     add("--jobs", type=int, default=1, help="Processes (default: 1).")
     add("--results", type=Path, help="File of results, one JSON object a line; it is continued.")
     add("--clean", type=int, default=0, help="Healthy exposures to render instead.")
+    add("--drawn", type=int, default=0, help="Healthy exposures to draw without rendering instead.")
     add("--json", action="store_true", help="Print one JSON object.")
     add("--limits", action="store_true", help="Print the published detection limits.")
     given = parser.parse_args()
@@ -53,6 +59,10 @@ def main() -> None:
             else clean_summary(found)
         )
         sys.exit(1 if any(row["alarm"] for row in found) else 0)
+    if given.drawn:
+        alarms = false_alarms(given.drawn, given.seed)
+        print(json.dumps({"machine": machine(), "drawn": given.drawn, "alarms": alarms}))
+        sys.exit(1 if alarms["any"] > given.drawn * MOST_ALARMS else 0)
     cases = draw(given.count, given.seed, rigs=given.rig or (), kinds=given.kind or ())
     rows = list(results(cases, given.results, given.jobs))
     if given.json:
