@@ -19,7 +19,7 @@ Array = NDArray[Any]
 
 _NOISES: Final = 10.0
 _STEP: Final = (1, 256)
-"""Of the rows and columns looked at: every line, by a few of its pixels; a lost packet is longer."""
+"""Of rows and columns looked at: every line, by a few of its pixels; a lost packet is longer."""
 _SHARE: Final = 1e-3
 """Of the pixels looked at; fewer below black are defects, which calibration interpolates."""
 _RUN_PX: Final = 16
