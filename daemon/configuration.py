@@ -9,7 +9,6 @@ from __future__ import annotations
 import ipaddress
 import re
 import stat
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -34,6 +33,7 @@ from daemon.configuration_problems import (
 from daemon.plan.reading import PlanError, read_plan
 from processing.quality.report import Thresholds
 from processing.rig import Rig, RigError, find_rig
+from processing.rig.toml_text import TomlError, parse_toml
 
 CONFIGURATION_MAX_BYTES = 1_000_000
 SIGNING_STATE = ".mavlink-signing.json"
@@ -366,13 +366,13 @@ def load(path: Path) -> tuple[Configuration, Rig]:
             raise ConfigurationError([f"{path}: not a regular file; give a service.toml"])
         if status.st_size > CONFIGURATION_MAX_BYTES:
             raise ConfigurationError([f"{path.name}: too large for a configuration"])
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        content = parse_toml(path.read_bytes())
     except OSError as error:
         reason = error.strerror or type(error).__name__
         raise ConfigurationError(
             [f"{path}: cannot be read ({reason}); give the path of a service.toml"]
         ) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except TomlError as error:
         raise ConfigurationError([f"{path.name}: not valid TOML: {error}"]) from error
     return from_mapping(content, path)
 

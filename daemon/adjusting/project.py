@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from daemon.adjusting.project_file import CameraSection, HeadSection, ProjectFile, read_project_file
 from daemon.adjusting.tables import ProjectError, Table, read_table
+from daemon.foreign_files import ForeignFileError, within
 from processing.bundle.adjust import Settings
 from processing.bundle.bent_rays import Rays
 from processing.bundle.network import (
@@ -38,7 +39,7 @@ from processing.bundle.network import (
 )
 from processing.bundle.self_calibration import parts_of, self_calibrating
 from processing.geometry.rotation import rotation_matrix
-from processing.rig import RigError, find_rig
+from processing.rig import RigError, find_rig, shipped_rigs
 
 Array = NDArray[np.float64]
 
@@ -78,15 +79,14 @@ def read_project(path: Path) -> Project:
     problems: list[str] = []
     cameras = tuple(_camera(section, folder, problems) for section in file.camera)
     heads = tuple(_head(section) for section in file.head)
-    images = read_table(
-        folder / file.files.images, ("image", "camera"), ("exposure", "head", *ANGLES)
-    )
+    images = _read(folder, file.files.images, ("image", "camera"), ("exposure", "head", *ANGLES))
     exposures = _optional(
         folder, file.files.exposures, ("exposure",), (*XYZ, *ANGLES, "position", "attitude")
     )
     points = _optional(folder, file.files.points, ("point",), (*XYZ, *SIGMAS, "role"))
-    seen = read_table(
-        folder / file.files.image_points,
+    seen = _read(
+        folder,
+        file.files.image_points,
         ("image", "point"),
         ("x_mm", "y_mm", "column_px", "row_px", "sx_um", "sy_um"),
     )
@@ -313,8 +313,9 @@ def _camera(section: CameraSection, folder: Path, problems: list[str]) -> Camera
     try:
         rig = None
         if section.rig is not None:
-            beside = folder / section.rig
-            rig = find_rig(str(beside) if beside.exists() else section.rig)
+            shipped = section.rig in shipped_rigs()
+            named = section.rig if shipped else str(within(folder, section.rig, "camera.rig"))
+            rig = find_rig(named)
         camera = self_calibrating(
             camera,
             section.parameters,
@@ -371,7 +372,14 @@ def _rotation(angles_deg: Array) -> Array:
 def _optional(
     folder: Path, name: str | None, needed: Sequence[str], known: Sequence[str]
 ) -> Table | None:
-    return None if name is None else read_table(folder / name, needed, known)
+    return None if name is None else _read(folder, name, needed, known)
+
+
+def _read(folder: Path, name: str, needed: Sequence[str], known: Sequence[str]) -> Table:
+    try:
+        return read_table(within(folder, name, "project.toml: files"), needed, known)
+    except ForeignFileError as error:
+        raise ProjectError([str(error)]) from error
 
 
 def _distances(folder: Path, file: ProjectFile, build: _Names) -> Distances:

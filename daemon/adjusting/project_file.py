@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from daemon.adjusting.tables import ProjectError
+from daemon.foreign_files import ForeignFileError, read_plain
 from processing.bundle.self_calibration import SetName
+from processing.rig.toml_text import TomlError, parse_toml
+
+PROJECT_FILE_MAX_BYTES = 4_000_000
 
 
 class _Section(BaseModel):
@@ -114,10 +117,10 @@ def read_project_file(path: Path) -> ProjectFile:
         ProjectError: with a sentence per mistake.
     """
     try:
-        content: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ProjectError([f"{path}: cannot be read; give the path of a project.toml"]) from error
-    except tomllib.TOMLDecodeError as error:
+        content = parse_toml(read_plain(path, PROJECT_FILE_MAX_BYTES))
+    except ForeignFileError as error:
+        raise ProjectError([f"{error}; give the path of a project.toml"]) from error
+    except TomlError as error:
         raise ProjectError([f"{path.name}: not valid TOML: {error}"]) from error
     try:
         return ProjectFile.model_validate(content)

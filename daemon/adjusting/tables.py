@@ -13,6 +13,7 @@ from pathlib import Path
 
 from daemon.disk.durable import new_file
 from daemon.errors import DaemonError
+from daemon.foreign_files import ForeignFileError, read_plain
 
 _MOST_BYTES = 2_000_000_000
 _MOST_PROBLEMS = 30
@@ -92,10 +93,10 @@ def read_table(path: Path, needed: Sequence[str], known: Sequence[str]) -> Table
         ProjectError: no such file, or columns that are missing or not known.
     """
     try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise ProjectError([f"{path.name}: larger than {_MOST_BYTES} bytes"])
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        text = read_plain(path, _MOST_BYTES).decode("utf-8")
+    except ForeignFileError as error:
+        raise ProjectError([str(error)]) from error
+    except UnicodeDecodeError as error:
         raise ProjectError([f"{path}: cannot be read ({error})"]) from error
     columns: tuple[str, ...] = ()
     rows: list[list[str]] = []

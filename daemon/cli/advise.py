@@ -29,6 +29,9 @@ def advise(
     plan: Annotated[
         Path | None, typer.Option(help="The plan; that of the mission, where it has one.")
     ] = None,
+    elevation: Annotated[
+        Path | None, typer.Option(help="Height model; that in the mission folder if omitted.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     from daemon.disk.level2 import write_folder
@@ -46,6 +49,8 @@ def advise(
         raise PlanError(f"{folder.path}: was flown without a plan; give --plan FILE")
     read = read_plan(path)
     _, section = mount_of(folder)
+    if elevation is not None:
+        section = section.model_copy(update={"elevation": elevation})
     rig = load_rig(folder.rig_path)
     along_m, across_m = image_on_ground_m(rig, section.height_above_ground_m)
     taken = flown.taken_of(folder, read.specification)

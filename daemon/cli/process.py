@@ -16,7 +16,9 @@ from rich.progress import Progress
 from daemon.cli.failures import end_walk
 from daemon.cli.level2_tables import print_reports
 from daemon.configuration import ConfigurationError, PlanSection, ProcessingSection
+from daemon.configuration_problems import dig
 from daemon.disk.mission import Mission
+from daemon.orientation.exterior import mount_of
 
 HELP = """Process the exposures of a mission folder again, Level-0 to Level-2.
 
@@ -60,7 +62,6 @@ def process(
     from daemon.disk.level2 import recover_level2
     from daemon.disk.records import sha256_hex
     from daemon.disk.walk import walk
-    from daemon.orientation.exterior import mount_of
     from daemon.orientation.ground import ground_of
     from daemon.products.processor import processor_for
     from daemon.service.worker import overlaps_of, process_exposure
@@ -131,8 +132,7 @@ def process(
 
 def flown_thresholds(folder: Mission) -> dict[str, float]:
     """Thresholds of the configuration that was flown, so that it is judged as in the air."""
-    flown = folder.flown_configuration()
-    given = flown.get("processing", {}).get("thresholds", {})
+    given = dig(folder.flown_configuration(), "processing", "thresholds") or {}
     try:
         return ProcessingSection.model_validate({"thresholds": given}).thresholds
     except ValidationError as error:
@@ -147,30 +147,29 @@ def as_flown(
 ) -> tuple[PlanSection, Path | None]:
     """Plan and radiometry of the configuration that was flown, where the mission has one.
 
-    Only these two are read: devices that were there in the air need not be here.
+    Only these two are read: devices that were there in the air need not be here. They are looked
+    for only where a mission may name them (`Mission.file_named`); the options name any place.
+
+    Raises:
+        ConfigurationError: the configuration cannot be used, or what it names is not there.
     """
-    flown = folder.flown_configuration()
-    try:
-        plan = PlanSection.model_validate(flown.get("plan", {}))
-    except ValidationError as error:
-        raise ConfigurationError([f"{folder.service_path}: plan: {error}"]) from error
+    _, plan = mount_of(folder)
     if elevation is not None:
         plan = plan.model_copy(update={"elevation": elevation})
-    if plan.elevation is not None and not plan.elevation.is_file():
-        raise ConfigurationError(
-            [
-                f"{folder.service_path}: plan.elevation is {str(plan.elevation)!r}, and that file "
-                f"is not here; give --elevation FILE"
-            ]
-        )
-    told = flown.get("mission", {}).get("radiometry")
+    elif plan.elevation is not None and not plan.elevation.is_file():
+        raise _elsewhere(folder, "plan.elevation", plan.elevation.name, "--elevation FILE")
+    told = dig(folder.flown_configuration(), "mission", "radiometry")
     if radiometry is None and told is not None:
-        radiometry = Path(told)
+        radiometry = folder.file_named(str(told))
         if not radiometry.is_dir():
-            raise ConfigurationError(
-                [
-                    f"{folder.service_path}: mission.radiometry is {told!r}, and that folder is "
-                    f"not here; give --radiometry FOLDER"
-                ]
-            )
+            raise _elsewhere(folder, "mission.radiometry", radiometry.name, "--radiometry FOLDER")
     return plan, radiometry
+
+
+def _elsewhere(folder: Mission, key: str, name: str, option: str) -> ConfigurationError:
+    return ConfigurationError(
+        [
+            f"{folder.service_path}: {key} names {name[:200]!r}, which is neither in the mission "
+            f"folder nor, by an absolute path without links, on a local disk; give {option}"
+        ]
+    )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,7 +15,7 @@ from rich.progress import Progress
 
 from daemon.cli.process import as_flown
 from daemon.configuration import Configuration, ConfigurationError
-from daemon.disk.mission import Mission
+from daemon.disk.mission import Mission, MissionError
 from daemon.tables import light_table
 
 HELP = """Feed what a mission recorded through the same code again, and compare.
@@ -120,9 +119,8 @@ def _show(folder: Mission, told: dict[str, Any], *, as_json: bool) -> None:
 def _flown_configuration(folder: Mission) -> Configuration:
     """The configuration that was flown; files that it names need not be here."""
     try:
-        content = tomllib.loads(folder.service_path.read_text(encoding="utf-8"))
-        return Configuration.model_validate(content)
-    except (OSError, tomllib.TOMLDecodeError, ValidationError) as error:
+        return Configuration.model_validate(folder.flown_configuration())
+    except (MissionError, ValidationError) as error:
         raise ConfigurationError(
             [f"{folder.service_path}: {error}; a replay needs what was flown"]
         ) from error

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import re
-import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from typing import Any
 from daemon.disk import durable
 from daemon.disk.chain_file import CHAIN_FILE, ChainFile, first_line
 from daemon.disk.records import (
+    RECORD_MAX_BYTES,
     RecordError,
     canonical_bytes,
     parse_record,
@@ -27,6 +27,8 @@ from daemon.disk.records import (
 )
 from daemon.disk.writer_lock import MissionError as MissionError
 from daemon.disk.writer_lock import is_locked, writer_lock
+from daemon.foreign_files import is_on_local_disk
+from processing.rig.toml_text import TomlError, parse_toml
 
 CURRENT_FILE = "current-mission.json"
 """In the root: which mission a restarted service continues; absent between flights."""
@@ -236,13 +238,24 @@ class Mission:
             MissionError: it cannot be read.
         """
         try:
-            return tomllib.loads(self.service_path.read_text(encoding="utf-8"))
+            if self.service_path.stat().st_size > RECORD_MAX_BYTES:
+                raise MissionError(f"{self.service_path}: too large for a configuration")
+            return parse_toml(self.service_path.read_bytes())
         except FileNotFoundError:
             return {}
-        except (OSError, ValueError) as error:
+        except (OSError, TomlError) as error:
             raise MissionError(
                 f"{self.service_path}: cannot be read ({error}); put a copy of what was flown there"
             ) from error
+
+    def file_named(self, name: str | Path) -> Path:
+        """Where a file or folder lies that the mission's own configuration names.
+
+        A mission comes from anywhere. An absolute path counts where it lies on a local disk and
+        passes no link; of any other name only the last part, in the mission folder.
+        """
+        named = Path(name)
+        return named if is_on_local_disk(named) else self.path / (named.name or "?")
 
     def numbers(self) -> list[int]:
         """Numbers of the exposures whose folder is there, ascending."""

@@ -11,23 +11,27 @@ import json
 import math
 import re
 import sys
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from daemon.errors import DaemonError
+from processing.rig.table import plain_name as plain_name
+from processing.rig.toml_text import is_nested_deeper
 
 RECORD_MAX_BYTES = 4_000_000
 """No record of ours comes near this; more is refused unread."""
 
+RECORD_DEPTH_MAX = 32
+
 EXACT_INTEGER_LIMIT = 2**53
-_LARGEST = sys.float_info.max
 """Larger integers do not survive a JSON reader that knows only doubles."""
+_LARGEST = sys.float_info.max
 
 _INSTANT = re.compile(r"-?(0|[1-9][0-9]{0,18})")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.\-]{0,63}")
 _REQUIRED: Any = object()
 
 
@@ -82,12 +86,9 @@ def parse_record(data: bytes, name: str) -> dict[str, Any]:
         raise RecordError([f"{name}: not a JSON record ({error})"]) from error
     if not isinstance(content, dict):
         raise RecordError([f"{name}: holds no JSON object; a record starts with {{"])
+    if is_nested_deeper(content, RECORD_DEPTH_MAX):
+        raise RecordError([f"{name}: nested too deeply to be a record"])
     return content
-
-
-def plain_name(name: str) -> bool:
-    """Whether a sensor or file name is safe in a path: letters, digits, `_`, `-`, inner dots."""
-    return _NAME.fullmatch(name) is not None and ".." not in name
 
 
 class Fields:
@@ -316,9 +317,8 @@ def _plain(value: Any, path: str, problems: list[str]) -> Any:
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     content = dict(pairs)
     if len(content) != len(pairs):
-        names = [key for key, _ in pairs]
-        twice = next(name for name in names if names.count(name) > 1)
-        raise ValueError(f"the key {twice!r} is given twice")
+        ((twice, _),) = Counter(key for key, _ in pairs).most_common(1)
+        raise ValueError(f"the key {twice[:60]!r} is given twice")
     return content
 
 

@@ -1,7 +1,7 @@
 """What support needs to see of a mission, in one file: no pixels, no raw bytes, no secrets.
 
 Configuration, rig, records and verdicts, what the devices and the service said, the ledger, and the
-versions of everything. Values of keys that sound like a secret are left out of the configuration.
+versions of everything. Secrets are left out of all of it (`daemon.export.redaction`).
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import platform
-import re
 import sys
 import zipfile
 from collections.abc import Iterator
@@ -19,14 +18,17 @@ from pathlib import Path
 from daemon.disk import durable
 from daemon.disk.catalog import Catalog, CatalogError
 from daemon.disk.flight_log import logs_of, read
-from daemon.disk.mission import Mission
+from daemon.disk.mission import Mission, MissionError
+from daemon.disk.records import RECORD_MAX_BYTES, RecordError, parse_record
 from daemon.disk.verification import VerifyReport
+from daemon.export.redaction import LEFT_OUT, text_without_secrets, without_secrets
+from daemon.foreign_files import ForeignFileError, read_plain
+from processing.rig.file import RIG_FILE_MAX_BYTES
 
 TOPICS = ("event/", "ledger", "audit", "trigger", "mark/", "log/")
 """Topics of the flight log that are told; navigation and raw bytes say where somebody flew."""
 
 EVENTS_MAX_BYTES = 50_000_000
-_SECRET = re.compile(r"(?i)^(\s*[\w.\-]*(token|secret|password|passwd|key)[\w.\-]*\s*=\s*).*$")
 
 
 @dataclass(frozen=True)
@@ -65,22 +67,29 @@ def write_bundle(
             contents[name] = len(text.encode("utf-8", "replace"))
 
         put("versions.json", json.dumps(_versions(), indent=1))
-        for file in (mission.path / "mission.json", mission.rig_path):
-            if file.exists():
-                put(file.name, file.read_text("utf-8", "replace"))
-        if mission.service_path.exists():
-            put("service.toml", without_secrets(mission.service_path.read_text("utf-8", "replace")))
+        put("mission.json", json.dumps(without_secrets(mission.about()), indent=1))
+        if mission.rig_path.exists():
+            text = read_plain(mission.rig_path, RIG_FILE_MAX_BYTES).decode("utf-8", "replace")
+            put("rig.toml", text_without_secrets(text))
+        put("service.json", _configuration(mission))
         put("exposures.jsonl", "".join(_records(mission)))
         put("log.jsonl", "".join(_told(mission)))
         put("events.json", json.dumps(_events(mission), indent=1))
         if verified is not None:
-            put("verify.json", json.dumps({"problems": list(verified.problems)}, indent=1))
+            put(
+                "verify.json",
+                json.dumps(without_secrets({"problems": verified.problems}), indent=1),
+            )
     return Bundle(path, contents)
 
 
-def without_secrets(text: str) -> str:
-    """Configuration with the values of keys that sound like a secret left out."""
-    return "\n".join(_SECRET.sub(r"\1\"left out\"", line) for line in text.splitlines()) + "\n"
+def _configuration(mission: Mission) -> str:
+    """The configuration that was flown; what cannot be parsed is left out as a whole."""
+    try:
+        flown = mission.flown_configuration()
+    except MissionError:
+        return json.dumps({LEFT_OUT: "service.toml cannot be read as TOML"})
+    return json.dumps(without_secrets(flown), indent=1, default=str)
 
 
 def _versions() -> dict[str, object]:
@@ -104,13 +113,12 @@ def _records(mission: Mission) -> Iterator[str]:
             ("quality", mission.level2(number) / "quality.json"),
         ):
             try:
-                content = json.loads(file.read_text("utf-8"))
-            except (OSError, ValueError) as error:
+                content = parse_record(read_plain(file, RECORD_MAX_BYTES), file.name)
+            except (ForeignFileError, RecordError) as error:
                 told[key] = f"not to be had: {type(error).__name__}"
                 continue
-            if isinstance(content, dict):
-                content.pop("navigation", None)
-            told[key] = content
+            content.pop("navigation", None)
+            told[key] = without_secrets(content)
         yield json.dumps(told) + "\n"
 
 
@@ -121,11 +129,12 @@ def _told(mission: Mission) -> Iterator[str]:
         for message in read(path):
             if not message.topic.startswith(TOPICS):
                 continue
-            payload = message.payload.decode("utf-8", "replace").strip()
-            line = json.dumps(
-                {"log": path.name, "topic": message.topic, "mono_ns": str(message.mono_ns)}
-            )
-            line = f'{line[:-1]}, "content": {payload}}}\n'
+            try:
+                content = without_secrets(parse_record(message.payload, message.topic))
+            except RecordError:
+                content = "not to be had: no record"
+            about = {"log": path.name, "topic": message.topic, "mono_ns": str(message.mono_ns)}
+            line = json.dumps({**about, "content": content}) + "\n"
             nbytes += len(line)
             if nbytes > EVENTS_MAX_BYTES:
                 yield '{"cut": "more than 50 MB of messages"}\n'
@@ -140,7 +149,7 @@ def _events(mission: Mission) -> list[dict[str, str]]:
         return [{"source": "index", "name": "unreadable", "sentence": str(error)}]
     try:
         return [
-            {"source": source, "name": name, "sentence": sentence}
+            {"source": source, "name": name, "sentence": text_without_secrets(sentence)}
             for source, name, sentence in catalog.events()
         ]
     finally:

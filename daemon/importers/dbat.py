@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 from daemon.adjusting.project import Checks
 from daemon.adjusting.project_file import AdjustSection, CameraSection, ProjectFile
 from daemon.adjusting.tables import ProjectError
+from daemon.foreign_files import ForeignFileError, read_plain, within
+from daemon.foreign_xml import XmlError, parse_xml
 from processing.bundle.network import (
     Attitudes,
     Camera,
@@ -33,6 +35,7 @@ from processing.bundle.network import (
 Array = NDArray[np.float64]
 
 _MOST_BYTES = 100_000_000
+ELEMENTS_MAX = 10_000
 _FREE = ("dx0", "dy0", "df", "k1", "k2", "k3", "p1", "p2", "b1")
 """Everything but skew, as its calibration scripts estimate."""
 
@@ -53,6 +56,17 @@ def import_dbat(script: Path) -> Imported:
         ProjectError: files that are missing, or settings that we do not have.
     """
     root = _parsed(script)
+    try:
+        return _imported(script, root)
+    except ProjectError:
+        raise
+    except (ValueError, ArithmeticError, LookupError) as error:
+        raise ProjectError(
+            [f"{script.name}: a number or a name of it cannot be used ({error})"]
+        ) from error
+
+
+def _imported(script: Path, root: ElementTree.Element) -> Imported:
     given = root.find("input")
     if given is None:
         raise ProjectError([f"{script.name}: no input section; a DBAT script has one"])
@@ -151,7 +165,7 @@ def _rows(script: Path, given: ElementTree.Element, what: str, kind: str) -> lis
         raise ProjectError([f"{script.name}: no file of {what}"])
     if (element.get("format") or "").replace(" ", "") != kind:
         raise ProjectError([f"{script.name}: {what} are read in the format {kind!r} only"])
-    path = script.parent / element.text.strip()
+    path = _within(script, element.text.strip())
     width = kind.count(",") + 1
     rows = []
     for number, line in enumerate(_text_of(path).splitlines(), 1):
@@ -164,23 +178,32 @@ def _rows(script: Path, given: ElementTree.Element, what: str, kind: str) -> lis
     return rows
 
 
+def _within(script: Path, name: str) -> Path:
+    try:
+        return within(script.parent, name, f"{script.name}: file")
+    except ForeignFileError as error:
+        raise ProjectError([str(error)]) from error
+
+
+def _bytes_of(path: Path) -> bytes:
+    try:
+        return read_plain(path, _MOST_BYTES)
+    except ForeignFileError as error:
+        raise ProjectError([str(error)]) from error
+
+
 def _text_of(path: Path) -> str:
     try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise ProjectError([f"{path}: larger than {_MOST_BYTES} bytes"])
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        return _bytes_of(path).decode("utf-8")
+    except UnicodeDecodeError as error:
         raise ProjectError([f"{path}: cannot be read ({error})"]) from error
 
 
 def _parsed(script: Path) -> ElementTree.Element:
-    text = _text_of(script)
-    if "<!ENTITY" in text or "<!DOCTYPE" in text:
-        raise ProjectError([f"{script.name}: declares entities; a DBAT script has none"])
     try:
-        return ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
-        raise ProjectError([f"{script.name}: not XML: {error}"]) from error
+        return parse_xml(_bytes_of(script), elements_max=ELEMENTS_MAX)
+    except XmlError as error:
+        raise ProjectError([f"{script.name}: {error}"]) from error
 
 
 def _text(script: Path, element: ElementTree.Element, key: str) -> str:

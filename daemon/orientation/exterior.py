@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import statistics
-import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +24,7 @@ from daemon.disk.mission import Mission
 from daemon.disk.walk import Walked, walk
 from daemon.exposure import Exposure, NavigationRecord
 from daemon.flight.navigation import metres_per_degree
+from daemon.foreign_files import read_plain
 from daemon.orientation.georeference import Place
 from processing.geometry.orientation import (
     BODY_FROM_CAMERA,
@@ -35,8 +35,10 @@ from processing.geometry.orientation import (
 )
 from processing.geometry.rotation import rotation_matrix
 from processing.rig import Cone, Rig
+from processing.rig.toml_text import parse_toml
 
 Array = NDArray[np.float64]
+MOUNT_FILE_MAX_BYTES = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -105,15 +107,22 @@ class Placing(Protocol):
 
 
 def mount_of(mission: Mission) -> tuple[MountSection, PlanSection]:
-    """Mount and plan of the configuration that was flown; defaults where there is none."""
+    """Mount and plan of the configuration that was flown; defaults where there is none.
+
+    A height model is looked for only where a mission may name one (`Mission.file_named`).
+
+    Raises:
+        ConfigurationError: the configuration cannot be used.
+    """
     flown = mission.flown_configuration()
     try:
-        return (
-            MountSection.model_validate(flown.get("mount", {})),
-            PlanSection.model_validate(flown.get("plan", {})),
-        )
+        mount = MountSection.model_validate(flown.get("mount", {}))
+        plan = PlanSection.model_validate(flown.get("plan", {}))
     except ValueError as error:
         raise ConfigurationError([f"{mission.service_path}: {error}"]) from error
+    if plan.elevation is not None:
+        plan = plan.model_copy(update={"elevation": mission.file_named(plan.elevation)})
+    return mount, plan
 
 
 def read_mount(path: Path) -> MountSection:
@@ -123,7 +132,8 @@ def read_mount(path: Path) -> MountSection:
         ConfigurationError: no such file, or no such section in it.
     """
     try:
-        return MountSection.model_validate(tomllib.loads(path.read_text(encoding="utf-8"))["mount"])
+        content = parse_toml(read_plain(path, MOUNT_FILE_MAX_BYTES))
+        return MountSection.model_validate(content["mount"])
     except KeyError as error:
         raise ConfigurationError([f"{path}: no [mount] in it"]) from error
     except (OSError, ValueError) as error:

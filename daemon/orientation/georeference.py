@@ -6,6 +6,7 @@ What PROJ can only do roughly, because a grid is not installed, is an error that
 from __future__ import annotations
 
 import math
+import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     import pyproj
 
 FROM_CRS = "EPSG:4979"
+_CODE = re.compile(r"[A-Za-z]{2,10}:\w{1,10}(\+([A-Za-z]{2,10}:)?\w{1,10})?", re.ASCII)
 STEP_DEG = 1e-3
 """Half the length, about 110 m, of the piece of meridian whose direction is taken."""
 
@@ -53,13 +55,18 @@ class Georeference:
     def __init__(self, crs: str) -> None:
         import_proj()
         import pyproj
+        from pyproj.network import set_network_enabled
         from pyproj.transformer import TransformerGroup
 
+        set_network_enabled(active=False)
         try:
+            # Other texts that PROJ takes name files and addresses, and a mission may say them.
+            if _CODE.fullmatch(crs) is None:
+                raise pyproj.exceptions.CRSError("no code of an authority")
             self.crs = pyproj.CRS.from_user_input(crs)
         except pyproj.exceptions.CRSError as error:
             raise GeoreferenceError(
-                f"{crs} is no coordinate system PROJ knows; "
+                f"{crs[:100]} is no coordinate system PROJ knows; "
                 "write it as EPSG:25833 or EPSG:25833+7837"
             ) from error
         self.name = crs

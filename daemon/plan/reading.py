@@ -8,17 +8,23 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 from daemon.errors import DaemonError
+from daemon.foreign_files import ForeignFileError, read_plain
+from daemon.foreign_xml import XmlError, parse_xml
 from daemon.plan.model import Plan, Plane, PlannedLine, Point, Specification
 
 PLAN_MAX_BYTES = 20_000_000
 LINES_MAX = 20_000
+CONTAINERS_MAX = 2_000_000
+"""Lists and objects of a JSON plan: each takes a hundred bytes of memory for two in the file."""
+ELEMENTS_MAX = 500_000
+NAME_MAX_CHARACTERS = 200
 WAYPOINT, DIGICAM_CONTROL, TRIGGER_DISTANCE, START_CAPTURE = 16, 203, 206, 2000
 BEND_RAD = math.radians(5.0)
 """Exposures named one by one make a line as long as the way does not turn further."""
@@ -35,13 +41,18 @@ def read_plan(path: Path) -> Plan:
         PlanError: too large, not of its kind, or without a line.
     """
     try:
-        if path.exists() and not path.is_file():
-            raise PlanError(f"{path}: is no file; give the path of a plan")
-        if path.stat().st_size > PLAN_MAX_BYTES:
-            raise PlanError(f"{path.name}: larger than {PLAN_MAX_BYTES / 1e6:.0f} MB, no plan")
-        data = path.read_bytes()
-    except OSError as error:
-        raise PlanError(f"{path}: cannot be read ({error.strerror})") from error
+        data = read_plain(path, PLAN_MAX_BYTES)
+    except ForeignFileError as error:
+        raise PlanError(f"flight plan {error}") from error
+    return plan_from_bytes(path, data)
+
+
+def plan_from_bytes(path: Path, data: bytes) -> Plan:
+    """The plan in the bytes of a file; `path` says its kind and names it in the error sentences.
+
+    Raises:
+        PlanError: not of its kind, or without a line.
+    """
     readers = {".geojson": _geojson, ".json": _geojson, ".kml": _kml, ".plan": _qgroundcontrol}
     reader = readers.get(path.suffix.lower())
     if reader is None:
@@ -56,9 +67,8 @@ def read_plan(path: Path) -> Plan:
         )
     if len(plan.lines) > LINES_MAX:
         raise PlanError(f"{path.name}: {len(plan.lines)} lines; {LINES_MAX} at most")
-    ids = [line.id for line in plan.lines]
-    twice = sorted({line_id for line_id in ids if ids.count(line_id) > 1})
-    if twice:
+    uses = Counter(line.id for line in plan.lines)
+    if twice := sorted(line_id for line_id, count in uses.items() if count > 1):
         raise PlanError(f"{path.name}: several lines are called {', '.join(twice[:5])}")
     return plan
 
@@ -75,18 +85,21 @@ def _geojson(name: str, data: bytes) -> Plan:
         if not isinstance(geometry, dict):
             continue
         properties = feature.get("properties") or {}
+        if not isinstance(properties, dict):
+            raise PlanError(f"{where}: its properties are no object")
         coordinates = geometry.get("coordinates")
         if geometry.get("type") == "Point" and "line" in properties:
             place = _point(where, coordinates, swapped=True)
-            places.setdefault(str(properties["line"]), []).append(place)
+            places.setdefault(_name(where, properties["line"]), []).append(place)
         if geometry.get("type") != "LineString":
             continue
         if not isinstance(coordinates, list) or len(coordinates) < 2:
             raise PlanError(f"{where}: a LineString has two places at least")
         points = [_point(where, pair, swapped=True) for pair in coordinates]
-        line_id = str(properties.get("id", feature.get("id", len(lines) + 1)))
+        line_id = _name(where, properties.get("id", feature.get("id", len(lines) + 1)))
         distance_m = _distance(where, properties.get("distance_m"))
-        lines += _straight(line_id, str(properties.get("strip", "")), points, distance_m)
+        strip = _name(where, properties.get("strip", ""))
+        lines += _straight(line_id, strip, points, distance_m)
     lines = [_exposed_at(line, places.pop(line.id, [])) for line in lines]
     if places:
         known = ", ".join(line.id for line in lines[:20])
@@ -119,17 +132,16 @@ def _distance(where: str, value: Any) -> float | None:
 
 
 def _kml(name: str, data: bytes) -> Plan:
-    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
-        raise PlanError(f"{name}: declares a document type or entities, which no KML needs")
     try:
-        root = ElementTree.fromstring(data)
-    except (ElementTree.ParseError, ValueError) as error:
-        raise PlanError(f"{name}: not XML ({error})") from error
+        root = parse_xml(data, elements_max=ELEMENTS_MAX)
+    except XmlError as error:
+        raise PlanError(f"{name}: {error}") from error
     lines: list[PlannedLine] = []
     for placemark in root.iter():
         if not placemark.tag.endswith("}Placemark") and placemark.tag != "Placemark":
             continue
-        title = next((e.text for e in placemark if e.tag.endswith("name") and e.text), None)
+        title = next((e.text for e in placemark if e.tag.endswith("name") and e.text), "")
+        title = _name(f"{name}: a Placemark", title)
         for element in placemark.iter():
             if not element.tag.endswith("LineString"):
                 continue
@@ -148,6 +160,8 @@ def _qgroundcontrol(name: str, data: bytes) -> Plan:
     if content.get("fileType") != "Plan" or not isinstance(mission, dict):
         raise PlanError(f"{name}: no QGroundControl plan (fileType, mission)")
     items = mission.get("items") or []
+    if not isinstance(items, list):
+        raise PlanError(f"{name}: mission.items is no list")
     lines = [
         PlannedLine(str(index), start, end, distance_m=distance_m)
         for index, (start, end, distance_m) in enumerate(_legs(name, items), start=1)
@@ -167,7 +181,10 @@ def _legs(name: str, items: Sequence[Any]) -> Iterator[tuple[Point, Point, float
             raise PlanError(f"{where}: no object")
         transects = item.get("TransectStyleComplexItem")
         if isinstance(transects, dict):
-            points = [_point(where, p) for p in transects.get("VisualTransectPoints") or []]
+            places = transects.get("VisualTransectPoints") or []
+            if not isinstance(places, list):
+                raise PlanError(f"{where}: VisualTransectPoints is no list")
+            points = [_point(where, p) for p in places]
             camera = transects.get("CameraCalc")
             way = camera.get("AdjustedFootprintFrontal") if isinstance(camera, dict) else None
             apart_m = _distance(where, way)
@@ -231,12 +248,24 @@ def _straight(
     ]
 
 
+def _name(where: str, value: Any) -> str:
+    """What a plan calls a line or strip: one line of text that a person can see."""
+    if isinstance(value, dict | list) or len(text := str(value)) > NAME_MAX_CHARACTERS:
+        raise PlanError(
+            f"{where}: {str(value)[:60]!r} is no name; {NAME_MAX_CHARACTERS} characters at most"
+        )
+    text = " ".join(text.split())
+    if not text.isprintable():
+        raise PlanError(f"{where}: the name {text!r} holds characters that cannot be seen")
+    return text
+
+
 def _point(where: str, pair: Any, *, swapped: bool = False) -> Point:
     """A place from [latitude, longitude], or the other way round where `swapped`."""
     try:
         first, second = float(pair[0]), float(pair[1])
-    except (TypeError, ValueError, IndexError, KeyError) as error:
-        raise PlanError(f"{where}: {str(pair)[:60]} is no place") from error
+    except (TypeError, ValueError, IndexError, KeyError, OverflowError) as error:
+        raise PlanError(f"{where}: {str(pair)[:60]!r} is no place") from error
     latitude, longitude = (second, first) if swapped else (first, second)
     if not (abs(latitude) <= 90 and abs(longitude) <= 180 and math.isfinite(latitude + longitude)):
         raise PlanError(f"{where}: {latitude} N {longitude} E is no place on earth")
@@ -260,15 +289,19 @@ def _specification(name: str, content: Any) -> Specification:
     }
     for key, value in content.items():
         if key not in limits:
-            raise PlanError(f"{name}: specification.{key}: there is {', '.join(limits)}")
+            raise PlanError(f"{name}: specification.{str(key)[:60]}: there is {', '.join(limits)}")
         low, high = limits[key]
         good = isinstance(value, int | float) and not isinstance(value, bool)
         if not good or not low <= value <= high:
-            raise PlanError(f"{name}: specification.{key} is {value!r}; {low:g} to {high:g}")
+            raise PlanError(
+                f"{name}: specification.{key} is {str(value)[:60]}; {low:g} to {high:g}"
+            )
     return Specification(**{str(key): float(value) for key, value in content.items()})
 
 
 def _json(name: str, data: bytes) -> dict[str, Any]:
+    if data.count(b"[") + data.count(b"{") > CONTAINERS_MAX:
+        raise PlanError(f"{name}: more than {CONTAINERS_MAX} lists and objects, no plan")
     try:
         content = json.loads(data.decode("utf-8-sig"))
     except ValueError as error:

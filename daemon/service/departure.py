@@ -142,7 +142,9 @@ def watch_process(configuration: Configuration) -> ProcessPlan | None:
     if configuration.watch is None:
         return None
     one = thread_counts(1)
-    return ProcessPlan("watch", "daemon.watch.process:main", (configuration.watch,), one)
+    return ProcessPlan(
+        "watch", "daemon.watch.process:main", (configuration.watch, configuration.plan), one
+    )
 
 
 def thread_counts(threads: int) -> dict[str, str]:

@@ -6,7 +6,6 @@ The exposures of a mission are chained to its own copy of the rig; another rig n
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ from daemon.disk.mission import Mission
 from daemon.flight.recovery_match import seal_from_log
 from daemon.service.findings import Finding, failed, passed
 from processing.rig import Rig, RigError, load_rig, shipped_rigs
+from processing.rig.toml_text import parse_toml
 
 NAMED_MOST: Final = 6
 """Differences that the sentence names; the event lists all."""
@@ -124,9 +124,7 @@ def rig_differences(flown: Path, configured: Path) -> list[str]:
     Comments, order and form do not count. A file that is no TOML differs as a whole.
     """
     try:
-        old, new = (
-            _leaves(tomllib.loads(path.read_text(encoding="utf-8"))) for path in (flown, configured)
-        )
+        old, new = (_leaves(parse_toml(path.read_bytes())) for path in (flown, configured))
     except (OSError, ValueError) as error:
         return [f"the whole file ({error})"]
     keys = sorted(key for key in old.keys() | new.keys() if old.get(key) != new.get(key))

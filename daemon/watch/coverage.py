@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from daemon.configuration import ConfigurationError
+from daemon.configuration import ConfigurationError, PlanSection
 from daemon.disk.mission import Mission
 from daemon.errors import DaemonError
 from daemon.orientation.exterior import mount_of
@@ -48,10 +48,17 @@ class _Known:
 
 
 class Coverage:
-    """What is planned and what has been seen of it. Without a plan there is neither."""
+    """What is planned and what has been seen of it. Without a plan there is neither.
 
-    def __init__(self, state: FlightState) -> None:
+    Args:
+        state: the flight as it is watched.
+        configured: where the service's own configuration puts the height model; without it the
+            mission's names count, within its folder.
+    """
+
+    def __init__(self, state: FlightState, configured: PlanSection | None = None) -> None:
         self._state = state
+        self._configured = configured
         self._mission: str | None = None
         self._known: _Known | None = None
         self._taken: dict[int, tuple[str, Taken]] = {}
@@ -61,7 +68,9 @@ class Coverage:
         """Take in what is new; often enough, since the state forgets."""
         if self._state.mission_path != self._mission:
             self._mission = self._state.mission_path
-            self._known = None if self._mission is None else _known_of(Path(self._mission))
+            self._known = (
+                None if self._mission is None else _known_of(Path(self._mission), self._configured)
+            )
             self._taken.clear()
             self._cursor = 0
         if self._known is None:
@@ -172,7 +181,7 @@ def advice_json(advice: Advice, coverage: Coverage) -> dict[str, Any]:
     }
 
 
-def _known_of(path: Path) -> _Known | None:
+def _known_of(path: Path, configured: PlanSection | None) -> _Known | None:
     try:
         mission = Mission.open(path)
         if mission.plan_path is None:
@@ -182,7 +191,7 @@ def _known_of(path: Path) -> _Known | None:
     except (OSError, DaemonError, ConfigurationError, RigError):
         return None
     along_m, across_m = image_on_ground_m(rig, section.height_above_ground_m)
-    relief, level_because = relief_or_reason(section)
+    relief, level_because = relief_or_reason(configured or section)
     return _Known(
         rig=rig,
         plan=plan,

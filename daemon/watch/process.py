@@ -14,7 +14,7 @@ import uvicorn
 from fastapi import FastAPI
 from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
-from daemon.configuration import ConfigurationError, MountSection, WatchSection
+from daemon.configuration import ConfigurationError, MountSection, PlanSection, WatchSection
 from daemon.disk.mission import Mission
 from daemon.disk.records import RecordError
 from daemon.errors import DaemonError
@@ -49,14 +49,14 @@ PING_S, PONG_WITHIN_S = 5.0, 10.0
 holds for one that stalls may be minutes of telemetry."""
 
 
-def main(link: Link, settings: WatchSection) -> None:
+def main(link: Link, settings: WatchSection, plan: PlanSection) -> None:
     """Serve watchers until told to stop."""
     confine()
     logging.getLogger("uvicorn.error").addFilter(FewLines())
-    asyncio.run(_serve(link, settings))
+    asyncio.run(_serve(link, settings, plan))
 
 
-async def _serve(link: Link, settings: WatchSection) -> None:
+async def _serve(link: Link, settings: WatchSection, plan: PlanSection) -> None:
     ground = _Ground()
     state = FlightState(f"syntopic {version('syntopic')}", ground.seen_from, pictures_of)
     ground.state = state
@@ -66,7 +66,7 @@ async def _serve(link: Link, settings: WatchSection) -> None:
             failing.add(finding.name)
             link.send(Told(_absent(finding.name, finding.sentence)))
     gate = Gate(link.send)
-    coverage = Coverage(state)
+    coverage = Coverage(state, plan)
     watchers = WatchSettings(_tokens(settings.tokens), settings.open)
     connections = Connections(settings.proxies)
     app = create_app(state, gate, watchers, coverage, connections)

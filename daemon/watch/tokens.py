@@ -10,7 +10,6 @@ import hmac
 import os
 import re
 import secrets
-import tomllib
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from typing import Literal
 
 from daemon.disk import durable
 from daemon.errors import DaemonError
+from processing.rig.toml_text import parse_toml
 
 Role = Literal["watch", "command"]
 ROLES: tuple[Role, ...] = ("watch", "command")
@@ -90,7 +90,7 @@ def read_tokens(path: Path | None) -> Tokens:
     try:
         if path.stat().st_mode & 0o007:
             raise TokenError(f"{path} is open to everybody; chmod 640 {path}")
-        content = tomllib.loads(path.read_text("utf-8"))
+        content = parse_toml(path.read_bytes())
     except (OSError, ValueError) as error:
         raise TokenError(f"{path}: cannot be read ({error})") from error
     holders: dict[str, Holder] = {}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime
 import stat
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,10 +19,18 @@ from processing.rig.model import (
     VirtualImage,
 )
 from processing.rig.table import RigError, Table
+from processing.rig.toml_text import TomlError, parse_toml
 
 RIG_FORMAT = 1
 RIG_FILE_MAX_BYTES = 1_000_000
 BANDS = ("pan", "red", "green", "blue", "nir", "red_edge")
+SIDE_MAX_PX = 65_535
+SENSOR_MAX_PIXELS = 200_000_000
+IMAGE_MAX_PIXELS = 500_000_000
+CONES_MAX, SENSORS_MAX = 64, 256
+PITCH_LIMITS_UM = (0.1, 1000.0)
+FOCAL_LIMITS_MM = (0.1, 100_000.0)
+EXPOSURE_OFFSET_LIMITS_NS = (-10_000_000_000, 10_000_000_000)
 JUSTIFICATIONS = ("right", "left")
 MOST_SKEW_PPM_PER_MM = 1000.0
 COLOUR_FILTER_ARRAYS = ("none", "RGGB", "BGGR", "GRBG", "GBRG")
@@ -62,11 +69,11 @@ def load_rig(path: Path) -> Rig:
             raise RigError([f"{path}: not a regular file; give a rig file"])
         if status.st_size > RIG_FILE_MAX_BYTES:
             raise RigError([f"{path.name}: larger than {RIG_FILE_MAX_BYTES} bytes; not a rig file"])
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        content = parse_toml(path.read_bytes())
     except OSError as error:
         reason = error.strerror or type(error).__name__
         raise RigError([f"{path}: cannot be read ({reason}); give a readable file"]) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except TomlError as error:
         raise RigError([f"{path.name}: not valid TOML ({error})"]) from error
     return rig_from_mapping(content, path.name)
 
@@ -82,7 +89,7 @@ def rig_from_mapping(content: Mapping[str, Any], file: str) -> Rig:
     image = top.table("virtual_image", optional=True)
     probes = top.table("probe_serials", optional=True)
     rig = Rig(
-        name=top.text("name"),
+        name=top.name("name"),
         title=top.text("title", ""),
         timing="synchronous"
         if top.choice("timing", ("syntopic", "synchronous")) == "synchronous"
@@ -118,13 +125,28 @@ def _date(calibration: Table) -> str:
 
 
 def _virtual_image(table: Table) -> VirtualImage:
-    return VirtualImage(
-        width_px=table.integer("width_px", positive=True),
-        height_px=table.integer("height_px", positive=True),
-        pitch_um=table.number("pitch_um", positive=True),
-        f_mm=table.number("f_mm", positive=True),
+    width_px, height_px = _size(table, IMAGE_MAX_PIXELS)
+    image = VirtualImage(
+        width_px=width_px,
+        height_px=height_px,
+        pitch_um=table.number("pitch_um", positive=True, limits=PITCH_LIMITS_UM),
+        f_mm=table.number("f_mm", positive=True, limits=FOCAL_LIMITS_MM),
         colour_ratio=_colour_ratio(table),
     )
+    if not 1 <= image.colour_width_px * image.colour_height_px <= IMAGE_MAX_PIXELS:
+        table.complain("colour_ratio", f"the colour image has 1 to {IMAGE_MAX_PIXELS} pixels")
+    return image
+
+
+def _size(table: Table, pixels_max: int) -> tuple[int, int]:
+    """Width and height, so that no file asks for more memory than a camera needs."""
+    width_px, height_px = (
+        table.integer(key, positive=True, limits=(1, SIDE_MAX_PX))
+        for key in ("width_px", "height_px")
+    )
+    if width_px * height_px > pixels_max:
+        table.complain("width_px", f"width times height is {pixels_max} pixels at most")
+    return width_px, height_px
 
 
 def _colour_ratio(table: Table) -> float:
@@ -151,7 +173,7 @@ def _cone(table: Table, defaults: Table) -> Cone:
     lens = table.table("lens").over(lens_defaults)
     sensors = [s.over(sensor_defaults) for s in table.tables("sensor")]
     cone = Cone(
-        name=table.text("name"),
+        name=table.name("name"),
         role="pan" if table.choice("role", ("pan", "colour")) == "pan" else "colour",
         bands=bands,
         position_mm=table.triple("position_mm"),
@@ -159,8 +181,12 @@ def _cone(table: Table, defaults: Table) -> Cone:
         rotation_sigma_urad=table.number("rotation_sigma_urad", 30.0, positive=True),
         probe=probe,
         calibration_c=calibration_c,
-        mark_to_mid_exposure_ns=table.integer("mark_to_mid_exposure_ns", 0),
-        mark_to_mid_exposure_sigma_ns=table.integer("mark_to_mid_exposure_sigma_ns", 1000),
+        mark_to_mid_exposure_ns=table.integer(
+            "mark_to_mid_exposure_ns", 0, limits=EXPOSURE_OFFSET_LIMITS_NS
+        ),
+        mark_to_mid_exposure_sigma_ns=table.integer(
+            "mark_to_mid_exposure_sigma_ns", 1000, limits=(0, EXPOSURE_OFFSET_LIMITS_NS[1])
+        ),
         lens=_lens(lens),
         sensors=tuple(_sensor(sensor, probe, calibration_c) for sensor in sensors),
     )
@@ -174,7 +200,7 @@ def _lens(table: Table) -> Lens:
         table.complain("direction", "a lens correction here is ideal_from_measured")
     number = table.number
     lens = Lens(
-        f_mm=number("f_mm", positive=True),
+        f_mm=number("f_mm", positive=True, limits=FOCAL_LIMITS_MM),
         f_ppm_per_k=number("f_ppm_per_k", 0.0),
         f_sigma_ppm=number("f_sigma_ppm", 20.0, positive=True),
         f_number=number("f_number", 5.6, positive=True),
@@ -217,12 +243,15 @@ def _sensor(table: Table, probe: str, calibration_c: float) -> Sensor:
     bits = table.integer("bits", 12, positive=True)
     if bits > 16:
         table.complain("bits", "a pixel has at most 16 bits")
+    width_px, height_px = _size(table, SENSOR_MAX_PIXELS)
     sensor = Sensor(
-        name=table.text("name"),
+        name=table.name("name"),
         serial=table.text("serial", ""),
-        width_px=table.integer("width_px", positive=True),
-        height_px=table.integer("height_px", positive=True),
-        pitch_um=table.number("pitch_um", positive=True, says="a pixel pitch is positive"),
+        width_px=width_px,
+        height_px=height_px,
+        pitch_um=table.number(
+            "pitch_um", positive=True, says="a pixel pitch is positive", limits=PITCH_LIMITS_UM
+        ),
         x_mm=table.number("x_mm"),
         y_mm=table.number("y_mm"),
         rotation_rad=table.number("rotation_rad", 0.0),
@@ -263,7 +292,10 @@ def _skew(table: Table, key: str) -> float:
 def _check_names(rig: Rig, file: str, problems: list[str]) -> None:
     cones = [cone.name for cone in rig.cones]
     sensors = [sensor.name for sensor in rig.sensors]
-    for kind, names in (("cone", cones), ("sensor", sensors)):
+    for kind, names, most in (("cone", cones, CONES_MAX), ("sensor", sensors, SENSORS_MAX)):
+        if len(names) > most:
+            problems.append(f"{file}: {len(names)} {kind}s; a rig has {most} at most")
+            continue
         twice = dict.fromkeys(name for name in names if names.count(name) > 1)
         problems.extend(f"{file}: {kind} name {n!r} is used twice; names are unique" for n in twice)
     for key in ("master_cone", "colour_master_cone", "reference_cone"):

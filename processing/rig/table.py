@@ -5,10 +5,20 @@ What the questions are is in `processing.rig.file`.
 
 from __future__ import annotations
 
-import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
+
+NUMBER_LIMIT = 1e12
+"""No length, angle, count or coefficient of a camera, in the units of the file, comes near."""
+TEXT_MAX_CHARACTERS = 1000
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.\-]{0,63}")
+
+
+def plain_name(name: str) -> bool:
+    """Whether a sensor or file name is safe in a path: letters, digits, `_`, `-`, inner dots."""
+    return _NAME.fullmatch(name) is not None and ".." not in name
 
 
 class RigError(ValueError):
@@ -32,28 +42,40 @@ class Table:
         self.asked: set[str] = set()
 
     def complain(self, key: str, cure: str) -> None:
-        found = f"is {self.content[key]!r}" if key in self.content else "is missing"
+        found = f"is {_shown(self.content[key])}" if key in self.content else "is missing"
         self.problems.append(f"{self.file}: {self._key(key)} {found}; {cure}")
 
     def number(
-        self, key: str, default: float | None = None, *, positive: bool = False, says: str = ""
+        self,
+        key: str,
+        default: float | None = None,
+        *,
+        positive: bool = False,
+        says: str = "",
+        limits: tuple[float, float] | None = None,
     ) -> float:
         value = self._get(key, default, "a number is needed")
         if value is None:
             return 1.0
-        if (
-            isinstance(value, bool)
-            or not isinstance(value, int | float)
-            or not math.isfinite(value)
-        ):
+        if not _is_number(value):
             self.complain(key, "a finite number is needed")
             return 1.0
         if positive and value <= 0:
             self.complain(key, says or "it is positive")
             return 1.0
+        if limits is not None and not limits[0] <= value <= limits[1]:
+            self.complain(key, f"it lies between {limits[0]:g} and {limits[1]:g}")
+            return 1.0
         return float(value)
 
-    def integer(self, key: str, default: int | None = None, *, positive: bool = False) -> int:
+    def integer(
+        self,
+        key: str,
+        default: int | None = None,
+        *,
+        positive: bool = False,
+        limits: tuple[int, int] = (-(2**53), 2**53),
+    ) -> int:
         value = self._get(key, default, "a whole number is needed")
         if value is None:
             return 1
@@ -63,12 +85,26 @@ class Table:
         if positive and value <= 0:
             self.complain(key, "it is positive")
             return 1
+        if not limits[0] <= value <= limits[1]:
+            self.complain(key, f"it lies between {limits[0]} and {limits[1]}")
+            return 1
+        return value
+
+    def name(self, key: str) -> str:
+        """A text that is safe as a file name."""
+        value = self.text(key)
+        if value and not plain_name(value):
+            self.complain(key, "letters, digits, '_', '-' and inner dots only, 64 at most")
+            return ""
         return value
 
     def text(self, key: str, default: str | None = None) -> str:
         value = self._get(key, default, "a text is needed")
         if value is not None and not isinstance(value, str):
             self.complain(key, "a text is needed")
+            return ""
+        if value and not (len(value) <= TEXT_MAX_CHARACTERS and value.isprintable()):
+            self.complain(key, f"{TEXT_MAX_CHARACTERS} characters at most, all of them visible")
             return ""
         return value or ""
 
@@ -88,11 +124,7 @@ class Table:
 
     def triple(self, key: str) -> tuple[float, float, float]:
         value = self._get(key, None, "three numbers are needed")
-        good = (
-            isinstance(value, list)
-            and len(value) == 3
-            and all(isinstance(v, int | float) and math.isfinite(v) for v in value)
-        )
+        good = isinstance(value, list) and len(value) == 3 and all(map(_is_number, value))
         if not good:
             if value is not None:
                 self.complain(key, "three numbers are needed")
@@ -164,7 +196,15 @@ def _numbers(value: object) -> tuple[float, ...]:
     """A list's numbers; none of them where one is no finite number."""
     if not isinstance(value, list):
         return ()
-    good = all(
-        isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in value
-    )
-    return tuple(float(v) for v in value) if good else ()
+    return tuple(float(v) for v in value) if all(map(_is_number, value)) else ()
+
+
+def _is_number(value: object) -> bool:
+    """Whether it is a number of a size that a camera may have; a TOML integer has any size."""
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return is_number and -NUMBER_LIMIT <= value <= NUMBER_LIMIT  # type: ignore[operator]
+
+
+def _shown(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."

@@ -129,3 +129,59 @@ def test_probes_have_serial_numbers_of_their_own_and_only_those_of_the_rig() -> 
     assert "probe 1" not in parts
     changed["probe_serials"] = {"boiler": "PT-18"}
     assert "probe_serials.boiler" in problems_of(changed)[0]
+
+
+def changed_rig(tmp_path: Path, before: str, after: str) -> Path:
+    text = shipped_rigs()["ultracam-x-mini"].read_text()
+    assert before in text
+    path = tmp_path / "rig.toml"
+    path.write_text(text.replace(before, after, 1))
+    return path
+
+
+@pytest.mark.trust
+@pytest.mark.parametrize(
+    ("before", "after", "sentence"),
+    [
+        ("width_px =", "width_px = 1000000000 #", "it lies between 1 and 65535"),
+        (
+            "width_px = 3480\nheight_px = 2226",
+            "width_px = 65535\nheight_px = 65535",
+            "width times height is",
+        ),
+        ("f_mm", "f_mm = 1e-300 # ", "it lies between"),
+        ("pitch_um", "pitch_um = 1e9 # ", "it lies between"),
+        ("frame_interval_s", "frame_interval_s = inf # ", "a finite number"),
+        ("frame_interval_s", f"frame_interval_s = 1{'0' * 400} # ", "a finite number"),
+        ("colour_ratio", "colour_ratio = 0.001 # ", "colour image"),
+        ("colour_ratio", "colour_ratio = 1e9 # ", "colour image"),
+        ("position_mm", f"position_mm = [0, 0, 1{'0' * 400}] # ", "three numbers"),
+        ('name = "SU00"', 'name = "../../SU00"', "letters, digits"),
+        ('name = "SU00"', 'name = "SU00\\u001b[2J"', "all of them visible"),
+        ('serial = "', 'serial = "\\u202e', "all of them visible"),
+        ("title", "title = '" + "x" * 5000 + "' # ", "1000 characters"),
+    ],
+)
+def test_a_value_that_no_camera_has_is_refused(
+    tmp_path: Path, before: str, after: str, sentence: str
+) -> None:
+    with pytest.raises(RigError, match=sentence) as refused:
+        load_rig(changed_rig(tmp_path, before, after))
+    assert max(map(len, refused.value.problems)) < 500
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"a = " + b"[" * 100_000,
+        b"a = " + b"[" * 500 + b"]" * 500,
+        b".".join([b"a"] * 5_000) + b" = 1",
+        b"a = 1" + b"0" * 5_000,
+        b"a = '\xff'",
+        b"\xff\xfea\0=\0001\0",
+    ],
+)
+def test_toml_that_costs_more_than_its_size_is_refused(tmp_path: Path, data: bytes) -> None:
+    (tmp_path / "rig.toml").write_bytes(data)
+    with pytest.raises(RigError, match="not valid TOML"):
+        load_rig(tmp_path / "rig.toml")

@@ -154,7 +154,7 @@ def test_qgroundcontrol_photographs_at_waypoints_are_lines_that_end_where_the_wa
         ("p.geojson", collection(feature([A, B]), specification={"overlap": 1}), "there is"),
         ("p.geojson", collection(feature([A, B]), specification={"sidelap": 2}), "0 to 0.95"),
         ("p.kml", b"<!DOCTYPE x [<!ENTITY a 'b'>]><kml/>", "document type or entities"),
-        ("p.kml", b"<kml", "not XML"),
+        ("p.kml", b"<kml", "not valid XML"),
         ("p.plan", b"{}", "no QGroundControl plan"),
     ],
 )

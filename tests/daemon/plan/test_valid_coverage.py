@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import shutil
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -200,9 +201,9 @@ def mission_of(folder: Path, shots: list[Shot], *, has_area: bool = True, plan: 
     return folder
 
 
-def advised(mission: Path) -> dict[str, Any]:
+def advised(mission: Path, *options: str) -> dict[str, Any]:
     """What `syntopic advise` prints."""
-    done = CliRunner().invoke(app, ["advise", str(mission), "--json"])
+    done = CliRunner().invoke(app, ["advise", str(mission), "--json", *options])
     told = json.loads(done.stdout)
     assert done.exit_code == (1 if told["segments"] else 0), done.output
     return dict(told)
@@ -315,7 +316,8 @@ def test_relief_is_followed_where_a_height_model_is_configured(tmp_path: Path) -
     heights = np.repeat(ridge(LINE_M / 2 - offset)[:, None], count, axis=1) + GROUND_M
     corner = (there.east_m + offset[0], there.north_m - offset[-1])
     rows = "\n".join(" ".join(f"{z:.2f}" for z in row) for row in heights)
-    (tmp_path / "dem.asc").write_text(
+    model = tmp_path / "dem.asc"
+    model.write_text(
         f"ncols {count}\nnrows {count}\nxllcenter {corner[0]}\nyllcenter {corner[1]}\n"
         f"cellsize {step}\nNODATA_value -9999\n{rows}\n"
     )
@@ -323,6 +325,15 @@ def test_relief_is_followed_where_a_height_model_is_configured(tmp_path: Path) -
     expected = short_of(shots, relief=ridge)
     level = short_of(shots)
     assert abs(expected.area_m2 - level.area_m2) > 2 * level.within_m2
+    relative = f'elevation = "../dem.asc"\nelevation_crs = "{crs}"\n'
+    mission = mission_of(tmp_path / "r", shots, plan=relative)
+    (note,) = advised(mission)["notes"]  # a mission's name leads out of its folder by no ".."
+    assert note.startswith("Level ground is assumed: ")
+    told = advised(mission, "--elevation", str(model))
+    assert told["hole_m2"] == pytest.approx(expected.area_m2, abs=expected.within_m2)
+    shutil.copy(model, mission)
+    told = advised(mission)
+    assert told["hole_m2"] == pytest.approx(expected.area_m2, abs=expected.within_m2)
     settings = f'elevation = "{tmp_path}/dem.asc"\nelevation_crs = "{crs}"\n'
     told = advised(mission_of(tmp_path / "a", shots, plan=settings))
     assert told["hole_m2"] == pytest.approx(expected.area_m2, abs=expected.within_m2)

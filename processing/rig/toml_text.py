@@ -1,0 +1,50 @@
+"""TOML of others: parsed with one kind of error, whatever is wrong with it.
+
+What the keys mean is the business of the readers.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from typing import Any, Final
+
+DEPTH_MAX: Final = 32
+"""Tables and lists within one another; no file of ours has more than six."""
+
+
+class TomlError(ValueError):
+    """Text that is not TOML; the sentence says why."""
+
+
+def parse_toml(data: bytes) -> dict[str, Any]:
+    """Parse a TOML document.
+
+    Raises:
+        TomlError: not UTF-8, not TOML, a number of more digits than Python reads, or nested more
+            than `DEPTH_MAX` deep.
+    """
+    try:
+        content = tomllib.loads(data.decode("utf-8"))
+    except RecursionError as error:
+        raise TomlError("nested too deeply") from error
+    except ValueError as error:
+        raise TomlError(str(error)) from error
+    if is_nested_deeper(content, DEPTH_MAX):
+        raise TomlError("nested too deeply")
+    return content
+
+
+def is_nested_deeper(content: object, depth: int) -> bool:
+    """Whether tables or lists lie more than `depth` within one another."""
+    level: list[object] = [content]
+    for _ in range(depth + 1):
+        level = [
+            inner
+            for outer in level
+            for inner in (outer.values() if isinstance(outer, Mapping) else outer)  # type: ignore[attr-defined]
+            if isinstance(inner, Mapping | list)
+        ]
+        if not level:
+            return False
+    return True
