@@ -55,7 +55,7 @@ class Georeference:
     def __init__(self, crs: str) -> None:
         import_proj()
         import pyproj
-        from pyproj.network import set_network_enabled
+        from pyproj.network import set_network_enabled  # type: ignore[attr-defined]
         from pyproj.transformer import TransformerGroup
 
         set_network_enabled(active=False)
