@@ -204,3 +204,32 @@ def test_starting_values_far_off_end_in_a_sentence() -> None:
     below = network.stations.position_m - np.array([0.0, 0.0, 5000.0])
     with pytest.raises(NetworkError, match="better starting values"):
         adjust(replace(network, stations=replace(network.stations, position_m=below)))
+
+
+def test_sigmas_are_scaled_only_where_that_is_asked_for() -> None:
+    made = aerial(seed=7, sigma_mm=2e-3, points=120)
+    table = made.network.image_points
+    network = replace(made.network, image_points=replace(table, sigma_mm=table.sigma_mm / 2.0))
+    result = adjust(network)
+    assert result.factors == {}
+    assert result.sigma0 == pytest.approx(2.0, rel=0.15)
+
+
+def test_each_round_of_data_snooping_is_announced_with_its_number() -> None:
+    made = aerial(seed=8, sigma_mm=1e-3, points=60)
+    table = made.network.image_points
+    rays = np.bincount(table.point, minlength=60)
+    wrong = np.flatnonzero(table.point == int(np.flatnonzero(rays >= 6)[-1]))[:2]
+    xy = table.xy_mm.copy()
+    xy[wrong] += [[0.1, 0.05], [-0.02, 0.03]]
+    network = replace(made.network, image_points=replace(table, xy_mm=xy))
+    rounds = []
+
+    def tell(what: str, number: int, value: float) -> None:
+        if what.endswith("left out"):
+            rounds.append((what, number))
+
+    result = adjust(network, Settings(reject_beyond=5.0), progress=tell)
+    assert [number for _, number in rounds] == list(range(1, len(rounds) + 1))
+    assert rounds[-1][0] == f"{int(result.rejected.sum())} image points left out"
+    assert set(wrong) <= set(np.flatnonzero(result.rejected))

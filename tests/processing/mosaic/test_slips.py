@@ -272,3 +272,30 @@ def test_the_other_part_begins_where_the_found_band_ends(first: int, last: int) 
     assert (other.dx_px, other.dy_px) == (-band.dx_px, -band.dy_px)
     inside = int(inside_slips(tie_points, (band,)).sum())
     assert other.points == 1200 - inside
+
+
+def worst(count: int, level: float, step: float) -> Slip | None:
+    """What `_worst` makes of points one pixel apart, the first half of them shifted in x."""
+    at = np.arange(count, dtype=np.float64)
+    residuals = np.full((count, 2), level)
+    residuals[: count // 2, 0] += step
+    noise = 0.01 * np.random.default_rng(1).standard_normal((count, 2))
+    sigma = np.full(count, 0.05)
+    found = slips._worst("SU00", "rows", count, at, residuals + noise, sigma, SlipSettings())
+    return None if found is None else found[0]
+
+
+@pytest.mark.parametrize("level", [0.0, 3.0, -8.0])
+def test_a_band_is_measured_against_the_rest_of_its_frame(level: float) -> None:
+    """Wherever the frame lies as a whole."""
+    slip = worst(280, level, 1.5)
+    assert slip is not None and (slip.first, slip.last) == (0, 139)
+    assert (slip.dx_px, slip.dy_px) == pytest.approx((1.5, 0.0), abs=0.01)
+    assert slip.share == 0.5 and slip.points == 140
+
+
+def test_half_of_four_bins_is_the_smallest_band() -> None:
+    slip = worst(28, 0.0, 20.0)
+    assert slip is not None and slip.points == 14
+    assert worst(21, 0.0, 20.0) is not None
+    assert worst(14, 0.0, 20.0) is None

@@ -87,6 +87,17 @@ def test_a_rotated_cone_moves_its_layer_as_its_homography_does() -> None:
     np.testing.assert_allclose(colour - turned_only, np.diag(own**2), rtol=1e-6, atol=1e-16)
 
 
+def test_a_layer_that_cannot_rotate_is_known_to_its_floor() -> None:
+    """In PAN pixels: 0.05 of a PAN layer, 0.3 of the colour master and 3 of its parallax."""
+    truth = make_truth(MINI, np.random.default_rng(1))
+    mosaic = free_mosaic(MINI, truth.start, no_tie_points(MINI))
+    settings = SupportSettings(rotation_rad=0.0)
+    pixel = mosaic.model.pitch_mm / mosaic.model.half_size_mm
+    for cone, floor in (("1", [0.05] * 8), ("G", [0.3, 0.3, 3.0, 0.3, 0.3, 3.0, 0.3, 0.3])):
+        sigma = np.sqrt(np.diag(_layer_covariance(mosaic, MINI.cone(cone), settings)))
+        np.testing.assert_allclose(sigma / pixel, floor, rtol=1e-9)
+
+
 @pytest.mark.parametrize(("read", "sigma_k"), [(("0", "1"), 0.1), (("1",), 2.0), ((), 15.0)])
 def test_a_probe_moves_all_its_sensors_together(read: tuple[str, ...], sigma_k: float) -> None:
     truth = make_truth(MINI, np.random.default_rng(1))

@@ -253,3 +253,16 @@ def test_the_default_accuracies_are_those_of_typical_points() -> None:
         typical = 0.1 if group.kind == PAN_TO_PAN else 0.3
         assert float(np.median(group.sigma)) == pytest.approx(typical, rel=0.01)
     assert math.isclose(settings.undetermined_px, 1.0) and settings.parallax_px == 0.0
+
+
+def test_residuals_far_below_their_sigmas_give_a_ratio_of_classes_too() -> None:
+    """Sums of squares below one: the residuals are a hundredth and a fiftieth of their sigmas."""
+    rng = np.random.default_rng(3)
+    off = rng.choice([-1.0, 1.0], (40, 2))
+    pan = group_of(0.01 * off)
+    colour = group_of(0.02 * off, kind=PAN_TO_COLOUR)
+    after, moved = class_scales([pan, colour], dict.fromkeys(CLASSES, 1.0), MosaicSettings())
+    assert after == {PAN_TO_PAN: 1.0, PAN_TO_COLOUR: pytest.approx(2.0)} and moved
+    still = group_of(np.zeros((40, 2)))
+    before = dict.fromkeys(CLASSES, 1.0)
+    assert class_scales([still, colour], before, MosaicSettings()) == (before, False)
