@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from processing.bundle.camera_model import ideal_mm
-from processing.bundle.equations import BehindCameraError, equations
+from processing.bundle.equations import GROUPS, BehindCameraError, equations
 from processing.bundle.network import Camera
 from processing.bundle.rotations import (
     angles_by_rotation_vector,
@@ -128,3 +128,40 @@ def test_points_behind_a_camera_are_told_of() -> None:
         equations(
             network, layout, starting_state(network), np.ones(len(network.image_points.image))
         )
+
+
+def test_misclosures_of_every_kind_are_in_sigmas() -> None:
+    network = with_everything().network
+    layout = layout_of(network, np.zeros(len(network.points.names), dtype=bool))
+    state = starting_state(network)
+    state = replace(state, points=state.points + np.array([0.06, -0.04, 0.03]))
+    weight = np.ones(len(network.image_points.image))
+    rows = equations(network, layout, state, weight)
+
+    def of(name: str) -> np.ndarray:
+        return np.sort(np.abs(rows.misclosure[rows.group == GROUPS.index(name)]))
+
+    def expected(off: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+        return np.sort(np.abs(off / sigma).ravel())
+
+    assert network.points.sigma_m[:8] == pytest.approx(0.02)
+    np.testing.assert_allclose(of("control plan"), np.repeat([2.0, 3.0], 8))
+    np.testing.assert_allclose(of("control height"), [1.5] * 8)
+    gnss = network.gnss
+    antenna = state.station + np.einsum("nij,nj->ni", state.attitude, gnss.lever_m)
+    off = gnss.position_m - antenna
+    np.testing.assert_allclose(of("GNSS plan"), expected(off[:, :2], gnss.sigma_m[:, :2]))
+    np.testing.assert_allclose(of("GNSS height"), expected(off[:, 2], gnss.sigma_m[:, 2]))
+    distances = network.distances
+    apart = np.linalg.norm(state.points[[20, 40]] - state.points[[30, 1]], axis=1)
+    np.testing.assert_allclose(
+        of("distance"), expected(apart - distances.distance_m, distances.sigma_m)
+    )
+    turns = logarithm(np.einsum("nji,njk->nik", network.bearings.rotation, state.attitude))
+    np.testing.assert_allclose(
+        of("attitude"), expected(turns, network.bearings.sigma_rad), rtol=1e-3
+    )
+    quarter = equations(network, layout, state, weight * 0.25)
+    image = rows.group < 2
+    np.testing.assert_allclose(quarter.misclosure[image], rows.misclosure[image] / 2.0)
+    np.testing.assert_allclose(quarter.misclosure[~image], rows.misclosure[~image])
