@@ -1,0 +1,57 @@
+"""Sums of an adjustment and limits of a judgement, against their definitions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from processing.geometry.placement import nominal_placements
+from processing.mosaic.free import free_mosaic
+from processing.mosaic.validity import judge_master
+from processing.rig import find_rig
+from tests.processing.mosaic.test_precision import mosaic_of
+from tests.processing.synthetic import make_truth, no_tie_points, tie_points_of
+
+MINI = find_rig("ultracam-x-mini")
+
+
+def test_points_without_noise_leave_a_sigma0_of_nothing() -> None:
+    rng = np.random.default_rng(2)
+    truth = make_truth(MINI, rng, sensor_px=0.2, layer_px=0.5)
+    points = tie_points_of(
+        truth, rng, per_overlap=20, per_sensor=30, sigma_pp_px=1e-9, sigma_pc_px=1e-9
+    )
+    mosaic = free_mosaic(MINI, truth.start, points)
+    assert mosaic.sigma0 < 1e-4
+    assert mosaic.redundancy > 100.0
+    # With a prior the unknowns take less than one degree of freedom each.
+    supported = free_mosaic(MINI, truth.start, points, prior=np.eye(len(mosaic.values)))
+    used = ~supported.outliers
+    own = float(supported.redundancy_numbers[used].sum())
+    assert supported.redundancy == pytest.approx(own, abs=1e-6)
+
+
+def test_sums_are_those_of_the_points_in_use() -> None:
+    _, mosaic = mosaic_of("ultracam-x-mini")
+    used = ~mosaic.outliers
+    assert mosaic.redundancy == pytest.approx(float(mosaic.redundancy_numbers[used].sum()))
+    assert sum(mosaic.used.values()) == int(used.sum())
+    assert mosaic.observations == 2 * int(used.sum())
+
+
+def test_a_sensor_is_named_beyond_the_limit_of_two_coordinates_of_one_of_four() -> None:
+    rig, mosaic = mosaic_of("ultracam-x-mini")
+    judged = judge_master(rig, mosaic, {})
+    assert judged.limit == pytest.approx(chi2.isf(0.001 / 4, 2))
+    assert judged.global_freedom == 4
+    assert judged.global_limit == pytest.approx(chi2.isf(0.001, 4))
+
+
+def test_a_camera_without_a_master_of_three_has_nothing_to_test() -> None:
+    rig = find_rig("dmc-mini")
+    mosaic = free_mosaic(rig, nominal_placements(rig, {}, {}), no_tie_points(rig))
+    judged = judge_master(rig, mosaic, {})
+    assert (judged.global_statistic, judged.global_freedom, judged.global_limit) == (0.0, 0, 0.0)
+    assert judged.consistent and judged.limit == float("inf")
+    assert judged.hypotheses == () and judged.displaced is None and not judged.several
