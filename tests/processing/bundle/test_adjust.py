@@ -223,11 +223,15 @@ def test_each_round_of_data_snooping_is_announced_with_its_number() -> None:
     xy = table.xy_mm.copy()
     xy[wrong] += [[0.1, 0.05], [-0.02, 0.03]]
     network = replace(made.network, image_points=replace(table, xy_mm=xy))
-    rounds = []
+    rounds, objectives = [], []
 
     def tell(what: str, number: int, value: float) -> None:
-        if what.endswith("left out"):
+        if what == "iteration":
+            objectives.append(value)
+        elif what.endswith("left out"):
             rounds.append((what, number))
+            # What the iterations before it ended with.
+            assert value == objectives[-1]
 
     result = adjust(network, Settings(reject_beyond=5.0), progress=tell)
     assert [number for _, number in rounds] == list(range(1, len(rounds) + 1))
