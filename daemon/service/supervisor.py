@@ -16,6 +16,9 @@ from daemon.service.processes import Child
 ANSWER_LIMIT_S: Mapping[str, float] = {"capture": 10.0, "writer": 60.0, "worker": 120.0}
 """How long a process may be silent before the watchdog is no longer fed: a writer waits for its
 disk, a worker finishes its exposure."""
+RESTART_LIMIT_S: Mapping[str, float] = {"watch": 60.0}
+"""How long a process on which no exposure depends may be silent before it is ended. It is started
+again as after any other end; the watchdog is fed meanwhile."""
 END_TIMEOUT_S = 5.0
 
 
@@ -67,15 +70,19 @@ class Supervisor:
             return False  # its end is noticed by the loop
 
     def ping(self) -> list[str]:
-        """Ask every child that a flight depends on for a sign of life.
+        """Ask every child for a sign of life, and end those that are silent and not needed.
 
         Returns:
-            The names of those that have been silent for too long.
+            The names of those that a flight depends on and that have been silent for too long.
         """
         watched = [name for name in self._children if name in ANSWER_LIMIT_S]
         for name in watched:
             self.send(name, Ping())
         now = time.monotonic()
+        for name in self._children.keys() & RESTART_LIMIT_S.keys():
+            self.tell(name, Ping())
+            if now - self._answered[name] > RESTART_LIMIT_S[name]:
+                self._children[name].process.kill()
         return [name for name in watched if now - self._answered[name] > ANSWER_LIMIT_S[name]]
 
     async def end(self, names: tuple[str, ...]) -> None:

@@ -7,6 +7,7 @@ import resource
 import socket
 import threading
 import time
+import zlib
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -18,8 +19,8 @@ from daemon.service.messages import Answer, Command, Stop, Told
 from daemon.service.processes import Child
 from daemon.watch.bodies import BODY_MAX_BYTES, parsed
 from daemon.watch.confinement import FILES_MAX, MEMORY_MAX_BYTES, OOM_SCORE
-from daemon.watch.connections import CONNECTIONS_PER_SOURCE, REQUESTS_BURST
-from daemon.watch.protocols import HEAD_MAX_BYTES, RECEIVED_BURST_BYTES
+from daemon.watch.connections import CONNECTIONS_PER_SOURCE, IDLE_MAX_S, REQUESTS_BURST
+from daemon.watch.protocols import HEAD_MAX_BYTES, MESSAGE_MAX_BYTES, RECEIVED_BURST_BYTES
 from daemon.watch.tokens import FAILURES_ALLOWED, add_token
 from tests.daemon.watch import flown
 from tests.daemon.watch.test_watchers import resident_kb
@@ -324,6 +325,42 @@ def test_a_talkative_or_malformed_watcher_is_let_go(page: Page, frames: bytes) -
         assert time.monotonic() - begun < 15, sent
     assert page.resident_kb - before_kb < GROWTH_MAX_KB
     assert page.ask(get("/api/v1/brief", "Connection: close"), OPERATOR)[0] == 200
+
+
+@pytest.mark.trust
+def test_a_compressed_message_that_expands_to_megabytes_is_not_taken(page: Page) -> None:
+    squeezed = zlib.compressobj(wbits=-15)
+    bomb = squeezed.compress(bytes(3_000_000)) + squeezed.flush(zlib.Z_SYNC_FLUSH)[:-4]
+    assert len(bomb) < MESSAGE_MAX_BYTES
+    before_kb = page.resident_kb
+    for _ in range(10):
+        with page.connect("127.0.0.7") as link:
+            link.sendall(upgrade("", "Sec-WebSocket-Extensions: permessage-deflate"))
+            assert b"permessage-deflate" in link.recv(4096)
+            link.sendall(masked(0x41, bomb))
+            assert b"\x03\xf1" in read_all(link)  # 1009, message too big
+    assert page.resident_kb - before_kb < GROWTH_MAX_KB
+
+
+@pytest.mark.soak
+def test_a_header_that_never_ends_is_cut_off(page: Page) -> None:
+    with page.connect("127.0.0.8") as link:
+        link.settimeout(IDLE_MAX_S + 10)
+        link.sendall(b"GET / HTTP/1.1\r\n")
+        begun = time.monotonic()
+        sending = threading.Thread(target=drip, args=(link,))
+        sending.start()
+        read_all(link)
+        assert IDLE_MAX_S - 2 < time.monotonic() - begun < IDLE_MAX_S + 8
+        sending.join()
+
+
+def drip(link: socket.socket) -> None:
+    """A header line every second, until the connection is gone."""
+    with suppress(OSError):
+        for number in range(int(IDLE_MAX_S) + 10):
+            link.sendall(f"X-{number}: 1\r\n".encode())
+            time.sleep(1.0)
 
 
 @pytest.mark.trust
