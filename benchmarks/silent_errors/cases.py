@@ -181,7 +181,9 @@ def accused(report: QualityReport) -> dict[str, frozenset[str]]:
     }
     if "CALIBRATION_EXPIRED" in raised:
         causes = _names(figures, "platform_causes", "platform_alternatives")
-        found["platform"] = causes or _names(figures, "platform_shift_head")
+        found["platform"] = causes or _names(
+            figures, "platform_shift_head", "platform_alternatives", "platform_scale_head"
+        )
     return {what: names for what, names in found.items() if names}
 
 

@@ -50,7 +50,7 @@ LIMITS: Final[Mapping[str, Limit]] = {
     "exposure-pan": Limit("exposure time of a PAN head", "%", _alike((X, DMC), 8.0)),
     "exposure-stated": Limit("exposure time stated of a PAN head", "%", _alike((X,), 8.0)),
     "exposure-colour": Limit("exposure time of a colour head", "%", _alike(STITCHED, 30.0)),
-    "probes-all": Limit("all probes alike", "K", {X: 2.0, L: 8.0, DMC: 8.0}),
+    "probes-all": Limit("all probes alike", "K", {X: 2.0}),
     "probe-one": Limit("one probe of a PAN cone", "K", {X: 2.0, L: 8.0, DMC: 8.0}),
     "stale": Limit("age of all temperatures, at 0.02 K/s", "s", _alike(STITCHED, 30.0)),
     "tdi": Limit("TDI count of a cone", "shifts", _alike((X, DMC), 1.0)),

@@ -179,5 +179,10 @@ def _changed_master(rig: Rig, mosaic: Mosaic, layers: LayerCheck | None) -> Iter
             yield moved(*quantity)
     elif not layers.changed:
         within = (ALONE_SIGMAS if alone else SCALE_SIGMAS) * layers.common_sigmas[0]
-        beyond = layers.common[0] ** 2 - within**2
-        yield moved(np.sqrt(max(beyond, 0.0)), 0.0, 0.0, 0.0)
+        beyond = np.sqrt(max(layers.common[0] ** 2 - within**2, 0.0)) * per_mm
+        part = np.array([0.0, 0.0, beyond, 0.0])
+        per_kelvin = datum_per_kelvin_px(rig, mosaic)
+        if alone and per_kelvin[2] != 0.0:
+            # Most likely it is the temperature, which moves a single sensor as well.
+            part = per_kelvin * beyond / per_kelvin[2]
+        yield part

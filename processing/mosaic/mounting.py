@@ -43,6 +43,9 @@ FAMILY_ALPHA: Final = 1e-5
 LEAST_SHIFT_PX: Final = 0.01
 LEAST_POINTS: Final = 24
 SCALED_PPM: Final = 100.0
+ALTERNATIVE_SHARE: Final = 0.5
+"""Of the largest shift, above which another head may be the one that moved: of one head that turned
+alone, the others seem to have gone a third of its way."""
 _ROUNDS: Final = 12
 
 
@@ -99,6 +102,16 @@ class PlatformCheck:
     def scaled(self) -> Mounting:
         """The head whose scale differs most from its neighbours'."""
         return max(self.heads, key=lambda head: abs(head.scale_ppm))
+
+    @property
+    def alternatives(self) -> tuple[str, ...]:
+        """Other heads that moved nearly as far as the farthest, where the test is failed."""
+        far = ALTERNATIVE_SHARE * math.hypot(*self.farthest.shift_px)
+        return tuple(
+            head.cone
+            for head in self.heads
+            if self.expired and head is not self.farthest and math.hypot(*head.shift_px) > far
+        )
 
     @property
     def farthest(self) -> Mounting:
@@ -204,6 +217,7 @@ def platform_figures(check: PlatformCheck | None) -> dict[str, Figure]:
         "platform_test": check.statistic / check.limit,
         "platform_shift_px": math.hypot(*farthest.shift_px),
         "platform_shift_head": farthest.cone,
+        "platform_alternatives": ", ".join(check.alternatives) or None,
         "platform_residual_px": max(residuals),
         "platform_scale_ppm": scaled.scale_ppm,
         "platform_scale_head": scaled.cone,

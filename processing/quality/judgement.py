@@ -389,8 +389,10 @@ def _platform(figures: Mapping[str, Figure]) -> list[Finding]:
         return []
     moved = _number(figures, "platform_shift_px") or 0.0
     scale = _number(figures, "common_scale_ppm") or 0.0
+    other = figures.get("platform_alternatives")
+    others = f", or {other}," if other else ""
     sentence = (
-        f"Head {figures.get('platform_shift_head')} sits {moved:.2f} px off the platform "
+        f"Head {figures.get('platform_shift_head')}{others} sits {moved:.2f} px off the platform "
         "calibration; the image is corrected for it. Go on, and calibrate the platform from this "
         "flight."
     )
@@ -398,7 +400,7 @@ def _platform(figures: Mapping[str, Figure]) -> list[Finding]:
         sentence = (
             f"The layers of the other cones do not fit the master cone (common scale {scale:+.0f} "
             f"ppm; cause: cone {causes}"
-            + (f", or {other}" if (other := figures.get("platform_alternatives")) else "")
+            + (f", or {other}" if other else "")
             + "): its principal distance or mounting has changed, or the rig file is of another "
             "camera. The whole image may be shifted or scaled; its stated accuracy says by how "
             "much. Check the serial numbers, and process again with the right calibration."

@@ -121,11 +121,18 @@ def test_a_common_scale_counts_beyond_two_standard_deviations() -> None:
     assert not found(rig, mosaic, layers=other).datum.any()
 
 
-def test_a_common_scale_counts_beyond_one_where_the_master_is_one_sensor() -> None:
+def test_a_common_scale_counts_beyond_one_sigma_and_as_warmth_where_the_master_is_one_sensor() -> (
+    None
+):
     rig, mosaic = mosaic_of("ultracam-l-mini")
-    datum = found(rig, mosaic, layers=check((19.0, 4.0, 5.0, 6.0), changed=False)).datum
-    expected = np.diag([0.0, 0.0, 19.0**2 - 10.0**2, 0.0]) * (1e-6 / mosaic.model.pitch_mm) ** 2
-    np.testing.assert_allclose(datum, expected, rtol=1e-9, atol=1e-18)
+    per_k = datum_per_kelvin_px(rig, mosaic)
+    datum = found(rig, mosaic, layers=check((-19.0, 4.0, 5.0, 6.0), changed=False)).datum
+    scale = np.sqrt(19.0**2 - 10.0**2) * 1e-6 / mosaic.model.pitch_mm
+    part = per_k / per_k[2] * scale
+    np.testing.assert_allclose(datum, np.outer(part, part), rtol=1e-9)
+    assert np.hypot(*part[:2]) > 0.01 and part[2] == pytest.approx(scale)
+    none = found(rig, mosaic, layers=check((9.0, 4.0, 5.0, 6.0), changed=False)).datum
+    assert not none.any()
 
 
 @pytest.mark.parametrize(("name", "alone"), [("ultracam-x-mini", False), ("ultracam-l-mini", True)])
@@ -262,3 +269,14 @@ def test_where_several_moved_any_two_may_be_in_place() -> None:
     pairs = [(a, b) for i, a in enumerate(MASTER) for b in MASTER[i + 1 :]]
     expected = mixed([refit(rig, mosaic, pair) for pair in pairs])
     np.testing.assert_allclose(datum, expected, rtol=5e-3, atol=1e-9)
+
+
+def test_heads_that_moved_nearly_as_far_are_alternatives() -> None:
+    moved = {"1": (0.9, 0.0), "2": (0.0, -2.0), "3": (0.8, 0.8), "4": (0.0, 0.99)}
+    heads = tuple(
+        dataclasses.replace(_head(name, (0.0, 0.0, 0.0), 0.0), shift_px=shift)
+        for name, shift in moved.items()
+    )
+    failed = PlatformCheck(heads, np.eye(12), 50.0, 9, 20.0)
+    assert failed.farthest.cone == "2" and failed.alternatives == ("3",)
+    assert dataclasses.replace(failed, statistic=20.0).alternatives == ()
