@@ -6,19 +6,18 @@ mathematics is in `processing.mosaic.flight_validity`.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from daemon.disk.durable import replace_file
-from daemon.disk.records import canonical_bytes
+from daemon.disk.records import RECORD_MAX_BYTES, RecordError, canonical_bytes, parse_record
+from daemon.foreign_files import ForeignFileError, read_plain
 from processing.mosaic.flight_validity import FlightSettings, FlightValidity, judge_flight
 from processing.mosaic.stitch_record import StitchRecord, StitchRecordError, stitch_record_from_json
 from processing.rig import load_rig
 
-RECORD_MAX_BYTES = 4_000_000
 DISPLACEMENTS_FILE = "export/displacements.json"
 """Where a mission holds what its flight says of displaced sensors."""
 
@@ -63,10 +62,9 @@ def _records(mission: Path) -> tuple[dict[int, StitchRecord], list[str]]:
         if not path.parent.name.isdigit():
             continue  # being written
         try:
-            if path.stat().st_size > RECORD_MAX_BYTES:
-                raise StitchRecordError("mosaic.json is too large to be one")
-            records[int(path.parent.name)] = stitch_record_from_json(json.loads(path.read_bytes()))
-        except (OSError, ValueError, StitchRecordError) as error:
+            content = parse_record(read_plain(path, RECORD_MAX_BYTES), path.name)
+            records[int(path.parent.name)] = stitch_record_from_json(content)
+        except (ForeignFileError, RecordError, StitchRecordError) as error:
             unreadable.append(f"{path.parent.name}: {error}")
     return records, unreadable
 

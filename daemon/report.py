@@ -23,6 +23,7 @@ from daemon.displacements import flight_displacements, write_displacements
 from daemon.errors import DaemonError
 from daemon.exposure import Exposure, to_json
 from daemon.plan.mission_advice import coverage_of
+from daemon.terminal import visible_value
 from processing.conditions import TIME_PARTS
 from processing.rig import RigError
 
@@ -62,7 +63,10 @@ def write_report(
     judged = flight_displacements(mission) if out is not None else write_displacements(mission)
     loader = jinja2.FileSystemLoader(Path(__file__).parent / "templates")
     environment = jinja2.Environment(
-        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined
+        loader=loader,
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        finalize=visible_value,
     )
     html = environment.get_template("report.html").render(
         mission=mission.name,

@@ -10,6 +10,7 @@ import jinja2
 import numpy as np
 
 from daemon.adjusting.project import Checks
+from daemon.terminal import visible_value
 from processing.bundle.adjust import Adjustment
 from processing.bundle.drawing import Panel, block_svg, pattern_svg
 from processing.bundle.findings import checked_against, control_residuals, systematic_residuals
@@ -41,7 +42,10 @@ def report_page(result: Adjustment, checks: Checks, report: Mapping[str, Any]) -
         drawings.append(block_svg(result, control_residuals(result), against, "From above"))
     loader = jinja2.FileSystemLoader(Path(__file__).parents[1] / "templates")
     environment = jinja2.Environment(
-        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined
+        loader=loader,
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        finalize=visible_value,
     )
     page = environment.get_template("adjustment.html")
     # The template takes drawings as they are: they are our own and escape what comes from files.

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 
 from daemon.adjusting.project import Checks
 from daemon.tables import light_table
+from daemon.terminal import Console
 from processing.bundle.adjust import Adjustment
 from processing.bundle.findings import (
     Agreement,
@@ -124,12 +124,12 @@ def report_of(
 def print_report(console: Console, report: Mapping[str, Any]) -> None:
     """The report as tables of 80 columns."""
     console.print(
-        f"[bold]{report['name']}[/]: {report['images']} images, {report['object_points']} object "
+        f"{report['name']}: {report['images']} images, {report['object_points']} object "
         f"points, {report['image_points']} image points",
         highlight=False,
     )
     console.print(
-        f"sigma0 [bold]{report['sigma0']:.5g}[/], redundancy {report['redundancy']}, "
+        f"sigma0 {report['sigma0']:.5g}, redundancy {report['redundancy']}, "
         f"{report['observations']} observations, {report['unknowns']} unknowns, "
         f"{report['iterations']} iterations, {report['seconds']} s, {report['peak_mib']} MiB",
         highlight=False,

@@ -22,6 +22,7 @@ from scipy.stats import norm
 from daemon.disk.durable import create_file, make_directories, new_files
 from daemon.disk.records import canonical_bytes
 from daemon.errors import DaemonError
+from daemon.terminal import visible_value
 
 CALIBRATION_FORMAT: Final = 1
 CALIBRATION_MAX_BYTES: Final = 50_000_000
@@ -212,7 +213,10 @@ def report_html(report: CalibrationReport) -> str:
     """The report as one page that needs nothing else."""
     loader = jinja2.FileSystemLoader(Path(__file__).parents[1] / "templates")
     environment = jinja2.Environment(
-        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined
+        loader=loader,
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        finalize=visible_value,
     )
     environment.filters["cell"] = _cell
     # The template takes drawings as they are: they are our own and escape what comes from files.

@@ -12,7 +12,6 @@ import sys
 from typing import NoReturn
 
 import typer
-from rich.console import Console
 
 from daemon.cli import (
     adjust,
@@ -46,6 +45,7 @@ from daemon.cli import (
 )
 from daemon.configuration import ConfigurationError
 from daemon.errors import DaemonError
+from daemon.terminal import Console
 from drivers.extras import MissingExtraError, missing_module
 from processing.rig import RigError
 
@@ -104,7 +104,7 @@ def main() -> NoReturn:
     except (ConfigurationError, RigError) as error:
         console = Console(stderr=True, soft_wrap=True)
         count = len(error.problems)
-        console.print(f"[bold red]Refused[/]: {count} mistake{'s' if count > 1 else ''}")
+        console.print(f"Refused: {count} mistake{'s' if count > 1 else ''}", style="bold red")
         for problem in error.problems:
             console.print(f"  {problem}", markup=False, highlight=False)
         sys.exit(2)

@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.progress import Progress
+
+from daemon.terminal import Console
 
 HELP = """Adjust a bundle: a project of text files, made by hand or by `syntopic import dbat`.
 
@@ -102,7 +103,7 @@ def adjust(
     console = Console()
     print_report(console, report)
     if out is not None:
-        console.print(f"Results: [bold]{out}[/]", soft_wrap=True)
+        console.print(f"Results: {out}", soft_wrap=True)
 
 
 def _peak_mib() -> float:

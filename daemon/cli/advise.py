@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from daemon.cli.failures import end_walk
 from daemon.tables import light_table
+from daemon.terminal import Console
 
 HELP = """List the segments of the plan that must be flown again.
 
@@ -114,7 +114,7 @@ def advise(
             console.print(
                 f"{advice.well_m / advice.planned_m:.1%} of {planned} is covered by {len(taken)} "
                 f"exposures; too few images see {advice.hole_m2 / 1e4:.2f} ha. The segments are in "
-                f"[bold]{out}[/]"
+                f"{out}"
             )
         else:
             console.print(f"All of {planned} is covered; nothing is to be flown again.")

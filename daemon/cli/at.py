@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
-from rich.console import Console
 from rich.progress import Progress
 
 from daemon.cli.failures import end_walk
@@ -22,6 +21,7 @@ from daemon.cli.options import (
     held_for,
 )
 from daemon.configuration import ConfigurationError
+from daemon.terminal import Console
 from drivers.extras import require
 
 if TYPE_CHECKING:
@@ -166,5 +166,5 @@ def at(
         highlight=False,
     )
     print_triangulation(console, report["triangulation"])
-    console.print(f"Results: [bold]{results}[/], report {results / 'report.html'}", soft_wrap=True)
+    console.print(f"Results: {results}, report {results / 'report.html'}", soft_wrap=True)
     end_walk(block.failures)

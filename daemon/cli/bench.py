@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 
 from daemon.tables import light_table
+from daemon.terminal import Console
 
 HELP = """Time the pipeline on one emulated exposure of a rig, beside its peers.
 
@@ -45,7 +45,7 @@ def bench(
     told = Console(stderr=True)
     with told.status(f"timing {found.name}"):
         place = measuring.exposures_of(rig, found, folder or _kept(found.name))
-        told.print(f"Rendered exposures are kept in [bold]{place}[/]", soft_wrap=True)
+        told.print(f"Rendered exposures are kept in {place}", soft_wrap=True)
         # In a process of its own, which begins as the service's worker does.
         for name, count in thread_counts(threads).items():
             os.environ.setdefault(name, count)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 
 from daemon.cli import (
     calibrate_boresight,
@@ -20,6 +19,7 @@ from daemon.cli import (
     calibrate_rig,
 )
 from daemon.tables import light_table
+from daemon.terminal import Console
 
 if TYPE_CHECKING:
     from daemon.calibration.thermal import Gathered
@@ -133,7 +133,7 @@ def validity(
             told["sentences"] or [without_steps(told["exposures"])]
         ):
             console.print(sentence)
-        console.print(f"Written: [bold]{path}[/]", soft_wrap=True)
+        console.print(f"Written: {path}", soft_wrap=True)
     raise typer.Exit(1 if told["steps"] else 0)
 
 
@@ -178,7 +178,7 @@ def _print(
 ) -> None:
     console = Console()
     console.print(
-        f"[bold]{gathered.rig.name}[/], calibration {gathered.rig.calibration_id}: "
+        f"{gathered.rig.name}, calibration {gathered.rig.calibration_id}: "
         f"{gathered.exposures} exposures"
     )
     for sentence in gathered.passed_over[:10]:
@@ -207,6 +207,6 @@ def _print(
         if not o.observable:
             console.print(f"Not observable: {o.what}: {o.why}", markup=False, highlight=False)
     if written is None:
-        console.print("[yellow]Nothing learned, nothing written[/]")
+        console.print("Nothing learned, nothing written", style="yellow")
     else:
-        console.print(f"Proposed calibration: [bold]{written}[/]", soft_wrap=True)
+        console.print(f"Proposed calibration: {written}", soft_wrap=True)

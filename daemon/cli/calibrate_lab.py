@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.progress import Progress
 
 from daemon.cli.options import AsJson, NewFolder, Series
+from daemon.terminal import Console
 
 HELP = """Calibration of a whole rig in a 3D test field.
 

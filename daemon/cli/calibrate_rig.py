@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.progress import Progress
 
 from daemon.cli.calibration_outcome import hand_over
 from daemon.cli.options import AsJson, NewFolder
 from daemon.tables import light_table
+from daemon.terminal import Console
 
 HELP = """Relative orientation of oblique heads against the nadir head, averaged over a block.
 

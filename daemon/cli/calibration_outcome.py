@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 import typer
-from rich.console import Console
 
 from daemon.tables import light_table
+from daemon.terminal import Console
 
 if TYPE_CHECKING:
     from daemon.calibration.report import CalibrationReport, Place
@@ -41,7 +41,7 @@ def hand_over(
         typer.echo(json.dumps({**calibration_json(report), "written": str(folder)}))
         return
     console = Console()
-    console.print(f"[bold]{report.title}[/]", highlight=False)
+    console.print(f"{report.title}", highlight=False)
     for sentence in report.verdicts:
         console.print(sentence, markup=False, highlight=False)
     for sentence in report.warnings:
@@ -69,6 +69,4 @@ def hand_over(
             console.print(table)
             if len(significant) > _MOST_ROWS:
                 console.print(f"and {len(significant) - _MOST_ROWS} more in the report")
-    console.print(
-        f"Calibration: [bold]{folder}[/], report {folder / 'report.html'}", soft_wrap=True
-    )
+    console.print(f"Calibration: {folder}, report {folder / 'report.html'}", soft_wrap=True)

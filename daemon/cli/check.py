@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
-from rich.markup import escape
+from rich.text import Text
 from rich.tree import Tree
 
 from daemon.cli.find import find as find_devices
 from daemon.cli.find_heads import find_heads
+from daemon.terminal import Console
 
 if TYPE_CHECKING:
     from daemon.configuration import Configuration
@@ -87,11 +87,11 @@ def check_flight(config: Path, *, fire: bool, as_json: bool) -> None:
     else:
         _print_tree(console, config, rig.name, findings)
         if outcome is Outcome.PASS:
-            console.print(f"All passes. Next: [bold]syntopic run {config}[/]")
+            console.print(f"All passes. Next: syntopic run {config}")
         elif outcome is Outcome.WAITING:
-            console.print("[yellow]Waiting[/] for what is marked so; nothing fails.")
+            console.print("Waiting for what is marked so; nothing fails.", style="yellow")
         else:
-            console.print("[bold red]Not ready[/]; do as the sentences in red say.")
+            console.print("Not ready; do as the sentences in red say.", style="bold red")
     raise typer.Exit(EXIT_STATUS[outcome])
 
 
@@ -122,7 +122,7 @@ def look(configuration: Configuration, rig: Rig, config: Path, *, fire: bool) ->
 
 
 def _print_tree(console: Console, config: Path, rig: str, findings: Sequence[Finding]) -> None:
-    tree = Tree(f"[bold]{config}[/] for {rig}: valid")
+    tree = Tree(f"{config} for {rig}: valid")
     for kind in dict.fromkeys(finding.kind for finding in findings):
         branch = tree.add(kind)
         for finding in findings:
@@ -131,5 +131,5 @@ def _print_tree(console: Console, config: Path, rig: str, findings: Sequence[Fin
             outcome = finding.outcome.value
             found = ", ".join(f"{key} {value}" for key, value in finding.found.items() if value)
             label = ": ".join(filter(None, (finding.name, finding.sentence or found)))
-            branch.add(f"[{COLOURS[outcome]}]{outcome}[/] {escape(label)}")
+            branch.add(Text.assemble((outcome, COLOURS[outcome]), " ", label))
     console.print(tree)

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
+
+from daemon.terminal import Console
 
 HELP = """Give a running service a command.
 

@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.live import Live
 from rich.table import Table
+from rich.text import Text
 
 from daemon.cli.sim import (
     Emulator,
@@ -30,6 +30,7 @@ from daemon.cli.sim import (
 )
 from daemon.disk.durable import replace_file
 from daemon.tables import light_table
+from daemon.terminal import Console
 from drivers.extras import require
 from processing.rig import Rig, RigError, find_rig
 
@@ -72,14 +73,14 @@ def demo(
     try:
         displace = _displacement(find_rig(rig)) if displace is None else displace
     except RigError as error:
-        console.print(f"[bold red]{error}[/]")
+        console.print(str(error), style="bold red")
         raise typer.Exit(1) from error
     arguments = simulator_arguments(
         rig, folder / "sim", seed=seed, dc=dc, displace=[displace] if displace else []
     )
     arguments += ["--scene-cache", str(out / "scenes"), "--exposures", str(exposures + 1)]
     arguments += ["--first-address", free_first_address(), "--receiver", receiver]
-    console.print(f"[bold]Emulating {rig}[/] at dC = {dc:+g} K, displaced: {displace or 'none'}")
+    console.print(f"Emulating {rig} at dC = {dc:+g} K, displaced: {displace or 'none'}")
     try:
         emulator = Emulator(arguments)
         try:
@@ -88,7 +89,7 @@ def demo(
             emulator.end()
         result = _judge(console, mission, Path(emulator.ready["truth"]), ledger)
     except (DemoError, EmulatorError) as error:
-        console.print(f"[bold red]{error}[/]")
+        console.print(str(error), style="bold red")
         raise typer.Exit(1) from error
     if as_json:
         typer.echo(json.dumps(result))
@@ -143,11 +144,11 @@ def _fly(
                     mission = Path(event["path"])
                 elif name == "watching":
                     address = f"http://{event['host']}:{event['port']}/"
-                    live.console.print(f"Watch it at [bold]{address}[/]")
+                    live.console.print(f"Watch it at {address}")
                 elif name == "ended":
                     ledger = event["ledger"]
                 elif name == "fault" or event.get("fault"):
-                    live.console.print(f"[yellow]{event['sentence']}[/]")
+                    live.console.print(str(event["sentence"]), style="yellow")
                 elif "number" in event:
                     rows.setdefault(event["number"], {})[name] = event
                 live.update(_table(rows, exposures))
@@ -192,9 +193,9 @@ _HEADINGS = (
 )
 
 
-def _cells(told: Mapping[str, Any]) -> list[str]:
+def _cells(told: Mapping[str, Any]) -> list[str | Text]:
     if "lost" in told:
-        return ["", "", "0", "", "", "", "", "", "[red]lost[/]"]
+        return ["", "", "0", "", "", "", "", "", Text("lost", "red")]
     sealed = told.get("sealed")
     if sealed is None:
         return ["", "", "", "", "", "", "", "", "stored" if "stored" in told else "triggered"]
@@ -211,7 +212,7 @@ def _cells(told: Mapping[str, Any]) -> list[str]:
         _number(figures.get("sigma0_px"), ".3f"),
         _number(figures.get("sigma0_um"), ".2f"),
         str(figures.get("displaced_sensor") or "-"),
-        f"[{colour}]{report['verdict']}[/]",
+        Text(str(report["verdict"]), colour),
     ]
 
 
@@ -297,7 +298,7 @@ def _print_result(console: Console, result: Mapping[str, Any], ledger: Mapping[s
     for name in ("frames", "marks"):
         received.add_row(name, *(str(ledger[name][cause]) for cause in causes))
     console.print(received)
-    console.print("balanced" if result["ledger_balanced"] else "[bold red]does not balance[/]")
+    console.print("balanced" if result["ledger_balanced"] else "does not balance")
     if result["rms_px"] is None:
         console.print("Nothing is stitched: every head has an image and an orientation of its own")
     else:
@@ -317,7 +318,7 @@ def _print_geometry(console: Console, result: Mapping[str, Any]) -> None:
     geometry.add_row("fixed method with TDM, inner", *_pair(result["rms_px_fixed"], None))
     geometry.add_row("fixed method without TDM, inner", *_pair(result["rms_px_no_tdm"], None))
     console.print(geometry)
-    console.print(f"Displaced sensor found: [bold]{result['displaced_sensor'] or 'none'}[/]")
+    console.print(f"Displaced sensor found: {result['displaced_sensor'] or 'none'}")
 
 
 def _pair(rms: float | None, worst: float | None) -> tuple[str, str]:

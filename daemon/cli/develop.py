@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 from rich.progress import Progress
 
 from daemon.cli.failures import end_walk
@@ -18,6 +17,7 @@ from daemon.disk.mission import Mission
 from daemon.disk.publication import sweep
 from daemon.disk.walk import walk
 from daemon.tables import light_table
+from daemon.terminal import Console
 
 if TYPE_CHECKING:
     from daemon.products.level3 import Developed
@@ -109,4 +109,4 @@ def _show(rows: Sequence[tuple[Developed, float]], root: Path) -> None:
     for done, _ in rows:
         for sentence in done.left_out:
             console.print(f"Exposure {done.number}: {sentence}", style="yellow", markup=False)
-    console.print(f"Images are in [bold]{root}[/]")
+    console.print(f"Images are in {root}")

@@ -8,9 +8,9 @@ from dataclasses import asdict
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from daemon.tables import light_table
+from daemon.terminal import Console
 
 HELP = """Say what an event of the service means, what causes it and what helps.
 

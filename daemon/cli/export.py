@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.progress import Progress
 
 from daemon.cli.failures import end_walk
 from daemon.tables import light_table
+from daemon.terminal import Console
 from drivers.extras import require
 
 ORIENTATION_HELP = """Exterior orientation of every cone of every exposure, at its own mid-exposure.
@@ -89,7 +89,7 @@ def raw(
     for name, nbytes in done.nbytes.items():
         console.print(f"{name}: {nbytes} bytes")
     console.print(f"events.csv: {done.events} exposures; frames.csv: every frame of theirs")
-    console.print(f"They are in [bold]{done.folder}[/]", soft_wrap=True)
+    console.print(f"They are in {done.folder}", soft_wrap=True)
     end_walk(done.failures)
 
 
@@ -114,7 +114,7 @@ def foxglove(
         typer.echo(json.dumps(content))
     else:
         told = ", ".join(f"{topic} {count}" for topic, count in done.messages.items())
-        Console().print(f"{told or 'nothing'}; written to [bold]{done.file}[/]", soft_wrap=True)
+        Console().print(f"{told or 'nothing'}; written to {done.file}", soft_wrap=True)
     end_walk(done.failures)
 
 
@@ -159,7 +159,7 @@ def pictures(
         }
         typer.echo(json.dumps(content))
     else:
-        Console().print(f"{len(files)} pictures in [bold]{files[0].parent}[/]", soft_wrap=True)
+        Console().print(f"{len(files)} pictures in {files[0].parent}", soft_wrap=True)
     end_walk(failures)
 
 
@@ -187,7 +187,7 @@ def certificate(
             f"of {camera['pixel_size_um']:g} um",
             highlight=False,
         )
-    console.print(f"Certificate: [bold]{path}[/]", soft_wrap=True)
+    console.print(f"Certificate: {path}", soft_wrap=True)
     end_walk(failures)
 
 
@@ -251,8 +251,7 @@ def orientation(
             f"{done.change_deg:.4f} deg"
         )
     console.print(
-        f"CSV, PAT-B, BINGO, footprints and STAC items are in [bold]{done.folder}[/]; read "
-        "about.txt first",
+        f"CSV, PAT-B, BINGO, footprints and STAC items are in {done.folder}; read about.txt first",
         soft_wrap=True,
     )
     end_walk(done.failures)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import typer
-from rich.console import Console
 from rich.text import Text
 
 from daemon.disk.walk import ExposureFailure
 from daemon.tables import light_table
+from daemon.terminal import Console
 
 
 def end_walk(failures: Sequence[ExposureFailure]) -> None:

@@ -8,11 +8,12 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import typer
-from rich.console import Console
 from rich.live import Live
 from rich.table import Table
+from rich.text import Text
 
 from daemon.tables import light_table
+from daemon.terminal import Console
 from drivers.extras import MissingExtraError, require
 
 if TYPE_CHECKING:
@@ -113,20 +114,18 @@ def _print(console: Console, found: Sequence[Found], sections: str) -> None:
     table = light_table("", ("port", "speaks", "heard"), ("baud",))
     for one in found:
         if one.speaker is None:
-            table.add_row(one.port, "[dim]nothing[/]", one.sentence, "")
+            table.add_row(one.port, Text("nothing", "dim"), one.sentence, "")
             continue
         heard = one.speaker.heard
         if one.speaker.missing:
-            heard += f"; [yellow]missing: {one.speaker.missing}[/]"
+            heard += f"; missing: {one.speaker.missing}"
         speed = "" if one.baudrate is None else f"{one.baudrate} {one.parity}"
-        table.add_row(one.port, f"[green]{one.speaker.protocol}[/]", heard, speed)
+        table.add_row(one.port, Text(one.speaker.protocol, "green"), heard, speed)
     console.print(table)
     if not sections:
         console.print(
             "Nothing was found. Check power and cables; see docs/drivers for each device."
         )
         return
-    console.print(
-        "Next: paste this into the service configuration, then [bold]syntopic check[/] it."
-    )
+    console.print("Next: paste this into the service configuration, then syntopic check it.")
     console.print(f"\n{sections}", markup=False, highlight=False, soft_wrap=True)

@@ -6,10 +6,9 @@ import json
 from typing import Any, NoReturn
 
 import typer
-from rich.console import Console
-from rich.markup import escape
 
 from daemon.tables import light_table
+from daemon.terminal import Console
 
 
 def find_heads(*, as_json: bool) -> NoReturn:
@@ -26,7 +25,7 @@ def find_heads(*, as_json: bool) -> NoReturn:
             where = settings.get("address") or settings.get("device", "")
             formats = ", ".join(what.get("formats", [])[:6])
             cells = (head["driver"], where, what["model"], what["serial"], formats)
-            table.add_row(*map(escape, cells))
+            table.add_row(*cells)
         console.print(table)
         for problem in problems:
             console.print(problem, style="yellow", markup=False, soft_wrap=True)

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.progress import Progress
+
+from daemon.terminal import Console
 
 app = typer.Typer(
     help="""Bring in exposures of other cameras as a mission folder for `syntopic process`.
@@ -57,12 +58,12 @@ def rededge(
     console = Console()
     worst = max(imported.lens_fit_px.values(), default=0.0)
     console.print(
-        f"{imported.exposures} exposures, {imported.frames} frames in [bold]{out}[/]; lens "
+        f"{imported.exposures} exposures, {imported.frames} frames in {out}; lens "
         f"distortion carried over within {worst:.3f} px"
     )
     for sentence in imported.missing:
         console.print(sentence, markup=False, style="yellow")
-    console.print(f"Next: [bold]syntopic process {out}[/]")
+    console.print(f"Next: syntopic process {out}")
 
 
 @app.command()
@@ -92,6 +93,6 @@ def dbat(
     console = Console()
     console.print(
         f"{counts['images']} images, {counts['object_points']} object points, "
-        f"{counts['image_points']} image points in [bold]{out}[/]"
+        f"{counts['image_points']} image points in {out}"
     )
-    console.print(f"Next: [bold]syntopic adjust {out}[/]")
+    console.print(f"Next: syntopic adjust {out}")

@@ -8,7 +8,8 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
+
+from daemon.terminal import Console
 
 if TYPE_CHECKING:
     from daemon.installation import Done
@@ -87,5 +88,5 @@ def _tell(done: Done, as_json: bool, verb: str, next_line: str) -> None:
             console.print(f"kept, edited by hand: {path}", style="yellow", highlight=False)
         for purpose, outcome in done.steps.items():
             console.print(f"{purpose}: {outcome}", highlight=False, soft_wrap=True)
-        console.print(f"Next: [bold]{next_line}[/]", highlight=False, soft_wrap=True)
+        console.print(f"Next: {next_line}", highlight=False, soft_wrap=True)
     raise typer.Exit(1 if done.failed else 0)

@@ -11,7 +11,8 @@ from collections.abc import Callable
 from typing import Any
 
 import typer
-from rich.console import Console
+
+from daemon.terminal import Console
 
 STATUS = 130
 """Exit status after SIGINT, as shells give it: 128 + 2."""

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from daemon.cli.failures import end_walk
 from daemon.cli.options import AsJson, AttitudeSigma, Crs, MountFile, PositionSigma, Trajectory
 from daemon.tables import light_table
+from daemon.terminal import Console
 from drivers.extras import require
 
 HELP = """Ground points from places measured in two or more oriented images, with their accuracy.
@@ -102,5 +102,5 @@ def intersect(
             markup=False,
         )
     if out is not None:
-        console.print(f"Table: [bold]{out}[/]", soft_wrap=True)
+        console.print(f"Table: {out}", soft_wrap=True)
     end_walk(done.failures)

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rich.console import Console
-
 from daemon.tables import light_table
+from daemon.terminal import Console
 
 Reports = Sequence[Mapping[str, Any]]
 

@@ -10,7 +10,6 @@ from typing import Annotated, Any
 
 import typer
 from pydantic import ValidationError
-from rich.console import Console
 from rich.progress import Progress
 
 from daemon.cli.failures import end_walk
@@ -19,6 +18,7 @@ from daemon.configuration import ConfigurationError, PlanSection, ProcessingSect
 from daemon.configuration_problems import dig
 from daemon.disk.mission import Mission
 from daemon.orientation.exterior import mount_of
+from daemon.terminal import Console
 
 HELP = """Process the exposures of a mission folder again, Level-0 to Level-2.
 
@@ -126,7 +126,7 @@ def process(
         console = Console()
         if reports:
             print_reports(console, f"Level-2 of {folder.id}", reports)
-        console.print(f"Products are in [bold]{folder.level2_root}[/]")
+        console.print(f"Products are in {folder.level2_root}")
     end_walk(done.failures)
 
 

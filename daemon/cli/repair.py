@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
+
+from daemon.terminal import Console
 
 HELP = """Bring index, records, logs and disk of a mission together, as the service does on start.
 
@@ -77,5 +78,5 @@ def repair(
         for sentence in done:
             console.print(sentence, markup=False, highlight=False)
         console.print(f"{len(report.settled)} exposures are sealed and in the index.")
-        console.print(f"Next: [bold]syntopic verify {folder.path}[/]")
+        console.print(f"Next: syntopic verify {folder.path}")
     raise typer.Exit(1 if report.problems else 0)

@@ -10,13 +10,13 @@ from typing import Annotated, Any
 
 import typer
 from pydantic import ValidationError
-from rich.console import Console
 from rich.progress import Progress
 
 from daemon.cli.process import as_flown
 from daemon.configuration import Configuration, ConfigurationError
 from daemon.disk.mission import Mission, MissionError
 from daemon.tables import light_table
+from daemon.terminal import Console
 
 HELP = """Feed what a mission recorded through the same code again, and compare.
 

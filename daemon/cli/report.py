@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from daemon.cli.failures import end_walk
 from daemon.cli.options import held_for
+from daemon.terminal import Console
 
 HELP = """Write the mission's report: one HTML file that needs nothing beside it.
 
@@ -53,9 +53,9 @@ def report(
         typer.echo(json.dumps(told))
         end_walk(done.failures)
         return
-    console.print(f"Report   [bold]{path}[/]")
+    console.print(f"Report   {path}")
     if bundle:
-        console.print(f"Bundle   [bold]{written.path}[/], {written.path.stat().st_size} bytes:")
+        console.print(f"Bundle   {written.path}, {written.path.stat().st_size} bytes:")
         for name, nbytes in written.contents.items():
             console.print(f"  {name}: {nbytes} bytes", highlight=False)
     end_walk(done.failures)

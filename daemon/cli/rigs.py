@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from daemon.disk.durable import replace_file
 from daemon.tables import light_table
+from daemon.terminal import Console
 from processing.rig import Rig, find_rig, load_rig, shipped_rigs
 
 app = typer.Typer(
@@ -47,7 +47,7 @@ def rigs(
         )
     console = Console()
     console.print(table)
-    console.print("Next: [bold]syntopic rigs show NAME[/]")
+    console.print("Next: syntopic rigs show NAME")
 
 
 @app.command()
@@ -103,7 +103,7 @@ def show(
         )
         return
     console = Console()
-    console.print(f"[bold]{rig.name}[/]  {rig.title}; {rig.timing}")
+    console.print(f"{rig.name}  {rig.title}; {rig.timing}")
     figures = ("f mm", "forward mm", "right mm", "param.", "constr.")
     cones = light_table("Cones", ("cone", "bands", "sensors"), figures)
     layers = {layer.cone: layer for layer in counts.cones}
@@ -141,9 +141,9 @@ def show(
             )
         )
     if drawing is None:
-        console.print("Next: [bold]--drawing FILE[/] draws the focal planes")
+        console.print("Next: --drawing FILE draws the focal planes")
     else:
-        console.print(f"Focal planes drawn in [bold]{drawing}[/]", soft_wrap=True)
+        console.print(f"Focal planes drawn in {drawing}", soft_wrap=True)
 
 
 def _row(rig: Rig) -> dict[str, object]:

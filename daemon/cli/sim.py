@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 
 from daemon.disk.durable import replace_file
+from daemon.terminal import Console
 from drivers.extras import require
 from processing.rig import find_rig
 
@@ -114,7 +114,7 @@ def sim(
     try:
         emulator = Emulator(arguments)
     except EmulatorError as error:
-        console.print(f"[red]{error}[/]")
+        console.print(str(error), style="red")
         raise typer.Exit(1) from error
     path = out / "service.toml"
     text = service_toml(emulator.ready, root="missions", watch_port=8470)
@@ -244,12 +244,12 @@ def _quoted(text: str) -> str:
 
 def _print_addresses(ready: Mapping[str, Any], path: Path) -> None:
     console = Console()
-    console.print(f"[bold]{ready['rig']}[/] is up: {len(ready['heads'])} GigE Vision heads")
+    console.print(f"{ready['rig']} is up: {len(ready['heads'])} GigE Vision heads")
     addresses = "  ".join(f"{name} {head['address']}" for name, head in ready["heads"].items())
     console.print(f"  heads     {addresses}")
     console.print(f"  trigger   pulse bus at {ready['pulse_bus']}")
     for title, device in (("receiver", ready["receiver"]), ("probes", ready["probes"])):
         console.print(f"  {title:8}  {device['driver']} at {device['port']}")
     console.print(f"  truth     {ready['truth']}")
-    console.print(f"Next, in another terminal: [bold]syntopic check {path}[/], then run it.")
+    console.print(f"Next, in another terminal: syntopic check {path}, then run it.")
     console.print("Ctrl-C ends the emulator.")

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from daemon.tables import light_table
+from daemon.terminal import Console
 
 app = typer.Typer(
     help="""Make and take back tokens for the API and the operator's page.

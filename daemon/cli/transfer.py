@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.progress import (
     BarColumn,
     DownloadColumn,
@@ -15,6 +14,8 @@ from rich.progress import (
     TimeRemainingColumn,
     TransferSpeedColumn,
 )
+
+from daemon.terminal import Console
 
 HELP = """Copy a mission to another disk and verify every file.
 
@@ -71,7 +72,7 @@ def transfer(
     console.print(
         f"{report.copied} files copied, {report.kept} identical files kept, "
         f"{report.nbytes / 1e9:.2f} GB in all; {report.verified.exposures} exposures and "
-        f"{report.verified.frames} frames verified in [bold]{report.target}[/]"
+        f"{report.verified.frames} frames verified in {report.target}"
     )
     if report.sealed_utc:
         console.print(f"The copy is sealed since {report.sealed_utc}.")

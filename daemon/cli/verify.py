@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
+
+from daemon.terminal import Console
 
 if TYPE_CHECKING:
     from daemon.disk.verification import VerifyReport

@@ -9,7 +9,6 @@ Source: MicaSense, "RedEdge metadata" and "RedEdge camera radiometric calibratio
 from __future__ import annotations
 
 import math
-import struct
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,7 +21,7 @@ from numpy.typing import NDArray
 
 from daemon.calibration.rig_text import rig_toml
 from daemon.disk import durable
-from daemon.disk.level0 import tiff_parts
+from daemon.disk.level0 import tiff_faults, tiff_parts
 from daemon.disk.mission import Mission, exposure_name
 from daemon.disk.records import canonical_bytes, sha256_hex
 from daemon.errors import DaemonError
@@ -161,7 +160,7 @@ def read_image(path: Path) -> tuple[RedEdgeImage, NDArray[np.uint16]]:
     Raises:
         ImagesError: no RedEdge image, damaged, or without what the calibration needs.
     """
-    from tifffile import TiffFile, TiffFileError
+    from tifffile import TiffFile
 
     try:
         if path.stat().st_size > _MAX_FILE_BYTES:
@@ -184,8 +183,7 @@ def read_image(path: Path) -> tuple[RedEdgeImage, NDArray[np.uint16]]:
         raise
     except XmpError as error:
         raise ImagesError([str(error)]) from error
-    except (TiffFileError, ValueError, KeyError, IndexError, TypeError, struct.error,
-            ZeroDivisionError, MemoryError) as error:  # fmt: skip
+    except tiff_faults() as error:
         sentence = f"{path.name}: not a usable RedEdge image ({type(error).__name__}: {error})"
         raise ImagesError([sentence]) from error
     if words.shape != shape:

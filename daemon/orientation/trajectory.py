@@ -22,10 +22,13 @@ from daemon.disk.records import sha256_hex
 from daemon.errors import DaemonError
 from daemon.exposure import NavigationRecord
 from daemon.flight.navigation import EXTRAPOLATION_LIMIT_NS, around, metres_per_degree
+from daemon.foreign_files import ForeignFileError, read_plain
 from drivers.contract import NavSample
 
 WEEK_NS = 604_800_000_000_000
 TRAJECTORY_MAX_BYTES = 4_000_000_000
+SBET_TIME_MAX_S = 1e8
+"""Seconds of the week, and weeks after its end."""
 SBET_FIELDS = (
     *("time_s", "latitude_rad", "longitude_rad", "height_m", "x_velocity", "y_velocity"),
     *("z_velocity", "roll_rad", "pitch_rad", "platform_heading_rad", "wander_rad"),
@@ -107,11 +110,9 @@ def read_trajectory(path: Path, *, around_gps_ns: int) -> Trajectory:
         TrajectoryError: what is not understood, with the place in the file.
     """
     try:
-        if path.stat().st_size > TRAJECTORY_MAX_BYTES:
-            raise TrajectoryError(f"{path}: larger than {TRAJECTORY_MAX_BYTES / 1e9:.0f} GB")
-        data = path.read_bytes()
-    except OSError as error:
-        raise TrajectoryError(f"{path}: cannot be read ({error.strerror})") from error
+        data = read_plain(path, TRAJECTORY_MAX_BYTES)
+    except ForeignFileError as error:
+        raise TrajectoryError(f"trajectory {error}") from error
     name = f"{path.stem}-{sha256_hex(data)[:8]}"
     if path.suffix.lower() == ".csv":
         return _of_samples(name, list(_csv(path, data)))
@@ -133,7 +134,8 @@ def _sbet(path: Path, data: bytes, around_gps_ns: int, name: str) -> Trajectory:
     column = {name: table[:, i] for i, name in enumerate(SBET_FIELDS)}
     steps_s = np.diff(column["time_s"])
     plausible = (
-        np.isfinite(table[:, :11]).all()
+        float(np.abs(column["time_s"]).max()) <= SBET_TIME_MAX_S
+        and np.isfinite(table[:, :11]).all()
         and float(np.abs(column["latitude_rad"]).max()) <= math.pi / 2
         and bool((steps_s > 0).all())
         and len(table) >= 2
@@ -163,22 +165,25 @@ def _sbet(path: Path, data: bytes, around_gps_ns: int, name: str) -> Trajectory:
 def _csv(path: Path, data: bytes) -> Iterator[NavSample]:
     try:
         lines = csv.DictReader(data.decode("utf-8-sig").splitlines())
+        headings = set(lines.fieldnames or ())
     except UnicodeDecodeError as error:
         raise TrajectoryError(f"{path}: not UTF-8 text ({error.reason})") from error
-    headings = set(lines.fieldnames or ())
+    except csv.Error as error:
+        raise TrajectoryError(f"{path}: no table ({error})") from error
     has_instant = "gps_ns" in headings or {"gps_week", "seconds_of_week"} <= headings
     missing = [name for name in CSV_COLUMNS if name not in headings]
     if missing or not has_instant:
         wanted = missing + ([] if has_instant else ["gps_ns (or gps_week, seconds_of_week)"])
         raise TrajectoryError(f"{path}: the line of headings lacks {', '.join(wanted)}")
     rows = []
-    for row in lines:
+    for row in _rows_of(path, lines):
         try:
             values = [float(row[name]) for name in CSV_COLUMNS]
             instant = _instant(row)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, KeyError) as error:
             raise TrajectoryError(f"{path}, line {lines.line_num}: {error}") from error
-        if not all(map(math.isfinite, values)) or abs(values[0]) > 90:
+        is_possible = 0 <= instant < 2**63 and all(abs(value) <= 1e6 for value in values)
+        if not is_possible or abs(values[0]) > 90:
             raise TrajectoryError(f"{path}, line {lines.line_num}: {values} is no place")
         rows.append((instant, values))
     rows.sort(key=lambda row: row[0])
@@ -186,6 +191,13 @@ def _csv(path: Path, data: bytes) -> Iterator[NavSample]:
         velocity = _mean_velocity(rows[max(i - 1, 0)], rows[min(i + 1, len(rows) - 1)])
         roll, pitch, heading = (math.radians(angle) for angle in values[3:])
         yield _sample(instant, (values[0], values[1], values[2]), velocity, (roll, pitch, heading))
+
+
+def _rows_of(path: Path, lines: csv.DictReader[str]) -> Iterator[dict[str, str]]:
+    try:
+        yield from lines
+    except csv.Error as error:
+        raise TrajectoryError(f"{path}, line {lines.line_num}: no table ({error})") from error
 
 
 def _instant(row: dict[str, str]) -> int:

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 
 from daemon.adjusting.project import Project
 from daemon.adjusting.tables import ProjectError, write_table
@@ -24,6 +23,7 @@ from daemon.orientation.georeference import Georeference
 from daemon.orientation.local_frame import FRAME_FILE
 from daemon.orientation.triangulation import Block
 from daemon.tables import light_table
+from daemon.terminal import Console
 from processing.bundle.adjust import Adjustment
 from processing.bundle.findings import (
     checked_against,

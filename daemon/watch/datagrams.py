@@ -36,6 +36,7 @@ PICTURE_EVERY = 4
 """One picture, or piece of one, to so many exposures that are said again."""
 
 PICTURES_KEPT = 8
+PIECES_MAX = 1000
 TICK_S = 0.1
 BURST_S = 1.0
 
@@ -119,6 +120,8 @@ class Received:
             kind, content = told["kind"], told["content"]
             if told["version"] != VERSION or not isinstance(content, dict):
                 raise ValueError("of another version")
+            if kind in ("exposure", "residuals", "thumbnail"):
+                _check_number(content["number"])
             if kind == "brief":
                 self._take_brief(content)
             elif kind == "fault":
@@ -128,6 +131,11 @@ class Received:
             elif kind == "residuals":
                 self._newer(self.residuals, content["number"], content)
             elif kind == "thumbnail":
+                _check_number(content["piece"])
+                if not (1 <= _check_number(content["pieces"]) <= PIECES_MAX):
+                    raise ValueError("of more pieces than a picture has")
+                if not isinstance(content["data"], bytes):
+                    raise TypeError("a piece of a picture is bytes")
                 pieces = self._pieces.setdefault(content["number"], {})
                 self._newer(pieces, content["piece"], content)
             for shown in (self.residuals, self._pieces):
@@ -152,6 +160,12 @@ class Received:
     def _newer(known: dict[Any, dict[str, Any]], key: Any, content: dict[str, Any]) -> None:
         if content["sequence"] >= known.get(key, {}).get("sequence", -1):
             known[key] = content
+
+
+def _check_number(value: object) -> int:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise TypeError("a whole number is needed")
+    return value
 
 
 async def send(state: FlightState, addresses: Mapping[str, tuple[str, int]], budget: float) -> None:

@@ -98,6 +98,8 @@ def read_frame(path: Path, *, room_nbytes: int) -> FrameFile:
         TypeError,
         AttributeError,
         ArithmeticError,
+        AssertionError,
+        MemoryError,
         RuntimeError,
         struct.error,
         zlib.error,

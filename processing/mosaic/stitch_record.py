@@ -191,7 +191,7 @@ def stitch_record_from_json(content: Mapping[str, Any]) -> StitchRecord:
             estimated_dc=tuple(EstimatedDc(**e) for e in content["estimated_dc"]),
             height_m=None if content.get("height_m") is None else float(content["height_m"]),
         )
-    except (KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError, AttributeError, OverflowError) as error:
         raise StitchRecordError(f"mosaic.json cannot be used: {error!r}") from error
     except ValueError as error:
         raise StitchRecordError(f"mosaic.json cannot be used: {error}") from error

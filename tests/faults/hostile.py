@@ -389,7 +389,13 @@ def gvcp_answers() -> Parser:
     sent: list[bytes] = []
     channel = mock.MagicMock()
     channel.__enter__.return_value = channel
-    channel.recv.side_effect = lambda _: sent.pop()
+
+    def receive(_: int) -> bytes:
+        if not sent:
+            raise TimeoutError("a head that says no more")
+        return sent.pop()
+
+    channel.recv.side_effect = receive
 
     def feed(data: bytes) -> None:
         nonlocal answered

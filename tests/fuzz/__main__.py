@@ -1,0 +1,154 @@
+"""`python -m tests.fuzz PARSER --seconds 60`: look for inputs that a parser does not survive.
+
+With atheris (`pip install --group fuzz`, Apache-2.0) it is guided by coverage, without it inputs
+are mutated blindly. A crash is printed with the input as hexadecimal, and the exit status is 1.
+`--keep` adds what reached new code to the committed corpus, minimised.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from tests.fuzz import corpus
+from tests.fuzz.targets import INPUT_MAX_S, INPUT_MAX_SIZE, TARGETS
+
+CRASH_STATUS = 77
+
+
+def main() -> int:
+    arguments = argparse.ArgumentParser(description=__doc__)
+    arguments.add_argument("parser", choices=[*TARGETS, "all"])
+    arguments.add_argument("--seconds", type=float, default=60.0)
+    arguments.add_argument("--keep", action="store_true")
+    arguments.add_argument("--work", type=Path, help="Where inputs are kept between runs.")
+    arguments.add_argument("--guided", help=argparse.SUPPRESS)
+    given, rest = arguments.parse_known_args()
+    if given.guided is not None:
+        return guided(given.parser, given.guided, rest)
+    names = list(TARGETS) if given.parser == "all" else [given.parser]
+    failed = [name for name in names if not _fuzz(name, given)]
+    print(f"{len(names) - len(failed)} of {len(names)} without a crash", *failed)
+    return 1 if failed else 0
+
+
+def _fuzz(name: str, given: argparse.Namespace) -> bool:
+    try:
+        import atheris  # noqa: F401
+    except ImportError:
+        return blind(name, given.seconds)
+    work = given.work or Path(tempfile.mkdtemp(prefix="fuzz-"))
+    inputs = work / name
+    inputs.mkdir(parents=True, exist_ok=True)
+    for number, data in enumerate((*corpus.read(name), *TARGETS[name]().seeds)):
+        (inputs / f"seed-{number}").write_bytes(data)
+    command = work / f"{name}.sh"  # libFuzzer starts itself again to minimise
+    line = shlex.join([sys.executable, "-m", "tests.fuzz", name, "--guided", str(command)])
+    command.write_text(f'#!/bin/sh\nexec {line} "$@"\n')
+    command.chmod(0o700)
+    limits = [f"-max_len={INPUT_MAX_SIZE}", "-rss_limit_mb=2048", "-timeout=30", "-verbosity=1"]
+    found = [f"-artifact_prefix={inputs}/", f"-max_total_time={given.seconds:.0f}"]
+    memory = Path("/dev/shm")
+    with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as place:
+        done = subprocess.run(
+            [str(command), *limits, *found, str(inputs)],
+            capture_output=True, text=True, check=False, env={**os.environ, "TMPDIR": place},
+        )  # fmt: skip
+    crashes = [path for kind in ("crash", "timeout", "oom") for path in inputs.glob(f"{kind}-*")]
+    said = done.stderr.splitlines()
+    print(name, *[line for line in said if "DONE" in line or "Done " in line][-2:], sep="  ")
+    if crashes or done.returncode:
+        print(
+            f"{name}: status {done.returncode}\n"
+            + "\n".join((done.stdout.splitlines() + said)[-25:])
+        )
+        for path in crashes:
+            print(f"{name}: {path}: {path.read_bytes()[:2000].hex()}")
+        return False
+    if given.keep:
+        merged = work / f"{name}.merged"
+        shutil.rmtree(merged, ignore_errors=True)
+        merged.mkdir()
+        subprocess.run(
+            [str(command), *limits, "-merge=1", str(merged), str(inputs)],
+            capture_output=True, check=True,
+        )  # fmt: skip
+        corpus.write(name, [path.read_bytes() for path in merged.iterdir()])
+    return True
+
+
+def guided(name: str, command: str, options: list[str]) -> int:
+    """Within a process of its own, started by `command`: libFuzzer ends it."""
+    import atheris
+
+    with atheris.instrument_imports(include=["daemon", "drivers", "processing", "tomllib"]):
+        target = TARGETS[name]()
+        for seed in target.seeds:
+            target.run(seed)
+
+    def one(data: bytes) -> None:
+        begun_s = time.process_time()
+        target.run(data)
+        if (took_s := time.process_time() - begun_s) > INPUT_MAX_S:
+            raise TimeoutError(f"{took_s:.1f} s of CPU")
+
+    atheris.Setup([command, *options], one)
+    atheris.Fuzz()
+    return 0
+
+
+def blind(name: str, seconds: float) -> bool:
+    """Mutate without a guide."""
+    target = TARGETS[name]()
+    ends_s = time.monotonic() + seconds
+    count = 0
+    for data in mutations((*corpus.read(name), *target.seeds), random.Random(0)):
+        count += 1
+        begun_s = time.process_time()
+        try:
+            target.run(data)
+        except Exception as error:  # noqa: BLE001 - this is what is looked for
+            print(f"{name}: {type(error).__name__}: {error}\n{data.hex()}")
+            return False
+        if time.process_time() - begun_s > INPUT_MAX_S:
+            print(f"{name}: more than {INPUT_MAX_S} s\n{data.hex()}")
+            return False
+        if time.monotonic() > ends_s:
+            break
+    print(f"{name}  {count} inputs, not guided")
+    return True
+
+
+def mutations(seeds: tuple[bytes, ...], chance: random.Random) -> Iterator[bytes]:
+    """Spoilt seeds, without end."""
+    words = [b"\xff" * 4, b"\0" * 4, b"\xff" * 8, b"\x7f", *b'1e999 -1 NaN " [ {'.split()]
+    while True:
+        data = bytearray(chance.choice(seeds))
+        for _ in range(chance.randint(1, 4)):
+            at = chance.randrange(len(data) + 1)
+            kind = chance.randrange(5)
+            if kind == 0:
+                del data[at : at + chance.randint(1, 16)]
+            elif kind == 1:
+                data[at:at] = chance.choice(words)
+            elif kind == 2:
+                data[at : at + 4] = chance.choice(words)
+            elif kind == 3:
+                other = chance.choice(seeds)
+                data[at:] = other[chance.randrange(len(other) + 1) :]
+            else:
+                data[at : at + 1] = bytes([chance.randrange(256)])
+        yield bytes(data[:INPUT_MAX_SIZE])
+
+
+if __name__ == "__main__":
+    sys.exit(main())
