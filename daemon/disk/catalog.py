@@ -138,12 +138,13 @@ class Catalog:
             if 0 < version < SCHEMA_VERSION:
                 connection = _migrated_copy(connection)
                 version = SCHEMA_VERSION
+            is_ours = is_plain(connection)
         except sqlite3.Error as error:
             raise CatalogError(_damaged(path, error)) from error
         if version != SCHEMA_VERSION:
             connection.close()
             raise CatalogError(_wrong_version(path, version))
-        if not is_plain(connection):
+        if not is_ours:
             connection.close()
             raise CatalogError(_damaged(path, "it holds views or triggers; ours has none"))
         return cls(connection)
@@ -265,8 +266,13 @@ class Catalog:
         }
 
     def events(self) -> list[tuple[str, str, str]]:
-        """Source, name and sentence of all events, in order."""
-        return self._read("SELECT source, name, sentence FROM events ORDER BY id")
+        """Source, name and sentence of all events, in order.
+
+        Raises:
+            CatalogError: damaged.
+        """
+        rows = self._read("SELECT source, name, sentence FROM events ORDER BY id")
+        return [(str(source), str(name), str(sentence)) for source, name, sentence in rows]
 
     def verdicts(self) -> dict[int, str]:
         """Verdict of every exposure that has products."""
@@ -325,8 +331,11 @@ class Catalog:
             self._connection.execute(statement, values)
 
     def _read(self, statement: str, values: tuple[Any, ...] = ()) -> list[Any]:
-        with self._lock:
-            return self._connection.execute(statement, values).fetchall()
+        try:
+            with self._lock:
+                return self._connection.execute(statement, values).fetchall()
+        except sqlite3.Error as error:
+            raise CatalogError(f"mission.db: damaged ({error}); syntopic repair") from error
 
 
 def _prepare(connection: sqlite3.Connection, path: Path) -> None:

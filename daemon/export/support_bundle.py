@@ -152,5 +152,7 @@ def _events(mission: Mission) -> list[dict[str, str]]:
             {"source": source, "name": name, "sentence": text_without_secrets(sentence)}
             for source, name, sentence in catalog.events()
         ]
+    except CatalogError as error:
+        return [{"source": "index", "name": "unreadable", "sentence": str(error)}]
     finally:
         catalog.close()

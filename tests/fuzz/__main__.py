@@ -49,13 +49,15 @@ def _fuzz(name: str, given: argparse.Namespace) -> bool:
     work = given.work or Path(tempfile.mkdtemp(prefix="fuzz-"))
     inputs = work / name
     inputs.mkdir(parents=True, exist_ok=True)
-    for number, data in enumerate((*corpus.read(name), *TARGETS[name]().seeds)):
+    seeds = TARGETS[name]().seeds
+    for number, data in enumerate((*corpus.read(name), *seeds)):
         (inputs / f"seed-{number}").write_bytes(data)
     command = work / f"{name}.sh"  # libFuzzer starts itself again to minimise
     line = shlex.join([sys.executable, "-m", "tests.fuzz", name, "--guided", str(command)])
     command.write_text(f'#!/bin/sh\nexec {line} "$@"\n')
     command.chmod(0o700)
-    limits = [f"-max_len={INPUT_MAX_SIZE}", "-rss_limit_mb=2048", "-timeout=30", "-verbosity=1"]
+    longest = max(INPUT_MAX_SIZE, *map(len, seeds))
+    limits = [f"-max_len={longest}", "-rss_limit_mb=2048", "-timeout=30", "-verbosity=1"]
     found = [f"-artifact_prefix={inputs}/", f"-max_total_time={given.seconds:.0f}"]
     memory = Path("/dev/shm")
     with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as place:

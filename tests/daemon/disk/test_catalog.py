@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sqlite3
 import threading
 from types import SimpleNamespace
@@ -248,3 +249,28 @@ def test_an_index_that_fails_otherwise_is_damaged_at_once(path, monkeypatch, cod
     with pytest.raises(CatalogError, match="damaged"):
         Catalog.open(path)
     assert (held.now_ms, held.attempts) == (50_000, 1)
+
+
+@pytest.mark.trust
+@pytest.mark.parametrize("page", range(8))
+def test_a_damaged_page_is_reported_and_never_another_error(tmp_path, page):
+    path = tmp_path / "mission.db"
+    catalog = Catalog.open(path)
+    catalog.add_event("SU00", "lost", "A.", is_fault=True, mono_ns=1, boot_id="b")
+    catalog.close()
+    with sqlite3.connect(path) as connection:
+        connection.execute("PRAGMA journal_mode = DELETE")
+        nbytes = connection.execute("PRAGMA page_size").fetchone()[0]
+    connection.close()
+    data = bytearray(path.read_bytes())
+    begin = max(page * nbytes, 100)
+    data[begin : begin + 64] = b"\xff" * 64
+    path.write_bytes(data)
+    with contextlib.suppress(CatalogError):
+        opened = Catalog.read(path)
+        try:
+            opened.events(), opened.exposures(), opened.verdicts(), opened.snapshot()
+        finally:
+            opened.close()
+    with contextlib.suppress(CatalogError):
+        Catalog.open(path).close()
