@@ -133,11 +133,12 @@ def read_plain(path: Path, max_nbytes: int) -> bytes:
         ForeignFileError: as `open_plain`, or the disk refused.
     """
     with open_plain(path, max_nbytes) as descriptor:
+        nbytes = os.fstat(descriptor).st_size
         try:
             with os.fdopen(os.dup(descriptor), "rb") as file:
-                data = file.read(max_nbytes + 1)
+                data = file.read(nbytes + 1)  # as much is set aside beforehand
         except OSError as error:
             raise ForeignFileError(f"{path}: cannot be read ({error.strerror})") from error
-    if len(data) > max_nbytes:
-        raise ForeignFileError(f"{path}: grew beyond {max_nbytes} bytes while it was read")
+    if len(data) > nbytes:
+        raise ForeignFileError(f"{path}: grew while it was read; try again when it is complete")
     return data
