@@ -1,5 +1,6 @@
 # First program of a PID namespace: a machine of its own for systemd, on this host's files. Nothing of
-# the host is written to: what systemd and the service write goes to tmpfs and to $PLACE.
+# the host is written to: what systemd and the service write goes to tmpfs and to $PLACE. Every unit that
+# is started here has DefaultDependencies=no: sysinit.target would set up the host's folders and devices.
 # Needs PLACE (writable), REPOSITORY, PYTHON (its prefix), PACKAGES (site-packages), PATH.
 set -e
 mount --make-rprivate /
@@ -24,6 +25,9 @@ for from in "$PYTHON:python" "$REPOSITORY:repository" "$PACKAGES:packages"; do
     mount --bind "${from%:*}" "/opt/${from##*:}"
 done
 REPOSITORY=/opt/repository
+# systemd empties /tmp at boot (tmpfiles.d); these are the ones of this machine from here on.
+mount -t tmpfs tmpfs /tmp
+mount -t tmpfs tmpfs /var/tmp
 rm -rf /etc/systemd/system
 mkdir -p /etc/systemd/system/syntopic.service.d
 echo 0123456789abcdef0123456789abcdef >/etc/machine-id
@@ -35,7 +39,7 @@ export LD_LIBRARY_PATH=/opt/python/lib PYTHONPATH=/opt/repository:/opt/packages 
 exec /opt/python/bin/python3 -m daemon "\$@"
 SH
 chmod 755 /opt/syntopic/bin/syntopic
-cp "$REPOSITORY"/systemd/*.service /etc/systemd/system/
+cp "$REPOSITORY/systemd/syntopic.service" /etc/systemd/system/
 cp "$REPOSITORY"/tests/installed/units/*.service /etc/systemd/system/
 cp "$REPOSITORY/tests/installed/units/flight.conf" /etc/systemd/system/syntopic.service.d/
 printf '[Unit]\nDefaultDependencies=no\nWants=flight.service\n' >/etc/systemd/system/flight.target

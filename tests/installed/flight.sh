@@ -27,8 +27,6 @@ page=$(grep -lx 900 /proc/[0-9]*/oom_score_adj | cut -d/ -f3)
 said page_user "$(ps -o user= -p "$page")"
 kill -9 "$page"
 said page_killed $?
-systemctl start syntopic-disk-health.service
-said health "$(grep -c '"disks"' /run/syntopic-health/disks.json)"
 for second in $(seq 300); do
     systemctl is-active -q syntopic.service || break
     sleep 1
