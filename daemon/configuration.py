@@ -239,7 +239,8 @@ class MavlinkCameraSection(_Section):
 
 class WatchSection(_Section):
     """Who may look in, and from where (docs/watching.md). Commands over the network always need a
-    token; at the Unix socket `control` whoever is of `control_group` may give them.
+    token; at the Unix socket `control` members of `control_group` are operators, and members of
+    `control_administrator_group` administrators.
     """
 
     host: str = "127.0.0.1"
@@ -254,6 +255,7 @@ class WatchSection(_Section):
     mavlink: MavlinkCameraSection | None = None
     control: Path | None = None
     control_group: str | None = None
+    control_administrator_group: str | None = None
     hosts: tuple[str, ...] = Field(default=(), max_length=16)
     proxies: tuple[str, ...] = Field(default=(), max_length=8)
 

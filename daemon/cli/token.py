@@ -14,7 +14,7 @@ from daemon.terminal import Console
 app = typer.Typer(
     help="""Make and take back tokens for the API and the operator's page.
 
-Examples: `syntopic token add operator --role command`, `syntopic token list`
+Examples: `syntopic token add operator --role operator`, `syntopic token list`
 """,
     rich_markup_mode="markdown",
     no_args_is_help=True,
@@ -26,14 +26,15 @@ DEFAULT_FILE = Path("/etc/syntopic/tokens.toml")
 @app.command()
 def add(
     name: Annotated[str, typer.Argument(help="Who: a person or a program.")],
-    role: Annotated[str, typer.Option(help="watch or command.")] = "watch",
+    role: Annotated[str, typer.Option(help="observer, operator or administrator.")] = "observer",
     file: TokenFile = DEFAULT_FILE,
 ) -> None:
     """Make a token and show it once.
 
-    Example: `syntopic token add operator --role command`
+    Example: `syntopic token add operator --role operator`
     """
-    from daemon.watch.tokens import ROLES, TokenError, add_token
+    from daemon.watch.roles import ROLES
+    from daemon.watch.tokens import TokenError, add_token
 
     chosen = next((known for known in ROLES if known == role), None)
     if chosen is None:

@@ -11,7 +11,7 @@ from typing import Any, Protocol, TypeGuard
 
 from daemon.disk.log_records import Message, loose_bytes
 from daemon.flight.arming import Lack
-from daemon.service.messages import Answer, Command
+from daemon.service.messages import Answer, Command, CommandRefused
 
 AUDIT_TOPIC = "audit"
 
@@ -80,10 +80,50 @@ def audit_message(command: Command, answer: Answer) -> Message:
         "command": command.name,
         "arguments": dict(command.arguments),
         "by": command.by,
+        "role": command.role,
+        "address": command.address,
         "done": answer.done,
         "sentence": answer.sentence,
     }
     return Message(AUDIT_TOPIC, time.monotonic_ns(), loose_bytes(content))
+
+
+def refusal_message(refused: CommandRefused) -> Message:
+    """A command that was refused before the service, for the flight log."""
+    content = {
+        "command": refused.name,
+        "by": refused.by,
+        "role": refused.role,
+        "address": refused.address,
+        "done": False,
+        "refused": True,
+        "count": refused.count,
+        "sentence": refused.sentence,
+    }
+    return Message(AUDIT_TOPIC, time.monotonic_ns(), loose_bytes(content))
+
+
+def command_event(command: Command, answer: Answer) -> dict[str, Any]:
+    """The event that reports a command."""
+    return {
+        "event": "command",
+        "name": command.name,
+        "by": command.by,
+        "done": answer.done,
+        "sentence": answer.sentence,
+        "override": bool(command.arguments.get("override")),
+    }
+
+
+def refusal_event(refused: CommandRefused) -> dict[str, Any]:
+    """The event that reports a command refused before the service."""
+    return {
+        "event": "command-refused",
+        "name": refused.name,
+        "by": refused.by,
+        "address": refused.address,
+        "sentence": refused.sentence,
+    }
 
 
 def _arm(command: Command, flight: Commanded) -> Answer:

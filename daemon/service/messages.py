@@ -59,6 +59,23 @@ class Command:
     name: str
     arguments: Mapping[str, Any]
     by: str
+    role: str = ""
+    address: str = ""
+
+
+@dataclass(frozen=True)
+class CommandRefused:
+    """Commands that the watch process did not pass on, for the audit log.
+
+    `count` is above 1 where several attempts share one entry.
+    """
+
+    name: str
+    by: str
+    role: str
+    address: str
+    sentence: str
+    count: int = 1
 
 
 @dataclass(frozen=True)
@@ -159,9 +176,10 @@ class Seal:
 
 @dataclass(frozen=True)
 class Log:
-    """Append a message to the flight log."""
+    """Append a message to the flight log; with `is_durable` it is on the disk at once."""
 
     message: Message
+    is_durable: bool = False
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 
 from daemon.configuration import Configuration
 from daemon.disk import recovery
-from daemon.disk.log_records import LoggedTrigger, message_of
+from daemon.disk.log_records import LoggedTrigger, Message, message_of
 from daemon.disk.mission import Mission
 from daemon.flight.arming import FILE as OVERRIDES
 from daemon.flight.arming import Lack, override_message, override_note
@@ -28,7 +28,13 @@ from daemon.flight.latches import FILE as UNHANDLED
 from daemon.flight.latches import Latch, Latches, previous_faults, read_unhandled, unhandled_note
 from daemon.flight.ledger import Ledger
 from daemon.flight.recovery_match import seal_from_log
-from daemon.service.commanding import audit_message, obey
+from daemon.service.commanding import (
+    audit_message,
+    command_event,
+    obey,
+    refusal_event,
+    refusal_message,
+)
 from daemon.service.departure import (
     capture_process,
     frame_rings,
@@ -43,7 +49,17 @@ from daemon.service.exposure_control import ExposureControl
 from daemon.service.hearing import Hearing
 from daemon.service.keeping import Keeping
 from daemon.service.line import Line, Order
-from daemon.service.messages import Begin, Bound, Command, Fire, Log, Pong, Told, UseMission
+from daemon.service.messages import (
+    Begin,
+    Bound,
+    Command,
+    CommandRefused,
+    Fire,
+    Log,
+    Pong,
+    Told,
+    UseMission,
+)
 from daemon.service.mirror import Mirror
 from daemon.service.notify import Notifier
 from daemon.service.pipeline_queue import PipelineQueue
@@ -267,15 +283,14 @@ class Service(Desk):
     def _on_command(self, command: Command) -> None:
         answer = obey(command, self)
         self.watching.answer(answer)
-        self.supervisor.send("writer", Log(audit_message(command, answer)))
-        self._event(
-            "command",
-            name=command.name,
-            by=command.by,
-            done=answer.done,
-            sentence=answer.sentence,
-            override=bool(command.arguments.get("override")),
-        )
+        self._audit(audit_message(command, answer), command_event(command, answer))
+
+    def _on_command_refused(self, refused: CommandRefused) -> None:
+        self._audit(refusal_message(refused), refusal_event(refused))
+
+    def _audit(self, message: Message, event: Mapping[str, Any]) -> None:
+        self.supervisor.send("writer", Log(message, is_durable=True))
+        self._event(**event)
 
     def _on_pong(self, pong: Pong) -> None:
         if pong.statistics:
@@ -286,6 +301,7 @@ class Service(Desk):
         Pong: _on_pong,
         Told: _on_told,
         Command: _on_command,
+        CommandRefused: _on_command_refused,
     }
 
     # In flight

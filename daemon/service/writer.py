@@ -100,6 +100,8 @@ class _Writing:
                 self.storage.note_products(order.number, order.files, order.verdict)
         elif isinstance(order, Log):
             self.storage.log.write(order.message)
+            if order.is_durable:
+                self.storage.log.sync()
         elif isinstance(order, Ping):
             self.link.send(Pong({}))
 

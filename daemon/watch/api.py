@@ -29,19 +29,23 @@ from daemon.disk.mission import exposure_name
 from daemon.watch.bodies import DOCUMENTED, command_body
 from daemon.watch.connections import WATCHERS_MAX, Connection, Connections, Use, source_of
 from daemon.watch.coverage import Coverage
-from daemon.watch.gate import Gate, NoAnswerError
+from daemon.watch.gate import Gate, NoAnswerError, NotPermittedError
 from daemon.watch.guard import CONNECTION, bearer
 from daemon.watch.metrics import exposition
 from daemon.watch.planned import add_plan
+from daemon.watch.roles import Principal
 from daemon.watch.state import EXPOSURES_KEPT, PARTS, PICTURE_PARTS, FlightState
 from daemon.watch.telemetry import LEAST_BYTES_PER_S, Subscription, packed
-from daemon.watch.tokens import Attempts, Holder, Role, Tokens
+from daemon.watch.tokens import Attempts, Holder, Tokens
 
 PAGE = Path(__file__).parent / "page"
 PROBLEM_JSON = "application/problem+json"
 TELEMETRY_TICK_S = 0.05
 SEND_TIMEOUT_S = 5.0
 """A watcher that does not take a record in this time is let go."""
+
+SUBPROTOCOL = "syntopic.v1"
+"""What a browser offers for telemetry, besides its token."""
 
 IMAGES = {
     "quicklook.jpg": "image/jpeg",
@@ -131,7 +135,7 @@ def create_app(
     app.middleware("http")(_harden)
     app.add_exception_handler(StarletteHTTPException, _http_problem)
     app.add_exception_handler(RequestValidationError, _validation_problem)
-    doors = _Doors(settings, connections or Connections())
+    doors = _Doors(settings, gate, connections or Connections())
     _add_state(app, state, doors)
     _add_products(app, state, doors)
     _add_commands(app, state, gate, doors)
@@ -144,29 +148,38 @@ def create_app(
 class _Doors:
     """Checks tokens; a door is a dependency of a route."""
 
-    def __init__(self, settings: WatchSettings, connections: Connections) -> None:
+    def __init__(self, settings: WatchSettings, gate: Gate, connections: Connections) -> None:
         self._settings = settings
+        self._gate = gate
         self._attempts = Attempts()
         self.connections = connections
 
-    def watch(self, request: Request) -> Holder:
-        if self._settings.is_open:
-            return Holder("anybody", "watch")
-        return self.admit(_bearer(request), request, "watch")
+    async def watch(self, request: Request) -> None:
+        if not self._settings.is_open:
+            self.admit(request)
 
-    def command(self, request: Request) -> Holder:
-        return self.admit(_bearer(request), request, "command")
+    async def command(self, request: Request) -> Principal:
+        """Who gives the command; the gate decides what their role permits."""
+        address = _address(request)
+        try:
+            holder = self.admit(request)
+        except HTTPException as error:
+            stranger = Principal("unknown", None, address)
+            self._gate.refuse(request.path_params.get("name", ""), stranger, error.detail)
+            raise
+        return Principal(holder.name, holder.role, address)
 
-    def admit(self, token: str | None, asking: HTTPConnection, role: Role) -> Holder:
+    def admit(self, asking: HTTPConnection) -> Holder:
         """Who comes with this token. A valid one is admitted, however many wrong ones came before.
 
         Raises:
-            HTTPException: 401, 403, or 429 after too many wrong tokens.
+            HTTPException: 401, or 429 after too many wrong tokens.
         """
+        token = bearer(asking.scope["headers"])
         if token is None:
             raise HTTPException(
                 401,
-                "a token is needed (syntopic token add NAME --role command makes one)",
+                "a token is needed (syntopic token add NAME --role operator makes one)",
                 {"WWW-Authenticate": "Bearer"},
             )
         holder = self._settings.tokens.holder_of(token)
@@ -175,19 +188,17 @@ class _Doors:
             if self._attempts.is_blocked(source, now_s):
                 raise HTTPException(429, "too many wrong tokens from this address; wait a minute")
             self._attempts.failed(source, now_s)
-            raise HTTPException(401, "this token is not known", {"WWW-Authenticate": "Bearer"})
+            raise HTTPException(401, "token rejected", {"WWW-Authenticate": "Bearer"})
         connection = _connection(asking)
         if connection is not None:
             connection.is_known = True
-        if role == "command" and holder.role != "command":
-            raise HTTPException(403, f"{holder.name} may watch, not command")
         return holder
 
-    def may_watch(self, token: str | None, asking: HTTPConnection) -> bool:
-        if self._settings.is_open and token is None:
+    def may_watch(self, asking: HTTPConnection) -> bool:
+        if self._settings.is_open and bearer(asking.scope["headers"]) is None:
             return True
         try:
-            self.admit(token, asking, "watch")
+            self.admit(asking)
         except HTTPException:
             return self._settings.is_open
         return True
@@ -287,15 +298,14 @@ def _add_products(app: FastAPI, state: FlightState, doors: _Doors) -> None:
 
 
 def _add_commands(app: FastAPI, state: FlightState, gate: Gate, doors: _Doors) -> None:
-    somebody_who_may = Depends(doors.command)
+    principal = Depends(doors.command)
 
     @app.post("/api/v1/commands/{name}", tags=["commands"], openapi_extra=DOCUMENTED)
-    async def command(
-        name: CommandName, request: Request, holder: Holder = somebody_who_may
-    ) -> Outcome:
-        """arm, start or stop the line, trigger, land, acknowledge, expose otherwise. Needs a token.
+    async def command(name: CommandName, request: Request, by: Principal = principal) -> Outcome:
+        """arm, start or stop the line, trigger, land, acknowledge, expose otherwise.
 
-        Every command is answered by the service and written into the flight log.
+        Needs a token of the role operator; new-mission, release-disk and accept-disk need the
+        role administrator. Every command is answered by the service and recorded in the audit log.
         """
         given = await command_body(request)
         if name == "acknowledge":
@@ -304,7 +314,9 @@ def _add_commands(app: FastAPI, state: FlightState, gate: Gate, doors: _Doors) -
             if not any(fault["id"] == given.fault for fault in state.faults()):
                 raise HTTPException(404, f"no fault {given.fault!r} is listed")
         try:
-            answer = await gate.command(name, given.model_dump(exclude_none=True), holder.name)
+            answer = await gate.command(name, given.model_dump(exclude_none=True), by)
+        except NotPermittedError as error:
+            raise HTTPException(403, str(error)) from error
         except NoAnswerError as error:
             raise HTTPException(504, str(error)) from error
         if answer.done and name == "acknowledge" and given.fault is not None:
@@ -322,8 +334,10 @@ def _add_telemetry(app: FastAPI, state: FlightState, doors: _Doors) -> None:
         bytes_per_s: float = math.inf,
     ) -> None:
         """Records as in docs/telemetry.md, from the whole state on, until the watcher goes."""
-        token = socket.query_params.get("token")
-        if not doors.may_watch(token, socket):
+        if "token" in socket.query_params:
+            await socket.close(1008, "a token belongs into a header, not into the address")
+            return
+        if not doors.may_watch(socket):
             await socket.close(1008, "a token is needed")
             return
         connection = _connection(socket)
@@ -332,7 +346,8 @@ def _add_telemetry(app: FastAPI, state: FlightState, doors: _Doors) -> None:
             return
         if connection is not None:
             connection.enter(Use.WATCHER)
-        await socket.accept()
+        offered = socket.scope.get("subprotocols", [])
+        await socket.accept(SUBPROTOCOL if SUBPROTOCOL in offered else None)
         # Over JSON pictures are fetched, not told.
         parts = PARTS if form == "json" else (*PARTS, *PICTURE_PARTS)
         told = Subscription(max(bytes_per_s, LEAST_BYTES_PER_S), parts)
@@ -422,10 +437,6 @@ def _title(status: int) -> str:
         504: "No answer",
     }
     return titles.get(status, "Not done")
-
-
-def _bearer(request: Request) -> str | None:
-    return bearer(request.scope["headers"])
 
 
 def _address(asking: HTTPConnection) -> str:

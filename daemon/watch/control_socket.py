@@ -1,5 +1,8 @@
 """Commands over a Unix socket, for those whom the machine itself knows to be of a group.
 
+Members of `control_group` are operators; root, the service's own user and members of
+`control_administrator_group` are administrators.
+
 Who asks is told by the kernel (SO_PEERCRED, SO_PEERGROUPS; unix(7)), never by the one who asks. A
 request is a line of JSON, {"command": "start", "arguments": {}}, and so is its answer,
 {"done": true, "sentence": "..."}.
@@ -15,7 +18,7 @@ import pwd
 import socket
 import stat
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +29,8 @@ from pydantic import ValidationError
 from daemon.errors import DaemonError
 from daemon.watch.api import CommandName
 from daemon.watch.bodies import CommandBody
-from daemon.watch.gate import Gate, NoAnswerError
+from daemon.watch.gate import Gate, NoAnswerError, NotPermittedError
+from daemon.watch.roles import Principal, Role
 from daemon.watch.state import FlightState
 
 SO_PEERGROUPS: Final = 59
@@ -41,8 +45,6 @@ IDLE_TIMEOUT_S: Final = 30.0
 ANSWER_TIMEOUT_S: Final = 10.0
 STRANGER_TIMEOUT_S: Final = 1.0
 CALLERS_MAX: Final = 8
-
-Refused = Callable[[str], None]
 
 
 class ControlError(DaemonError):
@@ -84,20 +86,25 @@ class ControlSocket:
 
     Args:
         path: where it is; the folder must be there.
-        group: whose members may command; None for the group the service runs as.
+        group: whose members are operators; None for the group the service runs as.
+        administrators: the group whose members are administrators; None for none.
         gate: the way to the service.
         state: what a fault that is acknowledged leaves.
-        refused: told of everybody who asked and may not.
     """
 
     def __init__(
-        self, path: Path, group: str | None, gate: Gate, state: FlightState, refused: Refused
+        self,
+        path: Path,
+        group: str | None,
+        administrators: str | None,
+        gate: Gate,
+        state: FlightState,
     ) -> None:
         self.path = path
         self._gate = gate
         self._state = state
-        self._refused = refused
         self._gid = _gid_of(group)
+        self._administrators = None if administrators is None else _gid_of(administrators)
         self._callers = 0
         self._server: asyncio.Server | None = None
 
@@ -119,26 +126,24 @@ class ControlSocket:
             with suppress(OSError):
                 self.path.unlink()
 
-    def may(self, caller: Caller) -> bool:
-        """Members of the group, the service's own user, and root."""
-        return caller.uid in (0, os.geteuid()) or self._gid in caller.groups
+    def role_of(self, caller: Caller) -> Role | None:
+        """The role of a process, by its user and groups; None for one that may not command."""
+        if caller.uid in (0, os.geteuid()) or self._administrators in caller.groups:
+            return "administrator"
+        return "operator" if self._gid in caller.groups else None
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         caller = caller_of(writer.get_extra_info("socket"))
+        by = Principal(caller.name, self.role_of(caller), f"control socket, pid {caller.pid}")
         try:
-            if not self.may(caller):
-                told = f"{caller.name} may not command; the group {self._group} may"
-                self._refused(told)
-                # Unread bytes would take the answer with them when the socket closes.
-                with suppress(TimeoutError):
-                    await asyncio.wait_for(reader.readline(), STRANGER_TIMEOUT_S)
-                await _answer(writer, done=False, sentence=told)
+            if by.role is None:
+                await self._turn_away(reader, writer, by)
             elif self._callers >= CALLERS_MAX:
                 await _answer(writer, done=False, sentence="too many callers; try again")
             else:
                 self._callers += 1
                 try:
-                    await self._hear(reader, writer, caller)
+                    await self._hear(reader, writer, by)
                 finally:
                     self._callers -= 1
         except (TimeoutError, ConnectionError, ValueError):
@@ -146,24 +151,36 @@ class ControlSocket:
         finally:
             writer.close()
 
+    async def _turn_away(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, by: Principal
+    ) -> None:
+        """Refuse a process that may not command, and record what it asked for."""
+        sentence = f"{by.name} may not command; the group {self._group} may"
+        wanted: tuple[str, Any] | str = ""
+        # Unread bytes would take the answer with them when the socket closes.
+        with suppress(TimeoutError, ValueError):
+            wanted = _request(await asyncio.wait_for(reader.readline(), STRANGER_TIMEOUT_S))
+        self._gate.refuse("" if isinstance(wanted, str) else wanted[0], by, sentence)
+        await _answer(writer, done=False, sentence=sentence)
+
     async def _hear(
-        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, caller: Caller
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, by: Principal
     ) -> None:
         while line := await asyncio.wait_for(reader.readline(), IDLE_TIMEOUT_S):
             if _asks_for_state(line):
                 await _answer(writer, done=True, sentence="", **self._state_now())
                 continue
-            done, sentence = await self._obey(line, caller)
+            done, sentence = await self._obey(line, by)
             await _answer(writer, done=done, sentence=sentence)
 
-    async def _obey(self, line: bytes, caller: Caller) -> tuple[bool, str]:
+    async def _obey(self, line: bytes, by: Principal) -> tuple[bool, str]:
         asked = _request(line)
         if isinstance(asked, str):
             return False, asked
         name, arguments = asked
         try:
-            answer = await self._gate.command(name, arguments, caller.name)
-        except NoAnswerError as error:
+            answer = await self._gate.command(name, arguments, by)
+        except (NoAnswerError, NotPermittedError) as error:
             return False, str(error)
         if answer.done and name == "acknowledge":
             self._state.acknowledge(str(arguments.get("fault")))

@@ -165,12 +165,16 @@ def is_same_origin(origin: str, host: str) -> bool:
 
 
 def bearer(headers: Collection[tuple[bytes, bytes]]) -> str | None:
-    """The token of an Authorization header."""
-    for name, value in headers:
-        if name == b"authorization":
-            found = re.fullmatch(r"[Bb]earer +(\S{1,200})", value.decode("latin-1"))
-            return found.group(1) if found else None
-    return None
+    """The token of an Authorization header, or among the subprotocols of a WebSocket.
+
+    A browser can set no other header of a WebSocket; in an address a token would end up in logs.
+    """
+    named = {name: value.decode("latin-1") for name, value in headers}
+    found = re.fullmatch(r"[Bb]earer +(\S{1,200})", named.get(b"authorization", ""))
+    if found is None:
+        offered = named.get(b"sec-websocket-protocol", "")
+        found = re.search(r"(?:^|,)\s*bearer\.([^\s,]{1,200})\s*(?:,|$)", offered)
+    return found.group(1) if found else None
 
 
 async def _refuse(scope: Scope, send: Send, status: int, detail: str) -> None:

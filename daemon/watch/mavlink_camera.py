@@ -17,10 +17,11 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, cast
 
 from daemon.configuration import MavlinkCameraSection
-from daemon.watch.gate import Gate, NoAnswerError
+from daemon.watch.gate import Gate, NoAnswerError, NotPermittedError
 from daemon.watch.mavlink_senders import Address, Senders
 from daemon.watch.mavlink_signatures import Signatures, read_key
 from daemon.watch.mavlink_wishes import ACTIONS, BY_IDENTITY, REQUESTS, whole, wish
+from daemon.watch.roles import Principal, Role
 from daemon.watch.state import FlightState
 from drivers.extras import require
 from drivers.leap_seconds import leap_seconds_at
@@ -39,6 +40,9 @@ UNKNOWN_ANGLE = (1.0, 0.0, 0.0, 0.0)
 VENDOR, FIRMWARE = "Syntopic", 1 << 24
 NAME_BYTES = 32
 MODE_IMAGE = 0
+ROLE: Role = "operator"
+"""Of senders that the configuration lets command."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -186,6 +190,13 @@ class MavlinkCamera(asyncio.DatagramProtocol):
         ):
             self._count("commands_refused")
             self._acknowledge(message, address, self._dialect.MAV_RESULT_DENIED)
+            wanted = None if action == "mode" else wish(action, message)
+            self._gate.refuse(
+                action if wanted is None else wanted[0],
+                _principal(message, address, None),
+                f"[watch.mavlink] commands is {self._settings.commands!r}"
+                + ("" if self._settings.commands == "none" else ", and the signature is not valid"),
+            )
             return
         if action == "mode":
             is_image = whole(message.param2) == MODE_IMAGE
@@ -206,11 +217,10 @@ class MavlinkCamera(asyncio.DatagramProtocol):
         self, message: Any, address: Address, name: str, arguments: Mapping[str, Any]
     ) -> None:
         await self._save_timestamps()
-        by = f"mavlink {message.get_srcSystem()}/{message.get_srcComponent()}"
         try:
-            answer = await self._gate.command(name, arguments, by)
+            answer = await self._gate.command(name, arguments, _principal(message, address, ROLE))
             done = answer.done
-        except NoAnswerError:
+        except (NoAnswerError, NotPermittedError):
             done = False
         result = "ACCEPTED" if done else "TEMPORARILY_REJECTED"
         self._acknowledge(message, address, getattr(self._dialect, f"MAV_RESULT_{result}"))
@@ -422,6 +432,11 @@ class MavlinkCamera(asyncio.DatagramProtocol):
 
 
 _ANGLES = ("roll", "pitch", "heading")
+
+
+def _principal(message: Any, address: Address, role: Role | None) -> Principal:
+    name = f"mavlink {message.get_srcSystem()}/{message.get_srcComponent()}"
+    return Principal(name, role, f"udp {address[0]}")
 
 
 def _name(text: str) -> list[int]:

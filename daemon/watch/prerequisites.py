@@ -101,11 +101,17 @@ def _certificate(settings: WatchSection) -> Iterator[Finding]:
 
 
 def _control(settings: WatchSection) -> Iterator[Finding]:
-    path, group = settings.control, settings.control_group
+    path = settings.control
     if path is None:
         return
-    if group is not None and not any(known.gr_name == group for known in grp.getgrall()):
-        sentence = f"there is no group {group!r}; [watch] control_group names one"
+    groups = settings.control_group, settings.control_administrator_group
+    known = {one.gr_name for one in grp.getgrall()}
+    unknown = [group for group in groups if group is not None and group not in known]
+    if unknown:
+        sentence = (
+            f"there is no group {unknown[0]!r}; [watch] control_group and "
+            "control_administrator_group name groups of this machine"
+        )
         yield failed("watch", "control", sentence)
     elif not path.parent.is_dir():
         sentence = f"{path.parent} is no folder; [watch] control names a path in a folder"

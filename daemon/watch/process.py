@@ -200,11 +200,9 @@ async def _control(
     if settings.control is None:
         return None
 
-    def refused(sentence: str) -> None:
-        link.send(Told({"event": "control-refused", "sentence": sentence}))
-
+    groups = settings.control_group, settings.control_administrator_group
     try:
-        control = ControlSocket(settings.control, settings.control_group, gate, state, refused)
+        control = ControlSocket(settings.control, *groups, gate, state)
         await control.begin()
     except ControlError as error:
         link.send(Told(_absent("control", f"no commands over the Unix socket: {error}")))

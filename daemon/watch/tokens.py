@@ -14,14 +14,12 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from daemon.disk import durable
 from daemon.errors import DaemonError
+from daemon.watch.roles import ROLES, Role
 from processing.rig.toml_text import parse_toml
 
-Role = Literal["watch", "command"]
-ROLES: tuple[Role, ...] = ("watch", "command")
 TOKEN_BYTES = 32
 PREFIX = "syn_"
 FAILURES_ALLOWED = 5
@@ -98,7 +96,11 @@ def read_tokens(path: Path | None) -> Tokens:
         role = entry.get("role") if isinstance(entry, dict) else None
         hashed = entry.get("sha256") if isinstance(entry, dict) else None
         if role not in ROLES or not isinstance(hashed, str) or not _HASH.fullmatch(hashed):
-            raise TokenError(f"{path}: {name}: role (watch, command) and sha256 are needed")
+            raise TokenError(
+                f"{path}: {name}: the role is {str(role)[:20]!r}; a token needs a role "
+                f"({', '.join(ROLES)}) and its sha256. Remove the entry and make the token again "
+                "(syntopic token add)"
+            )
         holders[hashed] = Holder(name, role)
     return Tokens(holders)
 

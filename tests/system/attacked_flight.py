@@ -75,7 +75,7 @@ def fly(out: Path, emulator: Emulator, count: int, block: int) -> dict[str, Any]
         f'{text}\n[watch.mavlink]\nconnect = "udpin:127.0.0.1:{MAVLINK_PORT}"\n'
         'commands = "signed"\nsigning_key = "key"\n'
     )
-    token = add_token(out / "tokens.toml", "operator", "command")
+    token = add_token(out / "tokens.toml", "operator", "operator")
     service = Running(config)
     attackers = None
     try:

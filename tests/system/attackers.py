@@ -188,8 +188,9 @@ def flood(page: Address) -> None:
 def wrong_token(page: Address) -> None:
     with connected(page) as talking:
         talking.sendall(
-            b"GET /api/v1/telemetry?token=syn_" + secrets.token_hex(16).encode() + b" HTTP/1.1\r\n"
-            b"Host: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            b"GET /api/v1/telemetry HTTP/1.1\r\nHost: 127.0.0.1\r\n"
+            b"Authorization: Bearer syn_" + secrets.token_hex(16).encode() + b"\r\n"
+            b"Upgrade: websocket\r\nConnection: Upgrade\r\n"
             b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
         )
         talking.recv(512)

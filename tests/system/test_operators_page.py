@@ -146,7 +146,7 @@ def camera(
     text = text.replace('line = "1"', 'file = "block.geojson"')
     text = text.replace('mode = "distance"', 'mode = "plan"')
     config.write_text(text.replace("[trigger]\n", '[trigger]\nstart = "on command"\n'))
-    token = add_token(folder / "tokens.toml", "operator", "command")
+    token = add_token(folder / "tokens.toml", "operator", "administrator")
     service = Running(config)
     try:
         told = service.wait_for(lambda e: e["event"] == "watching", READY_WITHIN_S)
@@ -315,7 +315,7 @@ def test_a_mission_of_waypoints_is_exposed_and_a_head_that_goes_is_seen_and_ackn
     text = darkened(service_toml(emulator.ready, root="missions", watch_port=0))
     text += f'\n[watch.mavlink]\nconnect = "udpin:127.0.0.1:{port}"\ncommands = "any"\n'
     config.write_text(text.replace("[trigger]\n", '[trigger]\nstart = "on command"\n'))
-    token = add_token(tmp_path / "tokens.toml", "operator", "command")
+    token = add_token(tmp_path / "tokens.toml", "operator", "administrator")
     service = Running(config)
     try:
         told = service.wait_for(lambda e: e["event"] == "watching", READY_WITHIN_S)

@@ -17,6 +17,11 @@ export function ask(dialogId, fieldId) {
   });
 }
 
+// A token; whatever else was copied along with it is left out, since headers take no other characters.
+export async function askToken() {
+  return (await ask("ask-token", "token")).replace(/[^A-Za-z0-9_-]/g, "");
+}
+
 // Why somebody flies although something is missing; each of that is listed with its cure.
 function askReason(refusal) {
   const missing = flight.brief?.status?.missing;
@@ -33,7 +38,7 @@ function say(sentence, refused) {
 export async function command(name, body = {}) {
   let token = sessionStorage.getItem("token");
   if (!token) {
-    token = await ask("ask-token", "token");
+    token = await askToken();
     if (!token) return false;
   }
   let response;

@@ -1,7 +1,7 @@
 // The operator's page: what came by telemetry, put where an operator looks for it.
 
 import { flight, listen, onChange } from "./state.js";
-import { ask, askCommand, command } from "./commands.js";
+import { askCommand, askToken, command } from "./commands.js";
 import { drawMap } from "./map.js";
 import { drawExposure } from "./exposure.js";
 import { followPlan } from "./plan.js";
@@ -280,6 +280,6 @@ listen((isLinked) => {
 }, async () => {
   by("link").textContent = "token needed";
   let token = "";
-  while (!token) token = await ask("ask-token", "token");
+  while (!token) token = await askToken();
   sessionStorage.setItem("token", token);
 });

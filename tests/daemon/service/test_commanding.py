@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from daemon.flight.arming import Lack
-from daemon.service.commanding import audit_message, obey
-from daemon.service.messages import Command
+from daemon.service.commanding import audit_message, obey, refusal_event, refusal_message
+from daemon.service.messages import Command, CommandRefused
 
 
 @dataclass
@@ -195,13 +195,15 @@ def test_landing_is_never_refused() -> None:
 
 
 def test_each_command_is_written_down_with_who_gave_it() -> None:
-    command = Command(1, "start", {"override": True}, "operator")
+    command = Command(1, "start", {"override": True}, "anna", "operator", "10.0.0.9")
     message = audit_message(command, obey(command, FakeService()))
     told = json.loads(message.payload)
     assert message.topic == "audit"
     assert told == {
+        "address": "10.0.0.9",
         "arguments": {"override": True},
-        "by": "operator",
+        "by": "anna",
+        "role": "operator",
         "command": "start",
         "done": True,
         "sentence": "the line runs",
@@ -215,3 +217,13 @@ def test_a_disk_is_released_and_accepted_by_its_name() -> None:
     assert give(service, "release-disk") == (False, "there is no disk ''")
     assert give(service, "accept-disk", disk="other") == (False, "there is no disk 'other'")
     assert service.line.done == ["release mirror", "accept mirror", "release ", "accept other"]
+
+
+def test_a_refused_command_is_written_down_with_role_address_and_count() -> None:
+    refused = CommandRefused("land", "pilot", "observer", "10.0.0.9", "land needs operator", 3)
+    message = refusal_message(refused)
+    assert (message.topic, json.loads(message.payload)["done"]) == ("audit", False)
+    told = json.loads(message.payload)
+    assert (told["command"], told["by"], told["role"]) == ("land", "pilot", "observer")
+    assert (told["address"], told["count"]) == ("10.0.0.9", 3)
+    assert refusal_event(refused)["event"] == "command-refused"

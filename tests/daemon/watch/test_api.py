@@ -6,14 +6,17 @@ import asyncio
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import get_args
 
 import msgpack
 import pytest
 from fastapi.testclient import TestClient
+from starlette.websockets import WebSocketDisconnect
 
-from daemon.service.messages import Answer, Command
-from daemon.watch.api import WatchSettings, create_app
+from daemon.service.messages import Answer, Command, CommandRefused
+from daemon.watch.api import CommandName, WatchSettings, create_app
 from daemon.watch.gate import Gate
+from daemon.watch.roles import COMMAND_ROLES
 from daemon.watch.state import FlightState
 from daemon.watch.tokens import add_token, read_tokens
 from tests.daemon.watch import flown
@@ -24,17 +27,22 @@ class Camera:
 
     def __init__(self, folder: Path) -> None:
         self.commands: list[Command] = []
+        self.refused: list[CommandRefused] = []
         self.lives = True
         self.refusal = ""
         self.state = FlightState("syntopic test")
         self.state.apply(flown.mission(str(folder / "mission")))
         self.gate = Gate(self.hear)
         path = folder / "tokens.toml"
-        self.operator = add_token(path, "operator", "command")
-        self.pilot = add_token(path, "pilot", "watch")
+        self.operator = add_token(path, "operator", "operator")
+        self.administrator = add_token(path, "chief", "administrator")
+        self.pilot = add_token(path, "pilot", "observer")
         self.tokens = read_tokens(path)
 
-    def hear(self, command: Command) -> None:
+    def hear(self, command: Command | CommandRefused) -> None:
+        if isinstance(command, CommandRefused):
+            self.refused.append(command)
+            return
         self.commands.append(command)
         if self.lives:
             answer = Answer(command.number, not self.refusal, self.refusal or "done as asked")
@@ -100,11 +108,59 @@ def test_nobody_commands_without_a_token_that_may(camera: Camera, client: TestCl
     assert client.post("/api/v1/commands/start", headers=bearer("guess")).status_code == 401
     answer = client.post("/api/v1/commands/start", headers=bearer(camera.pilot))
     assert answer.status_code == 403
-    assert "pilot may watch" in answer.json()["detail"]
+    assert "pilot has the role observer; start needs the role operator" in answer.json()["detail"]
     assert camera.commands == []
     done = client.post("/api/v1/commands/start", headers=bearer(camera.operator))
     assert done.json() == {"done": True, "sentence": "done as asked"}
-    assert [(c.name, c.by) for c in camera.commands] == [("start", "operator")]
+    (command,) = camera.commands
+    assert (command.name, command.by, command.role) == ("start", "operator", "operator")
+    assert command.address == "testclient"
+    assert [(one.name, one.by, one.role, one.address) for one in camera.refused] == [
+        ("start", "unknown", "none", "testclient"),
+        ("start", "unknown", "none", "testclient"),
+        ("start", "pilot", "observer", "testclient"),
+    ]
+
+
+@pytest.mark.trust
+@pytest.mark.parametrize("name", get_args(CommandName))
+def test_each_command_is_obeyed_from_its_role_on(
+    camera: Camera, client: TestClient, name: str
+) -> None:
+    assert name in COMMAND_ROLES
+    camera.state.apply(flown.lost("SU02"))
+    (fault,) = client.get("/api/v1/faults").json()
+    body = {"fault": fault["id"]} if name == "acknowledge" else {}
+    by_role = (camera.pilot, camera.operator, camera.administrator)
+    obeyed = [
+        client.post(f"/api/v1/commands/{name}", headers=bearer(token), json=body).status_code == 200
+        for token in by_role
+    ]
+    needs_administrator = name in ("new-mission", "release-disk", "accept-disk")
+    assert obeyed == [False, not needs_administrator, True]
+    assert len(camera.commands) == sum(obeyed)
+    assert len(camera.refused) == 3 - sum(obeyed)
+
+
+@pytest.mark.trust
+def test_a_token_travels_in_a_header_and_never_in_the_address(camera: Camera) -> None:
+    telemetry = "/api/v1/telemetry?form=json"
+    with camera.client(is_open=False) as client:
+        for address, given in (
+            (telemetry, {}),
+            (f"{telemetry}&token={camera.pilot}", {}),
+            (f"{telemetry}&token={camera.pilot}", {"headers": bearer(camera.pilot)}),
+            (telemetry, {"subprotocols": ["syntopic.v1", "bearer.syn_guess"]}),
+            (telemetry, {"headers": bearer("syn_guess")}),
+        ):
+            with pytest.raises(WebSocketDisconnect), client.websocket_connect(address, **given):
+                pass
+        with client.websocket_connect(telemetry, headers=bearer(camera.pilot)) as socket:
+            assert socket.receive_json()["version"] == 1
+        offered = ["syntopic.v1", f"bearer.{camera.pilot}"]
+        with client.websocket_connect(telemetry, subprotocols=offered) as socket:
+            assert socket.accepted_subprotocol == "syntopic.v1"
+            assert socket.receive_json()["version"] == 1
 
 
 def test_guessing_is_stopped_and_keeps_no_valid_token_out(

@@ -18,12 +18,14 @@ from typing import Any
 
 import pytest
 
-from daemon.service.messages import Answer, Command
+from daemon.service.messages import Answer, Command, CommandRefused
 from daemon.watch.control_socket import Caller, ControlError, ControlSocket, caller_of, give
 from daemon.watch.gate import Gate
+from daemon.watch.roles import Role
 from daemon.watch.state import FlightState
 from tests.daemon.watch import flown
 
+RELEASE = "release-disk"
 ME = f"uid {os.geteuid()}"
 ASK = """
 import json, os, socket, sys
@@ -32,7 +34,7 @@ os.setgid(65534)
 os.setuid(65534)
 with socket.socket(socket.AF_UNIX) as connection:
     connection.connect(sys.argv[1])
-    connection.sendall(b'{"command": "start"}\\n')
+    connection.sendall(b'{"command": "%s"}\\n' % sys.argv[3].encode())
     sys.stdout.write(connection.makefile().readline())
 """
 
@@ -42,18 +44,21 @@ class Service:
 
     def __init__(self) -> None:
         self.commands: list[Command] = []
-        self.refused: list[str] = []
+        self.refused: list[CommandRefused] = []
         self.state = FlightState("syntopic test")
         self.gate = Gate(self.hear)
 
-    def hear(self, command: Command) -> None:
+    def hear(self, command: Command | CommandRefused) -> None:
+        if isinstance(command, CommandRefused):
+            self.refused.append(command)
+            return
         self.commands.append(command)
         answer = Answer(command.number, command.name != "stop", "as asked")
         asyncio.get_running_loop().call_soon(self.gate.answered, answer)
 
     @asynccontextmanager
     async def listening(self, path: Path, group: str | None = None) -> AsyncIterator[ControlSocket]:
-        control = ControlSocket(path, group, self.gate, self.state, self.refused.append)
+        control = ControlSocket(path, group, None, self.gate, self.state)
         await control.begin()
         try:
             yield control
@@ -142,22 +147,21 @@ def test_a_line_without_end_is_cut_off_and_others_are_heard(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    ("caller", "may"),
+    ("caller", "role"),
     [
-        (Caller(1, 0, frozenset()), True),
-        (Caller(1, os.geteuid(), frozenset()), True),
-        (Caller(1, 4711, frozenset({os.getegid()})), True),
-        (Caller(1, 4711, frozenset({4712})), False),
+        (Caller(1, 0, frozenset()), "administrator"),
+        (Caller(1, os.geteuid(), frozenset()), "administrator"),
+        (Caller(1, 4711, frozenset({grp.getgrnam("adm").gr_gid})), "administrator"),
+        (Caller(1, 4711, frozenset({grp.getgrnam("dialout").gr_gid})), "operator"),
+        (Caller(1, 4711, frozenset({4712})), None),
     ],
 )
-def test_the_group_root_and_the_service_itself_may(
-    caller: Caller, may: bool, tmp_path: Path
+def test_user_and_groups_of_a_process_are_its_role(
+    caller: Caller, role: Role | None, tmp_path: Path
 ) -> None:
     service = Service()
-    control = ControlSocket(
-        tmp_path / "c", None, service.gate, service.state, service.refused.append
-    )
-    assert control.may(caller) is may
+    control = ControlSocket(tmp_path / "c", "dialout", "adm", service.gate, service.state)
+    assert control.role_of(caller) == role
 
 
 def test_the_kernel_says_which_groups_somebody_is_of() -> None:
@@ -180,11 +184,11 @@ def _ask_as_others(path: Path) -> None:
     service = Service()
     group = grp.getgrnam("dialout")
 
-    def ask(groups: str) -> dict[str, Any]:
+    def ask(groups: str, name: str) -> dict[str, Any]:
         # Knocking is open to all, as where the hardened unit may not give the socket away.
         path.chmod(0o666)
         done = subprocess.run(
-            [sys.executable, "-c", ASK, str(path), groups],
+            [sys.executable, "-c", ASK, str(path), groups, name],
             capture_output=True,
             text=True,
             timeout=20,
@@ -192,16 +196,22 @@ def _ask_as_others(path: Path) -> None:
         )
         return dict(json.loads(done.stdout))
 
-    async def run() -> tuple[dict[str, Any], dict[str, Any]]:
+    async def run() -> list[dict[str, Any]]:
         async with service.listening(path, group.gr_name):
-            stranger = await asyncio.to_thread(ask, "")
-            return stranger, await asyncio.to_thread(ask, str(group.gr_gid))
+            asked = (("", "start"), (str(group.gr_gid), "start"), (str(group.gr_gid), RELEASE))
+            return [await asyncio.to_thread(ask, *one) for one in asked]
 
-    stranger, member = asyncio.run(run())
+    stranger, member, too_much = asyncio.run(run())
     assert (stranger["done"], "dialout may" in stranger["sentence"]) == (False, True)
-    assert service.refused == [stranger["sentence"]]
     assert member["done"] is True
-    assert [command.by.split(" (")[0] for command in service.commands] == ["uid 65534"]
+    assert (too_much["done"], "administrator" in too_much["sentence"]) == (False, True)
+    (command,) = service.commands
+    assert (command.by.split(" (")[0], command.role) == ("uid 65534", "operator")
+    assert command.address.startswith("control socket, pid ")
+    assert [(one.name, one.role, one.sentence) for one in service.refused] == [
+        ("start", "none", stranger["sentence"]),
+        (RELEASE, "operator", too_much["sentence"]),
+    ]
 
 
 def test_a_socket_left_by_a_killed_service_is_taken_over_and_a_file_is_not(tmp_path: Path) -> None:
@@ -230,9 +240,7 @@ def test_nobody_listening_and_no_such_group_end_in_sentences(tmp_path: Path) -> 
         give(tmp_path / "none.sock", "start", {})
     service = Service()
     with pytest.raises(ControlError, match="no group"):
-        ControlSocket(
-            tmp_path / "c", "no-such-group", service.gate, service.state, service.refused.append
-        )
+        ControlSocket(tmp_path / "c", "no-such-group", None, service.gate, service.state)
 
 
 def test_the_command_line_gives_what_it_is_told_and_its_status_says_what_became(

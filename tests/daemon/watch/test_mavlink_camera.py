@@ -93,6 +93,10 @@ def test_only_signed_commands_are_obeyed_but_everybody_may_look(signed: Flying) 
     assert wait_for(lambda: stranger.hear("CAMERA_INFORMATION"), "what camera it is")
     assert stranger.ask(2000, 0, 0, 1) == dialect.MAV_RESULT_DENIED
     assert signed.commands == []
+    wait_for(lambda: signed.refused, "the record of the refused command")
+    (refused,) = signed.refused
+    assert (refused.name, refused.role, refused.address) == ("trigger", "none", "udp 127.0.0.1")
+    assert refused.by.startswith("mavlink ") and "signature" in refused.sentence
     stranger.close()
     forger = Station(signed.port, secrets.token_bytes(32))
     forger.heard.clear()
@@ -103,7 +107,7 @@ def test_only_signed_commands_are_obeyed_but_everybody_may_look(signed: Flying) 
     forger.close()
     operator = Station(signed.port, KEY)
     assert operator.ask(2000, 0, 0, 1) == dialect.MAV_RESULT_ACCEPTED
-    assert [c.name for c in signed.commands] == ["trigger"]
+    assert [(c.name, c.role) for c in signed.commands] == [("trigger", "operator")]
     operator.close()
 
 
@@ -140,6 +144,7 @@ def test_requests_of_every_kind_are_answered_or_refused() -> None:
         assert station.ask(31337) == unsupported
         assert station.ask(2000, 0, 1, 3) == dialect.MAV_RESULT_DENIED  # nobody may command
         assert flying.camera.counts["commands_refused"] == 1
+        wait_for(lambda: flying.refused, "the record of the refused command")
     finally:
         station.close()
         flying.close()

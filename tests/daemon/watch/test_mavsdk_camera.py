@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from daemon.configuration import MavlinkCameraSection
-from daemon.service.messages import Answer, Command
+from daemon.service.messages import Answer, Command, CommandRefused
 from daemon.watch.gate import Gate
 from daemon.watch.mavlink_camera import MavlinkCamera
 from daemon.watch.state import FlightState
@@ -34,6 +34,7 @@ class Flying:
         self.state.apply(flown.mission())
         self.state.apply(flown.status("ready"))
         self.commands: list[Command] = []
+        self.refused: list[CommandRefused] = []
         self.lose: set[int] = set()
         self.number = 0
         self.sent_indices: list[int] = []
@@ -64,7 +65,10 @@ class Flying:
         self._begun.set()
         self._loop.run_forever()
 
-    def _obey(self, command: Command) -> None:
+    def _obey(self, command: Command | CommandRefused) -> None:
+        if isinstance(command, CommandRefused):
+            self.refused.append(command)
+            return
         self.commands.append(command)
         self._loop.call_soon(self.gate.answered, Answer(command.number, True, "done"))
         if command.name == "trigger":

@@ -27,7 +27,7 @@ class Service:
     """The service's end of the watch process, in the hands of the test."""
 
     def __init__(self, folder: Path, *, port: int = 0, is_open: bool = True) -> None:
-        self.token = add_token(folder / "tokens.toml", "operator", "command")
+        self.token = add_token(folder / "tokens.toml", "operator", "administrator")
         tokens = folder / "tokens.toml"
         settings = WatchSection(port=port, tokens=tokens, announce=False, open=is_open)
         self.child = Child("watch", "daemon.watch.process:main", (settings,), {})
@@ -220,7 +220,8 @@ def test_a_wrong_token_is_refused_in_words(service: Service, browser: Browser) -
     browser.evaluate("sessionStorage.setItem('token', 'guess')")
     browser.click("[data-command=start]")
     browser.wait_for("document.querySelector('#answer').innerText !== ''", WITHIN_S)
-    browser.wait_for("document.querySelector('#answer').innerText.includes('not known')", WITHIN_S)
+    rejected = "document.querySelector('#answer').innerText.includes('token rejected')"
+    browser.wait_for(rejected, WITHIN_S)
     assert len(service.commands) == before
     browser.evaluate(f"sessionStorage.setItem('token', {json.dumps(service.token)})")
     browser.click("[data-command=start]")

@@ -36,7 +36,7 @@ class Page:
     """A page process, its token, and the service's end of it."""
 
     def __init__(self, folder: Path, **settings: object) -> None:
-        self.token = add_token(folder / "tokens.toml", "operator", "command")
+        self.token = add_token(folder / "tokens.toml", "operator", "operator")
         section = WatchSection(
             host="127.0.0.1", port=0, announce=False, tokens=folder / "tokens.toml", **settings
         )
@@ -252,7 +252,11 @@ def test_wrong_tokens_never_keep_a_valid_one_out(page: Page) -> None:
     assert statuses[:FAILURES_ALLOWED] == [401] * FAILURES_ALLOWED
     assert statuses[FAILURES_ALLOWED:] == [429, 429]
     for _ in range(FAILURES_ALLOWED + 1):
-        page.ask(upgrade("&token=guess", "Origin: http://127.0.0.1", "Connection: close"))
+        page.ask(
+            upgrade(
+                "", "Authorization: Bearer guess", "Origin: http://127.0.0.1", "Connection: close"
+            )
+        )
     assert page.ask(command("guess", f"X-Forwarded-For: {OPERATOR}"))[0] == 429
     assert page.ask(command("guess"), OPERATOR)[0] == 401
     assert page.stop_command(ATTACKER)[0] == 200
@@ -376,7 +380,7 @@ def test_watchers_of_one_address_do_not_take_the_places_of_others(page: Page) ->
             link.sendall(upgrade())
             assert link.recv(4096).startswith(b"HTTP/1.1 101")
         with page.connect(source) as link:
-            link.sendall(upgrade(f"&token={page.token}"))
+            link.sendall(upgrade("", f"Authorization: Bearer {page.token}"))
             assert link.recv(4096).startswith(b"HTTP/1.1 101")
     finally:
         for link in held:

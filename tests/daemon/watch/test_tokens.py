@@ -11,13 +11,13 @@ from daemon.watch.tokens import Attempts, TokenError, add_token, read_tokens, re
 
 def test_a_token_is_known_by_its_hash_only(tmp_path: Path) -> None:
     path = tmp_path / "tokens.toml"
-    pilot = add_token(path, "pilot", "watch")
-    operator = add_token(path, "operator", "command")
+    pilot = add_token(path, "pilot", "observer")
+    operator = add_token(path, "operator", "operator")
     assert pilot not in path.read_text()
     assert path.stat().st_mode & 0o777 == 0o640
     tokens = read_tokens(path)
     assert tokens.holder_of(operator) is not None
-    assert tokens.holder_of(operator).role == "command"
+    assert tokens.holder_of(operator).role == "operator"
     assert tokens.holder_of(pilot).name == "pilot"
     assert tokens.holder_of(operator + "x") is None
     assert tokens.holder_of("") is None
@@ -28,26 +28,27 @@ def test_a_token_is_known_by_its_hash_only(tmp_path: Path) -> None:
 
 def test_a_name_has_one_token_and_odd_names_none(tmp_path: Path) -> None:
     path = tmp_path / "tokens.toml"
-    add_token(path, "operator", "command")
+    add_token(path, "operator", "operator")
     with pytest.raises(TokenError, match="has a token"):
-        add_token(path, "operator", "watch")
+        add_token(path, "operator", "observer")
     for name in ("", "a b", "a]\n[root", "x" * 65):
         with pytest.raises(TokenError):
-            add_token(path, name, "watch")
+            add_token(path, name, "observer")
     with pytest.raises(TokenError, match="nobody"):
         remove_token(path, "pilot")
 
 
 def test_a_file_open_to_everybody_or_damaged_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "tokens.toml"
-    add_token(path, "operator", "command")
+    add_token(path, "operator", "operator")
     path.chmod(0o644)
     with pytest.raises(TokenError, match="chmod 640"):
         read_tokens(path)
     path.chmod(0o640)
-    path.write_text('[x]\nrole = "root"\nsha256 = "00"\n')
-    with pytest.raises(TokenError, match="role"):
-        read_tokens(path)
+    for role in ("root", "command", "watch"):
+        path.write_text(f'[x]\nrole = "{role}"\nsha256 = "{"0" * 64}"\n')
+        with pytest.raises(TokenError, match=f"'{role}'; a token needs a role .observer, operator"):
+            read_tokens(path)
 
 
 def test_after_five_wrong_tokens_an_address_waits_a_minute() -> None:
