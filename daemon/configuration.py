@@ -36,6 +36,9 @@ from processing.rig import Rig, RigError, find_rig
 from processing.rig.toml_text import TomlError, parse_toml
 
 CONFIGURATION_MAX_BYTES = 1_000_000
+_WATCH_FILES = ("tokens", "tls_certificate", "tls_key", "control")
+"""Keys of `[watch]` whose paths count from the file's folder."""
+
 SIGNING_STATE = ".mavlink-signing.json"
 """Below the missions: the last timestamps of signed MAVLink messages."""
 
@@ -247,8 +250,8 @@ class WatchSection(_Section):
     port: int = Field(default=8470, ge=0, le=65535)
     open: bool = True
     tokens: Path | None = None
-    certificate: Path | None = None
-    key: Path | None = None
+    tls_certificate: Path | None = None
+    tls_key: Path | None = None
     announce: bool = True
     udp: tuple[str, ...] = Field(default=(), max_length=8)
     udp_bytes_per_s: float = Field(default=4000.0, ge=1000)
@@ -263,6 +266,14 @@ class WatchSection(_Section):
     def udp_addresses(self) -> dict[str, tuple[str, int]]:
         """Where datagrams go, by the text in the configuration."""
         return {text: (text.rpartition(":")[0], int(text.rpartition(":")[2])) for text in self.udp}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _names_tls_keys(cls, given: Any) -> Any:
+        for old in ("certificate", "key"):
+            if isinstance(given, dict) and old in given:
+                raise ValueError(f"{old} is now named tls_{old}; rename it")
+        return given
 
     @model_validator(mode="after")
     def _has_addresses(self) -> WatchSection:
@@ -292,13 +303,13 @@ class WatchSection(_Section):
 
     @model_validator(mode="after")
     def _is_safe(self) -> WatchSection:
-        if (self.certificate is None) != (self.key is None):
-            raise ValueError("certificate and key belong together; give both or none")
+        if (self.tls_certificate is None) != (self.tls_key is None):
+            raise ValueError("tls_certificate and tls_key belong together; give both or none")
         leaves = not (self.host.startswith("127.") or self.host in ("::1", "localhost"))
-        if leaves and self.tokens is not None and self.certificate is None:
+        if leaves and self.tokens is not None and self.tls_certificate is None:
             raise ValueError(
                 f"host {self.host} lies outside this machine, and tokens would travel in the "
-                "clear; give certificate and key, or no tokens (then nobody may command)"
+                "clear; give tls_certificate and tls_key, or no tokens (then nobody may command)"
             )
         return self
 
@@ -449,7 +460,7 @@ def _anchored(configuration: Configuration, folder: Path) -> Configuration:
         plan = plan.model_copy(update={"elevation": folder / plan.elevation})
     watch = configuration.watch
     if watch is not None:
-        files = {name: getattr(watch, name) for name in ("tokens", "certificate", "key", "control")}
+        files = {name: getattr(watch, name) for name in _WATCH_FILES}
         update: dict[str, Any] = {
             name: folder / path for name, path in files.items() if path is not None
         }

@@ -35,7 +35,7 @@ EXTRAS: Final[Mapping[str, Extra]] = {
     "mavlink": Extra("MAVLink needs pymavlink", ("pymavlink",)),
     "watch": Extra(
         "the page, the API and telemetry need the packages of [watch]",
-        ("fastapi", "uvicorn", "websockets", "msgpack", "zeroconf", "prometheus_client"),
+        ("fastapi", "uvicorn", "websockets", "msgpack", "zeroconf", "ifaddr", "prometheus_client"),
     ),
 }
 

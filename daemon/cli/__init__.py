@@ -19,6 +19,7 @@ from daemon.cli import (
     at,
     bench,
     calibrate,
+    certificate,
     check,
     command,
     demo,
@@ -66,6 +67,7 @@ app.command(name="explain", help=explain.HELP)(explain.explain)
 app.command(name="monitor", help=monitor.HELP)(monitor.monitor)
 app.command(name="command", help=command.HELP)(command.command)
 app.command(name="check", help=check.HELP)(check.check)
+app.command(name="certificate", help=certificate.HELP)(certificate.certificate)
 app.command(name="process", help=process.HELP)(process.process)
 app.command(name="develop", help=develop.HELP)(develop.develop)
 app.command(name="verify", help=verify.HELP)(verify.verify)

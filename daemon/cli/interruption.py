@@ -46,6 +46,9 @@ SENTENCES = {
         ("explain", "check", "verify", "replay", "advise", "disk-health"), _NOTHING_WRITTEN
     ),
     **dict.fromkeys(("bench", "rigs", "token list"), _NOTHING_WRITTEN),
+    "certificate": (
+        f"every file is complete, and the service uses the certificate it had; {AGAIN} to finish"
+    ),
     "token": (
         "the token file is complete; run `syntopic token list` to see whether it was changed"
     ),

@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Annotated, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from pydantic import BaseModel, Field, FiniteFloat, ValidationError
 from rich.console import Console, Group
 from rich.live import Live
 from rich.panel import Panel
@@ -17,18 +18,23 @@ from rich.text import Text
 
 from daemon.errors import DaemonError
 from daemon.tables import light_table
-from daemon.watch.state import PARTS, PICTURE_PARTS
-from drivers.extras import require
+from daemon.watch.state import EXPOSURES_KEPT, PARTS, PICTURE_PARTS
+
+if TYPE_CHECKING:
+    from daemon.watch.finding import Announced
 
 HELP = """Watch a flight from a terminal: phase, ledger, faults, the last exposures.
 
-Without an address the services on the network are looked for; one is watched, several are listed.
+Without an address the services that announce themselves are listed; a single one is watched. What
+is announced decides neither about TLS nor about where a token goes: https:// or --tls asks for TLS,
+and a token is sent only to an address that was given.
 
-Examples: `syntopic monitor`, `syntopic monitor 10.0.0.5:8470 --bytes-per-s 4000`
+Examples: `syntopic monitor`, `syntopic monitor 10.0.0.5:8470 --bytes-per-s 4000`,
+`syntopic monitor https://camera1.local:8470 --authority authority.pem`
 """
-FIND_S = 3.0
-SILENT_S = 10.0
 ROWS = 12
+FAULTS_SHOWN = 20
+DEVICES_KEPT = 500
 COLOURS = {"good": "green", "usable": "yellow", "refly": "red", "lost": "red"}
 MARKS = {"good": "●", "usable": "▲", "refly": "■", "lost": "✖"}
 
@@ -37,43 +43,94 @@ class MonitorError(DaemonError):
     """Nothing can be watched; the sentence says why."""
 
 
-@dataclass(frozen=True)
-class Found:
-    """A service that announced itself."""
+class _Figures(BaseModel):
+    sigma0_px: FiniteFloat | None = None
+    dc_k: FiniteFloat | None = None
+    tie_points_pp: int | None = None
 
-    address: str
-    text: dict[str, str]
+
+class _Exposure(BaseModel):
+    number: int = Field(ge=0, lt=10**9)
+    step: str = ""
+    verdict: str | None = None
+    frames: int | None = None
+    figures: _Figures = _Figures()
+
+
+class _Device(BaseModel):
+    name: str
+
+
+class _Fault(BaseModel):
+    sentence: str
+    stands: bool
+
+
+class _Mission(BaseModel):
+    id: str = ""
+
+
+class _Triggers(BaseModel):
+    triggers: int = 0
+    complete: int = 0
+    degraded: int = 0
+    lost: int = 0
+
+
+class _Ledger(BaseModel):
+    triggers: _Triggers = _Triggers()
+
+
+class _Status(BaseModel):
+    ledger: _Ledger | None = None
+    exposures_left: int | None = None
+    clock_sigma_ns: FiniteFloat | None = None
+
+
+class _Record(BaseModel):
+    """What is drawn of a telemetry record (docs/telemetry.md); other keys are only passed on."""
+
+    phase: str
+    simulated: bool = False
+    mission: _Mission
+    status: _Status = _Status()
+    faults: list[_Fault] = []
+    exposures: list[_Exposure] = []
+    devices: list[_Device] = []
 
 
 def monitor(
-    address: Annotated[str, typer.Argument(help="HOST:PORT; found by itself if left out.")] = "",
-    token: Annotated[str, typer.Option(envvar="SYNTOPIC_TOKEN", help="If looking needs one.")] = "",
-    bytes_per_s: Annotated[float, typer.Option(help="Budget of a thin link.", min=1000)] = 1e6,
-    tls: Annotated[bool, typer.Option(help="The service speaks TLS.")] = False,
+    address: Annotated[
+        str, typer.Argument(help="HOST:PORT or URL (default: discovered by mDNS).")
+    ] = "",
+    token: Annotated[
+        str, typer.Option(envvar="SYNTOPIC_TOKEN", help="Access token, if reading requires one.")
+    ] = "",
+    bytes_per_s: Annotated[
+        float, typer.Option(help="Budget of a thin link.", min=1000, max=1.5e6)
+    ] = 1e6,
+    tls: Annotated[bool, typer.Option(help="Require TLS, as https:// does.")] = False,
+    authority: Annotated[
+        Path | None, typer.Option(help="PEM file of the authority to trust (default: system's).")
+    ] = None,
+    token_without_tls: Annotated[
+        bool, typer.Option("--token-without-tls", help="Send the token unencrypted, too.")
+    ] = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print the state once, as one JSON object.")
     ] = False,
 ) -> None:
+    from daemon.watch.client import Access, records, service_at
+
     console = Console(stderr=as_json)
-    if not address:
-        found = find_services()
-        if not found:
-            raise MonitorError(
-                f"no service was heard within {FIND_S:.0f} s; give its address: "
-                "syntopic monitor HOST:PORT"
-            )
-        if len(found) > 1:
-            console.print(_services_table(found))
-            raise typer.Exit(2)
-        address, tls = found[0].address, found[0].text.get("tls") == "true"
-    scheme = "wss" if tls else "ws"
-    url = f"{scheme}://{address}/api/v1/telemetry?form=msgpack&bytes_per_s={bytes_per_s:.0f}"
+    service = service_at(address or _only_one(console, token), tls=tls)
+    access = Access(token, authority, token_without_tls)
     state: _Seen | None = None
-    with Live(Text(f"calling {address}"), console=console, refresh_per_second=4) as live:
-        for record in _records(url, token):
+    with Live(Text(f"calling {service.address}"), console=console, refresh_per_second=4) as live:
+        for record in records(service, access, bytes_per_s):
             if record is None and state is not None:
-                since = f"✖ NO LINK since {time.strftime('%H:%M:%S')}: what is shown is of then"
-                live.update(Group(Text(since, style="bold red"), state.drawn(address)))
+                since = f"✖ Connection lost {time.strftime('%H:%M:%S')}. Values are frozen."
+                live.update(Group(Text(since, style="bold red"), state.drawn(service.address)))
                 state = None
             elif record is not None:
                 # Each link tells all there is.
@@ -83,35 +140,30 @@ def monitor(
                     live.update(Text())
                     typer.echo(json.dumps(state.as_json()))
                     return
-                live.update(state.drawn(address))
+                live.update(state.drawn(service.address))
 
 
-def find_services(within_s: float = FIND_S) -> list[Found]:
-    """Services that announce themselves by multicast DNS on this network."""
-    require("watch")
-    from zeroconf import ServiceBrowser, ServiceStateChange, Zeroconf
+def _only_one(console: Console, token: str) -> str:
+    """The address of the service that announces itself, where there is one and no token."""
+    from daemon.watch.finding import FIND_S, SERVICES_MAX, find_services
 
-    names: set[str] = set()
-
-    def heard(
-        zeroconf: Zeroconf, service_type: str, name: str, state_change: ServiceStateChange
-    ) -> None:
-        if state_change is ServiceStateChange.Added:
-            names.add(name)
-
-    zeroconf = Zeroconf()
-    try:
-        ServiceBrowser(zeroconf, "_syntopic._tcp.local.", handlers=[heard])
-        time.sleep(within_s)
-        found = []
-        for name in sorted(names):
-            info = zeroconf.get_service_info("_syntopic._tcp.local.", name, timeout=1000)
-            if info is not None and info.parsed_addresses():
-                text = {k.decode(): (v or b"").decode() for k, v in info.properties.items()}
-                found.append(Found(f"{info.parsed_addresses()[0]}:{info.port}", text))
-        return found
-    finally:
-        zeroconf.close()
+    found = find_services()
+    if not found:
+        raise MonitorError(
+            f"no service announced itself within {FIND_S:.0f} s; give its address: "
+            "syntopic monitor HOST:PORT"
+        )
+    if len(found) == 1 and not token:
+        return found[0].address
+    console.print(_services_table(found))
+    if token:
+        raise MonitorError(
+            "a token is not sent to an address that was only announced, since anybody can announce "
+            "one; give the address: syntopic monitor https://HOST:PORT"
+        )
+    if len(found) >= SERVICES_MAX:
+        raise MonitorError(f"{SERVICES_MAX} services or more announce themselves; give an address")
+    raise typer.Exit(2)
 
 
 class _Seen:
@@ -121,12 +173,32 @@ class _Seen:
         self.brief: dict[str, Any] = {}
         self.exposures: dict[int, dict[str, Any]] = {}
         self.devices: dict[str, dict[str, Any]] = {}
+        self._drawn: dict[int, _Exposure] = {}
+        self._record: _Record | None = None
 
     def take(self, record: dict[str, Any]) -> None:
-        for one in record.pop("exposures", []):
-            self.exposures[one["number"]] = one
-        for one in record.pop("devices", []):
-            self.devices[one["name"]] = one
+        """Add a record.
+
+        Raises:
+            MonitorError: it does not have the form of docs/telemetry.md.
+        """
+        try:
+            known = _Record.model_validate(record)
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(str(part) for part in first["loc"])
+            raise MonitorError(
+                f"the service sends no telemetry that is understood: {where}: {first['msg']}; look "
+                "at the address, and at the version of both sides"
+            ) from None
+        self._record = known
+        for exposure, content in zip(known.exposures, record.pop("exposures", []), strict=True):
+            self.exposures[exposure.number], self._drawn[exposure.number] = content, exposure
+        for device, content in zip(known.devices, record.pop("devices", []), strict=True):
+            self.devices[device.name] = content
+        for kept, most in ((self.exposures, EXPOSURES_KEPT), (self._drawn, EXPOSURES_KEPT)):
+            _drop_oldest(kept, most)
+        _drop_oldest(self.devices, DEVICES_KEPT)
         for part in (*PARTS, *PICTURE_PARTS):
             record.pop(part, None)
         self.brief = record
@@ -139,37 +211,44 @@ class _Seen:
         }
 
     def drawn(self, address: str) -> Group:
-        status = self.brief.get("status", {})
-        ledger = (status.get("ledger") or {}).get("triggers", {})
-        mark = "SIMULATED  " if self.brief.get("simulated") else ""
-        head = Text(f"{mark}{self.brief['mission'].get('id', '')}  {address}\n", style="bold")
+        assert self._record is not None
+        status, mission = self._record.status, self._record.mission
+        triggers = (status.ledger or _Ledger()).triggers
+        left = "?" if status.exposures_left is None else status.exposures_left
+        mark = "SIMULATED  " if self._record.simulated else ""
+        head = Text(f"{mark}{mission.id}  {address}\n", style="bold")
         head.append(
-            f"{self.brief['phase']}   triggers {ledger.get('triggers', 0)}, complete "
-            f"{ledger.get('complete', 0)}, degraded {ledger.get('degraded', 0)}, lost "
-            f"{ledger.get('lost', 0)}   {status.get('exposures_left', '?')} exposures left   "
-            f"clock ±{_duration(status.get('clock_sigma_ns'))}"
+            f"{self._record.phase}   triggers {triggers.triggers}, complete {triggers.complete}, "
+            f"degraded {triggers.degraded}, lost {triggers.lost}   {left} exposures left   "
+            f"clock ±{_duration(status.clock_sigma_ns)}"
         )
-        return Group(Panel(head), *self._faults(), self._table())
+        return Group(Panel(head), *self._faults(self._record.faults), self._table())
 
-    def _faults(self) -> Iterator[Text]:
-        for fault in self.brief.get("faults", []):
-            word, style = ("✖ WARNING", "red") if fault["stands"] else ("▲ passed", "yellow")
-            yield Text(f"{word}  {fault['sentence']}", style=style)
+    def _faults(self, faults: list[_Fault]) -> Iterator[Text]:
+        for fault in faults[:FAULTS_SHOWN]:
+            word, style = ("✖ WARNING", "red") if fault.stands else ("▲ passed", "yellow")
+            yield Text(f"{word}  {fault.sentence}", style=style)
+        if len(faults) > FAULTS_SHOWN:
+            yield Text(f"and {len(faults) - FAULTS_SHOWN} more faults", style="red")
 
     def _table(self) -> Table:
         table = light_table("", ("exposure", "verdict"), ("frames", "s0 px", "dC", "tie points"))
-        for _, one in sorted(self.exposures.items())[-ROWS:]:
-            figures, verdict = one.get("figures", {}), str(one.get("verdict") or "")
-            word = verdict or str(one["step"])
+        for number, one in sorted(self._drawn.items())[-ROWS:]:
+            word = one.verdict or one.step
             table.add_row(
-                str(one["number"]),
+                str(number),
                 Text(f"{MARKS.get(word, '')} {word}", COLOURS.get(word, "")),
-                str(one.get("frames", "")),
-                _number(figures.get("sigma0_px"), ".3f"),
-                _number(figures.get("dc_k"), "+.1f"),
-                f"{figures.get('tie_points_pp', '')}",
+                _number(one.frames, "d"),
+                _number(one.figures.sigma0_px, ".3f"),
+                _number(one.figures.dc_k, "+.1f"),
+                _number(one.figures.tie_points_pp, "d"),
             )
         return table
+
+
+def _drop_oldest(kept: dict[Any, Any], most: int) -> None:
+    while len(kept) > most:
+        del kept[next(iter(kept))]
 
 
 def _number(value: float | None, form: str) -> str:
@@ -186,32 +265,9 @@ def _duration(ns: float | None) -> str:
     return f"{ns:.0f} ns"
 
 
-def _records(url: str, token: str) -> Iterator[dict[str, Any] | None]:
-    """Telemetry for ever; None when the link breaks, which is taken up again."""
-    require("watch")
-    import msgpack
-    from websockets.exceptions import ConnectionClosed, InvalidHandshake
-    from websockets.sync.client import connect
-
-    told = False
-    while True:
-        try:
-            with connect(f"{url}&token={token}" if token else url, max_size=16_000_000) as link:
-                while True:
-                    yield msgpack.unpackb(link.recv(timeout=SILENT_S))
-                    told = True
-        except (ConnectionClosed, InvalidHandshake, OSError, TimeoutError) as error:
-            if not told:
-                raise MonitorError(
-                    f"{url.split('?')[0]}: no telemetry ({error}); look at the address, and "
-                    "whether looking needs a token"
-                ) from error
-            yield None
-            time.sleep(1.0)
-
-
-def _services_table(found: list[Found]) -> Table:
-    table = light_table("Several services; name one", ("address", "rig", "mission", "phase"), ())
+def _services_table(found: list[Announced]) -> Table:
+    columns = ("rig", "mission", "phase", "tls")
+    table = light_table("Announced services; name one", ("address", *columns), ())
     for one in found:
-        table.add_row(one.address, *(one.text.get(key, "") for key in ("rig", "mission", "phase")))
+        table.add_row(one.address, *(Text(one.text.get(key, "")) for key in columns))
     return table

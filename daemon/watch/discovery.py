@@ -11,11 +11,13 @@ from contextlib import suppress
 from typing import Any
 
 from daemon.configuration import WatchSection
+from daemon.watch.authority import machine_addresses
 from daemon.watch.state import FlightState
 
 SERVICE_TYPE = "_syntopic._tcp.local."
 REFRESH_S = 5.0
-_TEXT_MAX = 200
+_TEXT_MAX_BYTES = 200
+"""Of a value; key and value together have 255 at most (RFC 6763, section 6.1)."""
 
 
 class Announcement:
@@ -77,19 +79,24 @@ class Announcement:
         mission = brief["mission"]
         return {
             "version": "1",
-            "software": str(brief["software"])[:_TEXT_MAX],
-            "rig": str(mission.get("rig") or "")[:_TEXT_MAX],
-            "mission": str(mission.get("id") or "")[:_TEXT_MAX],
+            "software": _bounded(brief["software"]),
+            "rig": _bounded(mission.get("rig") or ""),
+            "mission": _bounded(mission.get("id") or ""),
             "phase": str(brief["phase"]),
             "simulated": str(brief["simulated"]).lower(),
-            "tls": str(self._settings.certificate is not None).lower(),
+            "tls": str(self._settings.tls_certificate is not None).lower(),
             "token": "command" if self._settings.open else "all",
         }
 
 
+def _bounded(text: object) -> str:
+    return str(text).encode("utf-8", "replace")[:_TEXT_MAX_BYTES].decode("utf-8", "ignore")
+
+
 def _addresses(host: str) -> list[str]:
-    """What is to be dialled: the address listened on, or every one of this host."""
-    if host not in ("0.0.0.0", "::"):
+    """What is to be dialled: the address listened on, or every IPv4 one of this machine."""
+    if host not in ("0.0.0.0", "::", "localhost"):
         return [host]
-    found = {str(info[4][0]) for info in socket.getaddrinfo(socket.gethostname(), None)}
-    return sorted(address for address in found if ":" not in address) or ["127.0.0.1"]
+    found = [address for address in machine_addresses() if ":" not in address]
+    beyond = [address for address in found if not address.startswith("127.")]
+    return ["127.0.0.1"] if host == "localhost" or not beyond else beyond

@@ -8,14 +8,23 @@ from __future__ import annotations
 
 import grp
 import socket
-import ssl
 import stat
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 from daemon.configuration import WatchSection
 from daemon.errors import DaemonError
-from daemon.service.findings import Finding, failed, passed
+from daemon.service.findings import Finding, Outcome, failed, passed
+from daemon.watch.certificates import (
+    CertificateError,
+    expiry_warning,
+    machine_names,
+    name_problem,
+    read_certificate,
+    server_context,
+    validity_problem,
+)
 from daemon.watch.mavlink_signatures import read_key
 from daemon.watch.tokens import TokenError, read_tokens
 
@@ -84,20 +93,26 @@ def _tokens(path: Path | None) -> Iterator[Finding]:
 
 
 def _certificate(settings: WatchSection) -> Iterator[Finding]:
-    if settings.certificate is None or settings.key is None:
+    """Whether there is a usable certificate, and whether clients accept it."""
+    path, key = settings.tls_certificate, settings.tls_key
+    if path is None or key is None:
         return
     try:
-        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-        context.load_cert_chain(settings.certificate, settings.key)
-    except (OSError, ValueError) as error:
-        yield failed(
-            "watch",
-            "certificate",
-            f"{settings.certificate} and {settings.key} cannot be loaded ({error}); give a PEM "
-            "certificate and its key. Nobody can watch",
-        )
+        certificate = read_certificate(path, server_context(path, key))
+    except CertificateError as error:
+        yield failed("watch", "certificate", f"{error}. Nobody can watch")
+        return
+    yield passed("watch", "certificate")
+    now_s = time.time()
+    problem = validity_problem(certificate, now_s) or name_problem(
+        certificate, settings.host, machine_names()
+    )
+    if problem is not None:
+        yield failed("watch", "certificate for clients", problem)
+    elif (warning := expiry_warning(certificate, now_s)) is not None:
+        yield Finding("watch", "certificate for clients", Outcome.WAITING, warning)
     else:
-        yield passed("watch", "certificate")
+        yield passed("watch", "certificate for clients")
 
 
 def _control(settings: WatchSection) -> Iterator[Finding]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import socket
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
@@ -25,6 +26,7 @@ from daemon.service.findings import Outcome
 from daemon.service.messages import Answer, Ping, Pong, Stop, Told
 from daemon.service.processes import Link, ServiceGoneError
 from daemon.watch.api import WatchSettings, create_app
+from daemon.watch.certificates import CertificateError, CertificateFiles, server_context
 from daemon.watch.confinement import confine
 from daemon.watch.connections import Connections, ListeningSocket
 from daemon.watch.control_socket import ControlError, ControlSocket
@@ -34,6 +36,7 @@ from daemon.watch.discovery import Announcement
 from daemon.watch.earlier import remember
 from daemon.watch.gate import Gate
 from daemon.watch.guard import Application, Guard, Occupancy
+from daemon.watch.listener import Listener
 from daemon.watch.mavlink_camera import MavlinkCamera
 from daemon.watch.pictures import pictures_of
 from daemon.watch.prerequisites import WatchError, listen, watch_findings
@@ -44,6 +47,9 @@ from drivers.extras import MissingExtraError
 from processing.rig import Rig, RigError, load_rig
 
 GATHER_S = 10.0
+RENEWAL_S = 5.0
+"""How often the certificate's files are looked at."""
+
 PING_S, PONG_WITHIN_S = 5.0, 10.0
 """So often a watcher is asked whether it still listens, and has so long to answer: what the kernel
 holds for one that stalls may be minutes of telemetry."""
@@ -71,6 +77,7 @@ async def _serve(link: Link, settings: WatchSection, plan: PlanSection) -> None:
     connections = Connections(settings.proxies)
     app = create_app(state, gate, watchers, coverage, connections)
     certified = "certificate" not in failing
+    files = _certificate_files(settings) if certified else None
     server = _Server(
         uvicorn.Config(
             _guarded(app, settings, watchers.tokens, connections),
@@ -85,9 +92,8 @@ async def _serve(link: Link, settings: WatchSection, plan: PlanSection) -> None:
             ws_ping_interval=PING_S,
             ws_ping_timeout=PONG_WITHIN_S,
             timeout_graceful_shutdown=1,
-            ssl_certfile=settings.certificate if certified else None,
-            ssl_keyfile=settings.key if certified else None,
-        )
+        ),
+        files,
     )
     listening, port = None, settings.port
     try:
@@ -97,13 +103,14 @@ async def _serve(link: Link, settings: WatchSection, plan: PlanSection) -> None:
     if listening is not None:
         listening = ListeningSocket(listening, connections)
         port = int(listening.getsockname()[1])
-        told = {"host": settings.host, "port": port, "tls": settings.certificate is not None}
+        told = {"host": settings.host, "port": port, "tls": files is not None}
         link.send(Told({"event": "watching", **told}))
     ending = asyncio.Event()
     announcement = Announcement(state, settings, port)
     saying = asyncio.create_task(send(state, settings.udp_addresses, settings.udp_bytes_per_s))
     gathering = asyncio.create_task(_gather(coverage))
     sweeping = asyncio.create_task(connections.keep_sweeping())
+    renewing = asyncio.create_task(_renew(files, link))
     camera = control = None
     if "mavlink camera" not in failing:
         camera = await _camera(settings, state, gate, ground, link)
@@ -129,6 +136,7 @@ async def _serve(link: Link, settings: WatchSection, plan: PlanSection) -> None:
         saying.cancel()
         gathering.cancel()
         sweeping.cancel()
+        renewing.cancel()
         for task in remembering:
             task.cancel()
         if camera is not None:
@@ -157,11 +165,58 @@ def _guarded(
 
 
 class _Server(uvicorn.Server):
-    """Ends when the service says so: signals of the whole process group are the service's."""
+    """Ends when the service says so: signals of the whole process group are the service's.
+
+    Connections are accepted by a `Listener`, with TLS where there are certificate files.
+    """
+
+    def __init__(self, config: uvicorn.Config, files: CertificateFiles | None) -> None:
+        super().__init__(config)
+        self._files = files
+        self._listeners: list[Listener] = []
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
         yield
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        await super().startup(sockets=[])
+        files = self._files
+        context = None if files is None else lambda: files.context
+        self._listeners = [Listener(one, self._protocol, context) for one in sockets or []]
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        for listener in self._listeners:
+            listener.close()
+        await super().shutdown(sockets)
+
+    def _protocol(self) -> asyncio.Protocol:
+        made: asyncio.Protocol = self.config.http_protocol_class(  # type: ignore[call-arg]
+            config=self.config, server_state=self.server_state, app_state=self.lifespan.state
+        )
+        return made
+
+
+def _certificate_files(settings: WatchSection) -> CertificateFiles | None:
+    if settings.tls_certificate is None or settings.tls_key is None:
+        return None
+    context = server_context(settings.tls_certificate, settings.tls_key)
+    return CertificateFiles(settings.tls_certificate, settings.tls_key, context)
+
+
+async def _renew(files: CertificateFiles | None, link: Link) -> None:
+    """Use a renewed certificate without a restart; connections that are open keep theirs."""
+    while files is not None:
+        await asyncio.sleep(RENEWAL_S)
+        try:
+            if not files.renewed():
+                continue
+            problem = ""
+        except CertificateError as error:
+            problem = f"{error}. The previous certificate is still used"
+        sentence = problem or "the renewed certificate is used from now on"
+        event = {"event": "tls-certificate", "fault": bool(problem), "sentence": sentence}
+        link.send(Told(event))
 
 
 async def _gather(coverage: Coverage) -> None:

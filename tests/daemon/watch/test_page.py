@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,12 +26,15 @@ WITHIN_S = 30.0
 class Service:
     """The service's end of the watch process, in the hands of the test."""
 
-    def __init__(self, folder: Path, *, port: int = 0, is_open: bool = True) -> None:
+    def __init__(
+        self, folder: Path, *, port: int = 0, is_open: bool = True, **further: Any
+    ) -> None:
         self.token = add_token(folder / "tokens.toml", "operator", "administrator")
         tokens = folder / "tokens.toml"
-        settings = WatchSection(port=port, tokens=tokens, announce=False, open=is_open)
+        settings = WatchSection(port=port, tokens=tokens, announce=False, open=is_open, **further)
         self.child = Child("watch", "daemon.watch.process:main", (settings,), {})
         self.commands: list[Command] = []
+        self.events: list[Mapping[str, Any]] = []
         self.refusal = ""
         self.address = ""
         self.until(lambda: bool(self.address))
@@ -47,8 +50,11 @@ class Service:
                 self.hear(self.child.connection.recv())
 
     def hear(self, message: object) -> None:
+        if isinstance(message, Told):
+            self.events.append(message.event)
         if isinstance(message, Told) and message.event.get("event") == "watching":
-            self.address = f"http://{message.event['host']}:{message.event['port']}/"
+            scheme = "https" if message.event["tls"] else "http"
+            self.address = f"{scheme}://{message.event['host']}:{message.event['port']}/"
         elif isinstance(message, Command):
             self.commands.append(message)
             refuses = self.refusal and not message.arguments["override"]

@@ -17,7 +17,7 @@ FILE = Path("x")
 def test_tokens_leave_the_machine_with_tls_only(host: str) -> None:
     with pytest.raises(ValidationError, match="travel in the clear"):
         WatchSection(host=host, tokens=FILE)
-    WatchSection(host=host, tokens=FILE, certificate=FILE, key=FILE)
+    WatchSection(host=host, tokens=FILE, tls_certificate=FILE, tls_key=FILE)
     WatchSection(host=host)  # watching alone needs none
 
 
@@ -26,7 +26,7 @@ def test_within_the_machine_they_may(host: str) -> None:
     WatchSection(host=host, tokens=FILE)
 
 
-@pytest.mark.parametrize("half", [{"certificate": FILE}, {"key": FILE}])
+@pytest.mark.parametrize("half", [{"tls_certificate": FILE}, {"tls_key": FILE}])
 def test_half_of_tls_is_none(half: dict[str, Any]) -> None:
     with pytest.raises(ValidationError, match="belong together"):
         WatchSection(**half)

@@ -1,0 +1,90 @@
+"""`syntopic certificate`: TLS for page, API, telemetry and monitor."""
+
+from __future__ import annotations
+
+import grp
+import json
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+HELP = """Make a local authority and a TLS certificate for this machine.
+
+The certificate has the machine's names (mDNS and host name), its addresses, and those given with
+--name. Install the authority on tablets and ground stations once (docs/tls.md); run the command
+again to renew the certificate, which a running service uses within seconds.
+
+Examples: `syntopic certificate`, `syntopic certificate --folder tls --name camera1.example.org`
+"""
+DEFAULT_FOLDER = Path("/etc/syntopic/tls")
+SERVICE_GROUP = "syntopic"
+
+
+def certificate(
+    folder: Annotated[
+        Path, typer.Option(help="Folder of the certificate and its key.")
+    ] = DEFAULT_FOLDER,
+    authority: Annotated[
+        Path | None, typer.Option(help="Folder of the authority (default: the same).")
+    ] = None,
+    names: Annotated[
+        list[str] | None, typer.Option("--name", help="Further name or IP address; repeatable.")
+    ] = None,
+    days: Annotated[
+        int, typer.Option(help="Validity of the certificate in days.", min=1, max=825)
+    ] = 397,
+    group: Annotated[
+        str | None, typer.Option(help="Group that reads the key (default: syntopic, if it exists).")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    from daemon.watch.authority import make_certificate
+
+    reader = _gid_of(group)
+    made = make_certificate(folder, authority=authority, names=names or (), days=days)
+    if reader is not None:
+        os.chown(made.key, -1, reader)
+    if as_json:
+        content = {
+            "certificate": str(made.certificate),
+            "key": str(made.key),
+            "authority": str(made.authority),
+            "names": made.names,
+            "authority_sha256": made.fingerprint,
+            "new_authority": made.is_new_authority,
+        }
+        typer.echo(json.dumps(content))
+        return
+    console = Console(soft_wrap=True, highlight=False)
+    lines = [
+        f"Certificate for {', '.join(made.names)}.",
+        "",
+        "In service.toml:",
+        "  [watch]",
+        f'  tls_certificate = "{made.certificate.absolute()}"',
+        f'  tls_key = "{made.key.absolute()}"',
+        "",
+        f"{'New authority' if made.is_new_authority else 'Authority'}: {made.authority}; install "
+        "it on tablets and ground stations, and compare its SHA-256:",
+        f"  {made.fingerprint}",
+        f"Keep {made.authority.with_suffix('.key')} secret; it is needed only for renewals.",
+    ]
+    for line in lines:
+        console.print(line, markup=False)
+
+
+def _gid_of(group: str | None) -> int | None:
+    """The group that reads the key; None to leave it as it is."""
+    from daemon.watch.certificates import CertificateError
+
+    if group is None and os.geteuid() != 0:
+        return None
+    try:
+        return grp.getgrnam(group or SERVICE_GROUP).gr_gid
+    except KeyError as error:
+        if group is None:
+            return None
+        raise CertificateError(f"there is no group {group!r} on this machine") from error
