@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import time
 import urllib.request
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
@@ -36,17 +37,26 @@ def chromium() -> str:
 class Browser:
     """One page in one browser. Every request it makes is noted in `requested`."""
 
-    def __init__(self, profile: Path, *, width: int = 1500, height: int = 1180) -> None:
+    def __init__(
+        self,
+        profile: Path,
+        *,
+        width: int = 1500,
+        height: int = 1180,
+        flags: Sequence[str] = (),
+        environment: Mapping[str, str] | None = None,
+    ) -> None:
         from websockets.sync.client import connect
 
         sandbox = ("--no-sandbox",) if os.geteuid() == 0 else ()
         self._process = subprocess.Popen(
             [
-                *(chromium(), *FLAGS, *sandbox, f"--user-data-dir={profile}"),
+                *(chromium(), *FLAGS, *flags, *sandbox, f"--user-data-dir={profile}"),
                 *(f"--window-size={width},{height}", "about:blank"),
             ],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
+            env={**os.environ, **(environment or {})},
         )
         port_file = profile / "DevToolsActivePort"
         deadline = time.monotonic() + START_TIMEOUT_S
