@@ -55,11 +55,11 @@ PING_S, PONG_WITHIN_S = 5.0, 10.0
 holds for one that stalls may be minutes of telemetry."""
 
 
-def main(link: Link, settings: WatchSection, plan: PlanSection) -> None:
-    """Serve watchers until told to stop."""
+def main(link: Link, settings: WatchSection, plan: PlanSection | None = None) -> None:
+    """Serve watchers until told to stop; `plan` names files that a mission may not."""
     confine()
     logging.getLogger("uvicorn.error").addFilter(FewLines())
-    asyncio.run(_serve(link, settings, plan))
+    asyncio.run(_serve(link, settings, plan or PlanSection()))
 
 
 async def _serve(link: Link, settings: WatchSection, plan: PlanSection) -> None:
