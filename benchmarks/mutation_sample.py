@@ -27,6 +27,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+from benchmarks import equivalent_in_processing
 from benchmarks.mutations import Mutation, mutations
 
 ROOT = Path(__file__).parent.parent
@@ -59,9 +60,6 @@ TIME_FACTOR = 3
 LEAST_LIMIT_S = 20.0
 """A mutation has this many times what the file takes without it, and no less than so long."""
 NOTICED_GOAL = 0.9
-_ANY_SIZE = "numpy takes any negative size as the one to be computed"
-_SAME_LENGTHS = "both sequences are made of the same one just above"
-_OVERWRITTEN = "every reader comes after the first look has written it"
 EQUIVALENT: dict[str, str] = {
     "daemon/disk/catalog.py: elif version < SCHEMA_VERSION:: < -> <=": (
         "the same version was handled two branches above"
@@ -99,63 +97,7 @@ EQUIVALENT: dict[str, str] = {
     "drivers/ublox/framing.py: return end - at if end <= len(buffer) else 0: - -> +": (
         "only whether it is zero is read"
     ),
-    "processing/geometry/terrain_rays.py: "
-    "over = point[:, 2] - model.at(point[:, :2]): 2 -> 3": "heights are read at columns 0 and 1",
-    "processing/geometry/terrain_rays.py: "
-    "middle = np.where(good, (near + far) / 2.0, 0.0): 0.0 -> 1.0": "only good rays are taken over",
-    "processing/geometry/terrain_rays.py: "
-    "under = above(middle) <= 0.0: <= -> <": "the bisection converges to the same point",
-    "processing/geometry/terrain_rays.py: "
-    "_HALVINGS: Final = 30: 30 -> 60": "30 halvings of any step are below a micrometre",
-    "processing/geometry/terrain_rays.py: "
-    "first = np.where(down, np.maximum((top - centre_m[2]) / unit[:, 2], 0.0), np.nan): / -> *": (
-        "the search starts earlier, still above all ground"
-    ),
-    "processing/mosaic/precision.py: "
-    "variance = np.sum((datum @ of_datum) * datum, axis=1).reshape(-1, 2): 1 -> 2": _ANY_SIZE,
-    "processing/mosaic/precision.py: result[probe] = moved.reshape(-1): 1 -> 2": _ANY_SIZE,
-    "processing/mosaic/precision.py: "
-    "for i, (s, cone) in enumerate(zip(sensors, cones, strict=True)):: True -> False": (
-        _SAME_LENGTHS
-    ),
-    "processing/mosaic/disturbance.py: "
-    "left = (_moved_px(mosaic, others) - _places(others) @ part).reshape(-1, 2): 1 -> 2": _ANY_SIZE,
-    "processing/mosaic/disturbance.py: "
-    "for part, weight in zip(parts, weights, strict=True):: True -> False": _SAME_LENGTHS,
-    "processing/mosaic/disturbance.py: "
-    "weights.append(float(np.prod(1.0 / (np.sum(left**2, axis=1) + LEAST_PX**2)))): 1.0 -> 1.5": (
-        "only ratios of weights count, and all are products of equally many factors"
-    ),
-    "processing/mosaic/weights.py: misclosure=(b - a).T.reshape(-1),: 1 -> 2": _ANY_SIZE,
-    "processing/mosaic/weights.py: misclosure=-group.difference.T.reshape(-1),: 1 -> 2": _ANY_SIZE,
-    "processing/mosaic/weights.py: "
-    "typical[kind] = float(np.median(sigmas)) if len(sigmas) else 1.0: 1.0 -> 1.5": (
-        "a class without points divides nothing by it"
-    ),
-    "processing/mosaic/weights.py: "
-    "every = [n.ravel() for n, g in zip(normalised, groups, strict=True) if g.kind == kind]: "
-    "True -> False": _SAME_LENGTHS,
-    "processing/mosaic/weights.py: "
-    "for w, group in zip(normalised, groups, strict=True):: True -> False": _SAME_LENGTHS,
-    "processing/geometry/topology.py: _RIGS: Final = 8: 8 -> 9": "size of a cache",
-    "processing/geometry/topology.py: whole = round(exact or 0.0): 0.0 -> 1.0": (
-        "without an exact ratio the result is None whatever is rounded"
-    ),
-    "processing/mosaic/slips.py: "
-    "for (band, sign), (every, _) in zip(banded, own, strict=True):: True -> False": (
-        "both sequences have the two sides of a pair"
-    ),
-} | {
-    f"processing/mosaic/weights.py: {name} = field(default_factory=lambda: "
-    f"np.empty({shape})): {change}": _OVERWRITTEN
-    for name, shape, change in (
-        ("difference: Array", "(0, 2)", "0 -> 1"),
-        ("difference: Array", "(0, 2)", "2 -> 3"),
-        ("redundancy: Array", "(0, 2)", "0 -> 1"),
-        ("redundancy: Array", "(0, 2)", "2 -> 3"),
-        ("factor: Array", "0", "0 -> 1"),
-    )
-}
+} | equivalent_in_processing.EQUIVALENT
 """Mutation as printed, without its line -> why no outcome differs."""
 
 
