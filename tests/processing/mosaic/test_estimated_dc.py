@@ -68,6 +68,9 @@ def test_what_the_probes_say_does_not_move_the_estimate(rig: Rig) -> None:
     for a, b in zip(right, stuck, strict=True):
         assert a.estimated_k == pytest.approx(b.estimated_k, abs=0.02)
         assert b.measured_k == 0.0 and b.disagrees and not a.disagrees
+        # At one temperature of all sensors the whole growth is the rate times the estimate.
+        assert a.estimated_k is not None
+        assert a.expansion_ppm == pytest.approx(a.rate_ppm_per_k * a.estimated_k, rel=1e-6)
 
 
 def test_an_expired_model_disagrees_with_its_probes(rig: Rig) -> None:
