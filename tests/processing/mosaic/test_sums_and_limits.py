@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
 from processing.geometry.placement import nominal_placements
+from processing.mosaic import validity
 from processing.mosaic.free import free_mosaic
-from processing.mosaic.validity import judge_master
+from processing.mosaic.misfit import Misfit
+from processing.mosaic.validity import Displacement, judge_master
 from processing.rig import find_rig
 from tests.processing.mosaic.test_precision import mosaic_of
+from tests.processing.mosaic.test_validity import exposure
 from tests.processing.synthetic import make_truth, no_tie_points, tie_points_of
 
 MINI = find_rig("ultracam-x-mini")
@@ -55,3 +60,28 @@ def test_a_camera_without_a_master_of_three_has_nothing_to_test() -> None:
     assert (judged.global_statistic, judged.global_freedom, judged.global_limit) == (0.0, 0, 0.0)
     assert judged.consistent and judged.limit == float("inf")
     assert judged.hypotheses == () and judged.displaced is None and not judged.several
+
+
+@pytest.mark.parametrize(("beyond", "displaced"), [(1.0, True), (-1.0, False)])
+def test_of_what_a_wrong_probe_leaves_the_likeliest_sensor_decides(
+    monkeypatch: pytest.MonkeyPatch, beyond: float, displaced: bool
+) -> None:
+    """Whether a sensor has moved as well, however wrong the probe is."""
+    _, _, mosaic, read = exposure(40, {}, dc_k=0.0, misread_k=9.0)
+    limit = float(chi2.isf(0.001 / 4, 2))
+    plain = validity._hypotheses
+    found: list[tuple[Displacement, ...]] = []
+
+    def hypotheses(misfit: Misfit) -> tuple[Displacement, ...]:
+        first, *others = plain(misfit)
+        if len(found) == 2:
+            first = dataclasses.replace(first, statistic=limit + beyond)
+            others = [dataclasses.replace(h, statistic=limit - 2.0) for h in others]
+        found.append((first, *others))
+        return found[-1]
+
+    monkeypatch.setattr(validity, "_hypotheses", hypotheses)
+    judged = judge_master(MINI, mosaic, read)
+    assert len(found) == 3
+    assert judged.displaced == (found[2][0] if displaced else None)
+    assert (judged.misread is None) == displaced
