@@ -24,6 +24,8 @@ def test_it_has_four_times_eight_unknowns_and_moves_no_sensor() -> None:
     truth = make_truth(MINI, rng, sensor_px=0.0)
     mosaic = fixed_mosaic(MINI, truth.start, tie_points_of(truth, rng))
     assert mosaic.method == "fixed"
+    # PAN and green are adjusted one after the other, with three iterations each at least.
+    assert mosaic.iterations >= 6
     assert len(mosaic.values) == mosaic.rank == len(mosaic.parameter_names) == 32
     assert mosaic.covariance.shape == (32, 32)
     assert mosaic.redundancy == mosaic.observations - 32
