@@ -80,7 +80,7 @@ class Outcome:
     """What became of a case, ready for JSON.
 
     `result` is `found`, `right` (nothing is said, and the image is right), `covered` (below the
-    limit, the image is within what is stated), `silent` (wrong beyond what is stated, and good) or
+    limit, places are within what is stated), `silent` (wrong beyond what is stated, and good) or
     `misled` (found, but only the innocent are named).
     """
 
@@ -157,9 +157,9 @@ def _result(
         return "found"
     placed = over is None or over <= COVERED
     shown = found.radiance <= RADIANCE and found.band_px <= BAND_PX and found.detail >= DETAIL
-    if placed and shown:
-        return "right" if case.above else "covered"
-    return "silent"
+    if not placed or (case.above and not shown):
+        return "silent"
+    return "right" if case.above else "covered"
 
 
 def accused(report: QualityReport) -> dict[str, frozenset[str]]:

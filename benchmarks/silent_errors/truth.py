@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -222,17 +223,19 @@ def _of_colour(planted: Planted, product: Product) -> Samples:
         sensor = cone.sensors[0]
         if cone.role != "colour" or sensor.name not in planted.frames:
             continue
-        raw = _grid(sensor, 7)
+        raw = _grid(sensor, 5)
         band = cone.bands[0]
         if is_bayer(sensor):
             raw, band = raw[_green_sites(sensor, raw)], BAYER_BANDS[1]
         raw = raw[on_sensor(truth, sensor.name, raw)]
         vip = true_positions(truth, sensor.name, raw)
-        at = np.rint((vip + 0.5) / image.colour_ratio - 0.5).astype(int)
-        shape = product.colour[band].shape
-        inside = (at >= 0).all(axis=1) & (at[:, 0] < shape[1]) & (at[:, 1] < shape[0])
-        at, raw = at[inside], raw[inside]
-        shown = product.colour[band][at[:, 1], at[:, 0]] / product.counts_per_dn
+        at = (vip + 0.5) / image.colour_ratio - 0.5
+        height, width = product.colour[band].shape
+        inside = ((at >= 0.0) & (at <= (width - 1, height - 1))).all(axis=1)
+        at, raw = at[inside].astype(np.float32), raw[inside]
+        picture = product.colour[band].astype(np.float32)
+        shown = cv2.remap(picture, at[:, :1], at[:, 1:], cv2.INTER_LINEAR)[:, 0]
+        shown = shown / product.counts_per_dn
         found[sensor.name] = _compared(planted, sensor.name, raw, shown)
     return found
 
