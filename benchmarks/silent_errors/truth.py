@@ -9,9 +9,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from benchmarks.honest_uncertainty import Held, held
 from benchmarks.silent_errors.exposures import Planted
@@ -232,10 +232,9 @@ def _of_colour(planted: Planted, product: Product) -> Samples:
         at = (vip + 0.5) / image.colour_ratio - 0.5
         height, width = product.colour[band].shape
         inside = ((at >= 0.0) & (at <= (width - 1, height - 1))).all(axis=1)
-        at, raw = at[inside].astype(np.float32), raw[inside]
+        at, raw = at[inside], raw[inside]
         picture = product.colour[band].astype(np.float32)
-        shown = cv2.remap(picture, at[:, :1], at[:, 1:], cv2.INTER_LINEAR)[:, 0]
-        shown = shown / product.counts_per_dn
+        shown = map_coordinates(picture, at.T[::-1], order=1) / product.counts_per_dn
         found[sensor.name] = _compared(planted, sensor.name, raw, shown)
     return found
 
