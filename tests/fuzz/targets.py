@@ -503,7 +503,7 @@ def control_line() -> Target:
 def command_body() -> Target:
     from pydantic import ValidationError
 
-    from daemon.watch.api import CommandBody
+    from daemon.watch.bodies import CommandBody
 
     seed = b'{"interval_s": 2.0, "count": 3, "reason": "x"}'
     return Target(CommandBody.model_validate_json, (ValidationError,), (seed,))

@@ -12,7 +12,7 @@ import tracemalloc
 
 import pytest
 
-from drivers.extras import MissingExtraError
+from drivers.extras import MissingExtraError, missing_module
 from tests.fuzz import corpus
 from tests.fuzz.__main__ import mutations
 from tests.fuzz.targets import INPUT_MAX_NBYTES, INPUT_MAX_S, TARGETS, Target
@@ -25,6 +25,8 @@ def target_of(name: str) -> Target:
     try:
         return TARGETS[name]()
     except (ImportError, MissingExtraError) as error:
+        if isinstance(error, ImportError) and missing_module(error) is None:
+            raise
         pytest.skip(f"an optional package is missing: {error}")
 
 
