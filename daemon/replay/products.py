@@ -7,6 +7,7 @@ taken from the log; everything else is computed.
 from __future__ import annotations
 
 import hashlib
+import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -17,6 +18,7 @@ from typing import Any
 import numpy as np
 import tifffile
 
+from daemon.disk.level0 import refuse_bomb, tiff_faults
 from daemon.disk.level0_folder import EXPOSURE_FILE, load_level0
 from daemon.disk.mission import Mission
 from daemon.disk.records import RecordError, canonical_bytes, parse_record, sha256_hex
@@ -34,6 +36,7 @@ from daemon.service.worker import settle_threads
 from processing.quality.report import Flag
 from processing.rig import Rig
 
+ARRAYS_MAX_NBYTES = 256_000_000
 UNTIMED = frozenset({"timings_s", "duration_s"})
 """Keys of quality.json that say how long things took."""
 
@@ -113,11 +116,16 @@ def content_hash(name: str, data: bytes) -> str:
     """SHA-256 of what a file says: decoded pixels and arrays, canonical JSON without durations."""
     digest = hashlib.sha256()
     if name.endswith(".tif"):
-        pixels = tifffile.imread(BytesIO(data))
+        with tifffile.TiffFile(BytesIO(data)) as tiff:
+            refuse_bomb(tiff.pages[0], Path(name))
+            pixels = tiff.pages[0].asarray()
         digest.update(f"{pixels.dtype} {pixels.shape}".encode())
         digest.update(np.ascontiguousarray(pixels).data)
     elif name.endswith(".npz"):
         with np.load(BytesIO(data), allow_pickle=False) as arrays:
+            announced = sum(member.file_size for member in arrays.zip.infolist())
+            if announced > ARRAYS_MAX_NBYTES:
+                raise ValueError(f"{name} announces {announced} bytes")
             for key in sorted(arrays):
                 array = np.ascontiguousarray(arrays[key])
                 digest.update(f"{key} {array.dtype} {array.shape}".encode())
@@ -133,10 +141,11 @@ def content_hash(name: str, data: bytes) -> str:
 
 def _hashes_on_disk(folder: Path) -> dict[str, str]:
     found = {}
+    faults: tuple[type[Exception], ...] = (OSError, EOFError, zipfile.BadZipFile, *tiff_faults())
     for path in folder.iterdir():
         try:
             found[path.name] = content_hash(path.name, path.read_bytes())
-        except (OSError, ValueError, RecordError, tifffile.TiffFileError):
+        except faults:
             found[path.name] = "unreadable"
     return found
 

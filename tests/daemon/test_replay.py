@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
+import tracemalloc
+import zipfile
 from collections.abc import Iterable
 from dataclasses import replace
 from io import BytesIO
@@ -22,7 +25,7 @@ from daemon.disk.mission import Mission
 from daemon.flight.decisions import Decision, decision_of
 from daemon.replay.codecs import Decoded, codec_for, decode_all
 from daemon.replay.flight import Replayed, replay_log
-from daemon.replay.products import content_hash
+from daemon.replay.products import _hashes_on_disk, content_hash
 from drivers.contract import (
     ClockReading,
     DeviceEvent,
@@ -216,3 +219,26 @@ def test_nothing_compared_is_not_agreement() -> None:
     assert replayed.agrees
     replayed.compare("ledger", agrees=False, sentence="it differs")
     assert (replayed.agrees, replayed.sentences) == (False, ["it differs"])
+
+
+@pytest.mark.trust
+def test_products_that_unpack_to_more_than_they_warrant_are_unreadable(tmp_path) -> None:
+    """A TIFF of 40,000 x 40,000 px in 5 kB, an .npz whose member announces gigabytes."""
+    buffer = io.BytesIO()
+    tifffile.imwrite(buffer, np.zeros((16, 16), np.uint16), metadata=None)
+    data = bytearray(buffer.getvalue())
+    with tifffile.TiffFile(io.BytesIO(data)) as tiff:
+        for code in (256, 257, 278):
+            at = tiff.pages[0].tags[code].valueoffset
+            size = 4 if tiff.pages[0].tags[code].dtype == 4 else 2
+            data[at : at + size] = (40_000).to_bytes(size, "little")
+    (tmp_path / "pan.tif").write_bytes(data)
+    with zipfile.ZipFile(tmp_path / "geometry.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("a.npy", bytes(300_000_000))
+    (tmp_path / "broken.npz").write_bytes(b"PK\x03\x04 no archive")
+    (tmp_path / "quality.json").write_bytes(b"[" * 100_000)
+    tracemalloc.start()
+    found = _hashes_on_disk(tmp_path)
+    assert tracemalloc.get_traced_memory()[1] < 64_000_000
+    tracemalloc.stop()
+    assert set(found.values()) == {"unreadable"}

@@ -501,12 +501,10 @@ def control_line() -> Target:
 
 
 def command_body() -> Target:
-    from pydantic import ValidationError
-
-    from daemon.watch.bodies import CommandBody
+    from daemon.watch.bodies import parsed
 
     seed = b'{"interval_s": 2.0, "count": 3, "reason": "x"}'
-    return Target(CommandBody.model_validate_json, (ValidationError,), (seed,))
+    return Target(parsed, (ValueError,), (seed,))
 
 
 def signed_mavlink() -> Target:
