@@ -7,6 +7,7 @@ taken from the log; everything else is computed.
 from __future__ import annotations
 
 import hashlib
+import tokenize
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -141,7 +142,8 @@ def content_hash(name: str, data: bytes) -> str:
 
 def _hashes_on_disk(folder: Path) -> dict[str, str]:
     found = {}
-    faults: tuple[type[Exception], ...] = (OSError, EOFError, zipfile.BadZipFile, *tiff_faults())
+    damaged = (EOFError, SyntaxError, tokenize.TokenError, zipfile.BadZipFile)
+    faults: tuple[type[Exception], ...] = (OSError, *damaged, *tiff_faults())
     for path in folder.iterdir():
         try:
             found[path.name] = content_hash(path.name, path.read_bytes())

@@ -7,6 +7,7 @@ which needs the overlaps, is in `processing.image.balance`. Source: seeds/dmc-ca
 from __future__ import annotations
 
 import math
+import tokenize
 import zipfile
 import zlib
 from dataclasses import dataclass
@@ -99,8 +100,12 @@ def load_radiometry(path: Path) -> RadiometricCalibration:
         zipfile.BadZipFile,
         zlib.error,
         ValueError,
+        LookupError,
+        TypeError,
+        ArithmeticError,
         EOFError,
         SyntaxError,
+        tokenize.TokenError,
         NotImplementedError,
         RuntimeError,
         MemoryError,
