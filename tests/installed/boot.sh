@@ -29,6 +29,9 @@ REPOSITORY=/opt/repository
 mount -t tmpfs tmpfs /tmp
 mount -t tmpfs tmpfs /var/tmp
 rm -rf /etc/systemd/system
+mkdir -p /etc/systemd/system/service.d
+# Nothing but the units below is started: no udev, no tmpfiles, no sysctl of a whole machine.
+printf '[Unit]\nDefaultDependencies=no\n' >/etc/systemd/system/service.d/alone.conf
 mkdir -p /etc/systemd/system/syntopic.service.d
 echo 0123456789abcdef0123456789abcdef >/etc/machine-id
 cp "$REPOSITORY/systemd/sysusers.conf" /etc/sysusers.d/syntopic.conf

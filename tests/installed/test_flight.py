@@ -14,6 +14,7 @@ import sysconfig
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 
 import pytest
 
@@ -95,7 +96,9 @@ def test_a_flight_passes_inside_the_hardened_unit(tmp_path: Path) -> None:
     missing = needed()
     if missing is not None:
         pytest.skip(missing)
-    said = boot(tmp_path)
+    with NamedTemporaryFile(prefix="not-of-this-machine-") as of_the_host:
+        said = boot(tmp_path)
+        assert Path(of_the_host.name).exists()
     told = (tmp_path / "service.err").read_text("utf-8")[-2000:]
     assert said["kernels"] == "0"
     assert said["started"] == "0", told
