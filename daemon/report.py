@@ -25,6 +25,7 @@ from daemon.exposure import Exposure, to_json
 from daemon.plan.mission_advice import coverage_of
 from daemon.terminal import visible_value
 from processing.conditions import TIME_PARTS
+from processing.quality.band_levels import level_steps, levels_of
 from processing.rig import RigError
 
 REPORT_FILE = "report.html"
@@ -75,7 +76,7 @@ def write_report(
         simulated=any(exposure["record"].get("simulated") for exposure in exposures),
         displaced=_displaced(exposures),
         tested=len(_figure(exposures, "displacement_test")),
-        flight_says=judged["sentences"],
+        flight_says=[*judged["sentences"], *_level_steps(exposures)],
         unreadable=failures,
         ledger=ledger,
         geometry=geometry,
@@ -186,6 +187,12 @@ def _temperature_series(
             if key.startswith("dc_k_") and value is not None:
                 series.setdefault(key.removeprefix("dc_k_"), []).append((exposure["number"], value))
     return series or {"mean": _figure(exposures, "dc_k")}
+
+
+def _level_steps(exposures: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Bands whose level changed alone from one exposure to the next, one sentence each."""
+    levels = {exposure["number"]: levels_of(exposure["figures"]) for exposure in exposures}
+    return [step.sentence for step in level_steps(levels)]
 
 
 def _figure(exposures: Sequence[Mapping[str, Any]], key: str) -> list[tuple[int, float]]:

@@ -22,6 +22,10 @@ from processing.rig import Cone, Rig
 
 T = TypeVar("T")
 
+ALIKE = 0.02
+"""Exposure times of cones that differ by less are those of one setting."""
+LARGEST_SCALE = 2.05
+
 TIME_PARTS = ("receiver", "clock", "trigger", "delay", "head")
 
 
@@ -114,21 +118,54 @@ def for_sensors(rig: Rig, of_cones: Mapping[str, T]) -> dict[str, T]:
     }
 
 
-def exposure_scales(rig: Rig, exposure_time_s: Mapping[str, float]) -> dict[str, float]:
-    """What the signal of each frame is multiplied by, so that all frames of a cone compare.
+def reference_exposure_times(rig: Rig, exposure_times: Mapping[str, float]) -> dict[str, float]:
+    """What exposure time the signal of each frame is brought to, by sensor name.
 
-    The median exposure time of the frames of its cone over its own: exactly 1 where the frames of
-    a cone were exposed alike, and for a frame whose exposure time is not known.
+    The median of its cone where that is the median of all PAN cones, or of all colour cones, to
+    within `ALIKE`; else the median of those. A cone exposed less than half as long keeps its own:
+    its highlights would leave the range of words.
+
+    Args:
+        exposure_times: positive, by sensor name, in any unit; the result has the same.
+    """
+    references: dict[str, float] = {}
+    for cones in (rig.pan_cones, rig.colour_cones):
+        of_cones = {
+            cone.name: statistics.median_low(known.values())
+            for cone in cones
+            if (known := by_sensor_of(cone, exposure_times))
+        }
+        if not of_cones:
+            continue
+        usual = statistics.median_low(of_cones.values())
+        for cone in cones:
+            own = of_cones.get(cone.name, usual)
+            keeps = abs(own / usual - 1.0) <= ALIKE or own < usual / LARGEST_SCALE
+            for name in by_sensor_of(cone, exposure_times):
+                references[name] = own if keeps else usual
+    return references
+
+
+def exposure_scales(rig: Rig, exposure_time_s: Mapping[str, float]) -> dict[str, float]:
+    """What the signal of each frame is multiplied by, so that all frames compare.
+
+    Exactly 1 where the frames of a cone were exposed alike, and as long as other cones. A frame
+    whose exposure time is not known has none.
 
     Args:
         exposure_time_s: positive, by sensor name.
     """
-    scales = {}
-    for cone in rig.cones:
-        times_s = by_sensor_of(cone, exposure_time_s)
-        for name, time_s in times_s.items():
-            scales[name] = statistics.median_low(times_s.values()) / time_s
-    return scales
+    references = reference_exposure_times(rig, exposure_time_s)
+    return {name: reference / exposure_time_s[name] for name, reference in references.items()}
+
+
+def exposure_scale_figures(scales: Mapping[str, float]) -> dict[str, Figure]:
+    """The frame whose level was corrected most, and by what factor."""
+    name = max(scales, key=lambda n: abs(math.log(scales[n])), default=None)
+    return {
+        "exposure_scaled_sensor": None if name is None or scales[name] == 1.0 else name,
+        "exposure_scale": None if name is None else scales[name],
+    }
 
 
 def condition_figures(

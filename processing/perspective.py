@@ -35,7 +35,7 @@ from processing.quality.judgement import judge
 from processing.quality.read_out import blank_unread, unread_figures
 from processing.quality.report import Figure, QualityReport, Thresholds
 from processing.quality.specification import Asked
-from processing.quality.uniformity import signal_steps, step_figures
+from processing.quality.uniformity import line_means_of, signal_steps, step_figures
 from processing.quality.valid_area import ValidArea, area_of, gap_cells, grid_of
 from processing.quality.words import word_figures
 from processing.radiometry.calibration import RadiometricCalibration
@@ -284,7 +284,9 @@ class HeadPipeline:
             sensor = self.rig.cone(name).sensors[0]
             leading[sensor.name] = bands.get("green", next(iter(bands.values())))
             rows[sensor.name] = (0, sensor.height_px - 1)
-        return step_figures(signal_steps(self.rig.sensors, leading, rows))
+        return step_figures(
+            signal_steps(self.rig.sensors, line_means_of(self.rig.sensors, leading, rows))
+        )
 
     def _map(self, cone: Cone, known: Mapping[str, float]) -> Array:
         """(h, w, 2) float32: where in the raw frame each pixel is; kept while temperatures stay."""

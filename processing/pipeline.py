@@ -19,6 +19,7 @@ from processing.conditions import (
     Conditions,
     Temperatures,
     condition_figures,
+    exposure_scale_figures,
     exposure_scales,
     parallax_px,
     usable_temperatures,
@@ -54,17 +55,27 @@ from processing.mosaic.slips import slip_figures
 from processing.mosaic.stitching import Method, stitch
 from processing.mosaic.validity import Validity
 from processing.product import Product, Settings
+from processing.quality.band_levels import level_figures
+from processing.quality.clipping import clipping_figures
+from processing.quality.common_ground import common_ground
 from processing.quality.figures import (
     estimated_dc_figures,
     frame_figures,
     stitching_figures,
     valid_area_figures,
 )
+from processing.quality.frame_blocks import block_edges, block_figures
+from processing.quality.frame_identity import (
+    FixedPatterns,
+    heads_by_pattern,
+    identity_figures,
+)
 from processing.quality.judgement import judge
+from processing.quality.local_sharpness import local_blur_figures
 from processing.quality.read_out import blank_unread, unread_figures
 from processing.quality.relative_sharpness import relative_sharpness_figures
 from processing.quality.report import Figure
-from processing.quality.uniformity import signal_steps, step_figures
+from processing.quality.uniformity import line_means_of, signal_steps, step_figures
 from processing.quality.valid_area import Mask, area_of, gap_cells, grid_of
 from processing.quality.words import word_figures
 from processing.radiometry.calibration import RadiometricCalibration
@@ -123,6 +134,7 @@ class Pipeline:
             sensor.name: corrector_for(sensor, known.get(sensor.name))
             for sensor in (*pan, *(head.sensor for head in self._heads))
         }
+        self._patterns = FixedPatterns(self._correctors)
         self._green = next(
             (
                 head
@@ -201,6 +213,8 @@ class Pipeline:
         with clock.stage("radiometry"):
             level1, statistics = self._correct(frames, conditions, temperatures)
             unread = unread_figures(rig, frames) | word_figures(rig, frames)
+            unread |= clipping_figures(rig, frames)
+            by_pattern = heads_by_pattern(rig, frames, self._patterns, start)
         if frames_read is not None:
             frames_read()
         with clock.stage("tie_points"):
@@ -258,6 +272,7 @@ class Pipeline:
             area = area_of({"pan": pan_gaps, **gaps})
         with clock.stage("quality"):
             figures = condition_figures(rig, conditions, temperatures)
+            figures |= exposure_scale_figures(exposure_scales(rig, conditions.exposure_time_s))
             figures |= unread | self._frame_figures(level1, statistics, start)
             figures |= stitching_figures(
                 rig,
@@ -279,7 +294,12 @@ class Pipeline:
                 for s in rig.sensors
                 if s.name in start
             }
-            figures |= step_figures(signal_steps(rig.sensors, level1, exposed))
+            means = line_means_of(rig.sensors, level1, exposed)
+            figures |= step_figures(signal_steps(rig.sensors, means))
+            figures |= block_figures(block_edges(rig, mosaic.placements, level1, means))
+            shared = common_ground(rig, mosaic.placements, level1)
+            figures |= local_blur_figures(rig, shared) | level_figures(rig, shared)
+            figures |= identity_figures(rig, by_pattern, start, tie_points, registrations)
             figures |= layer_figures(layers) | slip_figures(rig, stitched.slips)
             figures |= precision_figures(rig, mosaic, level1, temperatures.usable_c, disturbance)
             figures |= self._whole_figures(image.source, frames, conditions)

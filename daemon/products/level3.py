@@ -7,7 +7,6 @@ Reads Level-2, writes `L3/`. The mathematics is in `processing.image.pansharpeni
 from __future__ import annotations
 
 import os
-import statistics
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +25,7 @@ from daemon.disk.records import canonical_bytes, sha256_hex
 from daemon.disk.walk import ExposureFailure, walk
 from daemon.errors import DaemonError
 from daemon.exposure import Exposure
-from processing.conditions import by_sensor_of
+from processing.conditions import reference_exposure_times
 from processing.image.pansharpening import pansharpened
 from processing.radiometry.tone_curve import (
     WORDS,
@@ -247,16 +246,17 @@ def _processed(mission: Mission) -> list[int]:
 def _exposure_times_us(mission: Mission, rig: Rig, number: int) -> dict[str, float]:
     """What the bands of an exposure were exposed for, as far as its record knows it.
 
-    Level-2 holds the frames of a cone brought to its median exposure time.
+    Level-2 holds frames as `reference_exposure_times` brings them to.
     """
     exposure = _record(mission, number)
     if exposure is None:
         return {}
     times_us = {f.sensor: f.exposure_time_us for f in exposure.frames if f.exposure_time_us}
+    references = reference_exposure_times(rig, times_us)
     return {
-        band: statistics.median_low(of_cone.values())
+        band: references[cone.sensors[0].name]
         for cone in rig.colour_cones
-        if (of_cone := by_sensor_of(cone, times_us))
+        if cone.sensors[0].name in references
         for band in cone.bands
     }
 

@@ -117,6 +117,14 @@ class Thresholds:
     displacement_verdict: float = 1.6
     """Test statistic over its critical value (0.1 %) from which a displaced sensor changes the
     verdict: of 100,000 healthy exposures one does. Below, the image is corrected and stays good."""
+    colour_blur_deficit: float = 0.12
+    """Share of the finest detail that a region of a colour frame lacks against the others: 0.25 is
+    left without any, a sharp one has about 0.45."""
+    pan_blur_deficit: float = 0.6
+    """Natural logarithm of how many times less energy of detail a region of a PAN frame has."""
+    exposure_scale: float = 1.25
+    clipped_fraction: float = 0.003
+    block_step: float = 0.02
     slip_refly_px: float = 0.5
     head_scale_ppm: float = 150.0
     """Of converging heads: calibrated principal distances agree to a tenth of it."""
@@ -213,6 +221,38 @@ FIGURES: Final[Mapping[str, str]] = {
     "word_format_sensors": "the frames it is wrong in, comma separated",
     "blurred_sensor": "PAN sensor that is less sharp than its neighbours in their overlaps",
     "blurred_ratio": "its fine detail over theirs",
+    "colour_blur_sensor": "colour sensor with the region that is least sharp against the other "
+    "frames of the same ground",
+    "colour_blur_deficit": "what is missing there of the share of the finest detail",
+    "colour_blur_region": "which region, raw pixels",
+    "pan_blur_sensor": "PAN sensor with the region that has least detail of its own pixels for "
+    "what colour sees there",
+    "pan_blur_deficit": "how many times less energy than usual, natural logarithm, beyond that "
+    "of the next frame's region",
+    "pan_blur_region": "which region, raw pixels",
+    "exchanged_frames": "frames that another head took than the one they are stored for, comma "
+    "separated",
+    "exchanged_from": "the heads they came from, in the same order",
+    "exchanged_by": "what shows it: fixed pattern, geometry",
+    "exposure_scaled_sensor": "frame whose level was corrected most for an exposure time other "
+    "than that of the other cones",
+    "exposure_scale": "what its signal was multiplied by",
+    "red_over_pan": "signal of red over that of PAN on the same ground, median",
+    "green_over_pan": "signal of green over that of PAN on the same ground, median",
+    "blue_over_pan": "signal of blue over that of PAN on the same ground, median",
+    "nir_over_pan": "signal of near infrared over that of PAN on the same ground, median",
+    "clipped_sensor": "frame whose signal ends at one value below full scale",
+    "clipped_sensors": "all such frames, comma separated",
+    "clipped_dn": "that value, raw DN",
+    "clipped_fraction": "share of its pixels there",
+    "block_sensor": "frame with a block whose signal differs: its edges follow lines of pixels, "
+    "and no other head shows them",
+    "block_step_dn": "change of signal over its edge, DN",
+    "block_step": "the same, relative",
+    "block_axis": "the edge runs between two rows or two columns",
+    "block_at": "the last line before it, raw pixels",
+    "block_first": "first pixel of the edge in these lines",
+    "block_last": "last pixel of it",
     "sharpness": "share of the finest detail: 0.25 smooth, 1 without any correlation",
     "time_sigma_ns": "standard deviation of the time of the least certain frame",
     "time_error_px": "way flown in that, speed x sigma, as a fraction of the GSD",

@@ -48,17 +48,46 @@ class SignalStep:
     lines: int
 
 
-def signal_steps(
+@dataclass(frozen=True)
+class LineMeans:
+    """Means of bundles of pixels along every line of a frame (`processing.image.line_means`).
+
+    `by_row` (bundles, rows) begins with row `first_row`, `by_column` is (bundles, columns).
+    """
+
+    by_row: Array
+    by_column: Array
+    first_row: int
+
+
+def line_means_of(
     sensors: Sequence[Sensor],
     frames: Mapping[str, Array],
     rows: Mapping[str, tuple[int, int]],
-) -> tuple[SignalStep, ...]:
-    """Search frames for steps along whole lines.
+) -> dict[str, LineMeans]:
+    """Line means of all frames that are there, by sensor name.
 
     Args:
         sensors: those to look at.
         frames: Level-1 words by sensor name, (h, w) uint16.
         rows: first and last exposed row by sensor name.
+    """
+    return {
+        s.name: LineMeans(*line_means(frames[s.name][first : last + 1]), first)
+        for s in sensors
+        if s.name in frames
+        for first, last in (rows[s.name],)
+    }
+
+
+def signal_steps(
+    sensors: Sequence[Sensor], means: Mapping[str, LineMeans]
+) -> tuple[SignalStep, ...]:
+    """Search frames for steps along whole lines.
+
+    Args:
+        sensors: those to look at.
+        means: of their lines, by sensor name.
 
     Returns:
         The largest step of each frame and axis that has one, the largest first; none where more
@@ -66,18 +95,16 @@ def signal_steps(
     """
     found = []
     for sensor in sensors:
-        if sensor.name not in frames:
+        if sensor.name not in means:
             continue
-        first, last = rows[sensor.name]
-        frame = frames[sensor.name][first : last + 1]
-        by_row, by_column = line_means(frame)
+        lines = means[sensor.name]
         least = LEAST_STEP_DN * level1_counts_per_dn(sensor.bits)
         axes: tuple[tuple[Literal["rows", "columns"], Array, int], ...] = (
-            ("rows", by_row, first),
-            ("columns", by_column, 0),
+            ("rows", lines.by_row, lines.first_row),
+            ("columns", lines.by_column, 0),
         )
-        for axis, means, offset in axes:
-            step = _largest(sensor.name, axis, means, offset, least)
+        for axis, by_line, offset in axes:
+            step = _largest(sensor.name, axis, by_line, offset, least)
             if step is not None:
                 found.append(step)
     if len({step.sensor for step in found}) > MOST_FRAMES:

@@ -25,6 +25,8 @@ from sim_hw.world.world import World
 
 Frames = Mapping[str, NDArray[Any]]
 
+BLACK_DN = 64
+
 
 @dataclass(frozen=True)
 class Planted:
@@ -152,3 +154,50 @@ def with_f(factor: float) -> Callable[[Cone], Cone]:
 def moved(x_px: float, y_px: float) -> Callable[[Sensor], Sensor]:
     """A calibrated place that is off by so many pixels."""
     return lambda s: replace(s, x_mm=s.x_mm + x_px * s.pitch_mm, y_mm=s.y_mm + y_px * s.pitch_mm)
+
+
+def gain(factor: float, first: int = 0, axis: int = 0) -> Callable[[Any], Any]:
+    """Signal above black times a factor, from one line on."""
+
+    def change(frame: Any) -> Any:
+        lines = frame if axis == 0 else frame.T
+        signal = (lines[first:].astype(np.float64) - BLACK_DN) * factor + BLACK_DN
+        lines[first:] = np.clip(np.rint(signal), 0, 4095)
+        return frame
+
+    return change
+
+
+def banded(dn: int, period: int) -> Callable[[Any], Any]:
+    """More DN in every other band of `period` rows."""
+
+    def change(frame: Any) -> Any:
+        bands = dn * ((np.arange(len(frame)) // period) % 2)
+        return np.clip(frame.astype(np.int32) + bands[:, None], 0, 4095).astype(np.uint16)
+
+    return change
+
+
+def block(dn: int, rows: slice, columns: slice) -> Callable[[Any], Any]:
+    """More DN in a rectangle."""
+
+    def change(frame: Any) -> Any:
+        frame[rows, columns] = np.minimum(frame[rows, columns] + dn, 4095)
+        return frame
+
+    return change
+
+
+def clipped(level_dn: int) -> Callable[[Any], Any]:
+    """No signal above a level."""
+    return lambda frame: np.minimum(frame, level_dn)
+
+
+def in_part(change: Callable[[Any], Any], rows: slice, columns: slice) -> Callable[[Any], Any]:
+    """A change that holds in a rectangle only."""
+
+    def partly(frame: Any) -> Any:
+        frame[rows, columns] = change(frame.copy())[rows, columns]
+        return frame
+
+    return partly

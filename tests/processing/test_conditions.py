@@ -10,8 +10,10 @@ import pytest
 from processing.conditions import (
     Conditions,
     condition_figures,
+    exposure_scale_figures,
     exposure_scales,
     parallax_px,
+    reference_exposure_times,
     usable_temperatures,
 )
 from processing.geometry.placement import nominal_placements
@@ -98,10 +100,21 @@ def test_the_frames_of_a_cone_are_brought_to_its_median_exposure_time() -> None:
     assert set(exposure_scales(rig, times_s).values()) == {1.0}
     scales = exposure_scales(rig, times_s | {"SU01": 0.002, "R": 0.001})
     assert scales["SU01"] == 2.0
-    # Cones are compared with nobody: red is alone in its cone.
+    # A quarter of the time of the others would leave the range of words: red keeps its own.
     assert {name for name, scale in scales.items() if scale != 1.0} == {"SU01"}
     assert "SU30" not in exposure_scales(rig, {"SU01": 0.002})
     assert exposure_scales(rig, {"SU00": 0.004, "SU01": 0.002})["SU00"] == 0.5
+
+
+def test_cones_are_brought_to_the_exposure_time_of_their_kind() -> None:
+    rig = find_rig("ultracam-x-mini")
+    times_s = {sensor.name: 0.012 if sensor.name in "RGBN" else 0.004 for sensor in rig.sensors}
+    scales = exposure_scales(rig, times_s | {"R": 0.006, "SU30": 0.008, "N": 0.0121})
+    assert {name: s for name, s in scales.items() if s != 1.0} == {"R": 2.0, "SU30": 0.5}
+    assert exposure_scale_figures(scales)["exposure_scale"] in (2.0, 0.5)
+    times_s |= {"R": 0.0058}
+    assert reference_exposure_times(rig, times_s)["R"] == 0.0058
+    assert reference_exposure_times(rig, times_s)["SU30"] == 0.004
 
 
 def test_smear_is_that_of_the_frame_that_moved_most() -> None:

@@ -66,6 +66,38 @@ def test_other_ground_in_a_frame_is_named_and_flown_again(
     assert "DISPLACED_SENSOR" not in outcome.flags
 
 
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_red_and_green_exchanged_are_both_named(healthy: Planted, calibrated: bool) -> None:
+    planted = replace(healthy, frames=_swapped("R", "G")(healthy.frames, {}))
+    if not calibrated:
+        planted = replace(planted, radiometry={})
+    outcome = planted.outcome()
+    assert outcome.verdict == "refly" and "FRAME_CORRUPT" in outcome.flags
+    pairs = zip(
+        outcome.figure("exchanged_frames").split(", "),
+        outcome.figure("exchanged_from").split(", "),
+        strict=True,
+    )
+    assert dict(pairs) == {"R": "G", "G": "R"}
+    assert outcome.figure("exchanged_by") == ("fixed pattern" if calibrated else "geometry")
+    assert "frame of R comes from head G" in outcome.sentences.replace("The", "the")
+    assert "CALIBRATION_EXPIRED" not in outcome.flags
+
+
+@pytest.mark.parametrize(("a", "b"), [("B", "N"), ("SU02", "SU21")])
+def test_frames_exchanged_between_calibrated_heads_are_named(
+    healthy: Planted, a: str, b: str
+) -> None:
+    outcome = replace(healthy, frames=_swapped(a, b)(healthy.frames, {})).outcome()
+    assert outcome.verdict == "refly" and outcome.figure("exchanged_by") == "fixed pattern"
+    assert set(outcome.figure("exchanged_frames").split(", ")) == {a, b}
+
+
+def test_a_healthy_exposure_has_its_own_frames(healthy: Planted) -> None:
+    for planted in (healthy, replace(healthy, radiometry={})):
+        assert planted.outcome().figure("exchanged_frames") is None
+
+
 @pytest.mark.parametrize("band", ["R", "B", "N"])
 def test_other_ground_in_a_colour_band_is_named(healthy: Planted, band: str) -> None:
     outcome = replace(healthy, frames=_turned(band)(healthy.frames, {})).outcome()

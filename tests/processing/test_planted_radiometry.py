@@ -10,37 +10,16 @@ import cv2
 import numpy as np
 import pytest
 
+from processing.quality.band_levels import level_steps, levels_of
 from processing.quality.words import wrong_format
-from tests.processing.planted import Planted, rendered
+from tests.processing.planted import Planted, banded, block, clipped, gain, in_part, rendered
 
 pytestmark = [pytest.mark.trust, pytest.mark.timeout(300)]
-
-BLACK_DN = 64
 
 
 @pytest.fixture(scope="module")
 def healthy() -> Planted:
     return rendered("ultracam-x-mini")
-
-
-def _gain(factor: float, first: int = 0, axis: int = 0) -> Callable[[Any], Any]:
-    """Signal above black times a factor, from one line on."""
-
-    def change(frame: Any) -> Any:
-        lines = frame if axis == 0 else frame.T
-        signal = (lines[first:].astype(np.float64) - BLACK_DN) * factor + BLACK_DN
-        lines[first:] = np.clip(np.rint(signal), 0, 4095)
-        return frame
-
-    return change
-
-
-def _banded(dn: int, period: int) -> Callable[[Any], Any]:
-    def change(frame: Any) -> Any:
-        bands = dn * ((np.arange(len(frame)) // period) % 2)
-        return np.clip(frame.astype(np.int32) + bands[:, None], 0, 4095).astype(np.uint16)
-
-    return change
 
 
 @pytest.mark.parametrize(
@@ -50,7 +29,7 @@ def _banded(dn: int, period: int) -> Callable[[Any], Any]:
 def test_a_gain_step_within_a_frame_is_named_with_its_line(
     healthy: Planted, sensor: str, axis: int, line: int, factor: float
 ) -> None:
-    outcome = healthy.with_frame(sensor, _gain(factor, line, axis)).outcome()
+    outcome = healthy.with_frame(sensor, gain(factor, line, axis)).outcome()
     assert outcome.verdict == "usable" and "FRAME_CORRUPT" in outcome.flags
     assert outcome.figure("signal_step_sensor") == sensor
     assert outcome.figure("signal_step_axis") == ("rows", "columns")[axis]
@@ -59,7 +38,7 @@ def test_a_gain_step_within_a_frame_is_named_with_its_line(
 
 
 def test_banding_is_named(healthy: Planted) -> None:
-    outcome = healthy.with_frame("SU10", _banded(30, 20)).outcome()
+    outcome = healthy.with_frame("SU10", banded(30, 20)).outcome()
     assert outcome.figure("signal_step_sensor") == "SU10" and "banding" in outcome.sentences
 
 
@@ -68,12 +47,55 @@ def test_a_pan_head_with_another_exposure_is_named_and_draws_no_other(
     healthy: Planted, factor: float
 ) -> None:
     clean = healthy.outcome()
-    outcome = healthy.with_frame("SU11", _gain(factor)).outcome()
+    outcome = healthy.with_frame("SU11", gain(factor)).outcome()
     assert outcome.verdict == "usable" and outcome.figure("gain_outlier") == "SU11"
     assert outcome.figure("gain_outlier_signal") == pytest.approx(factor, rel=0.02)
     both = (outcome.product.pan > 0) & (clean.product.pan > 0)
     ratio = np.median(outcome.product.pan[both] / clean.product.pan[both])
     assert ratio == pytest.approx(1.0, abs=0.005)
+
+
+@pytest.mark.parametrize("sensor", ["R", "SU11", "SU30"])
+def test_a_head_exposed_half_as_long_as_its_record_states_keeps_its_level(
+    healthy: Planted, sensor: str
+) -> None:
+    clean = healthy.outcome()
+    pan, red = clean.product.pan.copy(), clean.product.colour["red"].copy()
+    times_s = {**healthy.conditions.exposure_time_s}
+    times_s[sensor] *= 0.5
+    planted = healthy.with_frame(sensor, gain(0.5))
+    planted = replace(planted, conditions=replace(planted.conditions, exposure_time_s=times_s))
+    outcome = planted.outcome()
+    assert outcome.verdict == "good" and "UNDEREXPOSED" in outcome.flags
+    assert outcome.figure("exposure_scaled_sensor") == sensor
+    assert outcome.figure("gain_outlier") is None and "as its record states" in outcome.sentences
+    for before, after in ((pan, outcome.product.pan), (red, outcome.product.colour["red"])):
+        both = (before > 0) & (after > 0)
+        assert np.median(after[both] / before[both]) == pytest.approx(1.0, abs=0.01)
+
+
+def test_red_exposed_half_as_long_without_saying_so_is_seen_over_a_flight(
+    healthy: Planted,
+) -> None:
+    usual = healthy.outcome().product.report.figures
+    changed = healthy.with_frame("R", gain(0.5)).outcome()
+    assert changed.verdict == "good"  # one exposure cannot show it
+    halved = changed.product.report.figures
+    flight = {3: levels_of(usual), 4: levels_of(halved), 6: {}, 7: levels_of(usual)}
+    down, up = level_steps(flight)
+    assert (down.band, down.before, down.exposure) == ("red", 3, 4)
+    assert (up.band, up.before, up.exposure) == ("red", 4, 7)
+    assert down.factor == pytest.approx(0.5, rel=0.02) and "level of red" in down.sentence
+
+
+def test_ground_that_changes_several_bands_is_no_step_of_one() -> None:
+    fields = {"red": 0.77, "green": 0.90, "blue": 0.55, "nir": 2.3}
+    water = {"red": 0.80, "green": 1.20, "blue": 1.46, "nir": 0.32}
+    soil = {"red": 1.12, "green": 0.96, "blue": 0.71, "nir": 1.2}
+    assert level_steps({1: fields, 2: fields, 3: water, 4: soil, 5: fields}) == ()
+    red = {**fields, "red": 0.77 * 1.6}
+    assert level_steps({1: fields, 2: red}) == ()
+    assert level_steps({1: fields, 2: {**fields, "red": 0.77 * 1.7}})[0].band == "red"
 
 
 @pytest.mark.parametrize(("sensor", "size"), [("SU11", (0, 0)), ("SU30", (0, 0)), ("SU02", (1, 5))])
@@ -109,3 +131,71 @@ def test_formats_of_words_by_the_rig_file(healthy: Planted) -> None:
     assert wrong_format(right, frame) is None and wrong_format(left, frame << 4) is None
     assert wrong_format(left, frame) == "right-justified"
     assert wrong_format(right, frame + np.uint16(4096)) == "beyond 12 bits"
+
+
+@pytest.mark.parametrize(
+    ("sensor", "dn", "rows", "columns"),
+    [
+        ("SU11", 40, slice(300, 500), slice(400, 700)),
+        ("SU00", 40, slice(0, 300), slice(0, 400)),
+        ("G", 40, slice(300, 500), slice(400, 700)),
+    ],
+)
+def test_a_block_with_another_offset_is_named_with_an_edge(
+    healthy: Planted, sensor: str, dn: int, rows: slice, columns: slice
+) -> None:
+    outcome = healthy.with_frame(sensor, block(dn, rows, columns)).outcome()
+    assert outcome.verdict == "usable" and "FRAME_CORRUPT" in outcome.flags
+    assert outcome.figure("block_sensor") == sensor and "no other head shows" in outcome.sentences
+    assert abs(outcome.figure("block_step_dn")) == pytest.approx(abs(dn), rel=0.3)
+    edges = (rows if outcome.figure("block_axis") == "rows" else columns).indices(1248)[:2]
+    assert outcome.figure("block_at") + 1 in edges
+
+
+@pytest.mark.parametrize(("sensor", "level_dn"), [("SU21", 1500), ("G", 1200), ("N", 1500)])
+def test_a_head_that_clips_below_full_scale_is_named_with_its_level(
+    healthy: Planted, sensor: str, level_dn: int
+) -> None:
+    outcome = healthy.with_frame(sensor, clipped(level_dn)).outcome()
+    assert outcome.verdict == "usable" and "OVEREXPOSED" in outcome.flags
+    assert outcome.figure("clipped_sensor") == sensor
+    assert outcome.figure("clipped_dn") == level_dn
+    share = float(np.mean(healthy.frames[sensor] >= level_dn))
+    assert outcome.figure("clipped_fraction") == pytest.approx(share, rel=0.2)
+
+
+WHOLE = slice(None)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "kind", "sigma_px", "smear_px", "rows", "columns"),
+    [
+        ("G", "colour", 3.0, 0, WHOLE, WHOLE),
+        ("R", "colour", 2.0, 0, slice(416, 832), slice(0, 624)),
+        ("SU30", "pan", 0.0, 5, slice(0, 416), slice(0, 624)),
+        ("SU11", "pan", 1.5, 0, slice(416, 832), slice(624, 1248)),
+    ],
+)
+def test_a_colour_head_or_a_region_without_fine_detail_is_named(
+    healthy: Planted,
+    sensor: str,
+    kind: str,
+    sigma_px: float,
+    smear_px: int,
+    rows: slice,
+    columns: slice,
+) -> None:
+    def blurred(frame: Any) -> Any:
+        if smear_px:
+            return cv2.blur(frame, (1, smear_px))
+        return cv2.GaussianBlur(frame, (0, 0), sigma_px)
+
+    outcome = healthy.with_frame(sensor, in_part(blurred, rows, columns)).outcome()
+    assert outcome.verdict == "usable" and "BLUR" in outcome.flags
+    assert outcome.figure(f"{kind}_blur_sensor") == sensor
+    region = outcome.figure(f"{kind}_blur_region")
+    assert f"{sensor} shows less fine detail" in outcome.sentences and region in outcome.sentences
+    if rows != WHOLE:
+        assert region == (
+            f"columns {columns.start} to {columns.stop - 1}, rows {rows.start} to {rows.stop - 1}"
+        )

@@ -1,0 +1,73 @@
+"""Frames whose signal ends below the converter's full scale: a pile of pixels at the highest value.
+
+Light has no highest value: noise alone spreads the brightest surface over many DN. A head with a
+wrong gain, a converter of fewer bits or a lookup table cuts off at one value.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.quality.report import Figure
+from processing.rig import Rig, Sensor
+
+Array = NDArray[Any]
+
+STEP: Final = (16, 8)
+"""Of the rows and columns looked at."""
+LEAST_SHARE: Final = 0.003
+"""Of the pixels of a frame at the value where it ends."""
+LEAST_PILE: Final = 8.0
+"""Pixels there over those of the values below it, each."""
+BELOW_DN: Final = 40
+MOST_ABOVE: Final = 0.001
+"""Of the pixels: defects may lie beyond the level."""
+
+
+def clipping_figures(rig: Rig, frames: Mapping[str, Array]) -> dict[str, Figure]:
+    """Name the frame that is cut off below full scale, the one with most pixels there.
+
+    Args:
+        rig: the camera.
+        frames: Level-0 frames by sensor name, (h, w) uint16, DN.
+    """
+    found = {
+        s.name: cut
+        for s in rig.sensors
+        if s.name in frames and (cut := clipped_at(s, frames[s.name])) is not None
+    }
+    if not found:
+        return {}
+    worst = max(found, key=lambda name: found[name][1])
+    return {
+        "clipped_sensor": worst,
+        "clipped_sensors": ", ".join(found),
+        "clipped_dn": found[worst][0],
+        "clipped_fraction": found[worst][1],
+    }
+
+
+def clipped_at(sensor: Sensor, frame: Array) -> tuple[int, float] | None:
+    """The value where a frame ends, DN, and the share of its pixels there; None for none.
+
+    Args:
+        sensor: what the rig file says.
+        frame: Level-0, (h, w) uint16.
+    """
+    sample = frame[:: STEP[0], :: STEP[1]].ravel() // sensor.words_per_dn
+    counts = np.bincount(sample, minlength=sensor.full_scale_dn + 1)
+    above = np.cumsum(counts[::-1])[::-1]
+    # The highest value that more than a few defects reach.
+    top = int(np.flatnonzero(above > MOST_ABOVE * len(sample))[-1])
+    share = float(counts[top]) / len(sample)
+    if top >= sensor.full_scale_dn - 1 or share < LEAST_SHARE:
+        return None
+    below = counts[max(top - BELOW_DN, 0) : top]
+    # Frames of one value throughout are no images: nothing is cut off them.
+    if not below.any() or counts[top] < LEAST_PILE * max(float(below.mean()), 1.0):
+        return None
+    return top, share

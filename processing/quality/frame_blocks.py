@@ -1,0 +1,246 @@
+"""Steps along part of a line of pixels that no other head shows: a block of the frame is changed.
+
+A gain or an offset that holds in a rectangle of a frame ends along rows and columns. So do roofs
+and fields now and then, but these are seen by other heads too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.geometry.placement import SensorPlacement, raw_from_vip_mm, vip_mm_from_raw
+from processing.geometry.topology import exact_colour_ratio
+from processing.image.line_means import BUNDLE_PX
+from processing.quality.report import Figure
+from processing.quality.uniformity import LineMeans
+from processing.radiometry.level1 import exposed_rows, level1_counts_per_dn
+from processing.rig import Rig, Sensor
+
+Array = NDArray[Any]
+
+RUN: Final = 5
+"""Neighbouring bundles of pixels that step alike."""
+LEAST_STEP_DN: Final = 12.0
+"""Of 12 bits, in each of them."""
+OVER_TEXTURE: Final = 1.0
+"""Over the RMS change from line to line of the frame."""
+MOST_BLUR: Final = 0.2
+"""Of the step, in the lines before and after it: a lens leaves a quarter and more."""
+NEAR_PX: Final = 3 * BUNDLE_PX
+"""How far from a corner edges may seem to end."""
+MOST_FRAMES: Final = 3
+"""Such edges in more frames of one exposure are roofs or rows of plants along the track."""
+CANDIDATES: Final = 6
+"""Edges of a frame that are compared with other heads, the largest."""
+MOST_SHARED: Final = 0.5
+"""Of the step that another head may show."""
+LEAST_HEADS: Final = 2
+SAMPLES: Final = 120
+"""Places along an edge, at most."""
+_RELATIVE: Final = 0.02
+
+
+@dataclass(frozen=True)
+class Block:
+    """An edge of a changed block: between line `at` and the next along `axis` of a frame.
+
+    It runs from pixel `first` to `last` of these lines; the signal changes by `step_dn`, by
+    `relative` of itself, where the head that shows most of it sees `shared`.
+    """
+
+    sensor: str
+    axis: Literal["rows", "columns"]
+    at: int
+    first: int
+    last: int
+    step_dn: float
+    relative: float
+    shared: float
+
+
+def block_edges(
+    rig: Rig,
+    placements: Mapping[str, SensorPlacement],
+    frames: Mapping[str, Array],
+    means: Mapping[str, LineMeans],
+) -> tuple[Block, ...]:
+    """Search all frames for edges of changed blocks.
+
+    Args:
+        rig: the camera.
+        placements: where the sensors lie, by name.
+        frames: Level-1 words by sensor name, (h, w) uint16.
+        means: of their lines, by sensor name.
+
+    Returns:
+        The largest edge of each frame that has one, the largest first.
+    """
+    edges = {name: _cornered(_candidates(rig.sensor(name), lines)) for name, lines in means.items()}
+    if sum(1 for of_frame in edges.values() if of_frame) > MOST_FRAMES:
+        return ()
+    found = []
+    for name, of_frame in edges.items():
+        sensor = rig.sensor(name)
+        for edge in of_frame[:CANDIDATES]:
+            block = _unshared(rig, placements, frames, sensor, edge)
+            if block is not None:
+                found.append(block)
+                break
+    return tuple(sorted(found, key=lambda block: -abs(block.relative)))
+
+
+def block_figures(blocks: tuple[Block, ...]) -> dict[str, Figure]:
+    """The largest edge in figures of the quality report."""
+    worst = blocks[0] if blocks else None
+    return {
+        "block_sensor": None if worst is None else worst.sensor,
+        "block_step_dn": None if worst is None else worst.step_dn,
+        "block_step": None if worst is None else worst.relative,
+        "block_axis": None if worst is None else worst.axis,
+        "block_at": None if worst is None else worst.at,
+        "block_first": None if worst is None else worst.first,
+        "block_last": None if worst is None else worst.last,
+    }
+
+
+@dataclass(frozen=True)
+class _Edge:
+    axis: Literal["rows", "columns"]
+    at: int
+    first: int
+    last: int
+    step: float
+
+
+def _candidates(sensor: Sensor, lines: LineMeans) -> list[_Edge]:
+    """Runs of bundles that step alike between two lines, the largest first."""
+    least = LEAST_STEP_DN * level1_counts_per_dn(sensor.bits)
+    edges: list[_Edge] = []
+    axes: tuple[tuple[Literal["rows", "columns"], Array, int, int], ...] = (
+        ("rows", lines.by_row, lines.first_row, sensor.width_px),
+        ("columns", lines.by_column, 0, sensor.height_px),
+    )
+    for axis, by_line, offset, length in axes:
+        if len(by_line) < RUN:
+            continue
+        change = np.diff(by_line, axis=1)
+        limit = max(least, OVER_TEXTURE * float(np.sqrt(np.mean(change * change))))
+        pace = length // len(by_line)
+        for sign in (1.0, -1.0):
+            steps = sign * change > limit
+            runs = steps[: len(steps) - RUN + 1].copy()
+            for k in range(1, RUN):
+                runs &= steps[k : len(steps) - RUN + 1 + k]
+            for at in np.flatnonzero(runs.any(axis=0)):
+                start = int(np.argmax(runs[:, at]))
+                stop = start
+                while stop < len(steps) and steps[stop, at]:
+                    stop += 1
+                step = float(np.median(change[start:stop, at]))
+                if _blur(change[start:stop], int(at)) > MOST_BLUR * abs(step):
+                    continue
+                first, last = start * pace, min((stop - 1) * pace + BUNDLE_PX, length) - 1
+                edges.append(_Edge(axis, int(at) + offset, first, last, step))
+    return sorted(edges, key=lambda e: -abs(e.step) * (e.last - e.first))
+
+
+def _cornered(edges: list[_Edge]) -> list[_Edge]:
+    """The edges that meet another one in a corner, or have one of the other sign opposite."""
+
+    def joined(a: _Edge, b: _Edge) -> bool:
+        if not 0.5 < abs(a.step / b.step) < 2.0:
+            return False
+        if a.axis == b.axis:
+            shared = min(a.last, b.last) - max(a.first, b.first)
+            return a.step * b.step < 0.0 and 2 * shared > max(a.last - a.first, b.last - b.first)
+        return (
+            min(abs(a.at - b.first), abs(a.at - b.last)) < NEAR_PX
+            and min(abs(b.at - a.first), abs(b.at - a.last)) < NEAR_PX
+        )
+
+    return [a for a in edges if any(joined(a, b) for b in edges if b is not a)]
+
+
+def _blur(change: Array, at: int) -> float:
+    """The larger change to either side of a step: a lens spreads edges on the ground over lines."""
+    beside = [k for k in (at - 1, at + 1) if 0 <= k < change.shape[1]]
+    return max(abs(float(np.median(change[:, k]))) for k in beside)
+
+
+def _unshared(
+    rig: Rig,
+    placements: Mapping[str, SensorPlacement],
+    frames: Mapping[str, Array],
+    sensor: Sensor,
+    edge: _Edge,
+) -> Block | None:
+    """The edge as a block where no other head shows half of it; None where one does, or too few see
+    it."""
+    pan = {s.name for cone in rig.pan_cones for s in cone.sensors}
+    ratio = max(round(exact_colour_ratio(rig) or 1.0), 1)
+    away = 1.5 * ratio + 1.0 if sensor.name in pan else 2.5
+    along = np.linspace(edge.first + 2, edge.last - 2, min(SAMPLES, edge.last - edge.first))
+    sides = []
+    for side in (-away, away):
+        across = np.full_like(along, edge.at + 0.5 + side)
+        pair = (along, across) if edge.axis == "rows" else (across, along)
+        sides.append(np.stack(pair, axis=1))
+    own = _step(frames[sensor.name], placements[sensor.name], tuple(sides), 1)
+    if own is None or not edge.step * own > _RELATIVE * abs(edge.step):
+        return None
+    ground = [vip_mm_from_raw(placements[sensor.name], side) for side in sides]
+    others = []
+    for name, frame in frames.items():
+        if name == sensor.name:
+            continue
+        with np.errstate(invalid="ignore"):
+            places = tuple(raw_from_vip_mm(placements[name], side) for side in ground)
+        seen = _step(frame, placements[name], places, 1 if name in pan else 0)
+        if seen is not None:
+            others.append(seen * np.sign(own))
+    if len(others) < LEAST_HEADS or max(others) > MOST_SHARED * abs(own):
+        return None
+    counts = level1_counts_per_dn(sensor.bits)
+    return Block(
+        sensor.name,
+        edge.axis,
+        edge.at,
+        edge.first,
+        edge.last,
+        edge.step / counts,
+        own,
+        float(max(others)),
+    )
+
+
+def _step(
+    frame: Array, placement: SensorPlacement, sides: tuple[Array, ...], reach: int
+) -> float | None:
+    """Change of signal from one row of places to the other, of itself; None where it is not seen.
+
+    Each place counts by the mean of the pixels within `reach`; 2 x 2 of a colour filter array.
+    """
+    sensor = placement.sensor
+    bayer = sensor.colour_filter_array != "none"
+    first, last = exposed_rows(sensor, placement.tdi_shifts)
+    around = range(2) if bayer else range(-reach, reach + 1)
+    values = []
+    for places in sides:
+        inside: Array = np.asarray(np.isfinite(places).all(axis=1))
+        at = np.rint(np.where(inside[:, None], places, 0.0)).astype(np.int64)
+        inside &= (at[:, 0] >= 2) & (at[:, 0] < sensor.width_px - 2)
+        inside &= (at[:, 1] >= first + 2) & (at[:, 1] <= last - 2)
+        at = np.where(inside[:, None], at, 2)
+        words = np.stack([frame[at[:, 1] + y, at[:, 0] + x] for y in around for x in around])
+        inside &= ((words & 1) == 0).all(axis=0) & (words > 0).all(axis=0)
+        values.append(np.where(inside, words.mean(axis=0), np.nan))
+    both = np.isfinite(values[0]) & np.isfinite(values[1])
+    if np.count_nonzero(both) < 0.8 * len(sides[0]):
+        return None
+    before, after = (float(np.median(side[both])) for side in values)
+    return (after - before) / max(0.5 * (after + before), 1.0)

@@ -1,0 +1,198 @@
+"""Which head did a frame come from? Frames of heads of the same kind fit each other's places.
+
+Two witnesses: the fixed pattern of the pixels' response, which no two sensors share, where heads
+are calibrated for it; and the place of the colour master's layer, where it fits another head's
+calibration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.geometry.placement import SensorPlacement, vip_mm_from_raw
+from processing.image.colour import BandRegistration
+from processing.matching.tie_points import PAN_TO_COLOUR, TiePoints
+from processing.quality.report import Figure
+from processing.radiometry.level1 import Corrector, exposed_rows
+from processing.rig import Rig, Sensor
+
+Array = NDArray[Any]
+
+PIXELS: Final = 30_000
+LEAST_ROWS: Final = 8
+"""Of a frame, evenly over its height, that are looked at."""
+OWN: Final = 6.0
+OTHER: Final = 8.0
+"""Correlation with a pattern over its standard deviation: below `OWN` it is not the frame's, above
+`OTHER` it is."""
+MOST_TEXTURE: Final = 3.0
+"""Times the usual change between pixels: edges count no more."""
+LEAST_POINTS: Final = 100
+LEAST_OFF_PX: Final = 1.5
+MOST_SHARE: Final = 0.4
+MOST_OFF_PX: Final = 1.3
+"""How far points of green may lie off by the calibration of the head they came from: PAN pixels,
+three sigmas of a mounting, and of what they do by their own one."""
+
+
+class FixedPatterns:
+    """The calibrated response of pixels as it shows between neighbours, computed once."""
+
+    def __init__(self, correctors: Mapping[str, Corrector]) -> None:
+        """Nothing is computed yet.
+
+        Args:
+            correctors: with the calibrated response of the pixels, by sensor name.
+        """
+        self._correctors = correctors
+        self._known: dict[tuple[str, int], Array] = {}
+
+    def of(self, name: str, shifts: int) -> Array | None:
+        """Second differences along the rows looked at, after so many TDI shifts.
+
+        None for a sensor without a calibrated response.
+        """
+        corrector = self._correctors.get(name)
+        if corrector is None or corrector.response is None:
+            return None
+        if (name, shifts) not in self._known:
+            rows = _rows(corrector.sensor, shifts)
+            visited = rows[:, None] - corrector.sensor.tdi_row_sign * np.arange(shifts + 1)
+            response = corrector.response[visited].mean(axis=1, dtype=np.float32)
+            self._known[name, shifts] = _relative_change(response)
+        return self._known[name, shifts]
+
+
+def heads_by_pattern(
+    rig: Rig,
+    frames: Mapping[str, Array],
+    patterns: FixedPatterns,
+    placements: Mapping[str, SensorPlacement],
+) -> dict[str, str]:
+    """Find frames that show another head's fixed pattern and not their own.
+
+    Args:
+        rig: the camera.
+        frames: Level-0 frames by sensor name, (h, w) uint16, DN.
+        patterns: of the pixels' response.
+        placements: their TDI shifts count, by sensor name.
+
+    Returns:
+        The sensor a frame came from, by the sensor it is stored for.
+    """
+    found = {}
+    for sensor in rig.sensors:
+        name = sensor.name
+        if name not in frames:
+            continue
+        shifts = placements[name].tdi_shifts
+        own = patterns.of(name, shifts)
+        if own is None:
+            continue
+        signal = frames[name][_rows(sensor, shifts)].astype(np.float32)
+        change = _relative_change(signal / sensor.words_per_dn - sensor.black_dn)
+        if _likeness(change, own) >= OWN:
+            continue
+        others = {
+            other.name: _likeness(change, pattern)
+            for other in rig.sensors
+            if other.name != name
+            and (sensor.width_px, sensor.height_px) == (other.width_px, other.height_px)
+            and (pattern := patterns.of(other.name, shifts)) is not None
+        }
+        best = max(others, key=lambda n: others[n], default=None)
+        if best is not None and others[best] > OTHER:
+            found[name] = best
+    return found
+
+
+def identity_figures(
+    rig: Rig,
+    by_pattern: Mapping[str, str],
+    placements: Mapping[str, SensorPlacement],
+    tie_points: TiePoints,
+    bands: Sequence[BandRegistration],
+) -> dict[str, Figure]:
+    """Name frames that came from another head than the one they are stored for.
+
+    Args:
+        rig: the camera.
+        by_pattern: of `heads_by_pattern`; where it is empty, the place of green decides.
+        placements: by calibration and TDM, by sensor name.
+        tie_points: with the colour master.
+        bands: how the others lie against it.
+    """
+    found = by_pattern or _by_place(rig, placements, tie_points, bands)
+    return {
+        "exchanged_frames": ", ".join(found) or None,
+        "exchanged_from": ", ".join(found.values()) or None,
+        "exchanged_by": None if not found else "fixed pattern" if by_pattern else "geometry",
+    }
+
+
+def _rows(sensor: Sensor, shifts: int) -> Array:
+    first, last = exposed_rows(sensor, shifts)
+    count = max(LEAST_ROWS, PIXELS // sensor.width_px)
+    rows: Array = np.linspace(first, last, count).astype(np.int64)
+    return rows
+
+
+def _relative_change(lines: Array) -> Array:
+    """Second differences along lines over what they are of, edges cut off."""
+    middle = lines[:, 1:-1]
+    change = (lines[:, 2:] - 2.0 * middle + lines[:, :-2]) / np.maximum(middle, np.float32(20.0))
+    most = MOST_TEXTURE * np.float32(np.median(np.abs(change)))
+    limited: Array = np.clip(change, -most, most)
+    return limited
+
+
+def _likeness(change: Array, pattern: Array) -> float:
+    """Correlation of two fields over its standard deviation."""
+    product = float(np.sum(change * pattern, dtype=np.float64))
+    squares = np.sum(change * change, dtype=np.float64) * np.sum(pattern**2, dtype=np.float64)
+    return product / float(np.sqrt(max(squares, 1e-30))) * float(np.sqrt(change.size))
+
+
+def _by_place(
+    rig: Rig,
+    placements: Mapping[str, SensorPlacement],
+    tie_points: TiePoints,
+    bands: Sequence[BandRegistration],
+) -> dict[str, str]:
+    """The colour master and the head whose calibration its frame fits, each named for the other."""
+    image = rig.virtual_image
+    if rig.colour_master_cone is None or image is None:
+        return {}
+    green = rig.cone(rig.colour_master_cone).sensors[0]
+    to_green = tie_points.kind == PAN_TO_COLOUR
+    if np.count_nonzero(to_green) < LEAST_POINTS:
+        return {}
+    points = tie_points.only(to_green)
+    pan_mm = np.empty_like(points.raw_a)
+    for k in np.unique(points.sensor_a):
+        here = points.sensor_a == k
+        pan_mm[here] = vip_mm_from_raw(placements[points.names[k]], points.raw_a[here])
+
+    def off_px(name: str) -> float:
+        apart = vip_mm_from_raw(placements[name], points.raw_b) - pan_mm
+        return float(np.median(np.hypot(apart[:, 0], apart[:, 1]))) / image.pitch_mm
+
+    own = off_px(green.name)
+    if own < LEAST_OFF_PX:
+        return {}
+    moved = {b.sensor: float(np.hypot(*b.band_from_green[:2, 2])) / image.pitch_mm for b in bands}
+    others = {
+        sensor.name: off_px(sensor.name)
+        for cone in rig.colour_cones
+        for sensor in cone.sensors
+        if moved.get(sensor.name, 0.0) > LEAST_OFF_PX
+        and (sensor.width_px, sensor.height_px) == (green.width_px, green.height_px)
+    }
+    best = min(others, key=lambda n: others[n], default=None)
+    if best is None or others[best] > min(MOST_OFF_PX, MOST_SHARE * own):
+        return {}
+    return {green.name: best, best: green.name}

@@ -1,0 +1,190 @@
+"""Findings about stitching: tie points, fit, displaced sensors, mountings, scales and slips."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+from processing.quality.report import Figure, Finding, Flag, Thresholds, Verdict
+from processing.quality.rules import above, misreading, number
+
+
+def stitching_findings(
+    figures: Mapping[str, Figure], nominal_bands: Sequence[str], t: Thresholds
+) -> list[Finding]:
+    findings = []
+    poorest = number(figures, "tie_points_min_overlap")
+    slipped = str(figures.get("slip_sensor") or "none") in str(
+        figures.get("tie_points_min_overlap_name")
+    )
+    explained = slipped or bool(figures.get("mismatched_sensors"))
+    if poorest is not None and poorest < t.tie_points_per_overlap and not explained:
+        where = figures.get("tie_points_min_overlap_name") or "an overlap"
+        total = number(figures, "tie_points_pp") or 0.0
+        too_few = total < t.tie_points_pp_refly
+        burnt = number(figures, "tie_points_min_overlap_burnt") or 0.0
+        sentence = (
+            f"Few tie points in {where} (water, snow, desert or cloud?): look at the quick look; "
+            "fly again if it should have had detail."
+        )
+        if burnt > t.burnt_overlap_fraction:
+            sentence = (
+                f"Few tie points in {where} because it is burnt out: {burnt:.0%} of the places "
+                "where points are sought hold saturated pixels. Shorten the exposure."
+            )
+        findings.append(
+            Finding(
+                Flag.TIE_POINTS,
+                Verdict.REFLY if too_few else Verdict.USABLE,
+                sentence,
+                poorest,
+                float(t.tie_points_per_overlap),
+            )
+        )
+    elsewhere = str(figures.get("mismatched_sensors") or "").split(", ")
+    weak = str(figures.get("resting_on_calibration") or "").split(", ")
+    resting = ", ".join(name for name in weak if name and name not in elsewhere)
+    if resting and not figures.get("slip_sensor"):
+        findings.append(
+            Finding(
+                Flag.TIE_POINTS,
+                Verdict.USABLE,
+                f"Too little detail to place {resting}: calibration and temperature help to place "
+                "them. Look at the quick look; fly again if there should have been detail.",
+                number(figures, "stitched_sigma_worst_px"),
+            )
+        )
+    findings += [
+        Finding(
+            Flag.TIE_POINTS,
+            Verdict.USABLE,
+            f"Too few tie points for {band}: it is placed by calibration; expect colour fringes.",
+            number(figures, f"{band}_points"),
+        )
+        for band in nominal_bands
+    ]
+    findings += above(
+        figures,
+        "sigma0_px",
+        Flag.SIGMA0,
+        (t.sigma0_px, t.sigma0_refly_px),
+        "The sensors do not fit together well; check exposure times and the mount of the heads.",
+    )
+    findings += _head_scale(figures, t) or _platform(figures)
+    findings += _slip(figures, t)
+    displaced = figures.get("displaced_sensor")
+    if displaced or figures.get("displaced_several"):
+        size = math.hypot(
+            number(figures, "displacement_x_px") or 0.0,
+            number(figures, "displacement_y_px") or 0.0,
+        )
+        sentence = (
+            f"Sensor {displaced} sits {size:.2f} px off its calibrated place; the image is "
+            "corrected for it. Go on, and have the camera calibrated."
+        )
+        alternatives, misread = figures.get("displaced_alternatives"), misreading(figures)
+        if figures.get("displaced_several"):
+            sentence = (
+                "More than one sensor of the master cone sits off its calibrated place, and which "
+                "ones cannot be told: the image fits together, but its place in the camera is "
+                "uncertain. Go on, and have the camera calibrated."
+            )
+        elif misread:
+            others = f" or {alternatives}" if alternatives else ""
+            sentence = (
+                f"Either sensor {displaced}{others} sits {size:.2f} px off its calibrated place or "
+                f"{misread}; the stitching cannot tell, and the image fits together. Go on, check "
+                "the probe after landing, and have the camera calibrated."
+            )
+        elif alternatives:
+            sentence = (
+                f"Sensor {displaced} sits {size:.2f} px off its calibrated place, unless it is "
+                f"{alternatives}; the image fits together. Go on, and have the camera calibrated."
+            )
+        test = number(figures, "displacement_test")
+        grave = test is None or test > t.displacement_verdict
+        verdict = Verdict.USABLE if grave else Verdict.GOOD
+        findings.append(Finding(Flag.DISPLACED_SENSOR, verdict, sentence, size))
+    return findings
+
+
+def _platform(figures: Mapping[str, Figure]) -> list[Finding]:
+    """Mountings and layers that are not as the platform calibration has them."""
+    test = number(figures, "platform_test")
+    if test is None or test <= 1.0:
+        return []
+    causes = figures.get("platform_causes")
+    of_slip = causes is not None and causes == figures.get("slip_cone")
+    if causes in str(figures.get("exchanged_frames") or "").split(", "):
+        return []
+    of_temperature = figures.get("platform_master_changed") and figures.get("dc_disagreement")
+    if of_slip or of_temperature:
+        return []
+    moved = number(figures, "platform_shift_px") or 0.0
+    scale = number(figures, "common_scale_ppm") or 0.0
+    other = figures.get("platform_alternatives")
+    others = f", or {other}," if other else ""
+    sentence = (
+        f"Head {figures.get('platform_shift_head')}{others} sits {moved:.2f} px off the platform "
+        "calibration; the image is corrected for it. Go on, and calibrate the platform from this "
+        "flight."
+    )
+    if figures.get("platform_master_changed"):
+        sentence = (
+            f"The layers of the other cones do not fit the master cone (common scale {scale:+.0f} "
+            f"ppm; cause: cone {causes}"
+            + (f", or {other}" if other else "")
+            + "): its principal distance or mounting has changed, or the rig file is of another "
+            "camera. The whole image may be shifted or scaled; its stated accuracy says by how "
+            "much. Check the serial numbers, and process again with the right calibration."
+        )
+    elif causes:
+        sentence = (
+            f"Cone {causes} differs from the platform calibration in scale or rotation (by up to "
+            f"{moved:.2f} px); the image is corrected for it. Check that the rig file belongs to "
+            "this camera, and calibrate the platform from this flight."
+        )
+    return [Finding(Flag.CALIBRATION_EXPIRED, Verdict.USABLE, sentence, test, 1.0)]
+
+
+def _head_scale(figures: Mapping[str, Figure], t: Thresholds) -> list[Finding]:
+    """A converging head whose scale does not fit: rotations cannot correct that."""
+    scale_ppm = number(figures, "platform_scale_ppm")
+    if scale_ppm is None or abs(scale_ppm) <= t.head_scale_ppm:
+        return []
+    return [
+        Finding(
+            Flag.CALIBRATION_EXPIRED,
+            Verdict.USABLE,
+            f"The scale of head {figures.get('platform_scale_head')} differs by {scale_ppm:+.0f} "
+            "ppm from its neighbours': its principal distance is not as calibrated. The image is "
+            "not corrected for it; its stated accuracy includes it. Check the serial numbers, and "
+            "calibrate the head.",
+            scale_ppm,
+            t.head_scale_ppm,
+        )
+    ]
+
+
+def _slip(figures: Mapping[str, Figure], t: Thresholds) -> list[Finding]:
+    """A band of a frame that was read out shifted."""
+    shift_px = number(figures, "slip_px")
+    if shift_px is None:
+        return []
+    others = str(figures.get("slip_sensors") or "").split(", ")[1:]
+    also = f" Also shifted: {', '.join(dict.fromkeys(others))}." if others else ""
+    alternatives = figures.get("slip_alternatives")
+    instead = f" (or {alternatives}, which sees the same ground)" if alternatives else ""
+    grave = shift_px >= t.slip_refly_px
+    return [
+        Finding(
+            Flag.FRAME_CORRUPT,
+            Verdict.REFLY if grave else Verdict.USABLE,
+            f"In the frame of {figures.get('slip_sensor')}{instead}, {figures.get('slip_axis')} "
+            f"{figures.get('slip_first')} to {figures.get('slip_last')} lie {shift_px:.1f} px off "
+            f"the rest: lines were lost or repeated in read-out.{also} Check the head and its "
+            "cable." + (" Fly this exposure again." if grave else ""),
+            shift_px,
+            t.slip_refly_px,
+        )
+    ]
