@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from benchmarks import rendered
 from daemon.measuring import machine
 from processing.image.composition import PanComposer, pan_cell_px
+from processing.image.kernels import DEFAULT_INTERPOLATION
 from processing.pipeline import Conditions, Pipeline, Product, Settings
 from processing.radiometry.calibration import RadiometricCalibration
 from processing.radiometry.level1 import (
@@ -290,7 +291,7 @@ def seams_of(
         look = Look(0, conditions.exposure_time_s[name] * 1e6, conditions.tdi_shifts[name])
         level1_of(head, frames[name], look, conditions, composer.frame(name))
         alone = composer.compose(
-            product.mosaic.placements, [name], feather_px=16, interpolation="cubic"
+            product.mosaic.placements, [name], feather_px=16, interpolation=DEFAULT_INTERPOLATION
         )
         gain = product.balance.gains[name]
         offset = product.balance.offsets.get(name, 0.0)

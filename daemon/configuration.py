@@ -31,6 +31,7 @@ from daemon.configuration_problems import (
     rig_problems,
 )
 from daemon.plan.reading import PlanError, read_plan
+from processing.image.kernels import DEFAULT_INTERPOLATION, Interpolation
 from processing.quality.report import Thresholds
 from processing.rig import Rig, RigError, find_rig
 from processing.rig.toml_text import TomlError, parse_toml
@@ -191,7 +192,7 @@ class ProcessingSection(_Section):
     """
 
     method: Literal["free", "fixed"] = "free"
-    interpolation: Literal["bilinear", "cubic", "lanczos"] = "cubic"
+    interpolation: Interpolation = DEFAULT_INTERPOLATION
     baselines: bool = False
     geometry: bool = True
     threads: int = Field(default=2, ge=1, le=256)

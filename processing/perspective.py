@@ -2,7 +2,6 @@
 
 For rigs whose heads look apart (oblique heads) nothing is stitched: distortion, principal point and
 the drift of sensor and lens are taken out, and the image is a central perspective of `f_mm`.
-OpenCV resamples and rounds places to a thirty-second of a pixel.
 
 Source: seeds/multi-camera-calibration.txt ("perfect perspective based on a resampling").
 """
@@ -29,6 +28,14 @@ from processing.conditions import (
 )
 from processing.geometry.placement import nominal_placements, raw_from_vip_mm, vip_mm_from_px
 from processing.geometry.rotation import rotation_matrix
+from processing.image.kernels import DEFAULT_INTERPOLATION, Interpolation
+from processing.image.lattice import OUTSIDE
+from processing.image.resampling import (
+    SATURATED_SOURCE,
+    SUPPORT_MARGIN_PX,
+    WEIGHT_UNIT,
+    resample,
+)
 from processing.image.sharpness import bright_level
 from processing.quality.figures import valid_area_figures
 from processing.quality.judgement import judge
@@ -53,15 +60,9 @@ from processing.rig import Cone, Rig, VirtualImage
 Array = NDArray[Any]
 
 LOOKS_APART_RAD: Final = math.radians(15.0)
-_STEP_PX: Final = 16
+_CELL_PX: Final = 16
 """The mapping is exact at every sixteenth pixel and linear between: 14 px of distortion at the
 corner bend by less than 1e-3 px over that."""
-_EDGE_PX: Final = 2.0
-_INTERPOLATION: Final = {
-    "bilinear": cv2.INTER_LINEAR,
-    "cubic": cv2.INTER_CUBIC,
-    "lanczos": cv2.INTER_LANCZOS4,
-}
 
 
 @dataclass(frozen=True)
@@ -117,7 +118,7 @@ class HeadPipeline:
     Args:
         rig: every cone has one sensor.
         radiometry: by sensor name; a sensor without one is taken as flat.
-        interpolation: bilinear, cubic or lanczos.
+        interpolation: as in `processing.image.kernels`.
         asked: what the project asks for, where it does.
 
     Raises:
@@ -130,7 +131,7 @@ class HeadPipeline:
         rig: Rig,
         radiometry: Mapping[str, RadiometricCalibration] | None = None,
         *,
-        interpolation: str = "cubic",
+        interpolation: Interpolation = DEFAULT_INTERPOLATION,
         threads: int = 2,
         thresholds: Thresholds | None = None,
         asked: Asked | None = None,
@@ -145,14 +146,14 @@ class HeadPipeline:
             sensor.name: corrector_for(sensor, (radiometry or {}).get(sensor.name))
             for sensor in rig.sensors
         }
-        self._interpolation = _INTERPOLATION[interpolation]
+        self._interpolation = interpolation
         self._threads = threads
         self._thresholds = thresholds or Thresholds()
         self._asked = asked or Asked()
-        self._maps: dict[str, tuple[tuple[float | None, float | None], Array]] = {}
+        self._lattices: dict[str, tuple[tuple[float | None, float | None], Array]] = {}
 
     def twin(self) -> HeadPipeline:
-        """Another for an exposure at the same time; calibrations and maps are shared."""
+        """Another for an exposure at the same time; calibrations and lattices are shared."""
         return copy.copy(self)
 
     def warm_up(self) -> None:
@@ -218,8 +219,10 @@ class HeadPipeline:
             frames_read()
         for cone in present:
             began = time.perf_counter()
-            at = self._map(cone, known)
-            bands = {name: self._resampled(plane, at) for name, plane in planes[cone.name].items()}
+            lattice = self._lattice(cone, known)
+            bands = {
+                name: self._resampled(plane, lattice) for name, plane in planes[cone.name].items()
+            }
             heads[cone.name] = HeadImage(cone.name, perspective_of(cone), bands)
             seconds["resampling"] += time.perf_counter() - began
         area = self._valid_area(heads)
@@ -288,25 +291,34 @@ class HeadPipeline:
             signal_steps(self.rig.sensors, line_means_of(self.rig.sensors, leading, rows))
         )
 
-    def _map(self, cone: Cone, known: Mapping[str, float]) -> Array:
-        """(h, w, 2) float32: where in the raw frame each pixel is; kept while temperatures stay."""
+    def _lattice(self, cone: Cone, known: Mapping[str, float]) -> Array:
+        """Raw (column, row) at every `_CELL_PX`-th pixel; kept while temperatures stay."""
         key = (known.get(cone.probe), known.get(cone.sensors[0].probe))
-        kept = self._maps.get(cone.name)
+        kept = self._lattices.get(cone.name)
         if kept is None or kept[0] != key:
-            kept = (key, _dense(cone, known))
-            self._maps[cone.name] = kept
+            kept = (key, _lattice_of(cone, known))
+            self._lattices[cone.name] = kept
         return kept[1]
 
-    def _resampled(self, plane: Array, at: Array) -> NDArray[np.uint16]:
+    def _resampled(self, plane: Array, lattice: Array) -> NDArray[np.uint16]:
         height, width = plane.shape
-        value = cv2.remap(plane, at, None, self._interpolation, borderMode=cv2.BORDER_REPLICATE)
+        value = np.empty((height, width), np.uint16)
+        source = np.empty((height, width), np.uint8)
+        edge = float(SUPPORT_MARGIN_PX)
+        resample(
+            np.ascontiguousarray(plane)[None],
+            np.array([[edge, width - 1 - edge - 1e-3, edge, height - 1 - edge - 1e-3]]),
+            lattice[None],
+            _CELL_PX,
+            np.full((1, *(2 * (n - 1) + 1 for n in lattice.shape[:2])), WEIGHT_UNIT, np.uint8),
+            np.ones(1, np.float32),
+            interpolation=self._interpolation,
+            out=value,
+            source=source,
+        )
         value = np.clip(value, LEVEL1_FLOOR, LEVEL1_CEILING) & np.uint16(0xFFFE)
-        nearest = cv2.remap(plane, at, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
-        value |= nearest & np.uint16(1)
-        x, y = at[..., 0], at[..., 1]
-        inside = (x >= _EDGE_PX) & (x <= width - 1 - _EDGE_PX)
-        inside &= (y >= _EDGE_PX) & (y <= height - 1 - _EDGE_PX) & (nearest > 0)
-        value[~inside] = 0
+        value |= (source & SATURATED_SOURCE != 0).astype(np.uint16)
+        value[source == 0] = 0
         return np.asarray(value, np.uint16)
 
 
@@ -342,22 +354,12 @@ def _placement(cone: Cone, temperatures_c: Mapping[str, float]) -> Any:
     return nominal_placements(rig, temperatures_c, {})[cone.sensors[0].name]
 
 
-def _dense(cone: Cone, known: Mapping[str, float]) -> Array:
+def _lattice_of(cone: Cone, known: Mapping[str, float]) -> Array:
+    """Raw (column, row) at every `_CELL_PX`-th pixel of the perspective, (rows, columns, 2)."""
     sensor = cone.sensors[0]
-    columns = np.arange(-(-(sensor.width_px - 1) // _STEP_PX) + 1) * _STEP_PX
-    rows = np.arange(-(-(sensor.height_px - 1) // _STEP_PX) + 1) * _STEP_PX
-    c, r = np.meshgrid(columns.astype(np.float64), rows.astype(np.float64))
-    coarse = raw_of_perspective(cone, known, np.stack([c.ravel(), r.ravel()], axis=1))
-    grid = coarse.reshape(*c.shape, 2)
-    along_rows = _between(grid, sensor.width_px, axis=1)
-    dense = _between(along_rows, sensor.height_px, axis=0).astype(np.float32)
-    return np.ascontiguousarray(np.nan_to_num(dense, nan=-1e6))
-
-
-def _between(grid: NDArray[np.float64], length: int, *, axis: int) -> NDArray[np.float64]:
-    """Linear interpolation of every `_STEP_PX`-th value to all of them."""
-    at = np.arange(length) / _STEP_PX
-    low = np.minimum(at.astype(int), grid.shape[axis] - 2)
-    share = (at - low).reshape((-1, 1) if axis else (-1, 1, 1))
-    before, after = np.take(grid, low, axis=axis), np.take(grid, low + 1, axis=axis)
-    return np.asarray(before + (after - before) * share)
+    columns = np.arange(-(-sensor.width_px // _CELL_PX) + 1) * float(_CELL_PX)
+    rows = np.arange(-(-sensor.height_px // _CELL_PX) + 1) * float(_CELL_PX)
+    c, r = np.meshgrid(columns, rows)
+    raw = raw_of_perspective(cone, known, np.stack([c.ravel(), r.ravel()], axis=1))
+    raw[~np.isfinite(raw).all(axis=1)] = OUTSIDE
+    return np.asarray(raw.reshape(*c.shape, 2))

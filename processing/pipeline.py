@@ -34,8 +34,9 @@ from processing.image.colour import (
     register_band,
 )
 from processing.image.composition import ColourComposer, PanComposer, pan_cell_px
+from processing.image.kernels import Interpolation
 from processing.image.quicklook import quicklook
-from processing.image.resampling import SATURATED_SOURCE, Interpolation
+from processing.image.resampling import SATURATED_SOURCE
 from processing.matching.content import (
     LEAST_TEXTURED,
     check_content,

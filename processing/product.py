@@ -12,7 +12,7 @@ from processing.conditions import Temperatures
 from processing.geometry.virtual_camera import GroundPlane
 from processing.image.balance import Balance
 from processing.image.colour import BandRegistration, ColourSettings
-from processing.image.resampling import Interpolation
+from processing.image.kernels import DEFAULT_INTERPOLATION, Interpolation
 from processing.matching.tie_points import TiePoints, TiePointSettings
 from processing.mosaic.estimated_dc import EstimatedDc
 from processing.mosaic.free import Mosaic, MosaicSettings
@@ -42,7 +42,7 @@ class Settings:
 
     method: Method = "free"
     use_drift: bool = True
-    interpolation: Interpolation = "cubic"
+    interpolation: Interpolation = DEFAULT_INTERPOLATION
     feather_px: int = 16
     baselines: bool = False
     geometry: bool = True

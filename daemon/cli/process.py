@@ -19,6 +19,7 @@ from daemon.configuration_problems import dig
 from daemon.disk.mission import Mission
 from daemon.orientation.exterior import mount_of
 from daemon.terminal import Console
+from processing.image.kernels import DEFAULT_INTERPOLATION, INTERPOLATIONS
 
 HELP = """Process the exposures of a mission folder again, Level-0 to Level-2.
 
@@ -40,7 +41,9 @@ def process(
         list[int] | None, typer.Option(help="An exposure's number; repeatable.")
     ] = None,
     method: Annotated[str, typer.Option(help="free or fixed.")] = "free",
-    interpolation: Annotated[str, typer.Option(help="bilinear, cubic or lanczos.")] = "cubic",
+    interpolation: Annotated[
+        str, typer.Option(help=f"Interpolation kernel: {', '.join(INTERPOLATIONS)}.")
+    ] = DEFAULT_INTERPOLATION,
     rig_file: Annotated[
         Path | None,
         typer.Option("--rig", help="Rig file of another calibration than the one flown."),
@@ -68,9 +71,9 @@ def process(
     from processing.radiometry.calibration import CalibrationError
     from processing.rig import load_rig
 
-    if method not in ("free", "fixed") or interpolation not in ("bilinear", "cubic", "lanczos"):
+    if method not in ("free", "fixed") or interpolation not in INTERPOLATIONS:
         raise ConfigurationError(
-            ["--method is free or fixed, --interpolation is bilinear, cubic or lanczos"]
+            [f"--method is free or fixed, --interpolation one of {', '.join(INTERPOLATIONS)}"]
         )
     folder = Mission.open(mission)
     rig = load_rig(rig_file or folder.rig_path)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.geometry.placement import SensorPlacement, raw_from_vip_mm, vip_mm_from_raw
+from processing.image.kernels import DEFAULT_INTERPOLATION
 from processing.image.lattice import OUTSIDE, interpolate_lattice
 from processing.image.resampling import (
     SATURATED_SOURCE,
@@ -61,7 +62,7 @@ def as_seen_by(
     region: tuple[int, int, int, int],
     step: int,
 ) -> AsSeen:
-    """The frame of a on the pixels of b, by one cubic resampling.
+    """The frame of a on the pixels of b, by one resampling.
 
     Args:
         a, b: predicted places.
@@ -102,7 +103,7 @@ def as_seen_by(
         _CELL_PX,
         weights,
         np.ones(1, np.float32),
-        interpolation="cubic",
+        interpolation=DEFAULT_INTERPOLATION,
         out=words,
         source=source,
     )

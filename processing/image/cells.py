@@ -1,15 +1,14 @@
-"""Fetching one cell of target pixels from one frame, in runs for the kernels of `taps`.
+"""Fetching one cell of target pixels from one frame, in runs for the loops of `taps`.
 
 Compiled; which cells are fetched from which frames, and what becomes of the values, is in
 `processing.image.resampling`. A cell lies between four lattice nodes, a scratch row longer than its
 side.
 
-Near the identity (`_NEARLY`) cubic and bilinear go in two passes: raw columns are interpolated to
-where the target row crosses them, then the row is interpolated. Taps stay at whole-number distances
-over long runs, so both passes vectorise, and each pixel costs 8 products for the 16 of the square
-of taps. The first pass takes the row's phase at the raw column instead of at the target pixel;
-both reproduce second-order surfaces exactly and differ by the row's slope (below 1e-3 on our
-cameras) times a third derivative. Everything else goes pixel by pixel.
+Near the identity (`_NEARLY`) pixels go in two passes: raw columns are interpolated to where the
+target row crosses them, then the row is interpolated. Taps stay at whole-number distances over long
+runs, so both passes vectorise, and each pixel costs 12 products for the 36 of the square of taps.
+The first pass takes the row's phase at the raw column instead of at the target pixel: it samples
+the row's own slanted line. Everything else goes pixel by pixel.
 """
 
 from __future__ import annotations
@@ -21,19 +20,15 @@ from numba import njit
 from numpy.typing import NDArray
 
 from processing.image.taps import (
-    CUBIC,
-    LANCZOS,
-    LANCZOS_PHASES,
+    LINE_WORDS,
     MISSING,
-    cubic_along,
-    cubic_down,
-    cubic_words,
+    along,
+    down,
+    down_strip,
     flags_along,
-    flags_along_linear,
     is_clean,
-    linear_along,
-    linear_down,
-    tap_weight,
+    weights_at,
+    words_strip,
 )
 
 Array = NDArray[Any]
@@ -41,17 +36,22 @@ Array = NDArray[Any]
 _NEARLY: Final = 0.02
 """Largest slope of a raw row, and difference of scale from one, that goes in two passes."""
 _SLACK: Final = 0.02
-"""How far, in px, a run of cubic taps may go past the phase 0..1. The pieces join smoothly, so 0.02
-px beyond a joint changes the value by 2e-4 of the local curvature; bilinear pieces join in a kink,
-so there it is nothing."""
+"""How far, in px, a run may go past the phase 0..1: tables of weights reach that far. Bilinear
+pieces join in a kink, so there it is nothing."""
 _LANES: Final = 8
 """Columns of the first pass come in whole vectors of this many words."""
+_EXTRA: Final = 5
+"""Raw pixels that a run of taps takes more than it has samples."""
+
+
+MOST_CELL_PX: Final = 64
+"""Side of the largest cell: its taps fit into a scratch row."""
 
 
 @njit(cache=True, nogil=True)
-def scratch_words(cell: int) -> int:
-    """Words of scratch that `fetch_cell` needs for cells of this side."""
-    return cell + cell // 16 + 2 * _LANES
+def _columns(samples):
+    """Raw columns that so many samples take, in whole vectors."""
+    return (samples + _EXTRA + _LANES - 1) // _LANES * _LANES
 
 
 @njit(cache=True, nogil=True)
@@ -63,61 +63,68 @@ def _run_length(phase, step, slack, most):
         room = (phase + slack) / -step
     else:
         return most
-    return most if room >= most else min(most, np.int64(room) + 1)
+    return most if room >= most else max(min(most, np.int64(room) + 1), 1)
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def _fetch_points(frame, code, table, c0, dc, r0, dr, values, flags, y, first, last):
-    """Pixel by pixel: Lanczos, and whatever is far from the identity."""
+def _fetch_points(frame, table, reach, c0, dc, r0, dr, values, flags, y, first, last):
+    """Pixel by pixel: whatever is far from the identity."""
     for k in range(first, last):
         c = c0 + dc * k
         r = r0 + dr * k
         ic = np.int64(np.floor(c))
         ir = np.int64(np.floor(r))
-        x = np.float32(c - ic)
-        z = np.float32(r - ir)
+        p, x = weights_at(table, np.float32(c - ic))
+        q, z = weights_at(table, np.float32(r - ir))
         total = np.float32(0.0)
         least = np.uint16(65535)
-        if code == LANCZOS:
-            p = np.int64((c - ic) * LANCZOS_PHASES + 0.5)
-            q = np.int64((r - ir) * LANCZOS_PHASES + 0.5)
-            for i in range(6):
-                line = np.float32(0.0)
-                for j in range(6):
-                    word = frame[ir - 2 + i, ic - 2 + j]
-                    least = min(least, word)
-                    line += table[p, j] * np.float32(word)
-                total += table[q, i] * line
-        else:
-            reach = 1 if code == CUBIC else 0
-            for i in range(-reach, 2 + reach):
-                line = np.float32(0.0)
-                for j in range(-reach, 2 + reach):
-                    word = frame[ir + i, ic + j]
-                    least = min(least, word)
-                    line += tap_weight(code, x - np.float32(j)) * np.float32(word)
-                total += tap_weight(code, z - np.float32(i)) * line
+        for i in range(2 - reach, 4 + reach):
+            line = np.float32(0.0)
+            for j in range(2 - reach, 4 + reach):
+                word = frame[ir - 2 + i, ic - 2 + j]
+                least = min(least, word)
+                line += (table[p, j] + x * table[p, 6 + j]) * np.float32(word)
+            total += (table[q, i] + z * table[q, 6 + i]) * line
         full = frame[ir, ic] | frame[ir, ic + 1] | frame[ir + 1, ic] | frame[ir + 1, ic + 1]
         values[y, k] = total
         flags[y, k] = np.uint8(full & np.uint16(1)) | np.uint8(np.uint8(least == 0) << np.uint8(1))
 
 
+@njit(cache=True, nogil=True)
+def _base(one, other, slack):
+    """Whole pixel that the taps of a run from one place to another lie around, and if all do."""
+    least = min(one, other)
+    most = max(one, other)
+    # The middle decides, so that both ends share what lies beyond the phase.
+    base = np.int64(np.floor(0.5 * (least + most)))
+    if least >= base - slack and most <= base + 1.0 + slack:
+        return base, True
+    return np.int64(np.floor(least)), False
+
+
 @njit(cache=True, fastmath=True, nogil=True)
-def _fetch_row(flat, width, code, c0, dc, r0, dr, values, flags, y, first, last, line, clean):
-    """Pixels first .. last - 1 of one row of a cell in two passes; flags unless `clean`."""
+def _fetch_row(
+    flat, width, rows, table, reach, slack, c0, dc, r0, dr, values, flags, y, span, line, spare
+):
+    """Pixels of one row of a cell in two passes.
+
+    Args:
+        rows: first and last raw row that taps may lie around.
+        slack: how far phases may go past 0..1, px.
+        span: first pixel, the one after the last.
+        spare: scratch for flags, or of no length where none are wanted.
+    """
+    first, last = span
     n = last - first
-    slack = _SLACK if code == CUBIC else 0.0
     g = dc - 1.0
     # Where pixel `first` and the last one have their taps, were all a whole pixel apart.
     begin = c0 + dc * first - first
     end = begin + g * (n - 1)
-    left = np.int64(np.floor(0.5 * (begin + end)))
-    if min(begin, end) < left - slack or max(begin, end) > left + 1.0 + slack:
-        left = np.int64(np.floor(min(begin, end)))
+    left, whole = _base(begin, end, slack)
     most = max(np.int64(np.floor(max(begin, end))), left)
     # Raw columns from `origin` on, as many as the taps reach, in whole vectors.
-    origin = left + first - 1
-    columns = (n + 3 + most - left + _LANES - 1) // _LANES * _LANES
+    origin = max(left + first - 2, 0)
+    columns = min(_columns(n + most - left), width - origin)
     slope = dr / dc
     at = r0 + slope * (origin - c0)
     done = np.int64(0)
@@ -125,36 +132,23 @@ def _fetch_row(flat, width, code, c0, dc, r0, dr, values, flags, y, first, last,
         r = at + slope * done
         ir = np.int64(np.floor(r))
         if done == 0:
-            # The middle decides, so that both ends share what lies beyond the phase.
-            middle = np.int64(np.floor(at + slope * 0.5 * (columns - 1)))
-            if (
-                min(at, at + slope * (columns - 1)) >= middle - slack
-                and max(at, at + slope * (columns - 1)) <= middle + 1.0 + slack
-            ):
-                ir = middle
+            base, all_rows = _base(at, at + slope * (columns - 1), slack)
+            ir = base if all_rows else ir
+        ir = min(max(ir, rows[0]), rows[1])
         count = _run_length(r - ir, slope, slack, columns - done)
         start = ir * width + origin + done
-        phase = np.float32(r - ir)
-        if code == CUBIC:
-            cubic_down(flat, start, width, phase, np.float32(slope), line[done:], count)
-        else:
-            linear_down(flat, start, width, phase, np.float32(slope), line[done:], count)
+        down(flat, start, width, np.float32(r - ir), np.float32(slope), table, line[done:], count)
         done += count
+    out = values[y, first:last]
     done = np.int64(0)
     while done < n:
         c = begin + g * done
-        ic = np.int64(np.floor(c))
-        if done == 0 and left - slack <= min(begin, end) and max(begin, end) <= left + 1.0 + slack:
-            ic = left
+        ic = left if whole else np.int64(np.floor(c))
         count = _run_length(c - ic, g, slack, n - done)
-        phase = np.float32(c - ic)
-        start = ic - left + done
-        if code == CUBIC:
-            cubic_along(line, start, phase, np.float32(g), values, y, first + done, count)
-        else:
-            linear_along(line, start, phase, np.float32(g), values, y, first + done, count)
+        start = ic + first + done - 2 - origin
+        along(line[start:], np.float32(c - ic), np.float32(g), table, out[done:], count)
         done += count
-    if clean:
+    if spare.shape[1] == 0:
         return
     done = np.int64(0)
     while done < n:
@@ -167,10 +161,7 @@ def _fetch_row(flat, width, code, c0, dc, r0, dr, values, flags, y, first, last,
             _run_length(r - ir, dr, 0.0, n - done),
         )
         start = ir * width + ic + first + done
-        if code == CUBIC:
-            flags_along(flat, start, width, flags, y, first + done, count)
-        else:
-            flags_along_linear(flat, start, width, flags, y, first + done, count)
+        flags_along(flat, start, width, reach, spare, flags[y, first + done : last], count)
         done += count
 
 
@@ -229,7 +220,7 @@ def _is_near_identity(corners):
 
 
 @njit(cache=True, nogil=True)
-def straight_taps(frame, valid, lattice, band, column, cell, code):
+def straight_taps(frame, valid, lattice, band, column, cell, reach):
     """Whether a cell's taps are one rectangle of raw pixels, and none of them marred.
 
     Returns:
@@ -237,7 +228,7 @@ def straight_taps(frame, valid, lattice, band, column, cell, code):
         has to be fetched by `fetch_cell`.
     """
     corners = _corners(lattice, band, column, cell)
-    if code != CUBIC or not _is_near_identity(corners):
+    if reach == 0 or not _is_near_identity(corners):
         return -1, -1
     c_least, c_most, r_least, r_most = _bounds(corners, cell)
     if not (
@@ -258,53 +249,76 @@ def straight_taps(frame, valid, lattice, band, column, cell, code):
     top = np.int64(np.floor(0.5 * (r_low + r_high)))
     if min(c_low - left, r_low - top) < -_SLACK or max(c_high - left, r_high - top) > 1.0 + _SLACK:
         return -1, -1
-    width = frame.shape[1]
-    first = (top - 1) * width + left - 1
-    if not is_clean(frame.reshape(-1), first, width, cell + 3, cell + 3):
+    height, width = frame.shape
+    if left < 2 or top < 2:
+        return -1, -1
+    if left - 2 + _columns(cell) > width or top - 2 + cell + _EXTRA > height:
+        return -1, -1
+    first = (top - 2) * width + left - 2
+    if not is_clean(frame.reshape(-1), first, width, cell + _EXTRA, cell + _EXTRA):
         return -1, -1
     return left, top
 
 
 @njit(cache=True, fastmath=True, nogil=True)
 def fetch_straight(
-    frame, lattice, band, column, cell, left, top, first, last, gain, offset, lines, out, x0, n
+    frame,
+    lattice,
+    band,
+    column,
+    cell,
+    table,
+    left,
+    top,
+    first,
+    last,
+    gain,
+    offset,
+    lines,
+    phases,
+    steps,
+    out,
+    x0,
+    n,
 ):
     """Rows first .. last - 1 of a cell of straight taps, gain and offset applied, into `out`.
 
     Args:
         left, top: from `straight_taps`; the other arguments as in `fetch_cell`.
-        lines: scratch, (last - first, `scratch_words`) float32.
+        lines: scratch, (last - first + 1) * `LINE_WORDS` float32.
+        phases, steps: scratch, (2, last - first) float32.
         out: (height, width) uint16; columns x0 .. x0 + n - 1 of the cell's rows are written.
     """
     width = frame.shape[1]
     flat = frame.reshape(-1)
     corners = _corners(lattice, band, column, cell)
-    columns = (n + 3 + _LANES - 1) // _LANES * _LANES
-    for y in range(first, last):
-        c0, r0, dc, dr = _row_of(corners, y / cell)
+    columns = _columns(n)
+    rows = last - first
+    for y in range(rows):
+        c0, r0, dc, dr = _row_of(corners, (first + y) / cell)
         # dr / dc, good to the square of the difference of scale from one.
         slope = dr * (2.0 - dc)
-        row = top + y
-        phase = np.float32(r0 + slope * (left - 1 - c0) - row)
-        start = row * width + left - 1
-        # A count known to the compiler leaves nothing over after whole vectors.
-        if columns == 72:
-            cubic_down(flat, start, width, phase, np.float32(slope), lines[y - first], 72)
-        elif columns == 40:
-            cubic_down(flat, start, width, phase, np.float32(slope), lines[y - first], 40)
-        else:
-            cubic_down(flat, start, width, phase, np.float32(slope), lines[y - first], columns)
-    for y in range(first, last):
-        c0, r0, dc, dr = _row_of(corners, y / cell)
-        phase = np.float32(c0 - left)
-        target = out[band * cell + y, x0 : x0 + n]
-        step = np.float32(dc - 1.0)
-        if n == 64:
-            cubic_words(lines[y - first], phase, step, gain, offset, target, 64)
-        elif n == 32:
-            cubic_words(lines[y - first], phase, step, gain, offset, target, 32)
-        else:
-            cubic_words(lines[y - first], phase, step, gain, offset, target, n)
+        phases[0, y] = r0 + slope * (left - 2 - c0) - (top + first + y)
+        steps[0, y] = slope
+        phases[1, y] = c0 - left
+        steps[1, y] = dc - 1.0
+    start = (top + first) * width + left - 2
+    # With a count known to the compiler nothing is left over, and rows go in pairs.
+    if columns == 72:
+        down_strip(flat, start, width, phases[0], steps[0], table, lines, rows, 72)
+    elif columns == 40:
+        down_strip(flat, start, width, phases[0], steps[0], table, lines, rows, 40)
+    else:
+        for y in range(rows):
+            line = lines[y * LINE_WORDS :]
+            down(flat, start + y * width, width, phases[0, y], steps[0, y], table, line, columns)
+    y0 = band * cell + first
+    if n == 64:
+        words_strip(lines, phases[1], steps[1], table, gain, offset, out, y0, x0, rows, 64)
+    elif n == 32:
+        words_strip(lines, phases[1], steps[1], table, gain, offset, out, y0, x0, rows, 32)
+    else:
+        words_strip(lines, phases[1], steps[1], table, gain, offset, out, y0, x0, rows, n)
 
 
 @njit(cache=True, nogil=True)
@@ -316,18 +330,18 @@ def _inside(valid, c0, dc, r0, dr, k):
 
 @njit(cache=True, fastmath=True, nogil=True)
 def fetch_cell(
-    frame, valid, lattice, band, column, cell, rows, n, code, table, line, values, flags
+    frame, valid, lattice, band, column, cell, rows, n, table, reach, line, spare, values, flags
 ):
     """All pixels of one cell from one frame.
 
     Args:
-        frame: (h, w) uint16 words, contiguous. One row more than the taps of the usable area reach
-            is there: whole vectors run past the end of a row.
+        frame: (h, w) uint16 words, contiguous.
         valid: first and last usable raw column, first and last usable raw row.
         lattice: (rows, columns, 2) raw (column, row) at the nodes; `band`, `column` name the cell.
         cell: its side, px; rows, n: how much of it lies in the target.
-        code: `BILINEAR`, `CUBIC`, `LANCZOS` with its `table`.
-        line: scratch of `scratch_words` float32.
+        table, reach: of a `processing.image.kernels.Kernel`.
+        line: scratch of `LINE_WORDS` float32.
+        spare: scratch, (2, `LINE_WORDS`) uint16.
         values: (cell, cell) float32, receives the signal where there is any.
         flags: (cell, cell) uint8, receives `SATURATED` | `MISSING`.
     """
@@ -338,20 +352,31 @@ def fetch_cell(
     whole = (
         c_least >= valid[0] and c_most <= valid[1] and r_least >= valid[2] and r_most <= valid[3]
     )
-    two_pass = code != LANCZOS and _is_near_identity(corners)
+    two_pass = _is_near_identity(corners)
+    # Past the phase 0..1 taps lie one pixel further out: not next to the border or a hole.
+    inner = (
+        c_least >= valid[0] + 1.0
+        and c_most <= valid[1] - 1.0
+        and r_least >= valid[2] + 1.0
+        and r_most <= valid[3] - 1.0
+    )
     clean = False
     if whole and two_pass:
-        first_row = np.int64(np.floor(r_least)) - 2
-        first_column = np.int64(np.floor(c_least)) - 2
+        further = 1 if inner else 0
+        first_row = np.int64(np.floor(r_least)) - 2 - further
+        first_column = np.int64(np.floor(c_least)) - 2 - further
         clean = is_clean(
             flat,
             first_row * width + first_column,
             width,
-            np.int64(np.floor(r_most)) + 4 - first_row,
-            np.int64(np.floor(c_most)) + 4 - first_column,
+            np.int64(np.floor(r_most)) + 4 + further - first_row,
+            np.int64(np.floor(c_most)) + 4 + further - first_column,
         )
+    slack = _SLACK if reach > 0 and inner and clean else 0.0
     if clean:
         flags[:rows] = 0
+    raw_rows = np.int64(np.floor(valid[2])), np.int64(np.floor(valid[3]))
+    marks = spare[:, :0] if clean else spare
     for y in range(rows):
         c0, r0, dc, dr = _row_of(corners, y / cell)
         first = np.int64(0)
@@ -367,7 +392,22 @@ def fetch_cell(
             continue
         if two_pass:
             _fetch_row(
-                flat, width, code, c0, dc, r0, dr, values, flags, y, first, last, line, clean
+                flat,
+                width,
+                raw_rows,
+                table,
+                reach,
+                slack,
+                c0,
+                dc,
+                r0,
+                dr,
+                values,
+                flags,
+                y,
+                (first, last),
+                line,
+                marks,
             )
         else:
-            _fetch_points(frame, code, table, c0, dc, r0, dr, values, flags, y, first, last)
+            _fetch_points(frame, table, reach, c0, dc, r0, dr, values, flags, y, first, last)

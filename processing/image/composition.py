@@ -22,6 +22,7 @@ from processing.geometry.placement import (
 )
 from processing.image.balance import Balance, balance_gains, node_means
 from processing.image.colour import ColourHead
+from processing.image.kernels import Interpolation
 from processing.image.lattice import (
     OUTSIDE,
     colour_raster,
@@ -33,7 +34,6 @@ from processing.image.lattice import (
 from processing.image.resampling import (
     WEIGHT_STEP_PX,
     WEIGHT_UNIT,
-    Interpolation,
     resample,
     usable_area,
 )

@@ -11,31 +11,30 @@ every other value is signal.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
 from processing.geometry.placement import SensorPlacement
-from processing.image.cells import fetch_cell, fetch_straight, scratch_words, straight_taps
+from processing.image.cells import MOST_CELL_PX, fetch_cell, fetch_straight, straight_taps
+from processing.image.kernels import KERNELS, Interpolation
 from processing.image.lattice import OUTSIDE
-from processing.image.taps import BILINEAR, CUBIC, LANCZOS, LANCZOS_TABLE, MISSING
+from processing.image.taps import LINE_WORDS, MISSING
 
 Array = NDArray[Any]
-Interpolation = Literal["bilinear", "cubic", "lanczos"]
 
 WEIGHT_STEP_PX: Final = 8
 """Seam weights are given at every eighth target pixel."""
 WEIGHT_UNIT: Final = 255
 SATURATED_SOURCE: Final = 0x80
 SUPPORT_MARGIN_PX: Final = 2
-"""Raw pixels lost at each side, so that the widest kernel never leaves the exposed rows."""
+"""Raw pixels lost at each side, so that six taps never leave the exposed rows."""
 
 _STRIP_ROWS: Final = 16
 """Rows that are fetched side by side: their scratch stays in the nearest cache, and a core keeps
 the addresses of about so many pages it writes to at hand. Twice as many take 1.7 times as long."""
-_CODES: Final = {"bilinear": BILINEAR, "cubic": CUBIC, "lanczos": LANCZOS}
 
 
 def resample(
@@ -66,10 +65,13 @@ def resample(
             with `SATURATED_SOURCE` set where one of the four nearest raw pixels was saturated.
 
     Raises:
-        ValueError: a cell that is no multiple of the weight step.
+        ValueError: a cell that is no multiple of the weight step, or larger than `MOST_CELL_PX`.
     """
-    if cell_px % WEIGHT_STEP_PX:
-        raise ValueError(f"cell of {cell_px} px; it is a multiple of {WEIGHT_STEP_PX}")
+    if cell_px % WEIGHT_STEP_PX or not 0 < cell_px <= MOST_CELL_PX:
+        raise ValueError(
+            f"cell of {cell_px} px; it is a multiple of {WEIGHT_STEP_PX}, at most {MOST_CELL_PX}"
+        )
+    kernel = KERNELS[interpolation]
     _resample(
         frames,
         valid,
@@ -78,8 +80,8 @@ def resample(
         weights,
         gains,
         np.zeros(len(gains), np.float32) if offsets is None else offsets,
-        _CODES[interpolation],
-        LANCZOS_TABLE,
+        kernel.table,
+        kernel.reach,
         out,
         source,
     )
@@ -212,10 +214,11 @@ def _mixed_cell(
     band,
     column,
     cell,
-    code,
     table,
+    reach,
     chosen,
     line,
+    spare,
     values,
     flags,
     total,
@@ -246,9 +249,10 @@ def _mixed_cell(
             cell,
             rows,
             n,
-            code,
             table,
+            reach,
             line,
+            spare,
             values,
             flags,
         )
@@ -279,14 +283,17 @@ def _mixed_cell(
 
 
 @njit(cache=True, parallel=True, fastmath=True, nogil=True)
-def _resample(frames, valid, lattices, cell, weights, gains, offsets, code, table, out, source):
+def _resample(frames, valid, lattices, cell, weights, gains, offsets, table, reach, out, source):
     height, width = out.shape
     nodes = cell // WEIGHT_STEP_PX
     columns = (width + cell - 1) // cell
     for band in prange((height + cell - 1) // cell):
         values = np.zeros((cell, cell), np.float32)
         flags = np.zeros((cell, cell), np.uint8)
-        lines = np.zeros((_STRIP_ROWS, scratch_words(cell)), np.float32)
+        lines = np.zeros((_STRIP_ROWS + 1) * LINE_WORDS, np.float32)
+        phases = np.empty((2, _STRIP_ROWS), np.float32)
+        steps = np.empty((2, _STRIP_ROWS), np.float32)
+        spare = np.empty((2, LINE_WORDS), np.uint16)
         total = np.empty((cell, cell), np.float32)
         weight = np.empty((cell, cell), np.float32)
         best = np.empty((cell, cell), np.float32)
@@ -299,7 +306,7 @@ def _resample(frames, valid, lattices, cell, weights, gains, offsets, code, tabl
             if found == 1:
                 s = chosen[0]
                 left, top = straight_taps(
-                    frames[s], valid[s], lattices[s], band, column, cell, code
+                    frames[s], valid[s], lattices[s], band, column, cell, reach
                 )
                 if left >= 0:
                     straight[column, 0] = s
@@ -316,10 +323,11 @@ def _resample(frames, valid, lattices, cell, weights, gains, offsets, code, tabl
                 band,
                 column,
                 cell,
-                code,
                 table,
+                reach,
                 chosen[:found],
-                lines[0],
+                lines[:LINE_WORDS],
+                spare,
                 values,
                 flags,
                 total,
@@ -345,6 +353,7 @@ def _resample(frames, valid, lattices, cell, weights, gains, offsets, code, tabl
                     band,
                     column,
                     cell,
+                    table,
                     straight[column, 1],
                     straight[column, 2],
                     first,
@@ -352,6 +361,8 @@ def _resample(frames, valid, lattices, cell, weights, gains, offsets, code, tabl
                     gains[s],
                     offsets[s],
                     lines,
+                    phases,
+                    steps,
                     out,
                     x0,
                     n,

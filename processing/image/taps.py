@@ -1,114 +1,208 @@
-"""The interpolation kernels of the resampling: taps across raw rows, along a row, and their flags.
+"""Compiled loops over runs of pixels: taps across raw rows, along a row, and their flags.
 
-Compiled loops over runs of pixels whose taps lie at whole-number distances, written to vectorise.
-Which pixels make a run is decided in `processing.image.cells`.
+The taps of a run lie at whole-number distances, so the loops vectorise. Weights come from a table
+(`processing.image.kernels`) and change linearly along a run, as phases do. Which pixels make a run
+is decided in `processing.image.cells`.
 """
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
-
-BILINEAR: Final = 0
-CUBIC: Final = 1
-LANCZOS: Final = 2
+from processing.image.kernels import MARGIN, PHASES
 
 SATURATED: Final = 1
 MISSING: Final = 2
 """Bits of a pixel's flag: one of the four nearest raw pixels saturated; no value at all."""
 
-LANCZOS_PHASES: Final = 1024
-
-
-def _lanczos_table() -> Array:
-    """Weights of the pixels -2 .. 3 at phases 0 .. 1, (phases + 1, 6) float32."""
-    phase = np.arange(LANCZOS_PHASES + 1) / LANCZOS_PHASES
-    offset = phase[:, None] - np.arange(-2, 4)[None, :]
-    table = np.sinc(offset) * np.sinc(offset / 3.0)
-    normalised: Array = (table / table.sum(axis=1, keepdims=True)).astype(np.float32)
-    return normalised
-
-
-LANCZOS_TABLE: Final = _lanczos_table()
+LINE_WORDS: Final = 96
+"""Words from one scratch row to the next: known to the compiler, which else would not vectorise."""
+_SPAN: Final = np.float32(0.08)
+"""Phases, in px, over which weights go in a straight line. At its ends a weight is then off by
+0.0008 of its second derivative: the phase error grows by 0.0004 px."""
+_LANES: Final = 8
+"""Words of a vector."""
 
 
 @njit(cache=True, fastmath=True, nogil=True, inline="always")
-def _catmull_rom(z):
-    """Weights of the pixels -1 .. 2 at a phase."""
-    half = np.float32(0.5)
-    z2 = z * z
-    z3 = z2 * z
-    w0 = z2 - half * (z3 + z)
-    w3 = half * (z3 - z2)
-    w2 = half * (z + z2) + np.float32(1.5) * (z2 - z3)
-    return w0, np.float32(1.0) - w0 - w2 - w3, w2, w3
+def weights_at(table, phase):
+    """Row of the table next to a phase, and the phase's distance from it, px."""
+    steps = phase * np.float32(PHASES)
+    row = np.int32(np.floor(steps + np.float32(0.5)))
+    row = min(max(row, np.int32(-MARGIN)), np.int32(PHASES + MARGIN))
+    return row + np.int32(MARGIN), (steps - np.float32(row)) / np.float32(PHASES)
+
+
+@njit(cache=True, nogil=True)
+def _piece(span, n):
+    """How many of n pixels weights go in one straight line, in whole vectors."""
+    if span <= _SPAN:
+        return n
+    pieces = np.int64(np.ceil(span / _SPAN))
+    return min(n, (n + pieces * _LANES - 1) // (pieces * _LANES) * _LANES)
+
+
+@njit(cache=True, fastmath=True, nogil=True, inline="always")
+def _spread(t):
+    """A row of the table as scalars: six weights, six slopes."""
+    return (t[0], t[1], t[2], t[3], t[4], t[5]), (t[6], t[7], t[8], t[9], t[10], t[11])
+
+
+@njit(cache=True, fastmath=True, nogil=True, inline="always")
+def _sum6(w, a, b, c, d, e, f):
+    return w[0] * a + w[1] * b + w[2] * c + w[3] * d + w[4] * e + w[5] * f
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def cubic_down(flat, start, width, first, step, line, n):
-    """Catmull-Rom across four raw rows at n columns; phases first + step * j."""
-    a0 = flat[start - width : start - width + n]
-    a1 = flat[start : start + n]
-    a2 = flat[start + width : start + width + n]
-    a3 = flat[start + 2 * width : start + 2 * width + n]
+def _down(flat, start, width, first, step, table, line, n):
+    row, beyond = weights_at(table, first + np.float32(0.5) * step * np.float32(np.int32(n - 1)))
+    begin = beyond - np.float32(0.5) * step * np.float32(np.int32(n - 1))
+    w, s = _spread(table[row])
+    a0 = flat[start - 2 * width : start - 2 * width + n]
+    a1 = flat[start - width : start - width + n]
+    a2 = flat[start : start + n]
+    a3 = flat[start + width : start + width + n]
+    a4 = flat[start + 2 * width : start + 2 * width + n]
+    a5 = flat[start + 3 * width : start + 3 * width + n]
     for j in range(n):
-        z = first + step * np.float32(np.int32(j))
-        w0, w1, w2, w3 = _catmull_rom(z)
-        line[j] = (
-            w0 * np.float32(np.int32(a0[j]))
-            + w1 * np.float32(np.int32(a1[j]))
-            + w2 * np.float32(np.int32(a2[j]))
-            + w3 * np.float32(np.int32(a3[j]))
+        b0 = np.float32(np.int32(a0[j]))
+        b1 = np.float32(np.int32(a1[j]))
+        b2 = np.float32(np.int32(a2[j]))
+        b3 = np.float32(np.int32(a3[j]))
+        b4 = np.float32(np.int32(a4[j]))
+        b5 = np.float32(np.int32(a5[j]))
+        x = begin + step * np.float32(np.int32(j))
+        line[j] = _sum6(w, b0, b1, b2, b3, b4, b5) + x * _sum6(s, b0, b1, b2, b3, b4, b5)
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def down(flat, start, width, first, step, table, line, n):
+    """Six raw rows interpolated at n columns from `start` on; phases first + step * j."""
+    piece = _piece(abs(step) * np.float32(np.int32(n)), n)
+    for done in range(0, n, piece):
+        at = first + step * np.float32(np.int32(done))
+        _down(flat, start + done, width, at, step, table, line[done:], min(piece, n - done))
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def middle_and_span(phases, steps, rows, n):
+    """Middle of the phases of some rows of n pixels, and how far they spread around it."""
+    least = np.float32(2.0)
+    most = np.float32(-1.0)
+    along = np.float32(np.int32(n - 1))
+    for y in range(rows):
+        end = phases[y] + steps[y] * along
+        least = min(least, min(phases[y], end))
+        most = max(most, max(phases[y], end))
+    return np.float32(0.5) * (least + most), most - least
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def down_strip(flat, start, width, phases, steps, table, lines, rows, n):
+    """As `down` for target rows whose taps lie one raw row apart, with one row of the table.
+
+    Row y has the phases phases[y] + steps[y] * j and goes to `lines` from y * `LINE_WORDS` on.
+    """
+    middle, span = middle_and_span(phases, steps, rows, n)
+    if span > _SPAN:
+        for y in range(rows):
+            line = lines[y * LINE_WORDS :]
+            down(flat, start + y * width, width, phases[y], steps[y], table, line, n)
+        return
+    row, beyond = weights_at(table, middle)
+    at = middle - beyond
+    w, s = _spread(table[row])
+    for y in range(0, rows - 1, 2):
+        # Raw pixels are converted once for two rows.
+        begin = start + (y - 2) * width
+        a0 = flat[begin : begin + n]
+        a1 = flat[begin + width : begin + width + n]
+        a2 = flat[begin + 2 * width : begin + 2 * width + n]
+        a3 = flat[begin + 3 * width : begin + 3 * width + n]
+        a4 = flat[begin + 4 * width : begin + 4 * width + n]
+        a5 = flat[begin + 5 * width : begin + 5 * width + n]
+        a6 = flat[begin + 6 * width : begin + 6 * width + n]
+        line = lines[y * LINE_WORDS :]
+        p0 = phases[y] - at
+        p1 = phases[y + 1] - at
+        s0 = steps[y]
+        s1 = steps[y + 1]
+        for j in range(n):
+            b0 = np.float32(np.int32(a0[j]))
+            b1 = np.float32(np.int32(a1[j]))
+            b2 = np.float32(np.int32(a2[j]))
+            b3 = np.float32(np.int32(a3[j]))
+            b4 = np.float32(np.int32(a4[j]))
+            b5 = np.float32(np.int32(a5[j]))
+            b6 = np.float32(np.int32(a6[j]))
+            x = p0 + s0 * np.float32(np.int32(j))
+            z = p1 + s1 * np.float32(np.int32(j))
+            upper = _sum6(w, b0, b1, b2, b3, b4, b5)
+            lower = _sum6(w, b1, b2, b3, b4, b5, b6)
+            line[j] = upper + x * _sum6(s, b0, b1, b2, b3, b4, b5)
+            line[j + LINE_WORDS] = lower + z * _sum6(s, b1, b2, b3, b4, b5, b6)
+    if rows % 2:
+        y = rows - 1
+        line = lines[y * LINE_WORDS :]
+        down(flat, start + y * width, width, phases[y], steps[y], table, line, n)
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _along(a, first, step, table, out, n):
+    row, beyond = weights_at(table, first + np.float32(0.5) * step * np.float32(np.int32(n - 1)))
+    begin = beyond - np.float32(0.5) * step * np.float32(np.int32(n - 1))
+    w, s = _spread(table[row])
+    for k in range(n):
+        x = begin + step * np.float32(np.int32(k))
+        out[k] = _sum6(w, a[k], a[k + 1], a[k + 2], a[k + 3], a[k + 4], a[k + 5]) + x * _sum6(
+            s, a[k], a[k + 1], a[k + 2], a[k + 3], a[k + 4], a[k + 5]
         )
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def cubic_along(line, start, first, step, values, y, k0, n):
-    """Catmull-Rom along the scratch row; phases first + step * k, taps from `start` + k on."""
-    a = line[start : start + n + 3]
-    out = values[y, k0 : k0 + n]
-    for k in range(n):
-        x = first + step * np.float32(np.int32(k))
-        u0, u1, u2, u3 = _catmull_rom(x)
-        out[k] = u0 * a[k] + u1 * a[k + 1] + u2 * a[k + 2] + u3 * a[k + 3]
+def along(line, first, step, table, out, n):
+    """Six values of the scratch row to each of n; phases first + step * k, taps from k on."""
+    piece = _piece(abs(step) * np.float32(np.int32(n)), n)
+    for done in range(0, n, piece):
+        at = first + step * np.float32(np.int32(done))
+        count = min(piece, n - done)
+        _along(line[done : done + count + 5], at, step, table, out[done : done + count], count)
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def cubic_words(a, first, step, gain, offset, out, n):
-    """As `cubic_along`, times gain plus offset, rounded to a word that is signal."""
+def words_strip(lines, phases, steps, table, gain, offset, out, y0, x0, rows, n):
+    """As `along` row by row, times gain plus offset, rounded to words that are signal.
+
+    Behind the rows, `lines` has one more.
+    """
     rise = offset + np.float32(0.5)
-    for k in range(n):
-        x = first + step * np.float32(np.int32(k))
-        u0, u1, u2, u3 = _catmull_rom(x)
-        v = u0 * a[k] + u1 * a[k + 1] + u2 * a[k + 2] + u3 * a[k + 3]
-        v = min(max(v * gain + rise, np.float32(1.0)), np.float32(65535.0))
-        out[k] = np.uint16(np.int32(v))
-
-
-@njit(cache=True, fastmath=True, nogil=True)
-def linear_down(flat, start, width, first, step, line, n):
-    """Linear across two raw rows; arguments as in `cubic_down`."""
-    a1 = flat[start : start + n]
-    a2 = flat[start + width : start + width + n]
-    for j in range(n):
-        z = first + step * np.float32(np.int32(j))
-        above = np.float32(np.int32(a1[j]))
-        line[j] = above + z * (np.float32(np.int32(a2[j])) - above)
-
-
-@njit(cache=True, fastmath=True, nogil=True)
-def linear_along(line, start, first, step, values, y, k0, n):
-    """Linear along the scratch row; arguments as in `cubic_along`."""
-    a = line[start + 1 : start + n + 2]
-    out = values[y, k0 : k0 + n]
-    for k in range(n):
-        x = first + step * np.float32(np.int32(k))
-        out[k] = a[k] + x * (a[k + 1] - a[k])
+    middle, span = middle_and_span(phases, steps, rows, n)
+    if span > _SPAN:
+        values = lines[rows * LINE_WORDS :]
+        for y in range(rows):
+            along(lines[y * LINE_WORDS :], phases[y], steps[y], table, values, n)
+            target = out[y0 + y, x0 : x0 + n]
+            for k in range(n):
+                v = min(max(values[k] * gain + rise, np.float32(1.0)), np.float32(65535.0))
+                target[k] = np.uint16(np.int32(v))
+        return
+    row, beyond = weights_at(table, middle)
+    at = middle - beyond
+    w, s = _spread(table[row])
+    for y in range(rows):
+        a = lines[y * LINE_WORDS : (y + 1) * LINE_WORDS]
+        target = out[y0 + y, x0 : x0 + n]
+        phase = phases[y] - at
+        step = steps[y]
+        for k in range(n):
+            x = phase + step * np.float32(np.int32(k))
+            v = _sum6(w, a[k], a[k + 1], a[k + 2], a[k + 3], a[k + 4], a[k + 5])
+            v += x * _sum6(s, a[k], a[k + 1], a[k + 2], a[k + 3], a[k + 4], a[k + 5])
+            v = min(max(v * gain + rise, np.float32(1.0)), np.float32(65535.0))
+            target[k] = np.uint16(np.int32(v))
 
 
 @njit(cache=True, nogil=True)
@@ -125,44 +219,29 @@ def is_clean(flat, start, width, rows, columns):
 
 
 @njit(cache=True, nogil=True)
-def flags_along(flat, start, width, flags, y, k0, n):
-    """Flags of n pixels whose taps move along the raw row that `start` lies on."""
-    a0 = flat[start - width - 1 : start - width + n + 2]
-    a1 = flat[start - 1 : start + n + 2]
-    a2 = flat[start + width - 1 : start + width + n + 2]
-    a3 = flat[start + 2 * width - 1 : start + 2 * width + n + 2]
-    out = flags[y, k0 : k0 + n]
+def flags_along(flat, start, width, reach, spare, out, n):
+    """Flags of n pixels whose four nearest raw pixels begin at `start` and move along that row.
+
+    Args:
+        reach: raw pixels beyond the four nearest that count, along each axis.
+        spare: scratch, (2, n + 2 + 2 * reach) uint16.
+    """
+    columns = n + 1 + 2 * reach
+    least = spare[0, :columns]
+    full = spare[1, :columns]
+    left = start - reach
+    near = flat[left : left + columns]
+    below = flat[left + width : left + width + columns]
+    for j in range(columns):
+        least[j] = min(near[j], below[j])
+        full[j] = near[j] | below[j]
+    for i in range(1, reach + 1):
+        upper = flat[left - i * width : left - i * width + columns]
+        lower = flat[left + (1 + i) * width : left + (1 + i) * width + columns]
+        for j in range(columns):
+            least[j] = min(least[j], min(upper[j], lower[j]))
     for k in range(n):
-        least0 = min(min(a0[k], a0[k + 1]), min(a0[k + 2], a0[k + 3]))
-        least1 = min(min(a1[k], a1[k + 1]), min(a1[k + 2], a1[k + 3]))
-        least2 = min(min(a2[k], a2[k + 1]), min(a2[k + 2], a2[k + 3]))
-        least3 = min(min(a3[k], a3[k + 1]), min(a3[k + 2], a3[k + 3]))
-        least = min(min(least0, least1), min(least2, least3))
-        full = (a1[k + 1] | a1[k + 2] | a2[k + 1] | a2[k + 2]) & np.uint16(1)
-        out[k] = np.uint8(full) | np.uint8(np.uint8(least == 0) << np.uint8(1))
-
-
-@njit(cache=True, nogil=True)
-def flags_along_linear(flat, start, width, flags, y, k0, n):
-    """As `flags_along`, where only the four nearest pixels are read."""
-    a1 = flat[start : start + n + 1]
-    a2 = flat[start + width : start + width + n + 1]
-    out = flags[y, k0 : k0 + n]
-    for k in range(n):
-        least = min(min(a1[k], a1[k + 1]), min(a2[k], a2[k + 1]))
-        full = (a1[k] | a1[k + 1] | a2[k] | a2[k + 1]) & np.uint16(1)
-        out[k] = np.uint8(full) | np.uint8(np.uint8(least == 0) << np.uint8(1))
-
-
-@njit(cache=True, fastmath=True, nogil=True)
-def tap_weight(code, distance):
-    """What a raw pixel at a distance weighs: linear, or Keys' cubic with a = -1/2."""
-    d = abs(distance)
-    one = np.float32(1.0)
-    if code == BILINEAR:
-        return max(one - d, np.float32(0.0))
-    if d < one:
-        return (np.float32(1.5) * d - np.float32(2.5)) * d * d + one
-    if d < np.float32(2.0):
-        return ((np.float32(2.5) - np.float32(0.5) * d) * d - np.float32(4.0)) * d + np.float32(2.0)
-    return np.float32(0.0)
+        out[k] = np.uint8((full[k + reach] | full[k + reach + 1]) & np.uint16(1))
+    for i in range(2 + 2 * reach):
+        for k in range(n):
+            out[k] |= np.uint8(np.uint8(least[k + i] == 0) << np.uint8(1))

@@ -61,8 +61,8 @@ def test_what_lies_on_a_straight_line_in_the_perspective_does_so_after_resamplin
     seen = found > 0
     assert seen.mean() > 0.95
     off = found[seen].astype(float) / 8.0 - expected[seen]
-    # The steepest slope is 59 DN/px: a sixty-fourth of a pixel, to which OpenCV rounds places.
-    assert np.sqrt(np.mean(off**2)) < 0.03 * 59.0
+    # The steepest slope is 59 DN/px. Rounding of the frame alone leaves 0.29 DN.
+    assert np.sqrt(np.mean(off**2)) < 0.009 * 59.0
     assert abs(off.mean()) < 0.2
 
 

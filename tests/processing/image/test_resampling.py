@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from processing.geometry.placement import nominal_placements, raw_from_vip_mm, vip_mm_from_px
 from processing.image.composition import COLOUR_CELL_PX, PAN_CELL_PX
+from processing.image.kernels import INTERPOLATIONS, Interpolation
 from processing.image.lattice import (
     OUTSIDE,
     colour_raster,
@@ -20,7 +21,6 @@ from processing.image.resampling import (
     SATURATED_SOURCE,
     WEIGHT_STEP_PX,
     WEIGHT_UNIT,
-    Interpolation,
     resample,
 )
 from processing.rig import find_rig
@@ -171,7 +171,8 @@ def test_two_passes_in_cells_of_the_product_are_the_textbook_kernel_to_an_eighth
 
 
 @pytest.mark.parametrize(
-    ("interpolation", "error"), [("bilinear", 0.07), ("cubic", 0.012), ("lanczos", 0.008)]
+    ("interpolation", "error"),
+    [("bilinear", 0.07), ("cubic", 0.012), ("lanczos", 0.008), ("phase-corrected", 0.05)],
 )
 def test_each_interpolation_follows_a_wave_of_eight_pixels(
     interpolation: Interpolation, error: float
@@ -195,7 +196,7 @@ def test_gain_is_applied_once_and_rounding_is_to_the_nearest() -> None:
 def test_an_offset_is_added_after_the_gain_wherever_a_frame_serves() -> None:
     frames = np.full((2, 130, 170), 10000, np.uint16)
     matrices = [(6.4, 1.0, 0.0, 7.6, 0.0, 1.0), (8.4, 1.0, 0.0, 9.6, 0.0, 1.0)]
-    for interpolation in ("bilinear", "cubic", "lanczos"):
+    for interpolation in INTERPOLATIONS:
         out, _ = fetch(
             frames[:1], matrices[:1], gains=[1.2], offsets=[-25.4], interpolation=interpolation
         )
@@ -204,15 +205,23 @@ def test_an_offset_is_added_after_the_gain_wherever_a_frame_serves() -> None:
     assert np.all(out == 10990)
 
 
-def test_saturated_pixels_and_holes_reach_the_image_as_such() -> None:
+@pytest.mark.parametrize(
+    ("interpolation", "reach"),
+    [("bilinear", 0), ("cubic", 1), ("lanczos", 2), ("phase-corrected", 2)],
+)
+def test_saturated_pixels_and_holes_reach_the_image_as_such(
+    interpolation: Interpolation, reach: int
+) -> None:
     frame = np.full((1, 130, 170), 5000, np.uint16)
     frame[0, 40, 50] |= 1
     frame[0, 80, 90] = 0
-    out, source = fetch(frame, [(5.0, 1.0, 0.0, 6.0, 0.0, 1.0)])
+    out, source = fetch(frame, [(5.0, 1.0, 0.0, 6.0, 0.0, 1.0)], interpolation=interpolation)
     saturated = np.argwhere(source & SATURATED_SOURCE)
     assert {tuple(p) for p in saturated} == {(33, 44), (33, 45), (34, 44), (34, 45)}
     holes = np.argwhere(source == 0)
-    assert {tuple(p) for p in holes} == {(y, x) for y in range(72, 76) for x in range(83, 87)}
+    assert {tuple(p) for p in holes} == {
+        (y, x) for y in range(73 - reach, 75 + reach) for x in range(84 - reach, 86 + reach)
+    }
     assert np.all(out[source == 0] == 0) and np.all(out[source != 0] >= 4999)
 
 
