@@ -60,7 +60,9 @@ def blank_unread(sensor: Sensor, frame: Array, *level1: Array) -> None:
     if (_unread_share(sensor, frame) or 0.0) < _SHARE:
         return
     low = (frame < _least_word(sensor)).astype(np.uint8)
-    lost = cv2.morphologyEx(low, cv2.MORPH_OPEN, np.ones((1, _RUN_PX), np.uint8)) != 0
+    run = np.ones((1, _RUN_PX), np.uint8)
+    # OpenCV's own opening with an even length moves the result by one pixel.
+    lost = cv2.dilate(cv2.erode(low, run), run, anchor=((_RUN_PX - 1) // 2, 0)) != 0
     for corrected in level1:
         corrected[lost] = 0
 
