@@ -400,7 +400,10 @@ def gvcp_answers() -> Parser:
     def feed(data: bytes) -> None:
         nonlocal answered
         sent.append(data)
-        with mock.patch.object(socket, "socket", return_value=channel):
+        with (
+            mock.patch.object(socket, "socket", return_value=channel),
+            mock.patch.object(gvcp.secrets, "randbelow", return_value=0),
+        ):
             answered += gvcp.control_privilege("127.0.0.1", timeout_s=0.1) is not None
 
     return Parser(
