@@ -93,7 +93,7 @@ def common_ground(
     reduced = noise / steps[:, None] ** 2
     return CommonGround(
         names=tuple(s.name for s in sensors),
-        pan=np.array([s.name in pan for s in sensors]),
+        pan=np.array([s.name in pan for s in sensors], dtype=np.bool_),
         place=place,
         mean=measured[..., 8],
         noise=noise,

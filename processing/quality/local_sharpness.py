@@ -140,6 +140,8 @@ def _worst_region(
 
 def _median(values: Array) -> Array:
     """Median along the first axis of what is there; NaN where nothing is."""
+    if not len(values):
+        return np.full(values.shape[1:], np.nan)
     empty = ~np.isfinite(values).any(axis=0)
     median: Array = np.nanmedian(np.where(empty, 0.0, values), axis=0)
     return np.where(empty, np.nan, median)

@@ -10,7 +10,10 @@ import cv2
 import numpy as np
 import pytest
 
+from processing.geometry.placement import nominal_placements
 from processing.quality.band_levels import level_steps, levels_of
+from processing.quality.common_ground import common_ground
+from processing.quality.local_sharpness import local_blur_figures
 from processing.quality.words import wrong_format
 from tests.processing.planted import Planted, banded, block, clipped, gain, in_part, rendered
 
@@ -86,6 +89,19 @@ def test_red_exposed_half_as_long_without_saying_so_is_seen_over_a_flight(
     assert (down.band, down.before, down.exposure) == ("red", 3, 4)
     assert (up.band, up.before, up.exposure) == ("red", 4, 7)
     assert down.factor == pytest.approx(0.5, rel=0.02) and "level of red" in down.sentence
+
+
+def test_common_ground_of_few_frames_finds_no_blur_and_raises_nothing(healthy: Planted) -> None:
+    places = nominal_placements(healthy.rig, {}, healthy.conditions.tdi_shifts)
+    for names in ((), ("SU30",), ("G",), ("SU30", "G"), ("R", "G", "B", "N")):
+        frames = {name: healthy.frames[name] * np.uint16(8) for name in names}
+        ground = common_ground(healthy.rig, places, frames)
+        assert ground is not None and ground.names == tuple(
+            s.name for s in healthy.rig.sensors if s.name in names
+        )
+        for kind in ("pan", "colour"):
+            deficit = local_blur_figures(healthy.rig, ground)[f"{kind}_blur_deficit"]
+            assert deficit is None or deficit < 0.12
 
 
 def test_ground_that_changes_several_bands_is_no_step_of_one() -> None:
