@@ -110,6 +110,18 @@ def test_malformed_telemetry_ends_in_a_sentence(data: bytes | str) -> None:
         assert "telemetry" in refused(watched(address))
 
 
+def test_only_what_prints_is_left_of_a_text() -> None:
+    assert printable("Größe 5 µm, 日本") == "Größe 5 µm, 日本"
+    assert (
+        printable("a\x1b[2J\x9b\x00\n\u202e\u200f\u2028\ud800z")
+        == "a\ufffd[2J" + "\ufffd" * 7 + "z"
+    )
+    assert printable("x" * 501) == "x" * 499 + "…" and printable("x" * 500) == "x" * 500
+    assert printable_tree({"a\x1b": [1.5, float("nan"), b"x", True]}) == {
+        "a\ufffd": [1.5, None, None, True]
+    }
+
+
 def test_control_sequences_of_a_service_never_reach_the_terminal() -> None:
     fault = {"id": "x", "sentence": f"SU02 {ESCAPES}", "stands": True}
     exposure = {"number": 1, "step": ESCAPES, "verdict": f"good{ESCAPES}"}
