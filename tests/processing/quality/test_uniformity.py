@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from processing.quality.uniformity import SignalStep, _largest, signal_steps, step_figures
+from processing.quality.uniformity import (
+    SignalStep,
+    _largest,
+    line_means_of,
+    signal_steps,
+    step_figures,
+)
 from processing.rig import find_rig
 
 Array = NDArray[np.float64]
@@ -136,11 +142,11 @@ ROWS = {s.name: (FIRST, FIRST + SIDE - 1) for s in SENSORS}
 def test_steps_of_frames_are_named_the_largest_first() -> None:
     made = frames(2)
     a, b = made
-    assert signal_steps(SENSORS, made, ROWS) == ()
+    assert signal_steps(SENSORS, line_means_of(SENSORS, made, ROWS)) == ()
     made[a][:, 300:] = 4400
     made[a][:FIRST], made[a][FIRST + SIDE :] = 0, 0
     made[b][FIRST + SIDE - 1] = 2000
-    found = signal_steps(SENSORS, made, ROWS)
+    found = signal_steps(SENSORS, line_means_of(SENSORS, made, ROWS))
     assert [(s.sensor, s.axis, s.at, s.lines) for s in found] == [
         (b, "rows", FIRST + SIDE - 2, 1),
         (a, "columns", 299, 1),
@@ -161,7 +167,7 @@ def test_steps_in_three_frames_are_the_ground_s(count: int, found: int) -> None:
     made = frames(4)
     for frame in list(made.values())[:count]:
         frame[FIRST + 100 : FIRST + SIDE] = 4400
-    assert len(signal_steps(SENSORS, made, ROWS)) == found
+    assert len(signal_steps(SENSORS, line_means_of(SENSORS, made, ROWS))) == found
 
 
 @pytest.mark.parametrize(("step_dn", "found"), [(5.75, 0), (6.25, 1)])
@@ -170,4 +176,4 @@ def test_six_dn_of_a_sensor_are_the_least_step(step_dn: float, found: int) -> No
     made = frames(1, level=400)
     frame = made[SENSORS[0].name]
     frame[FIRST + 100 : FIRST + SIDE] = 400 + round(8 * step_dn)
-    assert len(signal_steps(SENSORS, made, ROWS)) == found
+    assert len(signal_steps(SENSORS, line_means_of(SENSORS, made, ROWS))) == found
