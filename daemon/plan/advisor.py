@@ -234,7 +234,7 @@ def _needed(strip: Strip, block: _Block) -> Counts:
         away = strip.points - other.start
         stations = np.arange(0.0, other.length_m + block.base_m, block.base_m)
         gives = _images_at(away @ other.ahead, stations, block.along_m)
-        gives[np.abs(away @ other.left) > block.across_m / 2 - STEP_M] = 0
+        gives[np.abs(away @ other.left) > block.across_m / 2 - _margin_m(block.across_m)] = 0
         by_line.append(np.minimum(gives, specification.images_on_every_point))
     most = np.sort(np.array(by_line), axis=0)[::-1][:lines_needed]
     return np.asarray(most.sum(axis=0))
@@ -254,13 +254,21 @@ def _images_at(
     along: NDArray[np.float64],
     stations: NDArray[np.float64],
     image_along_m: float,
-    margin_m: float = STEP_M,
+    margin_m: float | None = None,
 ) -> Counts:
-    """How many images at the stations see the places along a line, of any shape."""
-    reach_m = image_along_m / 2 - margin_m
+    """How many images at the stations see the places along a line, of any shape.
+
+    The margin at the border of an image is that of `_margin_m` where none is given.
+    """
+    reach_m = image_along_m / 2 - (_margin_m(image_along_m) if margin_m is None else margin_m)
     high = np.searchsorted(stations, along + reach_m, side="right")
     low = np.searchsorted(stations, along - reach_m, side="left")
     return np.asarray(high - low, np.int16)
+
+
+def _margin_m(image_m: float) -> float:
+    """How near to the border of a planned image the ground need not be seen, m."""
+    return min(STEP_M, image_m / 250.0)
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,8 @@ ACROSS_LEAST = 9
 """At least so many points across a strip are looked at."""
 FINENESS = 256
 """Points are so many to the length of an image, not closer than `STEP_M`."""
+COARSENESS = 16
+"""No fewer points than these to the length of an image, however small it is."""
 STEP_M = 2.0
 """How finely coverage is looked at; a hole that is narrower is none."""
 
@@ -112,7 +114,7 @@ def strip_of(
     if length_m == 0.0:
         return None
     ahead = (end - start) / length_m
-    step_m = max(STEP_M, image_along_m / FINENESS)
+    step_m = min(max(STEP_M, image_along_m / FINENESS), image_along_m / COARSENESS)
     along = np.arange(0.0, length_m + step_m / 2, step_m)
     count = max(ACROSS_LEAST, round(2 * half_width_m / step_m) + 1)
     across = np.linspace(-half_width_m, half_width_m, count)

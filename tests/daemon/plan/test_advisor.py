@@ -202,3 +202,28 @@ def test_only_lines_for_which_something_changed_are_looked_at_again():
     assert kept(moved, flown) == {second}
     unplaced = look({}, [*taken, Taken(len(taken) + 1, ())])
     assert kept(flown, unplaced) == set()
+
+
+@pytest.mark.trust
+@pytest.mark.parametrize("image_m", [0.4, 3.0, 30.0])
+def test_images_of_a_few_metres_are_asked_for_like_large_ones(image_m):
+    end = PLANE.place(0.0, 20 * image_m)
+    plan = Plan("small", (PlannedLine("1", PLANE.place(0.0, 0.0), end),), SPECIFICATION)
+
+    def look(taken):
+        return advise(plan, taken, image_along_m=image_m, image_across_m=1.5 * image_m)
+
+    def square(number, at_m):
+        corners = ((-0.75, -0.5), (0.75, -0.5), (0.75, 0.5), (-0.75, 0.5))
+        return Taken(
+            number, tuple(PLANE.place(x * image_m, at_m + y * image_m) for x, y in corners)
+        )
+
+    flown = [square(k + 1, at) for k, at in enumerate(np.arange(0, 20.1, 0.4) * image_m)]
+    assert look(flown).is_complete
+    assert look([]).segments[0].length_m == pytest.approx(20 * image_m)
+    assert look([]).well_m == 0.0
+    gap = [one for one in flown if not 20 <= one.number <= 22]
+    (segment,) = look(gap).segments
+    assert segment.from_m <= 7.7 * image_m and segment.to_m >= 8.3 * image_m
+    assert segment.length_m < 5 * image_m

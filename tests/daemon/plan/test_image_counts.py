@@ -220,7 +220,7 @@ def test_the_cells_of_gaps_run_across_and_down() -> None:
 
 def test_images_at_stations_see_half_an_image_less_a_margin_to_each_side() -> None:
     stations = np.array([0.0, 40.0, 80.0])
-    along = np.array([0.0, 47.9, 48.0, 48.1, 31.9, 32.0, 40.0, 128.0, 128.1, -48.0])
+    along = np.array([0.0, 49.5, 49.6, 49.7, 30.3, 30.4, 40.0, 129.6, 129.7, -49.6])
     counts = _images_at(along, stations, 100.0)
     assert counts.tolist() == [2, 3, 3, 2, 2, 3, 3, 1, 0, 1]
     assert _images_at(np.array([50.0, 50.1]), stations, 100.0, margin_m=0.0).tolist() == [3, 2]
