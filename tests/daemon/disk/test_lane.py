@@ -35,6 +35,14 @@ def test_waiting_is_counted_only_without_progress_and_never_more_than_a_look(
     assert done.result(10) and lane.end(10.0)
 
 
+def test_the_first_look_at_pending_work_counts_from_zero(tmp_path: Path) -> None:
+    lane, go_on = lane_of(tmp_path), threading.Event()
+    done = lane.submit(lambda: go_on.wait(10))
+    assert lane.look(0.1) == pytest.approx(0.1)
+    go_on.set()
+    assert done.result(10) and lane.end(10.0)
+
+
 def test_a_lane_that_was_abandoned_begins_nothing_and_names_nothing(tmp_path: Path) -> None:
     lane, begun, go_on = lane_of(tmp_path), threading.Event(), threading.Event()
     mission = new_mission(tmp_path / "root")

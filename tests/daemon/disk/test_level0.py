@@ -84,6 +84,14 @@ def test_a_tiff_that_does_not_fit_is_refused_with_what_was_found(tmp_path, pixel
         read_tiff(tmp_path / "c.tif", width_px=64, height_px=48)
 
 
+@pytest.mark.parametrize("plane", [2, 3])
+def test_a_plane_that_the_file_does_not_have_is_refused(tmp_path, plane):
+    path = _write(tmp_path / "two.tif", [PIXELS, PIXELS])
+    assert np.array_equal(read_tiff(path, plane=1), PIXELS)
+    with pytest.raises(RasterError, match="one plane"):
+        read_tiff(path, plane=plane)
+
+
 def test_a_torn_or_foreign_file_is_refused_at_every_length(tmp_path):
     whole = b"".join(tiff_parts([PIXELS], {"sensor": "SU00"}))
     for length in [*range(0, 400, 7), PIXEL_ALIGNMENT, len(whole) - 1]:

@@ -173,12 +173,29 @@ def test_any_bytes_are_a_plan_or_refused(
         read_plan(path)
 
 
+@pytest.mark.parametrize(("strip", "written"), [("", "4"), ("S2", "S2")])
+def test_advice_names_the_strip_of_its_line_or_the_line(strip: str, written: str) -> None:
+    line = PlannedLine("4", Point(47.0, 15.0), Point(47.1, 15.0), strip)
+    segment = Segment(line, 100.0, 300.0, Point(47.01, 15.0), Point(47.02, 15.0), ())
+    (feature_written,) = json.loads(geojson([segment]))["features"]
+    assert feature_written["properties"]["strip"] == written
+
+
+def test_an_exposure_on_an_unknown_line_is_refused_with_twenty_lines_named(tmp_path: Path) -> None:
+    place = {"type": "Point", "coordinates": A}
+    lines = [feature([A, B], id=f"L{number:02}") for number in range(1, 26)]
+    data = collection(*lines, {"type": "Feature", "properties": {"line": "M"}, "geometry": place})
+    with pytest.raises(PlanError, match=r"line 'M'; there is L01, L02, .*, L20$"):
+        plan_of(tmp_path, "p.geojson", data)
+
+
 def test_advice_comes_back_as_a_plan_and_as_a_mission(tmp_path: Path) -> None:
     line = PlannedLine("4 & 5", Point(47.0, 15.0), Point(47.1, 15.0))
     segment = Segment(line, 100.0, 300.0, Point(47.01, 15.0), Point(47.02, 15.0), ("refly <BLUR>",))
     for name, text in (("a.geojson", geojson([segment])), ("a.kml", kml([segment]))):
         (again,) = plan_of(tmp_path, name, text.encode()).lines
         assert (again.start, again.end) == (segment.start, segment.end)
+    assert "<name>Fly again</name>" in kml([segment])
     text = mavlink_mission([segment], height_m=500.0, distance_m=80.0)
     assert text.startswith("QGC WPL 110\n")
     wp = pytest.importorskip("pymavlink.mavwp", reason="pip install 'syntopic[mavlink]'")
