@@ -173,6 +173,8 @@ INFINITE = json.loads("1e999")
         ("velocity", [1, 2], None, 1),
         ("velocity", [1, 2, True], None, 1),
         ("velocity", [1, INFINITE, 3], None, 1),
+        ("velocity", [1, 1e300, 3], None, 1),
+        ("velocity", [1, 9.99e299, 3], (1.0, 9.99e299, 3.0), 0),
         ("scalars", ABSENT, {}, 0),
         ("scalars", None, {}, 1),
         ("scalars", {"a": 1, "b": "x", "c": 1.5}, {"a": 1, "b": "x", "c": 1.5}, 0),

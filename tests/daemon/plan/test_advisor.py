@@ -152,6 +152,32 @@ def test_the_reasons_name_the_exposures() -> None:
     assert float(np.hypot(*start)) == pytest.approx(segment.from_m, abs=0.01)
 
 
+@pytest.mark.parametrize("index", [0, 5, -1])
+def test_an_exposure_without_a_place_is_named_next_to_those_that_touch_the_hole(index: int) -> None:
+    plan = block(1)
+    taken = fly(plan)
+    number = taken[index].number
+    taken[index] = Taken(number, (), why_not="no position")
+    (segment,) = advise(plan, taken, image_along_m=ALONG_M, image_across_m=ACROSS_M).segments
+    assert segment.reasons == (f"exposure {number}: no position",)
+
+
+def test_a_hole_has_the_same_area_at_either_edge_of_a_strip() -> None:
+    plan = block(1)
+    ahead, left = axes(30.0)
+    areas_m2 = []
+    for shift_m in (-0.2 * ACROSS_M, 0.2 * ACROSS_M):
+        taken = [
+            Taken(number, footprint(ahead * station_m + left * shift_m, ahead))
+            for number, station_m in enumerate(np.arange(0.0, LINE_M + 1, BASE_M), 1)
+        ]
+        advice = advise(plan, taken, image_along_m=ALONG_M, image_across_m=ACROSS_M)
+        areas_m2.append(advice.hole_m2)
+    # The strip is 0.7 images wide; of its half, 0.05 images are not seen.
+    assert areas_m2[0] == pytest.approx(0.05 * ACROSS_M * LINE_M, rel=0.05)
+    assert areas_m2[1] == pytest.approx(areas_m2[0], rel=1e-3)
+
+
 def test_a_line_flown_beside_its_place_is_flown_again_whole() -> None:
     plan = block(1)
     _, left = axes(30.0)

@@ -207,6 +207,17 @@ def test_a_place_is_exposed_late_by_a_quarter_of_the_distance_at_most(
     assert due_ns == pytest.approx((next_m - north_m) / SPEED_MPS * NS, abs=1e3)
 
 
+@pytest.mark.parametrize(("beyond_m", "place"), [(0.0, 0), (1e-9, 1)])
+def test_a_place_is_left_behind_beyond_a_quarter_of_the_distance_only(
+    beyond_m: float, place: int
+) -> None:
+    steering = trigger(line("7", 0.0))
+    here = steering.on_line(at(0.0, 0.0))
+    assert here is not None
+    here = replace(here, along_m=25.0 + beyond_m)
+    assert steering._follow(here, here.mono_ns)[steering._next] == 100.0 * place
+
+
 @pytest.mark.parametrize(("north_m", "next_m"), [(175.1, 300.0), (174.9, 200.0)])
 def test_an_exposure_counts_for_a_place_from_a_quarter_of_the_distance_on(
     north_m: float, next_m: float

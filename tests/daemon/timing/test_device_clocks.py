@@ -61,6 +61,14 @@ def test_a_device_that_starts_again_is_learned_anew() -> None:
     assert clocks.at("never read", 0) is None
 
 
+@pytest.mark.parametrize(("back_ns", "steps"), [(NS, 0), (NS + 1, 1)])
+def test_a_reading_more_than_a_second_back_is_a_restart(back_ns: int, steps: int) -> None:
+    clock = DeviceClock()
+    clock.read(ClockReading("SU00", 500 * NS, NS, 50_000))
+    clock.read(ClockReading("SU00", 500 * NS - back_ns, 2 * NS, 50_000))
+    assert clock.restarts == steps
+
+
 class Port:
     """An autopilot whose clock is 7 s ahead; it answers 300 us after it was asked."""
 

@@ -8,9 +8,10 @@ from dataclasses import replace
 import pytest
 
 from daemon.timing.clock import HostClock, RoundTrips, _Lateness
+from daemon.timing.mark_matching import MarkMatcher, _agree, _Channel, _Held, _is_same
 from daemon.timing.matching import Cause, Matcher, start_of_exposure_mono_ns
 from drivers.contract import Frame
-from tests.daemon.timing.test_matching import frame, matcher, pulse
+from tests.daemon.timing.test_matching import frame, mark, matcher, pulse
 
 NS = 1_000_000_000
 MS = 1_000_000
@@ -349,3 +350,29 @@ def test_what_is_forgotten_is_what_lies_before_a_number() -> None:
     assert arrived(made, frame(3)) is Cause.USED
     made.forget_before(3)
     assert arrived(made, frame(2)) is Cause.SPURIOUS
+
+
+@pytest.mark.parametrize(("apart_ns", "is_one"), [(1_000, True), (-1_000, True), (1_001, False)])
+def test_marks_of_one_input_are_the_same_up_to_a_microsecond(apart_ns: int, is_one: bool) -> None:
+    first = mark(1)
+    assert _is_same(first, replace(first, gps_ns=first.gps_ns + apart_ns)) is is_one
+    assert not _is_same(first, replace(first, channel=1))
+
+
+@pytest.mark.parametrize(("apart_ns", "agree"), [(2_000_000, True), (2_000_001, False)])
+def test_shifts_agree_within_a_millisecond_and_five_sigmas(apart_ns: int, agree: bool) -> None:
+    # Both pulses are known to 0.1 ms.
+    first, second = mark(1), replace(mark(1), gps_ns=mark(1).gps_ns + apart_ns)
+    assert _agree((_Held(first), pulse(1)), (_Held(second), pulse(1))) is agree
+
+
+@pytest.mark.parametrize(
+    ("offset", "count", "is_allowed"),
+    [(5, 12, True), (5, 13, False), (5, 11, False), (0xFFFF, 6, True), (None, 13, True)],
+)
+def test_a_count_is_allowed_where_it_differs_by_the_confirmed_offset(
+    offset: int | None, count: int, is_allowed: bool
+) -> None:
+    marks = MarkMatcher(HostClock())
+    marks._channels[("gnss", 0)] = _Channel(offset, is_confirmed=offset is not None)
+    assert marks._count_allows(mark(7, count=count), pulse(7)) is is_allowed
