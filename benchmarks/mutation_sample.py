@@ -97,6 +97,17 @@ EQUIVALENT: dict[str, str] = {
     "drivers/ublox/framing.py: return end - at if end <= len(buffer) else 0: - -> +": (
         "only whether it is zero is read"
     ),
+    "daemon/disk/resync.py: closing(sqlite3.connect(address, uri=True)) as reading,: "
+    "True -> False": (
+        "SQLite built with SQLITE_USE_URI, as Debian's is, reads addresses in any case"
+    ),
+    "daemon/timing/matching.py: since_latch_ns = abs((frame.device_ns or 0) - "
+    "(frame.device_clock_ns or 0)): 0 -> 1": (
+        "both are there where a start is known; one that is 0 counts as 1 ns of drift time"
+    ),
+    "drivers/mavlink/decoder.py: if angle < 1e-9:: 1e-9 -> 1.5000000000000002e-09": (
+        "the least angle above 0 that the arc cosine gives is 1.5e-8"
+    ),
 } | equivalent_in_processing.EQUIVALENT
 """Mutation as printed, without its line -> why no outcome differs."""
 
