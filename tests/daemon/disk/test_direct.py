@@ -46,3 +46,29 @@ def test_a_full_disk_is_told_and_not_tried_again(
     monkeypatch.setattr(direct, "_write_all", full)
     with pytest.raises(OSError, match="No space left"):
         direct.create_file(tmp_path / "pan.tif", [bytes(direct.WORTH_IT_BYTES)])
+
+
+@pytest.mark.parametrize("leaves_a_file", [False, True])
+def test_where_the_disk_refuses_the_way_past_the_cache_the_file_is_whole_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, leaves_a_file: bool
+) -> None:
+    plain_open = os.open
+
+    def refusing(path: Path, flags: int, mode: int = 0o777) -> int:
+        if flags & os.O_DIRECT:
+            if leaves_a_file:
+                Path(path).touch()
+            raise OSError(errno.EINVAL, "Invalid argument")
+        return plain_open(path, flags, mode)
+
+    monkeypatch.setattr(os, "open", refusing)
+    content = os.urandom(direct.WORTH_IT_BYTES)
+    assert direct.create_file(tmp_path / "pan.tif", [content]) == len(content)
+    assert (tmp_path / "pan.tif").read_bytes() == content
+
+
+def test_a_disk_that_refuses_for_another_reason_is_told_and_not_tried_again(tmp_path: Path) -> None:
+    (tmp_path / "pan.tif").write_bytes(b"of another writer")
+    with pytest.raises(FileExistsError):
+        direct.create_file(tmp_path / "pan.tif", [bytes(direct.WORTH_IT_BYTES)])
+    assert (tmp_path / "pan.tif").read_bytes() == b"of another writer"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import threading
 from pathlib import Path
 
@@ -141,3 +143,21 @@ def test_a_set_of_files_is_complete_where_its_last_file_is(tmp_path: Path, is_th
         run_to_call(lambda: write(first), last)
         write(first)
         assert not [name for name in names_in(tmp_path) if name.startswith(".0.")]
+
+
+def test_on_a_disk_without_hard_links_a_file_that_must_not_exist_is_not_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refusing(*_: object, **__: object) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", refusing)
+    for content in (OLD, NEW):
+        part = tmp_path / "part"
+        part.write_bytes(content)
+        if content == OLD:
+            durable._rename_to_free_name(part, tmp_path / "file")
+        else:
+            with pytest.raises(FileExistsError):
+                durable._rename_to_free_name(part, tmp_path / "file")
+    assert (tmp_path / "file").read_bytes() == OLD
