@@ -9,6 +9,7 @@ from __future__ import annotations
 import atexit
 import contextlib
 import functools
+import io
 import json
 import logging
 import shutil
@@ -490,6 +491,33 @@ def telemetry() -> Target:
     return Target(parse, (), seeds)
 
 
+def monitor() -> Target:
+    """What `syntopic monitor` receives over its WebSocket, until it is drawn and printed."""
+    import msgpack
+    from rich.console import Console
+
+    from daemon.cli.monitor import MonitorError, _Seen
+    from daemon.watch.client import _record
+
+    console = Console(file=io.StringIO(), width=100)
+
+    def parse(data: bytes) -> object:
+        seen = _Seen()
+        seen.take(_record(data))
+        console.print(seen.drawn("127.0.0.1:8000"))
+        console.file.seek(0)
+        console.file.truncate()
+        return json.dumps(seen.as_json())
+
+    exposure = {"number": 7, "verdict": "good", "step": "judged", "frames": 13}
+    fault = {"sentence": "SU00 does not answer; look at its cable", "stands": True}
+    status = {"exposures_left": 12, "clock_sigma_ns": 2.5e3}
+    brief = {"phase": "flying", "mission": {"id": "m"}, "status": status, "faults": [fault]}
+    seed: bytes = msgpack.packb({**brief, "exposures": [exposure], "devices": [{"name": "SU00"}]})
+    errors = (MonitorError, ValueError, TypeError, RecursionError, msgpack.UnpackException)
+    return Target(parse, errors, (seed, msgpack.packb(brief)))
+
+
 def control_line() -> Target:
     from daemon.watch.control_socket import _asks_for_state, _request
 
@@ -560,6 +588,7 @@ TARGETS: Mapping[str, Callable[[], Target]] = {
     "laboratory-series": laboratory_series,
     "catalog": catalog,
     "telemetry": telemetry,
+    "monitor": monitor,
     "control-line": control_line,
     "command-body": command_body,
     "signed-mavlink": signed_mavlink,
