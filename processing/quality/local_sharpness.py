@@ -23,6 +23,8 @@ CELLS: Final = 4
 """A frame is divided into so many cells each way; a region is two by two of them."""
 LEAST_WINDOWS: Final = 24
 LEAST_FRAMES: Final = 3
+ALONE_DEFICIT: Final = 0.1
+"""A band that only PAN can be compared with may hold so much less: near infrared, of vegetation."""
 OVER_NOISE: Final = 2.0
 """Detail counts where it is so many times that of noise."""
 _AXES: Final[tuple[Literal["columns", "rows"], ...]] = ("columns", "rows")
@@ -94,7 +96,8 @@ def _colour_deficits(ground: CommonGround) -> Array:
         clear = ground.far > OVER_NOISE * 2.0 * ground.noise_reduced[..., None]
         share = np.where(clear, ground.near / ground.far, np.nan)
     several = np.isfinite(share).sum(axis=0) >= LEAST_FRAMES
-    return np.where(several, _median(share) - share, np.nan)
+    alone = np.isfinite(share[~ground.pan]).sum(axis=0) < 2
+    return np.where(several, _median(share) - share - ALONE_DEFICIT * alone, np.nan)
 
 
 def _pan_deficits(ground: CommonGround) -> Array:
