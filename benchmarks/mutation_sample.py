@@ -105,6 +105,10 @@ EQUIVALENT: dict[str, str] = {
     "(frame.device_clock_ns or 0)): 0 -> 1": (
         "both are there where a start is known; one that is 0 counts as 1 ns of drift time"
     ),
+    "daemon/timing/clock_model.py: return statistics.median(ratios) / 0.6745 "
+    "if len(ratios) >= SCATTER_FROM else 1.0: 1.0 -> 1.5": (
+        "a factor up to SCATTER_LARGE counts as 1 where it is used"
+    ),
     "drivers/mavlink/decoder.py: if angle < 1e-9:: 1e-9 -> 1.5000000000000002e-09": (
         "the least angle above 0 that the arc cosine gives is 1.5e-8"
     ),

@@ -317,22 +317,24 @@ class HostClock:
         told += self._alarm(
             "pps-holdover",
             self._is_silent(self._pps.last, mono_ns, PPS_HOLDOVER_NS),
-            "no edge of the pulse per second for {0:.0f} s: the clock coasts, its time is good to "
-            "{1:.3g} ms now; check the PPS cable and the receiver's fix",
+            "no edge of the pulse per second for {0:.0f} s: the clock coasts, {1}; check the PPS "
+            "cable and the receiver's fix",
             "the pulse per second is back",
             mono_ns,
+            since_ns=self._pps.last.from_ns if self._pps.last else mono_ns,
         )
         has_marks = self._last_mark_ns is not None and not len(self._pps)
         silent = self._pulses_since_mark >= MARKS_MISSED
         told += self._alarm(
             "mark-holdover",
             has_marks and silent and mono_ns - (self._last_mark_ns or 0) > MARK_HOLDOVER_NS,
-            "no event mark for {0:.0f} s: times are interpolated, good to {1:.3g} ms now; check "
-            "the strobe cable and that the receiver sends its marks",
+            "no event mark for {0:.0f} s: times are interpolated, {1}; check the strobe cable and "
+            "that the receiver sends its marks",
             "the receiver delivers again; the next exposure shows whether its event marks do"
             if self._awaits_mark
             else "event marks are back",
             mono_ns,
+            since_ns=self._last_mark_ns or 0,
         )
         told += self._alarm(
             "second-unnamed",
@@ -341,6 +343,7 @@ class HostClock:
             "its epoch; check that PPS and messages are of the same receiver",
             "the pulse per second is named",
             mono_ns,
+            since_ns=mono_ns,
         )
         steps = self._marks.steps + self._pps.steps
         if steps > self._steps_told:
@@ -445,7 +448,7 @@ class HostClock:
         return last is not None and mono_ns - last.from_ns > limit_ns
 
     def _alarm(
-        self, name: str, is_so: bool, sentence: str, cleared: str, mono_ns: int
+        self, name: str, is_so: bool, sentence: str, cleared: str, mono_ns: int, *, since_ns: int
     ) -> list[ClockEvent]:
         if is_so == self._told.get(name, False):
             return []
@@ -453,6 +456,8 @@ class HostClock:
         if not is_so:
             return [ClockEvent(name, False, cleared)]
         estimate = self.gps_at(mono_ns)
-        coasting_s = estimate.coasting_ns * 1e-9 if estimate else 0.0
-        sigma_ms = estimate.sigma_ns * 1e-6 if estimate else math.inf
-        return [ClockEvent(name, True, sentence.format(coasting_s, sigma_ms))]
+        good = "no time of the receiver is known yet"
+        if estimate is not None:
+            good = f"its time is good to {estimate.sigma_ns * 1e-6:.3g} ms now"
+        silent_s = (mono_ns - since_ns) * 1e-9
+        return [ClockEvent(name, True, sentence.format(silent_s, good))]

@@ -104,6 +104,21 @@ def test_without_any_date_or_without_a_fix_there_is_no_sample() -> None:
     assert (records, decoder.fix, decoder.leap_seconds) == ([], "none", None)
 
 
+def test_sentences_without_a_time_are_counted_once() -> None:
+    decoder, _ = decode(2 * sentence("GNGGA,,,,,,0,00,99.9,,,,,,"))
+    assert decoder.seen["GGA"] == 2
+
+
+@pytest.mark.parametrize(("time", "is_valid"), [("100009.99", True), ("100010.00", False)])
+def test_a_time_without_a_date_is_believed_less_than_ten_seconds_on(
+    time: str, is_valid: bool
+) -> None:
+    gga = sentence(f"GNGGA,{time},4730.0,N,00830.0,E,4,17,0.8,952.5,M,47.5,M,,")
+    far = sentence("GNGGA,113000.00,4730.0,N,00830.0,E,4,17,0.8,952.5,M,47.5,M,,")
+    dated, later, *_ = samples(epoch("100000.00") + gga + far)
+    assert (dated.time_valid, later.time_valid) == (True, is_valid)
+
+
 def test_the_published_event_is_a_mark_at_its_gps_time() -> None:
     (mark,) = decode(EVENT)[1]
     assert isinstance(mark, EventMark)

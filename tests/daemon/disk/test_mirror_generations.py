@@ -13,14 +13,14 @@ from typer.testing import CliRunner
 
 from daemon.cli import app
 from daemon.disk.durable import remove_tree
-from daemon.disk.generations import read_generations
+from daemon.disk.generations import next_generation, read_generations, write_generations
 from daemon.disk.level0_folder import CAPTURE_FILE, EXPOSURE_FILE
-from daemon.disk.mirror_start import find_disks
+from daemon.disk.mirror_start import _pull_tail, find_disks
 from daemon.disk.mission import DISCARDED, Mission
 from daemon.disk.store import verify
 from tests.daemon.disk.faulty_disk import refusing
 from tests.daemon.disk.test_mirrored import Flown
-from tests.daemon.small_camera import capture_of, pixels_of
+from tests.daemon.small_camera import capture_of, new_mission, pixels_of
 
 pytestmark = pytest.mark.trust
 
@@ -91,6 +91,17 @@ def test_what_a_killed_flight_wrote_to_one_disk_only_is_on_both_afterwards(flown
     for label in flown.roots:
         assert flown.copy(label).numbers() == [1, 2, 3]
         assert verify(flown.copy(label)).problems == ()
+
+
+@pytest.mark.parametrize("with_history", [(), (0,), (1,)])
+def test_without_a_history_of_both_copies_nothing_is_taken_over(
+    tmp_path: Path, with_history: tuple[int, ...]
+) -> None:
+    copies = [new_mission(tmp_path / name) for name in ("a", "b")]
+    for index in with_history:
+        write_generations(copies[index].path, next_generation((), ["1"], 1))
+    findings: list[str] = []
+    assert (_pull_tail(copies[0], copies[1], findings), findings) == ([], [])
 
 
 def test_a_log_that_lost_its_end_on_one_disk_is_taken_from_the_other(flown: Flown) -> None:

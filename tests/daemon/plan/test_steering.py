@@ -188,6 +188,17 @@ def test_a_place_on_a_line_is_counted_in_flight_direction(
     assert here.along_at_m(2 * NS) == pytest.approx(along_m + 2 * SPEED_MPS)
 
 
+def test_a_place_is_counted_along_and_across_an_oblique_line() -> None:
+    oblique = PlannedLine("7", PLANE.place(0.0, 0.0), PLANE.place(600.0, 800.0))
+    course_deg = math.degrees(math.atan2(0.6, 0.8))
+    # 400 m along the line, and 30 m to its right.
+    here = trigger(oblique).on_line(at(240.0 + 24.0, 320.0 - 18.0, course_deg=course_deg))
+    assert here is not None
+    assert (here.along_m, abs(here.across_m)) == pytest.approx((400.0, 30.0), abs=1e-3)
+    on_it = trigger(oblique).on_line(at(240.0, 320.0, course_deg=course_deg))
+    assert on_it is not None and on_it.across_m == pytest.approx(0.0, abs=1e-3)
+
+
 @pytest.mark.parametrize(
     ("north_m", "name"), [(-49.9, "7"), (-50.1, None), (1049.9, "7"), (1050.1, None)]
 )

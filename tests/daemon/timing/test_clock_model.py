@@ -13,9 +13,11 @@ from daemon.timing.clock_model import (
     GRID_SCALE,
     GRID_WANDER,
     NEGLIGIBLE,
+    OUTLIER,
     RATE_SIGMA,
     ClockModel,
     Pair,
+    _Fit,
 )
 
 Array = NDArray[np.float64]
@@ -72,3 +74,36 @@ def test_offset_and_sigma_are_those_of_the_dense_solution(at_s: float) -> None:
     off_ns, sigma_ns = dense(at_s)
     assert found.to_ns - at_s * NS == pytest.approx(off_ns, abs=0.6)
     assert found.sigma_ns == pytest.approx(sigma_ns, rel=1e-5)
+
+
+def test_an_outlier_loses_weight_by_how_far_it_is_off_what_the_others_say() -> None:
+    u = np.arange(-15.0, 1.0)
+    off_ns = np.round(np.random.default_rng(1).normal(0.0, 50.0, len(u)))
+    off_ns[7] += 5_000.0
+    fit = _Fit(
+        [Pair(round(a * NS), round(a * NS + b), 50.0) for a, b in zip(u, off_ns, strict=True)], 1.0
+    )
+    # As stated, before any sigma grows.
+    fit._sigma = fit._stated
+    fit._solve()
+    best = int(np.argmax(fit._weight))
+    wander, scale = fit._wander[best], fit._scale[best]
+    expected = []
+    for index in range(len(u)):
+        rest = np.arange(len(u)) != index
+        z, start = off_ns - off_ns[-1], u[0]
+        readings = wander * covariance(u[rest] - start, u[rest] - start)
+        readings += np.diag(np.full(rest.sum(), (scale * 50.0) ** 2))
+        inverse = np.linalg.inv(readings)
+        design, row = np.stack([np.ones(rest.sum()), u[rest]], axis=1), np.array([1.0, u[index]])
+        normal = design.T @ inverse @ design + np.diag([0.0, RATE_SIGMA**-2])
+        line = np.linalg.solve(normal, design.T @ inverse @ z[rest])
+        here = u[index : index + 1] - start
+        across = wander * covariance(here, u[rest] - start)[0]
+        gap = row - across @ inverse @ design
+        variance = wander * covariance(here, here)[0, 0] - across @ inverse @ across
+        variance += gap @ np.linalg.solve(normal, gap) + (scale * 50.0) ** 2
+        mean = row @ line + across @ inverse @ (z[rest] - design @ line)
+        expected.append(abs(z[index] - mean) / (OUTLIER * 0.75 * math.sqrt(variance)))
+    assert max(expected) > 2.0
+    assert fit._growth() == pytest.approx(np.maximum(expected, 1.0), rel=1e-4)

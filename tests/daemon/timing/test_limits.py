@@ -232,6 +232,22 @@ def test_marks_are_missed_after_three_pulses_and_more_than_10_s() -> None:
     assert [event.is_fault for event in clock.events(16 * NS)] == [False]
 
 
+@pytest.mark.parametrize(
+    ("has_messages", "good"),
+    [(False, "no time of the receiver is known yet"), (True, "its time is good to 202 ms now")],
+)
+def test_a_silence_of_edges_is_counted_from_the_last_one_whatever_else_gives_time(
+    has_messages: bool, good: str
+) -> None:
+    clock = HostClock()
+    clock.pps_edge(0, 1_000)
+    if has_messages:
+        clock.message_arrived(GPS_NS, 350 * MS)
+    (fault,) = clock.events(8 * NS)
+    assert fault.name == "pps-holdover"
+    assert f"no edge of the pulse per second for 8 s: the clock coasts, {good}" in fault.sentence
+
+
 def test_edges_that_50_messages_cannot_name_are_a_fault() -> None:
     clock = HostClock()
     clock.pps_edge(0, 1_000)
