@@ -12,8 +12,9 @@ from daemon.configuration import MountSection
 from daemon.disk.mission import Mission
 from daemon.exposure import Exposure, NavigationRecord
 from daemon.plan.model import Plane, Point
-from daemon.plan.overlaps import Overlaps, Surroundings
+from daemon.plan.overlaps import Overlaps, Surroundings, _samples, _sees
 from daemon.service import worker
+from processing.quality.nominal_area import nominal_area
 from processing.rig import find_rig
 
 RIG = find_rig("ultracam-x-mini")
@@ -105,3 +106,16 @@ def test_a_record_that_cannot_be_read_costs_its_own_overlap_only(tmp_path: Path)
     (tmp_path / "L0/000001/exposure.json").write_bytes(b'{"number": 1, ')
     (tmp_path / "service.toml").write_text("[plan]\nground_height_m = 400.0\n")
     assert worker.overlaps_of(Mission(tmp_path, tmp_path.name), RIG).of(1) == Surroundings()
+
+
+def test_an_image_sees_nothing_in_its_gaps_and_nothing_beyond_its_border() -> None:
+    image = replace(
+        overlaps_of(exposure(1, "a", 0.0, 0.0, 0.0))._seen[1],
+        area=nominal_area(RIG, ["SU11"]),
+    )
+    (band, *_) = image.area.gaps
+    there = _samples(image.corners)
+    seen = _sees(image, there, band)
+    assert float(seen.mean()) == pytest.approx(image.area.share(band), abs=0.05)
+    assert 0.0 < float(seen.mean()) < 1.0
+    assert not _sees(image, there + 3.0 * ACROSS_M, band).any()

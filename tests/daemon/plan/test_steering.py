@@ -189,14 +189,15 @@ def test_a_place_on_a_line_is_counted_in_flight_direction(
 
 
 def test_a_place_is_counted_along_and_across_an_oblique_line() -> None:
-    oblique = PlannedLine("7", PLANE.place(0.0, 0.0), PLANE.place(600.0, 800.0))
+    oblique = PlannedLine("8", PLANE.place(300.0, 100.0), PLANE.place(900.0, 900.0))
+    steering = trigger(line("7", -2000.0), oblique)
     course_deg = math.degrees(math.atan2(0.6, 0.8))
-    # 400 m along the line, and 30 m to its right.
-    here = trigger(oblique).on_line(at(240.0 + 24.0, 320.0 - 18.0, course_deg=course_deg))
-    assert here is not None
-    assert (here.along_m, abs(here.across_m)) == pytest.approx((400.0, 30.0), abs=1e-3)
-    on_it = trigger(oblique).on_line(at(240.0, 320.0, course_deg=course_deg))
-    assert on_it is not None and on_it.across_m == pytest.approx(0.0, abs=1e-3)
+    for turn_deg, along_m, across_m in ((0.0, 400.0, 30.0), (180.0, 600.0, -30.0)):
+        # 400 m from the start, and 30 m to the right of it.
+        sample = at(300.0 + 240.0 + 24.0, 100.0 + 320.0 - 18.0, course_deg=course_deg + turn_deg)
+        here = steering.on_line(sample)
+        assert here is not None
+        assert (here.along_m, here.across_m) == pytest.approx((along_m, across_m), abs=0.1)
 
 
 @pytest.mark.parametrize(
