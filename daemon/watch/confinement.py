@@ -6,6 +6,7 @@ reach. When it exceeds them it ends and is started again; the flight goes on.
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import resource
 from contextlib import suppress
@@ -20,7 +21,13 @@ OOM_SCORE = 900
 
 
 def confine() -> None:
-    """Bound this process; what the machine does not permit is left out."""
+    """Bound this process; what the machine does not permit is left out.
+
+    Only a process that was started for this is bounded, never one that serves a page beside other
+    work: limits cannot be taken back.
+    """
+    if multiprocessing.parent_process() is None:
+        return
     for kind, most in (
         (resource.RLIMIT_DATA, MEMORY_MAX_BYTES),
         (resource.RLIMIT_NOFILE, FILES_MAX),

@@ -18,7 +18,7 @@ from daemon.configuration import WatchSection
 from daemon.service.messages import Answer, Command, Stop, Told
 from daemon.service.processes import Child
 from daemon.watch.bodies import BODY_MAX_BYTES, parsed
-from daemon.watch.confinement import FILES_MAX, MEMORY_MAX_BYTES, OOM_SCORE
+from daemon.watch.confinement import FILES_MAX, MEMORY_MAX_BYTES, OOM_SCORE, confine
 from daemon.watch.connections import CONNECTIONS_PER_SOURCE, IDLE_MAX_S, REQUESTS_BURST
 from daemon.watch.protocols import HEAD_MAX_BYTES, MESSAGE_MAX_BYTES, RECEIVED_BURST_BYTES
 from daemon.watch.tokens import FAILURES_ALLOWED, add_token
@@ -491,3 +491,10 @@ def test_the_pages_process_is_bounded_by_itself(page: Page) -> None:
     assert data_kb * 1024 < MEMORY_MAX_BYTES / 2
     # This process, the service, has none of these limits.
     assert resource.getrlimit(resource.RLIMIT_DATA)[0] != MEMORY_MAX_BYTES
+
+
+def test_a_process_that_was_not_started_for_the_page_is_not_bounded() -> None:
+    before = [resource.getrlimit(kind) for kind in (resource.RLIMIT_DATA, resource.RLIMIT_NOFILE)]
+    confine()
+    after = [resource.getrlimit(kind) for kind in (resource.RLIMIT_DATA, resource.RLIMIT_NOFILE)]
+    assert after == before
