@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from daemon.measuring import machine
+from daemon.cli.benchmark.measurement import machine
 from processing.bundle.adjust import Adjustment, Settings, adjust
 from processing.bundle.camera_model import ideal_mm
 from processing.bundle.drawing import Panel, pattern_svg

@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from daemon.adjusting.project import Checks
-from daemon.adjusting.project_file import ProjectFile
-from daemon.adjusting.tables import write_table
-from daemon.adjusting.writing import write_project
-from daemon.calibration.boresight import controlled_of
-from daemon.measuring import machine
+from daemon.cli.benchmark.measurement import machine
+from daemon.postflight.adjustment.project import Checks
+from daemon.postflight.adjustment.project_file import ProjectFile
+from daemon.postflight.adjustment.tables import write_table
+from daemon.postflight.adjustment.writing import write_project
+from daemon.postflight.calibration.boresight import controlled_of
 from processing.bundle.adjust import adjust
 from processing.bundle.network import (
     Attitudes,

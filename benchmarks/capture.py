@@ -28,10 +28,10 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.ring_heads import RING, build_ring, is_whole, number_of
-from daemon import bench
+from daemon.cli.benchmark import pipeline
+from daemon.cli.benchmark.measurement import machine
 from daemon.cli.sim import free_first_address
-from daemon.disk.level0_folder import read_sealed
-from daemon.measuring import machine
+from daemon.mission.store.level0_folder import read_sealed
 from processing.rig import Rig, find_rig
 
 KEPT_EXPOSURES = 6
@@ -137,7 +137,7 @@ def _run(options: argparse.Namespace, rig: Rig, folder: Path) -> dict[str, Any]:
     ring = cache / "capture" / (f"{rig.name}-noise" if options.noise else rig.name)
     frames = place = None
     if not options.noise:
-        place = bench.exposures_of(options.rig, rig, cache / "bench" / rig.name)
+        place = pipeline.exposures_of(options.rig, rig, cache / "bench" / rig.name)
         frames = place / "mission" / "L0" / "000001"
     _refuse_small_disk(cache, exposure_nbytes * RING)
     build_ring(options.rig, frames, ring)

@@ -12,14 +12,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from daemon.configuration import load
-from daemon.disk.mission import Mission
-from daemon.exposure import Exposure
-from daemon.service import service
-from daemon.service.departure import ProcessPlan, worker_process
-from daemon.service.messages import Ping, Pong, Stop, WorkerBuilt
-from daemon.service.pipeline_queue import PipelineQueue
-from daemon.service.processes import Link
+from daemon.configuration.model import load
+from daemon.mission.exposure import Exposure
+from daemon.mission.layout import Mission
+from daemon.onboard.pipeline.pipeline_queue import PipelineQueue
+from daemon.onboard.service import service
+from daemon.onboard.service.departure import ProcessPlan, worker_process
+from daemon.onboard.service.messages import Ping, Pong, Stop, WorkerBuilt
+from daemon.onboard.service.processes import Link
 
 
 class Told(service.Service):
@@ -46,7 +46,7 @@ class NoPipeline(PipelineQueue):
 
 
 def idle_worker(link: Link, _settings: Any, _rings: Any) -> None:
-    """In the place of `daemon.service.worker.main`: it makes no image."""
+    """In the place of `daemon.onboard.pipeline.worker.main`: it makes no image."""
     link.send(WorkerBuilt())
     while not isinstance(order := link.receive(timeout_s=1.0), Stop):
         if isinstance(order, Ping):

@@ -19,17 +19,17 @@ from typing import Any, cast
 
 import numpy as np
 
-from daemon.measuring import machine
-from processing.conditions import for_sensors
-from processing.pipeline import Conditions, Pipeline, Product, Settings
+from daemon.cli.benchmark.measurement import machine
+from processing.geometry.conditions import for_sensors
+from processing.pipelines.stitched import Conditions, Pipeline, Product, Settings
 from processing.quality.report import Flag
 from processing.radiometry.calibration import load_radiometry
 from processing.rig import shipped_rigs
-from sim_hw.seeding import random_stream
 from sim_hw.world import camera, laboratory
 from sim_hw.world.electronics import Electronics, true_sensor
 from sim_hw.world.rendering import Look, light_on_sensor
 from sim_hw.world.scene import open_scene
+from sim_hw.world.seeding import random_stream
 from sim_hw.world.world import World, WorldSettings
 
 EPOCH_NS = 1_400_000_000_000_000_000

@@ -29,7 +29,7 @@ from benchmarks.stitching_trials import (
     matching_errors,
     world_and_rig,
 )
-from daemon.measuring import machine
+from daemon.cli.benchmark.measurement import machine
 from processing.mosaic.flight_validity import judge_flight
 from processing.mosaic.free import Mosaic
 from processing.mosaic.stitch_record import stitch_record

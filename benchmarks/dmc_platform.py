@@ -18,7 +18,7 @@ from scipy.stats import chi2
 
 from benchmarks import rendered
 from benchmarks.stitching_trials import same_ground, world_and_rig
-from processing.conditions import Conditions, for_sensors
+from processing.geometry.conditions import Conditions, for_sensors
 from processing.geometry.placement import nominal_placements, raw_from_vip_mm
 from processing.geometry.rotation import rotation_matrix
 from processing.geometry.topology import overlaps

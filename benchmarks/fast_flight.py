@@ -16,13 +16,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from benchmarks.fast_flight_score import Comparison, Score, Truth
-from daemon.configuration import Configuration, from_mapping
-from daemon.exposure import Capture, Exposure
-from daemon.flight.flight import Flight, Identity
-from daemon.flight.ledger import Ledger
-from daemon.service.line import Line, Order
-from daemon.timing.matching import Pulse
-from drivers.clock import BackOff
+from daemon.configuration.model import Configuration, from_mapping
+from daemon.mission.exposure import Capture, Exposure
+from daemon.onboard.flight.flight import Flight, Identity
+from daemon.onboard.flight.ledger import Ledger
+from daemon.onboard.service.line import Line, Order
+from daemon.onboard.timing.matching import Pulse
 from drivers.contract import (
     DeviceError,
     EventMark,
@@ -31,20 +30,21 @@ from drivers.contract import (
     NavSample,
     TemperatureSample,
 )
-from drivers.modbus_rtu.frames import find_reply
-from drivers.trigger.pulse_bus import PulseBusTrigger
-from drivers.ublox.decoder import UbxDecoder
+from drivers.receivers.ublox.decoder import UbxDecoder
+from drivers.thermometers.modbus_rtu.frames import find_reply
+from drivers.timescales.clock import BackOff
+from drivers.triggers.pulse_bus import PulseBusTrigger
 from processing.rig import Rig, find_rig
-from sim_hw.clockwork import ClockworkHead, ClockworkRig, SentFrame, Timeline
 from sim_hw.faults.plan import Planned
-from sim_hw.world_clock import NS_PER_S, NS_PER_WEEK, WorldClock
+from sim_hw.processes.clockwork import ClockworkHead, ClockworkRig, SentFrame, Timeline
+from sim_hw.world.world_clock import NS_PER_S, NS_PER_WEEK, WorldClock
 
 EXPOSURE_NS = 4_000_000
 TICK_NS = 100_000_000
 LATCH_NS = 2 * NS_PER_S
 LATCH_SIGMA_NS = 80_000
 SUSPICION_NS = 2 * NS_PER_S
-"""A head that answers nothing for so long is lost; see `drivers.aravis.head`."""
+"""A head that answers nothing for so long is lost; see `drivers.cameras.aravis.head`."""
 REOPENED_SERIAL_NS = 5 * NS_PER_S
 """Longest pause before a lost serial port is tried again."""
 ANSWER_TIMEOUT_NS = NS_PER_S // 2
@@ -295,7 +295,7 @@ class FastFlight:
     # What the service does
 
     def _fire(self, order: Order) -> None:
-        """Order a pulse and tell the flight what came of it; see `daemon.service.capture`."""
+        """Order a pulse and tell the flight what came of it; see `daemon.onboard.capture`."""
         self._ordered_ns[order.number] = order.mono_ns
         try:
             if order.delays_ns != self._programmed:
@@ -368,7 +368,7 @@ class FastFlight:
         self.open_s.append((now_ns - self._ordered_ns[exposure.number]) / NS_PER_S)
 
     def _look_after(self, head: ClockworkHead, session: _Session, now_ns: int) -> None:
-        """What the driver of a head does between frames; see `drivers.aravis.head`."""
+        """What the driver of a head does between frames; see `drivers.cameras.aravis.head`."""
         answers = head.answers(now_ns)
         if not session.is_open:
             if answers and now_ns >= session.next_try_ns:

@@ -1,6 +1,7 @@
 """What became of every pulse of a fast flight, and how its records compare with that.
 
-The flight itself is in `benchmarks.fast_flight`; what is true only `sim_hw.clockwork` knows.
+The flight itself is in `benchmarks.fast_flight`; what is true only `sim_hw.processes.clockwork`
+knows.
 """
 
 from __future__ import annotations
@@ -9,9 +10,9 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from daemon.exposure import Exposure, NavigationRecord
-from sim_hw.clockwork import EARTH_M_PER_DEG, ClockworkRig
-from sim_hw.world_clock import NS_PER_S
+from daemon.mission.exposure import Exposure, NavigationRecord
+from sim_hw.processes.clockwork import EARTH_M_PER_DEG, ClockworkRig
+from sim_hw.world.world_clock import NS_PER_S
 
 NAV_TOLERANCE_M = 1.0
 SIGMAS = 6

@@ -34,8 +34,8 @@ from benchmarks.rendered import (
     take,
     world_settings,
 )
-from daemon.measuring import machine
-from processing.pipeline import Conditions, Pipeline, Product, Settings
+from daemon.cli.benchmark.measurement import machine
+from processing.pipelines.stitched import Conditions, Pipeline, Product, Settings
 from processing.quality.report import NO_FLAGS, Flag, Thresholds
 from processing.rig import Rig
 from sim_hw.world.rendering import residual_smear_px

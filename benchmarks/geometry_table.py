@@ -27,8 +27,8 @@ from benchmarks.rendered import (
     with_random_rotations,
     world_settings,
 )
-from daemon.measuring import machine
-from processing.pipeline import Pipeline, Settings
+from daemon.cli.benchmark.measurement import machine
+from processing.pipelines.stitched import Pipeline, Settings
 from processing.rig import Rig, load_rig, shipped_rigs
 from sim_hw.world.scene import Scene, open_scene
 from sim_hw.world.snapshots import Heads

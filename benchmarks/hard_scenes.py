@@ -18,8 +18,8 @@ from pathlib import Path
 import cv2
 
 from benchmarks.rendered import errors_of, process, radiometry_of, take, world_settings
-from daemon.measuring import machine
-from processing.pipeline import Pipeline, Product, Settings
+from daemon.cli.benchmark.measurement import machine
+from processing.pipelines.stitched import Pipeline, Product, Settings
 from processing.quality.report import NO_FLAGS, Flag
 from processing.rig import find_rig
 from sim_hw.world.grounds import GROUNDS

@@ -31,9 +31,9 @@ from benchmarks.stitching_trials import (
     true_px,
     world_and_rig,
 )
-from daemon.measuring import machine
+from daemon.cli.benchmark.measurement import machine
 from processing.mosaic.precision import datum_covariance, placed_covariance_px
-from processing.pipeline import Pipeline, Settings
+from processing.pipelines.stitched import Pipeline, Settings
 from sim_hw.world.scene import open_scene
 from sim_hw.world.snapshots import Heads
 from sim_hw.world.world import World

@@ -19,13 +19,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from daemon.calibration.laboratory.field import RigCalibration, calibrate_rig
-from daemon.calibration.laboratory.field_measuring import Exposure, Field, Looks
-from daemon.calibration.laboratory.field_report import Estimated, covariance_of, estimated
+from daemon.postflight.calibration.laboratory.field import RigCalibration, calibrate_rig
+from daemon.postflight.calibration.laboratory.field_measuring import Exposure, Field, Looks
+from daemon.postflight.calibration.laboratory.field_report import (
+    Estimated,
+    covariance_of,
+    estimated,
+)
 from processing.bundle.rotations import logarithm
 from processing.geometry.rotation import rotation_matrix
 from processing.rig import Rig, find_rig
-from sim_hw import test_field
+from sim_hw.laboratory import test_field
 
 Array = NDArray[np.float64]
 

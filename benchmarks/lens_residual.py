@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.calibration.rig_text import rig_toml
+from daemon.postflight.calibration.rig_text import rig_toml
 from processing.geometry.residual_grid import ResidualGrid, fit_residual_grid
 from processing.rig import Cone, LensGrid, Rig, find_rig
 
@@ -62,7 +62,7 @@ def measure(name: str, out: Path) -> dict[str, Any]:
     known = rigs(name)
     out.mkdir(parents=True, exist_ok=True)
     (out / "true.toml").write_bytes(rig_toml(known["true"]))
-    _run("sim_hw.exposures", str(out / "true.toml"), "--out", str(out), "--dc", "12")
+    _run("sim_hw.processes.exposures", str(out / "true.toml"), "--out", str(out), "--dc", "12")
     found: dict[str, Any] = {"rig": name}
     for kind in ("with", "without"):
         (out / "mission/rig.toml").write_bytes(rig_toml(known[kind]))

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.chart import Chart
-from daemon.measuring import machine
+from daemon.cli.benchmark.measurement import machine
 from processing.matching.patches import INTERPOLATION, match_patches
 from processing.matching.tie_points import TiePointSettings
 

@@ -14,15 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from daemon import bench
-from daemon.configuration import PlanSection
-from daemon.disk import store
-from daemon.disk.mission import Mission
-from daemon.disk.radiometry_folder import RadiometryFolder
-from daemon.measuring import machine
+from daemon.cli.benchmark import pipeline
+from daemon.cli.benchmark.measurement import machine
+from daemon.configuration.model import PlanSection
+from daemon.mission.layout import Mission
+from daemon.mission.store import store
+from daemon.mission.store.radiometry_folder import RadiometryFolder
+from daemon.onboard.pipeline.lanes import Lanes
 from daemon.products.conditions import conditions_of
-from daemon.service.lanes import Lanes
-from processing.pipeline import Pipeline, Settings
+from processing.pipelines.stitched import Pipeline, Settings
 from processing.quality.report import Flag
 from processing.rig import find_rig, load_rig
 
@@ -38,7 +38,7 @@ def main() -> None:
     options = parser.parse_args()
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "syntopic"
     found = find_rig(options.rig)
-    folder = bench.exposures_of(options.rig, found, cache / "bench" / found.name)
+    folder = pipeline.exposures_of(options.rig, found, cache / "bench" / found.name)
     seen = held_mib(folder, options.exposures, options.lanes)
     settled = seen[min(SETTLED_AFTER, len(seen) - 1)]
     told: dict[str, Any] = {
@@ -60,7 +60,7 @@ def held_mib(folder: Path, exposures: int, lanes: int) -> list[float]:
     """MiB of the process after every exposure, in the order they were done.
 
     Args:
-        folder: from `daemon.bench.exposures_of`.
+        folder: from `daemon.cli.benchmark.pipeline.exposures_of`.
     """
     mission = Mission.open(folder / "mission")
     rig = load_rig(mission.rig_path)

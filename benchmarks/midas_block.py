@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.measuring import machine
+from daemon.cli.benchmark.measurement import machine
 from processing.bundle.adjust import Adjustment, adjust
 from processing.bundle.findings import control_residuals, heads_of
 from processing.bundle.intersection import (

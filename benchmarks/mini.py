@@ -23,13 +23,13 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from daemon.configuration import PlanSection
-from daemon.disk.mission import Mission
-from daemon.disk.store import Level0Writer, load_level0
-from daemon.exposure import Capture, FrameRecord
-from daemon.measuring import interleaved, machine
+from daemon.cli.benchmark.measurement import interleaved, machine
+from daemon.configuration.model import PlanSection
+from daemon.mission.exposure import Capture, FrameRecord
+from daemon.mission.layout import Mission
+from daemon.mission.store.store import Level0Writer, load_level0
 from daemon.products.conditions import conditions_of
-from processing.pipeline import Pipeline, Settings
+from processing.pipelines.stitched import Pipeline, Settings
 from processing.quality.report import Flag
 from processing.radiometry.calibration import load_radiometry
 from processing.rig import load_rig

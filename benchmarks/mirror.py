@@ -20,13 +20,13 @@ from tempfile import mkdtemp
 
 import numpy as np
 
-from daemon.disk import durable
-from daemon.disk.mirror_start import begin_mirrored, find_disks
-from daemon.disk.mirrored import MirroredStorage
-from daemon.disk.mission import Mission
-from daemon.disk.returning import ReturnSettings
-from daemon.disk.store import Level0Writer
-from daemon.exposure import Capture, FrameRecord
+from daemon.mission.exposure import Capture, FrameRecord
+from daemon.mission.layout import Mission
+from daemon.mission.mirror.mirror_start import begin_mirrored, find_disks
+from daemon.mission.mirror.mirrored import MirroredStorage
+from daemon.mission.mirror.returning import ReturnSettings
+from daemon.mission.store import durable
+from daemon.mission.store.store import Level0Writer
 from processing.rig import find_rig, shipped_rigs
 
 RIG = "ultracam-x"

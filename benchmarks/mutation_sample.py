@@ -33,16 +33,16 @@ from benchmarks.mutations import Mutation, mutations
 ROOT = Path(__file__).parent.parent
 COPIED = ("daemon", "drivers", "processing", "sim_hw", "tests", "benchmarks", "docs", "systemd")
 DECIDING = (
-    "daemon/flight/*.py",
-    "daemon/timing/*.py",
-    "daemon/disk/*.py",
-    "daemon/plan/*.py",
+    "daemon/onboard/flight/*.py",
+    "daemon/onboard/timing/*.py",
+    "daemon/mission/*.py",
+    "daemon/planning/*.py",
     "drivers/*/decoder.py",
     "drivers/*/framing.py",
-    "drivers/nmea/sentences.py",
-    "drivers/gpsd/reports.py",
-    "drivers/message_framer.py",
-    "drivers/gps_time.py",
+    "drivers/receivers/nmea/sentences.py",
+    "drivers/receivers/gpsd/reports.py",
+    "drivers/receivers/message_framer.py",
+    "drivers/timescales/gps_time.py",
     "processing/mosaic/*.py",
     "processing/bundle/*.py",
     "processing/quality/*.py",
@@ -61,55 +61,55 @@ LEAST_LIMIT_S = 20.0
 """A mutation has this many times what the file takes without it, and no less than so long."""
 NOTICED_GOAL = 0.9
 EQUIVALENT: dict[str, str] = {
-    "daemon/disk/catalog.py: elif version < SCHEMA_VERSION:: < -> <=": (
+    "daemon/mission/catalog/catalog.py: elif version < SCHEMA_VERSION:: < -> <=": (
         "the same version was handled two branches above"
     ),
-    'daemon/disk/catalog.py: code = getattr(error, "sqlite_errorcode", 0) & 0xFF: 0 -> 1': (
+    'daemon/mission/catalog/catalog.py: code = getattr(error, "sqlite_errorcode", 0) & 0xFF: 0 -> 1': (
         "neither 0 nor 1 (SQLITE_ERROR) is busy or locked"
     ),
-    "daemon/flight/ledger.py: self._in_storage[Storage.VOLATILE] += 1: += -> -=": (
+    "daemon/onboard/flight/ledger.py: self._in_storage[Storage.VOLATILE] += 1: += -> -=": (
         "the number of volatile exposures is never read"
     ),
-    "daemon/flight/ledger.py: self._in_storage[Storage.VOLATILE] += 1: 1 -> 2": (
+    "daemon/onboard/flight/ledger.py: self._in_storage[Storage.VOLATILE] += 1: 1 -> 2": (
         "the number of volatile exposures is never read"
     ),
-    "daemon/timing/clock.py: COARSE_SIGMA_NS: Final = round((ARRIVAL_MAX_NS - ARRIVAL_MIN_NS)"
+    "daemon/onboard/timing/clock.py: COARSE_SIGMA_NS: Final = round((ARRIVAL_MAX_NS - ARRIVAL_MIN_NS)"
     " / math.sqrt(12)): - -> +": "ARRIVAL_MIN_NS is 0",
-    "daemon/timing/clock.py: second = math.ceil((max(behind) + ARRIVAL_MIN_NS) / SECOND_NS): "
+    "daemon/onboard/timing/clock.py: second = math.ceil((max(behind) + ARRIVAL_MIN_NS) / SECOND_NS): "
     "+ -> -": "ARRIVAL_MIN_NS is 0",
-    "daemon/timing/clock.py: (r, min(1.0, limit * s / max(abs(r - middle), 1e-9)) / s**2): "
+    "daemon/onboard/timing/clock.py: (r, min(1.0, limit * s / max(abs(r - middle), 1e-9)) / s**2): "
     "1e-9 -> 1.5000000000000002e-09": (
         "limit * s is 4 at least, so that a residual below 4 ns counts in full either way"
     ),
-    "drivers/gps_time.py: leap = (difference + SECOND_NS // 2) // SECOND_NS: 2 -> 3": (
+    "drivers/timescales/gps_time.py: leap = (difference + SECOND_NS // 2) // SECOND_NS: 2 -> 3": (
         "within the slack of 1 ms both round alike, beyond it both give None"
     ),
-    "drivers/septentrio/decoder.py: count=self._counts[channel] % (1 << COUNT_BITS),: 1 -> 2": (
+    "drivers/receivers/septentrio/decoder.py: count=self._counts[channel] % (1 << COUNT_BITS),: 1 -> 2": (
         "no flight has 2**32 marks"
     ),
-    "drivers/gps_time.py: offset = (itow_ms * 1_000_000 - near_gps_ns + WEEK_NS // 2) % WEEK_NS"
+    "drivers/timescales/gps_time.py: offset = (itow_ms * 1_000_000 - near_gps_ns + WEEK_NS // 2) % WEEK_NS"
     " - WEEK_NS // 2: + -> -": "modulo a week, half a week more is half a week less",
-    "drivers/gps_time.py: difference = (itow_ms * 1_000_000 - utc + WEEK_NS // 2) % WEEK_NS"
+    "drivers/timescales/gps_time.py: difference = (itow_ms * 1_000_000 - utc + WEEK_NS // 2) % WEEK_NS"
     " - WEEK_NS // 2: + -> -": "modulo a week, half a week more is half a week less",
-    "daemon/disk/transfer_removal.py: source.replace(MARK_FILE, json.dumps(mark, indent=1)"
+    "daemon/mission/transfer/transfer_removal.py: source.replace(MARK_FILE, json.dumps(mark, indent=1)"
     '.encode("utf-8", "replace") + b"\\n"): 1 -> 2': "layout of a file that is read as JSON",
-    "daemon/disk/resync.py: repetition = 1: 1 -> 2": "any free name will do",
-    "drivers/ublox/framing.py: return end - at if end <= len(buffer) else 0: - -> +": (
+    "daemon/mission/mirror/resync.py: repetition = 1: 1 -> 2": "any free name will do",
+    "drivers/receivers/ublox/framing.py: return end - at if end <= len(buffer) else 0: - -> +": (
         "only whether it is zero is read"
     ),
-    "daemon/disk/resync.py: closing(sqlite3.connect(address, uri=True)) as reading,: "
+    "daemon/mission/mirror/resync.py: closing(sqlite3.connect(address, uri=True)) as reading,: "
     "True -> False": (
         "SQLite built with SQLITE_USE_URI, as Debian's is, reads addresses in any case"
     ),
-    "daemon/timing/matching.py: since_latch_ns = abs((frame.device_ns or 0) - "
+    "daemon/onboard/timing/matching.py: since_latch_ns = abs((frame.device_ns or 0) - "
     "(frame.device_clock_ns or 0)): 0 -> 1": (
         "both are there where a start is known; one that is 0 counts as 1 ns of drift time"
     ),
-    "daemon/timing/clock_model.py: return statistics.median(ratios) / 0.6745 "
+    "daemon/onboard/timing/clock_model.py: return statistics.median(ratios) / 0.6745 "
     "if len(ratios) >= SCATTER_FROM else 1.0: 1.0 -> 1.5": (
         "a factor up to SCATTER_LARGE counts as 1 where it is used"
     ),
-    "drivers/mavlink/decoder.py: if angle < 1e-9:: 1e-9 -> 1.5000000000000002e-09": (
+    "drivers/receivers/mavlink/decoder.py: if angle < 1e-9:: 1e-9 -> 1.5000000000000002e-09": (
         "the least angle above 0 that the arc cosine gives is 1.5e-8"
     ),
 } | equivalent_in_processing.EQUIVALENT

@@ -19,9 +19,9 @@ from pathlib import Path
 from benchmarks.fast_flight import FastFlight
 from benchmarks.fast_flight_score import Score
 from processing.rig import find_rig
-from sim_hw.clockwork import RECEIVER_NAME, devices_of
 from sim_hw.faults.catalogue import CATALOGUE
 from sim_hw.faults.plan import Planned
+from sim_hw.processes.clockwork import RECEIVER_NAME, devices_of
 
 RIG = "ultracam-x-mini"
 SMALL_RIG = "ultracam-l-mini"

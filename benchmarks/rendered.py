@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.conditions import for_sensors
-from processing.pipeline import Conditions, Pipeline, Product
+from processing.geometry.conditions import for_sensors
+from processing.pipelines.stitched import Conditions, Pipeline, Product
 from processing.radiometry.calibration import RadiometricCalibration
 from processing.rig import shipped_rigs
 from sim_hw.judge import compare

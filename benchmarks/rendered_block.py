@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.rendered import process, radiometry_of, take, world_settings
-from daemon.measuring import machine
+from daemon.cli.benchmark.measurement import machine
 from processing.bundle.adjust import Settings, adjust
 from processing.bundle.findings import checked_against, image_residuals_mm
 from processing.bundle.network import (
@@ -37,8 +37,8 @@ from processing.bundle.rotations import exponential
 from processing.bundle.self_calibration import SETS, SetName, parts_of, self_calibrating
 from processing.bundle.start import intersected
 from processing.matching.patches import INTERPOLATION, match_patches, select_features
-from processing.pipeline import Pipeline
-from processing.pipeline import Settings as PipelineSettings
+from processing.pipelines.stitched import Pipeline
+from processing.pipelines.stitched import Settings as PipelineSettings
 from processing.rig import VirtualImage
 from sim_hw.world import camera
 from sim_hw.world.scene import open_scene

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from benchmarks.midas_block import network_of
-from daemon.adjusting.project import Checks
-from daemon.adjusting.project_file import ProjectFile
-from daemon.adjusting.writing import write_project
-from daemon.measuring import machine
+from daemon.cli.benchmark.measurement import machine
+from daemon.postflight.adjustment.project import Checks
+from daemon.postflight.adjustment.project_file import ProjectFile
+from daemon.postflight.adjustment.writing import write_project
 from processing.bundle.adjust import adjust
 from processing.bundle.network import Network
 from processing.bundle.rotations import logarithm

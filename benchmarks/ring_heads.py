@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 
 from processing.rig import find_rig
 from sim_hw.devices.pulse_bus import Firing, PulseBus
-from sim_hw.ending import end_with_parent
 from sim_hw.gige.head import ExposureRequest, FrameSize, GigeHead, HeadIdentity, Pacing
-from sim_hw.world_clock import DeviceClock
+from sim_hw.processes.ending import end_with_parent
+from sim_hw.world.world_clock import DeviceClock
 
 RING = 3
 MARK = np.frombuffer(b"syntopic", "<u2")

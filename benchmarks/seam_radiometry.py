@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks import rendered
-from daemon.measuring import machine
+from daemon.cli.benchmark.measurement import machine
 from processing.image.composition import PanComposer, pan_cell_px
 from processing.image.kernels import DEFAULT_INTERPOLATION
-from processing.pipeline import Conditions, Pipeline, Product, Settings
+from processing.pipelines.stitched import Conditions, Pipeline, Product, Settings
 from processing.radiometry.calibration import RadiometricCalibration
 from processing.radiometry.level1 import (
     corrector_for,
@@ -33,11 +33,11 @@ from processing.radiometry.level1 import (
     level1_from_level0,
 )
 from processing.rig import Cone, Sensor
-from sim_hw.seeding import random_stream
 from sim_hw.world import laboratory
 from sim_hw.world.electronics import Electronics, SensorTruth, over_tdi_path, true_sensor
 from sim_hw.world.rendering import Look
 from sim_hw.world.scene import open_scene
+from sim_hw.world.seeding import random_stream
 from sim_hw.world.snapshots import Snapshot
 from sim_hw.world.world import World
 

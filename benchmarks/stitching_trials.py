@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks import rendered
-from processing.conditions import Conditions, for_sensors, parallax_px
+from processing.geometry.conditions import Conditions, for_sensors, parallax_px
 from processing.geometry.placement import (
     nominal_placements,
     raw_from_vip_mm,
@@ -28,7 +28,7 @@ from processing.geometry.topology import colour_ratio
 from processing.matching.tie_points import PAN_TO_COLOUR, PAN_TO_PAN, TiePoints
 from processing.mosaic.free import Mosaic, MosaicSettings, free_mosaic
 from processing.mosaic.validity import Validity, judge_master, robust_datum
-from processing.pipeline import Pipeline, Settings
+from processing.pipelines.stitched import Pipeline, Settings
 from processing.rig import Rig
 from sim_hw.world.camera import true_camera
 from sim_hw.world.flight import Flight

@@ -21,13 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.time_truth import Fired, Host, delay_error_ns, inside, receiver_stamp
-from daemon.exposure import Capture, FrameRecord
-from daemon.flight.composing import compose, instant_of
-from daemon.flight.navigation import Track
-from daemon.flight.temperatures import Temperatures
-from daemon.measuring import machine
-from daemon.timing.clock import HostClock
-from daemon.timing.matching import Pulse
+from daemon.cli.benchmark.measurement import machine
+from daemon.mission.exposure import Capture, FrameRecord
+from daemon.onboard.flight.composing import compose, instant_of
+from daemon.onboard.flight.temperatures import Temperatures
+from daemon.onboard.timing.clock import HostClock
+from daemon.onboard.timing.matching import Pulse
+from daemon.orientation.navigation import Track
 from drivers.contract import EventMark
 from processing.quality.report import Flag
 from processing.rig import find_rig

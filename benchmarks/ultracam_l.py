@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.measuring import machine
-from processing.conditions import Conditions, for_sensors, parallax_px
+from daemon.cli.benchmark.measurement import machine
+from processing.geometry.conditions import Conditions, for_sensors, parallax_px
 from processing.geometry.placement import (
     SensorPlacement,
     nominal_placements,

@@ -22,14 +22,14 @@ from scipy.stats import chi2
 from benchmarks import rendered
 from benchmarks.stitching_trials import mosaic_settings, world_and_rig
 from benchmarks.ultracam_l import tie_points
-from daemon.measuring import machine
+from daemon.cli.benchmark.measurement import machine
 from processing.calibration.platform import (
     COLOUR_SHIFT_PX,
     COLOUR_TURN_PX,
     PlatformCalibration,
     calibrate_platform,
 )
-from processing.conditions import for_sensors
+from processing.geometry.conditions import for_sensors
 from processing.geometry.placement import nominal_placements
 from processing.matching.tie_points import PAN_TO_COLOUR, TiePoints
 from processing.mosaic.free import free_mosaic

@@ -11,12 +11,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from processing.rig import RigError, load_rig, shipped_rigs
-from sim_hw.ending import end_with_parent
+from sim_hw.processes.ending import end_with_parent
+from sim_hw.processes.simulator import SimulatorSettings, simulate
 from sim_hw.receivers.kinds import PROBES, RECEIVERS
-from sim_hw.simulator import SimulatorSettings, simulate
 from sim_hw.world.grounds import GROUNDS
 from sim_hw.world.world import WorldSettings
-from sim_hw.world_clock import WorldClock
+from sim_hw.world.world_clock import WorldClock
 
 
 def parser() -> argparse.ArgumentParser:

@@ -21,7 +21,9 @@ def test_no_other_distribution_provides_our_import_names(package: str) -> None:
     assert not owners, f"{package} also comes from {owners}; uninstall that in this environment"
 
 
-@pytest.mark.parametrize("module", ["daemon.service.service", "daemon.cli", "daemon.cli.run"])
+@pytest.mark.parametrize(
+    "module", ["daemon.onboard.service.service", "daemon.cli", "daemon.cli.run"]
+)
 def test_the_service_imports_neither_hardware_nor_kernels_nor_opencv(module: str) -> None:
     code = (
         f"import sys, {module}; print(sorted({{'gi', 'numba', 'cv2', 'scipy'}} & set(sys.modules)))"
@@ -40,7 +42,7 @@ def test_only_the_capture_side_of_the_drivers_imports_gi() -> None:
         if re.search(r"^\s*(import gi\b|from gi\b)", path.read_text(), re.MULTILINE)
     ]
     assert importing
-    assert all(path.startswith("drivers/aravis/") for path in importing), importing
+    assert all(path.startswith("drivers/cameras/aravis/") for path in importing), importing
 
 
 def test_processes_are_spawned_never_forked() -> None:

@@ -26,7 +26,7 @@ from benchmarks.silent_errors.clean import clean_rows, clean_summary
 from benchmarks.silent_errors.drawn import false_alarms
 from benchmarks.silent_errors.exposures import RIGS
 from benchmarks.silent_errors.limits import LIMITS, table
-from daemon.measuring import machine
+from daemon.cli.benchmark.measurement import machine
 
 Row = dict[str, Any]
 

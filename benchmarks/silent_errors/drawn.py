@@ -24,7 +24,7 @@ from processing.mosaic.mounting import check_platform, place_covariance, rotatio
 from processing.mosaic.slips import find_slips
 from processing.mosaic.stitch_record import layer_scale_design
 from processing.mosaic.validity import judge_master
-from processing.pipeline import Product
+from processing.pipelines.stitched import Product
 from processing.quality.report import Thresholds
 from processing.rig import Cone, Rig
 

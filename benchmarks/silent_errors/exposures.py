@@ -25,9 +25,9 @@ from benchmarks.rendered import (
     world_settings,
 )
 from benchmarks.silent_errors.scenes import SCENES, Tone
-from processing.conditions import Conditions
-from processing.perspective import HeadPipeline, HeadsProduct
-from processing.pipeline import Pipeline, Product, Settings
+from processing.geometry.conditions import Conditions
+from processing.pipelines.perspective import HeadPipeline, HeadsProduct
+from processing.pipelines.stitched import Pipeline, Product, Settings
 from processing.radiometry.calibration import RadiometricCalibration
 from processing.rig import Cone, Rig, Sensor, find_rig
 from sim_hw.world import snapshots

@@ -18,8 +18,8 @@ from benchmarks.silent_errors.exposures import Planted
 from processing.geometry.placement import vip_mm_from_raw, vip_px_from_mm
 from processing.geometry.projective import apply_projective
 from processing.mosaic.precision import moved_datum_design, placed_covariance_px
-from processing.perspective import HeadsProduct
-from processing.pipeline import Product
+from processing.pipelines.perspective import HeadsProduct
+from processing.pipelines.stitched import Product
 from processing.radiometry.demosaic import BAYER_BANDS, is_bayer
 from processing.rig import Sensor
 from sim_hw.judge import on_sensor, true_positions

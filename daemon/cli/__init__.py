@@ -44,10 +44,10 @@ from daemon.cli import (
     transfer,
     verify,
 )
-from daemon.configuration import ConfigurationError
+from daemon.configuration.model import ConfigurationError
 from daemon.errors import DaemonError
-from daemon.terminal import Console
-from drivers.extras import MissingExtraError, missing_module
+from daemon.terminal.console import Console
+from drivers.base.extras import MissingExtraError, missing_module
 from processing.rig import RigError
 
 app = typer.Typer(

@@ -13,7 +13,7 @@ from typing import Annotated
 import typer
 from rich.progress import Progress
 
-from daemon.terminal import Console
+from daemon.terminal.console import Console
 
 HELP = """Adjust a bundle: a project of text files, made by hand or by `syntopic import dbat`.
 
@@ -44,10 +44,10 @@ def adjust(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from daemon.adjusting.project import read_project
-    from daemon.adjusting.tables import ProjectError
-    from daemon.adjusting.telling import print_report, report_of
-    from daemon.adjusting.writing import write_results
+    from daemon.postflight.adjustment.project import read_project
+    from daemon.postflight.adjustment.tables import ProjectError
+    from daemon.postflight.adjustment.telling import print_report, report_of
+    from daemon.postflight.adjustment.writing import write_results
     from processing.bundle.adjust import adjust as adjusted
     from processing.bundle.network import NetworkError
     from processing.bundle.rank import DefectError

@@ -9,8 +9,8 @@ from typing import Annotated
 import typer
 
 from daemon.cli.failures import end_walk
-from daemon.tables import light_table
-from daemon.terminal import Console
+from daemon.terminal.console import Console
+from daemon.terminal.tables import light_table
 
 HELP = """List the segments of the plan that must be flown again.
 
@@ -34,13 +34,13 @@ def advise(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from daemon.disk.level2 import write_folder
-    from daemon.disk.mission import Mission
+    from daemon.mission.layout import Mission
+    from daemon.mission.store.level2 import write_folder
     from daemon.orientation.exterior import exposures_of, mount_of
-    from daemon.plan import advisor, flown, writing
-    from daemon.plan.image_size import image_on_ground_m
-    from daemon.plan.reading import PlanError, read_plan
-    from daemon.plan.relief import relief_or_reason
+    from daemon.planning import advisor, flown, writing
+    from daemon.planning.image_size import image_on_ground_m
+    from daemon.planning.reading import PlanError, read_plan
+    from daemon.planning.relief import relief_or_reason
     from processing.rig import load_rig
 
     folder = Mission.open(mission)

@@ -20,9 +20,9 @@ from daemon.cli.options import (
     Trajectory,
     held_for,
 )
-from daemon.configuration import ConfigurationError
-from daemon.terminal import Console
-from drivers.extras import require
+from daemon.configuration.model import ConfigurationError
+from daemon.terminal.console import Console
+from drivers.base.extras import require
 
 if TYPE_CHECKING:
     from processing.bundle.self_calibration import SetName
@@ -79,11 +79,16 @@ def at(
     as_json: AsJson = False,
 ) -> None:
     require("geodesy")
-    from daemon.adjusting.tables import ProjectError
-    from daemon.adjusting.telling import print_report, report_of
     from daemon.cli.adjust import _peak_mib
-    from daemon.disk.mission import Mission
-    from daemon.orientation.triangulation import (
+    from daemon.mission.layout import Mission
+    from daemon.postflight.adjustment.tables import ProjectError
+    from daemon.postflight.adjustment.telling import print_report, report_of
+    from daemon.postflight.triangulation.report import (
+        print_triangulation,
+        triangulation_of,
+        write_triangulation,
+    )
+    from daemon.postflight.triangulation.triangulation import (
         Asked,
         TriangulationError,
         attitude_sigmas,
@@ -91,11 +96,6 @@ def at(
         matched,
         project_of,
         weighted,
-    )
-    from daemon.orientation.triangulation_report import (
-        print_triangulation,
-        triangulation_of,
-        write_triangulation,
     )
     from processing.bundle.adjust import adjust
     from processing.bundle.network import NetworkError

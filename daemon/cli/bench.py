@@ -11,8 +11,8 @@ from typing import Annotated, Any
 
 import typer
 
-from daemon.tables import light_table
-from daemon.terminal import Console
+from daemon.terminal.console import Console
+from daemon.terminal.tables import light_table
 
 HELP = """Time the pipeline on one emulated exposure of a rig, beside its peers.
 
@@ -37,8 +37,8 @@ def bench(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from daemon import bench as measuring
-    from daemon.service.departure import thread_counts
+    from daemon.cli.benchmark import pipeline as measuring
+    from daemon.onboard.service.departure import thread_counts
     from processing.rig import find_rig
 
     found = find_rig(rig)

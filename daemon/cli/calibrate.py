@@ -18,11 +18,11 @@ from daemon.cli import (
     calibrate_radiometric,
     calibrate_rig,
 )
-from daemon.tables import light_table
-from daemon.terminal import Console
+from daemon.terminal.console import Console
+from daemon.terminal.tables import light_table
 
 if TYPE_CHECKING:
-    from daemon.calibration.thermal import Gathered
+    from daemon.postflight.calibration.thermal import Gathered
     from processing.calibration.thermal_learning import Learned, Observability
     from processing.calibration.thermal_proposal import Change
 
@@ -73,9 +73,9 @@ def thermal(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from daemon.calibration.report import content_digest
-    from daemon.calibration.rig_text import rig_toml
-    from daemon.calibration.thermal import gather, write_rig
+    from daemon.postflight.calibration.report import content_digest
+    from daemon.postflight.calibration.rig_text import rig_toml
+    from daemon.postflight.calibration.thermal import gather, write_rig
     from processing.calibration.thermal_learning import learned, observability
     from processing.calibration.thermal_proposal import proposed_rig
 
@@ -113,8 +113,12 @@ def validity(
     mission: Annotated[Path, typer.Argument(help="A mission folder with Level-2.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from daemon.disk.mission import Mission
-    from daemon.displacements import DISPLACEMENTS_FILE, without_steps, write_displacements
+    from daemon.mission.layout import Mission
+    from daemon.postflight.displacements import (
+        DISPLACEMENTS_FILE,
+        without_steps,
+        write_displacements,
+    )
 
     held = Mission.open(mission)
     folder = held.path

@@ -12,8 +12,8 @@ from rich.progress import Progress
 
 from daemon.cli.calibration_outcome import hand_over
 from daemon.cli.options import AsJson, NewFolder
-from daemon.tables import light_table
-from daemon.terminal import Console
+from daemon.terminal.console import Console
+from daemon.terminal.tables import light_table
 
 HELP = """Boresight, lever arm and time offset: inertial against controlled orientation.
 
@@ -61,12 +61,12 @@ def boresight(
     out: NewFolder = None,
     as_json: AsJson = False,
 ) -> None:
-    from daemon.adjusting.project import read_project
-    from daemon.calibration import boresight as flight
-    from daemon.calibration.report import place_of, read_previous, serial_warnings
-    from daemon.configuration import MountSection
-    from daemon.disk.mission import Mission
+    from daemon.configuration.model import MountSection
+    from daemon.mission.layout import Mission
     from daemon.orientation.exterior import mount_of, read_mount
+    from daemon.postflight.adjustment.project import read_project
+    from daemon.postflight.calibration import boresight as flight
+    from daemon.postflight.calibration.report import place_of, read_previous, serial_warnings
     from processing.bundle.adjust import adjust
     from processing.bundle.network import NetworkError
     from processing.bundle.rank import DefectError

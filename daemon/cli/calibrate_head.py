@@ -11,7 +11,7 @@ import typer
 from rich.progress import Progress
 
 from daemon.cli.options import AsJson, NewFolder
-from daemon.terminal import Console
+from daemon.terminal.console import Console
 
 HELP = """Geometric calibration of single heads from collimator series.
 
@@ -23,7 +23,7 @@ report and the comparison with a previous calibration.
 Examples: `syntopic calibrate head SERIES`, `syntopic calibrate head SERIES --previous
 head-2026-05-02 --k3`
 
-A series to try: `python -m sim_hw.collimator dmc --sensor P1 --out collimator`
+A series to try: `python -m sim_hw.laboratory.collimator dmc --sensor P1 --out collimator`
 """
 
 
@@ -36,12 +36,12 @@ def head(
     k3: Annotated[bool, typer.Option("--k3", help="Estimate K3 too.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    from daemon.calibration.laboratory.head import FREE, calibrate_head, targets_of
-    from daemon.calibration.laboratory.head_report import calibrated_rig, head_report
-    from daemon.calibration.laboratory.series import read_series
-    from daemon.calibration.report import place_of, read_previous
-    from daemon.calibration.rig_text import rig_toml
     from daemon.cli.calibration_outcome import hand_over
+    from daemon.postflight.calibration.laboratory.head import FREE, calibrate_head, targets_of
+    from daemon.postflight.calibration.laboratory.head_report import calibrated_rig, head_report
+    from daemon.postflight.calibration.laboratory.series import read_series
+    from daemon.postflight.calibration.report import place_of, read_previous
+    from daemon.postflight.calibration.rig_text import rig_toml
     from processing.geometry.residual_grid import grid_bytes
 
     given = read_series(series, kind="head")

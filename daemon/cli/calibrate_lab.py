@@ -11,7 +11,7 @@ import typer
 from rich.progress import Progress
 
 from daemon.cli.options import AsJson, NewFolder, Series
-from daemon.terminal import Console
+from daemon.terminal.console import Console
 
 HELP = """Calibration of a whole rig in a 3D test field.
 
@@ -23,7 +23,7 @@ comparison with a previous calibration.
 
 Examples: `syntopic calibrate lab SERIES`, `syntopic calibrate lab SERIES --previous lab-2026-05-02`
 
-A series to try: `python -m sim_hw.test_field ultracam-l-mini --out field`
+A series to try: `python -m sim_hw.laboratory.test_field ultracam-l-mini --out field`
 """
 
 
@@ -35,18 +35,22 @@ def lab(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    from daemon.calibration.laboratory.field import calibrate_rig
-    from daemon.calibration.laboratory.field_measuring import exposures_of, field_of, measured
-    from daemon.calibration.laboratory.field_report import (
+    from daemon.cli.calibration_outcome import hand_over
+    from daemon.postflight.calibration.laboratory.field import calibrate_rig
+    from daemon.postflight.calibration.laboratory.field_measuring import (
+        exposures_of,
+        field_of,
+        measured,
+    )
+    from daemon.postflight.calibration.laboratory.field_report import (
         covariance_bytes,
         covariance_of,
         estimated,
         field_report,
     )
-    from daemon.calibration.laboratory.series import read_series
-    from daemon.calibration.report import place_of, read_previous
-    from daemon.calibration.rig_text import rig_toml
-    from daemon.cli.calibration_outcome import hand_over
+    from daemon.postflight.calibration.laboratory.series import read_series
+    from daemon.postflight.calibration.report import place_of, read_previous
+    from daemon.postflight.calibration.rig_text import rig_toml
 
     given = read_series(series, kind="lab")
     exposures, field = exposures_of(given), field_of(given)

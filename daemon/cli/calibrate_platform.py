@@ -35,8 +35,8 @@ def platform(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    from daemon.calibration.platform import KIND, read_missions, report_of, rig_file
-    from daemon.calibration.report import place_of, read_previous
+    from daemon.postflight.calibration.platform import KIND, read_missions, report_of, rig_file
+    from daemon.postflight.calibration.report import place_of, read_previous
     from processing.calibration.platform import calibrate_platform, calibrated_rig
 
     before = None if previous is None else read_previous(previous, kind=KIND)

@@ -11,7 +11,7 @@ import typer
 from rich.progress import Progress
 
 from daemon.cli.options import AsJson, NewFolder, Series
-from daemon.terminal import Console
+from daemon.terminal.console import Console
 
 HELP = """Radiometric calibration of heads from dark and flat series.
 
@@ -23,7 +23,7 @@ the configuration takes it, a report and the comparison with a previous calibrat
 Examples: `syntopic calibrate radiometric SERIES`, `syntopic calibrate radiometric SERIES --aperture
 6.3 --previous radiometric-2026-05-02 --out radiometric-2026-11-21`
 
-A series to try: `python -m sim_hw.sphere ultracam-x-mini --sensor SU00 --out sphere`
+A series to try: `python -m sim_hw.laboratory.sphere ultracam-x-mini --sensor SU00 --out sphere`
 """
 
 
@@ -39,18 +39,18 @@ def radiometric(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    from daemon.calibration.laboratory.radiometric import (
+    from daemon.cli.calibration_outcome import hand_over
+    from daemon.postflight.calibration.laboratory.radiometric import (
         calibrate_sensor,
         checks_of,
         common_level,
         sets_of,
         shots_of,
     )
-    from daemon.calibration.laboratory.radiometric_maps import files_of
-    from daemon.calibration.laboratory.radiometric_report import radiometric_report
-    from daemon.calibration.laboratory.series import read_series
-    from daemon.calibration.report import place_of, read_previous
-    from daemon.cli.calibration_outcome import hand_over
+    from daemon.postflight.calibration.laboratory.radiometric_maps import files_of
+    from daemon.postflight.calibration.laboratory.radiometric_report import radiometric_report
+    from daemon.postflight.calibration.laboratory.series import read_series
+    from daemon.postflight.calibration.report import place_of, read_previous
 
     given = read_series(series, kind="radiometric")
     shots = shots_of(given)

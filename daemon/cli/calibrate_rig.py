@@ -12,8 +12,8 @@ from rich.progress import Progress
 
 from daemon.cli.calibration_outcome import hand_over
 from daemon.cli.options import AsJson, NewFolder
-from daemon.tables import light_table
-from daemon.terminal import Console
+from daemon.terminal.console import Console
+from daemon.terminal.tables import light_table
 
 HELP = """Relative orientation of oblique heads against the nadir head, averaged over a block.
 
@@ -43,9 +43,9 @@ def rig(
     out: NewFolder = None,
     as_json: AsJson = False,
 ) -> None:
-    from daemon.adjusting.project import read_project
-    from daemon.calibration.report import place_of, read_previous
-    from daemon.calibration.rig import (
+    from daemon.postflight.adjustment.project import read_project
+    from daemon.postflight.calibration.report import place_of, read_previous
+    from daemon.postflight.calibration.rig import (
         GRAD,
         RigCalibrationError,
         calibrated_rig,

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from daemon.tables import light_table
-from daemon.terminal import Console
+from daemon.terminal.console import Console
+from daemon.terminal.tables import light_table
 
 if TYPE_CHECKING:
-    from daemon.calibration.report import CalibrationReport, Place
+    from daemon.postflight.calibration.report import CalibrationReport, Place
 
 _MOST_ROWS = 40
 
@@ -30,7 +30,7 @@ def hand_over(
     The report's id is `place.name`; a digest of the content is put behind it. `rig_file` makes
     `rig.toml` by the whole id.
     """
-    from daemon.calibration.report import calibration_json, identified, write_calibration
+    from daemon.postflight.calibration.report import calibration_json, identified, write_calibration
 
     report, files = identified(report, files or {}, rig_file)
     folder = place.of(report.calibration_id)

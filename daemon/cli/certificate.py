@@ -41,7 +41,7 @@ def certificate(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from daemon.watch.authority import make_certificate
+    from daemon.onboard.monitoring.access.authority import make_certificate
 
     reader = _gid_of(group)
     made = make_certificate(folder, authority=authority, names=names or (), days=days)
@@ -78,7 +78,7 @@ def certificate(
 
 def _gid_of(group: str | None) -> int | None:
     """The group that reads the key; None to leave it as it is."""
-    from daemon.watch.certificates import CertificateError
+    from daemon.onboard.monitoring.access.certificates import CertificateError
 
     if group is None and os.geteuid() != 0:
         return None

@@ -14,11 +14,11 @@ from rich.tree import Tree
 
 from daemon.cli.find import find as find_devices
 from daemon.cli.find_heads import find_heads
-from daemon.terminal import Console
+from daemon.terminal.console import Console
 
 if TYPE_CHECKING:
-    from daemon.configuration import Configuration
-    from daemon.service.findings import Finding
+    from daemon.configuration.model import Configuration
+    from daemon.onboard.preflight.findings import Finding
     from processing.rig import Rig
 
 HELP = """Validate a configuration, build what `run` builds, and prove each device with one datum.
@@ -73,8 +73,8 @@ def check(
 
 def check_flight(config: Path, *, fire: bool, as_json: bool) -> None:
     """Look at everything a flight with this configuration needs, and print it."""
-    from daemon.configuration import load
-    from daemon.service.findings import EXIT_STATUS, Outcome, overall
+    from daemon.configuration.model import load
+    from daemon.onboard.preflight.findings import EXIT_STATUS, Outcome, overall
 
     configuration, rig = load(config)
     console = Console(stderr=as_json)
@@ -97,11 +97,11 @@ def check_flight(config: Path, *, fire: bool, as_json: bool) -> None:
 
 def look(configuration: Configuration, rig: Rig, config: Path, *, fire: bool) -> list[Finding]:
     """All findings: of the running service where there is one, else of what `run` would build."""
-    from daemon.service.departure import interrupted_mission
-    from daemon.service.prerequisites import prerequisites
-    from daemon.service.resumption import resumption_finding
-    from daemon.service.trial import try_out
-    from daemon.watch.asking import ask_service
+    from daemon.onboard.monitoring.access.asking import ask_service
+    from daemon.onboard.preflight.prerequisites import prerequisites
+    from daemon.onboard.preflight.resumption import resumption_finding
+    from daemon.onboard.preflight.trial import try_out
+    from daemon.onboard.service.departure import interrupted_mission
 
     mission = interrupted_mission(configuration)
     if mission is not None and mission.is_held():
@@ -115,7 +115,7 @@ def look(configuration: Configuration, rig: Rig, config: Path, *, fire: bool) ->
         if finding.prevents:
             return findings
     if configuration.watch is not None:
-        from daemon.watch.prerequisites import watch_findings
+        from daemon.onboard.monitoring.prerequisites import watch_findings
 
         findings += watch_findings(configuration.watch)
     return findings + asyncio.run(try_out(configuration, rig, fire=fire))

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from daemon.terminal import Console
+from daemon.terminal.console import Console
 
 HELP = """Give a running service a command.
 
@@ -37,7 +37,7 @@ def command(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from daemon.watch.control_socket import give
+    from daemon.onboard.monitoring.access.control_socket import give
 
     arguments: dict[str, Any] = {"override": True} if override else {}
     for given in values or []:

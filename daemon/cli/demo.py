@@ -28,10 +28,10 @@ from daemon.cli.sim import (
     service_toml,
     simulator_arguments,
 )
-from daemon.disk.durable import replace_file
-from daemon.tables import light_table
-from daemon.terminal import Console
-from drivers.extras import require
+from daemon.mission.store.durable import replace_file
+from daemon.terminal.console import Console
+from daemon.terminal.tables import light_table
+from drivers.base.extras import require
 from processing.rig import Rig, RigError, find_rig
 
 HELP = """Fly the first flight: an emulated rig is captured, stitched and judged.
@@ -232,7 +232,7 @@ def _judge(
     console: Console, mission: Path, truth: Path, ledger: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Hold the products against the emulator's truth, and write the report."""
-    from daemon.report import write_report
+    from daemon.postflight.report import write_report
 
     started = time.monotonic()
     with console.status("comparing the stitched images with the truth"):

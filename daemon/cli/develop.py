@@ -12,12 +12,12 @@ import typer
 from rich.progress import Progress
 
 from daemon.cli.failures import end_walk
-from daemon.configuration import ConfigurationError
-from daemon.disk.mission import Mission
-from daemon.disk.publication import sweep
-from daemon.disk.walk import walk
-from daemon.tables import light_table
-from daemon.terminal import Console
+from daemon.configuration.model import ConfigurationError
+from daemon.mission.layout import Mission
+from daemon.mission.store.publication import sweep
+from daemon.mission.walk import walk
+from daemon.terminal.console import Console
+from daemon.terminal.tables import light_table
 
 if TYPE_CHECKING:
     from daemon.products.level3 import Developed

@@ -19,7 +19,7 @@ Examples: `syntopic disk-health`, `syntopic disk-health --out /tmp/disks.json`
 def disk_health(
     out: Annotated[Path | None, typer.Option(help="File to write (default: in /run).")] = None,
 ) -> None:
-    from daemon.disk import health
+    from daemon.mission.store import health
 
     path = out or health.REPORT
     try:

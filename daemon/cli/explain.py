@@ -9,8 +9,8 @@ from typing import Annotated
 
 import typer
 
-from daemon.tables import light_table
-from daemon.terminal import Console
+from daemon.terminal.console import Console
+from daemon.terminal.tables import light_table
 
 HELP = """Say what an event of the service means, what causes it and what helps.
 
@@ -25,7 +25,7 @@ def explain(
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object.")] = False,
     markdown: Annotated[bool, typer.Option("--markdown", help="The page docs/events.md.")] = False,
 ) -> None:
-    from daemon.flight.event_table import TABLE, as_markdown, entry_of
+    from daemon.onboard.flight.event_table import TABLE, as_markdown, entry_of
 
     if markdown:
         sys.stdout.write(as_markdown())

@@ -10,9 +10,9 @@ import typer
 from rich.progress import Progress
 
 from daemon.cli.failures import end_walk
-from daemon.tables import light_table
-from daemon.terminal import Console
-from drivers.extras import require
+from daemon.terminal.console import Console
+from daemon.terminal.tables import light_table
+from drivers.base.extras import require
 
 ORIENTATION_HELP = """Exterior orientation of every cone of every exposure, at its own mid-exposure.
 
@@ -69,8 +69,8 @@ def raw(
 
     Example: `syntopic export raw missions/20261121T101500Z-ultracam-x-mini`
     """
-    from daemon.disk.mission import Mission
-    from daemon.export.raw import export_raw
+    from daemon.mission.layout import Mission
+    from daemon.postflight.export.raw import export_raw
 
     folder = Mission.open(mission)
     with folder.held():
@@ -102,8 +102,8 @@ def foxglove(
 
     Example: `syntopic export foxglove missions/20261121T101500Z-ultracam-x-mini`
     """
-    from daemon.disk.mission import Mission
-    from daemon.export.foxglove import export_foxglove
+    from daemon.mission.layout import Mission
+    from daemon.postflight.export.foxglove import export_foxglove
 
     folder = Mission.open(mission)
     with folder.held():
@@ -132,8 +132,8 @@ def pictures(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from daemon.disk.mission import Mission
-    from daemon.export.pictures import KINDS, PictureError, export_pictures
+    from daemon.mission.layout import Mission
+    from daemon.postflight.export.pictures import KINDS, PictureError, export_pictures
 
     if kind not in KINDS:
         raise PictureError(f"--as is {kind!r}; cog or jpeg is right")
@@ -168,8 +168,8 @@ def certificate(
     mission: Annotated[Path, typer.Argument(help="Mission folder.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from daemon.disk.mission import Mission
-    from daemon.export.certificate import write_certificate
+    from daemon.mission.layout import Mission
+    from daemon.postflight.export.certificate import write_certificate
 
     folder = Mission.open(mission)
     with folder.held():
@@ -211,8 +211,8 @@ def orientation(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from daemon.disk.mission import Mission
-    from daemon.export import orientation as orientation_export
+    from daemon.mission.layout import Mission
+    from daemon.postflight.export import orientation as orientation_export
 
     folder = Mission.open(mission)
     with folder.held(), Progress(console=Console(stderr=True), transient=True) as progress:

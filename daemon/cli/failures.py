@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import typer
 from rich.text import Text
 
-from daemon.disk.walk import ExposureFailure
-from daemon.tables import light_table
-from daemon.terminal import Console
+from daemon.mission.walk import ExposureFailure
+from daemon.terminal.console import Console
+from daemon.terminal.tables import light_table
 
 
 def end_walk(failures: Sequence[ExposureFailure]) -> None:

@@ -12,9 +12,9 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from daemon.tables import light_table
-from daemon.terminal import Console
-from drivers.extras import MissingExtraError, require
+from daemon.terminal.console import Console
+from daemon.terminal.tables import light_table
+from drivers.base.extras import MissingExtraError, require
 
 if TYPE_CHECKING:
     from drivers.detection.search import Found

@@ -7,8 +7,8 @@ from typing import Any, NoReturn
 
 import typer
 
-from daemon.tables import light_table
-from daemon.terminal import Console
+from daemon.terminal.console import Console
+from daemon.terminal.tables import light_table
 
 
 def find_heads(*, as_json: bool) -> NoReturn:
@@ -45,7 +45,7 @@ def found_heads() -> tuple[list[dict[str, Any]], list[str]]:
 
 
 def _genicam_heads() -> tuple[list[dict[str, Any]], list[str]]:
-    from drivers.aravis import discovery
+    from drivers.cameras.aravis import discovery
     from drivers.contract import DeviceError
 
     try:
@@ -64,8 +64,8 @@ def _genicam_heads() -> tuple[list[dict[str, Any]], list[str]]:
 
 def v4l2_heads() -> tuple[list[dict[str, Any]], list[str]]:
     """The kernel's capture nodes alone; see `found_heads`."""
-    from drivers.v4l2.discovery import capture_nodes
-    from drivers.v4l2.formats import FORMATS
+    from drivers.cameras.v4l2.discovery import capture_nodes
+    from drivers.cameras.v4l2.formats import FORMATS
 
     found: list[dict[str, Any]] = []
     problems: list[str] = []

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 from rich.progress import Progress
 
-from daemon.terminal import Console
+from daemon.terminal.console import Console
 
 app = typer.Typer(
     help="""Bring in exposures of other cameras as a mission folder for `syntopic process`.
@@ -36,7 +36,7 @@ def rededge(
 
     Example: `syntopic import rededge 000/ --out missions/field-7`
     """
-    from daemon.importers.rededge import import_rededge
+    from daemon.postflight.importers.rededge import import_rededge
 
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("importing", total=None)
@@ -76,8 +76,8 @@ def dbat(
 
     Example: `syntopic import dbat camcal.xml --out camcal`
     """
-    from daemon.adjusting.writing import write_project
-    from daemon.importers.dbat import import_dbat
+    from daemon.postflight.adjustment.writing import write_project
+    from daemon.postflight.importers.dbat import import_dbat
 
     imported = import_dbat(script)
     write_project(out, imported.file, imported.network, imported.checks)

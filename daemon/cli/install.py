@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daemon.terminal import Console
+from daemon.terminal.console import Console
 
 if TYPE_CHECKING:
-    from daemon.installation import Done
+    from daemon.onboard.installation import Done
 
 HELP = """Lay out the service: unit, user, folders, device rules, kernel settings, compiled kernels.
 
@@ -40,8 +40,8 @@ def install(
     replace: Annotated[bool, typer.Option(help="Also overwrite what was edited by hand.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    from daemon import installation
-    from daemon.configuration import load
+    from daemon.configuration.model import load
+    from daemon.onboard import installation
 
     command = Path(sys.argv[0]).absolute()
     configuration = PurePosixPath(config.absolute())
@@ -68,7 +68,7 @@ def install(
 
 
 def uninstall(root: Root = Path("/"), as_json: AsJson = False) -> None:
-    from daemon import installation
+    from daemon.onboard import installation
 
     console = Console(stderr=True)
     done = installation.uninstall(

@@ -1,7 +1,7 @@
 """What Ctrl-C leaves behind, in one sentence for each command.
 
-Files appear whole or not at all (`daemon.disk.durable`), so that what each sentence says holds at
-any instant. A command that handles Ctrl-C itself (`run`, `sim`) ends in its own way.
+Files appear whole or not at all (`daemon.mission.store.durable`), so that what each sentence says
+holds at any instant. A command that handles Ctrl-C itself (`run`, `sim`) ends in its own way.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 
 import typer
 
-from daemon.terminal import Console
+from daemon.terminal.console import Console
 
 STATUS = 130
 """Exit status after SIGINT, as shells give it: 128 + 2."""

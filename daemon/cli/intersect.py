@@ -11,9 +11,9 @@ import typer
 
 from daemon.cli.failures import end_walk
 from daemon.cli.options import AsJson, AttitudeSigma, Crs, MountFile, PositionSigma, Trajectory
-from daemon.tables import light_table
-from daemon.terminal import Console
-from drivers.extras import require
+from daemon.terminal.console import Console
+from daemon.terminal.tables import light_table
+from drivers.base.extras import require
 
 HELP = """Ground points from places measured in two or more oriented images, with their accuracy.
 
@@ -49,11 +49,11 @@ def intersect(
     as_json: AsJson = False,
 ) -> None:
     require("geodesy")
-    from daemon.adjusting.tables import write_table
-    from daemon.disk.mission import Mission
-    from daemon.orientation.intersection import IntersectionError, Uncertain
-    from daemon.orientation.intersection import intersect as intersected
-    from daemon.orientation.triangulation import attitude_sigmas
+    from daemon.mission.layout import Mission
+    from daemon.postflight.adjustment.tables import write_table
+    from daemon.postflight.triangulation.intersection import IntersectionError, Uncertain
+    from daemon.postflight.triangulation.intersection import intersect as intersected
+    from daemon.postflight.triangulation.triangulation import attitude_sigmas
 
     if out is not None and out.exists():
         raise IntersectionError(f"{out} exists; give another name with --out")

@@ -21,7 +21,7 @@ def kernels(
     ] = "ultracam-x-mini",
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from processing import compiled
+    from processing.pipelines import compiled
 
     found = find_rig(rig)
     done = compiled.compile_for(found)

@@ -17,11 +17,11 @@ from rich.table import Table
 from rich.text import Text
 
 from daemon.errors import DaemonError
-from daemon.tables import light_table
-from daemon.watch.state import EXPOSURES_KEPT, PARTS, PICTURE_PARTS
+from daemon.onboard.monitoring.state import EXPOSURES_KEPT, PARTS, PICTURE_PARTS
+from daemon.terminal.tables import light_table
 
 if TYPE_CHECKING:
-    from daemon.watch.finding import Announced
+    from daemon.onboard.monitoring.client.finding import Announced
 
 HELP = """Watch a flight from a terminal: phase, ledger, faults, the last exposures.
 
@@ -120,7 +120,7 @@ def monitor(
         bool, typer.Option("--json", help="Print the state once, as one JSON object.")
     ] = False,
 ) -> None:
-    from daemon.watch.client import Access, records, service_at
+    from daemon.onboard.monitoring.client.client import Access, records, service_at
 
     console = Console(stderr=as_json)
     service = service_at(address or _only_one(console, token), tls=tls)
@@ -145,7 +145,7 @@ def monitor(
 
 def _only_one(console: Console, token: str) -> str:
     """The address of the service that announces itself, where there is one and no token."""
-    from daemon.watch.finding import FIND_S, SERVICES_MAX, find_services
+    from daemon.onboard.monitoring.client.finding import FIND_S, SERVICES_MAX, find_services
 
     found = find_services()
     if not found:

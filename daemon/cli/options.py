@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from daemon.disk.mission import Mission
+from daemon.mission.layout import Mission
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 

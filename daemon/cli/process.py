@@ -14,11 +14,11 @@ from rich.progress import Progress
 
 from daemon.cli.failures import end_walk
 from daemon.cli.level2_tables import print_reports
-from daemon.configuration import ConfigurationError, PlanSection, ProcessingSection
-from daemon.configuration_problems import dig
-from daemon.disk.mission import Mission
+from daemon.configuration.model import ConfigurationError, PlanSection, ProcessingSection
+from daemon.configuration.problems import dig
+from daemon.mission.layout import Mission
 from daemon.orientation.exterior import mount_of
-from daemon.terminal import Console
+from daemon.terminal.console import Console
 from processing.image.kernels import DEFAULT_INTERPOLATION, INTERPOLATIONS
 
 HELP = """Process the exposures of a mission folder again, Level-0 to Level-2.
@@ -61,13 +61,13 @@ def process(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
-    from daemon.disk import store
-    from daemon.disk.level2 import recover_level2
-    from daemon.disk.records import sha256_hex
-    from daemon.disk.walk import walk
+    from daemon.mission.records import sha256_hex
+    from daemon.mission.store import store
+    from daemon.mission.store.level2 import recover_level2
+    from daemon.mission.walk import walk
+    from daemon.onboard.pipeline.worker import overlaps_of, process_exposure
     from daemon.orientation.ground import ground_of
     from daemon.products.processor import processor_for
-    from daemon.service.worker import overlaps_of, process_exposure
     from processing.radiometry.calibration import CalibrationError
     from processing.rig import load_rig
 

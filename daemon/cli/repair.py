@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from daemon.terminal import Console
+from daemon.terminal.console import Console
 
 HELP = """Bring index, records, logs and disk of a mission together, as the service does on start.
 
@@ -32,10 +32,12 @@ def repair(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from daemon.disk import durable, mirror_repair, recovery
-    from daemon.disk.log_seals import close_run, seal_logs
-    from daemon.disk.mission import Mission
-    from daemon.flight.recovery_match import seal_from_log
+    from daemon.mission.layout import Mission
+    from daemon.mission.log.log_seals import close_run, seal_logs
+    from daemon.mission.mirror import mirror_repair
+    from daemon.mission.store import durable
+    from daemon.mission.verification import recovery
+    from daemon.onboard.flight.recovery_match import seal_from_log
     from processing.rig import load_rig
 
     folder, other = Mission.open(mission), None if mirror is None else Mission.open(mirror)

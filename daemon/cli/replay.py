@@ -13,10 +13,10 @@ from pydantic import ValidationError
 from rich.progress import Progress
 
 from daemon.cli.process import as_flown
-from daemon.configuration import Configuration, ConfigurationError
-from daemon.disk.mission import Mission, MissionError
-from daemon.tables import light_table
-from daemon.terminal import Console
+from daemon.configuration.model import Configuration, ConfigurationError
+from daemon.mission.layout import Mission, MissionError
+from daemon.terminal.console import Console
+from daemon.terminal.tables import light_table
 
 HELP = """Feed what a mission recorded through the same code again, and compare.
 
@@ -50,11 +50,11 @@ def replay(
     configuration = _flown_configuration(folder)
     threads = configuration.processing.threads
     os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
-    from daemon.disk.flight_log import logs_of
-    from daemon.replay.flight import Replayed, replay_log
-    from daemon.replay.products import compare_products, compare_records
-    from daemon.service.departure import identity
-    from daemon.service.messages import WorkerSettings
+    from daemon.mission.log.flight_log import logs_of
+    from daemon.onboard.service.departure import identity
+    from daemon.onboard.service.messages import WorkerSettings
+    from daemon.postflight.replay.flight import Replayed, replay_log
+    from daemon.postflight.replay.products import compare_products, compare_records
     from processing.rig import load_rig
 
     rig = load_rig(folder.rig_path)

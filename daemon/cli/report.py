@@ -10,7 +10,7 @@ import typer
 
 from daemon.cli.failures import end_walk
 from daemon.cli.options import held_for
-from daemon.terminal import Console
+from daemon.terminal.console import Console
 
 HELP = """Write the mission's report: one HTML file that needs nothing beside it.
 
@@ -32,10 +32,10 @@ def report(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from daemon.disk.mission import Mission
-    from daemon.disk.verification import verify
-    from daemon.export.support_bundle import write_bundle
-    from daemon.report import write_report
+    from daemon.mission.layout import Mission
+    from daemon.mission.verification.verification import verify
+    from daemon.postflight.export.support_bundle import write_bundle
+    from daemon.postflight.report import write_report
 
     folder = Mission.open(mission)
     console = Console(stderr=as_json, soft_wrap=True)

@@ -8,9 +8,9 @@ from typing import Annotated
 
 import typer
 
-from daemon.disk.durable import replace_file
-from daemon.tables import light_table
-from daemon.terminal import Console
+from daemon.mission.store.durable import replace_file
+from daemon.terminal.console import Console
+from daemon.terminal.tables import light_table
 from processing.rig import Rig, find_rig, load_rig, shipped_rigs
 
 app = typer.Typer(
@@ -64,7 +64,7 @@ def show(
     """
     from processing.geometry import topology
     from processing.mosaic import drawing as draw
-    from processing.perspective import looks_apart
+    from processing.pipelines.perspective import looks_apart
 
     rig = find_rig(name)
     counts = topology.counts(rig)

@@ -39,11 +39,11 @@ def run(
         ),
     ] = False,
 ) -> None:
-    from daemon.configuration import load
-    from daemon.service.departure import interrupted_mission
-    from daemon.service.processes import die_with_parent
-    from daemon.service.resumption import close_interrupted
-    from daemon.service.service import Service
+    from daemon.configuration.model import load
+    from daemon.onboard.preflight.resumption import close_interrupted
+    from daemon.onboard.service.departure import interrupted_mission
+    from daemon.onboard.service.processes import die_with_parent
+    from daemon.onboard.service.service import Service
 
     if parent is not None:
         die_with_parent(parent, signal.SIGTERM)

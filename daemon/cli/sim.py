@@ -17,9 +17,9 @@ from typing import Annotated, Any
 
 import typer
 
-from daemon.disk.durable import replace_file
-from daemon.terminal import Console
-from drivers.extras import require
+from daemon.mission.store.durable import replace_file
+from daemon.terminal.console import Console
+from drivers.base.extras import require
 from processing.rig import find_rig
 
 HELP = """Run the emulated devices of a rig until Ctrl-C.

@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from daemon.tables import light_table
-from daemon.terminal import Console
+from daemon.terminal.console import Console
+from daemon.terminal.tables import light_table
 
 app = typer.Typer(
     help="""Make and take back tokens for the API and the operator's page.
@@ -33,8 +33,8 @@ def add(
 
     Example: `syntopic token add operator --role operator`
     """
-    from daemon.watch.roles import ROLES
-    from daemon.watch.tokens import TokenError, add_token
+    from daemon.onboard.monitoring.access.roles import ROLES
+    from daemon.onboard.monitoring.access.tokens import TokenError, add_token
 
     chosen = next((known for known in ROLES if known == role), None)
     if chosen is None:
@@ -53,7 +53,7 @@ def remove(
 
     Example: `syntopic token remove operator`
     """
-    from daemon.watch.tokens import remove_token
+    from daemon.onboard.monitoring.access.tokens import remove_token
 
     remove_token(file, name)
     typer.echo(f"{name} has no token any more; restart the service to make it so")
@@ -68,7 +68,7 @@ def list_(
 
     Example: `syntopic token list --file tokens.toml`
     """
-    from daemon.watch.tokens import read_tokens
+    from daemon.onboard.monitoring.access.tokens import read_tokens
 
     holders = sorted(read_tokens(file).holders.values(), key=lambda holder: holder.name)
     if as_json:

@@ -15,7 +15,7 @@ from rich.progress import (
     TransferSpeedColumn,
 )
 
-from daemon.terminal import Console
+from daemon.terminal.console import Console
 
 HELP = """Copy a mission to another disk and verify every file.
 
@@ -35,9 +35,9 @@ def transfer(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from daemon.disk.mission import Mission
-    from daemon.disk.transfer import finish_transfer
-    from daemon.disk.transfer import transfer as run
+    from daemon.mission.layout import Mission
+    from daemon.mission.transfer.transfer import finish_transfer
+    from daemon.mission.transfer.transfer import transfer as run
 
     columns = (BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:

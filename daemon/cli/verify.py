@@ -12,10 +12,10 @@ from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
 
-from daemon.terminal import Console
+from daemon.terminal.console import Console
 
 if TYPE_CHECKING:
-    from daemon.disk.verification import VerifyReport
+    from daemon.mission.verification.verification import VerifyReport
 
 HELP = """Check everything in a mission folder against its hashes and list what has no hash.
 
@@ -33,8 +33,8 @@ def verify(
     mission: Annotated[Path, typer.Argument(help="Mission folder.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from daemon.disk import store
-    from daemon.disk.mission import Mission
+    from daemon.mission.layout import Mission
+    from daemon.mission.store import store
 
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("verifying", total=None)
@@ -51,7 +51,7 @@ def verify(
 
 
 def _print(report: VerifyReport) -> None:
-    from daemon.disk.verification import STATES
+    from daemon.mission.verification.verification import STATES
 
     console = Console(soft_wrap=True)
     table = Table("what", "files", "hash in", title="Covered", title_justify="left", box=None)

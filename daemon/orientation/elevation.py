@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from daemon.errors import DaemonError
-from daemon.foreign_files import ForeignFileError, open_plain
+from daemon.mission.foreign_files import ForeignFileError, open_plain
 from daemon.orientation.georeference import Georeference
-from drivers.extras import require
+from drivers.base.extras import require
 from processing.geometry.terrain_rays import HeightModel
 
 MODEL_MAX_BYTES = 2_000_000_000

@@ -18,14 +18,14 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.configuration import ConfigurationError, MountSection, PlanSection
-from daemon.disk.level0_folder import read_sealed
-from daemon.disk.mission import Mission
-from daemon.disk.walk import Walked, walk
-from daemon.exposure import Exposure, NavigationRecord
-from daemon.flight.navigation import metres_per_degree
-from daemon.foreign_files import read_plain
+from daemon.configuration.model import ConfigurationError, MountSection, PlanSection
+from daemon.mission.exposure import Exposure, NavigationRecord
+from daemon.mission.foreign_files import read_plain
+from daemon.mission.layout import Mission
+from daemon.mission.store.level0_folder import read_sealed
+from daemon.mission.walk import Walked, walk
 from daemon.orientation.georeference import Place
+from daemon.orientation.navigation import metres_per_degree
 from processing.geometry.orientation import (
     BODY_FROM_CAMERA,
     grid_from_camera,

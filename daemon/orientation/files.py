@@ -12,7 +12,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from daemon.configuration import MountSection
+from daemon.configuration.model import MountSection
 from daemon.orientation.exterior import ExteriorOrientation, Unoriented
 from daemon.orientation.georeference import Georeference
 from processing.geometry.orientation import phi_omega_kappa

@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from daemon.configuration import MountSection
-from daemon.disk.mission import Mission
-from daemon.exposure import NavigationRecord
-from daemon.flight.navigation import metres_per_degree
+from daemon.configuration.model import MountSection
+from daemon.mission.exposure import NavigationRecord
+from daemon.mission.layout import Mission
 from daemon.orientation.exterior import ExteriorOrientation
 from daemon.orientation.files import image_extent_mm
-from drivers.leap_seconds import leap_seconds_at
+from daemon.orientation.navigation import metres_per_degree
+from drivers.timescales.leap_seconds import leap_seconds_at
 from processing.geometry.orientation import (
     BODY_FROM_CAMERA,
     grid_from_camera,

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from daemon.errors import DaemonError
-from drivers.extras import require
+from drivers.base.extras import require
 
 if TYPE_CHECKING:
     import pyproj

@@ -10,8 +10,8 @@ from typing import Final
 
 import numpy as np
 
-from daemon.configuration import MountSection, PlanSection
-from daemon.exposure import NavigationRecord
+from daemon.configuration.model import MountSection, PlanSection
+from daemon.mission.exposure import NavigationRecord
 from daemon.orientation.elevation import read_elevation
 from daemon.orientation.footprints import seen_from
 from daemon.orientation.georeference import Georeference

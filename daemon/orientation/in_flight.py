@@ -10,12 +10,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from daemon.configuration import MountSection
-from daemon.exposure import Exposure, NavigationRecord
-from daemon.flight.navigation import metres_per_degree
+from daemon.configuration.model import MountSection
+from daemon.mission.exposure import Exposure, NavigationRecord
 from daemon.orientation.exterior import ExteriorOrientation, Unoriented, orient
 from daemon.orientation.footprints import footprint
 from daemon.orientation.georeference import Place
+from daemon.orientation.navigation import metres_per_degree
 from processing.rig import Rig
 
 FORMAT: Final = 1

@@ -10,10 +10,10 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from daemon.configuration import MountSection
-from daemon.disk.mission import Mission
+from daemon.configuration.model import MountSection
 from daemon.errors import DaemonError
-from daemon.exposure import Exposure
+from daemon.mission.exposure import Exposure
+from daemon.mission.layout import Mission
 from daemon.orientation.exterior import (
     ExteriorOrientation,
     Unoriented,
@@ -23,7 +23,7 @@ from daemon.orientation.exterior import (
 )
 from daemon.orientation.georeference import Georeference, utm_of
 from daemon.orientation.trajectory import Trajectory, flown, read_trajectory
-from drivers.extras import require
+from drivers.base.extras import require
 from processing.rig import Rig, load_rig
 
 

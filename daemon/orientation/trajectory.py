@@ -1,7 +1,7 @@
 """The way the camera flew: the flight's own navigation, or a post-processed trajectory from a file.
 
 A trajectory answers where the camera was at an instant. Where it comes from differs, how it is
-interpolated does not (`daemon.flight.navigation`).
+interpolated does not (`daemon.orientation.navigation`).
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.disk.flight_log import logs_of, read
-from daemon.disk.log_records import record_of
-from daemon.disk.mission import Mission
-from daemon.disk.records import sha256_hex
 from daemon.errors import DaemonError
-from daemon.exposure import NavigationRecord
-from daemon.flight.navigation import EXTRAPOLATION_LIMIT_NS, around, metres_per_degree
-from daemon.foreign_files import ForeignFileError, read_plain
+from daemon.mission.exposure import NavigationRecord
+from daemon.mission.foreign_files import ForeignFileError, read_plain
+from daemon.mission.layout import Mission
+from daemon.mission.log.flight_log import logs_of, read
+from daemon.mission.log.log_records import record_of
+from daemon.mission.records import sha256_hex
+from daemon.orientation.navigation import EXTRAPOLATION_LIMIT_NS, around, metres_per_degree
 from drivers.contract import NavSample
 
 WEEK_NS = 604_800_000_000_000

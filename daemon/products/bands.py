@@ -1,6 +1,6 @@
 """Level-2 of a rig without a virtual image: one raster per band, its mask, and the report.
 
-What the bands are is made by `processing.band_pipeline`; here they get their files.
+What the bands are is made by `processing.pipelines.bands`; here they get their files.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.disk.level2 import pictures, simulated_mark
-from daemon.disk.mission import Mission
-from daemon.disk.records import canonical_bytes
-from daemon.exposure import Exposure
+from daemon.mission.exposure import Exposure
+from daemon.mission.layout import Mission
+from daemon.mission.records import canonical_bytes
+from daemon.mission.store.level2 import pictures, simulated_mark
 from daemon.products.reports import Contents, FramesRead, Made, report_json
-from processing.band_pipeline import BandPipeline, FrameSettings
-from processing.conditions import Conditions
+from processing.geometry.conditions import Conditions
 from processing.image.band_registration import RegisteredBand
+from processing.pipelines.bands import BandPipeline, FrameSettings
 from processing.radiometry.calibration import CalibrationError
 from processing.radiometry.radiance import RadianceCalibration, load_radiance
 from processing.rig import Rig

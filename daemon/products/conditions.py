@@ -6,15 +6,15 @@ import datetime
 import math
 import statistics
 
-from daemon.configuration import PlanSection
-from daemon.disk.frame_checks import tdi_shifts
-from daemon.exposure import Exposure
+from daemon.configuration.model import PlanSection
+from daemon.mission.exposure import Exposure
+from daemon.mission.store.frame_checks import tdi_shifts
 from daemon.orientation.ground import Ground
-from daemon.plan.overlaps import Surroundings
-from drivers.leap_seconds import leap_seconds_at
-from processing.conditions import by_sensor_of
+from daemon.planning.overlaps import Surroundings
+from drivers.timescales.leap_seconds import leap_seconds_at
+from processing.geometry.conditions import by_sensor_of
 from processing.geometry.sun import sun_elevation_rad
-from processing.pipeline import Conditions
+from processing.pipelines.stitched import Conditions
 from processing.quality.report import Flag
 from processing.rig import Rig
 

@@ -1,6 +1,6 @@
 """Level-2 of a rig whose heads look apart: an image of every head in strict perspective.
 
-What they are is made by `processing.perspective`; here they get their files.
+What they are is made by `processing.pipelines.perspective`; here they get their files.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.disk.level0 import tiff_parts
-from daemon.disk.level2 import pictures, simulated_mark
-from daemon.disk.records import canonical_bytes
-from daemon.exposure import Exposure
+from daemon.mission.exposure import Exposure
+from daemon.mission.records import canonical_bytes
+from daemon.mission.store.level0 import tiff_parts
+from daemon.mission.store.level2 import pictures, simulated_mark
 from daemon.products.reports import Contents, FramesRead, Made, report_json
-from processing.conditions import Conditions
-from processing.perspective import HeadPipeline, HeadsProduct
+from processing.geometry.conditions import Conditions
+from processing.pipelines.perspective import HeadPipeline, HeadsProduct
 
 _TILE_PX = 480
 _RGB = ("red", "green", "blue")

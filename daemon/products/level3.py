@@ -15,17 +15,17 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.disk import durable
-from daemon.disk.level0 import read_description, refuse_bomb, tiff_faults
-from daemon.disk.level0_folder import exposure_of, read_capture, read_sealed
-from daemon.disk.level2 import BAND_ORDER
-from daemon.disk.mission import Mission, exposure_name
-from daemon.disk.publication import published
-from daemon.disk.records import canonical_bytes, sha256_hex
-from daemon.disk.walk import ExposureFailure, walk
 from daemon.errors import DaemonError
-from daemon.exposure import Exposure
-from processing.conditions import reference_exposure_times
+from daemon.mission.exposure import Exposure
+from daemon.mission.layout import Mission, exposure_name
+from daemon.mission.records import canonical_bytes, sha256_hex
+from daemon.mission.store import durable
+from daemon.mission.store.level0 import read_description, refuse_bomb, tiff_faults
+from daemon.mission.store.level0_folder import exposure_of, read_capture, read_sealed
+from daemon.mission.store.level2 import BAND_ORDER
+from daemon.mission.store.publication import published
+from daemon.mission.walk import ExposureFailure, walk
+from processing.geometry.conditions import reference_exposure_times
 from processing.image.pansharpening import pansharpened
 from processing.radiometry.tone_curve import (
     WORDS,

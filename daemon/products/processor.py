@@ -14,20 +14,20 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.configuration import MountSection, PlanSection, ProcessingSection
-from daemon.disk.mission import Mission
-from daemon.disk.radiometry_folder import RadiometryFolder
-from daemon.disk.records import canonical_bytes
-from daemon.exposure import Exposure
+from daemon.configuration.model import MountSection, PlanSection, ProcessingSection
+from daemon.mission.exposure import Exposure
+from daemon.mission.layout import Mission
+from daemon.mission.records import canonical_bytes
+from daemon.mission.store.radiometry_folder import RadiometryFolder
 from daemon.orientation.in_flight import orientation_json
-from daemon.plan.reading import read_plan
+from daemon.planning.reading import read_plan
 from daemon.products.bands import bands_made, radiance_folder, radiance_of
 from daemon.products.heads import heads_made
 from daemon.products.reports import FramesRead, Made
 from daemon.products.stitched import stitched_made
-from processing.band_pipeline import BandPipeline
-from processing.perspective import HeadPipeline, looks_apart
-from processing.pipeline import Conditions, Pipeline, Settings
+from processing.pipelines.bands import BandPipeline
+from processing.pipelines.perspective import HeadPipeline, looks_apart
+from processing.pipelines.stitched import Conditions, Pipeline, Settings
 from processing.quality.report import Thresholds
 from processing.quality.specification import Asked
 from processing.radiometry.histogram import sampled_histogram

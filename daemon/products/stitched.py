@@ -1,6 +1,6 @@
 """Level-2 of a rig with a virtual image: one image, its colour, geometry and residuals.
 
-What they are is made by `processing.pipeline`; here they get their files.
+What they are is made by `processing.pipelines.stitched`; here they get their files.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.disk import level2
-from daemon.exposure import Exposure
+from daemon.mission.exposure import Exposure
+from daemon.mission.store import level2
 from daemon.products.reports import FramesRead, Made, report_json
 from processing.mosaic.drawing import residuals_svg
 from processing.mosaic.residual_vectors import residual_vectors
 from processing.mosaic.stitch_record import stitch_record, stitch_record_json
-from processing.pipeline import Conditions, Pipeline
+from processing.pipelines.stitched import Conditions, Pipeline
 
 
 def stitched_made(

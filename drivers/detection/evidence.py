@@ -12,19 +12,19 @@ from typing import Any, Final
 
 from drivers.contract import DeviceError
 from drivers.detection.lines import lines_in
-from drivers.mavlink.decoder import MavlinkDecoder
-from drivers.mavlink.navigator import MavlinkNavigator
-from drivers.message_decoder import MessageDecoder
-from drivers.nmea.decoder import NmeaDecoder
-from drivers.nmea.navigator import NmeaNavigator
-from drivers.novatel.decoder import NovatelDecoder
-from drivers.novatel.navigator import NovatelNavigator
-from drivers.receiver import ListeningNavigator
-from drivers.receiver_fix import fix_in_words
-from drivers.septentrio.decoder import SbfDecoder
-from drivers.septentrio.navigator import SeptentrioNavigator
-from drivers.ublox.decoder import UbxDecoder
-from drivers.ublox.navigator import UbloxNavigator
+from drivers.receivers.mavlink.decoder import MavlinkDecoder
+from drivers.receivers.mavlink.navigator import MavlinkNavigator
+from drivers.receivers.message_decoder import MessageDecoder
+from drivers.receivers.nmea.decoder import NmeaDecoder
+from drivers.receivers.nmea.navigator import NmeaNavigator
+from drivers.receivers.novatel.decoder import NovatelDecoder
+from drivers.receivers.novatel.navigator import NovatelNavigator
+from drivers.receivers.receiver import ListeningNavigator
+from drivers.receivers.receiver_fix import fix_in_words
+from drivers.receivers.septentrio.decoder import SbfDecoder
+from drivers.receivers.septentrio.navigator import SeptentrioNavigator
+from drivers.receivers.ublox.decoder import UbxDecoder
+from drivers.receivers.ublox.navigator import UbloxNavigator
 
 KEPT_TEXT_NBYTES: Final = 20_000
 _GPSD: Final = re.compile(rb'(^|\n)\{"class": ?"VERSION", ?"release":')

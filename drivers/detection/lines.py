@@ -1,6 +1,6 @@
 """Lines of text of an instrument nobody knows: what they have in common, as a pattern.
 
-What a pattern is, is in `drivers.ascii_line.pattern`.
+What a pattern is, is in `drivers.thermometers.ascii_line.pattern`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import Final
 
-from drivers.ascii_line.pattern import MAX_LINE, MAX_PATTERN
+from drivers.thermometers.ascii_line.pattern import MAX_LINE, MAX_PATTERN
 
 ENOUGH_LINES: Final = 2
 MOST_READINGS: Final = 64

@@ -14,11 +14,11 @@ from typing import Final
 
 from serial.tools import list_ports
 
-from drivers.clock import Clock, HostClock
 from drivers.contract import DeviceError
 from drivers.detection.evidence import Evidence, Speaker
-from drivers.modbus_rtu.frames import find_reply, read_request
-from drivers.serial_device import LineLostError, PortOpener, SerialLine, open_serial_port
+from drivers.thermometers.modbus_rtu.frames import find_reply, read_request
+from drivers.timescales.clock import Clock, HostClock
+from drivers.transport.serial_device import LineLostError, PortOpener, SerialLine, open_serial_port
 
 BAUDRATES: Final = (
     115_200, 9_600, 38_400, 57_600, 230_400, 460_800, 921_600, 19_200, 4_800,

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.conditions import Conditions
+from processing.geometry.conditions import Conditions
 from processing.geometry.projective import rotation_homography
 from processing.geometry.rotation import rotation_matrix
 from processing.quality.report import Figure

@@ -1,7 +1,7 @@
 """Figures of the quality report that come from pixels and stitching, by their documented names.
 
-What the circumstances alone tell is in `processing.conditions`; what the figures mean for the crew
-is decided in `processing.quality.report`.
+What the circumstances alone tell is in `processing.geometry.conditions`; what the figures mean for
+the crew is decided in `processing.quality.report`.
 """
 
 from __future__ import annotations

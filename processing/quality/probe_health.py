@@ -1,7 +1,7 @@
 """Temperature probes over a flight: which of them can be believed, and what stands in for the rest.
 
 Pure functions on recorded samples; whether a reading may be used in one exposure alone is decided
-in `processing.conditions`, what stitching says about temperature in
+in `processing.geometry.conditions`, what stitching says about temperature in
 `processing.mosaic.estimated_dc`.
 """
 

@@ -38,7 +38,7 @@ COLOUR_FILTER_ARRAYS = ("none", "RGGB", "BGGR", "GRBG", "GBRG")
 
 def shipped_rigs() -> dict[str, Path]:
     """Rig files that come with the package, by name."""
-    return {path.stem: path for path in sorted((Path(__file__).parents[1] / "rigs").glob("*.toml"))}
+    return {path.stem: path for path in sorted((Path(__file__).parent / "files").glob("*.toml"))}
 
 
 def find_rig(name_or_path: str) -> Rig:

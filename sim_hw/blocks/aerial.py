@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.rig import Rig
-from sim_hw.seeding import random_stream
 from sim_hw.world.camera import rotation_opk
+from sim_hw.world.seeding import random_stream
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_hw.seeding import random_stream
 from sim_hw.world.camera import BODY_FROM_CAMERA, rotation_opk
+from sim_hw.world.seeding import random_stream
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from sim_hw.devices.pseudo_terminal import PseudoTerminal
 from sim_hw.devices.serving import Line, LineDevice
-from sim_hw.world_clock import NS_PER_S
+from sim_hw.world.world_clock import NS_PER_S
 
 _COMMAND_MAX_BYTES = 64
 

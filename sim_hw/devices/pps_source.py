@@ -13,7 +13,7 @@ import time
 from collections import Counter
 from collections.abc import Mapping
 
-from sim_hw.world_clock import NS_PER_S, WorldClock
+from sim_hw.world.world_clock import NS_PER_S, WorldClock
 
 _ACCEPT_S = 0.2
 

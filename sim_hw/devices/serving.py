@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Protocol
 
-from sim_hw.world_clock import NS_PER_S
+from sim_hw.world.world_clock import NS_PER_S
 
 DRAIN_S = 0.05
 """Longest wait before the host, the closing and the wire are looked after again."""

@@ -14,7 +14,7 @@ from typing import Generic, Protocol, TypeVar
 
 from sim_hw.faults.catalogue import CATALOGUE
 from sim_hw.faults.plan import Planned
-from sim_hw.world_clock import NS_PER_S, NS_PER_WEEK
+from sim_hw.world.world_clock import NS_PER_S, NS_PER_WEEK
 
 T = TypeVar("T")
 

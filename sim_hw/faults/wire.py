@@ -13,7 +13,7 @@ from typing import Protocol
 
 from sim_hw.devices.serving import LineDevice
 from sim_hw.faults.channel import Channel
-from sim_hw.world_clock import WorldClock
+from sim_hw.world.world_clock import WorldClock
 
 NOISE_BYTES = 2000
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sim_hw.faults.channel import Channel
 from sim_hw.faults.plan import Planned
-from sim_hw.world_clock import DeviceClock
+from sim_hw.world.world_clock import DeviceClock
 
 
 @dataclass(frozen=True)

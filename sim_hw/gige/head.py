@@ -22,7 +22,7 @@ from sim_hw.gige.pacing import Pacing
 from sim_hw.gige.registers import FrameSize, HeadIdentity, RegisterMemory
 from sim_hw.gige.server import ControlServer
 from sim_hw.gige.stream import StreamChannel
-from sim_hw.world_clock import NS_PER_S, DeviceClock
+from sim_hw.world.world_clock import NS_PER_S, DeviceClock
 
 __all__ = [
     "NO_PULSE",

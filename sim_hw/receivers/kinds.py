@@ -22,7 +22,7 @@ from sim_hw.receivers.novatel_receiver import NovatelReceiver
 from sim_hw.receivers.receiver import EmulatedReceiver, ReceiverState
 from sim_hw.receivers.septentrio_receiver import SeptentrioReceiver
 from sim_hw.receivers.ublox_receiver import UbloxReceiver
-from sim_hw.world_clock import WorldClock
+from sim_hw.world.world_clock import WorldClock
 
 BAUDRATE = 115_200
 PROBE_BAUDRATES = {"modbus": 19_200, "ascii": 9_600}

@@ -21,7 +21,13 @@ from sim_hw.receivers.mavlink_messages import Listener, Received, by_number, mes
 from sim_hw.receivers.nmea_sentences import GEOID_UNDULATION_M, course_deg, longitude_deg, speed_mps
 from sim_hw.receivers.receiver import BOOT_NS, ReceiverAccuracy, ReceiverState
 from sim_hw.receivers.utc_jitter import UtcErrors, UtcJitter
-from sim_hw.world_clock import LEAP_SECONDS, NS_PER_S, DeviceClock, WorldClock, unix_ns_from_gps_ns
+from sim_hw.world.world_clock import (
+    LEAP_SECONDS,
+    NS_PER_S,
+    DeviceClock,
+    WorldClock,
+    unix_ns_from_gps_ns,
+)
 
 FIXED_WING, PX4, ACTIVE = 1, 12, 4
 ARMED_AND_CUSTOM_MODE = 0x80 | 0x01

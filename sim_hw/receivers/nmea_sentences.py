@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 
 from sim_hw.receivers.receiver import ReceiverState
-from sim_hw.world_clock import (
+from sim_hw.world.world_clock import (
     LEAP_SECONDS,
     NS_PER_S,
     gps_week_and_tow_ns,

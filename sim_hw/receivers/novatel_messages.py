@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 
 from sim_hw.receivers.nmea_sentences import GEOID_UNDULATION_M, course_deg, longitude_deg, speed_mps
 from sim_hw.receivers.receiver import ReceiverAccuracy, ReceiverState
-from sim_hw.world_clock import NS_PER_S, gps_week_and_tow_ns, unix_ns_from_gps_ns
+from sim_hw.world.world_clock import NS_PER_S, gps_week_and_tow_ns, unix_ns_from_gps_ns
 
 HEADER_NBYTES = 28
 COM1 = 32

@@ -16,7 +16,7 @@ from typing import ClassVar
 from sim_hw.devices.pseudo_terminal import PseudoTerminal
 from sim_hw.devices.serving import Line, LineDevice
 from sim_hw.faults.catalogue import MARK, NAVIGATION
-from sim_hw.world_clock import LEAP_SECONDS, NS_PER_S, WorldClock
+from sim_hw.world.world_clock import LEAP_SECONDS, NS_PER_S, WorldClock
 
 STROBE_WIDTH_NS = 50_000
 """From the rising to the falling edge of a strobe."""

@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 
 from sim_hw.receivers.nmea_sentences import GEOID_UNDULATION_M, course_deg, longitude_deg
 from sim_hw.receivers.receiver import ReceiverAccuracy, ReceiverState
-from sim_hw.world_clock import NS_PER_S, gps_week_and_tow_ns, unix_ns_from_gps_ns
+from sim_hw.world.world_clock import NS_PER_S, gps_week_and_tow_ns, unix_ns_from_gps_ns
 
 DO_NOT_USE = -2e10
 RTK_FIXED = 4

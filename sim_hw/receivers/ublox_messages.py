@@ -18,7 +18,7 @@ from sim_hw.receivers.nmea_sentences import (
     utc_fields,
 )
 from sim_hw.receivers.receiver import ReceiverAccuracy, ReceiverState
-from sim_hw.world_clock import NS_PER_WEEK, gps_week_and_tow_ns
+from sim_hw.world.world_clock import NS_PER_WEEK, gps_week_and_tow_ns
 
 _NS_PER_MS = 1_000_000
 

@@ -27,7 +27,7 @@ from sim_hw.receivers.ublox_messages import (
     nav_timels,
     tim_tm2,
 )
-from sim_hw.world_clock import WorldClock
+from sim_hw.world.world_clock import WorldClock
 
 __all__ = ["LATENCY_NS", "STROBE_WIDTH_NS", "ReceiverAccuracy", "ReceiverState", "UbloxReceiver"]
 

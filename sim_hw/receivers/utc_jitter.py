@@ -6,7 +6,7 @@ import math
 import random
 from dataclasses import dataclass
 
-from sim_hw.world_clock import NS_PER_S
+from sim_hw.world.world_clock import NS_PER_S
 
 
 @dataclass(frozen=True)

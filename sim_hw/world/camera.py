@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from processing.rig import Cone, Lens, Rig, Sensor
-from sim_hw.seeding import random_stream
 from sim_hw.world.flight import Pose
+from sim_hw.world.seeding import random_stream
 
 Array = NDArray[np.float64]
 

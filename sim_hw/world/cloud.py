@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_hw.seeding import random_stream
 from sim_hw.world import spline
 from sim_hw.world.grounds import rough
+from sim_hw.world.seeding import random_stream
 
 Array = NDArray[np.float64]
 

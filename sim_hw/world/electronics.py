@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.rig import Cone, Sensor
-from sim_hw.seeding import random_stream
+from sim_hw.world.seeding import random_stream
 
 Map = NDArray[np.float32]
 

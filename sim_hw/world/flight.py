@@ -15,8 +15,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_hw.seeding import random_stream
 from sim_hw.world.ellipsoid import ecef_from_enu_rotation, geodetic_from_enu
+from sim_hw.world.seeding import random_stream
 
 Matrix = NDArray[np.float64]
 

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.rig import Sensor
-from sim_hw.seeding import random_stream
-from sim_hw.whole_file import whole_file
 from sim_hw.world import electronics
 from sim_hw.world.electronics import Map, SensorTruth
+from sim_hw.world.seeding import random_stream
+from sim_hw.world.whole_file import whole_file
 
 BIAS_FRAMES = 64
 DARK_FRAMES = 16

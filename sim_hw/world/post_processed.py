@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from sim_hw.seeding import random_stream
-from sim_hw.whole_file import whole_file
 from sim_hw.world.flight import Flight, path_point
+from sim_hw.world.seeding import random_stream
+from sim_hw.world.whole_file import whole_file
 from sim_hw.world.world import World
 
 POSITION_M = (0.05, 0.05, 0.05)

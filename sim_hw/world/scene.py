@@ -22,9 +22,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_hw.seeding import random_stream
 from sim_hw.world import quilting, spline
 from sim_hw.world.grounds import GROUNDS
+from sim_hw.world.seeding import random_stream
 
 Band = NDArray[np.uint16]
 

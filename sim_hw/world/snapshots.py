@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.rig import Cone, Sensor
-from sim_hw.seeding import random_stream
 from sim_hw.world import laboratory
 from sim_hw.world.electronics import Electronics, true_sensor
 from sim_hw.world.flight import Flight
 from sim_hw.world.laboratory import Radiometry
 from sim_hw.world.rendering import Look, Map, light_on_sensor
 from sim_hw.world.scene import Scene
+from sim_hw.world.seeding import random_stream
 from sim_hw.world.truth import Taken, exposure_truth
 from sim_hw.world.world import World
 

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from sim_hw.seeding import random_stream
-from sim_hw.whole_file import whole_file
 from sim_hw.world import camera
 from sim_hw.world.flight import Flight
+from sim_hw.world.seeding import random_stream
 from sim_hw.world.snapshots import look_of
+from sim_hw.world.whole_file import whole_file
 from sim_hw.world.world import World
 
 

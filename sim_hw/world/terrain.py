@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_hw.seeding import random_stream
+from sim_hw.world.seeding import random_stream
 
 Array = NDArray[np.float64]
 

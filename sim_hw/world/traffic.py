@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_hw.seeding import random_stream
 from sim_hw.world import spline
 from sim_hw.world.grounds import motorways_px
 from sim_hw.world.scene import COLOURS, PAN_MIX, Scene, SceneSettings
+from sim_hw.world.seeding import random_stream
 
 LANES = 8
 LANE_M = 3.75

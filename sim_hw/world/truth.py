@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.rig import Cone, Sensor
-from sim_hw.whole_file import whole_file
 from sim_hw.world import camera
 from sim_hw.world.flight import Flight
 from sim_hw.world.rendering import Look, content_rows, grid_axis, sensor_directions
+from sim_hw.world.whole_file import whole_file
 from sim_hw.world.world import CABIN_C, World, WorldSettings
 
 Array = NDArray[np.float64]

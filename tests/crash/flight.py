@@ -17,16 +17,16 @@ from typing import Any, Literal
 
 import numpy as np
 
-from daemon.disk import durable, log_seals
-from daemon.disk.level0_folder import read_sealed
-from daemon.disk.level2 import write_level2
-from daemon.disk.log_records import LoggedTrigger, message_of
-from daemon.disk.mission import Mission
-from daemon.disk.recovery import recover
-from daemon.exposure import Exposure
-from daemon.flight.recovery_match import seal_from_log
-from daemon.service import writer
-from daemon.service.messages import (
+from daemon.mission.exposure import Exposure
+from daemon.mission.layout import Mission
+from daemon.mission.log import log_seals
+from daemon.mission.log.log_records import LoggedTrigger, message_of
+from daemon.mission.store import durable
+from daemon.mission.store.level0_folder import read_sealed
+from daemon.mission.store.level2 import write_level2
+from daemon.mission.verification.recovery import recover
+from daemon.onboard.flight.recovery_match import seal_from_log
+from daemon.onboard.service.messages import (
     Log,
     NoteProducts,
     Seal,
@@ -36,6 +36,7 @@ from daemon.service.messages import (
     Stored,
     WriteFailed,
 )
+from daemon.onboard.storage import writer
 from drivers.contract import TriggerPulse
 from tests.daemon.small_camera import (
     SENSORS,

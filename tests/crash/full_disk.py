@@ -14,10 +14,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from daemon.disk.level0_folder import read_sealed
-from daemon.exposure import Exposure
-from daemon.service import writer
-from daemon.service.messages import Seal, Sealed, Told, WriteFailed
+from daemon.mission.exposure import Exposure
+from daemon.mission.store.level0_folder import read_sealed
+from daemon.onboard.service.messages import Seal, Sealed, Told, WriteFailed
+from daemon.onboard.storage import writer
 from tests.crash import judging
 from tests.crash.flight import Flown, Ring
 from tests.daemon.small_camera import SENSORS, new_mission

@@ -7,16 +7,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from daemon.disk.catalog import Catalog
-from daemon.disk.flight_log import logs_of, read
-from daemon.disk.level0 import read_tiff
-from daemon.disk.level0_folder import read_sealed
-from daemon.disk.log_records import Message
-from daemon.disk.mission import Mission
-from daemon.disk.recovery import RecoveryReport, recover
-from daemon.disk.store import Level0Writer, verify
-from daemon.flight.ledger import Ledger
-from daemon.flight.recovery_match import seal_from_log
+from daemon.mission.catalog.catalog import Catalog
+from daemon.mission.layout import Mission
+from daemon.mission.log.flight_log import logs_of, read
+from daemon.mission.log.log_records import Message
+from daemon.mission.store.level0 import read_tiff
+from daemon.mission.store.level0_folder import read_sealed
+from daemon.mission.store.store import Level0Writer, verify
+from daemon.mission.verification.recovery import RecoveryReport, recover
+from daemon.onboard.flight.ledger import Ledger
+from daemon.onboard.flight.recovery_match import seal_from_log
 from tests.daemon.small_camera import final_record, pixels_of, small_rig, store_one
 
 MAY_BE_TOLD = ("was damaged on the disk; read with care",)

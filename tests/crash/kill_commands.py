@@ -25,12 +25,12 @@ from pathlib import Path
 
 from daemon import cli
 from daemon.cli import process, repair, report  # noqa: F401 - the children need not import them
-from daemon.disk import durable
-from daemon.disk.mission import Mission
-from daemon.disk.transfer_removal import removing_path
-from daemon.disk.verification import verify
+from daemon.mission.layout import Mission
+from daemon.mission.store import durable
+from daemon.mission.transfer.transfer_removal import removing_path
+from daemon.mission.verification.verification import verify
+from daemon.onboard.pipeline import worker  # noqa: F401
 from daemon.products import processor  # noqa: F401
-from daemon.service import worker  # noqa: F401
 from tests.crash.kill_transfer import content_of
 from tests.crash.write_log import STRACE
 from tests.daemon.diverging_camera import flown_mission

@@ -19,17 +19,17 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from daemon.disk import durable
-from daemon.disk.catalog import Catalog
-from daemon.disk.flight_log import FlightLog
-from daemon.disk.level2 import write_level2
-from daemon.disk.log_seals import seal_logs
-from daemon.disk.mission import Mission
-from daemon.disk.store import Level0Writer
-from daemon.disk.transfer import finish_transfer, transfer
-from daemon.disk.transfer_note import LEFT_OUT, NOTE_FILE
-from daemon.disk.transfer_removal import removing_path
-from daemon.disk.verification import verify
+from daemon.mission.catalog.catalog import Catalog
+from daemon.mission.layout import Mission
+from daemon.mission.log.flight_log import FlightLog
+from daemon.mission.log.log_seals import seal_logs
+from daemon.mission.store import durable
+from daemon.mission.store.level2 import write_level2
+from daemon.mission.store.store import Level0Writer
+from daemon.mission.transfer.transfer import finish_transfer, transfer
+from daemon.mission.transfer.transfer_note import LEFT_OUT, NOTE_FILE
+from daemon.mission.transfer.transfer_removal import removing_path
+from daemon.mission.verification.verification import verify
 from tests.crash.kill_at_call import WRITES, run_to_call
 from tests.daemon.small_camera import final_record, new_mission, store_one
 

@@ -17,7 +17,7 @@ import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from daemon.disk.mission import Mission
+from daemon.mission.layout import Mission
 from tests.crash.flight import live
 from tests.crash.judging import Told, judge
 from tests.daemon.small_camera import new_mission

@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from daemon.disk import durable
+from daemon.mission.store import durable
 from tests.crash.disk import TORN, VARIANTS, Disk, Tree, at_random, put, variants
 from tests.crash.judging import Told, judge
 from tests.crash.write_log import Operation, record

@@ -13,8 +13,8 @@ from typing import Any
 import typer
 
 from daemon.cli.run import run
-from daemon.service import departure, service
-from daemon.service.messages import (
+from daemon.onboard.service import departure, service
+from daemon.onboard.service.messages import (
     Begin,
     FramesRead,
     Ping,
@@ -25,11 +25,11 @@ from daemon.service.messages import (
     WorkerBuilt,
     WorkerReady,
 )
-from daemon.service.processes import Link
+from daemon.onboard.service.processes import Link
 
 
 def idle_worker(link: Link, _settings: Any, _rings: Any) -> None:
-    """In the place of `daemon.service.worker.main`."""
+    """In the place of `daemon.onboard.pipeline.worker.main`."""
     link.send(WorkerBuilt())
     while not isinstance(order := link.receive(timeout_s=1.0), Stop):
         if isinstance(order, Ping):

@@ -15,8 +15,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from daemon.disk.mission import Mission
-from daemon.disk.verification import verify
+from daemon.mission.layout import Mission
+from daemon.mission.verification.verification import verify
 
 SIZE = "size=400m"
 STORED_BEFORE = 2

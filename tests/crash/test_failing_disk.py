@@ -11,9 +11,9 @@ from tempfile import mkdtemp
 
 import pytest
 
-from daemon.disk import durable
-from daemon.disk.level0_folder import read_sealed
-from daemon.disk.mission import Mission
+from daemon.mission.layout import Mission
+from daemon.mission.store import durable
+from daemon.mission.store.level0_folder import read_sealed
 from tests.crash.flight import ILL
 from tests.crash.judging import Told, judge
 from tests.crash.prefixes import ACKS, FLOWN, ROOT

@@ -11,7 +11,7 @@ from tempfile import mkdtemp
 
 import pytest
 
-from daemon.disk import durable
+from daemon.mission.store import durable
 from tests.crash.kill_commands import COMMANDS
 from tests.crash.prefixes import ROOT
 from tests.crash.test_prefixes import MEMORY

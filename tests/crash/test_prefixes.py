@@ -9,7 +9,7 @@ from tempfile import mkdtemp
 
 import pytest
 
-from daemon.disk import durable
+from daemon.mission.store import durable
 from tests.crash.disk import DROPPED, KEPT, TORN, VARIANTS, ZEROS, Disk, everything
 from tests.crash.prefixes import ACKS, Figures, cut, fly
 from tests.crash.write_log import needs_strace

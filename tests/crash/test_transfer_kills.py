@@ -13,7 +13,7 @@ from tempfile import mkdtemp
 
 import pytest
 
-from daemon.disk import durable
+from daemon.mission.store import durable
 from tests.crash.disk import DROPPED, KEPT, VARIANTS, ZEROS, Disk, at_random, put, variants
 from tests.crash.kill_transfer import BEGUN, FLOWN, OTHER_DISK, Trial, content_of
 from tests.crash.prefixes import ROOT, key_of

@@ -18,12 +18,12 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-from daemon.disk import durable
-from daemon.disk.mission import CURRENT_FILE, Mission
-from daemon.disk.recovery import recover
-from daemon.disk.store import verify
-from daemon.flight.arming import FILE, Lack, override_note
-from daemon.flight.recovery_match import seal_from_log
+from daemon.mission.layout import CURRENT_FILE, Mission
+from daemon.mission.store import durable
+from daemon.mission.store.store import verify
+from daemon.mission.verification.recovery import recover
+from daemon.onboard.flight.arming import FILE, Lack, override_note
+from daemon.onboard.flight.recovery_match import seal_from_log
 from tests.crash.flight import live
 from tests.daemon.small_camera import new_mission, small_rig
 

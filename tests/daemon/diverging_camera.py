@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from daemon.disk.mission import Mission
-from daemon.disk.records import sha256_hex
-from daemon.disk.store import Level0Writer
-from daemon.exposure import Capture, FrameRecord, NavigationRecord, TemperatureRecord
+from daemon.mission.exposure import Capture, FrameRecord, NavigationRecord, TemperatureRecord
+from daemon.mission.layout import Mission
+from daemon.mission.records import sha256_hex
+from daemon.mission.store.store import Level0Writer
 from tests.daemon.small_camera import final_record
 
 HEADS = ("LEFT", "RIGHT")

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.disk.level0_folder import exposure_of
-from daemon.disk.log_records import LoggedRecord
-from daemon.disk.mission import Mission
-from daemon.disk.store import Level0Writer
-from daemon.exposure import Capture, Exposure, FrameRecord, TemperatureRecord
+from daemon.mission.exposure import Capture, Exposure, FrameRecord, TemperatureRecord
+from daemon.mission.layout import Mission
+from daemon.mission.log.log_records import LoggedRecord
+from daemon.mission.store.level0_folder import exposure_of
+from daemon.mission.store.store import Level0Writer
 from drivers.contract import EventMark, TemperatureSample
 from processing.rig import Rig, rig_from_mapping
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.disk.mission import Mission
-from daemon.disk.records import RecordError, parse_record
-from daemon.disk.store import load_level0, verify
-from daemon.exposure import Exposure, NavigationRecord, capture_bytes, from_json, to_json
+from daemon.mission.exposure import Exposure, NavigationRecord, capture_bytes, from_json, to_json
+from daemon.mission.layout import Mission
+from daemon.mission.records import RecordError, parse_record
+from daemon.mission.store.store import load_level0, verify
 from processing.quality.report import FIGURES, Flag, Thresholds
 from processing.rig import Cone, Drift, Lens, Rig, Sensor, VirtualImage, load_rig
 from tests.daemon.small_camera import (
@@ -159,7 +159,7 @@ def test_every_key_of_a_rig_file_is_named(page):
 def test_a_hand_written_exposure_with_mistakes_is_refused_with_all_of_them(tmp_path):
     import tifffile
 
-    from daemon.disk.records import RecordError
+    from daemon.mission.records import RecordError
 
     folder = tmp_path / "m" / "L0" / "000001"
     folder.mkdir(parents=True)

@@ -22,8 +22,8 @@ from typing import Any
 
 import numpy as np
 
-from drivers.aravis.gvcp import control_privilege
-from drivers.aravis.head import AravisHead
+from drivers.cameras.aravis.gvcp import control_privilege
+from drivers.cameras.aravis.head import AravisHead
 from drivers.contract import (
     CHUNK_ALLOWANCE_NBYTES,
     DeviceError,
@@ -215,7 +215,7 @@ def a_quick_restart_is_noticed() -> dict[str, object]:
 
 HOLDER = """
 import sys
-from drivers.aravis.library import aravis
+from drivers.cameras.aravis.library import aravis
 camera = aravis().Camera.new(sys.argv[1])
 print(camera.get_device().is_controller(), flush=True)
 sys.stdin.read()
@@ -367,7 +367,7 @@ def a_head_that_waits_for_its_line_refuses_a_software_trigger() -> dict[str, obj
 def packets_fit_the_network() -> dict[str, object]:
     """A network that carries 1500 bytes; only in a namespace of our own, where nobody minds."""
     from sim_hw.gige.head import ExposureRequest, FrameSize, GigeHead, HeadIdentity
-    from sim_hw.world_clock import DeviceClock
+    from sim_hw.world.world_clock import DeviceClock
 
     set_mtu = 0x8922
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
@@ -408,7 +408,7 @@ def light_that_changes_is_followed() -> dict[str, object]:
     )
     from processing.radiometry.histogram import sampled_histogram
     from sim_hw.gige.head import ExposureRequest, FrameSize, GigeHead, HeadIdentity
-    from sim_hw.world_clock import DeviceClock
+    from sim_hw.world.world_clock import DeviceClock
 
     random = np.random.default_rng(4)
     ground = np.minimum(random.lognormal(-1.4, 0.5, (SIZE, SIZE)), 2.0)

@@ -19,12 +19,12 @@ from pathlib import Path
 from typing import Any, Final
 
 from drivers.contract import NavSample
-from drivers.gpsd.reports import GpsdReports
-from drivers.message_decoder import MessageDecoder
-from drivers.nmea.decoder import NmeaDecoder
-from drivers.novatel.decoder import NovatelDecoder
-from drivers.septentrio.decoder import SbfDecoder
-from drivers.ublox.decoder import UbxDecoder
+from drivers.receivers.gpsd.reports import GpsdReports
+from drivers.receivers.message_decoder import MessageDecoder
+from drivers.receivers.nmea.decoder import NmeaDecoder
+from drivers.receivers.novatel.decoder import NovatelDecoder
+from drivers.receivers.septentrio.decoder import SbfDecoder
+from drivers.receivers.ublox.decoder import UbxDecoder
 from tests.drivers.real_gpsd import running_gpsd
 
 CORPUS: Final = Path(__file__).parents[3] / "shared" / "data" / "nav" / "gpsd-daemon"

@@ -8,7 +8,7 @@ import struct
 import pytest
 
 from drivers.contract import NavSample
-from drivers.ublox.decoder import UbxDecoder
+from drivers.receivers.ublox.decoder import UbxDecoder
 from tests.drivers import test_mavlink as mavlink
 from tests.drivers import test_novatel as novatel
 from tests.drivers import test_septentrio as septentrio

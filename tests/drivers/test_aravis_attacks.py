@@ -19,16 +19,16 @@ from typer.testing import CliRunner
 
 from daemon.cli import app
 from daemon.cli.find_heads import found_heads
-from drivers.aravis import gvcp
-from drivers.aravis.senders import NewSockets
+from drivers.cameras.aravis import gvcp
+from drivers.cameras.aravis.senders import NewSockets
 from drivers.contract import DeviceError, FrameStatus
-from drivers.udp_port import open_udp_port
+from drivers.transport.udp_port import open_udp_port
 from sim_hw.faults.plan import Planned
 from sim_hw.gige import features
 from sim_hw.gige.gvsp import PAYLOAD_IMAGE
 from sim_hw.gige.head import FrameSize, GigeHead, HeadIdentity, Pacing, WireFaults
-from sim_hw.world_clock import DeviceClock
-from tests.daemon.watch.test_mavsdk_camera import free_port
+from sim_hw.world.world_clock import DeviceClock
+from tests.daemon.onboard.monitoring.test_mavsdk_camera import free_port
 from tests.drivers.test_aravis_head import NETWORK, PATTERN, SHAPE, Pair, flying
 
 pytest.importorskip("gi", reason="needs PyGObject (extra aravis) and gir1.2-aravis-0.8")

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.aravis.action_trigger import ActionTrigger
-from drivers.aravis.head import AravisHead
+from drivers.cameras.aravis.action_trigger import ActionTrigger
+from drivers.cameras.aravis.head import AravisHead
 from drivers.contract import (
     CHUNK_ALLOWANCE_NBYTES,
     DeviceError,
@@ -33,7 +33,7 @@ from sim_hw.gige.head import (
     Pacing,
     WireFaults,
 )
-from sim_hw.world_clock import DeviceClock
+from sim_hw.world.world_clock import DeviceClock
 
 pytest.importorskip("gi", reason="needs PyGObject (extra aravis) and gir1.2-aravis-0.8")
 pytestmark = pytest.mark.timeout(240)

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.ascii_line.thermometer import AsciiLineThermometer
 from drivers.contract import DeviceError, TemperatureSample
+from drivers.thermometers.ascii_line.thermometer import AsciiLineThermometer
 from tests.drivers.lines import PtyLine
 from tests.drivers.stand_ins import FakeClock, FakePort, Notebook
 

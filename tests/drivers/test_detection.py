@@ -21,11 +21,11 @@ from typer.testing import CliRunner
 
 from daemon.cli import app
 from daemon.cli.find import toml_sections
-from drivers import registry
-from drivers.ascii_line.pattern import LinePattern
+from drivers.base import registry
 from drivers.detection.evidence import Evidence
 from drivers.detection.lines import lines_in
 from drivers.detection.search import Found, search
+from drivers.thermometers.ascii_line.pattern import LinePattern
 from sim_hw.devices.ascii_probe import AsciiProbe
 from sim_hw.devices.modbus_probe import ModbusProbe
 from sim_hw.devices.network_line import TcpLine, UdpLine
@@ -35,7 +35,7 @@ from sim_hw.receivers.nmea_receiver import NmeaReceiver
 from sim_hw.receivers.novatel_receiver import NovatelReceiver
 from sim_hw.receivers.septentrio_receiver import SeptentrioReceiver
 from sim_hw.receivers.ublox_receiver import UbloxReceiver
-from sim_hw.world_clock import WorldClock
+from sim_hw.world.world_clock import WorldClock
 from tests.drivers.uart_relay import UartRelay, sampled
 from tests.sim_hw.receiver_state import state_at
 from tests.system.flown import syntopic

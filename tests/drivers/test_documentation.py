@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from drivers import registry
-from drivers.settings import Setting
+from drivers.base import registry
+from drivers.base.settings import Setting
 
 DOCUMENTATION = Path(__file__).parents[2] / "docs" / "drivers"
 PAGES = [

@@ -15,11 +15,11 @@ from dataclasses import replace
 import pytest
 
 from drivers.contract import EventMark, NavSample
-from drivers.nmea.navigator import NmeaNavigator
-from drivers.novatel.navigator import NovatelNavigator
-from drivers.receiver import ListeningNavigator
-from drivers.septentrio.navigator import SeptentrioNavigator
-from drivers.ublox.navigator import UbloxNavigator
+from drivers.receivers.nmea.navigator import NmeaNavigator
+from drivers.receivers.novatel.navigator import NovatelNavigator
+from drivers.receivers.receiver import ListeningNavigator
+from drivers.receivers.septentrio.navigator import SeptentrioNavigator
+from drivers.receivers.ublox.navigator import UbloxNavigator
 from sim_hw.devices.network_line import TcpLine, UdpLine
 from sim_hw.devices.pseudo_terminal import PseudoTerminal
 from sim_hw.receivers.nmea_receiver import NmeaReceiver
@@ -27,7 +27,7 @@ from sim_hw.receivers.novatel_receiver import NovatelReceiver
 from sim_hw.receivers.receiver import EmulatedReceiver, ReceiverState
 from sim_hw.receivers.septentrio_receiver import SeptentrioReceiver
 from sim_hw.receivers.ublox_receiver import UbloxReceiver
-from sim_hw.world_clock import WorldClock
+from sim_hw.world.world_clock import WorldClock
 from tests.drivers.stand_ins import Notebook, running
 from tests.sim_hw.receiver_state import NS, STATE, WEEK_NS
 

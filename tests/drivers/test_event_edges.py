@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
-from drivers import registry
+from drivers.base import registry
 from drivers.contract import DeviceEvent, EventMark, NavSample
 from sim_hw.receivers.receiver import STROBE_WIDTH_NS, EmulatedReceiver
 from sim_hw.receivers.septentrio_messages import FALLING, RISING
 from sim_hw.receivers.septentrio_receiver import SeptentrioReceiver
 from sim_hw.receivers.ublox_receiver import UbloxReceiver
-from sim_hw.world_clock import WorldClock
+from sim_hw.world.world_clock import WorldClock
 from tests.drivers.stand_ins import FakeClock, FakePort, Notebook, running
 from tests.drivers.ubx_frames import nav_pvt, tim_tm2
 from tests.sim_hw.receiver_state import state_at

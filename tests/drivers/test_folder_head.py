@@ -16,10 +16,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from daemon.disk.level0 import tiff_parts
+from daemon.mission.store.level0 import tiff_parts
+from drivers.cameras.folder.frames import FrameFileError, read_frame
+from drivers.cameras.folder.head import FolderHead
 from drivers.contract import CHUNK_ALLOWANCE_NBYTES, DeviceError, Frame, FrameStatus, Record
-from drivers.folder.frames import FrameFileError, read_frame
-from drivers.folder.head import FolderHead
 from tests.drivers.stand_ins import FakeClock, Notebook
 
 HEIGHT, WIDTH = 6, 8

@@ -4,7 +4,15 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.gps_time import DAY_NS, SECOND_NS, WEEK_NS, UtcFields, gps_from_utc, gps_near, utc_ns
+from drivers.timescales.gps_time import (
+    DAY_NS,
+    SECOND_NS,
+    WEEK_NS,
+    UtcFields,
+    gps_from_utc,
+    gps_near,
+    utc_ns,
+)
 
 EPOCH = (1980, 1, 6, 0, 0, 0, 0)
 

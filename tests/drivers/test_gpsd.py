@@ -14,10 +14,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.contract import DeviceError, NavSample
-from drivers.gps_time import SECOND_NS, UtcFields, utc_ns
-from drivers.gpsd.navigator import GpsdNavigator
-from drivers.gpsd.reports import MAX_LINE, GpsdReports
-from drivers.ublox.decoder import UbxDecoder
+from drivers.receivers.gpsd.navigator import GpsdNavigator
+from drivers.receivers.gpsd.reports import MAX_LINE, GpsdReports
+from drivers.receivers.ublox.decoder import UbxDecoder
+from drivers.timescales.gps_time import SECOND_NS, UtcFields, utc_ns
 from tests.drivers.real_gpsd import PROGRAM, RealGpsd, running_gpsd
 from tests.drivers.stand_ins import Notebook
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from drivers.contract import NavSample
-from drivers.gpsd.reports import GpsdReports
+from drivers.receivers.gpsd.reports import GpsdReports
 from tests.drivers.test_gpsd import ATT, TPV, lines, samples
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from drivers.contract import DeviceError, Record, TemperatureSample
-from drivers.host.thermometer import HostThermometer
+from drivers.thermometers.host.thermometer import HostThermometer
 from tests.drivers.stand_ins import FakeClock, Notebook
 
 

@@ -13,19 +13,19 @@ from dataclasses import dataclass
 
 import pytest
 
-from drivers.mavlink.decoder import MavlinkDecoder
-from drivers.message_decoder import MessageDecoder
-from drivers.nmea.decoder import NmeaDecoder
-from drivers.novatel.decoder import NovatelDecoder
-from drivers.septentrio.decoder import SbfDecoder
-from drivers.ublox.decoder import UbxDecoder
+from drivers.receivers.mavlink.decoder import MavlinkDecoder
+from drivers.receivers.message_decoder import MessageDecoder
+from drivers.receivers.nmea.decoder import NmeaDecoder
+from drivers.receivers.novatel.decoder import NovatelDecoder
+from drivers.receivers.septentrio.decoder import SbfDecoder
+from drivers.receivers.ublox.decoder import UbxDecoder
 from sim_hw.receivers.mavlink_autopilot import MavlinkAutopilot
 from sim_hw.receivers.nmea_receiver import NmeaReceiver
 from sim_hw.receivers.novatel_receiver import NovatelReceiver
 from sim_hw.receivers.receiver import Edge, EmulatedReceiver
 from sim_hw.receivers.septentrio_receiver import SeptentrioReceiver
 from sim_hw.receivers.ublox_receiver import UbloxReceiver
-from sim_hw.world_clock import WorldClock
+from sim_hw.world.world_clock import WorldClock
 from tests.sim_hw.receiver_state import NS, START_GPS_NS, state_at
 
 IN_CI = 1_000_000

@@ -18,17 +18,17 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from drivers.contract import ClockReading, DeviceError, EventMark, NavSample
-from drivers.gps_time import SECOND_NS, WEEK_NS
-from drivers.mavlink.boot_clock import GPS_EPOCH_UNIX_NS
-from drivers.mavlink.decoder import MavlinkDecoder, Timesync, angles_of, between
-from drivers.mavlink.navigator import MavlinkNavigator
-from drivers.message_decoder import Nav
+from drivers.receivers.mavlink.boot_clock import GPS_EPOCH_UNIX_NS
+from drivers.receivers.mavlink.decoder import MavlinkDecoder, Timesync, angles_of, between
+from drivers.receivers.mavlink.navigator import MavlinkNavigator
+from drivers.receivers.message_decoder import Nav
+from drivers.timescales.gps_time import SECOND_NS, WEEK_NS
 from sim_hw.devices.network_line import TcpLine, UdpLine
 from sim_hw.devices.pseudo_terminal import PseudoTerminal
 from sim_hw.devices.serving import Line
 from sim_hw.receivers.mavlink_autopilot import MavlinkAutopilot
 from sim_hw.receivers.receiver import ReceiverState
-from sim_hw.world_clock import WorldClock
+from sim_hw.world.world_clock import WorldClock
 from tests.drivers.stand_ins import FakeClock, FakePort, Notebook, running
 from tests.sim_hw.receiver_state import STATE
 

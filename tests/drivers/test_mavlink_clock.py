@@ -12,12 +12,12 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from drivers.contract import DeviceEvent, EventMark, NavSample
-from drivers.gps_time import SECOND_NS
-from drivers.mavlink.boot_clock import BootClock
-from drivers.mavlink.navigator import MavlinkNavigator
+from drivers.receivers.mavlink.boot_clock import BootClock
+from drivers.receivers.mavlink.navigator import MavlinkNavigator
+from drivers.timescales.gps_time import SECOND_NS
 from sim_hw.receivers.mavlink_autopilot import MavlinkAutopilot
 from sim_hw.receivers.utc_jitter import UtcErrors, UtcJitter
-from sim_hw.world_clock import WorldClock
+from sim_hw.world.world_clock import WorldClock
 from tests.drivers.stand_ins import FakeClock, FakePort, Notebook, running
 from tests.drivers.test_mavlink import BOOT_MS, GPS_NS, UNIX_US, Bus, decode, flying, new_line
 from tests.drivers.test_udp_port import WITHIN_S

@@ -9,7 +9,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from drivers.contract import EventMark, NavSample
-from drivers.mavlink.decoder import MavlinkDecoder, angles_of, between, quaternion_of
+from drivers.receivers.mavlink.decoder import MavlinkDecoder, angles_of, between, quaternion_of
 from tests.drivers.test_mavlink import BOOT_MS, UNIX_US, Bus, decode, marks, samples
 
 

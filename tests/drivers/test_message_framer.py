@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.message_framer import MessageFramer, line_size
+from drivers.receivers.message_framer import MessageFramer, line_size
 
 
 def message(content: bytes, start: bytes = b"$") -> bytes:

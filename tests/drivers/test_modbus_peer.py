@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 from drivers.contract import DeviceError, TemperatureSample
-from drivers.modbus_rtu.thermometer import ModbusThermometer
+from drivers.thermometers.modbus_rtu.thermometer import ModbusThermometer
 from tests.drivers.lines import PtyLine
 from tests.drivers.stand_ins import Notebook
 

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.contract import DeviceError, TemperatureSample
-from drivers.modbus_rtu.frames import crc16, find_reply, read_request
-from drivers.modbus_rtu.thermometer import ModbusThermometer
+from drivers.thermometers.modbus_rtu.frames import crc16, find_reply, read_request
+from drivers.thermometers.modbus_rtu.thermometer import ModbusThermometer
 from tests.drivers.stand_ins import FakeClock, FakePort, Notebook
 
 

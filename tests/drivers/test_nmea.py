@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from pynmeagps import NMEAReader
 
 from drivers.contract import DeviceError, EventMark, NavSample
-from drivers.gps_time import WEEK_NS
-from drivers.message_decoder import Nav
-from drivers.nmea.decoder import NmeaDecoder
-from drivers.nmea.navigator import NmeaNavigator
-from drivers.ublox.decoder import UbxDecoder
+from drivers.receivers.message_decoder import Nav
+from drivers.receivers.nmea.decoder import NmeaDecoder
+from drivers.receivers.nmea.navigator import NmeaNavigator
+from drivers.receivers.ublox.decoder import UbxDecoder
+from drivers.timescales.gps_time import WEEK_NS
 from tests.drivers.stand_ins import FakeClock, FakePort
 
 NAV = Path(__file__).parents[3] / "shared" / "data" / "nav"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.nmea.sentences import (
+from drivers.receivers.nmea.sentences import (
     angle_deg,
     day_number,
     day_of,

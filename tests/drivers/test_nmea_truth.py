@@ -8,10 +8,10 @@ import random
 
 import pytest
 
-from daemon.exposure import NavigationRecord
-from daemon.flight.navigation import Track
+from daemon.mission.exposure import NavigationRecord
+from daemon.orientation.navigation import Track
 from drivers.contract import NavSample
-from drivers.nmea.decoder import NmeaDecoder
+from drivers.receivers.nmea.decoder import NmeaDecoder
 from tests.drivers.test_nmea import SECOND_NS, sentence
 
 pytestmark = pytest.mark.trust

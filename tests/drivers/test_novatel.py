@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from novatel_edie import oem
 
 from drivers.contract import EventMark, NavSample
-from drivers.gps_time import WEEK_NS
-from drivers.message_decoder import Nav
-from drivers.novatel.decoder import NovatelDecoder
-from drivers.novatel.framing import crc32
+from drivers.receivers.message_decoder import Nav
+from drivers.receivers.novatel.decoder import NovatelDecoder
+from drivers.receivers.novatel.framing import crc32
+from drivers.timescales.gps_time import WEEK_NS
 
 NAV = Path(__file__).parents[3] / "shared" / "data" / "nav"
 EXCERPT = Path(__file__).parent / "data" / "novatel-ins2-excerpt.gps"

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from drivers.contract import EventMark, NavSample
-from drivers.gps_time import WEEK_NS
-from drivers.novatel.decoder import NovatelDecoder
+from drivers.receivers.novatel.decoder import NovatelDecoder
+from drivers.timescales.gps_time import WEEK_NS
 from tests.drivers.test_novatel import WEEK, decode, log, marks, pva
 
 SECOND_NS = 10**9

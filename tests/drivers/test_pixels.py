@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.pixels import Packing, packed_nbytes, pixels_in_a_group, unpack
+from drivers.cameras.pixels import Packing, packed_nbytes, pixels_in_a_group, unpack
 
 BITS = {
     Packing.BYTES: 8,

@@ -15,11 +15,11 @@ import pytest
 from typer.testing import CliRunner
 
 from daemon.cli import app
-from drivers import port_holder, serial_device
+from drivers.base.registry import driver_for
 from drivers.contract import DeviceError
-from drivers.port_holder import Holder, held_sentence, holders, other_holders
-from drivers.registry import driver_for
-from drivers.serial_device import SerialDevice, open_serial_port
+from drivers.transport import port_holder, serial_device
+from drivers.transport.port_holder import Holder, held_sentence, holders, other_holders
+from drivers.transport.serial_device import SerialDevice, open_serial_port
 from tests.drivers.lines import PtyLine
 
 pytestmark = pytest.mark.trust

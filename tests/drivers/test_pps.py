@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 
 from drivers.contract import DeviceError, DeviceEvent, LifeCycle, PpsEdge, Record
-from drivers.pps import binding
-from drivers.pps.binding import CAN_WAIT, CAPTURE_ASSERT, CAPTURE_CLEAR, Edges, edges_of
-from drivers.pps.device import PpsDevice, wall_clock
-from drivers.pps.emulated import EmulatedPps
+from drivers.triggers.pps import binding
+from drivers.triggers.pps.binding import CAN_WAIT, CAPTURE_ASSERT, CAPTURE_CLEAR, Edges, edges_of
+from drivers.triggers.pps.device import PpsDevice, wall_clock
+from drivers.triggers.pps.emulated import EmulatedPps
 
 NS = 1_000_000_000
 OFFSET_NS = 1_790_000_000 * NS

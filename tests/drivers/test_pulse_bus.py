@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from drivers.contract import DeviceError
-from drivers.trigger.pulse_bus import PulseBusTrigger
+from drivers.triggers.pulse_bus import PulseBusTrigger
 
 Answer = Callable[[str], str | None]
 

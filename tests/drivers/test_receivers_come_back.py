@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from drivers import registry
+from drivers.base import registry
 from drivers.contract import EventMark, NavSample
 from sim_hw.devices.network_line import UdpLine
 from sim_hw.devices.pseudo_terminal import PseudoTerminal
@@ -25,7 +25,7 @@ from sim_hw.receivers.novatel_receiver import NovatelReceiver
 from sim_hw.receivers.receiver import EmulatedReceiver
 from sim_hw.receivers.septentrio_receiver import SeptentrioReceiver
 from sim_hw.receivers.ublox_receiver import UbloxReceiver
-from sim_hw.world_clock import WorldClock
+from sim_hw.world.world_clock import WorldClock
 from tests.drivers.stand_ins import Notebook
 from tests.sim_hw.receiver_state import state_at
 

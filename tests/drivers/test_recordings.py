@@ -17,8 +17,8 @@ from pathlib import Path
 import pytest
 
 from drivers.contract import NavSample
-from drivers.novatel.decoder import NovatelDecoder
-from drivers.ublox.decoder import UbxDecoder
+from drivers.receivers.novatel.decoder import NovatelDecoder
+from drivers.receivers.ublox.decoder import UbxDecoder
 
 NAV = Path(__file__).parents[3] / "shared" / "data" / "nav"
 WEEK_NS = 604_800 * 10**9

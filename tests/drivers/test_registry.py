@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers import registry
+from drivers.base import registry
 from drivers.contract import DeviceError
 
 EVERY_DRIVER = [(kind, name) for kind, names in registry.kinds().items() for name in names]

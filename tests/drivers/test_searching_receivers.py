@@ -6,16 +6,16 @@ from collections.abc import Callable
 
 import pytest
 
-from daemon.watch.state import FlightState
+from daemon.onboard.monitoring.state import FlightState
 from drivers.detection.evidence import Evidence
 from drivers.detection.search import search
-from drivers.gpsd.navigator import GpsdNavigator
-from drivers.message_decoder import MessageDecoder
-from drivers.nmea.decoder import NmeaDecoder
-from drivers.nmea.navigator import NmeaNavigator
-from drivers.receiver_fix import fix_in_words
-from drivers.septentrio.decoder import SbfDecoder
-from drivers.ublox.decoder import UbxDecoder
+from drivers.receivers.gpsd.navigator import GpsdNavigator
+from drivers.receivers.message_decoder import MessageDecoder
+from drivers.receivers.nmea.decoder import NmeaDecoder
+from drivers.receivers.nmea.navigator import NmeaNavigator
+from drivers.receivers.receiver_fix import fix_in_words
+from drivers.receivers.septentrio.decoder import SbfDecoder
+from drivers.receivers.ublox.decoder import UbxDecoder
 from tests.drivers import test_mavlink as mavlink
 from tests.drivers import test_septentrio as septentrio
 from tests.drivers.real_gpsd import PROGRAM, running_gpsd

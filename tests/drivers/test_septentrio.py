@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from pysbf2 import SBFReader
 
 from drivers.contract import DeviceError, EventMark, NavSample
-from drivers.gps_time import WEEK_NS
-from drivers.message_decoder import Nav
-from drivers.septentrio.blocks import crc
-from drivers.septentrio.decoder import SbfDecoder
-from drivers.septentrio.navigator import SeptentrioNavigator
+from drivers.receivers.message_decoder import Nav
+from drivers.receivers.septentrio.blocks import crc
+from drivers.receivers.septentrio.decoder import SbfDecoder
+from drivers.receivers.septentrio.navigator import SeptentrioNavigator
+from drivers.timescales.gps_time import WEEK_NS
 from tests.drivers.stand_ins import FakeClock, FakePort
 
 WEEK = 2445

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from drivers.contract import EventMark, NavSample
-from drivers.gps_time import WEEK_NS
-from drivers.septentrio.decoder import SbfDecoder
+from drivers.receivers.septentrio.decoder import SbfDecoder
+from drivers.timescales.gps_time import WEEK_NS
 from tests.drivers.test_septentrio import (
     MS,
     UNKNOWN,

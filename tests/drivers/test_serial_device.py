@@ -12,7 +12,7 @@ import pytest
 import serial
 
 from drivers.contract import DeviceError, LifeCycle, RawBytes, TemperatureSample
-from drivers.serial_device import SerialDevice, SerialLine, open_serial_port
+from drivers.transport.serial_device import SerialDevice, SerialLine, open_serial_port
 from tests.drivers.stand_ins import FakeClock, FakePort, Notebook, refusing_port
 
 

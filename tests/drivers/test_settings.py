@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from drivers.base.settings import Configured, Setting, SettingsError
 from drivers.contract import DeviceError
-from drivers.settings import Configured, Setting, SettingsError
 
 
 class Lamp(Configured):

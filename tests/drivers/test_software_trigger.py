@@ -9,7 +9,7 @@ from typing import cast
 import pytest
 
 from drivers.contract import DeviceError, Head
-from drivers.trigger.software import SoftwareTrigger
+from drivers.triggers.software import SoftwareTrigger
 
 
 class StubHead:

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from drivers.contract import DeviceError, DeviceEvent, NavSample
-from drivers.serial_device import open_serial_port
-from drivers.tcp_port import TcpPort
-from drivers.ublox.decoder import UbxDecoder
-from drivers.ublox.navigator import UbloxNavigator
+from drivers.receivers.ublox.decoder import UbxDecoder
+from drivers.receivers.ublox.navigator import UbloxNavigator
+from drivers.transport.serial_device import open_serial_port
+from drivers.transport.tcp_port import TcpPort
 from tests.drivers.stand_ins import Notebook
 
 RECORDED = (Path(__file__).parent / "data" / "ublox-neo-m8l-excerpt.ubx").read_bytes()

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import tifffile
 
-from daemon.disk.level0 import RasterError, check_tiff, read_frame, read_tiff
-from drivers.folder.frames import FrameFileError
-from drivers.folder.frames import read_frame as read_folder_frame
-from drivers.tiff_layout import MOST_PAGES, layout_problem
+from daemon.mission.store.level0 import RasterError, check_tiff, read_frame, read_tiff
+from drivers.cameras.folder.frames import FrameFileError
+from drivers.cameras.folder.frames import read_frame as read_folder_frame
+from drivers.cameras.tiff_layout import MOST_PAGES, layout_problem
 
 pytestmark = pytest.mark.trust
 PIXELS = np.arange(48 * 64, dtype=np.uint16).reshape(48, 64)

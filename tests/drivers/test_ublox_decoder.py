@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.contract import EventMark, NavSample
-from drivers.gps_time import WEEK_NS, UtcFields, gps_from_utc, gps_near, utc_ns
-from drivers.ublox.decoder import UbxDecoder
+from drivers.receivers.ublox.decoder import UbxDecoder
+from drivers.timescales.gps_time import WEEK_NS, UtcFields, gps_from_utc, gps_near, utc_ns
 from tests.drivers.ubx_frames import (
     RECEIVER,
     UTC,

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyubx2 import ERR_IGNORE, UBX_PROTOCOL, UBXReader
 
-from drivers.ublox.decoder import LENGTHS, UbxDecoder
-from drivers.ublox.framing import UbxFramer
+from drivers.receivers.ublox.decoder import LENGTHS, UbxDecoder
+from drivers.receivers.ublox.framing import UbxFramer
 from tests.drivers.ubx_frames import frame, nav_att, nav_eoe, nav_timegps, tim_tm2
 
 EXCERPTS = sorted((Path(__file__).parent / "data").glob("*.ubx"))

@@ -11,9 +11,9 @@ import pytest
 from pyubx2 import ERR_IGNORE, UBX_PROTOCOL, UBXReader
 
 from drivers.contract import DeviceError, NavSample, RawBytes
-from drivers.gps_time import WEEK_NS
-from drivers.ublox.decoder import UbxDecoder
-from drivers.ublox.navigator import UbloxNavigator
+from drivers.receivers.ublox.decoder import UbxDecoder
+from drivers.receivers.ublox.navigator import UbloxNavigator
+from drivers.timescales.gps_time import WEEK_NS
 from tests.drivers.lines import PtyLine
 from tests.drivers.stand_ins import Notebook
 from tests.drivers.ubx_frames import frame

@@ -10,10 +10,10 @@ from contextlib import contextmanager
 
 import pytest
 
-from drivers import udp_port
 from drivers.contract import DeviceError, NavSample
-from drivers.mavlink.navigator import MavlinkNavigator
-from drivers.udp_port import Sender, open_udp_port
+from drivers.receivers.mavlink.navigator import MavlinkNavigator
+from drivers.transport import udp_port
+from drivers.transport.udp_port import Sender, open_udp_port
 from tests.drivers.stand_ins import Notebook, running
 from tests.drivers.test_mavlink import BOOT_MS, Bus, free_udp_port
 

@@ -6,11 +6,11 @@ from typing import Any, cast
 
 import pytest
 
+from drivers.cameras.v4l2 import uapi
+from drivers.cameras.v4l2.camera import V4l2Camera
+from drivers.cameras.v4l2.node import Control, VideoNode
+from drivers.cameras.v4l2.settings import V4l2Settings
 from drivers.contract import DeviceError
-from drivers.v4l2 import uapi
-from drivers.v4l2.camera import V4l2Camera
-from drivers.v4l2.node import Control, VideoNode
-from drivers.v4l2.settings import V4l2Settings
 
 INTEGER = 1
 EXPOSURE = Control(uapi.CID_EXPOSURE_ABSOLUTE, "exposure_time_absolute", INTEGER, 1, 400, 0)

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from drivers.v4l2 import uapi
-from drivers.v4l2.formats import FORMATS
+from drivers.cameras.v4l2 import uapi
+from drivers.cameras.v4l2.formats import FORMATS
 
 STRUCTURES = {
     "v4l2_capability": uapi.Capability,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from drivers.v4l2.sequence import Counted, SequenceCounter
+from drivers.cameras.v4l2.sequence import Counted, SequenceCounter
 
 
 def told(*sequences: int) -> list[Counted]:

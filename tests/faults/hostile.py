@@ -16,17 +16,17 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from drivers.aravis import gvcp
-from drivers.ascii_line.thermometer import AsciiLineThermometer
+from drivers.cameras.aravis import gvcp
 from drivers.contract import DeviceError
-from drivers.gpsd.reports import GpsdReports
-from drivers.message_decoder import MessageDecoder
-from drivers.modbus_rtu.frames import crc16, find_reply
-from drivers.nmea.decoder import NmeaDecoder
-from drivers.novatel.decoder import NovatelDecoder
-from drivers.septentrio.decoder import SbfDecoder
-from drivers.trigger.pulse_bus import PulseBusTrigger
-from drivers.ublox.decoder import UbxDecoder
+from drivers.receivers.gpsd.reports import GpsdReports
+from drivers.receivers.message_decoder import MessageDecoder
+from drivers.receivers.nmea.decoder import NmeaDecoder
+from drivers.receivers.novatel.decoder import NovatelDecoder
+from drivers.receivers.septentrio.decoder import SbfDecoder
+from drivers.receivers.ublox.decoder import UbxDecoder
+from drivers.thermometers.ascii_line.thermometer import AsciiLineThermometer
+from drivers.thermometers.modbus_rtu.frames import crc16, find_reply
+from drivers.triggers.pulse_bus import PulseBusTrigger
 from sim_hw.gige.control import Actions, ControlChannel
 from sim_hw.gige.registers import FrameSize, HeadIdentity, RegisterMemory
 from sim_hw.receivers.mavlink_autopilot import MavlinkAutopilot
@@ -36,7 +36,7 @@ from sim_hw.receivers.novatel_receiver import NovatelReceiver
 from sim_hw.receivers.receiver import EmulatedReceiver, ReceiverState
 from sim_hw.receivers.septentrio_receiver import SeptentrioReceiver
 from sim_hw.receivers.ublox_receiver import UbloxReceiver
-from sim_hw.world_clock import WorldClock
+from sim_hw.world.world_clock import WorldClock
 from tests.drivers.stand_ins import FakeClock
 
 GPS_NS = 1_447_400_000_000_000_000
@@ -229,7 +229,7 @@ def septentrio() -> Parser:
 
 
 def mavlink() -> Parser:
-    from drivers.mavlink.decoder import MavlinkDecoder
+    from drivers.receivers.mavlink.decoder import MavlinkDecoder
 
     autopilot = MavlinkAutopilot(WorldClock(GPS_NS, 0), lambda _: STATE)
     stream = b""

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from drivers import registry
+from drivers.base import registry
 from drivers.contract import (
     CHUNK_ALLOWANCE_NBYTES,
     DeviceError,
@@ -33,7 +33,7 @@ from drivers.contract import (
     RawBytes,
     Record,
 )
-from sim_hw.lone import HEIGHT_PX, KINDS, WIDTH_PX
+from sim_hw.processes.lone import HEIGHT_PX, KINDS, WIDTH_PX
 
 ROOT = Path(__file__).parents[2]
 HEADS = ("head-1", "head-2")
@@ -191,7 +191,7 @@ NURSERY = ThreadPoolExecutor(1, thread_name_prefix="nursery")
 
 def _popen(device: Device) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [sys.executable, "-m", "sim_hw.lone", device.kind, "--at", device.at],
+        [sys.executable, "-m", "sim_hw.processes.lone", device.kind, "--at", device.at],
         cwd=ROOT,
         stdout=subprocess.PIPE,
         text=True,

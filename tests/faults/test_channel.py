@@ -6,7 +6,7 @@ import pytest
 
 from sim_hw.faults.channel import BytesDamage, Channel
 from sim_hw.faults.plan import Planned
-from sim_hw.world_clock import NS_PER_S, NS_PER_WEEK
+from sim_hw.world.world_clock import NS_PER_S, NS_PER_WEEK
 
 
 def channel(

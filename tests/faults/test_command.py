@@ -37,7 +37,14 @@ def test_an_emulated_rig_with_impossible_faults_tells_all_of_them_and_does_not_s
 def test_a_lone_device_refuses_a_fault_it_cannot_have(tmp_path: Path) -> None:
     done = subprocess.run(
         [
-            *(sys.executable, "-m", "sim_hw.lone", "modbus", "--at", str(tmp_path / "port")),
+            *(
+                sys.executable,
+                "-m",
+                "sim_hw.processes.lone",
+                "modbus",
+                "--at",
+                str(tmp_path / "port"),
+            ),
             *("--fault", "wrong-week@3"),
         ],
         cwd=ROOT,

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from benchmarks.fast_flight import FastFlight
 from benchmarks.pairing import SMALL_RIG, shortcomings
-from daemon.configuration import LimitsSection
-from daemon.service.worker import report_unprocessed
+from daemon.configuration.model import LimitsSection
+from daemon.onboard.pipeline.worker import report_unprocessed
 from processing.quality.report import Flag
 from sim_hw.faults.plan import Planned
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from drivers.contract import CHUNK_ALLOWANCE_NBYTES, DeviceEvent, Frame, FrameStatus, Record
 from sim_hw.faults.plan import Planned
 from sim_hw.gige.head import ExposureRequest, FrameSize, GigeHead, HeadIdentity, WireFaults
-from sim_hw.world_clock import DeviceClock
+from sim_hw.world.world_clock import DeviceClock
 
 pytest.importorskip("gi", reason="needs PyGObject (extra aravis)")
 pytestmark = pytest.mark.timeout(240)
@@ -52,7 +52,7 @@ class Host:
     """The driver in its thread, and what it yielded: frames with the pulse of their pixels."""
 
     def __init__(self) -> None:
-        from drivers.aravis.head import AravisHead
+        from drivers.cameras.aravis.head import AravisHead
 
         self.memory = Memory()
         self.driver = AravisHead(

@@ -19,7 +19,7 @@ from sim_hw.faults.plan import Planned
 from sim_hw.faults.wire import FaultyWire, FaultyWorldClock
 from sim_hw.receivers.receiver import ReceiverState
 from sim_hw.receivers.ublox_receiver import UbloxReceiver
-from sim_hw.world_clock import NS_PER_WEEK, WorldClock
+from sim_hw.world.world_clock import NS_PER_WEEK, WorldClock
 
 WITHIN_S = 20.0
 STATE = ReceiverState(48.0, 11.0, 500.0, (60.0, 0.0, 0.0), 0.0, 0.0, 0.0)

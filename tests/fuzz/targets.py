@@ -69,7 +69,7 @@ def _line(name: str, start: tuple[float, float]) -> dict[str, object]:
 
 
 def plan_geojson() -> Target:
-    from daemon.plan.reading import PlanError, plan_from_bytes
+    from daemon.planning.reading import PlanError, plan_from_bytes
 
     place = {"type": "Point", "coordinates": [15.001, 47.0]}
     content = {
@@ -85,7 +85,7 @@ def plan_geojson() -> Target:
 
 
 def plan_kml() -> Target:
-    from daemon.plan.reading import PlanError, plan_from_bytes
+    from daemon.planning.reading import PlanError, plan_from_bytes
 
     text = (
         '<?xml version="1.0"?><kml xmlns="http://www.opengis.net/kml/2.2"><Document><Placemark>'
@@ -97,7 +97,7 @@ def plan_kml() -> Target:
 
 
 def plan_qgroundcontrol() -> Target:
-    from daemon.plan.reading import PlanError, plan_from_bytes
+    from daemon.planning.reading import PlanError, plan_from_bytes
 
     items = [
         {"command": 16, "params": [0, 0, 0, None, 47.0, 15.4, 100]},
@@ -126,7 +126,7 @@ def rig() -> Target:
 
 
 def configuration() -> Target:
-    from daemon.configuration import ConfigurationError, from_mapping
+    from daemon.configuration.model import ConfigurationError, from_mapping
     from processing.rig.toml_text import TomlError, parse_toml
 
     seed = (
@@ -144,7 +144,7 @@ def configuration() -> Target:
 
 
 def tokens() -> Target:
-    from daemon.watch.tokens import TokenError, read_tokens
+    from daemon.onboard.monitoring.access.tokens import TokenError, read_tokens
 
     def parse(data: bytes) -> object:
         path = _file("tokens.toml", data)
@@ -159,8 +159,8 @@ def tokens() -> Target:
 
 
 def exposure_record() -> Target:
-    from daemon.disk.records import RecordError, parse_record
-    from daemon.exposure import capture_bytes, capture_from_json, exposure_bytes, from_json
+    from daemon.mission.exposure import capture_bytes, capture_from_json, exposure_bytes, from_json
+    from daemon.mission.records import RecordError, parse_record
     from tests.daemon.small_camera import capture_of, final_record
 
     def parse(data: bytes) -> object:
@@ -175,8 +175,8 @@ def exposure_record() -> Target:
 
 
 def quality_report() -> Target:
-    from daemon.disk.level2 import read_report
-    from daemon.disk.records import RecordError
+    from daemon.mission.records import RecordError
+    from daemon.mission.store.level2 import read_report
     from processing.quality import valid_area
 
     def parse(data: bytes) -> object:
@@ -193,7 +193,7 @@ def quality_report() -> Target:
 
 
 def stitch_record() -> Target:
-    from daemon.disk.records import RecordError, parse_record
+    from daemon.mission.records import RecordError, parse_record
     from processing.mosaic.stitch_record import StitchRecordError, stitch_record_from_json
 
     return Target(
@@ -210,8 +210,8 @@ def stitch_record() -> Target:
 def flight_log() -> Target:
     from mcap.writer import CompressionType, Writer
 
-    from daemon.disk.flight_log import read
-    from daemon.disk.log_records import record_of
+    from daemon.mission.log.flight_log import read
+    from daemon.mission.log.log_records import record_of
 
     def seed(compression: CompressionType) -> bytes:
         buffer = BytesIO()
@@ -231,7 +231,7 @@ def flight_log() -> Target:
 
 
 def chain() -> Target:
-    from daemon.disk.chain_file import first_line, read_history
+    from daemon.mission.verification.chain_file import first_line, read_history
 
     return Target(
         lambda data: read_history(_file("chain.jsonl", data)), (), (first_line("a" * 64),)
@@ -260,7 +260,13 @@ def _tiffs() -> tuple[bytes, ...]:
 
 
 def level0_tiff() -> Target:
-    from daemon.disk.level0 import RasterError, check_tiff, read_description, read_frame, read_tiff
+    from daemon.mission.store.level0 import (
+        RasterError,
+        check_tiff,
+        read_description,
+        read_frame,
+        read_tiff,
+    )
 
     def parse(data: bytes) -> None:
         path = _file("SU00.tif", data)
@@ -280,7 +286,7 @@ def level0_tiff() -> Target:
 
 
 def folder_frame() -> Target:
-    from drivers.folder.frames import FrameFileError, read_frame
+    from drivers.cameras.folder.frames import FrameFileError, read_frame
 
     return Target(
         lambda data: read_frame(_file("a.tif", data), room_nbytes=1_000_000),
@@ -290,7 +296,7 @@ def folder_frame() -> Target:
 
 
 def rededge_image() -> Target:
-    from daemon.importers.rededge import ImagesError, read_image
+    from daemon.postflight.importers.rededge import ImagesError, read_image
     from tests.daemon.rededge_data import packet, write_tiff
 
     path = _folder() / "seed.tif"
@@ -384,7 +390,7 @@ def trajectory_sbet() -> Target:
 
 
 def xmp() -> Target:
-    from daemon.importers.xmp import XmpError, read_xmp
+    from daemon.postflight.importers.xmp import XmpError, read_xmp
     from tests.daemon.rededge_data import packet
 
     def parse(data: bytes) -> object:
@@ -395,8 +401,8 @@ def xmp() -> Target:
 
 
 def dbat_script() -> Target:
-    from daemon.adjusting.tables import ProjectError
-    from daemon.importers.dbat import import_dbat
+    from daemon.postflight.adjustment.tables import ProjectError
+    from daemon.postflight.importers.dbat import import_dbat
 
     seed = (
         b"<document><meta><name>n</name></meta><input><cameras><camera><name>c</name>"
@@ -412,15 +418,15 @@ def dbat_script() -> Target:
 
 
 def adjustment_project() -> Target:
-    from daemon.adjusting.project_file import read_project_file
-    from daemon.adjusting.tables import ProjectError
+    from daemon.postflight.adjustment.project_file import read_project_file
+    from daemon.postflight.adjustment.tables import ProjectError
 
     seed = b'format = 1\nname = "n"\n[[camera]]\nname = "c"\nf_mm = 50\nfree = ["k1"]\n'
     return Target(lambda data: read_project_file(_file("p.toml", data)), (ProjectError,), (seed,))
 
 
 def adjustment_table() -> Target:
-    from daemon.adjusting.tables import ProjectError, read_table
+    from daemon.postflight.adjustment.tables import ProjectError, read_table
 
     def parse(data: bytes) -> object:
         return read_table(_file("t.csv", data), ("point",), ("x_m",)).numbers("x_m")
@@ -429,7 +435,7 @@ def adjustment_table() -> Target:
 
 
 def laboratory_series() -> Target:
-    from daemon.calibration.laboratory.series import SeriesError, read_series
+    from daemon.postflight.calibration.laboratory.series import SeriesError, read_series
     from processing.rig import RigError, shipped_rigs
 
     def parse(data: bytes) -> object:
@@ -446,7 +452,7 @@ def laboratory_series() -> Target:
 def catalog() -> Target:
     import sqlite3
 
-    from daemon.disk.catalog import Catalog, CatalogError
+    from daemon.mission.catalog.catalog import Catalog, CatalogError
 
     path = _folder() / "seed.db"
     path.unlink(missing_ok=True)
@@ -471,7 +477,7 @@ def catalog() -> Target:
 def telemetry() -> Target:
     import msgpack
 
-    from daemon.watch.datagrams import VERSION, Received
+    from daemon.onboard.monitoring.mavlink.datagrams import VERSION, Received
 
     def parse(data: bytes) -> object:
         received = Received()
@@ -497,7 +503,7 @@ def monitor() -> Target:
     from rich.console import Console
 
     from daemon.cli.monitor import MonitorError, _Seen
-    from daemon.watch.client import _record
+    from daemon.onboard.monitoring.client.client import _record
 
     console = Console(file=io.StringIO(), width=100)
 
@@ -519,7 +525,7 @@ def monitor() -> Target:
 
 
 def control_line() -> Target:
-    from daemon.watch.control_socket import _asks_for_state, _request
+    from daemon.onboard.monitoring.access.control_socket import _asks_for_state, _request
 
     def parse(data: bytes) -> object:
         return _asks_for_state(data), _request(data)
@@ -529,14 +535,14 @@ def control_line() -> Target:
 
 
 def command_body() -> Target:
-    from daemon.watch.bodies import parsed
+    from daemon.onboard.monitoring.web.bodies import parsed
 
     seed = b'{"interval_s": 2.0, "count": 3, "reason": "x"}'
     return Target(parsed, (ValueError,), (seed,))
 
 
 def signed_mavlink() -> Target:
-    from daemon.watch.mavlink_signatures import Signatures
+    from daemon.onboard.monitoring.mavlink.signatures import Signatures
 
     def parse(data: bytes) -> object:
         return Signatures(bytes(32), None).accept(data)

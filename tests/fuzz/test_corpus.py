@@ -12,7 +12,7 @@ import tracemalloc
 
 import pytest
 
-from drivers.extras import MissingExtraError, missing_module
+from drivers.base.extras import MissingExtraError, missing_module
 from tests.fuzz import corpus
 from tests.fuzz.__main__ import mutations
 from tests.fuzz.targets import INPUT_MAX_NBYTES, INPUT_MAX_S, TARGETS, Target

@@ -17,8 +17,8 @@ from pathlib import Path
 import pytest
 
 from drivers.contract import DeviceEvent, PpsEdge, Record
-from drivers.pps.binding import CAN_WAIT, CAPTURE_ASSERT, KernelPps
-from drivers.pps.device import PpsDevice
+from drivers.triggers.pps.binding import CAN_WAIT, CAPTURE_ASSERT, KernelPps
+from drivers.triggers.pps.device import PpsDevice
 
 GUEST = Path(os.environ.get("KERNEL_GUEST", "/dev/kernel-guest"))
 PORT, CONTROL, IRQ = 0x378, 0x37A, 7

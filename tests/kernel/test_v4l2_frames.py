@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from drivers.cameras.v4l2.formats import FORMATS
 from drivers.contract import FrameStatus
-from drivers.v4l2.formats import FORMATS
 from tests.kernel import vivid
 
 SHAPE = (720, 1280)

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import pytest
 
+from drivers.cameras.v4l2.discovery import capture_nodes
 from drivers.contract import DeviceError
-from drivers.v4l2.discovery import capture_nodes
 from tests.kernel import vivid
 
 SIZE = {"width_px": 640, "height_px": 360, "pixel_format": "SRGGB12"}

@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.cameras.v4l2.head import V4l2Head
 from drivers.contract import DeviceEvent, Frame, LifeCycle, Record
-from drivers.v4l2.head import V4l2Head
 
 GUEST = Path(os.environ.get("KERNEL_GUEST", "/dev/kernel-guest"))
 PATIENCE_S = 60.0

@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.conditions import Conditions, for_sensors
+from processing.geometry.conditions import Conditions, for_sensors
 from processing.rig import shipped_rigs
-from sim_hw.seeding import random_stream
 from sim_hw.world.electronics import Electronics, SensorTruth, true_sensor
 from sim_hw.world.flight import Flight
 from sim_hw.world.rendering import Look, light_on_sensor
 from sim_hw.world.scene import open_scene
+from sim_hw.world.seeding import random_stream
 from sim_hw.world.snapshots import look_of, sensors_of
 from sim_hw.world.truth import true_vip
 from sim_hw.world.world import World, WorldSettings

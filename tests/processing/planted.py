@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.rendered import conditions_of, errors_of, radiometry_of, take, world_settings
-from processing.conditions import Conditions
-from processing.pipeline import Pipeline, Product, Settings
+from processing.geometry.conditions import Conditions
+from processing.pipelines.stitched import Pipeline, Product, Settings
 from processing.radiometry.calibration import RadiometricCalibration
 from processing.rig import Cone, Rig, Sensor
 from sim_hw.world.snapshots import Heads, Snapshot

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from processing.compiled import compile_for, kernels
+from processing.pipelines.compiled import compile_for, kernels
 from processing.rig import find_rig
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from processing.conditions import (
+from processing.geometry.conditions import (
     Conditions,
     condition_figures,
     exposure_scale_figures,

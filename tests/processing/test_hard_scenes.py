@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks.hard_scenes import SCENES, Camera, Outcome
-from processing.pipeline import Product
+from processing.pipelines.stitched import Product
 from processing.quality.report import Flag
 
 pytestmark = pytest.mark.timeout(600)

@@ -7,8 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from processing.conditions import Conditions
-from processing.perspective import HeadPipeline, looks_apart, perspective_of, raw_of_perspective
+from processing.geometry.conditions import Conditions
+from processing.pipelines.perspective import (
+    HeadPipeline,
+    looks_apart,
+    perspective_of,
+    raw_of_perspective,
+)
 from processing.quality.report import QualityReport
 from processing.rig import Cone, Rig, find_rig
 from sim_hw.world.camera import true_camera, undistorted

@@ -12,13 +12,13 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from processing.compiled import kernels, variants
-from processing.conditions import usable_temperatures
+from processing.geometry.conditions import usable_temperatures
 from processing.geometry.placement import nominal_placements, vip_mm_from_raw, vip_px_from_mm
 from processing.image.lattice import colour_raster
 from processing.mosaic.drawing import residuals_svg
 from processing.mosaic.residual_vectors import residual_vectors
-from processing.pipeline import Conditions, Pipeline, Product, Settings
+from processing.pipelines.compiled import kernels, variants
+from processing.pipelines.stitched import Conditions, Pipeline, Product, Settings
 from processing.quality.report import FIGURES, Flag, Verdict, as_json
 from processing.radiometry.level1 import exposed_rows, level1_counts_per_dn
 from processing.rig import Rig, find_rig

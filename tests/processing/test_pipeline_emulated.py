@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from processing.pipeline import Pipeline, Product, Settings
+from processing.pipelines.stitched import Pipeline, Product, Settings
 from processing.quality.report import Flag, Verdict
 from processing.radiometry.calibration import load_radiometry
 from sim_hw.world import laboratory

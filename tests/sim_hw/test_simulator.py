@@ -24,8 +24,8 @@ from pymodbus.client import ModbusSerialClient
 from pyubx2 import UBXReader
 
 from sim_hw.gige import features as at
-from sim_hw.head_process import FirstLine
-from sim_hw.simulator import SimulatorError, head_addresses
+from sim_hw.processes.head_process import FirstLine
+from sim_hw.processes.simulator import SimulatorError, head_addresses
 from sim_hw.world.electronics import Electronics, true_sensor
 from sim_hw.world.rendering import Look, light_on_sensor
 from sim_hw.world.scene import open_scene

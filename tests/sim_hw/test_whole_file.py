@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sim_hw.whole_file import whole_file
+from sim_hw.world.whole_file import whole_file
 from tests.crash.kill_at_call import run_to_call
 
 pytestmark = pytest.mark.trust

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_hw.world_clock import (
+from sim_hw.world.world_clock import (
     DeviceClock,
     WorldClock,
     gps_ns_from_unix_ns,

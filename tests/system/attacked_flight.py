@@ -25,7 +25,7 @@ from typing import Any
 import tifffile
 
 from daemon.cli.sim import Emulator, free_first_address, service_toml, simulator_arguments
-from daemon.watch.tokens import add_token
+from daemon.onboard.monitoring.access.tokens import add_token
 from tests.system.flown import ROOT, syntopic
 from tests.system.test_operators_page import Running
 

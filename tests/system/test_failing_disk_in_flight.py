@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from daemon.cli.sim import Emulator, free_first_address, service_toml, simulator_arguments
-from daemon.disk.level0_folder import read_sealed
-from daemon.disk.mission import Mission
-from daemon.disk.verification import verify
+from daemon.mission.layout import Mission
+from daemon.mission.store.level0_folder import read_sealed
+from daemon.mission.verification.verification import verify
 from tests.crash.write_log import needs_strace, run_ill
 from tests.system.flown import ROOT
 

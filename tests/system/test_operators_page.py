@@ -25,12 +25,12 @@ from typing import Any
 import pytest
 
 from daemon.cli.sim import Emulator, free_first_address, service_toml, simulator_arguments
-from daemon.plan.model import Plane, Point
-from daemon.plan.reading import read_plan
-from daemon.watch.tokens import add_token
+from daemon.onboard.monitoring.access.tokens import add_token
+from daemon.planning.model import Plane, Point
+from daemon.planning.reading import read_plan
 from sim_hw.world.flight import FlightPlan
 from tests.browser import Browser, chromium
-from tests.daemon.watch.test_mavsdk_camera import free_port
+from tests.daemon.onboard.monitoring.test_mavsdk_camera import free_port
 from tests.system.flown import ROOT, Flown
 from tests.system.waypoints import darkened, fly_mission
 

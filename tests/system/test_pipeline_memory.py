@@ -19,7 +19,14 @@ GROWTH_LIMIT_MIB = 8.0
 
 @pytest.mark.parametrize("lanes", [1, 2])
 def test_memory_does_not_grow_over_two_hundred_exposures(tmp_path: Path, lanes: int) -> None:
-    command = [sys.executable, "-m", "sim_hw.exposures", "ultracam-x-mini", "--out", str(tmp_path)]
+    command = [
+        sys.executable,
+        "-m",
+        "sim_hw.processes.exposures",
+        "ultracam-x-mini",
+        "--out",
+        str(tmp_path),
+    ]
     subprocess.run([*command, "--dc", "12"], check=True, timeout=300, stdout=subprocess.DEVNULL)
     seen = held_mib(tmp_path, EXPOSURES, lanes)
     print(f"PSS MiB: {seen[SETTLED_AFTER]:.1f} after {SETTLED_AFTER}, {seen[-1]:.1f} at the end")

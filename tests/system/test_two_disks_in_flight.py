@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 
 from daemon.cli.sim import Emulator, free_first_address, service_toml, simulator_arguments
-from daemon.disk.flight_log import logs_of
-from daemon.disk.level0_folder import read_sealed
-from daemon.disk.mission import Mission
-from daemon.disk.verification import verify
+from daemon.mission.layout import Mission
+from daemon.mission.log.flight_log import logs_of
+from daemon.mission.store.level0_folder import read_sealed
+from daemon.mission.verification.verification import verify
 from processing.quality.report import Flag
 from tests.system.flown import ROOT
 

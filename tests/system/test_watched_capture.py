@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from daemon.cli.sim import Emulator, free_first_address, service_toml, simulator_arguments
-from tests.daemon.watch.test_watchers import STALLED, WATCHERS, follow, stall
+from tests.daemon.onboard.monitoring.test_watchers import STALLED, WATCHERS, follow, stall
 from tests.system.flown import Flown
 from tests.system.test_operators_page import READY_WITHIN_S, Running, busy_share
 

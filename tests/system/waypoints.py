@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import tifffile
 
-from daemon.plan.model import Plane, Point
+from daemon.planning.model import Plane, Point
 from sim_hw.receivers.mavlink_mission import HEADER, MissionAutopilot, Place, read_mission
 from sim_hw.world.flight import FlightPlan
 

@@ -10,7 +10,7 @@ import pytest
 
 from daemon.orientation.trajectory import Trajectory, read_trajectory
 from drivers.contract import NavSample
-from tests.daemon.flight.test_flight import GPS_NS, NS, nav
+from tests.daemon.onboard.flight.test_flight import GPS_NS, NS, nav
 
 pytestmark = pytest.mark.trust
 

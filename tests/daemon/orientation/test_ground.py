@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.configuration import ConfigurationError, MountSection, PlanSection, load
-from daemon.exposure import Exposure, NavigationRecord
+from daemon.configuration.model import ConfigurationError, MountSection, PlanSection, load
+from daemon.mission.exposure import Exposure, NavigationRecord
 from daemon.orientation.ground import Ground, ground_of
 from daemon.products.conditions import conditions_of
-from processing.conditions import Conditions
+from processing.geometry.conditions import Conditions
 from processing.geometry.placement import nominal_placements, vip_mm_from_raw
 from processing.geometry.virtual_camera import ground_plane
 from processing.quality.report import Flag

@@ -16,8 +16,8 @@ import pytest
 pytest.importorskip("pyproj", reason="needs the extra geodesy")
 rasterio = pytest.importorskip("rasterio", reason="needs the extra geotiff")
 
-from daemon.disk.mission import Mission  # noqa: E402
-from daemon.foreign_files import is_on_local_disk  # noqa: E402
+from daemon.mission.foreign_files import is_on_local_disk  # noqa: E402
+from daemon.mission.layout import Mission  # noqa: E402
 from daemon.orientation.elevation import ElevationError, read_elevation  # noqa: E402
 from daemon.orientation.exterior import mount_of  # noqa: E402
 from daemon.orientation.georeference import Georeference, GeoreferenceError  # noqa: E402
@@ -164,7 +164,9 @@ def test_a_path_below_a_network_mount_or_through_a_link_is_not_local(
     assert not is_on_local_disk(tmp_path / "link" / "passwd")
     for kind in ("autofs", "nfs4", "cifs", "fuse.sshfs", "proc"):
         mounts = [("/", "ext4"), (str(tmp_path), kind)]
-        monkeypatch.setattr("daemon.foreign_files._mounts", lambda mounts=mounts: iter(mounts))
+        monkeypatch.setattr(
+            "daemon.mission.foreign_files._mounts", lambda mounts=mounts: iter(mounts)
+        )
         assert not is_on_local_disk(tmp_path / "far" / "dem.tif"), kind
 
 

@@ -17,18 +17,14 @@ from typer.testing import CliRunner
 
 from daemon.cli import app
 from daemon.cli.process import as_flown
-from daemon.configuration import PlanSection, ProcessingSection
-from daemon.disk import store
-from daemon.disk.level0 import read_description
-from daemon.disk.mission import Mission
-from daemon.export.certificate import CertificateError, certificate_of
-from daemon.exposure import NavigationRecord, exposure_bytes
-from daemon.orientation.local_frame import LocalFrame
-from daemon.orientation.triangulation import TriangulationError, block_of, matched
-from daemon.replay.flight import Replayed
-from daemon.service import worker
-from daemon.service.memory import FrameRing
-from daemon.service.messages import (
+from daemon.configuration.model import PlanSection, ProcessingSection
+from daemon.mission.exposure import NavigationRecord, exposure_bytes
+from daemon.mission.layout import Mission
+from daemon.mission.store import store
+from daemon.mission.store.level0 import read_description
+from daemon.onboard.capture.memory import FrameRing
+from daemon.onboard.pipeline import worker
+from daemon.onboard.service.messages import (
     Begin,
     FramesRead,
     Judged,
@@ -39,9 +35,13 @@ from daemon.service.messages import (
     WorkerReady,
     WorkerSettings,
 )
+from daemon.orientation.local_frame import LocalFrame
+from daemon.postflight.export.certificate import CertificateError, certificate_of
+from daemon.postflight.replay.flight import Replayed
+from daemon.postflight.triangulation.triangulation import TriangulationError, block_of, matched
 from processing.matching.blocks import BlockMatching
 from processing.rig import load_rig, shipped_rigs
-from sim_hw.exposures import EPOCH_GPS_NS, FIRST_AFTER_S, write_exposures
+from sim_hw.processes.exposures import EPOCH_GPS_NS, FIRST_AFTER_S, write_exposures
 from sim_hw.world import camera
 from sim_hw.world.world import World, WorldSettings
 
@@ -179,7 +179,7 @@ def test_a_flight_over_a_height_model_is_replayed_with_the_model_from_elsewhere(
     (mission.path / "log").mkdir()
     (mission.path / "log" / "1.mcap").touch()
     again = {"records": [exposure], "is_complete": True}
-    monkeypatch.setattr("daemon.replay.flight.replay_log", lambda *_: Replayed(**again))
+    monkeypatch.setattr("daemon.postflight.replay.flight.replay_log", lambda *_: Replayed(**again))
     models = [hill(tmp_path / f"{top}.asc", here, top) for top in (150.0, 300.0)]
     shutil.rmtree(mission.level2_root)
     flown_with = ["process", str(mission.path), "--only", "2", "--elevation", str(models[0])]

@@ -15,15 +15,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.configuration import MountSection
-from daemon.disk.flight_log import FlightLog
-from daemon.disk.log_records import message_of
-from daemon.disk.mission import Mission
-from daemon.export.orientation import export_orientation
+from daemon.configuration.model import MountSection
+from daemon.mission.layout import Mission
+from daemon.mission.log.flight_log import FlightLog
+from daemon.mission.log.log_records import message_of
 from daemon.orientation.exterior import ExteriorOrientation, exposures_of, mount_of, orient
 from daemon.orientation.georeference import Georeference, GeoreferenceError, utm_of
 from daemon.orientation.inputs import OrientationError
 from daemon.orientation.trajectory import TrajectoryError, flown, read_trajectory
+from daemon.postflight.export.orientation import export_orientation
 from drivers.contract import NavSample
 from processing.geometry.rotation import rotation_matrix as r
 from processing.rig import load_rig, shipped_rigs

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from daemon.adjusting.project import read_project
 from daemon.cli import app
-from daemon.disk.level0 import tiff_parts
-from daemon.disk.mission import Mission, MissionError
+from daemon.mission.layout import Mission, MissionError
+from daemon.mission.store.level0 import tiff_parts
 from daemon.orientation.local_frame import LocalFrame
+from daemon.postflight.adjustment.project import read_project
 from processing.rig import shipped_rigs
-from sim_hw.exposures import EPOCH_GPS_NS, FIRST_AFTER_S
+from sim_hw.processes.exposures import EPOCH_GPS_NS, FIRST_AFTER_S
 from sim_hw.world import camera
 from sim_hw.world.flight import Flight
 from sim_hw.world.post_processed import marks_of_lines, write_trajectory

@@ -8,12 +8,12 @@ from dataclasses import replace
 
 import pytest
 
-from daemon.calibration.rig_text import rig_toml
-from daemon.configuration import PlanSection
-from daemon.disk.records import RecordError
-from daemon.exposure import Exposure, FrameRecord, from_json
+from daemon.configuration.model import PlanSection
+from daemon.mission.exposure import Exposure, FrameRecord, from_json
+from daemon.mission.records import RecordError
+from daemon.onboard.pipeline.worker import report_unprocessed
+from daemon.postflight.calibration.rig_text import rig_toml
 from daemon.products.conditions import conditions_of
-from daemon.service.worker import report_unprocessed
 from processing.quality.judgement import judge
 from processing.quality.report import Flag, Verdict
 from processing.rig import RigError, find_rig

@@ -10,11 +10,11 @@ import pytest
 import tifffile
 from typer.testing import CliRunner
 
-from daemon.calibration.rig_text import rig_toml
 from daemon.cli import app
-from daemon.configuration import ConfigurationError
-from daemon.disk.level0 import read_description, tiff_parts
-from daemon.disk.mission import Mission, MissionError
+from daemon.configuration.model import ConfigurationError
+from daemon.mission.layout import Mission, MissionError
+from daemon.mission.store.level0 import read_description, tiff_parts
+from daemon.postflight.calibration.rig_text import rig_toml
 from daemon.products import level3
 from processing.rig import find_rig, load_rig, rig_from_mapping
 from tests.processing.image.test_pansharpening import box_means, scene

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from benchmarks.boresight import error_of, inertial_of, judged, network_of
-from daemon.calibration.boresight import controlled_of
+from daemon.postflight.calibration.boresight import controlled_of
 from processing.bundle.adjust import adjust
 from processing.bundle.start import completed
 from processing.calibration.boresight import PARAMETERS, WORTH, Boresight, calibrated, mounting_of

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from daemon.calibration.rig_text import rig_toml
+from daemon.postflight.calibration.rig_text import rig_toml
 from processing.geometry.lens import ideal_from_measured, measured_from_ideal
 from processing.geometry.placement import vip_mm_from_px
 from processing.geometry.residual_grid import (
@@ -17,7 +17,7 @@ from processing.geometry.residual_grid import (
     grid_of_lens,
     left_by_halves,
 )
-from processing.perspective import perspective_of, raw_of_perspective
+from processing.pipelines.perspective import perspective_of, raw_of_perspective
 from processing.rig import Cone, LensGrid, Rig, RigError, find_rig, rig_from_mapping
 from sim_hw.world.camera import true_camera, undistorted
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from processing.conditions import Conditions
+from processing.geometry.conditions import Conditions
 from processing.geometry.placement import nominal_placements, vip_mm_from_raw
 from processing.geometry.rotation import rotation_matrix
 from processing.geometry.topology import corners, counts, overlaps

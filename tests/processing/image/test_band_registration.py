@@ -8,9 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from processing.band_pipeline import SATURATED, SIGNAL_UNIT, VALID, BandPipeline
-from processing.conditions import Conditions
 from processing.geometry.brown import Brown, lens_from_brown, measured_from_ideal_brown
+from processing.geometry.conditions import Conditions
 from processing.geometry.lens import measured_from_ideal
 from processing.geometry.placement import (
     raw_from_vip_mm,
@@ -27,6 +26,7 @@ from processing.image.band_registration import (
     reference_image,
     register_to_reference,
 )
+from processing.pipelines.bands import SATURATED, SIGNAL_UNIT, VALID, BandPipeline
 from processing.quality.report import Flag
 from processing.rig import find_rig
 from tests.processing.textures import Texture

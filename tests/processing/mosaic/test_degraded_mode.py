@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from processing.matching.tie_points import TiePointSettings
-from processing.pipeline import Pipeline, Product, Settings
+from processing.pipelines.stitched import Pipeline, Product, Settings
 from processing.quality.nominal_area import nominal_area
 from processing.quality.report import Flag, Verdict, as_json
 from processing.rig import Rig, find_rig

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks import rendered
-from processing.pipeline import Conditions, Pipeline
+from processing.pipelines.stitched import Conditions, Pipeline
 from processing.quality.report import Flag, Verdict
 from processing.rig import Rig
 from sim_hw.world.snapshots import Heads

@@ -21,7 +21,7 @@ from processing.geometry.placement import (
 from processing.geometry.projective import apply_projective
 from processing.mosaic.free import free_mosaic
 from processing.mosaic.pan_only import pan_only_mosaic
-from processing.pipeline import Pipeline, Product, Settings
+from processing.pipelines.stitched import Pipeline, Product, Settings
 from processing.quality.report import Flag, Verdict
 from processing.rig import Rig, find_rig
 from tests.processing.emulated import Emulated, after_similarity, expose, rms

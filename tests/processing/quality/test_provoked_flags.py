@@ -12,7 +12,7 @@ from dataclasses import replace
 import pytest
 
 from benchmarks.flags import FAULTS, THRESHOLDS, Camera, Fault
-from processing.pipeline import Conditions
+from processing.pipelines.stitched import Conditions
 from processing.quality.report import NO_FLAGS, Flag, Verdict
 from processing.quality.specification import Asked
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 import serial
 
-from drivers import registry
-from drivers.ascii_line.thermometer import AsciiLineThermometer
+from drivers.base import registry
 from drivers.contract import TemperatureSample
+from drivers.thermometers.ascii_line.thermometer import AsciiLineThermometer
 from sim_hw.devices.ascii_probe import AsciiProbe
 from sim_hw.devices.network_line import TcpLine
 from sim_hw.devices.pseudo_terminal import PseudoTerminal

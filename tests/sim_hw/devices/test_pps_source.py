@@ -5,9 +5,9 @@ from __future__ import annotations
 import threading
 
 from drivers.contract import DeviceEvent, PpsEdge
-from drivers.pps.device import PpsDevice
+from drivers.triggers.pps.device import PpsDevice
 from sim_hw.devices.pps_source import PpsSource
-from sim_hw.world_clock import NS_PER_S, WorldClock
+from sim_hw.world.world_clock import NS_PER_S, WorldClock
 
 
 def test_edges_are_whole_seconds_of_gps_time_and_a_pulled_cable_is_told() -> None:

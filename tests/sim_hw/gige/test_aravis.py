@@ -23,7 +23,7 @@ from sim_hw.gige.head import (
     Pacing,
     WireFaults,
 )
-from sim_hw.world_clock import DeviceClock
+from sim_hw.world.world_clock import DeviceClock
 
 pytestmark = pytest.mark.peer
 

@@ -26,7 +26,7 @@ from sim_hw.gige.head import (
     WireFaults,
 )
 from sim_hw.gige.registers import RegisterMemory
-from sim_hw.world_clock import DeviceClock
+from sim_hw.world.world_clock import DeviceClock
 
 SIZE = FrameSize(320, 200)
 IDENTITY = HeadIdentity("127.77.1.1", "T-0001", "Head", "Maker", "SU00")

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from sim_hw.devices.network_line import UdpLine
 from sim_hw.receivers.mavlink_autopilot import DEFAULT_HZ, MavlinkAutopilot
 from sim_hw.receivers.mavlink_messages import Listener, Received, definitions, message, x25
-from sim_hw.world_clock import WorldClock
+from sim_hw.world.world_clock import WorldClock
 from tests.sim_hw.receiver_state import NS, START_GPS_NS, STATE, state_at
 
 dialect = pytest.importorskip(

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from daemon.plan.advisor import Segment
-from daemon.plan.model import PlannedLine, Point
-from daemon.plan.writing import mavlink_mission
+from daemon.planning.advisor import Segment
+from daemon.planning.model import PlannedLine, Point
+from daemon.planning.writing import mavlink_mission
 from sim_hw.receivers.mavlink_mission import MissionAutopilot, read_mission
 
 LATITUDE, LONGITUDE = 47.0, 15.0

@@ -14,14 +14,14 @@ from typing import Any
 import pytest
 
 from drivers.contract import EventMark
-from drivers.novatel.decoder import NovatelDecoder
+from drivers.receivers.novatel.decoder import NovatelDecoder
 from sim_hw.faults.catalogue import MARK, NAVIGATION
 from sim_hw.receivers.nmea_receiver import NmeaReceiver
 from sim_hw.receivers.novatel_receiver import CLOCK_OFFSET_MAX_NS, NovatelReceiver
 from sim_hw.receivers.receiver import Edge, EmulatedReceiver
 from sim_hw.receivers.septentrio_messages import FALLING, RISING
 from sim_hw.receivers.septentrio_receiver import SeptentrioReceiver
-from sim_hw.world_clock import WorldClock
+from sim_hw.world.world_clock import WorldClock
 from tests.sim_hw.receiver_state import NS, START_GPS_NS, STATE, WEEK_NS, state_at
 from tests.sim_hw.receivers.test_ublox_receiver import free_port, gpsd_position
 

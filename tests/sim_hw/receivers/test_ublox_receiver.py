@@ -28,7 +28,7 @@ from sim_hw.receivers.ublox_receiver import (
     ReceiverAccuracy,
     UbloxReceiver,
 )
-from sim_hw.world_clock import WorldClock
+from sim_hw.world.world_clock import WorldClock
 from tests.sim_hw.receiver_state import NS, START_GPS_NS, STATE, WEEK_NS, state_at
 
 GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from sim_hw.seeding import random_stream
 from sim_hw.world.ellipsoid import ecef_from_geodetic, geodetic_from_ecef, geodetic_from_enu
 from sim_hw.world.flight import Flight, FlightPlan, attitude_tremor, enu_from_body, path_point
+from sim_hw.world.seeding import random_stream
 from sim_hw.world.terrain import mild_relief
 
 EPOCH = 1_400_000_000_000_000_000

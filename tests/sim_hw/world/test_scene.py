@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim_hw.seeding import random_stream
 from sim_hw.world import quilting, spline
 from sim_hw.world.scene import (
     UNIT,
@@ -21,6 +20,7 @@ from sim_hw.world.scene import (
     radiance,
     shipped_pictures,
 )
+from sim_hw.world.seeding import random_stream
 
 SETTINGS = SceneSettings(seed=1, width_px=1500, height_px=1200, sample_m=0.2, colour_ratio=3)
 

@@ -1,0 +1,1 @@
+"""`syntopic bench`: the pipeline timed in turn with its peers."""

@@ -1,0 +1,1 @@
+"""`service.toml`: its model, and all that is wrong with it at once."""

@@ -1,0 +1,221 @@
+"""Mistakes in a configuration that lie between its sections: devices, triggers, ports, the rig.
+
+Each is a sentence with file, key, value and what would be right. What a section alone may hold is
+in `daemon.configuration.model`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from drivers.base import registry
+from drivers.contract import DeviceError
+from processing.rig import Rig
+
+
+def device_problems(
+    content: Mapping[str, Any], file: str, trigger_keys: frozenset[str]
+) -> list[str]:
+    """What is wrong with the devices of a configuration, whatever the rig.
+
+    Args:
+        content: parsed TOML.
+        file: names the file in the sentences.
+        trigger_keys: keys of `[trigger]` that are not the driver's.
+    """
+    return [
+        *_driver_problems(content, file, trigger_keys),
+        *_name_problems(content, file),
+        *_trigger_problems(content, file),
+        *_port_problems(content, file),
+    ]
+
+
+def rig_problems(content: Mapping[str, Any], rig: Rig, file: str) -> list[str]:
+    """Where the devices of a configuration and the rig do not belong together."""
+    return [
+        *_sensor_problems(content, rig, file),
+        *_serial_problems(content, rig, file),
+        *_tdi_problems(content, rig, file),
+    ]
+
+
+def dig(content: Mapping[str, Any], *keys: str) -> Any:
+    """The value below these keys; None where there is none."""
+    value: Any = content
+    for key in keys:
+        value = value.get(key) if isinstance(value, Mapping) else None
+    return value
+
+
+def _driver_problems(
+    content: Mapping[str, Any], file: str, trigger_keys: frozenset[str]
+) -> list[str]:
+    """What the drivers say of the settings meant for them."""
+    own_keys = {
+        "head": {"driver", "sensor"},
+        "thermometer": {"driver", "name"},
+        "navigator": {"driver", "name"},
+        "pps": {"driver", "name"},
+        "trigger": set(trigger_keys),
+    }
+    problems: list[str] = []
+    for kind, own in own_keys.items():
+        sections = content.get(kind)
+        listed = sections if isinstance(sections, list) else [sections]
+        for index, section in enumerate(listed):
+            if not isinstance(section, Mapping) or not isinstance(section.get("driver"), str):
+                continue
+            key = kind if kind == "trigger" else f"{kind}[{index}]"
+            settings = {name: value for name, value in section.items() if name not in own}
+            found = registry.problems(kind, section["driver"], settings)
+            problems += [f"{file}: {key}.{problem}" for problem in found]
+    return problems
+
+
+def _sensor_problems(content: Mapping[str, Any], rig: Rig, file: str) -> list[str]:
+    """Whether the heads and the sensors of the rig belong together."""
+    heads = content.get("head")
+    given = [
+        head["sensor"]
+        for head in (heads if isinstance(heads, list) else [])
+        if isinstance(head, Mapping) and isinstance(head.get("sensor"), str)
+    ]
+    known = {sensor.name for sensor in rig.sensors}
+    problems = []
+    for index, name in enumerate(given):
+        if name not in known:
+            listed = ", ".join(sorted(known))
+            problems.append(f"{file}: head[{index}].sensor is {name!r}; {rig.name} has {listed}")
+        elif name in given[:index]:
+            problems.append(f"{file}: head[{index}].sensor is {name!r} for the second time")
+    return problems
+
+
+def _sections(content: Mapping[str, Any], kind: str) -> list[Mapping[str, Any]]:
+    listed = content.get(kind)
+    return [one for one in listed if isinstance(one, Mapping)] if isinstance(listed, list) else []
+
+
+def _name_problems(content: Mapping[str, Any], file: str) -> list[str]:
+    """Devices of one name: records of one would be taken for the other's."""
+    problems = []
+    taken: dict[str, str] = {}
+    for kind, key in (("head", "sensor"), ("thermometer", "name"), ("navigator", "name")):
+        for index, section in enumerate(_sections(content, kind)):
+            name, place = section.get(key), f"{kind}[{index}].{key}"
+            if not isinstance(name, str):
+                continue
+            # A sensor named twice is reported with the rig's sensors.
+            if name in taken and not (kind == "head" and taken[name].startswith("head")):
+                problems.append(
+                    f"{file}: {place} is {name!r}, as is {taken[name]}; give each device a name "
+                    "of its own"
+                )
+            taken.setdefault(name, place)
+    return problems
+
+
+def _trigger_problems(content: Mapping[str, Any], file: str) -> list[str]:
+    """Heads that wait for another start of exposure than the trigger gives."""
+    driver_name = dig(content, "trigger", "driver")
+    problems = []
+    try:
+        trigger: Any = registry.driver_for("trigger", str(driver_name))
+    except DeviceError:
+        return []
+    for index, section in enumerate(_sections(content, "head")):
+        try:
+            head: Any = registry.driver_for("head", str(section.get("driver")))
+        except DeviceError:
+            continue
+        source = section.get("trigger_source", head.trigger_source.default)
+        choices = head.trigger_source.choices
+        if source not in choices or source == trigger.head_trigger_source:
+            continue
+        if trigger.head_trigger_source in choices:
+            cure = f'set trigger_source = "{trigger.head_trigger_source}"'
+        else:
+            cure = f"a head of driver {section.get('driver')} has {', '.join(choices)}"
+        problems.append(
+            f"{file}: head[{index}].trigger_source is {source!r}, and trigger.driver "
+            f"{driver_name!r} starts exposures by {trigger.head_trigger_source!r}; {cure}, or "
+            "choose another trigger.driver"
+        )
+    return problems
+
+
+def _port_problems(content: Mapping[str, Any], file: str) -> list[str]:
+    """Two devices at one port or address: whoever opens it second gets nothing."""
+    problems = []
+    taken: dict[tuple[str, str], str] = {}
+    for kind, key in (
+        ("head", "address"),
+        ("head", "device"),
+        ("thermometer", "port"),
+        ("navigator", "port"),
+        ("pps", "device"),
+    ):
+        for index, section in enumerate(_sections(content, kind)):
+            value, place = section.get(key), f"{kind}[{index}].{key}"
+            if not isinstance(value, str) or section.get("driver") == "gpsd":
+                continue
+            if (key, value) in taken:
+                problems.append(
+                    f"{file}: {place} is {value!r}, as is {taken[key, value]}; one of them is wrong"
+                )
+            taken.setdefault((key, value), place)
+    return problems
+
+
+def _serial_problems(content: Mapping[str, Any], rig: Rig, file: str) -> list[str]:
+    """Parts that the rig does not have."""
+    there = {"lens": [cone.name for cone in rig.cones], "probe": list(rig.probes)}
+    return [
+        f"{file}: serials.{kind}.{name} is of nothing {rig.name} has: {', '.join(names) or 'none'}"
+        for kind, names in there.items()
+        if isinstance(given := dig(content, "serials", kind), Mapping)
+        for name in given
+        if name not in names
+    ]
+
+
+def mirror_problems(
+    root: Path, mirror: Path, timeout_s: float, exposures_in_memory: int, rig: Rig, file: str
+) -> list[str]:
+    """Whether the mirror is another place, and is given up before the memory for frames is full."""
+    problems = []
+    one, other = root.resolve(), mirror.resolve()
+    if one == other or one in other.parents or other in one.parents:
+        problems.append(
+            f"{file}: mission.mirror is {mirror}, which is mission.root, in it or around it; give "
+            "a folder on another disk"
+        )
+    # One exposure is being written when a disk stalls; the others find room in memory meanwhile.
+    bridged_s = (exposures_in_memory - 1) * rig.frame_interval_s
+    if timeout_s >= bridged_s:
+        enough = 2 + int(timeout_s / rig.frame_interval_s)
+        problems.append(
+            f"{file}: limits.mirror_timeout_s is {timeout_s:g}; memory for {exposures_in_memory} "
+            f"exposures bridges {bridged_s:g} s at one every {rig.frame_interval_s:g} s: give a "
+            f"shorter time, or set limits.exposures_in_memory to {enough}"
+        )
+    return problems
+
+
+def _tdi_problems(content: Mapping[str, Any], rig: Rig, file: str) -> list[str]:
+    """TDI moves charge from row to row, and on a Bayer head from colour to colour."""
+    heads = content.get("head")
+    bayer = {s.name: s for s in rig.sensors if s.colour_filter_array != "none"}
+    return [
+        f"{file}: head[{index}].tdi_shifts is {head['tdi_shifts']}; {head['sensor']} is a Bayer "
+        f"head ({bayer[head['sensor']].colour_filter_array}), where moving charge would mix "
+        "colours: set 0 and expose shorter"
+        for index, head in enumerate(heads if isinstance(heads, list) else [])
+        if isinstance(head, Mapping)
+        and head.get("sensor") in bayer
+        and isinstance(head.get("tdi_shifts"), int)
+        and head["tdi_shifts"] > 0
+    ]

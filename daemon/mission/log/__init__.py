@@ -1,0 +1,1 @@
+"""The flight log: every message of a flight with its time."""

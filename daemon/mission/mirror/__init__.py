@@ -1,0 +1,1 @@
+"""A mission on two disks: drop, return and resynchronisation."""

@@ -1,0 +1,100 @@
+"""Which disks hold a mission, and since when: `disks.json` in each copy of a mirrored mission.
+
+Each time a disk is dropped or joins, a new generation with the disks that belong to it is written
+durably before anything more is called stored. The history decides which of two copies leads.
+"""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from daemon.mission.records import Fields, RecordError, canonical_bytes, parse_record
+from daemon.mission.store import durable
+
+STATE_FILE = "disks.json"
+STATE_FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Generation:
+    """A period in which the same disks held the mission.
+
+    `token` is random: two disks that went apart may count alike, but never have the same token.
+    `disks` are ids (`daemon.mission.store.disk_identity`), `first` is the number of the first
+    exposure that a disk dropped at the beginning of this generation may lack.
+    """
+
+    number: int
+    token: str
+    disks: tuple[str, ...]
+    first: int = 1
+
+
+Generations = tuple[Generation, ...]
+"""Generations of a copy, oldest first; empty for a mission that was never mirrored."""
+
+
+def next_generation(history: Generations, disks: Sequence[str], first: int) -> Generations:
+    """The history with a new generation of these disks at its end."""
+    number = 1 + (history[-1].number if history else 0)
+    return (*history, Generation(number, secrets.token_hex(8), tuple(disks), first))
+
+
+def leads(history: Generations, other: Generations) -> bool:
+    """Whether a copy knows all that another knows: the other's last generation is in its history.
+
+    Both lead where they are in step; neither where each went on without the other.
+    """
+    return not other or other[-1].token in {generation.token for generation in history}
+
+
+def first_difference(behind: Generations, leading: Generations) -> int:
+    """Number of the first exposure that a copy may lack of one that leads."""
+    since = leading[len(behind) :]
+    return min((generation.first for generation in since), default=1)
+
+
+def read_generations(mission: Path) -> Generations:
+    """The history of a copy; empty where there is none.
+
+    Raises:
+        RecordError: the file is damaged.
+        OSError: the disk refused.
+    """
+    try:
+        content = parse_record((mission / STATE_FILE).read_bytes(), STATE_FILE)
+    except FileNotFoundError:
+        return ()
+    problems: list[str] = []
+    fields = Fields(content, "", STATE_FILE, problems)
+    fields.integer("format")
+    history = tuple(
+        Generation(
+            one.integer("number", minimum=1),
+            one.name("token"),
+            one.names("disks"),
+            one.integer("first", 1),
+        )
+        for one in fields.objects("generations")
+    )
+    if problems or not history:
+        raise RecordError(problems or [f"{STATE_FILE}: names no generation"])
+    return history
+
+
+def write_generations(mission: Path, history: Generations) -> None:
+    """Write the history of a copy; it is durable on return.
+
+    Raises:
+        OSError: the disk refused; the earlier one is still there.
+    """
+    generations: list[dict[str, Any]] = [
+        {"number": g.number, "token": g.token, "disks": list(g.disks), "first": g.first}
+        for g in history
+    ]
+    content = {"format": STATE_FORMAT, "generations": generations}
+    durable.replace_file(mission / STATE_FILE, canonical_bytes(content))

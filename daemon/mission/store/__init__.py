@@ -1,0 +1,1 @@
+"""Frames, rasters and records on disk, written durably."""

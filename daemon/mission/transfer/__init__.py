@@ -1,0 +1,1 @@
+"""Copying a mission to another disk, and removing the source once the copy is verified."""

@@ -1,0 +1,403 @@
+"""Copying a mission to another disk: resumable, verified, never at the cost of the last copy.
+
+Every file is hashed in the source and read back from the copy's disk in each run, whatever an
+earlier run noted. The states of a copy are in `daemon.mission.transfer.transfer_note`; removing the
+source is in `daemon.mission.transfer.transfer_removal`.
+"""
+
+from __future__ import annotations
+
+import fcntl
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+from daemon.mission.catalog.catalog import Catalog, CatalogError
+from daemon.mission.layout import Mission, MissionError
+from daemon.mission.store import durable
+from daemon.mission.store.tree import FileEntry, FileTree, Step
+from daemon.mission.transfer.transfer_note import (
+    LEFT_OUT,
+    NOTE_FILE,
+    CopiedFile,
+    TransferError,
+    TransferNote,
+    read_note,
+)
+from daemon.mission.transfer.transfer_removal import (
+    REMOVING_SUFFIX,
+    check_sealed,
+    copy_named_by,
+    finish_removal,
+    remove_sealed_source,
+    removing_path,
+)
+from daemon.mission.verification.verification import VerifyReport, verify
+
+Progress = Callable[[int, int], None]
+
+
+def no_progress(_done: int, _total: int) -> None:
+    """For callers that show none."""
+
+
+@dataclass(frozen=True)
+class TransferReport:
+    """What was done.
+
+    `copied` files were written, `kept` were identical in the copy of an earlier run. `sealed_utc`
+    is empty where the copy is not sealed.
+    """
+
+    target: Path
+    copied: int
+    kept: int
+    nbytes: int
+    verified: VerifyReport
+    source_removed: bool
+    sealed_utc: str = ""
+
+
+def transfer(
+    mission: Mission,
+    disk: Path,
+    *,
+    remove_source: bool = False,
+    progress: Progress = no_progress,
+) -> TransferReport:
+    """Copy a mission into the folder `disk`, under its own id.
+
+    Args:
+        mission: the source.
+        disk: a folder of another disk; it is created if it is missing.
+        remove_source: seal the copy and remove the source once the copy is complete and verified.
+        progress: called with bytes done and bytes in total; each byte is read in the source and in
+            the copy.
+
+    Raises:
+        TransferError: no room, a target that is not empty and not ours, a source that lacks what
+            the copy has, or a copy that cannot be verified.
+        TreeError: links or devices in source or target, or a disk that returns other bytes.
+        MissionError: another process holds the mission or the copy.
+        OSError: a disk refused; what was copied so far is kept for the next run.
+    """
+    source_path = mission.path.resolve()
+    target_path = disk.resolve() / mission.id
+    if mission.id.endswith(REMOVING_SUFFIX):
+        raise TransferError(
+            f"{source_path} is what is left of a mission that was transferred to "
+            f"{copy_named_by(source_path)}; name the mission as it was called before"
+        )
+    if target_path == source_path or target_path.is_relative_to(source_path):
+        raise TransferError(f"{disk} is where the mission is; name a folder of another disk")
+    with ExitStack() as stack:
+        stack.enter_context(mission.held())
+        source = stack.enter_context(FileTree.open(source_path))
+        durable.make_directories(target_path.parent)
+        target = stack.enter_context(_locked_target(target_path, source))
+        note = read_note(target, mission)
+        _settle_index(mission)
+        if note is not None and note.state == "sealed":
+            copying = _Copying(source, target, note.files, progress)
+            return copying.confirm_sealed(note, remove=remove_source)
+        copying = _Copying(source, target, note.files if note else {}, progress)
+        return copying.run(mission, remove=remove_source)
+
+
+def finish_transfer(
+    source_path: Path, disk: Path, *, progress: Progress = no_progress
+) -> TransferReport | None:
+    """Go on where a transfer was interrupted after the source lost its name.
+
+    Args:
+        source_path: where the mission was.
+        disk: the folder it was transferred to.
+        progress: as for `transfer`.
+
+    Returns:
+        None where nothing suggests that this mission was ever transferred.
+
+    Raises:
+        TransferError: the copy is not sealed, or not as it was sealed.
+    """
+    source_path = source_path.resolve()
+    target_path = disk.resolve() / source_path.name
+    removing = removing_path(source_path)
+    is_left = removing.is_dir()
+    if not target_path.is_dir():
+        if is_left:
+            raise TransferError(
+                f"{source_path} was transferred to {copy_named_by(removing)}; name that disk"
+            )
+        return None
+    with ExitStack() as stack:
+        target = stack.enter_context(_locked_target(target_path, None))
+        note = read_note(target)
+        if note is None or note.state != "sealed" or note.mission != source_path.name:
+            if is_left:
+                raise TransferError(
+                    f"{target_path} is not the sealed copy; {source_path} was transferred to "
+                    f"{copy_named_by(removing)}: name that disk"
+                )
+            return None
+        if is_left:
+            stack.enter_context(Mission(removing, note.mission).held())
+        step = _counter(note.nbytes, progress)
+        check_sealed(target, note, step)
+        if is_left:
+            finish_removal(removing, note)
+    return _sealed_report(target_path, note, source_removed=True)
+
+
+class _Copying:
+    """One run over one source and one target, both held."""
+
+    def __init__(
+        self,
+        source: FileTree,
+        target: FileTree,
+        noted: Mapping[str, CopiedFile],
+        progress: Progress,
+    ) -> None:
+        self._source = source
+        self._target = target
+        self._noted = noted
+        self._folders, files = source.walk()
+        self._entries = [entry for entry in files if entry.name not in LEFT_OUT]
+        self._nbytes = sum(entry.nbytes for entry in self._entries)
+        self._step = _counter(2 * self._nbytes, progress)
+
+    def run(self, mission: Mission, *, remove: bool) -> TransferReport:
+        """Copy, verify, and seal and remove the source where that is wanted."""
+        gone = self._gone_from_source()
+        self._refuse_without_room()
+        note = TransferNote(mission.id, mission.genesis_sha256(), "copying")
+        expected = {e.name: CopiedFile(e.nbytes, self._verified(e.name)) for e in self._entries}
+        still_there = {name: self._noted[name] for name in gone}
+        replace(note, files={**still_there, **expected}).write(self._target)
+        for folder in self._folders:
+            self._target.make_folder(folder)
+        files: dict[str, CopiedFile] = {}
+        kept = 0
+        for entry in self._entries:
+            sha256, is_kept = self._copy(entry)
+            kept += is_kept
+            files[entry.name] = CopiedFile(entry.nbytes, sha256)
+        for name in gone:
+            self._target.unlink(name)
+        self._target.sync_folders(self._folders)
+        _sync_above(self._target.path)
+        verified = verify(Mission.open(self._target.path))
+        if not verified.is_well:
+            raise TransferError(
+                f"the copy in {self._target.path} has an error: {verified.problems[0]} "
+                f"({len(verified.problems)} in all). If `syntopic verify {self._source.path}` "
+                "reports the same, the copy is faithful; the source is kept"
+            )
+        note = replace(
+            note,
+            state="complete",
+            files=files,
+            exposures=verified.exposures,
+            frames=verified.frames,
+        )
+        note.write(self._target)
+        if remove:
+            note = replace(note, state="sealed", sealed_utc=f"{datetime.now(UTC):%FT%TZ}")
+            self._refuse_changed_source(self._entries)
+            note.write(self._target)
+            remove_sealed_source(self._source, note, self._target.path)
+        return TransferReport(
+            self._target.path,
+            len(files) - kept,
+            kept,
+            self._nbytes,
+            verified,
+            remove,
+            note.sealed_utc,
+        )
+
+    def confirm_sealed(self, note: TransferNote, *, remove: bool) -> TransferReport:
+        """The copy was sealed by an earlier run: it is read again and never written."""
+        found = {entry.name: entry.nbytes for entry in self._entries}
+        differing = sorted(
+            name
+            for name in {*found, *note.files}
+            if name not in note.files or found.get(name) != note.files[name].nbytes
+        )
+        for name in note.files:
+            if not differing and self._hash_source(name) != note.files[name].sha256:
+                differing.append(name)
+        if differing:
+            raise TransferError(
+                f"{self._source.path / differing[0]} differs from the copy that was sealed on "
+                f"{note.sealed_utc} ({len(differing)} such files); source and copy are kept. "
+                "Transfer the mission into another folder, or remove the one that is not wanted"
+            )
+        check_sealed(self._target, note, self._step)
+        if remove:
+            self._refuse_changed_source(self._entries)
+            remove_sealed_source(self._source, note, self._target.path)
+        return _sealed_report(self._target.path, note, source_removed=remove)
+
+    def _copy(self, entry: FileEntry) -> tuple[str, bool]:
+        """Bring one file into the copy; its SHA-256, and whether the copy had it already."""
+        size = self._target.size(entry.name)
+        if size is not None:
+            there = self._target.sha256(entry.name, self._step, from_disk=True)
+            if size == entry.nbytes:
+                here = self._hash_source(entry.name)
+                if here == there:
+                    return here, True
+            if _is_captured(entry.name) and there == self._verified(entry.name):
+                raise TransferError(
+                    f"{self._source.path / entry.name} differs from the copy that was verified "
+                    f"earlier in {self._target.path}; both are kept. Run `syntopic verify "
+                    f"{self._source.path}`, or transfer the mission into another folder"
+                )
+        return self._target.copy_from(self._source, entry, self._step), False
+
+    def _gone_from_source(self) -> list[str]:
+        """Files of the copy, products and exports only, that the source does not have any more.
+
+        Unfinished files of an interrupted run are removed.
+
+        Raises:
+            TransferError: the target holds files that no transfer put there, or captured data that
+                the source has lost.
+        """
+        ours = {entry.name for entry in self._entries}
+        gone = []
+        unfinished = []
+        for file in self._target.walk()[1]:
+            if file.name in ours or file.name in LEFT_OUT:
+                continue
+            whole = _name_of_part(file.name)
+            if whole in self._noted:
+                unfinished.append(file.name)
+            elif file.name not in self._noted:
+                raise TransferError(
+                    f"{self._target.path / file.name} is not part of this mission; move it away or "
+                    "choose another disk"
+                )
+            elif _is_captured(file.name):
+                raise TransferError(
+                    f"{self._source.path} has lost {file.name}, which the copy in "
+                    f"{self._target.path} has; the copy is left as it is. Transfer the mission "
+                    "into another folder if that file is not wanted"
+                )
+            else:
+                gone.append(file.name)
+        for name in unfinished:
+            self._target.unlink(name)
+        return gone
+
+    def _refuse_without_room(self) -> None:
+        needed = sum(e.nbytes for e in self._entries if self._target.size(e.name) != e.nbytes)
+        free = durable.free_bytes(self._target.path)
+        if free < needed:
+            raise TransferError(
+                f"{self._target.path}: {needed / 1e9:.1f} GB are to be copied and "
+                f"{free / 1e9:.1f} GB are free"
+            )
+
+    def _refuse_changed_source(self, entries: list[FileEntry]) -> None:
+        found = [entry for entry in self._source.walk()[1] if entry.name not in LEFT_OUT]
+        if found != entries:
+            raise TransferError(
+                f"{self._source.path} changed while it was copied; it is kept. "
+                "Run the transfer again"
+            )
+
+    def _verified(self, name: str) -> str | None:
+        noted = self._noted.get(name)
+        return noted.sha256 if noted else None
+
+    def _hash_source(self, name: str) -> str:
+        return self._source.sha256(name, self._step, from_disk=False)
+
+
+@contextmanager
+def _locked_target(path: Path, source: FileTree | None) -> Iterator[FileTree]:
+    """Open the folder of the copy, create it if missing, and keep others out.
+
+    Raises:
+        TransferError: the folder is the source, or not empty and not from a transfer.
+        MissionError: another process writes there.
+    """
+    if source is not None and not path.is_symlink():
+        durable.make_directories(path)
+    with FileTree.open(path) as target:
+        if source is not None and target.is_same(source):
+            raise TransferError(f"{path} is where the mission is; name a folder of another disk")
+        try:
+            fcntl.flock(target.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise MissionError(f"another transfer writes to {path}; wait for its end") from error
+        folders, files = target.walk()
+        has_note = any(file.name == NOTE_FILE for file in files)
+        if not has_note and (folders or any(file.name not in LEFT_OUT for file in files)):
+            raise TransferError(
+                f"{path} is not empty and was not made by a transfer; move it away or choose "
+                "another disk"
+            )
+        with Mission(path, path.name).held():
+            yield target
+
+
+def _settle_index(mission: Mission) -> None:
+    """Fold the write-ahead log into the index, so that one file holds it."""
+    if not mission.catalog_path.exists():
+        return
+    try:
+        Catalog.open(mission.catalog_path).close()
+    except CatalogError as error:
+        raise TransferError(f"{error}; run syntopic repair first") from error
+
+
+def _sync_above(path: Path) -> None:
+    """Make the names of the folders above durable, also of those that an earlier run created."""
+    device = path.stat().st_dev
+    for folder in path.parents:
+        if folder.stat().st_dev != device:
+            return
+        with suppress(PermissionError):  # a folder that we may not read was not created by us
+            durable.sync_directory(folder)
+
+
+def _is_captured(name: str) -> bool:
+    """Whether a file holds what cannot be made again: frames, records, logs, the configuration."""
+    first, _, below = name.partition("/")
+    if first == "log":
+        return below.endswith(".mcap")
+    return first in ("L0", "mission.json", "rig.toml", "service.toml") or first.startswith("plan.")
+
+
+def _name_of_part(name: str) -> str | None:
+    """The name that an unfinished file was to get; None for any other file."""
+    folder, _, last = name.rpartition("/")
+    if not (last.startswith(".") and last.endswith(durable.PART_SUFFIX)):
+        return None
+    whole = last[1 : -len(durable.PART_SUFFIX)]
+    return f"{folder}/{whole}" if folder else whole
+
+
+def _counter(total: int, progress: Progress) -> Step:
+    done = 0
+
+    def step(count: int) -> None:
+        nonlocal done
+        done += count
+        progress(done, max(total, done))
+
+    progress(0, total)
+    return step
+
+
+def _sealed_report(target: Path, note: TransferNote, *, source_removed: bool) -> TransferReport:
+    verified = VerifyReport(note.exposures, note.frames, note.nbytes, ())
+    return TransferReport(
+        target, 0, len(note.files), note.nbytes, verified, source_removed, note.sealed_utc
+    )

@@ -1,0 +1,1 @@
+"""What runs in the air: capture, flight logic, storage, pipeline, monitoring."""

@@ -1,0 +1,1 @@
+"""The process of the devices: heads, receivers, probes and triggers."""

@@ -1,0 +1,129 @@
+"""Whether others are on the network of the heads: there somebody can send in a head's name."""
+
+from __future__ import annotations
+
+import ipaddress
+import socket
+import struct
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from daemon.configuration.model import Configuration
+from daemon.onboard.preflight.findings import Finding, passed
+from processing.rig import Rig
+
+ROUTES: Final = Path("/proc/net/route")
+NEIGHBOURS: Final = Path("/proc/net/arp")
+GATEWAY: Final = 0x0002
+COMPLETE: Final = 0x2
+NAMED_MAX: Final = 3
+
+
+@dataclass(frozen=True)
+class Route:
+    """A line of the kernel's table for IPv4."""
+
+    interface: str
+    network: ipaddress.IPv4Network
+    is_gateway: bool
+
+
+def head_network(configuration: Configuration, _rig: Rig) -> Iterator[Finding]:
+    """A caution for each network that heads share with others; it keeps nobody from flying."""
+    heads = {
+        head.sensor: address
+        for head in configuration.head
+        if (address := _ip_address(head.settings.get("address"))) and not address.is_loopback
+    }
+    if not heads:
+        return
+    try:
+        routes, neighbours = ROUTES.read_text("ascii"), NEIGHBOURS.read_text("ascii")
+    except OSError:
+        return
+    cautions = cautions_of(heads, routes, neighbours)
+    for interface, sentence in cautions.items():
+        yield passed("network", interface, f"caution: {sentence}")
+    if not cautions:
+        yield passed("network", "heads", "no other computer was seen on the network of the heads")
+
+
+def cautions_of(
+    heads: Mapping[str, ipaddress.IPv4Address], routes: str, neighbours: str
+) -> dict[str, str]:
+    """What is wrong with the network of each interface that leads to heads.
+
+    Args:
+        heads: address by sensor.
+        routes: text of /proc/net/route.
+        neighbours: text of /proc/net/arp.
+    """
+    table = _routes(routes)
+    seen = _neighbours(neighbours)
+    by_interface: dict[str, list[str]] = {}
+    beyond: set[str] = set()
+    for sensor, address in heads.items():
+        fitting = [route for route in table if address in route.network]
+        if not fitting:
+            continue
+        route = max(fitting, key=lambda r: r.network.prefixlen)
+        by_interface.setdefault(route.interface, []).append(sensor)
+        if route.is_gateway:
+            beyond.add(route.interface)
+    found = {}
+    for interface, sensors in by_interface.items():
+        others = sorted(seen.get(interface, set()) - set(heads.values()))
+        why = [str(address) for address in others[:NAMED_MAX]]
+        if len(others) > NAMED_MAX:
+            why.append(f"{len(others) - NAMED_MAX} more")
+        if interface in beyond:
+            why.insert(0, "a router lies in between")
+        elif any(r.interface == interface and r.network.prefixlen == 0 for r in table):
+            why.insert(0, "the default route leads there")
+        if why:
+            found[interface] = (
+                f"{_listed(sensors)} on a network shared with others ({', '.join(why)}): who "
+                "forges the address of a head there can put pixels into its frames. Give the "
+                "heads an interface of their own"
+            )
+    return found
+
+
+def _listed(sensors: list[str]) -> str:
+    if len(sensors) == 1:
+        return f"head {sensors[0]} is"
+    return f"{len(sensors)} heads ({sensors[0]} to {sensors[-1]}) are"
+
+
+def _ip_address(value: object) -> ipaddress.IPv4Address | None:
+    try:
+        return ipaddress.IPv4Address(value) if isinstance(value, str) else None
+    except ValueError:
+        return None
+
+
+def _routes(text: str) -> list[Route]:
+    found = []
+    for line in text.splitlines()[1:]:
+        fields = line.split()
+        if len(fields) >= 8:
+            network = ipaddress.IPv4Network((_from_hex(fields[1]), _from_hex(fields[7])))
+            found.append(Route(fields[0], network, bool(int(fields[3], 16) & GATEWAY)))
+    return found
+
+
+def _neighbours(text: str) -> dict[str, set[ipaddress.IPv4Address]]:
+    """Addresses that have answered, by interface."""
+    found: dict[str, set[ipaddress.IPv4Address]] = {}
+    for line in text.splitlines()[1:]:
+        fields = line.split()
+        if len(fields) >= 6 and int(fields[2], 16) & COMPLETE:
+            found.setdefault(fields[5], set()).add(ipaddress.IPv4Address(fields[0]))
+    return found
+
+
+def _from_hex(text: str) -> str:
+    """An address as the kernel prints it: the number in the host's byte order."""
+    return socket.inet_ntoa(struct.pack("=I", int(text, 16)))

@@ -1,0 +1,87 @@
+"""What the service decided and when, as messages of the flight log, so that a replay decides alike.
+
+Which exposures are stored or sealed at an instant follows from that instant; it is recorded, since
+a loaded machine looks later. What a replay makes of it is in `daemon.postflight.replay`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, cast
+
+from daemon.mission.exposure import Exposure
+from daemon.mission.log.log_records import Message, loose_bytes
+from daemon.mission.records import RecordError, parse_record
+from daemon.onboard.flight.flight import Flight, ToStore
+
+TOPIC = "decision"
+Kind = Literal[
+    "begin", "order", "not-fired", "tick", "stored", "not-stored", "sealed", "not-sealed", "process"
+]
+
+
+@dataclass(frozen=True)
+class Decision:
+    """One decision at `mono_ns`; `number` is the exposure it is about, 0 for none."""
+
+    kind: Kind
+    mono_ns: int
+    number: int = 0
+    detail: Mapping[str, Any] = field(default_factory=dict)
+
+    def message(self) -> Message:
+        """It, for the flight log."""
+        content = {"kind": self.kind, "number": self.number, **self.detail}
+        return Message(TOPIC, self.mono_ns, loose_bytes(content))
+
+
+def decision_of(message: Message) -> Decision | None:
+    """The decision in a message of the flight log; None for other topics and damaged content."""
+    if message.topic != TOPIC:
+        return None
+    try:
+        content = dict(parse_record(message.payload, TOPIC))
+    except RecordError:
+        return None
+    kind, number = content.pop("kind", None), content.pop("number", 0)
+    if not isinstance(kind, str) or not isinstance(number, int):
+        return None
+    # A word of a later version is kept as it is.
+    return Decision(cast(Kind, kind), message.mono_ns, number, content)
+
+
+@dataclass(frozen=True)
+class Tick:
+    """What fell due at an instant: exposures to store, given up (number, cause), and to seal.
+
+    `foreseen` is the record of one that is only not sealed yet because its mark is the first.
+    """
+
+    to_store: tuple[ToStore, ...]
+    given_up: tuple[tuple[int, str], ...]
+    to_seal: Exposure | None
+    foreseen: Exposure | None
+    asked_to_seal: bool
+    resolved: int
+
+    @property
+    def detail(self) -> dict[str, Any] | None:
+        """What the log has to say of it; None where nothing fell due."""
+        told = {
+            "store": [due.capture.number for due in self.to_store],
+            "given_up": [number for number, _ in self.given_up],
+            "seal": None if self.to_seal is None else self.to_seal.number,
+            "foreseen": None if self.foreseen is None else self.foreseen.number,
+            "resolved": self.resolved,
+        }
+        return {**told, "asked_to_seal": self.asked_to_seal} if any(told.values()) else None
+
+
+def tick(flight: Flight, mono_ns: int, *, may_seal: bool, may_foresee: bool = True) -> Tick:
+    """What falls due now; `may_seal`: no record is on its way to the disk."""
+    to_store = tuple(flight.due_to_store(mono_ns))
+    given_up = tuple(flight.due_to_give_up(mono_ns))
+    to_seal = flight.due_to_seal(mono_ns) if may_seal else None
+    foreseen = flight.due_to_foresee() if may_seal and may_foresee and to_seal is None else None
+    return Tick(to_store, given_up, to_seal, foreseen, may_seal, len(flight.resolved_marks))

@@ -1,0 +1,64 @@
+"""The record of an exposure that a crash left unsealed, made from the flight log.
+
+The same matching and the same composing as in flight, fed with what was logged around the trigger.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from daemon.mission.exposure import Capture, Exposure
+from daemon.mission.log.log_records import LoggedRecord, LoggedTrigger
+from daemon.mission.verification.recovery import Complete
+from daemon.onboard.flight.composing import compose, instant_of
+from daemon.onboard.flight.temperatures import Temperatures
+from daemon.onboard.timing.clock import HostClock
+from daemon.onboard.timing.matching import Matcher, Pulse
+from daemon.orientation.navigation import Track
+from drivers.contract import EventMark, NavSample, PpsEdge, TemperatureSample
+from processing.geometry.drift import lagged_sensors
+from processing.quality.report import Flag
+from processing.rig import Rig
+
+
+def seal_from_log(rig: Rig) -> Complete:
+    """What `daemon.mission.verification.recovery.recover` needs to seal exposures of this rig."""
+    cone_of_head = {sensor.name: cone.name for cone in rig.cones for sensor in cone.sensors}
+
+    def complete(capture: Capture, records: Sequence[LoggedRecord]) -> Exposure:
+        clock = HostClock()
+        matcher = Matcher(cone_of_head, clock)
+        track = Track()
+        temperatures = Temperatures(lagged_sensors(rig))
+        pulse: Pulse | None = None
+        for record in records:
+            if isinstance(record, NavSample) and record.time_valid:
+                track.add(record)
+                clock.message_arrived(record.gps_ns, record.mono_ns)
+            elif isinstance(record, LoggedTrigger):
+                given = pulse_of(record)
+                matcher.pulse(given)
+                pulse = given if given.number == capture.number else pulse
+            elif isinstance(record, EventMark):
+                matcher.mark(record)
+            elif isinstance(record, PpsEdge):
+                clock.pps_edge(record.mono_ns, record.sigma_ns)
+            elif isinstance(record, TemperatureSample):
+                temperatures.add(record)
+        instant = instant_of(matcher.mark_of(capture.number), pulse, clock)
+        return compose(rig, capture, pulse, instant, track, temperatures, Flag(0))
+
+    return complete
+
+
+def pulse_of(logged: LoggedTrigger) -> Pulse:
+    """The pulse as the matching needs it."""
+    return Pulse(
+        number=logged.number,
+        mono_ns=logged.pulse.mono_ns,
+        sigma_ns=logged.pulse.sigma_ns,
+        count=logged.pulse.count,
+        delays_ns=logged.delays_ns,
+        strobe_delay_ns=logged.strobe_delay_ns,
+        spread_ns=logged.pulse.spread_ns,
+    )

@@ -1,0 +1,1 @@
+"""Who may read and command: tokens, roles, certificates and sockets."""

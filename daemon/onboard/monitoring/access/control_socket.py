@@ -1,0 +1,331 @@
+"""Commands over a Unix socket, for those whom the machine itself knows to be of a group.
+
+Members of `control_group` are operators; root, the service's own user and members of
+`control_administrator_group` are administrators.
+
+Who asks is told by the kernel (SO_PEERCRED, SO_PEERGROUPS; unix(7)), never by the one who asks. A
+request is a line of JSON, {"command": "start", "arguments": {}}, and so is its answer,
+{"done": true, "sentence": "..."}.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import grp
+import json
+import os
+import pwd
+import socket
+import stat
+import struct
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, get_args
+
+from pydantic import ValidationError
+
+from daemon.errors import DaemonError
+from daemon.onboard.monitoring.access.gate import Gate, NoAnswerError, NotPermittedError
+from daemon.onboard.monitoring.access.roles import Principal, Role
+from daemon.onboard.monitoring.state import FlightState
+from daemon.onboard.monitoring.web.api import CommandName
+from daemon.onboard.monitoring.web.bodies import CommandBody
+
+SO_PEERGROUPS: Final = 59
+"""Of Linux 4.13, <asm-generic/socket.h>; Python has no name for it."""
+GROUPS_MAX: Final = 256
+"""Python asks for 1024 bytes at most. Whoever is in more groups is taken by the first one alone."""
+LINE_MAX_BYTES: Final = 16_384
+ANSWER_MAX_BYTES: Final = 1_000_000
+STATE: Final = "state"
+"""Asks for what the service knows of itself; nothing is done, and nothing goes to the log."""
+IDLE_TIMEOUT_S: Final = 30.0
+ANSWER_TIMEOUT_S: Final = 10.0
+STRANGER_TIMEOUT_S: Final = 1.0
+CALLERS_MAX: Final = 8
+
+
+class ControlError(DaemonError):
+    """A socket that cannot be opened or reached; the sentence says what to do."""
+
+
+@dataclass(frozen=True)
+class Caller:
+    """Who is at the other end, by the kernel."""
+
+    pid: int
+    uid: int
+    groups: frozenset[int]
+
+    @property
+    def name(self) -> str:
+        """For the audit log: the number cannot be renamed, the name can be read."""
+        try:
+            return f"uid {self.uid} ({pwd.getpwuid(self.uid).pw_name})"
+        except KeyError:
+            return f"uid {self.uid}"
+
+
+def caller_of(connection: socket.socket) -> Caller:
+    """Who connected, at the time of connecting."""
+    layout = struct.Struct("3i")
+    found = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, layout.size)
+    pid, uid, gid = layout.unpack(found)
+    size = struct.calcsize("I")
+    listed = b""
+    with suppress(OSError):
+        listed = connection.getsockopt(socket.SOL_SOCKET, SO_PEERGROUPS, GROUPS_MAX * size)
+    groups = struct.unpack(f"{len(listed) // size}I", listed)
+    return Caller(pid, uid, frozenset((gid, *groups)))
+
+
+class ControlSocket:
+    """The socket, and what is asked over it.
+
+    Args:
+        path: where it is; the folder must be there.
+        group: whose members are operators; None for the group the service runs as.
+        administrators: the group whose members are administrators; None for none.
+        gate: the way to the service.
+        state: what a fault that is acknowledged leaves.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        group: str | None,
+        administrators: str | None,
+        gate: Gate,
+        state: FlightState,
+    ) -> None:
+        self.path = path
+        self._gate = gate
+        self._state = state
+        self._gid = _gid_of(group)
+        self._administrators = None if administrators is None else _gid_of(administrators)
+        self._callers = 0
+        self._server: asyncio.Server | None = None
+
+    async def begin(self) -> None:
+        """Listen.
+
+        Raises:
+            ControlError: the path is taken, or the folder is not ours to write into.
+        """
+        listening = _listen(self.path, self._gid)
+        self._server = await asyncio.start_unix_server(
+            self._serve, sock=listening, limit=LINE_MAX_BYTES
+        )
+
+    def end(self) -> None:
+        """Listen no more; the path is free again."""
+        if self._server is not None:
+            self._server.close()
+            with suppress(OSError):
+                self.path.unlink()
+
+    def role_of(self, caller: Caller) -> Role | None:
+        """The role of a process, by its user and groups; None for one that may not command."""
+        if caller.uid in (0, os.geteuid()) or self._administrators in caller.groups:
+            return "administrator"
+        return "operator" if self._gid in caller.groups else None
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        caller = caller_of(writer.get_extra_info("socket"))
+        by = Principal(caller.name, self.role_of(caller), f"control socket, pid {caller.pid}")
+        try:
+            if by.role is None:
+                await self._turn_away(reader, writer, by)
+            elif self._callers >= CALLERS_MAX:
+                await _answer(writer, done=False, sentence="too many callers; try again")
+            else:
+                self._callers += 1
+                try:
+                    await self._hear(reader, writer, by)
+                finally:
+                    self._callers -= 1
+        except (TimeoutError, ConnectionError, ValueError):
+            pass  # it stalled, went, or sent a line without end; nothing is kept for it
+        finally:
+            writer.close()
+
+    async def _turn_away(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, by: Principal
+    ) -> None:
+        """Refuse a process that may not command, and record what it asked for."""
+        sentence = f"{by.name} may not command; the group {self._group} may"
+        wanted: tuple[str, Any] | str = ""
+        # Unread bytes would take the answer with them when the socket closes.
+        with suppress(TimeoutError, ValueError):
+            wanted = _request(await asyncio.wait_for(reader.readline(), STRANGER_TIMEOUT_S))
+        self._gate.refuse("" if isinstance(wanted, str) else wanted[0], by, sentence)
+        await _answer(writer, done=False, sentence=sentence)
+
+    async def _hear(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, by: Principal
+    ) -> None:
+        while line := await asyncio.wait_for(reader.readline(), IDLE_TIMEOUT_S):
+            if _asks_for_state(line):
+                await _answer(writer, done=True, sentence="", **self._state_now())
+                continue
+            done, sentence = await self._obey(line, by)
+            await _answer(writer, done=done, sentence=sentence)
+
+    async def _obey(self, line: bytes, by: Principal) -> tuple[bool, str]:
+        asked = _request(line)
+        if isinstance(asked, str):
+            return False, asked
+        name, arguments = asked
+        try:
+            answer = await self._gate.command(name, arguments, by)
+        except (NoAnswerError, NotPermittedError) as error:
+            return False, str(error)
+        if answer.done and name == "acknowledge":
+            self._state.acknowledge(str(arguments.get("fault")))
+        return answer.done, answer.sentence
+
+    def _state_now(self) -> dict[str, Any]:
+        """What `ask` returns."""
+        brief = self._state.brief()
+        devices = [
+            {key: device.get(key) for key in ("kind", "name", "state", "sentence")}
+            for device in self._state.changed("devices", 0)
+        ]
+        return {
+            "phase": brief["phase"],
+            "missing": brief["status"].get("missing", []),
+            "devices": devices,
+            "faults": brief["faults"],
+        }
+
+    @property
+    def _group(self) -> str:
+        try:
+            return grp.getgrgid(self._gid).gr_name
+        except KeyError:
+            return str(self._gid)
+
+
+def give(path: Path, name: str, arguments: Mapping[str, Any]) -> tuple[bool, str]:
+    """Give one command over a socket; whether it was done, and the service's sentence.
+
+    Raises:
+        ControlError: nobody listens, it may not be reached, or no answer came in time.
+    """
+    answer = _exchange(path, {"command": name, "arguments": dict(arguments)})
+    return bool(answer.get("done")), str(answer.get("sentence", ""))
+
+
+def ask(path: Path) -> Mapping[str, Any]:
+    """The state of the service: phase, devices, what is missing for arming, and faults.
+
+    Raises:
+        ControlError: as for `give`, or the caller may not ask.
+    """
+    answer = _exchange(path, {"command": STATE})
+    if not answer.get("done"):
+        raise ControlError(f"{path}: {answer.get('sentence')}")
+    return answer
+
+
+def _exchange(path: Path, asked: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Send a line and read the line that answers it."""
+    request = json.dumps(asked).encode() + b"\n"
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+            connection.settimeout(ANSWER_TIMEOUT_S)
+            connection.connect(str(path))
+            connection.sendall(request)
+            with connection.makefile("rb") as answers:
+                answer = json.loads(answers.readline(ANSWER_MAX_BYTES))
+    except PermissionError as error:
+        raise ControlError(f"{path}: permission denied; ask for the group that commands") from error
+    except (OSError, ValueError) as error:
+        raise ControlError(
+            f"{path}: no answer ({error}); does the service run, with [watch] control?"
+        ) from error
+    return answer if isinstance(answer, Mapping) else {}
+
+
+def _request(line: bytes) -> tuple[str, dict[str, Any]] | str:
+    """The command of a line and its arguments, or what is wrong with it."""
+    try:
+        asked = json.loads(line)
+        name, arguments = asked["command"], asked.get("arguments", {})
+        body = CommandBody.model_validate(arguments)
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        if isinstance(error, ValidationError):
+            told = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
+            return f"arguments: {told}"
+        return 'not understood; a line is {"command": NAME, "arguments": {...}}'
+    if name not in get_args(CommandName):
+        return f"there is no command {str(name)[:40]!r}; one of {', '.join(get_args(CommandName))}"
+    return str(name), body.model_dump(exclude_none=True)
+
+
+def _asks_for_state(line: bytes) -> bool:
+    try:
+        asked = json.loads(line)
+    except (ValueError, RecursionError):
+        return False
+    return isinstance(asked, dict) and asked.get("command") == STATE
+
+
+async def _answer(
+    writer: asyncio.StreamWriter, *, done: bool, sentence: str, **state: object
+) -> None:
+    writer.write(json.dumps({"done": done, "sentence": sentence, **state}).encode() + b"\n")
+    await asyncio.wait_for(writer.drain(), ANSWER_TIMEOUT_S)
+
+
+def _gid_of(group: str | None) -> int:
+    if group is None:
+        return os.getegid()
+    try:
+        return grp.getgrnam(group).gr_gid
+    except KeyError as error:
+        raise ControlError(
+            f"there is no group {group!r}; [watch] control_group names one"
+        ) from error
+
+
+def _listen(path: Path, gid: int) -> socket.socket:
+    listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
+    try:
+        _clear(path)
+        listening.bind(str(path))
+        path.chmod(0o660)
+        if gid != os.getegid():
+            try:
+                os.chown(path, -1, gid)
+            except PermissionError:
+                # The hardened unit may not; then everybody may knock, and the kernel says who.
+                path.chmod(0o666)
+        listening.listen(CALLERS_MAX)
+    except OSError as error:
+        listening.close()
+        raise ControlError(
+            f"{path}: {error.strerror or error}; [watch] control names a path in a folder the "
+            "service may write into"
+        ) from error
+    listening.setblocking(False)
+    return listening
+
+
+def _clear(path: Path) -> None:
+    """Take away a socket that nobody listens at any more, and nothing else."""
+    try:
+        if not stat.S_ISSOCK(path.lstat().st_mode):
+            raise FileExistsError(17, "something that is no socket lies there")
+    except FileNotFoundError:
+        return
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.settimeout(1.0)
+        try:
+            probe.connect(str(path))
+        except ConnectionRefusedError:
+            path.unlink()
+            return
+    raise FileExistsError(17, "another service listens there")

@@ -1,0 +1,1 @@
+"""The other side of the page: `syntopic monitor` and discovery."""

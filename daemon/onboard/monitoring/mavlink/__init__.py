@@ -1,0 +1,1 @@
+"""The MAVLink camera: commands, senders and signatures."""

@@ -1,0 +1,98 @@
+"""Who sends MAVLink to the camera: each is parsed apart, and their number is bounded.
+
+What a message asks for is in `daemon.onboard.monitoring.mavlink.camera`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from drivers.receivers.mavlink.library import MavlinkParser
+from drivers.receivers.message_framer import MessageFramer
+
+DATAGRAM_MAX_BYTES: Final = 2048
+STREAMS_MAX: Final = 16
+"""Senders whose messages go on from one datagram to the next."""
+STREAM_BYTES_PER_S: Final = 8000
+"""For all unsigned ones of these together; searching damaged bytes for messages costs time."""
+PEERS_MAX: Final = 16
+PEER_FORGOTTEN_S: Final = 60.0
+
+Address = tuple[str, int]
+
+
+@dataclass
+class _Peer:
+    last_s: float
+    is_signed: bool
+
+
+class Senders:
+    """Those who were heard lately.
+
+    `peers` get what is sent unasked. Where there is no place left, a sender whose signature was
+    verified takes the place of one without; an unsigned newcomer waits until one is free.
+    """
+
+    def __init__(self, parser: MavlinkParser) -> None:
+        self._parser = parser
+        self._peers: dict[Address, _Peer] = {}
+        self._streams: dict[Address, MessageFramer] = {}
+        self._credit_bytes, self._credit_s = float(STREAM_BYTES_PER_S), 0.0
+
+    @property
+    def peers(self) -> tuple[Address, ...]:
+        return tuple(self._peers)
+
+    def messages(self, data: bytes, address: Address, now_s: float) -> tuple[list[bytes], int]:
+        """Whole checked messages of a datagram, and the number of bytes that were none.
+
+        A datagram of whole messages, as nearly all are, is parsed alone: nothing that came before
+        can damage it. Others are a part of the stream of bytes of their sender.
+        """
+        if len(data) > DATAGRAM_MAX_BYTES:
+            return [], len(data)
+        whole = self._parser.messages_of(data)
+        if whole is not None:
+            self._streams.pop(address, None)
+            return whole, 0
+        if not self._is_signed(address) and not self._pay(len(data), now_s):
+            return [], len(data)
+        # Taken out and put back: the last one is the one that was used last.
+        stream = self._streams.pop(address, None) or self._parser.framer()
+        self._streams[address] = stream
+        while len(self._streams) > STREAMS_MAX:
+            unsigned = [each for each in self._streams if not self._is_signed(each)]
+            del self._streams[(unsigned or list(self._streams))[0]]
+        before = stream.bad_bytes
+        return stream.feed(data), stream.bad_bytes - before
+
+    def met(self, address: Address, now_s: float, *, is_signed: bool) -> bool:
+        """A message of a sender came; whether it is a peer now."""
+        for old in [a for a, p in self._peers.items() if now_s - p.last_s > PEER_FORGOTTEN_S]:
+            del self._peers[old]
+        peer = self._peers.get(address)
+        if peer is not None:
+            peer.last_s, peer.is_signed = now_s, peer.is_signed or is_signed
+            return True
+        if len(self._peers) >= PEERS_MAX:
+            leaving = [a for a, p in self._peers.items() if is_signed and not p.is_signed]
+            if not leaving:
+                return False
+            del self._peers[min(leaving, key=lambda each: self._peers[each].last_s)]
+        self._peers[address] = _Peer(now_s, is_signed)
+        return True
+
+    def _is_signed(self, address: Address) -> bool:
+        peer = self._peers.get(address)
+        return peer is not None and peer.is_signed
+
+    def _pay(self, nbytes: int, now_s: float) -> bool:
+        passed_s, self._credit_s = now_s - self._credit_s, now_s
+        gained = passed_s * STREAM_BYTES_PER_S
+        self._credit_bytes = min(self._credit_bytes + gained, STREAM_BYTES_PER_S)
+        if nbytes > self._credit_bytes:
+            return False
+        self._credit_bytes -= nbytes
+        return True

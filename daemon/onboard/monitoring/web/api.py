@@ -1,0 +1,455 @@
+"""The API over HTTP and WebSocket: state for watchers, commands for those who hold a token.
+
+Errors are problem+json (RFC 9457). What an exposure looks like is read from the mission folder; the
+service is asked for nothing but commands.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import time
+from collections.abc import Awaitable, Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from fastapi import Depends, FastAPI, HTTPException, Query, Request, Response, WebSocket
+from fastapi import Path as PathParameter
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import FileResponse, JSONResponse, PlainTextResponse
+from fastapi.staticfiles import StaticFiles
+from pydantic import BaseModel
+from starlette.exceptions import HTTPException as StarletteHTTPException
+from starlette.requests import HTTPConnection
+from starlette.websockets import WebSocketDisconnect
+
+from daemon.mission.layout import exposure_name
+from daemon.onboard.monitoring.access.gate import Gate, NoAnswerError, NotPermittedError
+from daemon.onboard.monitoring.access.roles import Principal
+from daemon.onboard.monitoring.access.tokens import Attempts, Holder, Tokens
+from daemon.onboard.monitoring.coverage import Coverage
+from daemon.onboard.monitoring.metrics import exposition
+from daemon.onboard.monitoring.planned import add_plan
+from daemon.onboard.monitoring.state import EXPOSURES_KEPT, PARTS, PICTURE_PARTS, FlightState
+from daemon.onboard.monitoring.telemetry import LEAST_BYTES_PER_S, Subscription, packed
+from daemon.onboard.monitoring.web.bodies import DOCUMENTED, command_body
+from daemon.onboard.monitoring.web.connections import (
+    WATCHERS_MAX,
+    Connection,
+    Connections,
+    Use,
+    source_of,
+)
+from daemon.onboard.monitoring.web.guard import CONNECTION, bearer
+
+PAGE = Path(__file__).parent / "page"
+PROBLEM_JSON = "application/problem+json"
+TELEMETRY_TICK_S = 0.05
+SEND_TIMEOUT_S = 5.0
+"""A watcher that does not take a record in this time is let go."""
+
+SUBPROTOCOL = "syntopic.v1"
+"""What a browser offers for telemetry, besides its token."""
+
+IMAGES = {
+    "quicklook.jpg": "image/jpeg",
+    "thumbnail.jpg": "image/jpeg",
+    "residuals.svg": "image/svg+xml",
+    "residuals.json": "application/json",
+    "histogram.json": "application/json",
+    "quality.json": "application/json",
+}
+CONTENT_SECURITY_POLICY = (
+    "default-src 'self'; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'; "
+    "connect-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'; "
+    "object-src 'none'; require-trusted-types-for 'script'; trusted-types default"
+)
+PRODUCT_POLICY = "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:"
+"""Of a file from a mission: whatever it holds, it is a picture and no page."""
+
+
+class Problem(BaseModel):
+    """An error, RFC 9457."""
+
+    type: str = "about:blank"
+    title: str
+    status: int
+    detail: str = ""
+
+
+class Outcome(BaseModel):
+    """What became of a command."""
+
+    done: bool
+    sentence: str
+
+
+Number = Annotated[int, PathParameter(ge=1, lt=10**9, description="of the exposure")]
+Product = Literal[
+    "quicklook.jpg",
+    "thumbnail.jpg",
+    "residuals.svg",
+    "residuals.json",
+    "histogram.json",
+    "quality.json",
+]
+CommandName = Literal[
+    "arm",
+    "start",
+    "stop",
+    "trigger",
+    "interval",
+    "distance",
+    "land",
+    "acknowledge",
+    "new-mission",
+    "exposure",
+    "release-disk",
+    "accept-disk",
+]
+
+
+@dataclass(frozen=True)
+class WatchSettings:
+    """Who may look and who may command.
+
+    `is_open`: looking needs no token.
+    """
+
+    tokens: Tokens
+    is_open: bool = True
+
+
+def create_app(
+    state: FlightState,
+    gate: Gate,
+    settings: WatchSettings,
+    coverage: Coverage | None = None,
+    connections: Connections | None = None,
+) -> FastAPI:
+    """The application; it has no state of its own but who is connected."""
+    app = FastAPI(
+        title="Syntopic",
+        description="State, products and commands of an aerial camera in flight.",
+        version="1",
+        responses={"default": _documented_problem(), 422: _documented_problem()},
+        docs_url=None,
+        redoc_url=None,
+    )
+    app.middleware("http")(_harden)
+    app.add_exception_handler(StarletteHTTPException, _http_problem)
+    app.add_exception_handler(RequestValidationError, _validation_problem)
+    doors = _Doors(settings, gate, connections or Connections())
+    _add_state(app, state, doors)
+    _add_products(app, state, doors)
+    _add_commands(app, state, gate, doors)
+    _add_telemetry(app, state, doors)
+    add_plan(app, coverage or Coverage(state), Depends(doors.watch))
+    _add_page(app)
+    return app
+
+
+class _Doors:
+    """Checks tokens; a door is a dependency of a route."""
+
+    def __init__(self, settings: WatchSettings, gate: Gate, connections: Connections) -> None:
+        self._settings = settings
+        self._gate = gate
+        self._attempts = Attempts()
+        self.connections = connections
+
+    async def watch(self, request: Request) -> None:
+        if not self._settings.is_open:
+            self.admit(request)
+
+    async def command(self, request: Request) -> Principal:
+        """Who gives the command; the gate decides what their role permits."""
+        address = _address(request)
+        try:
+            holder = self.admit(request)
+        except HTTPException as error:
+            stranger = Principal("unknown", None, address)
+            self._gate.refuse(request.path_params.get("name", ""), stranger, error.detail)
+            raise
+        return Principal(holder.name, holder.role, address)
+
+    def admit(self, asking: HTTPConnection) -> Holder:
+        """Who comes with this token. A valid one is admitted, however many wrong ones came before.
+
+        Raises:
+            HTTPException: 401, or 429 after too many wrong tokens.
+        """
+        token = bearer(asking.scope["headers"])
+        if token is None:
+            raise HTTPException(
+                401,
+                "a token is needed (syntopic token add NAME --role operator makes one)",
+                {"WWW-Authenticate": "Bearer"},
+            )
+        holder = self._settings.tokens.holder_of(token)
+        if holder is None:
+            source, now_s = source_of(_address(asking)), time.monotonic()
+            if self._attempts.is_blocked(source, now_s):
+                raise HTTPException(429, "too many wrong tokens from this address; wait a minute")
+            self._attempts.failed(source, now_s)
+            raise HTTPException(401, "token rejected", {"WWW-Authenticate": "Bearer"})
+        connection = _connection(asking)
+        if connection is not None:
+            connection.is_known = True
+        return holder
+
+    def may_watch(self, asking: HTTPConnection) -> bool:
+        if self._settings.is_open and bearer(asking.scope["headers"]) is None:
+            return True
+        try:
+            self.admit(asking)
+        except HTTPException:
+            return self._settings.is_open
+        return True
+
+
+def _add_state(app: FastAPI, state: FlightState, doors: _Doors) -> None:
+    watcher = Depends(doors.watch)
+
+    @app.get("/api/v1/state", dependencies=[watcher], tags=["state"])
+    async def whole_state() -> dict[str, Any]:
+        """Everything a watcher needs to begin with."""
+        return state.snapshot()
+
+    @app.get("/api/v1/brief", dependencies=[watcher], tags=["state"])
+    async def brief_state() -> dict[str, Any]:
+        """Phase, ledger, disk, clock, faults."""
+        return {"version": 1, **state.brief()}
+
+    @app.get("/api/v1/ledger", dependencies=[watcher], tags=["state"])
+    async def ledger() -> dict[str, Any]:
+        """The balance sheet of triggers, frames and marks."""
+        return dict(state.brief()["status"].get("ledger") or {})
+
+    @app.get("/api/v1/devices", dependencies=[watcher], tags=["state"])
+    async def devices() -> list[dict[str, Any]]:
+        """Every device, whether it delivers, and what helps if not."""
+        return state.changed("devices", 0)
+
+    @app.get("/api/v1/faults", dependencies=[watcher], tags=["state"])
+    async def faults() -> list[dict[str, Any]]:
+        """Faults that stand, or that passed and nobody has acknowledged."""
+        return state.faults()
+
+    @app.get("/api/v1/events", dependencies=[watcher], tags=["state"])
+    async def events(after: Annotated[int, Query(ge=0, lt=2**53)] = 0) -> list[dict[str, Any]]:
+        """What happened, oldest first, after a sequence number."""
+        return state.changed("events", after)
+
+    @app.get(
+        "/api/v1/configuration",
+        dependencies=[watcher],
+        tags=["state"],
+        response_class=PlainTextResponse,
+        responses={200: {"content": {"text/plain": {}}}},
+    )
+    async def configuration() -> PlainTextResponse:
+        """The configuration that is flown, TOML."""
+        if state.mission_path is None:
+            raise HTTPException(404, "no mission yet")
+        path = Path(state.mission_path) / "service.toml"
+        try:
+            return PlainTextResponse(path.read_text("utf-8"))
+        except OSError as error:
+            raise HTTPException(404, "the mission has no service.toml") from error
+
+    @app.get("/metrics", tags=["state"], dependencies=[watcher], response_class=PlainTextResponse)
+    async def metrics() -> Response:
+        """Prometheus exposition."""
+        return Response(exposition(state), media_type="text/plain; version=0.0.4")
+
+
+def _add_products(app: FastAPI, state: FlightState, doors: _Doors) -> None:
+    watcher = Depends(doors.watch)
+
+    @app.get("/api/v1/exposures", dependencies=[watcher], tags=["exposures"])
+    async def exposures(
+        after: Annotated[int, Query(ge=0, lt=10**9, description="number")] = 0,
+        limit: Annotated[int, Query(ge=1, le=EXPOSURES_KEPT)] = 100,
+    ) -> list[dict[str, Any]]:
+        """Exposures by number."""
+        return state.exposures(after, limit)
+
+    @app.get("/api/v1/exposures/{number}", dependencies=[watcher], tags=["exposures"])
+    async def exposure(number: Number) -> dict[str, Any]:
+        """One exposure: what came, when it was, how it was judged."""
+        found = state.exposure(number)
+        if found is None:
+            raise HTTPException(404, f"exposure {number} is not known")
+        return found
+
+    @app.get(
+        "/api/v1/exposures/{number}/{product}",
+        dependencies=[watcher],
+        tags=["exposures"],
+        response_class=FileResponse,
+        responses={200: {"content": {kind: {} for kind in IMAGES.values()}}},
+    )
+    async def product(number: Number, product: Product) -> FileResponse:
+        """Quick look, residual vectors, histogram or quality report, as they are on disk."""
+        if state.mission_path is None:
+            raise HTTPException(404, "no mission yet")
+        path = Path(state.mission_path) / "L2" / exposure_name(number) / product
+        if not path.is_file():
+            raise HTTPException(404, f"exposure {number} has no {product} (yet)")
+        policy = {"Content-Security-Policy": PRODUCT_POLICY}
+        return FileResponse(path, media_type=IMAGES[product], headers=policy)
+
+
+def _add_commands(app: FastAPI, state: FlightState, gate: Gate, doors: _Doors) -> None:
+    principal = Depends(doors.command)
+
+    @app.post("/api/v1/commands/{name}", tags=["commands"], openapi_extra=DOCUMENTED)
+    async def command(name: CommandName, request: Request, by: Principal = principal) -> Outcome:
+        """arm, start or stop the line, trigger, land, acknowledge, expose otherwise.
+
+        Needs a token of the role operator; new-mission, release-disk and accept-disk need the
+        role administrator. Every command is answered by the service and recorded in the audit log.
+        """
+        given = await command_body(request)
+        if name == "acknowledge":
+            if given.fault is None:
+                raise HTTPException(409, "acknowledge needs the fault's id")
+            if not any(fault["id"] == given.fault for fault in state.faults()):
+                raise HTTPException(404, f"no fault {given.fault!r} is listed")
+        try:
+            answer = await gate.command(name, given.model_dump(exclude_none=True), by)
+        except NotPermittedError as error:
+            raise HTTPException(403, str(error)) from error
+        except NoAnswerError as error:
+            raise HTTPException(504, str(error)) from error
+        if answer.done and name == "acknowledge" and given.fault is not None:
+            state.acknowledge(given.fault)
+        if not answer.done:
+            raise HTTPException(409, answer.sentence)
+        return Outcome(done=True, sentence=answer.sentence)
+
+
+def _add_telemetry(app: FastAPI, state: FlightState, doors: _Doors) -> None:
+    @app.websocket("/api/v1/telemetry")
+    async def telemetry(
+        socket: WebSocket,
+        form: Literal["json", "msgpack"] = "msgpack",
+        bytes_per_s: float = math.inf,
+    ) -> None:
+        """Records as in docs/telemetry.md, from the whole state on, until the watcher goes."""
+        if "token" in socket.query_params:
+            await socket.close(1008, "a token belongs into a header, not into the address")
+            return
+        if not doors.may_watch(socket):
+            await socket.close(1008, "a token is needed")
+            return
+        connection = _connection(socket)
+        if not doors.connections.may_watch(connection):
+            await socket.close(1013, f"too many watchers: {WATCHERS_MAX}")
+            return
+        if connection is not None:
+            connection.enter(Use.WATCHER)
+        offered = socket.scope.get("subprotocols", [])
+        await socket.accept(SUBPROTOCOL if SUBPROTOCOL in offered else None)
+        # Over JSON pictures are fetched, not told.
+        parts = PARTS if form == "json" else (*PARTS, *PICTURE_PARTS)
+        told = Subscription(max(bytes_per_s, LEAST_BYTES_PER_S), parts)
+        gone = asyncio.ensure_future(_until_gone(socket))
+        try:
+            while not gone.done():
+                record = told.record(state, time.monotonic())
+                if record is not None:
+                    await asyncio.wait_for(_send(socket, record, form), SEND_TIMEOUT_S)
+                await asyncio.wait([gone], timeout=TELEMETRY_TICK_S)
+        except (TimeoutError, WebSocketDisconnect, RuntimeError):
+            pass  # it stalled or went; nothing is kept for it
+        finally:
+            gone.cancel()
+            with suppress(RuntimeError, WebSocketDisconnect):
+                await socket.close()
+
+
+async def _send(socket: WebSocket, record: Any, form: str) -> None:
+    if form == "msgpack":
+        await socket.send_bytes(packed(record))
+    else:
+        await socket.send_json(record)
+
+
+async def _until_gone(socket: WebSocket) -> None:
+    """Hear what the watcher says, which is nothing, until it goes."""
+    with suppress(WebSocketDisconnect, RuntimeError):
+        while True:
+            await socket.receive_text()
+
+
+def _add_page(app: FastAPI) -> None:
+    @app.get("/docs", include_in_schema=False)
+    async def docs() -> FileResponse:
+        return FileResponse(PAGE / "api.html")
+
+    app.mount("/", StaticFiles(directory=PAGE, html=True), name="page")
+
+
+def _documented_problem() -> dict[str, Any]:
+    schema = Problem.model_json_schema()
+    return {"description": "what is wrong", "content": {PROBLEM_JSON: {"schema": schema}}}
+
+
+async def _harden(
+    request: Request, call_next: Callable[[Request], Awaitable[Response]]
+) -> Response:
+    response = await call_next(request)
+    response.headers.setdefault("Content-Security-Policy", CONTENT_SECURITY_POLICY)
+    response.headers["Cross-Origin-Resource-Policy"] = "same-origin"
+    response.headers["Cross-Origin-Opener-Policy"] = "same-origin"
+    response.headers["X-Content-Type-Options"] = "nosniff"
+    response.headers["Referrer-Policy"] = "no-referrer"
+    response.headers["Cache-Control"] = "no-cache"
+    return response
+
+
+async def _http_problem(_request: Request, error: Exception) -> Response:
+    assert isinstance(error, StarletteHTTPException)
+    problem = Problem(
+        title=_title(error.status_code), status=error.status_code, detail=error.detail
+    )
+    headers = dict(error.headers or {})
+    return JSONResponse(problem.model_dump(), error.status_code, headers, PROBLEM_JSON)
+
+
+async def _validation_problem(_request: Request, error: Exception) -> Response:
+    assert isinstance(error, RequestValidationError)
+    sentences = [f"{'.'.join(map(str, e['loc'][1:]))}: {e['msg']}" for e in error.errors()]
+    problem = Problem(title=_title(422), status=422, detail="; ".join(sentences))
+    return JSONResponse(problem.model_dump(), 422, media_type=PROBLEM_JSON)
+
+
+def _title(status: int) -> str:
+    titles: Mapping[int, str] = {
+        401: "Not known here",
+        403: "Not allowed",
+        404: "Not found",
+        405: "No such method",
+        408: "Too slow",
+        409: "Not possible now",
+        413: "Too large",
+        415: "Not JSON",
+        422: "Not understood",
+        429: "Too many attempts",
+        504: "No answer",
+    }
+    return titles.get(status, "Not done")
+
+
+def _address(asking: HTTPConnection) -> str:
+    return asking.client.host if asking.client else ""
+
+
+def _connection(asking: HTTPConnection) -> Connection | None:
+    """The TCP connection it came on; None in tests without a server."""
+    found = asking.scope.get("state", {}).get(CONNECTION)
+    return found if isinstance(found, Connection) else None

@@ -1,0 +1,1 @@
+"""What is checked before a flight, and how a mission is resumed."""

@@ -1,0 +1,115 @@
+"""From the start of the service to its mission: prerequisites, the worker, and the mission itself.
+
+What is refused here is refused before a new mission exists. `syntopic check` looks at the same
+prerequisites and builds the same worker (`daemon.onboard.preflight.trial`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import ClassVar
+
+from daemon.configuration.model import Configuration
+from daemon.mission.layout import Mission
+from daemon.mission.mirror.mirror_start import FoundDisks, begin_mirrored, resume_mirrored
+from daemon.onboard.preflight.findings import Outcome
+from daemon.onboard.preflight.prerequisites import AFTER_RESTART, LOOKS, prerequisites
+from daemon.onboard.preflight.resumption import resume
+from daemon.onboard.service.departure import create_mission, disks_of, interrupted_mission
+from daemon.onboard.service.desk import Desk
+from daemon.onboard.service.hearing import Tell
+from daemon.onboard.service.messages import WorkerBuilt, WorkerRefused
+from processing.rig import Rig
+
+
+class Preparation(Desk):
+    """What happens before there is a mission.
+
+    `rig` is the one that flies: the mission's own where one is resumed. `interrupted` is the
+    mission that is resumed, `disks` are those of a mirrored one, `is_built` says whether the worker
+    has its pipeline.
+
+    Args:
+        configuration: the one in force.
+        rig: the one that it names.
+        config_path: its file.
+        tell: told of what is worth knowing.
+        fail: told why the service cannot start.
+    """
+
+    def __init__(
+        self,
+        configuration: Configuration,
+        rig: Rig,
+        config_path: Path,
+        tell: Tell,
+        fail: Callable[[str], None],
+    ) -> None:
+        self._configuration = configuration
+        self._config_path = config_path
+        self._tell = tell
+        self._fail = fail
+        self.rig = rig
+        self.interrupted: Mission | None = None
+        self.disks: FoundDisks | None = None
+        self.is_built = False
+
+    async def look(self) -> bool:
+        """Look at what a flight needs, and for a mission to be resumed; False where it fails.
+
+        Raises:
+            MissionError: the marker of the mission being flown is damaged.
+            OSError: no disk of a mirrored configuration can be used.
+        """
+        self.disks = await asyncio.to_thread(disks_of, self._configuration)
+        if self.disks is None:
+            self.interrupted = interrupted_mission(self._configuration)
+        else:
+            self.interrupted = self.disks.mission
+        looks = LOOKS if self.interrupted is None else AFTER_RESTART
+        findings = await asyncio.to_thread(prerequisites, self._configuration, self.rig, looks)
+        for finding in findings:
+            if finding.outcome is Outcome.FAIL and not finding.prevents:
+                item, sentence = f"{finding.kind} {finding.name}", finding.sentence
+                self._tell("prerequisite", fault=True, item=item, sentence=sentence)
+        refusals = [finding.sentence for finding in findings if finding.prevents]
+        for refusal in refusals:
+            self._fail(refusal)
+        return not refusals and (self.interrupted is None or self._resume(self.interrupted))
+
+    def mission(self) -> Mission | None:
+        """The mission that is resumed, else a new one; None where the disk refuses it."""
+        create = partial(create_mission, self._configuration, self.rig, self._config_path)
+        try:
+            if self.disks is not None:
+                is_new = self.interrupted is None
+                found = self.disks
+                self.disks = begin_mirrored(found, create) if is_new else resume_mirrored(found)
+                return self.disks.mission
+            return create() if self.interrupted is None else self.interrupted
+        except OSError as error:
+            root = self._configuration.mission.root
+            self._fail(f"no mission can be begun in {root} ({error}); check the disk")
+            return None
+
+    def _resume(self, mission: Mission) -> bool:
+        """Fly on with the rig that the mission's exposures were made with."""
+        resumption = resume(mission, self._configuration, self.rig, self._config_path)
+        if resumption.refusal:
+            self._fail(resumption.refusal)
+            return False
+        self.rig = resumption.rig
+        differences = list(resumption.differences)
+        self._tell("resumed", sentence=resumption.sentence, differences=differences)
+        return True
+
+    def _on_built(self, _built: WorkerBuilt) -> None:
+        self.is_built = True
+
+    def _on_refused(self, refused: WorkerRefused) -> None:
+        self._fail(refused.sentence)
+
+    handlers: ClassVar = {WorkerBuilt: _on_built, WorkerRefused: _on_refused}

@@ -1,0 +1,279 @@
+"""What a flight needs before any device is opened: looked at by `run` at its start, and by `check`.
+
+Both go through `prerequisites`, so that they cannot disagree. What devices say is judged by
+`daemon.onboard.capture.devices`, what is missing for arming by `daemon.onboard.flight.arming`.
+"""
+
+from __future__ import annotations
+
+import datetime
+import errno
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Final, TypeAlias
+
+from daemon.configuration.model import Configuration
+from daemon.mission.store import durable
+from daemon.mission.store.disk_identity import same_file_system
+from daemon.mission.store.guard import LEVEL2_SHARE
+from daemon.mission.store.health import read_health
+from daemon.onboard.capture.devices import frame_nbytes
+from daemon.onboard.capture.head_network import head_network
+from daemon.onboard.preflight.findings import Finding, Outcome, failed, passed
+from drivers.base import registry
+from drivers.base.extras import MissingExtraError, require
+from processing.rig import Rig
+
+Look: TypeAlias = Callable[[Configuration, Rig], Iterator[Finding]]
+
+PACE_NBYTES_MIN: Final = 16_000_000
+PACE_NBYTES_MAX: Final = 512_000_000
+PACE_TRIES: Final = 3
+"""Other programs write, too: the best of so many tries counts."""
+_BLOCK_NBYTES: Final = 4_000_000
+
+
+def prerequisites(
+    configuration: Configuration, rig: Rig, looks: Sequence[Look] | None = None
+) -> list[Finding]:
+    """Every item that can be looked at without a device, in the order of `LOOKS`.
+
+    An item that prevents the flight ends the looking: what follows may need it.
+    """
+    findings: list[Finding] = []
+    for look in LOOKS if looks is None else looks:
+        findings += look(configuration, rig)
+        if any(finding.prevents for finding in findings):
+            break
+    return findings
+
+
+def libraries(configuration: Configuration, rig: Rig) -> Iterator[Finding]:
+    """Optional packages that the configuration needs."""
+    needed = {
+        extra
+        for kind, driver in configuration.drivers
+        for extra in registry.extras_of(kind, driver)
+    }
+    if configuration.watch is not None:
+        needed |= {"watch"} | ({"mavlink"} if configuration.watch.mavlink is not None else set())
+    if configuration.plan.elevation is not None:
+        needed.add("geodesy")
+        if configuration.plan.elevation.suffix.lower() != ".asc":
+            needed.add("geotiff")
+    for extra in sorted(needed):
+        try:
+            require(extra)
+        except MissingExtraError as error:
+            yield failed("library", extra, str(error), prevents=True)
+        else:
+            yield passed("library", extra)
+
+
+def calibration(configuration: Configuration, rig: Rig) -> Iterator[Finding]:
+    """The age of the calibration, and its files of every sensor that flies."""
+    name = rig.calibration_id
+    age_days = (_today() - datetime.date.fromisoformat(rig.calibration_date)).days
+    if age_days > rig.calibration_valid_days:
+        yield failed(
+            "calibration",
+            name,
+            f"calibration {name} of {rig.calibration_date} is {age_days} days old and was valid "
+            f"for {rig.calibration_valid_days}; calibrate the camera. Exposures are flagged "
+            "CALIBRATION_EXPIRED",
+        )
+    folder = configuration.mission.radiometry
+    missing = [
+        head.sensor
+        for head in configuration.head
+        if folder is not None
+        and not any((folder / f"{head.sensor}{suffix}").exists() for suffix in (".npz", ".json"))
+    ]
+    if missing:
+        yield failed(
+            "calibration",
+            "radiometry",
+            f"{folder} has no calibration of {', '.join(missing)}; add {missing[0]}.npz (or "
+            f"{missing[0]}.json for radiance). Pixels of these heads are taken as ideal",
+        )
+    elif age_days <= rig.calibration_valid_days:
+        yield passed("calibration", name, date=rig.calibration_date)
+
+
+def storage(configuration: Configuration, _rig: Rig) -> Iterator[Finding]:
+    """The root of missions and its mirror: there or creatable, and writable.
+
+    Of two disks one is enough for a flight.
+    """
+    root, mirror = configuration.mission.root, configuration.mission.mirror
+    if mirror is None:
+        yield _writable("root", root, prevents=True)
+        return
+    findings = [_writable("root", root), _writable("mirror", mirror)]
+    if all(finding.outcome is Outcome.FAIL for finding in findings):
+        findings = [_writable("root", root, prevents=True)]
+    yield from findings
+    if same_file_system(root, mirror):
+        yield passed(
+            "disk",
+            "mirror",
+            f"caution: {mirror} lies on the same file system as {root}; one fault takes both: "
+            "mount another disk there",
+        )
+
+
+def _writable(key: str, root: Path, *, prevents: bool = False) -> Finding:
+    try:
+        if key == "mirror" and not root.is_dir():
+            # A folder made here would lie below a mount point, on the wrong disk.
+            raise NotADirectoryError(errno.ENOENT, "there is no such folder")
+        durable.make_directories(root)
+        probe = root / f".check-{os.getpid()}{durable.PART_SUFFIX}"
+        probe.unlink(missing_ok=True)
+        try:
+            durable.create_file(probe, [b"syntopic check\n"])
+        finally:
+            probe.unlink(missing_ok=True)
+    except OSError as error:
+        return failed(
+            "disk",
+            str(root),
+            f"mission.{key} {root} cannot be written ({error.strerror or error}); mount the disk, "
+            "free it, or give the user of the service the right to write there",
+            prevents=prevents,
+        )
+    return passed("disk", str(root), free_gb=f"{durable.free_bytes(root) / 1e9:.1f}")
+
+
+def disk_health(configuration: Configuration, _rig: Rig) -> Iterator[Finding]:
+    """What the disks state of themselves, where the helper reads it."""
+    mission = configuration.mission
+    for key, root in (("root", mission.root), ("mirror", mission.mirror)):
+        if root is None:
+            continue
+        name = f"health of {key}"
+        try:
+            found = read_health(root)
+        except OSError:
+            continue  # `storage` says what is wrong with it
+        if found is None:
+            sentence = "not read; run: sudo systemctl enable --now syntopic-disk-health.timer"
+            yield Finding("disk", name, Outcome.NOT_TRIED, sentence)
+        elif found.problems:
+            yield failed("disk", name, f"disk of {root}: {'; '.join(found.problems)}")
+        else:
+            stated = {"temperature_c": found.temperature_c, "wear_percent": found.wear_percent}
+            numbers = {k: f"{value:g}" for k, value in stated.items() if value is not None}
+            yield passed("disk", name, model=found.model, serial=found.serial, **numbers)
+
+
+def memory(configuration: Configuration, rig: Rig) -> Iterator[Finding]:
+    """Memory for the frames of the exposures that are held at a time."""
+    depth = configuration.limits.exposures_in_memory
+    needed = depth * exposure_nbytes(configuration, rig)
+    available = available_memory_nbytes()
+    if available is not None and needed > available:
+        yield failed(
+            "memory",
+            "frames",
+            f"frames of {depth} exposures need {needed / 1e9:.1f} GB of memory and "
+            f"{available / 1e9:.1f} GB are available; end other programs, add memory, or lower "
+            "limits.exposures_in_memory",
+            prevents=True,
+        )
+    else:
+        yield passed("memory", "frames", needed_gb=f"{needed / 1e9:.2f}")
+
+
+def pace(configuration: Configuration, rig: Rig) -> Iterator[Finding]:
+    """Whether the disk writes as fast as exposures may come."""
+    root = configuration.mission.root
+    nbytes = exposure_nbytes(configuration, rig)
+    interval_s = exposure_interval_s(configuration, rig)
+    needed = (1 + LEVEL2_SHARE) * nbytes / interval_s
+    size = min(max(2 * nbytes, PACE_NBYTES_MIN), PACE_NBYTES_MAX)
+    size = min(size, durable.free_bytes(root) // 2)
+    if size < _BLOCK_NBYTES:
+        return  # a full disk is reported by arming
+    measured = 0.0
+    try:
+        for _ in range(PACE_TRIES):
+            measured = max(measured, size / write_s(root, size))
+            if measured >= needed:
+                break
+    except OSError as error:
+        sentence = f"the disk of {root} refused to write {size} bytes ({error.strerror or error})"
+        yield failed("disk", "pace", f"{sentence}; check the disk")
+        return
+    told = f"{measured / 1e6:.0f} MB/s measured, {needed / 1e6:.0f} MB/s needed"
+    if measured < needed:
+        yield failed(
+            "disk",
+            "pace",
+            f"the disk of {root} is too slow: {told} for an exposure every {interval_s:g} s; use "
+            "a faster disk, or expose less often. Frames that find no free memory are lost",
+        )
+    else:
+        yield passed("disk", "pace", told)
+
+
+LOOKS: Final[Sequence[Look]] = (
+    libraries,
+    calibration,
+    storage,
+    disk_health,
+    memory,
+    head_network,
+    pace,
+)
+"""Every prerequisite, in the order they are looked at."""
+AFTER_RESTART: Final[Sequence[Look]] = (libraries, calibration, storage, memory, head_network)
+"""Those of a flight that is resumed: nothing is measured while exposures are waited for."""
+
+
+def exposure_nbytes(configuration: Configuration, rig: Rig) -> int:
+    """Bytes of the frames of one exposure."""
+    return sum(frame_nbytes(rig, head.sensor) for head in configuration.head)
+
+
+def exposure_interval_s(configuration: Configuration, rig: Rig) -> float:
+    """The shortest time between exposures that the trigger asks for, at the planned speed."""
+    trigger = configuration.trigger
+    interval_s = trigger.interval_s
+    if trigger.distance_m is not None:
+        interval_s = trigger.distance_m / configuration.plan.ground_speed_mps
+    return max(interval_s, rig.frame_interval_s)
+
+
+def available_memory_nbytes() -> int | None:
+    """What the kernel says can be used without swapping; None where it says nothing."""
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        return None
+    found = [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
+    return found[0] if found else None
+
+
+def write_s(root: Path, nbytes: int) -> float:
+    """Seconds that a file of so many bytes takes to be durable in a folder; it is removed again.
+
+    Raises:
+        OSError: the disk refused.
+    """
+    path = root / f".pace-{os.getpid()}{durable.PART_SUFFIX}"
+    block = memoryview(os.urandom(_BLOCK_NBYTES))
+    parts = [block[: min(_BLOCK_NBYTES, nbytes - at)] for at in range(0, nbytes, _BLOCK_NBYTES)]
+    path.unlink(missing_ok=True)
+    started = time.monotonic()
+    try:
+        durable.create_file(path, parts, mode=0o644)
+        return time.monotonic() - started
+    finally:
+        path.unlink(missing_ok=True)
+
+
+def _today() -> datetime.date:
+    return datetime.datetime.now(datetime.UTC).date()

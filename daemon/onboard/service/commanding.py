@@ -1,0 +1,268 @@
+"""What a person may tell a flying service to do, and when it may not be done.
+
+Each command answers with a sentence, and each is written into the flight log with who gave it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol, TypeGuard
+
+from daemon.mission.log.log_records import Message, loose_bytes
+from daemon.onboard.flight.arming import Lack
+from daemon.onboard.service.messages import Answer, Command, CommandRefused
+
+AUDIT_TOPIC = "audit"
+
+
+class CommandedLine(Protocol):
+    """The line commands act on; `daemon.onboard.service.line.Line`."""
+
+    runs: bool
+
+    @property
+    def is_flown(self) -> bool: ...
+    def trigger_once(self) -> None: ...
+    def trigger_each(self, interval_s: float, count: int) -> None: ...
+    def trigger_along(self, distance_m: float) -> None: ...
+
+
+class Arming(Protocol):
+    """What a flight needs; `daemon.onboard.preflight.preflight.Preflight`."""
+
+    def lacks(self) -> Sequence[Lack]: ...
+    def arm(self) -> None: ...
+    def override(self, by: str, missing: Sequence[Lack], reason: str = "") -> None: ...
+
+
+class Exposing(Protocol):
+    """Who sets the heads; `daemon.onboard.capture.exposure_control.ExposureControl`."""
+
+    def command(self, wanted: Mapping[str, Any], by: str) -> str | None: ...
+
+
+class Disks(Protocol):
+    """The disks of the mission; `daemon.onboard.storage.mirror.Mirror`."""
+
+    def release(self, label: str) -> str | None: ...
+    def accept(self, label: str) -> str | None: ...
+
+
+class Commanded(Protocol):
+    """The service commands act on."""
+
+    is_ready: bool
+
+    @property
+    def line(self) -> CommandedLine: ...
+    @property
+    def preflight(self) -> Arming: ...
+    @property
+    def exposure(self) -> Exposing: ...
+    @property
+    def mirror(self) -> Disks: ...
+    def acknowledge(self, fault: str) -> bool: ...
+    def land(self, *, again: bool = False) -> None: ...
+
+
+def obey(command: Command, flight: Commanded) -> Answer:
+    """Do what is asked, or say why not."""
+    handler = _COMMANDS.get(command.name)
+    if handler is None:
+        return _no(command, f"there is no command {command.name}")
+    return handler(command, flight)
+
+
+def audit_message(command: Command, answer: Answer) -> Message:
+    """The command and its answer, for the flight log."""
+    content = {
+        "command": command.name,
+        "arguments": dict(command.arguments),
+        "by": command.by,
+        "role": command.role,
+        "address": command.address,
+        "done": answer.done,
+        "sentence": answer.sentence,
+    }
+    return Message(AUDIT_TOPIC, time.monotonic_ns(), loose_bytes(content))
+
+
+def refusal_message(refused: CommandRefused) -> Message:
+    """A command that was refused before the service, for the flight log."""
+    content = {
+        "command": refused.name,
+        "by": refused.by,
+        "role": refused.role,
+        "address": refused.address,
+        "done": False,
+        "refused": True,
+        "count": refused.count,
+        "sentence": refused.sentence,
+    }
+    return Message(AUDIT_TOPIC, time.monotonic_ns(), loose_bytes(content))
+
+
+def command_event(command: Command, answer: Answer) -> dict[str, Any]:
+    """The event that reports a command."""
+    return {
+        "event": "command",
+        "name": command.name,
+        "by": command.by,
+        "done": answer.done,
+        "sentence": answer.sentence,
+        "override": bool(command.arguments.get("override")),
+    }
+
+
+def refusal_event(refused: CommandRefused) -> dict[str, Any]:
+    """The event that reports a command refused before the service."""
+    return {
+        "event": "command-refused",
+        "name": refused.name,
+        "by": refused.by,
+        "address": refused.address,
+        "sentence": refused.sentence,
+    }
+
+
+def _arm(command: Command, flight: Commanded) -> Answer:
+    refusal = _not_armed(command, flight)
+    return refusal or _yes(command, "armed; the line may be started")
+
+
+def _start(command: Command, flight: Commanded) -> Answer:
+    if flight.line.runs and not flight.line.is_flown:
+        return _no(command, "the line runs already")
+    refusal = _not_armed(command, flight)
+    if refusal is not None:
+        return refusal
+    flight.line.runs = True
+    return _yes(command, "the line runs")
+
+
+def _stop(command: Command, flight: Commanded) -> Answer:
+    if not flight.line.runs:
+        return _no(command, "the line does not run")
+    flight.line.runs = False
+    return _yes(command, "the line is stopped; what was triggered is finished")
+
+
+def _trigger(command: Command, flight: Commanded) -> Answer:
+    refusal = _not_armed(command, flight)
+    if refusal is not None:
+        return refusal
+    flight.line.trigger_once()
+    return _yes(command, "one exposure is made as soon as the camera can")
+
+
+def _interval(command: Command, flight: Commanded) -> Answer:
+    interval_s, count = command.arguments.get("interval_s"), command.arguments.get("count", 0)
+    if not _is_positive(interval_s) or not isinstance(count, int) or count < 0:
+        return _no(command, "interval needs interval_s above 0 and a count, 0 for no end")
+    refusal = _not_armed(command, flight)
+    if refusal is not None:
+        return refusal
+    flight.line.trigger_each(float(interval_s), count)
+    return _yes(command, f"an exposure every {interval_s:g} s, or as fast as the camera can")
+
+
+def _distance(command: Command, flight: Commanded) -> Answer:
+    distance_m = command.arguments.get("distance_m")
+    if not _is_positive(distance_m):
+        return _no(command, "distance needs distance_m above 0")
+    refusal = _not_armed(command, flight)
+    if refusal is not None:
+        return refusal
+    flight.line.trigger_along(float(distance_m))
+    return _yes(command, f"an exposure every {distance_m:g} m")
+
+
+def _land(command: Command, flight: Commanded) -> Answer:
+    flight.land()
+    return _yes(command, "no more exposures; what is open is sealed, then the service ends")
+
+
+def _new_mission(command: Command, flight: Commanded) -> Answer:
+    if flight.line.runs and not flight.line.is_flown:
+        return _no(command, "the line runs; stop it first")
+    flight.land(again=True)
+    return _yes(command, "this mission is closed, and the next one begins with its configuration")
+
+
+def _exposure(command: Command, flight: Commanded) -> Answer:
+    refusal = flight.exposure.command(command.arguments, command.by)
+    if refusal is not None:
+        return _no(command, refusal)
+    return _yes(command, "the exposures from now on are made with it")
+
+
+def _acknowledge(command: Command, flight: Commanded) -> Answer:
+    fault = command.arguments.get("fault")
+    if not isinstance(fault, str) or not flight.acknowledge(fault):
+        return _no(command, f"no fault {fault!r} is listed")
+    return _yes(command, f"noted that {command.by} has seen {fault}")
+
+
+def _release_disk(command: Command, flight: Commanded) -> Answer:
+    label = str(command.arguments.get("disk", ""))
+    refusal = flight.mirror.release(label)
+    if refusal is not None:
+        return _no(command, refusal)
+    return _yes(command, f"disk {label} is being released; unmount it when the events say so")
+
+
+def _accept_disk(command: Command, flight: Commanded) -> Answer:
+    label = str(command.arguments.get("disk", ""))
+    refusal = flight.mirror.accept(label)
+    if refusal is not None:
+        return _no(command, refusal)
+    return _yes(command, f"the disk that is at the place of {label} is brought up to date and used")
+
+
+def _not_armed(command: Command, flight: Commanded) -> Answer | None:
+    """The refusal, where the camera is not ready to fly and nobody takes that upon them."""
+    if flight.line.is_flown:
+        return _no(command, "the planned number of exposures is flown")
+    if not flight.is_ready:
+        return _no(command, "the service is not ready: devices open and kernels load")
+    missing = flight.preflight.lacks()
+    firm = [lack for lack in missing if not lack.may_be_overridden]
+    if firm:
+        return _no(command, f"not armed: {'; '.join(map(str, firm))}")
+    if missing and not command.arguments.get("override"):
+        told = "; ".join(map(str, missing))
+        return _no(command, f"not armed: {told}; override to fly without")
+    if missing:
+        reason = str(command.arguments.get("reason", ""))
+        flight.preflight.override(command.by, missing, reason)
+    flight.preflight.arm()
+    return None
+
+
+def _is_positive(value: object) -> TypeGuard[float]:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < 1e6
+
+
+def _yes(command: Command, sentence: str) -> Answer:
+    return Answer(command.number, True, sentence)
+
+
+def _no(command: Command, sentence: str) -> Answer:
+    return Answer(command.number, False, sentence)
+
+
+_COMMANDS: Mapping[str, Callable[[Command, Commanded], Answer]] = {
+    "arm": _arm,
+    "start": _start,
+    "stop": _stop,
+    "trigger": _trigger,
+    "interval": _interval,
+    "distance": _distance,
+    "land": _land,
+    "acknowledge": _acknowledge,
+    "new-mission": _new_mission,
+    "exposure": _exposure,
+    "release-disk": _release_disk,
+    "accept-disk": _accept_disk,
+}

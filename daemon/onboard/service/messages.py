@@ -1,0 +1,397 @@
+"""What the service and its child processes say to each other: small frozen dataclasses.
+
+Pixels never travel; where frames are meant, the slot of each head's shared memory is named. This
+module imports nothing heavy, so that every process may.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from daemon.configuration.model import PlanSection, ProcessingSection
+from daemon.mission.exposure import Capture, Exposure, FrameRecord
+from daemon.mission.log.log_records import Message
+from daemon.mission.store.disk_identity import Disk
+from drivers.contract import TriggerPulse
+from processing.radiometry.exposure_control import ExposureSettings
+
+# To any child
+
+
+@dataclass(frozen=True)
+class Stop:
+    """Let go of everything and end."""
+
+
+@dataclass(frozen=True)
+class Ping:
+    """Say that you are alive."""
+
+
+# From any child
+
+
+@dataclass(frozen=True)
+class Pong:
+    """Alive; and the statistics of what is inside, by name."""
+
+    statistics: Mapping[str, Mapping[str, int]]
+
+
+# To and from watch
+
+
+@dataclass(frozen=True)
+class Told:
+    """Something happened: plain JSON types with a key "event"."""
+
+    event: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Command:
+    """Somebody wants something of the service; `by` is who, as the token says."""
+
+    number: int
+    name: str
+    arguments: Mapping[str, Any]
+    by: str
+    role: str = ""
+    address: str = ""
+
+
+@dataclass(frozen=True)
+class CommandRefused:
+    """Commands that the watch process did not pass on, for the audit log.
+
+    `count` is above 1 where several attempts share one entry.
+    """
+
+    name: str
+    by: str
+    role: str
+    address: str
+    sentence: str
+    count: int = 1
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What became of a command, in a sentence."""
+
+    number: int
+    done: bool
+    sentence: str
+
+
+# To capture
+
+
+@dataclass(frozen=True)
+class DeviceSpec:
+    """A device to be opened: its kind, driver, name, and the settings of that driver.
+
+    `output` is the trigger's output that a head is wired to, its cone.
+    """
+
+    kind: str
+    driver: str
+    name: str
+    settings: Mapping[str, Any]
+    output: str = ""
+
+
+@dataclass(frozen=True)
+class Fire:
+    """Give pulse `sequence`, each output delayed from the same moment."""
+
+    sequence: int
+    delays_ns: Mapping[str, int]
+
+
+@dataclass(frozen=True)
+class Adjust:
+    """Expose with this from the next pulse on, by head."""
+
+    settings: Mapping[str, ExposureSettings]
+
+
+@dataclass(frozen=True)
+class Recycle:
+    """These slots, by head, may be filled again."""
+
+    slots: Mapping[str, int]
+
+
+# From capture; besides these it passes on every record of `drivers.contract`
+
+
+@dataclass(frozen=True)
+class Bound:
+    """A device answered; `found` is what it said of itself (model, serial, ...)."""
+
+    kind: str
+    name: str
+    found: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class NotBound:
+    """A device did not answer at first; it goes on being looked for."""
+
+    kind: str
+    name: str
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Fired:
+    """The answer to `Fire`; `pulse` is None where none was given."""
+
+    sequence: int
+    pulse: TriggerPulse | None
+    sentence: str
+
+
+# To the writer
+
+
+@dataclass(frozen=True)
+class Store:
+    """Make an exposure's frames durable; by head, the slots they lie in."""
+
+    capture: Capture
+    slots: Mapping[str, int]
+
+
+@dataclass(frozen=True)
+class Seal:
+    """Write the final record of a stored exposure."""
+
+    exposure: Exposure
+
+
+@dataclass(frozen=True)
+class Log:
+    """Append a message to the flight log; with `is_durable` it is on the disk at once."""
+
+    message: Message
+    is_durable: bool = False
+
+
+@dataclass(frozen=True)
+class NoteProducts:
+    """Note in the index that an exposure has products: file name to size in bytes."""
+
+    number: int
+    files: Mapping[str, int]
+    verdict: str | None
+
+
+@dataclass(frozen=True)
+class WriteNote:
+    """Put a small file under a name below the root of every disk in use."""
+
+    name: str
+    data: bytes
+
+
+@dataclass(frozen=True)
+class EndMission:
+    """Nobody is to go on with the mission after `Stop`."""
+
+
+@dataclass(frozen=True)
+class DropDisk:
+    """Drop this disk where another is in use, and say why."""
+
+    disk: str
+    why: str
+
+
+@dataclass(frozen=True)
+class ReleaseDisk:
+    """Close everything on this disk, so that it can be unmounted."""
+
+    disk: str
+
+
+@dataclass(frozen=True)
+class AcceptDisk:
+    """Use whatever disk is at the place of this one, once it is up to date."""
+
+    disk: str
+
+
+# From the writer
+
+
+@dataclass(frozen=True)
+class DiskChanged:
+    """A disk was dropped, was released or has joined; `in_use` are those in use from now on.
+
+    `name` is the event's, `dropped_count` counts the faults of this run.
+    """
+
+    name: str
+    disk: Disk
+    sentence: str
+    in_use: tuple[Disk, ...]
+    dropped_count: int
+
+
+@dataclass(frozen=True)
+class DiskStatus:
+    """How each disk is: plain JSON types."""
+
+    disks: tuple[Mapping[str, Any], ...]
+
+
+@dataclass(frozen=True)
+class Stored:
+    """The pixels are durable; `frames` now carry file and hash.
+
+    `disks` are the ids of the disks that have them, empty where the mission has one disk.
+    """
+
+    number: int
+    frames: tuple[FrameRecord, ...]
+    duration_s: float
+    disks: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Sealed:
+    """The record is durable."""
+
+    number: int
+    sha256: str
+
+
+@dataclass(frozen=True)
+class WriteFailed:
+    """The disk refused; the exposure is not stored or not sealed.
+
+    `may_pass`: the demand was right and may be made again when the disk has come to itself.
+    """
+
+    number: int
+    sentence: str
+    may_pass: bool = False
+
+
+# To the worker
+
+
+@dataclass(frozen=True)
+class WorkerSettings:
+    """What a pipeline worker needs to know before there is a mission.
+
+    `plan_file` is the flight plan whose requirements exposures are judged by.
+    """
+
+    rig: str
+    radiometry: Path | None
+    plan_file: Path | None
+    plan: PlanSection
+    processing: ProcessingSection
+
+
+@dataclass(frozen=True)
+class Begin:
+    """Load the kernels, then process for this mission; for none where only that is tried."""
+
+    mission: Path | None
+
+
+@dataclass(frozen=True)
+class UseMission:
+    """Read and write the mission in this folder from now on: another disk leads."""
+
+    mission: Path
+
+
+@dataclass(frozen=True)
+class Process:
+    """Process this exposure; `slots` by head, or None to read Level-0.
+
+    While it is not sealed its verdict may be told, but nothing is written: `Settled` follows.
+    """
+
+    exposure: Exposure
+    slots: Mapping[str, int] | None
+    is_sealed: bool = True
+
+
+@dataclass(frozen=True)
+class Settled:
+    """What became of an exposure that was begun unsealed: its record, or None for none."""
+
+    number: int
+    exposure: Exposure | None
+
+
+# From the worker
+
+
+@dataclass(frozen=True)
+class WorkerBuilt:
+    """The pipeline of this rig is built, its calibrations are read; `Begin` is waited for."""
+
+
+@dataclass(frozen=True)
+class WorkerRefused:
+    """No pipeline can be built; the sentence says why, and the cure. The process ends."""
+
+    sentence: str
+
+
+@dataclass(frozen=True)
+class WorkerReady:
+    """Kernels are compiled and loaded; nothing compiles from here on."""
+
+    warm_up_s: float
+
+
+@dataclass(frozen=True)
+class FramesRead:
+    """The frames of this exposure are no longer needed in memory; it is still in work."""
+
+    number: int
+
+
+@dataclass(frozen=True)
+class Judged:
+    """The verdict is known, its products are not written yet; `report` as in `Processed`."""
+
+    number: int
+    report: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Processed:
+    """Products are written; `report` is the content of quality.json.
+
+    `histograms` are counts of raw DN by sensor, as in histogram.json.
+    """
+
+    number: int
+    report: Mapping[str, Any]
+    files: Mapping[str, int]
+    duration_s: float
+    histograms: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class ProcessFailed:
+    """This exposure has no product; the sentence says why, and the cure.
+
+    `report` is a quality report all the same, with the flag NOT_PROCESSED.
+    """
+
+    number: int
+    sentence: str
+    report: Mapping[str, Any] = field(default_factory=dict)

@@ -1,0 +1,112 @@
+"""The processes of the service, seen from its event loop: started, listened to, asked for a sign of
+life, and ended. What messages mean is not known here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from typing import Any
+
+from daemon.onboard.service.messages import Ping, Stop
+from daemon.onboard.service.processes import Child
+
+ANSWER_LIMIT_S: Mapping[str, float] = {"capture": 10.0, "writer": 60.0, "worker": 120.0}
+"""How long a process may be silent before the watchdog is no longer fed: a writer waits for its
+disk, a worker finishes its exposure."""
+RESTART_LIMIT_S: Mapping[str, float] = {"watch": 60.0}
+"""How long a process on which no exposure depends may be silent before it is ended. It is started
+again as after any other end; the watchdog is fed meanwhile."""
+END_TIMEOUT_S = 5.0
+
+
+class Supervisor:
+    """Child processes by name.
+
+    Args:
+        hear: called with every message a child sends.
+        died: called with the name of a child that ended without being told to.
+    """
+
+    def __init__(self, hear: Callable[[object], None], died: Callable[[str], None]) -> None:
+        self._hear = hear
+        self._died = died
+        self._children: dict[str, Child] = {}
+        self._answered: dict[str, float] = {}
+
+    def spawn(
+        self, name: str, target: str, arguments: tuple[Any, ...], environment: Mapping[str, str]
+    ) -> None:
+        """Start a child; `target` is "module:function". One of that name that died is cleared."""
+        dead = self._children.pop(name, None)
+        if dead is not None:
+            dead.end(0.0)
+        child = Child(name, target, arguments, environment)
+        self._children[name] = child
+        self._answered[name] = time.monotonic()
+        asyncio.get_running_loop().add_reader(child.connection.fileno(), self._receive, child)
+
+    def send(self, name: str, message: object) -> None:
+        """Tell a child something. One that is gone is noticed by its silence, not here.
+
+        One that was ended hears nothing any more: others may still talk while they are seen off.
+        """
+        child = self._children.get(name)
+        if child is None:
+            return
+        try:
+            child.send(message)
+        except OSError:
+            self._receive(child)  # what it said before it ended, and then that it did
+
+    def tell(self, name: str, message: object) -> bool:
+        """Tell a child something unless that would take time; False where it was dropped."""
+        child = self._children.get(name)
+        try:
+            return child is not None and child.tell(message)
+        except OSError:
+            return False  # its end is noticed by the loop
+
+    def ping(self) -> list[str]:
+        """Ask every child for a sign of life, and end those that are silent and not needed.
+
+        Returns:
+            The names of those that a flight depends on and that have been silent for too long.
+        """
+        watched = [name for name in self._children if name in ANSWER_LIMIT_S]
+        for name in watched:
+            self.send(name, Ping())
+        now = time.monotonic()
+        for name in self._children.keys() & RESTART_LIMIT_S.keys():
+            self.tell(name, Ping())
+            if now - self._answered[name] > RESTART_LIMIT_S[name]:
+                self._children[name].process.kill()
+        return [name for name in watched if now - self._answered[name] > ANSWER_LIMIT_S[name]]
+
+    async def end(self, names: tuple[str, ...]) -> None:
+        """Tell children to stop, in this order, and see them off."""
+        loop = asyncio.get_running_loop()
+        for name in names:
+            child = self._children.pop(name, None)
+            if child is None:
+                continue
+            loop.remove_reader(child.connection.fileno())
+            with suppress(OSError):  # it may be gone already
+                child.send(Stop())
+            await asyncio.to_thread(child.end, END_TIMEOUT_S)
+
+    def _receive(self, child: Child) -> None:
+        """Everything a child has to say right now."""
+        try:
+            while child.connection.poll():
+                message = child.connection.recv()
+                self._answered[child.name] = time.monotonic()
+                self._hear(message)
+        except (EOFError, ConnectionError):
+            self._lost(child)
+
+    def _lost(self, child: Child) -> None:
+        asyncio.get_running_loop().remove_reader(child.connection.fileno())
+        self._died(child.name)

@@ -1,0 +1,1 @@
+"""The writer process and the coordination of one or two disks."""

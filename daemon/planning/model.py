@@ -1,0 +1,104 @@
+"""A flight plan: lines with their ids, and what the project asks of the images.
+
+Places are WGS 84 in degrees. A `Plane` lays a project flat, good to decimetres over some
+kilometres.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from daemon.orientation.navigation import metres_per_degree
+
+
+class Point(NamedTuple):
+    """A place, degrees."""
+
+    latitude_deg: float
+    longitude_deg: float
+
+
+@dataclass(frozen=True)
+class PlannedLine:
+    """A line to be flown from `start` to `end`; `strip` groups lines that continue each other.
+
+    Exposures are due every `distance_m` from the start on, or at the places `at_m` (metres from
+    the start, rising) where the plan names them; where it says neither, by the overlap.
+    """
+
+    id: str
+    start: Point
+    end: Point
+    strip: str = ""
+    distance_m: float | None = None
+    at_m: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class Specification:
+    """What a project asks for.
+
+    Overlaps are shares of the image's extent along and across the line, as planned; the least that
+    is taken is `overlap_tolerance` below them. An exposure that breaks what is asked for has to be
+    flown again, and does not count for the advisor. `gsd_m` and `sun_deg` (elevation) are asked for
+    only where they are given.
+    """
+
+    forward_overlap: float = 0.6
+    sidelap: float = 0.3
+    overlap_tolerance: float = 0.1
+    gsd_m: float | None = None
+    tilt_deg: float = 5.0
+    crab_deg: float = 10.0
+    sun_deg: float | None = None
+    time_sigma_ns: float = 1e9
+
+    @property
+    def images_on_every_point(self) -> int:
+        """How many images of a line must see each point of it: 2 at 60 %, 5 at 80 %."""
+        return max(1, math.floor(1.0 / (1.0 - self.forward_overlap) + 1e-9))
+
+    @property
+    def lines_on_every_point(self) -> int:
+        """From how many lines each point must be seen: 1 at 30 % sidelap, 2 at 60 %."""
+        return max(1, math.floor(1.0 / (1.0 - self.sidelap) + 1e-9))
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Lines in the order they are to be flown."""
+
+    name: str
+    lines: tuple[PlannedLine, ...]
+    specification: Specification = Specification()
+
+    def line(self, line_id: str) -> PlannedLine:
+        """The line of that id; KeyError names those there are."""
+        for line in self.lines:
+            if line.id == line_id:
+                return line
+        raise KeyError(
+            f"no line {line_id!r}; there are {', '.join(line.id for line in self.lines)}"
+        )
+
+
+class Plane:
+    """Metres east and north of an origin."""
+
+    def __init__(self, origin: Point) -> None:
+        self.origin = origin
+        self._north_m, self._east_m = metres_per_degree(origin.latitude_deg, 0.0)
+
+    def flat(self, point: Point) -> tuple[float, float]:
+        return (
+            (point.longitude_deg - self.origin.longitude_deg) * self._east_m,
+            (point.latitude_deg - self.origin.latitude_deg) * self._north_m,
+        )
+
+    def place(self, east_m: float, north_m: float) -> Point:
+        return Point(
+            self.origin.latitude_deg + north_m / self._north_m,
+            self.origin.longitude_deg + east_m / self._east_m,
+        )

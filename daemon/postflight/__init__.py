@@ -1,0 +1,1 @@
+"""What runs after landing: adjustment, calibration, exchange, replay and reports."""

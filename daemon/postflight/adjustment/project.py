@@ -1,0 +1,447 @@
+"""Reading an adjustment project: `project.toml` and its tables become a network.
+
+The format is told in docs/formats.md. Coordinates without a value are NaN in the network and found
+by `processing.bundle.start`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.mission.foreign_files import ForeignFileError, within
+from daemon.postflight.adjustment.project_file import (
+    CameraSection,
+    HeadSection,
+    ProjectFile,
+    read_project_file,
+)
+from daemon.postflight.adjustment.tables import ProjectError, Table, read_table
+from processing.bundle.adjust import Settings
+from processing.bundle.bent_rays import Rays
+from processing.bundle.network import (
+    INTERIOR,
+    Attitudes,
+    Bearings,
+    Camera,
+    Constraint,
+    Distances,
+    Gnss,
+    Head,
+    ImagePoints,
+    Images,
+    Network,
+    Points,
+    Stations,
+    no_bearings,
+    no_distances,
+    no_gnss,
+)
+from processing.bundle.self_calibration import parts_of, self_calibrating
+from processing.geometry.rotation import rotation_matrix
+from processing.rig import RigError, find_rig, shipped_rigs
+
+Array = NDArray[np.float64]
+
+XYZ = ("x_m", "y_m", "z_m")
+SIGMAS = ("sx_m", "sy_m", "sz_m")
+ANGLES = ("omega_deg", "phi_deg", "kappa_deg")
+
+
+@dataclass(frozen=True)
+class Checks:
+    """Independent coordinates of object points: names, (n, 3) m, sigmas (n, 3) m."""
+
+    names: tuple[str, ...]
+    xyz_m: Array
+    sigma_m: Array
+
+
+@dataclass(frozen=True)
+class Project:
+    """What is adjusted, how, and what it is held against."""
+
+    name: str
+    file: ProjectFile
+    network: Network
+    settings: Settings
+    checks: Checks
+
+
+def read_project(path: Path) -> Project:
+    """Read a project file and its tables.
+
+    Raises:
+        ProjectError: with a sentence per mistake.
+    """
+    file = read_project_file(path)
+    folder = path.parent
+    problems: list[str] = []
+    cameras = tuple(_camera(section, folder, problems) for section in file.camera)
+    heads = tuple(_head(section) for section in file.head)
+    images = _read(folder, file.files.images, ("image", "camera"), ("exposure", "head", *ANGLES))
+    exposures = _optional(
+        folder, file.files.exposures, ("exposure",), (*XYZ, *ANGLES, "position", "attitude")
+    )
+    points = _optional(folder, file.files.points, ("point",), (*XYZ, *SIGMAS, "role"))
+    seen = _read(
+        folder,
+        file.files.image_points,
+        ("image", "point"),
+        ("x_mm", "y_mm", "column_px", "row_px", "sx_um", "sy_um"),
+    )
+    build = _Names(images, exposures, seen, points, problems)
+    told = [problem for t in build.tables for problem in t.problems]
+    if told:
+        # Names that are not unique fit no index: what else is wrong cannot be told yet.
+        raise ProjectError(told)
+    network = Network(
+        cameras=cameras,
+        heads=heads,
+        stations=build.stations(),
+        attitudes=build.attitudes(),
+        images=build.images(file),
+        points=build.points(),
+        image_points=build.image_points(file, cameras),
+        distances=_distances(folder, file, build),
+        gnss=_gnss(folder, file, build),
+        bearings=_bearings(folder, file, build),
+        constraints=tuple(Constraint(dict(c.coefficients)) for c in file.constraint),
+        rays=Rays(file.adjust.earth_radius_m, file.adjust.refraction, file.adjust.ground_m),
+    )
+    problems += [p for table in build.tables for p in table.problems]
+    if problems:
+        raise ProjectError(problems)
+    a = file.adjust
+    settings = Settings(
+        most_iterations=a.most_iterations,
+        robust=a.robust,
+        reject_beyond=a.reject_beyond,
+        variance_components=a.variance_components,
+        minimum_norm=a.minimum_norm,
+    )
+    return Project(file.name, file, network, settings, build.checks())
+
+
+class _Names:
+    """Tables by name, and the indices of what they name."""
+
+    def __init__(
+        self, images: Table, exposures: Table | None, seen: Table, points: Table | None,
+        problems: list[str],
+    ) -> None:  # fmt: skip
+        self.tables = [t for t in (images, exposures, seen, points) if t is not None]
+        self.problems = problems
+        self._images, self._exposures, self._seen, self._points = images, exposures, seen, points
+        self.image_names = images.names("image")
+        listed = exposures.names("exposure") if exposures is not None else []
+        of_image = [
+            given or name
+            for given, name in zip(images.text("exposure"), self.image_names, strict=True)
+        ]
+        self.exposure_names = list(dict.fromkeys([*listed, *of_image]))
+        self._exposure_of_image = of_image
+        self._own = np.array([images.numbers(c) for c in ANGLES]).T.reshape(-1, 3)
+        self._has_own = np.isfinite(self._own).all(axis=1)
+        own = [n for n, has in zip(self.image_names, self._has_own, strict=True) if has]
+        needing = dict.fromkeys(
+            e for e, has in zip(of_image, self._has_own, strict=True) if not has
+        )
+        self.attitude_names = [*needing, *(f"image {name}" for name in own)]
+        roles = points.text("role", "tie") if points is not None else []
+        listed_points = points.names("point") if points is not None else []
+        self.point_names = list(dict.fromkeys([*listed_points, *seen.text("point")]))
+        self._roles = roles
+        self.exposure_at = {name: k for k, name in enumerate(self.exposure_names)}
+        self.attitude_at = {name: k for k, name in enumerate(self.attitude_names)}
+        self.image_at = {name: k for k, name in enumerate(self.image_names)}
+        self.point_at = {name: k for k, name in enumerate(self.point_names)}
+
+    def index(self, table: Table, column: str, at: dict[str, int], what: str) -> NDArray[np.int64]:
+        found = []
+        for name, line in zip(table.text(column), table.lines, strict=True):
+            if name not in at:
+                table.wrong(line, f"{what} {name!r} is not there")
+            found.append(at.get(name, 0))
+        return np.array(found, dtype=np.int64)
+
+    def stations(self) -> Stations:
+        n = len(self.exposure_names)
+        position = np.full((n, 3), np.nan)
+        held = np.zeros(n, dtype=bool)
+        table = self._exposures
+        if table is not None:
+            at = self.index(table, "exposure", self.exposure_at, "exposure")
+            position[at] = np.array([table.numbers(c) for c in XYZ]).T.reshape(-1, 3)
+            held[at] = self._held(table, "position")
+        return Stations(tuple(self.exposure_names), position, held)
+
+    def attitudes(self) -> Attitudes:
+        n = len(self.attitude_names)
+        rotation = np.full((n, 3, 3), np.nan)
+        held = np.zeros(n, dtype=bool)
+        table = self._exposures
+        if table is not None:
+            angles = np.array([table.numbers(c) for c in ANGLES]).T.reshape(-1, 3)
+            fixed = self._held(table, "attitude")
+            for name, own, hold in zip(table.text("exposure"), angles, fixed, strict=True):
+                if name in self.attitude_at:
+                    rotation[self.attitude_at[name]] = _rotation(own)
+                    held[self.attitude_at[name]] = hold
+        for name, own, has in zip(self.image_names, self._own, self._has_own, strict=True):
+            if has:
+                rotation[self.attitude_at[f"image {name}"]] = _rotation(own)
+        return Attitudes(tuple(self.attitude_names), rotation, held)
+
+    def images(self, file: ProjectFile) -> Images:
+        table = self._images
+        cameras = {c.name: k for k, c in enumerate(file.camera)}
+        heads = {"": -1, **{h.name: k for k, h in enumerate(file.head)}}
+        station = [self.exposure_at[e] for e in self._exposure_of_image]
+        attitude = [
+            self.attitude_at[f"image {name}" if has else exposure]
+            for name, exposure, has in zip(
+                self.image_names, self._exposure_of_image, self._has_own, strict=True
+            )
+        ]
+        return Images(
+            tuple(self.image_names),
+            np.array(station, dtype=np.int64),
+            np.array(attitude, dtype=np.int64),
+            self.index(table, "camera", cameras, "camera"),
+            self.index(table, "head", heads, "head"),
+        )
+
+    def points(self) -> Points:
+        n = len(self.point_names)
+        xyz, sigma = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
+        far = np.zeros(n, dtype=bool)
+        table = self._points
+        if table is not None:
+            given = np.array([table.numbers(c) for c in XYZ]).T.reshape(-1, 3)
+            own = np.array([table.numbers(c) for c in SIGMAS]).T.reshape(-1, 3)
+            for k, role in enumerate(self._roles):
+                if role not in ("tie", "control", "check", "direction"):
+                    table.wrong(
+                        table.lines[k],
+                        f"role is {role!r}; one of tie, control, check, direction is right",
+                    )
+                xyz[k] = given[k] if role != "check" else np.nan
+                sigma[k] = own[k] if role in ("control", "direction") else np.nan
+                far[k] = role == "direction"
+                if role in ("control", "direction") and not np.isfinite(given[k]).any():
+                    table.wrong(table.lines[k], f"a {role} point needs coordinates")
+                if (own[k] < 0.0).any():
+                    table.wrong(table.lines[k], "a sigma is negative; 0 holds, empty leaves free")
+            # A coordinate that is not known is no control, whatever sigma stands there.
+            sigma[: len(given)] = np.where(np.isfinite(given), sigma[: len(given)], np.nan)
+        return Points(tuple(self.point_names), xyz, sigma, far)
+
+    def checks(self) -> Checks:
+        table = self._points
+        if table is None:
+            return Checks((), np.zeros((0, 3)), np.zeros((0, 3)))
+        rows = [k for k, role in enumerate(self._roles) if role == "check"]
+        given = np.array([table.numbers(c) for c in XYZ]).T.reshape(-1, 3)
+        own = np.array([table.numbers(c, 0.0) for c in SIGMAS]).T.reshape(-1, 3)
+        return Checks(tuple(self.point_names[k] for k in rows), given[rows], own[rows])
+
+    def image_points(self, file: ProjectFile, cameras: Sequence[Camera]) -> ImagePoints:
+        table = self._seen
+        image = self.index(table, "image", self.image_at, "image")
+        point = self.index(table, "point", self.point_at, "point")
+        sigma = np.array(
+            [table.numbers(c, file.adjust.image_sigma_um) for c in ("sx_um", "sy_um")]
+        ).T.reshape(-1, 2)
+        if table.has("x_mm") and table.has("y_mm"):
+            xy = np.array([table.numbers("x_mm"), table.numbers("y_mm")]).T.reshape(-1, 2)
+        elif table.has("column_px") and table.has("row_px"):
+            px = np.array([table.numbers("column_px"), table.numbers("row_px")]).T.reshape(-1, 2)
+            xy = self._from_pixels(file, image, px)
+        else:
+            self.problems.append(
+                f"{table.file}: columns x_mm, y_mm or column_px, row_px are needed"
+            )
+            xy = np.zeros((len(table.rows), 2))
+        for row in np.flatnonzero(~np.isfinite(xy).all(axis=1)):
+            table.wrong(table.lines[row], "an image point needs both coordinates")
+        return ImagePoints(image, point, np.nan_to_num(xy), sigma * 1e-3)
+
+    def _from_pixels(self, file: ProjectFile, image: NDArray[np.int64], px: Array) -> Array:
+        camera_at = {c.name: c for c in file.camera}
+        names = self._images.text("camera")
+        xy = np.zeros_like(px)
+        told: set[str] = set()
+        for k in np.unique(image):
+            camera = camera_at.get(names[k])
+            if camera is None:
+                continue
+            if camera.pixel_um is None or camera.width_px is None or camera.height_px is None:
+                if camera.name not in told:
+                    told.add(camera.name)
+                    self.problems.append(
+                        f"camera {camera.name}: pixel coordinates need pixel_um, width_px and "
+                        "height_px"
+                    )
+                continue
+            rows, pitch = image == k, camera.pixel_um * 1e-3
+            xy[rows, 0] = (px[rows, 0] - (camera.width_px - 1) / 2.0) * pitch
+            xy[rows, 1] = ((camera.height_px - 1) / 2.0 - px[rows, 1]) * pitch
+        return xy
+
+    def _held(self, table: Table, column: str) -> NDArray[np.bool_]:
+        found = []
+        for value, line in zip(table.text(column, "free"), table.lines, strict=True):
+            if value not in ("free", "held"):
+                table.wrong(line, f"{column} is {value!r}; free or held is right")
+            found.append(value == "held")
+        return np.array(found, dtype=bool)
+
+
+def _camera(section: CameraSection, folder: Path, problems: list[str]) -> Camera:
+    camera = Camera(
+        section.name,
+        section.f_mm,
+        section.xp_mm,
+        section.yp_mm,
+        section.model,
+        np.array([getattr(section, name) for name in INTERIOR]),
+        frozenset(section.free),
+        dict(section.sigma),
+        pixel_mm=None if section.pixel_um is None else section.pixel_um * 1e-3,
+    )
+    try:
+        rig = None
+        if section.rig is not None:
+            shipped = section.rig in shipped_rigs()
+            named = section.rig if shipped else str(within(folder, section.rig, "camera.rig"))
+            rig = find_rig(named)
+        camera = self_calibrating(
+            camera,
+            section.parameters,
+            () if rig is None else parts_of(rig),
+            master_cone="" if rig is None else rig.master_cone,
+            interior=section.interior,
+        )
+    except RigError as error:
+        problems += list(error.problems)
+    except ValueError as error:
+        problems.append(str(error))
+    return _shortened(camera, section, problems)
+
+
+def _shortened(camera: Camera, section: CameraSection, problems: list[str]) -> Camera:
+    """Without the parameters that were dropped, and with the values of terms that are known."""
+    names = {t.name for t in camera.terms}
+    foreign = [n for n in section.without if n not in names and n not in camera.free]
+    foreign += [n for n in section.terms if n not in names]
+    if foreign:
+        problems.append(f"camera {camera.name}: {foreign} are not parameters of its set")
+    terms = tuple(
+        replace(t, value=section.terms.get(t.name, t.value))
+        for t in camera.terms
+        if t.name not in section.without
+    )
+    left = {t.name for t in terms}
+    gauges = tuple(g for g in camera.gauges if set(g) <= left)
+    return replace(
+        camera, free=camera.free - frozenset(section.without), terms=terms, gauges=gauges
+    )
+
+
+def _head(section: HeadSection) -> Head:
+    angles = np.array([section.omega_deg, section.phi_deg, section.kappa_deg])
+    sigma = section.rotation_sigma_deg
+    return Head(
+        section.name,
+        _rotation(angles),
+        np.array([section.x_m, section.y_m, section.z_m]),
+        rotation_free=section.rotation == "free",
+        offset_free=section.offset == "free",
+        rotation_sigma_rad=None if sigma is None else math.radians(sigma),
+        offset_sigma_m=section.offset_sigma_m,
+    )
+
+
+def _rotation(angles_deg: Array) -> Array:
+    if not np.isfinite(angles_deg).all():
+        return np.full((3, 3), np.nan)
+    return rotation_matrix(*(math.radians(float(a)) for a in angles_deg))
+
+
+def _optional(
+    folder: Path, name: str | None, needed: Sequence[str], known: Sequence[str]
+) -> Table | None:
+    return None if name is None else _read(folder, name, needed, known)
+
+
+def _read(folder: Path, name: str, needed: Sequence[str], known: Sequence[str]) -> Table:
+    try:
+        return read_table(within(folder, name, "project.toml: files"), needed, known)
+    except ForeignFileError as error:
+        raise ProjectError([str(error)]) from error
+
+
+def _distances(folder: Path, file: ProjectFile, build: _Names) -> Distances:
+    table = _optional(
+        folder, file.files.distances, ("point_a", "point_b", "distance_m", "sigma_m"), ()
+    )
+    if table is None:
+        return no_distances()
+    build.tables.append(table)
+    return Distances(
+        build.index(table, "point_a", build.point_at, "point"),
+        build.index(table, "point_b", build.point_at, "point"),
+        np.array(table.numbers("distance_m")),
+        np.array(table.numbers("sigma_m")),
+    )
+
+
+def _gnss(folder: Path, file: ProjectFile, build: _Names) -> Gnss:
+    lever = ("lever_x_m", "lever_y_m", "lever_z_m")
+    table = _optional(
+        folder, file.files.gnss, ("exposure", *XYZ, *SIGMAS), ("line", "time_s", *lever)
+    )
+    if table is None:
+        return no_gnss()
+    build.tables.append(table)
+    station = build.index(table, "exposure", build.exposure_at, "exposure")
+    levers = np.array([table.numbers(c, 0.0) for c in lever]).T.reshape(-1, 3)
+    attitude = np.array([build.attitude_at.get(n, -1) for n in table.text("exposure")])
+    for row in np.flatnonzero((attitude < 0) & (levers != 0.0).any(axis=1)):
+        table.wrong(
+            table.lines[row],
+            "a lever arm needs an attitude of the exposure; here every image has its own",
+        )
+    lines = tuple(dict.fromkeys(name for name in table.text("line") if name))
+    at = {"": -1, **{name: k for k, name in enumerate(lines)}}
+    return Gnss(
+        station=station,
+        attitude=np.clip(attitude, 0, None).astype(np.int64),
+        position_m=np.array([table.numbers(c) for c in XYZ]).T.reshape(-1, 3),
+        sigma_m=np.array([table.numbers(c) for c in SIGMAS]).T.reshape(-1, 3),
+        lever_m=levers,
+        line=build.index(table, "line", at, "line"),
+        time_s=np.array(table.numbers("time_s", 0.0)),
+        lines=lines,
+        drift=file.adjust.gnss,
+    )
+
+
+def _bearings(folder: Path, file: ProjectFile, build: _Names) -> Bearings:
+    table = _optional(folder, file.files.attitudes, ("exposure", *ANGLES, "sigma_deg"), ())
+    if table is None:
+        return no_bearings()
+    build.tables.append(table)
+    angles = np.array([table.numbers(c) for c in ANGLES]).T.reshape(-1, 3)
+    sigma = np.radians(np.array(table.numbers("sigma_deg")))
+    return Bearings(
+        build.index(table, "exposure", build.attitude_at, "attitude of exposure"),
+        np.array([_rotation(a) for a in angles]).reshape(-1, 3, 3),
+        np.tile(sigma[:, None], (1, 3)),
+    )

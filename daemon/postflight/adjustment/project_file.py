@@ -1,0 +1,133 @@
+"""What project.toml of an adjustment may say; docs/formats.md tells the same to people."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from daemon.mission.foreign_files import ForeignFileError, read_plain
+from daemon.postflight.adjustment.tables import ProjectError
+from processing.bundle.self_calibration import SetName
+from processing.rig.toml_text import TomlError, parse_toml
+
+PROJECT_FILE_MAX_BYTES = 4_000_000
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class AdjustSection(_Section):
+    """How to adjust."""
+
+    robust: bool = False
+    reject_beyond: float | None = Field(default=None, gt=1.0)
+    variance_components: bool = False
+    minimum_norm: bool = False
+    most_iterations: int = Field(default=30, ge=1, le=1000)
+    image_sigma_um: float = Field(default=1.0, gt=0.0)
+    gnss: Literal["none", "shift", "linear"] = "none"
+    earth_radius_m: float | None = Field(default=None, gt=1e6)
+    refraction: bool = False
+    ground_m: float = 0.0
+
+
+class FilesSection(_Section):
+    """Where the tables are, relative to the project file."""
+
+    images: str = "images.csv"
+    image_points: str = "image_points.csv"
+    exposures: str | None = None
+    points: str | None = None
+    distances: str | None = None
+    gnss: str | None = None
+    attitudes: str | None = None
+
+
+class CameraSection(_Section):
+    """A camera."""
+
+    name: str
+    f_mm: float = Field(gt=0.0)
+    xp_mm: float = 0.0
+    yp_mm: float = 0.0
+    model: Literal["australis", "centred"] = "australis"
+    pixel_um: float | None = Field(default=None, gt=0.0)
+    width_px: int | None = Field(default=None, gt=0)
+    height_px: int | None = Field(default=None, gt=0)
+    dx0: float = 0.0
+    dy0: float = 0.0
+    df: float = 0.0
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    b1: float = 0.0
+    b2: float = 0.0
+    free: tuple[str, ...] = ()
+    sigma: dict[str, float] = {}
+    parameters: SetName = "none"
+    interior: bool = False
+    rig: str | None = None
+    without: tuple[str, ...] = ()
+    terms: dict[str, float] = {}
+
+
+class HeadSection(_Section):
+    """Where a camera sits against the others of an exposure."""
+
+    name: str
+    omega_deg: float = 0.0
+    phi_deg: float = 0.0
+    kappa_deg: float = 0.0
+    x_m: float = 0.0
+    y_m: float = 0.0
+    z_m: float = 0.0
+    rotation: Literal["held", "free"] = "held"
+    offset: Literal["held", "free"] = "held"
+    rotation_sigma_deg: float | None = Field(default=None, gt=0.0)
+    offset_sigma_m: float | None = Field(default=None, gt=0.0)
+
+
+class ConstraintSection(_Section):
+    """Corrections of named unknowns whose weighted sum is zero."""
+
+    coefficients: dict[str, float] = Field(min_length=1)
+
+
+class ProjectFile(_Section):
+    """project.toml."""
+
+    format: Literal[1]
+    name: str
+    adjust: AdjustSection = AdjustSection()
+    files: FilesSection = FilesSection()
+    camera: tuple[CameraSection, ...] = Field(min_length=1)
+    head: tuple[HeadSection, ...] = ()
+    constraint: tuple[ConstraintSection, ...] = ()
+
+
+def read_project_file(path: Path) -> ProjectFile:
+    """Read and validate project.toml.
+
+    Raises:
+        ProjectError: with a sentence per mistake.
+    """
+    try:
+        content = parse_toml(read_plain(path, PROJECT_FILE_MAX_BYTES))
+    except ForeignFileError as error:
+        raise ProjectError([f"{error}; give the path of a project.toml"]) from error
+    except TomlError as error:
+        raise ProjectError([f"{path.name}: not valid TOML: {error}"]) from error
+    try:
+        return ProjectFile.model_validate(content)
+    except ValidationError as error:
+        raise ProjectError(
+            [
+                f"{path.name}: {'.'.join(str(part) for part in detail['loc'])}: {detail['msg']}"
+                for detail in error.errors()
+            ]
+        ) from error

@@ -1,0 +1,82 @@
+"""Since when a sensor has been displaced: the stitching records of a landed mission, together.
+
+Read from `mosaic.json` of every exposure and written to `export/displacements.json`; the
+mathematics is in `processing.mosaic.flight_validity`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from daemon.mission.foreign_files import ForeignFileError, read_plain
+from daemon.mission.records import RECORD_MAX_BYTES, RecordError, canonical_bytes, parse_record
+from daemon.mission.store.durable import replace_file
+from processing.mosaic.flight_validity import FlightSettings, FlightValidity, judge_flight
+from processing.mosaic.stitch_record import StitchRecord, StitchRecordError, stitch_record_from_json
+from processing.rig import load_rig
+
+DISPLACEMENTS_FILE = "export/displacements.json"
+"""Where a mission holds what its flight says of displaced sensors."""
+
+
+def write_displacements(mission: Path) -> Mapping[str, Any]:
+    """Judge the flight and write `export/displacements.json`.
+
+    Returns:
+        The content of the file: `sentences`, one for each step; `steps`, see
+        `processing.mosaic.flight_validity.Step`; `exposures` used and `left_out`, by cone;
+        `unreadable`, sentences about records that could not be read.
+    """
+    content = flight_displacements(mission)
+    path = mission / DISPLACEMENTS_FILE
+    path.parent.mkdir(exist_ok=True)
+    replace_file(path, canonical_bytes(content))
+    return content
+
+
+def flight_displacements(mission: Path) -> dict[str, Any]:
+    """What `write_displacements` writes; nothing is written."""
+    records, unreadable = _records(mission)
+    return _content(judge_flight(load_rig(mission / "rig.toml"), records), unreadable)
+
+
+def without_steps(exposures: Mapping[str, int]) -> str:
+    """What a flight without steps says, by how many exposures of each cone were judged."""
+    if not exposures:
+        return "Not judged: it takes three sensors in the master cone, or two in another PAN cone."
+    least = 2 * FlightSettings().least_exposures
+    few = [cone for cone, count in exposures.items() if count < least]
+    if len(few) == len(exposures):
+        return f"Not judged: whether a sensor moved shows in {least} exposures of a cone or more."
+    if few:
+        return f"No sensor is seen to move; not judged: cone {', '.join(few)} (too few exposures)."
+    return "No sensor is seen to move."
+
+
+def _records(mission: Path) -> tuple[dict[int, StitchRecord], list[str]]:
+    records, unreadable = {}, []
+    for path in sorted(mission.glob("L2/[0-9]*/mosaic.json")):
+        if not path.parent.name.isdigit():
+            continue  # being written
+        try:
+            content = parse_record(read_plain(path, RECORD_MAX_BYTES), path.name)
+            records[int(path.parent.name)] = stitch_record_from_json(content)
+        except (ForeignFileError, RecordError, StitchRecordError) as error:
+            unreadable.append(f"{path.parent.name}: {error}")
+    return records, unreadable
+
+
+def _content(found: FlightValidity, unreadable: list[str]) -> dict[str, Any]:
+    return {
+        "sentences": [step.sentence for step in found.steps],
+        "steps": [
+            asdict(step) | {"length_px": step.length_px, "alternatives": list(step.alternatives)}
+            for step in found.steps
+        ],
+        "exposures": dict(found.exposures),
+        "left_out": {cone: list(numbers) for cone, numbers in found.left_out.items()},
+        "unreadable": unreadable,
+    }

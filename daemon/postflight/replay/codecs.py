@@ -1,0 +1,142 @@
+"""Recorded bytes of a device through its driver again, on a clock that goes as they came.
+
+The driver is the one that flew; only its port and its clock are stand-ins. What comes out is held
+against the records of the flight log by `daemon.postflight.replay.flight`.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from drivers.base import registry
+from drivers.contract import (
+    ClockReading,
+    DeviceError,
+    DeviceEvent,
+    EventMark,
+    NavSample,
+    RawBytes,
+    TemperatureSample,
+)
+from drivers.transport.serial_device import SerialDevice, SerialLine
+
+Decoded = NavSample | EventMark | TemperatureSample | ClockReading
+NEW_LINE = frozenset({"lost", "silent"})
+"""Device events after which the port is opened anew, and half a message is of no use."""
+
+
+class _Clock:
+    """Stands still but for what is waited and what arrives."""
+
+    def __init__(self) -> None:
+        self.now_ns = 0
+
+    def mono_ns(self) -> int:
+        return self.now_ns
+
+    def wait(self, event: threading.Event, timeout_s: float) -> bool:
+        self.now_ns += max(1, round(timeout_s * 1e9))
+        return event.is_set()
+
+
+class _Port:
+    """Gives the recorded chunks one by one, whole, each whenever the driver waits for bytes."""
+
+    def __init__(self, clock: _Clock) -> None:
+        self.timeout: Any = 0.0
+        self.chunks: deque[RawBytes] = deque()
+        self._clock = clock
+        self._rest = b""
+
+    @property
+    def in_waiting(self) -> int:
+        return len(self._rest)
+
+    def read(self, size: int = 1) -> bytes:
+        if not self._rest and self.timeout and self.chunks:
+            chunk = self.chunks.popleft()
+            self._rest = chunk.data
+            self._clock.now_ns = max(self._clock.now_ns, chunk.mono_ns)
+        elif not self._rest:
+            # What was drained in flight is logged apart: a driver finds its line empty.
+            self._clock.now_ns += round((self.timeout or 0.0) * 1e9)
+        data, self._rest = self._rest[:size], self._rest[size:]
+        return data
+
+    def write(self, data: bytes, /) -> int | None:
+        return len(data)
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+class Codec:
+    """A device of the flight, fed with what it said then."""
+
+    def __init__(self, driver: SerialDevice, port: _Port, clock: _Clock) -> None:
+        self._driver = driver
+        self._port = port
+        self._clock = clock
+        self._line = SerialLine(port, lambda _data: None)
+
+    def decode(self, chunks: Iterable[RawBytes]) -> list[Decoded]:
+        """What these bytes mean, after those before them."""
+        self._port.chunks.extend(chunks)
+        if self._port.chunks:
+            self._clock.now_ns = max(self._clock.now_ns, self._port.chunks[0].mono_ns)
+        found: list[Decoded] = []
+        while self._port.chunks:
+            found += self._driver.step(self._line)
+        return found
+
+    def reopened(self) -> None:
+        """The port was opened anew: half a message is of no use."""
+        self._driver.connected()
+
+
+def codec_for(kind: str, driver: str, name: str, settings: Mapping[str, object]) -> Codec | None:
+    """The codec of a device as configured; None where its records are not made of logged bytes."""
+    try:
+        made = registry.driver_for(kind, driver)
+    except (DeviceError, ImportError):
+        return None
+    if not issubclass(made, SerialDevice):
+        return None
+    clock = _Clock()
+    port = _Port(clock)
+    return Codec(made(name, settings, clock=clock, open_port=lambda *_: port), port, clock)
+
+
+def has_first_bytes(heard: Iterable[RawBytes | DeviceEvent]) -> bool:
+    """Whether the log holds what a device said before it was open, or there was nothing.
+
+    That was told to nobody, but the decoder learned from it, such as whether attitudes come.
+    """
+    first = next(iter(heard), None)
+    return not isinstance(first, DeviceEvent) or first.name != "opened"
+
+
+def decode_all(codec: Codec, heard: Iterable[RawBytes | DeviceEvent]) -> list[Decoded]:
+    """Everything a device said in one run of the service.
+
+    Args:
+        heard: its bytes and events in their order. Bytes before it is open came while it was
+            looked for: they are decoded, and what they mean was told to nobody.
+    """
+    found: list[Decoded] = []
+    chunks: list[RawBytes] = []
+    was_opened = False
+    for record in heard:
+        if isinstance(record, RawBytes):
+            chunks.append(record)
+        elif record.name == "opened" and not was_opened:
+            codec.decode(chunks)
+            chunks, was_opened = [], True
+        elif record.name in NEW_LINE:
+            found += codec.decode(chunks)
+            chunks = []
+            codec.reopened()
+    return found + codec.decode(chunks)

@@ -1,0 +1,1 @@
+"""Ground points and blocks from a landed mission."""

@@ -1,0 +1,444 @@
+"""Aerial triangulation of a mission: matched, adjusted with direct georeferencing as start.
+
+The result is an adjustment project like any other (docs/formats.md), with all its tables, and the
+orientations in the coordinate system asked for. Matching is in `processing.matching.blocks`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.errors import DaemonError
+from daemon.mission.exposure import Exposure
+from daemon.mission.layout import Mission
+from daemon.mission.store.level0 import check_tiff, read_description, read_tiff
+from daemon.mission.walk import ExposureFailure, walk
+from daemon.orientation.exterior import ExteriorOrientation, exposures_of
+from daemon.orientation.inputs import orienting
+from daemon.orientation.local_frame import LocalFrame
+from daemon.postflight.adjustment.project import Checks, Project
+from daemon.postflight.adjustment.project_file import ProjectFile
+from daemon.postflight.adjustment.tables import Table, read_table
+from processing.bundle.adjust import Settings, adjust
+from processing.bundle.iterations import Progress
+from processing.bundle.network import (
+    Attitudes,
+    Bearings,
+    Camera,
+    Gnss,
+    ImagePoints,
+    Images,
+    Network,
+    Points,
+    Stations,
+)
+from processing.bundle.self_calibration import SetName, parts_of, self_calibrating
+from processing.bundle.start import completed
+from processing.matching.blocks import BlockMatching, TiedBlock, image_mm, tied_block
+from processing.pipelines.perspective import perspective_of
+from processing.rig import Rig, VirtualImage, load_rig
+
+Array = NDArray[np.float64]
+Picture = NDArray[np.float32]
+
+KEPT_IMAGES = 12
+TIE_SIGMA_PX = 0.03
+MEASURED_SIGMA_PX = 0.3
+GEODETIC = ("latitude_deg", "longitude_deg", "height_m")
+SIGMAS = ("sx_m", "sy_m", "sz_m")
+
+
+class TriangulationError(DaemonError, ValueError):
+    """A mission that cannot be triangulated; the sentence says what is missing."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """How to triangulate.
+
+    `parameters` is the set of additional parameters, `interior` whether it holds the interior
+    orientation. Sigmas: position (3,) m east, north, up; attitude (3,) rad about the camera's axes.
+    `drift`: what is unknown of the GNSS positions of each line.
+    """
+
+    parameters: SetName = "none"
+    interior: bool = False
+    position_sigma_m: tuple[float, float, float] = (0.05, 0.05, 0.08)
+    attitude_sigma_rad: tuple[float, float, float] = (1e-4, 1e-4, 1.5e-4)
+    drift: str = "none"
+    reject_beyond: float = 4.0
+    matching: BlockMatching = field(default_factory=BlockMatching)
+
+
+@dataclass(frozen=True)
+class Block:
+    """Images of one geometry, stitched or of heads, with a start orientation in a local frame.
+
+    `failures` are exposures whose record or images cannot be read; they are not in the block.
+    """
+
+    mission: Mission
+    rig: Rig
+    image: VirtualImage
+    oriented: tuple[ExteriorOrientation, ...]
+    crs: str
+    frame: LocalFrame
+    station_m: Array
+    rotation: Array
+    ground_m: float
+    failures: tuple[ExposureFailure, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(eo.name for eo in self.oriented)
+
+    @property
+    def camera(self) -> str:
+        """What the images' common camera is called."""
+        heads = dict.fromkeys(eo.cone for eo in self.oriented if not eo.is_virtual)
+        return "-".join(heads) or "stitched"
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        return tuple(eo.line_id for eo in self.oriented)
+
+    @property
+    def gsd_m(self) -> float:
+        """Mean size of a pixel on the ground."""
+        height = float(self.station_m[:, 2].mean()) - self.ground_m
+        return height * self.image.pitch_mm / self.image.f_mm
+
+
+def block_of(
+    mission: Mission,
+    *,
+    crs: str | None = None,
+    trajectory_file: Path | None = None,
+    mount_file: Path | None = None,
+    heads: Sequence[str] = (),
+) -> Block:
+    """Orient the exposures that have a stitched PAN image, or the images of heads.
+
+    Args:
+        heads: cones whose own images make the block, alike in pixels and principal distance; none:
+            the stitched images.
+
+    Raises:
+        TriangulationError: a rig without such images, or fewer than two of them.
+        TrajectoryError, GeoreferenceError: as their modules say.
+    """
+    rig = load_rig(mission.rig_path)
+    image = _common_image(rig, heads)
+    files = [f"{name}.tif" for name in heads or ("pan",)]
+    read = exposures_of(mission)
+    candidates = {
+        number: exposure
+        for number, exposure in read.results.items()
+        if exposure.mark_gps_ns is not None
+        and all((mission.level2(number) / file).exists() for file in files)
+    }
+
+    def with_usable_images(number: int) -> Exposure:
+        for file in files:
+            check_tiff(
+                mission.level2(number) / file, width_px=image.width_px, height_px=image.height_px
+            )
+        return candidates[number]
+
+    usable = walk(candidates, with_usable_images)
+    exposures = list(usable.results.values())
+    failures = (*read.failures, *usable.failures)
+    if len(exposures) < 2:
+        raise TriangulationError(
+            f"{mission.path}: {len(exposures)} sealed exposures with {', '.join(files)} and a "
+            "time; a block takes two or more. Run `syntopic process` first"
+            + "".join(f"; exposure {one.exposure}: {one.cause}" for one in failures)
+        )
+    means = orienting(
+        mission, exposures, crs=crs, trajectory_file=trajectory_file, mount_file=mount_file
+    )
+    oriented = [
+        eo for eo in means.oriented(exposures) if (eo.cone in heads if heads else eo.is_virtual)
+    ]
+    if len(oriented) < 2:
+        raise TriangulationError(
+            f"{mission.path}: {len(oriented)} exposures have an attitude; direct georeferencing is "
+            "the start of a block: give --trajectory with one that has it"
+        )
+    latitude = np.array([eo.latitude_deg for eo in oriented])
+    longitude = np.array([eo.longitude_deg for eo in oriented])
+    frame = LocalFrame(float(latitude.mean()), float(longitude.mean()))
+    station = frame.from_geodetic(latitude, longitude, np.array([eo.height_m for eo in oriented]))
+    rotation = np.array(
+        [
+            frame.local_from_enu(eo.latitude_deg, eo.longitude_deg) @ eo.enu_from_camera
+            for eo in oriented
+        ]
+    )
+    return Block(
+        mission, rig, image, tuple(oriented), means.crs, frame, station, rotation,
+        means.ground_height_m, failures,
+    )  # fmt: skip
+
+
+def _common_image(rig: Rig, heads: Sequence[str]) -> VirtualImage:
+    """The geometry of all images of a block."""
+    if not heads:
+        if rig.virtual_image is None:
+            raise TriangulationError(
+                f"rig {rig.name} stitches no PAN image; name heads whose own images make a block: "
+                f"--head, of {', '.join(cone.name for cone in rig.cones)}"
+            )
+        return rig.virtual_image
+    known = {} if rig.virtual_image else {c.name: perspective_of(c) for c in rig.cones}
+    images = {known.get(name) for name in heads}
+    image = images.pop()
+    if image is None or images:
+        raise TriangulationError(
+            f"--head {', '.join(heads)}: a block is made of images of heads alike in pixels and "
+            f"principal distance; {rig.name} has {', '.join(known) or 'stitched images, no heads'}"
+        )
+    return image
+
+
+def matched(block: Block, settings: BlockMatching, progress: Callable[[int], None]) -> TiedBlock:
+    """Tie points of all overlapping images; a dozen of them are kept in memory."""
+    kept: OrderedDict[int, Picture] = OrderedDict()
+
+    def load(k: int) -> Picture:
+        if k in kept:
+            kept.move_to_end(k)
+            return kept[k]
+        words = _words(block, block.oriented[k])
+        kept[k] = np.where(words == 0, np.nan, words).astype(np.float32)
+        if len(kept) > KEPT_IMAGES:
+            kept.popitem(last=False)
+        return kept[k]
+
+    return tied_block(
+        load, block.image, block.station_m, block.rotation, block.ground_m, settings,
+        progress=progress,
+    )  # fmt: skip
+
+
+def _words(block: Block, eo: ExteriorOrientation) -> NDArray[np.uint16]:
+    """Pixels of an image: PAN, or of a head the green band, else the first."""
+    path = block.mission.level2(eo.exposure) / ("pan.tif" if eo.is_virtual else f"{eo.cone}.tif")
+    bands = [] if eo.is_virtual else read_description(path).get("bands", [])
+    plane = bands.index("green") if "green" in bands else 0 if len(bands) > 1 else None
+    return read_tiff(
+        path, width_px=block.image.width_px, height_px=block.image.height_px, plane=plane
+    )
+
+
+def project_of(
+    block: Block,
+    tied: TiedBlock,
+    asked: Asked,
+    *,
+    points_file: Path | None = None,
+    measured_file: Path | None = None,
+) -> Project:
+    """Everything as an adjustment project in the local frame.
+
+    Raises:
+        TriangulationError: no tie points, or a set that the rig cannot have.
+        daemon.postflight.adjustment.tables.ProjectError: control files with mistakes.
+    """
+    if not len(tied.image):
+        raise TriangulationError(
+            "no tie points were found: do the images overlap, and is the orientation right to a "
+            "few pixels? Try --search with more pixels"
+        )
+    surveyed = _surveyed(block, points_file, measured_file)
+    n, pitch = len(block.names), block.image.pitch_mm
+    ties = tied.points
+    names = (*(f"t{k}" for k in range(ties)), *surveyed.names)
+    xyz = np.full((len(names), 3), np.nan)
+    sigma = np.full((len(names), 3), np.nan)
+    control = np.array([role == "control" for role in surveyed.roles], dtype=bool)
+    xyz[ties:][control] = surveyed.xyz_m[control]
+    sigma[ties:][control] = surveyed.sigma_m[control]
+    image = np.concatenate([tied.image, surveyed.image])
+    point = np.concatenate([tied.point, surveyed.point + ties])
+    px = np.concatenate([tied.px, surveyed.px])
+    spread = np.concatenate([np.full(len(tied.image), TIE_SIGMA_PX), surveyed.sigma_px]) * pitch
+    lines = tuple(dict.fromkeys(block.lines))
+    file = _file(block, asked)
+    try:
+        camera = self_calibrating(
+            Camera(block.camera, block.image.f_mm, pixel_mm=pitch),
+            asked.parameters,
+            parts_of(block.rig) if asked.parameters.startswith("sensors") else (),
+            master_cone=block.rig.master_cone,
+            interior=asked.interior,
+        )
+    except ValueError as error:
+        raise TriangulationError(str(error)) from error
+    every = np.arange(n)
+    network = Network(
+        cameras=(camera,),
+        stations=Stations(block.names, block.station_m, np.zeros(n, bool)),
+        attitudes=Attitudes(block.names, block.rotation, np.zeros(n, bool)),
+        images=Images(block.names, every, every, np.zeros(n, np.int64), np.full(n, -1)),
+        points=Points(names, xyz, sigma, np.zeros(len(names), bool)),
+        image_points=ImagePoints(
+            image, point, image_mm(block.image, px), np.stack([spread, spread], axis=1)
+        ),
+        gnss=Gnss(
+            station=every,
+            attitude=every,
+            position_m=block.station_m,
+            sigma_m=np.tile(asked.position_sigma_m, (n, 1)),
+            lever_m=np.zeros((n, 3)),
+            line=np.array([lines.index(line) for line in block.lines], dtype=np.int64),
+            time_s=np.array([eo.gps_ns - block.oriented[0].gps_ns for eo in block.oriented]) * 1e-9,
+            lines=tuple(line or "line" for line in lines),
+            drift="linear"
+            if asked.drift == "linear"
+            else "shift"
+            if asked.drift == "shift"
+            else "none",
+        ),
+        bearings=Bearings(every, block.rotation, np.tile(asked.attitude_sigma_rad, (n, 1))),
+    )
+    settings = Settings(robust=True, reject_beyond=asked.reject_beyond, variance_components=True)
+    checks = Checks(
+        tuple(name for name, c in zip(surveyed.names, control, strict=True) if not c),
+        surveyed.xyz_m[~control],
+        surveyed.sigma_m[~control],
+    )
+    return Project(file.name, file, network, settings, checks)
+
+
+def weighted(project: Project, ties: int, progress: Progress | None = None) -> Project:
+    """The project with the sigma of matched coordinates as matching shows it.
+
+    Adjusted without measured points; these keep the sigma they were given, and would otherwise be
+    scaled with coordinates many times better than theirs.
+
+    Raises:
+        NetworkError, DefectError: as `processing.bundle.adjust.adjust`.
+    """
+    network = project.network
+    table = network.image_points
+    own = table.point < ties
+    alone = replace(
+        network,
+        image_points=ImagePoints(
+            table.image[own], table.point[own], table.xy_mm[own], table.sigma_mm[own]
+        ),
+        points=replace(network.points, sigma_m=np.full_like(network.points.sigma_m, np.nan)),
+    )
+    settings = replace(project.settings, reject_beyond=None, variance_components=True)
+    found = adjust(completed(alone), settings, progress=progress)
+    factor = [found.factors.get(name, 1.0) for name in ("image x", "image y")]
+    scale = np.where(own[:, None], np.sqrt(factor), 1.0)
+    return replace(
+        project,
+        network=replace(network, image_points=replace(table, sigma_mm=table.sigma_mm * scale)),
+        settings=replace(project.settings, variance_components=False),
+    )
+
+
+@dataclass(frozen=True)
+class _Surveyed:
+    names: tuple[str, ...]
+    roles: tuple[str, ...]
+    xyz_m: Array
+    sigma_m: Array
+    image: NDArray[np.int64]
+    point: NDArray[np.int64]
+    px: Array
+    sigma_px: Array
+
+
+def _surveyed(block: Block, points_file: Path | None, measured_file: Path | None) -> _Surveyed:
+    none = np.zeros(0, np.int64)
+    if points_file is None or measured_file is None:
+        if points_file is not None or measured_file is not None:
+            raise TriangulationError(
+                "--points and --measured go together: where points are on the ground, and where "
+                "in the images"
+            )
+        empty = np.zeros((0, 3))
+        return _Surveyed((), (), empty, empty, none, none, np.zeros((0, 2)), np.zeros(0))
+    table = read_table(points_file, ("point", "role", *GEODETIC), SIGMAS)
+    names = table.names("point")
+    roles = table.text("role")
+    for role, line in zip(roles, table.lines, strict=True):
+        if role not in ("control", "check"):
+            table.wrong(line, f"role is {role!r}; control or check is right")
+    place = np.array([table.numbers(c) for c in GEODETIC])
+    sigma = np.array([table.numbers(c, 0.02) for c in SIGMAS]).T.reshape(-1, 3)
+    seen = read_table(measured_file, ("image", "point", "column_px", "row_px"), ("sigma_px",))
+    image = _index(seen, "image", block.names)
+    point = _index(seen, "point", names)
+    px = np.array([seen.numbers("column_px"), seen.numbers("row_px")]).T.reshape(-1, 2)
+    spread = np.array(seen.numbers("sigma_px", MEASURED_SIGMA_PX))
+    told = [*table.problems, *seen.problems]
+    if told or not np.isfinite(place).all() or not np.isfinite(px).all():
+        raise TriangulationError("; ".join(told) or "an empty cell where a number is needed")
+    return _Surveyed(
+        tuple(names),
+        tuple(roles),
+        block.frame.from_geodetic(*place),
+        sigma,
+        image,
+        point,
+        px,
+        spread,
+    )
+
+
+def _index(table: Table, column: str, names: Sequence[str]) -> NDArray[np.int64]:
+    at = {name: k for k, name in enumerate(names)}
+    found = []
+    for name, line in zip(table.text(column), table.lines, strict=True):
+        if name not in at:
+            table.wrong(line, f"{column} {name!r} is not there")
+        found.append(at.get(name, 0))
+    return np.array(found, dtype=np.int64)
+
+
+def _file(block: Block, asked: Asked) -> ProjectFile:
+    camera = {
+        "name": block.camera,
+        "f_mm": block.image.f_mm,
+        "pixel_um": block.image.pitch_um,
+        "width_px": block.image.width_px,
+        "height_px": block.image.height_px,
+        "parameters": asked.parameters,
+        "interior": asked.interior,
+    }
+    if asked.parameters.startswith("sensors"):
+        camera["rig"] = "rig.toml"
+    return ProjectFile.model_validate(
+        {
+            "format": 1,
+            "name": f"{block.mission.id}, {asked.parameters}",
+            "adjust": {
+                "robust": True,
+                "reject_beyond": asked.reject_beyond,
+                "gnss": asked.drift,
+                "image_sigma_um": TIE_SIGMA_PX * block.image.pitch_um,
+            },
+            "camera": [camera],
+        }
+    )
+
+
+def attitude_sigmas(mdeg: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Sigmas about the camera's x, y, z of sigmas of roll, pitch and heading, mdeg, in rad.
+
+    The camera looks down: its x lies across (pitch), its y along the flight (roll).
+    """
+    roll, pitch, heading = (math.radians(v * 1e-3) for v in mdeg)
+    return pitch, roll, heading

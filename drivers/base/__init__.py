@@ -1,0 +1,1 @@
+"""What all drivers share: life cycle, settings, registry and throttled messages."""

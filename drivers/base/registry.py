@@ -1,0 +1,91 @@
+"""Which drivers there are, by kind and name.
+
+The service validates configuration with this and the capture process creates devices with it;
+importing it, or asking it, loads no hardware library.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from typing import Final
+
+from drivers.base.settings import Configured
+from drivers.contract import DeviceError
+
+_PLACES: Final[Mapping[str, Mapping[str, str]]] = {
+    "head": {
+        "aravis": "drivers.cameras.aravis.head:AravisHead",
+        "folder": "drivers.cameras.folder.head:FolderHead",
+        "v4l2": "drivers.cameras.v4l2.head:V4l2Head",
+    },
+    "trigger": {
+        "pulse-bus": "drivers.triggers.pulse_bus:PulseBusTrigger",
+        "software": "drivers.triggers.software:SoftwareTrigger",
+        "gige-action": "drivers.cameras.aravis.action_trigger:ActionTrigger",
+    },
+    "thermometer": {
+        "modbus-rtu": "drivers.thermometers.modbus_rtu.thermometer:ModbusThermometer",
+        "ascii-line": "drivers.thermometers.ascii_line.thermometer:AsciiLineThermometer",
+        "host": "drivers.thermometers.host.thermometer:HostThermometer",
+    },
+    "pps": {
+        "kernel": "drivers.triggers.pps.device:PpsDevice",
+    },
+    "navigator": {
+        "ublox": "drivers.receivers.ublox.navigator:UbloxNavigator",
+        "gpsd": "drivers.receivers.gpsd.navigator:GpsdNavigator",
+        "nmea": "drivers.receivers.nmea.navigator:NmeaNavigator",
+        "novatel": "drivers.receivers.novatel.navigator:NovatelNavigator",
+        "septentrio": "drivers.receivers.septentrio.navigator:SeptentrioNavigator",
+        "mavlink": "drivers.receivers.mavlink.navigator:MavlinkNavigator",
+    },
+}
+
+
+_EXTRAS: Final[Mapping[str, tuple[str, ...]]] = {
+    "aravis": ("aravis",),
+    "gige-action": ("aravis",),
+    "mavlink": ("mavlink",),
+}
+
+
+def extras_of(kind: str, driver_name: str) -> tuple[str, ...]:
+    """The optional libraries a driver needs, by their names in `drivers.base.extras`."""
+    return _EXTRAS.get(driver_name, ()) if driver_name in _PLACES.get(kind, {}) else ()
+
+
+def kinds() -> Mapping[str, tuple[str, ...]]:
+    """The kinds of device, and the names of the drivers of each."""
+    return {kind: tuple(places) for kind, places in _PLACES.items()}
+
+
+def driver_for(kind: str, driver_name: str) -> type[Configured]:
+    """The driver class.
+
+    Every class is created with `(name, settings)`; a head also with `memory=` (FrameMemory), the
+    software trigger with `heads=` (heads by output).
+
+    Raises:
+        DeviceError: no such kind or driver; the sentence lists those there are.
+    """
+    if kind not in _PLACES:
+        raise DeviceError(f"kind is {kind!r}; one of {', '.join(_PLACES)}")
+    places = _PLACES[kind]
+    if driver_name not in places:
+        raise DeviceError(f"driver is {driver_name!r}; a {kind} has {', '.join(places)}")
+    module, _, attribute = places[driver_name].partition(":")
+    driver: type[Configured] = getattr(importlib.import_module(module), attribute)
+    return driver
+
+
+def problems(kind: str, driver_name: str, settings: Mapping[str, object]) -> list[str]:
+    """What is wrong with the settings of a device, one sentence a mistake; empty where nothing is.
+
+    `settings` holds the driver's own keys only, neither the device's name nor the driver's.
+    """
+    try:
+        driver = driver_for(kind, driver_name)
+    except DeviceError as error:
+        return [str(error)]
+    return driver.problems(settings)

@@ -1,0 +1,43 @@
+"""GenICam names of pixel formats, and how their pixels are packed.
+
+Source: PFNC 2.4; GigE Vision 2.0, table 26-1 for the formats that end in Packed.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Final
+
+from drivers.cameras.pixels import Packing, pixels_in_a_group
+
+_NAME: Final = re.compile(r"(?:Mono|Bayer(?:RG|GR|GB|BG))(\d+\w*)")
+_PACKINGS: Final = {
+    "8": Packing.BYTES,
+    "10": Packing.WORDS,
+    "10p": Packing.LSB_10,
+    "10Packed": Packing.GVSP_10,
+    "12": Packing.WORDS,
+    "12p": Packing.LSB_12,
+    "12Packed": Packing.GVSP_12,
+    "14": Packing.WORDS,
+    "16": Packing.WORDS,
+}
+
+
+def packing_of(pixel_format: str) -> Packing | None:
+    """How a format's pixels lie; None for a format that is no frame of a survey camera.
+
+    Example:
+        >>> packing_of("BayerRG12p")
+        <Packing.LSB_12: '12p'>
+    """
+    found = _NAME.fullmatch(pixel_format)
+    return _PACKINGS.get(found[1]) if found else None
+
+
+def unsuitable(packing: Packing, width_px: int) -> str | None:
+    """Why a packing does not fit a width; None where it does."""
+    group = pixels_in_a_group(packing)
+    if width_px % group == 0:
+        return None
+    return f"width_px is {width_px}; a format packed as {packing.value} needs a multiple of {group}"

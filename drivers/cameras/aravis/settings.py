@@ -1,0 +1,88 @@
+"""What can be set of a GenICam head, and which settings contradict each other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from drivers.base.settings import Configured, Setting
+from drivers.cameras.aravis.formats import packing_of
+
+
+class AravisSettings(Configured):
+    """The settings of `drivers.cameras.aravis.head.AravisHead`."""
+
+    address = Setting(
+        "", required=True, says="IP address of the head, or its name as arv-tool says"
+    )
+    serial = Setting("", says="serial number the head must have; empty takes any")
+    width_px = Setting(0, minimum=0, says="columns; 0 takes what the head is set to")
+    height_px = Setting(0, minimum=0, says="rows; 0 takes what the head is set to")
+    pixel_format = Setting("Mono16", says="GenICam name of the pixel format")
+    exposure_time_us = Setting(1000.0, minimum=1, maximum=60e6, says="exposure time, us")
+    gain_db = Setting(0.0, minimum=-20, maximum=60, says="gain, dB")
+    tdi_shifts = Setting(0, minimum=0, maximum=1000, says="TDI shifts; 0 for a head without TDI")
+    trigger_source = Setting(
+        "line", choices=("line", "software", "action"), says="what starts an exposure"
+    )
+    trigger_line = Setting("Line1", says="GenICam name of the head's trigger input")
+    trigger_action = Setting("Action1", says="GenICam name of the head's action signal")
+    action_device_key = Setting(
+        0x5359_4E54, minimum=0, maximum=0xFFFF_FFFF, says="device key of action commands"
+    )
+    action_group_key = Setting(
+        1, minimum=0, maximum=0xFFFF_FFFF, says="group key of action commands"
+    )
+    action_group_mask = Setting(
+        1, minimum=1, maximum=0xFFFF_FFFF, says="groups of action commands the head is in, bits"
+    )
+    packet_size = Setting(
+        0, minimum=0, maximum=65535, says="bytes of a stream packet; 0 tries what passes"
+    )
+    packet_size_limit = Setting(
+        8192, minimum=576, maximum=65535, says="the largest packet that is tried"
+    )
+    socket_buffer_bytes = Setting(
+        33_554_432,
+        minimum=65536,
+        maximum=1 << 30,
+        says="receive buffer; the kernel's rmem_max limits it",
+    )
+    packet_socket = Setting(
+        False, says="read packets below the network stack (needs CAP_NET_RAW, fewer copies)"
+    )
+    packet_timeout_ms = Setting(
+        20.0, minimum=1, maximum=1000, says="a packet so late is asked for again"
+    )
+    frame_retention_ms = Setting(
+        500.0, minimum=10, maximum=5000, says="without a packet for so long a frame is given up"
+    )
+    chunks = Setting(True, says="let the head write time, exposure and counter behind the pixels")
+    latch_interval_s = Setting(
+        2.0, minimum=0.5, maximum=2.5, says="time between readings of the head's clock and health"
+    )
+    held_limit_s = Setting(
+        15.0, minimum=1, maximum=120, says="how long a dead controller's hold is waited out"
+    )
+
+    @classmethod
+    def contradictions(cls, values: Mapping[str, Any]) -> list[str]:
+        found = []
+        if (values["width_px"] == 0) != (values["height_px"] == 0):
+            found.append(
+                f"width_px is {values['width_px']} and height_px is {values['height_px']}; "
+                "give both or neither"
+            )
+        if packing_of(values["pixel_format"]) is None:
+            found.append(
+                f"pixel_format is {values['pixel_format']!r}; a GenICam name of 8 to 16 bits, "
+                "monochrome or Bayer, such as Mono12p or BayerRG12"
+            )
+        if 0 < values["packet_size"] < 576:
+            found.append(f"packet_size is {values['packet_size']}; 0 or at least 576")
+        if values["frame_retention_ms"] < 2 * values["packet_timeout_ms"]:
+            found.append(
+                f"frame_retention_ms is {values['frame_retention_ms']:g}; at least twice "
+                "packet_timeout_ms, so that a packet can be asked for again"
+            )
+        return found

@@ -1,0 +1,269 @@
+"""Frames of one head, received into memory of our own.
+
+Slots and Aravis' buffers are paired here; when a stream is made and dropped is decided in
+`drivers.cameras.aravis.head`.
+"""
+
+from __future__ import annotations
+
+import gc
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from drivers.cameras.aravis.camera import AravisCamera
+from drivers.cameras.aravis.library import aravis, aravis_error
+from drivers.cameras.aravis.senders import (
+    StreamSenders,
+    hold_packet_sockets,
+    interface_towards,
+    socket_inodes,
+)
+from drivers.cameras.aravis.settings import AravisSettings
+from drivers.cameras.pixels import Packing, bytes_at, packed_nbytes, unpack, words_at
+from drivers.contract import DeviceError, FrameMemory
+
+INFOS: Final = {
+    "n_underruns": "underrun_packets",
+    "n_resend_requests": "resend_requests",
+    "n_resent_packets": "resent_packets",
+    "n_missing_packets": "missing_packets",
+    "n_missing_frames": "missing_frames",
+    "n_received_packets": "received_packets",
+    "n_ignored_packets": "ignored_packets",
+    "n_error_packets": "error_packets",
+    "n_transferred_bytes": "bytes",
+}
+"""What Aravis counts, and what it is called here. Its underruns are packets, not frames."""
+ALIGNMENT: Final = 8
+GVSP_OVERHEAD_NBYTES: Final = 36
+"""IP, UDP and GVSP headers of a packet: what its size holds besides pixels."""
+
+
+@dataclass(frozen=True)
+class ReceivedFrame:
+    """A buffer that Aravis has given back, and the slot its pixels lie in.
+
+    `reason` is Aravis' word for its status; the figures are None where no leader came.
+    """
+
+    slot: int
+    reason: str
+    frame_id: int
+    leader_ns: int
+    width_px: int | None
+    height_px: int | None
+    pixel_format_code: int | None
+    chunk_timestamp: int | None
+    chunk_exposure_us: float | None
+    chunk_counter: int | None
+    chunk_gain: float | None
+    chunk_temperature_c: float | None
+    chunk_frame_id: int | None
+
+
+class FrameStream:
+    """The stream of an opened head into `memory`.
+
+    `free` slots are lent to Aravis at once, others by `lend`. Aravis writes into a slot from
+    `lend` until `pop` gives it back; the buffers are kept alive here for as long.
+
+    Raises:
+        DeviceError: the slots are too small, or the stream cannot be made.
+    """
+
+    def __init__(
+        self,
+        camera: AravisCamera,
+        settings: AravisSettings,
+        memory: FrameMemory,
+        free: Iterable[int],
+    ) -> None:
+        library = aravis()
+        nbytes = camera.geometry.payload_nbytes
+        geometry = camera.geometry
+        pixel_count = geometry.width_px * geometry.height_px
+        self._packing, self._pixel_count = geometry.packing, pixel_count
+        needed = max(nbytes, 2 * pixel_count)
+        if memory.slot_nbytes < needed:
+            raise DeviceError(
+                f"{settings.name} at {settings.address}: a frame has {needed} bytes, its slot "
+                f"{memory.slot_nbytes}; give slots of the sensor's size plus "
+                "CHUNK_ALLOWANCE_NBYTES, and check width_px, height_px and pixel_format"
+            )
+        self._parser = camera.chunk_parser
+        packet_size = int(camera.frame_settings.get("GevSCPSPacketSize", 0))
+        # Leader and trailer besides the payload; without packets (USB) every underrun is a frame.
+        self._packets_per_frame = (
+            2 + -(-nbytes // (packet_size - GVSP_OVERHEAD_NBYTES)) if packet_size else 1
+        )
+        # Packed pixels are received at the end of the slot: unpacked from there to its start they
+        # never overtake themselves, and no memory besides is needed.
+        self._offset = 0
+        if self._packing is not Packing.WORDS:
+            self._offset = (memory.slot_nbytes - nbytes) // ALIGNMENT * ALIGNMENT
+        self._memory = memory
+        self._buffers = {
+            slot: library.Buffer.new(nbytes, memory.address(slot) + self._offset)
+            for slot in range(memory.slot_count)
+        }
+        self._slots = {hash(buffer): slot for slot, buffer in self._buffers.items()}
+        self._stream: Any = camera.raw.create_stream(None, None)
+        if self._stream is None:
+            raise DeviceError(
+                f"{settings.name} at {settings.address}: the stream cannot be made; check that no "
+                "other program holds the head"
+            )
+        self._senders: StreamSenders | None = None
+        self._ignored = 0
+        self._restarts = 0
+        if camera.raw.is_gv_device():
+            self._hold_to_the_head(camera, settings)
+            self._tune(settings)
+        for slot in free:
+            self.lend(slot)
+
+    def lend(self, slot: int) -> None:
+        """Let Aravis fill this slot next; from any thread."""
+        self._stream.push_buffer(self._buffers[slot])
+
+    def pop(self, timeout_s: float) -> ReceivedFrame | None:
+        """Wait for a frame, at most so long. The slot is the caller's until `lend`."""
+        buffer = self._stream.timeout_pop_buffer(round(timeout_s * 1e6))
+        if buffer is None:
+            return None
+        reason = str(buffer.get_status().value_nick)
+        # Aravis complains on stderr when asked for the size of a frame that it gave up.
+        whole = reason == "success"
+        if whole:
+            self._ignored = self._ignored_packets()
+        parser = self._parser if whole and buffer.has_chunks() else None
+        return ReceivedFrame(
+            slot=self._slots[hash(buffer)],
+            reason=reason,
+            frame_id=int(buffer.get_frame_id()),
+            leader_ns=int(buffer.get_timestamp()),
+            width_px=int(buffer.get_image_width()) if whole else None,
+            height_px=int(buffer.get_image_height()) if whole else None,
+            pixel_format_code=int(buffer.get_image_pixel_format()) if whole else None,
+            chunk_timestamp=_chunk(parser, "get_integer_value", buffer, "ChunkTimestamp"),
+            chunk_exposure_us=_chunk(parser, "get_float_value", buffer, "ChunkExposureTime"),
+            chunk_counter=_chunk(parser, "get_integer_value", buffer, "ChunkCounterValue"),
+            chunk_gain=_chunk(parser, "get_float_value", buffer, "ChunkGain"),
+            chunk_temperature_c=_chunk(parser, "get_float_value", buffer, "ChunkTemperature"),
+            chunk_frame_id=_chunk(parser, "get_integer_value", buffer, "ChunkFrameID"),
+        )
+
+    def unpack(self, slot: int) -> None:
+        """Make 16-bit words, right-justified, of what was received into a slot; after `pop`."""
+        if self._packing is Packing.WORDS:
+            return
+        address = self._memory.address(slot)
+        packed = bytes_at(address + self._offset, packed_nbytes(self._packing, self._pixel_count))
+        unpack(self._packing, packed, words_at(address, self._pixel_count))
+
+    def counted(self) -> Counter[str]:
+        """What Aravis has counted of this stream, and `underruns` in frames.
+
+        `other_senders` are datagrams of others, which were dropped.
+        """
+        found: Counter[str] = Counter()
+        for theirs, ours in INFOS.items():
+            found[ours] = self._info(theirs)
+        found["underruns"] = -(-found["underrun_packets"] // self._packets_per_frame)
+        found["stream_restarts"] = self._restarts
+        if self._senders is not None:
+            found["other_senders"] = self._senders.look(found["received_packets"])
+        return found
+
+    @property
+    def others(self) -> str:
+        """Who sent last without being the head, and who is accepted."""
+        if self._senders is None or not self._senders.last_other:
+            return ""
+        return f"the last from {self._senders.last_other}; only {self._senders.source} is accepted"
+
+    def restart_if_behind(self) -> bool:
+        """Begin again where Aravis takes the head's frames for old ones and drops them.
+
+        Aravis drops up to 100 frames after a block number that was too large, or once the head
+        counts from 1 again. A whole frame of ignored packets, and none delivered since, means that.
+        """
+        if self._ignored_packets() - self._ignored < self._packets_per_frame:
+            return False
+        self._stream.stop_thread(False)
+        self._stream.start_thread()
+        self._ignored = self._ignored_packets()
+        self._restarts += 1
+        return True
+
+    def drop(self) -> None:
+        """End the stream. When this returns Aravis writes into no slot any more."""
+        weak = self._stream.weak_ref()
+        self._stream = None
+        gc.collect()
+        # The last reference stops the stream's thread. Were one left somewhere, memory that is
+        # handed out anew would be written into: stop the thread by hand then.
+        left = weak()
+        if left is not None:
+            left.stop_thread(False)
+        if self._senders is not None:
+            self._senders.close()
+        self._parser = None
+        self._buffers.clear()
+        self._slots.clear()
+
+    def _info(self, name: str) -> int:
+        return int(self._stream.get_info_uint64_by_name(name))
+
+    def _ignored_packets(self) -> int:
+        """Packets that Aravis dropped although there was a buffer for them."""
+        return self._info("n_ignored_packets") - self._info("n_underruns")
+
+    def _hold_to_the_head(self, camera: AravisCamera, settings: AravisSettings) -> None:
+        """Let only the head's datagrams reach Aravis, and begin after those that came before."""
+        stream, address = self._stream, camera.ip_address
+        stream.stop_thread(False)
+        port = int(stream.get_port())
+        self._senders = StreamSenders(
+            port, address, camera.stream_source_port, camera.fire_test_packet
+        )
+        known = socket_inodes()
+        stream.start_thread()
+        if settings.packet_socket:
+            source = address, self._senders.source_port
+            hold_packet_sockets(known, source, (interface_towards(address), port))
+
+    def _tune(self, settings: AravisSettings) -> None:
+        library, stream = aravis(), self._stream
+        socket_nbytes = min(settings.socket_buffer_bytes, receive_buffer_limit())
+        stream.set_property("socket-buffer", library.GvStreamSocketBuffer.FIXED)
+        stream.set_property("socket-buffer-size", socket_nbytes)
+        # Aravis widens its socket only once a first frame has begun, and loses that one.
+        if self._senders is not None:
+            self._senders.widen(socket_nbytes)
+        stream.set_property("packet-resend", library.GvStreamPacketResend.ALWAYS)
+        stream.set_property("packet-request-ratio", 1.0)
+        stream.set_property("packet-timeout", round(settings.packet_timeout_ms * 1e3))
+        stream.set_property("frame-retention", round(settings.frame_retention_ms * 1e3))
+
+
+def receive_buffer_limit() -> int:
+    """The largest socket buffer the kernel grants, net.core.rmem_max in bytes."""
+    try:
+        return int(Path("/proc/sys/net/core/rmem_max").read_text(encoding="ascii"))
+    except (OSError, ValueError):
+        return 212_992
+
+
+def _chunk(parser: Any, method: str, buffer: Any, name: str) -> Any:
+    """A chunk's value; None where the head does not send this one."""
+    if parser is None:
+        return None
+    failed = aravis_error()
+    try:
+        return getattr(parser, method)(buffer, name)
+    except failed:
+        return None

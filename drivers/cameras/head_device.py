@@ -1,0 +1,94 @@
+"""What every head has, whatever it is reached through: frames in slots of the caller's memory."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from typing import ClassVar
+
+from drivers.base.device import DeviceDriver
+from drivers.contract import DeviceError, FrameMemory
+from drivers.timescales.clock import Clock
+
+
+class HeadDevice(DeviceDriver):
+    """A head whose frames land in memory of the caller's.
+
+    One thread at a time calls `bind` and `run`; `recycle`, `trigger`, `close` and `statistics` are
+    for any thread.
+    """
+
+    kind: ClassVar = "head"
+    counted: ClassVar[tuple[str, ...]] = ("frames", "underruns", "opened")
+    delivered: ClassVar = "frames"
+
+    def __init__(
+        self,
+        name: str,
+        settings: Mapping[str, object],
+        *,
+        memory: FrameMemory,
+        clock: Clock | None = None,
+    ) -> None:
+        super().__init__(name, settings, clock=clock)
+        self._memory = memory
+        self._slots = threading.Lock()
+        self._lent_out: set[int] = set()
+        self._last_slot = -1
+
+    def recycle(self, slot: int) -> None:
+        """Hand a slot back; from any thread. ValueError for a slot that was not handed out."""
+        with self._slots:
+            if slot not in self._lent_out:
+                raise ValueError(f"{self.name}: slot {slot} was not handed out; recycle it once")
+            self._lent_out.discard(slot)
+            self._returned(slot)
+
+    def statistics(self) -> Mapping[str, int]:
+        """Counters since creation, by stable name; see the driver's page."""
+        return dict(sorted(self.counters.items()))
+
+    def adjust(self, exposure_time_us: float, gain_db: float, tdi_shifts: int) -> None:
+        """See `drivers.contract.Head`; a driver that can overrides this."""
+        raise DeviceError(
+            f"{self.name}: settings of this head cannot be changed while it runs; change them in "
+            "the configuration and start again"
+        )
+
+    # For a driver to say
+
+    def _returned(self, slot: int) -> None:
+        """A slot came back. Called with `_slots` held."""
+
+    def _opened_sentence(self) -> str:
+        return f"The head {self.name} is open; nothing to do."
+
+    def _tell_opened(self) -> None:
+        self.teller.tell("opened", self._opened_sentence())
+
+    # For a driver to use
+
+    def _lend_out(self, slot: int) -> None:
+        """Note that a slot goes to the caller with its frame."""
+        with self._slots:
+            self._lent_out.add(slot)
+
+    def _free_slot(self) -> int | None:
+        """The next slot that nobody has; None, counted and told, where all are taken."""
+        with self._slots:
+            free = [slot for slot in range(self._memory.slot_count) if slot not in self._lent_out]
+            if free:
+                # In turn, so that a slot that is let go of too early shows at once.
+                slot = min(free, key=lambda s: (s <= self._last_slot, s))
+                self._last_slot = slot
+                return slot
+        self.counters["underruns"] += 1
+        self._complain_of_underrun()
+        return None
+
+    def _complain_of_underrun(self) -> None:
+        self.teller.complain(
+            "underrun",
+            f"The head {self.name} lost a frame because all {self._memory.slot_count} slots "
+            "are taken. Storage is too slow for this rate; lengthen the interval.",
+        )

@@ -1,0 +1,78 @@
+"""Which video capture nodes there are, and how the one that a configuration means is found."""
+
+from __future__ import annotations
+
+import errno
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from drivers.cameras.v4l2.formats import known
+from drivers.cameras.v4l2.node import VideoNode
+from drivers.cameras.v4l2.uapi import fourcc_name
+
+NODES: Final = Path("/dev")
+SYSFS: Final = Path("/sys/class/video4linux")
+
+
+@dataclass(frozen=True)
+class FoundNode:
+    """A capture node; `problem` says why nothing more is known of it."""
+
+    path: str
+    card: str = ""
+    driver: str = ""
+    bus: str = ""
+    serial: str = ""
+    formats: tuple[str, ...] = ()
+    problem: str = ""
+
+
+def capture_nodes() -> list[FoundNode]:
+    """Every capture node of this host; nodes of other kinds are left out."""
+    found = []
+    for path in sorted(NODES.glob("video*"), key=lambda p: (len(p.name), p.name)):
+        try:
+            node = VideoNode(str(path))
+        except OSError as error:
+            if error.errno not in (errno.ENODEV, errno.ENOTTY, errno.ENXIO):
+                found.append(FoundNode(str(path), problem=error.strerror or str(error)))
+            continue
+        try:
+            formats = tuple(_name(code) for code in node.formats())
+        except OSError:
+            formats = ()
+        finally:
+            node.close()
+        found.append(
+            FoundNode(
+                str(path), node.card, node.driver, node.bus, serial_number(str(path)), formats
+            )
+        )
+    return found
+
+
+def path_of(device: str) -> str | None:
+    """The node of a path, or of a bus as v4l2-ctl says; None where there is none now."""
+    if device.startswith("/"):
+        return device if Path(device).exists() else None
+    return next((node.path for node in capture_nodes() if node.bus == device), None)
+
+
+def serial_number(path: str) -> str:
+    """The serial number of the USB device behind a node; empty where it has none."""
+    try:
+        place = (SYSFS / Path(path).resolve().name / "device").resolve(strict=True)
+    except OSError:
+        return ""
+    for folder in (place, *list(place.parents)[:2]):
+        try:
+            return (folder / "serial").read_text(encoding="utf-8").strip()
+        except (OSError, UnicodeDecodeError):
+            continue
+    return ""
+
+
+def _name(code: int) -> str:
+    ours = known(code)
+    return ours.name if ours else fourcc_name(code)

@@ -1,0 +1,364 @@
+"""An opened video node of the kernel: its ioctls, its buffers, its controls.
+
+Every call either returns or raises OSError; none waits but `wait`, which has a time-out. What is
+asked when, and what an error means for the head, is in `drivers.cameras.v4l2.head`.
+
+Source: Documentation/userspace-api/media/v4l of the kernel.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import errno
+import fcntl
+import mmap
+import os
+import re
+import select
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from drivers.cameras.v4l2 import uapi
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+NS_PER_S: Final = 1_000_000_000
+NS_PER_US: Final = 1_000
+_NUMBERS: Final = (
+    uapi.CTRL_TYPE_INTEGER,
+    uapi.CTRL_TYPE_BOOLEAN,
+    uapi.CTRL_TYPE_MENU,
+    uapi.CTRL_TYPE_INTEGER64,
+    uapi.CTRL_TYPE_BITMASK,
+    uapi.CTRL_TYPE_INTEGER_MENU,
+)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How a frame lies in a buffer."""
+
+    width_px: int
+    height_px: int
+    code: int
+    row_nbytes: int
+    nbytes: int
+
+
+@dataclass(frozen=True)
+class Control:
+    """A control of the head, named as v4l2-ctl does."""
+
+    id: int
+    name: str
+    type: int
+    minimum: int
+    maximum: int
+    flags: int
+
+    @property
+    def is_button(self) -> bool:
+        return self.type == uapi.CTRL_TYPE_BUTTON
+
+    @property
+    def is_readable_number(self) -> bool:
+        return self.type in _NUMBERS and not self.flags & uapi.CTRL_FLAG_WRITE_ONLY
+
+
+@dataclass(frozen=True)
+class Filled:
+    """A buffer the kernel has filled.
+
+    `stamp_ns` is CLOCK_MONOTONIC, None where the kernel says that its stamp is of another clock.
+    """
+
+    index: int
+    offset: int
+    nbytes: int
+    sequence: int
+    has_error: bool
+    stamp_ns: int | None
+    is_start_of_exposure: bool
+
+
+class VideoNode:
+    """A video capture node, open until `close`; single- and multi-planar API alike.
+
+    Raises:
+        OSError: it cannot be opened, or is no streaming capture node (ENOTTY, ENODEV).
+    """
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+        self._fd = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+        self._maps: list[tuple[mmap.mmap, int]] = []
+        try:
+            capability = self._call(uapi.QUERYCAP, uapi.Capability())
+            capabilities = capability.capabilities
+            if capabilities & uapi.CAP_DEVICE_CAPS:
+                capabilities = capability.device_caps
+            if capabilities & uapi.CAP_VIDEO_CAPTURE:
+                self.buffer_type = uapi.BUF_TYPE_VIDEO_CAPTURE
+            elif capabilities & uapi.CAP_VIDEO_CAPTURE_MPLANE:
+                self.buffer_type = uapi.BUF_TYPE_VIDEO_CAPTURE_MPLANE
+            else:
+                raise OSError(errno.ENODEV, "it is no capture node")
+            if not capabilities & uapi.CAP_STREAMING:
+                raise OSError(errno.ENODEV, "it cannot stream")
+        except OSError:
+            self.close()
+            raise
+        self.driver = _text(capability.driver)
+        self.card = _text(capability.card)
+        self.bus = _text(capability.bus_info)
+        self.kernel = ".".join(str(capability.version >> s & 0xFF) for s in (16, 8, 0))
+
+    @property
+    def is_multi_planar(self) -> bool:
+        return self.buffer_type == uapi.BUF_TYPE_VIDEO_CAPTURE_MPLANE
+
+    def close(self) -> None:
+        """Let go of mappings and descriptor: a device that was unplugged waits for both."""
+        self.free_buffers()
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1
+
+    def wait(self, timeout_s: float) -> int:
+        """Wait for a frame; the bits of poll(2), 0 where none came in time."""
+        poll = select.poll()
+        poll.register(self._fd, select.POLLIN)
+        found = poll.poll(timeout_s * 1e3)
+        return found[0][1] if found else 0
+
+    def sign_of_life(self) -> None:
+        """Raises OSError (ENODEV) where the device is gone."""
+        self._call(uapi.QUERYCAP, uapi.Capability())
+
+    # Format
+
+    def formats(self) -> list[int]:
+        """Codes of the formats the head offers."""
+        codes: list[int] = []
+        for index in range(256):
+            description = uapi.FormatDescription(index=index, type=self.buffer_type)
+            try:
+                self._call(uapi.ENUM_FMT, description)
+            except OSError as error:
+                if error.errno == errno.EINVAL:
+                    break
+                raise
+            codes.append(int(description.pixelformat))
+        return codes
+
+    def layout(self) -> Layout:
+        """What the head is set to."""
+        form = uapi.Format(type=self.buffer_type)
+        return self._layout(self._call(uapi.G_FMT, form))
+
+    def set_layout(self, width_px: int, height_px: int, code: int) -> Layout:
+        """Ask for a format; what the head made of it, which may be something else."""
+        form = self._call(uapi.G_FMT, uapi.Format(type=self.buffer_type))
+        pix = form.fmt.pix_mp if self.is_multi_planar else form.fmt.pix
+        pix.width, pix.height, pix.pixelformat = width_px, height_px, code
+        pix.field = uapi.FIELD_NONE
+        if self.is_multi_planar:
+            pix.num_planes = 1
+            pix.plane_fmt[0].bytesperline = pix.plane_fmt[0].sizeimage = 0
+        else:
+            pix.bytesperline = pix.sizeimage = 0
+        return self._layout(self._call(uapi.S_FMT, form))
+
+    def set_input(self, number: int) -> None:
+        self._call(uapi.S_INPUT, ctypes.c_int(number))
+
+    def set_interval(self, interval_s: float) -> float:
+        """Ask for a frame interval; what the head made of it."""
+        parm = self._call(uapi.G_PARM, uapi.StreamParm(type=self.buffer_type))
+        fraction = parm.parm.capture.timeperframe
+        fraction.numerator, fraction.denominator = round(interval_s * 1e6), 1_000_000
+        self._call(uapi.S_PARM, parm)
+        return float(fraction.numerator / fraction.denominator if fraction.denominator else 0)
+
+    def _layout(self, form: uapi.Format) -> Layout:
+        if not self.is_multi_planar:
+            pix = form.fmt.pix
+            return Layout(
+                pix.width, pix.height, int(pix.pixelformat), pix.bytesperline, pix.sizeimage
+            )
+        pix = form.fmt.pix_mp
+        if pix.num_planes != 1:
+            raise OSError(errno.EINVAL, f"the format has {pix.num_planes} planes, not one")
+        plane = pix.plane_fmt[0]
+        return Layout(
+            pix.width, pix.height, int(pix.pixelformat), plane.bytesperline, plane.sizeimage
+        )
+
+    # Buffers
+
+    def make_buffers(self, count: int) -> int:
+        """Have the kernel make buffers and map them; how many it made."""
+        request = uapi.RequestBuffers(count=count, type=self.buffer_type, memory=uapi.MEMORY_MMAP)
+        self._call(uapi.REQBUFS, request)
+        for index in range(request.count):
+            buffer, planes = self._buffer(index)
+            self._call(uapi.QUERYBUF, buffer)
+            offset = planes[0].m.mem_offset if self.is_multi_planar else buffer.m.offset
+            length = planes[0].length if self.is_multi_planar else buffer.length
+            mapped = mmap.mmap(
+                self._fd, length, mmap.MAP_SHARED, mmap.PROT_READ | mmap.PROT_WRITE, offset=offset
+            )
+            self._maps.append((mapped, length))
+        return len(self._maps)
+
+    def free_buffers(self) -> None:
+        """Unmap, then hand the buffers back; never raises, since a lost device refuses."""
+        for mapped, _ in self._maps:
+            # A view left somewhere lets go of its mapping when it is collected.
+            with contextlib.suppress(BufferError):
+                mapped.close()
+        self._maps.clear()
+        if self._fd >= 0:
+            request = uapi.RequestBuffers(
+                count=0, type=getattr(self, "buffer_type", 1), memory=uapi.MEMORY_MMAP
+            )
+            with contextlib.suppress(OSError):
+                self._call(uapi.REQBUFS, request)
+
+    def content(self, filled: Filled) -> NDArray[np.uint8]:
+        """What a filled buffer holds. Not to be kept: a view holds the mapping open."""
+        import numpy as np
+
+        mapped, length = self._maps[filled.index]
+        end = min(filled.nbytes, length)
+        return np.frombuffer(mapped, np.uint8, max(0, end - filled.offset), filled.offset)
+
+    def queue(self, index: int) -> None:
+        """Give a buffer to the kernel."""
+        buffer, _planes = self._buffer(index)
+        self._call(uapi.QBUF, buffer)
+
+    def dequeue(self) -> Filled | None:
+        """The next filled buffer; None where there is none yet."""
+        buffer, planes = self._buffer(0)
+        try:
+            self._call(uapi.DQBUF, buffer)
+        except OSError as error:
+            if error.errno == errno.EAGAIN:
+                return None
+            raise
+        flags = int(buffer.flags)
+        stamp = buffer.timestamp
+        clock = flags & uapi.BUF_FLAG_TIMESTAMP_MASK
+        return Filled(
+            index=int(buffer.index),
+            offset=int(planes[0].data_offset) if self.is_multi_planar else 0,
+            nbytes=int(planes[0].bytesused if self.is_multi_planar else buffer.bytesused),
+            sequence=int(buffer.sequence),
+            has_error=bool(flags & uapi.BUF_FLAG_ERROR),
+            stamp_ns=stamp.tv_sec * NS_PER_S + stamp.tv_usec * NS_PER_US
+            if clock == uapi.BUF_FLAG_TIMESTAMP_MONOTONIC
+            else None,
+            is_start_of_exposure=flags & uapi.BUF_FLAG_TSTAMP_SRC_MASK
+            == uapi.BUF_FLAG_TSTAMP_SRC_SOE,
+        )
+
+    def stream_on(self) -> None:
+        self._call(uapi.STREAMON, ctypes.c_int(self.buffer_type))
+
+    def stream_off(self) -> None:
+        self._call(uapi.STREAMOFF, ctypes.c_int(self.buffer_type))
+
+    def _buffer(self, index: int) -> tuple[uapi.Buffer, Any]:
+        planes = (uapi.Plane * uapi.VIDEO_MAX_PLANES)()
+        buffer = uapi.Buffer(index=index, type=self.buffer_type, memory=uapi.MEMORY_MMAP)
+        if self.is_multi_planar:
+            buffer.m.planes = ctypes.cast(planes, ctypes.POINTER(uapi.Plane))
+            buffer.length = 1
+        return buffer, planes
+
+    # Controls
+
+    def controls(self) -> dict[str, Control]:
+        """All controls that are no classes, strings or compounds, by name."""
+        found: dict[str, Control] = {}
+        query = uapi.QueryExtCtrl(id=uapi.CTRL_FLAG_NEXT_CTRL)
+        while True:
+            try:
+                self._call(uapi.QUERY_EXT_CTRL, query)
+            except OSError as error:
+                if error.errno in (errno.EINVAL, errno.ENOTTY):
+                    return found
+                raise
+            usable = query.type in (*_NUMBERS, uapi.CTRL_TYPE_BUTTON) and query.elems <= 1
+            if usable and not query.flags & uapi.CTRL_FLAG_DISABLED:
+                name = control_name(_text(query.name))
+                found[name] = Control(
+                    int(query.id),
+                    name,
+                    int(query.type),
+                    int(query.minimum),
+                    int(query.maximum),
+                    int(query.flags),
+                )
+            query = uapi.QueryExtCtrl(id=query.id | uapi.CTRL_FLAG_NEXT_CTRL)
+
+    def read(self, control: Control) -> int:
+        one = uapi.ExtControl(id=control.id)
+        self._control(uapi.G_EXT_CTRLS, one)
+        is_wide = control.type == uapi.CTRL_TYPE_INTEGER64
+        return int(one.u.value64 if is_wide else one.u.value)
+
+    def write(self, control: Control, value: int) -> None:
+        one = uapi.ExtControl(id=control.id)
+        if control.type == uapi.CTRL_TYPE_INTEGER64:
+            one.u.value64 = value
+        else:
+            one.u.value = value
+        self._control(uapi.S_EXT_CTRLS, one)
+
+    def read_all(self, controls: Mapping[str, Control]) -> dict[str, int]:
+        """The values of those that can be read now; the others are left out."""
+        found: dict[str, int] = {}
+        for name, control in controls.items():
+            if not control.is_readable_number:
+                continue
+            try:
+                found[name] = self.read(control)
+            except OSError as error:
+                if error.errno == errno.ENODEV:
+                    raise
+        return found
+
+    def _control(self, request: int, one: uapi.ExtControl) -> None:
+        several = uapi.ExtControls(which=uapi.CTRL_WHICH_CUR_VAL, count=1)
+        several.controls = ctypes.pointer(one)
+        self._call(request, several)
+
+    def _call(self, request: int, argument: Any) -> Any:
+        if self._fd < 0:
+            raise OSError(errno.ENODEV, "the node is closed")
+        while True:
+            try:
+                fcntl.ioctl(self._fd, request, argument)
+            except InterruptedError:
+                continue
+            return argument
+
+
+def control_name(title: str) -> str:
+    """A control's title as v4l2-ctl writes it.
+
+    Example:
+        >>> control_name("Exposure Time, Absolute")
+        'exposure_time_absolute'
+    """
+    return re.sub(r"[^a-z0-9]+", "_", title.lower()).strip("_")
+
+
+def _text(value: bytes) -> str:
+    return value.decode("utf-8", errors="replace").strip()

@@ -1,0 +1,1 @@
+"""GNSS and INS receivers: framing, decoding and navigation."""

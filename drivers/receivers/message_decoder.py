@@ -1,0 +1,115 @@
+"""What the decoders of all receivers have in common: counting, and surviving what is fed to them.
+
+How bytes are cut into messages is said by each protocol's framer, what they mean by each decoder;
+the arithmetic of time is in `drivers.timescales.gps_time`.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections import Counter
+from typing import ClassVar, Protocol
+
+from drivers.contract import EventMark, NavSample
+from drivers.timescales.gps_time import FAR_NS
+
+Nav = NavSample | EventMark
+
+
+class Framer(Protocol):
+    """Cuts whole, checked messages out of a stream, and counts them."""
+
+    frames: int
+    bad_frames: int
+    bad_bytes: int
+
+    @property
+    def pending(self) -> int:
+        """Bytes of a message that is not whole yet."""
+
+    def reset(self) -> None: ...
+
+    def feed(self, data: bytes) -> list[bytes]: ...
+
+
+class MessageDecoder:
+    """Bytes in, records out, no I/O and no clock. Nothing that is fed raises.
+
+    A protocol says in `on_message` what a whole message means, in `unreadable` which exceptions
+    mean that one makes no sense, and in `bad_counter` how those are called in the statistics.
+    """
+
+    unreadable: tuple[type[Exception], ...] = (ValueError,)
+    bad_counter: ClassVar[str] = "bad_messages"
+
+    def __init__(self, receiver: str, framer: Framer, counters: tuple[str, ...]) -> None:
+        self.receiver = receiver
+        self.counters: Counter[str] = Counter({self.bad_counter: 0} | dict.fromkeys(counters, 0))
+        self.seen: Counter[str] = Counter()
+        """Messages understood, by name."""
+        self._framer = framer
+        self._leap: int | None = None
+        self.other_edges = 0
+        """Event marks in succession of the edge that is not the configured one."""
+        self._gps_ns: int | None = None
+        """GPS time of the last navigation epoch whose time could be trusted."""
+        self.fix: str | None = None
+        """The receiver's last word about its fix, as in NavSample; None before any."""
+        self.satellites: int | None = None
+        """Satellites in use; None where the receiver has not said."""
+
+    @abstractmethod
+    def on_message(self, message: bytes, mono_ns: int) -> list[Nav]:
+        """Records that one whole message makes; one of `unreadable` where it makes no sense."""
+
+    @property
+    def leap_seconds(self) -> int | None:
+        """GPS - UTC as the receiver knows it; None before it does."""
+        return self._leap
+
+    @property
+    def frames(self) -> int:
+        """Undamaged messages so far, of any kind."""
+        return self._framer.frames
+
+    @property
+    def bad_messages(self) -> int:
+        """Messages whose checksum, length or content was wrong."""
+        return self._framer.bad_frames + self.counters[self.bad_counter]
+
+    @property
+    def bad_bytes(self) -> int:
+        """Bytes that belong to no message."""
+        return self._framer.bad_bytes
+
+    @property
+    def pending(self) -> int:
+        """Bytes kept of a message that is not whole yet."""
+        return self._framer.pending
+
+    def reset(self) -> None:
+        """The line was opened anew: forget what was half received."""
+        self._framer.reset()
+        self.fix = self.satellites = None
+
+    def feed(self, data: bytes, mono_ns: int) -> list[Nav]:
+        """Records that became whole with these bytes, stamped with their arrival."""
+        records: list[Nav] = []
+        for message in self._framer.feed(data):
+            try:
+                made = self.on_message(message, mono_ns)
+            except self.unreadable:
+                self.counters[self.bad_counter] += 1
+                continue
+            records.extend(made)
+            for record in made:
+                if isinstance(record, NavSample):
+                    self.fix, self.satellites = record.fix, record.satellites
+        return records
+
+    def near_navigation(self, gps_ns: int) -> bool:
+        """Whether a mark may be of this time; one far from navigation is counted."""
+        if self._gps_ns is None or abs(gps_ns - self._gps_ns) <= FAR_NS:
+            return True
+        self.counters["marks_far"] += 1
+        return False

@@ -1,0 +1,1 @@
+"""Temperature probes and the host's own sensors."""

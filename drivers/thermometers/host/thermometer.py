@@ -1,0 +1,142 @@
+"""The host's own temperature sensors as a thermometer.
+
+What they are and how one is read is in `drivers.thermometers.host.sensors`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar, Final
+
+from drivers.base.device import DeviceDriver
+from drivers.base.settings import Setting
+from drivers.contract import DeviceError, LifeCycle, Sink, TemperatureSample
+from drivers.thermometers.host.sensors import HostSensor, SensorGoneError, find_sensors
+from drivers.timescales.clock import Clock
+
+SYSFS: Final = Path("/sys")
+
+
+class HostThermometer(DeviceDriver):
+    """Sensors of the Linux host: hwmon chips (processor, disks, boards) and iio devices.
+
+    A sensor is named `chip/channel`, `chip/label`, or `chip@device/...` where chips of one name
+    are to be told apart; never by its number, which changes from boot to boot. A sensor whose
+    files vanish yields nothing until it is found again under its name; one that its chip calls
+    faulty yields samples with `value_c=None`.
+
+    Source: Linux Documentation/hwmon/sysfs-interface, ABI/testing/sysfs-bus-iio.
+    """
+
+    kind: ClassVar = "thermometer"
+    counted = ("readings", "failures", "open_sensors", "losses")
+
+    sensors: Setting[tuple[str, ...]] = Setting(
+        (), required=True, minimum=1, maximum=64, says="sensors as chip/channel or chip/label"
+    )
+    channels: Setting[tuple[str, ...]] = Setting(
+        (), required=True, minimum=1, maximum=64, says="names of the probes, one for each sensor"
+    )
+    interval_s = Setting(1.0, minimum=0.05, maximum=3600, says="time from reading to reading")
+
+    def __init__(
+        self,
+        name: str,
+        settings: Mapping[str, object],
+        *,
+        clock: Clock | None = None,
+        root: Path = SYSFS,
+    ) -> None:
+        super().__init__(name, settings, clock=clock)
+        self._root = root
+        self._found: dict[str, HostSensor] = {}
+        self._lost: set[str] = set()
+
+    @classmethod
+    def contradictions(cls, values: Mapping[str, Any]) -> list[str]:
+        sensors, channels = values["sensors"], values["channels"]
+        found = []
+        if len(sensors) != len(channels):
+            found.append(f"channels has {len(channels)} names; sensors has {len(sensors)}")
+        for key in ("sensors", "channels"):
+            twice = sorted({name for name in values[key] if values[key].count(name) > 1})
+            if twice:
+                found.append(f"{key} names {', '.join(twice)} twice; once is enough")
+        wrong = [sensor for sensor in sensors if "/" not in sensor.strip("/")]
+        if wrong:
+            found.append(f"sensors names {', '.join(wrong)}; chip/channel, as coretemp/temp1")
+        return found
+
+    def bind(self) -> Mapping[str, str]:
+        """Find and read every sensor. See `drivers.contract.Device`."""
+        found = {}
+        problems = []
+        known = find_sensors(self._root)
+        for probe, sensor in zip(self.channels, self.sensors, strict=True):
+            try:
+                self._found[probe] = self._find(sensor, known)
+                value_c = self._found[probe].read_c()
+            except SensorGoneError as error:
+                problems.append(f"{self.name}: {error}")
+                continue
+            found[f"probe {probe}"] = "open" if value_c is None else f"{value_c:.1f} degC"
+        if problems:
+            raise DeviceError("\n".join(problems))
+        self._state = LifeCycle.BOUND
+        return found
+
+    def _reach(self) -> None:
+        """Sysfs is always there; a sensor that is not is looked for at every reading."""
+
+    def _tell_opened(self) -> None:
+        self.teller.tell("opened", f"The host's sensors {self.name} are read; nothing to do.")
+
+    def _serve(self, sink: Sink) -> None:
+        self._state = LifeCycle.ACTIVE
+        next_ns = self.clock.mono_ns()
+        while not self._closing.is_set():
+            self._read_all(sink)
+            now_ns = self.clock.mono_ns()
+            next_ns = max(next_ns + round(self.interval_s * 1e9), now_ns)
+            self.clock.wait(self._closing, (next_ns - now_ns) * 1e-9)
+
+    def _read_all(self, sink: Sink) -> None:
+        known: list[HostSensor] | None = None
+        for probe, sensor in zip(self.channels, self.sensors, strict=True):
+            try:
+                if probe not in self._found:
+                    known = find_sensors(self._root) if known is None else known
+                    self._found[probe] = self._find(sensor, known)
+                value_c = self._found[probe].read_c()
+            except SensorGoneError as error:
+                self._found.pop(probe, None)
+                self.counters["failures"] += 1
+                if probe not in self._lost:
+                    self._lost.add(probe)
+                    self.counters["losses"] += 1
+                    self.teller.tell(
+                        "lost",
+                        f"The sensor {sensor} of probe {probe} cannot be read ({error}). Check "
+                        "that its kernel module is loaded; it is looked for again by itself.",
+                        fault=True,
+                    )
+                continue
+            if probe in self._lost:
+                self._lost.discard(probe)
+                self.teller.tell(
+                    "recovered", f"The sensor {sensor} of probe {probe} is back; nothing to do."
+                )
+            self.counters["readings"] += 1
+            self.counters["open_sensors"] += value_c is None
+            sink(TemperatureSample(probe, value_c, self.clock.mono_ns()))
+
+    def _find(self, sensor: str, known: list[HostSensor]) -> HostSensor:
+        matches = [candidate for candidate in known if sensor in candidate.words]
+        if len(matches) == 1:
+            return matches[0]
+        if matches:
+            devices = ", ".join(candidate.words[-1] for candidate in matches)
+            raise SensorGoneError(f"sensor {sensor} is there {len(matches)} times: {devices}")
+        listed = ", ".join(candidate.words[0] for candidate in known[:20]) or "none at all"
+        raise SensorGoneError(f"sensor {sensor} is not there; the host has {listed}")

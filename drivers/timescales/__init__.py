@@ -1,0 +1,1 @@
+"""GPS time, UTC with leap seconds, and the monotonic clock."""

@@ -1,0 +1,32 @@
+"""Leap seconds between GPS and UTC as data, for receivers that speak UTC only.
+
+A receiver that says its own count is believed before this table. Source: IERS Bulletin C.
+"""
+
+from __future__ import annotations
+
+import bisect
+import datetime
+from typing import Final
+
+from drivers.timescales.gps_time import GPS_EPOCH_DAY, SECOND_NS
+
+SINCE: Final = (
+    (1981, 7), (1982, 7), (1983, 7), (1985, 7), (1988, 1), (1990, 1), (1991, 1), (1992, 7),
+    (1993, 7), (1994, 7), (1996, 1), (1997, 7), (1999, 1), (2006, 1), (2009, 1), (2012, 7),
+    (2015, 7), (2017, 1),
+)  # fmt: skip
+"""Year and month from whose first instant on there is one more."""
+
+_STARTS_NS: Final = tuple(
+    (datetime.date(year, month, 1).toordinal() - GPS_EPOCH_DAY) * 86_400 * SECOND_NS
+    for year, month in SINCE
+)
+
+
+def leap_seconds_at(utc_ns: int) -> int:
+    """GPS - UTC in seconds at a UTC instant counted without leap seconds from the GPS epoch.
+
+    Within a leap second itself, ask for the instant one second before.
+    """
+    return bisect.bisect_right(_STARTS_NS, utc_ns)

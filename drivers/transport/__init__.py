@@ -1,0 +1,1 @@
+"""Serial ports, TCP and UDP: opening, time-outs and reconnecting."""

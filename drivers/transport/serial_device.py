@@ -1,0 +1,381 @@
+"""Base of devices on a serial line: opening, reconnecting, counting, and noticing silence.
+
+What the bytes mean is in the driver of each device, which says it in `step` and `identify`.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import termios
+import threading
+from abc import abstractmethod
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from typing import Any, Final, Protocol
+
+import serial
+
+from drivers.base.device import DeviceDriver
+from drivers.base.settings import Setting
+from drivers.contract import (
+    ClockReading,
+    DeviceError,
+    EventMark,
+    LifeCycle,
+    NavSample,
+    RawBytes,
+    Sink,
+    TemperatureSample,
+)
+from drivers.timescales.clock import Clock
+from drivers.transport.port_holder import held_sentence, holders, is_pseudo_terminal, other_holders
+from drivers.transport.tcp_port import SCHEME, open_tcp_port
+from drivers.transport.udp_port import LISTEN_SCHEME, SPEAK_SCHEME, Sender, UdpPort, open_udp_port
+
+READ_STEP_S: Final = 0.2
+"""Longest wait for bytes before the driver looks up again."""
+WRITE_TIMEOUT_S: Final = 1.0
+UNLOGGED_KEPT: Final = 4096
+"""Chunks of bytes read before there is a log to put them into."""
+
+STALE: Final = ".stale"
+"""Ends the name under which bytes are logged that came too late to be read."""
+
+Sample = NavSample | EventMark | TemperatureSample | ClockReading
+
+
+class Port(Protocol):
+    """What is used of `serial.Serial`."""
+
+    timeout: Any
+
+    @property
+    def in_waiting(self) -> int: ...
+
+    def read(self, size: int = ...) -> bytes: ...
+
+    def write(self, data: bytes, /) -> int | None: ...
+
+    def close(self) -> None: ...
+
+
+class LineLostError(Exception):
+    """The port went away below us; internal to the serial drivers."""
+
+
+class SerialLine:
+    """One open port. Every byte read is counted and handed to the flight log."""
+
+    def __init__(
+        self,
+        port: Port,
+        received: Callable[[bytes], None],
+        stale: Callable[[bytes], None] = lambda _data: None,
+    ) -> None:
+        self._port = port
+        self._received = received
+        self._stale = stale
+
+    def read(self, timeout_s: float) -> bytes:
+        """What has come, waiting for the first byte at most so long; may be empty.
+
+        Raises:
+            LineLostError: the port is gone.
+        """
+        data = self._take(timeout_s)
+        if data:
+            self._received(data)
+        return data
+
+    def drain(self, steps: int) -> int:
+        """Take away what came unasked, in so many reads at most; how many bytes that were.
+
+        They are logged apart: a replay that took them for an answer would have one too many.
+        """
+        count = 0
+        for _ in range(steps):
+            data = self._take(0.0)
+            if not data:
+                break
+            self._stale(data)
+            count += len(data)
+        return count
+
+    def _take(self, timeout_s: float) -> bytes:
+        try:
+            self._port.timeout = timeout_s
+            data = bytes(self._port.read(1))
+            waiting = self._port.in_waiting if data else 0
+            if waiting:
+                data += bytes(self._port.read(waiting))
+        except (serial.SerialException, OSError, termios.error, TypeError) as error:
+            raise LineLostError(_reason(error)) from error
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Send; LineLostError where the port is gone or takes nothing for a second."""
+        try:
+            self._port.write(data)
+        except (serial.SerialException, OSError, termios.error, TypeError) as error:
+            raise LineLostError(_reason(error)) from error
+
+    def close(self) -> None:
+        # A port that is already gone may refuse even this; there is nothing left to let go of.
+        try:
+            self._port.close()
+        except (serial.SerialException, OSError, termios.error):
+            return
+
+
+PortOpener = Callable[[str, int, str], Port]
+
+
+def open_serial_port(path: str, baudrate: int, parity: str) -> Port:
+    """Open a port for ourselves alone, 8 data bits, one stop bit; or a network address.
+
+    Addresses are tcp://host:port, udpin://host:port (listens; with ?from=ADDRESS to that sender
+    only) and udpout://host:port (speaks).
+
+    A port that another program has open is not used: each would get a part of the bytes.
+
+    Raises:
+        DeviceError: it cannot be opened, or another program holds it; the sentence says why, which
+            program as far as it can be known, and what to do.
+    """
+    if path.startswith(SCHEME):
+        return open_tcp_port(path)
+    if path.startswith((LISTEN_SCHEME, SPEAK_SCHEME)):
+        return open_udp_port(path)
+    try:
+        port = serial.Serial(
+            path,
+            baudrate=baudrate,
+            parity=parity,
+            timeout=READ_STEP_S,
+            write_timeout=WRITE_TIMEOUT_S,
+            exclusive=True,
+        )
+    except (serial.SerialException, OSError, termios.error, ValueError) as error:
+        number = getattr(error, "errno", None) or (error.args[0] if error.args else None)
+        if number == errno.EINVAL and parity != "N":
+            cure = f'parity {parity} is refused, as a pseudo-terminal does; set parity = "N" there'
+        elif number == errno.ENOENT:
+            cure = "there is no such port; check the cable and the port's name"
+        elif number in (errno.EACCES, errno.EPERM):
+            cure = "permission denied; add the service's user to the group dialout"
+        elif number == errno.EBUSY or "lock" in str(error):
+            cure = held_sentence(path, holders(path))
+        else:
+            cure = f"{_reason(error)}; check the cable, the port's name and its settings"
+        raise DeviceError(f"port {path} cannot be opened: {cure}") from error
+    if others := other_holders(path):
+        port.close()
+        raise DeviceError(f"port {path} cannot be opened: {held_sentence(path, others)}")
+    if not is_pseudo_terminal(path):
+        _keep_others_out(port)
+    return port
+
+
+def _keep_others_out(port: serial.Serial) -> None:
+    """Have the kernel refuse the port to programs that do not look at locks, such as gpsd."""
+    # A driver without terminal settings refuses; the lock is there all the same.
+    with suppress(OSError):
+        fcntl.ioctl(port.fileno(), termios.TIOCEXCL)
+
+
+def _shared_sentence(path: str) -> str:
+    """Who else reads a port by now, as a sentence to be appended; empty where nobody is seen."""
+    others = [] if "://" in path else other_holders(path)
+    return f" The port is shared: {held_sentence(path, others)}." if others else ""
+
+
+def _reason(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+class SerialDevice(DeviceDriver):
+    """A device on a serial line, run by one thread of the caller's.
+
+    A driver declares its settings and says in `step` how it listens or asks; `heard` is to be
+    called for every message that was understood. No byte from the line raises out of `run`.
+    """
+
+    port = Setting("", required=True, says="serial port, such as /dev/ttyUSB0")
+    silence_s = Setting(
+        5.0, minimum=0.5, maximum=3600, says="without a message for so long the device is silent"
+    )
+
+    counted = (
+        "bytes",
+        "messages",
+        "bad_messages",
+        "bad_bytes",
+        "timeouts",
+        "opened",
+        "silences",
+    )
+    delivered = "messages"
+    what: str = "device"
+    """What it is, for the operator's sentences."""
+    silence_cure: str = "Check its power, wiring and baud rate"
+    """What the operator is to do about its silence."""
+
+    def __init__(
+        self,
+        name: str,
+        settings: Mapping[str, object],
+        *,
+        clock: Clock | None = None,
+        open_port: PortOpener = open_serial_port,
+    ) -> None:
+        super().__init__(name, settings, clock=clock)
+        self._open_port = open_port
+        self._lock = threading.Lock()
+        self._line: SerialLine | None = None
+        self._heard_ns = 0
+        self._silent = False
+        self._sender: Sender | None = None
+        self._unlogged: deque[RawBytes] = deque(maxlen=UNLOGGED_KEPT)
+
+    # What a driver says
+
+    @abstractmethod
+    def line_settings(self) -> tuple[int, str]:
+        """Baud rate and parity."""
+
+    @abstractmethod
+    def identify(self, line: SerialLine) -> Mapping[str, str]:
+        """Ask who is there; DeviceError with the cure where nobody fitting answers."""
+
+    @abstractmethod
+    def step(self, line: SerialLine) -> Iterable[Sample]:
+        """One turn of listening or asking, a second at most; what was understood."""
+
+    def connected(self) -> None:
+        """A port was opened: what was half received on the one before is of no use."""
+
+    def is_identified(self) -> bool:
+        """Whether what was understood is of the device itself, not of somebody else on its bus."""
+        return True
+
+    def heard(self, *, messages: int = 1) -> None:
+        """So many messages were understood just now."""
+        if messages <= 0:
+            return
+        self.counters["messages"] += messages
+        if self._sender is not None and self.is_identified():
+            self._sender.lock()
+        self._heard_ns = self.clock.mono_ns()
+        if self._silent:
+            self._silent = False
+            self.teller.tell(
+                "recovered", f"The {self.what} {self.name} speaks again; nothing to do."
+            )
+
+    # The contract
+
+    def bind(self) -> Mapping[str, str]:
+        """Open the port and ask who is there. See `drivers.contract.Device`."""
+        if self._line is None:
+            self._line = self._open()
+        try:
+            found = {"port": self.port, **self.identify(self._line)}
+        except LineLostError as error:
+            self._let_go()
+            raise DeviceError(
+                f"{self.name}: port {self.port} was lost: {error}; check the cable"
+            ) from error
+        except DeviceError as error:
+            self._let_go()
+            if self._sender is None or not self._sender.others:
+                raise
+            raise DeviceError(f"{error}; {self._sender.sentence()}") from error
+        self._state = LifeCycle.BOUND
+        return found
+
+    # How it is done
+
+    def _reach(self) -> None:
+        self._line = self._line or self._open()
+
+    def _tell_opened(self) -> None:
+        # What came while binding belongs into the log as well: a replay begins there.
+        while self._unlogged and self.teller.sink is not None:
+            self.teller.sink(self._unlogged.popleft())
+        # A silent line is opened anew again and again, which is not news.
+        if self._is_lost or not self._silent:
+            self.teller.tell("opened", f"The {self.what} {self.name} is open at {self.port}.")
+
+    def _open(self) -> SerialLine:
+        baudrate, parity = self.line_settings()
+        try:
+            port = self._open_port(self.port, baudrate, parity)
+        except DeviceError as error:
+            raise DeviceError(f"{self.name}: {error}") from error
+        self.counters["opened"] += 1
+        if isinstance(port, UdpPort) and port.sender is not None:
+            # Who is listened to does not change because the port was opened again.
+            self._sender = port.sender = self._sender or port.sender
+        self.connected()
+        return SerialLine(port, self._received, lambda data: self._received(data, STALE))
+
+    def _received(self, data: bytes, suffix: str = "") -> None:
+        self.counters["bytes"] += len(data)
+        raw = RawBytes(self.name + suffix, self.clock.mono_ns(), data)
+        if self.teller.sink is not None:
+            self.teller.sink(raw)
+        else:
+            self._unlogged.append(raw)
+
+    def _serve(self, sink: Sink) -> None:
+        """Listen until closing, loss, or a whole silence, after which it is worth opening anew."""
+        line = self._line
+        assert line is not None
+        self._state = LifeCycle.ACTIVE
+        self._heard_ns = self.clock.mono_ns()
+        silence_ns = round(self.silence_s * 1e9)
+        while not self._closing.is_set():
+            try:
+                for sample in self.step(line):
+                    sink(sample)
+                self._count_other_senders()
+            except LineLostError as error:
+                self._state = LifeCycle.INACTIVE
+                self._tell_lost(
+                    f"The {self.what} {self.name} at {self.port} was lost ({error}). Check cable "
+                    f"and power; it is opened again by itself.{_shared_sentence(self.port)}"
+                )
+                return
+            if self.clock.mono_ns() - self._heard_ns >= silence_ns:
+                self._tell_silence()
+                return
+
+    def _count_other_senders(self) -> None:
+        if self._sender is None or self._sender.others == self.counters["other_senders"]:
+            return
+        self.counters["other_senders"] = self._sender.others
+        self.teller.complain(
+            "other-sender",
+            f"The {self.what} {self.name} at {self.port}: {self._sender.sentence()}.",
+        )
+
+    def _tell_silence(self) -> None:
+        if self._silent:
+            return
+        self._silent = True
+        self.counters["silences"] += 1
+        self.teller.tell(
+            "silent",
+            f"The {self.what} {self.name} at {self.port} has said nothing understandable for "
+            f"{self.silence_s:g} s. {self.silence_cure}; the port is opened anew by itself."
+            f"{_shared_sentence(self.port)}",
+            fault=True,
+        )
+
+    def _let_go(self) -> None:
+        with self._lock:
+            line, self._line = self._line, None
+        if line is not None:
+            line.close()

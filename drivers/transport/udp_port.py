@@ -1,0 +1,192 @@
+"""Datagrams that read and write like a serial port.
+
+For autopilots and receivers that send over UDP; which devices use it is said by their `port`:
+"udpin://host:port" listens there, "udpin://host:port?from=ADDRESS" to that sender only, and
+"udpout://host:port" speaks to that address.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import socket
+import time
+import weakref
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+from urllib.parse import parse_qs, urlsplit
+
+from drivers.contract import DeviceError
+from drivers.transport.tcp_port import host_and_number
+
+LISTEN_SCHEME: Final = "udpin://"
+SPEAK_SCHEME: Final = "udpout://"
+DATAGRAM_NBYTES: Final = 65_536
+NEW_PORT_AFTER_S: Final = 2.0
+"""A sender that was silent for so long may come back from another port: it was restarted."""
+
+Address = tuple[str, int]
+
+listening: Final[weakref.WeakSet[socket.socket]] = weakref.WeakSet()
+"""The sockets of this process that listen here; from before they are bound."""
+
+
+@dataclass
+class Sender:
+    """Whose datagrams a listening port takes; it outlives the port, which may be opened again.
+
+    `address` is the configured one, or that of the first sender whose message was understood. Until
+    there is one, datagrams of all senders are taken. Afterwards no other address is accepted,
+    however long the sender is silent; only its own port may change, `NEW_PORT_AFTER_S` after its
+    last datagram.
+    """
+
+    address: str | None = None
+    port: int | None = None
+    is_configured: bool = False
+    others: int = 0
+    """Datagrams of other senders, which were dropped."""
+    last_other: str = ""
+    _last: Address | None = None
+    _last_ns: int = 0
+
+    @property
+    def last(self) -> Address | None:
+        """Where the newest datagram that was taken came from, and answers go."""
+        return self._last
+
+    def takes(self, source: Address, mono_ns: int) -> bool:
+        """Whether a datagram from there is taken; one that is not is counted."""
+        is_restarted = mono_ns - self._last_ns >= NEW_PORT_AFTER_S * 1e9
+        is_same_port = self.port in (None, source[1]) or is_restarted
+        if self.address not in (None, source[0]) or not is_same_port:
+            self.others += 1
+            self.last_other = f"{source[0]}:{source[1]}"
+            return False
+        if self.port is not None:
+            self.port = source[1]
+        self._last, self._last_ns = source, mono_ns
+        return True
+
+    def lock(self) -> None:
+        """What was taken last was understood: from now on it is this sender's port alone."""
+        if self._last is not None and self.port is None:
+            self.address, self.port = self._last
+
+    def sentence(self) -> str:
+        """How many datagrams of others were dropped, and what to do."""
+        cure = (
+            "correct ?from= in its port" if self.is_configured else "add ?from=ADDRESS to its port"
+        )
+        port = "" if self.port is None else f":{self.port}"
+        return (
+            f"{self.others} datagrams of other senders were dropped, the last from "
+            f"{self.last_other}; only {self.address}{port} is accepted. End the other sender, or "
+            f"{cure}"
+        )
+
+
+class UdpPort:
+    """One UDP socket; the port `drivers.transport.serial_device.SerialLine` reads from.
+
+    `sender` says whose datagrams are taken where it listens, so that two senders cannot tear each
+    other's messages apart; None where it speaks to one address, as the kernel drops others then.
+    """
+
+    def __init__(
+        self,
+        udp: socket.socket,
+        sender: Sender | None,
+        *,
+        mono_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        self._socket = udp
+        self.sender = sender
+        self._mono_ns = mono_ns
+        self._buffer = b""
+        self.timeout: float = 0.0
+
+    @property
+    def in_waiting(self) -> int:
+        """Bytes that `read` has without waiting."""
+        return len(self._buffer)
+
+    def read(self, size: int = 1) -> bytes:
+        """At most `size` bytes, empty where none comes in `timeout` seconds; OSError: refused."""
+        if not self._buffer:
+            self._buffer = self._datagram()
+        data, self._buffer = self._buffer[:size], self._buffer[size:]
+        return data
+
+    def _datagram(self) -> bytes:
+        """The next datagram that is taken; empty where none comes in time."""
+        until_s = time.monotonic() + self.timeout
+        while True:
+            self._socket.settimeout(max(until_s - time.monotonic(), 1e-3))
+            try:
+                data, source = self._socket.recvfrom(DATAGRAM_NBYTES)
+            except TimeoutError:
+                return b""
+            if self.sender is None or self.sender.takes((source[0], source[1]), self._mono_ns()):
+                return data
+            if time.monotonic() >= until_s:
+                return b""
+
+    def write(self, data: bytes, /) -> int:
+        """Send one datagram; nothing is sent while nobody has spoken yet."""
+        if self.sender is None:
+            return self._socket.send(data)
+        return self._socket.sendto(data, self.sender.last) if self.sender.last else 0
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+def open_udp_port(address: str) -> UdpPort:
+    """Open "udpin://host:port", "udpin://host:port?from=ADDRESS" or "udpout://host:port".
+
+    Raises:
+        DeviceError: the address is wrong or taken; the sentence names the cure.
+    """
+    place = host_and_number(address)
+    if place is None:
+        raise DeviceError(
+            f"port {address} is no address; write udpin://host:port, such as udpin://0.0.0.0:14550"
+        )
+    is_listening = address.startswith(LISTEN_SCHEME)
+    only_from = _only_from(address) if is_listening else None
+    udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        if is_listening:
+            listening.add(udp)
+            udp.bind(place)
+            return UdpPort(udp, Sender(only_from, is_configured=only_from is not None))
+        udp.connect(place)
+        return UdpPort(udp, None)
+    except (OSError, UnicodeError) as error:
+        udp.close()
+        raise DeviceError(
+            f"port {address} cannot be opened: {error or type(error).__name__}; check the address, "
+            "and that no other program listens there"
+        ) from error
+
+
+def _only_from(address: str) -> str | None:
+    """The sender that "?from=" names.
+
+    Raises:
+        DeviceError: it is no IPv4 address, or there is another key.
+    """
+    query = urlsplit(address).query
+    if not query:
+        return None
+    given = parse_qs(query, keep_blank_values=True)
+    try:
+        if set(given) != {"from"} or len(given["from"]) != 1:
+            raise ValueError(f"{query!r} is not from=ADDRESS")
+        return str(ipaddress.IPv4Address(given["from"][0]))
+    except ValueError as error:
+        raise DeviceError(
+            f"port {address}: {error}; write udpin://host:port?from=10.0.0.5 with the sender's "
+            "IPv4 address"
+        ) from error

@@ -1,1 +1,0 @@
-"""Who fires: the pulse bus, and software triggers of the heads where there is no unit."""

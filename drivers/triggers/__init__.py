@@ -1,0 +1,1 @@
+"""Trigger outputs and pulses per second."""

@@ -1,0 +1,68 @@
+"""An emulated PPS source behind a TCP port, for machines without one: same edges, same interface.
+
+Each line is an edge: `<assert sequence> <nanoseconds of CLOCK_REALTIME>`.
+"""
+
+from __future__ import annotations
+
+import socket
+import time
+from typing import Final
+
+from drivers.triggers.pps.binding import CAN_WAIT, CAPTURE_ASSERT, Edges
+
+SCHEME: Final = "tcp://"
+CONNECT_TIMEOUT_S: Final = 2.0
+LINE_MAX_BYTES: Final = 64
+
+
+class EmulatedPps:
+    """The client of an emulated source. OSError where it is not there, or gone."""
+
+    def __init__(self, address: str) -> None:
+        host, _, port = address.removeprefix(SCHEME).rpartition(":")
+        if not port.isdecimal():
+            raise OSError(f"{address!r} names no port; tcp://host:port is right")
+        self._socket = socket.create_connection((host, int(port)), timeout=CONNECT_TIMEOUT_S)
+        self._received = b""
+
+    def capabilities(self) -> int:
+        return CAPTURE_ASSERT | CAN_WAIT
+
+    def mode(self) -> int:
+        return CAPTURE_ASSERT
+
+    def set_mode(self, mode: int) -> None:
+        """Nothing to set: it captures what it can."""
+
+    def fetch(self, timeout_s: float) -> Edges | None:
+        """As the kernel's: the next edge, None where none comes in time. Odd lines are skipped."""
+        deadline = time.monotonic() + timeout_s
+        while (left_s := deadline - time.monotonic()) > 0:
+            line, separator, rest = self._received.partition(b"\n")
+            if separator:
+                self._received = rest
+                words = line.split()
+                if len(words) == 2 and all(word.isdigit() and len(word) < 20 for word in words):
+                    return Edges(int(words[0]), 0, int(words[1]), 0)
+                continue
+            self._socket.settimeout(left_s)
+            try:
+                piece = self._socket.recv(4096)
+            except TimeoutError:
+                return None
+            if not piece:
+                raise OSError("the source hung up")
+            self._received = (self._received + piece)[-4096:]
+        return None
+
+    def latest(self) -> Edges | None:
+        """None: edges wait in the line until they are fetched."""
+        return None
+
+    def is_there(self) -> bool:
+        """Yes: `fetch` raises where the source hung up."""
+        return True
+
+    def close(self) -> None:
+        self._socket.close()

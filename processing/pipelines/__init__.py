@@ -1,0 +1,1 @@
+"""From the frames of one exposure to its images and figures."""

@@ -1,0 +1,1 @@
+"""Emulated laboratory set-ups: collimator, calibration field, integrating sphere."""

@@ -1,0 +1,1 @@
+"""Emulated devices as processes: one device alone, or a whole flight."""

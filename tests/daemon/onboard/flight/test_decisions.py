@@ -1,0 +1,54 @@
+"""What falls due at an instant, and what the flight log has to say of it."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from daemon.onboard.flight.decisions import Tick, tick
+
+NOTHING = Tick((), (), None, None, asked_to_seal=True, resolved=0)
+
+
+def due(to_seal: object = None) -> Any:
+    """A flight with a record to foresee, and perhaps one to seal."""
+    return SimpleNamespace(
+        due_to_store=lambda _: [],
+        due_to_give_up=lambda _: [],
+        due_to_seal=lambda _: to_seal,
+        due_to_foresee=lambda: "foreseen",
+        resolved_marks=[],
+    )
+
+
+@pytest.mark.parametrize(
+    ("may_seal", "may_foresee", "to_seal", "foreseen"),
+    [
+        (True, True, None, "foreseen"),
+        (True, False, None, None),
+        (False, True, None, None),
+        (False, False, None, None),
+        (True, True, "sealed", None),
+    ],
+)
+def test_a_record_is_foreseen_only_while_none_is_sealed(
+    may_seal: bool, may_foresee: bool, to_seal: object, foreseen: object
+) -> None:
+    found = tick(due(to_seal), 7, may_seal=may_seal, may_foresee=may_foresee)
+    assert (found.to_seal, found.foreseen) == (to_seal, foreseen)
+    assert found.asked_to_seal is may_seal
+
+
+def test_the_log_is_told_only_where_something_fell_due() -> None:
+    assert NOTHING.detail is None
+    given_up = Tick((), ((3, "no head sent a frame"),), None, None, asked_to_seal=True, resolved=0)
+    assert given_up.detail == {
+        "store": [],
+        "given_up": [3],
+        "seal": None,
+        "foreseen": None,
+        "resolved": 0,
+        "asked_to_seal": True,
+    }

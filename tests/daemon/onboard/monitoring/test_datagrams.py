@@ -1,0 +1,143 @@
+"""Over a link that loses a third, is slow, late and away for minutes, a watcher still converges.
+
+The link is emulated on a clock of its own: loss, delay, bandwidth with a queue, outages.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import random
+from dataclasses import dataclass, field
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from daemon.onboard.monitoring.mavlink.datagrams import DATAGRAM_MAX_BYTES, Received, Sender
+from daemon.onboard.monitoring.state import FlightState
+from tests.daemon.onboard.monitoring import flown
+
+
+@dataclass
+class Relay:
+    """A lossy link: what goes in at a time comes out later, or not at all."""
+
+    loss: float
+    delay_s: float
+    bytes_per_s: float
+    outages_s: tuple[tuple[float, float], ...] = ()
+    queue_bytes: int = 8000
+    random: random.Random = field(default_factory=lambda: random.Random(1))
+    _waiting: list[tuple[float, int, bytes]] = field(default_factory=list)
+    _free_s: float = 0.0
+    _count: itertools.count[int] = field(default_factory=itertools.count)
+    carried: int = 0
+
+    def put(self, data: bytes, now_s: float) -> None:
+        is_out = any(a <= now_s < b for a, b in self.outages_s)
+        queued = max(0.0, self._free_s - now_s) * self.bytes_per_s
+        if is_out or self.random.random() < self.loss or queued > self.queue_bytes:
+            return
+        self._free_s = max(self._free_s, now_s) + len(data) / self.bytes_per_s
+        self.carried += len(data)
+        jitter_s = self.random.uniform(0, 0.1)
+        heapq.heappush(
+            self._waiting, (self._free_s + self.delay_s + jitter_s, next(self._count), data)
+        )
+
+    def take(self, now_s: float) -> list[bytes]:
+        out = []
+        while self._waiting and self._waiting[0][0] <= now_s:
+            out.append(heapq.heappop(self._waiting)[2])
+        return out
+
+
+def fly(relay: Relay, seconds: float, exposures: int, faults_s: dict[str, float]):
+    """Fly and watch; returns state, watcher, and when each fault was seen."""
+    state, sender, watcher = FlightState("syntopic test"), Sender(4000 * 0.9), Received()
+    state.apply(flown.mission())
+    seen: dict[str, float] = {}
+    raised: set[str] = set()
+    number = 0
+    for tick in range(int(seconds * 10)):
+        now_s = tick / 10
+        if number < exposures and now_s >= 2.0 * (number + 1):
+            number += 1
+            for event in flown.exposure(number, "usable" if number % 5 == 0 else "good"):
+                state.apply(event)
+        if tick % 10 == 0:
+            state.apply(flown.status(triggers=number))
+        for device, at_s in faults_s.items():
+            if now_s >= at_s and device not in raised:
+                raised.add(device)
+                state.apply(flown.lost(device))
+        for datagram in sender.due(state, now_s):
+            assert len(datagram) <= DATAGRAM_MAX_BYTES
+            relay.put(datagram, now_s)
+        for datagram in relay.take(now_s):
+            watcher.take(datagram)
+        for fault in watcher.faults.values():
+            seen.setdefault(fault["device"], now_s)
+    return state, watcher, seen
+
+
+def test_a_thin_lossy_link_with_outages_ends_up_with_the_same_state() -> None:
+    outages = ((60.0, 120.0), (200.0, 230.0))
+    relay = Relay(loss=0.3, delay_s=0.6, bytes_per_s=4000, outages_s=outages)
+    faults_s = {f"SU0{i}": at_s for i, at_s in enumerate((10.0, 45.0, 130.0, 190.0))}
+    state, watcher, seen = fly(relay, 600.0, exposures=150, faults_s=faults_s)
+    waits_s = {device: round(seen[device] - at_s, 1) for device, at_s in faults_s.items()}
+    print(f"faults seen after {waits_s} s; {relay.carried / 600:.0f} B/s carried")
+    assert max(waits_s.values()) <= 5.0
+    assert watcher.brief["status"]["ledger"] == state.brief()["status"]["ledger"]
+    assert watcher.brief["verdicts"] == state.brief()["verdicts"]
+    assert set(watcher.faults) == {fault["id"] for fault in state.faults()}
+    told = {one["number"]: one["verdict"] for one in watcher.exposures.values()}
+    assert told == {one["number"]: one["verdict"] for one in state.exposures()}
+    assert watcher.bad == 0
+
+
+def test_a_fault_in_an_outage_is_seen_soon_after_it() -> None:
+    relay = Relay(loss=0.3, delay_s=0.6, bytes_per_s=4000, outages_s=((20.0, 80.0),))
+    _, _, seen = fly(relay, 100.0, exposures=30, faults_s={"SU02": 40.0})
+    assert 80.0 <= seen["SU02"] <= 85.0
+
+
+def test_one_who_comes_late_is_told_what_was() -> None:
+    relay = Relay(loss=0.0, delay_s=0.0, bytes_per_s=1e9, outages_s=((0.0, 150.0),))
+    state, watcher, _ = fly(relay, 260.0, exposures=60, faults_s={})
+    assert len(watcher.exposures) == len(state.exposures()) == 60
+
+
+def test_a_fault_that_is_over_goes() -> None:
+    state, sender, watcher = FlightState("x"), Sender(1e6), Received()
+    state.apply(flown.mission())
+    state.apply(flown.lost("SU02"))
+    for datagram in sender.due(state, 0.0):
+        watcher.take(datagram)
+    assert list(watcher.faults) == ["device SU02"]
+    state.apply(flown.recovered("SU02"))
+    state.acknowledge("device SU02")
+    for datagram in sender.due(state, 5.0):
+        watcher.take(datagram)
+    assert watcher.faults == {}
+
+
+@given(st.lists(st.binary(max_size=100), max_size=5))
+def test_any_bytes_are_counted_and_harm_nothing(datagrams: list[bytes]) -> None:
+    watcher = Received()
+    for datagram in datagrams:
+        watcher.take(datagram)
+    assert watcher.bad == len(datagrams)
+
+
+@pytest.mark.parametrize("bytes_per_s", [1000.0, 4000.0])
+def test_the_budget_is_kept(bytes_per_s: float) -> None:
+    state, sender = FlightState("x"), Sender(bytes_per_s)
+    state.apply(flown.mission())
+    for number in range(1, 100):
+        for event in flown.exposure(number):
+            state.apply(event)
+    sent = sum(len(d) for tick in range(600) for d in sender.due(state, tick / 10))
+    assert sent <= bytes_per_s * 61

@@ -1,0 +1,96 @@
+"""Under any budget a watcher ends up with the service's state, and what matters comes first."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgpack
+import pytest
+
+from daemon.onboard.monitoring.state import FlightState
+from daemon.onboard.monitoring.telemetry import Subscription, packed
+from tests.daemon.onboard.monitoring import flown
+
+
+def fly(state: FlightState, numbers: range) -> None:
+    for number in numbers:
+        for event in flown.exposure(number):
+            state.apply(event)
+        state.apply(flown.status(triggers=number))
+
+
+@pytest.mark.parametrize("bytes_per_s", [1000, 4000, 1e9])
+def test_every_watcher_converges_within_its_budget(bytes_per_s: float) -> None:
+    state = FlightState("syntopic test")
+    state.apply(flown.mission())
+    told = Subscription(bytes_per_s)
+    seen: dict[int, object] = {}
+    nbytes, now_s, brief = 0, 0.0, None
+    for step in range(2000):
+        now_s = step * 0.2
+        if step < 200 and step % 10 == 0:
+            fly(state, range(step // 10 + 1, step // 10 + 2))
+        record = told.record(state, now_s)
+        if record is None:
+            continue
+        nbytes += len(packed(record))
+        assert nbytes <= bytes_per_s * (now_s + 3.0) + 1500
+        brief = record
+        for one in record.get("exposures", []):
+            seen[one["number"]] = dict(one)
+    assert seen == {one["number"]: one for one in state.exposures()}
+    assert brief is not None
+    assert brief["status"]["ledger"] == state.brief()["status"]["ledger"]
+
+
+def test_a_fault_overtakes_everything_else() -> None:
+    state = FlightState("syntopic test")
+    state.apply(flown.mission())
+    fly(state, range(1, 500))
+    told = Subscription(2000)
+    assert told.record(state, 0.0) is not None
+    state.apply(flown.lost("SU02"))
+    now_s = 0.0
+    while True:
+        now_s += 0.2
+        record = told.record(state, now_s)
+        if record is not None and record["faults"]:
+            break
+    assert now_s <= 2.0
+
+
+def test_a_record_is_msgpack_that_any_reader_reads() -> None:
+    state = FlightState("syntopic test")
+    state.apply(flown.mission())
+    fly(state, range(1, 3))
+    record = Subscription().record(state, 0.0)
+    assert msgpack.unpackb(packed(record)) == record
+    assert record["version"] == 1
+
+
+def test_nothing_new_is_said_only_once_in_a_while() -> None:
+    state = FlightState("syntopic test")
+    state.apply(flown.mission())
+    told = Subscription()
+    times = [step * 0.1 for step in range(100) if told.record(state, step * 0.1) is not None]
+    assert len(times) == pytest.approx(10, abs=1)
+
+
+def test_the_schema_names_every_key_that_is_told() -> None:
+    state = FlightState("syntopic test")
+    settings = {"by": "operator", "control": "manual", "lock": "line", "locked_on": None}
+    lost = {"event": "lost", "mono_ns": "1", "number": 2, "cause": "no frames"}
+    bound = {"event": "bound", "device": "SU02", "kind": "head", "found": {}}
+    for event in (
+        *(flown.mission(), bound, flown.lost("SU02"), *flown.exposure(1), lost, flown.status()),
+        {"event": "exposure-settings", "settings": {}, **settings},
+    ):
+        state.apply(event)
+    snapshot = state.snapshot()
+    del snapshot["events"]  # each kind has its own keys, docs/events.md
+    told = set(snapshot)
+    for part in snapshot.values():
+        for item in part if isinstance(part, list) else [part]:
+            told |= set(item) if isinstance(item, dict) else set()
+    schema = (Path(__file__).parents[4] / "docs/telemetry.md").read_text()
+    assert {key for key in told if f"`{key}`" not in schema} == set()

@@ -1,0 +1,80 @@
+"""Commands, obeyed or refused, are on the disk at once."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from daemon.mission.log.flight_log import FlightLog, LogReader, read
+from daemon.mission.log.log_records import Message
+from daemon.onboard.service.messages import Answer, Command, CommandRefused, Log
+from daemon.onboard.service.service import Service
+from daemon.onboard.storage.writer import _Writing
+from tests.daemon.onboard.service.test_commanding import FakeService
+
+pytestmark = pytest.mark.trust
+
+
+class Flight(FakeService):
+    """Takes commands as the service does, and remembers what it sends to whom."""
+
+    _on_command = Service._on_command
+    _on_command_refused = Service._on_command_refused
+    _audit = Service._audit
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.sent: list[tuple[str, Log]] = []
+        self.answers: list[Answer] = []
+        self.events: list[dict[str, Any]] = []
+        self.supervisor = SimpleNamespace(send=lambda *sent: self.sent.append(sent))
+        self.watching = SimpleNamespace(answer=self.answers.append)
+
+    def _event(self, event: str, **content: Any) -> None:
+        self.events.append({"event": event, **content})
+
+
+def synced(folder: Path) -> list[Message]:
+    """The messages of a log up to its last byte known to be on the disk."""
+    (path,) = folder.glob("*.mcap")
+    reader: LogReader = read(path)
+    messages = list(reader)
+    assert reader.bad_checkpoints == 0
+    return messages
+
+
+def test_a_command_and_a_refusal_are_in_the_flight_log_and_on_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flight = Flight()
+    flight._on_command(Command(1, "trigger", {}, "anna", "operator", "10.0.0.9"))
+    flight._on_command(Command(2, "release-disk", {"disk": "x"}, "eva", "administrator", "unix"))
+    flight._on_command_refused(CommandRefused("land", "unknown", "none", "10.0.0.66", "no", 7))
+    assert [answer.done for answer in flight.answers] == [True, False]
+    assert [(one["event"], one["name"]) for one in flight.events] == [
+        ("command", "trigger"),
+        ("command", "release-disk"),
+        ("command-refused", "land"),
+    ]
+    log = FlightLog.create(tmp_path)
+    writing = _Writing(None, SimpleNamespace(log=log), {})
+    syncs = []
+    really_sync = log.sync
+    monkeypatch.setattr(log, "sync", lambda: (syncs.append(1), really_sync()))
+    writing.obey(Log(Message("raw/gnss", 1, b"x")))
+    assert not syncs, "what devices send is synced once a second"
+    for i, (process, order) in enumerate(flight.sent, start=1):
+        assert process == "writer"
+        writing.obey(order)
+        assert len(syncs) == i
+    told = [json.loads(one.payload) for one in synced(tmp_path) if one.topic == "audit"]
+    assert [(one["by"], one["role"], one["address"], one["done"]) for one in told] == [
+        ("anna", "operator", "10.0.0.9", True),
+        ("eva", "administrator", "unix", False),
+        ("unknown", "none", "10.0.0.66", False),
+    ]
+    assert told[2]["refused"] is True and told[2]["count"] == 7

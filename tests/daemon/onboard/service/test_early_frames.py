@@ -1,0 +1,122 @@
+"""Frames that arrive before the answer to their trigger, as software triggers answer last."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pytest
+
+from daemon.onboard.service.hearing import EARLY_FRAME_LIMIT_NS, Hearing
+from daemon.onboard.service.line import Order
+from daemon.onboard.service.messages import Fired
+from drivers.contract import TriggerPulse
+from tests.daemon.onboard.flight.test_flight import HEADS, NS, STROBE_NS, flight, frame, pulse
+
+pytestmark = pytest.mark.trust
+INTERVAL_S = 1.35
+
+
+class Flown:
+    """A flight's records in the order in which they come; what was reported of frames."""
+
+    def __init__(self) -> None:
+        self.flight = flight()
+        self.logged: list[object] = []
+        self.reported: list[str] = []
+        self.hearing = Hearing(
+            self.flight,
+            self.logged.append,
+            lambda event, **content: self.reported.append(f"{event} {content.get('cause')}"),
+        )
+
+    def order(self, number: int) -> None:
+        given = pulse(number, INTERVAL_S * number)
+        assert self.flight.order(given.mono_ns) == number
+        order = Order(number, given.mono_ns, given.delays_ns, STROBE_NS)
+        self.hearing.orders[number] = order
+
+    def frame(self, number: int, head: str, *, is_timed: bool) -> None:
+        """A frame of a head; one of a folder has no clock of its own."""
+        given = pulse(number, INTERVAL_S * number)
+        came = frame(head, given, slot=number % 3)
+        if not is_timed:
+            came = replace(came, device_clock_ns=None, device_clock_mono_ns=None)
+        self.hearing.hear(came)
+
+    def answer(self, number: int, *, fired: bool = True) -> None:
+        given = pulse(number, INTERVAL_S * number)
+        said = TriggerPulse(number, given.mono_ns, given.sigma_ns, given.count, given.spread_ns)
+        self.hearing.hear(Fired(number, said if fired else None, "" if fired else "no unit"))
+
+    @property
+    def frames(self) -> dict[str, int]:
+        sheet = self.flight.ledger.sheet().frames
+        return {cause: getattr(sheet, cause) for cause in ("used", "spurious", "late")}
+
+
+@pytest.fixture(params=[False, True], ids=["folder", "with a clock"])
+def is_timed(request: pytest.FixtureRequest) -> Iterator[bool]:
+    yield request.param
+
+
+def test_a_frame_before_the_answer_to_its_trigger_is_used(is_timed: bool) -> None:
+    flown = Flown()
+    for number in range(1, 6):
+        flown.order(number)
+        flown.frame(number, HEADS[0], is_timed=is_timed)
+        flown.frame(number, HEADS[1], is_timed=is_timed)
+        flown.answer(number)
+        flown.frame(number, HEADS[2], is_timed=is_timed)
+    assert flown.frames == {"used": 15, "spurious": 0, "late": 0}
+    assert not flown.reported
+    # A replay of the log sees the trigger first.
+    kinds = [type(record).__name__ for record in flown.logged]
+    assert kinds == ["LoggedTrigger", "Frame", "Frame", "Frame"] * 5
+
+
+def test_an_early_frame_is_not_given_to_an_exposure_whose_own_is_missing() -> None:
+    flown = Flown()
+    for number in (1, 2, 3):
+        flown.order(number)
+        flown.answer(number)
+        for head in HEADS if number < 3 else HEADS[1:]:
+            flown.frame(number, head, is_timed=False)
+    flown.order(4)
+    flown.frame(4, HEADS[0], is_timed=False)
+    flown.answer(4)
+    assert flown.frames["spurious"] == 0
+    exposures = flown.flight._open
+    assert HEADS[0] not in exposures[3].frames
+    assert exposures[4].frames[HEADS[0]].counter == 4
+
+
+def test_a_frame_of_an_earlier_exposure_does_not_wait_for_a_trigger() -> None:
+    flown = Flown()
+    flown.order(1)
+    flown.answer(1)
+    flown.order(2)
+    flown.frame(1, HEADS[0], is_timed=True)
+    assert flown.frames["used"] == 1
+
+
+def test_an_early_frame_of_a_trigger_that_failed_is_spurious_and_its_slot_free() -> None:
+    flown = Flown()
+    flown.order(1)
+    flown.frame(1, HEADS[0], is_timed=False)
+    assert flown.frames == {"used": 0, "spurious": 0, "late": 0}
+    flown.answer(1, fired=False)
+    assert flown.frames["spurious"] == 1
+    assert flown.flight.idle_slots == [(HEADS[0], 1)]
+
+
+def test_a_trigger_that_never_answers_keeps_no_slot_for_ever() -> None:
+    flown = Flown()
+    flown.order(1)
+    flown.frame(1, HEADS[0], is_timed=False)
+    came = pulse(1, INTERVAL_S).mono_ns + NS
+    flown.hearing.tell_of_time(came)
+    assert not flown.flight.idle_slots
+    flown.hearing.tell_of_time(came + EARLY_FRAME_LIMIT_NS + NS)
+    assert flown.flight.idle_slots == [(HEADS[0], 1)]
+    assert flown.frames["spurious"] == 1
