@@ -66,7 +66,7 @@ def test_settings_that_contradict_each_other_are_refused() -> None:
 def test_validating_every_driver_loads_no_hardware_library() -> None:
     code = (
         "import sys\n"
-        "from drivers import registry\n"
+        "from drivers.base import registry\n"
         "for kind, names in registry.kinds().items():\n"
         "    for name in names: registry.problems(kind, name, {})\n"
         "print(sorted({'gi', 'numba', 'cv2', 'numpy', 'tifffile'} & set(sys.modules)))\n"
