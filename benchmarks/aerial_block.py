@@ -1,4 +1,4 @@
-"""`python -m benchmarks.aerial_block`: the UltraCam L block of the paper, adjusted at full count.
+"""`python -m benchmarks.aerial_block`: the UltraCam L block, adjusted at full count.
 
 The emulator flies 296 frames in six lines and three cross strips and plants a systematic pattern
 of 2 um; the block is adjusted with each set of additional parameters and held against the truth.

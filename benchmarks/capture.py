@@ -1,4 +1,4 @@
-"""`python -m benchmarks.capture`: capture at full size (DESIGN 9, b), or with the pipeline (c).
+"""`python -m benchmarks.capture`: capture at full size, or with the pipeline (`--pipeline`).
 
 Thirteen emulated GigE Vision heads send frames made beforehand; the service captures, matches,
 hashes, stores and syncs them as in flight. `--pipeline` has it process them, too. What is verified

@@ -3,7 +3,7 @@
 Renders emulated mini exposures over real imagery while the camera cools, rests and warms again, and
 one probe sticks; draws dC by the probes beside dC by stitching.
 
-Source: seeds/ultracam-calibration.txt, fig. 1.
+Source: Ladstädter et al. (2010), fig. 1.
 """
 
 from __future__ import annotations

@@ -130,7 +130,7 @@ def true_turns(world: World, rig: Rig) -> Array:
 
 
 def pooled(trials: list[Trial]) -> dict[str, float | int]:
-    """The figures of DESIGN 9 over all trials."""
+    """Errors squared in their covariance, and errors in sigmas, over all trials."""
     rank = sum(t.rank for t in trials)
     normalised = np.abs(np.concatenate([t.normalised for t in trials]))
     errors = np.concatenate([t.error_rad for t in trials])

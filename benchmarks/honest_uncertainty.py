@@ -1,8 +1,8 @@
 """`python -m benchmarks.honest_uncertainty`: is the mosaic as accurate as it says, and no more?
 
 Stitches exposures rendered by the emulator and exposures whose tie points are drawn with the errors
-measured on the rendered ones, and holds every error against the covariance stated for it (DESIGN
-section 9). Truth, relief and errors of calibration, drift, mounting and probes are the emulator's.
+measured on the rendered ones, and holds every error against the covariance stated for it. Truth,
+relief and errors of calibration, drift, mounting and probes are the emulator's.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class Held:
 
 @dataclass(frozen=True)
 class Pooled:
-    """What many exposures say together; the interval is that of DESIGN section 9."""
+    """What many exposures say together; the interval holds 99.9 % of chi-square."""
 
     exposures: int
     rank: int

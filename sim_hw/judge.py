@@ -1,4 +1,4 @@
-"""The judge: holds the geometry of stitched images against the emulator's truth (DESIGN 9).
+"""The judge: holds the geometry of stitched images against the emulator's truth.
 
 A pure function with a thin command line. It reads what the mission says of itself and what the
 emulator knows, and nothing of the pipeline's.

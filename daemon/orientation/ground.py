@@ -1,6 +1,7 @@
 """How high above the ground an exposure was taken: over a height model, where one is configured.
 
-The mean over the image's footprint is what converging heads are projected onto (DESIGN 5.6).
+The mean over the image's footprint is what converging heads are projected onto
+(docs/mathematics/virtual-camera.md#ground-plane).
 """
 
 from __future__ import annotations

@@ -1,6 +1,8 @@
 """Position, velocity and attitude at one instant, from the samples around it.
 
 Position along a cubic through both positions and velocities, attitude by quaternion.
+
+Source: docs/mathematics/navigation.md#position-between-two-samples; Shoemake (1985).
 """
 
 from __future__ import annotations

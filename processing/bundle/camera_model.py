@@ -1,6 +1,7 @@
 """Interior orientation: measured image coordinates to ideal ones, and derivatives.
 
-Eq. 5.1 of seeds/dmc-calibration.txt in two readings (`Camera.model`), plus the additional terms.
+Heier et al. (2002), eq. 5.1, in two readings (`Camera.model`), plus the additional terms
+(docs/mathematics/bundle.md#camera-model).
 The correction is added to what was measured: ideal = measured + delta(measured).
 """
 

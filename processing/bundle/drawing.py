@@ -1,7 +1,7 @@
 """Plain SVG drawings of an adjustment: systematic image residuals, and the block from above.
 
 Strings only, without scripts or fonts of their own. Source of the first picture:
-seeds/ultracam-calibration.txt, fig. 10.
+Ladstädter et al. (2010), fig. 10.
 """
 
 from __future__ import annotations

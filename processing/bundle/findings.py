@@ -219,7 +219,8 @@ def image_residuals_mm(result: Adjustment) -> Array:
 
 
 def systematic_residuals(result: Adjustment, camera: int, cells: tuple[int, int]) -> Pattern:
-    """Mean image residuals of one camera over a grid of (columns, rows) cells, as in fig. 10."""
+    """Mean image residuals of one camera over a grid of (columns, rows) cells, as in Ladstädter
+    et al. (2010), fig. 10."""
     table = result.network.image_points
     residual = image_residuals_mm(result)
     own = (result.network.images.camera[table.image] == camera) & np.isfinite(residual).all(axis=1)

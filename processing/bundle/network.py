@@ -42,8 +42,8 @@ class NetworkError(ValueError):
 class Camera:
     """The interior orientation of one camera.
 
-    `model` says how the ten act on measured coordinates (`camera_model`): `australis` is eq. 5.1
-    of the DMC paper about the given principal point; `centred` applies affinity and shear first
+    `model` says how the ten act on measured coordinates (`camera_model`): `australis` is eq. 5.1 of
+    Heier et al. (2002) about the given principal point; `centred` applies affinity and shear first
     and the polynomials about the estimated principal point, as most close-range programs do.
 
     `interior` holds starting values of the ten, (10,); `free` names those to be estimated, `sigma`

@@ -5,7 +5,7 @@ parameters, as the sets a photogrammetrist of these cameras knows; what the last
 made of is not public, and these are our own:
 
 - `none`;
-- `radial`: K1 and K2 of eq. 5.1;
+- `radial`: K1 and K2 of Heier et al. (2002), eq. 5.1;
 - `sensors`: with them P1 and P2 (lens elements off the axis), dx0, dy0 and df (interior
   orientation; only where GNSS positions and two flying heights part it from the orientation of the
   images), and two shifts of every CCD: 7 + 2 (n - 1);

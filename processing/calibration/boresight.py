@@ -3,7 +3,7 @@
 Least squares of all exposures at once, with the whole covariance of the adjusted orientations. What
 the flight cannot separate is left at its given value and named, with what would part it.
 
-Source: seeds/multi-camera-calibration.txt (boresite calibration); DESIGN 5.9.
+Source: docs/mathematics/boresight.md#model; Jacobsen (2008), boresite calibration.
 """
 
 from __future__ import annotations

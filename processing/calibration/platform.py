@@ -7,7 +7,8 @@ the axes of the virtual image.
 A cone beside the flight axis sees from another place than the master cone; what that turns its
 image by is taken off with the height above ground.
 
-Source: seeds/dmc-calibration.txt, 6.1; seeds/ultracam-calibration.txt, "platform calibration".
+Source: docs/mathematics/virtual-camera.md#platform-calibration-from-a-flight; Heier et al. (2002),
+6.1; Ladstädter et al. (2010), "platform calibration".
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 Every image's rotation is turned back by that of the reference image of the same exposure; what is
 left is averaged over the block with the whole covariance of the adjustment.
 
-Source: seeds/multi-camera-calibration.txt, table 2.
+Source: docs/mathematics/boresight.md#relative-orientation-of-heads; Jacobsen (2008), table 2.
 """
 
 from __future__ import annotations

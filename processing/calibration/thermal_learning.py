@@ -3,7 +3,7 @@
 Each exposure's stitching adds to normal equations; what comes out is a proposal for a person to
 accept, and never finds its way into a product by itself.
 
-Source: DESIGN 5.3.
+Source: docs/mathematics/drift.md#learning and #what-is-observable.
 """
 
 from __future__ import annotations
@@ -280,7 +280,8 @@ def _inner_from_values(cone: Cone) -> tuple[Array, Array]:
 
     Returns:
         T (4 m - 4, 4 m) takes corrections in any gauge to inner coordinates; B (4 m, 4 m - 4) takes
-        these to corrections whose sums over the sensors vanish (as eq. 6a, 7a, 7b).
+        these to corrections whose sums over the sensors vanish (as Ladstädter et al. (2010), eq.
+            6a, 7a, 7b).
     """
     m = len(cone.sensors)
     differences = np.linalg.svd(np.ones((1, m)))[2][1:].T

@@ -1,7 +1,9 @@
-"""Brown's distortion as computer vision writes it, carried into the lens correction of eq. 5.1.
+"""Brown's distortion as computer vision writes it, carried into the lens correction.
 
 Makers of small cameras state measured = f(ideal); a rig file holds ideal = measured + delta. The
 correction is fitted once, and the fit says how well it does.
+
+Source: docs/mathematics/lens.md#from-browns-model; Brown (1971); Heier et al. (2002), eq. 5.1.
 """
 
 from __future__ import annotations

@@ -287,9 +287,11 @@ def head_smear_px(cone: Cone, conditions: Conditions) -> float | None:
 
 
 def _smear(rig: Rig, sensor: str, conditions: Conditions) -> tuple[float, float] | None:
-    """Motion in pixels along and across track that the sensor's TDI leaves (DESIGN 5.11).
+    """Motion in pixels along and across track that the sensor's TDI leaves.
 
     Rotation adds to translation by absolute value: the worst place of the image counts.
+
+    Source: docs/mathematics/quality.md#smear.
     """
     time_s = conditions.exposure_time_s.get(sensor)
     gsd_m = ground_sampling_distance_m(rig, conditions)

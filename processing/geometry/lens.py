@@ -1,8 +1,10 @@
-"""The lens correction of a cone: Australis ten parameters, eq. 5.1 of seeds/dmc-calibration.txt,
-and the grid of what they leave, where the rig file holds one.
+"""The lens correction of a cone: the ten parameters of Australis, and the grid of what they leave,
+where the rig file holds one.
 
 Points are mm in the layer, origin at the calibrated principal point; the direction is part of
 each function's name.
+
+Source: docs/mathematics/lens.md#ten-parameters; Heier et al. (2002), eq. 5.1.
 """
 
 from __future__ import annotations

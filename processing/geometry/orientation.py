@@ -4,6 +4,8 @@ Inertial systems tell roll, pitch and heading of the body against the local leve
 down); photogrammetry wants omega, phi, kappa of the camera against a map grid (east, north, up).
 Between them lie two constant matrices, the boresight, and the convergence of the meridian.
 Conversion goes through the matrix, never by renaming angles. Rotations are (3, 3), float64.
+
+Source: docs/mathematics/coordinates.md#from-roll-pitch-heading-to-the-grid.
 """
 
 from __future__ import annotations

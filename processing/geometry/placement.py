@@ -1,8 +1,10 @@
 """Where a sensor's pixels fall in the virtual image plane, and back.
 
 A placement composes TDI, TDM, skew, lens, principal distance, similarity S and layer
-transformation P (eq. 1 of seeds/ultracam-calibration.txt); adjusting S and P is the work of
-`processing.mosaic.free`.
+transformation P; adjusting S and P is the work of `processing.mosaic.free`.
+
+Source: docs/mathematics/coordinates.md#from-sensor-to-virtual-image; Ladstädter et al. (2010), eq.
+1.
 """
 
 from __future__ import annotations
@@ -156,7 +158,7 @@ def vip_mm_from_raw(placement: SensorPlacement, colrow: Array) -> Array:
     Returns:
         VIP points, shape (n, 2), mm, x right, y up.
 
-    Source: seeds/ultracam-calibration.txt, eq. 1.
+    Source: Ladstädter et al. (2010), eq. 1.
     """
     corrected = corrected_mm_from_raw(placement, np.asarray(colrow, dtype=np.float64))
     return apply_projective(placement.layer @ placement.similarity.matrix, corrected)

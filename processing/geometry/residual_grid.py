@@ -1,7 +1,9 @@
 """What a lens does beyond the ten parameters: a grid of corrections, to be added on top of them.
 
-Direction: *ideal from measured*, as eq. 5.1. The grid is taken at the measured place and added to
-what the ten parameters made of it (DESIGN 5.2).
+Direction: *ideal from measured*, as the ten parameters. The grid is taken at the measured place and
+added to what they made of it.
+
+Source: docs/mathematics/lens.md#residual-grid.
 """
 
 from __future__ import annotations

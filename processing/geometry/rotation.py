@@ -1,6 +1,8 @@
 """Rotation matrices from angles; the one home of the order omega, phi, kappa.
 
 R = Rx(omega) Ry(phi) Rz(kappa), camera to object, radians. Other orders convert through the matrix.
+
+Source: docs/mathematics/coordinates.md#rotation-matrix.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ A head's image is carried onto a horizontal plane of the ground and from there i
 image; that is a projective transformation of its layer. Which heads are turned how is adjusted in
 `processing.mosaic.free`.
 
-Source: seeds/dmc-calibration.txt, 6.1 and fig. 8; DESIGN 5.6.
+Source: docs/mathematics/virtual-camera.md#ground-plane; Heier et al. (2002), 6.1 and fig. 8.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Balancing the PAN heads from the histograms of their overlaps (DESIGN 5.1).
+"""Balancing the PAN heads from the histograms of their overlaps.
 
 A gain for each sensor; an offset too where an overlap spans light and dark enough to tell it. Also
 samples the heads at common nodes of the virtual image, which the seams use too.
 
-Source: seeds/dmc-calibration.txt, 6.2.
+Source: docs/mathematics/radiometry.md#balance-between-heads; Heier et al. (2002), 6.2.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _MIN_SAMPLES: Final = 30
 _MIN_SIGNAL: Final = 80.0
 """Level-1 counts (10 DN of 12 bits): below, the ratio of two means says little."""
 _SPAN: Final = 4.0
-"""Light over dark from which on an overlap tells an offset from a gain (DESIGN 5.1)."""
+"""Light over dark from which on an overlap tells an offset from a gain."""
 _LEVELS: Final = 12
 _UNLIKE: Final = 2e-4
 """What parallax and reflection leave between two cones at one level, of its signal."""

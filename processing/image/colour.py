@@ -1,9 +1,9 @@
-"""Which head sees which colours, and registering them to green (DESIGN 5.7).
+"""Which head sees which colours, and registering them to green.
 
 Heads are registered by projective transformations; green itself is placed by the adjustment of the
 mosaic, and the pixels are fetched in `processing.image.resampling`.
 
-Source: seeds/dmc-calibration.txt, 6.1; seeds/ultracam-calibration.txt, steps 5 and 6.
+Source: Heier et al. (2002), 6.1; Ladstädter et al. (2010), steps 5 and 6 of the previous versions.
 """
 
 from __future__ import annotations

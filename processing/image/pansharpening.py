@@ -1,4 +1,4 @@
-"""Pansharpening: the detail of the PAN image in the colours of the colour raster (DESIGN 5.7).
+"""Pansharpening: the detail of the PAN image in the colours of the colour raster.
 
 Each band becomes PAN times a smooth ratio, found so that the mean over the PAN pixels below a
 colour pixel is that colour pixel: geometry is PAN's, radiometry at colour resolution is kept.

@@ -10,6 +10,8 @@ does to the gradients cancels; and interpolation passes the same noise at every 
 Why unequal sharpness does not matter: to first order it leaves a multiple of the image's Laplacian,
 which is even where slopes are odd. One unknown of its own takes it out of shift and residuals, so
 that what is left to tell the sigma is noise.
+
+Source: docs/mathematics/matching.md#least-squares-matching; Gruen (1985).
 """
 
 from __future__ import annotations

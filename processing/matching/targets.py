@@ -3,7 +3,7 @@
 There is no drawn template: every image is matched to others of the same target under an affine
 change, gain and offset, and the positions that fit all matches are adjusted. What "the target's
 middle" is stays undetermined by one common shift, which the orientation of a series takes.
-Source: seeds/dmc-calibration.txt, 5.1.2.
+Source: Heier et al. (2002), 5.1.2.
 """
 
 from __future__ import annotations

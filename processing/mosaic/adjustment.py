@@ -2,6 +2,9 @@
 
 Blocks of observations that touch few unknowns each are accumulated into dense normal equations;
 what an observation or an unknown means is the caller's.
+
+Source: docs/mathematics/mosaicking.md#datum-by-inner-constraints; Förstner and Wrobel (2016),
+estimation with constraints.
 """
 
 from __future__ import annotations

@@ -4,6 +4,8 @@ A roof's sunny side or the edge of a field looks otherwise in green than in PAN,
 whose colours are not quite in one place: every point on it is off the same way. What that does to
 the covariance of the unknowns is reckoned here from the residuals of one exposure; single points
 and their weights are judged in `processing.mosaic.weights`.
+
+Source: docs/mathematics/mosaicking.md#accuracy.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
-"""What fixes the datum of a mosaic: inner constraints between its unknowns (DESIGN 5.4, 5.6).
+"""What fixes the datum of a mosaic: inner constraints between its unknowns.
 
 The adjustment they go into is in `processing.mosaic.free`.
 
-Source: seeds/ultracam-calibration.txt, eq. 6 and 7; seeds/dmc-calibration.txt, 6.1.
+Source: docs/mathematics/mosaicking.md#datum-by-inner-constraints; Ladstädter et al. (2010), eq. 6
+and 7; Heier et al. (2002), 6.1.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Plain SVG drawings: a rig's focal planes and virtual image, and what a stitching left over.
 
 Strings only, no fonts or scripts needed; they are shown by a browser, in the report and by
-`syntopic rigs show`. Sources of the pictures: seeds/ultracam-calibration.txt, fig. 2 to 5.
+`syntopic rigs show`. Sources of the pictures: Ladstädter et al. (2010), fig. 2 to 5.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 A second way to dC beside the probes, for cones of two or more CCDs, always with its standard
 deviation. What drift does is in `processing.geometry.drift`; nothing found here moves a pixel.
 
-Source: DESIGN 5.3; seeds/ultracam-calibration.txt, fig. 1, "estimation of dC from the stitching
-scales".
+Source: docs/mathematics/drift.md#estimated-dc; Ladstädter et al. (2010), fig. 1, "estimation of dC
+from the stitching scales".
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Did a sensor move in flight? What the stitching of many exposures says together (DESIGN 5.4).
+"""Did a sensor move in flight? What the stitching of many exposures says together.
 
 One exposure sees a displacement of a few hundredths of a pixel through its own noise; a flight of
 them sees when it began, and what calibration does not know drops out of the difference. The single

@@ -1,10 +1,11 @@
-"""Free image mosaicking: every sensor finds its place from tie points alone (DESIGN 5.4).
+"""Free image mosaicking: every sensor finds its place from tie points alone.
 
 The adjustment and its statistics live here; the unknowns are laid out in
 `processing.mosaic.model`, what observations weigh is in `processing.mosaic.weights`, and whether
 the result agrees with the calibration is judged in `processing.mosaic.validity`.
 
-Source: seeds/ultracam-calibration.txt, eq. 1-7, tables 1 and 2.
+Source: docs/mathematics/mosaicking.md#observation-equations; Ladstädter et al. (2010), eq. 1-7,
+tables 1 and 2.
 """
 
 from __future__ import annotations
@@ -138,7 +139,7 @@ def free_mosaic(
 
     Which unknowns there are follows from the rig: with a master cone the layers of the others are
     projective transformations onto its own; without one the PAN heads converge, and each has the
-    three angles of its mounting, whose mean turn is zero (DESIGN 5.6).
+    three angles of its mounting, whose mean turn is zero.
 
     Args:
         rig: the camera.
@@ -153,7 +154,7 @@ def free_mosaic(
         The mosaic. What tie points do not determine (missing frames, empty overlaps) stays at its
         start and is named.
 
-    Source: seeds/ultracam-calibration.txt, eq. 1-7.
+    Source: Ladstädter et al. (2010), eq. 1-7.
     """
     start = _starts(placements)
     cones = mosaic_cones(rig)

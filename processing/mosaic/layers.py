@@ -6,7 +6,8 @@ A change that all other cones share is the master's own; it moves the whole imag
 corrected. What changes in all cones alike cannot be observed by stitching: that takes a bundle
 adjustment with ground control or GNSS.
 
-Source: seeds/ultracam-calibration.txt, "platform calibration"; DESIGN 5.3.
+Source: docs/mathematics/validity.md#layers-against-the-platform-calibration; Ladstädter et al.
+(2010), "platform calibration".
 """
 
 from __future__ import annotations

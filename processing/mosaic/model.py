@@ -1,4 +1,4 @@
-"""The model of a mosaic: which S and P are free, and how VIP points depend on them (eq. 1, 2).
+"""The model of a mosaic: which S and P are free, and how VIP points depend on them.
 
 The unknowns are accumulated corrections against the start (calibration + TDM), never increments;
 their adjustment is in `processing.mosaic.free`.
@@ -119,7 +119,8 @@ def vip_and_design(
         Points (n, 2) in px of the virtual image, the indices (k,) of the unknowns touched, and the
         points' derivatives by these, (k, 2, n), px per unknown's own unit.
 
-    Source: seeds/ultracam-calibration.txt, eq. 1 and 2.
+    Source: docs/mathematics/mosaicking.md#observation-equations; Ladstädter et al. (2010), eq. 1
+    and 2.
     """
     n = len(corrected_mm)
     similarity = _similarity(model, start, values)

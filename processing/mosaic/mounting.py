@@ -4,7 +4,8 @@ Turns are small rotation vectors (rad) about the axes of the virtual image (x ri
 up), found against the platform calibration; the adjustment that finds them is in
 `processing.mosaic.free`.
 
-Source: seeds/dmc-calibration.txt, 6.1.
+Source: docs/mathematics/virtual-camera.md#mounting-angles; Heier et al. (2002), 6.1. Eq. 6 is that
+of Ladstädter et al. (2010).
 """
 
 from __future__ import annotations

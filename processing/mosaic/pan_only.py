@@ -1,9 +1,9 @@
-"""The experiment of the UltraCam L paper: PAN stitched without the colour master's help.
+"""The experiment with an UltraCam L: PAN stitched without the colour master's help.
 
 P/P tie points alone, a layer transformation of four parameters, and layers that were not
 pre-corrected by the platform calibration: what is lost without P/C points, not a method to fly.
 
-Source: seeds/ultracam-calibration.txt, "UltraCam L project review", fig. 10 left.
+Source: Ladstädter et al. (2010), "UltraCam L project review", fig. 10 left.
 """
 
 from __future__ import annotations

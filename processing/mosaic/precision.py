@@ -4,6 +4,9 @@ Three parts: the adjustment's covariance, which `processing.mosaic.free` makes; 
 drift coefficients of the master sensors the datum rests on; and the temperature of the master cone,
 which a common expansion hides in. Whether the calibration holds is judged in
 `processing.mosaic.validity`.
+
+Source: docs/mathematics/mosaicking.md#accuracy-of-the-image. Eq. 6 is that of Ladstädter et al.
+(2010).
 """
 
 from __future__ import annotations

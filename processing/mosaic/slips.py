@@ -3,6 +3,8 @@
 A head that drops or repeats lines shifts a band of its frame, or everything after one line. The
 adjustment spreads that over sensors that are in order; the residuals of the frame's own tie
 points, rejected ones included, still step along its rows or columns. Nothing is corrected here.
+
+Source: docs/mathematics/validity.md#read-out-slips.
 """
 
 from __future__ import annotations

@@ -1,8 +1,10 @@
-"""Where tie points are weak, calibration and platform take part in the adjustment (DESIGN 5.4).
+"""Where tie points are weak, calibration and platform take part in the adjustment.
 
 The free mosaic asks tie points alone; over water, sand, snow or under a cloud they say too little
 and their noise would bend the image. Here it is decided when that is so, and what calibration,
 temperature and platform know; the adjustment itself is in `processing.mosaic.free`.
+
+Source: docs/mathematics/mosaicking.md#supported-mosaic.
 """
 
 from __future__ import annotations

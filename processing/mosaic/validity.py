@@ -3,7 +3,8 @@
 Only the judgement and the datum that follows from it live here; the adjustment is in
 `processing.mosaic.free`. Displacements are (x right, y up), found minus expected, in PAN px.
 
-Source: seeds/ultracam-calibration.txt, "Optimal IO reconstruction", fig. 5 and 6; DESIGN 5.4.
+Source: docs/mathematics/validity.md#one-displaced-sensor; Ladstädter et al. (2010), "Optimal IO
+reconstruction", fig. 5 and 6.
 """
 
 from __future__ import annotations

@@ -2,6 +2,8 @@
 
 A-priori accuracy, variance components and data snooping; the adjustment that asks for them is in
 `processing.mosaic.free`.
+
+Source: docs/mathematics/mosaicking.md#weights.
 """
 
 from __future__ import annotations
@@ -35,7 +37,7 @@ class MosaicSettings:
 
     `sigma_pp_px`, `sigma_pc_px` are the a-priori standard deviations of one coordinate difference
     of a typical P/P and P/C point, in PAN px; the ratio of the two is found again from the data.
-    `parallax_px` is what relief leaves in P/C points (DESIGN 5.4), for this exposure.
+    `parallax_px` is what relief leaves in P/C points of this exposure.
     A direction of the unknowns that tie points know worse than `undetermined_px` (at the farthest
     point of the image) is held at its start, to so much: calibration and platform know it better.
     """

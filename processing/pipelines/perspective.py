@@ -3,7 +3,7 @@
 For rigs whose heads look apart (oblique heads) nothing is stitched: distortion, principal point and
 the drift of sensor and lens are taken out, and the image is a central perspective of `f_mm`.
 
-Source: seeds/multi-camera-calibration.txt ("perfect perspective based on a resampling").
+Source: Jacobsen (2008) ("perfect perspective based on a resampling").
 """
 
 from __future__ import annotations

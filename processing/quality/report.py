@@ -16,7 +16,7 @@ Figure = float | int | str | None
 
 
 class Flag(enum.IntFlag):
-    """The documented bit set of DESIGN 5.11. A bit keeps its place for ever."""
+    """The documented bit set (docs/formats.md). A bit keeps its place in all versions."""
 
     FRAME_MISSING = 1 << 0
     FRAME_LATE = 1 << 1

@@ -1,7 +1,8 @@
-"""Radiometric calibration of a sensor: what it is, and the file that holds it (DESIGN 5.1).
+"""Radiometric calibration of a sensor: what it is, and the file that holds it.
 
 The pass that applies it to pixels is in `processing.radiometry.level1`; balancing between heads,
-which needs the overlaps, is in `processing.image.balance`. Source: seeds/dmc-calibration.txt, 5.2.
+which needs the overlaps, is in `processing.image.balance`. Source:
+docs/mathematics/radiometry.md#offset-and-gain; Heier et al. (2002), 5.2.
 """
 
 from __future__ import annotations

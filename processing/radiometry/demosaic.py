@@ -1,4 +1,4 @@
-"""Three full colours of a Bayer head: green for matching and all bands for the image (DESIGN 5.7).
+"""Three full colours of a Bayer head: green for matching and all bands for the image.
 
 All kernels are linear and symmetric about the pixel they serve, so no colour is shifted against the
 raw pixels, by any part of a pixel: the demosaic shift is zero by construction, for each of the four

@@ -1,4 +1,4 @@
-"""Level-0 to Level-1: raw counts to linear signal in one fused pass over the pixels (DESIGN 5.1).
+"""Level-0 to Level-1: raw counts to linear signal in one fused pass over the pixels.
 
 Defects are interpolated here too; what the calibration is and where it comes from is in
 `processing.radiometry.calibration`.
@@ -8,6 +8,8 @@ neighbour in reach. Any other word is linear signal above black in units of 1 /
 `level1_counts_per_dn` DN (8 counts to the DN for 12 bits, so rounding stays far below the read
 noise); its lowest bit says that the pixel was saturated before it was scaled. Signal at or below
 black is held at `LEVEL1_FLOOR`.
+
+Source: docs/mathematics/radiometry.md#offset-and-gain, #tdi and #defects; Heier et al. (2002), 5.2.
 """
 
 from __future__ import annotations

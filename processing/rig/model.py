@@ -25,7 +25,10 @@ Role = Literal["pan", "colour"]
 
 @dataclass(frozen=True)
 class Drift:
-    """What one kelvin of dC does to a sensor's place in its cone (DESIGN 5.3)."""
+    """What one kelvin of dC does to a sensor's place in its cone.
+
+    Source: docs/mathematics/drift.md#linear-model.
+    """
 
     x_um_per_k: float = 0.0
     y_um_per_k: float = 0.0
@@ -104,7 +107,7 @@ class LensGrid:
 
 @dataclass(frozen=True)
 class Lens:
-    """Principal distance and the Australis ten, eq. 5.1 of seeds/dmc-calibration.txt.
+    """Principal distance and the Australis ten, Heier et al. (2002), eq. 5.1.
 
     The correction carries *measured* image coordinates to *ideal* ones: ideal = measured + delta,
     with what `residual_grid` adds. `f_ppm_per_k` is the drift of the principal distance against dC

@@ -91,7 +91,7 @@ class Pattern:
     """What the right half of the image (x > 0) suffers: a projective distortion; and radial.
 
     The right half's layer was joined to the left one by fewer parameters than its distortion has,
-    as in the experiment of the UltraCam L paper. `projective` are its eight small coefficients
+    as in the experiment of Ladstädter et al. (2010). `projective` are its eight small coefficients
     about the half's centre (shift x, y, four of the affine part, two of perspective), `radial` K1.
     """
 
@@ -172,9 +172,9 @@ ULTRACAM_L = Frame(9735 * 3.6e-3, 6588 * 3.6e-3, 70.0, 7.2e-3)
 
 
 def ultracam_l_plan() -> Plan:
-    """The flight of the UltraCam L paper: 296 frames, six lines and three cross strips, GSD 10 cm.
+    """The UltraCam L flight: 296 frames, six lines and three cross strips, GSD 10 cm.
 
-    The paper gives counts and GSD; overlaps of 80 and 40 % are ours.
+    Ladstädter et al. (2010) give counts and GSD; overlaps of 80 and 40 % are ours.
     """
     height, base, apart = 972.2, 131.8, 584.0
     strips = []

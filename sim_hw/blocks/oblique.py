@@ -1,9 +1,9 @@
-"""The block of the MIDAS paper: one nadir and four oblique heads, three lines of four stations.
+"""The block of Jacobsen (2008): one nadir and four oblique heads, three lines of four stations.
 
 Image coordinates only, by the emulator's own projection: lenses that distort by up to 100 um, heads
 mounted as the paper's table 2 has them, control read from an orthoimage and a height model.
 
-Source: seeds/multi-camera-calibration.txt. Its table lists phi, omega, kappa with phi primary, in
+Source: Jacobsen (2008), table 2. It lists phi, omega, kappa with phi primary, in
 grads; three values lost their leading sign and zero and are read as -.0261, -.3585, -.5065.
 """
 

@@ -36,7 +36,7 @@ ANGLE_SIGMA_RAD: Final = 0.3e-6
 HOLDER_SIGMA_RAD: Final = 2e-3
 PROBE_NOISE_K: Final = 0.05
 EXTRA_UM: Final = 0.25
-"""Amplitude of what the true lens does beyond eq. 5.1."""
+"""Amplitude of what the true lens does beyond Heier et al. (2002), eq. 5.1."""
 LENS_SPREAD: Final = {
     "dx0_mm": 0.02,
     "dy0_mm": 0.02,

@@ -151,7 +151,7 @@ def skewed_by(sensor: Sensor, about_mm: Array) -> Array:
 def undistorted(lens: Lens, xy_mm: Array) -> Array:
     """Ideal from measured image coordinates: the ten parameters, z = -f, and the grid on top.
 
-    Source: seeds/dmc-calibration.txt, eq. 5.1.
+    Source: Heier et al. (2002), eq. 5.1.
     """
     x, y = xy_mm[..., 0], xy_mm[..., 1]
     r2 = x * x + y * y

@@ -48,7 +48,7 @@ def true_vip(
     rows: Array,
     master_mid_gps_ns: int,
 ) -> tuple[Array, Array]:
-    """Where the ideal master camera would see the rays of raw pixels (DESIGN 9).
+    """Where the ideal master camera would see the rays of raw pixels.
 
     The ray leaves the sensor's own cone at the cone's own mid-exposure, from where the content of
     the raw pixel was then, meets flat ground at the mean height of the terrain, and is projected

@@ -16,7 +16,10 @@ Array = NDArray[np.float64]
 
 
 def ideal_from_measured(lens: Lens, measured_mm: Array) -> Array:
-    """Eq. 5.1 by cv2.projectPoints; (n, 2) mm. B1, B2, df and the offsets by an affine matrix."""
+    """Heier et al. (2002), eq. 5.1, by cv2.projectPoints; (n, 2) mm.
+
+    B1, B2, df and the offsets are an affine matrix.
+    """
     points = np.column_stack([measured_mm, np.ones(len(measured_mm))])
     # OpenCV: p1 goes with 2xy in x and r2 + 2y2 in y; the paper's P1 with r2 + 2x2 in x.
     coefficients = np.array([lens.k1, lens.k2, lens.p2, lens.p1, lens.k3])
@@ -81,7 +84,10 @@ def vip_px_of_raw(
 
 
 def placed(layer: Array, similarity: tuple[float, float, float, float], xy_mm: Array) -> Array:
-    """Eq. 1, x_vip = P S u', by cv2.transform and cv2.perspectiveTransform; (n, 2) mm."""
+    """x_vip = P S u' by cv2.transform and cv2.perspectiveTransform; (n, 2) mm.
+
+    Source: Ladstädter et al. (2010), eq. 1.
+    """
     x, y, turn, scale = similarity
     c, s = scale * np.cos(turn), scale * np.sin(turn)
     affine = np.array([[c, -s, x], [s, c, y]])

@@ -3,6 +3,8 @@
 The clock that is asked is an oscillator whose rate wanders; how much it wanders, and how well the
 readings deserve the sigma they came with, is learned from the pairs themselves. Nothing here knows
 what the pairs were made of.
+
+Source: docs/mathematics/time.md#clock-model; Rasmussen and Williams (2006), section 2.7.
 """
 
 from __future__ import annotations

@@ -3,6 +3,8 @@
 A mark is given to a pulse only where its time fits that pulse and no other, and where neither its
 count nor its arrival speaks for another. What cannot be decided is held, and looked at again
 whenever something new is known; what belongs nowhere in the end is spurious.
+
+Source: docs/mathematics/time.md#which-mark-belongs-to-which-pulse.
 """
 
 from __future__ import annotations

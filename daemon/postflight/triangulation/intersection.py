@@ -4,7 +4,7 @@ All heads of an exposure share its position and attitude, all exposures the bore
 a head its mounting: what these are uncertain by is carried into the points with its correlations.
 The mathematics is in `processing.bundle.intersection`.
 
-Source: seeds/multi-camera-calibration.txt ("object coordinates ... by combined intersection").
+Source: Jacobsen (2008) ("object coordinates ... by combined intersection").
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Bias and dark signal of every pixel from dark series over temperature and exposure time.
 
 offset(T, t) = bias + dark * t * 2^((T - reference) / doubling): bias and dark by pixel, the
-doubling of the whole sensor. Source: seeds/dmc-calibration.txt, 5.2.
+doubling of the whole sensor. Source: Heier et al. (2002), 5.2.
 """
 
 from __future__ import annotations

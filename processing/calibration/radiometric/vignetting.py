@@ -2,7 +2,7 @@
 
 The part of vignetting that comes from mounts at a distance falls with the area of the diaphragm.
 So the field of light at f-number N over that at N0 is 1 + (1/N^2 - 1/N0^2) * polynomial in r^2, and
-any aperture between is had from a few measured ones. Source: seeds/dmc-calibration.txt, 5.2.
+any aperture between is had from a few measured ones. Source: Heier et al. (2002), 5.2.
 """
 
 from __future__ import annotations

@@ -52,7 +52,7 @@ def turned(omega: float, phi: float, kappa: float) -> Array:
 
 
 def measured_from_ideal(camera: Camera, ideal: Array) -> Array:
-    """Eq. 5.1 inverted by fixed-point iteration, one image point (2,)."""
+    """Heier et al. (2002), eq. 5.1, inverted by fixed-point iteration, one image point (2,)."""
     dx0, dy0, df, k1, k2, k3, p1, p2, b1, b2 = camera.interior
     measured = ideal.copy()
     for _ in range(60):

@@ -1,4 +1,4 @@
-"""Eq. 5.1: every sign by a number, and the way back."""
+"""Heier et al. (2002), eq. 5.1: every sign by a number, and the way back."""
 
 from __future__ import annotations
 

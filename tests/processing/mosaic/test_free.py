@@ -137,7 +137,10 @@ def test_the_datum_holds_for_accumulated_corrections() -> None:
 
 
 def test_the_datum_leaves_the_smallest_sum_of_squares_at_the_master_sensors() -> None:
-    """No shift, scale or turn of the image brings them nearer to their calibration (eq. 6)."""
+    """No shift, scale or turn of the image brings them nearer to their calibration.
+
+    Source: Ladstädter et al. (2010), eq. 6.
+    """
     rng = np.random.default_rng(5)
     truth = make_truth(MINI, rng, sensor_px=2.0)
     points = tie_points_of(truth, rng)

@@ -3,7 +3,7 @@
 Every CCD's shift, rotation, scale and perspective skew, every cone's lens and its rotation against
 the master cone, in one bundle adjustment. Datum: principal distance and principal point of the
 cones stay as they are, and the first CCD of each cone is not turned. Sources:
-seeds/ultracam-calibration.txt, laboratory calibration; docs/calibration.md.
+Ladstädter et al. (2010), laboratory calibration; docs/calibration.md.
 """
 
 from __future__ import annotations

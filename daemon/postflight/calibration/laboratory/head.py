@@ -1,7 +1,7 @@
 """Geometric calibration of a head from collimator series (`calibrate head`).
 
 Targets are found by matching them to one another, their known directions and the ten parameters
-adjusted with one rotation for every series. Source: seeds/dmc-calibration.txt, 5.1.
+adjusted with one rotation for every series. Source: Heier et al. (2002), 5.1.
 """
 
 from __future__ import annotations

@@ -145,8 +145,8 @@ def _parameters(heads: Sequence[HeadGeometry]) -> Sheet:
             "correlated beyond 0.95",
         ),
         rows,
-        "Eq. 5.1, ideal from measured, about the origin of the layer; principal distance as in the "
-        "rig file, its change is df.",
+        "Heier et al. (2002), eq. 5.1, ideal from measured, about the origin of the "
+        "layer; principal distance as in the rig file, its change is df.",
     )
 
 

@@ -1,7 +1,7 @@
 """Radiometric calibration of heads from dark and flat series (`calibrate radiometric`).
 
 Reads the frames set by set, composes `processing.calibration.radiometric`, and holds the result
-against frames that took no part. Source: seeds/dmc-calibration.txt, 5.2; EMVA Standard 1288.
+against frames that took no part. Source: Heier et al. (2002), 5.2; EMVA Standard 1288.
 """
 
 from __future__ import annotations

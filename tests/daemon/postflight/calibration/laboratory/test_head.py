@@ -59,7 +59,8 @@ def test_a_head_comes_out_below_a_twentieth_of_a_pixel_and_the_grid_takes_the_re
     assert figures["targets"] > 90
     assert figures["series"] == 4
     assert figures["residual_px"] < 1.0 / 20.0
-    # 0.25 um of what the lens does beyond eq. 5.1 are in the residuals, and hardly in what is left.
+    # 0.25 um of what the lens does beyond Heier et al. (2002), eq. 5.1, are in the residuals, and
+    # hardly in what is left.
     assert figures["residual_with_grid_px"] < 0.75 * figures["residual_px"]
     assert told["serials"]["collimator"] == "SIM-COLLIMATOR-1"
     assert told["serials"]["sensor P1"] == "DM-P1"
