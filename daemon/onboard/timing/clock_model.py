@@ -294,12 +294,14 @@ class _Fit:
         self._stated = stated
         self._sigma = stated
         self._start = float(self._u[0])
+        self._solve()
         for _ in range(ROUNDS):
-            self._solve()
             sigma = stated * self._growth()
             if bool(np.all(np.abs(sigma - self._sigma) <= 0.05 * self._sigma)):
                 break
+            # An estimate is right only with the solution of the sigmas it uses.
             self._sigma = sigma
+            self._solve()
 
     def _solve(self) -> None:
         n = len(self._u)

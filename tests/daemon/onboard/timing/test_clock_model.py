@@ -107,3 +107,28 @@ def test_an_outlier_loses_weight_by_how_far_it_is_off_what_the_others_say() -> N
         expected.append(abs(z[index] - mean) / (OUTLIER * 0.75 * math.sqrt(variance)))
     assert max(expected) > 2.0
     assert fit._growth() == pytest.approx(np.maximum(expected, 1.0), rel=1e-4)
+
+
+def pairs_with_outliers(seed: int) -> list[Pair]:
+    """Of a clock without offset: sigma 50 ns, a quarter of them 0.1 to 100 us away."""
+    random = np.random.default_rng(seed)
+    count = int(random.integers(4, 12))
+    u_s = np.sort(random.uniform(0.0, 20.0, count))
+    off_ns = random.normal(0.0, 50.0, count)
+    odd = random.choice(count, max(1, count // 4), replace=False)
+    off_ns[odd] += random.choice([-1.0, 1.0], len(odd)) * 10 ** random.uniform(2.0, 5.0, len(odd))
+    return [Pair(round(a * NS), round(a * NS + b), 50.0) for a, b in zip(u_s, off_ns, strict=True)]
+
+
+@pytest.mark.parametrize("seed", [11, 112, 116, 185, 242, 248])
+def test_sigmas_that_grow_in_the_last_round_are_solved_with(seed: int) -> None:
+    pairs = pairs_with_outliers(seed)
+    fit = _Fit(pairs, 1.0)
+    assert np.any(fit._sigma > fit._stated)
+    span_ns = pairs[-1].from_ns
+    at_ns = [span_ns // 2, span_ns, span_ns + 10 * NS]
+    found = [fit.at(one, 0.0) for one in at_ns]
+    for one, (to_ns, sigma_ns) in zip(at_ns, found, strict=True):
+        assert abs(to_ns - one) < 5.0 * sigma_ns
+    fit._solve()
+    assert found == [fit.at(one, 0.0) for one in at_ns]
