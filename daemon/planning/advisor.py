@@ -14,10 +14,10 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from daemon.planning.image_counts import (
     STEP_M,
+    Array,
     Counts,
     Flags,
     Flown,
@@ -251,8 +251,8 @@ def _to_come(strip: Strip, block: _Block, line: PlannedLine) -> Counts:
 
 
 def _images_at(
-    along: NDArray[np.float64],
-    stations: NDArray[np.float64],
+    along: Array,
+    stations: Array,
     image_along_m: float,
     margin_m: float | None = None,
 ) -> Counts:
@@ -352,9 +352,11 @@ class _Found:
             b0, b1 = max(b0, strip.across[0]), min(b1, strip.across[-1])
             corners = ((a0, b0), (a1, b0), (a1, b1), (a0, b1))
             rings.append(tuple(place(*strip.place(a, b)) for a, b in corners))
-        weights = np.ones(cells.shape[1])
-        weights[[0, -1]] = 0.5  # the strip's edge runs through the middle of the outer points
-        area_m2 = float((cells * weights).sum()) * strip.cell_m[0] * strip.cell_m[1]
+        area_m2 = float(
+            _within(strip.along[rows], half_along, 0.0, strip.length_m)
+            @ cells
+            @ _within(strip.across, half_across, strip.across[0], strip.across[-1])
+        )
         worst = np.unravel_index(np.argmax(np.where(cells, self.short[rows], -1)), cells.shape)
         short = np.maximum.reduce([self.needed - self.inside, *self.lack.values()])[rows]
         needed = int(self.needed[rows][worst])
@@ -392,6 +394,12 @@ class _Found:
             return tuple(reasons)
         worst = min(holes, key=lambda hole: hole.images - hole.needed)
         return (f"seen by {worst.images} of the {worst.needed} images needed",)
+
+
+def _within(centres_m: Array, half_m: float, low_m: float, high_m: float) -> Array:
+    """How much of cells lies between two limits, such as the ends of a line, metres."""
+    inside: Array = np.minimum(centres_m + half_m, high_m) - np.maximum(centres_m - half_m, low_m)
+    return np.maximum(inside, 0.0)
 
 
 def _exposures(numbers: Iterable[int]) -> str:

@@ -253,3 +253,31 @@ def test_images_of_a_few_metres_are_asked_for_like_large_ones(image_m):
     (segment,) = look(gap).segments
     assert segment.from_m <= 7.7 * image_m and segment.to_m >= 8.3 * image_m
     assert segment.length_m < 5 * image_m
+
+
+def area_of(corners: tuple[Point, ...]) -> float:
+    """By the shoelace formula, square metres."""
+    x, y = np.array([PLANE.flat(corner) for corner in corners]).T
+    return float(abs(x @ np.roll(y, -1) - y @ np.roll(x, -1))) / 2
+
+
+@pytest.mark.parametrize("length_m", [LINE_M, LINE_M + 0.3 * STEP_M, LINE_M + 0.6 * STEP_M])
+@pytest.mark.parametrize("lost", [slice(0, 2), slice(-2, None), slice(4, 6), slice(None)])
+def test_a_hole_has_the_area_of_its_rings_and_ends_with_its_line(
+    length_m: float, lost: slice
+) -> None:
+    ahead, _ = axes(30.0)
+    line = PlannedLine("1", PLANE.place(0.0, 0.0), PLANE.place(*(ahead * length_m)))
+    taken = [
+        Taken(number, footprint(ahead * station_m, ahead))
+        for number, station_m in enumerate(np.arange(0.0, length_m + BASE_M, BASE_M), 1)
+    ]
+    whole = len(range(len(taken))[lost]) == len(taken)
+    taken[lost] = [replace(one, why_not="refly (BLUR)") for one in taken[lost]]
+    plan = Plan("block", (line,), SPECIFICATION)
+    (segment,) = advise(plan, taken, image_along_m=ALONG_M, image_across_m=ACROSS_M).segments
+    rings_m2 = sum(area_of(ring) for hole in segment.holes for ring in hole.rings)
+    assert segment.area_m2 == pytest.approx(rings_m2, rel=1e-6)
+    if whole:
+        # No point of the line is seen: the hole is its whole strip, up to the last planned image.
+        assert segment.area_m2 == pytest.approx(0.7 * ACROSS_M * length_m, rel=1e-3)
