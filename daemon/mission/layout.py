@@ -147,6 +147,11 @@ class Mission:
         mission_id = content.get("mission")
         if not isinstance(mission_id, str) or not plain_name(mission_id):
             raise MissionError(f"{marker}: names no mission; remove it to start a new one")
+        if not (root / mission_id).is_dir():
+            raise MissionError(
+                f"{marker}: names mission {mission_id}, and {root / mission_id} is no folder; put "
+                f"the folder back to continue the mission, or remove {marker} to start without it"
+            )
         try:
             return cls.open(root / mission_id)
         except MissionError as error:

@@ -1,0 +1,64 @@
+"""The folder of the mission being flown was removed by hand: the sentence, and its two cures."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from daemon import cli
+from daemon.configuration import load
+from daemon.disk.mission import CURRENT_FILE, Mission
+from daemon.service.departure import create_mission, interrupted_mission
+from tests.daemon.service.flight_parts import Planted
+
+pytestmark = pytest.mark.trust
+
+
+@pytest.fixture
+def planted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Planted]:
+    made = Planted(tmp_path, monkeypatch)
+    made.add("[watch]\nport = 0")
+    made.write()
+    yield made
+    for close in made.closing:
+        close()
+
+
+@pytest.mark.parametrize(
+    "command", [("check",), ("check", "--json"), ("run",), ("run", "--new-mission")]
+)
+def test_a_removed_mission_folder_is_named_with_cures_that_work(
+    command: tuple[str, ...],
+    planted: Planted,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    configuration, rig = load(planted.config)
+    mission = create_mission(configuration, rig, planted.config)
+    marker, aside = mission.root / CURRENT_FILE, planted.folder / "aside"
+    mission.path.rename(aside)
+    monkeypatch.setattr(sys, "argv", ["syntopic", *command, str(planted.config)])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 1
+    said = capsys.readouterr()
+    assert said.err.splitlines() == [
+        f"{marker}: names mission {mission.id}, and {mission.path} is no folder; put the folder "
+        f"back to continue the mission, or remove {marker} to start without it"
+    ]
+    assert said.out == ""
+    assert json.loads(marker.read_text())["mission"] == mission.id, "nothing was changed"
+    # The first cure.
+    shutil.copytree(aside, mission.path)
+    assert interrupted_mission(configuration) == mission
+    # The second one.
+    shutil.rmtree(mission.path)
+    marker.unlink()
+    assert interrupted_mission(configuration) is None
+    begun = create_mission(configuration, rig, planted.config)
+    assert Mission.current(mission.root) == begun
