@@ -224,3 +224,25 @@ def test_binding_says_what_was_heard_or_what_to_switch_on() -> None:
         bind(b"\xb5\x62\x00")
     with pytest.raises(DeviceError, match="nothing came"):
         bind(b"")
+
+
+@pytest.mark.parametrize(
+    ("week", "day", "leap", "is_read"),
+    [
+        (0, 0, 0, True),
+        (65_535, 6, 99, True),
+        (-1, 0, 0, False),
+        (65_536, 0, 0, False),
+        (2181, -1, 18, False),
+        (2181, 7, 18, False),
+        (2181, 5, -1, False),
+        (2181, 5, 100, False),
+    ],
+)
+def test_an_event_beyond_week_day_or_leap_seconds_is_left_out(
+    week: int, day: int, leap: int, is_read: bool
+) -> None:
+    event = sentence(f"PTNL,EVT,100000.500000,1,7,{week},{day},{leap}")
+    gps_ns = [record.gps_ns for record in decode(event)[1] if isinstance(record, EventMark)]
+    at_ns = week * WEEK_NS + (day * 86_400 + 36_000 + leap) * SECOND_NS + SECOND_NS // 2
+    assert gps_ns == ([at_ns] if is_read else [])

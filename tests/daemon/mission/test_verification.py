@@ -358,3 +358,18 @@ def make_old(mission: Mission) -> None:
     durable.create_file(
         mission.log_dir / "seals.json", [canonical_bytes({"format": 1, "logs": seals})]
     )
+
+
+def test_a_broken_chain_of_hashes_is_named_in_flight_without_a_chain_file(mission: Mission) -> None:
+    make_old(mission)
+    marker = mission.root / "current-mission.json"
+    marker.write_text(json.dumps({"mission": mission.id}))
+    assert verify(mission).state == "flown"
+    assert verify(mission).problems == ()
+    record = mission.level0(2) / "exposure.json"
+    content = json.loads(record.read_bytes())
+    content["previous_sha256"] = "0" * 64
+    record.chmod(0o644)
+    record.write_bytes(canonical_bytes(content))
+    problems = verify(mission).problems
+    assert any("chain is broken before exposure 2" in one for one in problems), problems

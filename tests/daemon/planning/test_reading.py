@@ -205,3 +205,26 @@ def test_advice_comes_back_as_a_plan_and_as_a_mission(tmp_path: Path) -> None:
     assert [loader.wp(i).command for i in range(4)] == [16, 206, 16, 206]
     assert math.isclose(loader.wp(2).x, 47.02, abs_tol=1e-6)
     assert [loader.wp(i).param1 for i in (1, 3)] == [80.0, 0.0]
+
+
+@pytest.mark.parametrize(("count", "is_read"), [(6, True), (5, False)])
+def test_a_waypoint_has_its_place_in_the_fifth_and_sixth_parameter(
+    tmp_path: Path, count: int, is_read: bool
+) -> None:
+    def item(command: int, *parameters: object) -> dict[str, object]:
+        return {"type": "SimpleItem", "command": command, "params": list(parameters)}
+
+    def waypoint(latitude: float) -> dict[str, object]:
+        return item(16, *(0, 0, 0, None, latitude, 15.4)[:count])
+
+    by_distance = [waypoint(47.00), item(206, 25), waypoint(47.01)]
+    once = item(203, 0, 0, 0, 0, 1)
+    by_photograph = [waypoint(47.00), once, waypoint(47.01), once]
+    for items in (by_distance, by_photograph):
+        data = json.dumps({"fileType": "Plan", "mission": {"items": items}}).encode()
+        if is_read:
+            (line,) = plan_of(tmp_path, "survey.plan", data).lines
+            assert (line.start, line.end) == (Point(47.00, 15.4), Point(47.01, 15.4))
+        else:
+            with pytest.raises(PlanError, match="no line"):
+                plan_of(tmp_path, "survey.plan", data)

@@ -10,7 +10,7 @@ import pytest
 from daemon.onboard.timing.clock import HostClock, RoundTrips, _Lateness
 from daemon.onboard.timing.mark_matching import MarkMatcher, _agree, _Channel, _Held, _is_same
 from daemon.onboard.timing.matching import Cause, Matcher, start_of_exposure_mono_ns
-from drivers.contract import Frame
+from drivers.contract import EventMark, Frame
 from tests.daemon.onboard.timing.test_matching import frame, mark, matcher, pulse
 
 NS = 1_000_000_000
@@ -392,3 +392,27 @@ def test_a_count_is_allowed_where_it_differs_by_the_confirmed_offset(
     marks = MarkMatcher(HostClock())
     marks._channels[("gnss", 0)] = _Channel(offset, is_confirmed=offset is not None)
     assert marks._count_allows(mark(7, count=count), pulse(7)) is is_allowed
+
+
+def marks_before_any_edge(*marks: EventMark, pulses: int = 1) -> MarkMatcher:
+    """By messages alone: marks first, then pulses from 1 on."""
+    clock = HostClock()
+    clock.message_arrived(GPS_NS, 60 * MS)
+    matching = MarkMatcher(clock)
+    for one in marks:
+        matching.mark(replace(one, count_bits=0))
+    for number in range(1, pulses + 1):
+        matching.pulse(pulse(number))
+    return matching
+
+
+def test_a_first_mark_is_believed_next_to_one_of_another_time() -> None:
+    matching = marks_before_any_edge(mark(1), mark(3))
+    assert matching.mark_of(1) == replace(mark(1), count_bits=0)
+
+
+def test_of_two_first_marks_near_one_pulse_neither_is_believed() -> None:
+    near = replace(mark(1), gps_ns=mark(1).gps_ns + 100 * MS)
+    matching = marks_before_any_edge(mark(1), near)
+    assert matching.mark_of(1) is None
+    assert matching.has_ambiguous(1)
