@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 
 from daemon import cli
-from daemon.configuration import load
-from daemon.disk.mission import CURRENT_FILE, Mission
-from daemon.service.departure import create_mission, interrupted_mission
-from tests.daemon.service.flight_parts import Planted
+from daemon.configuration.model import load
+from daemon.mission.layout import CURRENT_FILE, Mission
+from daemon.onboard.service.departure import create_mission, interrupted_mission
+from tests.daemon.onboard.service.flight_parts import Planted
 
 pytestmark = pytest.mark.trust
 
