@@ -17,7 +17,7 @@ from benchmarks.honest_uncertainty import Held, held
 from benchmarks.silent_errors.exposures import Planted
 from processing.geometry.placement import vip_mm_from_raw, vip_px_from_mm
 from processing.geometry.projective import apply_projective
-from processing.mosaic.precision import moved_datum_design, placed_covariance_px
+from processing.mosaic.precision import disturbance_covariance_px, placed_covariance_px
 from processing.pipelines.perspective import HeadsProduct
 from processing.pipelines.stitched import Product
 from processing.radiometry.demosaic import BAYER_BANDS, is_bayer
@@ -132,16 +132,13 @@ def _normalised(planted: Planted, product: Product, points: Mapping[str, Array])
     if not points or product.mosaic.redundancy <= 0:
         return None
     image, mosaic = planted.world.image, product.mosaic
-    error, designs, own = [], [], []
+    error = []
     for name, raw in points.items():
         mm = vip_mm_from_raw(mosaic.placements[name], raw)
         off = vip_px_from_mm(image, mm) - _true(planted, name, raw)
         error.append((off * (1.0, -1.0)).reshape(-1))
-        designs.append(moved_datum_design(planted.rig, mosaic, mm))
-        own.append(np.tile(product.disturbance.frames.get(name, np.zeros(2)), len(raw)))
     tie, datum = placed_covariance_px(planted.rig, mosaic, points, product.temperatures.usable_c)
-    design = np.concatenate(designs)
-    added = design @ product.disturbance.datum @ design.T + np.diag(np.concatenate(own))
+    added = disturbance_covariance_px(planted.rig, mosaic, points, product.disturbance)
     return held(np.concatenate(error), tie + datum + added)
 
 

@@ -10,7 +10,8 @@ Source: docs/mathematics/validity.md#what-findings-add. Eq. 6 is that of Ladstä
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -19,9 +20,17 @@ from numpy.typing import NDArray
 from processing.mosaic.datum import datum_candidates
 from processing.mosaic.estimated_dc import EstimatedDc, combined_dc
 from processing.mosaic.free import Mosaic
+from processing.mosaic.held import HeldPart, HeldQuantities, calibrated_parts, scaled_part
 from processing.mosaic.layers import LayerCheck
 from processing.mosaic.mounting import PlatformCheck
-from processing.mosaic.precision import Disturbance, datum_design, datum_per_kelvin_px
+from processing.mosaic.precision import (
+    BLIND_SIGMA_K,
+    PROBE_SIGMA_K,
+    UNKNOWN_SIGMA_K,
+    Disturbance,
+    datum_design,
+    datum_per_kelvin_px,
+)
 from processing.mosaic.slips import Slip
 from processing.mosaic.validity import Validity
 from processing.rig import Rig, Sensor
@@ -36,8 +45,8 @@ STALE_K_PER_S: Final = 0.02
 """How fast temperatures change that were read too long ago."""
 HEAD_SCALE_PPM: Final = 50.0
 """Of a converging head; healthy ones reach half of it."""
-BENT_SHARE: Final = 0.5
-"""Of the misfit of a head with another scale that its neighbours take."""
+RELATIVE_SHIFT: Final = 3.0
+"""The largest of a few shifts of frames against each other, over the sigma of a coordinate of one."""
 LEAST_PX: Final = 0.02
 """Displacements below are alike."""
 
@@ -51,7 +60,11 @@ def disturbance_of(
     layers: LayerCheck | None,
     platform: PlatformCheck | None,
     slips: Sequence[Slip],
+    held: HeldQuantities | None,
+    temperatures_c: Mapping[str, float],
     stale_s: float = 0.0,
+    shifted_px: float = 0.0,
+    weak: Collection[str] = (),
 ) -> Disturbance:
     """Add up what the findings of one exposure may have done to the image.
 
@@ -63,7 +76,11 @@ def disturbance_of(
         layers: the other cones against the platform calibration.
         platform: the mountings of converging heads against it.
         slips: shifted bands of frames.
+        held: what the adjustment of converging heads holds.
+        temperatures_c: temperatures that were read, by probe name.
         stale_s: age of the temperatures where they are too old, else zero.
+        shifted_px: how far frames lay apart beyond the search for tie points, else zero.
+        weak: sensors that rest on calibration.
     """
     warmed = tuple(_wrong_temperature(rig, mosaic, estimated_dc))
     # A wrong temperature changes the scale of all layers alike, too.
@@ -77,15 +94,79 @@ def disturbance_of(
         shift = np.array([slip.dx_px, slip.dy_px])
         for name in (slip.sensor, *slip.alternatives):
             frames[name] = frames.get(name, np.zeros(2)) + slip.share * shift**2
-    if platform is not None and abs(platform.scaled.scale_ppm) > HEAD_SCALE_PPM:
-        for head in platform.heads:
-            for sensor in rig.cone(head.cone).sensors:
-                # Even pixels of a side have a third of its square half length. The adjustment
-                # bends the other heads towards the one that does not fit.
-                ppm = platform.scaled.scale_ppm * (1.0 if head == platform.scaled else BENT_SHARE)
-                reach = np.array([sensor.width_px, sensor.height_px]) / 2.0 * ppm * 1e-6
-                frames[sensor.name] = frames.get(sensor.name, np.zeros(2)) + reach**2 / 3.0
-    return Disturbance(datum, frames)
+    unplaced, apart = _unplaced(rig, mosaic, shifted_px, weak)
+    parts = (*_held(rig, mosaic, platform, held, temperatures_c, stale_s), *apart)
+    return Disturbance(datum + unplaced + _common_scale(mosaic, platform, held), frames, parts)
+
+
+def _held(
+    rig: Rig,
+    mosaic: Mosaic,
+    platform: PlatformCheck | None,
+    held: HeldQuantities | None,
+    temperatures_c: Mapping[str, float],
+    stale_s: float,
+) -> Iterator[HeldPart]:
+    """What the calibration of converging heads does, and heads that are not as calibrated."""
+    if held is None:
+        return
+    unknown_k = UNKNOWN_SIGMA_K if temperatures_c else BLIND_SIGMA_K
+    sigma_k = {
+        probe: math.hypot(
+            PROBE_SIGMA_K if probe in temperatures_c else unknown_k, STALE_K_PER_S * stale_s
+        )
+        for probe in rig.probes
+    }
+    yield from calibrated_parts(rig, held, temperatures_c, sigma_k)
+    scaled = scaled_part(held, least=HEAD_SCALE_PPM * 1e-6)
+    if scaled is not None:
+        yield scaled
+    if platform is None or not platform.expired:
+        return
+    for head in platform.heads:
+        # A displaced sensor passes for a turned head, whose image bends otherwise.
+        for part, shift_px in zip(held.parts[head.cone][:2], head.shift_px, strict=True):
+            yield part.times(shift_px * mosaic.model.pitch_mm)
+
+
+def _common_scale(
+    mosaic: Mosaic, platform: PlatformCheck | None, held: HeldQuantities | None
+) -> Array:
+    """Where several heads have other scales, what all have in common is known no better."""
+    datum = np.zeros((4, 4))
+    if held is None or platform is None or not platform.expired:
+        return datum
+    changed = np.abs(held.scales) > HEAD_SCALE_PPM * 1e-6
+    if changed.sum() > 1:
+        datum[2, 2] = float(np.mean(held.scales**2)) / mosaic.model.pitch_mm**2
+    return datum
+
+
+def _unplaced(
+    rig: Rig, mosaic: Mosaic, shifted_px: float, weak: Collection[str]
+) -> tuple[Array, tuple[HeldPart, ...]]:
+    """Frames that lay elsewhere than calibrated, where tie points do not say where.
+
+    The calibration that holds them is off by as much, the datum's among it.
+    """
+    datum = np.zeros((4, 4))
+    owners = {name.split(".")[0] for name in mosaic.undetermined}
+    owners |= {*weak, *(rig.cone_of(name).name for name in weak)}
+    if not shifted_px or not owners:
+        return datum, ()
+    sigma_px = shifted_px / RELATIVE_SHIFT
+    # A cone's place in the image is that of its mounting as well, which the master has none of.
+    of_datum = (sigma_px / 2.0) ** 2
+    half_mm = mosaic.model.half_size_mm
+    datum = np.diag([1.0, 1.0, half_mm**-2, half_mm**-2]) * of_datum
+    parts = []
+    for i, name in enumerate(mosaic.model.names):
+        if name.split(".")[0] not in owners:
+            continue
+        unknowns = np.zeros(len(mosaic.model.names))
+        unknowns[i] = mosaic.model.units[i] * sigma_px
+        parts.append(HeldPart(unknowns))
+    return datum, tuple(parts)
 
 
 def _turned_heads(mosaic: Mosaic, platform: PlatformCheck | None) -> Iterator[Array]:
@@ -174,7 +255,10 @@ def _changed_master(rig: Rig, mosaic: Mosaic, layers: LayerCheck | None) -> Iter
         return np.array([-f_px * by_y, f_px * by_x, scale_ppm * per_mm, by_z * per_mm])
 
     if layers.master_changed:
-        yield moved(*layers.common)
+        # Each by itself: together they would state one direction only, and that of their noise.
+        beyond = np.abs(layers.common) > SCALE_SIGMAS * layers.common_sigmas
+        for quantity in np.diag(layers.common)[beyond]:
+            yield moved(*quantity)
     elif len(layers.causes) > 1:
         changes = np.sqrt(np.mean([layer.values**2 for layer in layers.layers], axis=0))
         for quantity in np.diag(changes)[: 3 if alone else 1]:

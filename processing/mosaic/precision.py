@@ -21,6 +21,7 @@ from processing.geometry.drift import sensor_dc
 from processing.geometry.placement import corrected_mm_from_raw, vip_mm_from_raw
 from processing.mosaic.datum import datum_candidates
 from processing.mosaic.free import Mosaic, vip_precision_px
+from processing.mosaic.held import HeldPart
 from processing.mosaic.model import vip_and_design
 from processing.quality.report import Figure
 from processing.rig import Rig, Sensor
@@ -35,14 +36,16 @@ BLIND_SIGMA_K = 15.0
 
 @dataclass(frozen=True)
 class Disturbance:
-    """Covariance that the findings of an exposure add (`processing.mosaic.disturbance`).
+    """Covariance beside that of tie points and datum (`processing.mosaic.disturbance`).
 
     `datum` (4, 4) is that of shift x, y (px), scale and rotation (px per mm) of the whole image;
-    `frames` (2,) the variance of a coordinate, px squared, of one sensor's pixels, by its name.
+    `frames` (2,) the variance of a coordinate, px squared, of one sensor's pixels, by its name;
+    `parts` are patterns of errors over the image, independent of each other.
     """
 
     datum: Array = field(default_factory=lambda: np.zeros((4, 4)))
     frames: Mapping[str, Array] = field(default_factory=dict)
+    parts: tuple[HeldPart, ...] = ()
 
 
 def precision_figures(
@@ -108,6 +111,8 @@ def placed_sigma_px(
     of_datum = datum_covariance(rig, mosaic, measured_c) + disturbance.datum
     variance = np.sum((datum @ of_datum) * datum, axis=1).reshape(-1, 2)
     variance = variance + disturbance.frames.get(sensor, np.zeros(2))
+    for part in disturbance.parts:
+        variance = variance + part.at(mosaic, sensor, colrow) ** 2
     return np.asarray(np.sqrt(tie_points**2 + variance))
 
 
@@ -144,6 +149,27 @@ def placed_covariance_px(
         jacobian @ mosaic.covariance @ jacobian.T,
         similarity @ datum_covariance(rig, mosaic, measured_c) @ similarity.T,
     )
+
+
+def disturbance_covariance_px(
+    rig: Rig, mosaic: Mosaic, points: Mapping[str, Array], disturbance: Disturbance
+) -> Array:
+    """Covariance (2 n, 2 n), px squared, that a disturbance adds; order as `placed_covariance_px`."""
+    designs = [
+        moved_datum_design(rig, mosaic, vip_mm_from_raw(mosaic.placements[name], colrow))
+        for name, colrow in points.items()
+    ]
+    own = [
+        np.tile(disturbance.frames.get(name, np.zeros(2)), len(colrow))
+        for name, colrow in points.items()
+    ]
+    design = np.concatenate(designs)
+    covariance = design @ disturbance.datum @ design.T + np.diag(np.concatenate(own))
+    for part in disturbance.parts:
+        errors = [part.at(mosaic, name, colrow).reshape(-1) for name, colrow in points.items()]
+        error = np.concatenate(errors)
+        covariance += np.outer(error, error)
+    return np.asarray(covariance)
 
 
 def datum_covariance(rig: Rig, mosaic: Mosaic, measured_c: Mapping[str, float]) -> Array:

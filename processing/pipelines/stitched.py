@@ -7,6 +7,7 @@ reads a file or waits for anything.
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -49,6 +50,7 @@ from processing.mosaic.disturbance import disturbance_of
 from processing.mosaic.estimated_dc import EstimatedDc, estimate_dc
 from processing.mosaic.fixed import fixed_mosaic
 from processing.mosaic.free import Mosaic, MosaicSettings
+from processing.mosaic.held import held_quantities
 from processing.mosaic.layers import check_layers, layer_figures
 from processing.mosaic.mounting import check_platform, platform_figures
 from processing.mosaic.precision import precision_figures
@@ -251,7 +253,11 @@ class Pipeline:
                 layers=layers,
                 platform=platform,
                 slips=stitched.slips,
+                held=held_quantities(mosaic, tie_points),
+                temperatures_c=temperatures.usable_c,
                 stale_s=self._stale_s(conditions),
+                shifted_px=max((math.hypot(*p) for p in content.shifted_px.values()), default=0.0),
+                weak=stitched.weak,
             )
         with clock.stage("composition"):
             image = self._pan.compose(
