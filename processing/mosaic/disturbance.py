@@ -46,7 +46,7 @@ STALE_K_PER_S: Final = 0.02
 HEAD_SCALE_PPM: Final = 50.0
 """Of a converging head; healthy ones reach half of it."""
 RELATIVE_SHIFT: Final = 3.0
-"""The largest of a few shifts of frames against each other, over the sigma of a coordinate of one."""
+"""The largest of a few shifts between frames, over the sigma of a coordinate of one."""
 LEAST_PX: Final = 0.02
 """Displacements below are alike."""
 

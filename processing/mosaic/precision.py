@@ -154,7 +154,7 @@ def placed_covariance_px(
 def disturbance_covariance_px(
     rig: Rig, mosaic: Mosaic, points: Mapping[str, Array], disturbance: Disturbance
 ) -> Array:
-    """Covariance (2 n, 2 n), px squared, that a disturbance adds; order as `placed_covariance_px`."""
+    """Covariance (2 n, 2 n) that a disturbance adds, px squared, as in `placed_covariance_px`."""
     designs = [
         moved_datum_design(rig, mosaic, vip_mm_from_raw(mosaic.placements[name], colrow))
         for name, colrow in points.items()
