@@ -22,7 +22,7 @@ from processing.mosaic.estimated_dc import EstimatedDc, combined_dc
 from processing.mosaic.free import Mosaic
 from processing.mosaic.held import HeldPart, HeldQuantities, calibrated_parts, scaled_part
 from processing.mosaic.layers import LayerCheck
-from processing.mosaic.mounting import PlatformCheck
+from processing.mosaic.mounting import Mounting, PlatformCheck
 from processing.mosaic.precision import (
     BLIND_SIGMA_K,
     PROBE_SIGMA_K,
@@ -86,7 +86,7 @@ def disturbance_of(
     # A wrong temperature changes the scale of all layers alike, too.
     changed = () if warmed else tuple(_changed_master(rig, mosaic, layers))
     datum = np.zeros((4, 4))
-    turned = [*_turned_heads(mosaic, platform), *_stale(rig, mosaic, stale_s)]
+    turned = [*_turned_heads(mosaic, platform, held), *_stale(rig, mosaic, stale_s)]
     for part in (*_other_datums(rig, mosaic, validity), *warmed, *changed, *turned):
         datum += np.outer(part, part)
     frames: dict[str, Array] = {}
@@ -123,10 +123,22 @@ def _held(
         yield scaled
     if platform is None or not platform.expired:
         return
+    f_mm = mosaic.model.f_mm
     for head in platform.heads:
         # A displaced sensor passes for a turned head, whose image bends otherwise.
-        for part, shift_px in zip(held.parts[head.cone][:2], head.shift_px, strict=True):
-            yield part.times(shift_px * mosaic.model.pitch_mm)
+        by_x, by_y, _ = _true_turn(mosaic, head, held)
+        for part, shift_mm in zip(held.parts[head.cone], (-f_mm * by_y, f_mm * by_x), strict=False):
+            yield part.times(shift_mm)
+
+
+def _true_turn(mosaic: Mosaic, head: Mounting, held: HeldQuantities | None) -> Array:
+    """The turn of a head (3,), rad, less what heads with another scale make of it."""
+    turn = np.array(head.turn_rad)
+    scaled = None if held is None else scaled_part(held, least=HEAD_SCALE_PPM * 1e-6)
+    if scaled is None:
+        return turn
+    first = mosaic.model.mountings[head.cone]
+    return np.asarray(turn - scaled.unknowns[first : first + 3])
 
 
 def _common_scale(
@@ -169,14 +181,16 @@ def _unplaced(
     return datum, tuple(parts)
 
 
-def _turned_heads(mosaic: Mosaic, platform: PlatformCheck | None) -> Iterator[Array]:
+def _turned_heads(
+    mosaic: Mosaic, platform: PlatformCheck | None, held: HeldQuantities | None
+) -> Iterator[Array]:
     """What heads that turned do to the mean of all, which is the datum; each on its own."""
     if platform is None or not platform.expired:
         return
     pitch_mm = mosaic.model.pitch_mm
     f_px = mosaic.model.f_mm / pitch_mm
     for head in platform.heads:
-        by_x, by_y, by_z = np.array(head.turn_rad) / (len(platform.heads) - 1)
+        by_x, by_y, by_z = _true_turn(mosaic, head, held) / (len(platform.heads) - 1)
         yield np.array([-f_px * by_y, f_px * by_x, 0.0, by_z / pitch_mm])
 
 

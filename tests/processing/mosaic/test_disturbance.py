@@ -184,18 +184,18 @@ def quantities(mosaic: Mosaic, scales: tuple[float, ...]) -> HeldQuantities:
 
 def test_heads_that_turned_move_the_mean_and_may_have_displaced_sensors() -> None:
     rig, mosaic = mosaic_of("dmc-mini")
-    moved = dataclasses.replace(_head("2", (0.0, -6e-5, 9e-5), 0.0), shift_px=(3.0, -4.0))
-    heads = (_head("1", (3e-5, 0.0, 0.0), 0.0), moved)
+    heads = (_head("1", (3e-5, 0.0, 0.0), 0.0), _head("2", (-4e-5, -6e-5, 9e-5), 0.0))
     expired = PlatformCheck(heads, np.zeros((6, 6)), 50.0, 3, 20.0)
     held = quantities(mosaic, (0.0, 0.0, 0.0, 0.0))
     disturbed = found(rig, mosaic, platform=expired, held=held)
     f_px, pitch = mosaic.model.f_mm / mosaic.model.pitch_mm, mosaic.model.pitch_mm
     first = np.array([0.0, 3e-5 * f_px, 0.0, 0.0])
-    second = np.array([6e-5 * f_px, 0.0, 0.0, 9e-5 / pitch])
+    second = np.array([6e-5 * f_px, -4e-5 * f_px, 0.0, 9e-5 / pitch])
     expected = np.outer(first, first) + np.outer(second, second)
     np.testing.assert_allclose(disturbed.datum, expected, rtol=1e-9)
     of_second = [part.layers["2"] for part in disturbed.parts[-2:]]
-    np.testing.assert_allclose(of_second, np.diag([3.0, -4.0, 0.0])[:2] * pitch, atol=1e-12)
+    shifts = np.diag([6e-5, -4e-5, 0.0])[:2] * mosaic.model.f_mm
+    np.testing.assert_allclose(of_second, shifts, atol=1e-12)
     fits = dataclasses.replace(expired, statistic=19.0)
     fewer = found(rig, mosaic, platform=fits, held=held)
     assert not fewer.datum.any() and len(fewer.parts) == len(disturbed.parts) - 4
@@ -214,6 +214,18 @@ def test_heads_with_other_scales_state_one_pattern_and_what_they_share() -> None
     two = found(rig, mosaic, platform=expired, held=both)
     np.testing.assert_allclose(two.datum[2, 2], (9e-8 + 16e-8) / 4.0 / pitch**2, rtol=1e-9)
     assert two.parts[healthy].layers["3"][2] == pytest.approx(-4e-4)
+
+
+def test_what_another_scale_makes_of_a_turn_is_no_turn() -> None:
+    rig, mosaic = mosaic_of("dmc-mini")
+    heads = tuple(_head(name, (3e-5, 0.0, 0.0), 0.0) for name in "1234")
+    expired = PlatformCheck(heads, np.zeros((12, 12)), 50.0, 9, 20.0)
+    held = quantities(mosaic, (0.0, 3e-4, 0.0, 0.0))
+    away = np.zeros(len(mosaic.model.names))
+    away[list(mosaic.model.mountings.values())] = 3e-5
+    assert found(rig, mosaic, platform=expired, held=held).datum.any()
+    explained = dataclasses.replace(held, away=away)
+    assert not found(rig, mosaic, platform=expired, held=explained).datum.any()
 
 
 def test_old_temperatures_warm_converging_heads_each_by_itself() -> None:
