@@ -22,6 +22,7 @@ from processing.matching.tie_points import PAN_TO_COLOUR, TiePoints
 from processing.mosaic.datum import mounting_constraints
 from processing.mosaic.free import Mosaic
 from processing.mosaic.model import vip_and_design
+from processing.quality.report import Figure
 from processing.rig import Cone, Rig
 
 Array = NDArray[np.float64]
@@ -169,12 +170,33 @@ def scaled_part(held: HeldQuantities, *, least: float) -> HeldPart | None:
     Returns:
         None where no head has another scale.
     """
-    large = np.abs(held.scales) > np.maximum(least, SIGNIFICANT * held.scale_sigmas)
+    large = _significant(held) & (np.abs(held.scales) > least)
     if not large.any():
         return None
     some = [held.parts[cone][2] for cone in held.cones]
     found = _sum(some, [float(s) for s in held.scales * large])
     return HeldPart(found.unknowns + held.away, found.layers)
+
+
+def scale_figures(held: HeldQuantities | None) -> dict[str, Figure]:
+    """The head whose scale differs most, in figures of the quality report.
+
+    Against `processing.mosaic.mounting.platform_figures`, which compare each head with its
+    neighbours alone, all heads are weighed together: the one that bends the others is named.
+    """
+    if held is None or not _significant(held).any():
+        return {}
+    sizes = np.abs(held.scales) * _significant(held)
+    i = int(np.argmax(sizes))
+    # A head that is placed too large has to shrink.
+    return {
+        "platform_scale_ppm": -float(held.scales[i]) * 1e6,
+        "platform_scale_head": held.cones[i],
+    }
+
+
+def _significant(held: HeldQuantities) -> NDArray[np.bool_]:
+    return np.asarray(np.abs(held.scales) > SIGNIFICANT * held.scale_sigmas)
 
 
 def _sum(parts: Sequence[HeldPart], factors: Sequence[float]) -> HeldPart:

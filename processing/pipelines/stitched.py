@@ -50,7 +50,7 @@ from processing.mosaic.disturbance import disturbance_of
 from processing.mosaic.estimated_dc import EstimatedDc, estimate_dc
 from processing.mosaic.fixed import fixed_mosaic
 from processing.mosaic.free import Mosaic, MosaicSettings
-from processing.mosaic.held import held_quantities
+from processing.mosaic.held import held_quantities, scale_figures
 from processing.mosaic.layers import check_layers, layer_figures
 from processing.mosaic.mounting import check_platform, platform_figures
 from processing.mosaic.precision import precision_figures
@@ -245,6 +245,7 @@ class Pipeline:
                 temperatures.usable_c,
                 parallax_px=self._mosaic_settings(conditions).parallax_px,
             )
+            held = held_quantities(mosaic, tie_points)
             disturbance = disturbance_of(
                 rig,
                 mosaic,
@@ -253,7 +254,7 @@ class Pipeline:
                 layers=layers,
                 platform=platform,
                 slips=stitched.slips,
-                held=held_quantities(mosaic, tie_points),
+                held=held,
                 temperatures_c=temperatures.usable_c,
                 stale_s=self._stale_s(conditions),
                 shifted_px=max((math.hypot(*p) for p in content.shifted_px.values()), default=0.0),
@@ -293,6 +294,7 @@ class Pipeline:
             figures |= self._burnt_overlap(figures, tie_points, start, level1)
             figures["resting_on_calibration"] = ", ".join(stitched.weak) or None
             figures |= estimated_dc_figures(estimated) | platform_figures(platform)
+            figures |= scale_figures(held)
             figures |= projection_figures(rig, conditions, settings.relief_fraction)
             figures |= content_figures(content)
             figures |= relative_sharpness_figures(rig, start, level1)
