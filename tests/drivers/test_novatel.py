@@ -262,3 +262,12 @@ def test_a_header_in_text_with_a_number_that_is_none_makes_a_bad_log(
 ) -> None:
     decoder, records = decode(line("BESTPOS", TEXT["BESTPOS"], **header))
     assert (decoder.bad_messages, records) == (1, [])
+
+
+@pytest.mark.parametrize(("nbytes", "is_framed"), [(8_192, True), (8_193, False)])
+def test_a_log_has_a_body_of_8192_bytes_at_most(nbytes: int, is_framed: bool) -> None:
+    long = log(4_242, bytes(nbytes))
+    decoder, _ = decode(long + mark_time(10.0))
+    # A longer one costs itself, and no log behind it.
+    assert (decoder.bad_bytes == 0) is is_framed
+    assert len(marks(long + mark_time(10.0))) == 1

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from daemon.mission.verification.chain import Link, follow_chain
+from tests.daemon.small_camera import new_mission
 
 GENESIS = "g" * 64
 
@@ -68,3 +71,15 @@ def test_a_record_that_quotes_nothing_is_no_part_of_the_chain():
 
 def test_an_empty_chain_begins_at_the_genesis():
     assert follow_chain([], GENESIS).head_sha256 == GENESIS
+
+
+def test_a_chain_file_is_let_go_once_and_may_be_closed_again(tmp_path):
+    mission = new_mission(tmp_path)
+    chain = mission.open_chain()
+
+    descriptor = chain._descriptor
+    assert descriptor is not None
+    chain.close()
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        os.fstat(descriptor)
+    chain.close()

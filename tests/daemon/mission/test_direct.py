@@ -72,3 +72,13 @@ def test_a_disk_that_refuses_for_another_reason_is_told_and_not_tried_again(tmp_
     with pytest.raises(FileExistsError):
         direct.create_file(tmp_path / "pan.tif", [bytes(direct.WORTH_IT_BYTES)])
     assert (tmp_path / "pan.tif").read_bytes() == b"of another writer"
+
+
+def test_parts_of_any_size_are_counted_and_cut_to_their_length(tmp_path: Path) -> None:
+    parts = [os.urandom(nbytes) for nbytes in (direct.BLOCK, 3, 2 * direct.BLOCK + 1, 5)]
+    descriptor = os.open(tmp_path / "parts", os.O_WRONLY | os.O_CREAT)
+    try:
+        assert direct._write_all(descriptor, parts) == 3 * direct.BLOCK + 9
+    finally:
+        os.close(descriptor)
+    assert (tmp_path / "parts").read_bytes() == b"".join(parts)

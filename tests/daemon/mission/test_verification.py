@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
@@ -23,6 +24,7 @@ from daemon.mission.store import durable
 from daemon.mission.store.level0_folder import hash_file
 from daemon.mission.store.level2 import write_level2
 from daemon.mission.store.store import Level0Writer
+from daemon.mission.store.tree import BLOCK_BYTES, _sha256
 from daemon.mission.verification.verification import VerifyReport, verify
 from tests.daemon.small_camera import RIG_TOML, SENSORS, final_record, fly, store_one
 
@@ -373,3 +375,37 @@ def test_a_broken_chain_of_hashes_is_named_in_flight_without_a_chain_file(missio
     record.write_bytes(canonical_bytes(content))
     problems = verify(mission).problems
     assert any("chain is broken before exposure 2" in one for one in problems), problems
+
+
+def test_a_mission_without_mission_json_is_laid_out_by_hand_only_without_chain_and_index(
+    mission: Mission,
+) -> None:
+    (mission.path / "mission.json").unlink()
+    missing = "mission.json: is missing; the chain of records begins with it"
+    assert missing in verify(mission).problems
+    mission.chain_path.unlink()
+    assert missing in verify(mission).problems, "the index names the mission's records"
+    mission.catalog_path.unlink()
+    by_hand = verify(mission)
+    assert missing not in by_hand.problems
+    reasons = [one.reason for one in by_hand.not_covered if "rig.toml" in one.files]
+    assert reasons == ["mission laid out by hand: no mission.json has a hash of it"]
+
+
+def test_what_is_appended_while_a_file_is_hashed_is_not_hashed(tmp_path: Path) -> None:
+    path, begun = tmp_path / "log", os.urandom(2 * BLOCK_BYTES)
+    path.write_bytes(begun)
+    read: list[int] = []
+
+    def grow(nbytes: int) -> None:
+        read.append(nbytes)
+        if len(read) < 5:
+            with path.open("ab") as file:
+                file.write(bytes(BLOCK_BYTES))
+
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        assert _sha256(descriptor, grow) == hashlib.sha256(begun).hexdigest()
+    finally:
+        os.close(descriptor)
+    assert read == [BLOCK_BYTES, BLOCK_BYTES]
