@@ -1,4 +1,4 @@
-"""`python -m benchmarks.midas_block`: the block of the MIDAS paper, repeated with its tables.
+"""`python -m benchmarks.midas_block`: the block of Jacobsen (2008), repeated with its tables.
 
 Bundle adjustment of all images with the heads' relative orientation, relative orientations averaged
 over the block (table 2), boresight, and combined intersection from direct orientation, held against

@@ -1,6 +1,6 @@
 """`python -m benchmarks.rig_calibration`: relative orientations against truth, over many blocks.
 
-The block of the MIDAS paper, every image oriented for itself, averaged as `syntopic calibrate rig`
+The block of Jacobsen (2008), every image oriented for itself, averaged as `syntopic calibrate rig`
 does; errors are held against their covariance. `--project` writes block 1 for the command.
 """
 
@@ -62,7 +62,7 @@ def write_block(folder: Path, *, seed: int = 1) -> None:
     file = ProjectFile.model_validate(
         {
             "format": 1,
-            "name": f"block of the MIDAS paper, seed {seed}",
+            "name": f"block of Jacobsen (2008), seed {seed}",
             "camera": [
                 {"name": c.name, "f_mm": c.f_mm, "pixel_um": PIXEL_MM * 1e3, "free": sorted(c.free)}
                 for c in network.cameras

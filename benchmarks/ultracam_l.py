@@ -1,6 +1,6 @@
 """`python -m benchmarks.ultracam_l`: two PAN cones stitched with and without the colour master.
 
-Repeats the experiment of the UltraCam L paper over an emulated line at full size and draws the
+Repeats the experiment of Ladstädter et al. (2010) over an emulated line at full size and draws the
 systematic residuals as its fig. 10 does. Nothing is rendered: tie points are where the emulator's
 camera sees the same ground, plus noise of the size measured on rendered exposures.
 """

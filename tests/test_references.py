@@ -21,7 +21,10 @@ OURSELVES: Final = Path(__file__).relative_to(ROOT).as_posix()
 LINK: Final = re.compile(r"\[[^\]\n]*(?:\n[^\]\n]*)?\]\(([^)\s]+)\)")
 PAGE: Final = re.compile(r"(?<![\w/.-])(docs/[\w/.-]+\.md)((?:(?:,| and)? ?#[\w-]+)*)")
 """A page, and any number of its sections: "docs/a.md#one, #two and #three"."""
-NOWHERE: Final = re.compile(r"\bDESIGN\b|(?<![\w-])seeds/|(?<![\w-])shared/")
+NOWHERE: Final = re.compile(
+    r"\bDESIGN\b|(?<![\w-])seeds/|(?<![\w-])shared/|\b[Pp]romise \d"
+    r"|\bthe (?:UltraCam(?: L)?|MIDAS|DMC) paper\b"
+)
 DATA: Final = re.compile(r"\.\./shared/data/")
 EQUATION: Final = re.compile(r"\b[Ee]q\.\s(?:#\s)?\d")
 NAME: Final = r"[A-ZÄÖÜ][\w'-]+"

@@ -1,9 +1,9 @@
 """Level-0 on disk: frames become *stored*, then their record is *sealed*.
 
 An exposure is stored when its folder has its final name, everything in it and above it is synced,
-and the index has committed it (promise 1). Reading back is in `daemon.mission.store.level0_folder`,
-checking in `daemon.mission.verification.verification`, what a crash leaves behind in
-`daemon.mission.verification.recovery`.
+and the index has committed it (docs/durability.md). Reading back is in
+`daemon.mission.store.level0_folder`, checking in `daemon.mission.verification.verification`, what a
+crash leaves behind in `daemon.mission.verification.recovery`.
 """
 
 from __future__ import annotations

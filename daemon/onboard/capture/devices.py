@@ -39,7 +39,7 @@ def frame_nbytes(rig: Rig, sensor_name: str) -> int:
 
 
 def serial_problem(rig: Rig, head: str, found: Mapping[str, str]) -> str | None:
-    """A sentence where the connected head is not the calibrated one (promise 6)."""
+    """A sentence where the connected head is not the calibrated one."""
     calibrated = rig.sensor(head).serial
     connected = found.get("serial", "")
     if not calibrated or not connected or calibrated == connected:

@@ -9,7 +9,7 @@ it; `imbalances` compares them. What an exposure may become is in
     received (marks)      = the same
 
 *Pending* is what arrived and is not attributed yet; at the end of a flight it is zero and the
-equation is the design's. The third check binds frames to triggers: exposures that are complete or
+term vanishes. The third check binds frames to triggers: exposures that are complete or
 degraded and do not name a head as missing are that head's used frames, give or take the exposures
 that are open or lost.
 """

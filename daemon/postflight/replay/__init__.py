@@ -1,1 +1,4 @@
-"""A recorded flight through the same code again: codecs, matching, ledger, pipeline (promise 8)."""
+"""A recorded flight through the same code again: codecs, matching, ledger, pipeline.
+
+How-to: docs/replay.md.
+"""

@@ -122,7 +122,7 @@ def test_frames_and_pixels_that_do_not_fit_are_refused_before_anything_is_writte
 
 
 def test_before_stored_is_said_every_byte_and_name_is_synced_in_order(mission, writer, monkeypatch):
-    """Promise 1, word by word: files, folder, rename, parent, commit."""
+    """The order is: files, folder, rename, parent, commit (docs/durability.md)."""
     trace = []
     real = {"fsync": os.fsync, "rename": Path.rename, "add": Catalog.add_stored}
 

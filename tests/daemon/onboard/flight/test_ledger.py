@@ -48,7 +48,7 @@ def test_only_judged_exposures_are_sealed_and_only_with_pixels_or_lost():
 
 
 class AnyFlight(RuleBasedStateMachine):
-    """Whatever happens in whatever order: the equations of the design hold after each step."""
+    """Whatever happens in whatever order: the equations of the ledger hold after each step."""
 
     @initialize()
     def begin(self):
