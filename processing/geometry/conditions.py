@@ -262,6 +262,22 @@ def _smears(rig: Rig, conditions: Conditions) -> dict[str, Figure]:
     }
 
 
+def tdi_misfit_px(rig: Rig, conditions: Conditions, largest_px: float) -> dict[str, float]:
+    """By PAN cone, what its TDI count leaves of the motion along track, where above `largest_px`.
+
+    Empty where no head shifts its charges.
+    """
+    found: dict[str, float] = {}
+    if rig.virtual_image is None or not any(conditions.tdi_shifts.values()):
+        return found
+    for cone in rig.pan_cones:
+        smears = [_smear(rig, sensor.name, conditions) for sensor in cone.sensors]
+        worst = max((smear[0] for smear in smears if smear is not None), default=0.0)
+        if worst > largest_px:
+            found[cone.name] = worst
+    return found
+
+
 def head_smear_px(cone: Cone, conditions: Conditions) -> float | None:
     """How far flat ground moves during the exposure where it moves farthest in a head's image.
 

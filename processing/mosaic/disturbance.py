@@ -65,6 +65,7 @@ def disturbance_of(
     stale_s: float = 0.0,
     shifted_px: float = 0.0,
     weak: Collection[str] = (),
+    smear_px: Mapping[str, float] | None = None,
 ) -> Disturbance:
     """Add up what the findings of one exposure may have done to the image.
 
@@ -81,12 +82,14 @@ def disturbance_of(
         stale_s: age of the temperatures where they are too old, else zero.
         shifted_px: how far frames lay apart beyond the search for tie points, else zero.
         weak: sensors that rest on calibration.
+        smear_px: by cone, what its stated TDI count leaves of the motion, where that is too much.
     """
     warmed = tuple(_wrong_temperature(rig, mosaic, estimated_dc))
     # A wrong temperature changes the scale of all layers alike, too.
     changed = () if warmed else tuple(_changed_master(rig, mosaic, layers))
     datum = np.zeros((4, 4))
     turned = [*_turned_heads(mosaic, platform, held), *_stale(rig, mosaic, stale_s)]
+    turned += _miscounted(rig, smear_px or {})
     for part in (*_other_datums(rig, mosaic, validity), *warmed, *changed, *turned):
         datum += np.outer(part, part)
     frames: dict[str, Array] = {}
@@ -194,6 +197,16 @@ def _turned_heads(
         yield np.array([-f_px * by_y, f_px * by_x, 0.0, by_z / pitch_mm])
 
 
+def _miscounted(rig: Rig, smear_px: Mapping[str, float]) -> Iterator[Array]:
+    """Where a TDI count does not fit the motion it may be the count: frames lie half of it off.
+
+    Layers that are stitched go along; the cones of the datum take it with them, each its share.
+    """
+    cones = {rig.cone_of(s.name).name for s in datum_candidates(rig)}
+    for name in sorted(cones & smear_px.keys()):
+        yield np.array([0.0, smear_px[name] / 2.0 / len(cones), 0.0, 0.0])
+
+
 def _stale(rig: Rig, mosaic: Mosaic, stale_s: float) -> Iterator[Array]:
     """What temperatures that were read long ago may do to the master cone."""
     if stale_s > 0.0:
@@ -283,6 +296,8 @@ def _changed_master(rig: Rig, mosaic: Mosaic, layers: LayerCheck | None) -> Iter
         part = np.array([0.0, 0.0, beyond, 0.0])
         per_kelvin = datum_per_kelvin_px(rig, mosaic)
         if alone and per_kelvin[2] != 0.0:
-            # Most likely it is the temperature, which moves a single sensor as well.
-            part = per_kelvin * beyond / per_kelvin[2]
+            # The principal distance or the temperature, which moves a single sensor as well: one
+            # is as likely as the other.
+            part = part * math.sqrt(0.5)
+            yield per_kelvin * part[2] / per_kelvin[2]
         yield part

@@ -23,6 +23,7 @@ from processing.geometry.conditions import (
     exposure_scale_figures,
     exposure_scales,
     parallax_px,
+    tdi_misfit_px,
     usable_temperatures,
 )
 from processing.geometry.placement import SensorPlacement, nominal_placements
@@ -259,6 +260,7 @@ class Pipeline:
                 stale_s=self._stale_s(conditions),
                 shifted_px=max((math.hypot(*p) for p in content.shifted_px.values()), default=0.0),
                 weak=stitched.weak,
+                smear_px=tdi_misfit_px(rig, conditions, settings.thresholds.smear_px),
             )
         with clock.stage("composition"):
             image = self._pan.compose(

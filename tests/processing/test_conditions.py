@@ -14,6 +14,7 @@ from processing.geometry.conditions import (
     exposure_scales,
     parallax_px,
     reference_exposure_times,
+    tdi_misfit_px,
     usable_temperatures,
 )
 from processing.geometry.placement import nominal_placements
@@ -49,6 +50,22 @@ def test_tdi_takes_its_shifts_off_the_smear_along_track(rig: Rig) -> None:
     assert found["smear_along_px"] == pytest.approx(abs(moved * math.cos(math.radians(3)) - 8))
     assert found["smear_across_px"] == pytest.approx(moved * math.sin(math.radians(3)))
     assert found["crab_deg"] == pytest.approx(3.0)
+
+
+def test_a_tdi_count_that_leaves_too_much_motion_is_given_by_cone(rig: Rig) -> None:
+    gsd = 1000 * 7.2e-6 / 0.1005
+    counts = {s.name: 6 if cone.name == "1" else 8 for cone in rig.cones for s in cone.sensors}
+    conditions = Conditions(
+        height_above_ground_m=1000.0,
+        ground_speed_mps=8.25 * gsd / 0.008,
+        exposure_time_s={sensor.name: 0.008 for sensor in rig.sensors},
+        tdi_shifts=counts,
+        crab_rad=0.0,
+    )
+    assert tdi_misfit_px(rig, conditions, 0.8) == {"1": pytest.approx(2.25)}
+    assert len(tdi_misfit_px(rig, conditions, 0.2)) == len(rig.pan_cones)
+    still = replace(conditions, tdi_shifts=dict.fromkeys(counts, 0))
+    assert tdi_misfit_px(rig, still, 0.8) == {}
 
 
 def test_angular_rates_smear_by_focal_length_over_pitch(rig: Rig) -> None:

@@ -161,8 +161,7 @@ def test_a_converging_head_with_a_wrong_principal_distance_is_not_called_correct
     outcome = converging.with_cone(head, with_f(1.001)).outcome()
     assert outcome.verdict != "good" and "CALIBRATION_EXPIRED" in outcome.flags
     assert "not corrected" in outcome.sentences and outcome.figure("slip_sensor") is None
-    # Which heads move with it cannot be seen, so that all widen: 1.10 px stated, 0.33 true for 2.
-    assert_covered(outcome, times=3.5)
+    assert_covered(outcome)
 
 
 def test_a_converging_head_that_turned_widens_the_sigma_by_the_mean(converging: Planted) -> None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from processing.geometry.projective import apply_projective, rotation_homography
 from processing.geometry.rotation import rotation_matrix
 from processing.geometry.similarity import fit_similarity
+from processing.mosaic.datum import datum_candidates
 from processing.mosaic.disturbance import LEAST_PX, disturbance_of
 from processing.mosaic.estimated_dc import EstimatedDc
 from processing.mosaic.free import Mosaic
@@ -39,6 +40,7 @@ def found(
     stale_s: float = 0.0,
     shifted_px: float = 0.0,
     weak: tuple[str, ...] = (),
+    smear_px: dict[str, float] | None = None,
 ) -> Disturbance:
     return disturbance_of(
         rig,
@@ -53,6 +55,7 @@ def found(
         stale_s=stale_s,
         shifted_px=shifted_px,
         weak=weak,
+        smear_px=smear_px,
     )
 
 
@@ -137,8 +140,9 @@ def test_a_common_scale_counts_beyond_one_sigma_and_as_warmth_where_the_master_i
     per_k = datum_per_kelvin_px(rig, mosaic)
     datum = found(rig, mosaic, layers=check((-19.0, 4.0, 5.0, 6.0), changed=False)).datum
     scale = np.sqrt(19.0**2 - 10.0**2) * 1e-6 / mosaic.model.pitch_mm
-    part = per_k / per_k[2] * scale
-    np.testing.assert_allclose(datum, np.outer(part, part), rtol=1e-9)
+    part, scaled = per_k / per_k[2] * scale, np.diag([0.0, 0.0, scale**2, 0.0])
+    # A principal distance is as likely as a temperature.
+    np.testing.assert_allclose(datum, (np.outer(part, part) + scaled) / 2.0, rtol=1e-9)
     assert np.hypot(*part[:2]) > 0.01 and part[2] == pytest.approx(scale)
     none = found(rig, mosaic, layers=check((9.0, 4.0, 5.0, 6.0), changed=False)).datum
     assert not none.any()
@@ -214,6 +218,16 @@ def test_heads_with_other_scales_state_one_pattern_and_what_they_share() -> None
     two = found(rig, mosaic, platform=expired, held=both)
     np.testing.assert_allclose(two.datum[2, 2], (9e-8 + 16e-8) / 4.0 / pitch**2, rtol=1e-9)
     assert two.parts[healthy].layers["3"][2] == pytest.approx(-4e-4)
+
+
+@pytest.mark.parametrize(("name", "sigma"), [("ultracam-x-mini", 0.6), ("dmc-mini", 0.15)])
+def test_a_count_of_shifts_that_does_not_fit_the_motion_moves_the_datum_by_half(
+    name: str, sigma: float
+) -> None:
+    rig, mosaic = mosaic_of(name)
+    cone = rig.cone_of(datum_candidates(rig)[0].name).name
+    datum = found(rig, mosaic, smear_px={cone: 1.2, "G": 5.0}).datum
+    np.testing.assert_allclose(datum, np.diag([0.0, sigma**2, 0.0, 0.0]), rtol=1e-9)
 
 
 def test_what_another_scale_makes_of_a_turn_is_no_turn() -> None:
