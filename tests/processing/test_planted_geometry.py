@@ -5,6 +5,8 @@ The stated sigma covers the error, and is at most three times as large.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from tests.processing.planted import Outcome, Planted, moved, rendered, slipped, turned, with_f
@@ -28,6 +30,17 @@ def test_a_healthy_exposure_raises_nothing(healthy: Planted) -> None:
     assert outcome.verdict == "good" and outcome.flags == set(), outcome.sentences
     assert_covered(outcome)
     assert outcome.figure("platform_test") < 0.5 and outcome.figure("slip_sensor") is None
+
+
+def test_a_tdi_count_of_the_master_that_misfits_the_motion_widens_the_sigma(
+    healthy: Planted,
+) -> None:
+    master = [s.name for s in healthy.rig.master_sensors]
+    counts = {n: k - (n in master) for n, k in healthy.conditions.tdi_shifts.items()}
+    wrong = replace(healthy, conditions=replace(healthy.conditions, tdi_shifts=counts))
+    outcome = wrong.outcome()
+    assert "BLUR" in outcome.flags and outcome.true_sigma_px > 0.2
+    assert_covered(outcome)
 
 
 @pytest.mark.parametrize("ppm", [1000.0, -300.0])
