@@ -4,7 +4,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: setup demo test test-v4l2 check audit bench attack soak clean
+.PHONY: setup demo test test-v4l2 check audit bench attack fuzz soak clean
 
 setup: .venv/ready .venv/kernels
 
@@ -50,6 +50,11 @@ bench: setup
 # The long form of what `make test` has in short.
 attack: setup
 	SYNTOPIC_ATTACKED_EXPOSURES=32 $(BIN)/python -m pytest -m attack --timeout=900 -s
+
+# Until 30 CPU minutes bring no new edge, parser by parser: many hours. It goes on where it was ended.
+fuzz: setup
+	$(BIN)/python -m pip install -q --require-hashes -r requirements-fuzz.lock
+	$(BIN)/python -m tests.fuzz all --quiet-minutes 30 --seconds 60 --work .fuzz
 
 soak: setup
 	$(BIN)/python -m pytest -m soak --timeout=7200

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, Final
 
 ROOT: Final = Path(__file__).parents[1]
+LOCKS: Final = ("requirements.lock", "requirements-fuzz.lock")
 VENDOR: Final = ROOT / "daemon" / "watch" / "page" / "vendor"
 DATABASE: Final = "https://api.osv.dev/v1/querybatch"
 TIMEOUT_S: Final = 20.0
@@ -52,8 +53,8 @@ class Package:
 
 
 def packages() -> list[Package]:
-    """All of the lock, those of other systems included, and the page's scripts."""
-    text = (ROOT / "requirements.lock").read_text(encoding="utf-8")
+    """All of the locks, those of other systems included, and the page's scripts."""
+    text = "".join((ROOT / name).read_text(encoding="utf-8") for name in LOCKS)
     pinned = re.findall(r"^([A-Za-z0-9][A-Za-z0-9._-]*)==([^\s;]+)", text, re.MULTILINE)
     listed = [Package("PyPI", name, version) for name, version in sorted(set(pinned))]
     for name, header in _HEADERS.items():

@@ -534,6 +534,31 @@ def control_line() -> Target:
     return Target(parse, (), (seed, b'{"command": "state"}'))
 
 
+def page_link() -> Target:
+    from daemon.onboard.service.messages import Command, CommandRefused, Pong, Told
+    from daemon.onboard.service.page_messages import (
+        InvalidMessageError,
+        pack_from_page,
+        unpack_from_page,
+        unpack_to_page,
+    )
+
+    def parse(data: bytes) -> object:
+        """Both directions: what is a message of one is none of the other."""
+        with contextlib.suppress(InvalidMessageError):
+            unpack_to_page(data)
+        return unpack_from_page(data)
+
+    arguments = {"interval_s": 2.0, "count": 3, "override": False, "reason": "x"}
+    seeds = (
+        Pong({}),
+        Command(1, "interval", arguments, "anna", "operator", "10.0.0.9"),
+        CommandRefused("land", "unknown", "none", "10.0.0.66", "no"),
+        Told({"event": "watching", "host": "::", "port": 8080, "tls": True}),
+    )
+    return Target(parse, (InvalidMessageError,), tuple(map(pack_from_page, seeds)))
+
+
 def command_body() -> Target:
     from daemon.onboard.monitoring.web.bodies import parsed
 
@@ -597,6 +622,7 @@ TARGETS: Mapping[str, Callable[[], Target]] = {
     "monitor": monitor,
     "control-line": control_line,
     "command-body": command_body,
+    "page-link": page_link,
     "signed-mavlink": signed_mavlink,
     **{f"device-{name}": device(name) for name in DEVICES},
 }

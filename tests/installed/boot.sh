@@ -29,10 +29,11 @@ REPOSITORY=/opt/repository
 mount -t tmpfs tmpfs /tmp
 mount -t tmpfs tmpfs /var/tmp
 rm -rf /etc/systemd/system
-mkdir -p /etc/systemd/system/service.d
+mkdir -p /etc/systemd/system/service.d /etc/systemd/system/timer.d
 # Nothing but the units below is started: no udev, no tmpfiles, no sysctl of a whole machine.
 printf '[Unit]\nDefaultDependencies=no\n' >/etc/systemd/system/service.d/alone.conf
-mkdir -p /etc/systemd/system/syntopic.service.d
+printf '[Unit]\nDefaultDependencies=no\n' >/etc/systemd/system/timer.d/alone.conf
+mkdir -p /etc/systemd/system/syntopic.service.d /etc/systemd/system/syntopic-disk-health.service.d
 echo 0123456789abcdef0123456789abcdef >/etc/machine-id
 cp "$REPOSITORY/systemd/sysusers.conf" /etc/sysusers.d/syntopic.conf
 systemd-sysusers /etc/sysusers.d/syntopic.conf
@@ -42,9 +43,21 @@ export LD_LIBRARY_PATH=/opt/python/lib PYTHONPATH=/opt/repository:/opt/packages 
 exec /opt/python/bin/python3 -m daemon "\$@"
 SH
 chmod 755 /opt/syntopic/bin/syntopic
-cp "$REPOSITORY/systemd/syntopic.service" /etc/systemd/system/
+cp "$REPOSITORY"/systemd/*.service "$REPOSITORY"/systemd/*.timer /etc/systemd/system/
 cp "$REPOSITORY"/tests/installed/units/*.service /etc/systemd/system/
 cp "$REPOSITORY/tests/installed/units/flight.conf" /etc/systemd/system/syntopic.service.d/
+# One disk that answers: whatever disks this machine has, and whether smartctl is installed.
+mkdir -p /opt/stub
+cat >/opt/stub/smartctl <<'SH'
+#!/bin/sh
+case $1 in
+--scan) echo '{"devices": [{"name": "/dev/nvme0", "type": "nvme"}]}' ;;
+*) echo '{"model_name": "Composed", "serial_number": "N0001", "smart_status": {"passed": true}}' ;;
+esac
+SH
+chmod 755 /opt/stub/smartctl
+printf '[Service]\nEnvironment=PATH=/opt/stub:/usr/bin:/bin\n' \
+    >/etc/systemd/system/syntopic-disk-health.service.d/stub.conf
 printf '[Unit]\nDefaultDependencies=no\nWants=flight.service\n' >/etc/systemd/system/flight.target
 exec env -i container=test PATH=/usr/sbin:/usr/bin:/sbin:/bin REPOSITORY="$REPOSITORY" \
     /lib/systemd/systemd --system --unit=flight.target --log-target=console --show-status=1

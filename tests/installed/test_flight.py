@@ -101,6 +101,10 @@ def test_a_flight_passes_inside_the_hardened_unit(tmp_path: Path) -> None:
         assert Path(of_the_host.name).exists()
     told = (tmp_path / "service.err").read_text("utf-8")[-2000:]
     assert said["kernels"] == "0"
+    assert (said["health_started"], said["health_result"]) == ("0", "success")
+    assert (said["health_file"], said["health_folder"]) == ("root 644", "root 755")
+    assert (said["health_read"], said["health_planted"]) == ("1", "1")
+    assert said["health_by_timer"] == "1"
     assert said["started"] == "0", told
     assert said["user"] == "syntopic"
     assert (said["NoNewPrivs"], said["Seccomp"], int(said["CapEff"], 16)) == ("1", "2", 0)

@@ -94,6 +94,9 @@ class Latches:
         elif kind in _RAISES:
             fault, device = _RAISES[kind]
             self.raise_fault(fault, sentence, device, sequence=sequence)
+        elif kind == "page-link":
+            self.raise_fault("page link", sentence, "service", sequence=sequence)
+            self.pass_fault("page link")  # it happened; nothing stands
         elif kind == "prerequisite":
             fault = f"prerequisite {event.get('item')}"
             self.raise_fault(fault, sentence, "service", sequence=sequence)

@@ -12,6 +12,8 @@ import resource
 from contextlib import suppress
 from pathlib import Path
 
+from daemon.onboard.monitoring.landlock import restrict
+
 MEMORY_MAX_BYTES = 1_000_000_000
 """Private memory, RLIMIT_DATA."""
 FILES_MAX = 1024
@@ -41,3 +43,4 @@ def confine() -> None:
         os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
     with suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text(str(OOM_SCORE), "ascii")
+    restrict()

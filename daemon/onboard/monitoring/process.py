@@ -49,7 +49,8 @@ from daemon.onboard.monitoring.web.guard import Application, Guard, Occupancy
 from daemon.onboard.monitoring.web.listener import Listener
 from daemon.onboard.preflight.findings import Outcome
 from daemon.onboard.service.messages import Answer, Ping, Pong, Stop, Told
-from daemon.onboard.service.processes import Link, ServiceGoneError
+from daemon.onboard.service.page_link import PageLink
+from daemon.onboard.service.processes import ServiceGoneError
 from daemon.orientation.exterior import mount_of
 from daemon.orientation.footprints import seen_from
 from drivers.base.extras import MissingExtraError
@@ -64,14 +65,14 @@ PING_S, PONG_WITHIN_S = 5.0, 10.0
 holds for one that stalls may be minutes of telemetry."""
 
 
-def main(link: Link, settings: WatchSection, plan: PlanSection | None = None) -> None:
+def main(link: PageLink, settings: WatchSection, plan: PlanSection | None = None) -> None:
     """Serve watchers until told to stop; `plan` names files that a mission may not."""
     confine()
     logging.getLogger("uvicorn.error").addFilter(FewLines())
     asyncio.run(_serve(link, settings, plan or PlanSection()))
 
 
-async def _serve(link: Link, settings: WatchSection, plan: PlanSection) -> None:
+async def _serve(link: PageLink, settings: WatchSection, plan: PlanSection) -> None:
     ground = _Ground()
     state = FlightState(f"syntopic {version('syntopic')}", ground.seen_from, pictures_of)
     ground.state = state
@@ -213,7 +214,7 @@ def _certificate_files(settings: WatchSection) -> CertificateFiles | None:
     return CertificateFiles(settings.tls_certificate, settings.tls_key, context)
 
 
-async def _renew(files: CertificateFiles | None, link: Link) -> None:
+async def _renew(files: CertificateFiles | None, link: PageLink) -> None:
     """Use a renewed certificate without a restart; connections that are open keep theirs."""
     while files is not None:
         await asyncio.sleep(RENEWAL_S)
@@ -236,7 +237,7 @@ async def _gather(coverage: Coverage) -> None:
 
 
 async def _camera(
-    settings: WatchSection, state: FlightState, gate: Gate, ground: _Ground, link: Link
+    settings: WatchSection, state: FlightState, gate: Gate, ground: _Ground, link: PageLink
 ) -> MavlinkCamera | None:
     """The rig as a camera of the vehicle, where that is wanted and possible."""
     if settings.mavlink is None:
@@ -258,7 +259,7 @@ async def _camera(
 
 
 async def _control(
-    settings: WatchSection, state: FlightState, gate: Gate, link: Link
+    settings: WatchSection, state: FlightState, gate: Gate, link: PageLink
 ) -> ControlSocket | None:
     """The Unix socket for commands, where that is wanted and possible."""
     if settings.control is None:
@@ -326,7 +327,7 @@ def _rig_and_ground(path: Path) -> tuple[Rig, MountSection, float] | None:
 
 
 def _hear(
-    link: Link,
+    link: PageLink,
     state: FlightState,
     gate: Gate,
     ending: asyncio.Event,

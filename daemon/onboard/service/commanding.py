@@ -11,7 +11,7 @@ from typing import Any, Protocol, TypeGuard
 
 from daemon.mission.log.log_records import Message, loose_bytes
 from daemon.onboard.flight.arming import Lack
-from daemon.onboard.service.messages import Answer, Command, CommandRefused
+from daemon.onboard.service.messages import Answer, Command, CommandRefused, InvalidMessages
 
 AUDIT_TOPIC = "audit"
 
@@ -124,6 +124,28 @@ def refusal_event(refused: CommandRefused) -> dict[str, Any]:
         "address": refused.address,
         "sentence": refused.sentence,
     }
+
+
+def refused_command(command: Command, sentence: str) -> CommandRefused:
+    """The record of a command that breaks the rules."""
+    known = command.name if command.name in _COMMANDS else "unknown"
+    return CommandRefused(known, command.by, command.role, command.address, sentence)
+
+
+def invalid_message(invalid: InvalidMessages) -> Message:
+    """Invalid messages of the page's process, for the flight log."""
+    content = {"invalid": invalid.count, "by": "page's process", "problem": invalid.sentence}
+    return Message(AUDIT_TOPIC, time.monotonic_ns(), loose_bytes(content))
+
+
+def invalid_event(invalid: InvalidMessages) -> dict[str, Any]:
+    """The event that reports them."""
+    sentence = (
+        f"{invalid.count} messages of the page's process to the service were invalid "
+        f"({invalid.sentence}) and dropped. Somebody may control that process: keep strangers off "
+        "its network and restart the service"
+    )
+    return {"event": "page-link", "fault": True, "sentence": sentence}
 
 
 def _arm(command: Command, flight: Commanded) -> Answer:

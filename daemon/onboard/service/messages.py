@@ -79,6 +79,14 @@ class CommandRefused:
 
 
 @dataclass(frozen=True)
+class InvalidMessages:
+    """What came from the page's process and was no message: how many, and what is wrong."""
+
+    count: int
+    sentence: str
+
+
+@dataclass(frozen=True)
 class Answer:
     """What became of a command, in a sentence."""
 

@@ -13,10 +13,10 @@ import os
 import select
 import signal
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from multiprocessing.connection import Connection
 from multiprocessing.reduction import ForkingPickler
-from typing import Any
+from typing import Any, ClassVar
 
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
 TELL_MAX_BYTES = 100_000
@@ -61,6 +61,10 @@ class Link:
 class Child:
     """The service's end: the process, and the connection to it."""
 
+    link: ClassVar[type] = Link
+    pause_s = 0.0
+    """For so long nothing more is to be received from it; more than 0 after too many messages."""
+
     def __init__(
         self,
         name: str,
@@ -69,10 +73,10 @@ class Child:
         environment: Mapping[str, str],
     ) -> None:
         self.name = name
-        self.connection, theirs = _SPAWN.Pipe(duplex=True)
+        self.connection, theirs = self._ends()
         self.process = _SPAWN.Process(
             target=_child_main,
-            args=(theirs, os.getpid(), target, arguments),
+            args=(type(self).link, theirs, os.getpid(), target, arguments),
             name=f"syntopic-{name}",
             daemon=True,
         )
@@ -89,6 +93,19 @@ class Child:
                 else:
                     os.environ[key] = value
         theirs.close()
+
+    def _ends(self) -> tuple[Any, Any]:
+        """Both ends of a new connection; a class that is not `Child` may use another kind."""
+        return _SPAWN.Pipe(duplex=True)
+
+    def receive(self) -> Iterator[object]:
+        """Every message that has come.
+
+        Raises:
+            EOFError, ConnectionError: the process is gone.
+        """
+        while self.connection.poll():
+            yield self.connection.recv()
 
     def send(self, message: object) -> None:
         """BrokenPipeError where the child is gone; the service notices by its sentinel."""
@@ -131,7 +148,8 @@ def die_with_parent(parent_pid: int, how: signal.Signals = signal.SIGKILL) -> No
 
 
 def _child_main(
-    connection: Connection,
+    link: type,
+    connection: Any,
     parent_pid: int,
     target: str,
     arguments: tuple[Any, ...],
@@ -143,7 +161,7 @@ def _child_main(
     threading.excepthook = _end_without_service
     module, _, function = target.partition(":")
     try:
-        getattr(importlib.import_module(module), function)(Link(connection), *arguments)
+        getattr(importlib.import_module(module), function)(link(connection), *arguments)
     except ServiceGoneError:
         os._exit(1)
 

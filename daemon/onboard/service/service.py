@@ -39,12 +39,16 @@ from daemon.onboard.flight.recovery_match import seal_from_log
 from daemon.onboard.pipeline.pipeline_queue import PipelineQueue
 from daemon.onboard.preflight.preflight import AT_ONCE, Preflight
 from daemon.onboard.preflight.preparation import Preparation
+from daemon.onboard.service.command_rules import violation
 from daemon.onboard.service.commanding import (
     audit_message,
     command_event,
+    invalid_event,
+    invalid_message,
     obey,
     refusal_event,
     refusal_message,
+    refused_command,
 )
 from daemon.onboard.service.departure import (
     capture_process,
@@ -58,11 +62,13 @@ from daemon.onboard.service.desk import Desk
 from daemon.onboard.service.hearing import Hearing
 from daemon.onboard.service.line import Line, Order
 from daemon.onboard.service.messages import (
+    Answer,
     Begin,
     Bound,
     Command,
     CommandRefused,
     Fire,
+    InvalidMessages,
     Log,
     Pong,
     Told,
@@ -287,9 +293,18 @@ class Service(Desk):
         self._event(**told.event)
 
     def _on_command(self, command: Command) -> None:
+        problem = violation(command)
+        if problem is not None:
+            # The page's process lets none of these pass: this one is no longer itself.
+            self.watching.answer(Answer(command.number, False, problem))
+            self._on_command_refused(refused_command(command, problem))
+            return
         answer = obey(command, self)
         self.watching.answer(answer)
         self._audit(audit_message(command, answer), command_event(command, answer))
+
+    def _on_invalid_messages(self, invalid: InvalidMessages) -> None:
+        self._audit(invalid_message(invalid), invalid_event(invalid))
 
     def _on_command_refused(self, refused: CommandRefused) -> None:
         self._audit(refusal_message(refused), refusal_event(refused))
@@ -308,6 +323,7 @@ class Service(Desk):
         Told: _on_told,
         Command: _on_command,
         CommandRefused: _on_command_refused,
+        InvalidMessages: _on_invalid_messages,
     }
 
     # In flight

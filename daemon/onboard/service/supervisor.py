@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any
 
-from daemon.onboard.service.messages import Ping, Stop
+from daemon.onboard.service.messages import InvalidMessages, Ping, Stop
 from daemon.onboard.service.processes import Child
 
 ANSWER_LIMIT_S: Mapping[str, float] = {"capture": 10.0, "writer": 60.0, "worker": 120.0}
@@ -20,6 +20,8 @@ RESTART_LIMIT_S: Mapping[str, float] = {"watch": 60.0}
 """How long a process on which no exposure depends may be silent before it is ended. It is started
 again as after any other end; the watchdog is fed meanwhile."""
 END_TIMEOUT_S = 5.0
+PAGE = "watch"
+"""The process that the network reaches."""
 
 
 class Supervisor:
@@ -43,7 +45,7 @@ class Supervisor:
         dead = self._children.pop(name, None)
         if dead is not None:
             dead.end(0.0)
-        child = Child(name, target, arguments, environment)
+        child = _made(name, target, arguments, environment)
         self._children[name] = child
         self._answered[name] = time.monotonic()
         asyncio.get_running_loop().add_reader(child.connection.fileno(), self._receive, child)
@@ -100,13 +102,35 @@ class Supervisor:
     def _receive(self, child: Child) -> None:
         """Everything a child has to say right now."""
         try:
-            while child.connection.poll():
-                message = child.connection.recv()
-                self._answered[child.name] = time.monotonic()
+            for message in child.receive():
+                if not isinstance(message, InvalidMessages):
+                    self._answered[child.name] = time.monotonic()
                 self._hear(message)
         except (EOFError, ConnectionError):
             self._lost(child)
+            return
+        if child.pause_s:
+            loop = asyncio.get_running_loop()
+            loop.remove_reader(child.connection.fileno())
+            loop.call_later(child.pause_s, self._go_on, child)
+
+    def _go_on(self, child: Child) -> None:
+        """Receive again from a child that had sent too much."""
+        if self._children.get(child.name) is child:
+            loop = asyncio.get_running_loop()
+            loop.add_reader(child.connection.fileno(), self._receive, child)
 
     def _lost(self, child: Child) -> None:
         asyncio.get_running_loop().remove_reader(child.connection.fileno())
         self._died(child.name)
+
+
+def _made(
+    name: str, target: str, arguments: tuple[Any, ...], environment: Mapping[str, str]
+) -> Child:
+    """The page's process speaks another language than the others: strangers can reach it."""
+    if name != PAGE:
+        return Child(name, target, arguments, environment)
+    from daemon.onboard.service.page_link import PageChild  # needs msgpack, of the extra `watch`
+
+    return PageChild(name, target, arguments, environment)

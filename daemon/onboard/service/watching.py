@@ -7,6 +7,7 @@ is in `daemon.onboard.monitoring`.
 from __future__ import annotations
 
 import asyncio
+import logging
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -16,11 +17,12 @@ from daemon.mission.exposure import Exposure, TemperatureRecord, navigation_to_j
 from daemon.onboard.flight.latches import DELIVERS, FIXED, IS_GONE, SEARCHES
 from daemon.onboard.service.departure import ProcessPlan
 from daemon.onboard.service.messages import Answer, Told
-from daemon.onboard.service.supervisor import Supervisor
+from daemon.onboard.service.supervisor import PAGE, Supervisor
 from daemon.onboard.timing.clock import GpsEstimate
 from drivers.contract import NavSample
 
-NAME = "watch"
+_LOG = logging.getLogger(__name__)
+NAME = PAGE
 RESTART_S = 3.0
 """How long after its death the process is started again."""
 HELD_MOST = 1000
@@ -70,8 +72,9 @@ class Watching:
     def _is_told(self, told: Told) -> bool:
         try:
             return self._supervisor.tell(NAME, told)
-        except ValueError:
+        except ValueError as error:
             self.dropped += 1
+            _LOG.warning("event %s is not shown to watchers: %s", told.event.get("event"), error)
             return True
 
     def answer(self, answer: Answer) -> None:

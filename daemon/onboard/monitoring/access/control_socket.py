@@ -31,7 +31,7 @@ from daemon.onboard.monitoring.access.gate import Gate, NoAnswerError, NotPermit
 from daemon.onboard.monitoring.access.roles import Principal, Role
 from daemon.onboard.monitoring.state import FlightState
 from daemon.onboard.monitoring.web.api import CommandName
-from daemon.onboard.monitoring.web.bodies import CommandBody
+from daemon.onboard.service.command_rules import CommandBody
 
 SO_PEERGROUPS: Final = 59
 """Of Linux 4.13, <asm-generic/socket.h>; Python has no name for it."""
@@ -176,6 +176,7 @@ class ControlSocket:
     async def _obey(self, line: bytes, by: Principal) -> tuple[bool, str]:
         asked = _request(line)
         if isinstance(asked, str):
+            self._gate.refuse("", by, asked)
             return False, asked
         name, arguments = asked
         try:

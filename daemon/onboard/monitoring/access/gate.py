@@ -50,11 +50,7 @@ class Gate:
             NotPermittedError: the role does not permit it; the attempt is recorded.
             NoAnswerError: none came in time.
         """
-        needed = missing_role(by, name)
-        if needed is not None:
-            sentence = f"{by.name} has the role {by.role}; {name} needs the role {needed}"
-            self.refuse(name, by, sentence)
-            raise NotPermittedError(sentence)
+        self.admit(name, by)
         number = next(self._numbers)
         answer: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
         self._waiting[number] = answer
@@ -67,6 +63,18 @@ class Gate:
             ) from error
         finally:
             del self._waiting[number]
+
+    def admit(self, name: str, by: Principal) -> None:
+        """Make sure that a role permits a command, before anything else of it is looked at.
+
+        Raises:
+            NotPermittedError: it does not; the attempt is recorded.
+        """
+        needed = missing_role(by, name)
+        if needed is not None:
+            sentence = f"{by.name} has the role {by.role}; {name} needs the role {needed}"
+            self.refuse(name, by, sentence)
+            raise NotPermittedError(sentence)
 
     def refuse(self, name: str, by: Principal, sentence: str) -> None:
         """Record an attempt that is refused; many of them are summarized once a minute.

@@ -1,4 +1,4 @@
-"""Roles, and the least role that each command requires.
+"""Who gives a command, and whether their role permits it.
 
 A command reaches the service only through `daemon.onboard.monitoring.access.gate`, which asks here,
 whatever way it came: page, API, MAVLink or control socket.
@@ -6,29 +6,11 @@ whatever way it came: page, API, MAVLink or control socket.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, Literal
 
-Role = Literal["observer", "operator", "administrator"]
-ROLES: Final[tuple[Role, ...]] = ("observer", "operator", "administrator")
-"""From the one that permits least; each includes those before it."""
+from daemon.onboard.service.command_rules import COMMAND_ROLES, ROLES, Role, permits
 
-COMMAND_ROLES: Final[Mapping[str, Role]] = {
-    "arm": "operator",
-    "start": "operator",
-    "stop": "operator",
-    "trigger": "operator",
-    "interval": "operator",
-    "distance": "operator",
-    "exposure": "operator",
-    "acknowledge": "operator",
-    "land": "operator",
-    "new-mission": "administrator",
-    "release-disk": "administrator",
-    "accept-disk": "administrator",
-}
-"""What flies the camera is the operator's; what changes disks or configuration is not."""
+__all__ = ["COMMAND_ROLES", "ROLES", "Principal", "Role", "missing_role"]
 
 
 @dataclass(frozen=True)
@@ -42,7 +24,6 @@ class Principal:
 
 def missing_role(principal: Principal, command: str) -> Role | None:
     """The role that `principal` needs for a command and does not have; None if permitted."""
-    needed = COMMAND_ROLES.get(command, ROLES[-1])
-    if principal.role is not None and ROLES.index(principal.role) >= ROLES.index(needed):
+    if permits(principal.role, command):
         return None
-    return needed
+    return COMMAND_ROLES.get(command, ROLES[-1])

@@ -27,7 +27,7 @@ from starlette.websockets import WebSocketDisconnect
 
 from daemon.mission.layout import exposure_name
 from daemon.onboard.monitoring.access.gate import Gate, NoAnswerError, NotPermittedError
-from daemon.onboard.monitoring.access.roles import Principal
+from daemon.onboard.monitoring.access.roles import COMMAND_ROLES, Principal, missing_role
 from daemon.onboard.monitoring.access.tokens import Attempts, Holder, Tokens
 from daemon.onboard.monitoring.coverage import Coverage
 from daemon.onboard.monitoring.metrics import exposition
@@ -49,6 +49,9 @@ PROBLEM_JSON = "application/problem+json"
 TELEMETRY_TICK_S = 0.05
 SEND_TIMEOUT_S = 5.0
 """A watcher that does not take a record in this time is let go."""
+
+LEAST_COMMAND = "arm"
+"""One of those that need the least role."""
 
 SUBPROTOCOL = "syntopic.v1"
 """What a browser offers for telemetry, besides its token."""
@@ -165,15 +168,25 @@ class _Doors:
             self.admit(request)
 
     async def command(self, request: Request) -> Principal:
-        """Who gives the command; the gate decides what their role permits."""
-        address = _address(request)
+        """Who gives the command, if their role permits it: before its name and body are judged."""
+        address, name = _address(request), request.path_params.get("name", "")
         try:
             holder = self.admit(request)
         except HTTPException as error:
             stranger = Principal("unknown", None, address)
-            self._gate.refuse(request.path_params.get("name", ""), stranger, error.detail)
+            self._gate.refuse(name, stranger, error.detail)
             raise
-        return Principal(holder.name, holder.role, address)
+        by = Principal(holder.name, holder.role, address)
+        if name in COMMAND_ROLES:
+            try:
+                self._gate.admit(name, by)
+            except NotPermittedError as error:
+                raise HTTPException(403, str(error)) from error
+            return by
+        self._gate.refuse(name, by, "there is no such command")
+        if missing_role(by, LEAST_COMMAND) is not None:
+            raise HTTPException(403, f"{by.name} has the role {by.role}, which gives no commands")
+        return by  # whoever commands at all learns which commands there are
 
     def admit(self, asking: HTTPConnection) -> Holder:
         """Who comes with this token. A valid one is admitted, however many wrong ones came before.
@@ -313,12 +326,16 @@ def _add_commands(app: FastAPI, state: FlightState, gate: Gate, doors: _Doors) -
         Needs a token of the role operator; new-mission, release-disk and accept-disk need the
         role administrator. Every command is answered by the service and recorded in the audit log.
         """
-        given = await command_body(request)
-        if name == "acknowledge":
-            if given.fault is None:
-                raise HTTPException(409, "acknowledge needs the fault's id")
-            if not any(fault["id"] == given.fault for fault in state.faults()):
-                raise HTTPException(404, f"no fault {given.fault!r} is listed")
+        try:
+            given = await command_body(request)
+            if name == "acknowledge":
+                if given.fault is None:
+                    raise HTTPException(409, "acknowledge needs the fault's id")
+                if not any(fault["id"] == given.fault for fault in state.faults()):
+                    raise HTTPException(404, f"no fault {given.fault!r} is listed")
+        except HTTPException as error:
+            gate.refuse(name, by, error.detail)
+            raise
         try:
             answer = await gate.command(name, given.model_dump(exclude_none=True), by)
         except NotPermittedError as error:

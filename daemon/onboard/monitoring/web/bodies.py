@@ -5,37 +5,16 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import AsyncIterator
-from typing import Any, Literal
+from typing import Any
 
 from fastapi import HTTPException, Request
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ValidationError
+
+from daemon.onboard.service.command_rules import CommandBody
 
 BODY_MAX_BYTES = 16_384
 BODY_MAX_S = 5.0
 """From the end of the header to the end of the body."""
-
-
-class CommandBody(BaseModel):
-    """What a command may carry besides its name."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    fault: str | None = Field(default=None, max_length=200, description="which, for acknowledge")
-    override: bool = Field(default=False, description="start although something is missing")
-    reason: str | None = Field(default=None, max_length=200, description="why, for override")
-    disk: Literal["root", "mirror"] | None = Field(
-        default=None, description="for release-disk and accept-disk"
-    )
-    interval_s: float | None = Field(default=None, gt=0, le=3600, description="for interval")
-    count: int = Field(default=0, ge=0, le=10**6, description="for interval; 0: until stopped")
-    distance_m: float | None = Field(default=None, gt=0, le=10**5, description="for distance")
-    control: Literal["manual", "automatic"] | None = Field(default=None, description="for exposure")
-    exposure_time_us: float | None = Field(default=None, gt=0, le=60e6, description="for exposure")
-    gain_db: float | None = Field(default=None, ge=0, le=60, description="for exposure")
-    tdi_shifts: int | None = Field(default=None, ge=0, le=1000, description="for exposure")
-    of: str | None = Field(
-        default=None, max_length=40, description="for exposure: pan, or a cone; else all"
-    )
 
 
 DOCUMENTED = {

@@ -266,3 +266,36 @@ def test_the_page_is_small_and_asks_nobody_else(client: TestClient) -> None:
             assert "https://" not in path.read_text(), path
     assert client.get("/docs").status_code == 200
     assert client.get("/openapi.json").json()["info"]["title"] == "Syntopic"
+
+
+@pytest.mark.attack
+@pytest.mark.parametrize(
+    ("body", "kind"),
+    [
+        (b"[[[", "application/json"),
+        (b'{"unknown": 1}', "application/json"),
+        (b"x=1", "text/plain"),
+        (b"[" * 20_000, "application/json"),
+    ],
+)
+def test_the_role_is_checked_before_the_body_and_every_attempt_is_recorded(
+    camera: Camera, client: TestClient, body: bytes, kind: str
+) -> None:
+    def answer(name: str, token: str) -> int:
+        headers = bearer(token) | {"Content-Type": kind}
+        path = f"/api/v1/commands/{name}"
+        return int(client.post(path, content=body, headers=headers).status_code)
+
+    assert answer("start", camera.pilot) == 403
+    assert answer("nonsense", camera.pilot) == 403
+    assert answer("release-disk", camera.operator) == 403
+    assert answer("start", camera.operator) in (413, 415, 422)
+    assert answer("nonsense", camera.operator) == 422
+    assert [(one.name, one.by, one.role) for one in camera.refused] == [
+        ("start", "pilot", "observer"),
+        ("unknown", "pilot", "observer"),
+        ("release-disk", "operator", "operator"),
+        ("start", "operator", "operator"),
+        ("unknown", "operator", "operator"),
+    ]
+    assert camera.commands == []

@@ -7,7 +7,7 @@ import importlib
 import multiprocessing
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -221,6 +221,8 @@ def _state(_gps_ns: int) -> ReceiverState:
 class ThreadChild:
     """In the place of `daemon.onboard.service.processes.Child`: the same target, in a thread."""
 
+    pause_s = 0.0
+
     def __init__(
         self, name: str, target: str, arguments: tuple[Any, ...], _environment: Mapping[str, str]
     ) -> None:
@@ -238,6 +240,10 @@ class ThreadChild:
 
         self.thread = threading.Thread(target=run, name=name, daemon=True)
         self.thread.start()
+
+    def receive(self) -> Iterator[object]:
+        while self.connection.poll():
+            yield self.connection.recv()
 
     def send(self, message: object) -> None:
         self.connection.send(message)
@@ -267,7 +273,7 @@ class Said:
 def in_threads(planted: Planted) -> None:
     """Let `check` and `run` start threads in the place of processes, and make no images."""
     patch = planted.monkeypatch.setattr
-    patch(supervisor, "Child", ThreadChild)
+    patch(supervisor, "_made", ThreadChild)
     patch(Processor, "warm_up", lambda _processor: None)
     patch(numba, "threading_layer", lambda: "omp")
     patch(worker, "settle_threads", lambda: None)

@@ -52,12 +52,12 @@ def test_a_command_and_a_refusal_are_in_the_flight_log_and_on_the_disk(
 ) -> None:
     flight = Flight()
     flight._on_command(Command(1, "trigger", {}, "anna", "operator", "10.0.0.9"))
-    flight._on_command(Command(2, "release-disk", {"disk": "x"}, "eva", "administrator", "unix"))
+    flight._on_command(Command(2, "acknowledge", {"fault": "x"}, "eva", "administrator", "unix"))
     flight._on_command_refused(CommandRefused("land", "unknown", "none", "10.0.0.66", "no", 7))
     assert [answer.done for answer in flight.answers] == [True, False]
     assert [(one["event"], one["name"]) for one in flight.events] == [
         ("command", "trigger"),
-        ("command", "release-disk"),
+        ("command", "acknowledge"),
         ("command-refused", "land"),
     ]
     log = FlightLog.create(tmp_path)

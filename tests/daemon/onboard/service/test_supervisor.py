@@ -27,7 +27,7 @@ def refusing(link: Link, *_: Any) -> None:
 def test_a_refusal_is_taken_in_before_the_end_of_its_process(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(supervisor, "Child", ThreadChild)
+    monkeypatch.setattr(supervisor, "_made", ThreadChild)
     said: list[object] = []
 
     async def begin() -> None:
