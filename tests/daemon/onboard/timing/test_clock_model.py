@@ -17,6 +17,7 @@ from daemon.onboard.timing.clock_model import (
     RATE_SIGMA,
     ClockModel,
     Pair,
+    _agree,
     _Fit,
 )
 
@@ -132,3 +133,11 @@ def test_sigmas_that_grow_in_the_last_round_are_solved_with(seed: int) -> None:
         assert abs(to_ns - one) < 5.0 * sigma_ns
     fit._solve()
     assert found == [fit.at(one, 0.0) for one in at_ns]
+
+
+@pytest.mark.parametrize("factor", [1.0, 4.0])
+def test_pairs_are_one_line_within_eight_of_their_sigmas_times_the_scatter(factor: float) -> None:
+    limit_ns = round(8.0 * factor * (50.0 + 30.0) + 5 * RATE_SIGMA * 2.0)
+    for off_ns, agree in ((limit_ns, True), (-limit_ns, True), (limit_ns + 1, False)):
+        pairs = [Pair(0, 0, 50.0), Pair(2 * NS, 2 * NS + off_ns, 30.0)]
+        assert _agree(pairs, factor) is agree
