@@ -36,10 +36,24 @@ class Case:
     arguments: Callable[[Path], list[str]]
     positions: int = 8
     reruns: bool = True
+    before: Callable[[Path], list[str]] | None = None
+    """What is run first, to its end."""
 
 
 def _mission(*words: str, options: tuple[str, ...] = ()) -> Callable[[Path], list[str]]:
     return lambda folder: [*words, str(folder / "flown" / MISSION), *options]
+
+
+def _install(folder: Path) -> list[str]:
+    return ["install", "--root", str(folder / "root")]
+
+
+def _token(action: str, folder: Path) -> list[str]:
+    return ["token", action, "tower", "--file", str(folder / "tokens.toml")]
+
+
+def _add_token(folder: Path) -> list[str]:
+    return _token("add", folder)
 
 
 CASES = (
@@ -56,15 +70,19 @@ CASES = (
             "--remove-source",
         ],
     ),
-    Case(
-        "token add",
-        lambda f: ["token", "add", "tower", "--file", str(f / "tokens.toml")],
-        reruns=False,
-    ),
+    Case("token add", _add_token, reruns=False),
     Case(
         "rigs show",
         lambda f: ["rigs", "show", "ultracam-x-mini", "--drawing", str(f / "rig.svg")],
     ),
+    Case("calibrate validity", _mission("calibrate", "validity")),
+    Case(
+        "certificate",
+        lambda f: ["certificate", "--folder", str(f / "tls"), "--name", "camera"],
+    ),
+    Case("install", _install, positions=6),
+    Case("uninstall", lambda f: ["uninstall", "--root", str(f / "root")], before=_install),
+    Case("token remove", lambda f: _token("remove", f), reruns=False, before=_add_token),
     Case("import dbat", lambda f: ["import", "dbat", str(DBAT), "--out", str(f / "camcal")]),
 )
 
@@ -127,15 +145,19 @@ def check_whole(folder: Path) -> None:
 def test_an_interrupted_command_leaves_whole_files_and_says_how_to_continue(
     case: Case, pristine: Path, tmp_path: Path
 ) -> None:
-    folder, said = tmp_path / "trial", tmp_path / "said.json"
+    folder, said, begun = tmp_path / "trial", tmp_path / "said.json", tmp_path / "begun"
+    shutil.copytree(pristine, begun)
+    if case.before is not None:
+        run_to_call(run(case.before(begun), said), None)
+        assert json.loads(said.read_text())["status"] == 0, said.read_text()
 
     def trial(last: int | None, by: signal.Signals = signal.SIGKILL) -> list[str]:
         shutil.rmtree(folder, ignore_errors=True)
-        shutil.copytree(pristine, folder)
+        shutil.copytree(begun, folder)
         said.unlink(missing_ok=True)
         return run_to_call(run(case.arguments(folder), said), last, torn=True, by=by)
 
-    shutil.copytree(pristine, folder)
+    shutil.copytree(begun, folder)
     run(case.arguments(folder), said)()  # what it imports is there for the trials
     count = len(trial(None))
     assert json.loads(said.read_text())["status"] == 0, said.read_text()
