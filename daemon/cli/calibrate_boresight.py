@@ -20,7 +20,7 @@ HELP = """Boresight, lever arm and time offset: inertial against controlled orie
 PROJECT is an adjustment project (docs/formats.md) with control; it is adjusted without its antenna
 positions and attitudes, and the result is compared with the trajectory: `inertial.csv` in the
 project, or a mission's (--mission, exposures named as their folders; --crs of the project, which
-a project of `syntopic at` tells itself). Fly
+a project of `syntopic triangulate` tells itself). Fly
 two heights, opposite and crossing lines and two speeds; what the flight cannot part is named and
 stays as it was given. The rig (--rig, or the mission's) tells the serial numbers of heads, lenses
 and probes. Writes a dated folder with mount.toml, report.html and calibration.json.

@@ -12,8 +12,6 @@ from typing import Any
 
 import typer
 
-from daemon.terminal.console import Console
-
 STATUS = 130
 """Exit status after SIGINT, as shells give it: 128 + 2."""
 
@@ -25,14 +23,14 @@ SENTENCES = {
     "demo": f"the exposures stored so far are complete; {AGAIN} for a new flight",
     "run": f"stored exposures are complete; {AGAIN} to continue the flight",
     "monitor": f"the flight is not affected; {AGAIN} to watch it",
-    "command": "the service may have received the command; run `syntopic monitor` to see its state",
+    "send": "the service may have received the command; run `syntopic monitor` to see its state",
     "process": (
         "the products of exposures processed so far are complete and all others are as before; "
         f"{AGAIN}, or name the remaining exposures with --only"
     ),
-    "develop": (
-        f"the images developed so far are complete and all others are as before; {AGAIN} to "
-        "develop the others"
+    "pansharpen": (
+        f"the images computed so far are complete and all others are as before; {AGAIN} to "
+        "compute the others"
     ),
     "repair": f"every step done so far is complete; {AGAIN} to finish",
     "transfer": (
@@ -43,7 +41,7 @@ SENTENCES = {
     "install": f"every file written so far is complete; {AGAIN} to finish",
     "uninstall": f"every file left is complete; {AGAIN} to finish",
     **dict.fromkeys(
-        ("explain", "check", "verify", "replay", "advise", "disk-health"), _NOTHING_WRITTEN
+        ("explain", "check", "verify", "replay", "reflights", "disk-health"), _NOTHING_WRITTEN
     ),
     **dict.fromkeys(("bench", "rigs", "token list"), _NOTHING_WRITTEN),
     "certificate": (
@@ -52,7 +50,7 @@ SENTENCES = {
     "token": (
         "the token file is complete; run `syntopic token list` to see whether it was changed"
     ),
-    **dict.fromkeys(("report", "adjust", "at", "orient", "intersect"), _WHOLE_FILES),
+    **dict.fromkeys(("report", "adjust", "triangulate", "orient", "intersect"), _WHOLE_FILES),
     **dict.fromkeys(("calibrate", "import", "export", "sim", "rigs show"), _WHOLE_FILES),
 }
 """By the name of a command, or of a group whose commands have none of their own."""
@@ -82,6 +80,8 @@ def make_interruptible(app: typer.Typer, group: str = "") -> None:
 
 def say(sentence: str) -> None:
     """Print where errors are printed."""
+    from daemon.terminal.console import Console
+
     console = Console(stderr=True, soft_wrap=True)
     console.print(sentence, style="yellow", markup=False, highlight=False)
 

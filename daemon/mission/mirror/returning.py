@@ -191,7 +191,7 @@ class ReturningDisk:
             what = "no disk of Syntopic" if found is None else "another disk"
             raise MirrorError(
                 f"{what} is at {self.disk.root}; mount the right one, or take this one with: "
-                f"syntopic command accept-disk --set disk={self.disk.label}"
+                f"syntopic send accept-disk --set disk={self.disk.label}"
             )
         self.disk = replace(self.disk, id=found)
 

@@ -25,7 +25,7 @@ _REASONS: tuple[tuple[str, str], ...] = (
     (".superseded/", "set aside when two copies of the mission were brought together"),
     (f"L0/{DISCARDED}/", "set aside by recovery; it was never stored"),
     ("L2/", "products, made again from Level-0 (syntopic process)"),
-    ("L3/", "products, made again from Level-2 (syntopic develop)"),
+    ("L3/", "products, made again from Level-2 (syntopic pansharpen)"),
     ("export/", "derived from the mission for other programs"),
 )
 """Beginning of a path, and why such a file has no hash."""

@@ -157,7 +157,7 @@ def system_of(project: Path, crs: str | None) -> str | LocalFrame:
     except FileNotFoundError as error:
         raise BoresightError(
             "--mission needs --crs, the coordinate system of the project, such as EPSG:25833; only "
-            "projects that `syntopic at` wrote tell their own"
+            "projects that `syntopic triangulate` wrote tell their own"
         ) from error
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise BoresightError(f"{frame}: {error}; give --crs") from error
@@ -175,7 +175,7 @@ def inertial_of_mission(
 
     Exposures are named as `syntopic export orientation` names them. Positions are those of the
     antenna, as the trajectory tells them. `system` is a coordinate system that PROJ knows, or the
-    local frame of a project that `syntopic at` wrote.
+    local frame of a project that `syntopic triangulate` wrote.
 
     Raises:
         BoresightError: no exposure of the project has an instant and an attitude, or the record of

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import ast
+import subprocess
+import sys
 from collections.abc import Iterator
+from importlib.metadata import version
 from typing import Any
 
 import pytest
 from typer.main import get_command
+from typer.testing import CliRunner
 
 from daemon.cli import app
+from daemon.cli.command_table import RENAMED, TABLE
 
 
 def commands(command: Any, name: str) -> Iterator[tuple[str, Any]]:
@@ -26,3 +32,58 @@ def test_every_command_has_an_example_and_says_what_each_option_is(name: str) ->
     assert "`syntopic " in command.help
     assert "Example" in command.help
     assert [p.name for p in command.params if not (p.help or p.name == "help")] == []
+
+
+LIGHT = (
+    "typer",
+    "click",
+    "rich",
+    "markdown_it",
+    "mdurl",
+    "pygments",
+    "shellingham",
+    "annotated_doc",
+)
+
+
+def test_the_help_page_imports_no_command_and_no_heavy_library() -> None:
+    code = (
+        "import sys\n"
+        "from daemon.cli import app\n"
+        "sys.argv = ['syntopic', '--help']\n"
+        "try:\n    app()\nexcept SystemExit:\n    pass\n"
+        "roots = {m.partition('.')[0] for m in sys.modules} - set(sys.stdlib_module_names)\n"
+        "print('ROOTS', sorted(roots))\n"
+        "print('OURS', sorted(m for m in sys.modules if m.startswith('daemon.')))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
+    roots, ours = (line.partition(" ")[2] for line in done.stdout.splitlines()[-2:])
+    allowed = LIGHT | {"daemon", "annotated_doc", "typing_extensions", "attr"}
+    assert {r for r in ast.literal_eval(roots) if not r.startswith("_")} <= allowed
+    assert ast.literal_eval(ours) == [
+        "daemon.cli",
+        "daemon.cli.command_table",
+        "daemon.cli.interruption",
+    ]
+    assert all(f" {name} " in done.stdout for name in TABLE)
+
+
+@pytest.mark.parametrize(("former", "present"), RENAMED.items())
+def test_a_former_name_is_refused_with_the_present_one(former: str, present: str) -> None:
+    done = CliRunner().invoke(app, [former, "MISSION"])
+    assert done.exit_code == 2
+    assert f"Use '{present}'" in done.output
+
+
+def test_summaries_are_imperative_sentences() -> None:
+    for entry in TABLE.values():
+        first = entry.summary.split()[0]
+        assert entry.summary.endswith(".") and len(entry.summary) <= 66
+        assert first[0].isupper() and not first.endswith(("s", "ing")), entry.summary
+
+
+def test_the_version_is_that_of_the_distribution() -> None:
+    done = CliRunner().invoke(app, ["--version"])
+    assert done.output.strip() == f"syntopic {version('syntopic')}"

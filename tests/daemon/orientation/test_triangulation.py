@@ -1,4 +1,4 @@
-"""`syntopic at`: two lines, flown there and back, matched and held against check points."""
+"""`syntopic triangulate`: two lines, flown both ways, matched and held against check points."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def _pan(world: World):
 
 def _asked(folder: Path, out: str, *more: str) -> list[str]:
     return [
-        "at", str(folder / "mission"), "--trajectory", str(folder / "trajectory.csv"),
+        "triangulate", str(folder / "mission"), "--trajectory", str(folder / "trajectory.csv"),
         "--out", str(folder / out), "--json", *more,
     ]  # fmt: skip
 
@@ -189,7 +189,7 @@ def test_images_and_records_that_cannot_be_read_are_left_out_and_listed(flown, t
     image.mkdir()
     (mission / "L0/000006/exposure.json").write_text('{"number": "6"}')
     where = ["--trajectory", str(flown[0] / "trajectory.csv"), "--json"]
-    done = RUN.invoke(app, ["at", str(mission), *where])
+    done = RUN.invoke(app, ["triangulate", str(mission), *where])
     assert done.exit_code == 1, done.output
     report = json.loads(done.stdout)
     assert report["triangulation"]["exposures"] == 3
@@ -204,6 +204,6 @@ def test_images_and_records_that_cannot_be_read_are_left_out_and_listed(flown, t
 @pytest.mark.trust
 def test_a_block_is_not_begun_while_another_process_writes_into_the_mission(flown) -> None:
     mission = Mission.open(flown[0] / "mission")
-    command = ["at", str(mission.path), "--trajectory", str(flown[0] / "trajectory.csv")]
+    command = ["triangulate", str(mission.path), "--trajectory", str(flown[0] / "trajectory.csv")]
     with mission.held(), pytest.raises(MissionError, match="is held by another process"):
         RUN.invoke(app, command, catch_exceptions=False)

@@ -202,8 +202,8 @@ def mission_of(folder: Path, shots: list[Shot], *, has_area: bool = True, plan: 
 
 
 def advised(mission: Path, *options: str) -> dict[str, Any]:
-    """What `syntopic advise` prints."""
-    done = CliRunner().invoke(app, ["advise", str(mission), "--json", *options])
+    """What `syntopic reflights` prints."""
+    done = CliRunner().invoke(app, ["reflights", str(mission), "--json", *options])
     told = json.loads(done.stdout)
     assert done.exit_code == (1 if told["segments"] else 0), done.output
     return dict(told)

@@ -119,13 +119,13 @@ def test_wishes_are_followed_and_an_earlier_result_is_replaced(mission):
 
 
 def test_the_command_develops_the_whole_mission_and_refuses_unknown_wishes(mission):
-    done = CliRunner().invoke(app, ["develop", str(mission.path), "--bits", "8", "--json"])
+    done = CliRunner().invoke(app, ["pansharpen", str(mission.path), "--bits", "8", "--json"])
     assert done.exit_code == 0, done.output
     told = json.loads(done.stdout)
     assert [row["exposure"] for row in told["exposures"]] == [1, 2, 3]
     assert all(set(row["files"]) == {"rgb-8.tif", "cir-8.tif"} for row in told["exposures"])
     with pytest.raises(ConfigurationError, match="--image is rgb or cir"):
-        CliRunner().invoke(app, ["develop", str(mission.path), "--image", "x"],
+        CliRunner().invoke(app, ["pansharpen", str(mission.path), "--image", "x"],
                            catch_exceptions=False)  # fmt: skip
 
 
@@ -169,7 +169,7 @@ def test_level_2_that_is_missing_or_damaged_is_told_with_its_cure(mission):
 )
 def test_the_command_goes_on_after_an_exposure_it_cannot_develop(mission, damage, cause):
     damage(mission)
-    done = CliRunner().invoke(app, ["develop", str(mission.path), "--bits", "8", "--json"])
+    done = CliRunner().invoke(app, ["pansharpen", str(mission.path), "--bits", "8", "--json"])
     assert done.exit_code == 1
     told = json.loads(done.stdout)
     assert [row["exposure"] for row in told["exposures"]] == [2, 3]
@@ -184,7 +184,7 @@ def test_the_command_goes_on_after_an_exposure_it_cannot_develop(mission, damage
 @pytest.mark.trust
 def test_develop_is_refused_while_another_process_writes_into_the_mission(mission):
     with mission.held(), pytest.raises(MissionError, match=r"held by another process: `.*`, proc"):
-        CliRunner().invoke(app, ["develop", str(mission.path)], catch_exceptions=False)
+        CliRunner().invoke(app, ["pansharpen", str(mission.path)], catch_exceptions=False)
     assert not (mission.path / "L3").exists()
 
 

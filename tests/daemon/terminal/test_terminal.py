@@ -48,7 +48,9 @@ def test_what_can_be_seen_stays_as_it_is() -> None:
 
 
 @pytest.mark.trust
-@pytest.mark.parametrize("command", ["check", "process", "report", "rigs show", "advise", "verify"])
+@pytest.mark.parametrize(
+    "command", ["check", "process", "report", "rigs show", "reflights", "verify"]
+)
 def test_a_hostile_name_in_an_argument_ends_in_a_sentence(tmp_path: Path, command: str) -> None:
     done = CliRunner().invoke(app, [*command.split(), f"{tmp_path}/[/x]\x1b[2J.toml"])
     assert done.exit_code != 0
@@ -63,7 +65,7 @@ def test_a_mission_and_a_plan_with_markup_in_their_names_are_advised_on(tmp_path
     plan = tmp_path / "[b].geojson"
     text = (mission / "plan.geojson").read_text()
     plan.write_text(text.replace('"id": "A"', '"id": "[/x] [blink]A"'))
-    asked = ["advise", str(mission), "--plan", str(plan)]
+    asked = ["reflights", str(mission), "--plan", str(plan)]
     done = CliRunner().invoke(app, asked)
     assert done.exit_code == 1 and isinstance(done.exception, SystemExit), done.output
     assert "[/x]" in done.output and "[red]" in done.output

@@ -256,7 +256,7 @@ def test_the_command_line_gives_what_it_is_told_and_its_status_says_what_became(
 
     def run(*arguments: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
-            [sys.executable, "-m", "daemon", "command", *arguments, "--socket", str(path)],
+            [sys.executable, "-m", "daemon", "send", *arguments, "--socket", str(path)],
             capture_output=True,
             text=True,
             timeout=60,

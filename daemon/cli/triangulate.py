@@ -1,4 +1,4 @@
-"""`syntopic at`: aerial triangulation of a mission."""
+"""`syntopic triangulate`: aerial triangulation of a mission."""
 
 from __future__ import annotations
 
@@ -38,14 +38,15 @@ grid), `exterior.csv` with the adjusted orientations, and all the tables docs/fo
 Of a rig whose heads look apart, those alike in pixels and principal distance make a block (--head):
 views that look about the same way are matched, oblique ones by the plane of the ground.
 
-Examples: `syntopic at MISSION --trajectory sbet.out`, `syntopic at MISSION --head 5 --head 8`,
-`syntopic at MISSION --set sensors-full --points points.csv --measured measured.csv --gnss shift`
+Examples: `syntopic triangulate MISSION --trajectory sbet.out`,
+`syntopic triangulate MISSION --head 5 --head 8`,
+`syntopic triangulate MISSION --set sensors-full --points points.csv --measured measured.csv`
 """
 
 SETS = ("none", "radial", "sensors", "sensors-full")
 
 
-def at(
+def triangulate(
     mission: Annotated[Path, typer.Argument(help="Mission folder with Level-2.")],
     set_name: Annotated[
         str, typer.Option("--set", help="none, radial, sensors or sensors-full (docs/bundle.md).")

@@ -1,4 +1,4 @@
-"""`syntopic advise`: what to fly again before leaving."""
+"""`syntopic reflights`: what to fly again before leaving."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ The plan is GeoJSON, KML or QGroundControl's .plan. The mission may still be fly
 GeoJSON, a KML and a MAVLink mission of the segments. The exit status is 1 while there are any. An
 exposure whose record cannot be read counts as not flown, and is listed at the end.
 
-Examples: `syntopic advise MISSION`, `syntopic advise MISSION --plan block.geojson`
+Examples: `syntopic reflights MISSION`, `syntopic reflights MISSION --plan block.geojson`
 """
 
 
-def advise(
+def reflights(
     mission: Annotated[Path, typer.Argument(help="Mission folder.")],
     plan: Annotated[
         Path | None, typer.Option(help="The plan; that of the mission, where it has one.")

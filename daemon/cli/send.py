@@ -1,4 +1,4 @@
-"""`syntopic command`: tell a running service something, over its Unix socket."""
+"""`syntopic send`: tell a running service something, over its Unix socket."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ land, acknowledge, exposure, new-mission, release-disk, accept-disk. They go ove
 socket (`[watch] control`) and need no token: the machine knows who you are, and your group decides.
 The exit status is 1 where the service refuses.
 
-Examples: `syntopic command start`,
-`syntopic command arm --override --set reason="probe 3 is known to be broken"`,
-`syntopic command interval --set interval_s=2.5 --set count=40`,
-`syntopic command acknowledge --set fault="device SU02"`,
-`syntopic command release-disk --set disk=mirror`
+Examples: `syntopic send start`,
+`syntopic send arm --override --set reason="probe 3 is known to be broken"`,
+`syntopic send interval --set interval_s=2.5 --set count=40`,
+`syntopic send acknowledge --set fault="device SU02"`,
+`syntopic send release-disk --set disk=mirror`
 """
 DEFAULT_SOCKET = Path("/run/syntopic/control.sock")
 
 
-def command(
+def send(
     name: Annotated[str, typer.Argument(help="What to do.")],
     socket: Annotated[Path, typer.Option(help="Where the service listens.")] = DEFAULT_SOCKET,
     override: Annotated[

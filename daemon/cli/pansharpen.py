@@ -1,4 +1,4 @@
-"""`syntopic develop`: Level-3 after landing, pansharpened and in one tone."""
+"""`syntopic pansharpen`: Level-3 after landing, pansharpened and in one tone."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ anew from all of them each time. An exposure's earlier images are replaced.
 An exposure that cannot be developed is listed at the end with its cause, is not in the tone curve,
 and makes the exit status 1; the others are done.
 
-Examples: `syntopic develop MISSION`, `syntopic develop MISSION --only 3 --image cir --bits 8`
+Examples: `syntopic pansharpen MISSION`, `syntopic pansharpen MISSION --only 3 --image cir --bits 8`
 """
 
 
-def develop(
+def pansharpen(
     mission: Annotated[Path, typer.Argument(help="Mission folder.")],
     only: Annotated[
         list[int] | None, typer.Option(help="An exposure's number; repeatable.")

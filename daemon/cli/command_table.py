@@ -1,0 +1,193 @@
+"""Every command of `syntopic`: its name, where it is, one line of help, and its group.
+
+A command's module is imported when the command runs, so that `syntopic --help` and the service
+load nothing of the others. The help page and README list the commands in this order.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterator, MutableMapping
+from typing import Any, Final, NamedTuple
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+from typer.main import get_command, get_group
+
+from daemon.cli import interruption
+
+
+class Command(NamedTuple):
+    """One command, or one group of commands (`object_name` is a `typer.Typer` there)."""
+
+    name: str
+    module: str
+    object_name: str
+    help_name: str
+    summary: str
+    group: str
+
+
+_AIR: Final = "In the air"
+_GROUND: Final = "After landing"
+_LABORATORY: Final = "In the laboratory"
+_BENCH: Final = "On the bench"
+
+
+def _command(
+    name: str, group: str, summary: str, place: str = "", help_name: str = "HELP"
+) -> Command:
+    module, _, object_name = (place or name).partition(":")
+    return Command(name, f"daemon.cli.{module}", object_name or module, help_name, summary, group)
+
+
+TABLE: Final = {
+    one.name: one
+    for one in (
+        _command("run", _AIR, "Run the onboard service until SIGTERM or until the plan is flown."),
+        _command("check", _AIR, "Check a configuration and prove each device with one datum."),
+        _command("monitor", _AIR, "Watch a flight from a terminal."),
+        _command("send", _AIR, "Send a command to a running service."),
+        _command("token", _AIR, "Create, list and revoke access tokens.", "token:app"),
+        _command("certificate", _AIR, "Create a local authority and a TLS certificate."),
+        _command("explain", _AIR, "Explain an event or a quality flag: cause and cure."),
+        _command("reflights", _AIR, "List the segments of the plan that must be flown again."),
+        _command("verify", _GROUND, "Check every file of a mission against its hash."),
+        _command("repair", _GROUND, "Bring index, records, logs and disks of a mission together."),
+        _command("transfer", _GROUND, "Copy a mission to another disk and verify every file."),
+        _command("report", _GROUND, "Write the mission report as one HTML file."),
+        _command("process", _GROUND, "Process exposures again, Level-0 to Level-2."),
+        _command("pansharpen", _GROUND, "Compute Level-3: pansharpened RGB and CIR images."),
+        _command(
+            "replay", _GROUND, "Replay a recorded flight through the code and compare hashes."
+        ),
+        _command(
+            "orient",
+            _GROUND,
+            "Compute the exterior orientation of every head.",
+            "export:orientation",
+            "ORIENTATION_HELP",
+        ),
+        _command("triangulate", _GROUND, "Run the aerial triangulation of a mission."),
+        _command("intersect", _GROUND, "Compute ground points from measured image points."),
+        _command("export", _GROUND, "Export a mission for other programs.", "export:app"),
+        _command(
+            "import", _GROUND, "Import exposures or projects of other systems.", "imports:app"
+        ),
+        _command("rigs", _LABORATORY, "List the shipped rigs or describe a rig file.", "rigs:app"),
+        _command(
+            "calibrate", _LABORATORY, "Compute calibrations, each a new file.", "calibrate:app"
+        ),
+        _command("adjust", _LABORATORY, "Adjust a bundle from a project of text files."),
+        _command("demo", _BENCH, "Fly the first flight with emulated devices."),
+        _command("sim", _BENCH, "Run the emulated devices of a rig until Ctrl-C."),
+        _command("bench", _BENCH, "Time the pipeline on one exposure, in turn with its peers."),
+        _command("kernels", _BENCH, "Compile the pipeline's kernels before a flight."),
+        _command(
+            "disk-health", _BENCH, "Read the health of every disk with smartctl.", "disk_health"
+        ),
+        _command("install", _BENCH, "Install the service: unit, user, folders, device rules."),
+        _command(
+            "uninstall",
+            _BENCH,
+            "Remove what `install` installed.",
+            "install:uninstall",
+            "UNINSTALL_HELP",
+        ),
+    )
+}
+
+RENAMED: Final = {
+    "at": "triangulate",
+    "develop": "pansharpen",
+    "advise": "reflights",
+    "command": "send",
+}
+"""Former names of commands, refused with the present one."""
+
+
+def load(entry: Command) -> Any:
+    """The command as click runs it, its module imported."""
+    found = getattr(importlib.import_module(entry.module), entry.object_name)
+    if isinstance(found, typer.Typer):
+        interruption.make_interruptible(found, entry.name)
+        group = get_group(found)
+        group.name = entry.name
+        return group
+    app = typer.Typer(add_completion=False, rich_markup_mode="markdown")
+    text = getattr(importlib.import_module(entry.module), entry.help_name)
+    app.command(name=entry.name, help=text)(found)
+    interruption.make_interruptible(app)
+    return get_command(app)
+
+
+class _Loaded(MutableMapping[str, Any]):
+    """Commands by name, each imported when it is looked up."""
+
+    def __init__(self) -> None:
+        self._loaded: dict[str, Any] = {}
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in self._loaded:
+            self._loaded[name] = load(TABLE[name])
+        return self._loaded[name]
+
+    def __setitem__(self, name: str, command: Any) -> None:
+        self._loaded[name] = command
+
+    def __delitem__(self, name: str) -> None:
+        del self._loaded[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in TABLE or name in self._loaded
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(TABLE)
+
+    def __len__(self) -> int:
+        return len(TABLE)
+
+
+class CommandGroup(TyperGroup):
+    """The commands of `TABLE`. Its help page lists summaries and imports no command."""
+
+    def __init__(self, **attributes: Any) -> None:
+        attributes["commands"] = {}
+        super().__init__(**attributes)
+        self.commands = _Loaded()
+        self._is_listing = False
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """The names, in the order of `TABLE`."""
+        return list(self.commands)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """As click asks for it.
+
+        Raises:
+            UsageError: `cmd_name` is a former name; the sentence has the present one.
+        """
+        if cmd_name in RENAMED:
+            ctx.fail(f"No such command '{cmd_name}'. Use '{RENAMED[cmd_name]}'.")
+        if cmd_name not in self.commands:
+            return None
+        if self._is_listing:
+            entry = TABLE[cmd_name]
+            return TyperCommand(entry.name, help=entry.summary, rich_help_panel=entry.group)
+        return self.commands[cmd_name]
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Print the help page from the summaries."""
+        self._is_listing = True
+        try:
+            super().format_help(ctx, formatter)
+        finally:
+            self._is_listing = False
+
+    def shell_complete(self, ctx: Any, incomplete: str) -> Any:
+        """Names and summaries that complete `incomplete`."""
+        self._is_listing = True
+        try:
+            return super().shell_complete(ctx, incomplete)
+        finally:
+            self._is_listing = False
