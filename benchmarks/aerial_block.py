@@ -20,19 +20,20 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from daemon.cli.benchmark.measurement import machine
-from processing.bundle.adjust import Adjustment, Settings, adjust
-from processing.bundle.camera_model import ideal_mm
-from processing.bundle.drawing import Panel, pattern_svg
-from processing.bundle.findings import (
-    Agreement,
-    Pattern,
-    checked_against,
+from processing.bundle.adjust import Adjustment, AdjustmentSettings, adjust
+from processing.bundle.adjustment_plots import ResidualPanel, pattern_svg
+from processing.bundle.adjustment_results import (
+    PointDifferences,
+    ResidualPattern,
+    check_point_differences,
     parameters_of,
     systematic_residuals,
 )
+from processing.bundle.camera_model import ideal_mm
+from processing.bundle.initial_values import intersect
 from processing.bundle.network import (
     Attitudes,
-    Camera,
+    CameraModel,
     Gnss,
     ImagePoints,
     Images,
@@ -45,15 +46,14 @@ from processing.bundle.self_calibration import (
     SetName,
     parameter_count,
     parts_of,
-    self_calibrating,
+    with_self_calibration,
 )
-from processing.bundle.start import intersected
 from processing.rig import find_rig
 from sim_hw.blocks.aerial import (
-    Block,
-    flown,
+    AerialBlock,
     image_grid,
-    left_after_orientation,
+    residuals_after_orientation,
+    simulate_block,
     small_plan,
     ultracam_l_plan,
 )
@@ -64,22 +64,22 @@ CELLS = (14, 10)
 
 
 @dataclass(frozen=True)
-class Judged:
+class AdjustedBlock:
     """One adjustment of a block, held against the truth."""
 
     name: SetName
     result: Adjustment | None
     figures: dict[str, Any]
-    checks: Agreement
-    pattern: Pattern
+    checks: PointDifferences
+    pattern: ResidualPattern
 
 
-def network_of(block: Block, name: SetName) -> Network:
+def network_of(block: AerialBlock, name: SetName) -> Network:
     """What an aerotriangulation is given of a block: measurements, control, navigation."""
     plan, n = block.plan, len(block.names)
     rig = find_rig(plan.rig)
-    camera = self_calibrating(
-        Camera("stitched", plan.frame.f_mm, pixel_mm=plan.frame.pixel_mm),
+    camera = with_self_calibration(
+        CameraModel("stitched", plan.frame.f_mm, pixel_mm=plan.frame.pixel_mm),
         name,
         parts_of(rig),
         master_cone=rig.master_cone,
@@ -89,7 +89,7 @@ def network_of(block: Block, name: SetName) -> Network:
     ray = np.column_stack([block.xy_mm, np.full(len(block.xy_mm), -plan.frame.f_mm)])
     direction = np.einsum("nij,nj->ni", block.start_rotation[block.image], ray)
     points = len(block.true_points)
-    xyz, _ = intersected(points, block.point, start[block.image], direction)
+    xyz, _ = intersect(points, block.point, start[block.image], direction)
     # A point that no two images see takes no part, wherever it is put.
     xyz = np.where(np.isfinite(xyz), xyz, 0.0)
     sigma = np.full((points, 3), np.nan)
@@ -120,15 +120,15 @@ def network_of(block: Block, name: SetName) -> Network:
     )
 
 
-def judged(block: Block, name: SetName) -> Judged:
+def evaluate(block: AerialBlock, name: SetName) -> AdjustedBlock:
     """Adjust a block with a set of additional parameters and hold it against the truth."""
     begun, cpu = time.perf_counter(), time.process_time()
     network = network_of(block, name)
-    result = adjust(network, Settings())
+    result = adjust(network, AdjustmentSettings())
     seconds, cpu = time.perf_counter() - begun, time.process_time() - cpu
     plan = block.plan
     rows = slice(plan.control, plan.control + plan.checks)
-    checks = checked_against(
+    checks = check_point_differences(
         result,
         network.points.names[rows],
         block.survey_m[rows],
@@ -138,7 +138,9 @@ def judged(block: Block, name: SetName) -> Judged:
     places = image_grid(plan.frame, 30, 20)
     corrected = ideal_mm(camera, result.state.interior[0], result.state.terms[0], places)
     # Measured is ideal plus pattern; the correction should be its opposite.
-    left = left_after_orientation(plan.frame, places, corrected - places + block.pattern.at(places))
+    left = residuals_after_orientation(
+        plan.frame, places, corrected - places + block.pattern.at(places)
+    )
     seen = systematic_residuals(result, 0, CELLS)
     pixel_m = plan.frame.pixel_mm * plan.strips[0].height_m / plan.frame.f_mm
     n = 3 * len(checks.names)
@@ -149,7 +151,7 @@ def judged(block: Block, name: SetName) -> Judged:
     true_error = result.state.points[rows] - block.true_points[rows]
     figures = {
         "parameters": parameter_count(camera),
-        "dispensable": sum(p.dispensable for p in parameters_of(result)),
+        "dispensable": sum(p.is_insignificant for p in parameters_of(result)),
         "seconds": seconds,
         "cpu_s": cpu,
         "iterations": len(result.iterations) - 1,
@@ -175,7 +177,7 @@ def judged(block: Block, name: SetName) -> Judged:
         "residual_pattern_rms_um": float(np.sqrt(np.mean(np.sum(seen.mean_mm**2, axis=1)))) * 1e3,
         "residual_pattern_max_um": float(np.hypot(*seen.mean_mm.T).max()) * 1e3,
     }
-    return Judged(name, result, figures, checks, seen)
+    return AdjustedBlock(name, result, figures, checks, seen)
 
 
 def main() -> None:
@@ -186,11 +188,11 @@ def main() -> None:
     parser.add_argument("--drawing", type=Path, default=None, help="where to draw fig. 10 (SVG)")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
-    block = flown(small_plan() if options.small else ultracam_l_plan(), options.seed)
-    found: list[Judged] = []
+    block = simulate_block(small_plan() if options.small else ultracam_l_plan(), options.seed)
+    found: list[AdjustedBlock] = []
     for name in SETS if options.set is None else (options.set,):
         # The adjusted network itself is let go: memory is that of one adjustment.
-        found.append(replace(judged(block, name), result=None))
+        found.append(replace(evaluate(block, name), result=None))
         if not options.json:
             _print(found[-1], first=len(found) == 1)
     peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
@@ -209,7 +211,7 @@ def main() -> None:
         print(f"peak resident memory of the process {peak_mib:.0f} MiB")
 
 
-def _print(j: Judged, *, first: bool) -> None:
+def _print(j: AdjustedBlock, *, first: bool) -> None:
     f = j.figures
     if first:
         print(
@@ -231,12 +233,12 @@ def _print(j: Judged, *, first: bool) -> None:
     )
 
 
-def _drawn(block: Block, panels: Sequence[Judged]) -> str:
+def _drawn(block: AerialBlock, panels: Sequence[AdjustedBlock]) -> str:
     frame = block.plan.frame
     half = (frame.half_width_mm, frame.half_height_mm)
     return pattern_svg(
         [
-            Panel(
+            ResidualPanel(
                 f"{j.name}, {j.figures['parameters']} parameters: at most "
                 f"{j.figures['residual_pattern_max_um']:.2f} um",
                 j.pattern,

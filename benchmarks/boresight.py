@@ -16,24 +16,30 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from daemon.cli.benchmark.measurement import machine
-from daemon.postflight.adjustment.project import Checks
+from daemon.postflight.adjustment.csv_tables import write_table
+from daemon.postflight.adjustment.project import CheckPoints
 from daemon.postflight.adjustment.project_file import ProjectFile
-from daemon.postflight.adjustment.tables import write_table
-from daemon.postflight.adjustment.writing import write_project
-from daemon.postflight.calibration.boresight import controlled_of
+from daemon.postflight.adjustment.project_writer import write_project
+from daemon.postflight.calibration.boresight_calibration import controlled_of
 from processing.bundle.adjust import adjust
+from processing.bundle.initial_values import completed
 from processing.bundle.network import (
     Attitudes,
-    Camera,
+    CameraModel,
     ImagePoints,
     Images,
     Network,
     Points,
     Stations,
 )
-from processing.bundle.rotations import logarithm
-from processing.bundle.start import completed
-from processing.calibration.boresight import WORTH, Boresight, Inertial, calibrated, mounting_of
+from processing.bundle.rotations import vectors_from_rotations
+from processing.calibration.boresight import (
+    PARAMETER_SCALES,
+    BoresightCalibration,
+    InertialOrientations,
+    calibrate_boresight,
+    mounting_of,
+)
 from processing.geometry.orientation import BODY_FROM_CAMERA, ENU_FROM_NED, level_from_body
 from sim_hw.blocks.calibration_flight import (
     F_MM,
@@ -41,8 +47,8 @@ from sim_hw.blocks.calibration_flight import (
     ONE_WAY,
     PIXEL_MM,
     CalibrationFlight,
-    Line,
-    flown_for_boresight,
+    CalibrationLine,
+    simulate_calibration_flight,
 )
 
 Array = NDArray[np.float64]
@@ -62,7 +68,7 @@ def network_of(flight: CalibrationFlight) -> Network:
     free = np.zeros(n, dtype=bool)
     every = np.arange(n)
     return Network(
-        cameras=(Camera("stitched", F_MM, pixel_mm=PIXEL_MM),),
+        cameras=(CameraModel("stitched", F_MM, pixel_mm=PIXEL_MM),),
         stations=Stations(names, flight.position_m, free),
         attitudes=Attitudes(names, start, free),
         images=Images(names, every, every, np.zeros(n, np.int64), np.full(n, -1)),
@@ -74,8 +80,8 @@ def network_of(flight: CalibrationFlight) -> Network:
     )  # fmt: skip
 
 
-def inertial_of(flight: CalibrationFlight) -> Inertial:
-    return Inertial(
+def inertial_of(flight: CalibrationFlight) -> InertialOrientations:
+    return InertialOrientations(
         flight.position_m,
         flight.velocity_mps,
         np.array([ENU_FROM_NED @ level_from_body(*a) for a in flight.angles_rad]),
@@ -95,7 +101,7 @@ def write_flight(flight: CalibrationFlight, folder: Path) -> None:
         }
     )
     nothing = np.zeros((0, 3))
-    write_project(folder, file, completed(network_of(flight)), Checks((), nothing, nothing))
+    write_project(folder, file, completed(network_of(flight)), CheckPoints((), nothing, nothing))
     write_table(
         folder / "inertial.csv",
         "Antenna positions and inertial attitudes at the marks of the exposures.",
@@ -120,13 +126,13 @@ def write_flight(flight: CalibrationFlight, folder: Path) -> None:
     )
 
 
-def error_of(found: Boresight, flight: CalibrationFlight) -> Array:
+def error_of(found: BoresightCalibration, flight: CalibrationFlight) -> Array:
     """Found less true, (10,), rad, m, s, in the order of the parameters."""
     truth = level_from_body(*flight.boresight_rad)
-    turn = logarithm((truth.T @ found.mounting.imu_from_body)[None])[0]
+    rotation = vectors_from_rotations((truth.T @ found.mounting.imu_from_body)[None])[0]
     return np.concatenate(
         [
-            turn,
+            rotation,
             found.mounting.antenna_m - flight.antenna_m,
             [found.mounting.time_offset_s - flight.time_offset_s],
             found.mounting.shift_m - flight.shift_m,
@@ -134,20 +140,26 @@ def error_of(found: Boresight, flight: CalibrationFlight) -> Array:
     )
 
 
-def judged(seed: int, lines: tuple[Line, ...], **how: Any) -> tuple[Boresight, Array, float, int]:
+def evaluate(
+    seed: int, lines: tuple[CalibrationLine, ...], **how: Any
+) -> tuple[BoresightCalibration, Array, float, int]:
     """One flight: what was found, its error, squares in its covariance, and their rank."""
-    flight = flown_for_boresight(seed, lines)
+    flight = simulate_calibration_flight(seed, lines)
     result = adjust(completed(network_of(flight)))
     surveyed = flight.antenna_m + np.random.default_rng([seed, 8]).normal(
         0.0, LEVEL_FLIGHT_LEVER_SIGMA_M, 3
     )
     given = mounting_of(surveyed, np.zeros(3))
-    found = calibrated(
+    found = calibrate_boresight(
         controlled_of(result, tuple(range(len(flight.centre_m)))), inertial_of(flight), given, **how
     )
     error = error_of(found, flight)
-    seen = found.basis.T @ (error / WORTH)
-    within = found.basis.T @ (found.covariance / WORTH[:, None] / WORTH) @ found.basis
+    seen = found.basis.T @ (error / PARAMETER_SCALES)
+    within = (
+        found.basis.T
+        @ (found.covariance / PARAMETER_SCALES[:, None] / PARAMETER_SCALES)
+        @ found.basis
+    )
     return found, error, float(seen @ np.linalg.solve(within, seen)), len(seen)
 
 
@@ -158,35 +170,35 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     if options.project is not None:
-        write_flight(flown_for_boresight(1), options.project)
+        write_flight(simulate_calibration_flight(1), options.project)
         return
-    told: dict[str, Any] = {"machine": machine(), "seeds": options.seeds}
-    cases: dict[str, tuple[tuple[Line, ...], dict[str, Any]]] = {
+    output: dict[str, Any] = {"machine": machine(), "seeds": options.seeds}
+    cases: dict[str, tuple[tuple[CalibrationLine, ...], dict[str, Any]]] = {
         "full flight": (FULL, {}),
         "full flight, lever arm surveyed": (FULL, {"lever_sigma_m": LEVEL_FLIGHT_LEVER_SIGMA_M}),
         "one line one way": (ONE_WAY, {}),
     }
     for name, (lines, how) in cases.items():
-        runs = [judged(seed, lines, **how) for seed in range(1, options.seeds + 1)]
+        runs = [evaluate(seed, lines, **how) for seed in range(1, options.seeds + 1)]
         squares, rank = sum(r[2] for r in runs), sum(r[3] for r in runs)
         low, high = (float(chi2.ppf(q, rank)) / rank for q in (0.0005, 0.9995))
         sigma = np.array([r[0].sigma for r in runs])
         ratio = np.abs([r[1] for r in runs]) / sigma
         ratio = ratio[np.isfinite(ratio)]
-        told[name] = {
+        output[name] = {
             "squares_per_rank": squares / rank,
             "bounds": [low, high],
             "rank": rank,
             "within_3_sigma": float(np.mean(ratio < 3.0)),
             "largest": float(ratio.max()),
             "median_sigma": np.median(sigma, axis=0).tolist(),
-            "unseparated": sorted({u.sentence for r in runs for u in r[0].unseparated}),
+            "unseparated": sorted({u.sentence for r in runs for u in r[0].inseparable}),
         }
     if options.json:
-        print(json.dumps(told))
+        print(json.dumps(output))
         return
     for name in cases:
-        f = told[name]
+        f = output[name]
         print(
             f"{name}: squares per rank {f['squares_per_rank']:.3f} ({f['bounds'][0]:.3f} to "
             f"{f['bounds'][1]:.3f} holds 99.9 %), {100 * f['within_3_sigma']:.1f} % within 3 "

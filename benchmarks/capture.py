@@ -27,14 +27,14 @@ import tifffile
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.ring_heads import RING, build_ring, is_whole, number_of
+from benchmarks.ring_heads import RING, build_ring, is_intact, number_of
 from daemon.cli.benchmark import pipeline
 from daemon.cli.benchmark.measurement import machine
 from daemon.cli.sim import free_first_address
 from daemon.mission.store.level0_folder import read_sealed
 from processing.rig import Rig, find_rig
 
-KEPT_EXPOSURES = 6
+RETAINED_EXPOSURES = 6
 """So many exposures may lie on disk: in writing, sealed and not yet looked at, or spare."""
 EXPOSURE_US = 4000.0
 TICK_HZ = os.sysconf("SC_CLK_TCK")
@@ -48,14 +48,14 @@ class Retention:
     """Looks at sealed exposures and deletes them; a test's, never the product's.
 
     Every exposure is looked at: each frame's number in its pixels against its record's count.
-    Every `whole_every`-th is read whole: the record's hash of each file, and the checksum that was
-    in the pixels when they were made.
+    Every `full_check_every`-th is read whole: the record's hash of each file, and the checksum that
+    was in the pixels when they were made.
     """
 
-    def __init__(self, whole_every: int) -> None:
-        self._whole_every = whole_every
-        self.looked_at = 0
-        self.read_whole = 0
+    def __init__(self, full_check_every: int) -> None:
+        self._full_check_every = full_check_every
+        self.checked = 0
+        self.fully_checked = 0
         self.problems: list[str] = []
 
     def take(self, folder: Path) -> None:
@@ -64,23 +64,23 @@ class Retention:
         if sealed is None:
             self.problems.append(f"{folder.name}: no record")
             return
-        self.looked_at += 1
-        whole = (self.looked_at - 1) % self._whole_every == 0
-        self.read_whole += whole
+        self.checked += 1
+        is_full_check = (self.checked - 1) % self._full_check_every == 0
+        self.fully_checked += is_full_check
         for frame in sealed.exposure.frames:
             path = folder / frame.file
             pixels = tifffile.memmap(path, mode="r")
             found = number_of(np.asarray(pixels[:1]))
             if found != frame.counter:
                 self.problems.append(f"{folder.name}/{frame.file}: of {found}, not {frame.counter}")
-            elif whole and not is_whole(np.asarray(pixels)):
+            elif is_full_check and not is_intact(np.asarray(pixels)):
                 self.problems.append(f"{folder.name}/{frame.file}: pixels differ")
-            if whole and hashlib.sha256(path.read_bytes()).hexdigest() != frame.sha256:
+            if is_full_check and hashlib.sha256(path.read_bytes()).hexdigest() != frame.sha256:
                 self.problems.append(f"{folder.name}/{frame.file}: hash differs")
         shutil.rmtree(folder)
 
 
-class Processor:
+class CpuMeter:
     """CPU seconds of processes since they were first asked for."""
 
     def __init__(self) -> None:
@@ -90,9 +90,9 @@ class Processor:
 
     def watch(self, pids: Mapping[str, int]) -> None:
         self._pids |= pids
-        self.look()
+        self.sample()
 
-    def look(self) -> None:
+    def sample(self) -> None:
         for name, pid in self._pids.items():
             try:
                 text = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace")
@@ -115,7 +115,12 @@ def main() -> None:
     parser.add_argument("--packet-size", type=int, default=9000)
     parser.add_argument("--rate", type=float, default=40.0, help="MB/s of one head")
     parser.add_argument("--processes", type=int, default=2, help="of emulated heads")
-    parser.add_argument("--whole-every", type=int, default=10, help="every n-th is read whole")
+    parser.add_argument(
+        "--full-check-every",
+        type=int,
+        default=10,
+        help="Interval of full checks, exposures (default: 10).",
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     rig = find_rig(options.rig)
@@ -131,20 +136,20 @@ def main() -> None:
 def _run(options: argparse.Namespace, rig: Rig, folder: Path) -> dict[str, Any]:
     exposure_nbytes = sum(2 * s.width_px * s.height_px for s in rig.sensors)
     # What the pipeline puts off waits on disk until it is done.
-    kept = KEPT_EXPOSURES + (options.exposures if options.pipeline else 0)
-    _refuse_small_disk(folder, exposure_nbytes * kept)
+    retained = RETAINED_EXPOSURES + (options.exposures if options.pipeline else 0)
+    _refuse_small_disk(folder, exposure_nbytes * retained)
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "syntopic"
     ring = cache / "capture" / (f"{rig.name}-noise" if options.noise else rig.name)
     frames = place = None
     if not options.noise:
-        place = pipeline.exposures_of(options.rig, rig, cache / "bench" / rig.name)
+        place = pipeline.benchmark_exposure(options.rig, rig, cache / "bench" / rig.name)
         frames = place / "mission" / "L0" / "000001"
     _refuse_small_disk(cache, exposure_nbytes * RING)
     build_ring(options.rig, frames, ring)
     interval_s = options.interval or rig.frame_interval_s
     block = free_first_address().rpartition(".")[0]
     addresses = {s.name: f"{block}.{2 + i}" for i, s in enumerate(rig.sensors)}
-    asked = {
+    request = {
         "rig": options.rig,
         "ring": str(ring),
         "addresses": addresses,
@@ -152,7 +157,7 @@ def _run(options: argparse.Namespace, rig: Rig, folder: Path) -> dict[str, Any]:
         "rate_bytes_per_s": options.rate * 1e6,
     }
     emulator = subprocess.Popen(
-        [sys.executable, "-m", "benchmarks.ring_heads", json.dumps(asked)],
+        [sys.executable, "-m", "benchmarks.ring_heads", json.dumps(request)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -167,7 +172,7 @@ def _run(options: argparse.Namespace, rig: Rig, folder: Path) -> dict[str, Any]:
         counted, _ = emulator.communicate(timeout=READY_WITHIN_S)
     finally:
         emulator.kill()
-    return _judged(
+    return _evaluate(
         options, rig, folder, flown, json.loads(counted), load_before, interval_s, exposure_nbytes
     )
 
@@ -224,7 +229,7 @@ def _fly(
     options: argparse.Namespace, config: Path, bus: Mapping[str, Any], interval_s: float
 ) -> dict[str, Any]:
     """Run the service to its end, looking at what it stores; what it said."""
-    processor, retention = Processor(), Retention(options.whole_every)
+    processor, retention = CpuMeter(), Retention(options.full_check_every)
     flown: dict[str, Any] = {"events": [], "store_s": [], "delay_s": [], "ledger": {}}
     flown |= {"processed": []}
     triggered_ns: dict[int, int] = {}
@@ -263,12 +268,12 @@ def _fly(
                 flown["store_s"].append(event["duration_s"])
                 flown["delay_s"].append((now_ns - triggered_ns[event["number"]]) * 1e-9)
             elif name == "sealed":
-                processor.look()
+                processor.sample()
                 flown["seconds"] = time.monotonic() - flown["started_s"]
                 if not options.pipeline:
                     retention.take(level0 / f"{event['number']:06d}")
             elif name in ("processed", "not-processed"):
-                processor.look()
+                processor.sample()
                 flown["processed_seconds"] = time.monotonic() - flown["started_s"]
                 flown["processed"].append(_processed(event, now_ns, triggered_ns))
                 retention.take(level0 / f"{event['number']:06d}")
@@ -316,7 +321,7 @@ def _of_pipeline(flown: Mapping[str, Any], interval_s: float) -> dict[str, Any]:
     }
 
 
-def _judged(
+def _evaluate(
     options: argparse.Namespace,
     rig: Rig,
     folder: Path,
@@ -342,7 +347,7 @@ def _judged(
         and set(sent.values()) == {wanted}
         and set(exposed.values()) == {wanted}
         and len(sent) == len(rig.sensors)
-        and retention.looked_at == wanted
+        and retention.checked == wanted
         and not retention.problems
     )
     return {
@@ -365,8 +370,8 @@ def _judged(
         "frames_sent": sum(sent.values()),
         "packets_sent": sum(head["packets_sent"] for head in counted.values()),
         "packets_resent": resent,
-        "looked_at": retention.looked_at,
-        "read_whole": retention.read_whole,
+        "checked": retention.checked,
+        "fully_checked": retention.fully_checked,
         "problems": retention.problems[:20],
         "events": flown["events"][:20],
         "cpu_s": flown["cpu_s"],
@@ -419,13 +424,13 @@ def _print(result: Mapping[str, Any]) -> None:
         if result[what]:
             spread = result[what]
             console.print(f"{what}: median {spread['median']:.2f}, at most {spread['max']:.2f}")
-    made = result["pipeline"]
-    if made:
+    stats = result["pipeline"]
+    if stats:
         console.print(
-            f"pipeline: {made['processed']} exposures in {made['seconds']:.0f} s, realtime_factor "
-            f"{made['realtime_factor']:.2f}, {made['behind']} put off as processing behind, "
-            f"{made['not_processed']} failed; {made['pipeline_s']['median']:.2f} s each, "
-            f"{made['trigger_to_products_s']['median']:.1f} s from trigger to products"
+            f"pipeline: {stats['processed']} exposures in {stats['seconds']:.0f} s, realtime_factor "
+            f"{stats['realtime_factor']:.2f}, {stats['behind']} put off as processing behind, "
+            f"{stats['not_processed']} failed; {stats['pipeline_s']['median']:.2f} s each, "
+            f"{stats['trigger_to_products_s']['median']:.1f} s from trigger to products"
         )
     console.print(
         f"ledger: {_counted(result['triggers'])}; frames: {_counted(result['frames_of_ledger'])}"
@@ -433,7 +438,7 @@ def _print(result: Mapping[str, Any]) -> None:
     console.print(
         f"heads exposed {result['frames_exposed']} frames, sent {result['frames_sent']}, "
         f"{result['packets_resent']} of {result['packets_sent']} packets twice; "
-        f"{result['looked_at']} exposures looked at, {result['read_whole']} read whole"
+        f"{result['checked']} exposures looked at, {result['fully_checked']} read whole"
     )
     for problem in (*result["problems"], *(str(event) for event in result["events"])):
         console.print(f"[red]{problem}[/]")

@@ -17,12 +17,12 @@ from daemon.mission.exposure import Exposure
 from daemon.mission.layout import Mission
 from daemon.onboard.pipeline.pipeline_queue import PipelineQueue
 from daemon.onboard.service import service
-from daemon.onboard.service.departure import ProcessPlan, worker_process
 from daemon.onboard.service.messages import Ping, Pong, Stop, WorkerBuilt
-from daemon.onboard.service.processes import Link
+from daemon.onboard.service.processes import ServiceConnection
+from daemon.onboard.service.startup import ProcessPlan, worker_process
 
 
-class Told(service.Service):
+class ReportingService(service.Service):
     """The service as it flies; it tells the numbers of its processes."""
 
     def _start(self, mission: Mission) -> None:
@@ -45,7 +45,7 @@ class NoPipeline(PipelineQueue):
             self.recycle(slots)
 
 
-def idle_worker(link: Link, _settings: Any, _rings: Any) -> None:
+def idle_worker(link: ServiceConnection, _settings: Any, _rings: Any) -> None:
     """In the place of `daemon.onboard.pipeline.worker.main`: it makes no image."""
     link.send(WorkerBuilt())
     while not isinstance(order := link.receive(timeout_s=1.0), Stop):
@@ -57,7 +57,7 @@ def _idle_worker(*arguments: Any) -> ProcessPlan:
     return worker_process(*arguments)._replace(target="benchmarks.capture_service:idle_worker")
 
 
-def _say(event: Mapping[str, Any]) -> None:
+def _print_event(event: Mapping[str, Any]) -> None:
     sys.stdout.write(json.dumps(event) + "\n")
     sys.stdout.flush()
 
@@ -66,7 +66,7 @@ def main() -> None:
     """`python -m benchmarks.capture_service service.toml [--pipeline]`: events, one a line."""
     path = Path(sys.argv[1])
     configuration, rig = load(path)
-    flown = Told(configuration, rig, path, _say)
+    flown = ReportingService(configuration, rig, path, _print_event)
     if "--pipeline" not in sys.argv[2:]:
         vars(service)["worker_process"] = _idle_worker
         vars(service)["PipelineQueue"] = NoPipeline

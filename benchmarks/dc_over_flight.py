@@ -21,13 +21,13 @@ import numpy as np
 
 from daemon.cli.benchmark.measurement import machine
 from processing.geometry.conditions import for_sensors
-from processing.pipelines.stitched import Conditions, Pipeline, Product, Settings
+from processing.pipelines.stitched import Conditions, Pipeline, PipelineSettings, Product
 from processing.quality.report import Flag
 from processing.radiometry.calibration import load_radiometry
 from processing.rig import shipped_rigs
-from sim_hw.world import camera, laboratory
+from sim_hw.world import sensor_calibration, true_camera
 from sim_hw.world.electronics import Electronics, true_sensor
-from sim_hw.world.rendering import Look, light_on_sensor
+from sim_hw.world.rendering import ExposureParameters, light_on_sensor
 from sim_hw.world.scene import open_scene
 from sim_hw.world.seeding import random_stream
 from sim_hw.world.world import World, WorldSettings
@@ -96,7 +96,7 @@ def fly(exposures: int) -> list[Point]:
         {cone.probe: cone.calibration_c for cone in rig.cones},
         {probe: float(random.uniform(-0.3, 0.3)) for probe in rig.probes},
     )
-    world.temperatures = cast(camera.Temperatures, profile)
+    world.temperatures = cast(true_camera.ProbeTemperatures, profile)
     needed = [c for c in rig.cones if c.role == "pan" or c.name == rig.colour_master_cone]
     points: list[Point] = []
     stuck_c: float | None = None
@@ -108,11 +108,11 @@ def fly(exposures: int) -> list[Point]:
             for sensor in cone.sensors:
                 true = true_sensor(cone, sensor, 4, field_radius_mm=world.field_radius_mm(cone))
                 heads[sensor.name] = Electronics(sensor, true, world.electrons_per_radiance_s(cone))
-                measured = laboratory.measure(sensor, true, 4)
-                laboratory.write_radiometry(Path(folder), sensor, measured)
+                measured = sensor_calibration.measure(sensor, true, 4)
+                sensor_calibration.write_radiometry(Path(folder), sensor, measured)
                 path = Path(folder) / "radiometry" / f"{sensor.name}.npz"
                 radiometry[sensor.name] = load_radiometry(path)
-        pipeline = Pipeline(rig, radiometry, Settings(geometry=False))
+        pipeline = Pipeline(rig, radiometry, PipelineSettings(geometry=False))
         for k in range(exposures):
             profile.minute = MINUTES * k / max(exposures - 1, 1)
             step_s = plan.distance_m / plan.ground_speed_mps * (k % LINE_EXPOSURES)
@@ -121,7 +121,7 @@ def fly(exposures: int) -> list[Point]:
             frames = {}
             for cone in needed:
                 ahead_m = (cone.position_mm[0] - reference_mm) * 1e-3
-                look = Look(
+                look = ExposureParameters(
                     mid_gps_ns=reference_ns - round(ahead_m / plan.ground_speed_mps * 1e9),
                     exposure_time_us=plan.exposure_time_us[cone.name],
                     tdi_shifts=plan.tdi_shifts[cone.name],
@@ -148,10 +148,10 @@ def fly(exposures: int) -> list[Point]:
                 ground_speed_mps=plan.ground_speed_mps,
                 height_above_ground_m=plan.height_above_ground_m,
             )
-            made = pipeline.process(frames, conditions)
+            product = pipeline.process(frames, conditions)
             own = [profile.own_k[cone.probe] for cone in rig.pan_cones]
             points.append(
-                _point(profile.minute, profile.dc_k(profile.minute) + float(np.mean(own)), made)
+                _point(profile.minute, profile.dc_k(profile.minute) + float(np.mean(own)), product)
             )
     return points
 
@@ -240,8 +240,10 @@ def drawing(points: Sequence[Point]) -> str:
     )
 
 
-def _point(minute: float, true_k: float, made: Product) -> Point:
-    known = [e for e in made.estimated_dc if e.estimated_k is not None and e.measured_k is not None]
+def _point(minute: float, true_k: float, product: Product) -> Point:
+    known = [
+        e for e in product.estimated_dc if e.estimated_k is not None and e.measured_k is not None
+    ]
     return Point(
         minute=minute,
         true_k=true_k,
@@ -249,7 +251,7 @@ def _point(minute: float, true_k: float, made: Product) -> Point:
         estimated_k={e.cone: e.estimated_k for e in known if e.estimated_k is not None},
         sigma_k={e.cone: e.sigma_k for e in known if e.sigma_k is not None},
         disagrees=tuple(e.cone for e in known if e.disagrees),
-        flagged=bool(made.report.flags & Flag.DC_DISAGREEMENT),
+        flagged=bool(product.report.flags & Flag.DC_DISAGREEMENT),
     )
 
 
@@ -270,8 +272,8 @@ def _text(x: float, y: float, content: str, anchor: str = "start", fill: str = "
 
 
 def _path(points: Iterable[tuple[float, float]]) -> str:
-    told = " L ".join(f"{x:.1f} {y:.1f}" for x, y in points)
-    return f'<path d="M {told}" fill="none" stroke="#2980b9" stroke-width="2"/>'
+    path_data = " L ".join(f"{x:.1f} {y:.1f}" for x, y in points)
+    return f'<path d="M {path_data}" fill="none" stroke="#2980b9" stroke-width="2"/>'
 
 
 if __name__ == "__main__":

@@ -70,7 +70,7 @@ def measure(scenes: Path, *, seed: int = SEED) -> dict[str, dict[str, tuple[floa
     conditions = rendered.conditions_of(exposure, seed=seed)
     heads = heads_of(world, changed=False)
     found = {}
-    for told, (what, level) in LIGHTS.items():
+    for light_name, (what, level) in LIGHTS.items():
         light = exposure.snapshot.light
         if level:
             light = light_of(world, heads, exposure.snapshot, what, level)
@@ -78,22 +78,22 @@ def measure(scenes: Path, *, seed: int = SEED) -> dict[str, dict[str, tuple[floa
         left: dict[str, list[Array]] = {kind: [] for kind in KINDS}
         for cone in world.rig.pan_cones:
             for sensor in cone.sensors:
-                head, look = heads[sensor.name], exposure.snapshot.looks[sensor.name]
+                head, look = heads[sensor.name], exposure.snapshot.parameters_by_sensor[sensor.name]
                 temperature_c = conditions.temperatures_c[sensor.probe]
                 assert temperature_c is not None
-                taken = Taken(head, light[sensor.name], look.exposure_time_us, temperature_c)
-                spectra += taken.spectra()
+                frame = NoisyFrame(head, light[sensor.name], look.exposure_time_us, temperature_c)
+                spectra += frame.spectra()
                 for kind, errors in left.items():
-                    errors.append(taken.left_by(kind))
-        least = bounds(np.mean(spectra, axis=0))
-        found[told] = {
-            kind: (float(np.sqrt(np.mean(np.concatenate(left[kind]) ** 2))), least[kind])
+                    errors.append(frame.left_by(kind))
+        minimum = bounds(np.mean(spectra, axis=0))
+        found[light_name] = {
+            kind: (float(np.sqrt(np.mean(np.concatenate(left[kind]) ** 2))), minimum[kind])
             for kind in KINDS
         }
     return found
 
 
-class Taken:
+class NoisyFrame:
     """One frame without TDI, so that a defect spoils itself alone; all in its noise's sigmas."""
 
     def __init__(self, head: Head, light: Any, exposure_time_us: float, temperature_c: float):
@@ -110,24 +110,24 @@ class Taken:
             temperature_c=temperature_c,
             random=random_stream(SEED, "noise", sensor.name),
         )
-        words = self._level1(truth.defect)
-        spoilt = (truth.defect != 0) | (words == 0) | ((words & 1) != 0)
+        pixels = self._level1(truth.defect)
+        spoilt = (truth.defect != 0) | (pixels == 0) | ((pixels & 1) != 0)
         spoilt[[0, -1]] = spoilt[:, [0, -1]] = True
         near = np.ones((2 * NEAR_PX + 1, 2 * NEAR_PX + 1), np.uint8)
         self._good = cv2.dilate(spoilt.astype(np.uint8), near) == 0
 
     def _level1(self, defect: NDArray[np.uint8]) -> NDArray[np.uint16]:
         sensor = self._head.sensor
-        words = np.zeros((sensor.height_px, sensor.width_px), np.uint16)
+        pixels = np.zeros((sensor.height_px, sensor.width_px), np.uint16)
         level1_from_level0(
             corrector_for(sensor, replace(self._head.calibration, defect=defect)),
             self._raw,
             temperature_c=self._temperature_c,
             exposure_time_s=self._time_us * 1e-6,
             tdi_shifts=0,
-            out=words,
+            out=pixels,
         )
-        return words
+        return pixels
 
     def left_by(self, kind: str) -> Array:
         """Errors of the pipeline at defects of this kind that are put in."""
@@ -139,10 +139,10 @@ class Taken:
         else:
             for row, column in np.ndindex(3, 3):
                 put[STEP_PX // 2 + row :: STEP_PX, STEP_PX // 2 + column :: STEP_PX] = True
-        words = self._level1(((self._head.truth.defect != 0) | put).astype(np.uint8))
-        seen = (words & 0xFFFE) / level1_counts_per_dn(self._head.sensor.bits)
-        looked_at = put & self._good
-        return np.asarray(((seen - self._ideal) / self._sigma)[looked_at])
+        pixels = self._level1(((self._head.truth.defect != 0) | put).astype(np.uint8))
+        seen = (pixels & 0xFFFE) / level1_counts_per_dn(self._head.sensor.bits)
+        compared = put & self._good
+        return np.asarray(((seen - self._ideal) / self._sigma)[compared])
 
     def spectra(self) -> list[Array]:
         """Power spectra of the light, block by block."""
@@ -165,9 +165,9 @@ def bounds(spectrum: Array) -> dict[str, float]:
     Args:
         spectrum: (n, n), light in units of the noise, which is white and one.
     """
-    whole = spectrum + 1.0
-    precision = np.fft.ifft2(1.0 / whole).real
-    column = float(np.mean(1.0 / np.mean(1.0 / whole, axis=1)))
+    total_power = spectrum + 1.0
+    precision = np.fft.ifft2(1.0 / total_power).real
+    column = float(np.mean(1.0 / np.mean(1.0 / total_power, axis=1)))
     places = [(row, k) for row in range(3) for k in range(3)]
     of_dust = np.array([[precision[a - c, b - d] for c, d in places] for a, b in places])
     dust = float(np.mean(np.diag(np.linalg.inv(of_dust))))

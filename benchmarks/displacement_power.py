@@ -2,9 +2,10 @@
 
 Thousands of outcomes of stitching with one master sensor moved a known way, and of healthy ones for
 false alarms, go through the pipeline's own judgement. What calibration, drift, probes and stitching
-are off by is drawn, the last from the covariance that `benchmarks.honest_uncertainty` holds; some
-are stitched in full as a control. Beside each figure stands what the best test could reach. Then
-whole flights are judged together, warm ones among them, and at last the probe is wrong instead.
+are off by is drawn, the last from the covariance that `benchmarks.uncertainty_consistency` holds;
+some are stitched in full as a control. Beside each figure stands what the best test could reach.
+Then whole flights are judged together, warm ones among them, and at last the probe is wrong
+instead.
 """
 
 from __future__ import annotations
@@ -21,19 +22,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from benchmarks import honest_uncertainty
+from benchmarks import uncertainty_consistency
 from benchmarks.chart import Chart
-from benchmarks.stitching_trials import (
+from benchmarks.stitching_samples import (
     MatchingErrors,
-    drawn_trial,
+    drawn_sample,
     matching_errors,
     world_and_rig,
 )
 from daemon.cli.benchmark.measurement import machine
-from processing.mosaic.flight_validity import judge_flight
-from processing.mosaic.free import Mosaic
+from processing.mosaic.flight_validity import evaluate_flight
+from processing.mosaic.free_mosaic import Mosaic
 from processing.mosaic.stitch_record import stitch_record
-from processing.mosaic.validity import Validity, judge_master
+from processing.mosaic.validity import Validity, evaluate_master
 from processing.rig import Rig, find_rig
 
 Array = NDArray[np.float64]
@@ -72,7 +73,7 @@ class Power:
     exposures: int
     found: float
     named: float
-    alone: float
+    named_uniquely: float
     ideal_found: float
     ideal_named: float
 
@@ -86,11 +87,11 @@ class FlightPower:
     flights: int
     found: float
     named: float
-    alone: float
+    named_uniquely: float
 
 
 @dataclass(frozen=True)
-class Misreading:
+class ProbeMisreading:
     """What is said where the master cone's probe reads `off_k` too much and no sensor has moved.
 
     Shares of `exposures`, or of `flights` from whose middle on it does: a sensor accused alone,
@@ -100,11 +101,11 @@ class Misreading:
     dc_k: float
     off_k: float
     exposures: int
-    accused: float
+    misattributed: float
     either: float
     named: float
     flights: int
-    flights_accused: float
+    flights_misattributed: float
     flights_named: float
 
 
@@ -129,7 +130,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.errors is None:
         with tempfile.TemporaryDirectory(prefix="syntopic-power-") as folder:
-            errors = matching_errors(honest_uncertainty.render(options.rendered, Path(folder)))
+            errors = matching_errors(uncertainty_consistency.render(options.rendered, Path(folder)))
     else:
         errors = MatchingErrors.load(options.errors)
     outcomes = Outcomes(errors)
@@ -146,20 +147,20 @@ def main() -> None:
         for length in (0.0, *FLIGHT_LENGTHS_PX)
     ]
     misreadings = [
-        outcomes.misread(dc_k, off_k, exposures=options.exposures, flights=options.flights)
+        outcomes.probe_bias(dc_k, off_k, exposures=options.exposures, flights=options.flights)
         for dc_k in MISREAD_DC_K
         for off_k in MISREAD_K
     ]
     if options.drawing is not None:
         options.drawing.write_text(drawing(powers), encoding="utf-8")
     if options.json:
-        told = {"healthy": options.healthy, "alarms": alarms}
-        told |= {"power": [vars(p) for p in powers], "control": [vars(p) for p in control]}
-        told |= {"flights": [vars(f) for f in flights]}
-        told |= {"misread": [vars(m) for m in misreadings]}
-        print(json.dumps({"machine": machine(), **told}))
+        output = {"healthy": options.healthy, "alarms": alarms}
+        output |= {"power": [vars(p) for p in powers], "control": [vars(p) for p in control]}
+        output |= {"flights": [vars(f) for f in flights]}
+        output |= {"misread": [vars(m) for m in misreadings]}
+        print(json.dumps({"machine": machine(), **output}))
         return
-    print(f"{honest_uncertainty.RIG}: {alarms} false alarms of {options.healthy} healthy\n")
+    print(f"{uncertainty_consistency.RIG}: {alarms} false alarms of {options.healthy} healthy\n")
     print(
         "| dC K | moved px | exposures | found | rightly named | named alone | best test: found "
         "| named |"
@@ -168,14 +169,14 @@ def main() -> None:
     for p in [*powers, *control]:
         print(
             f"| {p.dc_k:g} | {p.length_px:.2f} | {p.exposures} | {p.found:.1%} | {p.named:.1%} "
-            f"| {p.alone:.1%} | {p.ideal_found:.1%} | {p.ideal_named:.1%} |"
+            f"| {p.named_uniquely:.1%} | {p.ideal_found:.1%} | {p.ideal_named:.1%} |"
         )
     print("\n| flight | moved px | flights | told | the right sensor | named alone |")
     print("|---|---|---|---|---|---|")
     for f in flights:
         print(
             f"| {f.flight} | {f.length_px:.2f} | {f.flights} | {f.found:.1%} | {f.named:.1%} "
-            f"| {f.alone:.1%} |"
+            f"| {f.named_uniquely:.1%} |"
         )
     print(
         "\n| dC K | probe off K | exposures | sensor accused | sensor or probe | probe named "
@@ -184,8 +185,8 @@ def main() -> None:
     print("|---|---|---|---|---|---|---|---|---|")
     for m in misreadings:
         print(
-            f"| {m.dc_k:g} | {m.off_k:g} | {m.exposures} | {m.accused:.1%} | {m.either:.1%} "
-            f"| {m.named:.1%} | {m.flights} | {m.flights_accused:.1%} | {m.flights_named:.1%} |"
+            f"| {m.dc_k:g} | {m.off_k:g} | {m.exposures} | {m.misattributed:.1%} | {m.either:.1%} "
+            f"| {m.named:.1%} | {m.flights} | {m.flights_misattributed:.1%} | {m.flights_named:.1%} |"
         )
 
 
@@ -193,11 +194,11 @@ class Outcomes:
     """What stitching may find of the master sensors, drawn; and what the judgement makes of it."""
 
     def __init__(self, errors: MatchingErrors) -> None:
-        self.rig = find_rig(honest_uncertainty.RIG)
+        self.rig = find_rig(uncertainty_consistency.RIG)
         self._templates = []
         for k in range(TEMPLATES):
-            world, rig = world_and_rig(honest_uncertainty.RIG, FIRST_SEED + k, dc_k=0.0)
-            mosaic = drawn_trial(world, rig, errors, seed=FIRST_SEED + k).equal
+            world, rig = world_and_rig(uncertainty_consistency.RIG, FIRST_SEED + k, dc_k=0.0)
+            mosaic = drawn_sample(world, rig, errors, seed=FIRST_SEED + k).equal
             units = mosaic.model.units
             values, directions = np.linalg.eigh(mosaic.covariance / np.outer(units, units))
             root = directions * np.sqrt(np.maximum(values, 0.0))
@@ -244,15 +245,15 @@ class Outcomes:
             temperatures[sensor.probe] = sensor.calibration_c + dc_k + probe_k + misread_k
         return replace(mosaic, values=values), temperatures
 
-    def judge(self, dc_k: float, moved: str | None, shift_px: tuple[float, float]) -> Validity:
+    def evaluate(self, dc_k: float, moved: str | None, shift_px: tuple[float, float]) -> Validity:
         """One exposure of a camera drawn anew."""
         mosaic, temperatures = self.stitched(self.camera(), dc_k, moved, shift_px)
-        return judge_master(self.rig, mosaic, temperatures)
+        return evaluate_master(self.rig, mosaic, temperatures)
 
     def flights(self, kind: str, *, length_px: float, flights: int) -> FlightPower:
         """Flights judged together, each by a camera of its own; one master sensor moves."""
         first_k, last_k, since = FLIGHTS[kind]
-        found = named = alone = 0
+        found = named = named_uniquely = 0
         for k in range(flights):
             camera = self.camera()
             moved = self.rig.master_sensors[k % len(self.rig.master_sensors)].name
@@ -265,45 +266,50 @@ class Outcomes:
                 records[number] = stitch_record(self.rig, mosaic, read, read)
             steps = [
                 s
-                for s in judge_flight(self.rig, records).steps
+                for s in evaluate_flight(self.rig, records).steps
                 if s.cone == self.rig.master_cone and s.kind != "misread"
             ]
             found += bool(steps)
             named += any(moved in (s.sensor, *s.alternatives) for s in steps)
-            alone += len(steps) == 1 and (steps[0].sensor, steps[0].alternatives) == (moved, ())
+            named_uniquely += len(steps) == 1 and (steps[0].sensor, steps[0].alternatives) == (
+                moved,
+                (),
+            )
         return FlightPower(
-            kind, length_px, flights, found / flights, named / flights, alone / flights
+            kind, length_px, flights, found / flights, named / flights, named_uniquely / flights
         )
 
-    def misread(self, dc_k: float, off_k: float, *, exposures: int, flights: int) -> Misreading:
+    def probe_bias(
+        self, dc_k: float, off_k: float, *, exposures: int, flights: int
+    ) -> ProbeMisreading:
         """The master cone's probe is wrong: in single exposures, and from half a flight on."""
-        accused = either = named = flights_accused = flights_named = 0
+        misattributed = either = named = flights_misattributed = flights_named = 0
         for _ in range(exposures):
-            found = judge_master(
+            found = evaluate_master(
                 self.rig, *self.stitched(self.camera(), dc_k, None, (0.0, 0.0), off_k)
             )
-            accused += found.displaced is not None and found.misread is None
-            either += found.displaced is not None and found.misread is not None
-            named += found.displaced is None and found.misread is not None
+            misattributed += found.displaced is not None and found.probe_bias is None
+            either += found.displaced is not None and found.probe_bias is not None
+            named += found.displaced is None and found.probe_bias is not None
         for _ in range(flights):
             camera, records = self.camera(), {}
             for number in range(1, FLIGHT_EXPOSURES + 1):
                 wrong_k = off_k if number > FLIGHT_EXPOSURES // 2 else 0.0
                 mosaic, read = self.stitched(camera, dc_k, None, (0.0, 0.0), wrong_k)
                 records[number] = stitch_record(self.rig, mosaic, read, read)
-            steps = judge_flight(self.rig, records).steps
+            steps = evaluate_flight(self.rig, records).steps
             kinds = [s.kind for s in steps if s.cone == self.rig.master_cone]
-            flights_accused += any(kind != "misread" for kind in kinds)
+            flights_misattributed += any(kind != "misread" for kind in kinds)
             flights_named += "misread" in kinds
-        return Misreading(
+        return ProbeMisreading(
             dc_k,
             off_k,
             exposures,
-            accused / max(exposures, 1),
+            misattributed / max(exposures, 1),
             either / max(exposures, 1),
             named / max(exposures, 1),
             flights,
-            flights_accused / max(flights, 1),
+            flights_misattributed / max(flights, 1),
             flights_named / max(flights, 1),
         )
 
@@ -312,7 +318,7 @@ class Outcomes:
         alarms = 0
         for _ in range(count):
             dc_k = float(self._random.uniform(-20.0, 20.0))
-            alarms += self.judge(dc_k, None, (0.0, 0.0)).displaced is not None
+            alarms += self.evaluate(dc_k, None, (0.0, 0.0)).displaced is not None
         return alarms
 
     def power(self, *, dc_k: float, length_px: float, exposures: int) -> Power:
@@ -323,13 +329,13 @@ class Outcomes:
             moved = masters[k % len(masters)]
             angle = float(self._random.uniform(0.0, 2.0 * math.pi))
             shift = (length_px * math.cos(angle), length_px * math.sin(angle))
-            tally.add(self.judge(dc_k, moved, shift), moved)
+            tally.add(self.evaluate(dc_k, moved, shift), moved)
         return tally.power(self.rig, dc_k, length_px)
 
 
 def stitched(errors: MatchingErrors, *, length_px: float, exposures: int) -> Power:
     """The same at dC = 0 with tie points, adjustment and all, the emulator's camera being moved."""
-    rig = find_rig(honest_uncertainty.RIG)
+    rig = find_rig(uncertainty_consistency.RIG)
     masters = [s.name for s in rig.cone(rig.master_cone).sensors]
     tally = _Tally()
     for k in range(exposures):
@@ -338,9 +344,9 @@ def stitched(errors: MatchingErrors, *, length_px: float, exposures: int) -> Pow
         moved = masters[k % len(masters)]
         shift = (length_px * math.cos(angle), length_px * math.sin(angle))
         world, calibrated = world_and_rig(
-            honest_uncertainty.RIG, seed, dc_k=0.0, displaced_px={moved: shift}
+            uncertainty_consistency.RIG, seed, dc_k=0.0, displaced_px={moved: shift}
         )
-        tally.add(drawn_trial(world, calibrated, errors, seed=seed).validity, moved)
+        tally.add(drawn_sample(world, calibrated, errors, seed=seed).validity, moved)
     return tally.power(rig, 0.0, length_px)
 
 
@@ -349,7 +355,7 @@ class _Tally:
     count: int = 0
     found: int = 0
     named: int = 0
-    alone: int = 0
+    named_uniquely: int = 0
 
     def add(self, validity: Validity, moved: str) -> None:
         self.count += 1
@@ -357,7 +363,7 @@ class _Tally:
             right = validity.displaced.sensor == moved
             self.found += 1
             self.named += right
-            self.alone += right and not validity.alternatives
+            self.named_uniquely += right and not validity.alternatives
 
     def power(self, rig: Rig, dc_k: float, length_px: float) -> Power:
         ideal_found, ideal_named = ideal(rig, dc_k=dc_k, length_px=length_px)
@@ -367,7 +373,7 @@ class _Tally:
             self.count,
             self.found / self.count,
             self.named / self.count,
-            self.alone / self.count,
+            self.named_uniquely / self.count,
             ideal_found,
             ideal_named,
         )
@@ -404,8 +410,8 @@ def ideal(rig: Rig, *, dc_k: float, length_px: float) -> tuple[float, float]:
     shift = length_px * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     statistics = np.empty((len(sensors), IDEAL_DRAWS))
     for i in range(len(sensors)):
-        mine = moved == i
-        y[mine] += shift[mine] @ contrasts[:, 2 * i : 2 * i + 2].T
+        own_columns = moved == i
+        y[own_columns] += shift[own_columns] @ contrasts[:, 2 * i : 2 * i + 2].T
     for i in range(len(sensors)):
         design = contrasts[:, 2 * i : 2 * i + 2]
         pull = y @ weight @ design
@@ -418,7 +424,7 @@ def ideal(rig: Rig, *, dc_k: float, length_px: float) -> tuple[float, float]:
 def drawing(powers: Sequence[Power]) -> str:
     """Found (full) and rightly named (hollow) over the displacement, a colour for each dC."""
     chart = Chart(
-        title=f"{honest_uncertainty.RIG}: one master sensor moved, {powers[0].exposures} a point",
+        title=f"{uncertainty_consistency.RIG}: one master sensor moved, {powers[0].exposures} a point",
         x_label="displacement, px",
         y_label="share of exposures",
         x_range=(0.0, 0.5),

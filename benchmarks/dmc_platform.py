@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from benchmarks import rendered
-from benchmarks.stitching_trials import same_ground, world_and_rig
+from benchmarks.stitching_samples import same_ground, world_and_rig
 from processing.geometry.conditions import Conditions, for_sensors
 from processing.geometry.placement import nominal_placements, raw_from_vip_mm
 from processing.geometry.rotation import rotation_matrix
@@ -27,8 +27,8 @@ from processing.matching.tie_points import PAN_TO_PAN, TiePoints
 from processing.mosaic.mounting import check_platform
 from processing.mosaic.pan_only import pan_only_mosaic
 from processing.rig import Rig
-from sim_hw.world.camera import rotation_opk
-from sim_hw.world.snapshots import look_of, probe_readings
+from sim_hw.world.snapshots import exposure_parameters_of, probe_readings
+from sim_hw.world.true_camera import rotation_opk
 from sim_hw.world.world import World
 
 Array = NDArray[np.float64]
@@ -41,7 +41,7 @@ DC_K = 12.0
 
 
 @dataclass(frozen=True)
-class Trial:
+class PlatformSample:
     """Nine contrasts between the turns of four heads: found minus true over their covariance."""
 
     square: float
@@ -51,11 +51,15 @@ class Trial:
     sigma_rad: Array
 
 
-def trial(name: str, seed: int) -> Trial:
+def sample_platform(name: str, seed: int) -> PlatformSample:
     """One camera, one exposure."""
     world, rig = world_and_rig(name, seed, dc_k=DC_K, exposures=1)
     flight, mark_ns = rendered.flight_and_mark(world, 0)
-    looks = {s.name: look_of(world, cone, mark_ns) for cone in rig.cones for s in cone.sensors}
+    looks = {
+        s.name: exposure_parameters_of(world, cone, mark_ns)
+        for cone in rig.cones
+        for s in cone.sensors
+    }
     probes = probe_readings(world, mark_ns, seed=seed)
     pose = flight.pose(mark_ns)
     conditions = Conditions(
@@ -91,7 +95,7 @@ def trial(name: str, seed: int) -> Trial:
     points = TiePoints(
         names=names,
         pairs=tuple((s.sensor_a, s.sensor_b) for s in strips),
-        sought=tuple(len(i) for i in index),
+        attempted=tuple(len(i) for i in index),
         sensor_a=sides[overlap, 0],
         sensor_b=sides[overlap, 1],
         raw_a=np.concatenate(raw_a),
@@ -105,11 +109,11 @@ def trial(name: str, seed: int) -> Trial:
     if check is None:
         raise RuntimeError(f"seed {seed}: the mountings could not be adjusted")
     contrasts = np.kron(np.linalg.svd(np.ones((1, len(check.heads))))[2][1:], np.eye(3))
-    found = np.concatenate([head.turn_rad for head in check.heads])
-    error = contrasts @ (found - true_turns(world, rig))
+    found = np.concatenate([head.correction_rad for head in check.heads])
+    error = contrasts @ (found - true_rotations(world, rig))
     covariance = contrasts @ check.covariance @ contrasts.T
     sigma = np.sqrt(np.diag(covariance))
-    return Trial(
+    return PlatformSample(
         square=float(error @ np.linalg.solve(covariance, error)),
         rank=len(error),
         normalised=error / sigma,
@@ -118,33 +122,37 @@ def trial(name: str, seed: int) -> Trial:
     )
 
 
-def true_turns(world: World, rig: Rig) -> Array:
+def true_rotations(world: World, rig: Rig) -> Array:
     """What the emulator turned the heads by, about the axes of the virtual image, (3 n,) rad."""
-    turns = []
+    rotations = []
     for cone in rig.pan_cones:
         calibrated = rotation_matrix(*cone.rotation_rad)
         error = rotation_opk(world.camera.mounting_error_rad[cone.name])
-        turn = calibrated @ error @ calibrated.T
-        turns += [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
-    return np.array(turns) / 2.0
+        rotation = calibrated @ error @ calibrated.T
+        rotations += [
+            rotation[2, 1] - rotation[1, 2],
+            rotation[0, 2] - rotation[2, 0],
+            rotation[1, 0] - rotation[0, 1],
+        ]
+    return np.array(rotations) / 2.0
 
 
-def pooled(trials: list[Trial]) -> dict[str, float | int]:
+def pooled(samples: list[PlatformSample]) -> dict[str, float | int]:
     """Errors squared in their covariance, and errors in sigmas, over all trials."""
-    rank = sum(t.rank for t in trials)
-    normalised = np.abs(np.concatenate([t.normalised for t in trials]))
-    errors = np.concatenate([t.error_rad for t in trials])
+    rank = sum(t.rank for t in samples)
+    normalised = np.abs(np.concatenate([t.normalised for t in samples]))
+    errors = np.concatenate([t.error_rad for t in samples])
     return {
-        "trials": len(trials),
+        "samples": len(samples),
         "rank": rank,
-        "mean_square": sum(t.square for t in trials) / rank,
+        "mean_square": sum(t.square for t in samples) / rank,
         "low": float(chi2.ppf(0.0005, rank)) / rank,
         "high": float(chi2.ppf(0.9995, rank)) / rank,
         "inside_3_sigma": float(np.mean(normalised < 3.0)),
         "largest": float(normalised.max()),
         "rms_error_urad": float(np.sqrt(np.mean(errors**2))) * 1e6,
         "rms_sigma_urad": float(
-            np.sqrt(np.mean(np.concatenate([t.sigma_rad for t in trials]) ** 2))
+            np.sqrt(np.mean(np.concatenate([t.sigma_rad for t in samples]) ** 2))
         )
         * 1e6,
     }
@@ -162,7 +170,7 @@ def main() -> None:
     line.add_argument("--seeds", type=int, default=SEEDS)
     line.add_argument("--out", type=Path, help="write the figures there as JSON")
     given = line.parse_args()
-    figures = pooled([trial(given.rig, 1 + k) for k in range(given.seeds)])
+    figures = pooled([sample_platform(given.rig, 1 + k) for k in range(given.seeds)])
     print(json.dumps(figures, indent=1))
     if given.out is not None:
         given.out.write_text(json.dumps(figures, indent=1))

@@ -15,13 +15,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from benchmarks.fast_flight_score import Comparison, Score, Truth
+from benchmarks.fast_flight_score import Comparison, PulseTruth, Score
 from daemon.configuration.model import Configuration, from_mapping
-from daemon.mission.exposure import Capture, Exposure
-from daemon.onboard.flight.flight import Flight, Identity
+from daemon.mission.exposure import CaptureRecord, Exposure
+from daemon.onboard.flight.flight import Flight, FlightIdentity
 from daemon.onboard.flight.ledger import Ledger
-from daemon.onboard.service.line import Line, Order
-from daemon.onboard.timing.matching import Pulse
+from daemon.onboard.service.flight_line import FlightLine, Order
+from daemon.onboard.timing.matching import FiredPulse
 from drivers.contract import (
     DeviceError,
     EventMark,
@@ -35,8 +35,13 @@ from drivers.thermometers.modbus_rtu.frames import find_reply
 from drivers.timescales.clock import BackOff
 from drivers.triggers.pulse_bus import PulseBusTrigger
 from processing.rig import Rig, find_rig
-from sim_hw.faults.plan import Planned
-from sim_hw.processes.clockwork import ClockworkHead, ClockworkRig, SentFrame, Timeline
+from sim_hw.faults.plan import PlannedFault
+from sim_hw.processes.discrete_event_rig import (
+    DiscreteEventHead,
+    DiscreteEventRig,
+    EventQueue,
+    SentFrame,
+)
 from sim_hw.world.world_clock import NS_PER_S, NS_PER_WEEK, WorldClock
 
 EXPOSURE_NS = 4_000_000
@@ -44,13 +49,13 @@ TICK_NS = 100_000_000
 LATCH_NS = 2 * NS_PER_S
 LATCH_SIGMA_NS = 80_000
 SUSPICION_NS = 2 * NS_PER_S
-"""A head that answers nothing for so long is lost; see `drivers.cameras.aravis.head`."""
+"""A head that answers nothing for so long is lost; see `drivers.cameras.aravis.aravis_head`."""
 REOPENED_SERIAL_NS = 5 * NS_PER_S
 """Longest pause before a lost serial port is tried again."""
 ANSWER_TIMEOUT_NS = NS_PER_S // 2
 DISK_NS = 150_000_000
 PROBE_C = 32.5
-FOREVER_NS = 60 * NS_PER_S
+FLIGHT_TIMEOUT_NS = 60 * NS_PER_S
 """An exposure that is open for so long hangs."""
 
 
@@ -77,13 +82,13 @@ class _Wire:
         if not flight.clockwork.trigger.is_connected(flight.clock.now_ns):
             flight.advance(flight.clock.now_ns + round(timeout_s * NS_PER_S))
             raise TimeoutError("timed out")
-        flight.clockwork.greet(flight.clock.now_ns)
+        flight.clockwork.connect_trigger_client(flight.clock.now_ns)
 
     def settimeout(self, value: float, /) -> None:
         self._timeout_s = value
 
     def sendall(self, data: bytes, /) -> None:
-        self._flight.clockwork.obey(data, self._flight.clock.now_ns)
+        self._flight.clockwork.execute(data, self._flight.clock.now_ns)
 
     def recv(self, size: int, /) -> bytes:
         flight = self._flight
@@ -116,17 +121,23 @@ class FastFlight:
     """One flight with its faults, from `fly` to its `Score`."""
 
     def __init__(
-        self, rig_name: str, planned: Sequence[Planned], *, exposures: int, seed: int, mission: Path
+        self,
+        rig_name: str,
+        planned: Sequence[PlannedFault],
+        *,
+        exposures: int,
+        seed: int,
+        mission: Path,
     ) -> None:
         self.rig = find_rig(rig_name)
         self.configuration = configuration(self.rig, exposures)
         self.clock = FakeClock()
-        self.timeline = Timeline()
+        self.timeline = EventQueue()
         # A week ends an hour after the start: every long flight passes a rollover.
         world = WorldClock(2400 * NS_PER_WEEK - 3600 * NS_PER_S, 1000 * NS_PER_S)
         self.world = world
         self.clock.now_ns = world.mono_ns_at_start
-        self.clockwork = ClockworkRig(
+        self.clockwork = DiscreteEventRig(
             self.rig, self.timeline, self, planned, world=world, seed=seed, exposure_ns=EXPOSURE_NS
         )
         self.inbox: deque[bytes] = deque()
@@ -134,12 +145,12 @@ class FastFlight:
         self.flight = Flight(
             self.rig,
             dict.fromkeys(heads, ""),
-            Identity("boot", "1", "calibration", "", "", "syntopic", simulated=True),
+            FlightIdentity("boot", "1", "calibration", "", "", "syntopic", simulated=True),
             self.configuration.limits,
             Ledger(heads),
             first_number=1,
         )
-        self.line = Line(self.configuration, self.rig, self.flight, mission, 0)
+        self.line = FlightLine(self.configuration, self.rig, self.flight, mission, 0)
         self.trigger = PulseBusTrigger(
             "trigger",
             {"port": 1},
@@ -156,15 +167,15 @@ class FastFlight:
         }
         self._pixels: dict[tuple[str, int], int] = {}
         """Which exposure's pixels lie in a slot: the truth, for the heads only."""
-        self._asked_ns: int | None = None
-        self._heard_of_probes = b""
+        self._requested_ns: int | None = None
+        self._probe_bytes = b""
         self._next_probe_ns = 0
-        self._chance = random.Random(f"host-{seed}")
-        self._captures: dict[int, Capture] = {}
+        self._rng = random.Random(f"host-{seed}")
+        self._captures: dict[int, CaptureRecord] = {}
         self._stored_pixels: dict[int, dict[str, int]] = {}
         self._answered: set[int] = set()
         self._ordered_ns: dict[int, int] = {}
-        self.truth: dict[int, Truth] = {}
+        self.truth: dict[int, PulseTruth] = {}
         self.records: list[Exposure] = []
         self.open_s: list[float] = []
         self.score = Score(exposures=exposures)
@@ -181,7 +192,7 @@ class FastFlight:
                 self.advance(self.clock.now_ns + round(wait_s * NS_PER_S))
             else:
                 self._fire(self.line.order(self.clock.now_ns))
-        end_ns = self.clock.now_ns + FOREVER_NS
+        end_ns = self.clock.now_ns + FLIGHT_TIMEOUT_NS
         self.advance(end_ns, until=lambda: not self.flight.open_numbers)
         self.score.hangs += len(self.flight.open_numbers)
         for exposure in self.clockwork.pulses:
@@ -215,40 +226,40 @@ class FastFlight:
 
     # What the devices say
 
-    def hear_answer(self, line: bytes, now_ns: int) -> None:
+    def on_trigger_answer(self, line: bytes, now_ns: int) -> None:
         self.inbox.append(line)
 
-    def hear_receiver(self, data: bytes, now_ns: int) -> None:
+    def on_receiver_data(self, data: bytes, now_ns: int) -> None:
         if not self._receiver_is_open:
             return
         for record in self._decoder.feed(data, now_ns):
             if isinstance(record, NavSample):
                 self.flight.navigation(record)
             elif isinstance(record, EventMark):
-                told = self.clockwork.receiver.told.get(record.gps_ns)
-                exposure = None if told is None else self._truth(told.exposure)
+                sent_marks = self.clockwork.receiver.sent_marks.get(record.gps_ns)
+                exposure = None if sent_marks is None else self._truth(sent_marks.exposure)
                 if exposure is not None:
                     waited_ns = now_ns - exposure.ordered_ns
                     limit_ns = self.configuration.limits.mark_timeout_s * NS_PER_S
-                    exposure.mark_came |= waited_ns < limit_ns and record.time_valid
+                    exposure.mark_received |= waited_ns < limit_ns and record.time_valid
                 self.flight.mark(record)
 
-    def hear_probes(self, data: bytes, now_ns: int) -> None:
-        if self._asked_ns is None or now_ns - self._asked_ns > ANSWER_TIMEOUT_NS:
+    def on_probe_data(self, data: bytes, now_ns: int) -> None:
+        if self._requested_ns is None or now_ns - self._requested_ns > ANSWER_TIMEOUT_NS:
             return
-        self._heard_of_probes += data
-        reply = find_reply(self._heard_of_probes, 1, len(self.rig.probes))
+        self._probe_bytes += data
+        reply = find_reply(self._probe_bytes, 1, len(self.rig.probes))
         if reply is None or reply.exception is not None:
             return
-        self._asked_ns = None
+        self._requested_ns = None
         for probe, register in zip(self.rig.probes, reply.registers, strict=True):
             value_c = None if register == 0x7FFF else register / 10
             if value_c not in (None, PROBE_C):
-                self.score.blame(f"probe {probe} said {value_c}, it is {PROBE_C}")
+                self.score.add_example(f"probe {probe} said {value_c}, it is {PROBE_C}")
                 self.score.imbalances += 1
             self.flight.temperature(TemperatureSample(probe, value_c, now_ns))
 
-    def hear_frame(self, frame: SentFrame, now_ns: int) -> None:
+    def on_frame(self, frame: SentFrame, now_ns: int) -> None:
         session = self._sessions[frame.head]
         head = self.clockwork.heads[frame.head]
         if not session.is_open or not head.channel.is_connected(now_ns):
@@ -272,18 +283,18 @@ class FastFlight:
             "half": FrameStatus.INCOMPLETE,
             "corrupt": FrameStatus.CORRUPT,
         }[frame.integrity]
-        whole = status is FrameStatus.COMPLETE
+        is_complete = status is FrameStatus.COMPLETE
         latch = session.latch
         return Frame(
             head=frame.head,
             slot=slot,
             status=status,
             frame_id=frame.counter,
-            counter=frame.counter if whole else None,
+            counter=frame.counter if is_complete else None,
             width_px=sensor.width_px,
             height_px=sensor.height_px,
             pixel_format="Mono16",
-            device_ns=frame.device_ns if whole else None,
+            device_ns=frame.device_ns if is_complete else None,
             device_clock_ns=None if latch is None else latch[0],
             device_clock_mono_ns=None if latch is None else latch[1],
             latch_sigma_ns=None if latch is None else LATCH_SIGMA_NS,
@@ -308,7 +319,7 @@ class FastFlight:
             self.flight.not_fired(order.number, str(error))
         else:
             self.flight.fired(
-                Pulse(
+                FiredPulse(
                     number=order.number,
                     mono_ns=pulse.mono_ns,
                     sigma_ns=pulse.sigma_ns,
@@ -319,21 +330,21 @@ class FastFlight:
             )
             self._answered.add(order.number)
 
-    def _truth(self, exposure: int) -> Truth | None:
+    def _truth(self, exposure: int) -> PulseTruth | None:
         """The truth of a pulse that was given; None for a frame that no pulse asked for."""
         if exposure not in self.truth and exposure in self.clockwork.pulses:
             number = self.clockwork.pulses[exposure]
-            self.truth[exposure] = Truth(number, self._ordered_ns[number])
+            self.truth[exposure] = PulseTruth(number, self._ordered_ns[number])
         return self.truth.get(exposure)
 
     def _tick(self, now_ns: int) -> None:
         for name, session in self._sessions.items():
-            self._look_after(self.clockwork.heads[name], session, now_ns)
-        self._look_after_receiver(now_ns)
+            self._maintain_head(self.clockwork.heads[name], session, now_ns)
+        self._maintain_receiver(now_ns)
         if now_ns >= self._next_probe_ns:
             self._next_probe_ns = now_ns + NS_PER_S
-            self._asked_ns, self._heard_of_probes = now_ns, b""
-            self.clockwork.ask_probes([PROBE_C] * len(self.rig.probes), now_ns)
+            self._requested_ns, self._probe_bytes = now_ns, b""
+            self.clockwork.poll_probes([PROBE_C] * len(self.rig.probes), now_ns)
         flight = self.flight
         for due in flight.due_to_store(now_ns):
             number, slots = due.capture.number, dict(due.slots)
@@ -363,18 +374,18 @@ class FastFlight:
         imbalances = flight.ledger.imbalances()
         self.score.imbalances += len(imbalances)
         for imbalance in imbalances:
-            self.score.blame(imbalance)
+            self.score.add_example(imbalance)
         self.records.append(exposure)
         self.open_s.append((now_ns - self._ordered_ns[exposure.number]) / NS_PER_S)
 
-    def _look_after(self, head: ClockworkHead, session: _Session, now_ns: int) -> None:
-        """What the driver of a head does between frames; see `drivers.cameras.aravis.head`."""
-        answers = head.answers(now_ns)
+    def _maintain_head(self, head: DiscreteEventHead, session: _Session, now_ns: int) -> None:
+        """What the driver of a head does between frames; see `drivers.cameras.aravis.aravis_head`."""
+        is_responding = head.is_responding(now_ns)
         if not session.is_open:
-            if answers and now_ns >= session.next_try_ns:
+            if is_responding and now_ns >= session.next_try_ns:
                 self._open_head(head, session)
             return
-        if not answers:
+        if not is_responding:
             session.suspected_ns = session.suspected_ns or now_ns
             if now_ns - session.suspected_ns > SUSPICION_NS:
                 self._lose_head(head, session, now_ns)
@@ -385,8 +396,8 @@ class FastFlight:
         elif now_ns - session.latched_ns >= LATCH_NS:
             self._latch(head, session, now_ns)
 
-    def _open_head(self, head: ClockworkHead, session: _Session) -> None:
-        if not head.answers(self.clock.now_ns):
+    def _open_head(self, head: DiscreteEventHead, session: _Session) -> None:
+        if not head.is_responding(self.clock.now_ns):
             return
         head.begin()
         session.is_open, session.suspected_ns = True, None
@@ -395,18 +406,18 @@ class FastFlight:
         self.flight.absent_heads.discard(head.name)
         self.events["opened"] += 1
 
-    def _lose_head(self, head: ClockworkHead, session: _Session, now_ns: int) -> None:
+    def _lose_head(self, head: DiscreteEventHead, session: _Session, now_ns: int) -> None:
         session.is_open = False
         session.next_try_ns = now_ns + round(session.pause.next_s() * NS_PER_S)
         self.flight.absent_heads.add(head.name)
         self.events["lost"] += 1
 
-    def _latch(self, head: ClockworkHead, session: _Session, now_ns: int) -> None:
-        error_ns = self._chance.randrange(-LATCH_SIGMA_NS, LATCH_SIGMA_NS)
+    def _latch(self, head: DiscreteEventHead, session: _Session, now_ns: int) -> None:
+        error_ns = self._rng.randrange(-LATCH_SIGMA_NS, LATCH_SIGMA_NS)
         session.latch = (head.clock_ns(now_ns), now_ns + error_ns)
         session.latched_ns = now_ns
 
-    def _look_after_receiver(self, now_ns: int) -> None:
+    def _maintain_receiver(self, now_ns: int) -> None:
         """A port that goes away is opened again; what was half received is forgotten."""
         connected = self.clockwork.receiver.channel.is_connected(now_ns)
         if self._receiver_is_open and not connected:

@@ -1,7 +1,7 @@
 """What became of every pulse of a fast flight, and how its records compare with that.
 
-The flight itself is in `benchmarks.fast_flight`; what is true only `sim_hw.processes.clockwork`
-knows.
+The flight itself is in `benchmarks.fast_flight`; what is true only
+`sim_hw.processes.discrete_event_rig` knows.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from daemon.mission.exposure import Exposure, NavigationRecord
-from sim_hw.processes.clockwork import EARTH_M_PER_DEG, ClockworkRig
+from sim_hw.processes.discrete_event_rig import EARTH_M_PER_DEG, DiscreteEventRig
 from sim_hw.world.world_clock import NS_PER_S
 
 NAV_TOLERANCE_M = 1.0
@@ -21,14 +21,14 @@ RECOVERY_NS = 3 * NS_PER_S
 
 
 @dataclass
-class Truth:
+class PulseTruth:
     """What became of one pulse that was given."""
 
     number: int
     ordered_ns: int
     frames: set[str] = field(default_factory=set)
     """Heads whose frame of this pulse came whole and in time."""
-    mark_came: bool = False
+    mark_received: bool = False
 
 
 @dataclass
@@ -37,10 +37,10 @@ class Score:
 
     exposures: int = 0
     sealed: int = 0
-    frames_came: int = 0
+    frames_received: int = 0
     frames_right: int = 0
     frames_wrong: int = 0
-    marks_came: int = 0
+    marks_received: int = 0
     marks_right: int = 0
     marks_wrong: int = 0
     pairs: int = 0
@@ -54,7 +54,7 @@ class Score:
     """Times without a mark that are further off than six of their sigmas."""
     hangs: int = 0
     imbalances: int = 0
-    hits: int = 0
+    occurrences: int = 0
     longest_open_s: float = 0.0
     examples: list[str] = field(default_factory=list)
 
@@ -63,7 +63,7 @@ class Score:
         """Wrong pairings of any kind."""
         return self.frames_wrong + self.marks_wrong + self.navigation_wrong
 
-    def blame(self, sentence: str) -> None:
+    def add_example(self, sentence: str) -> None:
         """Keep the first few examples of what went wrong."""
         if len(self.examples) < 8:
             self.examples.append(sentence)
@@ -77,9 +77,9 @@ class Comparison:
     pixels were stored; `open_s` are the seconds each exposure was open.
     """
 
-    clockwork: ClockworkRig
+    clockwork: DiscreteEventRig
     heads: Collection[str]
-    truth: Mapping[int, Truth]
+    truth: Mapping[int, PulseTruth]
     records: Sequence[Exposure]
     stored_pixels: Mapping[int, Mapping[str, int]]
     open_s: Sequence[float]
@@ -89,12 +89,12 @@ class Comparison:
         """Fill the score."""
         score = self.score
         exposure_of = {number: exposure for exposure, number in self.clockwork.pulses.items()}
-        whole: dict[int, Exposure] = {}
+        complete_exposures: dict[int, Exposure] = {}
         marked: set[int] = set()
         for record in self.records:
             score.sealed += 1
             exposure = exposure_of.get(record.number, 0)
-            whole[exposure] = record
+            complete_exposures[exposure] = record
             self._compare_frames(record, exposure)
             if self._compare_mark(record, exposure):
                 marked.add(exposure)
@@ -104,22 +104,28 @@ class Comparison:
         heads = set(self.heads)
         for exposure, truth in self.truth.items():
             pixels = self.stored_pixels.get(truth.number, {})
-            score.frames_came += len(truth.frames)
-            score.marks_came += truth.mark_came
-            matched = {h for h in truth.frames if pixels.get(h) == exposure and exposure in whole}
-            if truth.mark_came:
+            score.frames_received += len(truth.frames)
+            score.marks_received += truth.mark_received
+            matched = {
+                h
+                for h in truth.frames
+                if pixels.get(h) == exposure and exposure in complete_exposures
+            }
+            if truth.mark_received:
                 score.pairs += len(truth.frames)
                 score.pairs_matched += len(matched) if exposure in marked else 0
-            if truth.mark_came and truth.frames == heads and exposure not in touched:
+            if truth.mark_received and truth.frames == heads and exposure not in touched:
                 score.untouched += 1
                 is_matched = matched == heads and exposure in marked
                 score.untouched_matched += is_matched
                 if not is_matched:
-                    score.blame(
+                    score.add_example(
                         f"exposure {truth.number}: untouched, but {len(matched)} frames and "
                         f"{'the' if exposure in marked else 'no'} mark"
                     )
-        score.hits = sum(len(channel.hits) for channel in self.clockwork.channels.values())
+        score.occurrences = sum(
+            len(channel.occurrences) for channel in self.clockwork.channels.values()
+        )
         score.longest_open_s = max(self.open_s, default=0.0)
 
     def _compare_frames(self, record: Exposure, exposure: int) -> None:
@@ -129,7 +135,7 @@ class Comparison:
                 self.score.frames_right += 1
             else:
                 self.score.frames_wrong += 1
-                self.score.blame(
+                self.score.add_example(
                     f"exposure {record.number}: {frame.sensor} has the pixels of pulse "
                     f"{pixels.get(frame.sensor)}, its pulse is {exposure}"
                 )
@@ -140,21 +146,21 @@ class Comparison:
         if gps_ns is None or sigma_ns is None:
             return False
         if record.mark_source == "event-mark":
-            told = self.clockwork.receiver.told.get(gps_ns)
-            if told is not None and told.exposure == exposure:
+            sent_marks = self.clockwork.receiver.sent_marks.get(gps_ns)
+            if sent_marks is not None and sent_marks.exposure == exposure:
                 self.score.marks_right += 1
                 return True
             self.score.marks_wrong += 1
-            self.score.blame(
+            self.score.add_example(
                 f"exposure {record.number}: has the mark of pulse "
-                f"{None if told is None else told.exposure}, its pulse is {exposure}"
+                f"{None if sent_marks is None else sent_marks.exposure}, its pulse is {exposure}"
             )
             return False
         if exposure:
             error_ns = gps_ns - self.clockwork.true_strobe_gps_ns[exposure]
             if abs(error_ns) > SIGMAS * sigma_ns and not self._receiver_clock_is_at_fault:
                 self.score.times_wrong += 1
-                self.score.blame(
+                self.score.add_example(
                     f"exposure {record.number}: {record.mark_source} time is off by "
                     f"{error_ns / 1e6:.3f} ms, its sigma is {sigma_ns / 1e6:.3f} ms"
                 )
@@ -163,7 +169,7 @@ class Comparison:
     @property
     def _receiver_clock_is_at_fault(self) -> bool:
         """Its time is then not the true one, and nobody on board can know."""
-        names = {hit.fault for hit in self.clockwork.receiver.channel.hits}
+        names = {hit.fault for hit in self.clockwork.receiver.channel.occurrences}
         return bool(names & {"clock-step", "clock-drift", "wrong-week"})
 
     def _compare_navigation(self, record: Exposure, exposure: int) -> None:
@@ -176,7 +182,7 @@ class Comparison:
             limit_m += SIGMAS * record.mark_sigma_ns * 1e-9 * 65.0
         if error_m > limit_m:
             self.score.navigation_wrong += 1
-            self.score.blame(
+            self.score.add_example(
                 f"exposure {record.number}: its position is {error_m:.1f} m off "
                 f"({record.navigation.method}, {record.mark_source})"
             )
@@ -195,7 +201,7 @@ class Comparison:
         touched: set[int] = set()
         spans: list[tuple[int, int]] = []
         for channel in self.clockwork.channels.values():
-            for hit in channel.hits:
+            for hit in channel.occurrences:
                 if hit.what.isdecimal():
                     touched.add(int(hit.what))
                 else:

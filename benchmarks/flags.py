@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 
 from benchmarks.rendered import (
-    Exposure,
+    RenderedExposure,
     conditions_of,
     flight_and_mark,
     process,
@@ -35,12 +35,12 @@ from benchmarks.rendered import (
     world_settings,
 )
 from daemon.cli.benchmark.measurement import machine
-from processing.pipelines.stitched import Conditions, Pipeline, Product, Settings
+from processing.pipelines.stitched import Conditions, Pipeline, PipelineSettings, Product
 from processing.quality.report import NO_FLAGS, Flag, Thresholds
 from processing.rig import Rig
 from sim_hw.world.rendering import residual_smear_px
 from sim_hw.world.scene import open_scene
-from sim_hw.world.snapshots import Heads, look_of
+from sim_hw.world.snapshots import RigElectronics, exposure_parameters_of
 from sim_hw.world.world import World
 
 RIG = "ultracam-x-mini"
@@ -48,7 +48,7 @@ PLACES = 6
 DRAWS = 5
 """Exposures made of one light."""
 LARGEST_DC_K = 20.0
-CALM_PX = 0.6
+MAX_TRUE_SMEAR_PX = 0.6
 """True smear above which an exposure is no clean one: three quarters of the threshold."""
 ATTEMPTS, ATTEMPT_SEEDS = 20, 1_000_000
 THRESHOLDS = Thresholds()
@@ -63,10 +63,10 @@ class Fault:
     """
 
     flag: Flag
-    says: str
+    description: str
     world: Callable[[int], Mapping[str, object]] = lambda seed: {}
-    light: Callable[[Exposure], Exposure] = lambda exposure: exposure
-    conditions: Callable[[Conditions], Conditions] = lambda told: told
+    light: Callable[[RenderedExposure], RenderedExposure] = lambda exposure: exposure
+    conditions: Callable[[Conditions], Conditions] = lambda conditions: conditions
 
 
 def main() -> None:
@@ -106,21 +106,21 @@ class Camera:
         self.places = places
         first = World(world_settings(RIG, 1, exposures=places))
         self.scene = open_scene(first.scene_settings, scenes)
-        self.heads = Heads(first, seed=1)
-        settings = Settings(geometry=False, threads=1)
+        self.heads = RigElectronics(first, seed=1)
+        settings = PipelineSettings(geometry=False, threads=1)
         self.pipeline = Pipeline(first.rig, radiometry_of(self.heads), settings)
-        self._taken: tuple[int, Fault | None, Exposure] | None = None
+        self._taken: tuple[int, Fault | None, RenderedExposure] | None = None
 
     def product(self, seed: int, fault: Fault | None) -> Product:
         """One exposure, processed; all that is random follows from the seed."""
         exposure = self._exposure(seed // DRAWS, fault)
-        self.pipeline.rig = calibrated_anew(exposure.world, seed)
-        told = conditions_of(exposure, seed=seed)
+        self.pipeline.rig = recalibrated(exposure.world, seed)
+        conditions = conditions_of(exposure, seed=seed)
         if fault is not None:
-            exposure, told = fault.light(exposure), fault.conditions(told)
-        return process(self.pipeline, self.heads, exposure, seed=seed, conditions=told)
+            exposure, conditions = fault.light(exposure), fault.conditions(conditions)
+        return process(self.pipeline, self.heads, exposure, seed=seed, conditions=conditions)
 
-    def _exposure(self, seed: int, fault: Fault | None) -> Exposure:
+    def _exposure(self, seed: int, fault: Fault | None) -> RenderedExposure:
         """The light of one seed; the last one is kept."""
         if self._taken is not None and self._taken[:2] == (seed, fault):
             return self._taken[2]
@@ -133,16 +133,18 @@ class Camera:
         place = int(random.integers(0, self.places))
         for attempt in range(ATTEMPTS):
             world = World(world_settings(RIG, seed + ATTEMPT_SEEDS * attempt, **others))
-            if true_smear_px(world, place) < CALM_PX:
+            if true_smear_px(world, place) < MAX_TRUE_SMEAR_PX:
                 break
         else:
-            raise ValueError(f"{ATTEMPTS} worlds smear more than {CALM_PX} px; place {place}")
+            raise ValueError(
+                f"{ATTEMPTS} worlds smear more than {MAX_TRUE_SMEAR_PX} px; place {place}"
+            )
         exposure = take(world, Path(), place=place, scene=self.scene)
         self._taken = (seed, fault, exposure)
         return exposure
 
 
-def calibrated_anew(world: World, seed: int) -> Rig:
+def recalibrated(world: World, seed: int) -> Rig:
     """The rig as a laboratory would state it whose errors follow from the seed; truth stays."""
     random = np.random.default_rng([seed, 13])
     cones = []
@@ -169,7 +171,9 @@ def true_smear_px(world: World, place: int) -> float:
     """The largest smear in the middle of any PAN sensor, by the emulator's own mapping."""
     flight, mark_ns = flight_and_mark(world, place)
     return max(
-        math.hypot(*residual_smear_px(world, flight, c, s, look_of(world, c, mark_ns)))
+        math.hypot(
+            *residual_smear_px(world, flight, c, s, exposure_parameters_of(world, c, mark_ns))
+        )
         for c in world.rig.pan_cones
         for s in c.sensors
     )
@@ -194,7 +198,11 @@ def raised(
             alarms.append((seed, str(unexpected.name)))
         if done % 10 == 0:
             print(
-                fault.says if fault else "clean", done, dict(counts), alarms[-3:], file=sys.stderr
+                fault.description if fault else "clean",
+                done,
+                dict(counts),
+                alarms[-3:],
+                file=sys.stderr,
             )
             sys.stderr.flush()
     return {"exposures": done, "raised": dict(counts), "others": alarms}
@@ -217,7 +225,7 @@ def table(result: Mapping[str, Any]) -> str:
     for name, found in result["faults"].items():
         fault = FAULTS[name]
         lines.append(
-            f"| {fault.says} | `{fault.flag.name}` | {found['exposures']} | {found['missed']} |"
+            f"| {fault.description} | `{fault.flag.name}` | {found['exposures']} | {found['missed']} |"
         )
     return "\n".join(lines)
 
@@ -229,7 +237,7 @@ def _displaced(seed: int) -> Mapping[str, object]:
     return {"displaced_px": {name: (0.3 * math.cos(angle), 0.3 * math.sin(angle))}}
 
 
-def _lit(exposure: Exposure, factor: float) -> Exposure:
+def _lit(exposure: RenderedExposure, factor: float) -> RenderedExposure:
     light = {
         name: np.asarray(seen * np.float32(factor), np.float32)
         for name, seen in exposure.snapshot.light.items()
@@ -237,20 +245,20 @@ def _lit(exposure: Exposure, factor: float) -> Exposure:
     return replace(exposure, snapshot=replace(exposure.snapshot, light=light))
 
 
-def _pan(exposure: Exposure) -> Iterator[tuple[str, Any]]:
+def _pan(exposure: RenderedExposure) -> Iterator[tuple[str, Any]]:
     for cone in exposure.world.rig.pan_cones:
         for sensor in cone.sensors:
             yield sensor.name, exposure.snapshot.light[sensor.name]
 
 
-def _dark(exposure: Exposure) -> Exposure:
+def _dark(exposure: RenderedExposure) -> RenderedExposure:
     """The 95th percentile of the signal at half of the threshold."""
     light = np.concatenate([seen[::16, ::16].ravel() for _, seen in _pan(exposure)])
     planned = 0.8 * float(np.percentile(light, 95.0))
     return _lit(exposure, 0.5 * THRESHOLDS.bright_fraction / planned)
 
 
-def _burnt(exposure: Exposure) -> Exposure:
+def _saturated(exposure: RenderedExposure) -> RenderedExposure:
     """Twice the threshold's share of the pixels at or above full scale, on the axis of the lens."""
     light = np.concatenate([seen[::4, ::4].ravel() for _, seen in _pan(exposure)])
     share = 100.0 * (1.0 - 2.0 * THRESHOLDS.saturated_fraction)
@@ -258,7 +266,7 @@ def _burnt(exposure: Exposure) -> Exposure:
     return _lit(exposure, 1.3 / (0.8 * float(np.percentile(light, share))))
 
 
-def _defocused(exposure: Exposure) -> Exposure:
+def _defocused(exposure: RenderedExposure) -> RenderedExposure:
     light = {
         name: np.asarray(cv2.GaussianBlur(seen, (0, 0), 2.0), np.float32)
         for name, seen in exposure.snapshot.light.items()
@@ -266,7 +274,7 @@ def _defocused(exposure: Exposure) -> Exposure:
     return replace(exposure, snapshot=replace(exposure.snapshot, light=light))
 
 
-def _clouded(exposure: Exposure) -> Exposure:
+def _clouded(exposure: RenderedExposure) -> RenderedExposure:
     """Half an image without any detail: every overlap of one side."""
     light = dict(exposure.snapshot.light)
     for name in ("SU00", "SU02", "SU20"):
@@ -274,37 +282,37 @@ def _clouded(exposure: Exposure) -> Exposure:
     return replace(exposure, snapshot=replace(exposure.snapshot, light=light))
 
 
-def _stuck(told: Conditions) -> Conditions:
+def _stuck(conditions: Conditions) -> Conditions:
     """Probe 0 off by four kelvin: twice 4.5 standard deviations of a typical estimate."""
-    read = dict(told.temperatures_c)
+    read = dict(conditions.temperatures_c)
     read["0"] = (read["0"] or 0.0) + 4.0
-    return replace(told, temperatures_c=read)
+    return replace(conditions, temperatures_c=read)
 
 
-def _turning(told: Conditions) -> Conditions:
+def _rotating(conditions: Conditions) -> Conditions:
     """A pitch rate that smears by twice the threshold during the exposure of PAN."""
-    time_s = told.exposure_time_s["SU00"]
+    time_s = conditions.exposure_time_s["SU00"]
     rate = 2.0 * THRESHOLDS.smear_px / (time_s * 100.5 / 7.2e-3)
-    return replace(told, angular_rate_rad_per_s=(0.0, rate, 0.0))
+    return replace(conditions, angular_rate_rad_per_s=(0.0, rate, 0.0))
 
 
 FAULTS: Mapping[str, Fault] = {
     "displaced": Fault(Flag.DISPLACED_SENSOR, "a master sensor off by 0.3 px", world=_displaced),
     "stuck-probe": Fault(Flag.DC_DISAGREEMENT, "a probe off by 4 K", conditions=_stuck),
     "dark": Fault(Flag.UNDEREXPOSED, "half of the least brightness", light=_dark),
-    "burnt": Fault(Flag.OVEREXPOSED, "twice the saturated pixels", light=_burnt),
+    "burnt": Fault(Flag.OVEREXPOSED, "twice the saturated pixels", light=_saturated),
     "defocused": Fault(Flag.BLUR, "defocused by 2 px", light=_defocused),
-    "turning": Fault(Flag.BLUR, "twice the smear", conditions=_turning),
+    "turning": Fault(Flag.BLUR, "twice the smear", conditions=_rotating),
     "no-detail": Fault(Flag.TIE_POINTS, "three sensors see no detail", light=_clouded),
     "tilted": Fault(
         Flag.TILT,
         "twice the tilt",
-        conditions=lambda told: replace(told, roll_rad=2 * THRESHOLDS.tilt_rad),
+        conditions=lambda conditions: replace(conditions, roll_rad=2 * THRESHOLDS.tilt_rad),
     ),
     "drifting": Fault(
         Flag.DRIFT,
         "twice the crab",
-        conditions=lambda told: replace(told, crab_rad=-2 * THRESHOLDS.crab_rad),
+        conditions=lambda conditions: replace(conditions, crab_rad=-2 * THRESHOLDS.crab_rad),
     ),
 }
 

@@ -28,16 +28,16 @@ from benchmarks.rendered import (
     world_settings,
 )
 from daemon.cli.benchmark.measurement import machine
-from processing.pipelines.stitched import Pipeline, Settings
+from processing.pipelines.stitched import Pipeline, PipelineSettings
 from processing.rig import Rig, load_rig, shipped_rigs
 from sim_hw.world.scene import Scene, open_scene
-from sim_hw.world.snapshots import Heads
+from sim_hw.world.snapshots import RigElectronics
 from sim_hw.world.world import World
 
 MINIS = tuple(f"ultracam-{name}-mini" for name in ("x", "xp", "d", "l", "lp"))
 DC_K = (-20.0, -10.0, 0.0, 10.0, 20.0)
 DISPLACED_PX = (0.0, 0.1, 0.3, 1.0, 3.0)
-KEPT_BELOW_PX = 5000
+RETAIN_HEADS_BELOW_PX = 5000
 """The maps of the sensors of wider images would fill the memory."""
 ROTATION_RAD = 0.3e-3
 """Standard deviation of the cones' rotations: what the shipped rig files have."""
@@ -102,24 +102,26 @@ def fly(
     """Render and judge one exposure for every dC, displacement and scene."""
     file = shipped_rigs()[rig]
     cache.mkdir(parents=True, exist_ok=True)
-    heads: Heads | None = None
+    heads: RigElectronics | None = None
     rows: list[Row] = []
     for number in scenes:
         scene: Scene | None = None
         for dc in dc_k:
             for size in displaced_px:
                 seed = 1000 * number + len(rows)
-                turned = with_random_rotations(
+                rotated_rig = with_random_rotations(
                     file, cache / f"{rig}-turned.toml", seed=seed, sigma_rad=ROTATION_RAD
                 )
-                moved = displacement(load_rig(turned), size, seed=seed)
-                world = World(world_settings(turned, seed, dc_k=dc, displaced_px=moved))
+                moved = displacement(load_rig(rotated_rig), size, seed=seed)
+                world = World(world_settings(rotated_rig, seed, dc_k=dc, displaced_px=moved))
                 # Heads and scene do not depend on where the cones look.
-                heads = heads or Heads(world, seed=1, keep=world.image.width_px < KEPT_BELOW_PX)
+                heads = heads or RigElectronics(
+                    world, seed=1, keep=world.image.width_px < RETAIN_HEADS_BELOW_PX
+                )
                 if scene is None:
-                    first = World(world_settings(turned, number))
+                    first = World(world_settings(rotated_rig, number))
                     scene = open_scene(first.scene_settings, cache)
-                rows.append(judged(world, heads, scene, number=number, moved=moved, size_px=size))
+                rows.append(evaluate(world, heads, scene, number=number, moved=moved, size_px=size))
                 print(rows[-1], file=sys.stderr, flush=True)
     return rows
 
@@ -132,9 +134,9 @@ def displacement(rig: Rig, size_px: float, *, seed: int) -> dict[str, tuple[floa
     return {name: (size_px * math.cos(angle), size_px * math.sin(angle))} if size_px else {}
 
 
-def judged(
+def evaluate(
     world: World,
-    heads: Heads,
+    heads: RigElectronics,
     scene: Scene,
     *,
     number: int,
@@ -143,7 +145,7 @@ def judged(
 ) -> Row:
     """Take, stitch and judge one exposure."""
     exposure = take(world, Path(), scene=scene)
-    pipeline = Pipeline(world.rig, radiometry_of(heads), Settings(baselines=True))
+    pipeline = Pipeline(world.rig, radiometry_of(heads), PipelineSettings(baselines=True))
     product = process(pipeline, heads, exposure, seed=world.settings.seed)
     free, fixed = (errors_of(product.geometry[m], exposure.snapshot) for m in ("free", "fixed"))
     return Row(

@@ -19,11 +19,11 @@ import cv2
 
 from benchmarks.rendered import errors_of, process, radiometry_of, take, world_settings
 from daemon.cli.benchmark.measurement import machine
-from processing.pipelines.stitched import Pipeline, Product, Settings
+from processing.pipelines.stitched import Pipeline, PipelineSettings, Product
 from processing.quality.report import NO_FLAGS, Flag
 from processing.rig import find_rig
-from sim_hw.world.grounds import GROUNDS
-from sim_hw.world.snapshots import Heads
+from sim_hw.world.ground_types import GROUNDS
+from sim_hw.world.snapshots import RigElectronics
 from sim_hw.world.world import World
 
 RIG = "ultracam-x-mini"
@@ -31,7 +31,7 @@ SEED = 5
 DC_K = 12.0
 RIGHT_PX = (0.05, 0.15)
 """Inner RMS and worst pixel of an image that counts as right."""
-TELLS = Flag.TIE_POINTS | Flag.SIGMA0 | Flag.UNDEREXPOSED | Flag.OVEREXPOSED | Flag.BLUR
+INFORMATIVE_FLAGS = Flag.TIE_POINTS | Flag.SIGMA0 | Flag.UNDEREXPOSED | Flag.OVEREXPOSED | Flag.BLUR
 """Flags that say: do not trust the geometry of this image blindly."""
 SIGMAS = 3.0
 PICTURE_PX = 232
@@ -42,7 +42,7 @@ PICTURE_QUALITY = 60
 class HardScene:
     """A ground, what hides it, and what moved in the camera."""
 
-    says: str
+    description: str
     ground: str = "landscape"
     cloud_over: str | None = None
     displaced_px: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -50,7 +50,7 @@ class HardScene:
 
 MOVED = {"SU02": (2.1, -2.1)}
 SCENES: Mapping[str, HardScene] = {
-    **{name: HardScene(ground.says, name) for name, ground in GROUNDS.items()},
+    **{name: HardScene(ground.description, name) for name, ground in GROUNDS.items()},
     "cloud-corner": HardScene("a cloud under sensor SU00", cloud_over="SU00"),
     "cloud-side": HardScene("a cloud under sensor SU10", cloud_over="SU10"),
     "cloud-middle": HardScene("a cloud under sensor SU30", cloud_over="SU30"),
@@ -72,8 +72,8 @@ class Outcome:
     fixed_rms_px: float
     stated_px: float
     tie_points: int
-    poorest: int
-    resting: str
+    tie_points_min_overlap: int
+    weak_sensors: str
     displaced: str
     flags: Flag
     verdict: str
@@ -83,11 +83,11 @@ class Outcome:
         return self.inner_rms_px < RIGHT_PX[0] and self.inner_max_px < RIGHT_PX[1]
 
     @property
-    def told(self) -> bool:
-        return bool(self.flags & TELLS)
+    def flagged(self) -> bool:
+        return bool(self.flags & INFORMATIVE_FLAGS)
 
     @property
-    def honest(self) -> bool:
+    def is_consistent(self) -> bool:
         """Whether the error is within three of the standard deviations stated."""
         return self.absolute_rms_px < SIGMAS * math.sqrt(2.0) * self.stated_px
 
@@ -98,10 +98,12 @@ class Camera:
     def __init__(self, scenes: Path, *, without: Collection[str] = ()) -> None:
         self.scenes, self.without = scenes, without
         first = World(world_settings(RIG, SEED))
-        self.heads = Heads(first, seed=1, without=without)
-        self.pipeline = Pipeline(find_rig(RIG), radiometry_of(self.heads), Settings(baselines=True))
+        self.heads = RigElectronics(first, seed=1, without=without)
+        self.pipeline = Pipeline(
+            find_rig(RIG), radiometry_of(self.heads), PipelineSettings(baselines=True)
+        )
 
-    def look(self, name: str) -> tuple[Outcome, Product]:
+    def evaluate(self, name: str) -> tuple[Outcome, Product]:
         """Render, stitch and judge a scene."""
         scene = SCENES[name]
         world = World(
@@ -129,8 +131,8 @@ class Camera:
             fixed_rms_px=float(fixed["inner_rms_px"]),
             stated_px=float(figures["stitched_sigma_px"] or math.nan),
             tie_points=int(figures["tie_points_pp"] or 0) + int(figures["tie_points_pc"] or 0),
-            poorest=int(figures["tie_points_min_overlap"] or 0),
-            resting=str(figures["resting_on_calibration"] or ""),
+            tie_points_min_overlap=int(figures["tie_points_min_overlap"] or 0),
+            weak_sensors=str(figures["resting_on_calibration"] or ""),
             displaced=str(figures["displaced_sensor"] or ""),
             flags=flags or NO_FLAGS,
             verdict=product.report.verdict.value,
@@ -150,7 +152,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="syntopic-hard-") as folder:
         camera = Camera(given.scene_cache or Path(folder))
         for name in given.scene or SCENES:
-            outcome, product = camera.look(name)
+            outcome, product = camera.evaluate(name)
             outcomes.append(outcome)
             print(outcome, file=sys.stderr, flush=True)
             if given.pictures is not None:
@@ -160,7 +162,7 @@ def main() -> None:
         print(json.dumps({"machine": machine(), "scenes": scenes}))
     else:
         print(table(outcomes))
-    sys.exit(0 if all((o.right or o.told) and o.honest for o in outcomes) else 1)
+    sys.exit(0 if all((o.right or o.flagged) and o.is_consistent for o in outcomes) else 1)
 
 
 def write_picture(product: Product, path: Path) -> None:
@@ -180,25 +182,25 @@ def table(outcomes: Collection[Outcome]) -> str:
         "|---|---|---|---|---|---|---|---|---|",
     ]
     lines += [
-        f"| `{o.scene}`: {SCENES[o.scene].says} | ![{o.scene}](hard-scenes/{o.scene}.jpg) | "
+        f"| `{o.scene}`: {SCENES[o.scene].description} | ![{o.scene}](hard-scenes/{o.scene}.jpg) | "
         f"{o.inner_rms_px:.3f} / {o.inner_max_px:.3f} | {o.absolute_rms_px:.3f} | "
-        f"{o.stated_px:.3f} | {o.fixed_rms_px:.3f} | {o.tie_points:,} ({o.poorest}) | "
-        f"{_resting(o.resting)} | {o.verdict}{_told(o)} |"
+        f"{o.stated_px:.3f} | {o.fixed_rms_px:.3f} | {o.tie_points:,} ({o.tie_points_min_overlap}) | "
+        f"{_weak_sensors_text(o.weak_sensors)} | {o.verdict}{_flag_text(o)} |"
         for o in outcomes
     ]
     return "\n".join(lines)
 
 
-def _resting(sensors: str) -> str:
+def _weak_sensors_text(sensors: str) -> str:
     names = [name for name in sensors.split(", ") if name]
     return "all" if len(names) == 9 else ", ".join(names) or "–"
 
 
-def _told(outcome: Outcome) -> str:
-    told = [f"`{name}`" for name in _names(outcome.flags)]
+def _flag_text(outcome: Outcome) -> str:
+    flagged = [f"`{name}`" for name in _names(outcome.flags)]
     if outcome.displaced:
-        told.append(f"names {outcome.displaced}")
-    return f": {', '.join(told)}" if told else ""
+        flagged.append(f"names {outcome.displaced}")
+    return f": {', '.join(flagged)}" if flagged else ""
 
 
 def _names(flags: Flag) -> list[str]:

@@ -19,17 +19,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from daemon.postflight.calibration.laboratory.field import RigCalibration, calibrate_rig
-from daemon.postflight.calibration.laboratory.field_measuring import Exposure, Field, Looks
-from daemon.postflight.calibration.laboratory.field_report import (
-    Estimated,
-    covariance_of,
-    estimated,
+from daemon.postflight.calibration.laboratory.calibration_field import RigCalibration, calibrate_rig
+from daemon.postflight.calibration.laboratory.field_measurement import (
+    FieldExposure,
+    TargetField,
+    TargetObservations,
 )
-from processing.bundle.rotations import logarithm
+from daemon.postflight.calibration.laboratory.field_report import (
+    EstimatedParameter,
+    covariance_of,
+    estimated_parameters,
+)
+from processing.bundle.rotations import vectors_from_rotations
 from processing.geometry.rotation import rotation_matrix
 from processing.rig import Rig, find_rig
-from sim_hw.laboratory import test_field
+from sim_hw.laboratory import calibration_field
 
 Array = NDArray[np.float64]
 
@@ -37,7 +41,7 @@ NOISE_PX = 0.005
 
 
 @dataclass(frozen=True)
-class Pooled:
+class PooledErrors:
     """Squared errors in their covariances, how many, and the standardised ones."""
 
     squares: float
@@ -54,59 +58,63 @@ class Pooled:
         return low / self.count, high / self.count
 
 
-def calibrated(
+def calibrate_sample(
     rig: Rig, seed: int, *, exposures: int, targets: tuple[int, int]
-) -> tuple[RigCalibration, test_field.TrueRig]:
+) -> tuple[RigCalibration, calibration_field.TrueRig]:
     """One rig, one field, one calibration from image coordinates."""
-    truth = test_field.true_rig(rig, seed)
-    plan = test_field.plan_for(rig, exposures)
-    xyz = test_field.targets(seed, targets, plan.size_m, plan.depth_m)
+    truth = calibration_field.true_rig(rig, seed)
+    plan = calibration_field.plan_for(rig, exposures)
+    xyz = calibration_field.targets(seed, targets, plan.size_m, plan.depth_m)
     random = np.random.default_rng(seed)
-    sigma = test_field.SURVEY_SIGMA_M
-    field = Field(
+    sigma = calibration_field.SURVEY_SIGMA_M
+    field = TargetField(
         tuple(f"T{k}" for k in range(len(xyz))),
         xyz + random.normal(0.0, sigma, xyz.shape),
         np.full(len(xyz), sigma),
     )
-    looks: list[tuple[int, int, NDArray[np.int64], Array]] = []
-    told = []
-    for k, (place, turn) in enumerate(test_field.poses(seed, exposures, plan.distance_m)):
-        told.append(Exposure(f"E{k}", {}, place, turn, {}))
+    observations: list[tuple[int, int, NDArray[np.int64], Array]] = []
+    field_exposures = []
+    for k, (place, rotation) in enumerate(
+        calibration_field.poses(seed, exposures, plan.distance_m)
+    ):
+        field_exposures.append(FieldExposure(f"E{k}", {}, place, rotation, {}))
         for j, sensor in enumerate(rig.sensors):
             cone = rig.cone_of(sensor.name)
-            index, px = test_field.seen(truth, cone, sensor, place, turn, xyz)
-            looks.append((k, j, index, px + random.normal(0.0, NOISE_PX, px.shape)))
-    table = Looks(
-        np.concatenate([np.full(len(i), k) for k, _, i, _ in looks]),
-        np.concatenate([np.full(len(i), j) for _, j, i, _ in looks]),
-        np.concatenate([i for _, _, i, _ in looks]),
-        np.concatenate([p for _, _, _, p in looks]),
+            index, px = calibration_field.seen(truth, cone, sensor, place, rotation, xyz)
+            observations.append((k, j, index, px + random.normal(0.0, NOISE_PX, px.shape)))
+    table = TargetObservations(
+        np.concatenate([np.full(len(i), k) for k, _, i, _ in observations]),
+        np.concatenate([np.full(len(i), j) for _, j, i, _ in observations]),
+        np.concatenate([i for _, _, i, _ in observations]),
+        np.concatenate([p for _, _, _, p in observations]),
     )
     found = calibrate_rig(
         rig,
-        told,
+        field_exposures,
         field,
         table,
-        offset_sigma_mm=test_field.OFFSET_MM,
-        skew_sigma_per_mm=test_field.SKEW_PER_MM,
+        offset_sigma_mm=calibration_field.OFFSET_MM,
+        skew_sigma_per_mm=calibration_field.SKEW_PER_MM,
         progress=lambda _what, _done, _total: None,
     )
     return found, truth
 
 
-def errors_of(found: RigCalibration, truth: test_field.TrueRig) -> tuple[list[Estimated], Array]:
+def errors_of(
+    found: RigCalibration, truth: calibration_field.TrueRig
+) -> tuple[list[EstimatedParameter], Array]:
     """What was estimated, and estimated less true in the adjustment's units."""
-    rows = estimated(found)
+    rows = estimated_parameters(found)
     errors = []
     for row in rows:
         if row.where.startswith("cone "):
             cone = found.rig.cone(row.where[5:])
             if row.what in ("omega", "phi", "kappa"):
-                turn = rotation_matrix(*cone.rotation_rad).T @ truth.master_from_cone(
+                rotation = rotation_matrix(*cone.rotation_rad).T @ truth.master_from_cone(
                     truth.rig.cone(cone.name)
                 )
                 axis = ("omega", "phi", "kappa").index(row.what)
-                errors.append(-float(logarithm(turn[None])[0, axis]))
+                errors.append(-float(vectors_from_rotations(rotation[None])[0, axis]))
             else:
                 errors.append(row.value - float(getattr(truth.rig.cone(cone.name).lens, row.what)))
             continue
@@ -124,12 +132,12 @@ def errors_of(found: RigCalibration, truth: test_field.TrueRig) -> tuple[list[Es
 
 
 def pooled(
-    rig: Rig, seeds: range, *, exposures: int, targets: tuple[int, int], tell: bool = False
-) -> Pooled:
+    rig: Rig, seeds: range, *, exposures: int, targets: tuple[int, int], verbose: bool = False
+) -> PooledErrors:
     squares, count, standardised = 0.0, 0, []
     for seed in seeds:
         begun = time.process_time()
-        found, truth = calibrated(rig, seed, exposures=exposures, targets=targets)
+        found, truth = calibrate_sample(rig, seed, exposures=exposures, targets=targets)
         rows, error = errors_of(found, truth)
         covariance = covariance_of(found, rows)
         scale = 1.0 / np.sqrt(np.diag(covariance))
@@ -139,14 +147,14 @@ def pooled(
         squares += own
         count += len(rows)
         standardised.append(error * scale)
-        if tell:
+        if verbose:
             print(
                 f"seed {seed}: {own / len(rows):.2f}, sigma {found.sigma_px:.4f} px, "
-                f"{len(found.looks.px)} points, {time.process_time() - begun:.1f} s",
+                f"{len(found.observations.px)} points, {time.process_time() - begun:.1f} s",
                 file=sys.stderr,
                 flush=True,
             )
-    return Pooled(squares, count, np.concatenate(standardised))
+    return PooledErrors(squares, count, np.concatenate(standardised))
 
 
 def main() -> None:
@@ -162,7 +170,7 @@ def main() -> None:
         range(1, given.seeds + 1),
         exposures=given.exposures,
         targets=(given.targets, given.targets),
-        tell=True,
+        verbose=True,
     )
     size = np.abs(result.standardised)
     figures = {

@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.postflight.calibration.rig_text import rig_toml
+from daemon.postflight.calibration.rig_writer import rig_toml
 from processing.geometry.residual_grid import ResidualGrid, fit_residual_grid
 from processing.rig import Cone, LensGrid, Rig, find_rig
 
 TARGETS, NODES = 400, (17, 13)
 TARGET_SIGMA_UM = 0.1
-RENDERED_WITHIN_S = 1800
+RENDER_TIMEOUT_S = 1800
 
 
 def ripple_um(xy_mm: NDArray[np.float64], half_mm: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -43,18 +43,18 @@ def lens_grids(cone: Cone, seed: int) -> tuple[LensGrid, LensGrid]:
     at = random.uniform(-1.0, 1.0, (TARGETS, 2)) * half
     seen = ripple_um(at, half) + random.normal(0.0, TARGET_SIGMA_UM, (TARGETS, 2))
     found = fit_residual_grid(at, seen * 1e-3, half_mm=(half[0], half[1]), nodes=NODES)
-    return ResidualGrid(x, y, dense).for_lens(), found.for_lens()
+    return ResidualGrid(x, y, dense).as_lens_grid(), found.as_lens_grid()
 
 
 def rigs(name: str) -> dict[str, Rig]:
     """The rig that flies, and what is known of it: with the grid found, and with none."""
     rig = find_rig(name)
-    made = {"true": [], "with": [], "without": []}  # type: dict[str, list[Cone]]
+    cones_by_kind = {"true": [], "with": [], "without": []}  # type: dict[str, list[Cone]]
     for k, cone in enumerate(rig.cones):
         dense, found = lens_grids(cone, k) if cone.role == "pan" else (None, None)
         for kind, grid in (("true", dense), ("with", found), ("without", None)):
-            made[kind].append(replace(cone, lens=replace(cone.lens, residual_grid=grid)))
-    return {kind: replace(rig, cones=tuple(cones)) for kind, cones in made.items()}
+            cones_by_kind[kind].append(replace(cone, lens=replace(cone.lens, residual_grid=grid)))
+    return {kind: replace(rig, cones=tuple(cones)) for kind, cones in cones_by_kind.items()}
 
 
 def measure(name: str, out: Path) -> dict[str, Any]:
@@ -66,19 +66,25 @@ def measure(name: str, out: Path) -> dict[str, Any]:
     found: dict[str, Any] = {"rig": name}
     for kind in ("with", "without"):
         (out / "mission/rig.toml").write_bytes(rig_toml(known[kind]))
-        told = _run("daemon", "process", str(out / "mission"), "--json")
-        judged = _run(
-            "sim_hw.judge", "--mission", str(out / "mission"), "--truth", str(out / "truth")
+        output = _run("daemon", "process", str(out / "mission"), "--json")
+        evaluation = _run(
+            "sim_hw.truth_comparison",
+            "--mission",
+            str(out / "mission"),
+            "--truth",
+            str(out / "truth"),
         )
-        figures = json.loads(told)["exposures"][0]["figures"]
-        found[kind] = json.loads(judged)["methods"]["free"] | {"sigma0_px": figures["sigma0_px"]}
+        figures = json.loads(output)["exposures"][0]["figures"]
+        found[kind] = json.loads(evaluation)["methods"]["free"] | {
+            "sigma0_px": figures["sigma0_px"]
+        }
     return found
 
 
 def _run(module: str, *arguments: str) -> str:
     done = subprocess.run(
         [sys.executable, "-m", module, *arguments],
-        capture_output=True, text=True, timeout=RENDERED_WITHIN_S, check=False,
+        capture_output=True, text=True, timeout=RENDER_TIMEOUT_S, check=False,
     )  # fmt: skip
     if done.returncode != 0:
         raise SystemExit(f"{module} failed: {done.stderr[-1000:]}")

@@ -22,7 +22,7 @@ from processing.matching.patches import INTERPOLATION, match_patches
 from processing.matching.tie_points import TiePointSettings
 
 Array = NDArray[np.float64]
-Words = NDArray[np.uint16]
+Pixels = NDArray[np.uint16]
 
 FULL_SCALE_DN = 4095
 BLACK_DN = 64.0
@@ -71,7 +71,7 @@ class Found:
     true_sigma: float
     predicted_sigma: float
     inside_3: float
-    kept: float
+    accepted: float
 
     @property
     def largest_mean(self) -> float:
@@ -105,9 +105,11 @@ class Texture:
 
     def moved(self, dx: float, dy: float, blur: float = 0.0) -> Array:
         """Its content moved right and down and blurred, exactly."""
-        turn = np.exp(-2j * np.pi * (self._fx * dx + self._fy * dy))
+        phase_ramp = np.exp(-2j * np.pi * (self._fx * dx + self._fy * dy))
         soft = np.exp(-2.0 * (np.pi * blur) ** 2 * (self._fx**2 + self._fy**2))
-        return np.asarray(np.fft.irfft2(self._spectrum * turn * soft, s=(self.size, self.size)))
+        return np.asarray(
+            np.fft.irfft2(self._spectrum * phase_ramp * soft, s=(self.size, self.size))
+        )
 
 
 def main() -> None:
@@ -121,7 +123,7 @@ def main() -> None:
     if options.drawing is not None:
         options.drawing.write_text(drawing(results), encoding="utf-8")
     if options.json:
-        print(json.dumps({"machine": machine(), "cases": [_told(found) for found in results]}))
+        print(json.dumps({"machine": machine(), "cases": [_as_json(found) for found in results]}))
         return
     print(
         "| pair | level | contrast | cutoff | blur | points a phase | largest mean | by chance "
@@ -158,8 +160,8 @@ def run(case: Case, *, phases: int, size: int, seed: int = 1) -> Found:
         if case.ratio > 1:
             other = _box_means(other, case.ratio)
         level_b = case.level * (COLOUR_LEVEL if case.ratio > 1 else 1.0)
-        a = exposed(texture.moved(0.0, 0.0), case.level, case.contrast, random)
-        b = exposed(other, level_b, case.contrast, random)
+        a = expose_texture(texture.moved(0.0, 0.0), case.level, case.contrast, random)
+        b = expose_texture(other, level_b, case.contrast, random)
         limits = np.array([0, b.shape[1] - 1, 0, b.shape[0] - 1], dtype=np.int64)
         search = settings.search_pp_px if case.ratio == 1 else settings.search_pc_px
         found = match_patches(
@@ -188,18 +190,20 @@ def run(case: Case, *, phases: int, size: int, seed: int = 1) -> Found:
         true_sigma=float(np.sqrt(np.mean(error**2))),
         predicted_sigma=float(np.sqrt(np.mean(sigma**2))),
         inside_3=float(np.mean(np.abs(error) < 3.0 * sigma[:, None])),
-        kept=float(np.mean(counts)) / len(at_a),
+        accepted=float(np.mean(counts)) / len(at_a),
     )
 
 
-def exposed(texture: Array, level: float, contrast: float, random: np.random.Generator) -> Words:
+def expose_texture(
+    texture: Array, level: float, contrast: float, random: np.random.Generator
+) -> Pixels:
     """Level-1 words of a texture as a sensor with the photon-transfer curve of the rigs sees it."""
     electrons = np.maximum(level * FULL_SCALE_DN * (1.0 + contrast * texture), 0.0)
     electrons *= ELECTRONS_PER_DN
     noise = np.sqrt(electrons + READ_NOISE_E**2) * random.standard_normal(texture.shape)
     dn = np.clip(np.rint(BLACK_DN + (electrons + noise) / ELECTRONS_PER_DN), 0, FULL_SCALE_DN)
-    words = np.maximum((dn - BLACK_DN) * LEVEL1_COUNTS_PER_DN, 2.0).astype(np.uint16) & 0xFFFE
-    return np.asarray(words | (dn >= FULL_SCALE_DN))
+    pixels = np.maximum((dn - BLACK_DN) * LEVEL1_COUNTS_PER_DN, 2.0).astype(np.uint16) & 0xFFFE
+    return np.asarray(pixels | (dn >= FULL_SCALE_DN))
 
 
 def drawing(results: Sequence[Found]) -> str:
@@ -233,7 +237,7 @@ def _box_means(image: Array, ratio: int) -> Array:
     return np.asarray(boxes.mean(axis=(1, 3)))
 
 
-def _told(found: Found) -> dict[str, object]:
+def _as_json(found: Found) -> dict[str, object]:
     return {
         **asdict(found.case),
         "largest_mean": found.largest_mean,
@@ -241,7 +245,7 @@ def _told(found: Found) -> dict[str, object]:
         "true_sigma": found.true_sigma,
         "predicted_sigma": found.predicted_sigma,
         "inside_3": found.inside_3,
-        "kept": found.kept,
+        "accepted": found.accepted,
     }
 
 

@@ -20,13 +20,13 @@ from daemon.configuration.model import PlanSection
 from daemon.mission.layout import Mission
 from daemon.mission.store import store
 from daemon.mission.store.radiometry_folder import RadiometryFolder
-from daemon.onboard.pipeline.lanes import Lanes
-from daemon.products.conditions import conditions_of
-from processing.pipelines.stitched import Pipeline, Settings
+from daemon.onboard.pipeline.pipeline_pool import PipelinePool
+from daemon.products.exposure_conditions import conditions_of
+from processing.pipelines.stitched import Pipeline, PipelineSettings
 from processing.quality.report import Flag
 from processing.rig import find_rig, load_rig
 
-SETTLED_AFTER = 4
+WARM_UP_EXPOSURES = 4
 """Exposures until each lane has touched all of its buffers, twice."""
 
 
@@ -34,29 +34,29 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.memory", description=__doc__)
     parser.add_argument("rig", help="name of a shipped rig")
     parser.add_argument("--exposures", type=int, default=200)
-    parser.add_argument("--lanes", type=int, default=2, help="exposures in work at a time")
+    parser.add_argument("--parallel", type=int, default=2, help="exposures in work at a time")
     options = parser.parse_args()
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "syntopic"
     found = find_rig(options.rig)
-    folder = pipeline.exposures_of(options.rig, found, cache / "bench" / found.name)
-    seen = held_mib(folder, options.exposures, options.lanes)
-    settled = seen[min(SETTLED_AFTER, len(seen) - 1)]
-    told: dict[str, Any] = {
+    folder = pipeline.benchmark_exposure(options.rig, found, cache / "bench" / found.name)
+    seen = held_mib(folder, options.exposures, options.parallel)
+    warmed_up = seen[min(WARM_UP_EXPOSURES, len(seen) - 1)]
+    output: dict[str, Any] = {
         "machine": machine(),
         "rig": found.name,
         "exposures": options.exposures,
-        "lanes": options.lanes,
-        "settled_mib": round(settled, 1),
+        "parallel": options.parallel,
+        "settled_mib": round(warmed_up, 1),
         "last_mib": round(seen[-1], 1),
         "most_mib": round(max(seen), 1),
         "tenths_mib": [
             round(float(np.median(part)), 1) for part in np.array_split(seen, 10) if len(part)
         ],
     }
-    print(json.dumps(told))
+    print(json.dumps(output))
 
 
-def held_mib(folder: Path, exposures: int, lanes: int) -> list[float]:
+def held_mib(folder: Path, exposures: int, parallel: int) -> list[float]:
     """MiB of the process after every exposure, in the order they were done.
 
     Args:
@@ -65,18 +65,18 @@ def held_mib(folder: Path, exposures: int, lanes: int) -> list[float]:
     mission = Mission.open(folder / "mission")
     rig = load_rig(mission.rig_path)
     radiometry = folder / "calibration" / "radiometry"
-    pipeline = Pipeline(rig, RadiometryFolder(radiometry, rig), Settings(geometry=False))
+    pipeline = Pipeline(rig, RadiometryFolder(radiometry, rig), PipelineSettings(geometry=False))
     pipeline.warm_up()
     stored, exposure = store.load_level0(mission.level0(1), rig)
     frames = {name: np.array(frame) for name, frame in stored.items()}
     conditions = conditions_of(exposure, rig, PlanSection(), Flag(0))
     seen: list[float] = []
 
-    def one(lane: Pipeline) -> None:
-        lane.process(frames, conditions)
+    def one(worker: Pipeline) -> None:
+        worker.process(frames, conditions)
         seen.append(pss_mib())
 
-    work = Lanes(pipeline, lanes)
+    work = PipelinePool(pipeline, parallel)
     for task in [work.submit(one) for _ in range(exposures)]:
         task.result()
     work.end()

@@ -17,25 +17,25 @@ from numpy.typing import NDArray
 
 from daemon.cli.benchmark.measurement import machine
 from processing.bundle.adjust import Adjustment, adjust
-from processing.bundle.findings import control_residuals, heads_of
-from processing.bundle.intersection import (
-    carried_covariance,
-    intersection,
-    orientation_layout,
-)
+from processing.bundle.adjustment_results import control_residuals, heads_of
+from processing.bundle.initial_values import completed
 from processing.bundle.network import (
     Attitudes,
-    Camera,
+    CameraModel,
     Gnss,
-    Head,
+    HeadMounting,
     ImagePoints,
     Images,
     Network,
     Points,
     Stations,
 )
-from processing.bundle.rotations import exponential, logarithm
-from processing.bundle.start import completed
+from processing.bundle.point_intersection import (
+    intersect_points,
+    orientation_layout,
+    propagated_covariance,
+)
+from processing.bundle.rotations import rotations_from_vectors, vectors_from_rotations
 from processing.calibration.relative_orientation import relative_orientations
 from sim_hw.blocks.oblique import (
     F_MM,
@@ -45,7 +45,7 @@ from sim_hw.blocks.oblique import (
     NADIR,
     PIXEL_MM,
     ObliqueBlock,
-    flown_obliquely,
+    simulate_oblique_block,
     table_2_rotation,
 )
 
@@ -53,13 +53,13 @@ Array = NDArray[np.float64]
 
 FREE = frozenset({"dx0", "dy0", "df", "k1", "k2"})
 PAPER = {"table 1": "sigma0 11 um, RMS 0.15 m, 1.60 m", "intersection": (0.62, 0.60, 1.63)}
-LEAST_POINTS = 10
-START_TURN_RAD = 0.01
+MIN_POINTS = 10
+START_ROTATION_RAD = 0.01
 """How far the mounting is thought to be from where it is, and the inertial unit from the camera."""
 
 
 @dataclass(frozen=True)
-class Repeated:
+class BlockResult:
     """What came out of one block."""
 
     figures: dict[str, Any]
@@ -84,14 +84,18 @@ def network_of(block: ObliqueBlock, heads: tuple[int, ...], *, own: bool) -> Net
     places = np.unique(np.stack([block.point, block.image // 5]), axis=1)[0]
     tied = np.bincount(places, minlength=len(block.points))[block.point] >= 2
     seen = np.bincount(block.image[tied], minlength=5 * n)
-    table = np.isin(block.image % 5, heads) & (seen[block.image] >= LEAST_POINTS)
+    table = np.isin(block.image % 5, heads) & (seen[block.image] >= MIN_POINTS)
     of_head = {h: i for i, h in enumerate(heads)}
     image_of = np.array(
         [(i // 5) * k + of_head[i % 5] if i % 5 in of_head else -1 for i in range(5 * n)]
     )
     exposure = np.repeat(np.arange(n), k)
     head = np.tile(np.arange(k), n)
-    start = block.inertial @ block.boresight @ exponential(np.full((n, 3), START_TURN_RAD / 2))
+    start = (
+        block.inertial
+        @ block.boresight
+        @ rotations_from_vectors(np.full((n, 3), START_ROTATION_RAD / 2))
+    )
     mounted = [table_2_rotation(HEADS[h]) for h in heads]
     names = tuple(f"{e}-{HEADS[h]}" for e in range(n) for h in heads)
     attitudes = np.array([start[e] @ mounted[h] for e, h in zip(exposure, head, strict=True)])
@@ -106,12 +110,14 @@ def network_of(block: ObliqueBlock, heads: tuple[int, ...], *, own: bool) -> Net
     return completed(
         Network(
             cameras=tuple(
-                Camera(HEADS[h], F_MM[HEADS[h]], free=FREE, pixel_mm=PIXEL_MM) for h in heads
+                CameraModel(HEADS[h], F_MM[HEADS[h]], free=FREE, pixel_mm=PIXEL_MM) for h in heads
             ),
             heads=()
             if own
             else tuple(
-                Head(HEADS[h], table_2_rotation(HEADS[h]), np.zeros(3), rotation_free=h != 0)
+                HeadMounting(
+                    HEADS[h], table_2_rotation(HEADS[h]), np.zeros(3), rotation_free=h != 0
+                )
                 for h in heads
             ),
             stations=Stations(exposures, block.gnss_m, np.zeros(n, bool)),
@@ -148,9 +154,9 @@ def network_of(block: ObliqueBlock, heads: tuple[int, ...], *, own: bool) -> Net
     )
 
 
-def repeated(seed: int) -> Repeated:
+def run_block(seed: int) -> BlockResult:
     """Fly, adjust, calibrate and intersect once."""
-    block = flown_obliquely(seed)
+    block = simulate_oblique_block(seed)
     nadir = adjust(network_of(block, (0,), own=False))
     separate = adjust(network_of(block, (0, 1, 2, 3, 4), own=True))
     oblique = adjust(network_of(block, (0, 1, 2, 3, 4), own=False))
@@ -173,13 +179,13 @@ def repeated(seed: int) -> Repeated:
         points=replace(network.points, xyz_m=oblique.state.points),
     )
     layout = orientation_layout(network)
-    covariance = carried_covariance(
+    covariance = propagated_covariance(
         layout,
         oblique,
         position_m=np.full(3, block.noise.gnss_m),
         attitude_rad=np.array(block.noise.inertial_rad),
     )
-    found = intersection(network, layout, covariance)
+    found = intersect_points(network, layout, covariance)
     rows = slice(block.control, block.control + block.checks)
     good = np.isfinite(found.xyz_m[rows]).all(axis=1)
     own = found.covariance_m2[rows][good]
@@ -202,13 +208,13 @@ def repeated(seed: int) -> Repeated:
                 ],
                 "averaged_less_adjusted_mgrad": [
                     float(v) * 200e3 / np.pi
-                    for v in logarithm(
+                    for v in vectors_from_rotations(
                         (oblique.state.head_rotation[k].T @ averaged[h.name].rotation)[None]
                     )[0]
                 ],
                 "error_mgrad": [
                     float(v) * 200e3 / np.pi
-                    for v in logarithm(
+                    for v in vectors_from_rotations(
                         (block.head_rotation[k].T @ oblique.state.head_rotation[k])[None]
                     )[0]
                 ],
@@ -226,7 +232,7 @@ def repeated(seed: int) -> Repeated:
             np.bincount(block.point, minlength=len(block.points))[rows][good].mean()
         ),
     }
-    return Repeated(
+    return BlockResult(
         figures, oblique, differences, sigma, true_error, np.sqrt(np.einsum("nii->ni", own))
     )
 
@@ -236,8 +242,8 @@ def _boresight(block: ObliqueBlock, result: Adjustment) -> Array:
     relative = np.einsum("nji,njk->nik", block.inertial, result.state.attitude)
     mean = relative[0]
     for _ in range(5):
-        off = logarithm(np.einsum("ji,njk->nik", mean, relative))
-        mean = mean @ exponential(off.mean(axis=0)[None])[0]
+        off = vectors_from_rotations(np.einsum("ji,njk->nik", mean, relative))
+        mean = mean @ rotations_from_vectors(off.mean(axis=0)[None])[0]
     return np.asarray(mean)
 
 
@@ -276,7 +282,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
-    found = [repeated(seed) for seed in range(1, options.seeds + 1)]
+    found = [run_block(seed) for seed in range(1, options.seeds + 1)]
     pooled = np.concatenate([(r.true_error_m / r.true_sigma_m).ravel() for r in found])
     rms = np.sqrt(np.mean(np.concatenate([r.differences_m for r in found]) ** 2, axis=0))
     predicted = np.sqrt(np.mean(np.concatenate([r.sigma_m for r in found]) ** 2, axis=0))

@@ -25,11 +25,11 @@ from rich.table import Table
 
 from daemon.cli.benchmark.measurement import interleaved, machine
 from daemon.configuration.model import PlanSection
-from daemon.mission.exposure import Capture, FrameRecord
+from daemon.mission.exposure import CaptureRecord, FrameRecord
 from daemon.mission.layout import Mission
 from daemon.mission.store.store import Level0Writer, load_level0
-from daemon.products.conditions import conditions_of
-from processing.pipelines.stitched import Pipeline, Settings
+from daemon.products.exposure_conditions import conditions_of
+from processing.pipelines.stitched import Pipeline, PipelineSettings
 from processing.quality.report import Flag
 from processing.radiometry.calibration import load_radiometry
 from processing.rig import load_rig
@@ -57,7 +57,7 @@ def main() -> None:
 
 
 def _fly(folder: Path) -> tuple[Mission, Path]:
-    said = subprocess.run(
+    completed = subprocess.run(
         [
             *(sys.executable, "-m", "daemon", "demo", "--json", "--exposures", "3"),
             *("--out", str(folder)),
@@ -66,14 +66,14 @@ def _fly(folder: Path) -> tuple[Mission, Path]:
         check=True,
         timeout=300,
     )
-    mission = Path(json.loads(said.stdout)["mission"])
+    mission = Path(json.loads(completed.stdout)["mission"])
     return Mission.open(mission), mission.parents[1] / "sim" / "calibration" / "radiometry"
 
 
 def _time_pipeline(mission: Mission, radiometry: Path, runs: int) -> dict[str, Any]:
     rig = load_rig(mission.rig_path)
     calibrations = {s.name: load_radiometry(radiometry / f"{s.name}.npz") for s in rig.sensors}
-    pipeline = Pipeline(rig, calibrations, Settings(geometry=False))
+    pipeline = Pipeline(rig, calibrations, PipelineSettings(geometry=False))
     pipeline.warm_up()
     frames, exposure = load_level0(mission.level0(2), rig)
     plan = PlanSection(ground_height_m=395.0, height_above_ground_m=3000.0)
@@ -122,7 +122,7 @@ def _time_writer(folder: Path, mission: Mission, runs: int) -> dict[str, Any]:
     )
 
     def store() -> None:
-        writer.write(Capture(number=next(numbers), frames=records), frames)
+        writer.write(CaptureRecord(number=next(numbers), frames=records), frames)
 
     def plain() -> None:
         path = folder / "plain"

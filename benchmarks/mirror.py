@@ -20,11 +20,11 @@ from tempfile import mkdtemp
 
 import numpy as np
 
-from daemon.mission.exposure import Capture, FrameRecord
+from daemon.mission.exposure import CaptureRecord, FrameRecord
 from daemon.mission.layout import Mission
-from daemon.mission.mirror.mirror_start import begin_mirrored, find_disks
+from daemon.mission.mirror.disk_rejoin import RejoinSettings
+from daemon.mission.mirror.mirror_startup import begin_mirrored, find_disks
 from daemon.mission.mirror.mirrored import MirroredStorage
-from daemon.mission.mirror.returning import ReturnSettings
 from daemon.mission.store import durable
 from daemon.mission.store.store import Level0Writer
 from processing.rig import find_rig, shipped_rigs
@@ -50,32 +50,32 @@ def _measured(folder: Path, count: int) -> dict[str, object]:
     }
     nbytes = sum(pixels.nbytes for pixels in memory.values())
     roots = {"root": folder / "a", "mirror": folder / "b"}
-    for root in (*roots.values(), folder / "alone"):
+    for root in (*roots.values(), folder / "single"):
         root.mkdir()
-    alone = Level0Writer(_mission(folder / "alone"))
+    single_disk = Level0Writer(_mission(folder / "single"))
     found = begin_mirrored(find_disks(roots), _mission)
     assert found.mission is not None
-    returns = ReturnSettings(0.05, 0.05)
+    rejoin = RejoinSettings(0.05, 0.05)
     storage = MirroredStorage(
-        found.mission.id, found.disks, stall_s=STALL_S, returns=returns, emit=lambda _: None
+        found.mission.id, found.disks, stall_s=STALL_S, rejoin=rejoin, emit=lambda _: None
     )
     while len(storage.in_use) < 2:
         storage.tick()
         time.sleep(0.01)
-    seconds: dict[str, list[float]] = {"alone": [], "mirrored": []}
-    processor: dict[str, list[float]] = {"alone": [], "mirrored": []}
+    seconds: dict[str, list[float]] = {"single": [], "mirrored": []}
+    processor: dict[str, list[float]] = {"single": [], "mirrored": []}
     for number in range(1, count + 1):
         capture = _capture(number, memory)
         for name in seconds:
             begun_s, used_s = time.monotonic(), sum(os.times()[:2])
-            if name == "alone":
-                alone.write(capture, memory)
+            if name == "single":
+                single_disk.write(capture, memory)
             else:
                 storage.write(capture, memory)
             seconds[name].append(time.monotonic() - begun_s)
             processor[name].append(sum(os.times()[:2]) - used_s)
     storage.close()
-    alone.close()
+    single_disk.close()
     return {
         "rig": RIG,
         "exposures": count,
@@ -99,8 +99,8 @@ def _mission(root: Path) -> Mission:
     )
 
 
-def _capture(number: int, memory: dict[str, np.ndarray]) -> Capture:
-    return Capture(number=number, frames=tuple(_frames(memory)))
+def _capture(number: int, memory: dict[str, np.ndarray]) -> CaptureRecord:
+    return CaptureRecord(number=number, frames=tuple(_frames(memory)))
 
 
 def _frames(memory: dict[str, np.ndarray]) -> Iterator[FrameRecord]:

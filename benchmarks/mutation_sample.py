@@ -27,7 +27,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from benchmarks import equivalent_in_processing
+from benchmarks import equivalent_mutations
 from benchmarks.mutations import Mutation, mutations
 
 ROOT = Path(__file__).parent.parent
@@ -50,16 +50,16 @@ DECIDING = (
 )
 NOT_DECIDING = ("drawing.py", "findings.py")
 """Pictures and sentences: no decision rests on them."""
-MOST_TEST_FILES = 8
+MAX_TEST_FILES = 8
 """So many of the nearest test files run, nearest first."""
 WATCHED = "processing/"
 """Of these modules only test files count that execute the changed line; others run in threads."""
 SLOWEST_S = 600
 """So long may one test file take without a mutation."""
 TIME_FACTOR = 3
-LEAST_LIMIT_S = 20.0
+MIN_TIMEOUT_S = 20.0
 """A mutation has this many times what the file takes without it, and no less than so long."""
-NOTICED_GOAL = 0.9
+DETECTION_GOAL = 0.9
 EQUIVALENT: dict[str, str] = {
     "daemon/mission/catalog/catalog.py: elif version < SCHEMA_VERSION:: < -> <=": (
         "the same version was handled two branches above"
@@ -73,11 +73,11 @@ EQUIVALENT: dict[str, str] = {
     "daemon/onboard/flight/ledger.py: self._in_storage[Storage.VOLATILE] += 1: 1 -> 2": (
         "the number of volatile exposures is never read"
     ),
-    "daemon/onboard/timing/clock.py: COARSE_SIGMA_NS: Final = round((ARRIVAL_MAX_NS - ARRIVAL_MIN_NS)"
+    "daemon/onboard/timing/gps_clock.py: COARSE_SIGMA_NS: Final = round((ARRIVAL_MAX_NS - ARRIVAL_MIN_NS)"
     " / math.sqrt(12)): - -> +": "ARRIVAL_MIN_NS is 0",
-    "daemon/onboard/timing/clock.py: second = math.ceil((max(behind) + ARRIVAL_MIN_NS) / SECOND_NS): "
+    "daemon/onboard/timing/gps_clock.py: second = math.ceil((max(behind) + ARRIVAL_MIN_NS) / SECOND_NS): "
     "+ -> -": "ARRIVAL_MIN_NS is 0",
-    "daemon/onboard/timing/clock.py: (r, min(1.0, limit * s / max(abs(r - middle), 1e-9)) / s**2): "
+    "daemon/onboard/timing/gps_clock.py: (r, min(1.0, limit * s / max(abs(r - middle), 1e-9)) / s**2): "
     "1e-9 -> 1.5000000000000002e-09": (
         "limit * s is 4 at least, so that a residual below 4 ns counts in full either way"
     ),
@@ -91,7 +91,7 @@ EQUIVALENT: dict[str, str] = {
     " - WEEK_NS // 2: + -> -": "modulo a week, half a week more is half a week less",
     "drivers/timescales/gps_time.py: difference = (itow_ms * 1_000_000 - utc + WEEK_NS // 2) % WEEK_NS"
     " - WEEK_NS // 2: + -> -": "modulo a week, half a week more is half a week less",
-    "daemon/mission/transfer/transfer_removal.py: source.replace(MARK_FILE, json.dumps(mark, indent=1)"
+    "daemon/mission/transfer/transfer_removal.py: source.replace(MOVED_FILE, json.dumps(mark, indent=1)"
     '.encode("utf-8", "replace") + b"\\n"): 1 -> 2': "layout of a file that is read as JSON",
     "daemon/mission/mirror/resync.py: repetition = 1: 1 -> 2": "any free name will do",
     "drivers/receivers/ublox/framing.py: return end - at if end <= len(buffer) else 0: - -> +": (
@@ -106,13 +106,13 @@ EQUIVALENT: dict[str, str] = {
         "both are there where a start is known; one that is 0 counts as 1 ns of drift time"
     ),
     "daemon/onboard/timing/clock_model.py: return statistics.median(ratios) / 0.6745 "
-    "if len(ratios) >= SCATTER_FROM else 1.0: 1.0 -> 1.5": (
+    "if len(ratios) >= SCATTER_PAIRS_MIN else 1.0: 1.0 -> 1.5": (
         "a factor up to SCATTER_LARGE counts as 1 where it is used"
     ),
     "drivers/receivers/mavlink/decoder.py: if angle < 1e-9:: 1e-9 -> 1.5000000000000002e-09": (
         "the least angle above 0 that the arc cosine gives is 1.5e-8"
     ),
-} | equivalent_in_processing.EQUIVALENT
+} | equivalent_mutations.EQUIVALENT
 """Mutation as printed, without its line -> why no outcome differs."""
 
 
@@ -252,7 +252,7 @@ def _try(tests: NearestTests, module: str, mutation: Mutation, source: str) -> O
     started = time.monotonic()
     try:
         path.write_text(mutation.apply(source))
-        outcome, ran = tests.judge(module, _statement(source, mutation.line))
+        outcome, ran = tests.run_tests(module, _statement(source, mutation.line))
     finally:
         path.write_text(source)
     seconds = round(time.monotonic() - started, 1)
@@ -279,7 +279,7 @@ class NearestTests:
         self._importers = _importers()
         self._plain: dict[str, PlainRun | None] = {}
 
-    def judge(self, module: str, lines: range) -> tuple[str, int]:
+    def run_tests(self, module: str, lines: range) -> tuple[str, int]:
         """Run test files on the changed tree until one of them fails.
 
         Args:
@@ -297,10 +297,10 @@ class NearestTests:
             ):
                 continue
             ran += 1
-            passed = _passes(self.tree, test, max(LEAST_LIMIT_S, TIME_FACTOR * plain.seconds))
+            passed = _passes(self.tree, test, max(MIN_TIMEOUT_S, TIME_FACTOR * plain.seconds))
             if not passed:
-                return "timeout" if passed is None else "noticed", ran
-            if ran == MOST_TEST_FILES:
+                return "timeout" if passed is None else "detected", ran
+            if ran == MAX_TEST_FILES:
                 break
         return "survived" if ran else "no tests", ran
 
@@ -376,16 +376,16 @@ def _recorded(record: Path | None) -> dict[_Key, Outcome]:
 
 def _print(outcomes: Sequence[Outcome], seed: int, *, as_json: bool) -> None:
     counts = Counter(outcome.outcome for outcome in outcomes)
-    judged = len(outcomes) - counts["equivalent"]
-    noticed = counts["noticed"] + counts["timeout"]
-    share = noticed / judged if judged else 1.0
+    evaluated = len(outcomes) - counts["equivalent"]
+    detected = counts["detected"] + counts["timeout"]
+    share = detected / evaluated if evaluated else 1.0
     unnoticed = [asdict(o) for o in outcomes if o.outcome in ("survived", "no tests")]
     if as_json:
         figures = {"seed": seed, "counts": counts, "noticed_share": share, "survived": unnoticed}
         print(json.dumps(figures))
     else:
-        print(f"seed {seed}: {dict(counts)}; noticed {share:.1%} (goal {NOTICED_GOAL:.0%})")
-    sys.exit(share < NOTICED_GOAL)
+        print(f"seed {seed}: {dict(counts)}; noticed {share:.1%} (goal {DETECTION_GOAL:.0%})")
+    sys.exit(share < DETECTION_GOAL)
 
 
 if __name__ == "__main__":

@@ -20,8 +20,8 @@ from benchmarks.fast_flight import FastFlight
 from benchmarks.fast_flight_score import Score
 from processing.rig import find_rig
 from sim_hw.faults.catalogue import CATALOGUE
-from sim_hw.faults.plan import Planned
-from sim_hw.processes.clockwork import RECEIVER_NAME, devices_of
+from sim_hw.faults.plan import PlannedFault
+from sim_hw.processes.discrete_event_rig import RECEIVER_NAME, devices_of
 
 RIG = "ultracam-x-mini"
 SMALL_RIG = "ultracam-l-mini"
@@ -32,7 +32,7 @@ INTERVAL_S = 1.37
 FIRST_FAULT_S = 20.0
 MANY_EVERY_S = 30.0
 LASTING_S = 4.0
-LEAST_MATCHED = 0.98
+MIN_MATCHED_SHARE = 0.98
 
 VARIANTS = (
     ("clock-step", RECEIVER_NAME, (0.001, 0.37, -0.37, 1.0, -1.0, 18.0, -18.0)),
@@ -50,7 +50,7 @@ class Case:
 
     title: str
     device: str
-    planned: tuple[Planned, ...]
+    planned: tuple[PlannedFault, ...]
 
 
 def single_cases(exposures: int, seed: int = 1, rig_name: str = RIG) -> Iterator[Case]:
@@ -67,35 +67,35 @@ def single_cases(exposures: int, seed: int = 1, rig_name: str = RIG) -> Iterator
             if topic and kind.level != "message":
                 continue
             for amount in varied.get((kind.name, device), (kind.amount,)):
-                chance = random.Random(f"{seed}-{kind.name}-{device}-{amount}")
-                times_s = sorted(FIRST_FAULT_S + chance.uniform(0.0, span_s) for _ in range(2))
-                lasting_s = None if kind.level == "clock" and kind.lasts_s is None else LASTING_S
+                rng = random.Random(f"{seed}-{kind.name}-{device}-{amount}")
+                times_s = sorted(FIRST_FAULT_S + rng.uniform(0.0, span_s) for _ in range(2))
+                lasting_s = None if kind.level == "clock" and kind.duration_s is None else LASTING_S
                 planned = (
-                    Planned(kind.name, name, times_s[0], None, kind.lasts_s, amount, topic),
-                    Planned(kind.name, name, times_s[1], None, lasting_s, amount, topic),
+                    PlannedFault(kind.name, name, times_s[0], None, kind.duration_s, amount, topic),
+                    PlannedFault(kind.name, name, times_s[1], None, lasting_s, amount, topic),
                 )
                 shown = f" {kind.amount_key}={amount:g}" if kind.amount_key else ""
                 # A clock that steps for good steps once: twice would be two faults.
-                once = kind.level == "clock" and kind.lasts_s is None
+                once = kind.level == "clock" and kind.duration_s is None
                 yield Case(f"{kind.name}{shown}", device, planned[: 1 if once else 2])
 
 
 def many_case(exposures: int, seed: int) -> Case:
     """Faults of all kinds at all devices, at random, for the whole flight."""
-    chance = random.Random(f"many-{seed}")
+    rng = random.Random(f"many-{seed}")
     devices = devices_of(find_rig(RIG))
     planned = []
     at_s = FIRST_FAULT_S
     while at_s < exposures * INTERVAL_S:
-        kind = chance.choice(list(CATALOGUE.values()))
-        of = chance.choice(sorted(kind.devices))
-        device = chance.choice([name for name, its in devices.items() if its == of])
-        lasts_s = chance.choice((kind.lasts_s, chance.uniform(0.5, 6.0)))
+        kind = rng.choice(list(CATALOGUE.values()))
+        of = rng.choice(sorted(kind.devices))
+        device = rng.choice([name for name, its in devices.items() if its == of])
+        duration_s = rng.choice((kind.duration_s, rng.uniform(0.5, 6.0)))
         if kind.level == "clock":
-            lasts_s = chance.uniform(5.0, 60.0)
-        amount = kind.amount if kind.name == "wrong-week" else kind.amount * chance.uniform(0.2, 3)
-        planned.append(Planned(kind.name, device, at_s, None, lasts_s, amount))
-        at_s += chance.expovariate(1.0 / MANY_EVERY_S)
+            duration_s = rng.uniform(5.0, 60.0)
+        amount = kind.amount if kind.name == "wrong-week" else kind.amount * rng.uniform(0.2, 3)
+        planned.append(PlannedFault(kind.name, device, at_s, None, duration_s, amount))
+        at_s += rng.expovariate(1.0 / MANY_EVERY_S)
     return Case(f"many: {len(planned)} faults", "all", tuple(planned))
 
 
@@ -141,7 +141,7 @@ def shortcomings(score: Score, *, single: bool = True) -> list[str]:
         found.append(f"{score.sealed} of {score.exposures} exposures have a record")
     if single and score.untouched_matched != score.untouched:
         found.append(f"{score.untouched - score.untouched_matched} untouched are not matched")
-    if not single and score.pairs_matched < LEAST_MATCHED * score.pairs:
+    if not single and score.pairs_matched < MIN_MATCHED_SHARE * score.pairs:
         found.append(f"only {score.pairs_matched} of {score.pairs} pairs are matched")
     return found
 
@@ -169,10 +169,10 @@ def row(case: Case, score: Score) -> str:
         case.title,
         case.device,
         score.exposures,
-        score.frames_came,
+        score.frames_received,
         score.frames_right,
         score.frames_wrong,
-        score.marks_came,
+        score.marks_received,
         score.marks_right,
         score.marks_wrong,
         score.navigation_wrong,
@@ -212,11 +212,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f"  {case.title} {case.device}: {sentence}", file=sys.stderr, flush=True)
             for example in score.examples[:3]:
                 print(f"    {example}", file=sys.stderr, flush=True)
-    everything = total(scores)
+    total_score = total(scores)
     print(
-        f"\n{everything.exposures} exposures, {everything.hits} hits of faults, "
-        f"{everything.pairs_matched} of {everything.pairs} pairs of frame and mark matched, "
-        f"{everything.wrong} wrong, {time.monotonic() - started:.0f} s"
+        f"\n{total_score.exposures} exposures, {total_score.occurrences} hits of faults, "
+        f"{total_score.pairs_matched} of {total_score.pairs} pairs of frame and mark matched, "
+        f"{total_score.wrong} wrong, {time.monotonic() - started:.0f} s"
     )
     return 1 if failed else 0
 

@@ -20,11 +20,11 @@ from processing.geometry.conditions import for_sensors
 from processing.pipelines.stitched import Conditions, Pipeline, Product
 from processing.radiometry.calibration import RadiometricCalibration
 from processing.rig import shipped_rigs
-from sim_hw.judge import compare
+from sim_hw.truth_comparison import compare
 from sim_hw.world import snapshots
-from sim_hw.world.flight import Flight
+from sim_hw.world.flight import SimulatedFlight
 from sim_hw.world.scene import Scene, open_scene
-from sim_hw.world.snapshots import Heads, Snapshot
+from sim_hw.world.snapshots import RigElectronics, Snapshot
 from sim_hw.world.world import World, WorldSettings
 
 EPOCH_GPS_NS = 1_447_000_000_000_000_000
@@ -39,11 +39,11 @@ _CONE_ROTATION = re.compile(r"^rotation_rad = \[.*?\]", re.MULTILINE)
 
 
 @dataclass(frozen=True)
-class Exposure:
+class RenderedExposure:
     """One exposure as the emulator took it, and the flight it belongs to."""
 
     world: World
-    flight: Flight
+    flight: SimulatedFlight
     snapshot: Snapshot
 
 
@@ -61,7 +61,7 @@ def take(
     place: int = 0,
     scene: Scene | None = None,
     without: Collection[str] = (),
-) -> Exposure:
+) -> RenderedExposure:
     """Take exposure number `place` of the first line.
 
     Args:
@@ -71,10 +71,10 @@ def take(
     scene = scene or open_scene(world.scene_settings, scenes)
     flight, mark_ns = flight_and_mark(world, place)
     snapshot = snapshots.take(world, scene, flight, mark_ns, without=without)
-    return Exposure(world, flight, snapshot)
+    return RenderedExposure(world, flight, snapshot)
 
 
-def flight_and_mark(world: World, place: int) -> tuple[Flight, int]:
+def flight_and_mark(world: World, place: int) -> tuple[SimulatedFlight, int]:
     """The flight whose first line begins under the first exposure, and the strobe of another."""
     first_ns = EPOCH_GPS_NS + round(FIRST_AFTER_S * 1e9)
     flight = world.flight.beginning_first_line_at(world.flight.distance_flown_m(first_ns))
@@ -82,7 +82,7 @@ def flight_and_mark(world: World, place: int) -> tuple[Flight, int]:
     return flight, first_ns + place * period_ns
 
 
-def radiometry_of(heads: Heads) -> dict[str, RadiometricCalibration]:
+def radiometry_of(heads: RigElectronics) -> dict[str, RadiometricCalibration]:
     """What the laboratory measured, as the pipeline takes it."""
     return {
         name: RadiometricCalibration(**measured.arrays())
@@ -90,7 +90,7 @@ def radiometry_of(heads: Heads) -> dict[str, RadiometricCalibration]:
     }
 
 
-def conditions_of(exposure: Exposure, *, seed: int) -> Conditions:
+def conditions_of(exposure: RenderedExposure, *, seed: int) -> Conditions:
     """What the service would know: probes, plan, attitude, rates; with the instruments' noise."""
     world, mark = exposure.world, exposure.snapshot.mark_gps_ns
     noise = np.random.default_rng([seed, 7])
@@ -112,17 +112,17 @@ def conditions_of(exposure: Exposure, *, seed: int) -> Conditions:
         angular_rate_rad_per_s=(
             (after.roll_rad - before.roll_rad) / step_s,
             (after.pitch_rad - before.pitch_rad) / step_s,
-            _turned(after.heading_rad - before.heading_rad) / step_s,
+            _rotated(after.heading_rad - before.heading_rad) / step_s,
         ),
-        crab_rad=_turned(pose.heading_rad - track) + float(noise.normal(0.0, ATTITUDE_SIGMA_RAD)),
+        crab_rad=_rotated(pose.heading_rad - track) + float(noise.normal(0.0, ATTITUDE_SIGMA_RAD)),
         time_sigma_ns=MARK_SIGMA_NS,
     )
 
 
 def process(
     pipeline: Pipeline,
-    heads: Heads,
-    exposure: Exposure,
+    heads: RigElectronics,
+    exposure: RenderedExposure,
     *,
     seed: int,
     conditions: Conditions | None = None,
@@ -163,5 +163,5 @@ def with_random_rotations(rig_file: Path, out: Path, *, seed: int, sigma_rad: fl
     return out
 
 
-def _turned(angle_rad: float) -> float:
+def _rotated(angle_rad: float) -> float:
     return (angle_rad + math.pi) % (2 * math.pi) - math.pi

@@ -20,29 +20,29 @@ from numpy.typing import NDArray
 
 from benchmarks.rendered import process, radiometry_of, take, world_settings
 from daemon.cli.benchmark.measurement import machine
-from processing.bundle.adjust import Settings, adjust
-from processing.bundle.findings import checked_against, image_residuals_mm
+from processing.bundle.adjust import AdjustmentSettings, adjust
+from processing.bundle.adjustment_results import check_point_differences, image_residuals_mm
+from processing.bundle.initial_values import intersect
 from processing.bundle.network import (
     Attitudes,
-    Bearings,
-    Camera,
+    CameraModel,
     Gnss,
     ImagePoints,
     Images,
+    MeasuredAttitudes,
     Network,
     Points,
     Stations,
 )
-from processing.bundle.rotations import exponential
-from processing.bundle.self_calibration import SETS, SetName, parts_of, self_calibrating
-from processing.bundle.start import intersected
+from processing.bundle.rotations import rotations_from_vectors
+from processing.bundle.self_calibration import SETS, SetName, parts_of, with_self_calibration
 from processing.matching.patches import INTERPOLATION, match_patches, select_features
+from processing.pipelines.stitched import PipelineSettings
 from processing.pipelines.stitched import Pipeline
-from processing.pipelines.stitched import Settings as PipelineSettings
 from processing.rig import VirtualImage
-from sim_hw.world import camera
+from sim_hw.world import true_camera
 from sim_hw.world.scene import open_scene
-from sim_hw.world.snapshots import Heads
+from sim_hw.world.snapshots import RigElectronics
 from sim_hw.world.world import World
 
 Array = NDArray[np.float64]
@@ -50,9 +50,9 @@ Array = NDArray[np.float64]
 CELLS = (26, 18)
 WINDOW_PX = 19
 SEARCH_PX = 14
-LEAST_CORRELATION = 0.9
-LEAST_PEAK_MARGIN = 0.1
-MOST_SIGMA_PX = 0.1
+MIN_CORRELATION = 0.9
+MIN_PEAK_MARGIN = 0.1
+MAX_SIGMA_PX = 0.1
 GNSS_M = 0.05
 INERTIAL_RAD = 8e-5
 SURVEY_M = 0.02
@@ -60,7 +60,7 @@ CONTROL = 12
 
 
 @dataclass(frozen=True)
-class Strip:
+class RenderedStrip:
     """Stitched images (H, W) float32, NaN without data; where the ideal camera truly stood."""
 
     world: World
@@ -76,15 +76,15 @@ class Matched:
     image: NDArray[np.int64]
     point: NDArray[np.int64]
     px: Array
-    home: NDArray[np.int64]
-    home_px: Array
+    source_image: NDArray[np.int64]
+    source_px: Array
 
 
-def rendered_strip(rig: str, frames: int, seed: int, scenes: Path) -> Strip:
+def rendered_strip(rig: str, frames: int, seed: int, scenes: Path) -> RenderedStrip:
     """Fly, expose and stitch."""
     world = World(world_settings(rig, seed, exposures=frames))
     scene = open_scene(world.scene_settings, scenes)
-    heads = Heads(world, seed=seed)
+    heads = RigElectronics(world, seed=seed)
     pipeline = Pipeline(world.rig, radiometry_of(heads), PipelineSettings(geometry=False))
     images, station, rotation = [], [], []
     master = world.rig.cone(world.rig.master_cone)
@@ -93,17 +93,17 @@ def rendered_strip(rig: str, frames: int, seed: int, scenes: Path) -> Strip:
         pan = process(pipeline, heads, exposure, seed=seed * 1000 + k).pan
         images.append(np.where(pan == 0, np.nan, pan).astype(np.float32))
         pose = exposure.flight.pose(exposure.snapshot.mark_gps_ns)
-        station.append(camera.projection_centre_m(master, pose))
-        rotation.append(pose.enu_from_body @ camera.BODY_FROM_CAMERA)
-    return Strip(world, images, np.array(station), np.array(rotation))
+        station.append(true_camera.projection_centre_m(master, pose))
+        rotation.append(pose.enu_from_body @ true_camera.BODY_FROM_CAMERA)
+    return RenderedStrip(world, images, np.array(station), np.array(rotation))
 
 
-def matched(strip: Strip, start_station: Array, start_rotation: Array) -> Matched:
+def match_strip(strip: RenderedStrip, start_station: Array, start_rotation: Array) -> Matched:
     """Feature-rich places of every image, found in the next two by prediction and matching."""
     image = strip.world.image
-    room = WINDOW_PX // 2 + SEARCH_PX + 8
-    columns = np.linspace(room, image.width_px - room, CELLS[0] + 1).astype(np.int64)
-    rows = np.linspace(room, image.height_px - room, CELLS[1] + 1).astype(np.int64)
+    margin_px = WINDOW_PX // 2 + SEARCH_PX + 8
+    columns = np.linspace(margin_px, image.width_px - margin_px, CELLS[0] + 1).astype(np.int64)
+    rows = np.linspace(margin_px, image.height_px - margin_px, CELLS[1] + 1).astype(np.int64)
     cells = np.array(
         [
             (columns[c], columns[c + 1] - 1, rows[r], rows[r + 1] - 1)
@@ -115,8 +115,8 @@ def matched(strip: Strip, start_station: Array, start_rotation: Array) -> Matche
     found_image: list[NDArray[np.int64]] = []
     found_point: list[NDArray[np.int64]] = []
     found_px: list[Array] = []
-    home: list[NDArray[np.int64]] = []
-    home_px: list[Array] = []
+    source_image: list[NDArray[np.int64]] = []
+    source_px: list[Array] = []
     count = 0
     for k in range(len(strip.images) - 1):
         chosen = select_features(strip.images[k], cells, WINDOW_PX // 2, 2, False)
@@ -127,16 +127,17 @@ def matched(strip: Strip, start_station: Array, start_rotation: Array) -> Matche
         for j in range(k + 1, min(k + 3, len(strip.images))):
             predicted = _pixels(image, start_station[j], start_rotation[j], ground)
             inside = (
-                (predicted > room) & (predicted < [image.width_px - room, image.height_px - room])
+                (predicted > margin_px)
+                & (predicted < [image.width_px - margin_px, image.height_px - margin_px])
             ).all(axis=1)
-            sought = np.flatnonzero(inside)
-            if not len(sought):
+            search = np.flatnonzero(inside)
+            if not len(search):
                 continue
             result = match_patches(
                 strip.images[k],
                 strip.images[j],
-                places[sought],
-                np.round(predicted[sought]).astype(np.int64),
+                places[search],
+                np.round(predicted[search]).astype(np.int64),
                 limits,
                 1,
                 WINDOW_PX // 2,
@@ -146,11 +147,11 @@ def matched(strip: Strip, start_station: Array, start_rotation: Array) -> Matche
             )
             good = (
                 (result[:, 7] > 0.0)
-                & (result[:, 4] <= MOST_SIGMA_PX)
-                & (result[:, 5] >= LEAST_CORRELATION)
-                & (result[:, 6] >= LEAST_PEAK_MARGIN)
+                & (result[:, 4] <= MAX_SIGMA_PX)
+                & (result[:, 5] >= MIN_CORRELATION)
+                & (result[:, 6] >= MIN_PEAK_MARGIN)
             )
-            own = sought[good]
+            own = search[good]
             # Both places moved by a fraction of a pixel; what counts is where the chosen pixel is.
             at = result[good, 2:4] - (result[good, :2] - places[own])
             rays.append((own, j, at))
@@ -162,8 +163,8 @@ def matched(strip: Strip, start_station: Array, start_rotation: Array) -> Matche
         found_image.append(np.full(len(used), k))
         found_point.append(number[used])
         found_px.append(places[used].astype(np.float64))
-        home.append(np.full(len(used), k))
-        home_px.append(places[used].astype(np.float64))
+        source_image.append(np.full(len(used), k))
+        source_px.append(places[used].astype(np.float64))
         for own, j, at in rays:
             found_image.append(np.full(len(own), j))
             found_point.append(number[own])
@@ -172,37 +173,39 @@ def matched(strip: Strip, start_station: Array, start_rotation: Array) -> Matche
         np.concatenate(found_image).astype(np.int64),
         np.concatenate(found_point).astype(np.int64),
         np.concatenate(found_px),
-        np.concatenate(home).astype(np.int64),
-        np.concatenate(home_px),
+        np.concatenate(source_image).astype(np.int64),
+        np.concatenate(source_px),
     )
 
 
-def navigated(strip: Strip, seed: int) -> tuple[Array, Array]:
+def simulate_navigation(strip: RenderedStrip, seed: int) -> tuple[Array, Array]:
     """Projection centres and rotations as receiver and inertial unit have them."""
     random = np.random.default_rng([seed, 3])
     n = len(strip.station)
     station = strip.station + random.normal(0.0, GNSS_M, (n, 3))
-    return station, strip.rotation @ exponential(random.normal(0.0, INERTIAL_RAD, (n, 3)))
+    return station, strip.rotation @ rotations_from_vectors(
+        random.normal(0.0, INERTIAL_RAD, (n, 3))
+    )
 
 
-def judged(strip: Strip, seed: int, found: Matched, name: SetName) -> dict[str, Any]:
+def evaluate(strip: RenderedStrip, seed: int, found: Matched, name: SetName) -> dict[str, Any]:
     """Adjust with a set of additional parameters and hold against the truth."""
     random = np.random.default_rng([seed, 4])
     image, n = strip.world.image, len(strip.station)
     rig = strip.world.rig
-    gnss, inertial = navigated(strip, seed)
+    gnss, inertial = simulate_navigation(strip, seed)
     truth = np.array(
         [
             strip.world.terrain.intersect(
                 strip.station[h], _directions(image, strip.rotation[h], px[None])[0]
             )
-            for h, px in zip(found.home, found.home_px, strict=True)
+            for h, px in zip(found.source_image, found.source_px, strict=True)
         ]
     )
     xy = _mm(image, found.px)
     ray = np.column_stack([xy, np.full(len(xy), -image.f_mm)])
     directions = np.einsum("nij,nj->ni", inertial[found.image], ray)
-    xyz, _ = intersected(len(truth), found.point, gnss[found.image], directions)
+    xyz, _ = intersect(len(truth), found.point, gnss[found.image], directions)
     sigma = np.full((len(truth), 3), np.nan)
     rays = np.bincount(found.point, minlength=len(truth))
     several = np.flatnonzero(rays == 3)
@@ -214,8 +217,8 @@ def judged(strip: Strip, seed: int, found: Matched, name: SetName) -> dict[str, 
     index = np.arange(n)
     network = Network(
         cameras=(
-            self_calibrating(
-                Camera("stitched", image.f_mm, pixel_mm=image.pitch_mm),
+            with_self_calibration(
+                CameraModel("stitched", image.f_mm, pixel_mm=image.pitch_mm),
                 name,
                 parts_of(rig),
                 master_cone=rig.master_cone,
@@ -237,17 +240,19 @@ def judged(strip: Strip, seed: int, found: Matched, name: SetName) -> dict[str, 
             line=np.full(n, -1),
             time_s=np.zeros(n),
         ),
-        bearings=Bearings(index, inertial, np.full((n, 3), INERTIAL_RAD)),
+        measured_attitudes=MeasuredAttitudes(index, inertial, np.full((n, 3), INERTIAL_RAD)),
     )
     begun = time.perf_counter()
-    result = adjust(network, Settings(robust=True, reject_beyond=4.0, variance_components=True))
+    result = adjust(
+        network, AdjustmentSettings(robust=True, reject_beyond=4.0, variance_components=True)
+    )
     adjusting_s = time.perf_counter() - begun
     residual = image_residuals_mm(result)
     good = np.isfinite(residual).all(axis=1)
     rms_um = np.sqrt(np.mean(residual[good] ** 2, axis=0)) * 1e3
     table = {g.name: g for g in result.groups}
     checks = np.setdiff1d(np.flatnonzero(rays >= 3), control)
-    against = checked_against(
+    against = check_point_differences(
         result,
         [network.points.names[k] for k in checks],
         truth[checks],
@@ -324,8 +329,8 @@ def main() -> None:
         strip = rendered_strip(
             options.rig, options.frames, options.seed, options.scenes or Path(folder)
         )
-        found = matched(strip, *navigated(strip, options.seed))
-        sets = {name: judged(strip, options.seed, found, name) for name in SETS}
+        found = match_strip(strip, *simulate_navigation(strip, options.seed))
+        sets = {name: evaluate(strip, options.seed, found, name) for name in SETS}
     if options.json:
         print(json.dumps({"machine": machine(), "rig": options.rig, "sets": sets}))
         return

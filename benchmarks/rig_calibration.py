@@ -18,12 +18,12 @@ from scipy.stats import chi2
 
 from benchmarks.midas_block import network_of
 from daemon.cli.benchmark.measurement import machine
-from daemon.postflight.adjustment.project import Checks
+from daemon.postflight.adjustment.project import CheckPoints
 from daemon.postflight.adjustment.project_file import ProjectFile
-from daemon.postflight.adjustment.writing import write_project
+from daemon.postflight.adjustment.project_writer import write_project
 from processing.bundle.adjust import adjust
 from processing.bundle.network import Network
-from processing.bundle.rotations import logarithm
+from processing.bundle.rotations import vectors_from_rotations
 from processing.calibration.relative_orientation import RelativeOrientations, relative_orientations
 from sim_hw.blocks.oblique import (
     HEADS,
@@ -31,7 +31,7 @@ from sim_hw.blocks.oblique import (
     PIXEL_MM,
     TABLE_2_GRAD,
     ObliqueBlock,
-    flown_obliquely,
+    simulate_oblique_block,
 )
 
 Array = NDArray[np.float64]
@@ -40,9 +40,9 @@ EVERY = tuple(range(len(HEADS)))
 MGRAD = 200e3 / np.pi
 
 
-def judged(seed: int, *, own: bool = True) -> tuple[RelativeOrientations, Array, float]:
+def evaluate(seed: int, *, own: bool = True) -> tuple[RelativeOrientations, Array, float]:
     """One block: what was found, errors (h, 3) about the heads' axes, squares in the covariance."""
-    block = flown_obliquely(seed)
+    block = simulate_oblique_block(seed)
     found = relative_orientations(adjust(network_of(block, EVERY, own=own)), NADIR)
     error = error_of(found, block)
     return found, error, float(error.ravel() @ np.linalg.solve(found.covariance, error.ravel()))
@@ -50,14 +50,14 @@ def judged(seed: int, *, own: bool = True) -> tuple[RelativeOrientations, Array,
 
 def error_of(found: RelativeOrientations, block: ObliqueBlock) -> Array:
     truth = [block.head_rotation[HEADS.index(head.head)] for head in found.heads]
-    return logarithm(
+    return vectors_from_rotations(
         np.array([t.T @ head.rotation for t, head in zip(truth, found.heads, strict=True)])
     )
 
 
 def write_block(folder: Path, *, seed: int = 1) -> None:
     """The block as an adjustment project, as somebody would hand it over."""
-    network = network_of(flown_obliquely(seed), EVERY, own=True)
+    network = network_of(simulate_oblique_block(seed), EVERY, own=True)
     network = _named_as_projects_are(network)
     file = ProjectFile.model_validate(
         {
@@ -70,7 +70,7 @@ def write_block(folder: Path, *, seed: int = 1) -> None:
         }
     )
     nothing = np.zeros((0, 3))
-    write_project(folder, file, network, Checks((), nothing, nothing))
+    write_project(folder, file, network, CheckPoints((), nothing, nothing))
 
 
 def _named_as_projects_are(network: Network) -> Network:
@@ -90,13 +90,13 @@ def main() -> None:
     if options.project is not None:
         write_block(options.project)
         return
-    runs = [judged(seed) for seed in range(1, options.seeds + 1)]
+    runs = [evaluate(seed) for seed in range(1, options.seeds + 1)]
     rank = sum(3 * len(r[0].heads) for r in runs)
     low, high = (float(chi2.ppf(q, rank)) / rank for q in (0.0005, 0.9995))
     ratio = np.concatenate(
         [(np.abs(e) / np.sqrt(np.diag(f.covariance)).reshape(-1, 3)).ravel() for f, e, _ in runs]
     )
-    told: dict[str, Any] = {
+    output: dict[str, Any] = {
         "machine": machine(),
         "seeds": options.seeds,
         "squares_per_rank": sum(r[2] for r in runs) / rank,
@@ -106,13 +106,13 @@ def main() -> None:
         "single_exposures": float(np.mean([r[0].squares for r in runs])),
     }
     if options.json:
-        print(json.dumps(told))
+        print(json.dumps(output))
         return
     print(
-        f"{options.seeds} blocks: squares per rank {told['squares_per_rank']:.3f} ({low:.3f} to "
-        f"{high:.3f} holds 99.9 %), {100 * told['within_3_sigma']:.1f} % within 3 sigma, largest "
-        f"{told['largest']:.1f}; single exposures about the averages "
-        f"{told['single_exposures']:.2f} of their variance"
+        f"{options.seeds} blocks: squares per rank {output['squares_per_rank']:.3f} ({low:.3f} to "
+        f"{high:.3f} holds 99.9 %), {100 * output['within_3_sigma']:.1f} % within 3 sigma, largest "
+        f"{output['largest']:.1f}; single exposures about the averages "
+        f"{output['single_exposures']:.2f} of their variance"
     )
     found = runs[0][0]
     for k, head in enumerate(found.heads):

@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 
 from processing.rig import find_rig
 from sim_hw.devices.pulse_bus import Firing, PulseBus
-from sim_hw.gige.head import ExposureRequest, FrameSize, GigeHead, HeadIdentity, Pacing
-from sim_hw.processes.ending import end_with_parent
-from sim_hw.world.world_clock import DeviceClock
+from sim_hw.gige.gige_head import ExposureRequest, FrameSize, GigeHead, HeadIdentity, Pacing
+from sim_hw.processes.parent_death import terminate_with_parent
+from sim_hw.world.world_clock import FreeRunningClock
 
 RING = 3
 MARK = np.frombuffer(b"syntopic", "<u2")
@@ -90,11 +90,11 @@ def number_of(frame: NDArray[np.uint16]) -> int | None:
     return int(head[NUMBER_AT]) | int(head[NUMBER_AT + 1]) << 16
 
 
-def is_whole(frame: NDArray[np.uint16]) -> bool:
+def is_intact(frame: NDArray[np.uint16]) -> bool:
     """Whether all pixels behind the header are those that were made beforehand."""
     flat = frame.reshape(-1)
-    told = int(flat[CHECKSUM_AT]) | int(flat[CHECKSUM_AT + 1]) << 16
-    return zlib.crc32(flat[HEADER_PX:].tobytes()) == told
+    received = int(flat[CHECKSUM_AT]) | int(flat[CHECKSUM_AT + 1]) << 16
+    return zlib.crc32(flat[HEADER_PX:].tobytes()) == received
 
 
 class RingSensor:
@@ -114,7 +114,7 @@ class RingSensor:
 def serve(plan: RingPlan, pipe: Connection) -> None:
     """Body of a process of heads: until the pipe closes; says what was counted at the end."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with_parent()
+    terminate_with_parent()
     rig = find_rig(plan.rig)
     heads: dict[str, GigeHead] = {}
     for index, (name, address) in enumerate(plan.addresses.items()):
@@ -125,7 +125,7 @@ def serve(plan: RingPlan, pipe: Connection) -> None:
             FrameSize(sensor.width_px, sensor.height_px),
             shown.expose,
             lambda _mono_ns: 30.0,
-            DeviceClock(offset_ns=index * 10**11, drift_ppm=float(index - 6)),
+            FreeRunningClock(offset_ns=index * 10**11, drift_ppm=float(index - 6)),
             packet_pacing=Pacing(plan.rate_bytes_per_s, 512 * 1024),
         )
     for head in heads.values():
@@ -134,10 +134,10 @@ def serve(plan: RingPlan, pipe: Connection) -> None:
     try:
         while True:
             if pipe.poll(POLL_S):
-                told = pipe.recv()
-                if told is None:
+                received = pipe.recv()
+                if received is None:
                     break
-                count, starts_ns = told
+                count, starts_ns = received
                 for name, head in heads.items():
                     if name in starts_ns:
                         head.line(starts_ns[name], count)
@@ -154,25 +154,25 @@ def main() -> None:
     Says where everything answers, ends when its standard input closes, and says then what was
     counted.
     """
-    asked = json.loads(sys.argv[1])
-    rig = find_rig(asked["rig"])
-    addresses = dict(asked["addresses"])
+    request = json.loads(sys.argv[1])
+    rig = find_rig(request["rig"])
+    addresses = dict(request["addresses"])
     context = multiprocessing.get_context("spawn")
     pipes, workers = [], []
     names = list(addresses)
-    for part in range(asked["processes"]):
-        chosen = names[part :: asked["processes"]]
+    for part in range(request["processes"]):
+        chosen = names[part :: request["processes"]]
         plan = RingPlan(
-            asked["rig"],
-            Path(asked["ring"]),
+            request["rig"],
+            Path(request["ring"]),
             {name: addresses[name] for name in chosen},
-            asked["rate_bytes_per_s"],
+            request["rate_bytes_per_s"],
         )
-        ours, theirs = context.Pipe()
-        worker = context.Process(target=serve, args=(plan, theirs), daemon=True)
+        parent_end, child_end = context.Pipe()
+        worker = context.Process(target=serve, args=(plan, child_end), daemon=True)
         worker.start()
-        theirs.close()
-        pipes.append(ours)
+        child_end.close()
+        pipes.append(parent_end)
         workers.append(worker)
     for pipe in pipes:
         if not pipe.poll(READY_WITHIN_S) or pipe.recv() != "ready":

@@ -24,7 +24,7 @@ from benchmarks import rendered
 from daemon.cli.benchmark.measurement import machine
 from processing.image.composition import PanComposer, pan_cell_px
 from processing.image.kernels import DEFAULT_INTERPOLATION
-from processing.pipelines.stitched import Conditions, Pipeline, Product, Settings
+from processing.pipelines.stitched import Conditions, Pipeline, PipelineSettings, Product
 from processing.radiometry.calibration import RadiometricCalibration
 from processing.radiometry.level1 import (
     corrector_for,
@@ -33,9 +33,9 @@ from processing.radiometry.level1 import (
     level1_from_level0,
 )
 from processing.rig import Cone, Sensor
-from sim_hw.world import laboratory
+from sim_hw.world import sensor_calibration
 from sim_hw.world.electronics import Electronics, SensorTruth, over_tdi_path, true_sensor
-from sim_hw.world.rendering import Look
+from sim_hw.world.rendering import ExposureParameters
 from sim_hw.world.scene import open_scene
 from sim_hw.world.seeding import random_stream
 from sim_hw.world.snapshots import Snapshot
@@ -51,7 +51,7 @@ LEVELS = (0.2, 0.5, 0.8)
 TEXTURE = 0.25
 """How much of its own contrast an image keeps at one level, so that its lights do not burn out."""
 BRIGHTEST = 0.97
-LEAST_COLUMN_PX = 64
+MIN_COLUMN_PX = 64
 """Length from which spoilt pixels above each other are a defect column."""
 DUST = 12
 DUST_PX = 3
@@ -114,8 +114,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="syntopic-seams-") as folder:
         seams, defects = measure(options.scenes or Path(folder), rig=options.rig)
     if options.json:
-        told = {"seams": [asdict(s) for s in seams], "defects": [asdict(d) for d in defects]}
-        print(json.dumps({"machine": machine(), **told}))
+        result = {"seams": [asdict(s) for s in seams], "defects": [asdict(d) for d in defects]}
+        print(json.dumps({"machine": machine(), **result}))
         return
     print("| scene | level | strips | RMS % | 99 % below | largest % | within 0.2 % | noise % |")
     print("|---|---|---|---|---|---|---|---|")
@@ -163,7 +163,7 @@ def measure(
     for changed in changes:
         heads = heads_of(world, changed=changed)
         calibrations = {name: head.calibration for name, head in heads.items()}
-        pipeline = Pipeline(world.rig, calibrations, Settings(geometry=False))
+        pipeline = Pipeline(world.rig, calibrations, PipelineSettings(geometry=False))
         label = ", heads changed since calibration" if changed else ""
         lights: dict[tuple[str, float], Mapping[str, Map]] = {
             (f"{kind}{label}", level): light_of(world, heads, exposure.snapshot, kind, level)
@@ -177,9 +177,9 @@ def measure(
             product = pipeline.process(frames, conditions)
             seams.append(seams_of(world, heads, frames, conditions, product, name, level))
             if not changed:
-                told = f"{name}, {level:.0%}" if level else name
+                result = f"{name}, {level:.0%}" if level else name
                 defects.append(
-                    defects_of(world, heads, frames, exposure.snapshot, conditions, light, told)
+                    defects_of(world, heads, frames, exposure.snapshot, conditions, light, result)
                 )
     return seams, defects
 
@@ -191,7 +191,7 @@ def heads_of(world: World, *, changed: bool) -> dict[str, Head]:
         for sensor in cone.sensors:
             truth = true_sensor(cone, sensor, SEED, field_radius_mm=world.field_radius_mm(cone))
             truth = replace(truth, defect=dusty(truth.defect, sensor.name))
-            measured = laboratory.measure(sensor, truth, SEED)
+            measured = sensor_calibration.measure(sensor, truth, SEED)
             if changed:
                 gain, black = random_stream(SEED, "change", sensor.name).normal(0.0, 1.0, 2)
                 truth = replace(
@@ -227,7 +227,7 @@ def light_of(
     mean = np.mean([float(np.mean(snapshot.light[name])) for name in heads])
     light = {}
     for name, head in heads.items():
-        look = snapshot.looks[name]
+        look = snapshot.parameters_by_sensor[name]
         unit = float(
             head.electronics.linear_dn(np.ones((1, 1), np.float32), look.exposure_time_us)[0, 0]
         )
@@ -237,8 +237,8 @@ def light_of(
             light[name] = np.full(seen.shape, level * full, np.float32)
             continue
         contrast = np.float32(TEXTURE) * (seen / np.float32(mean) - np.float32(1.0))
-        wished = np.float32(level * full) * (np.float32(1.0) + contrast)
-        light[name] = np.clip(wished, 0.0, BRIGHTEST * full).astype(np.float32)
+        wanted = np.float32(level * full) * (np.float32(1.0) + contrast)
+        light[name] = np.clip(wanted, 0.0, BRIGHTEST * full).astype(np.float32)
     return light
 
 
@@ -247,7 +247,7 @@ def frames_of(
 ) -> dict[str, NDArray[np.uint16]]:
     frames = {}
     for name, head in heads.items():
-        look = snapshot.looks[name]
+        look = snapshot.parameters_by_sensor[name]
         frames[name] = head.electronics.frame(
             light[name],
             exposure_time_us=look.exposure_time_us,
@@ -260,7 +260,7 @@ def frames_of(
 
 
 def level1_of(
-    head: Head, raw: NDArray[np.uint16], look: Look, conditions: Conditions, out: Any
+    head: Head, raw: NDArray[np.uint16], look: ExposureParameters, conditions: Conditions, out: Any
 ) -> None:
     """The Level-1 words of a frame as the pipeline makes them."""
     level1_from_level0(
@@ -288,7 +288,9 @@ def seams_of(
     for name in product.sensors:
         head = heads[name]
         composer = PanComposer(world.image, [head.sensor], cell_px=pan_cell_px(world.rig))
-        look = Look(0, conditions.exposure_time_s[name] * 1e6, conditions.tdi_shifts[name])
+        look = ExposureParameters(
+            0, conditions.exposure_time_s[name] * 1e6, conditions.tdi_shifts[name]
+        )
         level1_of(head, frames[name], look, conditions, composer.frame(name))
         alone = composer.compose(
             product.mosaic.placements, [name], feather_px=16, interpolation=DEFAULT_INTERPOLATION
@@ -328,9 +330,9 @@ def _strips(owner: NDArray[np.int64], images: Sequence[Map]) -> list[tuple[float
     half = STRIP_PX // 2
     found = []
     for a, b in np.unique(pairs, axis=0):
-        mine = (pairs[:, 0] == a) & (pairs[:, 1] == b)
-        for strip in np.unique(rows[mine] // STRIP_PX):
-            here = mine & (rows // STRIP_PX == strip)
+        own_side = (pairs[:, 0] == a) & (pairs[:, 1] == b)
+        for strip in np.unique(rows[own_side] // STRIP_PX):
+            here = own_side & (rows // STRIP_PX == strip)
             if np.count_nonzero(here) < STRIP_PX:
                 continue
             sums, pixels = np.zeros(2), 0
@@ -359,7 +361,7 @@ def defects_of(
     kinds: list[NDArray[np.uint8]] = []
     for cone in world.rig.pan_cones:
         for sensor in cone.sensors:
-            head, look = heads[sensor.name], snapshot.looks[sensor.name]
+            head, look = heads[sensor.name], snapshot.parameters_by_sensor[sensor.name]
             out = np.zeros(frames[sensor.name].shape, np.uint16)
             level1_of(head, frames[sensor.name], look, conditions, out)
             ideal = head.electronics.linear_dn(light[sensor.name], look.exposure_time_us)
@@ -368,17 +370,17 @@ def defects_of(
             electrons = ideal * response * sensor.electrons_per_dn + sensor.read_noise_e**2
             sigma = np.sqrt(electrons) / sensor.electrons_per_dn / response
             error = out / level1_counts_per_dn(sensor.bits) - ideal
-            whole = np.zeros(out.shape, np.bool_)
+            inner = np.zeros(out.shape, np.bool_)
             first, last = exposed_rows(sensor, look.tdi_shifts)
-            whole[first + 8 : last - 7, 8:-8] = True
-            whole &= (out > 0) & ((out & 1) == 0)
+            inner[first + 8 : last - 7, 8:-8] = True
+            inner &= (out > 0) & ((out & 1) == 0)
             spoilt = over_tdi_path(head.truth.defect.astype(np.float32), **path) > 0
-            kinds.append(kinds_of(spoilt, look.tdi_shifts)[whole & spoilt])
-            off.append((error / sigma)[whole & spoilt])
-            good.append((error / sigma)[whole & ~spoilt][::50])
+            kinds.append(kinds_of(spoilt, look.tdi_shifts)[inner & spoilt])
+            off.append((error / sigma)[inner & spoilt])
+            good.append((error / sigma)[inner & ~spoilt][::50])
             mean = _box(ideal)
             local = np.sqrt(np.maximum(_box(ideal * ideal) - mean * mean, 0.0) + sigma**2)
-            spread.append((error / local)[whole & spoilt])
+            spread.append((error / local)[inner & spoilt])
     z, contrast, kind = np.concatenate(off), np.concatenate(spread), np.concatenate(kinds)
     single, column, dust = (float(np.sqrt(np.mean(z[kind == k] ** 2))) for k in range(3))
     return Defects(
@@ -399,7 +401,7 @@ def kinds_of(spoilt: NDArray[np.bool_], tdi_shifts: int) -> NDArray[np.uint8]:
     """0 where a single pixel spoils, 1 where a column, 2 where more side by side."""
     _, labels, found, _ = cv2.connectedComponentsWithStats(spoilt.astype(np.uint8), connectivity=8)
     width, height, area = (found[:, k] for k in (2, 3, 4))
-    kind = np.where(height >= LEAST_COLUMN_PX, 1, np.where(area > tdi_shifts + 1, 2, 0))
+    kind = np.where(height >= MIN_COLUMN_PX, 1, np.where(area > tdi_shifts + 1, 2, 0))
     kind[(kind == 2) & (width == 1)] = 0
     return np.asarray(kind.astype(np.uint8)[labels])
 

@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 
 from benchmarks.time_truth import Fired, Host, delay_error_ns, inside, receiver_stamp
 from daemon.cli.benchmark.measurement import machine
-from daemon.mission.exposure import Capture, FrameRecord
-from daemon.onboard.flight.composing import compose, instant_of
-from daemon.onboard.flight.temperatures import Temperatures
-from daemon.onboard.timing.clock import HostClock
-from daemon.onboard.timing.matching import Pulse
+from daemon.mission.exposure import CaptureRecord, FrameRecord
+from daemon.onboard.flight.record_builder import build_record, instant_of
+from daemon.onboard.flight.temperatures import TemperatureHistory
+from daemon.onboard.timing.gps_clock import GpsClock
+from daemon.onboard.timing.matching import FiredPulse
 from daemon.orientation.navigation import Track
 from drivers.contract import EventMark
 from processing.quality.report import Flag
@@ -69,72 +69,72 @@ class Stamp:
     sigma_ns: float
 
 
-def pulse_of(fired: Fired) -> Pulse:
+def pulse_of(fired: Fired) -> FiredPulse:
     middle_ns = (fired.before_ns + fired.after_ns) // 2
     half_ns = (fired.after_ns - fired.before_ns + 1) // 2
-    return Pulse(1, middle_ns, half_ns, 1, DELAYS_NS, STROBE_NS, SPREAD_NS)
+    return FiredPulse(1, middle_ns, half_ns, 1, DELAYS_NS, STROBE_NS, SPREAD_NS)
 
 
-def mark_of(chance: np.random.Generator, fired: Fired) -> EventMark:
+def mark_of(rng: np.random.Generator, fired: Fired) -> EventMark:
     strobe_s = fired.true_s + STROBE_NS * 1e-9
-    said_ns = receiver_stamp(chance, strobe_s, ACCURACY_NS, RESOLUTION_NS)
-    return EventMark("gnss", 0, EPOCH_NS + said_ns, round(ACCURACY_NS), 0, 0, True, 0)
+    stamped_ns = receiver_stamp(rng, strobe_s, ACCURACY_NS, RESOLUTION_NS)
+    return EventMark("gnss", 0, EPOCH_NS + stamped_ns, round(ACCURACY_NS), 0, 0, True, 0)
 
 
-def stamp(
-    chance: np.random.Generator, clock: HostClock, fired: Fired, mark: EventMark | None
-) -> Stamp:
+def stamp(rng: np.random.Generator, clock: GpsClock, fired: Fired, mark: EventMark | None) -> Stamp:
     """A frame's time as the service records it, against when it was truly exposed."""
     pulse = pulse_of(fired)
     frame = FrameRecord(FAR_SENSOR, "", "", "", 1, 1, "Mono12", None, None, EXPOSURE_US, None, 0)
-    record = compose(
+    record = build_record(
         RIG,
-        Capture(1, frames=(frame,)),
+        CaptureRecord(1, frames=(frame,)),
         pulse,
         instant_of(mark, pulse, clock),
         Track(),
-        Temperatures(),
+        TemperatureHistory(),
         Flag(0),
     )
     (timed,) = record.frames
     assert timed.mid_exposure_gps_ns is not None and timed.time_sigma_ns is not None
     delay_ns = DELAYS_NS[RIG.cone_of(FAR_SENSOR).name] + 2_000_000
     true_ns = fired.true_s * 1e9 + delay_ns
-    true_ns += delay_error_ns(chance, SPREAD_NS) + chance.normal(0.0, HEAD_NS)
+    true_ns += delay_error_ns(rng, SPREAD_NS) + rng.normal(0.0, HEAD_NS)
     return Stamp(timed.mid_exposure_gps_ns - EPOCH_NS - true_ns, timed.time_sigma_ns)
 
 
-def one_host(seed: int, *, harshness: float = 1.0) -> list[Stamp]:
+def one_host(seed: int, *, temperature_factor: float = 1.0) -> list[Stamp]:
     """One stamp for each of SETS, of a host, a crystal and a trigger unit drawn with that seed."""
-    chance = np.random.default_rng([20261121, seed])
-    host = Host(chance, WARM_S + COAST_S + 10.0, harshness=harshness)
-    with_pps, marks_only = warmed(host), HostClock()
-    at_s = 1.0 + chance.uniform(0.0, 1.0)
+    rng = np.random.default_rng([20261121, seed])
+    host = Host(rng, WARM_S + COAST_S + 10.0, temperature_factor=temperature_factor)
+    with_pps, marks_only = warmed(host), GpsClock()
+    at_s = 1.0 + rng.uniform(0.0, 1.0)
     key = 0
     while at_s < WARM_S - INTERVAL_S:
         fired = host.fire(at_s)
-        mark, pulse = mark_of(chance, fired), pulse_of(fired)
+        mark, pulse = mark_of(rng, fired), pulse_of(fired)
         for clock in (with_pps, marks_only):
             clock.pulse_given(pulse.sigma_ns)
             strobe_ns = pulse.mono_ns + STROBE_NS
             clock.mark_matched(
                 mark.gps_ns, strobe_ns, pulse.sigma_ns, accuracy_ns=mark.accuracy_ns, key=key
             )
-        at_s += INTERVAL_S + chance.uniform(0.0, 0.05)
+        at_s += INTERVAL_S + rng.uniform(0.0, 0.05)
         key += 1
     last, later = host.fire(at_s), host.fire(at_s + COAST_S)
     return [
-        stamp(chance, with_pps, last, None),
-        stamp(chance, marks_only, last, mark_of(chance, last)),
-        stamp(chance, marks_only, last, None),
-        stamp(chance, with_pps, later, None),
-        stamp(chance, marks_only, later, None),
+        stamp(rng, with_pps, last, None),
+        stamp(rng, marks_only, last, mark_of(rng, last)),
+        stamp(rng, marks_only, last, None),
+        stamp(rng, with_pps, later, None),
+        stamp(rng, marks_only, later, None),
     ]
 
 
-def stamps(runs: int, *, first: int = 0, harshness: float = 1.0) -> Mapping[str, Errors]:
+def stamps(runs: int, *, first: int = 0, temperature_factor: float = 1.0) -> Mapping[str, Errors]:
     """Errors and stated sigmas of so many independent hosts, for each of SETS."""
-    hosts = [one_host(seed, harshness=harshness) for seed in range(first, first + runs)]
+    hosts = [
+        one_host(seed, temperature_factor=temperature_factor) for seed in range(first, first + runs)
+    ]
     return {
         name: (
             np.array([host[index].error_ns for host in hosts]),
@@ -158,8 +158,8 @@ def coasts(runs: int, after_s: Sequence[float]) -> tuple[NDArray[np.float64], ND
     errors = np.empty((runs, len(after_s)))
     sigmas = np.empty_like(errors)
     for run in range(runs):
-        chance = np.random.default_rng([4711, run])
-        host = Host(chance, WARM_S + max(after_s) + 5.0)
+        rng = np.random.default_rng([4711, run])
+        host = Host(rng, WARM_S + max(after_s) + 5.0)
         clock = warmed(host)
         for index, after in enumerate(after_s):
             at_s = WARM_S - 1.0 + after
@@ -170,9 +170,9 @@ def coasts(runs: int, after_s: Sequence[float]) -> tuple[NDArray[np.float64], ND
     return errors, sigmas
 
 
-def warmed(host: Host) -> HostClock:
+def warmed(host: Host) -> GpsClock:
     """A clock after a minute of edges, named by messages."""
-    clock = HostClock()
+    clock = GpsClock()
     for k in range(3):
         arrived_ns = round(host.clock.reads(0.2 * k + 0.06))
         clock.message_arrived(EPOCH_NS + 200_000_000 * k, arrived_ns)
@@ -235,7 +235,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.time_chain", description=__doc__)
     parser.add_argument("svg", type=Path, help="where the drawing goes")
     parser.add_argument("--runs", type=int, default=1000, help="independent hosts")
-    parser.add_argument("--harshness", type=float, default=1.0, help="what temperature does, times")
+    parser.add_argument(
+        "--temperature-factor", type=float, default=1.0, help="what temperature does, times"
+    )
     given = parser.parse_args(arguments)
     after_s = [1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0, 45.0, 50.0, 55.0, 60.0]
     errors_ns, sigmas_ns = coasts(given.runs // 2, after_s)
@@ -244,10 +246,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for index, after in enumerate(after_s):
         share = inside(errors_ns[:, index], sigmas_ns[:, index], 2.0)
         print(f"  {after:.0f} s: {100 * share:.1f} %")
-    print(f"{machine()}; {given.runs} hosts, harshness {given.harshness:g}\n")
+    print(f"{machine()}; {given.runs} hosts, harshness {given.temperature_factor:g}\n")
     print("| set | median error | median sigma | within 1 sigma | within 2 | within 3 | worst |")
     print("|---|---|---|---|---|---|---|")
-    for name, errors in stamps(given.runs, harshness=given.harshness).items():
+    for name, errors in stamps(given.runs, temperature_factor=given.temperature_factor).items():
         print(row(name, errors))
     return 0
 

@@ -30,12 +30,12 @@ from processing.geometry.placement import (
 )
 from processing.geometry.topology import Rectangle, colour_coverage, overlaps
 from processing.matching.tie_points import PAN_TO_COLOUR, PAN_TO_PAN, TiePoints
-from processing.mosaic.fixed import fixed_mosaic
-from processing.mosaic.free import Mosaic, MosaicSettings, free_mosaic
+from processing.mosaic.fixed_mosaic import fixed_mosaic
+from processing.mosaic.free_mosaic import Mosaic, MosaicSettings, free_mosaic
 from processing.mosaic.pan_only import pan_only_mosaic
 from processing.rig import Rig, VirtualImage, shipped_rigs
-from sim_hw.world.flight import Flight
-from sim_hw.world.rendering import Look, ground_points
+from sim_hw.world.flight import SimulatedFlight
+from sim_hw.world.rendering import ExposureParameters, ground_points
 from sim_hw.world.truth import true_vip
 from sim_hw.world.world import World, WorldSettings
 
@@ -82,7 +82,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="syntopic-bench-") as folder:
         rig_file = shipped_rigs()[options.rig]
         if options.rotation is not None:
-            rig_file = _turned(rig_file, options.rotation * 1e-3, Path(folder))
+            rig_file = _rotated(rig_file, options.rotation * 1e-3, Path(folder))
         world = World(
             WorldSettings(
                 rig_file=str(rig_file),
@@ -113,8 +113,8 @@ def main() -> None:
     if options.json:
         print(json.dumps(result))
         return
-    turned = " ".join(f"{v * 1e3:+.3f}" for v in rotation)
-    print(f"{world.rig.name}, {options.exposures} exposures, cone 1 turned by {turned} mrad")
+    rotated = " ".join(f"{v * 1e3:+.3f}" for v in rotation)
+    print(f"{world.rig.name}, {options.exposures} exposures, cone 1 turned by {rotated} mrad")
     print(f"{'':46}inner RMS  worst px   systematic RMS  worst um")
     for name, f in figures.items():
         print(
@@ -123,7 +123,7 @@ def main() -> None:
         )
 
 
-def _turned(rig_file: Path, angle_rad: float, folder: Path) -> Path:
+def _rotated(rig_file: Path, angle_rad: float, folder: Path) -> Path:
     """The rig with the second PAN cone turned by omega = phi = angle, calibrated and true alike."""
     text = rig_file.read_text()
     head, found, tail = text.partition('name = "1"')
@@ -187,12 +187,12 @@ def _conditions(world: World, probes: Mapping[str, float]) -> Conditions:
     )
 
 
-def _looks(world: World, reference_ns: int) -> dict[str, Look]:
+def _looks(world: World, reference_ns: int) -> dict[str, ExposureParameters]:
     """The exposure of every cone, each over the place of the reference cone."""
     rig, plan = world.rig, world.plan
     reference_mm = rig.cone(rig.reference_cone).position_mm[0]
     return {
-        cone.name: Look(
+        cone.name: ExposureParameters(
             reference_ns
             - round((cone.position_mm[0] - reference_mm) * 1e-3 / plan.ground_speed_mps * 1e9),
             plan.exposure_time_us[cone.name],
@@ -216,8 +216,8 @@ def _grid(world: World, rig: Rig, name: str) -> Array:
 
 def tie_points(
     world: World,
-    flight: Flight,
-    looks: Mapping[str, Look],
+    flight: SimulatedFlight,
+    looks: Mapping[str, ExposureParameters],
     start: Placements,
     rng: np.random.Generator,
     *,
@@ -267,7 +267,7 @@ def tie_points(
     return TiePoints(
         names=names,
         pairs=tuple((a, b) for a, b, _, _ in areas),
-        sought=tuple(len(block) for block in rows),
+        attempted=tuple(len(block) for block in rows),
         sensor_a=table[:, 0].astype(np.int64),
         sensor_b=table[:, 1].astype(np.int64),
         raw_a=table[:, 2:4],
@@ -281,14 +281,14 @@ def tie_points(
 
 def _same_ground(
     world: World,
-    flight: Flight,
-    looks: Mapping[str, Look],
+    flight: SimulatedFlight,
+    looks: Mapping[str, ExposureParameters],
     seen: tuple[str, Array],
-    sought: tuple[str, Array],
+    attempted: tuple[str, Array],
 ) -> Array:
     """Raw pixels of the sought sensor that see the ground of the first's; Newton's method."""
     target = _ground(world, flight, looks, *seen)
-    name, raw = sought[0], sought[1].copy()
+    name, raw = attempted[0], attempted[1].copy()
     for _ in range(4):
         here = _ground(world, flight, looks, name, raw)
         by_column = _ground(world, flight, looks, name, raw + np.array([1.0, 0.0])) - here
@@ -299,7 +299,11 @@ def _same_ground(
 
 
 def _ground(
-    world: World, flight: Flight, looks: Mapping[str, Look], name: str, raw: Array
+    world: World,
+    flight: SimulatedFlight,
+    looks: Mapping[str, ExposureParameters],
+    name: str,
+    raw: Array,
 ) -> Array:
     """East and north, m, of what raw pixels see."""
     cone = world.rig.cone_of(name)
@@ -311,8 +315,8 @@ def _ground(
 
 def _errors(
     world: World,
-    flight: Flight,
-    looks: Mapping[str, Look],
+    flight: SimulatedFlight,
+    looks: Mapping[str, ExposureParameters],
     mosaic: Mosaic,
     raw: Mapping[str, Array],
 ) -> tuple[Array, Array]:

@@ -20,24 +20,24 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from benchmarks import rendered
-from benchmarks.stitching_trials import mosaic_settings, world_and_rig
+from benchmarks.stitching_samples import mosaic_settings, world_and_rig
 from benchmarks.ultracam_l import tie_points
 from daemon.cli.benchmark.measurement import machine
 from processing.calibration.platform import (
+    COLOUR_ROTATION_PX,
     COLOUR_SHIFT_PX,
-    COLOUR_TURN_PX,
     PlatformCalibration,
     calibrate_platform,
 )
 from processing.geometry.conditions import for_sensors
 from processing.geometry.placement import nominal_placements
 from processing.matching.tie_points import PAN_TO_COLOUR, TiePoints
-from processing.mosaic.free import free_mosaic
+from processing.mosaic.free_mosaic import free_mosaic
 from processing.mosaic.stitch_record import StitchRecord, stitch_record
 from processing.rig import Rig
-from sim_hw.world.camera import rotation_opk
-from sim_hw.world.post_processed import marks_of_lines
-from sim_hw.world.snapshots import look_of, probe_readings
+from sim_hw.world.post_processed_trajectory import marks_of_lines
+from sim_hw.world.snapshots import exposure_parameters_of, probe_readings
+from sim_hw.world.true_camera import rotation_opk
 from sim_hw.world.world import World
 
 Array = NDArray[np.float64]
@@ -47,17 +47,17 @@ LINES = 2
 POINTS_PER_OVERLAP, POINTS_PER_SENSOR = 60, 150
 
 
-def flown(name: str, seed: int, exposures: int) -> tuple[World, PlatformCalibration]:
+def fly_platform(name: str, seed: int, exposures: int) -> tuple[World, PlatformCalibration]:
     """One camera and what one flight of `exposures` on each line finds of it."""
     world, rig = world_and_rig(name, seed, dc_k=DC_K, exposures=exposures)
     flight, first_ns = rendered.flight_and_mark(world, 0)
     random = np.random.default_rng([seed, 13])
     settings = mosaic_settings(world)
     left = np.random.default_rng([seed, 17])
-    bias = left.normal(0.0, (COLOUR_SHIFT_PX, COLOUR_SHIFT_PX, COLOUR_TURN_PX))
+    bias = left.normal(0.0, (COLOUR_SHIFT_PX, COLOUR_SHIFT_PX, COLOUR_ROTATION_PX))
     records: list[StitchRecord] = []
     for mark_ns in marks_of_lines(world, flight, first_ns, exposures, LINES):
-        looks = {cone.name: look_of(world, cone, mark_ns) for cone in rig.cones}
+        looks = {cone.name: exposure_parameters_of(world, cone, mark_ns) for cone in rig.cones}
         probes = probe_readings(world, mark_ns, seed=seed * 1000 + len(records))
         start = nominal_placements(rig, probes, for_sensors(rig, world.plan.tdi_shifts))
         points = tie_points(
@@ -86,30 +86,41 @@ def biased(rig: Rig, points: TiePoints, bias: Array) -> TiePoints:
     return replace(points, raw_b=points.raw_b + off * (points.kind == PAN_TO_COLOUR)[:, None])
 
 
-def true_turn(master_from_cone: Array, mounting_error_rad: tuple[float, float, float]) -> Array:
+def true_rotation(master_from_cone: Array, mounting_error_rad: tuple[float, float, float]) -> Array:
     """What the emulator turned a cone by, about the axes of the virtual image, (3,) rad."""
-    turn = master_from_cone @ rotation_opk(mounting_error_rad) @ master_from_cone.T
-    return np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
+    rotation = master_from_cone @ rotation_opk(mounting_error_rad) @ master_from_cone.T
+    return (
+        np.array(
+            [
+                rotation[2, 1] - rotation[1, 2],
+                rotation[0, 2] - rotation[2, 0],
+                rotation[1, 0] - rotation[0, 1],
+            ]
+        )
+        / 2
+    )
 
 
-def judged(name: str, seeds: int, exposures: int) -> dict[str, Any]:
+def evaluate(name: str, seeds: int, exposures: int) -> dict[str, Any]:
     """By cone: errors of the turns in their covariance over `seeds` flights."""
     squares: dict[str, float] = {}
     ratios: dict[str, list[Array]] = {}
     errors: dict[str, list[Array]] = {}
     stated: dict[str, list[Array]] = {}
     for seed in range(1, seeds + 1):
-        world, found = flown(name, seed, exposures)
+        world, found = fly_platform(name, seed, exposures)
         for cone in found.cones:
             true = world.camera.master_from_cone(world.rig.cone(cone.cone))
-            error = cone.turn_rad - true_turn(true, world.camera.mounting_error_rad[cone.cone])
+            error = cone.correction_rad - true_rotation(
+                true, world.camera.mounting_error_rad[cone.cone]
+            )
             own = float(error @ np.linalg.solve(cone.covariance, error))
             squares[cone.cone] = squares.get(cone.cone, 0.0) + own
             ratios.setdefault(cone.cone, []).append(error / np.sqrt(np.diag(cone.covariance)))
             errors.setdefault(cone.cone, []).append(error)
             stated.setdefault(cone.cone, []).append(np.diag(cone.covariance))
-        told = ", ".join(f"{c} {3.0 * v / seed / 9.0:.2f}" for c, v in squares.items())
-        print(f"flight {seed}: squares per rank so far: {told}", file=sys.stderr, flush=True)
+        output = ", ".join(f"{c} {3.0 * v / seed / 9.0:.2f}" for c, v in squares.items())
+        print(f"flight {seed}: squares per rank so far: {output}", file=sys.stderr, flush=True)
     return {
         cone: {
             "errors": 3 * len(ratios[cone]),
@@ -127,20 +138,20 @@ def judged(name: str, seeds: int, exposures: int) -> dict[str, Any]:
     }
 
 
-def compared(calibration: Path, truth: Path) -> dict[str, Any]:
+def compare_with_truth(calibration: Path, truth: Path) -> dict[str, Any]:
     """Turns of a `calibration.json` less those of the emulator's truth, urad."""
     found = json.loads((calibration / "calibration.json").read_text())["figures"]
     cones = json.loads((truth / "parameters.json").read_text())["cones"]
-    told = {}
-    for cone, turn in found["turn_urad"].items():
+    output = {}
+    for cone, rotation in found["rotation_urad"].items():
         true = cones[cone]
-        error = true_turn(np.array(true["master_from_cone"]), true["mounting_error_rad"])
-        told[cone] = {
-            "error_urad": (np.array(turn) - error * 1e6).tolist(),
+        error = true_rotation(np.array(true["master_from_cone"]), true["mounting_error_rad"])
+        output[cone] = {
+            "error_urad": (np.array(rotation) - error * 1e6).tolist(),
             "sigma_urad": found["turn_sigma_urad"][cone],
             "with_places_urad": found["with_places_urad"][cone],
         }
-    return told
+    return output
 
 
 def main() -> None:
@@ -154,11 +165,11 @@ def main() -> None:
     line.add_argument("--truth", type=Path, help="truth folder of those exposures")
     given = line.parse_args()
     if given.calibration is not None:
-        print(json.dumps(compared(given.calibration, given.truth), indent=1))
+        print(json.dumps(compare_with_truth(given.calibration, given.truth), indent=1))
         return
-    figures = judged(given.rig, given.seeds, given.exposures)
-    told = {"machine": machine(), "rig": given.rig, "flights": given.seeds, "cones": figures}
-    print(json.dumps(told, indent=1))
+    figures = evaluate(given.rig, given.seeds, given.exposures)
+    output = {"machine": machine(), "rig": given.rig, "flights": given.seeds, "cones": figures}
+    print(json.dumps(output, indent=1))
 
 
 if __name__ == "__main__":

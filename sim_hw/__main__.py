@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from processing.rig import RigError, load_rig, shipped_rigs
-from sim_hw.processes.ending import end_with_parent
+from sim_hw.processes.parent_death import terminate_with_parent
 from sim_hw.processes.simulator import SimulatorSettings, simulate
-from sim_hw.receivers.kinds import PROBES, RECEIVERS
-from sim_hw.world.grounds import GROUNDS
+from sim_hw.receivers.device_kinds import PROBES, RECEIVERS
+from sim_hw.world.ground_types import GROUNDS
 from sim_hw.world.world import WorldSettings
 from sim_hw.world.world_clock import WorldClock
 
@@ -85,7 +85,7 @@ def rig_file(name_or_path: str) -> Path:
 def main(arguments: Sequence[str] | None = None) -> int:
     given = parser().parse_args(arguments)
     if given.parent is not None:
-        end_with_parent(given.parent)
+        terminate_with_parent(given.parent)
     if given.processes < 1 or given.exposures < 1:
         print("sim_hw: processes and exposures are at least 1", file=sys.stderr)
         return 2
@@ -94,7 +94,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except RigError as error:
         print(f"sim_hw: {error}", file=sys.stderr)
         return 2
-    clock = WorldClock.starting_now()
+    clock = WorldClock.from_wall_clock()
     world = WorldSettings(
         rig_file=str(path.resolve()),
         seed=given.seed,
@@ -118,7 +118,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         scenario=given.scenario,
         receiver=given.receiver,
         has_pps=given.pps,
-        is_still=given.still,
+        is_frozen=given.still,
         has_digests=given.digests,
         probe=given.probe,
     )

@@ -26,14 +26,14 @@ DATABASE: Final = "https://api.osv.dev/v1/querybatch"
 TIMEOUT_S: Final = 20.0
 LARGEST_ANSWER_BYTES: Final = 10_000_000
 
-LOOKED_AT: Final[Mapping[str, str]] = {}
+REVIEWED: Final[Mapping[str, str]] = {}
 """Advisories that do not touch us, by name, and why; a person has looked. What is listed here and
 matches nothing any more is complained of."""
 
 _HEADERS: Final = {"leaflet": r"Leaflet (\d[\d.]*\d)", "uplot": r"uPlot \(v(\d[\d.]*\d)\)"}
 
 
-class NotAskedError(Exception):
+class AuditError(Exception):
     """The database did not answer, or not as it is specified; the sentence says how."""
 
 
@@ -60,67 +60,67 @@ def packages() -> list[Package]:
     for name, header in _HEADERS.items():
         found = re.search(header, (VENDOR / f"{name}.js").read_text(encoding="utf-8")[:500])
         if found is None:
-            raise NotAskedError(f"{name}.js does not say its version")
+            raise AuditError(f"{name}.js does not say its version")
         listed.append(Package("npm", name, found[1]))
     return listed
 
 
-def advisories(asked: list[Package], database: str = DATABASE) -> dict[Package, list[str]]:
+def advisories(queried: list[Package], database: str = DATABASE) -> dict[Package, list[str]]:
     """Names of the advisories that match, by package; those without are left out.
 
     Raises:
-        NotAskedError: no network, another answer than the one specified, or not all of it.
+        AuditError: no network, another answer than the one specified, or not all of it.
     """
-    body = json.dumps({"queries": [package.query for package in asked]}).encode()
+    body = json.dumps({"queries": [package.query for package in queried]}).encode()
     request = urllib.request.Request(database, body, {"Content-Type": "application/json"})
     try:
         with urllib.request.urlopen(request, timeout=TIMEOUT_S) as answer:
             results = json.loads(answer.read(LARGEST_ANSWER_BYTES))["results"]
-        if len(results) != len(asked):
-            raise NotAskedError(f"{database}: {len(results)} answers to {len(asked)} questions")
+        if len(results) != len(queried):
+            raise AuditError(f"{database}: {len(results)} answers to {len(queried)} questions")
         named = [[str(one["id"]) for one in result.get("vulns", ())] for result in results]
         if any(
             "next_page_token" in r and not names for r, names in zip(results, named, strict=True)
         ):
-            raise NotAskedError(f"{database}: answers in pages; look at osv.dev yourself")
+            raise AuditError(f"{database}: answers in pages; look at osv.dev yourself")
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         reason = getattr(error, "reason", error)
-        raise NotAskedError(f"{database}: {reason}") from error
+        raise AuditError(f"{database}: {reason}") from error
     # What has a further page and names on this one fails as it is.
-    return {package: names for package, names in zip(asked, named, strict=True) if names}
+    return {package: names for package, names in zip(queried, named, strict=True) if names}
 
 
-def problems(found: Mapping[Package, list[str]], looked_at: Mapping[str, str]) -> list[str]:
+def problems(found: Mapping[Package, list[str]], reviewed: Mapping[str, str]) -> list[str]:
     """A sentence for every advisory nobody has looked at, and every look that is out of date."""
     unseen = [
         f"{package.name} {package.version}: https://osv.dev/vulnerability/{name}; take a version "
         "without it, or have a person look at it and note it in tests/audit.py"
         for package, names in found.items()
         for name in names
-        if name not in looked_at
+        if name not in reviewed
     ]
     matched = {name for names in found.values() for name in names}
-    gone = [f"{name} matches nothing any more; take it out of tests/audit.py" for name in looked_at]
+    stale = [f"{name} matches nothing any more; take it out of tests/audit.py" for name in reviewed]
     return unseen + [
-        said for said, name in zip(gone, looked_at, strict=True) if name not in matched
+        sentence for sentence, name in zip(stale, reviewed, strict=True) if name not in matched
     ]
 
 
 def main(arguments: list[str], database: str = DATABASE) -> int:
     """The exit status; see the top of this file."""
-    asked = packages()
+    queried = packages()
     try:
-        found = advisories(asked, database)
-    except NotAskedError as error:
+        found = advisories(queried, database)
+    except AuditError as error:
         print(f"NOT AUDITED: {error}", file=sys.stderr)
         print("NOT AUDITED: run `make audit` where the network reaches it", file=sys.stderr)
         return 2 if "--required" in arguments else 0
-    told = problems(found, LOOKED_AT)
-    for sentence in told:
+    findings = problems(found, REVIEWED)
+    for sentence in findings:
         print(sentence, file=sys.stderr)
     matching = sum(len(names) for names in found.values())
-    print(f"{len(asked)} packages audited, {matching} advisories match, {len(told)} problems")
-    return 1 if told else 0
+    print(f"{len(queried)} packages audited, {matching} advisories match, {len(findings)} problems")
+    return 1 if findings else 0
 
 
 if __name__ == "__main__":

@@ -99,23 +99,23 @@ class Browser:
         self._number += 1
         self._link.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
         while True:
-            told = json.loads(self._link.recv(timeout=CALL_TIMEOUT_S))
-            if told.get("id") == self._number:
-                assert "error" not in told, told
-                result: dict[str, Any] = told["result"]
+            message = json.loads(self._link.recv(timeout=CALL_TIMEOUT_S))
+            if message.get("id") == self._number:
+                assert "error" not in message, message
+                result: dict[str, Any] = message["result"]
                 return result
-            self._note(told)
+            self._note(message)
 
     def open(self, address: str) -> None:
         self.call("Page.navigate", url=address)
 
     def evaluate(self, script: str) -> Any:
         """The value of an expression on the page."""
-        told = self.call(
+        message = self.call(
             "Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True
         )
-        assert "exceptionDetails" not in told, told["exceptionDetails"]
-        return told["result"].get("value")
+        assert "exceptionDetails" not in message, message["exceptionDetails"]
+        return message["result"].get("value")
 
     def wait_for(self, script: str, within_s: float) -> float:
         """Wait until an expression is true; returns how long that took, in seconds."""
@@ -136,12 +136,12 @@ class Browser:
 
     def picture(self, path: Path) -> None:
         """What is seen, as PNG."""
-        told = self.call("Page.captureScreenshot", format="png")
+        message = self.call("Page.captureScreenshot", format="png")
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(base64.b64decode(told["data"]))
+        path.write_bytes(base64.b64decode(message["data"]))
 
-    def _note(self, told: dict[str, Any]) -> None:
-        method, content = told.get("method"), told.get("params", {})
+    def _note(self, message: dict[str, Any]) -> None:
+        method, content = message.get("method"), message.get("params", {})
         if method == "Network.requestWillBeSent":
             self.requested.append(content["request"]["url"])
         elif method == "Runtime.exceptionThrown":

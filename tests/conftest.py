@@ -26,12 +26,12 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """File by file, but all flights as if they were one."""
     from xdist.scheduler import LoadFileScheduling
 
-    class RightOfWay(LoadFileScheduling):
+    class FlightsFirstScheduling(LoadFileScheduling):
         def _split_scope(self, nodeid: str) -> str:
             flights = "tests/system"
             return flights if nodeid.startswith(f"{flights}/") else super()._split_scope(nodeid)
 
-    return RightOfWay(config, log)
+    return FlightsFirstScheduling(config, log)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

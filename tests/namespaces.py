@@ -43,14 +43,14 @@ def two_hosts() -> Iterator[tuple[Host, Host]]:
     mark = secrets.token_hex(3)
     names = (f"syn-a-{mark}", f"syn-b-{mark}")
     links = (f"sa{mark}", f"sb{mark}")
-    made = []
+    devices = []
     try:
         for name in names:
             try:
                 _ip("netns", "add", name)
             except subprocess.CalledProcessError as error:
                 pytest.skip(f"no network namespaces here: {error.stderr.decode().strip()}")
-            made.append(name)
+            devices.append(name)
         _ip("-n", names[0], "link", "add", links[0], "type", "veth", "peer", links[1])
         _ip("-n", names[0], "link", "set", links[1], "netns", names[1])
         hosts = []
@@ -63,7 +63,7 @@ def two_hosts() -> Iterator[tuple[Host, Host]]:
         for host in hosts:
             host.end()
     finally:
-        for name in made:
+        for name in devices:
             _ip("netns", "delete", name)
 
 

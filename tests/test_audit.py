@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.audit import NotAskedError, Package, advisories, main, packages, problems
+from tests.audit import AuditError, Package, advisories, main, packages, problems
 
 
 class Database:
@@ -36,11 +36,11 @@ class Database:
         self.server = HTTPServer(("127.0.0.1", 0), Handler)
         self.address = f"http://127.0.0.1:{self.server.server_port}/v1/querybatch"
 
-    def answer(self, asked: dict[str, Any]) -> bytes:
+    def answer(self, queried: dict[str, Any]) -> bytes:
         if self.body is not None:
             return self.body
         results = []
-        for query in asked["queries"]:
+        for query in queried["queries"]:
             package = query["package"]
             key = (package["ecosystem"], package["name"], query["version"])
             names = [{"id": name, "modified": "2026-01-01"} for name in self.known.get(key, [])]
@@ -50,12 +50,12 @@ class Database:
 
 @pytest.fixture
 def database() -> Iterator[Database]:
-    made = Database()
-    thread = threading.Thread(target=made.server.serve_forever, daemon=True)
+    fake = Database()
+    thread = threading.Thread(target=fake.server.serve_forever, daemon=True)
     thread.start()
-    yield made
-    made.server.shutdown()
-    made.server.server_close()
+    yield fake
+    fake.server.shutdown()
+    fake.server.server_close()
     thread.join(5)
 
 
@@ -78,9 +78,9 @@ def test_an_advisory_of_a_pinned_version_fails_the_check(
     database.known["PyPI", "jinja2", pinned.version] = ["PYSEC-2099-1"]
     database.known["PyPI", "jinja2", "0.1"] = ["PYSEC-2000-9"]
     assert main([], database.address) == 1
-    said = capsys.readouterr().err
-    assert f"jinja2 {pinned.version}" in said and "PYSEC-2099-1" in said
-    assert "PYSEC-2000-9" not in said
+    stderr = capsys.readouterr().err
+    assert f"jinja2 {pinned.version}" in stderr and "PYSEC-2099-1" in stderr
+    assert "PYSEC-2000-9" not in stderr
 
 
 def test_an_advisory_that_a_person_has_looked_at_is_let_pass_as_long_as_it_matches() -> None:
@@ -89,7 +89,7 @@ def test_an_advisory_that_a_person_has_looked_at_is_let_pass_as_long_as_it_match
     assert "matches nothing" in problems({}, {"PYSEC-2099-1": "templates are ours"})[0]
 
 
-def test_a_database_out_of_reach_is_told_and_fails_only_where_it_is_required(
+def test_an_unreachable_database_is_reported_and_fails_only_where_it_is_required(
     database: Database, capsys: pytest.CaptureFixture[str]
 ) -> None:
     closed = "http://127.0.0.1:1/v1/querybatch"
@@ -113,14 +113,14 @@ def test_an_answer_that_is_none_is_not_taken_for_a_clean_one(
     database: Database, body: bytes
 ) -> None:
     database.body = body
-    with pytest.raises(NotAskedError):
+    with pytest.raises(AuditError):
         advisories(packages(), database.address)
 
 
 def test_a_page_without_names_that_goes_on_is_not_taken_for_a_clean_one(
     database: Database,
 ) -> None:
-    asked = packages()
-    database.body = json.dumps({"results": [{"next_page_token": "2"}] * len(asked)}).encode()
-    with pytest.raises(NotAskedError, match="pages"):
-        advisories(asked, database.address)
+    queried = packages()
+    database.body = json.dumps({"results": [{"next_page_token": "2"}] * len(queried)}).encode()
+    with pytest.raises(AuditError, match="pages"):
+        advisories(queried, database.address)

@@ -44,7 +44,7 @@ def test_a_licence_is_judged_by_all_its_parts(licence: str, is_tool: bool, may: 
     assert (Package("something", licence, is_tool).problem is None) is may
 
 
-def test_a_package_that_says_two_things_is_held_to_both() -> None:
+def test_a_package_with_two_statements_must_satisfy_both() -> None:
     classifiers = [
         "License :: OSI Approved :: MIT License",
         "License :: OSI Approved :: GNU General Public License v3 (GPLv3)",

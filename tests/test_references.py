@@ -163,7 +163,7 @@ def test_every_entry_of_the_list_is_cited_somewhere() -> None:
     assert sorted(entries().difference(*cited_in().values())) == []
 
 
-def test_code_that_names_an_equation_says_of_which_work() -> None:
+def test_code_that_names_an_equation_names_its_work() -> None:
     cited = cited_in()
     unclear = [
         name

@@ -30,7 +30,7 @@ from daemon.cli.benchmark.measurement import machine
 
 Row = dict[str, Any]
 
-MOST_ALARMS: Final = 3e-4
+MAX_ALARMS: Final = 3e-4
 """Share of drawn healthy exposures whose verdict may change."""
 
 
@@ -62,7 +62,7 @@ def main() -> None:
     if given.drawn:
         alarms = false_alarms(given.drawn, given.seed)
         print(json.dumps({"machine": machine(), "drawn": given.drawn, "alarms": alarms}))
-        sys.exit(1 if alarms["any"] > given.drawn * MOST_ALARMS else 0)
+        sys.exit(1 if alarms["any"] > given.drawn * MAX_ALARMS else 0)
     cases = draw(given.count, given.seed, rigs=given.rig or (), kinds=given.kind or ())
     rows = list(results(cases, given.results, given.jobs))
     if given.json:
@@ -96,7 +96,7 @@ def _write(file: Path | None, row: Row) -> Row:
     if file is not None:
         with file.open("a") as out:
             out.write(json.dumps(row) + "\n")
-    print(f"{row['number']} {row['rig']} {row['says']}: {row['result']}", file=sys.stderr)
+    print(f"{row['number']} {row['rig']} {row['description']}: {row['result']}", file=sys.stderr)
     return row
 
 
@@ -127,7 +127,7 @@ def summary(rows: Sequence[Row]) -> str:
 
 def _wrong(rows: Iterable[Row]) -> list[str]:
     return [
-        f"{row['result']}: {row['number']} {row['kind']} {row['rig']} {row['says']} "
+        f"{row['result']}: {row['number']} {row['kind']} {row['rig']} {row['description']} "
         f"({row['share']:.2f} of the limit): {row['verdict']} {row['flags']} {row['named']}, "
         f"error/sigma {row['over_sigma'] or 0:.2f} ({row['error_px'] or 0:.3f} px), band "
         f"{row['band_px']:.2f} px, radiance {row['radiance']:.1%} of {row['radiance_of']}, "
@@ -140,7 +140,7 @@ def _wrong(rows: Iterable[Row]) -> list[str]:
 def _sigmas(rows: Sequence[Row]) -> list[str]:
     """Normalised errors of flagged and unflagged images against the 99.9 % points of chi-square."""
     lines = []
-    for says, flagged in (("without a flag", False), ("with a flag", True)):
+    for label, flagged in (("without a flag", False), ("with a flag", True)):
         some = [r for r in rows if r["rank"] and bool(r["flags"]) == flagged]
         if not some:
             continue
@@ -151,7 +151,7 @@ def _sigmas(rows: Sequence[Row]) -> list[str]:
         stated = float(np.sqrt(np.mean([r["stated_px"] ** 2 for r in some])))
         wide = sum(r["stated_px"] > WIDEST * r["error_px"] for r in some)
         lines.append(
-            f"{says}: {len(some)} images, mean square of normalised errors {mean:.3f} "
+            f"{label}: {len(some)} images, mean square of normalised errors {mean:.3f} "
             f"(rank {rank}, {low:.3f} .. {high:.3f}); {true:.3f} px true, {stated:.3f} stated; "
             f"{wide} state more than {WIDEST:g} times their error"
         )

@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.silent_errors.exposures import again, healthy
+from benchmarks.silent_errors.exposures import healthy, remeasured
 from benchmarks.silent_errors.faults import FAULTS
 from benchmarks.silent_errors.limits import LIMITS
 from benchmarks.silent_errors.truth import Found, compare, detail_of
@@ -89,7 +89,7 @@ class Outcome:
     rig: str
     share: float
     size: float
-    says: str
+    description: str
     above: bool
     verdict: str
     flags: str
@@ -109,16 +109,16 @@ class Outcome:
 
 def run(case: Case) -> Outcome:
     """Plant, process and judge one case."""
-    planted = again(case.rig, case.exposure, case.seed)
-    fault = FAULTS[case.kind](planted, case.size, np.random.default_rng([case.seed, 29]))
-    product = fault.planted.process()
+    emulated = remeasured(case.rig, case.exposure, case.seed)
+    fault = FAULTS[case.kind](emulated, case.size, np.random.default_rng([case.seed, 29]))
+    product = fault.emulated.process()
     report = product.report
-    found = compare(fault.planted, product, clean_detail(case.rig, case.exposure))
+    found = compare(fault.emulated, product, clean_detail(case.rig, case.exposure))
     over = None
     if found.error_px is not None and found.stated_px:
         over = found.error_px / found.stated_px
-    named = accused(report)
-    result = _result(case, report, found, over, named, fault.culprits)
+    named = named_causes(report)
+    result = _result(case, report, found, over, named, fault.true_causes)
     whitened = found.normalised
     return Outcome(
         number=case.number,
@@ -126,7 +126,7 @@ def run(case: Case) -> Outcome:
         rig=case.rig,
         share=case.share,
         size=case.size,
-        says=fault.says,
+        description=fault.description,
         above=case.above,
         verdict=report.verdict.value,
         flags=", ".join(str(flag.name) for flag in report.flags),
@@ -149,9 +149,9 @@ def _result(
     found: Found,
     over: float | None,
     named: Mapping[str, frozenset[str]],
-    culprits: frozenset[str],
+    true_causes: frozenset[str],
 ) -> str:
-    if any(not (names & culprits) for names in named.values()):
+    if any(not (names & true_causes) for names in named.values()):
         return "misled"
     if report.verdict is not Verdict.GOOD:
         return "found"
@@ -162,7 +162,7 @@ def _result(
     return "right" if case.above else "covered"
 
 
-def accused(report: QualityReport) -> dict[str, frozenset[str]]:
+def named_causes(report: QualityReport) -> dict[str, frozenset[str]]:
     """Who is named as a cause, by what he is accused of; alternatives among them."""
     raised = {flag.name for flag in report.flags}
     figures = report.figures
@@ -198,8 +198,8 @@ def _names(figures: Mapping[str, Figure], *keys: str) -> frozenset[str]:
 @cache
 def clean_detail(rig: str, number: int) -> Mapping[str, NDArray[Any]]:
     """Fine detail of the image of a healthy exposure."""
-    planted = healthy(rig, number)
-    return detail_of(planted, planted.process())
+    emulated = healthy(rig, number)
+    return detail_of(emulated, emulated.process())
 
 
 def by_exposure(cases: Sequence[Case]) -> Iterator[Case]:

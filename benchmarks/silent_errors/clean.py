@@ -16,9 +16,9 @@ from typing import Any, Final
 import numpy as np
 from scipy.stats import chi2
 
-from benchmarks.flags import CALM_PX, true_smear_px
-from benchmarks.silent_errors.cases import accused
-from benchmarks.silent_errors.exposures import again, world_of
+from benchmarks.flags import MAX_TRUE_SMEAR_PX, true_smear_px
+from benchmarks.silent_errors.cases import named_causes
+from benchmarks.silent_errors.exposures import remeasured, world_of
 from benchmarks.silent_errors.limits import DMC, L, X
 from benchmarks.silent_errors.scenes import SCENES
 from benchmarks.silent_errors.truth import compare
@@ -54,15 +54,15 @@ def _clean(number: int, seed: int) -> Row:
     light = number // DRAWS
     rig = RIGS[light % len(RIGS)]
     scene = list(SCENES)[light // len(RIGS) % len(SCENES)]
-    place = _calm(rig, scene, FIRST + 10 * light)
-    planted = again(rig, place, seed * 1_000_000 + number, scene=scene)
-    product = planted.process()
+    place = _first_without_smear(rig, scene, FIRST + 10 * light)
+    emulated = remeasured(rig, place, seed * 1_000_000 + number, scene=scene)
+    product = emulated.process()
     report = product.report
-    found = compare(planted, product, {})
+    found = compare(emulated, product, {})
     changing = [f.flag for f in report.findings if f.verdict is not Verdict.GOOD]
     unexpected = [str(f.name) for f in changing if not f & SCENES[scene].expected]
-    named = {what: ", ".join(sorted(names)) for what, names in accused(report).items()}
-    accusing = [f"{what} {names}" for what, names in named.items() if changing]
+    named = {what: ", ".join(sorted(names)) for what, names in named_causes(report).items()}
+    naming = [f"{what} {names}" for what, names in named.items() if changing]
     return {
         "number": number,
         "rig": rig,
@@ -70,7 +70,7 @@ def _clean(number: int, seed: int) -> Row:
         "light": place,
         "verdict": report.verdict.value,
         "flags": ", ".join(str(flag.name) for flag in report.flags),
-        "alarm": "; ".join([*unexpected, *accusing]),
+        "alarm": "; ".join([*unexpected, *naming]),
         "error_px": found.error_px,
         "stated_px": found.stated_px,
         "squares": None
@@ -80,10 +80,10 @@ def _clean(number: int, seed: int) -> Row:
     }
 
 
-def _calm(rig: str, scene: str, first: int) -> int:
+def _first_without_smear(rig: str, scene: str, first: int) -> int:
     """The first exposure from `first` on without true smear: the mount's tremor smears some."""
     for number in range(first, first + 10):
-        if true_smear_px(world_of(rig, number, scene), 0) < CALM_PX:
+        if true_smear_px(world_of(rig, number, scene), 0) < MAX_TRUE_SMEAR_PX:
             return number
     return first
 
@@ -115,5 +115,7 @@ def clean_summary(rows: Sequence[Row]) -> str:
             f"| {true:.3f} | {stated:.3f} |"
         )
     alarmed = Counter(f"{r['rig']} {r['scene']} {r['light']}: {r['alarm']}" for r in rows)
-    lines += [f"{n} x {says}" for says, n in alarmed.items() if not says.endswith(": ")]
+    lines += [
+        f"{n} x {scene_text}" for scene_text, n in alarmed.items() if not scene_text.endswith(": ")
+    ]
     return "\n".join(lines)

@@ -15,15 +15,15 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.silent_errors.exposures import again
+from benchmarks.silent_errors.exposures import remeasured
 from benchmarks.silent_errors.limits import DMC, L, X
 from processing.mosaic.estimated_dc import estimate_dc
-from processing.mosaic.free import Mosaic
+from processing.mosaic.free_mosaic import Mosaic
 from processing.mosaic.layers import check_layers
 from processing.mosaic.mounting import check_platform, place_covariance, rotation_of_layer
-from processing.mosaic.slips import find_slips
+from processing.mosaic.readout_slips import find_slips
 from processing.mosaic.stitch_record import layer_scale_design
-from processing.mosaic.validity import judge_master
+from processing.mosaic.validity import evaluate_master
 from processing.pipelines.stitched import Product
 from processing.quality.report import Thresholds
 from processing.rig import Cone, Rig
@@ -31,13 +31,13 @@ from processing.rig import Cone, Rig
 Array = NDArray[np.float64]
 Random = np.random.Generator
 
-TURNS: Final = (X, X, X, X, X, L, DMC)
+RIG_SEQUENCE: Final = (X, X, X, X, X, L, DMC)
 """The rig of each drawn exposure in turn."""
 PROBE_SIGMA_K: Final = 0.1
 LARGEST_DC_K: Final = 15.0
-ALIKE_PX: Final = 60.0
+CORRELATED_PX: Final = 60.0
 """Tie points of a cell of this side in the first frame share a part of their error."""
-ALIKE_SHARE: Final = 0.3
+CORRELATED_SHARE: Final = 0.3
 """Of the variance of a residual."""
 
 
@@ -52,44 +52,44 @@ class Template:
 
 def template(rig: str) -> Template:
     """An exposure of a rig, rendered and processed."""
-    planted = again(rig, 0, 7)
-    product = planted.process()
+    emulated = remeasured(rig, 0, 7)
+    product = emulated.process()
     assert isinstance(product, Product)
     mosaic = product.free
     units = mosaic.model.units
     values, directions = np.linalg.eigh(mosaic.covariance / np.outer(units, units))
     root = units[:, None] * (directions * np.sqrt(np.maximum(values, 0.0)))
-    return Template(planted.rig, product, root)
+    return Template(emulated.rig, product, root)
 
 
 def false_alarms(count: int, seed: int) -> Counter[str]:
     """How many of `count` drawn exposures change a verdict, by finding; `any` counts exposures."""
-    templates = {rig: template(rig) for rig in dict.fromkeys(TURNS)}
+    templates = {rig: template(rig) for rig in dict.fromkeys(RIG_SEQUENCE)}
     found: Counter[str] = Counter()
     for number in range(count):
-        of = templates[TURNS[number % len(TURNS)]]
-        alarms = judged(of, np.random.default_rng([seed, 37, number]))
+        of = templates[RIG_SEQUENCE[number % len(RIG_SEQUENCE)]]
+        alarms = raised_findings(of, np.random.default_rng([seed, 37, number]))
         found.update(alarms)
         found["any"] += bool(alarms)
     return found
 
 
-def judged(of: Template, random: Random) -> list[str]:
+def raised_findings(of: Template, random: Random) -> list[str]:
     """Draw one exposure; the findings that change its verdict."""
     mosaic, temperatures = _drawn(of, random)
     rig, tie_points = of.rig, of.product.tie_points
     alarms = []
-    validity = judge_master(rig, mosaic, temperatures)
+    validity = evaluate_master(rig, mosaic, temperatures)
     if validity.displaced is not None:
         test = validity.displaced.statistic / validity.limit
         alarms += ["displaced"] if test > Thresholds().displacement_verdict else []
-    alarms += ["misread"] if validity.misread is not None else []
+    alarms += ["misread"] if validity.probe_bias is not None else []
     if any(e.disagrees for e in estimate_dc(rig, mosaic, temperatures)):
         alarms.append("temperature")
     layers = check_layers(rig, mosaic, temperatures)
     alarms += ["layers"] if layers is not None and layers.changed else []
     platform = check_platform(rig, mosaic, tie_points, temperatures)
-    alarms += ["platform"] if platform is not None and platform.expired else []
+    alarms += ["platform"] if platform is not None and platform.is_expired else []
     alarms += ["slip"] if find_slips(rig, tie_points, mosaic.residuals_px) else []
     return alarms
 
@@ -117,12 +117,12 @@ def _drawn(of: Template, random: Random) -> tuple[Mosaic, dict[str, float]]:
             off_um -= np.array([drift.x_um_per_k, drift.y_um_per_k]) * off_k
             values[first : first + 2] += off_um * 1e-3
             values[first + 3] -= drift.scale_ppm_per_k * 1e-6 * off_k
-    _turn_layers(rig, mosaic, values, read, random)
-    _turn_mountings(rig, mosaic, values, random)
+    _perturb_layers(rig, mosaic, values, read, random)
+    _perturb_mountings(rig, mosaic, values, random)
     return replace(mosaic, values=values, residuals_px=_residuals(of, random)), temperatures
 
 
-def _turn_layers(
+def _perturb_layers(
     rig: Rig, mosaic: Mosaic, values: Array, read: Mapping[str, float], random: Random
 ) -> None:
     """Principal distances and mountings off by their sigmas."""
@@ -147,17 +147,17 @@ def _turn_layers(
         values[own] += np.linalg.pinv(design[:, own]) @ wanted
 
 
-def _turn_mountings(rig: Rig, mosaic: Mosaic, values: Array, random: Random) -> None:
+def _perturb_mountings(rig: Rig, mosaic: Mosaic, values: Array, random: Random) -> None:
     """Converging heads turned by their sigmas; the mean is the datum's."""
-    turns = {}
+    rotations = {}
     for name in mosaic.model.mountings:
         cone = rig.cone(name)
         places = place_covariance(cone, {})
-        turns[name] = random.normal(0.0, cone.rotation_sigma_urad * 1e-6, 3)
-        turns[name] += random.multivariate_normal(np.zeros(3), places)
-    mean = np.mean(list(turns.values()), axis=0) if turns else np.zeros(3)
+        rotations[name] = random.normal(0.0, cone.rotation_sigma_urad * 1e-6, 3)
+        rotations[name] += random.multivariate_normal(np.zeros(3), places)
+    mean = np.mean(list(rotations.values()), axis=0) if rotations else np.zeros(3)
     for name, first in mosaic.model.mountings.items():
-        values[first : first + 3] += turns[name] - mean
+        values[first : first + 3] += rotations[name] - mean
 
 
 def _residuals(of: Template, random: Random) -> Array:
@@ -171,14 +171,14 @@ def _residuals(of: Template, random: Random) -> Array:
         relative = points.sigma_px / np.median(points.sigma_px[used])
         spread = np.sqrt(np.nanmean((mosaic.residuals_px[used] / relative[used, None]) ** 2))
         sigma[rows] = (relative * spread)[rows]
-    cells = np.floor(points.raw_a / ALIKE_PX).astype(np.int64)
+    cells = np.floor(points.raw_a / CORRELATED_PX).astype(np.int64)
     number = (points.overlap * 1000 + cells[:, 0]) * 1000 + cells[:, 1]
     _, cell = np.unique(number, return_inverse=True)
     shared = random.standard_normal((int(cell.max()) + 1, 2))[cell]
     own = random.standard_normal((len(points), 2))
-    field = np.sqrt(ALIKE_SHARE) * shared + np.sqrt(1.0 - ALIKE_SHARE) * own
+    field = np.sqrt(CORRELATED_SHARE) * shared + np.sqrt(1.0 - CORRELATED_SHARE) * own
     # Points that the adjustment had no use for stay as they were, blunders among them.
     drawn = field * sigma[:, None]
-    kept = mosaic.outliers | ~np.isfinite(mosaic.residuals_px).all(axis=1)
-    drawn[kept] = mosaic.residuals_px[kept]
+    retained = mosaic.outliers | ~np.isfinite(mosaic.residuals_px).all(axis=1)
+    drawn[retained] = mosaic.residuals_px[retained]
     return np.asarray(drawn, np.float64)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 
 from benchmarks.rendered import (
-    Exposure,
+    RenderedExposure,
     conditions_of,
     flight_and_mark,
     radiometry_of,
@@ -27,13 +27,13 @@ from benchmarks.rendered import (
 from benchmarks.silent_errors.scenes import SCENES, Tone
 from processing.geometry.conditions import Conditions
 from processing.pipelines.perspective import HeadPipeline, HeadsProduct
-from processing.pipelines.stitched import Pipeline, Product, Settings
+from processing.pipelines.stitched import Pipeline, PipelineSettings, Product
 from processing.radiometry.calibration import RadiometricCalibration
 from processing.rig import Cone, Rig, Sensor, find_rig
 from sim_hw.world import snapshots
-from sim_hw.world.camera import MOUNTING_RESIDUAL_RAD
 from sim_hw.world.scene import open_scene
-from sim_hw.world.snapshots import Heads, Snapshot
+from sim_hw.world.snapshots import RigElectronics, Snapshot
+from sim_hw.world.true_camera import MOUNTING_RESIDUAL_RAD
 from sim_hw.world.world import World
 
 RIGS = ("ultracam-x-mini", "ultracam-l-mini", "dmc-mini", "midas-mini")
@@ -47,7 +47,7 @@ Content = Callable[[Array], Array]
 
 
 @dataclass(frozen=True)
-class Planted:
+class EmulatedExposure:
     """An exposure and its truth.
 
     `frames`, `rig` and `conditions` are what the pipeline gets. `light` are true radiances by
@@ -74,22 +74,22 @@ class Planted:
     def process(self) -> Product | HeadsProduct:
         """Make the image as `syntopic process` does."""
         if self.stitched:
-            return Pipeline(self.rig, self.radiometry, Settings(threads=1)).process(
+            return Pipeline(self.rig, self.radiometry, PipelineSettings(threads=1)).process(
                 self.frames, self.conditions
             )
         heads = HeadPipeline(self.rig, self.radiometry, threads=1)
         return heads.process(self.frames, self.conditions)
 
-    def with_frame(self, name: str, change: Callable[[Array], Array]) -> Planted:
+    def with_frame(self, name: str, change: Callable[[Array], Array]) -> EmulatedExposure:
         """The same with one frame changed."""
         return replace(self, frames={**self.frames, name: change(self.frames[name].copy())})
 
-    def with_cone(self, name: str, change: Callable[[Cone], Cone]) -> Planted:
+    def with_cone(self, name: str, change: Callable[[Cone], Cone]) -> EmulatedExposure:
         """The same with another calibration of one cone; the camera itself is as it was."""
         cones = tuple(change(c) if c.name == name else c for c in self.rig.cones)
         return replace(self, rig=replace(self.rig, cones=cones))
 
-    def with_sensor(self, name: str, change: Callable[[Sensor], Sensor]) -> Planted:
+    def with_sensor(self, name: str, change: Callable[[Sensor], Sensor]) -> EmulatedExposure:
         """The same with another calibration of one sensor."""
 
         def changed(cone: Cone) -> Cone:
@@ -99,15 +99,15 @@ class Planted:
         return self.with_cone(self.rig.cone_of(name).name, changed)
 
 
-def healthy(rig: str, number: int) -> Planted:
+def healthy(rig: str, number: int) -> EmulatedExposure:
     """A healthy exposure of a rig; the same number gives the same one."""
     return _read_out(rig, number, "landscape", seed=_seed(rig, number))
 
 
-def again(rig: str, number: int, seed: int, *, scene: str = "landscape") -> Planted:
+def remeasured(rig: str, number: int, seed: int, *, scene: str = "landscape") -> EmulatedExposure:
     """The same light with other noise and with places as another laboratory would state them."""
-    planted = _read_out(rig, number, scene, seed=seed)
-    return replace(planted, rig=calibrated_again(planted.world, seed))
+    emulated = _read_out(rig, number, scene, seed=seed)
+    return replace(emulated, rig=recalibrated(emulated.world, seed))
 
 
 def world_of(rig: str, number: int, scene: str = "landscape") -> World:
@@ -133,7 +133,7 @@ def _seed(rig: str, number: int) -> int:
 
 
 @lru_cache(maxsize=4)
-def _lit(rig: str, number: int, scene: str, place: int) -> Exposure:
+def _lit(rig: str, number: int, scene: str, place: int) -> RenderedExposure:
     world = world_of(rig, number, scene)
     flight, mark_ns = flight_and_mark(world, place)
     with TemporaryDirectory(prefix="syntopic-silent-") as folder:
@@ -142,7 +142,7 @@ def _lit(rig: str, number: int, scene: str, place: int) -> Exposure:
     tone = SCENES[scene].tone
     if tone is not None:
         snapshot = replace(snapshot, light=_toned(snapshot, tone, _seed(rig, number)))
-    return Exposure(world, flight, snapshot)
+    return RenderedExposure(world, flight, snapshot)
 
 
 def _toned(snapshot: Snapshot, tone: Tone, seed: int) -> dict[str, Array]:
@@ -161,38 +161,38 @@ def _toned(snapshot: Snapshot, tone: Tone, seed: int) -> dict[str, Array]:
 
 
 @lru_cache(maxsize=2)
-def _heads(rig: str) -> Heads:
+def _heads(rig: str) -> RigElectronics:
     """The electronics of a rig, which all its exposures share."""
-    return Heads(world_of(rig, 0), seed=1 + RIGS.index(rig))
+    return RigElectronics(world_of(rig, 0), seed=1 + RIGS.index(rig))
 
 
-def _read_out(rig: str, number: int, scene: str, *, seed: int) -> Planted:
+def _read_out(rig: str, number: int, scene: str, *, seed: int) -> EmulatedExposure:
     # The cloud of a scene hangs over the first exposure of the line.
-    taken, heads = _lit(rig, number, scene, 0), _heads(rig)
+    exposure, heads = _lit(rig, number, scene, 0), _heads(rig)
 
     def before() -> Frames:
         other = _lit(rig, number, scene, 1)
         return heads.frames(other.world, other.snapshot, seed=seed + 1)
 
-    return Planted(
-        rig=taken.world.rig,
-        frames=heads.frames(taken.world, taken.snapshot, seed=seed),
-        conditions=conditions_of(taken, seed=seed),
+    return EmulatedExposure(
+        rig=exposure.world.rig,
+        frames=heads.frames(exposure.world, exposure.snapshot, seed=seed),
+        conditions=conditions_of(exposure, seed=seed),
         radiometry=radiometry_of(heads),
-        world=taken.world,
-        snapshot=taken.snapshot,
+        world=exposure.world,
+        snapshot=exposure.snapshot,
         other=before,
     )
 
 
-def calibrated_again(world: World, seed: int) -> Rig:
+def recalibrated(world: World, seed: int) -> Rig:
     """The rig as a laboratory would state it whose errors follow from the seed; truth stays.
 
     Places of the sensors and angles of all cones but the master's are drawn by their sigmas.
     """
     random = np.random.default_rng([seed, 13])
 
-    def turned(cone: Cone) -> tuple[float, float, float]:
+    def rotated_rad(cone: Cone) -> tuple[float, float, float]:
         if cone.name == world.rig.master_cone:
             return cone.rotation_rad
         off = np.add(cone.rotation_rad, world.camera.mounting_error_rad[cone.name])
@@ -207,7 +207,9 @@ def calibrated_again(world: World, seed: int) -> Rig:
         )
 
     cones = tuple(
-        replace(cone, rotation_rad=turned(cone), sensors=tuple(stated(s) for s in cone.sensors))
+        replace(
+            cone, rotation_rad=rotated_rad(cone), sensors=tuple(stated(s) for s in cone.sensors)
+        )
         for cone in world.rig.cones
     )
     return replace(world.rig, cones=cones)

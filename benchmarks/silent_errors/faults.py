@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.silent_errors.exposures import Planted
+from benchmarks.silent_errors.exposures import EmulatedExposure
 from processing.rig import Cone, Rig, Sensor
 
 Array = NDArray[Any]
@@ -22,27 +22,33 @@ T = TypeVar("T")
 class Fault:
     """What was planted: the exposure, what may rightly be named as the cause, and a description."""
 
-    planted: Planted
-    culprits: frozenset[str]
-    says: str
+    emulated: EmulatedExposure
+    true_causes: frozenset[str]
+    description: str
 
 
-Plant = Callable[[Planted, float, Random], Fault]
+FaultInjector = Callable[[EmulatedExposure, float, Random], Fault]
 
 
-def _of_cone(planted: Planted, cone: Cone, change: Callable[[Cone], Cone], says: str) -> Fault:
+def _of_cone(
+    emulated: EmulatedExposure, cone: Cone, change: Callable[[Cone], Cone], description: str
+) -> Fault:
     names = frozenset({cone.name, *(s.name for s in cone.sensors)})
-    return Fault(planted.with_cone(cone.name, change), names, f"cone {cone.name}: {says}")
+    return Fault(emulated.with_cone(cone.name, change), names, f"cone {cone.name}: {description}")
 
 
-def _of_sensor(planted: Planted, name: str, change: Callable[[Sensor], Sensor], says: str) -> Fault:
-    names = frozenset({name, planted.rig.cone_of(name).name})
-    return Fault(planted.with_sensor(name, change), names, f"{name}: {says}")
+def _of_sensor(
+    emulated: EmulatedExposure, name: str, change: Callable[[Sensor], Sensor], description: str
+) -> Fault:
+    names = frozenset({name, emulated.rig.cone_of(name).name})
+    return Fault(emulated.with_sensor(name, change), names, f"{name}: {description}")
 
 
-def _of_frame(planted: Planted, name: str, change: Callable[[Array], Array], says: str) -> Fault:
-    names = frozenset({name, planted.rig.cone_of(name).name})
-    return Fault(planted.with_frame(name, change), names, f"{name}: {says}")
+def _of_frame(
+    emulated: EmulatedExposure, name: str, change: Callable[[Array], Array], description: str
+) -> Fault:
+    names = frozenset({name, emulated.rig.cone_of(name).name})
+    return Fault(emulated.with_frame(name, change), names, f"{name}: {description}")
 
 
 def _any(random: Random, some: Sequence[T]) -> T:
@@ -68,55 +74,57 @@ def _several(rig: Rig) -> list[str]:
     return [s.name for cone in rig.pan_cones if len(cone.sensors) > 1 for s in cone.sensors]
 
 
-def _principal_distance(planted: Planted, ppm: float, random: Random) -> Fault:
-    cone, off = _any(random, planted.rig.pan_cones), _sign(random) * ppm
-    return _of_cone(planted, cone, _with_f(off), f"principal distance {off:+.0f} ppm")
+def _principal_distance(emulated: EmulatedExposure, ppm: float, random: Random) -> Fault:
+    cone, off = _any(random, emulated.rig.pan_cones), _sign(random) * ppm
+    return _of_cone(emulated, cone, _with_f(off), f"principal distance {off:+.0f} ppm")
 
 
 def _with_f(ppm: float) -> Callable[[Cone], Cone]:
     return lambda c: replace(c, lens=replace(c.lens, f_mm=c.lens.f_mm * (1.0 + ppm * 1e-6)))
 
 
-def _turned(turn_rad: Sequence[float]) -> Callable[[Cone], Cone]:
+def _rotated(rotation_rad: Sequence[float]) -> Callable[[Cone], Cone]:
     def change(cone: Cone) -> Cone:
-        x, y, z = (a + b for a, b in zip(cone.rotation_rad, turn_rad, strict=True))
+        x, y, z = (a + b for a, b in zip(cone.rotation_rad, rotation_rad, strict=True))
         return replace(cone, rotation_rad=(x, y, z))
 
     return change
 
 
-def _cone_turned(planted: Planted, urad: float, random: Random) -> Fault:
-    rig = planted.rig
+def _cone_rotated(emulated: EmulatedExposure, urad: float, random: Random) -> Fault:
+    rig = emulated.rig
     cone = _any(random, [c for c in rig.cones if c.name != rig.master_cone])
     axis, off = int(random.integers(0, 3)), _sign(random) * urad
-    turn = np.eye(3)[axis] * off * 1e-6
-    return _of_cone(planted, cone, _turned(turn), f"turned {off:+.0f} urad about {'xyz'[axis]}")
+    rotation = np.eye(3)[axis] * off * 1e-6
+    return _of_cone(
+        emulated, cone, _rotated(rotation), f"turned {off:+.0f} urad about {'xyz'[axis]}"
+    )
 
 
 def _moved(x_px: float, y_px: float) -> Callable[[Sensor], Sensor]:
     return lambda s: replace(s, x_mm=s.x_mm + x_px * s.pitch_mm, y_mm=s.y_mm + y_px * s.pitch_mm)
 
 
-def _sensor_displaced(planted: Planted, px: float, random: Random) -> Fault:
-    name, angle = _any(random, _several(planted.rig)), float(random.uniform(0.0, 2.0 * np.pi))
+def _sensor_displaced(emulated: EmulatedExposure, px: float, random: Random) -> Fault:
+    name, angle = _any(random, _several(emulated.rig)), float(random.uniform(0.0, 2.0 * np.pi))
     x, y = px * np.cos(angle), px * np.sin(angle)
-    return _of_sensor(planted, name, _moved(x, y), f"displaced {x:+.2f}, {y:+.2f} px")
+    return _of_sensor(emulated, name, _moved(x, y), f"displaced {x:+.2f}, {y:+.2f} px")
 
 
-def _sensor_rotated(planted: Planted, urad: float, random: Random) -> Fault:
-    name, off = _any(random, _several(planted.rig)), _sign(random) * urad
+def _sensor_rotated(emulated: EmulatedExposure, urad: float, random: Random) -> Fault:
+    name, off = _any(random, _several(emulated.rig)), _sign(random) * urad
     return _of_sensor(
-        planted,
+        emulated,
         name,
         lambda s: replace(s, rotation_rad=s.rotation_rad + off * 1e-6),
         f"rotated {off:+.0f} urad",
     )
 
 
-def _slip(planted: Planted, lines: float, random: Random) -> Fault:
-    name = _any(random, [*_pan(planted.rig), *_leading(planted.rig)])
+def _slip(emulated: EmulatedExposure, lines: float, random: Random) -> Fault:
+    name = _any(random, [*_pan(emulated.rig), *_leading(emulated.rig)])
     axis = int(random.integers(0, 2))
-    sensor = planted.rig.sensor(name)
+    sensor = emulated.rig.sensor(name)
     size = (sensor.height_px, sensor.width_px)[axis]
     count = min(round(lines), size // 2)
     first, by = int(random.integers(8, size - count - 8)), int(random.integers(1, 5))
@@ -134,9 +142,9 @@ def _slip(planted: Planted, lines: float, random: Random) -> Fault:
         moved[inside, 1 - axis] += by
         return moved
 
-    says = f"{count} {('rows', 'columns')[axis]} from {first} on are those {by} further on"
-    fault = _of_frame(planted, name, change, says)
-    return replace(fault, planted=replace(fault.planted, content={name: content}))
+    description = f"{count} {('rows', 'columns')[axis]} from {first} on are those {by} further on"
+    fault = _of_frame(emulated, name, change, description)
+    return replace(fault, emulated=replace(fault.emulated, content={name: content}))
 
 
 def _leading(rig: Rig) -> list[str]:
@@ -149,20 +157,20 @@ def _blurred(sigma: float) -> Callable[[Array], Array]:
     return lambda frame: np.asarray(cv2.GaussianBlur(frame, (0, 0), sigma))
 
 
-def _blur(planted: Planted, sigma: float, random: Random) -> Fault:
-    name = _any(random, _pan(planted.rig))
-    return _of_frame(planted, name, _blurred(sigma), f"blurred by {sigma:.2f} px")
+def _blur(emulated: EmulatedExposure, sigma: float, random: Random) -> Fault:
+    name = _any(random, _pan(emulated.rig))
+    return _of_frame(emulated, name, _blurred(sigma), f"blurred by {sigma:.2f} px")
 
 
-def _blur_region(planted: Planted, sigma: float, random: Random) -> Fault:
-    name = _any(random, _pan(planted.rig))
-    part, where = _part(planted.rig.sensor(name), 2, random)
+def _blur_region(emulated: EmulatedExposure, sigma: float, random: Random) -> Fault:
+    name = _any(random, _pan(emulated.rig))
+    part, where = _part(emulated.rig.sensor(name), 2, random)
 
     def change(frame: Array) -> Array:
         frame[part] = cv2.GaussianBlur(frame, (0, 0), sigma)[part]
         return frame
 
-    return _of_frame(planted, name, change, f"blurred by {sigma:.2f} px in {where}")
+    return _of_frame(emulated, name, change, f"blurred by {sigma:.2f} px in {where}")
 
 
 def _part(sensor: Sensor, parts: int, random: Random) -> tuple[tuple[slice, slice], str]:
@@ -174,9 +182,9 @@ def _part(sensor: Sensor, parts: int, random: Random) -> tuple[tuple[slice, slic
     return (slice(top, top + height), slice(left, left + width)), where
 
 
-def _blur_band(planted: Planted, sigma: float, random: Random) -> Fault:
-    name = _any(random, _colour(planted.rig))
-    bayer = planted.rig.sensor(name).colour_filter_array != "none"
+def _blur_band(emulated: EmulatedExposure, sigma: float, random: Random) -> Fault:
+    name = _any(random, _colour(emulated.rig))
+    bayer = emulated.rig.sensor(name).colour_filter_array != "none"
 
     def change(frame: Array) -> Array:
         if not bayer:
@@ -187,17 +195,17 @@ def _blur_band(planted: Planted, sigma: float, random: Random) -> Fault:
                 frame[row::2, column::2] = cv2.GaussianBlur(plane, (0, 0), sigma / 2.0)
         return frame
 
-    return _of_frame(planted, name, change, f"blurred by {sigma:.2f} px")
+    return _of_frame(emulated, name, change, f"blurred by {sigma:.2f} px")
 
 
-def _smear(planted: Planted, px: float, random: Random) -> Fault:
-    name, along = _any(random, _pan(planted.rig)), bool(random.integers(0, 2))
+def _smear(emulated: EmulatedExposure, px: float, random: Random) -> Fault:
+    name, along = _any(random, _pan(emulated.rig)), bool(random.integers(0, 2))
     # Of an even length the content would shift by half a pixel, too.
     length = 1 + 2 * max(1, round((px - 1.0) / 2.0))
     size = (1, length) if along else (length, 1)
     way = "along" if along else "across"
     return _of_frame(
-        planted, name, lambda f: np.asarray(cv2.blur(f, size)), f"smeared by {length} px {way}"
+        emulated, name, lambda f: np.asarray(cv2.blur(f, size)), f"smeared by {length} px {way}"
     )
 
 
@@ -206,137 +214,139 @@ def _scaled(sensor: Sensor, frame: Array, factor: Any) -> Array:
     return np.asarray(np.clip(np.rint(signal), 0, sensor.full_scale_dn), np.uint16)
 
 
-def _gain_step(planted: Planted, percent: float, random: Random) -> Fault:
-    name, axis = _any(random, [s.name for s in planted.rig.sensors]), int(random.integers(0, 2))
-    sensor = planted.rig.sensor(name)
+def _gain_step(emulated: EmulatedExposure, percent: float, random: Random) -> Fault:
+    name, axis = _any(random, [s.name for s in emulated.rig.sensors]), int(random.integers(0, 2))
+    sensor = emulated.rig.sensor(name)
     size = (sensor.height_px, sensor.width_px)[axis]
     line, off = int(random.integers(size // 8, size - size // 8)), _sign(random) * percent
     factors = np.where(np.arange(size) < line, 1.0, 1.0 + off / 100.0)
     factor = factors[:, None] if axis == 0 else factors[None, :]
-    says = f"signal {off:+.1f} % from {('row', 'column')[axis]} {line} on"
-    return _of_frame(planted, name, lambda f: _scaled(sensor, f, factor), says)
+    description = f"signal {off:+.1f} % from {('row', 'column')[axis]} {line} on"
+    return _of_frame(emulated, name, lambda f: _scaled(sensor, f, factor), description)
 
 
-def _banding(planted: Planted, percent: float, random: Random) -> Fault:
-    name, axis = _any(random, [s.name for s in planted.rig.sensors]), int(random.integers(0, 2))
-    sensor = planted.rig.sensor(name)
+def _banding(emulated: EmulatedExposure, percent: float, random: Random) -> Fault:
+    name, axis = _any(random, [s.name for s in emulated.rig.sensors]), int(random.integers(0, 2))
+    sensor = emulated.rig.sensor(name)
     size, period = (sensor.height_px, sensor.width_px)[axis], int(random.integers(8, 41))
-    signal = float(np.median(planted.frames[name])) - sensor.black_dn
+    signal = float(np.median(emulated.frames[name])) - sensor.black_dn
     dn = np.rint(percent / 100.0 * signal) * ((np.arange(size) // period) % 2)
     lines = dn[:, None] if axis == 0 else dn[None, :]
-    says = f"{('rows', 'columns')[axis]} in turn of {period} {dn.max():.0f} DN brighter"
-    return _of_frame(planted, name, lambda f: _added(sensor, f, lines), says)
+    description = f"{('rows', 'columns')[axis]} in turn of {period} {dn.max():.0f} DN brighter"
+    return _of_frame(emulated, name, lambda f: _added(sensor, f, lines), description)
 
 
 def _added(sensor: Sensor, frame: Array, dn: Any) -> Array:
     return np.asarray(np.clip(frame + dn, 0, sensor.full_scale_dn), np.uint16)
 
 
-def _block_offset(planted: Planted, dn: float, random: Random) -> Fault:
-    name = _any(random, _pan(planted.rig))
-    sensor = planted.rig.sensor(name)
+def _block_offset(emulated: EmulatedExposure, dn: float, random: Random) -> Fault:
+    name = _any(random, _pan(emulated.rig))
+    sensor = emulated.rig.sensor(name)
     part, where = _part(sensor, 4, random)
     added = np.zeros((sensor.height_px, sensor.width_px))
     added[part] = round(dn)
-    says = f"{dn:.0f} DN brighter in {where}"
-    return _of_frame(planted, name, lambda f: _added(sensor, f, added), says)
+    description = f"{dn:.0f} DN brighter in {where}"
+    return _of_frame(emulated, name, lambda f: _added(sensor, f, added), description)
 
 
-def _clipping(planted: Planted, percent: float, random: Random) -> Fault:
-    name = _any(random, _pan(planted.rig))
-    level = float(np.percentile(planted.frames[name], 100.0 - percent))
-    says = f"clipped at {level:.0f} DN, {percent:.1f} % of its pixels"
-    return _of_frame(planted, name, lambda f: np.minimum(f, np.uint16(level)), says)
+def _clipping(emulated: EmulatedExposure, percent: float, random: Random) -> Fault:
+    name = _any(random, _pan(emulated.rig))
+    level = float(np.percentile(emulated.frames[name], 100.0 - percent))
+    description = f"clipped at {level:.0f} DN, {percent:.1f} % of its pixels"
+    return _of_frame(emulated, name, lambda f: np.minimum(f, np.uint16(level)), description)
 
 
-def _exposure_of(planted: Planted, name: str, percent: float, random: Random) -> Fault:
+def _exposure_of(emulated: EmulatedExposure, name: str, percent: float, random: Random) -> Fault:
     factor = 1.0 + percent / 100.0
     factor = factor if random.integers(0, 2) else 1.0 / factor
-    sensor = planted.rig.sensor(name)
+    sensor = emulated.rig.sensor(name)
     return _of_frame(
-        planted, name, lambda f: _scaled(sensor, f, factor), f"exposed {factor:.2f} times as long"
+        emulated, name, lambda f: _scaled(sensor, f, factor), f"exposed {factor:.2f} times as long"
     )
 
 
-def _exposure_pan(planted: Planted, percent: float, random: Random) -> Fault:
-    return _exposure_of(planted, _any(random, _pan(planted.rig)), percent, random)
+def _exposure_pan(emulated: EmulatedExposure, percent: float, random: Random) -> Fault:
+    return _exposure_of(emulated, _any(random, _pan(emulated.rig)), percent, random)
 
 
-def _exposure_colour(planted: Planted, percent: float, random: Random) -> Fault:
-    return _exposure_of(planted, _any(random, _colour(planted.rig)), percent, random)
+def _exposure_colour(emulated: EmulatedExposure, percent: float, random: Random) -> Fault:
+    return _exposure_of(emulated, _any(random, _colour(emulated.rig)), percent, random)
 
 
-def _exposure_stated(planted: Planted, percent: float, random: Random) -> Fault:
-    name = _any(random, _several(planted.rig))
+def _exposure_stated(emulated: EmulatedExposure, percent: float, random: Random) -> Fault:
+    name = _any(random, _several(emulated.rig))
     factor = 1.0 + percent / 100.0
     factor = factor if random.integers(0, 2) else 1.0 / factor
-    times = dict(planted.conditions.exposure_time_s)
+    times = dict(emulated.conditions.exposure_time_s)
     times[name] *= factor
-    conditions = replace(planted.conditions, exposure_time_s=times)
-    culprits = frozenset({name, planted.rig.cone_of(name).name})
-    says = f"{name}: stated to be exposed {factor:.2f} times as long"
-    return Fault(replace(planted, conditions=conditions), culprits, says)
+    conditions = replace(emulated.conditions, exposure_time_s=times)
+    true_causes = frozenset({name, emulated.rig.cone_of(name).name})
+    description = f"{name}: stated to be exposed {factor:.2f} times as long"
+    return Fault(replace(emulated, conditions=conditions), true_causes, description)
 
 
-def _with_probes(planted: Planted, off_k: Mapping[str, float]) -> Planted:
+def _with_probes(emulated: EmulatedExposure, off_k: Mapping[str, float]) -> EmulatedExposure:
     read = {
         p: None if c is None else c + off_k.get(p, 0.0)
-        for p, c in planted.conditions.temperatures_c.items()
+        for p, c in emulated.conditions.temperatures_c.items()
     }
-    return replace(planted, conditions=replace(planted.conditions, temperatures_c=read))
+    return replace(emulated, conditions=replace(emulated.conditions, temperatures_c=read))
 
 
-def _probes_all(planted: Planted, kelvin: float, random: Random) -> Fault:
+def _probes_all(emulated: EmulatedExposure, kelvin: float, random: Random) -> Fault:
     off = _sign(random) * kelvin
-    changed = _with_probes(planted, dict.fromkeys(planted.rig.probes, off))
-    names = frozenset(planted.rig.probes) | {c.name for c in planted.rig.cones}
+    changed = _with_probes(emulated, dict.fromkeys(emulated.rig.probes, off))
+    names = frozenset(emulated.rig.probes) | {c.name for c in emulated.rig.cones}
     return Fault(changed, names, f"all probes {off:+.1f} K")
 
 
-def _probe_one(planted: Planted, kelvin: float, random: Random) -> Fault:
-    cone, off = _any(random, planted.rig.pan_cones), _sign(random) * kelvin
+def _probe_one(emulated: EmulatedExposure, kelvin: float, random: Random) -> Fault:
+    cone, off = _any(random, emulated.rig.pan_cones), _sign(random) * kelvin
     read = {cone.probe, *(s.probe for s in cone.sensors)}
     names = frozenset(read | {cone.name})
-    return Fault(_with_probes(planted, dict.fromkeys(read, off)), names, f"probe {read} {off:+.1f}")
-
-
-def _stale(planted: Planted, seconds: float, random: Random) -> Fault:
-    fault = _probes_all(planted, 0.02 * seconds, random)
-    ages = dict.fromkeys(planted.rig.probes, seconds)
-    conditions = replace(fault.planted.conditions, temperature_age_s=ages)
-    return replace(fault, planted=replace(fault.planted, conditions=conditions))
-
-
-def _tdi(planted: Planted, shifts: float, random: Random) -> Fault:
-    cone = _any(random, planted.rig.pan_cones)
-    off = int(_sign(random)) * max(1, round(shifts))
-    counts = dict(planted.conditions.tdi_shifts)
-    for sensor in cone.sensors:
-        counts[sensor.name] = max(0, counts[sensor.name] + off)
-    conditions = replace(planted.conditions, tdi_shifts=counts)
-    names = frozenset({cone.name, *(s.name for s in cone.sensors)})
     return Fault(
-        replace(planted, conditions=conditions), names, f"cone {cone.name}: TDI count {off:+d}"
+        _with_probes(emulated, dict.fromkeys(read, off)), names, f"probe {read} {off:+.1f}"
     )
 
 
-def _half_frame(planted: Planted, percent: float, random: Random) -> Fault:
-    name = _any(random, [s.name for s in planted.rig.sensors])
-    lines = round(planted.rig.sensor(name).height_px * min(percent, 90.0) / 100.0)
+def _stale(emulated: EmulatedExposure, seconds: float, random: Random) -> Fault:
+    fault = _probes_all(emulated, 0.02 * seconds, random)
+    ages = dict.fromkeys(emulated.rig.probes, seconds)
+    conditions = replace(fault.emulated.conditions, temperature_age_s=ages)
+    return replace(fault, emulated=replace(fault.emulated, conditions=conditions))
+
+
+def _tdi(emulated: EmulatedExposure, shifts: float, random: Random) -> Fault:
+    cone = _any(random, emulated.rig.pan_cones)
+    off = int(_sign(random)) * max(1, round(shifts))
+    counts = dict(emulated.conditions.tdi_shifts)
+    for sensor in cone.sensors:
+        counts[sensor.name] = max(0, counts[sensor.name] + off)
+    conditions = replace(emulated.conditions, tdi_shifts=counts)
+    names = frozenset({cone.name, *(s.name for s in cone.sensors)})
+    return Fault(
+        replace(emulated, conditions=conditions), names, f"cone {cone.name}: TDI count {off:+d}"
+    )
+
+
+def _half_frame(emulated: EmulatedExposure, percent: float, random: Random) -> Fault:
+    name = _any(random, [s.name for s in emulated.rig.sensors])
+    lines = round(emulated.rig.sensor(name).height_px * min(percent, 90.0) / 100.0)
 
     def change(frame: Array) -> Array:
         frame[-lines:] = 0
         return frame
 
-    fault = _of_frame(planted, name, change, f"last {lines} rows not read out")
-    return replace(fault, planted=replace(fault.planted, elsewhere=frozenset({name})))
+    fault = _of_frame(emulated, name, change, f"last {lines} rows not read out")
+    return replace(fault, emulated=replace(fault.emulated, elsewhere=frozenset({name})))
 
 
-def _wrong_unit(planted: Planted, times: float, random: Random) -> Fault:
-    rig, changed = planted.rig, planted
+def _wrong_unit(emulated: EmulatedExposure, times: float, random: Random) -> Fault:
+    rig, changed = emulated.rig, emulated
     for cone in rig.cones:
-        turn = random.normal(0.0, 300e-6 * times, 3) * float(cone.name != rig.master_cone)
-        changed = changed.with_cone(cone.name, _turned([float(a) for a in turn]))
+        rotation = random.normal(0.0, 300e-6 * times, 3) * float(cone.name != rig.master_cone)
+        changed = changed.with_cone(cone.name, _rotated([float(a) for a in rotation]))
         changed = changed.with_cone(cone.name, _with_f(float(random.normal(0.0, 500.0 * times))))
         for sensor in cone.sensors:
             x, y = random.normal(0.0, 2.0 * times, 2)
@@ -345,52 +355,54 @@ def _wrong_unit(planted: Planted, times: float, random: Random) -> Fault:
     return Fault(changed, names, f"rig file of another unit, {times:.1f} times its differences")
 
 
-def _exchanged(planted: Planted, a: str, b: str) -> Fault:
-    frames = {**planted.frames, a: planted.frames[b], b: planted.frames[a]}
-    names = frozenset({a, b, planted.rig.cone_of(a).name, planted.rig.cone_of(b).name})
-    changed = replace(planted, frames=frames, elsewhere=frozenset({a, b}))
+def _exchanged(emulated: EmulatedExposure, a: str, b: str) -> Fault:
+    frames = {**emulated.frames, a: emulated.frames[b], b: emulated.frames[a]}
+    names = frozenset({a, b, emulated.rig.cone_of(a).name, emulated.rig.cone_of(b).name})
+    changed = replace(emulated, frames=frames, elsewhere=frozenset({a, b}))
     return Fault(changed, names, f"frames of {a} and {b} swapped")
 
 
-def _bands_swapped(planted: Planted, _: float, random: Random) -> Fault:
-    a, b = random.choice(_colour(planted.rig), 2, replace=False)
-    fault = _exchanged(planted, str(a), str(b))
+def _bands_swapped(emulated: EmulatedExposure, _: float, random: Random) -> Fault:
+    a, b = random.choice(_colour(emulated.rig), 2, replace=False)
+    fault = _exchanged(emulated, str(a), str(b))
     # The same ground, in another colour.
-    return replace(fault, planted=replace(fault.planted, elsewhere=frozenset()))
+    return replace(fault, emulated=replace(fault.emulated, elsewhere=frozenset()))
 
 
-def _frames_swapped(planted: Planted, _: float, random: Random) -> Fault:
-    a, b = random.choice(_pan(planted.rig), 2, replace=False)
-    return _exchanged(planted, str(a), str(b))
+def _frames_swapped(emulated: EmulatedExposure, _: float, random: Random) -> Fault:
+    a, b = random.choice(_pan(emulated.rig), 2, replace=False)
+    return _exchanged(emulated, str(a), str(b))
 
 
-def _other_ground(change: Callable[[Planted, str], Array], says: str) -> Plant:
-    def plant(planted: Planted, _: float, random: Random) -> Fault:
-        name = _any(random, [s.name for s in planted.rig.sensors])
-        fault = _of_frame(planted, name, lambda _: change(planted, name), says)
-        return replace(fault, planted=replace(fault.planted, elsewhere=frozenset({name})))
+def _other_ground(
+    change: Callable[[EmulatedExposure, str], Array], description: str
+) -> FaultInjector:
+    def inject(emulated: EmulatedExposure, _: float, random: Random) -> Fault:
+        name = _any(random, [s.name for s in emulated.rig.sensors])
+        fault = _of_frame(emulated, name, lambda _: change(emulated, name), description)
+        return replace(fault, emulated=replace(fault.emulated, elsewhere=frozenset({name})))
 
-    return plant
+    return inject
 
 
-def _words(planted: Planted, _: float, random: Random) -> Fault:
-    name = _any(random, [s.name for s in planted.rig.sensors])
-    shift = 16 - planted.rig.sensor(name).bits
+def _words(emulated: EmulatedExposure, _: float, random: Random) -> Fault:
+    name = _any(random, [s.name for s in emulated.rig.sensors])
+    shift = 16 - emulated.rig.sensor(name).bits
     if random.integers(0, 2):
-        return _of_frame(planted, name, lambda f: f.byteswap(), "words byte-swapped")
-    return _of_frame(planted, name, lambda f: f << shift, "words left-justified")
+        return _of_frame(emulated, name, lambda f: f.byteswap(), "words byte-swapped")
+    return _of_frame(emulated, name, lambda f: f << shift, "words left-justified")
 
 
-def _frame_lost(planted: Planted, _: float, random: Random) -> Fault:
-    name = _any(random, [s.name for s in planted.rig.sensors])
-    frames = {n: f for n, f in planted.frames.items() if n != name}
-    changed = replace(planted, frames=frames, elsewhere=frozenset({name}))
-    return Fault(changed, frozenset({name, planted.rig.cone_of(name).name}), f"{name} lost")
+def _frame_lost(emulated: EmulatedExposure, _: float, random: Random) -> Fault:
+    name = _any(random, [s.name for s in emulated.rig.sensors])
+    frames = {n: f for n, f in emulated.frames.items() if n != name}
+    changed = replace(emulated, frames=frames, elsewhere=frozenset({name}))
+    return Fault(changed, frozenset({name, emulated.rig.cone_of(name).name}), f"{name} lost")
 
 
-FAULTS: Final[Mapping[str, Plant]] = {
+FAULTS: Final[Mapping[str, FaultInjector]] = {
     "principal-distance": _principal_distance,
-    "cone-turned": _cone_turned,
+    "cone-turned": _cone_rotated,
     "sensor-displaced": _sensor_displaced,
     "sensor-rotated": _sensor_rotated,
     "slip": _slip,

@@ -22,12 +22,12 @@ class Limit:
     empty where there is no size: it is always found.
     """
 
-    says: str
+    description: str
     unit: str
     by_rig: Mapping[str, float]
 
 
-def _alike(rigs: tuple[str, ...], limit: float) -> Mapping[str, float]:
+def _same_limit(rigs: tuple[str, ...], limit: float) -> Mapping[str, float]:
     return dict.fromkeys(rigs, limit)
 
 
@@ -38,34 +38,34 @@ LIMITS: Final[Mapping[str, Limit]] = {
     "cone-turned": Limit("a cone turned about one axis", "urad", {X: 150.0, L: 150.0, DMC: 200.0}),
     "sensor-displaced": Limit("a sensor of a cone of several displaced", "px", {X: 0.3}),
     "sensor-rotated": Limit("a sensor of a cone of several rotated", "urad", {X: 500.0}),
-    "slip": Limit("lines of a frame shifted by 1 to 4 px", "lines", _alike(STITCHED, 80.0)),
-    "blur": Limit("a PAN head blurred", "px (sigma)", _alike(STITCHED, 1.0)),
-    "blur-region": Limit("a quarter of a PAN frame blurred", "px (sigma)", _alike(STITCHED, 1.5)),
-    "blur-band": Limit("a colour head blurred", "px (sigma)", _alike(STITCHED, 1.5)),
-    "smear": Limit("a PAN head smeared along or across", "px", _alike(STITCHED, 4.0)),
-    "gain-step": Limit("signal of a frame from one line on", "%", _alike(EVERY, 5.5)),
-    "banding": Limit("lines of a frame brighter, 8 to 40 in turn", "%", _alike(EVERY, 5.0)),
-    "block-offset": Limit("a block of a frame brighter", "DN", _alike(STITCHED, 40.0)),
-    "clipping": Limit("pixels of a PAN head clipped below full scale", "%", _alike(STITCHED, 2.0)),
-    "exposure-pan": Limit("exposure time of a PAN head", "%", _alike((X, DMC), 8.0)),
-    "exposure-stated": Limit("exposure time stated of a PAN head", "%", _alike((X,), 8.0)),
-    "exposure-colour": Limit("exposure time of a colour head", "%", _alike(STITCHED, 30.0)),
+    "slip": Limit("lines of a frame shifted by 1 to 4 px", "lines", _same_limit(STITCHED, 80.0)),
+    "blur": Limit("a PAN head blurred", "px (sigma)", _same_limit(STITCHED, 1.0)),
+    "blur-region": Limit("a quarter of a PAN frame blurred", "px (sigma)", _same_limit(STITCHED, 1.5)),
+    "blur-band": Limit("a colour head blurred", "px (sigma)", _same_limit(STITCHED, 1.5)),
+    "smear": Limit("a PAN head smeared along or across", "px", _same_limit(STITCHED, 4.0)),
+    "gain-step": Limit("signal of a frame from one line on", "%", _same_limit(EVERY, 5.5)),
+    "banding": Limit("lines of a frame brighter, 8 to 40 in turn", "%", _same_limit(EVERY, 5.0)),
+    "block-offset": Limit("a block of a frame brighter", "DN", _same_limit(STITCHED, 40.0)),
+    "clipping": Limit("pixels of a PAN head clipped below full scale", "%", _same_limit(STITCHED, 2.0)),
+    "exposure-pan": Limit("exposure time of a PAN head", "%", _same_limit((X, DMC), 8.0)),
+    "exposure-stated": Limit("exposure time stated of a PAN head", "%", _same_limit((X,), 8.0)),
+    "exposure-colour": Limit("exposure time of a colour head", "%", _same_limit(STITCHED, 30.0)),
     "probes-all": Limit("all probes alike", "K", {X: 2.0}),
     "probe-one": Limit("one probe of a PAN cone", "K", {X: 2.0, L: 8.0, DMC: 8.0}),
-    "stale": Limit("age of all temperatures, at 0.02 K/s", "s", _alike(STITCHED, 30.0)),
-    "tdi": Limit("TDI count of a cone", "shifts", _alike((X, DMC), 1.0)),
-    "half-frame": Limit("lines of a frame not read out", "%", _alike(EVERY, 2.0)),
+    "stale": Limit("age of all temperatures, at 0.02 K/s", "s", _same_limit(STITCHED, 30.0)),
+    "tdi": Limit("TDI count of a cone", "shifts", _same_limit((X, DMC), 1.0)),
+    "half-frame": Limit("lines of a frame not read out", "%", _same_limit(EVERY, 2.0)),
     "wrong-unit": Limit(
         "rig file of another unit: f 500 ppm, angles 300 urad, places 2 px", "times",
-        _alike(STITCHED, 1.0),
+        _same_limit(STITCHED, 1.0),
     ),
-    "bands-swapped": Limit("frames of two colour heads swapped", "", _alike((X, DMC), 1.0)),
-    "frames-swapped": Limit("frames of two PAN heads swapped", "", _alike(STITCHED, 1.0)),
-    "frame-other": Limit("a frame of another exposure", "", _alike(STITCHED, 1.0)),
-    "frame-turned": Limit("a frame turned by 180 degrees", "", _alike(STITCHED, 1.0)),
-    "frame-mirrored": Limit("a frame mirrored", "", _alike(STITCHED, 1.0)),
-    "words": Limit("words left-justified or byte-swapped", "", _alike(EVERY, 1.0)),
-    "frame-lost": Limit("a frame lost", "", _alike(EVERY, 1.0)),
+    "bands-swapped": Limit("frames of two colour heads swapped", "", _same_limit((X, DMC), 1.0)),
+    "frames-swapped": Limit("frames of two PAN heads swapped", "", _same_limit(STITCHED, 1.0)),
+    "frame-other": Limit("a frame of another exposure", "", _same_limit(STITCHED, 1.0)),
+    "frame-turned": Limit("a frame turned by 180 degrees", "", _same_limit(STITCHED, 1.0)),
+    "frame-mirrored": Limit("a frame mirrored", "", _same_limit(STITCHED, 1.0)),
+    "words": Limit("words left-justified or byte-swapped", "", _same_limit(EVERY, 1.0)),
+    "frame-lost": Limit("a frame lost", "", _same_limit(EVERY, 1.0)),
 }  # fmt: skip
 
 
@@ -80,5 +80,7 @@ def table() -> str:
             "–" if rig not in limit.by_rig else f"{limit.by_rig[rig]:g}" if limit.unit else "always"
             for rig in EVERY
         ]
-        lines.append(f"| `{name}` | {limit.says} | {limit.unit} | " + " | ".join(cells) + " |")
+        lines.append(
+            f"| `{name}` | {limit.description} | {limit.unit} | " + " | ".join(cells) + " |"
+        )
     return "\n".join(lines)

@@ -24,7 +24,7 @@ _WATER: Final = Flag.TIE_POINTS | Flag.UNDEREXPOSED | Flag.BLUR
 class CleanScene:
     """Settings of the world, a tone over its ground, and the flags that the scene itself raises."""
 
-    says: str
+    description: str
     world: Mapping[str, object] = field(default_factory=dict)
     tone: Tone | None = None
     expected: Flag = NO_FLAGS
@@ -47,9 +47,9 @@ def _shadow(columns: Array, rows: Array, random: np.random.Generator) -> Array:
 
 def _fields(columns: Array, rows: Array, random: np.random.Generator) -> Array:
     """Fields of even tone whose edges run nearly along rows and columns of the image."""
-    turn = float(random.normal(0.0, np.radians(3.0)))
-    along = columns * np.cos(turn) + rows * np.sin(turn)
-    across = rows * np.cos(turn) - columns * np.sin(turn)
+    azimuth = float(random.normal(0.0, np.radians(3.0)))
+    along = columns * np.cos(azimuth) + rows * np.sin(azimuth)
+    across = rows * np.cos(azimuth) - columns * np.sin(azimuth)
     number = np.zeros(columns.shape, np.int64)
     for at, span in ((along, 4200.0), (across, 3200.0)):
         edges = np.sort(random.uniform(-300.0, span, int(random.integers(4, 12))))

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from benchmarks.honest_uncertainty import Held, held
-from benchmarks.silent_errors.exposures import Planted
+from benchmarks.silent_errors.exposures import EmulatedExposure
+from benchmarks.uncertainty_consistency import NormalizedErrors, normalized_errors
 from processing.geometry.placement import vip_mm_from_raw, vip_px_from_mm
 from processing.geometry.projective import apply_projective
 from processing.mosaic.precision import disturbance_covariance_px, placed_covariance_px
@@ -22,13 +22,13 @@ from processing.pipelines.perspective import HeadsProduct
 from processing.pipelines.stitched import Product
 from processing.radiometry.demosaic import BAYER_BANDS, is_bayer
 from processing.rig import Sensor
-from sim_hw.judge import on_sensor, true_positions
+from sim_hw.truth_comparison import on_sensor, true_positions
 
 Array = NDArray[Any]
 
 BLOCKS: Final = 8
 """Regions of a frame along each side whose radiance is compared."""
-LEAST_PIXELS: Final = 12
+MIN_PIXELS: Final = 12
 CHECK: Final = (5, 5)
 DARK: Final = 0.02
 """Radiance below which a relative error says nothing."""
@@ -49,14 +49,16 @@ class Found:
     error_px: float | None
     stated_px: float | None
     worst: float | None
-    normalised: Held | None
+    normalised: NormalizedErrors | None
     band_px: float
     radiance: float
     radiance_of: str
     detail: float
 
 
-def compare(planted: Planted, product: Product | HeadsProduct, clean: Mapping[str, Array]) -> Found:
+def compare(
+    emulated: EmulatedExposure, product: Product | HeadsProduct, clean: Mapping[str, Array]
+) -> Found:
     """Hold an image against the truth.
 
     Args:
@@ -64,34 +66,34 @@ def compare(planted: Planted, product: Product | HeadsProduct, clean: Mapping[st
         product: the image and its report.
         clean: fine detail by sensor (`detail_of`) of the exposure without a fault.
     """
-    regions = _radiance(planted, product)
+    regions = _radiance(emulated, product)
     worst = max(regions, key=lambda name: regions[name], default="")
-    detail = detail_of(planted, product)
+    detail = detail_of(emulated, product)
     shares = [share for name in detail if (share := _share(detail[name], clean.get(name)))]
     if isinstance(product, HeadsProduct):
         return Found(None, None, None, None, 0.0, regions.get(worst, 0.0), worst, min(shares))
-    errors = _errors(planted, product)
+    errors = _errors(emulated, product)
     every = np.concatenate(list(errors.values()))
     stated = product.report.figures["stitched_sigma_px"]
-    points = _check_points(planted, product)
+    points = _check_points(emulated, product)
     return Found(
         error_px=float(np.sqrt(np.mean(every**2))),
         stated_px=None if stated is None else float(stated),
         worst=_worst(errors, product),
-        normalised=_normalised(planted, product, points),
-        band_px=max(_bands(planted, product).values(), default=0.0),
+        normalised=_normalised(emulated, product, points),
+        band_px=max(_bands(emulated, product).values(), default=0.0),
         radiance=regions.get(worst, 0.0),
         radiance_of=worst,
         detail=min(shares, default=1.0),
     )
 
 
-def _errors(planted: Planted, product: Product) -> dict[str, Array]:
+def _errors(emulated: EmulatedExposure, product: Product) -> dict[str, Array]:
     """Truth minus place of the pixels behind the image, (n, 2) px, by PAN sensor."""
-    truth, geometry = planted.snapshot.truth, product.geometry[product.mosaic.method]
+    truth, geometry = emulated.snapshot.truth, product.geometry[product.mosaic.method]
     found = {}
     for name in truth["pan_sensors"].tolist():
-        if f"{name}.vip" not in geometry or name in planted.elsewhere:
+        if f"{name}.vip" not in geometry or name in emulated.elsewhere:
             continue
         used = geometry[f"{name}.weight"] > 0
         vip, raw = (
@@ -99,14 +101,14 @@ def _errors(planted: Planted, product: Product) -> dict[str, Array]:
         )
         inside = on_sensor(truth, name, raw)
         raw, vip = raw[inside], vip[inside]
-        found[name] = _true(planted, name, raw) - vip
+        found[name] = _true(emulated, name, raw) - vip
     return found or {"": np.zeros((1, 2))}
 
 
-def _true(planted: Planted, name: str, raw: Array) -> Array:
+def _true(emulated: EmulatedExposure, name: str, raw: Array) -> Array:
     """Where the content of raw pixels belongs in the virtual image."""
-    content = planted.content.get(name)
-    return true_positions(planted.snapshot.truth, name, raw if content is None else content(raw))
+    content = emulated.content.get(name)
+    return true_positions(emulated.snapshot.truth, name, raw if content is None else content(raw))
 
 
 def _worst(errors: Mapping[str, Array], product: Product) -> float | None:
@@ -116,49 +118,53 @@ def _worst(errors: Mapping[str, Array], product: Product) -> float | None:
     return max(float(np.sqrt(np.mean(e**2))) for e in errors.values()) / stated
 
 
-def _check_points(planted: Planted, product: Product) -> dict[str, Array]:
+def _check_points(emulated: EmulatedExposure, product: Product) -> dict[str, Array]:
     points = {}
-    for cone in planted.rig.pan_cones:
+    for cone in emulated.rig.pan_cones:
         for s in cone.sensors:
-            if s.name in product.mosaic.placements and s.name not in planted.elsewhere:
+            if s.name in product.mosaic.placements and s.name not in emulated.elsewhere:
                 columns = np.linspace(0.03, 0.97, CHECK[0]) * (s.width_px - 1)
                 rows = np.linspace(0.03, 0.97, CHECK[1]) * (s.height_px - 1)
                 points[s.name] = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
     return points
 
 
-def _normalised(planted: Planted, product: Product, points: Mapping[str, Array]) -> Held | None:
+def _normalised(
+    emulated: EmulatedExposure, product: Product, points: Mapping[str, Array]
+) -> NormalizedErrors | None:
     """Errors of check points against the covariance stated for them, findings included."""
     if not points or product.mosaic.redundancy <= 0:
         return None
-    image, mosaic = planted.world.image, product.mosaic
+    image, mosaic = emulated.world.image, product.mosaic
     error = []
     for name, raw in points.items():
         mm = vip_mm_from_raw(mosaic.placements[name], raw)
-        off = vip_px_from_mm(image, mm) - _true(planted, name, raw)
+        off = vip_px_from_mm(image, mm) - _true(emulated, name, raw)
         error.append((off * (1.0, -1.0)).reshape(-1))
-    tie, datum = placed_covariance_px(planted.rig, mosaic, points, product.temperatures.usable_c)
-    added = disturbance_covariance_px(planted.rig, mosaic, points, product.disturbance)
-    return held(np.concatenate(error), tie + datum + added)
+    tie, datum = placed_covariance_px(emulated.rig, mosaic, points, product.temperatures.usable_c)
+    added = disturbance_covariance_px(
+        emulated.rig, mosaic, points, product.uncertainty_contribution
+    )
+    return normalized_errors(np.concatenate(error), tie + datum + added)
 
 
-def _bands(planted: Planted, product: Product) -> dict[str, float]:
+def _bands(emulated: EmulatedExposure, product: Product) -> dict[str, float]:
     """RMS error of a coordinate of every colour head, colour pixels."""
-    image, truth = planted.world.image, planted.snapshot.truth
+    image, truth = emulated.world.image, emulated.snapshot.truth
     found = {}
     homographies = {
         r.sensor: np.linalg.inv(r.band_from_green) for r in product.bands if r.registered
     }
-    for cone in planted.rig.cones:
+    for cone in emulated.rig.cones:
         name = cone.sensors[0].name
-        if cone.role != "colour" or name not in planted.frames or name in planted.elsewhere:
+        if cone.role != "colour" or name not in emulated.frames or name in emulated.elsewhere:
             continue
         raw = _grid(cone.sensors[0], 32)
         mm = vip_mm_from_raw(product.mosaic.placements[name], raw)
         vip = vip_px_from_mm(image, apply_projective(homographies.get(name, np.eye(3)), mm))
         inside = ((vip >= 0.0) & (vip <= (image.width_px - 1, image.height_px - 1))).all(axis=1)
         inside &= on_sensor(truth, name, raw)
-        off = _true(planted, name, raw[inside]) - vip[inside]
+        off = _true(emulated, name, raw[inside]) - vip[inside]
         found[name] = float(np.sqrt(np.mean(off**2))) / image.colour_ratio
     return found
 
@@ -171,25 +177,25 @@ def _grid(sensor: Sensor, step: int) -> Array:
     return np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
 
 
-def _radiance(planted: Planted, product: Product | HeadsProduct) -> dict[str, float]:
+def _radiance(emulated: EmulatedExposure, product: Product | HeadsProduct) -> dict[str, float]:
     """The largest relative error of the radiance of a region of a frame, by sensor.
 
     The image's own level (one factor for all PAN, one for each rig of heads' band) is free.
     """
     samples = (
-        _of_heads(planted, product)
+        _of_heads(emulated, product)
         if isinstance(product, HeadsProduct)
-        else {**_of_pan(planted, product), **_of_colour(planted, product)}
+        else {**_of_pan(emulated, product), **_of_colour(emulated, product)}
     )
     found = {}
     for name, (raw, shown, true) in samples.items():
-        sensor = planted.rig.sensor(name)
+        sensor = emulated.rig.sensor(name)
         block = (raw[:, 1] * BLOCKS // sensor.height_px).astype(int) * BLOCKS
         block += (raw[:, 0] * BLOCKS // sensor.width_px).astype(int)
         pixels = np.bincount(block, minlength=BLOCKS**2)
         of_true = np.bincount(block, true, BLOCKS**2)
         of_shown = np.bincount(block, shown, BLOCKS**2)
-        enough = (pixels >= LEAST_PIXELS) & (of_true > DARK * pixels * np.median(true) * 10)
+        enough = (pixels >= MIN_PIXELS) & (of_true > DARK * pixels * np.median(true) * 10)
         if enough.any():
             ratio = of_shown[enough] / of_true[enough]
             found[name] = float(np.max(np.abs(ratio - 1.0)))
@@ -199,26 +205,26 @@ def _radiance(planted: Planted, product: Product | HeadsProduct) -> dict[str, fl
 Samples = dict[str, tuple[Array, Array, Array]]
 
 
-def _of_pan(planted: Planted, product: Product) -> Samples:
+def _of_pan(emulated: EmulatedExposure, product: Product) -> Samples:
     geometry = product.geometry[product.mosaic.method]
     found: Samples = {}
-    for name in planted.snapshot.truth["pan_sensors"].tolist():
+    for name in emulated.snapshot.truth["pan_sensors"].tolist():
         if f"{name}.vip" not in geometry:
             continue
         used = geometry[f"{name}.weight"] > 0.5
         vip = geometry[f"{name}.vip"][used].astype(int)
         raw = geometry[f"{name}.raw"][used]
         shown = product.pan[vip[:, 1], vip[:, 0]] / product.counts_per_dn
-        found[name] = _compared(planted, name, raw, shown)
+        found[name] = _compared(emulated, name, raw, shown)
     return found
 
 
-def _of_colour(planted: Planted, product: Product) -> Samples:
-    image, truth = planted.world.image, planted.snapshot.truth
+def _of_colour(emulated: EmulatedExposure, product: Product) -> Samples:
+    image, truth = emulated.world.image, emulated.snapshot.truth
     found: Samples = {}
-    for cone in planted.rig.cones:
+    for cone in emulated.rig.cones:
         sensor = cone.sensors[0]
-        if cone.role != "colour" or sensor.name not in planted.frames:
+        if cone.role != "colour" or sensor.name not in emulated.frames:
             continue
         raw = _grid(sensor, 5)
         band = cone.bands[0]
@@ -232,20 +238,20 @@ def _of_colour(planted: Planted, product: Product) -> Samples:
         at, raw = at[inside], raw[inside]
         picture = product.colour[band].astype(np.float32)
         shown = map_coordinates(picture, at.T[::-1], order=1) / product.counts_per_dn
-        found[sensor.name] = _compared(planted, sensor.name, raw, shown)
+        found[sensor.name] = _compared(emulated, sensor.name, raw, shown)
     return found
 
 
-def _of_heads(planted: Planted, product: HeadsProduct) -> Samples:
+def _of_heads(emulated: EmulatedExposure, product: HeadsProduct) -> Samples:
     """Green of every head at the raw pixels nearby: its perspective moves pixels but little."""
     found: Samples = {}
     for name, head in product.heads.items():
-        sensor = planted.rig.cone(name).sensors[0]
+        sensor = emulated.rig.cone(name).sensors[0]
         raw = _grid(sensor, 7)
         raw = raw[_green_sites(sensor, raw)]
         at = raw.astype(int)
         shown = head.bands[BAYER_BANDS[1]][at[:, 1], at[:, 0]] / 8.0
-        found[sensor.name] = _compared(planted, sensor.name, raw, shown)
+        found[sensor.name] = _compared(emulated, sensor.name, raw, shown)
     return found
 
 
@@ -256,30 +262,32 @@ def _green_sites(sensor: Sensor, raw: Array) -> Array:
     return np.asarray(green[(at[:, 1] % 2) * 2 + at[:, 0] % 2])
 
 
-def _compared(planted: Planted, name: str, raw: Array, shown: Array) -> tuple[Array, Array, Array]:
+def _compared(
+    emulated: EmulatedExposure, name: str, raw: Array, shown: Array
+) -> tuple[Array, Array, Array]:
     """Raw pixels with data, what the image shows there (DN) and what it should show."""
-    cone, sensor = planted.world.rig.cone_of(name), planted.rig.sensor(name)
-    look = planted.snapshot.looks[name]
+    cone, sensor = emulated.world.rig.cone_of(name), emulated.rig.sensor(name)
+    look = emulated.snapshot.parameters_by_sensor[name]
     seconds = look.exposure_time_us * 1e-6
-    factor = planted.world.electrons_per_radiance_s(cone) * seconds / sensor.electrons_per_dn
+    factor = emulated.world.electrons_per_radiance_s(cone) * seconds / sensor.electrons_per_dn
     at = np.clip(np.rint(raw).astype(int), 0, (sensor.width_px - 1, sensor.height_px - 1))
-    true = planted.snapshot.light[name][at[:, 1], at[:, 0]] * factor
+    true = emulated.snapshot.light[name][at[:, 1], at[:, 0]] * factor
     good = (shown > 0) & (true < 0.9 * (sensor.full_scale_dn - sensor.black_dn))
     return raw[good], shown[good].astype(np.float64), true[good].astype(np.float64)
 
 
-def detail_of(planted: Planted, product: Product | HeadsProduct) -> dict[str, Array]:
+def detail_of(emulated: EmulatedExposure, product: Product | HeadsProduct) -> dict[str, Array]:
     """Fine detail of the image, by sensor: differences of neighbouring pixels."""
     if isinstance(product, HeadsProduct):
         return {n: _differences(h.bands[BAYER_BANDS[1]]) for n, h in product.heads.items()}
     found = {}
-    truth = planted.snapshot.truth
+    truth = emulated.snapshot.truth
     for name in truth["pan_sensors"].tolist():
         columns, rows = (truth[f"{name}.vip_{what}"] for what in ("column", "row"))
         top, low = (int(rows[1:-1, 1:-1].min()), int(rows[1:-1, 1:-1].max()))
         left, right = (int(columns[1:-1, 1:-1].min()), int(columns[1:-1, 1:-1].max()))
         found[name] = _differences(product.pan[max(top, 0) : low, max(left, 0) : right])
-    for cone in planted.rig.cones:
+    for cone in emulated.rig.cones:
         if cone.role == "colour":
             found[cone.name] = _differences(product.colour[cone.bands[0]])
     return found

@@ -14,7 +14,7 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from daemon.cli import interruption
+from daemon.cli import interrupt_messages
 from daemon.cli.command_table import CommandGroup
 
 app = typer.Typer(
@@ -59,8 +59,10 @@ def main() -> NoReturn:
     try:
         app()
     except KeyboardInterrupt:
-        interruption.say(f"Interrupted: nothing was begun; {interruption.AGAIN}.")
-        sys.exit(interruption.STATUS)
+        interrupt_messages.print_notice(
+            f"Interrupted: nothing was begun; {interrupt_messages.RETRY_HINT}."
+        )
+        sys.exit(interrupt_messages.STATUS)
     except Exception as error:  # noqa: BLE001 - what is not understood is raised again
         _print_refusal(error)
     sys.exit(0)
@@ -112,5 +114,5 @@ def _disk_refusal(error: OSError) -> Exception:
     where = " to ".join(names) or "the disk"
     return DaemonError(
         f"{where}: {error.strerror}. Files that have their names are complete; remove the cause "
-        f"and {interruption.AGAIN}"
+        f"and {interrupt_messages.RETRY_HINT}"
     )

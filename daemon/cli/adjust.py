@@ -44,14 +44,14 @@ def adjust(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
+    from daemon.postflight.adjustment.csv_tables import ProjectError
     from daemon.postflight.adjustment.project import read_project
-    from daemon.postflight.adjustment.tables import ProjectError
-    from daemon.postflight.adjustment.telling import print_report, report_of
-    from daemon.postflight.adjustment.writing import write_results
+    from daemon.postflight.adjustment.project_writer import write_results
+    from daemon.postflight.adjustment.summary import print_report, report_of
     from processing.bundle.adjust import adjust as adjusted
+    from processing.bundle.initial_values import completed
     from processing.bundle.network import NetworkError
-    from processing.bundle.rank import DefectError
-    from processing.bundle.start import completed
+    from processing.bundle.rank_diagnosis import RankDefectError
 
     if out is not None and (out / "project.toml").exists():
         raise ProjectError([f"{out} holds a project already; give another folder"])
@@ -78,8 +78,8 @@ def adjust(
             result = adjusted(completed(given.network), settings, progress=show)
     except NetworkError as error:
         problems = error.problems
-    except DefectError as error:
-        problems = tuple(defect.sentence for defect in error.defects)
+    except RankDefectError as error:
+        problems = tuple(defect.sentence for defect in error.rank_defects)
     if problems:
         if as_json:
             typer.echo(json.dumps({"name": given.name, "problems": list(problems)}))

@@ -31,27 +31,27 @@ def bench(
     runs: Annotated[int, typer.Option(min=1, help="How often everything is timed.")] = 5,
     peers: Annotated[bool, typer.Option(help="Time cv2.remap and nona + enblend too.")] = True,
     threads: Annotated[int, typer.Option(min=1, help="Cores the pipeline may use.")] = 2,
-    lanes: Annotated[int, typer.Option(min=1, help="Exposures in work at a time.")] = 2,
+    parallel: Annotated[int, typer.Option(min=1, help="Exposures in work at a time.")] = 2,
     folder: Annotated[
         Path | None, typer.Option(help="Where rendered exposures are kept (default: cache).")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     from daemon.cli.benchmark import pipeline as measuring
-    from daemon.onboard.service.departure import thread_counts
+    from daemon.onboard.service.startup import thread_counts
     from processing.rig import find_rig
 
     found = find_rig(rig)
-    told = Console(stderr=True)
-    with told.status(f"timing {found.name}"):
-        place = measuring.exposures_of(rig, found, folder or _kept(found.name))
-        told.print(f"Rendered exposures are kept in {place}", soft_wrap=True)
+    console = Console(stderr=True)
+    with console.status(f"timing {found.name}"):
+        place = measuring.benchmark_exposure(rig, found, folder or _cache_folder(found.name))
+        console.print(f"Rendered exposures are kept in {place}", soft_wrap=True)
         # In a process of its own, which begins as the service's worker does.
         for name, count in thread_counts(threads).items():
             os.environ.setdefault(name, count)
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as worker:
             result = worker.submit(
-                measuring.measure, place, runs=runs, threads=threads, peers=peers, lanes=lanes
+                measuring.measure, place, runs=runs, threads=threads, peers=peers, parallel=parallel
             ).result()
     if as_json:
         typer.echo(json.dumps(result))
@@ -59,7 +59,7 @@ def bench(
         _print(result)
 
 
-def _kept(rig_name: str) -> Path:
+def _cache_folder(rig_name: str) -> Path:
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return cache / "syntopic" / "bench" / rig_name
 

@@ -22,9 +22,9 @@ from daemon.terminal.console import Console
 from daemon.terminal.tables import light_table
 
 if TYPE_CHECKING:
-    from daemon.postflight.calibration.thermal import Gathered
-    from processing.calibration.thermal_learning import Learned, Observability
-    from processing.calibration.thermal_proposal import Change
+    from daemon.postflight.calibration.thermal_calibration import ThermalRecords
+    from processing.calibration.thermal_learning import LearnedDrift, Observability
+    from processing.calibration.thermal_proposal import ProposedChange
 
 HELP = """Calibrations from the laboratory, and from flown missions; each is a new, dated file.
 
@@ -73,15 +73,15 @@ def thermal(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from daemon.postflight.calibration.report import content_digest
-    from daemon.postflight.calibration.rig_text import rig_toml
-    from daemon.postflight.calibration.thermal import gather, write_rig
-    from processing.calibration.thermal_learning import learned, observability
+    from daemon.postflight.calibration.calibration_report import content_digest
+    from daemon.postflight.calibration.rig_writer import rig_toml
+    from daemon.postflight.calibration.thermal_calibration import read_thermal_records, write_rig
+    from processing.calibration.thermal_learning import observability, solve_drift
     from processing.calibration.thermal_proposal import proposed_rig
 
-    gathered = gather(missions)
-    rig = gathered.rig
-    found = learned(rig, gathered.state)
+    records = read_thermal_records(missions)
+    rig = records.rig
+    found = solve_drift(rig, records.state)
     today = f"{datetime.now(UTC):%Y-%m-%d}"
     name = f"{rig.calibration_id}-thermal-{today}"
     proposal, changes = proposed_rig(rig, found, calibration_id=name, date=today)
@@ -89,22 +89,22 @@ def thermal(
     if changes:
         remark = (
             f"{rig.name}, proposed by `syntopic calibrate thermal` on {today} from "
-            f"{gathered.exposures} exposures,\nin place of calibration {rig.calibration_id}. "
+            f"{records.exposures} exposures,\nin place of calibration {rig.calibration_id}. "
             "It counts only where it is configured.\nPer-kelvin values and places of sensors "
             "relative to each other are learned; what is common to\nthe sensors of a cone is as "
             "it was."
         )
         digest = content_digest({"rig.toml": rig_toml(proposal, remark=remark)})
-        beside = missions[0].resolve().parent / f"{rig.name}-thermal-{today}-{digest}.toml"
-        written = out or beside
+        default_path = missions[0].resolve().parent / f"{rig.name}-thermal-{today}-{digest}.toml"
+        written = out or default_path
         # The same content has the same name: it is there already.
-        if out is not None or not beside.exists():
+        if out is not None or not default_path.exists():
             write_rig(replace(proposal, calibration_id=f"{name}-{digest}"), written, remark=remark)
     seen = observability(rig)
     if as_json:
-        typer.echo(json.dumps(_json(gathered, found, changes, seen, written)))
+        typer.echo(json.dumps(_json(records, found, changes, seen, written)))
     else:
-        _print(gathered, found, changes, seen, written)
+        _print(records, found, changes, seen, written)
     raise typer.Exit(0 if changes else 1)
 
 
@@ -123,36 +123,38 @@ def validity(
     held = Mission.open(mission)
     folder = held.path
     with held.held():
-        told = write_displacements(folder)
+        displacements = write_displacements(folder)
     path = folder / DISPLACEMENTS_FILE
     if as_json:
-        typer.echo(json.dumps({**told, "written": str(path)}))
+        typer.echo(json.dumps({**displacements, "written": str(path)}))
     else:
         console = Console()
-        counted = ", ".join(f"{n} of cone {cone}" for cone, n in told["exposures"].items())
-        if not any(told["exposures"].values()):
-            counted = "none; has the mission been processed?" if told["exposures"] else "none"
+        counted = ", ".join(f"{n} of cone {cone}" for cone, n in displacements["exposures"].items())
+        if not any(displacements["exposures"].values()):
+            counted = (
+                "none; has the mission been processed?" if displacements["exposures"] else "none"
+            )
         console.print(f"Exposures with a record: {counted}")
-        for sentence in told["unreadable"] + (
-            told["sentences"] or [without_steps(told["exposures"])]
+        for sentence in displacements["unreadable"] + (
+            displacements["sentences"] or [without_steps(displacements["exposures"])]
         ):
             console.print(sentence)
         console.print(f"Written: {path}", soft_wrap=True)
-    raise typer.Exit(1 if told["steps"] else 0)
+    raise typer.Exit(1 if displacements["steps"] else 0)
 
 
 def _json(
-    gathered: Gathered,
-    found: Learned,
-    changes: tuple[Change, ...],
+    records: ThermalRecords,
+    found: LearnedDrift,
+    changes: tuple[ProposedChange, ...],
     seen: tuple[Observability, ...],
     written: Path | None,
 ) -> dict[str, Any]:
     return {
-        "rig": gathered.rig.name,
-        "calibration_id": gathered.rig.calibration_id,
-        "exposures": gathered.exposures,
-        "passed_over": list(gathered.passed_over),
+        "rig": records.rig.name,
+        "calibration_id": records.rig.calibration_id,
+        "exposures": records.exposures,
+        "skipped": list(records.skipped),
         "dc_spread_k": dict(found.spread_k),
         "not_learned": dict(found.reasons),
         "variance_factors": dict(found.variance_factors),
@@ -174,21 +176,21 @@ def _json(
 
 
 def _print(
-    gathered: Gathered,
-    found: Learned,
-    changes: tuple[Change, ...],
+    records: ThermalRecords,
+    found: LearnedDrift,
+    changes: tuple[ProposedChange, ...],
     seen: tuple[Observability, ...],
     written: Path | None,
 ) -> None:
     console = Console()
     console.print(
-        f"{gathered.rig.name}, calibration {gathered.rig.calibration_id}: "
-        f"{gathered.exposures} exposures"
+        f"{records.rig.name}, calibration {records.rig.calibration_id}: "
+        f"{records.exposures} exposures"
     )
-    for sentence in gathered.passed_over[:10]:
+    for sentence in records.skipped[:10]:
         console.print(f"  passed over: {sentence}", markup=False, highlight=False)
-    if len(gathered.passed_over) > 10:
-        console.print(f"  and {len(gathered.passed_over) - 10} more")
+    if len(records.skipped) > 10:
+        console.print(f"  and {len(records.skipped) - 10} more")
     for key, reason in found.reasons.items():
         console.print(f"  cone {key}: nothing learned, {reason}", markup=False, highlight=False)
     if changes:

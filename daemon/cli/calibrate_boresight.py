@@ -10,7 +10,7 @@ import numpy as np
 import typer
 from rich.progress import Progress
 
-from daemon.cli.calibration_outcome import hand_over
+from daemon.cli.calibration_output import publish_calibration
 from daemon.cli.options import AsJson, NewFolder
 from daemon.terminal.console import Console
 from daemon.terminal.tables import light_table
@@ -63,21 +63,25 @@ def boresight(
 ) -> None:
     from daemon.configuration.model import MountSection
     from daemon.mission.layout import Mission
-    from daemon.orientation.exterior import mount_of, read_mount
+    from daemon.orientation.exterior_orientation import mount_of, read_mount
     from daemon.postflight.adjustment.project import read_project
-    from daemon.postflight.calibration import boresight as flight
-    from daemon.postflight.calibration.report import place_of, read_previous, serial_warnings
+    from daemon.postflight.calibration import boresight_calibration as flight
+    from daemon.postflight.calibration.calibration_report import (
+        calibration_folder,
+        read_previous,
+        serial_warnings,
+    )
     from processing.bundle.adjust import adjust
+    from processing.bundle.initial_values import completed
     from processing.bundle.network import NetworkError
-    from processing.bundle.rank import DefectError
-    from processing.bundle.start import completed
+    from processing.bundle.rank_diagnosis import RankDefectError
     from processing.rig import find_rig, load_rig
 
     path = project / "project.toml" if project.is_dir() else project
     given = read_project(path)
     before = None if previous is None else read_previous(previous, kind="boresight")
     today = f"{datetime.now(UTC):%Y-%m-%d}"
-    place = place_of(out, "boresight", today, beside=path.parent)
+    place = calibration_folder(out, "boresight", today, next_to=path.parent)
     flown_with = None if rig is None else find_rig(rig)
     sigma_m = np.array(position_sigma)
     sigma_rad = np.radians(np.array(attitude_sigma) * 1e-3)
@@ -111,11 +115,11 @@ def boresight(
                     task, description=f"{what} {number}: {value:.6g}"
                 ),
             )
-    except (NetworkError, DefectError) as error:
+    except (NetworkError, RankDefectError) as error:
         raise flight.BoresightError(
             f"the images cannot be oriented by their control: {error}"
         ) from error
-    done = flight.compared(
+    done = flight.compare_boresight(
         adjusted, exposures, inertial, section, held=tuple(hold or ()), lever_sigma_m=lever_sigma
     )
     serials = {} if flown_with is None else flown_with.serials
@@ -139,7 +143,7 @@ def boresight(
             table.add_row(q.where, q.what, f"{q.value:.6f}", known, q.unit)
         console.print(table)
         console.print(f"sigma0 {done.found.sigma0:.3f}, redundancy {done.found.redundancy}")
-    hand_over(
+    publish_calibration(
         report,
         place,
         files={"mount.toml": flight.mount_toml(done, date=today, project=given.name)},

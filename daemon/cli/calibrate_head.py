@@ -36,12 +36,16 @@ def head(
     k3: Annotated[bool, typer.Option("--k3", help="Estimate K3 too.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    from daemon.cli.calibration_outcome import hand_over
-    from daemon.postflight.calibration.laboratory.head import FREE, calibrate_head, targets_of
+    from daemon.cli.calibration_output import publish_calibration
+    from daemon.postflight.calibration.calibration_report import calibration_folder, read_previous
+    from daemon.postflight.calibration.laboratory.head_geometry import (
+        FREE,
+        calibrate_head,
+        targets_of,
+    )
     from daemon.postflight.calibration.laboratory.head_report import calibrated_rig, head_report
-    from daemon.postflight.calibration.laboratory.series import read_series
-    from daemon.postflight.calibration.report import place_of, read_previous
-    from daemon.postflight.calibration.rig_text import rig_toml
+    from daemon.postflight.calibration.laboratory.laboratory_series import read_series
+    from daemon.postflight.calibration.rig_writer import rig_toml
     from processing.geometry.residual_grid import grid_bytes
 
     given = read_series(series, kind="head")
@@ -50,13 +54,13 @@ def head(
     angle_sigma = given.table.number("angle_sigma_rad", 1e-6, positive=True)
     given.checked()
     today = f"{datetime.now(UTC):%Y-%m-%d}"
-    place = place_of(out, f"{given.rig.name}-head", today, beside=series)
+    place = calibration_folder(out, f"{given.rig.name}-head", today, next_to=series)
     before = (previous, read_previous(previous, kind="head")) if previous else None
     heads = []
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("reading", total=None)
 
-        def tell(what: str, done: int, total: int) -> None:
+        def show_progress(what: str, done: int, total: int) -> None:
             progress.update(task, description=what, completed=done, total=total)
 
         for sensor in given.rig.sensors:
@@ -69,7 +73,7 @@ def head(
                     target_radius_rad=radius,
                     angle_sigma_rad=angle_sigma,
                     free=(*FREE, "k3") if k3 else FREE,
-                    progress=tell,
+                    progress=show_progress,
                 )
                 heads.append(found)
     report = head_report(given, heads, calibration_id=place.name, date=today, previous=before)
@@ -79,7 +83,7 @@ def head(
         f"head` on {today},\nin place of calibration {given.rig.calibration_id}. It counts only "
         "where it is configured."
     )
-    hand_over(
+    publish_calibration(
         report,
         place,
         files={f"residual-grid/{h.sensor.name}.npz": grid_bytes(h.grid) for h in heads},

@@ -23,7 +23,7 @@ comparison with a previous calibration.
 
 Examples: `syntopic calibrate lab SERIES`, `syntopic calibrate lab SERIES --previous lab-2026-05-02`
 
-A series to try: `python -m sim_hw.laboratory.test_field ultracam-l-mini --out field`
+A series to try: `python -m sim_hw.laboratory.calibration_field ultracam-l-mini --out field`
 """
 
 
@@ -35,46 +35,46 @@ def lab(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    from daemon.cli.calibration_outcome import hand_over
-    from daemon.postflight.calibration.laboratory.field import calibrate_rig
-    from daemon.postflight.calibration.laboratory.field_measuring import (
-        exposures_of,
+    from daemon.cli.calibration_output import publish_calibration
+    from daemon.postflight.calibration.calibration_report import calibration_folder, read_previous
+    from daemon.postflight.calibration.laboratory.calibration_field import calibrate_rig
+    from daemon.postflight.calibration.laboratory.field_measurement import (
+        field_exposures,
         field_of,
-        measured,
+        measure_targets,
     )
     from daemon.postflight.calibration.laboratory.field_report import (
         covariance_bytes,
         covariance_of,
-        estimated,
+        estimated_parameters,
         field_report,
     )
-    from daemon.postflight.calibration.laboratory.series import read_series
-    from daemon.postflight.calibration.report import place_of, read_previous
-    from daemon.postflight.calibration.rig_text import rig_toml
+    from daemon.postflight.calibration.laboratory.laboratory_series import read_series
+    from daemon.postflight.calibration.rig_writer import rig_toml
 
     given = read_series(series, kind="lab")
-    exposures, field = exposures_of(given), field_of(given)
+    exposures, field = field_exposures(given), field_of(given)
     offset_sigma = given.table.number("offset_sigma_mm", 0.2, positive=True)
     skew_sigma = given.table.number("skew_sigma_per_mm", 5e-6, positive=True)
     given.checked()
     today = f"{datetime.now(UTC):%Y-%m-%d}"
-    place = place_of(out, f"{given.rig.name}-lab", today, beside=series)
+    place = calibration_folder(out, f"{given.rig.name}-lab", today, next_to=series)
     before = (previous, read_previous(previous, kind="lab")) if previous else None
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("measuring", total=None)
 
-        def tell(what: str, done: int, total: int) -> None:
+        def show_progress(what: str, done: int, total: int) -> None:
             progress.update(task, description=what, completed=done, total=total or None)
 
-        looks = measured(given.rig, exposures, field, progress=tell)
+        observations = measure_targets(given.rig, exposures, field, progress=show_progress)
         found = calibrate_rig(
             given.rig,
             exposures,
             field,
-            looks,
+            observations,
             offset_sigma_mm=offset_sigma,
             skew_sigma_per_mm=skew_sigma,
-            progress=tell,
+            progress=show_progress,
         )
     report = field_report(given, found, calibration_id=place.name, date=today, previous=before)
     rig = replace(found.rig, calibration_date=today)
@@ -83,8 +83,8 @@ def lab(
         f"{given.rig.calibration_id}.\nIt counts only where it is configured. Standard deviations "
         "and correlations: calibration.json and covariance.npz\nbeside it."
     )
-    rows = estimated(found)
-    hand_over(
+    rows = estimated_parameters(found)
+    publish_calibration(
         report,
         place,
         files={"covariance.npz": covariance_bytes(rows, covariance_of(found, rows))},

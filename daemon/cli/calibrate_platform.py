@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from daemon.cli.calibration_outcome import hand_over
+from daemon.cli.calibration_output import publish_calibration
 from daemon.cli.options import AsJson, NewFolder
 
 HELP = """Platform calibration: how every head is mounted, from many exposures.
@@ -35,18 +35,23 @@ def platform(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    from daemon.postflight.calibration.platform import KIND, read_missions, report_of, rig_file
-    from daemon.postflight.calibration.report import place_of, read_previous
+    from daemon.postflight.calibration.calibration_report import calibration_folder, read_previous
+    from daemon.postflight.calibration.platform_calibration import (
+        KIND,
+        read_missions,
+        report_of,
+        rig_file,
+    )
     from processing.calibration.platform import calibrate_platform, calibrated_rig
 
     before = None if previous is None else read_previous(previous, kind=KIND)
     flown = read_missions(missions)
     today = f"{datetime.now(UTC):%Y-%m-%d}"
-    place = place_of(out, f"{flown.rig.name}-platform", today, beside=missions[0])
+    place = calibration_folder(out, f"{flown.rig.name}-platform", today, next_to=missions[0])
     found = calibrate_platform(flown.rig, flown.records)
     made = calibrated_rig(flown.rig, found, calibration_id=place.name, date=today)
     report = report_of(flown, found, calibration_id=place.name, date=today, previous=before)
-    hand_over(
+    publish_calibration(
         report,
         place,
         rig_file=lambda name: rig_file(replace(made, calibration_id=name), flown, date=today),

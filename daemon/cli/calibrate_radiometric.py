@@ -39,7 +39,9 @@ def radiometric(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    from daemon.cli.calibration_outcome import hand_over
+    from daemon.cli.calibration_output import publish_calibration
+    from daemon.postflight.calibration.calibration_report import calibration_folder, read_previous
+    from daemon.postflight.calibration.laboratory.laboratory_series import read_series
     from daemon.postflight.calibration.laboratory.radiometric import (
         calibrate_sensor,
         checks_of,
@@ -49,8 +51,6 @@ def radiometric(
     )
     from daemon.postflight.calibration.laboratory.radiometric_maps import files_of
     from daemon.postflight.calibration.laboratory.radiometric_report import radiometric_report
-    from daemon.postflight.calibration.laboratory.series import read_series
-    from daemon.postflight.calibration.report import place_of, read_previous
 
     given = read_series(series, kind="radiometric")
     shots = shots_of(given)
@@ -58,14 +58,14 @@ def radiometric(
     monitor_sigma = given.table.number("monitor_sigma", 1e-3)
     given.checked()
     today = f"{datetime.now(UTC):%Y-%m-%d}"
-    place = place_of(out, f"{given.rig.name}-radiometric", today, beside=series)
+    place = calibration_folder(out, f"{given.rig.name}-radiometric", today, next_to=series)
     before = (previous, read_previous(previous, kind="radiometric")) if previous else None
     names = [s.name for s in given.rig.sensors if any(x.sensor == s.name for x in shots)]
     heads = []
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("reading", total=len(sets_of(shots)))
 
-        def tell(what: str) -> None:
+        def show_progress(what: str) -> None:
             progress.update(task, description=what, advance=1)
 
         for name in names:
@@ -75,7 +75,7 @@ def radiometric(
                 own,
                 temperature_sigma_c=temperature_sigma,
                 monitor_sigma=monitor_sigma,
-                progress=tell,
+                progress=show_progress,
             )
             heads.append(replace(head, checks=checks_of(head, own)))
     measured = {s.f_number for s in shots if s.light == "flat" and s.use == "fit"}
@@ -91,4 +91,4 @@ def radiometric(
         previous=before,
     )
     files = files_of(heads, common_level(heads, pan), apertures)
-    hand_over(report, place, files=files, as_json=as_json)
+    publish_calibration(report, place, files=files, as_json=as_json)

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 from rich.progress import Progress
 
-from daemon.cli.calibration_outcome import hand_over
+from daemon.cli.calibration_output import publish_calibration
 from daemon.cli.options import AsJson, NewFolder
 from daemon.terminal.console import Console
 from daemon.terminal.tables import light_table
@@ -44,8 +44,8 @@ def rig(
     as_json: AsJson = False,
 ) -> None:
     from daemon.postflight.adjustment.project import read_project
-    from daemon.postflight.calibration.report import place_of, read_previous
-    from daemon.postflight.calibration.rig import (
+    from daemon.postflight.calibration.calibration_report import calibration_folder, read_previous
+    from daemon.postflight.calibration.rig_calibration import (
         GRAD,
         RigCalibrationError,
         calibrated_rig,
@@ -53,9 +53,9 @@ def rig(
         rig_file,
     )
     from processing.bundle.adjust import adjust
+    from processing.bundle.initial_values import completed
     from processing.bundle.network import NetworkError
-    from processing.bundle.rank import DefectError
-    from processing.bundle.start import completed
+    from processing.bundle.rank_diagnosis import RankDefectError
     from processing.calibration.relative_orientation import relative_orientations
     from processing.rig import find_rig
 
@@ -64,7 +64,7 @@ def rig(
     old = find_rig(rig)
     before = None if previous is None else read_previous(previous, kind="rig")
     today = f"{datetime.now(UTC):%Y-%m-%d}"
-    place = place_of(out, f"{old.name}-rig", today, beside=path.parent)
+    place = calibration_folder(out, f"{old.name}-rig", today, next_to=path.parent)
     try:
         with Progress(console=Console(stderr=True), transient=True) as progress:
             task = progress.add_task("starting values", total=None)
@@ -77,7 +77,7 @@ def rig(
             )
         name = reference or old.master_cone or given.network.cameras[0].name
         found = relative_orientations(result, name, least_points=least_points)
-    except (NetworkError, DefectError, ValueError) as error:
+    except (NetworkError, RankDefectError, ValueError) as error:
         raise RigCalibrationError(f"{given.name}: {error}") from error
     made = calibrated_rig(old, result, found, calibration_id=place.name, date=today)
     report = report_of(given, result, found, made, date=today, previous=before)
@@ -98,7 +98,7 @@ def rig(
                 ]
                 table.add_row(head.head, *cells, str(head.exposures))
             console.print(table)
-    hand_over(
+    publish_calibration(
         report,
         place,
         rig_file=lambda name: rig_file(

@@ -41,36 +41,36 @@ def certificate(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from daemon.onboard.monitoring.access.authority import make_certificate
+    from daemon.onboard.monitoring.access.certificate_authority import issue_certificate
 
     reader = _gid_of(group)
-    made = make_certificate(folder, authority=authority, names=names or (), days=days)
+    issued = issue_certificate(folder, authority=authority, names=names or (), days=days)
     if reader is not None:
-        os.chown(made.key, -1, reader)
+        os.chown(issued.key, -1, reader)
     if as_json:
         content = {
-            "certificate": str(made.certificate),
-            "key": str(made.key),
-            "authority": str(made.authority),
-            "names": made.names,
-            "authority_sha256": made.fingerprint,
-            "new_authority": made.is_new_authority,
+            "certificate": str(issued.certificate),
+            "key": str(issued.key),
+            "authority": str(issued.authority),
+            "names": issued.names,
+            "authority_sha256": issued.fingerprint,
+            "new_authority": issued.is_new_authority,
         }
         typer.echo(json.dumps(content))
         return
     console = Console(soft_wrap=True, highlight=False)
     lines = [
-        f"Certificate for {', '.join(made.names)}.",
+        f"Certificate for {', '.join(issued.names)}.",
         "",
         "In service.toml:",
         "  [watch]",
-        f'  tls_certificate = "{made.certificate.absolute()}"',
-        f'  tls_key = "{made.key.absolute()}"',
+        f'  tls_certificate = "{issued.certificate.absolute()}"',
+        f'  tls_key = "{issued.key.absolute()}"',
         "",
-        f"{'New authority' if made.is_new_authority else 'Authority'}: {made.authority}; install "
+        f"{'New authority' if issued.is_new_authority else 'Authority'}: {issued.authority}; install "
         "it on tablets and ground stations, and compare its SHA-256:",
-        f"  {made.fingerprint}",
-        f"Keep {made.authority.with_suffix('.key')} secret; it is needed only for renewals.",
+        f"  {issued.fingerprint}",
+        f"Keep {issued.authority.with_suffix('.key')} secret; it is needed only for renewals.",
     ]
     for line in lines:
         console.print(line, markup=False)
@@ -78,7 +78,7 @@ def certificate(
 
 def _gid_of(group: str | None) -> int | None:
     """The group that reads the key; None to leave it as it is."""
-    from daemon.onboard.monitoring.access.certificates import CertificateError
+    from daemon.onboard.monitoring.access.certificates import TlsCertificateError
 
     if group is None and os.geteuid() != 0:
         return None
@@ -87,4 +87,4 @@ def _gid_of(group: str | None) -> int | None:
     except KeyError as error:
         if group is None:
             return None
-        raise CertificateError(f"there is no group {group!r} on this machine") from error
+        raise TlsCertificateError(f"there is no group {group!r} on this machine") from error

@@ -12,13 +12,13 @@ import typer
 from rich.text import Text
 from rich.tree import Tree
 
-from daemon.cli.find import find as find_devices
 from daemon.cli.find_heads import find_heads
+from daemon.cli.find_ports import find as find_devices
 from daemon.terminal.console import Console
 
 if TYPE_CHECKING:
     from daemon.configuration.model import Configuration
-    from daemon.onboard.preflight.findings import Finding
+    from daemon.onboard.preflight.check_results import CheckResult
     from processing.rig import Rig
 
 HELP = """Validate a configuration, build what `run` builds, and prove each device with one datum.
@@ -74,62 +74,64 @@ def check(
 def check_flight(config: Path, *, fire: bool, as_json: bool) -> None:
     """Look at everything a flight with this configuration needs, and print it."""
     from daemon.configuration.model import load
-    from daemon.onboard.preflight.findings import EXIT_STATUS, Outcome, overall
+    from daemon.onboard.preflight.check_results import EXIT_STATUS, CheckOutcome, worst_outcome
 
     configuration, rig = load(config)
     console = Console(stderr=as_json)
     with console.status("looking at what a flight needs"):
-        findings = look(configuration, rig, config, fire=fire)
-    outcome = overall(findings)
+        results = collect_results(configuration, rig, config, fire=fire)
+    outcome = worst_outcome(results)
     if as_json:
-        listed = [finding.as_json() for finding in findings]
+        listed = [result.as_json() for result in results]
         typer.echo(json.dumps({"rig": rig.name, "outcome": outcome.value, "findings": listed}))
     else:
-        _print_tree(console, config, rig.name, findings)
-        if outcome is Outcome.PASS:
+        _print_tree(console, config, rig.name, results)
+        if outcome is CheckOutcome.PASS:
             console.print(f"All passes. Next: syntopic run {config}")
-        elif outcome is Outcome.WAITING:
+        elif outcome is CheckOutcome.WAITING:
             console.print("Waiting for what is marked so; nothing fails.", style="yellow")
         else:
             console.print("Not ready; do as the sentences in red say.", style="bold red")
     raise typer.Exit(EXIT_STATUS[outcome])
 
 
-def look(configuration: Configuration, rig: Rig, config: Path, *, fire: bool) -> list[Finding]:
+def collect_results(
+    configuration: Configuration, rig: Rig, config: Path, *, fire: bool
+) -> list[CheckResult]:
     """All findings: of the running service where there is one, else of what `run` would build."""
-    from daemon.onboard.monitoring.access.asking import ask_service
+    from daemon.onboard.monitoring.access.service_query import query_service
     from daemon.onboard.preflight.prerequisites import prerequisites
-    from daemon.onboard.preflight.resumption import resumption_finding
-    from daemon.onboard.preflight.trial import try_out
-    from daemon.onboard.service.departure import interrupted_mission
+    from daemon.onboard.preflight.resumption import resumption_result
+    from daemon.onboard.preflight.system_check import run_system_check
+    from daemon.onboard.service.startup import interrupted_mission
 
     mission = interrupted_mission(configuration)
     if mission is not None and mission.is_held():
-        return ask_service(configuration, mission)
-    findings = prerequisites(configuration, rig)
-    if any(finding.prevents for finding in findings):
-        return findings
+        return query_service(configuration, mission)
+    results = prerequisites(configuration, rig)
+    if any(result.is_blocking for result in results):
+        return results
     if mission is not None:
-        finding, rig = resumption_finding(mission, configuration, rig, config)
-        findings.append(finding)
-        if finding.prevents:
-            return findings
+        result, rig = resumption_result(mission, configuration, rig, config)
+        results.append(result)
+        if result.is_blocking:
+            return results
     if configuration.watch is not None:
-        from daemon.onboard.monitoring.prerequisites import watch_findings
+        from daemon.onboard.monitoring.monitoring_prerequisites import check_monitoring
 
-        findings += watch_findings(configuration.watch)
-    return findings + asyncio.run(try_out(configuration, rig, fire=fire))
+        results += check_monitoring(configuration.watch)
+    return results + asyncio.run(run_system_check(configuration, rig, fire=fire))
 
 
-def _print_tree(console: Console, config: Path, rig: str, findings: Sequence[Finding]) -> None:
+def _print_tree(console: Console, config: Path, rig: str, results: Sequence[CheckResult]) -> None:
     tree = Tree(f"{config} for {rig}: valid")
-    for kind in dict.fromkeys(finding.kind for finding in findings):
+    for kind in dict.fromkeys(result.kind for result in results):
         branch = tree.add(kind)
-        for finding in findings:
-            if finding.kind != kind:
+        for result in results:
+            if result.kind != kind:
                 continue
-            outcome = finding.outcome.value
-            found = ", ".join(f"{key} {value}" for key, value in finding.found.items() if value)
-            label = ": ".join(filter(None, (finding.name, finding.sentence or found)))
+            outcome = result.outcome.value
+            found = ", ".join(f"{key} {value}" for key, value in result.found.items() if value)
+            label = ": ".join(filter(None, (result.name, result.sentence or found)))
             branch.add(Text.assemble((outcome, COLOURS[outcome]), " ", label))
     console.print(tree)

@@ -14,10 +14,10 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command, get_group
 
-from daemon.cli import interruption
+from daemon.cli import interrupt_messages
 
 
-class Command(NamedTuple):
+class CommandEntry(NamedTuple):
     """One command, or one group of commands (`object_name` is a `typer.Typer` there)."""
 
     name: str
@@ -28,7 +28,7 @@ class Command(NamedTuple):
     group: str
 
 
-_AIR: Final = "In the air"
+_IN_FLIGHT: Final = "In the air"
 _GROUND: Final = "After landing"
 _LABORATORY: Final = "In the laboratory"
 _BENCH: Final = "On the bench"
@@ -36,22 +36,30 @@ _BENCH: Final = "On the bench"
 
 def _command(
     name: str, group: str, summary: str, place: str = "", help_name: str = "HELP"
-) -> Command:
+) -> CommandEntry:
     module, _, object_name = (place or name).partition(":")
-    return Command(name, f"daemon.cli.{module}", object_name or module, help_name, summary, group)
+    return CommandEntry(
+        name, f"daemon.cli.{module}", object_name or module, help_name, summary, group
+    )
 
 
 TABLE: Final = {
     one.name: one
     for one in (
-        _command("run", _AIR, "Run the onboard service until SIGTERM or until the plan is flown."),
-        _command("check", _AIR, "Check a configuration and prove each device with one datum."),
-        _command("monitor", _AIR, "Watch a flight from a terminal."),
-        _command("send", _AIR, "Send a command to a running service."),
-        _command("token", _AIR, "Create, list and revoke access tokens.", "token:app"),
-        _command("certificate", _AIR, "Create a local authority and a TLS certificate."),
-        _command("explain", _AIR, "Explain an event or a quality flag: cause and cure."),
-        _command("reflights", _AIR, "List the segments of the plan that must be flown again."),
+        _command(
+            "run", _IN_FLIGHT, "Run the onboard service until SIGTERM or until the plan is flown."
+        ),
+        _command(
+            "check", _IN_FLIGHT, "Check a configuration and prove each device with one datum."
+        ),
+        _command("monitor", _IN_FLIGHT, "Watch a flight from a terminal."),
+        _command("send", _IN_FLIGHT, "Send a command to a running service."),
+        _command("token", _IN_FLIGHT, "Create, list and revoke access tokens.", "token:app"),
+        _command("certificate", _IN_FLIGHT, "Create a local authority and a TLS certificate."),
+        _command("explain", _IN_FLIGHT, "Explain an event or a quality flag: cause and cure."),
+        _command(
+            "reflights", _IN_FLIGHT, "List the segments of the plan that must be flown again."
+        ),
         _command("verify", _GROUND, "Check every file of a mission against its hash."),
         _command("repair", _GROUND, "Bring index, records, logs and disks of a mission together."),
         _command("transfer", _GROUND, "Copy a mission to another disk and verify every file."),
@@ -106,18 +114,18 @@ RENAMED: Final = {
 """Former names of commands, refused with the present one."""
 
 
-def load(entry: Command) -> Any:
+def load(entry: CommandEntry) -> Any:
     """The command as click runs it, its module imported."""
     found = getattr(importlib.import_module(entry.module), entry.object_name)
     if isinstance(found, typer.Typer):
-        interruption.make_interruptible(found, entry.name)
+        interrupt_messages.make_interruptible(found, entry.name)
         group = get_group(found)
         group.name = entry.name
         return group
     app = typer.Typer(add_completion=False, rich_markup_mode="markdown")
     text = getattr(importlib.import_module(entry.module), entry.help_name)
     app.command(name=entry.name, help=text)(found)
-    interruption.make_interruptible(app)
+    interrupt_messages.make_interruptible(app)
     return get_command(app)
 
 

@@ -87,7 +87,7 @@ def demo(
             mission, ledger = _fly(console, emulator, folder, exposures)
         finally:
             emulator.end()
-        result = _judge(console, mission, Path(emulator.ready["truth"]), ledger)
+        result = _compare_with_truth(console, mission, Path(emulator.ready["truth"]), ledger)
     except (DemoError, EmulatorError) as error:
         console.print(str(error), style="bold red")
         raise typer.Exit(1) from error
@@ -174,8 +174,8 @@ def _events(service: subprocess.Popen[str]) -> Iterator[dict[str, Any]]:
 def _table(rows: Mapping[int, Mapping[str, Any]], exposures: int) -> Table:
     """The live table; it fits a terminal of 80 columns."""
     table = light_table(f"Line 1, {exposures} exposures", (), _HEADINGS)
-    for number, told in sorted(rows.items()):
-        table.add_row(str(number), *_cells(told))
+    for number, events in sorted(rows.items()):
+        table.add_row(str(number), *_cells(events))
     return table
 
 
@@ -193,16 +193,16 @@ _HEADINGS = (
 )
 
 
-def _cells(told: Mapping[str, Any]) -> list[str | Text]:
-    if "lost" in told:
+def _cells(events: Mapping[str, Any]) -> list[str | Text]:
+    if "lost" in events:
         return ["", "", "0", "", "", "", "", "", Text("lost", "red")]
-    sealed = told.get("sealed")
+    sealed = events.get("sealed")
     if sealed is None:
-        return ["", "", "", "", "", "", "", "", "stored" if "stored" in told else "triggered"]
+        return ["", "", "", "", "", "", "", "", "stored" if "stored" in events else "triggered"]
     cells = [_gps_text(sealed["mark_gps_ns"]), str(sealed["mark_sigma_ns"]), str(sealed["frames"])]
-    if "processed" not in told:
+    if "processed" not in events:
         return [*cells, "", "", "", "", "", "sealed"]
-    report = told["processed"]["report"]
+    report = events["processed"]["report"]
     figures = report["figures"]
     colour = {"good": "green", "usable": "yellow", "refly": "red"}[report["verdict"]]
     return [
@@ -228,17 +228,17 @@ def _gps_text(gps_ns: str | None) -> str:
     return f"{seconds % 604_800}.{nanoseconds // 100_000:04d}"
 
 
-def _judge(
+def _compare_with_truth(
     console: Console, mission: Path, truth: Path, ledger: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Hold the products against the emulator's truth, and write the report."""
-    from daemon.postflight.report import write_report
+    from daemon.postflight.mission_report import write_report
 
     started = time.monotonic()
     with console.status("comparing the stitched images with the truth"):
-        judged = subprocess.run(
+        comparison = subprocess.run(
             [
-                *(sys.executable, "-m", "sim_hw.judge"),
+                *(sys.executable, "-m", "sim_hw.truth_comparison"),
                 *("--mission", str(mission), "--truth", str(truth)),
             ],
             capture_output=True,
@@ -246,9 +246,9 @@ def _judge(
             timeout=EVENT_TIMEOUT_S,
             check=False,
         )
-    if judged.returncode != 0:
-        raise DemoError(f"the judge failed: {judged.stderr.strip()[-500:]}")
-    geometry = json.loads(judged.stdout)
+    if comparison.returncode != 0:
+        raise DemoError(f"the judge failed: {comparison.stderr.strip()[-500:]}")
+    geometry = json.loads(comparison.stdout)
     reports = [
         json.loads(path.read_text()) for path in sorted((mission / "L2").glob("*/quality.json"))
     ]

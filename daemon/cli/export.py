@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 from rich.progress import Progress
 
-from daemon.cli.failures import end_walk
+from daemon.cli.exposure_failures import exit_if_failed
 from daemon.terminal.console import Console
 from daemon.terminal.tables import light_table
 from drivers.base.extras import require
@@ -76,21 +76,21 @@ def raw(
     with folder.held():
         done = export_raw(folder)
     if as_json:
-        told = {
+        listed = {
             "folder": str(done.folder),
             "nbytes": done.nbytes,
             "events": done.events,
             "failures": [failure.as_json() for failure in done.failures],
         }
-        typer.echo(json.dumps(told))
-        end_walk(done.failures)
+        typer.echo(json.dumps(listed))
+        exit_if_failed(done.failures)
         return
     console = Console()
     for name, nbytes in done.nbytes.items():
         console.print(f"{name}: {nbytes} bytes")
     console.print(f"events.csv: {done.events} exposures; frames.csv: every frame of theirs")
     console.print(f"They are in {done.folder}", soft_wrap=True)
-    end_walk(done.failures)
+    exit_if_failed(done.failures)
 
 
 @app.command()
@@ -113,9 +113,9 @@ def foxglove(
         content = {"file": str(done.file), "messages": done.messages, "failures": failures}
         typer.echo(json.dumps(content))
     else:
-        told = ", ".join(f"{topic} {count}" for topic, count in done.messages.items())
-        Console().print(f"{told or 'nothing'}; written to {done.file}", soft_wrap=True)
-    end_walk(done.failures)
+        listed = ", ".join(f"{topic} {count}" for topic, count in done.messages.items())
+        Console().print(f"{listed or 'nothing'}; written to {done.file}", soft_wrap=True)
+    exit_if_failed(done.failures)
 
 
 @app.command(help=PICTURES_HELP)
@@ -133,7 +133,7 @@ def pictures(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     from daemon.mission.layout import Mission
-    from daemon.postflight.export.pictures import KINDS, PictureError, export_pictures
+    from daemon.postflight.export.level2_export import KINDS, PictureError, export_pictures
 
     if kind not in KINDS:
         raise PictureError(f"--as is {kind!r}; cog or jpeg is right")
@@ -160,7 +160,7 @@ def pictures(
         typer.echo(json.dumps(content))
     else:
         Console().print(f"{len(files)} pictures in {files[0].parent}", soft_wrap=True)
-    end_walk(failures)
+    exit_if_failed(failures)
 
 
 @app.command(help=CERTIFICATE_HELP)
@@ -169,17 +169,17 @@ def certificate(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     from daemon.mission.layout import Mission
-    from daemon.postflight.export.certificate import write_certificate
+    from daemon.postflight.export.camera_certificate import write_certificate
 
     folder = Mission.open(mission)
     with folder.held():
-        told, path, failures = write_certificate(folder)
+        listed, path, failures = write_certificate(folder)
     if as_json:
-        typer.echo(json.dumps(told))
-        end_walk(failures)
+        typer.echo(json.dumps(listed))
+        exit_if_failed(failures)
         return
     console = Console()
-    for camera in told["cameras"]:
+    for camera in listed["cameras"]:
         x, y = camera["principal_point_mm"]
         console.print(
             f"{camera['name']}: principal distance {camera['principal_distance_mm']:.6f} mm, "
@@ -188,7 +188,7 @@ def certificate(
             highlight=False,
         )
     console.print(f"Certificate: {path}", soft_wrap=True)
-    end_walk(failures)
+    exit_if_failed(failures)
 
 
 @app.command(help=ORIENTATION_HELP)
@@ -212,7 +212,7 @@ def orientation(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     from daemon.mission.layout import Mission
-    from daemon.postflight.export import orientation as orientation_export
+    from daemon.postflight.export import orientation_set as orientation_export
 
     folder = Mission.open(mission)
     with folder.held(), Progress(console=Console(stderr=True), transient=True) as progress:
@@ -228,7 +228,7 @@ def orientation(
         )
     if as_json:
         typer.echo(json.dumps(orientation_export.as_json(done)))
-        end_walk(done.failures)
+        exit_if_failed(done.failures)
         return
     console = Console()
     table = light_table(
@@ -244,7 +244,7 @@ def orientation(
     if stitched:
         console.print(f"and {len(done.oriented) - len(stitched)} of single heads, in the files")
     for one in done.missing:
-        console.print(f"{one.exposure:06d} {one.cone}: not oriented, {one.why}", style="yellow")
+        console.print(f"{one.exposure:06d} {one.cone}: not oriented, {one.reason}", style="yellow")
     if done.change_m is not None:
         console.print(
             f"Against the flight's own navigation: at most {done.change_m:.3f} m and "
@@ -254,4 +254,4 @@ def orientation(
         f"CSV, PAT-B, BINGO, footprints and STAC items are in {done.folder}; read about.txt first",
         soft_wrap=True,
     )
-    end_walk(done.failures)
+    exit_if_failed(done.failures)

@@ -76,10 +76,15 @@ def v4l2_heads() -> tuple[list[dict[str, Any]], list[str]]:
         elif not ours:
             problems.append(f"{node.path} ({node.card}) has no format that is one of ours")
         else:
-            told = {"model": node.card, "serial": node.serial, "bus": node.bus, "formats": ours}
+            properties = {
+                "model": node.card,
+                "serial": node.serial,
+                "bus": node.bus,
+                "formats": ours,
+            }
             widest = max(ours, key=lambda name: FORMATS[name].bits)
             settings = {"device": node.path, "pixel_format": widest}
-            found.append({"driver": "v4l2", "settings": settings, "found": told})
+            found.append({"driver": "v4l2", "settings": settings, "found": properties})
     return found, problems
 
 

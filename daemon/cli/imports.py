@@ -76,7 +76,7 @@ def dbat(
 
     Example: `syntopic import dbat camcal.xml --out camcal`
     """
-    from daemon.postflight.adjustment.writing import write_project
+    from daemon.postflight.adjustment.project_writer import write_project
     from daemon.postflight.importers.dbat import import_dbat
 
     imported = import_dbat(script)

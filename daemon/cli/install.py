@@ -12,7 +12,7 @@ import typer
 from daemon.terminal.console import Console
 
 if TYPE_CHECKING:
-    from daemon.onboard.installation import Done
+    from daemon.onboard.installation import InstallationReport
 
 HELP = """Lay out the service: unit, user, folders, device rules, kernel settings, compiled kernels.
 
@@ -55,7 +55,7 @@ def install(
         installation.contents(command, configuration, missions, mirror),
         installation.steps(command, rig),
         root=root,
-        tell=lambda line: console.print(line, style="dim", highlight=False),
+        log=lambda line: console.print(line, style="dim", highlight=False),
         replace=replace,
     )
     next_line = (
@@ -64,7 +64,7 @@ def install(
         else f"write {configuration} (syntopic sim RIG writes one to begin with), then "
         "syntopic check it, then install again: its rig's kernels are compiled then"
     )
-    _tell(done, as_json, "written", next_line)
+    _print_outcome(done, as_json, "written", next_line)
 
 
 def uninstall(root: Root = Path("/"), as_json: AsJson = False) -> None:
@@ -72,19 +72,24 @@ def uninstall(root: Root = Path("/"), as_json: AsJson = False) -> None:
 
     console = Console(stderr=True)
     done = installation.uninstall(
-        root=root, tell=lambda line: console.print(line, style="dim", highlight=False)
+        root=root, log=lambda line: console.print(line, style="dim", highlight=False)
     )
-    _tell(done, as_json, "removed", "missions are still in /var/lib/syntopic")
+    _print_outcome(done, as_json, "removed", "missions are still in /var/lib/syntopic")
 
 
-def _tell(done: Done, as_json: bool, verb: str, next_line: str) -> None:
+def _print_outcome(done: InstallationReport, as_json: bool, verb: str, next_line: str) -> None:
     if as_json:
-        told = {verb: done.files, "kept": done.kept, "steps": done.steps, "next": next_line}
-        typer.echo(json.dumps(told))
+        content = {
+            verb: done.files,
+            "retained": done.retained,
+            "steps": done.steps,
+            "next": next_line,
+        }
+        typer.echo(json.dumps(content))
     else:
         console = Console()
         console.print(f"{len(done.files)} files {verb}")
-        for path in done.kept:
+        for path in done.retained:
             console.print(f"kept, edited by hand: {path}", style="yellow", highlight=False)
         for purpose, outcome in done.steps.items():
             console.print(f"{purpose}: {outcome}", highlight=False, soft_wrap=True)

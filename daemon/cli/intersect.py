@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from daemon.cli.failures import end_walk
+from daemon.cli.exposure_failures import exit_if_failed
 from daemon.cli.options import AsJson, AttitudeSigma, Crs, MountFile, PositionSigma, Trajectory
 from daemon.terminal.console import Console
 from daemon.terminal.tables import light_table
@@ -50,9 +50,12 @@ def intersect(
 ) -> None:
     require("geodesy")
     from daemon.mission.layout import Mission
-    from daemon.postflight.adjustment.tables import write_table
-    from daemon.postflight.triangulation.intersection import IntersectionError, Uncertain
-    from daemon.postflight.triangulation.intersection import intersect as intersected
+    from daemon.postflight.adjustment.csv_tables import write_table
+    from daemon.postflight.triangulation.space_intersection import (
+        IntersectionError,
+        IntersectionSigmas,
+    )
+    from daemon.postflight.triangulation.space_intersection import intersect as intersected
     from daemon.postflight.triangulation.triangulation import attitude_sigmas
 
     if out is not None and out.exists():
@@ -60,7 +63,7 @@ def intersect(
     done = intersected(
         Mission.open(mission),
         measured,
-        Uncertain(
+        IntersectionSigmas(
             image_px=image_sigma,
             position_m=position_sigma,
             attitude_rad=attitude_sigmas(attitude_sigma),
@@ -86,7 +89,7 @@ def intersect(
         )  # fmt: skip
     if as_json:
         typer.echo(json.dumps(asdict(done)))
-        end_walk(done.failures)
+        exit_if_failed(done.failures)
         return
     console = Console()
     columns = ("east m", "north m", "height m", "\u00b1 x", "\u00b1 y", "\u00b1 z", "rays")
@@ -103,4 +106,4 @@ def intersect(
         )
     if out is not None:
         console.print(f"Table: {out}", soft_wrap=True)
-    end_walk(done.failures)
+    exit_if_failed(done.failures)

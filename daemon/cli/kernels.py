@@ -21,13 +21,13 @@ def kernels(
     ] = "ultracam-x-mini",
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from processing.pipelines import compiled
+    from processing.pipelines import kernel_compilation
 
     found = find_rig(rig)
-    done = compiled.compile_for(found)
+    done = kernel_compilation.compile_for(found)
     if as_json:
-        told = {"rig": found.name, "compiled": done.compiled, "seconds": round(done.seconds, 2)}
-        typer.echo(json.dumps(told | {"variants": dict(done.variants)}))
+        content = {"rig": found.name, "compiled": done.compiled, "seconds": round(done.seconds, 2)}
+        typer.echo(json.dumps(content | {"variants": dict(done.variants)}))
         return
     typer.echo(
         f"{sum(done.variants.values())} kernels ready for {rig}, {done.compiled} of them compiled "

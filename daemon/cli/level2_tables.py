@@ -20,8 +20,8 @@ def print_reports(console: Console, title: str, reports: Reports) -> None:
     for report in reports:
         for finding in report["findings"]:
             if finding["verdict"] != "good":
-                said = f"Exposure {report['exposure']}: {finding['sentence']}"
-                console.print(said, markup=False, highlight=False)
+                line = f"Exposure {report['exposure']}: {finding['sentence']}"
+                console.print(line, markup=False, highlight=False)
 
 
 def _stitched(console: Console, title: str, reports: Reports) -> None:

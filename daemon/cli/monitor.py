@@ -17,11 +17,11 @@ from rich.table import Table
 from rich.text import Text
 
 from daemon.errors import DaemonError
-from daemon.onboard.monitoring.state import EXPOSURES_KEPT, PARTS, PICTURE_PARTS
+from daemon.onboard.monitoring.flight_state import EXPOSURES_MAX, PARTS, PREVIEW_PARTS
 from daemon.terminal.tables import light_table
 
 if TYPE_CHECKING:
-    from daemon.onboard.monitoring.client.finding import Announced
+    from daemon.onboard.monitoring.client.mdns_browser import AnnouncedService
 
 HELP = """Watch a flight from a terminal: phase, ledger, faults, the last exposures.
 
@@ -34,7 +34,7 @@ Examples: `syntopic monitor`, `syntopic monitor 10.0.0.5:8470 --bytes-per-s 4000
 """
 ROWS = 12
 FAULTS_SHOWN = 20
-DEVICES_KEPT = 500
+DEVICES_MAX = 500
 COLOURS = {"good": "green", "usable": "yellow", "refly": "red", "lost": "red"}
 MARKS = {"good": "●", "usable": "▲", "refly": "■", "lost": "✖"}
 
@@ -120,22 +120,26 @@ def monitor(
         bool, typer.Option("--json", help="Print the state once, as one JSON object.")
     ] = False,
 ) -> None:
-    from daemon.onboard.monitoring.client.client import Access, records, service_at
+    from daemon.onboard.monitoring.client.telemetry_client import (
+        AccessOptions,
+        parse_service_address,
+        telemetry_records,
+    )
 
     console = Console(stderr=as_json)
-    service = service_at(address or _only_one(console, token), tls=tls)
-    access = Access(token, authority, token_without_tls)
-    state: _Seen | None = None
+    service = parse_service_address(address or _single_service(console, token), tls=tls)
+    access = AccessOptions(token, authority, token_without_tls)
+    state: _MonitorState | None = None
     with Live(Text(f"calling {service.address}"), console=console, refresh_per_second=4) as live:
-        for record in records(service, access, bytes_per_s):
+        for record in telemetry_records(service, access, bytes_per_s):
             if record is None and state is not None:
                 since = f"✖ Connection lost {time.strftime('%H:%M:%S')}. Values are frozen."
                 live.update(Group(Text(since, style="bold red"), state.drawn(service.address)))
                 state = None
             elif record is not None:
                 # Each link tells all there is.
-                state = state or _Seen()
-                state.take(record)
+                state = state or _MonitorState()
+                state.receive(record)
                 if as_json:
                     live.update(Text())
                     typer.echo(json.dumps(state.as_json()))
@@ -143,14 +147,14 @@ def monitor(
                 live.update(state.drawn(service.address))
 
 
-def _only_one(console: Console, token: str) -> str:
+def _single_service(console: Console, token: str) -> str:
     """The address of the service that announces itself, where there is one and no token."""
-    from daemon.onboard.monitoring.client.finding import FIND_S, SERVICES_MAX, find_services
+    from daemon.onboard.monitoring.client.mdns_browser import BROWSE_S, SERVICES_MAX, find_services
 
     found = find_services()
     if not found:
         raise MonitorError(
-            f"no service announced itself within {FIND_S:.0f} s; give its address: "
+            f"no service announced itself within {BROWSE_S:.0f} s; give its address: "
             "syntopic monitor HOST:PORT"
         )
     if len(found) == 1 and not token:
@@ -166,7 +170,7 @@ def _only_one(console: Console, token: str) -> str:
     raise typer.Exit(2)
 
 
-class _Seen:
+class _MonitorState:
     """The state as far as it was told."""
 
     def __init__(self) -> None:
@@ -176,14 +180,14 @@ class _Seen:
         self._drawn: dict[int, _Exposure] = {}
         self._record: _Record | None = None
 
-    def take(self, record: dict[str, Any]) -> None:
+    def receive(self, record: dict[str, Any]) -> None:
         """Add a record.
 
         Raises:
             MonitorError: it does not have the form of docs/telemetry.md.
         """
         try:
-            known = _Record.model_validate(record)
+            validated = _Record.model_validate(record)
         except ValidationError as error:
             first = error.errors()[0]
             where = ".".join(str(part) for part in first["loc"])
@@ -191,15 +195,15 @@ class _Seen:
                 f"the service sends no telemetry that is understood: {where}: {first['msg']}; look "
                 "at the address, and at the version of both sides"
             ) from None
-        self._record = known
-        for exposure, content in zip(known.exposures, record.pop("exposures", []), strict=True):
+        self._record = validated
+        for exposure, content in zip(validated.exposures, record.pop("exposures", []), strict=True):
             self.exposures[exposure.number], self._drawn[exposure.number] = content, exposure
-        for device, content in zip(known.devices, record.pop("devices", []), strict=True):
+        for device, content in zip(validated.devices, record.pop("devices", []), strict=True):
             self.devices[device.name] = content
-        for kept, most in ((self.exposures, EXPOSURES_KEPT), (self._drawn, EXPOSURES_KEPT)):
-            _drop_oldest(kept, most)
-        _drop_oldest(self.devices, DEVICES_KEPT)
-        for part in (*PARTS, *PICTURE_PARTS):
+        for entries, limit in ((self.exposures, EXPOSURES_MAX), (self._drawn, EXPOSURES_MAX)):
+            _drop_oldest(entries, limit)
+        _drop_oldest(self.devices, DEVICES_MAX)
+        for part in (*PARTS, *PREVIEW_PARTS):
             record.pop(part, None)
         self.brief = record
 
@@ -226,18 +230,23 @@ class _Seen:
 
     def _faults(self, faults: list[_Fault]) -> Iterator[Text]:
         for fault in faults[:FAULTS_SHOWN]:
-            word, style = ("✖ WARNING", "red") if fault.stands else ("▲ passed", "yellow")
-            yield Text(f"{word}  {fault.sentence}", style=style)
+            verdict_or_step, style = (
+                ("✖ WARNING", "red") if fault.stands else ("▲ passed", "yellow")
+            )
+            yield Text(f"{verdict_or_step}  {fault.sentence}", style=style)
         if len(faults) > FAULTS_SHOWN:
             yield Text(f"and {len(faults) - FAULTS_SHOWN} more faults", style="red")
 
     def _table(self) -> Table:
         table = light_table("", ("exposure", "verdict"), ("frames", "s0 px", "dC", "tie points"))
         for number, one in sorted(self._drawn.items())[-ROWS:]:
-            word = one.verdict or one.step
+            verdict_or_step = one.verdict or one.step
             table.add_row(
                 str(number),
-                Text(f"{MARKS.get(word, '')} {word}", COLOURS.get(word, "")),
+                Text(
+                    f"{MARKS.get(verdict_or_step, '')} {verdict_or_step}",
+                    COLOURS.get(verdict_or_step, ""),
+                ),
                 _number(one.frames, "d"),
                 _number(one.figures.sigma0_px, ".3f"),
                 _number(one.figures.dc_k, "+.1f"),
@@ -246,9 +255,9 @@ class _Seen:
         return table
 
 
-def _drop_oldest(kept: dict[Any, Any], most: int) -> None:
-    while len(kept) > most:
-        del kept[next(iter(kept))]
+def _drop_oldest(entries: dict[Any, Any], limit: int) -> None:
+    while len(entries) > limit:
+        del entries[next(iter(entries))]
 
 
 def _number(value: float | None, form: str) -> str:
@@ -265,7 +274,7 @@ def _duration(ns: float | None) -> str:
     return f"{ns:.0f} ns"
 
 
-def _services_table(found: list[Announced]) -> Table:
+def _services_table(found: list[AnnouncedService]) -> Table:
     columns = ("rig", "mission", "phase", "tls")
     table = light_table("Announced services; name one", ("address", *columns), ())
     for one in found:

@@ -29,7 +29,7 @@ AttitudeSigma = Annotated[
 ]
 
 
-def held_for(mission: Mission, target: Path) -> AbstractContextManager[None]:
+def lock_for(mission: Mission, target: Path) -> AbstractContextManager[None]:
     """Hold the mission against other writers, if `target` is a place in it.
 
     Raises:

@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.progress import Progress
 
-from daemon.cli.failures import end_walk
+from daemon.cli.exposure_failures import exit_if_failed
 from daemon.configuration.model import ConfigurationError
+from daemon.mission.exposure_batch import for_each_exposure
 from daemon.mission.layout import Mission
 from daemon.mission.store.publication import sweep
-from daemon.mission.walk import walk
 from daemon.terminal.console import Console
 from daemon.terminal.tables import light_table
 
 if TYPE_CHECKING:
-    from daemon.products.level3 import Developed
+    from daemon.products.level3 import PansharpenedExposure
 
 HELP = """Make Level-3 of a mission after landing: pansharpened RGB and CIR in 16 and 8 bits.
 
@@ -62,17 +62,21 @@ def pansharpen(
             folder, rig, lambda _, done, total: progress.update(task, completed=done, total=total)
         )
 
-        def develop_one(number: int) -> tuple[level3.Developed, float]:
+        def develop_one(number: int) -> tuple[level3.PansharpenedExposure, float]:
             started = time.monotonic()
-            done = level3.develop(
+            done = level3.pansharpen(
                 folder, rig, number, tones, images=images, depths=depths, threads=threads
             )
             return done, time.monotonic() - started
 
-        known = {failure.exposure for failure in unreadable}
-        numbers = [number for number in only or sorted(tones.scales) if number not in known]
+        unreadable_numbers = {failure.exposure for failure in unreadable}
+        numbers = [
+            number for number in only or sorted(tones.scales) if number not in unreadable_numbers
+        ]
         progress.update(task, description="developing", total=len(numbers), completed=0)
-        walked = walk(numbers, develop_one, lambda count: progress.update(task, completed=count))
+        walked = for_each_exposure(
+            numbers, develop_one, lambda count: progress.update(task, completed=count)
+        )
     rows = list(walked.results.values())
     failures = (*unreadable, *walked.failures)
     if as_json:
@@ -93,11 +97,11 @@ def pansharpen(
         }
         typer.echo(json.dumps(content))
     else:
-        _show(rows, level3.level3_root(folder))
-    end_walk(failures)
+        _print_table(rows, level3.level3_root(folder))
+    exit_if_failed(failures)
 
 
-def _show(rows: Sequence[tuple[Developed, float]], root: Path) -> None:
+def _print_table(rows: Sequence[tuple[PansharpenedExposure, float]], root: Path) -> None:
     table = light_table("Level-3", (), ("exposure", "files", "MB", "s"))
     for done, seconds in rows:
         nbytes = sum(done.files.values())

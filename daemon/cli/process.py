@@ -12,12 +12,12 @@ import typer
 from pydantic import ValidationError
 from rich.progress import Progress
 
-from daemon.cli.failures import end_walk
+from daemon.cli.exposure_failures import exit_if_failed
 from daemon.cli.level2_tables import print_reports
 from daemon.configuration.model import ConfigurationError, PlanSection, ProcessingSection
-from daemon.configuration.problems import dig
+from daemon.configuration.problems import nested_value
 from daemon.mission.layout import Mission
-from daemon.orientation.exterior import mount_of
+from daemon.orientation.exterior_orientation import mount_of
 from daemon.terminal.console import Console
 from processing.image.kernels import DEFAULT_INTERPOLATION, INTERPOLATIONS
 
@@ -61,12 +61,12 @@ def process(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
-    from daemon.mission.records import sha256_hex
+    from daemon.mission.canonical_json import sha256_hex
+    from daemon.mission.exposure_batch import for_each_exposure
     from daemon.mission.store import store
     from daemon.mission.store.level2 import recover_level2
-    from daemon.mission.walk import walk
     from daemon.onboard.pipeline.worker import overlaps_of, process_exposure
-    from daemon.orientation.ground import ground_of
+    from daemon.orientation.ground_model import ground_of
     from daemon.products.processor import processor_for
     from processing.radiometry.calibration import CalibrationError
     from processing.rig import load_rig
@@ -112,14 +112,16 @@ def process(
                 plan,
                 exposure,
                 frames,
-                surroundings=overlaps.of(number),
+                overlap_shares=overlaps.of(number),
                 ground=ground,
             )
             return {**report, "duration_s": round(time.monotonic() - started, 3)}
 
         numbers = only or folder.numbers()
         progress.update(task, description="processing", total=len(numbers))
-        done = walk(numbers, process_one, lambda count: progress.update(task, completed=count))
+        done = for_each_exposure(
+            numbers, process_one, lambda count: progress.update(task, completed=count)
+        )
     reports = list(done.results.values())
     if as_json:
         failures = [failure.as_json() for failure in done.failures]
@@ -130,18 +132,18 @@ def process(
         if reports:
             print_reports(console, f"Level-2 of {folder.id}", reports)
         console.print(f"Products are in {folder.level2_root}")
-    end_walk(done.failures)
+    exit_if_failed(done.failures)
 
 
 def flown_thresholds(folder: Mission) -> dict[str, float]:
     """Thresholds of the configuration that was flown, so that it is judged as in the air."""
-    given = dig(folder.flown_configuration(), "processing", "thresholds") or {}
+    given = nested_value(folder.flown_configuration(), "processing", "thresholds") or {}
     try:
         return ProcessingSection.model_validate({"thresholds": given}).thresholds
     except ValidationError as error:
-        said = error.errors()[0]["msg"].removeprefix("Value error, ")
+        message = error.errors()[0]["msg"].removeprefix("Value error, ")
         raise ConfigurationError(
-            [f"{folder.service_path}: processing.thresholds: {said}"]
+            [f"{folder.service_path}: processing.thresholds: {message}"]
         ) from error
 
 
@@ -160,16 +162,18 @@ def as_flown(
     if elevation is not None:
         plan = plan.model_copy(update={"elevation": elevation})
     elif plan.elevation is not None and not plan.elevation.is_file():
-        raise _elsewhere(folder, "plan.elevation", plan.elevation.name, "--elevation FILE")
-    told = dig(folder.flown_configuration(), "mission", "radiometry")
-    if radiometry is None and told is not None:
-        radiometry = folder.file_named(str(told))
+        raise _missing_file(folder, "plan.elevation", plan.elevation.name, "--elevation FILE")
+    configured = nested_value(folder.flown_configuration(), "mission", "radiometry")
+    if radiometry is None and configured is not None:
+        radiometry = folder.file_named(str(configured))
         if not radiometry.is_dir():
-            raise _elsewhere(folder, "mission.radiometry", radiometry.name, "--radiometry FOLDER")
+            raise _missing_file(
+                folder, "mission.radiometry", radiometry.name, "--radiometry FOLDER"
+            )
     return plan, radiometry
 
 
-def _elsewhere(folder: Mission, key: str, name: str, option: str) -> ConfigurationError:
+def _missing_file(folder: Mission, key: str, name: str, option: str) -> ConfigurationError:
     return ConfigurationError(
         [
             f"{folder.service_path}: {key} names {name[:200]!r}, which is neither in the mission "

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from daemon.cli.failures import end_walk
+from daemon.cli.exposure_failures import exit_if_failed
 from daemon.terminal.console import Console
 from daemon.terminal.tables import light_table
 
@@ -36,10 +36,10 @@ def reflights(
 ) -> None:
     from daemon.mission.layout import Mission
     from daemon.mission.store.level2 import write_folder
-    from daemon.orientation.exterior import exposures_of, mount_of
-    from daemon.planning import advisor, flown, writing
+    from daemon.orientation.exterior_orientation import mount_of, sealed_exposures
+    from daemon.planning import exposure_footprints, reflight_files, reflight_planning
     from daemon.planning.image_size import image_on_ground_m
-    from daemon.planning.reading import PlanError, read_plan
+    from daemon.planning.plan_readers import PlanError, read_plan
     from daemon.planning.relief import relief_or_reason
     from processing.rig import load_rig
 
@@ -53,25 +53,25 @@ def reflights(
         section = section.model_copy(update={"elevation": elevation})
     rig = load_rig(folder.rig_path)
     along_m, across_m = image_on_ground_m(rig, section.height_above_ground_m)
-    taken = flown.taken_of(folder, read.specification)
+    taken = exposure_footprints.exposure_footprints(folder, read.specification)
     relief, level = relief_or_reason(section)
-    advice = advisor.advise(
+    advice = reflight_planning.reflights(
         read, taken, image_along_m=along_m, image_across_m=across_m, relief=relief
     )
     notes = [level] if level else []
-    if without := flown.without_valid_area(folder):
+    if without := exposure_footprints.without_valid_area(folder):
         notes.append(
             f"{without} of {len(taken)} exposures have no recorded valid area: they count whole, "
             "except for heads that sent no image. Run syntopic process to compute it."
         )
     base_m = along_m * (1.0 - read.specification.forward_overlap)
-    read_records = exposures_of(folder)
+    read_records = sealed_exposures(folder)
     simulated = any(exposure.simulated for exposure in read_records.results.values())
     out = folder.export_dir / "fly-again"
     texts = {
-        "fly-again.geojson": writing.geojson(advice.segments, simulated=simulated),
-        "fly-again.kml": writing.kml(advice.segments, simulated=simulated),
-        "fly-again.waypoints": writing.mavlink_mission(
+        "fly-again.geojson": reflight_files.geojson(advice.segments, simulated=simulated),
+        "fly-again.kml": reflight_files.kml(advice.segments, simulated=simulated),
+        "fly-again.waypoints": reflight_files.mavlink_mission(
             advice.segments, height_m=section.height_above_ground_m, distance_m=base_m
         ),
     }
@@ -83,7 +83,7 @@ def reflights(
                     "folder": str(out),
                     "exposures": len(taken),
                     "planned_m": advice.planned_m,
-                    "well_m": advice.well_m,
+                    "covered_m": advice.covered_m,
                     "hole_m2": round(advice.hole_m2, 1),
                     "notes": notes,
                     "segments": [
@@ -92,7 +92,7 @@ def reflights(
                             "from_m": one.from_m,
                             "to_m": one.to_m,
                             "reasons": list(one.reasons),
-                            "holes": [writing.hole_json(hole) for hole in one.holes],
+                            "holes": [reflight_files.hole_json(hole) for hole in one.holes],
                         }
                         for one in advice.segments
                     ],
@@ -112,7 +112,7 @@ def reflights(
         planned = f"{advice.planned_m / 1000:.1f} km"
         if advice.segments:
             console.print(
-                f"{advice.well_m / advice.planned_m:.1%} of {planned} is covered by {len(taken)} "
+                f"{advice.covered_m / advice.planned_m:.1%} of {planned} is covered by {len(taken)} "
                 f"exposures; too few images see {advice.hole_m2 / 1e4:.2f} ha. The segments are in "
                 f"{out}"
             )
@@ -120,5 +120,5 @@ def reflights(
             console.print(f"All of {planned} is covered; nothing is to be flown again.")
         for note in notes:
             console.print(note)
-    end_walk(read_records.failures)
+    exit_if_failed(read_records.failures)
     raise typer.Exit(0 if advice.is_complete else 1)

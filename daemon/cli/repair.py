@@ -69,7 +69,7 @@ def repair(
                     "problems": list(report.problems),
                     "sealed": list(report.sealed),
                     "lost": list(report.lost),
-                    "exposures": len(report.settled),
+                    "exposures": len(report.finalized),
                 }
             )
         )
@@ -79,6 +79,6 @@ def repair(
             console.print(problem, style="red", markup=False, highlight=False)
         for sentence in done:
             console.print(sentence, markup=False, highlight=False)
-        console.print(f"{len(report.settled)} exposures are sealed and in the index.")
+        console.print(f"{len(report.finalized)} exposures are sealed and in the index.")
         console.print(f"Next: syntopic verify {folder.path}")
     raise typer.Exit(1 if report.problems else 0)

@@ -33,7 +33,7 @@ SENTENCES_SHOWN = 20
 
 def replay(
     mission: Annotated[Path, typer.Argument(help="Mission folder.")],
-    lanes: Annotated[
+    parallel: Annotated[
         list[int] | None, typer.Option(help="Exposures in work; repeatable. 1 and 2 if not given.")
     ] = None,
     only: Annotated[
@@ -51,15 +51,15 @@ def replay(
     threads = configuration.processing.threads
     os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
     from daemon.mission.log.flight_log import logs_of
-    from daemon.onboard.service.departure import identity
     from daemon.onboard.service.messages import WorkerSettings
-    from daemon.postflight.replay.flight import Replayed, replay_log
-    from daemon.postflight.replay.products import compare_products, compare_records
+    from daemon.onboard.service.startup import identity
+    from daemon.postflight.replay.flight_replay import ReplayResult, replay_log
+    from daemon.postflight.replay.product_comparison import compare_products, compare_records
     from processing.rig import load_rig
 
     rig = load_rig(folder.rig_path)
     made = identity(configuration, rig, folder)
-    total = Replayed(is_complete=True)
+    total = ReplayResult(is_complete=True)
     logs = logs_of(folder.log_dir)
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("records", total=len(logs))
@@ -79,7 +79,7 @@ def replay(
                 plan=plan,
                 processing=configuration.processing,
             )
-            for count in lanes or [1, 2]:
+            for count in parallel or [1, 2]:
                 progress.update(
                     task,
                     description=f"images, {count} in work",
@@ -91,7 +91,7 @@ def replay(
                     rig,
                     settings,
                     total,
-                    lanes=count,
+                    parallel=count,
                     only=only or (),
                     progress=lambda _number: progress.advance(task),
                 )
@@ -100,18 +100,18 @@ def replay(
         raise typer.Exit(1)
 
 
-def _show(folder: Mission, told: dict[str, Any], *, as_json: bool) -> None:
+def _show(folder: Mission, result: dict[str, Any], *, as_json: bool) -> None:
     if as_json:
-        typer.echo(json.dumps({"mission": str(folder.path), **told}))
+        typer.echo(json.dumps({"mission": str(folder.path), **result}))
         return
     table = light_table(f"Replay of {folder.id}", ("what",), ("equal", "different"))
-    for row in told["compared"]:
+    for row in result["compared"]:
         table.add_row(row["what"], str(row["equal"]), str(row["different"]))
     console = Console()
     console.print(table)
-    for sentence in told["sentences"][:SENTENCES_SHOWN]:
+    for sentence in result["sentences"][:SENTENCES_SHOWN]:
         console.print(sentence, style="yellow", markup=False)
-    left = len(told["sentences"]) - SENTENCES_SHOWN
+    left = len(result["sentences"]) - SENTENCES_SHOWN
     if left > 0:
         console.print(f"and {left} more; --json has all of them")
 

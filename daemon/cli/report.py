@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from daemon.cli.failures import end_walk
-from daemon.cli.options import held_for
+from daemon.cli.exposure_failures import exit_if_failed
+from daemon.cli.options import lock_for
 from daemon.terminal.console import Console
 
 HELP = """Write the mission's report: one HTML file that needs nothing beside it.
@@ -35,27 +35,27 @@ def report(
     from daemon.mission.layout import Mission
     from daemon.mission.verification.verification import verify
     from daemon.postflight.export.support_bundle import write_bundle
-    from daemon.postflight.report import write_report
+    from daemon.postflight.mission_report import write_report
 
     folder = Mission.open(mission)
     console = Console(stderr=as_json, soft_wrap=True)
-    with held_for(folder, out or folder.export_dir):
+    with lock_for(folder, out or folder.export_dir):
         done = write_report(folder.path, out=out)
         failures = [failure.as_json() for failure in done.failures]
-        told: dict[str, object] = {"report": str(done.path), "failures": failures}
+        content: dict[str, object] = {"report": str(done.path), "failures": failures}
         if bundle:
             with console.status("checking every frame and record"):
                 verified = verify(folder)
             written = write_bundle(folder, verified, out=out)
-            told |= {"bundle": str(written.path), "contents": written.contents}
+            content |= {"bundle": str(written.path), "contents": written.contents}
     path = done.path
     if as_json:
-        typer.echo(json.dumps(told))
-        end_walk(done.failures)
+        typer.echo(json.dumps(content))
+        exit_if_failed(done.failures)
         return
     console.print(f"Report   {path}")
     if bundle:
         console.print(f"Bundle   {written.path}, {written.path.stat().st_size} bytes:")
         for name, nbytes in written.contents.items():
             console.print(f"  {name}: {nbytes} bytes", highlight=False)
-    end_walk(done.failures)
+    exit_if_failed(done.failures)

@@ -63,8 +63,8 @@ def show(
     Examples: `syntopic rigs show ultracam-x`, `syntopic rigs show my-rig.toml --drawing rig.svg`
     """
     from processing.geometry import topology
-    from processing.mosaic import drawing as draw
-    from processing.pipelines.perspective import looks_apart
+    from processing.mosaic import mosaic_plots as draw
+    from processing.pipelines.perspective import has_diverging_axes
 
     rig = find_rig(name)
     counts = topology.counts(rig)
@@ -128,7 +128,7 @@ def show(
             f"{overlap.rectangle.height_mm / pitch_mm:.0f}",
         )
     console.print(strips)
-    if looks_apart(rig):
+    if has_diverging_axes(rig):
         console.print("Nothing is stitched: each head is an image of its own (docs/midas.md)")
     else:
         console.print(

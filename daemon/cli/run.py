@@ -41,42 +41,42 @@ def run(
 ) -> None:
     from daemon.configuration.model import load
     from daemon.onboard.preflight.resumption import close_interrupted
-    from daemon.onboard.service.departure import interrupted_mission
     from daemon.onboard.service.processes import die_with_parent
     from daemon.onboard.service.service import Service
+    from daemon.onboard.service.startup import interrupted_mission
 
     if parent is not None:
         die_with_parent(parent, signal.SIGTERM)
     show = _print_json if json_lines else _print_line
-    goes_on, status = True, 0
-    while goes_on:
+    continues, status = True, 0
+    while continues:
         # Read anew: a new mission may have another plan.
         configuration, rig = load(config)
         if new_mission and (mission := interrupted_mission(configuration)) is not None:
             show({"event": "closed", "id": mission.id, "recovery": close_interrupted(mission)})
         service = Service(configuration, rig, config, show)
         status = asyncio.run(service.run())
-        goes_on = service.goes_on and status == 0
+        continues = service.continues and status == 0
     raise typer.Exit(status)
 
 
 def _print_json(event: Mapping[str, Any]) -> None:
-    _say(json.dumps(event))
+    _write_line(json.dumps(event))
 
 
 def _print_line(event: Mapping[str, Any]) -> None:
     """One fact a line, key=value; what is long (reports, ledgers) is in the mission folder."""
-    told = [
+    fields = [
         f"{key}={value}"
         for key, value in event.items()
         if key not in ("event", "mono_ns", "report", "ledger") and value not in (None, [], {})
     ]
     if "report" in event:
-        told.append(f"verdict={event['report'].get('verdict')}")
-    _say(f"{event['event']} {' '.join(told)}")
+        fields.append(f"verdict={event['report'].get('verdict')}")
+    _write_line(f"{event['event']} {' '.join(fields)}")
 
 
-def _say(line: str) -> None:
+def _write_line(line: str) -> None:
     """Nobody need listen: a reader that has gone, or a full disk behind it, ends no flight."""
     try:
         print(line, flush=True)

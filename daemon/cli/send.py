@@ -37,7 +37,7 @@ def send(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    from daemon.onboard.monitoring.access.control_socket import give
+    from daemon.onboard.monitoring.access.control_socket import send_command
 
     arguments: dict[str, Any] = {"override": True} if override else {}
     for given in values or []:
@@ -45,7 +45,7 @@ def send(
         if not equals:
             raise typer.BadParameter(f"--set {given}: write KEY=VALUE")
         arguments[key] = _read(value)
-    done, sentence = give(socket, name, arguments)
+    done, sentence = send_command(socket, name, arguments)
     if as_json:
         typer.echo(json.dumps({"done": done, "sentence": sentence}))
     else:

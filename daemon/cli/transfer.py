@@ -58,7 +58,7 @@ def transfer(
                 {
                     "target": str(report.target),
                     "copied": report.copied,
-                    "kept": report.kept,
+                    "already_present": report.already_present,
                     "nbytes": report.nbytes,
                     "exposures": report.verified.exposures,
                     "frames": report.verified.frames,
@@ -70,7 +70,7 @@ def transfer(
         return
     console = Console(soft_wrap=True)
     console.print(
-        f"{report.copied} files copied, {report.kept} identical files kept, "
+        f"{report.copied} files copied, {report.already_present} identical files kept, "
         f"{report.nbytes / 1e9:.2f} GB in all; {report.verified.exposures} exposures and "
         f"{report.verified.frames} frames verified in {report.target}"
     )

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 from rich.progress import Progress
 
-from daemon.cli.failures import end_walk
+from daemon.cli.exposure_failures import exit_if_failed
 from daemon.cli.options import (
     AsJson,
     AttitudeSigma,
@@ -18,7 +18,7 @@ from daemon.cli.options import (
     MountFile,
     PositionSigma,
     Trajectory,
-    held_for,
+    lock_for,
 )
 from daemon.configuration.model import ConfigurationError
 from daemon.terminal.console import Console
@@ -82,27 +82,27 @@ def triangulate(
     require("geodesy")
     from daemon.cli.adjust import _peak_mib
     from daemon.mission.layout import Mission
-    from daemon.postflight.adjustment.tables import ProjectError
-    from daemon.postflight.adjustment.telling import print_report, report_of
+    from daemon.postflight.adjustment.csv_tables import ProjectError
+    from daemon.postflight.adjustment.summary import print_report, report_of
     from daemon.postflight.triangulation.report import (
         print_triangulation,
         triangulation_of,
         write_triangulation,
     )
     from daemon.postflight.triangulation.triangulation import (
-        Asked,
         TriangulationError,
+        TriangulationSettings,
         attitude_sigmas,
         block_of,
-        matched,
+        match_mission_block,
         project_of,
-        weighted,
+        weight_by_residuals,
     )
     from processing.bundle.adjust import adjust
+    from processing.bundle.initial_values import completed
     from processing.bundle.network import NetworkError
-    from processing.bundle.rank import DefectError
-    from processing.bundle.start import completed
-    from processing.matching.blocks import BlockMatching
+    from processing.bundle.rank_diagnosis import RankDefectError
+    from processing.matching.block_matching import BlockMatching
 
     if set_name not in SETS or gnss not in ("none", "shift", "linear"):
         raise ConfigurationError(
@@ -115,7 +115,7 @@ def triangulate(
         raise ProjectError(
             [f"{results} holds a triangulation already; give another folder with --out"]
         )
-    asked = Asked(
+    requirements = TriangulationSettings(
         parameters=cast("SetName", set_name),
         interior=interior,
         position_sigma_m=position_sigma,
@@ -128,21 +128,23 @@ def triangulate(
         folder, crs=crs, trajectory_file=trajectory, mount_file=mount, heads=head or ()
     )
     with (
-        held_for(folder, results),
+        lock_for(folder, results),
         Progress(console=Console(stderr=True), transient=True) as progress,
     ):
         task = progress.add_task("matching", total=len(block.names))
-        tied = matched(block, asked.matching, lambda done: progress.update(task, completed=done))
-        project = project_of(block, tied, asked, points_file=points, measured_file=measured)
+        tied = match_mission_block(
+            block, requirements.matching, lambda done: progress.update(task, completed=done)
+        )
+        project = project_of(block, tied, requirements, points_file=points, measured_file=measured)
         progress.update(task, total=None, description="starting values")
         try:
 
             def show(what: str, number: int, squares: float) -> None:
                 progress.update(task, description=f"{what} {number}: {squares:.6g}")
 
-            project = weighted(project, tied.points, show)
+            project = weight_by_residuals(project, tied.points, show)
             result = adjust(completed(project.network), project.settings, progress=show)
-        except (NetworkError, DefectError) as error:
+        except (NetworkError, RankDefectError) as error:
             raise TriangulationError(f"{folder.path}: {error}") from error
         report = report_of(
             result,
@@ -156,7 +158,7 @@ def triangulate(
         write_triangulation(results, block, project, result, report)
     if as_json:
         typer.echo(json.dumps(report | {"folder": str(results)}))
-        end_walk(block.failures)
+        exit_if_failed(block.failures)
         return
     console = Console()
     short = report | {"rejected": [], "left_out": [], "control": {"count": 0}}
@@ -168,4 +170,4 @@ def triangulate(
     )
     print_triangulation(console, report["triangulation"])
     console.print(f"Results: {results}, report {results / 'report.html'}", soft_wrap=True)
-    end_walk(block.failures)
+    exit_if_failed(block.failures)

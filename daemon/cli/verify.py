@@ -42,7 +42,7 @@ def verify(
         def show(done: int, total: int) -> None:
             progress.update(task, completed=done, total=total)
 
-        report = store.verify(Mission.open(mission, looks_below=False), show)
+        report = store.verify(Mission.open(mission, checks_subfolders=False), show)
     if as_json:
         typer.echo(json.dumps(asdict(report)))
     else:

@@ -26,11 +26,11 @@ from pydantic import (
 
 from daemon.configuration.problems import (
     device_problems,
-    dig,
     mirror_problems,
+    nested_value,
     rig_problems,
 )
-from daemon.planning.reading import PlanError, read_plan
+from daemon.planning.plan_readers import PlanError, read_plan
 from processing.image.kernels import DEFAULT_INTERPOLATION, Interpolation
 from processing.quality.report import Thresholds
 from processing.rig import Rig, RigError, find_rig
@@ -52,11 +52,11 @@ class ConfigurationError(ValueError):
         super().__init__("\n".join(problems))
 
 
-class _Section(BaseModel):
+class _ConfigurationSection(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class MissionSection(_Section):
+class MissionSection(_ConfigurationSection):
     """Where flights are kept and which camera flies.
 
     With `mirror`, a folder on another disk, everything is stored on both (docs/mirror.md).
@@ -70,7 +70,7 @@ class MissionSection(_Section):
     end_when_done: bool = False
 
 
-class PlanSection(_Section):
+class PlanSection(_ConfigurationSection):
     """What the flight was planned to be; navigation replaces it as soon as it speaks.
 
     `file` holds the lines (docs/plan.md); beside them by more than `corridor_m`, a quarter of the
@@ -89,7 +89,7 @@ class PlanSection(_Section):
     elevation_crs: str = ""
 
     @model_validator(mode="after")
-    def _says_where_the_model_lies(self) -> PlanSection:
+    def _requires_elevation_crs(self) -> PlanSection:
         if self.elevation is not None and not self.elevation_crs:
             raise ValueError(
                 "elevation needs elevation_crs, the model's system, such as EPSG:25833+7837"
@@ -97,7 +97,7 @@ class PlanSection(_Section):
         return self
 
 
-class MountSection(_Section):
+class MountSection(_ConfigurationSection):
     """How the camera sits against what the receiver speaks of (docs/orientation.md).
 
     `antenna_m` is the point whose position the receiver tells, in the body frame of the rig;
@@ -110,7 +110,7 @@ class MountSection(_Section):
     time_offset_ms: float = 0.0
 
 
-class SerialsSection(_Section):
+class SerialsSection(_ConfigurationSection):
     """Serial numbers that no bus tells, read off the labels of lenses (by cone) and probes;
     compared with the calibration's before a flight (docs/arming.md).
     """
@@ -138,7 +138,7 @@ class TriggerSection(BaseModel):
     start: Literal["at once", "on command"] = "at once"
 
     @model_validator(mode="after")
-    def _distance_is_given(self) -> TriggerSection:
+    def _requires_distance(self) -> TriggerSection:
         if self.mode == "distance" and self.distance_m is None:
             raise ValueError("mode 'distance' needs distance_m, the way between two exposures in m")
         return self
@@ -156,19 +156,19 @@ class DeviceSection(BaseModel):
         return dict(self.model_extra or {})
 
 
-class HeadSection(DeviceSection):
+class HeadDeviceSection(DeviceSection):
     """The head that carries a sensor of the rig."""
 
     sensor: str
 
 
-class NamedSection(DeviceSection):
+class NamedDeviceSection(DeviceSection):
     """A thermometer, a navigator or a pulse per second."""
 
     name: str
 
 
-class ExposureSection(_Section):
+class ExposureSection(_ConfigurationSection):
     """Who sets the exposure of the heads, and within what (docs/exposure.md).
 
     `target` is where the brightest hundredth of the pixels should begin, as a share of the full
@@ -179,13 +179,13 @@ class ExposureSection(_Section):
     lock: Literal["line", "never"] = "line"
     target: float = Field(default=0.6, ge=0.1, le=0.95)
     smear_px: float = Field(default=0.5, gt=0, le=10)
-    gain_most_db: float = Field(default=12.0, ge=0, le=48)
-    time_least_us: float = Field(default=100.0, gt=0)
-    time_most_us: float = Field(default=20_000.0, gt=0)
-    tdi_most: int = Field(default=32, ge=0, le=1000)
+    gain_max_db: float = Field(default=12.0, ge=0, le=48)
+    exposure_time_min_us: float = Field(default=100.0, gt=0)
+    exposure_time_max_us: float = Field(default=20_000.0, gt=0)
+    tdi_shifts_max: int = Field(default=32, ge=0, le=1000)
 
 
-class ProcessingSection(_Section):
+class ProcessingSection(_ConfigurationSection):
     """How exposures become images, and by which thresholds they are judged.
 
     `thresholds` are those of `processing.quality.report.Thresholds` that are not the defaults.
@@ -196,12 +196,12 @@ class ProcessingSection(_Section):
     baselines: bool = False
     geometry: bool = True
     threads: int = Field(default=2, ge=1, le=256)
-    exposures_in_work: int = Field(default=2, ge=1, le=16)
+    parallel_exposures: int = Field(default=2, ge=1, le=16)
     thresholds: dict[str, FiniteFloat] = Field(default_factory=dict)
 
     @field_validator("thresholds")
     @classmethod
-    def _are_thresholds(cls, given: dict[str, float]) -> dict[str, float]:
+    def _check_thresholds(cls, given: dict[str, float]) -> dict[str, float]:
         unknown = sorted(given.keys() - {field.name for field in fields(Thresholds)})
         if unknown:
             raise ValueError(
@@ -210,7 +210,7 @@ class ProcessingSection(_Section):
         return given
 
 
-class MavlinkCameraSection(_Section):
+class MavlinkCameraSection(_ConfigurationSection):
     """The rig as one camera of a vehicle (docs/mavlink-camera.md).
 
     `connect` is "udpout:HOST:PORT", where a ground station or autopilot listens, or
@@ -228,11 +228,11 @@ class MavlinkCameraSection(_Section):
     feedback: bool = False
 
     @model_validator(mode="after")
-    def _is_usable(self) -> MavlinkCameraSection:
+    def _check_connection(self) -> MavlinkCameraSection:
         scheme, _, rest = self.connect.partition(":")
         host, _, port = rest.rpartition(":")
-        good_port = port.isdecimal() and 0 < int(port) < 65536
-        if scheme not in ("udpin", "udpout") or not host or not good_port:
+        is_valid_port = port.isdecimal() and 0 < int(port) < 65536
+        if scheme not in ("udpin", "udpout") or not host or not is_valid_port:
             raise ValueError(
                 f"connect is {self.connect!r}; write udpout:HOST:PORT or udpin:HOST:PORT"
             )
@@ -241,7 +241,7 @@ class MavlinkCameraSection(_Section):
         return self
 
 
-class WatchSection(_Section):
+class WatchSection(_ConfigurationSection):
     """Who may look in, and from where (docs/watching.md). Commands over the network always need a
     token; at the Unix socket `control` members of `control_group` are operators, and members of
     `control_administrator_group` administrators.
@@ -249,7 +249,7 @@ class WatchSection(_Section):
 
     host: str = "127.0.0.1"
     port: int = Field(default=8470, ge=0, le=65535)
-    open: bool = True
+    anonymous_read: bool = True
     tokens: Path | None = None
     tls_certificate: Path | None = None
     tls_key: Path | None = None
@@ -270,14 +270,14 @@ class WatchSection(_Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _names_tls_keys(cls, given: Any) -> Any:
+    def _refuse_old_keys(cls, given: Any) -> Any:
         for old in ("certificate", "key"):
             if isinstance(given, dict) and old in given:
                 raise ValueError(f"{old} is now named tls_{old}; rename it")
         return given
 
     @model_validator(mode="after")
-    def _has_addresses(self) -> WatchSection:
+    def _check_udp(self) -> WatchSection:
         for text in self.udp:
             host, _, port = text.rpartition(":")
             if not host or not port.isdecimal() or not 0 < int(port) < 65536:
@@ -286,7 +286,7 @@ class WatchSection(_Section):
 
     @field_validator("hosts")
     @classmethod
-    def _are_names(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+    def _check_hosts(cls, names: tuple[str, ...]) -> tuple[str, ...]:
         for name in names:
             if not re.fullmatch(r"[A-Za-z0-9]([A-Za-z0-9.\-]{0,251}[A-Za-z0-9])?", name):
                 raise ValueError(f"hosts has {name!r}; write a host name without scheme and port")
@@ -294,7 +294,7 @@ class WatchSection(_Section):
 
     @field_validator("proxies")
     @classmethod
-    def _are_addresses(cls, addresses: tuple[str, ...]) -> tuple[str, ...]:
+    def _check_proxies(cls, addresses: tuple[str, ...]) -> tuple[str, ...]:
         for address in addresses:
             try:
                 ipaddress.ip_address(address)
@@ -303,11 +303,11 @@ class WatchSection(_Section):
         return addresses
 
     @model_validator(mode="after")
-    def _is_safe(self) -> WatchSection:
+    def _check_tls(self) -> WatchSection:
         if (self.tls_certificate is None) != (self.tls_key is None):
             raise ValueError("tls_certificate and tls_key belong together; give both or none")
-        leaves = not (self.host.startswith("127.") or self.host in ("::1", "localhost"))
-        if leaves and self.tokens is not None and self.tls_certificate is None:
+        is_remote = not (self.host.startswith("127.") or self.host in ("::1", "localhost"))
+        if is_remote and self.tokens is not None and self.tls_certificate is None:
             raise ValueError(
                 f"host {self.host} lies outside this machine, and tokens would travel in the "
                 "clear; give tls_certificate and tls_key, or no tokens (then nobody may command)"
@@ -315,7 +315,7 @@ class WatchSection(_Section):
         return self
 
 
-class LimitsSection(_Section):
+class LimitsSection(_ConfigurationSection):
     """How long is waited for what, and how deep the memory is."""
 
     frame_timeout_s: float = Field(default=8.0, gt=0)
@@ -330,7 +330,7 @@ class LimitsSection(_Section):
     power_fail_s: float = Field(default=5.0, gt=0, le=60)
 
 
-class Configuration(_Section):
+class Configuration(_ConfigurationSection):
     """The whole file."""
 
     mission: MissionSection
@@ -338,10 +338,10 @@ class Configuration(_Section):
     mount: MountSection = MountSection()
     serials: SerialsSection = SerialsSection()
     trigger: TriggerSection
-    head: tuple[HeadSection, ...] = Field(min_length=1)
-    thermometer: tuple[NamedSection, ...] = ()
-    navigator: tuple[NamedSection, ...] = ()
-    pps: tuple[NamedSection, ...] = Field(default=(), max_length=1)
+    head: tuple[HeadDeviceSection, ...] = Field(min_length=1)
+    thermometer: tuple[NamedDeviceSection, ...] = ()
+    navigator: tuple[NamedDeviceSection, ...] = ()
+    pps: tuple[NamedDeviceSection, ...] = Field(default=(), max_length=1)
     exposure: ExposureSection = ExposureSection()
     processing: ProcessingSection = ProcessingSection()
     limits: LimitsSection = LimitsSection()
@@ -360,7 +360,7 @@ class Configuration(_Section):
         return (*listed, ("trigger", self.trigger.driver))
 
     @model_validator(mode="after")
-    def _has_a_plan_to_follow(self) -> Configuration:
+    def _requires_plan(self) -> Configuration:
         if self.trigger.mode == "plan" and self.plan.file is None:
             raise ValueError("trigger.mode is 'plan' and there is no plan.file; give the plan")
         return self
@@ -396,7 +396,7 @@ def from_mapping(content: Mapping[str, Any], path: Path) -> tuple[Configuration,
     file = path.name
     problems = device_problems(content, file, frozenset(TriggerSection.model_fields))
     rig: Rig | None = None
-    rig_name = dig(content, "mission", "rig")
+    rig_name = nested_value(content, "mission", "rig")
     if isinstance(rig_name, str):
         try:
             rig = find_rig(_rig_path(rig_name, path))
@@ -409,13 +409,13 @@ def from_mapping(content: Mapping[str, Any], path: Path) -> tuple[Configuration,
         problems += [_sentence(file, detail) for detail in error.errors()]
     if rig is not None:
         problems += rig_problems(content, rig, file)
-    radiometry = dig(content, "mission", "radiometry")
+    radiometry = nested_value(content, "mission", "radiometry")
     if isinstance(radiometry, str) and not (path.parent / radiometry).is_dir():
         problems.append(
             f"{file}: mission.radiometry is {radiometry!r}, and there is no such folder; give the "
             "folder with a calibration of each sensor, or leave the key out"
         )
-    plan_file = dig(content, "plan", "file")
+    plan_file = nested_value(content, "plan", "file")
     if isinstance(plan_file, str):
         try:
             read_plan(path.parent / plan_file)
@@ -430,23 +430,23 @@ def from_mapping(content: Mapping[str, Any], path: Path) -> tuple[Configuration,
             rig,
             file,
         )
-    model = dig(content, "plan", "elevation")
+    model = nested_value(content, "plan", "elevation")
     if isinstance(model, str) and not (path.parent / model).is_file():
         problems.append(f"{file}: plan.elevation is {model!r}, and there is no such file")
     if problems or configuration is None or rig is None:
         raise ConfigurationError(problems)
-    return _anchored(configuration, path.parent.resolve()), rig
+    return _with_absolute_paths(configuration, path.parent.resolve()), rig
 
 
 def _rig_path(name: str, path: Path) -> str:
-    beside = path.parent / name
-    return str(beside) if name.endswith(".toml") and beside.exists() else name
+    local_path = path.parent / name
+    return str(local_path) if name.endswith(".toml") and local_path.exists() else name
 
 
-def _anchored(configuration: Configuration, folder: Path) -> Configuration:
+def _with_absolute_paths(configuration: Configuration, folder: Path) -> Configuration:
     mission = configuration.mission
     radiometry = None if mission.radiometry is None else folder / mission.radiometry
-    anchored = mission.model_copy(
+    mission_section = mission.model_copy(
         update={
             "root": folder / mission.root,
             "mirror": None if mission.mirror is None else folder / mission.mirror,
@@ -468,13 +468,15 @@ def _anchored(configuration: Configuration, folder: Path) -> Configuration:
         if watch.mavlink is not None and watch.mavlink.signing_key is not None:
             signing = {
                 "signing_key": folder / watch.mavlink.signing_key,
-                "signing_state": anchored.root / SIGNING_STATE
+                "signing_state": mission_section.root / SIGNING_STATE
                 if watch.mavlink.signing_state is None
                 else folder / watch.mavlink.signing_state,
             }
             update["mavlink"] = watch.mavlink.model_copy(update=signing)
         watch = watch.model_copy(update=update)
-    return configuration.model_copy(update={"mission": anchored, "plan": plan, "watch": watch})
+    return configuration.model_copy(
+        update={"mission": mission_section, "plan": plan, "watch": watch}
+    )
 
 
 def _sentence(file: str, detail: Any) -> str:

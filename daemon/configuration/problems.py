@@ -42,7 +42,7 @@ def rig_problems(content: Mapping[str, Any], rig: Rig, file: str) -> list[str]:
     ]
 
 
-def dig(content: Mapping[str, Any], *keys: str) -> Any:
+def nested_value(content: Mapping[str, Any], *keys: str) -> Any:
     """The value below these keys; None where there is none."""
     value: Any = content
     for key in keys:
@@ -102,25 +102,25 @@ def _sections(content: Mapping[str, Any], kind: str) -> list[Mapping[str, Any]]:
 def _name_problems(content: Mapping[str, Any], file: str) -> list[str]:
     """Devices of one name: records of one would be taken for the other's."""
     problems = []
-    taken: dict[str, str] = {}
+    used_by: dict[str, str] = {}
     for kind, key in (("head", "sensor"), ("thermometer", "name"), ("navigator", "name")):
         for index, section in enumerate(_sections(content, kind)):
             name, place = section.get(key), f"{kind}[{index}].{key}"
             if not isinstance(name, str):
                 continue
             # A sensor named twice is reported with the rig's sensors.
-            if name in taken and not (kind == "head" and taken[name].startswith("head")):
+            if name in used_by and not (kind == "head" and used_by[name].startswith("head")):
                 problems.append(
-                    f"{file}: {place} is {name!r}, as is {taken[name]}; give each device a name "
+                    f"{file}: {place} is {name!r}, as is {used_by[name]}; give each device a name "
                     "of its own"
                 )
-            taken.setdefault(name, place)
+            used_by.setdefault(name, place)
     return problems
 
 
 def _trigger_problems(content: Mapping[str, Any], file: str) -> list[str]:
     """Heads that wait for another start of exposure than the trigger gives."""
-    driver_name = dig(content, "trigger", "driver")
+    driver_name = nested_value(content, "trigger", "driver")
     problems = []
     try:
         trigger: Any = registry.driver_for("trigger", str(driver_name))
@@ -150,7 +150,7 @@ def _trigger_problems(content: Mapping[str, Any], file: str) -> list[str]:
 def _port_problems(content: Mapping[str, Any], file: str) -> list[str]:
     """Two devices at one port or address: whoever opens it second gets nothing."""
     problems = []
-    taken: dict[tuple[str, str], str] = {}
+    used_by: dict[tuple[str, str], str] = {}
     for kind, key in (
         ("head", "address"),
         ("head", "device"),
@@ -162,21 +162,21 @@ def _port_problems(content: Mapping[str, Any], file: str) -> list[str]:
             value, place = section.get(key), f"{kind}[{index}].{key}"
             if not isinstance(value, str) or section.get("driver") == "gpsd":
                 continue
-            if (key, value) in taken:
+            if (key, value) in used_by:
                 problems.append(
-                    f"{file}: {place} is {value!r}, as is {taken[key, value]}; one of them is wrong"
+                    f"{file}: {place} is {value!r}, as is {used_by[key, value]}; one of them is wrong"
                 )
-            taken.setdefault((key, value), place)
+            used_by.setdefault((key, value), place)
     return problems
 
 
 def _serial_problems(content: Mapping[str, Any], rig: Rig, file: str) -> list[str]:
     """Parts that the rig does not have."""
-    there = {"lens": [cone.name for cone in rig.cones], "probe": list(rig.probes)}
+    available = {"lens": [cone.name for cone in rig.cones], "probe": list(rig.probes)}
     return [
         f"{file}: serials.{kind}.{name} is of nothing {rig.name} has: {', '.join(names) or 'none'}"
-        for kind, names in there.items()
-        if isinstance(given := dig(content, "serials", kind), Mapping)
+        for kind, names in available.items()
+        if isinstance(given := nested_value(content, "serials", kind), Mapping)
         for name in given
         if name not in names
     ]
@@ -196,11 +196,11 @@ def mirror_problems(
     # One exposure is being written when a disk stalls; the others find room in memory meanwhile.
     bridged_s = (exposures_in_memory - 1) * rig.frame_interval_s
     if timeout_s >= bridged_s:
-        enough = 2 + int(timeout_s / rig.frame_interval_s)
+        required_depth = 2 + int(timeout_s / rig.frame_interval_s)
         problems.append(
             f"{file}: limits.mirror_timeout_s is {timeout_s:g}; memory for {exposures_in_memory} "
             f"exposures bridges {bridged_s:g} s at one every {rig.frame_interval_s:g} s: give a "
-            f"shorter time, or set limits.exposures_in_memory to {enough}"
+            f"shorter time, or set limits.exposures_in_memory to {required_depth}"
         )
     return problems
 

@@ -10,12 +10,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, cast, get_args
 
-from daemon.mission.records import Fields, RecordError, canonical_bytes
+from daemon.mission.canonical_json import Fields, RecordError, canonical_bytes
 from drivers.contract import Velocity
 
 TimeSource = Literal["event-mark", "pps", "interpolated", "host", "none"]
 RecordState = Literal["complete", "degraded", "lost"]
-Missing = tuple[tuple[str, str], ...]
+MissingFrames = tuple[tuple[str, str], ...]
 """What an exposure lacks and why: (sensor, cause) pairs."""
 
 EXPOSURE_FORMAT = 1
@@ -95,7 +95,7 @@ class NavigationRecord:
 
 
 @dataclass(frozen=True)
-class Capture:
+class CaptureRecord:
     """What is known when the pixels become durable: enough to seal the exposure after a crash.
 
     Written as `capture.json` beside the frames. `trigger_mono_ns` counts on the CLOCK_MONOTONIC
@@ -108,7 +108,7 @@ class Capture:
     trigger_sigma_ns: int = 0
     boot_id: str = ""
     frames: tuple[FrameRecord, ...] = ()
-    missing: Missing = ()
+    missing: MissingFrames = ()
     line_id: str = ""
     strip_id: str = ""
     calibration_id: str = ""
@@ -142,7 +142,7 @@ class Exposure:
     mark_count: int | None = None
     time_budget_ns: Mapping[str, int] = field(default_factory=dict)
     frames: tuple[FrameRecord, ...] = ()
-    missing: Missing = ()
+    missing: MissingFrames = ()
     temperatures: tuple[TemperatureRecord, ...] = ()
     navigation: NavigationRecord | None = None
     line_id: str = ""
@@ -187,7 +187,7 @@ def exposure_bytes(exposure: Exposure) -> bytes:
     return canonical_bytes(to_json(exposure))
 
 
-def capture_bytes(capture: Capture) -> bytes:
+def capture_bytes(capture: CaptureRecord) -> bytes:
     """The exact content of `capture.json`."""
     return canonical_bytes(_shared_json(capture, "capture"))
 
@@ -215,18 +215,18 @@ def from_json(content: Mapping[str, Any], file: str = "exposure.json") -> Exposu
         disks=fields.names("disks"),
         previous_sha256=fields.sha256("previous_sha256"),
     )
-    _refuse_twice([t.probe for t in exposure.temperatures], "temperatures", fields)
+    _refuse_duplicates([t.probe for t in exposure.temperatures], "temperatures", fields)
     fields.refuse_unknown()
     if problems:
         raise RecordError(problems)
     return exposure
 
 
-def capture_from_json(content: Mapping[str, Any], file: str = "capture.json") -> Capture:
+def capture_from_json(content: Mapping[str, Any], file: str = "capture.json") -> CaptureRecord:
     """Read what `capture_bytes` wrote. RecordError as for `from_json`."""
     problems: list[str] = []
     fields = Fields(content, "", file, problems)
-    capture = Capture(**_shared_from(fields, "capture"))
+    capture = CaptureRecord(**_shared_from(fields, "capture"))
     fields.refuse_unknown()
     if problems:
         raise RecordError(problems)
@@ -292,7 +292,7 @@ def frame_to_json(frame: FrameRecord) -> dict[str, Any]:
     }
 
 
-def _shared_json(record: Exposure | Capture, kind: str) -> dict[str, Any]:
+def _shared_json(record: Exposure | CaptureRecord, kind: str) -> dict[str, Any]:
     return {
         "format": EXPOSURE_FORMAT,
         "kind": kind,
@@ -316,11 +316,11 @@ def _shared_json(record: Exposure | Capture, kind: str) -> dict[str, Any]:
 
 def _shared_from(fields: Fields, kind: str) -> dict[str, Any]:
     if fields.integer("format", EXPOSURE_FORMAT) != EXPOSURE_FORMAT:
-        fields.complain("format", f"this version reads format {EXPOSURE_FORMAT}")
+        fields.add_problem("format", f"this version reads format {EXPOSURE_FORMAT}")
     fields.choice("kind", (kind,), kind)
     frames = tuple(_frame(item) for item in fields.objects("frames"))
-    _refuse_twice([frame.sensor for frame in frames], "frames", fields)
-    _refuse_twice([frame.file for frame in frames if frame.file], "frames", fields)
+    _refuse_duplicates([frame.sensor for frame in frames], "frames", fields)
+    _refuse_duplicates([frame.file for frame in frames if frame.file], "frames", fields)
     return {
         "number": fields.integer("number", minimum=1),
         "trigger_sequence": fields.integer("trigger_sequence", 0),
@@ -382,7 +382,7 @@ def _missing(fields: Fields) -> tuple[str, str]:
 def _navigation(fields: Fields) -> NavigationRecord:
     gps_ns = fields.instant("gps_ns")
     if gps_ns is None:
-        fields.complain("gps_ns", "the instant of the position is needed")
+        fields.add_problem("gps_ns", "the instant of the position is needed")
     method = fields.choice("method", NAVIGATION_METHODS, "nearest")
     reference = fields.choice("height_reference", HEIGHT_REFERENCES, "ellipsoid")
     record = NavigationRecord(
@@ -415,11 +415,13 @@ def _navigation(fields: Fields) -> NavigationRecord:
 def _budget(fields: Fields) -> dict[str, int]:
     found = fields.scalars("time_budget_ns")
     if not all(isinstance(value, int) and value >= 0 for value in found.values()):
-        fields.complain("time_budget_ns", "whole nanoseconds, by what they come from, are needed")
+        fields.add_problem(
+            "time_budget_ns", "whole nanoseconds, by what they come from, are needed"
+        )
     return {name: value for name, value in found.items() if isinstance(value, int)}
 
 
-def _refuse_twice(names: list[str], key: str, fields: Fields) -> None:
+def _refuse_duplicates(names: list[str], key: str, fields: Fields) -> None:
     for name in dict.fromkeys(n for n in names if names.count(n) > 1):
         fields.problems.append(f"{fields.file}: {key} names {name!r} twice; once is right")
 

@@ -95,7 +95,7 @@ def _mounts() -> Iterator[tuple[str, str]]:
 
 
 @contextmanager
-def open_plain(path: Path, max_nbytes: int) -> Iterator[int]:
+def open_regular_file(path: Path, max_nbytes: int) -> Iterator[int]:
     """A descriptor of a regular file, open for reading until the block ends.
 
     What was checked is what is read, even if the path is exchanged meanwhile. Nothing waits: a pipe
@@ -126,13 +126,13 @@ def open_plain(path: Path, max_nbytes: int) -> Iterator[int]:
         os.close(descriptor)
 
 
-def read_plain(path: Path, max_nbytes: int) -> bytes:
+def read_regular_file(path: Path, max_nbytes: int) -> bytes:
     """The bytes of a regular file.
 
     Raises:
-        ForeignFileError: as `open_plain`, or the disk refused.
+        ForeignFileError: as `open_regular_file`, or the disk refused.
     """
-    with open_plain(path, max_nbytes) as descriptor:
+    with open_regular_file(path, max_nbytes) as descriptor:
         nbytes = os.fstat(descriptor).st_size
         try:
             with os.fdopen(os.dup(descriptor), "rb") as file:

@@ -15,8 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from daemon.mission.foreign_files import is_on_local_disk
-from daemon.mission.records import (
+from daemon.mission.canonical_json import (
     RECORD_MAX_BYTES,
     RecordError,
     canonical_bytes,
@@ -24,6 +23,7 @@ from daemon.mission.records import (
     plain_name,
     sha256_hex,
 )
+from daemon.mission.foreign_files import is_on_local_disk
 from daemon.mission.store import durable
 from daemon.mission.verification.chain_file import CHAIN_FILE, ChainFile, first_line
 from daemon.mission.writer_lock import MissionError as MissionError
@@ -109,12 +109,13 @@ class Mission:
         return cls(root / mission_id, mission_id)
 
     @classmethod
-    def open(cls, path: Path, *, looks_below: bool = True) -> Mission:
+    def open(cls, path: Path, *, checks_subfolders: bool = True) -> Mission:
         """A mission folder that exists, flown or laid out by hand.
 
         Args:
             path: the folder.
-            looks_below: refuse links and pipes in the folders below as well; without it the caller
+            checks_subfolders: refuse links and pipes in the folders below as well; without it the
+            caller
                 does not follow them.
 
         Raises:
@@ -125,9 +126,11 @@ class Mission:
             raise MissionError(f"{path}: no such folder; give the path of a mission")
         if not (path / "L0").is_dir():
             raise MissionError(f"{path}: has no folder L0; a mission keeps its exposures there")
-        if (odd := _first_odd(path, looks_below=looks_below)) is not None:
+        if (
+            special_file := _first_special_file(path, checks_subfolders=checks_subfolders)
+        ) is not None:
             raise MissionError(
-                f"{odd}: is a link, a pipe or a device; a mission holds plain files and folders: "
+                f"{special_file}: is a link, a pipe or a device; a mission holds plain files and folders: "
                 "put what it leads to in its place"
             )
         return cls(path, path.resolve().name)
@@ -337,7 +340,7 @@ def is_exposure_name(name: str) -> bool:
     )
 
 
-def _first_odd(folder: Path, *, looks_below: bool) -> str | None:
+def _first_special_file(folder: Path, *, checks_subfolders: bool) -> str | None:
     """The first entry below a folder that is neither plain file nor folder; None where none is."""
     waiting = [str(folder)]
     while waiting:
@@ -347,7 +350,7 @@ def _first_odd(folder: Path, *, looks_below: bool) -> str | None:
             continue  # being replaced, or not to be read; whoever reads it says so
         for entry in entries:
             if entry.is_dir(follow_symlinks=False):
-                waiting += [entry.path] if looks_below else []
+                waiting += [entry.path] if checks_subfolders else []
             elif not entry.is_file(follow_symlinks=False):
                 return entry.path
     return None

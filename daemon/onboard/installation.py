@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 from daemon.errors import DaemonError
-from daemon.mission.records import sha256_hex
+from daemon.mission.canonical_json import sha256_hex
 from daemon.mission.store import durable
 
 CONFIGURATION = PurePosixPath("/etc/syntopic/service.toml")
@@ -54,7 +54,7 @@ class InstallationError(DaemonError):
 
 
 @dataclass(frozen=True)
-class Step:
+class InstallationStep:
     """A command to be run after the files are there, and why."""
 
     purpose: str
@@ -64,15 +64,15 @@ class Step:
 
 
 @dataclass
-class Done:
+class InstallationReport:
     """What was done: files written or removed, files kept, steps with their outcome."""
 
     files: list[str] = field(default_factory=list)
-    kept: list[str] = field(default_factory=list)
+    retained: list[str] = field(default_factory=list)
     steps: dict[str, str] = field(default_factory=dict)
     failed: list[str] = field(default_factory=list)
 
-    def run(self, step: Step) -> None:
+    def run(self, step: InstallationStep) -> None:
         """Run a step and note its outcome."""
         try:
             self.steps[step.purpose] = _run(step)
@@ -83,12 +83,12 @@ class Done:
 
 def templates_dir() -> Path:
     """Where the files to be laid out are: beside the checkout, or where the wheel put them."""
-    beside = Path(__file__).resolve().parents[2] / "systemd"
+    checkout = Path(__file__).resolve().parents[2] / "systemd"
     installed = Path(sysconfig.get_path("data")) / "share" / "syntopic" / "systemd"
-    for folder in (beside, installed):
+    for folder in (checkout, installed):
         if (folder / "syntopic.service").is_file():
             return folder
-    raise InstallationError(f"the unit files are neither in {beside} nor in {installed}")
+    raise InstallationError(f"the unit files are neither in {checkout} nor in {installed}")
 
 
 def contents(
@@ -133,13 +133,15 @@ def contents(
     return texts
 
 
-def steps(command: Path, rig: str | None) -> list[Step]:
+def steps(command: Path, rig: str | None) -> list[InstallationStep]:
     """What follows the files: user, folders, kernels, and telling the running system."""
     first = [
-        Step("make the user", ("systemd-sysusers", str(TARGETS["sysusers.conf"]))),
-        Step("make the folders", ("systemd-tmpfiles", "--create", str(TARGETS["tmpfiles.conf"]))),
+        InstallationStep("make the user", ("systemd-sysusers", str(TARGETS["sysusers.conf"]))),
+        InstallationStep(
+            "make the folders", ("systemd-tmpfiles", "--create", str(TARGETS["tmpfiles.conf"]))
+        ),
     ]
-    compile_kernels = Step(
+    compile_kernels = InstallationStep(
         "compile the pipeline's kernels",
         (
             *("runuser", "-u", USER, "--", "env", f"NUMBA_CACHE_DIR={KERNEL_CACHE}"),
@@ -148,22 +150,24 @@ def steps(command: Path, rig: str | None) -> list[Step]:
         KERNELS_TIMEOUT_S,
     )
     last = [
-        Step("kernel settings", ("sysctl", "-q", "-p", str(TARGETS["sysctl.conf"])), 10.0, True),
-        Step("device rules", ("udevadm", "control", "--reload"), 10.0, True),
-        Step("device rules for what is plugged in", ("udevadm", "trigger"), 10.0, True),
-        Step("read the unit", ("systemctl", "daemon-reload"), COMMAND_TIMEOUT_S, True),
+        InstallationStep(
+            "kernel settings", ("sysctl", "-q", "-p", str(TARGETS["sysctl.conf"])), 10.0, True
+        ),
+        InstallationStep("device rules", ("udevadm", "control", "--reload"), 10.0, True),
+        InstallationStep("device rules for what is plugged in", ("udevadm", "trigger"), 10.0, True),
+        InstallationStep("read the unit", ("systemctl", "daemon-reload"), COMMAND_TIMEOUT_S, True),
     ]
     return [*first, *([compile_kernels] if rig else []), *last]
 
 
 def install(
     texts: dict[str, str],
-    todo: Sequence[Step],
+    todo: Sequence[InstallationStep],
     *,
     root: Path,
-    tell: Callable[[str], None],
+    log: Callable[[str], None],
     replace: bool = False,
-) -> Done:
+) -> InstallationReport:
     """Write the files below `root` and, where `root` is the machine itself, run the steps.
 
     Args:
@@ -188,11 +192,11 @@ def install(
             f"edited by hand since it was installed: {', '.join(edited)}. Move the change into a "
             "drop-in (systemctl edit syntopic), or give --replace"
         )
-    done = Done()
+    done = InstallationReport()
     hashes = dict(noted)
     try:
         for path, text in sorted(texts.items()):
-            tell(f"write {path}")
+            log(f"write {path}")
             _write(_below(root, path), text)
             hashes[path] = sha256_hex(text.encode())
             done.files.append(path)
@@ -204,12 +208,12 @@ def install(
         ) from error
     if root == Path("/"):
         for step in todo:
-            tell(step.purpose)
+            log(step.purpose)
             done.run(step)
     return done
 
 
-def uninstall(*, root: Path, tell: Callable[[str], None]) -> Done:
+def uninstall(*, root: Path, log: Callable[[str], None]) -> InstallationReport:
     """Remove what `install` wrote, unless it was edited since, and the compiled kernels.
 
     Raises:
@@ -218,20 +222,22 @@ def uninstall(*, root: Path, tell: Callable[[str], None]) -> Done:
     noted = _manifest(root)
     if not noted:
         raise InstallationError(f"nothing was installed here: {_below(root, MANIFEST)} is missing")
-    done = Done()
+    done = InstallationReport()
     if root == Path("/"):
-        stop = Step("stop the service", ("systemctl", "disable", "--now", "syntopic"), 120.0, True)
-        tell(stop.purpose)
+        stop = InstallationStep(
+            "stop the service", ("systemctl", "disable", "--now", "syntopic"), 120.0, True
+        )
+        log(stop.purpose)
         done.run(stop)
     try:
         for path, hash_noted in sorted(noted.items()):
             there = _hash_of(_below(root, path))
             if there == hash_noted:
-                tell(f"remove {path}")
+                log(f"remove {path}")
                 _below(root, path).unlink()
                 done.files.append(path)
             elif there is not None:
-                done.kept.append(path)
+                done.retained.append(path)
         _remove_kernels(_below(root, KERNEL_CACHE))
         _below(root, MANIFEST).unlink()
         _remove_if_empty(_below(root, DROP_IN).parent)
@@ -240,7 +246,7 @@ def uninstall(*, root: Path, tell: Callable[[str], None]) -> Done:
             f"{error.filename} cannot be removed ({error.strerror}); uninstall as root"
         ) from error
     if root == Path("/"):
-        done.run(Step("forget the unit", ("systemctl", "daemon-reload"), 60.0, True))
+        done.run(InstallationStep("forget the unit", ("systemctl", "daemon-reload"), 60.0, True))
     return done
 
 
@@ -274,7 +280,7 @@ def _write(path: Path, text: str) -> None:
         part.chmod(0o644)  # whatever the umask of the administrator
 
 
-def _run(step: Step) -> str:
+def _run(step: InstallationStep) -> str:
     """Run a step; returns its outcome in words.
 
     Raises:
@@ -289,9 +295,9 @@ def _run(step: Step) -> str:
     except (OSError, subprocess.TimeoutExpired) as error:
         raise InstallationError(f"{' '.join(step.command)}: {error}") from error
     if ended.returncode != 0:
-        said = (ended.stderr or ended.stdout).strip().splitlines()
+        output = (ended.stderr or ended.stdout).strip().splitlines()
         raise InstallationError(
-            f"{' '.join(step.command)} ended with {ended.returncode}: {' '.join(said[-2:])}"
+            f"{' '.join(step.command)} ended with {ended.returncode}: {' '.join(output[-2:])}"
         )
     return "done"
 

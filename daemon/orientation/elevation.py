@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from daemon.errors import DaemonError
-from daemon.mission.foreign_files import ForeignFileError, open_plain
+from daemon.mission.foreign_files import ForeignFileError, open_regular_file
 from daemon.orientation.georeference import Georeference
 from drivers.base.extras import require
 from processing.geometry.terrain_rays import HeightModel
@@ -33,7 +33,7 @@ _ASCII_HEADER = {*_ASCII_KEYS, "nodata_value"} | {
     f"{axis}ll{place}" for axis in "xy" for place in ("corner", "center")
 }
 _ASCII_HEADER_MAX_BYTES = 4096
-_GDAL_LOOKS_AT_ONE_FILE = {
+_GDAL_SINGLE_FILE = {
     "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",
     "GDAL_PAM_ENABLED": "NO",
     "GDAL_GEOREF_SOURCES": "INTERNAL",
@@ -52,7 +52,7 @@ def read_elevation(path: Path, georeference: Georeference) -> HeightModel:
         ElevationError: no plain file, damaged, too large, or in another coordinate system.
     """
     try:
-        with open_plain(path, MODEL_MAX_BYTES) as descriptor:
+        with open_regular_file(path, MODEL_MAX_BYTES) as descriptor:
             if path.suffix.lower() == ".asc":
                 return _ascii(path, descriptor)
             return _geotiff(path, descriptor, georeference)
@@ -87,11 +87,11 @@ def _ascii_header(head: bytes) -> tuple[dict[str, float], int]:
     keys: dict[str, float] = {}
     at = 0
     for line in head.splitlines(keepends=True):
-        words = line.decode("ascii").split()
-        if words and (len(words) != 2 or words[0].lower() not in _ASCII_HEADER):
+        fields = line.decode("ascii").split()
+        if fields and (len(fields) != 2 or fields[0].lower() not in _ASCII_HEADER):
             return keys, at
-        if words:
-            keys[words[0].lower()] = float(words[1])
+        if fields:
+            keys[fields[0].lower()] = float(fields[1])
         at += len(line)
     return keys, at
 
@@ -119,7 +119,7 @@ def _geotiff(path: Path, descriptor: int, georeference: Georeference) -> HeightM
     opened = f"/proc/self/fd/{descriptor}"
     try:
         with (
-            rasterio.Env(**_GDAL_LOOKS_AT_ONE_FILE),
+            rasterio.Env(**_GDAL_SINGLE_FILE),
             rasterio.open(opened, driver="GTiff", sharing=False) as raster,
         ):
             _check_raster(path, raster)
@@ -185,10 +185,10 @@ def _checked(path: Path, model: HeightModel) -> HeightModel:
     heights[~np.isfinite(heights)] = np.nan
     if np.isnan(heights).all():
         raise ElevationError(f"{path}: {heights.shape} heights, none of them known")
-    least, most = float(np.nanmin(heights)), float(np.nanmax(heights))
-    if not (HEIGHT_LIMITS_M[0] <= least and most <= HEIGHT_LIMITS_M[1]):
+    minimum, maximum = float(np.nanmin(heights)), float(np.nanmax(heights))
+    if not (HEIGHT_LIMITS_M[0] <= minimum and maximum <= HEIGHT_LIMITS_M[1]):
         raise ElevationError(
-            f"{path}: heights from {least:g} to {most:g} m; the earth has none such: declare the "
+            f"{path}: heights from {minimum:g} to {maximum:g} m; the earth has none such: declare the "
             "value that stands for no height (gdal_edit.py -a_nodata)"
         )
     return model

@@ -16,9 +16,9 @@ import numpy as np
 from daemon.configuration.model import MountSection
 from daemon.mission.exposure import NavigationRecord
 from daemon.mission.layout import Mission
-from daemon.orientation.exterior import ExteriorOrientation
-from daemon.orientation.files import image_extent_mm
+from daemon.orientation.exterior_orientation import ExteriorOrientation
 from daemon.orientation.navigation import metres_per_degree
+from daemon.orientation.orientation_files import image_extent_mm
 from drivers.timescales.leap_seconds import leap_seconds_at
 from processing.geometry.orientation import (
     BODY_FROM_CAMERA,
@@ -64,7 +64,7 @@ def footprint(
     ]
 
 
-def seen_from(
+def footprint_corners(
     rig: Rig, mount: MountSection, navigation: NavigationRecord, ground_m: float
 ) -> list[tuple[float, float]] | None:
     """The corners (longitude, latitude) of the image taken there, before any georeferencing.

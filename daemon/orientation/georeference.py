@@ -29,7 +29,7 @@ class GeoreferenceError(DaemonError):
 
 
 @dataclass(frozen=True)
-class Place:
+class ProjectedPoint:
     """A point in the target system: east, north and height in metres, and where true north is.
 
     `azimuth_of_north_rad` is clockwise from grid north; `scale` is grid length over true length.
@@ -75,7 +75,7 @@ class Georeference:
             warnings.simplefilter("ignore")  # what it warns of is the error below
             group = TransformerGroup(FROM_CRS, self.crs, always_xy=True, allow_ballpark=False)
         if not group.transformers or not group.best_available:
-            raise GeoreferenceError(_what_is_missing(crs, group.unavailable_operations))
+            raise GeoreferenceError(_missing_grids(crs, group.unavailable_operations))
         self._transformer: pyproj.Transformer = group.transformers[0]
         self.operation = str(self._transformer.description)
         self.accuracy_m = float(self._transformer.accuracy)
@@ -86,7 +86,7 @@ class Georeference:
         vertical = [part for part in self.crs.sub_crs_list if part.is_vertical]
         return str(vertical[0].name) if vertical else "ellipsoid of WGS 84"
 
-    def place(self, latitude_deg: float, longitude_deg: float, height_m: float) -> Place:
+    def place(self, latitude_deg: float, longitude_deg: float, height_m: float) -> ProjectedPoint:
         """Transform a position, height above the ellipsoid.
 
         Raises:
@@ -97,7 +97,7 @@ class Georeference:
         above = self._transform(longitude_deg, north_of, height_m)
         below = self._transform(longitude_deg, south_of, height_m)
         along = (above[0] - below[0], above[1] - below[1])
-        return Place(
+        return ProjectedPoint(
             east_m=east,
             north_m=north,
             height_m=height,
@@ -150,7 +150,7 @@ def _refuse_unfit(crs: pyproj.CRS, name: str) -> None:
         raise GeoreferenceError(f"{name} ({crs.name}) counts in {', '.join(sorted(units))}, not m")
 
 
-def _what_is_missing(name: str, unavailable: Sequence[object]) -> str:
+def _missing_grids(name: str, unavailable: Sequence[object]) -> str:
     for operation in unavailable:
         grids = [grid for grid in getattr(operation, "grids", []) if not grid.available]
         if grids:

@@ -22,20 +22,20 @@ NANOSECONDS = 1e9
 WGS84_A_M = 6_378_137.0
 WGS84_E2 = 6.694379990141e-3
 EXTRAPOLATION_LIMIT_NS = 2_000_000_000
-MEMORY_NS = 120_000_000_000
+HISTORY_NS = 120_000_000_000
 SAMPLES_TO_STEP_BACK = 3
-LATEST_ARRIVAL_NS = 700_000_000
-BEFORE_NS = 100_000_000
+ARRIVAL_LATENCY_MAX_NS = 700_000_000
+EARLY_TOLERANCE_NS = 100_000_000
 """How long a sample may have been on its way, and how well "about when" is meant."""
 CONTRADICTION_M = 1.0
 CONTRADICTION_MPS2 = 2.0
 CONTRADICTION_SIGMAS = 5
 """How far two positions may disagree with the way between them, beside their sigmas."""
-CLIMB_MOST_MPS = 60.0
+CLIMB_RATE_MAX_MPS = 60.0
 """Faster than any aircraft that takes images climbs or sinks."""
 CLIMB_SIGMA_MPS = 3.0
 """Standard deviation of a climb that the receiver does not send."""
-POSITION_FIXES_BY_WORTH = ("2d", "dead-reckoning", "3d")
+POSITION_FIXES_WORST_FIRST = ("2d", "dead-reckoning", "3d")
 
 Attitude = tuple[float | None, float | None, float | None]
 """Roll, pitch, heading, rad."""
@@ -53,7 +53,7 @@ class Track:
     def __init__(self) -> None:
         self._samples: deque[NavSample] = deque()
         self._before_step: deque[NavSample] = deque()
-        self._from_the_past: list[NavSample] = []
+        self._out_of_order: list[NavSample] = []
 
     @property
     def last(self) -> NavSample | None:
@@ -65,15 +65,15 @@ class Track:
         if sample.position is None:
             return
         if self._samples and sample.gps_ns <= self._samples[-1].gps_ns:
-            past = self._from_the_past
-            if past and sample.gps_ns <= past[-1].gps_ns:
-                past.clear()
-            past.append(sample)
-            if len(past) >= SAMPLES_TO_STEP_BACK:
-                self._before_step, self._samples = self._samples, deque(past)
-                past.clear()
+            out_of_order = self._out_of_order
+            if out_of_order and sample.gps_ns <= out_of_order[-1].gps_ns:
+                out_of_order.clear()
+            out_of_order.append(sample)
+            if len(out_of_order) >= SAMPLES_TO_STEP_BACK:
+                self._before_step, self._samples = self._samples, deque(out_of_order)
+                out_of_order.clear()
             return
-        self._from_the_past.clear()
+        self._out_of_order.clear()
         if self._samples and _contradict(self._samples[-1], sample):
             before = self._before_step
             is_outlier = len(self._samples) == 1 and before and not _contradict(before[-1], sample)
@@ -82,15 +82,15 @@ class Track:
             else:
                 self._before_step, self._samples = self._samples, deque()
         self._samples.append(sample)
-        while self._samples[-1].gps_ns - self._samples[0].gps_ns > MEMORY_NS:
+        while self._samples[-1].gps_ns - self._samples[0].gps_ns > HISTORY_NS:
             self._samples.popleft()
 
-    def reaches(self, gps_ns: int) -> bool:
+    def covers(self, gps_ns: int) -> bool:
         """Whether a sample at or after that instant is there, and its time not in question.
 
         Where a height came just before, one that has a height is waited for, two seconds at most.
         """
-        if not self._samples or self._from_the_past or self._samples[-1].gps_ns < gps_ns:
+        if not self._samples or self._out_of_order or self._samples[-1].gps_ns < gps_ns:
             return False
         if self._samples[-1].gps_ns - gps_ns >= EXTRAPOLATION_LIMIT_NS:
             return True
@@ -110,14 +110,14 @@ class Track:
         """
         samples = self._samples
         if self._before_step and samples and mono_ns is not None:
-            if mono_ns < self._before_step[-1].mono_ns - LATEST_ARRIVAL_NS:
+            if mono_ns < self._before_step[-1].mono_ns - ARRIVAL_LATENCY_MAX_NS:
                 samples = self._before_step
             elif mono_ns < samples[0].mono_ns:
                 return None
-        return around([s for s in samples if _is_timely(s, gps_ns, mono_ns)], gps_ns)
+        return navigation_at([s for s in samples if _matches_host_time(s, gps_ns, mono_ns)], gps_ns)
 
 
-def around(samples: Iterable[NavSample], gps_ns: int) -> NavigationRecord | None:
+def navigation_at(samples: Iterable[NavSample], gps_ns: int) -> NavigationRecord | None:
     """Navigation at an instant from the best of the samples near it; None without any.
 
     Samples with a height are preferred to those without: two of them around the instant, then any
@@ -131,10 +131,10 @@ def around(samples: Iterable[NavSample], gps_ns: int) -> NavigationRecord | None
     usable = [s for s in samples if s.position is not None]
     full = [s for s in usable if s.height_m is not None]
     nearest = _nearest(full, gps_ns)
-    chosen = _around(full, gps_ns) or _around(usable, gps_ns)
+    chosen = _bracketing(full, gps_ns) or _bracketing(usable, gps_ns)
     if chosen is None:
-        alone = nearest or _nearest(usable, gps_ns)
-        return None if alone is None else _extrapolated(alone, gps_ns)
+        single = nearest or _nearest(usable, gps_ns)
+        return None if single is None else _extrapolated(single, gps_ns)
     record = _interpolated(*chosen, gps_ns)
     if record.height_m is not None or nearest is None:
         return record
@@ -147,7 +147,7 @@ def around(samples: Iterable[NavSample], gps_ns: int) -> NavigationRecord | None
     )
 
 
-def _around(samples: Sequence[NavSample], gps_ns: int) -> tuple[NavSample, NavSample] | None:
+def _bracketing(samples: Sequence[NavSample], gps_ns: int) -> tuple[NavSample, NavSample] | None:
     """The last one before and the first one after an instant, two seconds apart at most."""
     before = max((s for s in samples if s.gps_ns <= gps_ns), key=_instant, default=None)
     after = min((s for s in samples if s.gps_ns > gps_ns), key=_instant, default=None)
@@ -173,14 +173,14 @@ def metres_per_degree(latitude_deg: float, height_m: float) -> tuple[float, floa
     return math.radians(meridian), math.radians(parallel)
 
 
-def _is_timely(sample: NavSample, gps_ns: int, mono_ns: int | None) -> bool:
+def _matches_host_time(sample: NavSample, gps_ns: int, mono_ns: int | None) -> bool:
     """Whether a sample and an instant are of one time, by when they were on the host's clock."""
     if abs(sample.gps_ns - gps_ns) > 2 * EXTRAPOLATION_LIMIT_NS:
         return False
     if mono_ns is None:
         return True
-    way_ns = (sample.mono_ns - mono_ns) - (sample.gps_ns - gps_ns)
-    return -BEFORE_NS <= way_ns <= LATEST_ARRIVAL_NS + BEFORE_NS
+    latency_ns = (sample.mono_ns - mono_ns) - (sample.gps_ns - gps_ns)
+    return -EARLY_TOLERANCE_NS <= latency_ns <= ARRIVAL_LATENCY_MAX_NS + EARLY_TOLERANCE_NS
 
 
 def _contradict(a: NavSample, b: NavSample) -> bool:
@@ -191,7 +191,7 @@ def _contradict(a: NavSample, b: NavSample) -> bool:
     """
     if b.gps_ns - a.gps_ns > EXTRAPOLATION_LIMIT_NS:
         return False
-    return _contradict_in_place(a, b) or _contradict_in_height(a, b)
+    return _contradict_in_position(a, b) or _contradict_in_height(a, b)
 
 
 def _contradict_in_height(a: NavSample, b: NavSample) -> bool:
@@ -200,7 +200,7 @@ def _contradict_in_height(a: NavSample, b: NavSample) -> bool:
     span_s = (b.gps_ns - a.gps_ns) / NANOSECONDS
     sigma_m = math.hypot(a.vertical_sigma_m or 0.0, b.vertical_sigma_m or 0.0)
     down_a, down_b = _down_mps(a), _down_mps(b)
-    climbed_m, fastest_mps = 0.0, CLIMB_MOST_MPS
+    climbed_m, fastest_mps = 0.0, CLIMB_RATE_MAX_MPS
     if down_a is not None and down_b is not None:
         climbed_m, fastest_mps = -(down_a + down_b) / 2 * span_s, 0.0
         speeds = (a.speed_sigma_mps or 0.0, b.speed_sigma_mps or 0.0)
@@ -209,13 +209,13 @@ def _contradict_in_height(a: NavSample, b: NavSample) -> bool:
     return abs(b.height_m - a.height_m - climbed_m) > allowed_m + CONTRADICTION_SIGMAS * sigma_m
 
 
-def _contradict_in_place(a: NavSample, b: NavSample) -> bool:
+def _contradict_in_position(a: NavSample, b: NavSample) -> bool:
     place_a, place_b = a.position, b.position
     va, vb = a.velocity_ned_mps, b.velocity_ned_mps
     if place_a is None or place_b is None or va is None or vb is None:
         return False
     span_s = (b.gps_ns - a.gps_ns) / NANOSECONDS
-    way = _way_m(place_a, place_b, a.height_m)
+    displacement = _displacement_m(place_a, place_b, a.height_m)
     flown = [(one + other) / 2 * span_s for one, other in zip(va[:2], vb[:2], strict=True)]
     sigma_m = math.hypot(
         a.horizontal_sigma_m or 0.0,
@@ -224,20 +224,20 @@ def _contradict_in_place(a: NavSample, b: NavSample) -> bool:
         (b.speed_sigma_mps or 0.0) * span_s,
     )
     allowed_m = CONTRADICTION_M + CONTRADICTION_MPS2 * span_s**2 + CONTRADICTION_SIGMAS * sigma_m
-    return math.dist(way, flown) > allowed_m
+    return math.dist(displacement, flown) > allowed_m
 
 
 def _interpolated(a: NavSample, b: NavSample, gps_ns: int) -> NavigationRecord:
     assert a.position is not None and b.position is not None
-    leg = _Leg((b.gps_ns - a.gps_ns) / NANOSECONDS, (gps_ns - a.gps_ns) / (b.gps_ns - a.gps_ns))
+    leg = _Segment((b.gps_ns - a.gps_ns) / NANOSECONDS, (gps_ns - a.gps_ns) / (b.gps_ns - a.gps_ns))
     speeds = (a.speed_sigma_mps, b.speed_sigma_mps)
     va, vb = a.velocity_ned_mps, b.velocity_ned_mps
-    moved_m, sigmas_m = [], []
-    for axis, way_m in enumerate(_way_m(a.position, b.position, a.height_m)):
+    offset_m, sigmas_m = [], []
+    for axis, displacement_m in enumerate(_displacement_m(a.position, b.position, a.height_m)):
         ends = None if va is None or vb is None else (va[:2][axis], vb[:2][axis])
         sigmas = (a.horizontal_sigma_m, b.horizontal_sigma_m)
-        axis_m, sigma_m = leg.carry(way_m, ends, sigmas, speeds)
-        moved_m.append(axis_m)
+        axis_m, sigma_m = leg.carry(displacement_m, ends, sigmas, speeds)
+        offset_m.append(axis_m)
         sigmas_m.append(sigma_m)
     height_m = vertical_sigma_m = None
     if a.height_m is not None and b.height_m is not None:
@@ -249,9 +249,9 @@ def _interpolated(a: NavSample, b: NavSample, gps_ns: int) -> NavigationRecord:
     record = _record(
         (a, b) if leg.share < 0.5 else (b, a),
         gps_ns,
-        _moved(a, (moved_m[0], moved_m[1])),
+        _offset_position(a, (offset_m[0], offset_m[1])),
         (height_m, vertical_sigma_m),
-        _worst(sigmas_m),
+        _largest_sigma(sigmas_m),
         _attitude_between(a, b, leg.share),
     )
     return replace(
@@ -259,12 +259,12 @@ def _interpolated(a: NavSample, b: NavSample, gps_ns: int) -> NavigationRecord:
         method="interpolated",
         gap_ns=b.gps_ns - a.gps_ns,
         velocity_ned_mps=_velocity_between(va, vb, leg.share),
-        speed_sigma_mps=_worst(speeds),
+        speed_sigma_mps=_largest_sigma(speeds),
     )
 
 
 @dataclass(frozen=True)
-class _Leg:
+class _Segment:
     """The way from one sample to the next: how long it takes, and which share has passed."""
 
     span_s: float
@@ -272,7 +272,7 @@ class _Leg:
 
     def carry(
         self,
-        way_m: float,
+        displacement_m: float,
         speeds_mps: tuple[float, float] | None,
         sigmas_m: tuple[float | None, float | None],
         speed_sigmas_mps: tuple[float | None, float | None],
@@ -283,61 +283,61 @@ class _Leg:
         one with the smaller sigma moves less. Without speeds the way is straight.
 
         Args:
-            way_m: from the first position to the second.
+            displacement_m: from the first position to the second.
             speeds_mps: at both ends; None where one is not known.
             sigmas_m: of both positions; where one is None the result has none.
             speed_sigmas_mps: of both speeds.
         """
         u, span_s = self.share, self.span_s
-        sigma_m, speed_sigma = _worst(sigmas_m), _worst(speed_sigmas_mps)
-        bend_m = CONTRADICTION_MPS2 * span_s**2 * u * (1 - u) / 2
+        sigma_m, speed_sigma = _largest_sigma(sigmas_m), _largest_sigma(speed_sigmas_mps)
+        manoeuvre_m = CONTRADICTION_MPS2 * span_s**2 * u * (1 - u) / 2
         if speeds_mps is None:
-            return u * way_m, None if sigma_m is None else math.hypot(sigma_m, bend_m)
-        start_m, end_m = 0.0, way_m
+            return u * displacement_m, None if sigma_m is None else math.hypot(sigma_m, manoeuvre_m)
+        start_m, end_m = 0.0, displacement_m
         if sigma_m is not None and speed_sigma is not None:
             first, last = (sigma or 0.0 for sigma in sigmas_m)
             flown = (speed_sigma * span_s) ** 2 / 2 + (CONTRADICTION_MPS2 * span_s**2 / 8) ** 2
-            misfit_m = way_m - sum(speeds_mps) / 2 * span_s
+            misfit_m = displacement_m - sum(speeds_mps) / 2 * span_s
             gain = misfit_m / (first**2 + last**2 + flown) if flown else 0.0
-            start_m, end_m = gain * first**2, way_m - gain * last**2
+            start_m, end_m = gain * first**2, displacement_m - gain * last**2
         # Cubic Hermite: passes through both positions with both velocities.
         weights = (u**3 - 2 * u**2 + u, u**3 - u**2)
-        moved_m = (
+        offset_m = (
             (2 * u**3 - 3 * u**2 + 1) * start_m
             + weights[0] * span_s * speeds_mps[0]
             + (-2 * u**3 + 3 * u**2) * end_m
             + weights[1] * span_s * speeds_mps[1]
         )
         if sigma_m is None or speed_sigma is None:
-            return moved_m, None if sigma_m is None else math.hypot(sigma_m, bend_m)
+            return offset_m, None if sigma_m is None else math.hypot(sigma_m, manoeuvre_m)
         by_speeds_m = speed_sigma * span_s * math.hypot(*weights)
-        return moved_m, math.hypot(sigma_m, by_speeds_m, bend_m * u * (1 - u))
+        return offset_m, math.hypot(sigma_m, by_speeds_m, manoeuvre_m * u * (1 - u))
 
 
 def _extrapolated(sample: NavSample, gps_ns: int) -> NavigationRecord:
     """Carried on by the sample's velocity; the sigmas grow with the way."""
-    away_s = (gps_ns - sample.gps_ns) / NANOSECONDS
+    elapsed_s = (gps_ns - sample.gps_ns) / NANOSECONDS
     velocity, speed_sigma = sample.velocity_ned_mps, sample.speed_sigma_mps
-    bend_m = CONTRADICTION_MPS2 * away_s**2 / 2
+    manoeuvre_m = CONTRADICTION_MPS2 * elapsed_s**2 / 2
     horizontal_m, vertical_m = sample.horizontal_sigma_m, sample.vertical_sigma_m
-    moved_m, height_m = (0.0, 0.0), sample.height_m
+    offset_m, height_m = (0.0, 0.0), sample.height_m
     if velocity is not None:
-        moved_m = (velocity[0] * away_s, velocity[1] * away_s)
-    if away_s:
+        offset_m = (velocity[0] * elapsed_s, velocity[1] * elapsed_s)
+    if elapsed_s:
         if velocity is None or speed_sigma is None or horizontal_m is None:
             horizontal_m = None
         else:
-            horizontal_m = math.hypot(horizontal_m, speed_sigma * away_s, bend_m)
+            horizontal_m = math.hypot(horizontal_m, speed_sigma * elapsed_s, manoeuvre_m)
         down = _down_mps(sample)
         climb_sigma = CLIMB_SIGMA_MPS if down is None or speed_sigma is None else speed_sigma
         if height_m is not None:
-            height_m -= (down or 0.0) * away_s
+            height_m -= (down or 0.0) * elapsed_s
         if vertical_m is not None:
-            vertical_m = math.hypot(vertical_m, climb_sigma * away_s, bend_m)
+            vertical_m = math.hypot(vertical_m, climb_sigma * elapsed_s, manoeuvre_m)
     record = _record(
         (sample, sample),
         gps_ns,
-        _moved(sample, moved_m),
+        _offset_position(sample, offset_m),
         (height_m, vertical_m),
         horizontal_m,
         (sample.roll_rad, sample.pitch_rad, sample.heading_rad),
@@ -357,13 +357,13 @@ def _record(
     nearest, _ = supports
     satellites = [s.satellites for s in supports if s.satellites is not None]
     sources = {s.sigma_source for s in supports}
-    source = next((word for word in ("none", "dop") if word in sources), nearest.sigma_source)
+    source = next((name for name in ("none", "dop") if name in sources), nearest.sigma_source)
     return NavigationRecord(
         receiver=nearest.receiver,
         gps_ns=gps_ns,
         method="extrapolated",
         gap_ns=abs(gps_ns - nearest.gps_ns),
-        fix=min((s.fix for s in supports), key=POSITION_FIXES_BY_WORTH.index),
+        fix=min((s.fix for s in supports), key=POSITION_FIXES_WORST_FIRST.index),
         satellites=min(satellites, default=None),
         latitude_deg=place_deg[0],
         longitude_deg=place_deg[1],
@@ -381,7 +381,7 @@ def _record(
     )
 
 
-def _way_m(
+def _displacement_m(
     a: tuple[float, float], b: tuple[float, float], height_m: float | None
 ) -> tuple[float, float]:
     """North and east from one place to another; a height that is not known shifts it by 1e-3."""
@@ -389,14 +389,16 @@ def _way_m(
     return (b[0] - a[0]) * north_m, math.remainder(b[1] - a[1], 360.0) * east_m
 
 
-def _moved(sample: NavSample, way_m: tuple[float, float]) -> tuple[float, float]:
+def _offset_position(sample: NavSample, displacement_m: tuple[float, float]) -> tuple[float, float]:
     """Latitude and longitude so far north and east of a sample."""
     assert sample.position is not None
     north_m, east_m = metres_per_degree(sample.position[0], sample.height_m or 0.0)
-    return sample.position[0] + way_m[0] / north_m, sample.position[1] + way_m[1] / east_m
+    return sample.position[0] + displacement_m[0] / north_m, sample.position[1] + displacement_m[
+        1
+    ] / east_m
 
 
-def _worst(sigmas: Sequence[float | None]) -> float | None:
+def _largest_sigma(sigmas: Sequence[float | None]) -> float | None:
     """The largest; None where one is not known."""
     known = [sigma for sigma in sigmas if sigma is not None]
     return max(known) if len(known) == len(sigmas) else None

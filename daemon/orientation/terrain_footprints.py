@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from daemon.orientation.exterior import ExteriorOrientation
-from daemon.orientation.files import image_extent_mm
+from daemon.orientation.exterior_orientation import ExteriorOrientation
 from daemon.orientation.georeference import Georeference
+from daemon.orientation.orientation_files import image_extent_mm
 from processing.geometry.terrain_rays import HeightModel, on_terrain
 from processing.rig import Rig
 

@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.errors import DaemonError
+from daemon.mission.canonical_json import sha256_hex
 from daemon.mission.exposure import NavigationRecord
-from daemon.mission.foreign_files import ForeignFileError, read_plain
+from daemon.mission.foreign_files import ForeignFileError, read_regular_file
 from daemon.mission.layout import Mission
 from daemon.mission.log.flight_log import logs_of, read
 from daemon.mission.log.log_records import record_of
-from daemon.mission.records import sha256_hex
-from daemon.orientation.navigation import EXTRAPOLATION_LIMIT_NS, around, metres_per_degree
+from daemon.orientation.navigation import EXTRAPOLATION_LIMIT_NS, metres_per_degree, navigation_at
 from drivers.contract import NavSample
 
 WEEK_NS = 604_800_000_000_000
@@ -60,7 +60,7 @@ class Trajectory:
         earlier = range(index - 1, -1, -1)
         later = range(index, len(self.instants_ns))
         near = [*self._near(earlier, gps_ns), *self._near(later, gps_ns)]
-        return around(near, gps_ns)
+        return navigation_at(near, gps_ns)
 
     def _near(self, indices: range, gps_ns: int) -> Iterator[NavSample]:
         """The samples within reach in one direction, as far as one with a height."""
@@ -73,7 +73,7 @@ class Trajectory:
                 return
 
 
-def flown(mission: Mission, receiver: str | None = None) -> Trajectory:
+def flown_trajectory(mission: Mission, receiver: str | None = None) -> Trajectory:
     """The navigation that was recorded in flight.
 
     Args:
@@ -93,9 +93,9 @@ def flown(mission: Mission, receiver: str | None = None) -> Trajectory:
     if receiver is None and found:
         receiver = max(found, key=lambda name: (_with_attitude(found[name]), len(found[name])))
     if receiver is None or receiver not in found:
-        heard = ", ".join(found) or "none at all"
+        recorded = ", ".join(found) or "none at all"
         raise TrajectoryError(
-            f"{mission.log_dir}: no navigation of {receiver or 'any receiver'}; heard were: {heard}"
+            f"{mission.log_dir}: no navigation of {receiver or 'any receiver'}; heard were: {recorded}"
         )
     return _of_samples("in-flight", found[receiver])
 
@@ -110,7 +110,7 @@ def read_trajectory(path: Path, *, around_gps_ns: int) -> Trajectory:
         TrajectoryError: what is not understood, with the place in the file.
     """
     try:
-        data = read_plain(path, TRAJECTORY_MAX_BYTES)
+        data = read_regular_file(path, TRAJECTORY_MAX_BYTES)
     except ForeignFileError as error:
         raise TrajectoryError(f"trajectory {error}") from error
     name = f"{path.stem}-{sha256_hex(data)[:8]}"

@@ -13,7 +13,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.planning.model import Plane, PlannedLine, Point
+from daemon.planning.model import LocalPlane, PlannedLine, Point
 from processing.quality.valid_area import ValidArea
 
 Array: TypeAlias = NDArray[np.float64]
@@ -23,11 +23,11 @@ Relief: TypeAlias = Callable[[Array], Array]
 """Metres above the level ground of the footprints, (...), of points (..., 2): latitude and
 longitude, degrees."""
 
-ACROSS_LEAST = 9
+ACROSS_MIN_POINTS = 9
 """At least so many points across a strip are looked at."""
-FINENESS = 256
+MAX_POINTS_PER_IMAGE = 256
 """Points are so many to the length of an image, not closer than `STEP_M`."""
-COARSENESS = 16
+MIN_POINTS_PER_IMAGE = 16
 """No fewer points than these to the length of an image, however small it is."""
 STEP_M = 2.0
 """How finely coverage is looked at; a hole that is narrower is none."""
@@ -38,26 +38,26 @@ _CORNERS = np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]])
 
 
 @dataclass(frozen=True)
-class Taken:
+class ExposureFootprint:
     """An exposure as the advisor sees it.
 
     `corners` is its footprint on level ground: left and right behind, right and left ahead; empty
-    where position or attitude are not known. `why_not` says why it does not count, such as "refly"
-    or "tilted"; empty where it does. `area` is its valid area, None where all of it is valid;
-    `partly` says what the gaps come from. `eye` is the projection centre and its height above the
-    level ground, metres; without it relief is left out.
+    where position or attitude are not known. `exclusion_reason` says why it does not count, such as
+    "refly" or "tilted"; empty where it does. `area` is its valid area, None where all of it is
+    valid; `partly` says what the gaps come from. `eye` is the projection centre and its height
+    above the level ground, metres; without it relief is left out.
     """
 
     number: int
     corners: tuple[Point, ...]
-    why_not: str = ""
+    exclusion_reason: str = ""
     area: ValidArea | None = None
-    partly: str = ""
-    eye: tuple[Point, float] | None = None
+    gap_cause: str = ""
+    projection_centre: tuple[Point, float] | None = None
 
 
 @dataclass(frozen=True)
-class Strip:
+class LineStrip:
     """The ground that a line must see: points along and across it, metres.
 
     `relief_m` (n, m) is above level ground; None is level. `cell_m` is the extent
@@ -88,13 +88,13 @@ class Strip:
 
 
 @dataclass(frozen=True)
-class Seen:
+class StripCoverage:
     """The points of a strip that an image may see, `where` in its rows and columns.
 
     `inside` are those within its footprint, `gaps` those of them without valid pixels, by band.
     """
 
-    taken: Taken
+    taken: ExposureFootprint
     where: tuple[slice, slice]
     inside: Flags
     gaps: Mapping[str, Flags] = field(default_factory=dict)
@@ -102,23 +102,25 @@ class Seen:
 
 def strip_of(
     line: PlannedLine,
-    plane: Plane,
+    plane: LocalPlane,
     *,
     half_width_m: float,
     image_along_m: float,
     relief: Relief | None = None,
-) -> Strip | None:
+) -> LineStrip | None:
     """The strip of a line; None where the line has no length."""
     start, end = np.array(plane.flat(line.start)), np.array(plane.flat(line.end))
     length_m = float(np.hypot(*(end - start)))
     if length_m == 0.0:
         return None
     ahead = (end - start) / length_m
-    step_m = min(max(STEP_M, image_along_m / FINENESS), image_along_m / COARSENESS)
+    step_m = min(
+        max(STEP_M, image_along_m / MAX_POINTS_PER_IMAGE), image_along_m / MIN_POINTS_PER_IMAGE
+    )
     along = np.arange(0.0, length_m + step_m / 2, step_m)
-    count = max(ACROSS_LEAST, round(2 * half_width_m / step_m) + 1)
+    count = max(ACROSS_MIN_POINTS, round(2 * half_width_m / step_m) + 1)
     across = np.linspace(-half_width_m, half_width_m, count)
-    strip = Strip(
+    strip = LineStrip(
         start=start,
         ahead=ahead,
         length_m=length_m,
@@ -133,62 +135,69 @@ def strip_of(
 
 
 @dataclass(frozen=True)
-class Flown:
+class FlightFootprints:
     """Exposures and their footprints in a plane, (n, 4, 2) metres."""
 
-    taken: Sequence[Taken]
+    taken: Sequence[ExposureFootprint]
     corners_m: Array
-    eyes_m: Sequence[tuple[Array, float] | None]
+    projection_centres_m: Sequence[tuple[Array, float] | None]
 
-    def near(self, strip: Strip) -> tuple[Taken, ...]:
+    def near(self, strip: LineStrip) -> tuple[ExposureFootprint, ...]:
         """Those whose footprint may touch a strip, in their order."""
         return tuple(self.taken[k] for k in self._near(strip))
 
-    def _near(self, strip: Strip) -> Sequence[int]:
-        away = self.corners_m - strip.start
-        reach, aside = away @ strip.ahead, away @ strip.left
+    def _near(self, strip: LineStrip) -> Sequence[int]:
+        offset_m = self.corners_m - strip.start
+        reach, across_m = offset_m @ strip.ahead, offset_m @ strip.left
         margin_m = np.array(
-            [_shift_m(strip, c, e) for c, e in zip(self.corners_m, self.eyes_m, strict=True)]
+            [
+                _shift_m(strip, c, e)
+                for c, e in zip(self.corners_m, self.projection_centres_m, strict=True)
+            ]
         )
         near = reach.max(axis=1) + margin_m >= 0.0
         near &= reach.min(axis=1) - margin_m <= strip.along[-1]
-        near &= aside.max(axis=1) + margin_m >= strip.across[0]
-        near &= aside.min(axis=1) - margin_m <= strip.across[-1]
+        near &= across_m.max(axis=1) + margin_m >= strip.across[0]
+        near &= across_m.min(axis=1) - margin_m <= strip.across[-1]
         return [int(k) for k in np.flatnonzero(near)]
 
-    def seen(self, strip: Strip) -> Iterator[Seen]:
+    def seen(self, strip: LineStrip) -> Iterator[StripCoverage]:
         """What each image sees of a strip; images that see nothing of it are passed over."""
         for k in self._near(strip):
-            found = _seen(strip, self.taken[k], self.corners_m[k], self.eyes_m[k])
+            found = _seen(strip, self.taken[k], self.corners_m[k], self.projection_centres_m[k])
             if found is not None:
                 yield found
 
 
-def flown_over(plane: Plane, taken: Sequence[Taken]) -> Flown:
+def project_footprints(plane: LocalPlane, taken: Sequence[ExposureFootprint]) -> FlightFootprints:
     """Exposures laid out in a plane; those without a footprint are passed over."""
     placed = [one for one in taken if one.corners]
     corners = [[plane.flat(corner) for corner in one.corners] for one in placed]
     eyes = [
-        None if e is None else (np.array(plane.flat(e[0])), e[1]) for e in (t.eye for t in placed)
+        None if e is None else (np.array(plane.flat(e[0])), e[1])
+        for e in (t.projection_centre for t in placed)
     ]
-    return Flown(placed, np.array(corners).reshape(-1, 4, 2), eyes)
+    return FlightFootprints(placed, np.array(corners).reshape(-1, 4, 2), eyes)
 
 
 def _seen(
-    strip: Strip, taken: Taken, corners: Array, eye: tuple[Array, float] | None
-) -> Seen | None:
-    margin_m = _shift_m(strip, corners, eye)
-    away = corners - strip.start
-    ends = np.stack([away @ strip.ahead, away @ strip.left], axis=1)
+    strip: LineStrip,
+    taken: ExposureFootprint,
+    corners: Array,
+    projection_centre: tuple[Array, float] | None,
+) -> StripCoverage | None:
+    margin_m = _shift_m(strip, corners, projection_centre)
+    offset_m = corners - strip.start
+    ends = np.stack([offset_m @ strip.ahead, offset_m @ strip.left], axis=1)
     low, high = ends.min(axis=0) - margin_m, ends.max(axis=0) + margin_m
     first, last = np.searchsorted(strip.along, [low[0], high[0]])
     left, right = np.searchsorted(strip.across, [low[1], high[1]])
     if first >= last or left >= right:
         return None
     along, across = strip.along[first:last, None], strip.across[None, left:right]
-    if strip.relief_m is not None and eye is not None:
-        centre = eye[0] - strip.start
-        height_m, relief_m = eye[1], strip.relief_m[first:last, left:right]
+    if strip.relief_m is not None and projection_centre is not None:
+        centre = projection_centre[0] - strip.start
+        height_m, relief_m = projection_centre[1], strip.relief_m[first:last, left:right]
         stretch = height_m / np.maximum(height_m - relief_m, 1e-3 * height_m)
         at = float(centre @ strip.ahead), float(centre @ strip.left)
         # Where the rays through points of the terrain meet the level ground.
@@ -204,19 +213,23 @@ def _seen(
     if taken.area is not None and taken.area.gaps:
         positive = np.where(inside, w, 1.0)
         gaps = gaps_of(taken.area, np.stack([u / positive, v / positive], axis=-1), inside)
-    return Seen(taken, (slice(first, last), slice(left, right)), inside, gaps)
+    return StripCoverage(taken, (slice(first, last), slice(left, right)), inside, gaps)
 
 
-def _shift_m(strip: Strip, corners: Array, eye: tuple[Array, float] | None) -> float:
+def _shift_m(
+    strip: LineStrip, corners: Array, projection_centre: tuple[Array, float] | None
+) -> float:
     """How far relief may move what an image sees, metres."""
-    if eye is None or strip.relief_m is None:
+    if projection_centre is None or strip.relief_m is None:
         return 0.0
     highest_m = float(np.max(np.abs(strip.relief_m)))
-    reach_m = float(np.max(np.hypot(*(corners - eye[0]).T)))
-    return reach_m * highest_m / max(eye[1] - highest_m, 1.0)
+    reach_m = float(np.max(np.hypot(*(corners - projection_centre[0]).T)))
+    return reach_m * highest_m / max(projection_centre[1] - highest_m, 1.0)
 
 
-def count_images(strip: Strip, seen: Sequence[Seen]) -> tuple[Counts, Mapping[str, Counts]]:
+def count_images(
+    strip: LineStrip, seen: Sequence[StripCoverage]
+) -> tuple[Counts, Mapping[str, Counts]]:
     """How many images have each point inside, and by band in how many of them it is in a gap."""
     shape = (len(strip.along), len(strip.across))
     inside: Counts = np.zeros(shape, np.int16)
@@ -280,7 +293,7 @@ def gaps_of(area: ValidArea | None, shares: Array, inside: Flags) -> dict[str, F
     return {band: inside & ~area.mask(band)[i, j] for band in area.gaps}
 
 
-def _degrees(plane: Plane, points: Array) -> Array:
+def _degrees(plane: LocalPlane, points: Array) -> Array:
     origin, north = plane.place(0.0, 0.0), plane.place(0.0, 1.0)
     east = plane.place(1.0, 0.0)
     return np.stack(

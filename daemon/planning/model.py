@@ -84,7 +84,7 @@ class Plan:
         )
 
 
-class Plane:
+class LocalPlane:
     """Metres east and north of an origin."""
 
     def __init__(self, origin: Point) -> None:

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from daemon.configuration.model import MountSection
 from daemon.mission.exposure import Exposure
-from daemon.orientation.footprints import seen_from
+from daemon.orientation.footprints import footprint_corners
 from daemon.planning.image_counts import Flags, gaps_of, image_shares, is_inside
-from daemon.planning.model import Plane, Point
+from daemon.planning.model import LocalPlane, Point
 from processing.quality.nominal_area import nominal_area
 from processing.quality.valid_area import ValidArea
 from processing.rig import Rig
@@ -33,14 +33,14 @@ NEIGHBOUR_WIDTHS = (0.1, 1.3)
 """How far beside this image, in its widths, one of a neighbouring line lies."""
 
 PARALLEL_RAD = math.radians(30.0)
-LEAST_ROWS = 0.5
+MIN_ROW_SHARE = 0.5
 """A neighbour that has not been flown beside half of this image is not judged."""
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class OverlapShares:
     """Shares of an exposure's footprint; None where there is nothing to compare with."""
 
     forward_overlap: float | None = None
@@ -48,7 +48,7 @@ class Surroundings:
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _FlownFootprint:
     """`corners` (4, 2) in metres: left and right behind, right and left ahead."""
 
     number: int
@@ -69,21 +69,21 @@ class Overlaps:
 
     def __init__(self, rig: Rig, mount: MountSection, ground_height_m: float) -> None:
         self._rig, self._mount, self._ground_m = rig, mount, ground_height_m
-        self._plane: Plane | None = None
-        self._seen: dict[int, _Seen] = {}
+        self._plane: LocalPlane | None = None
+        self._seen: dict[int, _FlownFootprint] = {}
 
     def add(self, exposure: Exposure) -> None:
         """Take in an exposure; one without line, position or attitude is passed over."""
         if not exposure.line_id or exposure.navigation is None:
             return
-        corners = seen_from(self._rig, self._mount, exposure.navigation, self._ground_m)
+        corners = footprint_corners(self._rig, self._mount, exposure.navigation, self._ground_m)
         if corners is None:
             return
         places = [Point(latitude, longitude) for longitude, latitude in corners]
-        self._plane = self._plane or Plane(places[0])
+        self._plane = self._plane or LocalPlane(places[0])
         flat = np.array([self._plane.flat(place) for place in places])
         ahead = flat[2] + flat[3] - flat[0] - flat[1]
-        self._seen[exposure.number] = _Seen(
+        self._seen[exposure.number] = _FlownFootprint(
             exposure.number,
             exposure.line_id,
             flat,
@@ -92,49 +92,51 @@ class Overlaps:
             nominal_area(self._rig, [sensor for sensor, _ in exposure.missing]),
         )
 
-    def of(self, number: int) -> Surroundings:
+    def of(self, number: int) -> OverlapShares:
         """What is known of an exposure that was taken in."""
         this = self._seen.get(number)
         if this is None:
-            return Surroundings()
+            return OverlapShares()
         before = (self._seen.get(number - back) for back in range(1, BEFORE + 1))
         last = next((one for one in before if one and one.line_id == this.line_id), None)
         forward = None if last is None else _share(this, _samples(this.corners), [last])
-        return Surroundings(forward, self._sidelap(this))
+        return OverlapShares(forward, self._sidelap(this))
 
-    def _sidelap(self, this: _Seen) -> float | None:
+    def _sidelap(self, this: _FlownFootprint) -> float | None:
         """The share seen by the nearest line on either side, the poorer of the two."""
         right = np.array([this.ahead[1], -this.ahead[0]])
         width_m = float(np.ptp(this.corners @ right))
         reach_m = 2.0 * float(np.max(np.ptp(this.corners, axis=0)))
         near, far = (share * width_m for share in NEIGHBOUR_WIDTHS)
-        sides: dict[tuple[bool, str], list[_Seen]] = {}
+        sides: dict[tuple[bool, str], list[_FlownFootprint]] = {}
         for other in self._seen.values():
             if other.number >= this.number or other.line_id == this.line_id:
                 continue
-            away = other.centre - this.centre
-            if np.abs(away).max() > reach_m:
+            offset_m = other.centre - this.centre
+            if np.abs(offset_m).max() > reach_m:
                 continue
-            beside_m = float(away @ right)
+            across_m = float(offset_m @ right)
             is_parallel = abs(float(other.ahead @ this.ahead)) > math.cos(PARALLEL_RAD)
-            if is_parallel and near < abs(beside_m) < far:
-                sides.setdefault((beside_m > 0, other.line_id), []).append(other)
+            if is_parallel and near < abs(across_m) < far:
+                sides.setdefault((across_m > 0, other.line_id), []).append(other)
         found: dict[bool, tuple[float, float]] = {}
         for (is_right, _), images in sides.items():
-            beside_m = float(np.mean([abs((o.centre - this.centre) @ right) for o in images]))
-            share = self._beside(this, images)
+            across_m = float(np.mean([abs((o.centre - this.centre) @ right) for o in images]))
+            share = self._share_seen_by_line(this, images)
             nearest = found.get(is_right)
-            if share is not None and (nearest is None or beside_m < nearest[0]):
-                found[is_right] = (beside_m, share)
+            if share is not None and (nearest is None or across_m < nearest[0]):
+                found[is_right] = (across_m, share)
         return min((share for _, share in found.values()), default=None)
 
-    def _beside(self, this: _Seen, images: Sequence[_Seen]) -> float | None:
+    def _share_seen_by_line(
+        self, this: _FlownFootprint, images: Sequence[_FlownFootprint]
+    ) -> float | None:
         """The share of this image that a line saw, over the rows it has been flown beside."""
         samples = _samples(this.corners)
         reaches = np.concatenate([image.corners @ this.ahead for image in images])
         rows = samples.mean(axis=1) @ this.ahead
         flown = (rows >= reaches.min()) & (rows <= reaches.max())
-        return _share(this, samples[flown], images) if flown.mean() >= LEAST_ROWS else None
+        return _share(this, samples[flown], images) if flown.mean() >= MIN_ROW_SHARE else None
 
 
 def _samples(corners: Array) -> Array:
@@ -146,17 +148,17 @@ def _samples(corners: Array) -> Array:
     return np.asarray(behind + steps[:, None, None] * (ahead - behind))
 
 
-def _share(this: _Seen, samples: Array, images: Sequence[_Seen]) -> float:
+def _share(this: _FlownFootprint, samples: Array, images: Sequence[_FlownFootprint]) -> float:
     """The share of the samples of an image that it sees itself and one of the others does, too."""
     bands = {band for one in (this, *images) for band in one.area.gaps}
     shares = []
     for band in bands or {""}:
-        others = np.logical_or.reduce([_sees(one, samples, band) for one in images])
-        shares.append(float((_sees(this, samples, band) & others).mean()))
+        others = np.logical_or.reduce([_visible(one, samples, band) for one in images])
+        shares.append(float((_visible(this, samples, band) & others).mean()))
     return min(shares)
 
 
-def _sees(image: _Seen, samples: Array, band: str) -> Flags:
+def _visible(image: _FlownFootprint, samples: Array, band: str) -> Flags:
     at = image_shares(image.corners, samples)
     inside = is_inside(at)
     gaps = gaps_of(image.area, at, inside).get(band)

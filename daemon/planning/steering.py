@@ -1,8 +1,8 @@
 """From a plan to the next exposure: which line is being flown, and when its next place is reached.
 
 Pure decisions on positions and a clock handed in, with the methods of the policies in
-`daemon.onboard.flight.triggering`. Places are fixed on the ground: a line gives the same ones flown
-either way.
+`daemon.onboard.flight.trigger_policies`. Places are fixed on the ground: a line gives the same ones
+flown either way.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from daemon.planning.model import Plan, Plane, PlannedLine, Point
+from daemon.planning.model import LocalPlane, Plan, PlannedLine, Point
 from drivers.contract import NavSample
 
 NANOSECONDS = 1_000_000_000
@@ -22,11 +22,11 @@ COURSE_TOLERANCE_RAD = math.radians(20.0)
 LATE_SHARE = 0.25
 """A place passed by less than this share of the distance is exposed late, else left out."""
 
-LEAST_SPEED_MPS = 1.0
+MIN_SPEED_MPS = 1.0
 
 
 @dataclass(frozen=True)
-class OnLine:
+class LinePosition:
     """Where on a planned line: metres flown along it and to the right of it, in flight direction.
 
     `along_m` is negative before the line begins. `speed_mps` is the part of the speed along it.
@@ -51,28 +51,28 @@ class PlanTrigger:
         plan: what is to be flown.
         distance_m: between two exposures, for lines that do not say so themselves.
         corridor_m: how far beside a line it is still flown.
-        least_interval_ns: the camera's own; never faster than that.
+        min_interval_ns: the camera's own; never faster than that.
     """
 
     def __init__(
-        self, plan: Plan, *, distance_m: float, corridor_m: float, least_interval_ns: int
+        self, plan: Plan, *, distance_m: float, corridor_m: float, min_interval_ns: int
     ) -> None:
         self.plan = plan
         self._distance_m = distance_m
         self._corridor_m = corridor_m
-        self._least_interval_ns = least_interval_ns
-        self._plane = Plane(plan.lines[0].start)
+        self._min_interval_ns = min_interval_ns
+        self._plane = LocalPlane(plan.lines[0].start)
         self._ends = [
             (self._plane.flat(line.start), self._plane.flat(line.end)) for line in plan.lines
         ]
         self._pass: tuple[str, bool] | None = None
         self._next = 0
-        self._known: tuple[NavSample | None, OnLine | None] = (None, None)
+        self._known: tuple[NavSample | None, LinePosition | None] = (None, None)
 
     def due(self, now_ns: int, last_fired_ns: int | None, nav: NavSample | None) -> int | None:
         """Host time of the next exposure; None while no line is flown, or it has been."""
         here = self.on_line(nav)
-        if here is None or here.speed_mps < LEAST_SPEED_MPS:
+        if here is None or here.speed_mps < MIN_SPEED_MPS:
             return None
         places = self._follow(here, now_ns)
         if self._next >= len(places):
@@ -81,7 +81,7 @@ class PlanTrigger:
         due_ns = here.mono_ns + round(ahead_m / here.speed_mps * NANOSECONDS)
         if last_fired_ns is None:
             return due_ns
-        return max(due_ns, last_fired_ns + self._least_interval_ns)
+        return max(due_ns, last_fired_ns + self._min_interval_ns)
 
     def fired(self, mono_ns: int, nav: NavSample | None) -> None:
         """An exposure was made; it counts for the next place if it was near it."""
@@ -90,8 +90,8 @@ class PlanTrigger:
             return
         places = self._follow(here, mono_ns)
         if self._next < len(places):
-            away_m = abs(here.along_at_m(mono_ns) - places[self._next])
-            self._next += away_m <= LATE_SHARE * self._step_m(places)
+            miss_m = abs(here.along_at_m(mono_ns) - places[self._next])
+            self._next += miss_m <= LATE_SHARE * self._step_m(places)
 
     def line_of(self, mono_ns: int, nav: NavSample | None) -> PlannedLine | None:
         """The planned line an exposure made now belongs to."""
@@ -102,18 +102,18 @@ class PlanTrigger:
         along_m = here.along_at_m(mono_ns)
         return here.line if -margin_m <= along_m <= here.length_m + margin_m else None
 
-    def on_line(self, nav: NavSample | None) -> OnLine | None:
+    def on_line(self, nav: NavSample | None) -> LinePosition | None:
         """The line that is flown, or that will be reached going straight on."""
         if self._known[0] is not nav:
             self._known = (nav, self._find(nav))
         return self._known[1]
 
-    def _find(self, nav: NavSample | None) -> OnLine | None:
+    def _find(self, nav: NavSample | None) -> LinePosition | None:
         if nav is None or nav.position is None or nav.velocity_ned_mps is None:
             return None
         north, east = nav.velocity_ned_mps[:2]
         speed_mps = math.hypot(north, east)
-        if speed_mps < LEAST_SPEED_MPS:
+        if speed_mps < MIN_SPEED_MPS:
             return None
         at = self._plane.flat(Point(*nav.position))
         found = [
@@ -128,7 +128,7 @@ class PlanTrigger:
             and one.speed_mps >= speed_mps * math.cos(COURSE_TOLERANCE_RAD)
             and one.along_m <= one.length_m + self._step_m(self._places_m(one))
         ]
-        return min(near, key=_remoteness, default=None)
+        return min(near, key=_distance_key, default=None)
 
     def _on(
         self,
@@ -137,7 +137,7 @@ class PlanTrigger:
         at: tuple[float, float],
         velocity: tuple[float, float],
         mono_ns: int,
-    ) -> OnLine | None:
+    ) -> LinePosition | None:
         (x0, y0), (x1, y1) = ends
         length_m = math.hypot(x1 - x0, y1 - y0)
         if length_m == 0.0:
@@ -146,7 +146,7 @@ class PlanTrigger:
         is_reversed = ahead[0] * velocity[0] + ahead[1] * velocity[1] < 0
         if is_reversed:
             ahead, x0, y0 = (-ahead[0], -ahead[1]), x1, y1
-        return OnLine(
+        return LinePosition(
             line=line,
             is_reversed=is_reversed,
             along_m=ahead[0] * (at[0] - x0) + ahead[1] * (at[1] - y0),
@@ -156,7 +156,7 @@ class PlanTrigger:
             mono_ns=mono_ns,
         )
 
-    def _follow(self, here: OnLine, now_ns: int) -> Sequence[float]:
+    def _follow(self, here: LinePosition, now_ns: int) -> Sequence[float]:
         """The places of the line that is flown; those that were missed are left behind."""
         places, along_m = self._places_m(here), here.along_at_m(now_ns)
         step_m = self._step_m(places)
@@ -168,13 +168,13 @@ class PlanTrigger:
             self._next += 1
         return places
 
-    def _places_m(self, here: OnLine) -> Sequence[float]:
+    def _places_m(self, here: LinePosition) -> Sequence[float]:
         return places_m(here.line, here.length_m, self._distance_m, is_reversed=here.is_reversed)
 
     def _step_m(self, places: Sequence[float]) -> float:
         """The smallest way between two places of a line."""
-        ways = (b - a for a, b in itertools.pairwise(places) if b > a)
-        return min(ways, default=self._distance_m)
+        spacings_m = (b - a for a, b in itertools.pairwise(places) if b > a)
+        return min(spacings_m, default=self._distance_m)
 
 
 def places_m(
@@ -191,6 +191,6 @@ def places_m(
     return tuple(length_m - place for place in reversed(places)) if is_reversed else places
 
 
-def _remoteness(one: OnLine) -> tuple[float, float]:
+def _distance_key(one: LinePosition) -> tuple[float, float]:
     """Lines that are being flown before those that are ahead, then the nearest beside."""
     return max(0.0, -one.along_m, one.along_m - one.length_m), abs(one.across_m)

@@ -11,10 +11,15 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from daemon.mission.foreign_files import ForeignFileError, read_plain
-from daemon.mission.records import RECORD_MAX_BYTES, RecordError, canonical_bytes, parse_record
+from daemon.mission.canonical_json import (
+    RECORD_MAX_BYTES,
+    RecordError,
+    canonical_bytes,
+    parse_record,
+)
+from daemon.mission.foreign_files import ForeignFileError, read_regular_file
 from daemon.mission.store.durable import replace_file
-from processing.mosaic.flight_validity import FlightSettings, FlightValidity, judge_flight
+from processing.mosaic.flight_validity import FlightSettings, FlightValidity, evaluate_flight
 from processing.mosaic.stitch_record import StitchRecord, StitchRecordError, stitch_record_from_json
 from processing.rig import load_rig
 
@@ -40,19 +45,21 @@ def write_displacements(mission: Path) -> Mapping[str, Any]:
 def flight_displacements(mission: Path) -> dict[str, Any]:
     """What `write_displacements` writes; nothing is written."""
     records, unreadable = _records(mission)
-    return _content(judge_flight(load_rig(mission / "rig.toml"), records), unreadable)
+    return _content(evaluate_flight(load_rig(mission / "rig.toml"), records), unreadable)
 
 
 def without_steps(exposures: Mapping[str, int]) -> str:
     """What a flight without steps says, by how many exposures of each cone were judged."""
     if not exposures:
         return "Not judged: it takes three sensors in the master cone, or two in another PAN cone."
-    least = 2 * FlightSettings().least_exposures
-    few = [cone for cone, count in exposures.items() if count < least]
-    if len(few) == len(exposures):
-        return f"Not judged: whether a sensor moved shows in {least} exposures of a cone or more."
-    if few:
-        return f"No sensor is seen to move; not judged: cone {', '.join(few)} (too few exposures)."
+    minimum = 2 * FlightSettings().min_exposures
+    too_few = [cone for cone, count in exposures.items() if count < minimum]
+    if len(too_few) == len(exposures):
+        return f"Not judged: whether a sensor moved shows in {minimum} exposures of a cone or more."
+    if too_few:
+        return (
+            f"No sensor is seen to move; not judged: cone {', '.join(too_few)} (too few exposures)."
+        )
     return "No sensor is seen to move."
 
 
@@ -62,7 +69,7 @@ def _records(mission: Path) -> tuple[dict[int, StitchRecord], list[str]]:
         if not path.parent.name.isdigit():
             continue  # being written
         try:
-            content = parse_record(read_plain(path, RECORD_MAX_BYTES), path.name)
+            content = parse_record(read_regular_file(path, RECORD_MAX_BYTES), path.name)
             records[int(path.parent.name)] = stitch_record_from_json(content)
         except (ForeignFileError, RecordError, StitchRecordError) as error:
             unreadable.append(f"{path.parent.name}: {error}")

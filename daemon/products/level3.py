@@ -16,19 +16,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.errors import DaemonError
+from daemon.mission.canonical_json import canonical_bytes, sha256_hex
 from daemon.mission.exposure import Exposure
+from daemon.mission.exposure_batch import ExposureFailure, for_each_exposure
 from daemon.mission.layout import Mission, exposure_name
-from daemon.mission.records import canonical_bytes, sha256_hex
 from daemon.mission.store import durable
-from daemon.mission.store.level0 import read_description, refuse_bomb, tiff_faults
-from daemon.mission.store.level0_folder import exposure_of, read_capture, read_sealed
+from daemon.mission.store.level0 import read_description, refuse_decompression_bomb, tiff_errors
+from daemon.mission.store.level0_folder import read_capture, read_sealed, unsealed_exposure
 from daemon.mission.store.level2 import BAND_ORDER
 from daemon.mission.store.publication import published
-from daemon.mission.walk import ExposureFailure, walk
 from processing.geometry.conditions import reference_exposure_times
 from processing.image.pansharpening import pansharpened
 from processing.radiometry.tone_curve import (
-    WORDS,
+    VALUE_COUNT,
     ToneCurve,
     curve_as_json,
     histogram,
@@ -55,7 +55,7 @@ class Level3Error(DaemonError):
 
 
 @dataclass(frozen=True)
-class Developed:
+class PansharpenedExposure:
     """What was written for one exposure: file name to size in bytes, and what could not be."""
 
     number: int
@@ -94,8 +94,8 @@ def mission_tones(
         OSError: the disk refused.
     """
     numbers = _processed(mission)
-    sums = {band: np.zeros(WORDS, np.int64) for band in BAND_ORDER}
-    timed = walk(numbers, lambda number: _exposure_times_us(mission, rig, number))
+    sums = {band: np.zeros(VALUE_COUNT, np.int64) for band in BAND_ORDER}
+    timed = for_each_exposure(numbers, lambda number: _exposure_times_us(mission, rig, number))
     scales = _scales(timed.results)
 
     def count(number: int) -> None:
@@ -108,7 +108,7 @@ def mission_tones(
         if progress is not None:
             progress("histograms", done, len(scales))
 
-    counted = walk(scales, count, show)
+    counted = for_each_exposure(scales, count, show)
     scales = {number: scales[number] for number in counted.results}
     failures = (*timed.failures, *counted.failures)
     try:
@@ -128,7 +128,7 @@ def mission_tones(
     return MissionTones(curve, sha256_hex(content), scales), failures
 
 
-def develop(
+def pansharpen(
     mission: Mission,
     rig: Rig,
     number: int,
@@ -137,7 +137,7 @@ def develop(
     images: Sequence[str] = tuple(IMAGES),
     depths: Sequence[int] = DEPTHS,
     threads: int = 1,
-) -> Developed:
+) -> PansharpenedExposure:
     """Write the Level-3 folder of one exposure, whole, in place of an earlier one.
 
     Args:
@@ -179,7 +179,7 @@ def develop(
                 }
                 planes = [sharp[band] for band in bands]
                 files[name] = _write(part / name, planes, tables, about, threads)
-    return Developed(number, files, tuple(left_out))
+    return PansharpenedExposure(number, files, tuple(left_out))
 
 
 def _tables(tones: MissionTones, number: int, bands: Sequence[str]) -> list[NDArray[np.uint8]]:
@@ -264,12 +264,12 @@ def _exposure_times_us(mission: Mission, rig: Rig, number: int) -> dict[str, flo
 def _scales(times_us: Mapping[int, Mapping[str, float]]) -> dict[int, dict[str, float]]:
     """Median exposure time of the mission over that of each exposure, by band."""
     usual = {
-        band: float(np.median([told[band] for told in times_us.values() if band in told]))
-        for band in {band for told in times_us.values() for band in told}
+        band: float(np.median([times[band] for times in times_us.values() if band in times]))
+        for band in {band for times in times_us.values() for band in times}
     }
     return {
-        number: {band: usual[band] / time for band, time in told.items()}
-        for number, told in times_us.items()
+        number: {band: usual[band] / time for band, time in times.items()}
+        for number, times in times_us.items()
     }
 
 
@@ -278,7 +278,7 @@ def _record(mission: Mission, number: int) -> Exposure | None:
     if (sealed := read_sealed(folder)) is not None:
         return sealed.exposure
     capture = read_capture(folder)
-    return None if capture is None else exposure_of(capture)
+    return None if capture is None else unsealed_exposure(capture)
 
 
 def _pan(mission: Mission, number: int) -> NDArray[np.uint16]:
@@ -309,13 +309,13 @@ def _read(path: Path, number: int) -> NDArray[np.uint16]:
     try:
         with TiffFile(path) as tiff:
             page = tiff.pages[0]
-            refuse_bomb(page, path)
+            refuse_decompression_bomb(page, path)
             pixels: NDArray[Any] = page.asarray()
     except FileNotFoundError as error:
         raise Level3Error(
             f"exposure {number}: has no {path.name} at Level-2; run syntopic process first"
         ) from error
-    except tiff_faults() as error:
+    except tiff_errors() as error:
         raise Level3Error(
             f"exposure {number}: {path.name} cannot be read ({error}); process it again"
         ) from error

@@ -15,21 +15,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.configuration.model import MountSection, PlanSection, ProcessingSection
+from daemon.mission.canonical_json import canonical_bytes
 from daemon.mission.exposure import Exposure
 from daemon.mission.layout import Mission
-from daemon.mission.records import canonical_bytes
 from daemon.mission.store.radiometry_folder import RadiometryFolder
-from daemon.orientation.in_flight import orientation_json
-from daemon.planning.reading import read_plan
-from daemon.products.bands import bands_made, radiance_folder, radiance_of
-from daemon.products.heads import heads_made
-from daemon.products.reports import FramesRead, Made
-from daemon.products.stitched import stitched_made
+from daemon.orientation.in_flight_orientation import orientation_json
+from daemon.planning.plan_readers import read_plan
+from daemon.products.band_images import build_bands, radiance_folder, radiance_of
+from daemon.products.head_images import build_heads
+from daemon.products.product_files import FramesRead, ProductFiles
+from daemon.products.stitched_image import build_stitched
 from processing.pipelines.bands import BandPipeline
-from processing.pipelines.perspective import HeadPipeline, looks_apart
-from processing.pipelines.stitched import Conditions, Pipeline, Settings
+from processing.pipelines.perspective import HeadPipeline, has_diverging_axes
+from processing.pipelines.stitched import Conditions, Pipeline, PipelineSettings
 from processing.quality.report import Thresholds
-from processing.quality.specification import Asked
+from processing.quality.requirements import QualityRequirements
 from processing.radiometry.histogram import sampled_histogram
 from processing.rig import Rig, Sensor
 
@@ -46,7 +46,7 @@ class AnyPipeline(Protocol):
     def warm_up(self) -> None:
         """Compile, or load, every kernel a flight will need."""
 
-    def twin(self) -> AnyPipeline:
+    def clone(self) -> AnyPipeline:
         """A second one for another exposure at the same time; calibrations are shared."""
 
 
@@ -59,7 +59,7 @@ class Processor:
     """
 
     pipeline: AnyPipeline
-    made: Callable[[Any, Exposure, Frames, Conditions, FramesRead], Made]
+    build: Callable[[Any, Exposure, Frames, Conditions, FramesRead], ProductFiles]
 
     @property
     def rig(self) -> Rig:
@@ -68,8 +68,8 @@ class Processor:
     def warm_up(self) -> None:
         self.pipeline.warm_up()
 
-    def twin(self) -> Processor:
-        return replace(self, pipeline=self.pipeline.twin())
+    def clone(self) -> Processor:
+        return replace(self, pipeline=self.pipeline.clone())
 
     def make(
         self,
@@ -78,9 +78,9 @@ class Processor:
         conditions: Conditions,
         *,
         frames_read: FramesRead = None,
-    ) -> Made:
+    ) -> ProductFiles:
         """Make the images of one exposure and judge it."""
-        return self.made(self.pipeline, exposure, frames, conditions, frames_read)
+        return self.build(self.pipeline, exposure, frames, conditions, frames_read)
 
 
 def processor_for(
@@ -117,15 +117,15 @@ def build_processor(
         CalibrationError, ValueError: a calibration that does not fit, or a rig of no known kind.
         PlanError: a plan that cannot be read.
     """
-    asked = asked_of(plan_file)
+    requirements = quality_requirements_of(plan_file)
     threads = processing.threads
     given: dict[str, Any] = processing.thresholds
     thresholds = replace(Thresholds(), **given)
-    if rig.virtual_image is None and not looks_apart(rig):
+    if rig.virtual_image is None and not has_diverging_axes(rig):
         radiance = radiance_of(rig, radiometry or own_radiance)
-        pipeline = BandPipeline(rig, radiance, threads=threads, asked=asked)
+        pipeline = BandPipeline(rig, radiance, threads=threads, requirements=requirements)
         pipeline.thresholds = replace(pipeline.thresholds, **given)
-        return Processor(pipeline, partial(bands_made, radiance))
+        return Processor(pipeline, partial(build_bands, radiance))
     known = None if radiometry is None else RadiometryFolder(radiometry, rig)
     if rig.virtual_image is None:
         return Processor(
@@ -135,25 +135,25 @@ def build_processor(
                 interpolation=processing.interpolation,
                 threads=threads,
                 thresholds=thresholds,
-                asked=asked,
+                requirements=requirements,
             ),
-            heads_made,
+            build_heads,
         )
     return Processor(
         Pipeline(
             rig,
             known,
-            Settings(
+            PipelineSettings(
                 method=processing.method,
                 interpolation=processing.interpolation,
                 baselines=processing.baselines,
                 geometry=processing.geometry,
                 threads=threads,
                 thresholds=thresholds,
-                asked=asked,
+                requirements=requirements,
             ),
         ),
-        stitched_made,
+        build_stitched,
     )
 
 
@@ -166,7 +166,7 @@ def make_products(
     conditions: Conditions,
     *,
     frames_read: Callable[[], None] | None = None,
-) -> Made:
+) -> ProductFiles:
     """All that Level-2 of one exposure holds: its images, and what is the same for every rig.
 
     Returns:
@@ -175,9 +175,9 @@ def make_products(
     """
     histograms = histograms_of(processor.rig, frames)  # before the frames are let go
     report, contents = processor.make(exposure, frames, conditions, frames_read=frames_read)
-    told = orientation_json(exposure, processor.rig, mount, plan.ground_height_m)
+    orientation = orientation_json(exposure, processor.rig, mount, plan.ground_height_m)
     contents["histogram.json"] = [canonical_bytes({k: list(v) for k, v in histograms.items()})]
-    contents["orientation.json"] = [canonical_bytes(told)]
+    contents["orientation.json"] = [canonical_bytes(orientation)]
     return report, contents
 
 
@@ -189,12 +189,12 @@ def histograms_of(rig: Rig, frames: Mapping[str, NDArray[np.uint16]]) -> dict[st
     }
 
 
-def asked_of(plan_file: Path | None) -> Asked:
+def quality_requirements_of(plan_file: Path | None) -> QualityRequirements:
     """What a flight plan asks of every exposure; nothing where there is none."""
     if plan_file is None:
-        return Asked()
+        return QualityRequirements()
     wanted = read_plan(plan_file).specification
-    return Asked(
+    return QualityRequirements(
         forward_overlap=max(0.0, wanted.forward_overlap - wanted.overlap_tolerance),
         sidelap=max(0.0, wanted.sidelap - wanted.overlap_tolerance),
         gsd_m=wanted.gsd_m,

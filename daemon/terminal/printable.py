@@ -16,7 +16,7 @@ _REPLACED: Final = frozenset({"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"})
 line and paragraph separators."""
 
 
-def printable(text: str, most: int = TEXT_MAX) -> str:
+def printable(text: str, max_characters: int = TEXT_MAX) -> str:
     """The text on one line, with U+FFFD for each character that does not print.
 
     Args:
@@ -27,8 +27,8 @@ def printable(text: str, most: int = TEXT_MAX) -> str:
         >>> printable("head\\x1b[2J SU11")
         'head\\ufffd[2J SU11'
     """
-    kept = text if len(text) <= most else text[: most - 1] + "…"
-    return "".join("\ufffd" if unicodedata.category(one) in _REPLACED else one for one in kept)
+    shortened = text if len(text) <= max_characters else text[: max_characters - 1] + "…"
+    return "".join("\ufffd" if unicodedata.category(one) in _REPLACED else one for one in shortened)
 
 
 def printable_tree(value: Any, depth: int = DEPTH_MAX) -> Any:

@@ -16,7 +16,7 @@ from drivers.contract import DeviceError
 
 
 @dataclass(frozen=True)
-class Extra:
+class OptionalDependency:
     """An optional dependency: what it is needed for, its modules, and its Debian packages."""
 
     purpose: str
@@ -24,16 +24,16 @@ class Extra:
     packages: str = ""
 
 
-EXTRAS: Final[Mapping[str, Extra]] = {
-    "aravis": Extra(
+EXTRAS: Final[Mapping[str, OptionalDependency]] = {
+    "aravis": OptionalDependency(
         "GigE Vision and USB3 Vision heads need Aravis",
         ("gi",),
         "gir1.2-aravis-0.8 libgirepository1.0-dev",
     ),
-    "geotiff": Extra("GeoTIFF files need rasterio", ("rasterio",)),
-    "geodesy": Extra("coordinate systems need pyproj", ("pyproj",)),
-    "mavlink": Extra("MAVLink needs pymavlink", ("pymavlink",)),
-    "watch": Extra(
+    "geotiff": OptionalDependency("GeoTIFF files need rasterio", ("rasterio",)),
+    "geodesy": OptionalDependency("coordinate systems need pyproj", ("pyproj",)),
+    "mavlink": OptionalDependency("MAVLink needs pymavlink", ("pymavlink",)),
+    "watch": OptionalDependency(
         "the page, the API and telemetry need the packages of [watch]",
         ("fastapi", "uvicorn", "websockets", "msgpack", "zeroconf", "ifaddr", "prometheus_client"),
     ),

@@ -13,11 +13,11 @@ from typing import Final
 from drivers.base.settings import Configured
 from drivers.contract import DeviceError
 
-_PLACES: Final[Mapping[str, Mapping[str, str]]] = {
+_DRIVER_PATHS: Final[Mapping[str, Mapping[str, str]]] = {
     "head": {
-        "aravis": "drivers.cameras.aravis.head:AravisHead",
-        "folder": "drivers.cameras.folder.head:FolderHead",
-        "v4l2": "drivers.cameras.v4l2.head:V4l2Head",
+        "aravis": "drivers.cameras.aravis.aravis_head:AravisHead",
+        "folder": "drivers.cameras.folder.folder_head:FolderHead",
+        "v4l2": "drivers.cameras.v4l2.v4l2_head:V4l2Head",
     },
     "trigger": {
         "pulse-bus": "drivers.triggers.pulse_bus:PulseBusTrigger",
@@ -52,12 +52,12 @@ _EXTRAS: Final[Mapping[str, tuple[str, ...]]] = {
 
 def extras_of(kind: str, driver_name: str) -> tuple[str, ...]:
     """The optional libraries a driver needs, by their names in `drivers.base.extras`."""
-    return _EXTRAS.get(driver_name, ()) if driver_name in _PLACES.get(kind, {}) else ()
+    return _EXTRAS.get(driver_name, ()) if driver_name in _DRIVER_PATHS.get(kind, {}) else ()
 
 
 def kinds() -> Mapping[str, tuple[str, ...]]:
     """The kinds of device, and the names of the drivers of each."""
-    return {kind: tuple(places) for kind, places in _PLACES.items()}
+    return {kind: tuple(driver_paths) for kind, driver_paths in _DRIVER_PATHS.items()}
 
 
 def driver_for(kind: str, driver_name: str) -> type[Configured]:
@@ -69,12 +69,12 @@ def driver_for(kind: str, driver_name: str) -> type[Configured]:
     Raises:
         DeviceError: no such kind or driver; the sentence lists those there are.
     """
-    if kind not in _PLACES:
-        raise DeviceError(f"kind is {kind!r}; one of {', '.join(_PLACES)}")
-    places = _PLACES[kind]
-    if driver_name not in places:
-        raise DeviceError(f"driver is {driver_name!r}; a {kind} has {', '.join(places)}")
-    module, _, attribute = places[driver_name].partition(":")
+    if kind not in _DRIVER_PATHS:
+        raise DeviceError(f"kind is {kind!r}; one of {', '.join(_DRIVER_PATHS)}")
+    driver_paths = _DRIVER_PATHS[kind]
+    if driver_name not in driver_paths:
+        raise DeviceError(f"driver is {driver_name!r}; a {kind} has {', '.join(driver_paths)}")
+    module, _, attribute = driver_paths[driver_name].partition(":")
     driver: type[Configured] = getattr(importlib.import_module(module), attribute)
     return driver
 

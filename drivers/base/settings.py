@@ -48,14 +48,14 @@ class Setting(Generic[T]):
         minimum: float | None = None,
         maximum: float | None = None,
         required: bool = False,
-        says: str,
+        help: str,  # noqa: A002 - as argparse and typer name it
     ) -> None:
         self.default: Final = default
         self.choices: Final = choices
         self.minimum: Final = minimum
         self.maximum: Final = maximum
         self.required: Final = required
-        self.says: Final = says
+        self.help: Final = help
         self.name = ""
 
     def __set_name__(self, owner: type, name: str) -> None:
@@ -84,11 +84,11 @@ class Setting(Generic[T]):
         Raises:
             ValueError: with what would be right.
         """
-        words, convert = _TYPES[type(self.default)]
+        type_description, convert = _TYPES[type(self.default)]
         try:
             converted: T = convert(value)
         except TypeError as error:
-            raise ValueError(f"{words} is needed") from error
+            raise ValueError(f"{type_description} is needed") from error
         if self.choices and converted not in self.choices:
             raise ValueError("one of " + ", ".join(repr(choice) for choice in self.choices))
         if isinstance(converted, tuple):
@@ -150,18 +150,18 @@ class Configured:
             try:
                 setting.convert(value)
             except ValueError as error:
-                problems.append(f"{key} is {value!r}; {error} ({setting.says})")
+                problems.append(f"{key} is {value!r}; {error} ({setting.help})")
         problems.extend(
-            f"{setting.name} is missing; {setting.type_name} is needed ({setting.says})"
+            f"{setting.name} is missing; {setting.type_name} is needed ({setting.help})"
             for setting in declared.values()
             if setting.required and setting.name not in settings
         )
         if not problems:
-            problems.extend(cls.contradictions(cls._values(settings)))
+            problems.extend(cls.setting_conflicts(cls._values(settings)))
         return problems
 
     @classmethod
-    def contradictions(cls, values: Mapping[str, Any]) -> list[str]:
+    def setting_conflicts(cls, values: Mapping[str, Any]) -> list[str]:
         """Mistakes that lie between settings, each right by itself; for a driver to override."""
         return []
 

@@ -20,7 +20,7 @@ class HeadDevice(DeviceDriver):
 
     kind: ClassVar = "head"
     counted: ClassVar[tuple[str, ...]] = ("frames", "underruns", "opened")
-    delivered: ClassVar = "frames"
+    delivery_counter: ClassVar = "frames"
 
     def __init__(
         self,
@@ -33,16 +33,16 @@ class HeadDevice(DeviceDriver):
         super().__init__(name, settings, clock=clock)
         self._memory = memory
         self._slots = threading.Lock()
-        self._lent_out: set[int] = set()
+        self._slots_in_use: set[int] = set()
         self._last_slot = -1
 
     def recycle(self, slot: int) -> None:
         """Hand a slot back; from any thread. ValueError for a slot that was not handed out."""
         with self._slots:
-            if slot not in self._lent_out:
+            if slot not in self._slots_in_use:
                 raise ValueError(f"{self.name}: slot {slot} was not handed out; recycle it once")
-            self._lent_out.discard(slot)
-            self._returned(slot)
+            self._slots_in_use.discard(slot)
+            self._slot_returned(slot)
 
     def statistics(self) -> Mapping[str, int]:
         """Counters since creation, by stable name; see the driver's page."""
@@ -57,37 +57,39 @@ class HeadDevice(DeviceDriver):
 
     # For a driver to say
 
-    def _returned(self, slot: int) -> None:
+    def _slot_returned(self, slot: int) -> None:
         """A slot came back. Called with `_slots` held."""
 
     def _opened_sentence(self) -> str:
         return f"The head {self.name} is open; nothing to do."
 
-    def _tell_opened(self) -> None:
-        self.teller.tell("opened", self._opened_sentence())
+    def _emit_opened(self) -> None:
+        self.emitter.emit("opened", self._opened_sentence())
 
     # For a driver to use
 
-    def _lend_out(self, slot: int) -> None:
+    def _mark_in_use(self, slot: int) -> None:
         """Note that a slot goes to the caller with its frame."""
         with self._slots:
-            self._lent_out.add(slot)
+            self._slots_in_use.add(slot)
 
     def _free_slot(self) -> int | None:
         """The next slot that nobody has; None, counted and told, where all are taken."""
         with self._slots:
-            free = [slot for slot in range(self._memory.slot_count) if slot not in self._lent_out]
+            free = [
+                slot for slot in range(self._memory.slot_count) if slot not in self._slots_in_use
+            ]
             if free:
                 # In turn, so that a slot that is let go of too early shows at once.
                 slot = min(free, key=lambda s: (s <= self._last_slot, s))
                 self._last_slot = slot
                 return slot
         self.counters["underruns"] += 1
-        self._complain_of_underrun()
+        self._report_underrun()
         return None
 
-    def _complain_of_underrun(self) -> None:
-        self.teller.complain(
+    def _report_underrun(self) -> None:
+        self.emitter.emit_throttled(
             "underrun",
             f"The head {self.name} lost a frame because all {self._memory.slot_count} slots "
             "are taken. Storage is too slow for this rate; lengthen the interval.",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-MOST_PAGES: Final = 16
+MAX_PAGES: Final = 16
 """So many directories are looked at; a file with more is no frame."""
 _TOP_LEFT: Final = 1
 _MIN_IS_WHITE: Final = 0
@@ -45,11 +45,11 @@ def layout_problem(tiff: Any) -> str | None:
     if photometric not in _BRIGHTER_IS_HIGHER:
         return f"PhotometricInterpretation is {photometric}; MinIsBlack (1) is needed"
     pages = tiff.pages
-    for number in range(1, MOST_PAGES + 1):
+    for number in range(1, MAX_PAGES + 1):
         try:
             further = pages[number]
         except IndexError:
             return None
         if not int(further.subfiletype) & _REDUCED:
             return f"holds several images (page {number + 1}); write one frame a file"
-    return f"holds more than {MOST_PAGES} pages; write one frame a file"
+    return f"holds more than {MAX_PAGES} pages; write one frame a file"

@@ -10,35 +10,35 @@ import math
 import re
 from typing import Final
 
-_WHOLE: Final = re.compile(r"[-+]?[0-9]{1,18}")
+_INTEGER: Final = re.compile(r"[-+]?[0-9]{1,18}")
 _DECIMAL: Final = re.compile(
     r"[-+]?([0-9]{1,20}(\.[0-9]{0,30})?|\.[0-9]{1,30})([eE][-+]?[0-9]{1,3})?"
 )
 
 
-def whole_number(text: str) -> int:
+def parse_integer(text: str) -> int:
     """The value of a field of a whole number.
 
     Raises:
         ValueError: it is empty or anything else, "1.0" and "1_0" too.
 
     Example:
-        >>> whole_number("2445")
+        >>> parse_integer("2445")
         2445
     """
-    if _WHOLE.fullmatch(text) is None:
+    if _INTEGER.fullmatch(text) is None:
         raise ValueError(f"{text!r} is not a whole number")
     return int(text)
 
 
-def decimal_number(text: str) -> float:
+def parse_decimal(text: str) -> float:
     """The value of a field of a finite decimal number, with or without an exponent.
 
     Raises:
         ValueError: it is empty, not finite or anything else.
 
     Example:
-        >>> decimal_number("-1.5e-03")
+        >>> parse_decimal("-1.5e-03")
         -0.0015
     """
     value = float(text) if _DECIMAL.fullmatch(text) else math.nan

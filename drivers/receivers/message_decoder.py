@@ -39,7 +39,7 @@ class MessageDecoder:
     mean that one makes no sense, and in `bad_counter` how those are called in the statistics.
     """
 
-    unreadable: tuple[type[Exception], ...] = (ValueError,)
+    decode_errors: tuple[type[Exception], ...] = (ValueError,)
     bad_counter: ClassVar[str] = "bad_messages"
 
     def __init__(self, receiver: str, framer: Framer, counters: tuple[str, ...]) -> None:
@@ -97,17 +97,17 @@ class MessageDecoder:
         records: list[Nav] = []
         for message in self._framer.feed(data):
             try:
-                made = self.on_message(message, mono_ns)
-            except self.unreadable:
+                decoded = self.on_message(message, mono_ns)
+            except self.decode_errors:
                 self.counters[self.bad_counter] += 1
                 continue
-            records.extend(made)
-            for record in made:
+            records.extend(decoded)
+            for record in decoded:
                 if isinstance(record, NavSample):
                     self.fix, self.satellites = record.fix, record.satellites
         return records
 
-    def near_navigation(self, gps_ns: int) -> bool:
+    def is_near_navigation(self, gps_ns: int) -> bool:
         """Whether a mark may be of this time; one far from navigation is counted."""
         if self._gps_ns is None or abs(gps_ns - self._gps_ns) <= FAR_NS:
             return True

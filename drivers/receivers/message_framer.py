@@ -53,7 +53,7 @@ class MessageFramer:
             at = start
             if match is None:
                 break
-            size = self._whole(buffer, at)
+            size = self._complete_message(buffer, at)
             if size is None:
                 break
             if size == 0:
@@ -66,7 +66,7 @@ class MessageFramer:
         self._buffer = buffer[at:]
         return found
 
-    def _whole(self, buffer: bytes, at: int) -> int | None:
+    def _complete_message(self, buffer: bytes, at: int) -> int | None:
         size = self._size_of(buffer, at)
         if not size:
             return size

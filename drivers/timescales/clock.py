@@ -23,7 +23,7 @@ class Clock(Protocol):
         """Wait for the event, at most so long; whether it is set."""
 
 
-class HostClock:
+class MonotonicClock:
     """The host's own clock."""
 
     def mono_ns(self) -> int:

@@ -30,23 +30,34 @@ from drivers.contract import (
     TemperatureSample,
 )
 from drivers.timescales.clock import Clock
-from drivers.transport.port_holder import held_sentence, holders, is_pseudo_terminal, other_holders
+from drivers.transport.port_users import (
+    holders,
+    is_pseudo_terminal,
+    other_holders,
+    port_in_use_sentence,
+)
 from drivers.transport.tcp_port import SCHEME, open_tcp_port
-from drivers.transport.udp_port import LISTEN_SCHEME, SPEAK_SCHEME, Sender, UdpPort, open_udp_port
+from drivers.transport.udp_port import (
+    LISTEN_SCHEME,
+    SEND_SCHEME,
+    SenderFilter,
+    UdpPort,
+    open_udp_port,
+)
 
-READ_STEP_S: Final = 0.2
+READ_TIMEOUT_S: Final = 0.2
 """Longest wait for bytes before the driver looks up again."""
 WRITE_TIMEOUT_S: Final = 1.0
-UNLOGGED_KEPT: Final = 4096
+UNLOGGED_MAX: Final = 4096
 """Chunks of bytes read before there is a log to put them into."""
 
-STALE: Final = ".stale"
+STALE_SUFFIX: Final = ".stale"
 """Ends the name under which bytes are logged that came too late to be read."""
 
 Sample = NavSample | EventMark | TemperatureSample | ClockReading
 
 
-class Port(Protocol):
+class SerialPort(Protocol):
     """What is used of `serial.Serial`."""
 
     timeout: Any
@@ -70,7 +81,7 @@ class SerialLine:
 
     def __init__(
         self,
-        port: Port,
+        port: SerialPort,
         received: Callable[[bytes], None],
         stale: Callable[[bytes], None] = lambda _data: None,
     ) -> None:
@@ -129,10 +140,10 @@ class SerialLine:
             return
 
 
-PortOpener = Callable[[str, int, str], Port]
+PortOpener = Callable[[str, int, str], SerialPort]
 
 
-def open_serial_port(path: str, baudrate: int, parity: str) -> Port:
+def open_serial_port(path: str, baudrate: int, parity: str) -> SerialPort:
     """Open a port for ourselves alone, 8 data bits, one stop bit; or a network address.
 
     Addresses are tcp://host:port, udpin://host:port (listens; with ?from=ADDRESS to that sender
@@ -146,49 +157,49 @@ def open_serial_port(path: str, baudrate: int, parity: str) -> Port:
     """
     if path.startswith(SCHEME):
         return open_tcp_port(path)
-    if path.startswith((LISTEN_SCHEME, SPEAK_SCHEME)):
+    if path.startswith((LISTEN_SCHEME, SEND_SCHEME)):
         return open_udp_port(path)
     try:
         port = serial.Serial(
             path,
             baudrate=baudrate,
             parity=parity,
-            timeout=READ_STEP_S,
+            timeout=READ_TIMEOUT_S,
             write_timeout=WRITE_TIMEOUT_S,
             exclusive=True,
         )
     except (serial.SerialException, OSError, termios.error, ValueError) as error:
         number = getattr(error, "errno", None) or (error.args[0] if error.args else None)
         if number == errno.EINVAL and parity != "N":
-            cure = f'parity {parity} is refused, as a pseudo-terminal does; set parity = "N" there'
+            hint = f'parity {parity} is refused, as a pseudo-terminal does; set parity = "N" there'
         elif number == errno.ENOENT:
-            cure = "there is no such port; check the cable and the port's name"
+            hint = "there is no such port; check the cable and the port's name"
         elif number in (errno.EACCES, errno.EPERM):
-            cure = "permission denied; add the service's user to the group dialout"
+            hint = "permission denied; add the service's user to the group dialout"
         elif number == errno.EBUSY or "lock" in str(error):
-            cure = held_sentence(path, holders(path))
+            hint = port_in_use_sentence(path, holders(path))
         else:
-            cure = f"{_reason(error)}; check the cable, the port's name and its settings"
-        raise DeviceError(f"port {path} cannot be opened: {cure}") from error
+            hint = f"{_reason(error)}; check the cable, the port's name and its settings"
+        raise DeviceError(f"port {path} cannot be opened: {hint}") from error
     if others := other_holders(path):
         port.close()
-        raise DeviceError(f"port {path} cannot be opened: {held_sentence(path, others)}")
+        raise DeviceError(f"port {path} cannot be opened: {port_in_use_sentence(path, others)}")
     if not is_pseudo_terminal(path):
-        _keep_others_out(port)
+        _lock_port(port)
     return port
 
 
-def _keep_others_out(port: serial.Serial) -> None:
+def _lock_port(port: serial.Serial) -> None:
     """Have the kernel refuse the port to programs that do not look at locks, such as gpsd."""
     # A driver without terminal settings refuses; the lock is there all the same.
     with suppress(OSError):
         fcntl.ioctl(port.fileno(), termios.TIOCEXCL)
 
 
-def _shared_sentence(path: str) -> str:
+def _port_shared_sentence(path: str) -> str:
     """Who else reads a port by now, as a sentence to be appended; empty where nobody is seen."""
     others = [] if "://" in path else other_holders(path)
-    return f" The port is shared: {held_sentence(path, others)}." if others else ""
+    return f" The port is shared: {port_in_use_sentence(path, others)}." if others else ""
 
 
 def _reason(error: BaseException) -> str:
@@ -202,9 +213,9 @@ class SerialDevice(DeviceDriver):
     called for every message that was understood. No byte from the line raises out of `run`.
     """
 
-    port = Setting("", required=True, says="serial port, such as /dev/ttyUSB0")
+    port = Setting("", required=True, help="serial port, such as /dev/ttyUSB0")
     silence_s = Setting(
-        5.0, minimum=0.5, maximum=3600, says="without a message for so long the device is silent"
+        5.0, minimum=0.5, maximum=3600, help="without a message for so long the device is silent"
     )
 
     counted = (
@@ -216,10 +227,10 @@ class SerialDevice(DeviceDriver):
         "opened",
         "silences",
     )
-    delivered = "messages"
+    delivery_counter = "messages"
     what: str = "device"
     """What it is, for the operator's sentences."""
-    silence_cure: str = "Check its power, wiring and baud rate"
+    silence_hint: str = "Check its power, wiring and baud rate"
     """What the operator is to do about its silence."""
 
     def __init__(
@@ -234,10 +245,10 @@ class SerialDevice(DeviceDriver):
         self._open_port = open_port
         self._lock = threading.Lock()
         self._line: SerialLine | None = None
-        self._heard_ns = 0
-        self._silent = False
-        self._sender: Sender | None = None
-        self._unlogged: deque[RawBytes] = deque(maxlen=UNLOGGED_KEPT)
+        self._last_message_ns = 0
+        self._is_silent = False
+        self._sender: SenderFilter | None = None
+        self._unlogged: deque[RawBytes] = deque(maxlen=UNLOGGED_MAX)
 
     # What a driver says
 
@@ -260,17 +271,17 @@ class SerialDevice(DeviceDriver):
         """Whether what was understood is of the device itself, not of somebody else on its bus."""
         return True
 
-    def heard(self, *, messages: int = 1) -> None:
+    def count_messages(self, *, messages: int = 1) -> None:
         """So many messages were understood just now."""
         if messages <= 0:
             return
         self.counters["messages"] += messages
         if self._sender is not None and self.is_identified():
             self._sender.lock()
-        self._heard_ns = self.clock.mono_ns()
-        if self._silent:
-            self._silent = False
-            self.teller.tell(
+        self._last_message_ns = self.clock.mono_ns()
+        if self._is_silent:
+            self._is_silent = False
+            self.emitter.emit(
                 "recovered", f"The {self.what} {self.name} speaks again; nothing to do."
             )
 
@@ -283,12 +294,12 @@ class SerialDevice(DeviceDriver):
         try:
             found = {"port": self.port, **self.identify(self._line)}
         except LineLostError as error:
-            self._let_go()
+            self._release_device()
             raise DeviceError(
                 f"{self.name}: port {self.port} was lost: {error}; check the cable"
             ) from error
         except DeviceError as error:
-            self._let_go()
+            self._release_device()
             if self._sender is None or not self._sender.others:
                 raise
             raise DeviceError(f"{error}; {self._sender.sentence()}") from error
@@ -297,16 +308,16 @@ class SerialDevice(DeviceDriver):
 
     # How it is done
 
-    def _reach(self) -> None:
+    def _open_device(self) -> None:
         self._line = self._line or self._open()
 
-    def _tell_opened(self) -> None:
+    def _emit_opened(self) -> None:
         # What came while binding belongs into the log as well: a replay begins there.
-        while self._unlogged and self.teller.sink is not None:
-            self.teller.sink(self._unlogged.popleft())
+        while self._unlogged and self.emitter.sink is not None:
+            self.emitter.sink(self._unlogged.popleft())
         # A silent line is opened anew again and again, which is not news.
-        if self._is_lost or not self._silent:
-            self.teller.tell("opened", f"The {self.what} {self.name} is open at {self.port}.")
+        if self._is_lost or not self._is_silent:
+            self.emitter.emit("opened", f"The {self.what} {self.name} is open at {self.port}.")
 
     def _open(self) -> SerialLine:
         baudrate, parity = self.line_settings()
@@ -319,13 +330,13 @@ class SerialDevice(DeviceDriver):
             # Who is listened to does not change because the port was opened again.
             self._sender = port.sender = self._sender or port.sender
         self.connected()
-        return SerialLine(port, self._received, lambda data: self._received(data, STALE))
+        return SerialLine(port, self._received, lambda data: self._received(data, STALE_SUFFIX))
 
     def _received(self, data: bytes, suffix: str = "") -> None:
         self.counters["bytes"] += len(data)
         raw = RawBytes(self.name + suffix, self.clock.mono_ns(), data)
-        if self.teller.sink is not None:
-            self.teller.sink(raw)
+        if self.emitter.sink is not None:
+            self.emitter.sink(raw)
         else:
             self._unlogged.append(raw)
 
@@ -334,7 +345,7 @@ class SerialDevice(DeviceDriver):
         line = self._line
         assert line is not None
         self._state = LifeCycle.ACTIVE
-        self._heard_ns = self.clock.mono_ns()
+        self._last_message_ns = self.clock.mono_ns()
         silence_ns = round(self.silence_s * 1e9)
         while not self._closing.is_set():
             try:
@@ -343,38 +354,38 @@ class SerialDevice(DeviceDriver):
                 self._count_other_senders()
             except LineLostError as error:
                 self._state = LifeCycle.INACTIVE
-                self._tell_lost(
+                self._emit_lost(
                     f"The {self.what} {self.name} at {self.port} was lost ({error}). Check cable "
-                    f"and power; it is opened again by itself.{_shared_sentence(self.port)}"
+                    f"and power; it is opened again by itself.{_port_shared_sentence(self.port)}"
                 )
                 return
-            if self.clock.mono_ns() - self._heard_ns >= silence_ns:
-                self._tell_silence()
+            if self.clock.mono_ns() - self._last_message_ns >= silence_ns:
+                self._emit_silent()
                 return
 
     def _count_other_senders(self) -> None:
         if self._sender is None or self._sender.others == self.counters["other_senders"]:
             return
         self.counters["other_senders"] = self._sender.others
-        self.teller.complain(
+        self.emitter.emit_throttled(
             "other-sender",
             f"The {self.what} {self.name} at {self.port}: {self._sender.sentence()}.",
         )
 
-    def _tell_silence(self) -> None:
-        if self._silent:
+    def _emit_silent(self) -> None:
+        if self._is_silent:
             return
-        self._silent = True
+        self._is_silent = True
         self.counters["silences"] += 1
-        self.teller.tell(
+        self.emitter.emit(
             "silent",
             f"The {self.what} {self.name} at {self.port} has said nothing understandable for "
-            f"{self.silence_s:g} s. {self.silence_cure}; the port is opened anew by itself."
-            f"{_shared_sentence(self.port)}",
+            f"{self.silence_s:g} s. {self.silence_hint}; the port is opened anew by itself."
+            f"{_port_shared_sentence(self.port)}",
             fault=True,
         )
 
-    def _let_go(self) -> None:
+    def _release_device(self) -> None:
         with self._lock:
             line, self._line = self._line, None
         if line is not None:

@@ -20,9 +20,9 @@ from drivers.contract import DeviceError
 from drivers.transport.tcp_port import host_and_number
 
 LISTEN_SCHEME: Final = "udpin://"
-SPEAK_SCHEME: Final = "udpout://"
+SEND_SCHEME: Final = "udpout://"
 DATAGRAM_NBYTES: Final = 65_536
-NEW_PORT_AFTER_S: Final = 2.0
+PORT_CHANGE_TIMEOUT_S: Final = 2.0
 """A sender that was silent for so long may come back from another port: it was restarted."""
 
 Address = tuple[str, int]
@@ -32,13 +32,13 @@ listening: Final[weakref.WeakSet[socket.socket]] = weakref.WeakSet()
 
 
 @dataclass
-class Sender:
+class SenderFilter:
     """Whose datagrams a listening port takes; it outlives the port, which may be opened again.
 
     `address` is the configured one, or that of the first sender whose message was understood. Until
     there is one, datagrams of all senders are taken. Afterwards no other address is accepted,
-    however long the sender is silent; only its own port may change, `NEW_PORT_AFTER_S` after its
-    last datagram.
+    however long the sender is silent; only its own port may change, `PORT_CHANGE_TIMEOUT_S` after
+    its last datagram.
     """
 
     address: str | None = None
@@ -55,9 +55,9 @@ class Sender:
         """Where the newest datagram that was taken came from, and answers go."""
         return self._last
 
-    def takes(self, source: Address, mono_ns: int) -> bool:
+    def accepts(self, source: Address, mono_ns: int) -> bool:
         """Whether a datagram from there is taken; one that is not is counted."""
-        is_restarted = mono_ns - self._last_ns >= NEW_PORT_AFTER_S * 1e9
+        is_restarted = mono_ns - self._last_ns >= PORT_CHANGE_TIMEOUT_S * 1e9
         is_same_port = self.port in (None, source[1]) or is_restarted
         if self.address not in (None, source[0]) or not is_same_port:
             self.others += 1
@@ -75,14 +75,14 @@ class Sender:
 
     def sentence(self) -> str:
         """How many datagrams of others were dropped, and what to do."""
-        cure = (
+        hint = (
             "correct ?from= in its port" if self.is_configured else "add ?from=ADDRESS to its port"
         )
         port = "" if self.port is None else f":{self.port}"
         return (
             f"{self.others} datagrams of other senders were dropped, the last from "
             f"{self.last_other}; only {self.address}{port} is accepted. End the other sender, or "
-            f"{cure}"
+            f"{hint}"
         )
 
 
@@ -96,7 +96,7 @@ class UdpPort:
     def __init__(
         self,
         udp: socket.socket,
-        sender: Sender | None,
+        sender: SenderFilter | None,
         *,
         mono_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
@@ -127,7 +127,7 @@ class UdpPort:
                 data, source = self._socket.recvfrom(DATAGRAM_NBYTES)
             except TimeoutError:
                 return b""
-            if self.sender is None or self.sender.takes((source[0], source[1]), self._mono_ns()):
+            if self.sender is None or self.sender.accepts((source[0], source[1]), self._mono_ns()):
                 return data
             if time.monotonic() >= until_s:
                 return b""
@@ -160,7 +160,7 @@ def open_udp_port(address: str) -> UdpPort:
         if is_listening:
             listening.add(udp)
             udp.bind(place)
-            return UdpPort(udp, Sender(only_from, is_configured=only_from is not None))
+            return UdpPort(udp, SenderFilter(only_from, is_configured=only_from is not None))
         udp.connect(place)
         return UdpPort(udp, None)
     except (OSError, UnicodeError) as error:

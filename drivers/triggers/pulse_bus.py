@@ -14,16 +14,16 @@ from typing import ClassVar, Final, Protocol
 
 from drivers.base.settings import Configured, Setting
 from drivers.contract import DeviceError, TriggerPulse
-from drivers.timescales.clock import Clock, HostClock
+from drivers.timescales.clock import Clock, MonotonicClock
 from drivers.triggers.delays import check_delays
 
 PROTOCOL: Final = ("PULSEBUS", "1")
 MAX_LINE: Final = 4096
-EARLIER_ANSWERS: Final = 32
+MAX_STALE_ANSWERS: Final = 32
 """Answers that may still come twice, or after their time."""
 
 
-class Connection(Protocol):
+class SocketLike(Protocol):
     """What is used of a `socket.socket`."""
 
     def settimeout(self, value: float, /) -> None: ...
@@ -37,11 +37,11 @@ class Connection(Protocol):
     def close(self) -> None: ...
 
 
-Connect = Callable[[str, int, float], Connection]
+Connect = Callable[[str, int, float], SocketLike]
 """Connects to host and port within so many seconds; OSError where that fails."""
 
 
-def connect_tcp(host: str, port: int, timeout_s: float) -> Connection:
+def connect_tcp(host: str, port: int, timeout_s: float) -> SocketLike:
     """A TCP connection that sends every line at once."""
     connection = socket.create_connection((host, port), timeout=timeout_s)
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -62,9 +62,9 @@ class PulseBusTrigger(Configured):
     head_trigger_source: ClassVar = "line"
     """The `trigger_source` that heads need for this trigger."""
 
-    host = Setting("127.0.0.1", required=False, says="address of the unit")
-    port = Setting(0, required=True, minimum=1, maximum=65535, says="TCP port of the unit")
-    timeout_s = Setting(0.5, minimum=0.05, maximum=5, says="longest wait for an answer")
+    host = Setting("127.0.0.1", required=False, help="address of the unit")
+    port = Setting(0, required=True, minimum=1, maximum=65535, help="TCP port of the unit")
+    timeout_s = Setting(0.5, minimum=0.05, maximum=5, help="longest wait for an answer")
 
     def __init__(
         self,
@@ -75,13 +75,13 @@ class PulseBusTrigger(Configured):
         connect: Connect = connect_tcp,
     ) -> None:
         super().__init__(name, settings)
-        self._clock: Clock = clock or HostClock()
+        self._clock: Clock = clock or MonotonicClock()
         self._connect_to = connect
         self._lock = threading.Lock()
-        self._socket: Connection | None = None
+        self._socket: SocketLike | None = None
         self._received = b""
         self._delays_ns: dict[str, int] = {}
-        self._earlier: deque[str] = deque(maxlen=EARLIER_ANSWERS)
+        self._earlier: deque[str] = deque(maxlen=MAX_STALE_ANSWERS)
         self._unit = ""
         self._outputs: tuple[str, ...] = ()
         self._closed = False
@@ -95,7 +95,7 @@ class PulseBusTrigger(Configured):
         """Connect; the unit's name, outputs and count. See `drivers.contract.Trigger`."""
         with self._lock:
             self._connect()
-            self._count = self._asked_count()
+            self._count = self._query_count()
             return {
                 "unit": self._unit,
                 "address": f"{self.host}:{self.port}",
@@ -137,7 +137,7 @@ class PulseBusTrigger(Configured):
             try:
                 self._connect()
                 before_ns = self._clock.mono_ns()
-                echo, count = self._ask(f"FIRE {sequence}", "FIRED", words=2)
+                echo, count = self._command(f"FIRE {sequence}", "FIRED", field_count=2)
                 after_ns = self._clock.mono_ns()
                 if echo != str(sequence) or not count.isdecimal():
                     raise self._lost(f"FIRE {sequence}", f"it answered for {echo}")
@@ -175,13 +175,13 @@ class PulseBusTrigger(Configured):
         known, self._count = self._count, None
         try:
             self._connect()
-            self._count = self._asked_count()
+            self._count = self._query_count()
         except DeviceError:
             return False
         return known is not None and self._count == known + 1
 
-    def _asked_count(self) -> int:
-        count = self._ask("STATUS", "STATUS")[0]
+    def _query_count(self) -> int:
+        count = self._command("STATUS", "STATUS")[0]
         if not count.isdecimal():
             raise self._lost("STATUS", f"the count {count!r} makes no sense")
         return int(count)
@@ -218,7 +218,7 @@ class PulseBusTrigger(Configured):
 
     def _send_delays(self) -> None:
         for output, delay_ns in self._delays_ns.items():
-            echo = self._ask(f"DELAY {output} {delay_ns}", "OK", words=3)
+            echo = self._command(f"DELAY {output} {delay_ns}", "OK", field_count=3)
             if echo != ["DELAY", output, str(delay_ns)]:
                 self._disconnect()
                 raise DeviceError(
@@ -226,7 +226,7 @@ class PulseBusTrigger(Configured):
                     "the unit is at fault, switch it off and on"
                 )
 
-    def _ask(self, command: str, expected: str, *, words: int = 1) -> list[str]:
+    def _command(self, command: str, expected: str, *, field_count: int = 1) -> list[str]:
         """Send a line; the words behind the expected one in the answer."""
         assert self._socket is not None
         try:
@@ -239,7 +239,7 @@ class PulseBusTrigger(Configured):
                 f"{self.name}: the trigger unit refuses {command!r}: {' '.join(answer[1:])}; "
                 "nothing was done"
             )
-        if answer[:1] != [expected] or len(answer) != words + 1:
+        if answer[:1] != [expected] or len(answer) != field_count + 1:
             raise self._lost(command, f"the answer {' '.join(answer)!r} makes no sense")
         return answer[1:]
 
@@ -256,7 +256,7 @@ class PulseBusTrigger(Configured):
                 return line.split()
             self._counters["stale_answers"] += 1
 
-    def _line(self, asked: str, deadline_ns: int | None = None) -> str:
+    def _line(self, command: str, deadline_ns: int | None = None) -> str:
         """The next line, within the time-out as a whole."""
         assert self._socket is not None
         if deadline_ns is None:
@@ -264,26 +264,26 @@ class PulseBusTrigger(Configured):
         while b"\n" not in self._received:
             left_s = (deadline_ns - self._clock.mono_ns()) * 1e-9
             if left_s <= 0:
-                raise self._lost(asked, f"no answer within {self.timeout_s:g} s")
+                raise self._lost(command, f"no answer within {self.timeout_s:g} s")
             try:
                 self._socket.settimeout(left_s)
                 piece = self._socket.recv(MAX_LINE)
             except TimeoutError:
                 continue
             except OSError as error:
-                raise self._lost(asked, error.strerror or str(error)) from error
+                raise self._lost(command, error.strerror or str(error)) from error
             if not piece or len(self._received) > MAX_LINE:
-                raise self._lost(asked, "the unit hung up" if not piece else "no end of line")
+                raise self._lost(command, "the unit hung up" if not piece else "no end of line")
             self._received += piece
         line, _, self._received = self._received.partition(b"\n")
         return line.decode("ascii", errors="replace")
 
-    def _lost(self, asked: str, why: str) -> DeviceError:
+    def _lost(self, command: str, why: str) -> DeviceError:
         """Drop the connection: a late answer must not be taken for that of the next question."""
         self._disconnect()
-        fired = "; whether the heads fired is not known" if asked.startswith("FIRE") else ""
+        fired = "; whether the heads fired is not known" if command.startswith("FIRE") else ""
         return DeviceError(
-            f"{self.name}: trigger unit at {self.host}:{self.port}, asked for {asked}: {why}"
+            f"{self.name}: trigger unit at {self.host}:{self.port}, asked for {command}: {why}"
             f"{fired}; it is connected anew at the next pulse, check power and cable"
         )
 

@@ -11,7 +11,7 @@ from typing import ClassVar
 
 from drivers.base.settings import Configured, Setting
 from drivers.contract import DeviceError, Head, TriggerPulse
-from drivers.timescales.clock import Clock, HostClock
+from drivers.timescales.clock import Clock, MonotonicClock
 from drivers.triggers.delays import check_delays
 
 log = logging.getLogger(__name__)
@@ -28,7 +28,7 @@ class SoftwareTrigger(Configured):
     fires_heads: ClassVar = True
     head_trigger_source: ClassVar = "software"
 
-    timeout_s = Setting(2.0, minimum=0.1, maximum=10, says="longest wait for the heads to be asked")
+    timeout_s = Setting(2.0, minimum=0.1, maximum=10, help="longest wait for the heads to be asked")
 
     def __init__(
         self,
@@ -39,7 +39,7 @@ class SoftwareTrigger(Configured):
         clock: Clock | None = None,
     ) -> None:
         super().__init__(name, settings)
-        self._clock: Clock = clock or HostClock()
+        self._clock: Clock = clock or MonotonicClock()
         self._heads = [(output, head) for output, group in heads.items() for head in group]
         if not self._heads:
             raise DeviceError(f"{name}: a software trigger needs at least one head")
@@ -69,12 +69,12 @@ class SoftwareTrigger(Configured):
         if self._closing.is_set():
             raise DeviceError(f"{self.name}: the trigger is closed; create a new one")
         start_ns = self._clock.mono_ns()
-        asked = {
+        pending = {
             self._threads.submit(self._fire_one, head, self._delays_ns[output], start_ns): head
             for output, head in self._heads
         }
-        done, late = concurrent.futures.wait(asked, timeout=self.timeout_s)
-        failures = [f"{asked[f].name}: not asked within {self.timeout_s:g} s" for f in late]
+        done, late = concurrent.futures.wait(pending, timeout=self.timeout_s)
+        failures = [f"{pending[f].name}: not asked within {self.timeout_s:g} s" for f in late]
         spans: list[tuple[int, int]] = []
         for future in done:
             error = future.exception()

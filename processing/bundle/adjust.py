@@ -13,28 +13,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.bundle.equations import BehindCameraError, Equations, equations
-from processing.bundle.iterations import Progress, Run, iterated, robust_weights
-from processing.bundle.network import Network, NetworkError, checked
-from processing.bundle.normal import Reduced, cofactor_matrix, point_normals
-from processing.bundle.rank import Defect, defects
-from processing.bundle.statistics import Group, groups_of, spread_of
-from processing.bundle.unknowns import Layout, State, layout_of, starting_state
+from processing.bundle.gauss_newton import Progress, Run, iterate, robust_weights
+from processing.bundle.network import Network, NetworkError, validate
+from processing.bundle.normal_equations import ReducedEquations, cofactor_matrix, point_normals
+from processing.bundle.rank_diagnosis import RankDefect, rank_defects
+from processing.bundle.statistics import ObservationGroup, groups_of, spread_of
+from processing.bundle.unknowns import ParameterLayout, ParameterValues, initial_values, layout_of
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-_LEAST_POINT_INFORMATION: Final = 1e-10
-_MOST_BEHIND: Final = 0.05
-_MOST_ROUNDS: Final = 12
-_COMPONENT_SETTLED: Final = 0.02
+_MIN_POINT_INFORMATION: Final = 1e-10
+_MAX_BEHIND_FRACTION: Final = 0.05
+_MAX_ROUNDS: Final = 12
+_COMPONENT_CONVERGED: Final = 0.02
 
 
 @dataclass(frozen=True)
-class Settings:
+class AdjustmentSettings:
     """How to adjust.
 
     Attributes:
-        most_iterations: of each Gauss-Newton run.
+        max_iterations: of each Gauss-Newton run.
         robust: first with Huber weights on image points, so that blunders pull less.
         reject_beyond: image points whose standardised residual (residual over its own a posteriori
             standard deviation) exceeds this are left out, worst first; None: no data snooping.
@@ -42,7 +42,7 @@ class Settings:
         minimum_norm: undetermined directions are no error; the shortest correction is taken.
     """
 
-    most_iterations: int = 30
+    max_iterations: int = 30
     robust: bool = False
     reject_beyond: float | None = None
     variance_components: bool = False
@@ -72,9 +72,9 @@ class Adjustment:
     """
 
     network: Network
-    layout: Layout
-    settings: Settings
-    state: State
+    layout: ParameterLayout
+    settings: AdjustmentSettings
+    state: ParameterValues
     sigma0: float
     redundancy: int
     observations: int
@@ -89,8 +89,8 @@ class Adjustment:
     rejected: Flags
     left_out: Flags
     factors: Mapping[str, float]
-    groups: tuple[Group, ...]
-    defects: tuple[Defect, ...] = field(default=())
+    groups: tuple[ObservationGroup, ...]
+    rank_defects: tuple[RankDefect, ...] = field(default=())
 
     @property
     def standardised(self) -> Array:
@@ -100,7 +100,10 @@ class Adjustment:
 
 
 def adjust(
-    network: Network, settings: Settings | None = None, *, progress: Progress | None = None
+    network: Network,
+    settings: AdjustmentSettings | None = None,
+    *,
+    progress: Progress | None = None,
 ) -> Adjustment:
     """Adjust a network by least squares.
 
@@ -112,19 +115,19 @@ def adjust(
     Raises:
         NetworkError: tables that do not fit, starting values far off, no convergence, or fewer
             observations than unknowns.
-        DefectError: something cannot be determined; it is named.
+        RankDefectError: something cannot be determined; it is named.
     """
-    checked(network)
-    settings = settings or Settings()
+    validate(network)
+    settings = settings or AdjustmentSettings()
     given = network
     weight = np.ones(len(network.image_points.image))
     rejected = np.zeros(len(weight), dtype=bool)
     factors: dict[str, float] = {}
-    state = starting_state(network)
-    tell = progress or (lambda _what, _iteration, _value: None)
+    state = initial_values(network)
+    report_progress = progress or (lambda _what, _iteration, _value: None)
     history: list[float] = []
     robust = settings.robust
-    for round_ in range(_MOST_ROUNDS + 1):
+    for round_ in range(_MAX_ROUNDS + 1):
         left_out = undetermined_points(network, state, weight)
         layout = layout_of(network, left_out)
         run = Run(
@@ -132,9 +135,9 @@ def adjust(
             layout,
             state,
             weight,
-            tell,
+            report_progress,
             history,
-            most_iterations=settings.most_iterations,
+            max_iterations=settings.max_iterations,
             minimum_norm=settings.minimum_norm,
         )
         if robust:
@@ -144,27 +147,29 @@ def adjust(
             weight = np.where(rejected, 0.0, 1.0)
             state, robust = run.state, False
             continue
-        rows, reduced = iterated(run)
+        rows, reduced = iterate(run)
         state = run.state
         result = _figures(run, settings, given, rows, reduced, left_out, rejected, factors)
-        if round_ == _MOST_ROUNDS:
+        if round_ == _MAX_ROUNDS:
             break
-        worst = _worst(result, settings.reject_beyond)
+        worst = _points_to_reject(result, settings.reject_beyond)
         if worst.any():
             rejected = rejected | worst
             weight = np.where(rejected, 0.0, 1.0)
-            tell(f"{int(rejected.sum())} image points left out", round_ + 1, history[-1])
+            report_progress(f"{int(rejected.sum())} image points left out", round_ + 1, history[-1])
             continue
-        if settings.variance_components and _unsettled(result):
-            factors = {g.name: g.factor for g in result.groups if _scalable(g)}
+        if settings.variance_components and _components_changing(result):
+            factors = {g.name: g.factor for g in result.groups if _is_estimable(g)}
             network = _rescaled(given, factors)
-            tell("variance components", round_ + 1, history[-1])
+            report_progress("variance components", round_ + 1, history[-1])
             continue
         break
     return result
 
 
-def undetermined_points(network: Network, state: State, weight: Array | None = None) -> Flags:
+def undetermined_points(
+    network: Network, state: ParameterValues, weight: Array | None = None
+) -> Flags:
     """Object points whose rays do not fix them.
 
     They are seen once or from one projection centre only; or they start behind a camera that sees
@@ -178,7 +183,7 @@ def undetermined_points(network: Network, state: State, weight: Array | None = N
     except BehindCameraError as error:
         behind = np.unique(network.image_points.point[error.image_points])
         behind = behind[~(network.points.sigma_m[behind] == 0.0).all(axis=1)]
-        if len(behind) > max(1.0, _MOST_BEHIND * len(found)):
+        if len(behind) > max(1.0, _MAX_BEHIND_FRACTION * len(found)):
             return found
         found[behind] = True
         try:
@@ -186,15 +191,15 @@ def undetermined_points(network: Network, state: State, weight: Array | None = N
         except BehindCameraError:
             return found
     values = np.linalg.eigvalsh(point_normals(rows, layout))
-    weak = ~(values[:, 0] > _LEAST_POINT_INFORMATION * np.maximum(values[:, 2], 1e-300))
+    weak = ~(values[:, 0] > _MIN_POINT_INFORMATION * np.maximum(values[:, 2], 1e-300))
     free = ~layout.locked[layout.eliminated_points].all(axis=1)
     found[layout.eliminated_points[weak & free]] = True
     return found
 
 
 def _bare_equations(
-    network: Network, left_out: Flags, state: State, weight: Array
-) -> tuple[Equations, Layout]:
+    network: Network, left_out: Flags, state: ParameterValues, weight: Array
+) -> tuple[Equations, ParameterLayout]:
     """Rows with the derivatives of object points only."""
     layout = layout_of(network, left_out)
     bare = replace(
@@ -210,20 +215,20 @@ def _bare_equations(
 
 def _figures(
     run: Run,
-    settings: Settings,
+    settings: AdjustmentSettings,
     given: Network,
     rows: Equations,
-    reduced: Reduced,
+    reduced: ReducedEquations,
     left_out: Flags,
     rejected: Flags,
     factors: Mapping[str, float],
 ) -> Adjustment:
     layout = run.layout
-    run.tell("covariances", len(run.history), run.history[-1])
+    run.report_progress("covariances", len(run.history), run.history[-1])
     cofactor = cofactor_matrix(reduced, layout.constraints, minimum_norm=run.minimum_norm)
-    found: tuple[Defect, ...] = ()
+    found: tuple[RankDefect, ...] = ()
     if run.minimum_norm:
-        found = defects(run.network, layout, run.state, reduced, singular=False)
+        found = rank_defects(run.network, layout, run.state, reduced, singular=False)
     own, leverage = spread_of(rows, reduced, cofactor)
     free_points = layout.eliminated_points
     held = layout.locked[free_points]
@@ -240,8 +245,10 @@ def _figures(
     point_cofactor = np.full((len(layout.locked), 3, 3), np.nan)
     own = np.where(held[:, :, None] | held[:, None, :], 0.0, own)
     point_cofactor[free_points] = own
-    for point in np.flatnonzero((layout.kept >= 0).any(axis=1) | _held_apart(layout)):
-        at = layout.kept[point]
+    for point in np.flatnonzero(
+        (layout.retained_points >= 0).any(axis=1) | _fixed_distance_points(layout)
+    ):
+        at = layout.retained_points[point]
         there = at >= 0
         point_cofactor[point] = 0.0
         point_cofactor[point][np.ix_(there, there)] = cofactor[np.ix_(at[there], at[there])]
@@ -266,16 +273,16 @@ def _figures(
         left_out=left_out,
         factors=dict(factors),
         groups=groups_of(rows, residual, redundancy_number, factors),
-        defects=found,
+        rank_defects=found,
     )
 
 
-def _held_apart(layout: Layout) -> Flags:
+def _fixed_distance_points(layout: ParameterLayout) -> Flags:
     """Fully held points that distances end at: neither eliminated nor with columns."""
     return np.asarray(layout.locked.all(axis=1) & (layout.eliminated < 0))
 
 
-def _worst(result: Adjustment, limit: float | None) -> Flags:
+def _points_to_reject(result: Adjustment, limit: float | None) -> Flags:
     """Image points to leave out next: beyond the limit and the largest of their image and point.
 
     One blunder makes its neighbours look bad; taking only the largest of each image and each object
@@ -299,16 +306,16 @@ def _worst(result: Adjustment, limit: float | None) -> Flags:
     )
 
 
-def _unsettled(result: Adjustment) -> bool:
+def _components_changing(result: Adjustment) -> bool:
     """Whether a variance component still differs from what the sigmas hold."""
     return any(
-        _scalable(g)
-        and abs(np.log(g.factor / result.factors.get(g.name, 1.0))) > _COMPONENT_SETTLED
+        _is_estimable(g)
+        and abs(np.log(g.factor / result.factors.get(g.name, 1.0))) > _COMPONENT_CONVERGED
         for g in result.groups
     )
 
 
-def _scalable(group: Group) -> bool:
+def _is_estimable(group: ObservationGroup) -> bool:
     """Enough redundancy for a variance component: known to about a third or better."""
     return bool(np.isfinite(group.factor) and group.factor > 0.0 and group.redundancy >= 15.0)
 
@@ -330,6 +337,9 @@ def _rescaled(network: Network, factors: Mapping[str, float]) -> Network:
         ),
         points=replace(points, sigma_m=points.sigma_m * plan_height),
         gnss=replace(gnss, sigma_m=gnss.sigma_m * gnss_scale),
-        bearings=replace(network.bearings, sigma_rad=network.bearings.sigma_rad * of("attitude")),
+        measured_attitudes=replace(
+            network.measured_attitudes,
+            sigma_rad=network.measured_attitudes.sigma_rad * of("attitude"),
+        ),
         distances=replace(network.distances, sigma_m=network.distances.sigma_m * of("distance")),
     )

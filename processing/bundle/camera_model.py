@@ -10,13 +10,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.bundle.network import Camera
+from processing.bundle.network import CameraModel
 from processing.bundle.terms import term_design
 
 Array = NDArray[np.float64]
 
 
-def principal_distance_mm(camera: Camera, interior: Array) -> float:
+def principal_distance_mm(camera: CameraModel, interior: Array) -> float:
     """What the collinearity equations project with.
 
     Australis keeps f and carries df in the correction (+x df / f); the centred model projects with
@@ -25,7 +25,7 @@ def principal_distance_mm(camera: Camera, interior: Array) -> float:
     return camera.f_mm if camera.model == "australis" else camera.f_mm - float(interior[2])
 
 
-def ideal_mm(camera: Camera, interior: Array, terms: Array, xy_mm: Array) -> Array:
+def ideal_mm(camera: CameraModel, interior: Array, terms: Array, xy_mm: Array) -> Array:
     """Ideal image coordinates (n, 2) of measured ones (n, 2), mm about the principal point.
 
     Args:
@@ -43,7 +43,7 @@ def ideal_mm(camera: Camera, interior: Array, terms: Array, xy_mm: Array) -> Arr
     return np.asarray(np.stack([x, y], axis=1) + delta)
 
 
-def interior_derivatives(camera: Camera, interior: Array, terms: Array, xy_mm: Array) -> Array:
+def interior_derivatives(camera: CameraModel, interior: Array, terms: Array, xy_mm: Array) -> Array:
     """d(ideal) / d(the ten), (n, 2, 10); df of the centred model acts in the projection: zero."""
     xy_mm = _placed(camera, terms, xy_mm)
     if camera.model == "australis":
@@ -59,7 +59,7 @@ def interior_derivatives(camera: Camera, interior: Array, terms: Array, xy_mm: A
     return result
 
 
-def term_derivatives(camera: Camera, interior: Array, terms: Array, xy_mm: Array) -> Array:
+def term_derivatives(camera: CameraModel, interior: Array, terms: Array, xy_mm: Array) -> Array:
     """d(ideal) / d(additional parameters), (n, 2, t)."""
     if not camera.terms:
         return np.zeros((len(xy_mm), 2, 0))
@@ -76,7 +76,7 @@ def term_derivatives(camera: Camera, interior: Array, terms: Array, xy_mm: Array
     return np.asarray(through @ moved)
 
 
-def _placed(camera: Camera, terms: Array, xy_mm: Array) -> Array:
+def _placed(camera: CameraModel, terms: Array, xy_mm: Array) -> Array:
     """Measured coordinates with what the additional parameters correct: they come before the ten,
     as a CCD lies behind its lens."""
     result = xy_mm
@@ -86,17 +86,17 @@ def _placed(camera: Camera, terms: Array, xy_mm: Array) -> Array:
     return result
 
 
-def _about_given(camera: Camera, xy_mm: Array) -> Array:
+def _about_given(camera: CameraModel, xy_mm: Array) -> Array:
     return np.asarray(xy_mm - np.array([camera.xp_mm, camera.yp_mm]))
 
 
-def _centred(camera: Camera, interior: Array, xy_mm: Array) -> tuple[Array, Array, Array]:
+def _centred(camera: CameraModel, interior: Array, xy_mm: Array) -> tuple[Array, Array, Array]:
     """Coordinates about the estimated principal point, after affinity and shear; and before."""
     about = xy_mm - np.array([camera.xp_mm, camera.yp_mm]) + interior[:2]
     return about[:, 0] * (1.0 + interior[8]) + about[:, 1] * interior[9], about[:, 1], about
 
 
-def _ten(camera: Camera, x: Array, y: Array) -> Array:
+def _ten(camera: CameraModel, x: Array, y: Array) -> Array:
     """The ten columns of eq. 5.1 at coordinates about the principal point, (n, 2, 10)."""
     r2 = x * x + y * y
     result = np.zeros((len(x), 2, 10))

@@ -12,16 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from processing.bundle.bent_rays import bent
 from processing.bundle.camera_model import (
     ideal_mm,
     interior_derivatives,
     principal_distance_mm,
     term_derivatives,
 )
+from processing.bundle.curvature_refraction import corrected_rays
 from processing.bundle.network import INTERIOR, Network
-from processing.bundle.rotations import logarithm, skew
-from processing.bundle.unknowns import Layout, State
+from processing.bundle.rotations import skew, vectors_from_rotations
+from processing.bundle.unknowns import ParameterLayout, ParameterValues
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -74,7 +74,12 @@ GROUPS = (
 
 
 def equations(
-    network: Network, layout: Layout, state: State, weight: Array, *, derivatives: bool = True
+    network: Network,
+    layout: ParameterLayout,
+    state: ParameterValues,
+    weight: Array,
+    *,
+    derivatives: bool = True,
 ) -> Equations:
     """All rows at the current state.
 
@@ -92,14 +97,14 @@ def equations(
     _image_rows(build, network, layout, state, weight)
     _control_rows(build, network, layout, state)
     _gnss_rows(build, network, layout, state)
-    _bearing_rows(build, network, layout, state)
+    _attitude_rows(build, network, layout, state)
     _distance_rows(build, network, layout, state)
     _prior_rows(build, network, layout, state)
     return build.equations()
 
 
 class _Builder:
-    def __init__(self, layout: Layout, derivatives: bool) -> None:
+    def __init__(self, layout: ParameterLayout, derivatives: bool) -> None:
         self.layout = layout
         self.derivatives = derivatives
         self.count = 0
@@ -148,11 +153,15 @@ class _Builder:
 
 
 def _image_rows(
-    build: _Builder, network: Network, layout: Layout, state: State, weight: Array
+    build: _Builder,
+    network: Network,
+    layout: ParameterLayout,
+    state: ParameterValues,
+    weight: Array,
 ) -> None:
     measured, images = network.image_points, network.images
     part = layout.eliminated[measured.point]
-    takes_part = (part >= 0) | (layout.kept[measured.point] >= 0).any(axis=1)
+    takes_part = (part >= 0) | (layout.retained_points[measured.point] >= 0).any(axis=1)
     takes_part |= layout.locked[measured.point].all(axis=1)
     behind: list[Indices] = []
     for index, camera in enumerate(network.cameras):
@@ -166,9 +175,11 @@ def _image_rows(
         object_from_rig = state.attitude[attitude]
         scale = np.where(network.points.at_infinity[point], 0.0, 1.0)
         ray = state.points[point] - scale[:, None] * state.station[station]
-        straight = network.rays.straight
-        if not straight:
-            ray, ray_by_point, ray_by_station = bent(ray, state.station[station, 2], network.rays)
+        is_straight = network.rays.is_straight
+        if not is_straight:
+            ray, ray_by_point, ray_by_station = corrected_rays(
+                ray, state.station[station, 2], network.rays
+            )
         in_rig = np.einsum("nji,nj->ni", object_from_rig, ray)
         rig_from_camera = np.broadcast_to(np.eye(3), (len(rows), 3, 3)).copy()
         offset = np.zeros((len(rows), 3))
@@ -193,7 +204,7 @@ def _image_rows(
             by_rig = np.einsum("nij,nkj->nik", by_seen, rig_from_camera)
             by_point = np.einsum("nij,nkj->nik", by_rig, object_from_rig)
             by_station = -by_point * scale[:, None, None]
-            if not straight:
+            if not is_straight:
                 by_point, by_station = by_point @ ray_by_point, by_point @ ray_by_station
             by_interior = -interior_derivatives(camera, interior, state.terms[index], measured_mm)
             if camera.model == "centred":
@@ -202,7 +213,7 @@ def _image_rows(
                 (layout.station[station], by_station),
                 (layout.attitude[attitude], by_rig @ skew(in_rig)),
                 (np.broadcast_to(layout.interior[index], (len(rows), 10)), by_interior),
-                (layout.kept[point], by_point),
+                (layout.retained_points[point], by_point),
             ]
             if camera.terms:
                 columns = np.broadcast_to(layout.terms[index], (len(rows), len(camera.terms)))
@@ -240,12 +251,14 @@ def _where(table: Indices, index: Indices) -> Indices:
     return np.where((index >= 0)[:, None], table[np.clip(index, 0, None)], -1)
 
 
-def _control_rows(build: _Builder, network: Network, layout: Layout, state: State) -> None:
+def _control_rows(
+    build: _Builder, network: Network, layout: ParameterLayout, state: ParameterValues
+) -> None:
     sigma = network.points.sigma_m
     part = layout.eliminated
     for axis in range(3):
         known = np.nan_to_num(sigma[:, axis]) > 0.0
-        rows = np.flatnonzero(known & ((part >= 0) | (layout.kept[:, axis] >= 0)))
+        rows = np.flatnonzero(known & ((part >= 0) | (layout.retained_points[:, axis] >= 0)))
         if not rows.size:
             continue
         unit = np.zeros((len(rows), 3))
@@ -255,27 +268,29 @@ def _control_rows(build: _Builder, network: Network, layout: Layout, state: Stat
             sigma[rows, axis],
             np.full(len(rows), 2 if axis < 2 else 3),
             rows,
-            [(layout.kept[rows, axis][:, None], np.ones((len(rows), 1)))],
+            [(layout.retained_points[rows, axis][:, None], np.ones((len(rows), 1)))],
             point=part[rows],
             point_part=unit,
         )
 
 
-def _gnss_rows(build: _Builder, network: Network, layout: Layout, state: State) -> None:
+def _gnss_rows(
+    build: _Builder, network: Network, layout: ParameterLayout, state: ParameterValues
+) -> None:
     gnss = network.gnss
     n = len(gnss.station)
     if not n:
         return
     rows = np.arange(n)
     lever = np.einsum("nij,nj->ni", state.attitude[gnss.attitude], gnss.lever_m)
-    since = _since_middle(network)
+    since = _seconds_from_mean(network)
     on_line = gnss.line >= 0
     computed = state.station[gnss.station] + lever
     if len(gnss.lines):
         line = np.clip(gnss.line, 0, None)
         bias = state.shift[line] + state.drift[line] * since[:, None]
         computed = computed + np.where(on_line[:, None], bias, 0.0)
-    turned = -np.einsum("nij,njk->nik", state.attitude[gnss.attitude], skew(gnss.lever_m))
+    rotated = -np.einsum("nij,njk->nik", state.attitude[gnss.attitude], skew(gnss.lever_m))
     for axis in range(3):
         entries = [
             (layout.station[gnss.station, axis][:, None], np.ones((n, 1))),
@@ -283,7 +298,7 @@ def _gnss_rows(build: _Builder, network: Network, layout: Layout, state: State) 
                 np.where(
                     (gnss.lever_m != 0.0).any(axis=1)[:, None], layout.attitude[gnss.attitude], -1
                 ),
-                turned[:, axis],
+                rotated[:, axis],
             ),
         ]
         if len(gnss.lines):
@@ -299,7 +314,7 @@ def _gnss_rows(build: _Builder, network: Network, layout: Layout, state: State) 
         )
 
 
-def _since_middle(network: Network) -> Array:
+def _seconds_from_mean(network: Network) -> Array:
     """Seconds since the mean time of each line's positions, so that shift and drift part."""
     gnss = network.gnss
     since = np.zeros(len(gnss.station))
@@ -310,51 +325,57 @@ def _since_middle(network: Network) -> Array:
     return since
 
 
-def _bearing_rows(build: _Builder, network: Network, layout: Layout, state: State) -> None:
-    bearings = network.bearings
-    n = len(bearings.attitude)
+def _attitude_rows(
+    build: _Builder, network: Network, layout: ParameterLayout, state: ParameterValues
+) -> None:
+    measured_attitudes = network.measured_attitudes
+    n = len(measured_attitudes.attitude)
     if not n:
         return
-    own = state.attitude[bearings.attitude]
-    misclosure = logarithm(np.einsum("nji,njk->nik", own, bearings.rotation))
-    turning = _by_turning(misclosure)
+    own = state.attitude[measured_attitudes.attitude]
+    misclosure = vectors_from_rotations(np.einsum("nji,njk->nik", own, measured_attitudes.rotation))
+    d_rotation = _rotation_jacobian(misclosure)
     for axis in range(3):
         build.add(
             misclosure[:, axis],
-            bearings.sigma_rad[:, axis],
+            measured_attitudes.sigma_rad[:, axis],
             np.full(n, 6),
             np.arange(n),
-            [(layout.attitude[bearings.attitude], turning[:, axis])],
+            [(layout.attitude[measured_attitudes.attitude], d_rotation[:, axis])],
         )
 
 
-def _by_turning(misclosure: Array) -> Array:
+def _rotation_jacobian(misclosure: Array) -> Array:
     """-d(log(exp(-d) exp(m))) / dd at d = 0, (n, 3, 3): one but for half the misclosure m."""
     k = skew(misclosure)
     return np.asarray(np.eye(3) - 0.5 * k + np.einsum("nij,njk->nik", k, k) / 12.0)
 
 
-def _distance_rows(build: _Builder, network: Network, layout: Layout, state: State) -> None:
+def _distance_rows(
+    build: _Builder, network: Network, layout: ParameterLayout, state: ParameterValues
+) -> None:
     distances = network.distances
     n = len(distances.point_a)
     if not n:
         return
-    apart = state.points[distances.point_b] - state.points[distances.point_a]
-    length = np.linalg.norm(apart, axis=1)
-    direction = apart / length[:, None]
+    separation = state.points[distances.point_b] - state.points[distances.point_a]
+    length = np.linalg.norm(separation, axis=1)
+    direction = separation / length[:, None]
     build.add(
         distances.distance_m - length,
         distances.sigma_m,
         np.full(n, 7),
         np.arange(n),
         [
-            (layout.kept[distances.point_b], direction),
-            (layout.kept[distances.point_a], -direction),
+            (layout.retained_points[distances.point_b], direction),
+            (layout.retained_points[distances.point_a], -direction),
         ],
     )
 
 
-def _prior_rows(build: _Builder, network: Network, layout: Layout, state: State) -> None:
+def _prior_rows(
+    build: _Builder, network: Network, layout: ParameterLayout, state: ParameterValues
+) -> None:
     """Pseudo-observations of interior orientation, terms and heads."""
     for index, camera in enumerate(network.cameras):
         given = np.concatenate([camera.interior, [t.value for t in camera.terms]])
@@ -366,10 +387,10 @@ def _prior_rows(build: _Builder, network: Network, layout: Layout, state: State)
         _add_prior(build, (given - now)[rows], sigma[rows], at[rows][:, None], None)
     for index, head in enumerate(network.heads):
         if head.rotation_free and head.rotation_sigma_rad is not None:
-            turned = logarithm((state.head_rotation[index].T @ head.rotation)[None])
+            rotated = vectors_from_rotations((state.head_rotation[index].T @ head.rotation)[None])
             columns = np.tile(layout.head_rotation[index], (3, 1))
             sigma = np.full(3, head.rotation_sigma_rad)
-            _add_prior(build, turned[0], sigma, columns, _by_turning(turned)[0])
+            _add_prior(build, rotated[0], sigma, columns, _rotation_jacobian(rotated)[0])
         if head.offset_free and head.offset_sigma_m is not None:
             moved = head.offset_m - state.head_offset[index]
             sigma = np.full(3, head.offset_sigma_m)

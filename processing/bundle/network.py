@@ -18,7 +18,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.bundle.bent_rays import Rays
+from processing.bundle.curvature_refraction import RayModel
 from processing.bundle.terms import Term
 
 Array = NDArray[np.float64]
@@ -39,7 +39,7 @@ class NetworkError(ValueError):
 
 
 @dataclass(frozen=True)
-class Camera:
+class CameraModel:
     """The interior orientation of one camera.
 
     `model` says how the ten act on measured coordinates (`camera_model`): `australis` is eq. 5.1 of
@@ -66,7 +66,7 @@ class Camera:
 
 
 @dataclass(frozen=True)
-class Head:
+class HeadMounting:
     """Where a camera sits in a rig: rotation rig_from_camera (3, 3), offset in rig axes, m (3,).
 
     A quantity is held at its value, estimated, or (`sigma` given, positive) estimated with its
@@ -166,7 +166,7 @@ class Gnss:
 
 
 @dataclass(frozen=True)
-class Bearings:
+class MeasuredAttitudes:
     """Measured attitudes (n, 3, 3), sigma (n, 3) rad about the axes of the camera or rig."""
 
     attitude: Indices
@@ -175,7 +175,7 @@ class Bearings:
 
 
 @dataclass(frozen=True)
-class Constraint:
+class LinearConstraint:
     """sum of coefficient * (unknown's correction against its starting value) = 0, by name."""
 
     coefficients: Mapping[str, float]
@@ -190,33 +190,33 @@ def no_gnss() -> Gnss:
     return Gnss(_index(()), _index(()), empty, empty, empty, _index(()), np.zeros(0))
 
 
-def no_bearings() -> Bearings:
-    return Bearings(_index(()), np.zeros((0, 3, 3)), np.zeros((0, 3)))
+def no_measured_attitudes() -> MeasuredAttitudes:
+    return MeasuredAttitudes(_index(()), np.zeros((0, 3, 3)), np.zeros((0, 3)))
 
 
 @dataclass(frozen=True)
 class Network:
     """All of it. `problems` names what does not fit together."""
 
-    cameras: tuple[Camera, ...]
+    cameras: tuple[CameraModel, ...]
     stations: Stations
     attitudes: Attitudes
     images: Images
     points: Points
     image_points: ImagePoints
-    heads: tuple[Head, ...] = ()
+    heads: tuple[HeadMounting, ...] = ()
     distances: Distances = field(default_factory=no_distances)
     gnss: Gnss = field(default_factory=no_gnss)
-    bearings: Bearings = field(default_factory=no_bearings)
-    constraints: tuple[Constraint, ...] = ()
-    rays: Rays = field(default_factory=Rays)
+    measured_attitudes: MeasuredAttitudes = field(default_factory=no_measured_attitudes)
+    constraints: tuple[LinearConstraint, ...] = ()
+    rays: RayModel = field(default_factory=RayModel)
 
     def problems(self) -> tuple[str, ...]:
         """One sentence for each mistake in shapes, indices and numbers; empty when it fits."""
         return tuple(_problems(self))
 
 
-def checked(network: Network) -> Network:
+def validate(network: Network) -> Network:
     """The network itself, or a NetworkError with everything that is wrong with it."""
     problems = network.problems()
     if problems:
@@ -240,7 +240,7 @@ def _problems(n: Network) -> list[str]:
     found += _indices("distance", "point", n.distances.point_b, len(n.points.names))
     found += _indices("GNSS position", "station", n.gnss.station, len(n.stations.names))
     found += _indices("GNSS position", "line", n.gnss.line, len(n.gnss.lines), least=-1)
-    found += _indices("bearing", "attitude", n.bearings.attitude, len(n.attitudes.names))
+    found += _indices("bearing", "attitude", n.measured_attitudes.attitude, len(n.attitudes.names))
     for what, array, shape in (
         ("stations", n.stations.position_m, (len(n.stations.names), 3)),
         ("attitudes", n.attitudes.rotation, (len(n.attitudes.names), 3, 3)),
@@ -257,7 +257,7 @@ def _problems(n: Network) -> list[str]:
         ("image coordinate", n.image_points.sigma_mm),
         ("distance", n.distances.sigma_m),
         ("GNSS position", n.gnss.sigma_m),
-        ("bearing", n.bearings.sigma_rad),
+        ("bearing", n.measured_attitudes.sigma_rad),
     ):
         if sigma.size and not (sigma > 0.0).all():
             found.append(f"a {what} has a sigma that is not positive; held values need no sigma")
@@ -278,7 +278,7 @@ def _problems(n: Network) -> list[str]:
         if len(set(names)) < len(names):
             twice = next(name for name in names if list(names).count(name) > 1)
             found.append(f"{what} {twice} is given twice")
-    if not n.rays.straight and n.points.at_infinity.any():
+    if not n.rays.is_straight and n.points.at_infinity.any():
         found.append("directions of a collimator have neither earth curvature nor refraction")
     return found
 

@@ -24,7 +24,7 @@ def skew(vectors: Array) -> Array:
     return result
 
 
-def exponential(vectors: Array) -> Array:
+def rotations_from_vectors(vectors: Array) -> Array:
     """Rotation matrices (n, 3, 3) of rotation vectors (n, 3), rad (Rodrigues)."""
     angle = np.linalg.norm(vectors, axis=1)
     safe = np.where(angle < _SMALL, 1.0, angle)
@@ -38,7 +38,7 @@ def exponential(vectors: Array) -> Array:
     )
 
 
-def logarithm(rotations: Array) -> Array:
+def vectors_from_rotations(rotations: Array) -> Array:
     """Rotation vectors (n, 3), rad, of rotations (n, 3, 3) below half a turn."""
     vector = 0.5 * np.stack(
         [

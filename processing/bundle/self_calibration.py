@@ -21,7 +21,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final, Literal
 
-from processing.bundle.network import Camera
+from processing.bundle.network import CameraModel
 from processing.bundle.terms import Kind, Part, Term
 from processing.geometry.placement import nominal_placements
 from processing.geometry.topology import footprint
@@ -64,14 +64,14 @@ def parts_of(rig: Rig) -> tuple[Part, ...]:
     return tuple(found)
 
 
-def self_calibrating(
-    camera: Camera,
+def with_self_calibration(
+    camera: CameraModel,
     name: SetName,
     parts: tuple[Part, ...] = (),
     *,
     master_cone: str | None = "",
     interior: bool = False,
-) -> Camera:
+) -> CameraModel:
     """The camera with a set of additional parameters to be estimated.
 
     Args:
@@ -116,6 +116,6 @@ def self_calibrating(
     return replace(camera, free=frozenset(free), terms=tuple(terms), gauges=tuple(gauges))
 
 
-def parameter_count(camera: Camera) -> int:
+def parameter_count(camera: CameraModel) -> int:
     """Independent parameters of a camera: what is estimated less its gauges."""
     return len(camera.free) + len(camera.terms) - len(camera.gauges)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from processing.bundle.equations import Equations
-from processing.bundle.normal import Reduced
+from processing.bundle.normal_equations import ReducedEquations
 
 Array = NDArray[np.float64]
 
@@ -22,7 +22,7 @@ _PART_BYTES = 64_000_000
 
 
 @dataclass(frozen=True)
-class Group:
+class ObservationGroup:
     """One kind of observation.
 
     `factor` is its variance component: the a posteriori over the a priori sigma, squared, NaN
@@ -37,7 +37,9 @@ class Group:
     worst: float
 
 
-def spread_of(equations: Equations, reduced: Reduced, cofactor: Array) -> tuple[Array, Array]:
+def spread_of(
+    equations: Equations, reduced: ReducedEquations, cofactor: Array
+) -> tuple[Array, Array]:
     """Cofactors of the eliminated points, and how much of each observation's error stays.
 
     Args:
@@ -85,7 +87,7 @@ def spread_of(equations: Equations, reduced: Reduced, cofactor: Array) -> tuple[
     return np.asarray(cofactors), np.asarray(np.clip(leverage, 0.0, 1.0))
 
 
-def _own_products(reduced: Reduced, cofactor: Array) -> Array:
+def _own_products(reduced: ReducedEquations, cofactor: Array) -> Array:
     """a Q a' of every row's columns a, (m,): rows with as many sparse entries go together."""
     thin, dense = reduced.sparse_columns, reduced.dense_columns
     rows, among_dense = reduced.design_sparse, cofactor[np.ix_(dense, dense)]
@@ -112,7 +114,7 @@ def _own_products(reduced: Reduced, cofactor: Array) -> Array:
 
 def groups_of(
     equations: Equations, residual: Array, redundancy: Array, factors: Mapping[str, float]
-) -> tuple[Group, ...]:
+) -> tuple[ObservationGroup, ...]:
     """Residuals and variance components of each kind of observation.
 
     Args:
@@ -130,7 +132,7 @@ def groups_of(
         squares = float(residual[rows] @ residual[rows])
         natural = residual[rows] * equations.sigma[rows]
         found.append(
-            Group(
+            ObservationGroup(
                 name=name,
                 count=int(rows.sum()),
                 redundancy=share,
@@ -143,7 +145,7 @@ def groups_of(
 
 
 def _parts(
-    reduced: Reduced, cofactor: Array
+    reduced: ReducedEquations, cofactor: Array
 ) -> Iterator[tuple[int, int, Array, sparse.csr_array, Array]]:
     """Points low..high, their coupling times the cofactors (3n, c), and the coupling itself."""
     points = len(reduced.point_factor)

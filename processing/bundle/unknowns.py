@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.bundle.network import INTERIOR, Constraint, Network, NetworkError
-from processing.bundle.rotations import exponential
+from processing.bundle.network import INTERIOR, LinearConstraint, Network, NetworkError
+from processing.bundle.rotations import rotations_from_vectors
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -32,7 +32,7 @@ class Unknown(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Layout:
+class ParameterLayout:
     """Columns of the unknowns; -1 is held.
 
     Attributes:
@@ -56,7 +56,7 @@ class Layout:
     terms: tuple[Indices, ...]
     shift: Indices
     drift: Indices
-    kept: Indices
+    retained_points: Indices
     eliminated: Indices
     locked: NDArray[np.bool_]
     unknowns: tuple[Unknown, ...]
@@ -73,7 +73,7 @@ class Layout:
 
 
 @dataclass(frozen=True)
-class State:
+class ParameterValues:
     """Current values of everything that may be unknown; shapes as in the network."""
 
     station: Array
@@ -87,11 +87,11 @@ class State:
     points: Array
 
 
-def starting_state(network: Network) -> State:
+def initial_values(network: Network) -> ParameterValues:
     """The values the network was given with."""
     heads = network.heads
     lines = len(network.gnss.lines)
-    return State(
+    return ParameterValues(
         station=network.stations.position_m.copy(),
         attitude=network.attitudes.rotation.copy(),
         head_rotation=np.array([h.rotation for h in heads]).reshape(-1, 3, 3),
@@ -104,7 +104,7 @@ def starting_state(network: Network) -> State:
     )
 
 
-def layout_of(network: Network, left_out: NDArray[np.bool_]) -> Layout:
+def layout_of(network: Network, left_out: NDArray[np.bool_]) -> ParameterLayout:
     """Give every unknown its column.
 
     Args:
@@ -157,18 +157,18 @@ def layout_of(network: Network, left_out: NDArray[np.bool_]) -> Layout:
     shift = [take(network.gnss.drift != "none", "GNSS shift", line, xyz) for line in lines]
     drift = [take(network.gnss.drift == "linear", "GNSS drift", line, xyz) for line in lines]
     locked = network.points.sigma_m == 0.0
-    kept = np.full((len(network.points.names), 3), -1, dtype=np.int64)
+    retained_points = np.full((len(network.points.names), 3), -1, dtype=np.int64)
     tied = np.union1d(network.distances.point_a, network.distances.point_b)
     for point in tied:
         for axis in range(3):
             if not locked[point, axis]:
-                kept[point, axis] = len(columns)
+                retained_points[point, axis] = len(columns)
                 columns.append(Unknown("point", network.points.names[point], xyz[axis]))
     eliminated = np.full(len(locked), -1, dtype=np.int64)
     free = ~left_out
     free[tied] = False
     eliminated[free] = np.arange(int(free.sum()))
-    return Layout(
+    return ParameterLayout(
         station=_table(station, 3),
         attitude=_table(attitude, 3),
         head_rotation=_table(head_rotation, 3),
@@ -177,7 +177,7 @@ def layout_of(network: Network, left_out: NDArray[np.bool_]) -> Layout:
         terms=tuple(terms),
         shift=_table(shift, 3),
         drift=_table(drift, 3),
-        kept=kept,
+        retained_points=retained_points,
         eliminated=eliminated,
         locked=locked,
         unknowns=tuple(columns),
@@ -185,7 +185,9 @@ def layout_of(network: Network, left_out: NDArray[np.bool_]) -> Layout:
     )
 
 
-def improved(state: State, layout: Layout, dx: Array, dpoints: Array) -> State:
+def apply_corrections(
+    state: ParameterValues, layout: ParameterLayout, dx: Array, dpoints: Array
+) -> ParameterValues:
     """The state with corrections dx (columns,) and those of eliminated points (n, 3) applied."""
 
     def part(columns: Indices) -> Array:
@@ -195,13 +197,13 @@ def improved(state: State, layout: Layout, dx: Array, dpoints: Array) -> State:
             else (np.zeros(columns.shape))
         )
 
-    points = state.points + part(layout.kept)
+    points = state.points + part(layout.retained_points)
     points[layout.eliminated_points] += dpoints
     return replace(
         state,
         station=state.station + part(layout.station),
-        attitude=state.attitude @ exponential(part(layout.attitude)),
-        head_rotation=state.head_rotation @ exponential(part(layout.head_rotation)),
+        attitude=state.attitude @ rotations_from_vectors(part(layout.attitude)),
+        head_rotation=state.head_rotation @ rotations_from_vectors(part(layout.head_rotation)),
         head_offset=state.head_offset + part(layout.head_offset),
         interior=state.interior + part(layout.interior),
         terms=tuple(v + part(c) for v, c in zip(state.terms, layout.terms, strict=True)),
@@ -219,7 +221,7 @@ def _used(network: Network) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     station[network.images.station[seen]] = True
     attitude[network.images.attitude[seen]] = True
     station[network.gnss.station] = True
-    attitude[network.bearings.attitude] = True
+    attitude[network.measured_attitudes.attitude] = True
     return station, attitude
 
 
@@ -232,7 +234,7 @@ def _constraints(network: Network, columns: list[Unknown]) -> Array:
     wanted = list(network.constraints)
     for camera in network.cameras:
         wanted += [
-            Constraint({f"camera {camera.name} {name}": 1.0 for name in gauge})
+            LinearConstraint({f"camera {camera.name} {name}": 1.0 for name in gauge})
             for gauge in camera.gauges
         ]
     rows = np.zeros((len(wanted), len(columns)))

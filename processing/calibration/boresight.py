@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.bundle.rotations import exponential, logarithm, skew
+from processing.bundle.rotations import rotations_from_vectors, skew, vectors_from_rotations
 from processing.geometry.orientation import BODY_FROM_CAMERA, level_from_body
 
 Array = NDArray[np.float64]
@@ -28,16 +28,16 @@ PARAMETERS: Final = (
     *("position shift east", "position shift north", "position shift up"),
 )
 GROUPS: Final = {"boresight": (0, 1, 2), "lever": (3, 4, 5), "time": (6,), "shift": (7, 8, 9)}
-WORTH: Final = np.array([1e-3, 1e-3, 1e-3, 0.5, 0.5, 0.5, 5e-3, 0.5, 0.5, 0.5])
+PARAMETER_SCALES: Final = np.array([1e-3, 1e-3, 1e-3, 0.5, 0.5, 0.5, 5e-3, 0.5, 0.5, 0.5])
 """rad, m, s, m: a direction known no better than this is as good as unknown."""
 
-_TAKES_PART: Final = 0.05
+_MIN_PARTICIPATION: Final = 0.05
 _ITERATIONS: Final = 8
-_LEAST_SPREAD_MPS: Final = 2.0
+_MIN_SPEED_SPREAD_MPS: Final = 2.0
 
 
 @dataclass(frozen=True)
-class Controlled:
+class ImageOrientations:
     """Orientations of n exposures from an adjustment that knew nothing of the trajectory.
 
     `centre_m` (n, 3) projection centres in object axes (east, north, up); `rotation` (n, 3, 3)
@@ -51,7 +51,7 @@ class Controlled:
 
 
 @dataclass(frozen=True)
-class Inertial:
+class InertialOrientations:
     """What receiver and inertial unit said at the same n mid-exposures, in the same object axes.
 
     `position_m` (n, 3) of the antenna; `velocity_mps` (n, 3); `rotation` (n, 3, 3) object from
@@ -68,7 +68,7 @@ class Inertial:
 
 
 @dataclass(frozen=True)
-class Mounting:
+class ImuMounting:
     """How the rig sits against the inertial unit and antenna.
 
     `imu_from_body` (3, 3); `antenna_m` (3,) from the rig's origin, forward, right, down;
@@ -83,7 +83,7 @@ class Mounting:
 
 
 @dataclass(frozen=True)
-class Unseparated:
+class InseparableParameters:
     """Parameters this flight does not part: a sentence with the cure, and who takes part."""
 
     sentence: str
@@ -91,7 +91,7 @@ class Unseparated:
 
 
 @dataclass(frozen=True)
-class Boresight:
+class BoresightCalibration:
     """What a calibration flight says.
 
     `covariance` (10, 10) in the order of `PARAMETERS` (rad, m, s), within what is determined: held
@@ -101,12 +101,12 @@ class Boresight:
     value one.
     """
 
-    mounting: Mounting
+    mounting: ImuMounting
     covariance: Array
     determined: NDArray[np.bool_]
     basis: Array
     held: tuple[str, ...]
-    unseparated: tuple[Unseparated, ...]
+    inseparable: tuple[InseparableParameters, ...]
     position_residual_m: Array
     attitude_residual_rad: Array
     sigma0: float
@@ -125,14 +125,14 @@ class Boresight:
         return np.asarray(self.covariance / spread / spread[:, None])
 
 
-def calibrated(
-    controlled: Controlled,
-    inertial: Inertial,
-    given: Mounting,
+def calibrate_boresight(
+    image_orientations: ImageOrientations,
+    inertial: InertialOrientations,
+    given: ImuMounting,
     *,
     held: Collection[str] = (),
     lever_sigma_m: float | None = None,
-) -> Boresight:
+) -> BoresightCalibration:
     """Compare inertial with controlled orientation.
 
     Args:
@@ -144,40 +144,44 @@ def calibrated(
     Raises:
         ValueError: fewer than three exposures, tables that do not fit, or an unknown group.
     """
-    n = len(controlled.centre_m)
-    _check(controlled, inertial, held)
+    n = len(image_orientations.centre_m)
+    _check(image_orientations, inertial, held)
     free = np.ones(10, dtype=bool)
     for group in held:
         free[list(GROUPS[group])] = False
     at = given
     if free[0]:
-        at = replace(given, imu_from_body=_mean_boresight(controlled, inertial))
+        at = replace(given, imu_from_body=_mean_boresight(image_orientations, inertial))
     for _ in range(_ITERATIONS):
-        misclosure, design, by_image = _equations(controlled, inertial, at)
-        weight = np.linalg.inv(_observation_covariance(controlled, inertial, at, by_image))
-        scaled = design[:, free] * WORTH[free]
+        misclosure, design, by_image = _equations(image_orientations, inertial, at)
+        weight = np.linalg.inv(_observation_covariance(image_orientations, inertial, at, by_image))
+        scaled = design[:, free] * PARAMETER_SCALES[free]
         normal = scaled.T @ weight @ scaled
         right = scaled.T @ weight @ misclosure
         prior = np.zeros(10)
         if lever_sigma_m is not None:
-            prior[3:6] = (WORTH[3:6] / lever_sigma_m) ** 2
-            away = (at.antenna_m - given.antenna_m) / WORTH[3:6]
-            kept = np.flatnonzero(free)
-            right[np.isin(kept, (3, 4, 5))] -= (prior[3:6] * away)[free[3:6]]
+            prior[3:6] = (PARAMETER_SCALES[3:6] / lever_sigma_m) ** 2
+            away = (at.antenna_m - given.antenna_m) / PARAMETER_SCALES[3:6]
+            free_columns = np.flatnonzero(free)
+            right[np.isin(free_columns, (3, 4, 5))] -= (prior[3:6] * away)[free[3:6]]
         normal = normal + np.diag(prior[free])
         values, vectors = np.linalg.eigh(normal)
         known = values > 1.0
         basis = vectors[:, known]
         step = np.zeros(10)
-        step[free] = WORTH[free] * (basis @ ((basis.T @ right) / values[known]))
-        step[free] += WORTH[free] * _back(at, step, given, vectors[:, ~known], free)
-        at = _moved(at, step)
-        if np.abs(step / WORTH).max(initial=0.0) < 1e-9:
+        step[free] = PARAMETER_SCALES[free] * (basis @ ((basis.T @ right) / values[known]))
+        step[free] += PARAMETER_SCALES[free] * _back(at, step, given, vectors[:, ~known], free)
+        at = _with_step(at, step)
+        if np.abs(step / PARAMETER_SCALES).max(initial=0.0) < 1e-9:
             break
-    misclosure, _, _ = _equations(controlled, inertial, at)
-    whole = np.zeros((10, int(known.sum())))
-    whole[free] = basis
-    covariance = (whole * WORTH[:, None]) / values[known] @ (whole * WORTH[:, None]).T
+    misclosure, _, _ = _equations(image_orientations, inertial, at)
+    full_basis = np.zeros((10, int(known.sum())))
+    full_basis[free] = basis
+    covariance = (
+        (full_basis * PARAMETER_SCALES[:, None])
+        / values[known]
+        @ (full_basis * PARAMETER_SCALES[:, None]).T
+    )
     lost = np.zeros((10, int((~known).sum())))
     lost[free] = vectors[:, ~known]
     squares = float(misclosure @ weight @ misclosure)
@@ -187,13 +191,13 @@ def calibrated(
         observations += 3
     redundancy = observations - int(known.sum())
     residual = misclosure.reshape(n, 6)
-    return Boresight(
+    return BoresightCalibration(
         mounting=at,
         covariance=np.asarray(covariance),
-        determined=free & ((lost**2).sum(axis=1) < _TAKES_PART),
-        basis=whole,
+        determined=free & ((lost**2).sum(axis=1) < _MIN_PARTICIPATION),
+        basis=full_basis,
         held=tuple(held),
-        unseparated=_named(lost, inertial),
+        inseparable=_named(lost, inertial),
         position_residual_m=residual[:, :3],
         attitude_residual_rad=residual[:, 3:],
         sigma0=math.sqrt(squares / redundancy) if redundancy > 0 else math.nan,
@@ -213,7 +217,7 @@ def roll_pitch_heading(imu_from_body: Array) -> Array:
     )
 
 
-def angle_covariance(found: Boresight) -> Array:
+def angle_covariance(found: BoresightCalibration) -> Array:
     """Covariance (3, 3), rad squared, of roll, pitch and heading of the boresight."""
     step = 1e-6
     here = roll_pitch_heading(found.mounting.imu_from_body)
@@ -221,7 +225,8 @@ def angle_covariance(found: Boresight) -> Array:
         [
             (
                 roll_pitch_heading(
-                    found.mounting.imu_from_body @ exponential(step * np.eye(3)[k : k + 1])[0]
+                    found.mounting.imu_from_body
+                    @ rotations_from_vectors(step * np.eye(3)[k : k + 1])[0]
                 )
                 - here
             )
@@ -239,9 +244,9 @@ def mounting_of(
     *,
     time_offset_s: float = 0.0,
     shift_m: Array | None = None,
-) -> Mounting:
+) -> ImuMounting:
     """A mounting from a lever arm and roll, pitch, heading of the boresight."""
-    return Mounting(
+    return ImuMounting(
         level_from_body(*(float(v) for v in boresight_rad)),
         np.asarray(antenna_m, dtype=np.float64),
         time_offset_s,
@@ -249,69 +254,73 @@ def mounting_of(
     )
 
 
-def _check(controlled: Controlled, inertial: Inertial, held: Collection[str]) -> None:
-    n = len(controlled.centre_m)
+def _check(
+    image_orientations: ImageOrientations, inertial: InertialOrientations, held: Collection[str]
+) -> None:
+    n = len(image_orientations.centre_m)
     unknown = sorted(set(held) - set(GROUPS))
     if unknown:
         raise ValueError(f"{unknown} cannot be held; one of {', '.join(GROUPS)} can")
     if n < 3:
         raise ValueError(f"{n} exposures with both orientations; a comparison takes three or more")
-    if len(inertial.position_m) != n or controlled.covariance.shape != (6 * n, 6 * n):
+    if len(inertial.position_m) != n or image_orientations.covariance.shape != (6 * n, 6 * n):
         raise ValueError(
             f"{n} controlled exposures, {len(inertial.position_m)} inertial ones, covariance "
-            f"{controlled.covariance.shape}; the same exposures and (6n, 6n) are needed"
+            f"{image_orientations.covariance.shape}; the same exposures and (6n, 6n) are needed"
         )
 
 
-def _mean_boresight(controlled: Controlled, inertial: Inertial) -> Array:
-    body = controlled.rotation @ BODY_FROM_CAMERA.T
+def _mean_boresight(image_orientations: ImageOrientations, inertial: InertialOrientations) -> Array:
+    body = image_orientations.rotation @ BODY_FROM_CAMERA.T
     relative = np.einsum("nji,njk->nik", inertial.rotation, body)
     mean = relative[0]
     for _ in range(5):
-        off = logarithm(np.einsum("ji,njk->nik", mean, relative))
-        mean = mean @ exponential(off.mean(axis=0)[None])[0]
+        off = vectors_from_rotations(np.einsum("ji,njk->nik", mean, relative))
+        mean = mean @ rotations_from_vectors(off.mean(axis=0)[None])[0]
     return np.asarray(mean)
 
 
-def _moved(at: Mounting, step: Array) -> Mounting:
-    return Mounting(
-        at.imu_from_body @ exponential(step[None, :3])[0],
+def _with_step(at: ImuMounting, step: Array) -> ImuMounting:
+    return ImuMounting(
+        at.imu_from_body @ rotations_from_vectors(step[None, :3])[0],
         at.antenna_m + step[3:6],
         at.time_offset_s + float(step[6]),
         at.shift_m + step[7:],
     )
 
 
-def _back(at: Mounting, step: Array, given: Mounting, lost: Array, free: Array) -> Array:
+def _back(at: ImuMounting, step: Array, given: ImuMounting, lost: Array, free: Array) -> Array:
     """A way along unseparated directions (scaled) that leaves lever arm and time as given, so that
     the shift of positions takes what nobody can tell."""
     moved = np.zeros(10)
     moved[3:6] = at.antenna_m - given.antenna_m
     moved[6] = at.time_offset_s - given.time_offset_s
-    away = ((moved + step) / WORTH)[free]
+    away = ((moved + step) / PARAMETER_SCALES)[free]
     mounted = np.isin(np.flatnonzero(free), (3, 4, 5, 6))
     way, *_ = np.linalg.lstsq(lost[mounted], -away[mounted], rcond=1e-3)
     return np.asarray(lost @ way)
 
 
 def _equations(
-    controlled: Controlled, inertial: Inertial, at: Mounting
+    image_orientations: ImageOrientations, inertial: InertialOrientations, at: ImuMounting
 ) -> tuple[Array, Array, Array]:
     """Misclosures (6n,), their sensitivity to the ten with reversed sign (6n, 10), and to the
     controlled orientations (n, 6, 6)."""
-    n = len(controlled.centre_m)
-    body = controlled.rotation @ BODY_FROM_CAMERA.T
-    turned = exponential(inertial.rate_rad_per_s * at.time_offset_s)
+    n = len(image_orientations.centre_m)
+    body = image_orientations.rotation @ BODY_FROM_CAMERA.T
+    rotation_in_offset = rotations_from_vectors(inertial.rate_rad_per_s * at.time_offset_s)
     misclosure = np.zeros((n, 6))
     misclosure[:, :3] = (
         inertial.position_m
         + inertial.velocity_mps * at.time_offset_s
-        - controlled.centre_m
+        - image_orientations.centre_m
         - body @ at.antenna_m
         - at.shift_m
     )
-    seen = np.einsum("nji,njk->nik", body, inertial.rotation @ turned @ at.imu_from_body)
-    misclosure[:, 3:] = logarithm(seen)
+    seen = np.einsum(
+        "nji,njk->nik", body, inertial.rotation @ rotation_in_offset @ at.imu_from_body
+    )
+    misclosure[:, 3:] = vectors_from_rotations(seen)
     design = np.zeros((n, 6, 10))
     design[:, 3:, :3] = -np.eye(3)
     design[:, :3, 3:6] = body
@@ -321,16 +330,19 @@ def _equations(
     by_image = np.zeros((n, 6, 6))
     by_image[:, :3, :3] = -np.eye(3)
     arm = BODY_FROM_CAMERA.T @ at.antenna_m
-    by_image[:, :3, 3:] = controlled.rotation @ skew(arm[None])[0]
+    by_image[:, :3, 3:] = image_orientations.rotation @ skew(arm[None])[0]
     by_image[:, 3:, 3:] = -BODY_FROM_CAMERA
     return misclosure.ravel(), design.reshape(6 * n, 10), by_image
 
 
 def _observation_covariance(
-    controlled: Controlled, inertial: Inertial, at: Mounting, by_image: Array
+    image_orientations: ImageOrientations,
+    inertial: InertialOrientations,
+    at: ImuMounting,
+    by_image: Array,
 ) -> Array:
     n = len(by_image)
-    blocks = controlled.covariance.reshape(n, 6, n, 6)
+    blocks = image_orientations.covariance.reshape(n, 6, n, 6)
     covariance = np.einsum("iab,ibjc,jdc->iajd", by_image, blocks, by_image, optimize=True)
     own = at.imu_from_body.T @ np.diag(inertial.attitude_sigma_rad**2) @ at.imu_from_body
     for k in range(n):
@@ -339,12 +351,12 @@ def _observation_covariance(
     return np.asarray(covariance.reshape(6 * n, 6 * n))
 
 
-def _named(lost: Array, inertial: Inertial) -> tuple[Unseparated, ...]:
+def _named(lost: Array, inertial: InertialOrientations) -> tuple[InseparableParameters, ...]:
     """Sentences for undetermined directions (10, k), scaled by their worth."""
     if not lost.shape[1]:
         return ()
-    together = (lost @ lost.T > _TAKES_PART) | (lost @ lost.T < -_TAKES_PART)
-    left = [int(k) for k in np.flatnonzero((lost**2).sum(axis=1) >= _TAKES_PART)]
+    together = (lost @ lost.T > _MIN_PARTICIPATION) | (lost @ lost.T < -_MIN_PARTICIPATION)
+    left = [int(k) for k in np.flatnonzero((lost**2).sum(axis=1) >= _MIN_PARTICIPATION)]
     found = []
     while left:
         group, queue = {left[0]}, [left[0]]
@@ -359,19 +371,19 @@ def _named(lost: Array, inertial: Inertial) -> tuple[Unseparated, ...]:
     return tuple(found)
 
 
-def _sentence(group: list[int], inertial: Inertial) -> Unseparated:
+def _sentence(group: list[int], inertial: InertialOrientations) -> InseparableParameters:
     names = tuple(PARAMETERS[k] for k in group)
     listed = " and ".join([", ".join(names[:-1]), names[-1]]) if len(names) > 1 else names[0]
     has = set(group)
     speed = np.linalg.norm(inertial.velocity_mps, axis=1)
-    cures = []
-    if 6 in has and 3 in has and float(np.ptp(speed)) < _LEAST_SPREAD_MPS:
-        cures.append(f"all lines were flown at {speed.mean():.0f} m/s: fly two speeds")
+    hints = []
+    if 6 in has and 3 in has and float(np.ptp(speed)) < _MIN_SPEED_SPREAD_MPS:
+        hints.append(f"all lines were flown at {speed.mean():.0f} m/s: fly two speeds")
     if has & {3, 4, 6} and has & {7, 8}:
-        cures.append("fly lines in opposite and in crossing directions")
+        hints.append("fly lines in opposite and in crossing directions")
     if {5, 9} <= has:
-        cures.append("level flight never parts them: survey the lever arm and give --lever-sigma")
-    if not cures:
-        cures.append("fly two heights, opposite and crossing lines and two speeds, or hold one")
+        hints.append("level flight never parts them: survey the lever arm and give --lever-sigma")
+    if not hints:
+        hints.append("fly two heights, opposite and crossing lines and two speeds, or hold one")
     verb = "cannot be told apart" if len(names) > 1 else "cannot be determined"
-    return Unseparated(f"{listed} {verb}: {'; '.join(cures)}", names)
+    return InseparableParameters(f"{listed} {verb}: {'; '.join(hints)}", names)

@@ -23,19 +23,19 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from processing.bundle.rotations import angles_by_rotation_vector, omega_phi_kappa
-from processing.mosaic.mounting import place_covariance, turned
-from processing.mosaic.stitch_record import TURNS, StitchRecord
+from processing.mosaic.mounting import place_covariance, rotated_mounting
+from processing.mosaic.stitch_record import ROTATIONS, StitchRecord
 from processing.rig import Cone, Rig
 
 Array = NDArray[np.float64]
 
-LEAST_EXPOSURES: Final = 3
-LEAST_SYNTOPIC: Final = 12
+MIN_EXPOSURES: Final = 3
+MIN_EXPOSURES_SYNTOPIC: Final = 12
 """Cones that fire one after the other are turned by the aircraft in between: more are needed."""
-LEAST_SIGMA_URAD: Final = 2.0
+MIN_SIGMA_URAD: Final = 2.0
 """A mount is not claimed to keep its angles better than this from flight to flight."""
 COLOUR_SHIFT_PX: Final = 0.002
-COLOUR_TURN_PX: Final = 0.001
+COLOUR_ROTATION_PX: Final = 0.001
 """What matching of PAN to the colour master leaves in every exposure alike, colour pixels: of
 shift, and at the corners turned about the middle. Measured on rendered flights
 (docs/calibration.md)."""
@@ -43,29 +43,30 @@ REGISTERED_PX: Final = 0.02
 """The same of a band registered to the colour master, shift and turn (docs/dmc.md)."""
 HEIGHT_SIGMA: Final = 0.02
 """How well the mean height above ground is known, of itself: relief, and the plan's own error."""
-_OUTLYING: Final = 5.0
-_SPREAD_OF_MEDIAN: Final = 1.4826
+_OUTLIER_LIMIT: Final = 5.0
+_MAD_TO_SIGMA: Final = 1.4826
 _SCATTER_ALPHA: Final = 0.01
 
 
 @dataclass(frozen=True)
-class CalibratedCone:
+class CalibratedConeMounting:
     """One cone, turned as the exposures say.
 
-    `turn_rad` against the calibration flown with, `turn_sigma_rad` of the mean, the sensor's place
-    in its head taken as calibrated; `scatter_rad` is that of a single exposure. `angles_rad` are
-    omega, phi, kappa with `angles_sigma_rad`, which holds the place's share too; so does the turn's
-    `covariance` (3, 3). `turns` (n, 3) are the exposures used, numbers `used` among the records.
+    `correction_rad` against the calibration flown with, `correction_sigma_rad` of the mean, the
+    sensor's place in its head taken as calibrated; `scatter_rad` is that of a single exposure.
+    `angles_rad` are omega, phi, kappa with `angles_sigma_rad`, which holds the place's share too;
+    so does the turn's `covariance` (3, 3). `turns` (n, 3) are the exposures used, numbers `used`
+    among the records.
     """
 
     cone: str
-    turn_rad: Array
-    turn_sigma_rad: Array
+    correction_rad: Array
+    correction_sigma_rad: Array
     scatter_rad: Array
     angles_rad: Array
     angles_sigma_rad: Array
     covariance: Array
-    turns: Array
+    corrections: Array
     used: tuple[int, ...]
     left_out: int
     unexplained_rad: Array
@@ -74,15 +75,15 @@ class CalibratedCone:
     @property
     def sigma_urad(self) -> float:
         """What a single exposure may find the mounting off by, for the rig file."""
-        own = float(np.sqrt(np.max(self.turn_sigma_rad**2 + self.unexplained_rad**2))) * 1e6
-        return max(own, LEAST_SIGMA_URAD)
+        own = float(np.sqrt(np.max(self.correction_sigma_rad**2 + self.unexplained_rad**2))) * 1e6
+        return max(own, MIN_SIGMA_URAD)
 
 
 @dataclass(frozen=True)
 class PlatformCalibration:
     """`cones` that could be calibrated; `missing` those that no or too few exposures tell of."""
 
-    cones: tuple[CalibratedCone, ...]
+    cones: tuple[CalibratedConeMounting, ...]
     missing: tuple[str, ...]
 
 
@@ -103,15 +104,17 @@ def calibrate_platform(rig: Rig, records: Sequence[StitchRecord]) -> PlatformCal
             )
     heads = [cone.name for cone in rig.pan_cones] if rig.has_virtual_camera else []
     complete = [
-        k for k, r in enumerate(records) if all(_tells(rig, rig.cone(name), r) for name in heads)
+        k
+        for k, r in enumerate(records)
+        if all(_is_usable_record(rig, rig.cone(name), r) for name in heads)
     ]
     cones, missing = [], []
     for cone in rig.cones:
         if cone.name == rig.master_cone:
             continue
-        among = complete if cone.name in heads else range(len(records))
-        telling = [k for k in among if _tells(rig, cone, records[k])]
-        found = _calibrated(rig, cone, records, telling)
+        candidates = complete if cone.name in heads else range(len(records))
+        usable = [k for k in candidates if _is_usable_record(rig, cone, records[k])]
+        found = _calibrated(rig, cone, records, usable)
         if found is None:
             missing.append(cone.name)
         else:
@@ -138,7 +141,7 @@ def calibrated_rig(
 
 
 @dataclass(frozen=True)
-class Mistaken:
+class ConfoundingEffect:
     """What passes for a turn of a cone and cannot be told from one, rad (about x, y, z).
 
     `places` of the sensors, the datum's too (one standard deviation, held in the angles' sigma);
@@ -152,84 +155,86 @@ class Mistaken:
     height: Array
 
 
-def mistaken(rig: Rig, cone: Cone, records: Sequence[StitchRecord]) -> Mistaken:
+def confounding_effect(rig: Rig, cone: Cone, records: Sequence[StitchRecord]) -> ConfoundingEffect:
     """How far each of these would turn a cone's image, at the heights that were flown."""
     heights = [r.height_m for r in records if r.height_m]
     per_m = 1.0 / float(np.mean(heights)) if heights else 0.0
-    apart_m = 0.0
+    base_along_m = 0.0
     if rig.timing == "syntopic":
-        apart_m = abs(cone.position_mm[0] - rig.image_position_mm[0]) * 1e-3
+        base_along_m = abs(cone.position_mm[0] - rig.image_position_mm[0]) * 1e-3
     right, forward = (abs(b) * 1e-3 for b in base_mm(rig, cone))
-    return Mistaken(
-        places=np.sqrt(np.diag(_places_of(rig, cone, records))),
-        speed=np.array([0.01 * apart_m * per_m, 0.0, 0.0]),
-        crab=np.array([0.0, math.sin(math.radians(1.0)) * apart_m * per_m, 0.0]),
+    return ConfoundingEffect(
+        places=np.sqrt(np.diag(_position_covariance(rig, cone, records))),
+        speed=np.array([0.01 * base_along_m * per_m, 0.0, 0.0]),
+        crab=np.array([0.0, math.sin(math.radians(1.0)) * base_along_m * per_m, 0.0]),
         height=np.array([forward, right, 0.0]) * 0.01 * per_m,
     )
 
 
-def shift_px(rig: Rig, turn_rad: Array) -> float:
+def shift_px(rig: Rig, correction_rad: Array) -> float:
     """How far a turn moves the middle of a cone's field, PAN pixels, about x and y alone."""
     if rig.virtual_image is None:
         return 0.0
-    return float(np.hypot(*turn_rad[:2])) * rig.virtual_image.f_mm / rig.virtual_image.pitch_mm
+    return (
+        float(np.hypot(*correction_rad[:2])) * rig.virtual_image.f_mm / rig.virtual_image.pitch_mm
+    )
 
 
 def _calibrated(
     rig: Rig, cone: Cone, records: Sequence[StitchRecord], used: Sequence[int]
-) -> CalibratedCone | None:
-    told = [_turn(rig, cone, records[k]) for k in used]
-    least = least_exposures(rig)
-    if len(told) < least:
+) -> CalibratedConeMounting | None:
+    observed = [_mounting_correction(rig, cone, records[k]) for k in used]
+    least = min_exposures(rig)
+    if len(observed) < least:
         return None
-    turns, stated = np.array([t for t, _ in told]), np.array([c for _, c in told])
-    middle = np.median(turns, axis=0)
-    apart = np.abs(turns - middle)
+    corrections, stated = np.array([t for t, _ in observed]), np.array([c for _, c in observed])
+    middle = np.median(corrections, axis=0)
+    deviations = np.abs(corrections - middle)
     spread = np.maximum(
-        _SPREAD_OF_MEDIAN * np.median(apart, axis=0),
+        _MAD_TO_SIGMA * np.median(deviations, axis=0),
         np.sqrt(np.median(np.diagonal(stated, axis1=1, axis2=2), axis=0)),
     )
-    good = (apart <= _OUTLYING * np.maximum(spread, 1e-12)).all(axis=1)
+    good = (deviations <= _OUTLIER_LIMIT * np.maximum(spread, 1e-12)).all(axis=1)
     if int(good.sum()) < least:
         return None
-    turns, stated = turns[good], stated[good]
-    n = len(turns)
-    mean, own = turns.mean(axis=0), stated.mean(axis=0)
-    seen = np.atleast_2d(np.cov(turns.T, ddof=1))
+    corrections, stated = corrections[good], stated[good]
+    n = len(corrections)
+    mean, own = corrections.mean(axis=0), stated.mean(axis=0)
+    seen = np.atleast_2d(np.cov(corrections.T, ddof=1))
     # Scatter counts where the exposures' own statement does not explain it.
     ratio = np.diag(seen) / np.maximum(np.diag(own), 1e-30)
     beyond = ratio > chi2.ppf(1.0 - _SCATTER_ALPHA / 3.0, n - 1) / (n - 1)
     # An aircraft turns slowly: neighbouring exposures err alike and count for less.
-    variance = np.where(beyond, np.diag(seen) * _alike(turns), np.diag(own))
+    variance = np.where(beyond, np.diag(seen) * _autocorrelation_factor(corrections), np.diag(own))
     scale = np.sqrt(variance / np.maximum(np.diag(own), 1e-30))
     of_mean = own * np.outer(scale, scale) / n
-    rotation = turned(cone, mean)
+    rotation = rotated_mounting(cone, mean)
     # A turn w before the rotation is one of R'w behind it.
     jacobian = angles_by_rotation_vector(rotation[None])[0] @ rotation.T
-    total = of_mean + _share_of_all(rig, cone, [records[k] for k in used])
-    return CalibratedCone(
+    total = of_mean + _common_covariance(rig, cone, [records[k] for k in used])
+    return CalibratedConeMounting(
         cone=cone.name,
-        turn_rad=mean,
-        turn_sigma_rad=np.sqrt(np.diag(of_mean)),
+        correction_rad=mean,
+        correction_sigma_rad=np.sqrt(np.diag(of_mean)),
         scatter_rad=np.sqrt(np.diag(seen)),
         angles_rad=omega_phi_kappa(rotation[None])[0],
         angles_sigma_rad=np.sqrt(np.diag(jacobian @ total @ jacobian.T)),
         covariance=total,
-        turns=turns,
-        used=tuple(int(k) for k, kept in zip(used, good, strict=True) if kept),
+        corrections=corrections,
+        used=tuple(int(k) for k, is_used in zip(used, good, strict=True) if is_used),
         left_out=int(np.count_nonzero(~good)),
         unexplained_rad=np.sqrt(np.where(beyond, np.maximum(np.diag(seen - own), 0.0), 0.0)),
     )
 
 
-def least_exposures(rig: Rig) -> int:
+def min_exposures(rig: Rig) -> int:
     """Below, a cone's mean is not told."""
-    return LEAST_SYNTOPIC if rig.timing == "syntopic" else LEAST_EXPOSURES
+    return MIN_EXPOSURES_SYNTOPIC if rig.timing == "syntopic" else MIN_EXPOSURES
 
 
-def _alike(turns: Array) -> Array:
+def _autocorrelation_factor(corrections: Array) -> Array:
     """(1 + r) / (1 - r) of neighbouring exposures' correlation r, (3,): at least one."""
-    off = turns - turns.mean(axis=0)
+    off = corrections - corrections.mean(axis=0)
     r = np.sum(off[1:] * off[:-1], axis=0) / np.maximum(np.sum(off**2, axis=0), 1e-30)
     r = np.clip(r, 0.0, 0.9)
     return np.asarray((1.0 + r) / (1.0 - r))
@@ -246,22 +251,22 @@ def base_mm(rig: Rig, cone: Cone) -> tuple[float, float]:
     return float(right), 0.0 if rig.timing == "syntopic" else float(forward)
 
 
-def _share_of_all(rig: Rig, cone: Cone, records: Sequence[StitchRecord]) -> Array:
+def _common_covariance(rig: Rig, cone: Cone, records: Sequence[StitchRecord]) -> Array:
     """What all exposures err by alike, (3, 3): places, matching of colour, height."""
-    share = _places_of(rig, cone, records)
+    share = _position_covariance(rig, cone, records)
     if cone.role == "colour":
         sensor = cone.sensors[0]
         is_master = cone.name == rig.colour_master_cone
         shift_px = COLOUR_SHIFT_PX if is_master else REGISTERED_PX
-        turn_px = COLOUR_TURN_PX if is_master else REGISTERED_PX
+        rotation_px = COLOUR_ROTATION_PX if is_master else REGISTERED_PX
         half_px = math.hypot(sensor.width_px, sensor.height_px) / 2.0
         across = shift_px * sensor.pitch_mm / cone.lens.f_mm
-        share = share + np.diag(np.square([across, across, turn_px / half_px]))
-    base = np.mean([_turn_by_base(rig, cone, r) for r in records], axis=0)
+        share = share + np.diag(np.square([across, across, rotation_px / half_px]))
+    base = np.mean([_base_rotation(rig, cone, r) for r in records], axis=0)
     return np.asarray(share + np.diag(np.square(HEIGHT_SIGMA * base)))
 
 
-def _places_of(rig: Rig, cone: Cone, records: Sequence[StitchRecord]) -> Array:
+def _position_covariance(rig: Rig, cone: Cone, records: Sequence[StitchRecord]) -> Array:
     """What places of sensors add to a turn, (3, 3): the cone's own, and that of the datum."""
     dc_k = {
         s.name: float(np.mean([abs(r.dc_k.get(s.name, 0.0)) for r in records])) for s in rig.sensors
@@ -276,18 +281,18 @@ def _places_of(rig: Rig, cone: Cone, records: Sequence[StitchRecord]) -> Array:
     return own * (1.0 - 2.0 / len(heads)) + of_mean
 
 
-def _tells(rig: Rig, cone: Cone, record: StitchRecord) -> bool:
+def _is_usable_record(rig: Rig, cone: Cone, record: StitchRecord) -> bool:
     known = record.height_m is not None and record.height_m > 0.0
-    return f"{cone.name}.{TURNS[0]}" in record.names and (known or not any(base_mm(rig, cone)))
+    return f"{cone.name}.{ROTATIONS[0]}" in record.names and (known or not any(base_mm(rig, cone)))
 
 
-def _turn(rig: Rig, cone: Cone, record: StitchRecord) -> tuple[Array, Array]:
-    at = [record.names.index(f"{cone.name}.{what}") for what in TURNS]
-    turn = record.values[at] * 1e-6 - _turn_by_base(rig, cone, record)
-    return turn, record.covariance[np.ix_(at, at)] * 1e-12
+def _mounting_correction(rig: Rig, cone: Cone, record: StitchRecord) -> tuple[Array, Array]:
+    at = [record.names.index(f"{cone.name}.{what}") for what in ROTATIONS]
+    correction = record.values[at] * 1e-6 - _base_rotation(rig, cone, record)
+    return correction, record.covariance[np.ix_(at, at)] * 1e-12
 
 
-def _turn_by_base(rig: Rig, cone: Cone, record: StitchRecord) -> Array:
+def _base_rotation(rig: Rig, cone: Cone, record: StitchRecord) -> Array:
     """The turn a base passes for over even ground: seen from the right, all lies farther left."""
     right, forward = base_mm(rig, cone)
     if record.height_m is None:

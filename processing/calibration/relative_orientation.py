@@ -16,35 +16,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.bundle.adjust import Adjustment
-from processing.bundle.rotations import exponential, logarithm
+from processing.bundle.rotations import rotations_from_vectors, vectors_from_rotations
 from processing.geometry.orientation import phi_omega_kappa
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 _ITERATIONS = 10
-_SETTLED_RAD = 1e-12
+_CONVERGED_RAD = 1e-12
 
 
 @dataclass(frozen=True)
 class RelativeOrientation:
     """One head against the reference head.
 
-    `rotation` (3, 3) is reference_from_head; `single_rad` (n, 3) what single exposures are off it
-    about the head's axes, none where the heads were parameters of the adjustment.
+    `rotation` (3, 3) is reference_from_head; `single_angles_rad` (n, 3) what single exposures are
+    off it about the head's axes, none where the heads were parameters of the adjustment.
     """
 
     head: str
     rotation: Array
-    single_rad: Array
+    single_angles_rad: Array
     exposures: int
 
     @property
     def spread_rad(self) -> Array:
         """(3,) standard deviation of single exposures; NaN where there are not two."""
-        if len(self.single_rad) < 2:
+        if len(self.single_angles_rad) < 2:
             return np.full(3, np.nan)
-        return np.asarray(self.single_rad.std(axis=0, ddof=1))
+        return np.asarray(self.single_angles_rad.std(axis=0, ddof=1))
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def relative_orientations(
     return _averaged(result, reference, _pairs(result, names.index(reference), least_points))
 
 
-def averaged(
+def average_rotations(
     reference_rotation: Array, head_rotation: Array, head: Indices, covariance: Array, heads: int
 ) -> tuple[Array, Array, Array]:
     """Mean relative rotations by generalised least squares.
@@ -122,7 +122,7 @@ def averaged(
         design[k, :, head[k], :] = np.eye(3)
     a = design.reshape(3 * n, 3 * heads)
     for _ in range(_ITERATIONS):
-        off = logarithm(np.einsum("nji,njk->nik", mean[head], relative))
+        off = vectors_from_rotations(np.einsum("nji,njk->nik", mean[head], relative))
         by = np.zeros((n, 3, n, 6))
         for k in range(n):
             by[k, :, k, :3] = -mean[head[k]].T
@@ -131,10 +131,10 @@ def averaged(
         weight = np.linalg.inv(flat @ covariance @ flat.T)
         cofactor = np.linalg.inv(a.T @ weight @ a)
         step = (cofactor @ (a.T @ weight @ off.ravel())).reshape(heads, 3)
-        mean = mean @ exponential(step)
-        if np.abs(step).max() < _SETTLED_RAD:
+        mean = mean @ rotations_from_vectors(step)
+        if np.abs(step).max() < _CONVERGED_RAD:
             break
-    off = logarithm(np.einsum("nji,njk->nik", mean[head], relative))
+    off = vectors_from_rotations(np.einsum("nji,njk->nik", mean[head], relative))
     return np.asarray(mean), np.asarray(cofactor), off
 
 
@@ -153,7 +153,7 @@ def _averaged(
     )
     covariance = result.sigma0**2 * result.cofactor[np.ix_(at, at)]
     covariance[np.ix_(at < 0, at < 0)] = 0.0
-    mean, own, off = averaged(
+    mean, own, off = average_rotations(
         result.state.attitude[first], result.state.attitude[second], head, covariance, len(cameras)
     )
     redundancy = 3 * (len(pairs) - len(cameras))
@@ -213,7 +213,7 @@ def _of_parameters(result: Adjustment, reference: str) -> RelativeOrientations:
         raise ValueError(
             f"head {reference!r} is the reference and free: hold it, all others are against it"
         )
-    turn = np.eye(3) if base is None else network.heads[base].rotation
+    rotation_change = np.eye(3) if base is None else network.heads[base].rotation
     free = [k for k, head in enumerate(network.heads) if head.rotation_free]
     at = np.concatenate([layout.head_rotation[k] for k in free])
     seen = {
@@ -225,7 +225,7 @@ def _of_parameters(result: Adjustment, reference: str) -> RelativeOrientations:
         heads=tuple(
             RelativeOrientation(
                 network.heads[k].name,
-                turn.T @ result.state.head_rotation[k],
+                rotation_change.T @ result.state.head_rotation[k],
                 np.zeros((0, 3)),
                 seen[k],
             )
@@ -242,8 +242,11 @@ def _angles_by_vector(rotation: Array) -> Array:
     step = 1e-6
     columns = []
     for axis in range(3):
-        turn = exponential(step * np.eye(3)[axis : axis + 1])[0]
-        ahead, behind = phi_omega_kappa(rotation @ turn), phi_omega_kappa(rotation @ turn.T)
+        rotation_change = rotations_from_vectors(step * np.eye(3)[axis : axis + 1])[0]
+        ahead, behind = (
+            phi_omega_kappa(rotation @ rotation_change),
+            phi_omega_kappa(rotation @ rotation_change.T),
+        )
         difference = np.array(ahead) - np.array(behind)
         columns.append((difference + math.pi) % (2 * math.pi) - math.pi)
     return np.stack(columns, axis=1) / (2 * step)

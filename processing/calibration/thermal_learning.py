@@ -22,7 +22,7 @@ from processing.rig import Cone, Rig
 
 Array = NDArray[np.float64]
 
-LEAST_SPREAD_K = 5.0
+MIN_DC_SPREAD_K = 5.0
 PROBE_SIGMA_K = 0.1
 MOTION_PPM = 1.0
 """Vertical motion between the exposures of two cones: 1 m/s over 3 ms at 3000 m."""
@@ -30,7 +30,7 @@ _QUANTITIES = tuple(SENSOR_UNITS)
 
 
 @dataclass(frozen=True)
-class Normal:
+class NormalEquations:
     """Normal equations of k offsets and k rates: y = offset + rate * dC.
 
     `information` (2 k, 2 k), `vector` (2 k,), `squares` the weighted sum of squares of y.
@@ -59,8 +59,8 @@ class ThermalState:
 
     rig: str
     calibration_id: str
-    places: Mapping[str, Normal] = field(default_factory=dict)
-    scales: Mapping[str, Normal] = field(default_factory=dict)
+    places: Mapping[str, NormalEquations] = field(default_factory=dict)
+    scales: Mapping[str, NormalEquations] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class LearnedScale:
 
 
 @dataclass(frozen=True)
-class Learned:
+class LearnedDrift:
     """What the flights say. `reasons` tell by cone why nothing was learned there."""
 
     sensors: tuple[LearnedSensor, ...]
@@ -146,16 +146,16 @@ def add_exposure(rig: Rig, state: ThermalState, record: StitchRecord) -> Thermal
         master = rig.cone(rig.master_cone)
         cone = rig.cone(name)
         names = set(record.names)
-        told = {s.name for s in (*cone.sensors, *master.sensors)} <= set(record.measured)
+        recorded_names = {s.name for s in (*cone.sensors, *master.sensors)} <= set(record.measured)
         # A lone master sensor is fixed: it is the scale.
-        fixed = len(master.sensors) == 1 or _is_there(master, names)
-        if f"{name}.{LAYER_SCALE}" in names and told and fixed:
+        fixed = len(master.sensors) == 1 or _is_recorded(master, names)
+        if f"{name}.{LAYER_SCALE}" in names and recorded_names and fixed:
             scales[name] = _add_scale(normal, master, cone, record)
     return ThermalState(state.rig, state.calibration_id, places, scales)
 
 
-def learned(rig: Rig, state: ThermalState) -> Learned:
-    """Solve what was gathered; cones with less than `LEAST_SPREAD_K` of spread in dC say nothing.
+def solve_drift(rig: Rig, state: ThermalState) -> LearnedDrift:
+    """Solve what was gathered; cones with less than `MIN_DC_SPREAD_K` of spread in dC say nothing.
 
     Standard deviations hold the scatter about the straight line where it exceeds what the
     covariances of the stitching promise.
@@ -168,10 +168,10 @@ def learned(rig: Rig, state: ThermalState) -> Learned:
     for kind, normals in (("places", state.places), ("scale", state.scales)):
         for name, normal in normals.items():
             key = f"{name} {kind}"
-            if normal.spread_k < LEAST_SPREAD_K:
+            if normal.spread_k < MIN_DC_SPREAD_K:
                 reasons[key] = (
                     f"dC spread over {normal.spread_k:.1f} K in {normal.exposures} exposures; "
-                    f"{LEAST_SPREAD_K:g} K are needed"
+                    f"{MIN_DC_SPREAD_K:g} K are needed"
                 )
                 continue
             solution, covariance, factors[key] = _solve(normal)
@@ -179,7 +179,7 @@ def learned(rig: Rig, state: ThermalState) -> Learned:
             if kind == "places":
                 sensors += _sensors(cone, normal, solution, covariance)
             else:
-                far_px = _far_px(rig, cone)
+                far_px = _field_radius_px(rig, cone)
                 largest = max(abs(normal.lowest_dc_k), abs(normal.highest_dc_k))
                 scales.append(
                     LearnedScale(
@@ -190,7 +190,7 @@ def learned(rig: Rig, state: ThermalState) -> Learned:
                         effect_px=abs(float(solution[1])) * 1e-6 * largest * far_px,
                     )
                 )
-    return Learned(tuple(sensors), tuple(scales), factors, reasons, spread)
+    return LearnedDrift(tuple(sensors), tuple(scales), factors, reasons, spread)
 
 
 def observability(rig: Rig) -> tuple[Observability, ...]:
@@ -262,17 +262,17 @@ def state_from_json(content: Mapping[str, Any]) -> ThermalState:
     )
 
 
-def _empty(size: int) -> Normal:
-    return Normal(np.zeros((2 * size, 2 * size)), np.zeros(2 * size))
+def _empty(size: int) -> NormalEquations:
+    return NormalEquations(np.zeros((2 * size, 2 * size)), np.zeros(2 * size))
 
 
-def _is_there(cone: Cone, names: set[str]) -> bool:
+def _is_recorded(cone: Cone, names: set[str]) -> bool:
     return all(f"{s.name}.{what}" in names for s in cone.sensors for what in _QUANTITIES)
 
 
 def _complete(cone: Cone, record: StitchRecord) -> bool:
     measured = {s.name for s in cone.sensors} <= set(record.measured)
-    return measured and _is_there(cone, set(record.names))
+    return measured and _is_recorded(cone, set(record.names))
 
 
 def _inner_from_values(cone: Cone) -> tuple[Array, Array]:
@@ -297,7 +297,7 @@ def _inner_from_values(cone: Cone) -> tuple[Array, Array]:
     return there[: 4 * (m - 1)], back
 
 
-def _add_places(normal: Normal, cone: Cone, record: StitchRecord) -> Normal:
+def _add_places(normal: NormalEquations, cone: Cone, record: StitchRecord) -> NormalEquations:
     inner, back = _inner_from_values(cone)
     rows = [record.names.index(f"{s.name}.{what}") for s in cone.sensors for what in _QUANTITIES]
     dc = np.array([record.dc_k[s.name] for s in cone.sensors])
@@ -315,7 +315,9 @@ def _rates(drift: Any) -> Array:
     )
 
 
-def _add_scale(normal: Normal, master: Cone, cone: Cone, record: StitchRecord) -> Normal:
+def _add_scale(
+    normal: NormalEquations, master: Cone, cone: Cone, record: StitchRecord
+) -> NormalEquations:
     """Scale of a cone's sensors in the image against the master's; larger is a shorter f."""
     row = np.zeros(len(record.names))
     row[record.names.index(f"{cone.name}.{LAYER_SCALE}")] = 1.0
@@ -332,10 +334,12 @@ def _add_scale(normal: Normal, master: Cone, cone: Cone, record: StitchRecord) -
     return _added(normal, value, np.array([[variance]]), dc[:, None], dc)
 
 
-def _added(normal: Normal, y: Array, covariance: Array, by_dc: Array, dc: Array) -> Normal:
+def _added(
+    normal: NormalEquations, y: Array, covariance: Array, by_dc: Array, dc: Array
+) -> NormalEquations:
     design = np.hstack([np.eye(len(y)), by_dc])
     weighted = np.linalg.solve(covariance, np.column_stack([design, y]))
-    return Normal(
+    return NormalEquations(
         normal.information + design.T @ weighted[:, :-1],
         normal.vector + design.T @ weighted[:, -1],
         normal.squares + float(y @ weighted[:, -1]),
@@ -345,7 +349,7 @@ def _added(normal: Normal, y: Array, covariance: Array, by_dc: Array, dc: Array)
     )
 
 
-def _solve(normal: Normal) -> tuple[Array, Array, float]:
+def _solve(normal: NormalEquations) -> tuple[Array, Array, float]:
     """Offsets and rates, their covariance, and the variance factor it was multiplied with."""
     inverse: Array = np.linalg.inv(normal.information).astype(np.float64)
     solution = inverse @ normal.vector
@@ -356,7 +360,9 @@ def _solve(normal: Normal) -> tuple[Array, Array, float]:
     return solution, inverse * factor, factor
 
 
-def _sensors(cone: Cone, normal: Normal, solution: Array, covariance: Array) -> list[LearnedSensor]:
+def _sensors(
+    cone: Cone, normal: NormalEquations, solution: Array, covariance: Array
+) -> list[LearnedSensor]:
     _, back = _inner_from_values(cone)
     k = normal.size
     offsets, rates = back @ solution[:k], back @ solution[k:]
@@ -388,7 +394,7 @@ def _by_quantity(values: Array) -> dict[str, float]:
     return dict(zip(_QUANTITIES, (float(v) for v in values), strict=True))
 
 
-def _far_px(rig: Rig, cone: Cone) -> float:
+def _field_radius_px(rig: Rig, cone: Cone) -> float:
     """From the middle of a cone to its farthest pixel, px of the virtual image."""
     reach = max(
         math.hypot(
@@ -401,7 +407,7 @@ def _far_px(rig: Rig, cone: Cone) -> float:
     return reach / cone.lens.f_mm * image.f_mm / image.pitch_mm
 
 
-def _normal_json(normal: Normal) -> dict[str, Any]:
+def _normal_json(normal: NormalEquations) -> dict[str, Any]:
     return {
         "information": normal.information.tolist(),
         "vector": normal.vector.tolist(),
@@ -411,13 +417,13 @@ def _normal_json(normal: Normal) -> dict[str, Any]:
     }
 
 
-def _normal_from(content: Mapping[str, Any]) -> Normal:
+def _normal_from(content: Mapping[str, Any]) -> NormalEquations:
     lowest, highest = content["dc_k"] or (math.inf, -math.inf)
     vector = np.array(content["vector"], np.float64)
     information = np.array(content["information"], np.float64)
     if information.shape != (len(vector), len(vector)):
         raise ValueError(f"information is {information.shape} for {len(vector)} unknowns")
-    return Normal(
+    return NormalEquations(
         information,
         vector,
         float(content["squares"]),

@@ -10,12 +10,12 @@ import dataclasses
 import math
 from dataclasses import dataclass
 
-from processing.calibration.thermal_learning import Learned, LearnedScale, LearnedSensor
+from processing.calibration.thermal_learning import LearnedDrift, LearnedScale, LearnedSensor
 from processing.rig import Cone, Rig, Sensor
 
 
 @dataclass(frozen=True)
-class Change:
+class ProposedChange:
     """One value, old and new, with the standard deviation of the new one and what it does.
 
     `where` is a sensor or a cone, `what` the key in the rig file. `effect_px` is what the change
@@ -44,8 +44,8 @@ _RATES = {
 
 
 def proposed_rig(
-    rig: Rig, learned: Learned, *, calibration_id: str, date: str
-) -> tuple[Rig, tuple[Change, ...]]:
+    rig: Rig, learned: LearnedDrift, *, calibration_id: str, date: str
+) -> tuple[Rig, tuple[ProposedChange, ...]]:
     """The rig with the learned rates and, since they belong together, the intercepts as places.
 
     What stitching cannot see keeps its old value: the sums over the sensors of a cone do not
@@ -54,24 +54,26 @@ def proposed_rig(
     """
     sensors = {s.sensor: s for s in learned.sensors}
     scales = {s.cone: s for s in learned.scales}
-    changes: list[Change] = []
+    changes: list[ProposedChange] = []
     cones = []
     for cone in rig.cones:
         new = tuple(
             _sensor(cone, s, sensors[s.name], changes) if s.name in sensors else s
             for s in cone.sensors
         )
-        made = dataclasses.replace(cone, sensors=new)
+        proposed = dataclasses.replace(cone, sensors=new)
         if cone.name in scales:
-            made = _lens(made, scales[cone.name], changes)
-        cones.append(made)
+            proposed = _lens(proposed, scales[cone.name], changes)
+        cones.append(proposed)
     proposal = dataclasses.replace(
         rig, cones=tuple(cones), calibration_id=calibration_id, calibration_date=date
     )
     return proposal, tuple(changes)
 
 
-def _sensor(cone: Cone, sensor: Sensor, found: LearnedSensor, changes: list[Change]) -> Sensor:
+def _sensor(
+    cone: Cone, sensor: Sensor, found: LearnedSensor, changes: list[ProposedChange]
+) -> Sensor:
     m = len(cone.sensors)
     half_um = math.hypot(sensor.width_px, sensor.height_px) / 2.0 * sensor.pitch_um
     # What an urad or a ppm does at the sensor's corner, um.
@@ -88,7 +90,9 @@ def _sensor(cone: Cone, sensor: Sensor, found: LearnedSensor, changes: list[Chan
             abs(found.rates[quantity]) * arm_um[quantity] * found.largest_dc_k / sensor.pitch_um
         )
         new = old + found.rates[quantity]
-        changes.append(Change(sensor.name, key, old, new, found.rate_sigmas[quantity], effect))
+        changes.append(
+            ProposedChange(sensor.name, key, old, new, found.rate_sigmas[quantity], effect)
+        )
         drift = dataclasses.replace(drift, **{key: new})
     # The inner part is as good as it was learned, the common part as good as it was.
     learned_um = max(found.rate_sigmas["x_um"], found.rate_sigmas["y_um"])
@@ -116,14 +120,16 @@ def _sensor(cone: Cone, sensor: Sensor, found: LearnedSensor, changes: list[Chan
     for quantity, key, unit in places:
         effect = abs(offsets[quantity]) * arm_um[quantity] / sensor.pitch_um
         old, new = getattr(sensor, key), getattr(new_sensor, key)
-        changes.append(Change(sensor.name, key, old, new, sigmas[quantity] * unit, effect))
+        changes.append(ProposedChange(sensor.name, key, old, new, sigmas[quantity] * unit, effect))
     return new_sensor
 
 
-def _lens(cone: Cone, found: LearnedScale, changes: list[Change]) -> Cone:
+def _lens(cone: Cone, found: LearnedScale, changes: list[ProposedChange]) -> Cone:
     old = cone.lens.f_ppm_per_k
     new = old + found.f_ppm_per_k
     changes.append(
-        Change(f"cone {cone.name}", "f_ppm_per_k", old, new, found.sigma_ppm_per_k, found.effect_px)
+        ProposedChange(
+            f"cone {cone.name}", "f_ppm_per_k", old, new, found.sigma_ppm_per_k, found.effect_px
+        )
     )
     return dataclasses.replace(cone, lens=dataclasses.replace(cone.lens, f_ppm_per_k=new))

@@ -21,7 +21,7 @@ from processing.rig import Lens
 Array = NDArray[np.float64]
 
 _GRID: Final = 41
-_BEYOND: Final = 1.02
+_GRID_OVERSIZE: Final = 1.02
 """The fit reaches a little past the frame: no extrapolation at its corners."""
 
 
@@ -68,7 +68,7 @@ def lens_from_brown(
     """
     f_mm = brown.f_px * pitch_mm
     centre = brown.principal_point_px
-    half = _BEYOND * max(
+    half = _GRID_OVERSIZE * max(
         centre[0], centre[1], width_px - 1 - centre[0], height_px - 1 - centre[1], 1.0
     )
     axis = np.linspace(-1.15 * half, 1.15 * half, _GRID) / brown.f_px

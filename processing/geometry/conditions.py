@@ -22,9 +22,9 @@ from processing.rig import Cone, Rig
 
 T = TypeVar("T")
 
-ALIKE = 0.02
+EXPOSURE_TIME_TOLERANCE = 0.02
 """Exposure times of cones that differ by less are those of one setting."""
-LARGEST_SCALE = 2.05
+MAX_EXPOSURE_SCALE = 2.05
 
 TIME_PARTS = ("receiver", "clock", "trigger", "delay", "head")
 
@@ -65,7 +65,7 @@ class Conditions:
 
 
 @dataclass(frozen=True)
-class Temperatures:
+class UsableTemperatures:
     """Temperatures that can be used, and the probes that gave none or an impossible one.
 
     `usable_c` are as read, lagged ones of sensors among them; `bridged_c` stand in for probes
@@ -78,12 +78,14 @@ class Temperatures:
     bridged_c: Mapping[str, float] = field(default_factory=dict)
 
     @property
-    def placing_c(self) -> dict[str, float]:
+    def placement_temperatures_c(self) -> dict[str, float]:
         """What sensors are placed with: as read where it can be used, else bridged."""
         return {**self.bridged_c, **self.usable_c}
 
 
-def usable_temperatures(rig: Rig, conditions: Conditions, thresholds: Thresholds) -> Temperatures:
+def usable_temperatures(
+    rig: Rig, conditions: Conditions, thresholds: Thresholds
+) -> UsableTemperatures:
     """Sort the probes the rig asks for into usable, missing and out of range."""
     usable, missing, out_of_range = {}, [], []
     for probe in rig.probes:
@@ -99,10 +101,10 @@ def usable_temperatures(rig: Rig, conditions: Conditions, thresholds: Thresholds
         lagged = conditions.temperatures_c.get(lagged_probe(sensor))
         if sensor.probe in usable and lagged is not None and math.isfinite(lagged):
             usable[lagged_probe(sensor)] = lagged
-    return Temperatures(usable, tuple(missing), tuple(out_of_range), bridged)
+    return UsableTemperatures(usable, tuple(missing), tuple(out_of_range), bridged)
 
 
-def by_sensor_of(cone: Cone, of_frames: Mapping[str, T]) -> dict[str, T]:
+def by_sensor_name(cone: Cone, of_frames: Mapping[str, T]) -> dict[str, T]:
     """What is known of a cone's frames, by sensor name."""
     names = [sensor.name for sensor in cone.sensors]
     return {name: of_frames[name] for name in names if name in of_frames}
@@ -133,16 +135,19 @@ def reference_exposure_times(rig: Rig, exposure_times: Mapping[str, float]) -> d
         of_cones = {
             cone.name: statistics.median_low(known.values())
             for cone in cones
-            if (known := by_sensor_of(cone, exposure_times))
+            if (known := by_sensor_name(cone, exposure_times))
         }
         if not of_cones:
             continue
         usual = statistics.median_low(of_cones.values())
         for cone in cones:
             own = of_cones.get(cone.name, usual)
-            keeps = abs(own / usual - 1.0) <= ALIKE or own < usual / LARGEST_SCALE
-            for name in by_sensor_of(cone, exposure_times):
-                references[name] = own if keeps else usual
+            is_unscaled = (
+                abs(own / usual - 1.0) <= EXPOSURE_TIME_TOLERANCE
+                or own < usual / MAX_EXPOSURE_SCALE
+            )
+            for name in by_sensor_name(cone, exposure_times):
+                references[name] = own if is_unscaled else usual
     return references
 
 
@@ -169,7 +174,7 @@ def exposure_scale_figures(scales: Mapping[str, float]) -> dict[str, Figure]:
 
 
 def condition_figures(
-    rig: Rig, conditions: Conditions, temperatures: Temperatures
+    rig: Rig, conditions: Conditions, temperatures: UsableTemperatures
 ) -> dict[str, Figure]:
     """Figures that need no pixels, by the names of `processing.quality.report.FIGURES`."""
     figures: dict[str, Figure] = {"gsd_m": ground_sampling_distance_m(rig, conditions)}
@@ -186,7 +191,7 @@ def condition_figures(
     figures["sidelap"] = conditions.sidelap
     sun = conditions.sun_elevation_rad
     figures["sun_deg"] = None if sun is None else math.degrees(sun)
-    shifts = by_sensor_of(rig.cone(rig.reference_cone), conditions.tdi_shifts)
+    shifts = by_sensor_name(rig.cone(rig.reference_cone), conditions.tdi_shifts)
     figures["tdi_shifts"] = max(shifts.values(), default=None)
     return figures
 
@@ -231,7 +236,7 @@ def parallax_px(rig: Rig, conditions: Conditions, relief_fraction: float) -> flo
     return base_mm * image.f_mm * relief_fraction / (height * 1e3) / image.pitch_mm
 
 
-def _dc(rig: Rig, temperatures: Temperatures) -> dict[str, Figure]:
+def _dc(rig: Rig, temperatures: UsableTemperatures) -> dict[str, Figure]:
     figures: dict[str, Figure] = {}
     pan = []
     for cone in rig.cones:

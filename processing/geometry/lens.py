@@ -58,8 +58,8 @@ def measured_from_ideal(lens: Lens, ideal_mm: Array) -> Array:
     measured = ideal_mm - lens_correction(lens, ideal_mm)
     for _ in range(_INVERSION_STEPS):
         misfit = ideal_from_measured(lens, measured) - ideal_mm
-        open_points = ~(np.abs(misfit).max(axis=1, initial=0.0) <= _INVERSION_TOLERANCE_MM)
-        if not open_points.any():
+        unconverged = ~(np.abs(misfit).max(axis=1, initial=0.0) <= _INVERSION_TOLERANCE_MM)
+        if not unconverged.any():
             return measured
         jacobian = _jacobian(lens, measured)
         determinant = jacobian[:, 0] * jacobian[:, 3] - jacobian[:, 1] * jacobian[:, 2]
@@ -68,7 +68,7 @@ def measured_from_ideal(lens: Lens, ideal_mm: Array) -> Array:
             step[:, 0] = jacobian[:, 3] * misfit[:, 0] - jacobian[:, 1] * misfit[:, 1]
             step[:, 1] = jacobian[:, 0] * misfit[:, 1] - jacobian[:, 2] * misfit[:, 0]
             measured = measured - step / determinant[:, None]
-    measured[open_points] = np.nan
+    measured[unconverged] = np.nan
     return measured
 
 

@@ -1,7 +1,7 @@
 """Where a sensor's pixels fall in the virtual image plane, and back.
 
 A placement composes TDI, TDM, skew, lens, principal distance, similarity S and layer
-transformation P; adjusting S and P is the work of `processing.mosaic.free`.
+transformation P; adjusting S and P is the work of `processing.mosaic.free_mosaic`.
 
 Source: docs/mathematics/coordinates.md#from-sensor-to-virtual-image; Ladstädter et al. (2010), eq.
 1.
@@ -25,7 +25,7 @@ from processing.rig import Cone, Rig, Sensor, VirtualImage
 
 Array = NDArray[np.float64]
 
-UNSKEWED: Final = (0.0, 0.0)
+NO_SKEW: Final = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ def raw_from_sensor_mm(placement: SensorPlacement, u_mm: Array) -> Array:
 def corrected_mm_from_raw(placement: SensorPlacement, colrow: Array) -> Array:
     """u' of eq. 1 (n, 2), mm: what S and P act on, independent of their adjustment."""
     physical = apply_similarity(placement.physical, sensor_mm_from_raw(placement, colrow))
-    if placement.sensor.skew_per_mm != UNSKEWED:
+    if placement.sensor.skew_per_mm != NO_SKEW:
         physical = _skewed(placement, physical)
     ideal = ideal_from_measured(placement.cone.lens, physical) * placement.f_ratio
     return apply_similarity(invert_similarity(start_similarity(placement)), ideal)
@@ -181,7 +181,7 @@ def raw_from_vip_mm(placement: SensorPlacement, xy_mm: Array) -> Array:
         / placement.f_ratio
     )
     physical = measured_from_ideal(placement.cone.lens, ideal)
-    if placement.sensor.skew_per_mm != UNSKEWED:
+    if placement.sensor.skew_per_mm != NO_SKEW:
         physical = _unskewed(placement, physical)
     return raw_from_sensor_mm(
         placement, apply_similarity(invert_similarity(placement.physical), physical)

@@ -40,7 +40,7 @@ class ResidualGrid:
         upper = delta[j + 1, i] * (1.0 - u) + delta[j + 1, i + 1] * u
         return np.asarray(lower * (1.0 - v) + upper * v)
 
-    def for_lens(self) -> LensGrid:
+    def as_lens_grid(self) -> LensGrid:
         """As a rig file holds it."""
         um = np.round(self.delta_mm * 1e3, 6)
         return LensGrid(
@@ -80,7 +80,7 @@ def fit_residual_grid(
     return ResidualGrid(x, y, delta)
 
 
-def left_by_halves(
+def cross_validation_residuals(
     measured_mm: Array, residual_mm: Array, *, half_mm: tuple[float, float], nodes: tuple[int, int]
 ) -> Array:
     """What a grid fitted to every other residual leaves of the rest, and the other way, (n, 2)."""

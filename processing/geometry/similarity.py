@@ -1,7 +1,7 @@
 """Plane similarities: shift, rotation and scale of a sensor in the layer of its cone.
 
 Only the transformation itself lives here; what a sensor's similarity is at a temperature is told
-by `processing.geometry.drift`, how it is adjusted by `processing.mosaic.free`.
+by `processing.geometry.drift`, how it is adjusted by `processing.mosaic.free_mosaic`.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.bundle.bent_rays import MEAN_EARTH_RADIUS_M
+from processing.bundle.curvature_refraction import MEAN_EARTH_RADIUS_M
 
 Array = NDArray[np.float64]
 

@@ -196,7 +196,7 @@ def intersection(a: Rectangle, b: Rectangle) -> Rectangle:
     )
 
 
-def seen_by_both(a: SensorPlacement, b: SensorPlacement) -> Rectangle:
+def common_view(a: SensorPlacement, b: SensorPlacement) -> Rectangle:
     """What two sensors both see; may be `empty`.
 
     A sensor that is tilted against the virtual image sees no upright rectangle of it: then the box
@@ -228,7 +228,7 @@ def _is_upright(placement: SensorPlacement) -> bool:
     return askew < _UPRIGHT_FRACTION * float(np.ptp(corners, axis=0).min())
 
 
-def _sees(placement: SensorPlacement, xy_mm: Array) -> bool:
+def _contains_point(placement: SensorPlacement, xy_mm: Array) -> bool:
     """Whether a point (1, 2) of the VIP falls on a sensor."""
     sensor, (column, row) = placement.sensor, raw_from_vip_mm(placement, xy_mm)[0]
     return bool(0 <= column <= sensor.width_px - 1 and 0 <= row <= sensor.height_px - 1)
@@ -245,7 +245,7 @@ def overlaps(rig: Rig) -> tuple[Overlap, ...]:
     for a, b in itertools.combinations(places, 2):
         if rig.cone_of(a).name == rig.cone_of(b).name:
             continue
-        common = seen_by_both(placements[a], placements[b])
+        common = common_view(placements[a], placements[b])
         if not common.empty and _is_strip(common, places[a], places[b]):
             result.append(Overlap(a, b, common))
     return tuple(result)
@@ -269,7 +269,7 @@ def corners(rig: Rig) -> tuple[Corner, ...]:
                 ]
             ]
         )
-        sensors = tuple(name for name in places if _sees(placements[name], centre))
+        sensors = tuple(name for name in places if _contains_point(placements[name], centre))
         if len(sensors) >= 3 and sensors not in found:
             for name in sensors:
                 common = intersection(common, places[name])
@@ -293,7 +293,7 @@ def colour_coverage(rig: Rig) -> Mapping[str, Rectangle]:
     colour = placements[colour_cone.sensors[0].name]
     result = {}
     for name in _pan_footprints(rig):
-        common = seen_by_both(placements[name], colour)
+        common = common_view(placements[name], colour)
         if not common.empty:
             result[name] = common
     return result
@@ -306,8 +306,8 @@ def colour_ratio(rig: Rig) -> int | None:
     cannot be compared by box means of raw pixels.
     """
     exact = exact_colour_ratio(rig)
-    whole = round(exact or 0.0)
-    return whole if exact and whole >= 1 and abs(exact / whole - 1.0) < 0.01 else None
+    rounded = round(exact or 0.0)
+    return rounded if exact and rounded >= 1 and abs(exact / rounded - 1.0) < 0.01 else None
 
 
 def exact_colour_ratio(rig: Rig) -> float | None:

@@ -2,7 +2,7 @@
 
 A head's image is carried onto a horizontal plane of the ground and from there into the virtual
 image; that is a projective transformation of its layer. Which heads are turned how is adjusted in
-`processing.mosaic.free`.
+`processing.mosaic.free_mosaic`.
 
 Source: docs/mathematics/virtual-camera.md#ground-plane; Heier et al. (2002), 6.1 and fig. 8.
 """

@@ -25,10 +25,10 @@ Array = NDArray[Any]
 NOT_COVERED: Final = -2.0
 UNUSABLE: Final = -1.0
 """Covered, but saturated or without data somewhere in the block."""
-ALONE: Final = -3.0
+SINGLE_COVERAGE: Final = -3.0
 """Covered by this frame and no other: not measured, since there is nothing to compare it with."""
 
-OUTLIER: Final = 0.08
+OUTLIER_LIMIT: Final = 0.08
 """A calibrated head's gain is within a percent of the others'; so far off, its exposure is not."""
 _BLOCK_PX: Final = 8
 _COARSE: Final = 8
@@ -38,7 +38,7 @@ _MIN_SIGNAL: Final = 80.0
 _SPAN: Final = 4.0
 """Light over dark from which on an overlap tells an offset from a gain."""
 _LEVELS: Final = 12
-_UNLIKE: Final = 2e-4
+_PAIR_DIFFERENCE_SIGMA: Final = 2e-4
 """What parallax and reflection leave between two cones at one level, of its signal."""
 _GAIN_SIGMA: Final = 0.05
 _OFFSET_SIGMA: Final = 24.0
@@ -86,7 +86,7 @@ class Balance:
         middle = float(np.median(list(logs.values())))
         name = max(logs, key=lambda n: abs(logs[n] - middle))
         off = logs[name] - middle
-        return (name, float(np.exp(-off))) if abs(off) > np.log1p(OUTLIER) else None
+        return (name, float(np.exp(-off))) if abs(off) > np.log1p(OUTLIER_LIMIT) else None
 
     @property
     def spread(self) -> float:
@@ -173,7 +173,7 @@ def balance_gains(names: Sequence[str], means: Array) -> Balance:
         logs = logs + change
     # One head that is far off does not draw the level of the others with it.
     off = logs - np.median(logs)
-    if len(logs) > 2 and np.count_nonzero(np.abs(off) > np.log1p(OUTLIER)) == 1:
+    if len(logs) > 2 and np.count_nonzero(np.abs(off) > np.log1p(OUTLIER_LIMIT)) == 1:
         tied = {name for pair in pairs for name in (pair.sensor_a, pair.sensor_b)}
         logs = np.where([name in tied for name in names], off, 0.0)
     gains = np.exp(logs).tolist()
@@ -207,7 +207,9 @@ def _levels(a: int, b: int, light_a: Array, light_b: Array) -> list[_Level]:
         spread = 1.4826 * float(np.median(np.abs(off - median)))
         signal = float(np.median(middle[part]))
         sigma = 1.2533 * max(spread, 1.0) / np.sqrt(len(part))
-        found.append(_Level(a, b, signal, median, float(np.hypot(sigma, _UNLIKE * signal))))
+        found.append(
+            _Level(a, b, signal, median, float(np.hypot(sigma, _PAIR_DIFFERENCE_SIGMA * signal)))
+        )
     return found
 
 
@@ -297,13 +299,13 @@ def _node_means(frames, valid, lattices, cell, out):
                     r = r0 + dr * k
                     if valid[s, 0] <= c <= valid[s, 1] and valid[s, 2] <= r <= valid[s, 3]:
                         j = lj * nodes + k
-                        line[j] = ALONE
+                        line[j] = SINGLE_COVERAGE
                         covering[j] += 1
                         places[s, j, 0] = np.int64(np.floor(c + 0.5)) - _BLOCK_PX // 2
                         places[s, j, 1] = np.int64(np.floor(r + 0.5)) - _BLOCK_PX // 2
         for s in range(count):
             for j in range(columns):
-                if covering[j] > 1 and out[s, i, j] == ALONE:
+                if covering[j] > 1 and out[s, i, j] == SINGLE_COVERAGE:
                     out[s, i, j] = _block_mean(frames[s], valid[s], places[s, j])
 
 
@@ -312,15 +314,15 @@ def _block_mean(frame, valid, corner):
     """Mean of a block within the usable area; `UNUSABLE` where a pixel is saturated or a hole."""
     total = np.int64(0)
     pixels = 0
-    marred = False
+    unusable = False
     for y in range(
         max(corner[1], np.int64(valid[2])), min(corner[1] + _BLOCK_PX, np.int64(valid[3]) + 1)
     ):
         for x in range(
             max(corner[0], np.int64(valid[0])), min(corner[0] + _BLOCK_PX, np.int64(valid[1]) + 1)
         ):
-            word = frame[y, x]
-            marred |= (word == 0) | ((word & 1) == 1)
-            total += word
+            value = frame[y, x]
+            unusable |= (value == 0) | ((value & 1) == 1)
+            total += value
             pixels += 1
-    return UNUSABLE if marred or pixels == 0 else total / pixels
+    return UNUSABLE if unusable or pixels == 0 else total / pixels

@@ -67,7 +67,7 @@ class RegisteredBand:
     sensor: str
     band_from_reference: Array
     points: int
-    sought: int
+    attempted: int
     rms_px: float | None
     rms_x_px: float | None
     rms_y_px: float | None
@@ -200,21 +200,21 @@ def _refine(
     )
     matches = _match(frames[0], frames[1], at, predicted, (settings.window_px, search_px), settings)
     if len(matches) < settings.min_points:
-        return replace(found, points=len(matches), sought=len(at), registered=False)
+        return replace(found, points=len(matches), attempted=len(at), registered=False)
     source = vip_mm_from_raw(reference, matches[:, 0:2])
     target = vip_mm_from_raw(other, matches[:, 2:4])
     sigma_mm = np.maximum(matches[:, 4], 0.02) * other.sensor.pitch_mm
     fitted, rms_mm, used = fit_projective(source, target, sigma_mm)
     residual_px = (target - apply_projective(fitted, source)) / other.sensor.pitch_mm
     length = np.hypot(residual_px[:, 0], residual_px[:, 1])
-    kept = np.argsort(length)[:used]
-    rms_x, rms_y = np.sqrt(np.mean(residual_px[kept] ** 2, axis=0))
-    shift = matches[kept, 2:4] - matches[kept, 0:2]
+    retained = np.argsort(length)[:used]
+    rms_x, rms_y = np.sqrt(np.mean(residual_px[retained] ** 2, axis=0))
+    shift = matches[retained, 2:4] - matches[retained, 0:2]
     return replace(
         found,
         band_from_reference=fitted,
         points=used,
-        sought=len(at),
+        attempted=len(at),
         rms_px=rms_mm / other.sensor.pitch_mm,
         rms_x_px=float(rms_x),
         rms_y_px=float(rms_y),
@@ -234,14 +234,14 @@ def _match(
 ) -> Array:
     """Accepted rows of `match_patches`, (n, 8)."""
     window_px, search_px = window_and_search_px
-    room = window_px // 2 + MARGIN_PX + 2
+    margin_px = window_px // 2 + MARGIN_PX + 2
     height, width = frame_b.shape
     with np.errstate(invalid="ignore"):
         inside = (
-            (predicted[:, 0] >= room)
-            & (predicted[:, 0] <= width - 1 - room)
-            & (predicted[:, 1] >= room)
-            & (predicted[:, 1] <= height - 1 - room)
+            (predicted[:, 0] >= margin_px)
+            & (predicted[:, 0] <= width - 1 - margin_px)
+            & (predicted[:, 1] >= margin_px)
+            & (predicted[:, 1] <= height - 1 - margin_px)
         )
     found = match_patches(
         frame_a,
@@ -266,14 +266,14 @@ def _match(
 
 def _positions(frame: Array, window_px: int, points: int) -> Array:
     """Feature-rich pixels on an even grid, (n, 2) int64 (column, row)."""
-    room = window_px // 2 + MARGIN_PX + 2
+    margin_px = window_px // 2 + MARGIN_PX + 2
     height, width = frame.shape
-    right, bottom = width - 1 - room, height - 1 - room
-    if right <= room or bottom <= room:
+    right, bottom = width - 1 - margin_px, height - 1 - margin_px
+    if right <= margin_px or bottom <= margin_px:
         return np.empty((0, 2), dtype=np.int64)
-    spacing = max(np.sqrt((right - room) * (bottom - room) / points), 3.0)
-    columns = np.linspace(room, right, max(2, round((right - room) / spacing) + 1))
-    rows = np.linspace(room, bottom, max(2, round((bottom - room) / spacing) + 1))
+    spacing = max(np.sqrt((right - margin_px) * (bottom - margin_px) / points), 3.0)
+    columns = np.linspace(margin_px, right, max(2, round((right - margin_px) / spacing) + 1))
+    rows = np.linspace(margin_px, bottom, max(2, round((bottom - margin_px) / spacing) + 1))
     c, r = (grid.ravel() for grid in np.meshgrid(range(len(columns) - 1), range(len(rows) - 1)))
     cells = np.stack(
         [np.ceil(columns[c]), np.floor(columns[c + 1]) - 1, np.ceil(rows[r]),

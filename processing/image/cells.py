@@ -20,50 +20,50 @@ from numba import njit
 from numpy.typing import NDArray
 
 from processing.image.taps import (
-    LINE_WORDS,
+    LINE_LENGTH,
     MISSING,
     along,
     down,
     down_strip,
     flags_along,
     is_clean,
+    values_strip,
     weights_at,
-    words_strip,
 )
 
 Array = NDArray[Any]
 
-_NEARLY: Final = 0.02
+_IDENTITY_TOLERANCE: Final = 0.02
 """Largest slope of a raw row, and difference of scale from one, that goes in two passes."""
 _SLACK: Final = 0.02
 """How far, in px, a run may go past the phase 0..1: tables of weights reach that far. Bilinear
 pieces join in a kink, so there it is nothing."""
-_LANES: Final = 8
+_VECTOR_WIDTH: Final = 8
 """Columns of the first pass come in whole vectors of this many words."""
 _EXTRA: Final = 5
 """Raw pixels that a run of taps takes more than it has samples."""
 
 
-MOST_CELL_PX: Final = 64
+MAX_CELL_PX: Final = 64
 """Side of the largest cell: its taps fit into a scratch row."""
 
 
 @njit(cache=True, nogil=True)
 def _columns(samples):
     """Raw columns that so many samples take, in whole vectors."""
-    return (samples + _EXTRA + _LANES - 1) // _LANES * _LANES
+    return (samples + _EXTRA + _VECTOR_WIDTH - 1) // _VECTOR_WIDTH * _VECTOR_WIDTH
 
 
 @njit(cache=True, nogil=True)
 def _run_length(phase, step, slack, most):
     """How many pixels a run goes on, from a phase in 0..1 until it leaves by more than `slack`."""
     if step > 0.0:
-        room = (1.0 + slack - phase) / step
+        margin_px = (1.0 + slack - phase) / step
     elif step < 0.0:
-        room = (phase + slack) / -step
+        margin_px = (phase + slack) / -step
     else:
         return most
-    return most if room >= most else max(min(most, np.int64(room) + 1), 1)
+    return most if margin_px >= most else max(min(most, np.int64(margin_px) + 1), 1)
 
 
 @njit(cache=True, fastmath=True, nogil=True)
@@ -81,9 +81,9 @@ def _fetch_points(frame, table, reach, c0, dc, r0, dr, values, flags, y, first, 
         for i in range(2 - reach, 4 + reach):
             line = np.float32(0.0)
             for j in range(2 - reach, 4 + reach):
-                word = frame[ir - 2 + i, ic - 2 + j]
-                least = min(least, word)
-                line += (table[p, j] + x * table[p, 6 + j]) * np.float32(word)
+                value = frame[ir - 2 + i, ic - 2 + j]
+                least = min(least, value)
+                line += (table[p, j] + x * table[p, 6 + j]) * np.float32(value)
             total += (table[q, i] + z * table[q, 6 + i]) * line
         full = frame[ir, ic] | frame[ir, ic + 1] | frame[ir + 1, ic] | frame[ir + 1, ic + 1]
         values[y, k] = total
@@ -120,7 +120,7 @@ def _fetch_row(
     # Where pixel `first` and the last one have their taps, were all a whole pixel apart.
     begin = c0 + dc * first - first
     end = begin + g * (n - 1)
-    left, whole = _base(begin, end, slack)
+    left, in_one_run = _base(begin, end, slack)
     most = max(np.int64(np.floor(max(begin, end))), left)
     # Raw columns from `origin` on, as many as the taps reach, in whole vectors.
     origin = max(left + first - 2, 0)
@@ -143,7 +143,7 @@ def _fetch_row(
     done = np.int64(0)
     while done < n:
         c = begin + g * done
-        ic = left if whole else np.int64(np.floor(c))
+        ic = left if in_one_run else np.int64(np.floor(c))
         count = _run_length(c - ic, g, slack, n - done)
         start = ic + first + done - 2 - origin
         along(line[start:], np.float32(c - ic), np.float32(g), table, out[done:], count)
@@ -216,7 +216,7 @@ def _bounds(corners, cell):
 @njit(cache=True, nogil=True)
 def _is_near_identity(corners):
     across = max(abs(corners[2] - 1.0), abs(corners[6] - 1.0))
-    return max(across, max(abs(corners[3]), abs(corners[7]))) < _NEARLY
+    return max(across, max(abs(corners[3]), abs(corners[7]))) < _IDENTITY_TOLERANCE
 
 
 @njit(cache=True, nogil=True)
@@ -285,7 +285,7 @@ def fetch_straight(
 
     Args:
         left, top: from `straight_taps`; the other arguments as in `fetch_cell`.
-        lines: scratch, (last - first + 1) * `LINE_WORDS` float32.
+        lines: scratch, (last - first + 1) * `LINE_LENGTH` float32.
         phases, steps: scratch, (2, last - first) float32.
         out: (height, width) uint16; columns x0 .. x0 + n - 1 of the cell's rows are written.
     """
@@ -310,15 +310,15 @@ def fetch_straight(
         down_strip(flat, start, width, phases[0], steps[0], table, lines, rows, 40)
     else:
         for y in range(rows):
-            line = lines[y * LINE_WORDS :]
+            line = lines[y * LINE_LENGTH :]
             down(flat, start + y * width, width, phases[0, y], steps[0, y], table, line, columns)
     y0 = band * cell + first
     if n == 64:
-        words_strip(lines, phases[1], steps[1], table, gain, offset, out, y0, x0, rows, 64)
+        values_strip(lines, phases[1], steps[1], table, gain, offset, out, y0, x0, rows, 64)
     elif n == 32:
-        words_strip(lines, phases[1], steps[1], table, gain, offset, out, y0, x0, rows, 32)
+        values_strip(lines, phases[1], steps[1], table, gain, offset, out, y0, x0, rows, 32)
     else:
-        words_strip(lines, phases[1], steps[1], table, gain, offset, out, y0, x0, rows, n)
+        values_strip(lines, phases[1], steps[1], table, gain, offset, out, y0, x0, rows, n)
 
 
 @njit(cache=True, nogil=True)
@@ -340,8 +340,8 @@ def fetch_cell(
         lattice: (rows, columns, 2) raw (column, row) at the nodes; `band`, `column` name the cell.
         cell: its side, px; rows, n: how much of it lies in the target.
         table, reach: of a `processing.image.kernels.Kernel`.
-        line: scratch of `LINE_WORDS` float32.
-        spare: scratch, (2, `LINE_WORDS`) uint16.
+        line: scratch of `LINE_LENGTH` float32.
+        spare: scratch, (2, `LINE_LENGTH`) uint16.
         values: (cell, cell) float32, receives the signal where there is any.
         flags: (cell, cell) uint8, receives `SATURATED` | `MISSING`.
     """
@@ -349,7 +349,7 @@ def fetch_cell(
     flat = frame.reshape(-1)
     corners = _corners(lattice, band, column, cell)
     c_least, c_most, r_least, r_most = _bounds(corners, cell)
-    whole = (
+    in_one_run = (
         c_least >= valid[0] and c_most <= valid[1] and r_least >= valid[2] and r_most <= valid[3]
     )
     two_pass = _is_near_identity(corners)
@@ -361,7 +361,7 @@ def fetch_cell(
         and r_most <= valid[3] - 1.0
     )
     clean = False
-    if whole and two_pass:
+    if in_one_run and two_pass:
         further = 1 if inner else 0
         first_row = np.int64(np.floor(r_least)) - 2 - further
         first_column = np.int64(np.floor(c_least)) - 2 - further
@@ -381,7 +381,7 @@ def fetch_cell(
         c0, r0, dc, dr = _row_of(corners, y / cell)
         first = np.int64(0)
         last = np.int64(n)
-        if not whole:
+        if not in_one_run:
             while first < last and not _inside(valid, c0, dc, r0, dr, first):
                 flags[y, first] = MISSING
                 first += 1

@@ -147,7 +147,7 @@ def register_band(
 
 def green_positions(green: SensorPlacement, green_frame: Array, settings: ColourSettings) -> Array:
     """Feature-rich pixels of the green frame on an even grid, (n, 2) int64 (column, row)."""
-    cells = _grid(green, _room(settings), settings)
+    cells = _grid(green, _window_margin_px(settings), settings)
     best = select_features(green_frame, cells, settings.window_px // 2, 2, True)
     positions: Array = best[best[:, 2] > 0.0, :2].astype(np.int64)
     return positions
@@ -219,16 +219,16 @@ def _match(
     at_green: Array,
     settings: ColourSettings,
 ) -> tuple[Array, Array, Array]:
-    room = _room(settings)
+    margin_px = _window_margin_px(settings)
     predicted = raw_from_vip_mm(other, vip_mm_from_raw(green, at_green.astype(np.float64)))
     first, last = exposed_rows(other.sensor, other.tdi_shifts)
     limits = np.array([0, other.sensor.width_px - 1, first, last], dtype=np.int64)
     with np.errstate(invalid="ignore"):
         inside = (
-            (predicted[:, 0] >= limits[0] + room)
-            & (predicted[:, 0] <= limits[1] - room)
-            & (predicted[:, 1] >= limits[2] + room)
-            & (predicted[:, 1] <= limits[3] - room)
+            (predicted[:, 0] >= limits[0] + margin_px)
+            & (predicted[:, 0] <= limits[1] - margin_px)
+            & (predicted[:, 1] >= limits[2] + margin_px)
+            & (predicted[:, 1] <= limits[3] - margin_px)
         )
     found = match_patches(
         green_frame,
@@ -251,15 +251,15 @@ def _match(
     return found[:, 0:2], found[:, 2:4], np.maximum(found[:, 4], 0.005)
 
 
-def _room(settings: ColourSettings) -> int:
+def _window_margin_px(settings: ColourSettings) -> int:
     """Pixels a window needs between its centre and the frame's border."""
     return settings.window_px // 2 + MARGIN_PX + 2
 
 
-def _grid(green: SensorPlacement, room: int, settings: ColourSettings) -> Array:
+def _grid(green: SensorPlacement, margin_px: int, settings: ColourSettings) -> Array:
     first, last = exposed_rows(green.sensor, green.tdi_shifts)
-    left, right = room, green.sensor.width_px - 1 - room
-    top, bottom = first + room, last - room
+    left, right = margin_px, green.sensor.width_px - 1 - margin_px
+    top, bottom = first + margin_px, last - margin_px
     if right <= left or bottom <= top:
         return np.empty((0, 4), dtype=np.int64)
     spacing = max(np.sqrt((right - left) * (bottom - top) / settings.points), 4.0)

@@ -52,7 +52,7 @@ interpolation between nodes is good to 0.003 px of PAN, 0.005 px of colour on ev
 LATTICE_ERROR_PX: Final = 0.008
 """Both ways together, at the worst place."""
 
-_NOWHERE: Final = (1.0, 0.0, 1.0, 0.0)
+_OUTSIDE_LATTICE: Final = (1.0, 0.0, 1.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class PanComposer:
         self._frames = _stack(self.sensors)
         self._lattices = np.full((count, rows, columns, 2), OUTSIDE)
         self._spare = np.full((rows, columns, 2), OUTSIDE)
-        self._valid = np.tile(np.array(_NOWHERE), (count, 1))
+        self._valid = np.tile(np.array(_OUTSIDE_LATTICE), (count, 1))
         self._means = np.zeros((count, *nodes), np.float32)
         self._weights = np.zeros((count, *nodes), np.uint8)
         self._pan = _paged((image.height_px, image.width_px))
@@ -146,7 +146,7 @@ class PanComposer:
                 self._valid[k] = _usable(placements[name])
             else:
                 self._lattices[k] = OUTSIDE
-                self._valid[k] = _NOWHERE
+                self._valid[k] = _OUTSIDE_LATTICE
         node_means(self._frames, self._valid, self._lattices, self.cell_px, self._means)
         balance = balance_gains(self.names, self._means)
         gains = np.array([balance.gains[name] for name in self.names], np.float32)
@@ -314,10 +314,10 @@ def _stack(sensors: Collection[Sensor]) -> Array:
 
 def _paged(shape: tuple[int, int]) -> Array:
     """Zeros of uint16 that begin on a page of memory, from where a disk takes them uncopied."""
-    words = shape[0] * shape[1]
-    memory = np.zeros(words + mmap.PAGESIZE // 2, np.uint16)
+    value_count = shape[0] * shape[1]
+    memory = np.zeros(value_count + mmap.PAGESIZE // 2, np.uint16)
     first = -memory.ctypes.data % mmap.PAGESIZE // 2
-    return memory[first : first + words].reshape(shape)
+    return memory[first : first + value_count].reshape(shape)
 
 
 def _usable(placement: SensorPlacement) -> tuple[float, ...]:

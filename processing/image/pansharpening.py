@@ -55,7 +55,7 @@ def pansharpened(pan: Array, colour: Mapping[str, Array], ratio: float) -> dict[
             )
     result = {name: np.zeros(pan.shape, np.uint16) for name in colour}
     # Strips begin where a colour pixel begins on a whole PAN row.
-    step = _whole_step(ratio)
+    step = _common_step(ratio)
     margin = -(-(ROUNDS + 2) // step) * step
     height_of = max(STRIP_ROWS // step, 1) * step
     for first in range(0, height, height_of):
@@ -65,15 +65,15 @@ def pansharpened(pan: Array, colour: Mapping[str, Array], ratio: float) -> dict[
         end = pan.shape[0] if last == height else round(last * ratio)
         begin, above = round(first * ratio), round(top * ratio)
         strip = pan[above : max(round(bottom * ratio), end)].astype(np.float32)
-        whole = strip[: round((bottom - top) * ratio), : round(width * ratio)]
+        covered = strip[: round((bottom - top) * ratio), : round(width * ratio)]
         for name, band in colour.items():
-            wished = band[top:bottom].astype(np.float32)
-            sharp = _sharpened(strip, whole, wished)
+            target_band = band[top:bottom].astype(np.float32)
+            sharp = _sharpened(strip, covered, target_band)
             result[name][begin:end] = sharp[begin - above : end - above]
     return result
 
 
-def _whole_step(ratio: float) -> int:
+def _common_step(ratio: float) -> int:
     """Colour pixels after which colour and PAN pixels end together; ValueError beyond twelve."""
     for step in range(1, 13):
         if abs(step * ratio - round(step * ratio)) < 1e-6:
@@ -81,34 +81,34 @@ def _whole_step(ratio: float) -> int:
     raise ValueError(f"ratio {ratio}; twelve colour pixels at most cover whole PAN pixels")
 
 
-def _sharpened(strip: Array, whole: Array, wished: Array) -> Array:
+def _sharpened(strip: Array, covered: Array, target_band: Array) -> Array:
     """One band of one strip, (rows, W) uint16; `whole` is the part of `strip` under colour."""
-    lit = (whole > 0.0).astype(np.float32)
-    share = _block_means(lit, wished.shape)
-    target = wished * share
+    has_signal = (covered > 0.0).astype(np.float32)
+    share = _block_means(has_signal, target_band.shape)
+    target = target_band * share
     usable = (target > 0.0).astype(np.float32)
     quotient = np.zeros_like(target)
-    np.divide(target, _block_means(whole, wished.shape), out=quotient, where=usable > 0.0)
+    np.divide(target, _block_means(covered, target_band.shape), out=quotient, where=usable > 0.0)
     for _ in range(ROUNDS):
-        found = _block_means(whole * _spread(quotient, usable, whole.shape), wished.shape)
+        found = _block_means(covered * _spread(quotient, usable, covered.shape), target_band.shape)
         np.multiply(quotient, target / np.maximum(found, 1e-6), out=quotient, where=usable > 0.0)
-    smooth = _spread(quotient, usable, whole.shape)
-    found = _block_means(whole * smooth, wished.shape)
+    smooth = _spread(quotient, usable, covered.shape)
+    found = _block_means(covered * smooth, target_band.shape)
     exact = np.zeros_like(target)
     np.divide(target, found, out=exact, where=usable > 0.0)
-    blocks = smooth * _repeated(exact, whole.shape)
+    blocks = smooth * _repeated(exact, covered.shape)
     field = cv2.copyMakeBorder(
         blocks,
         0,
-        strip.shape[0] - whole.shape[0],
+        strip.shape[0] - covered.shape[0],
         0,
-        strip.shape[1] - whole.shape[1],
+        strip.shape[1] - covered.shape[1],
         cv2.BORDER_REPLICATE,
     )
     signal = strip * field
-    words: Array = np.clip(np.rint(signal), 1.0, _CEILING).astype(np.uint16)
-    words[signal <= 0.0] = 0
-    return words
+    values: Array = np.clip(np.rint(signal), 1.0, _CEILING).astype(np.uint16)
+    values[signal <= 0.0] = 0
+    return values
 
 
 def _spread(quotient: Array, usable: Array, shape: tuple[int, ...]) -> Array:

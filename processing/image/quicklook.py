@@ -141,9 +141,9 @@ def _block_means(image, factor, step, out):
         for y in range(i * factor, (i + 1) * factor, step):
             line = image[y, : columns * factor]
             for x in range(columns * factor):
-                word = np.int32(line[x])
-                totals[x] += word
-                counts[x] += np.int32(word != 0)
+                value = np.int32(line[x])
+                totals[x] += value
+                counts[x] += np.int32(value != 0)
         for j in range(columns):
             total = np.int64(0)
             count = np.int64(0)

@@ -18,10 +18,10 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from processing.geometry.placement import SensorPlacement
-from processing.image.cells import MOST_CELL_PX, fetch_cell, fetch_straight, straight_taps
+from processing.image.cells import MAX_CELL_PX, fetch_cell, fetch_straight, straight_taps
 from processing.image.kernels import KERNELS, Interpolation
 from processing.image.lattice import OUTSIDE
-from processing.image.taps import LINE_WORDS, MISSING
+from processing.image.taps import LINE_LENGTH, MISSING
 
 Array = NDArray[Any]
 
@@ -65,11 +65,11 @@ def resample(
             with `SATURATED_SOURCE` set where one of the four nearest raw pixels was saturated.
 
     Raises:
-        ValueError: a cell that is no multiple of the weight step, or larger than `MOST_CELL_PX`.
+        ValueError: a cell that is no multiple of the weight step, or larger than `MAX_CELL_PX`.
     """
-    if cell_px % WEIGHT_STEP_PX or not 0 < cell_px <= MOST_CELL_PX:
+    if cell_px % WEIGHT_STEP_PX or not 0 < cell_px <= MAX_CELL_PX:
         raise ValueError(
-            f"cell of {cell_px} px; it is a multiple of {WEIGHT_STEP_PX}, at most {MOST_CELL_PX}"
+            f"cell of {cell_px} px; it is a multiple of {WEIGHT_STEP_PX}, at most {MAX_CELL_PX}"
         )
     kernel = KERNELS[interpolation]
     _resample(
@@ -124,19 +124,21 @@ def _add_share(
         flag = flags[y]
         value = values[y]
         sums = total[y]
-        whole = weight[y]
+        total_weight = weight[y]
         highest = best[y]
-        whence = mark[y]
+        source_index = mark[y]
         for k in range(n):
             there = flag[k] < MISSING
             w = line[k] if there else zero
             v = value[k] if there else zero
             sums[k] += w * (gain * v + offset)
-            whole[k] += w
+            total_weight[k] += w
             leads = w > highest[k]
             full = np.int32(flag[k] & 1) * np.int32(w > zero) * np.int32(SATURATED_SOURCE)
-            kept = whence[k] | full
-            whence[k] = ((kept & np.int32(SATURATED_SOURCE)) | name) if leads else kept
+            source_flags = source_index[k] | full
+            source_index[k] = (
+                ((source_flags & np.int32(SATURATED_SOURCE)) | name) if leads else source_flags
+            )
             highest[k] = w if leads else highest[k]
 
 
@@ -148,14 +150,14 @@ def _finish_single(values, flags, gain, offset, name, out, source, y0, x0, rows,
     ceiling = np.float32(65535.0)
     for y in range(rows):
         line = out[y0 + y, x0 : x0 + n]
-        whence = source[y0 + y, x0 : x0 + n]
+        source_index = source[y0 + y, x0 : x0 + n]
         for k in range(n):
             there = flags[y, k] < MISSING
             v = values[y, k] if there else floor
             v = min(max(v * gain + rise, floor), ceiling)
             line[k] = np.uint16(np.int32(v)) if there else np.uint16(0)
             seen = name | np.uint8(np.uint8(flags[y, k] & 1) << np.uint8(7))
-            whence[k] = seen if there else np.uint8(0)
+            source_index[k] = seen if there else np.uint8(0)
 
 
 @njit(cache=True, nogil=True)
@@ -191,16 +193,16 @@ def _finish_blend(total, weight, mark, out, source, y0, x0, rows, n):
     ceiling = np.float32(65535.0)
     for y in range(rows):
         line = out[y0 + y, x0 : x0 + n]
-        whence = source[y0 + y, x0 : x0 + n]
+        source_index = source[y0 + y, x0 : x0 + n]
         sums = total[y]
-        whole = weight[y]
+        total_weight = weight[y]
         marks = mark[y]
         for k in range(n):
-            there = whole[k] > np.float32(0.0)
-            v = sums[k] / (whole[k] if there else floor) + half
+            there = total_weight[k] > np.float32(0.0)
+            v = sums[k] / (total_weight[k] if there else floor) + half
             v = min(max(v, floor), ceiling)
             line[k] = np.uint16(np.int32(v)) if there else np.uint16(0)
-            whence[k] = np.uint8(marks[k]) if there else np.uint8(0)
+            source_index[k] = np.uint8(marks[k]) if there else np.uint8(0)
 
 
 @njit(cache=True, nogil=True)
@@ -290,10 +292,10 @@ def _resample(frames, valid, lattices, cell, weights, gains, offsets, table, rea
     for band in prange((height + cell - 1) // cell):
         values = np.zeros((cell, cell), np.float32)
         flags = np.zeros((cell, cell), np.uint8)
-        lines = np.zeros((_STRIP_ROWS + 1) * LINE_WORDS, np.float32)
+        lines = np.zeros((_STRIP_ROWS + 1) * LINE_LENGTH, np.float32)
         phases = np.empty((2, _STRIP_ROWS), np.float32)
         steps = np.empty((2, _STRIP_ROWS), np.float32)
-        spare = np.empty((2, LINE_WORDS), np.uint16)
+        spare = np.empty((2, LINE_LENGTH), np.uint16)
         total = np.empty((cell, cell), np.float32)
         weight = np.empty((cell, cell), np.float32)
         best = np.empty((cell, cell), np.float32)
@@ -326,7 +328,7 @@ def _resample(frames, valid, lattices, cell, weights, gains, offsets, table, rea
                 table,
                 reach,
                 chosen[:found],
-                lines[:LINE_WORDS],
+                lines[:LINE_LENGTH],
                 spare,
                 values,
                 flags,
@@ -371,5 +373,5 @@ def _resample(frames, valid, lattices, cell, weights, gains, offsets, table, rea
         for y in range(band * cell, band * cell + rows):
             for column in range(columns):
                 if straight[column, 0] >= 0:
-                    whence = source[y, column * cell : (column + 1) * cell]
-                    whence[:] = np.uint8(straight[column, 0] + 1)
+                    source_index = source[y, column * cell : (column + 1) * cell]
+                    source_index[:] = np.uint8(straight[column, 0] + 1)

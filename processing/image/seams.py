@@ -33,7 +33,7 @@ _NOISE_FLOOR_COUNTS: Final = 100.0
 
 
 @dataclass(frozen=True)
-class _Part:
+class _JoinedSensors:
     """Sensors already joined, in the box of nodes from (row, column) on that holds them all: who
     owns each node, and the owner's signal there."""
 
@@ -75,13 +75,16 @@ def seam_labels(centres: Array, means: Array, gains: Array, feather_px: int) -> 
         for index in row[1:]:
             joined = _join(joined, _part(means, gains, index), margin, upright=True)
         parts.append(joined)
-    whole = parts[0]
+    joined_all = parts[0]
     for part in parts[1:]:
-        whole = _join(whole, part, margin, upright=False)
+        joined_all = _join(joined_all, part, margin, upright=False)
     labels = np.zeros(means.shape[1:], np.int8)
-    box = (slice(whole.row, whole.end_row), slice(whole.column, whole.end_column))
-    labels[box] = whole.labels
-    orphaned = whole.signal == np.float32(NOT_COVERED)
+    box = (
+        slice(joined_all.row, joined_all.end_row),
+        slice(joined_all.column, joined_all.end_column),
+    )
+    labels[box] = joined_all.labels
+    orphaned = joined_all.signal == np.float32(NOT_COVERED)
     if orphaned.any():
         inner = labels[box]
         for index in range(len(means)):
@@ -122,15 +125,17 @@ def seam_weights(labels: Array, feather_px: int, out: Array) -> None:
     _feather(labels, (kernel / kernel.sum()).astype(np.float32), out)
 
 
-def _part(means: Array, gains: Array, index: int) -> _Part:
+def _part(means: Array, gains: Array, index: int) -> _JoinedSensors:
     rows, columns = covered_box(means[index])
     there = means[index][rows, columns]
     signal = np.where(there >= 0.0, there * np.float32(gains[index]), there)
     labels = np.full(signal.shape, index, np.int8)
-    return _Part(rows.start, columns.start, labels, signal.astype(np.float32))
+    return _JoinedSensors(rows.start, columns.start, labels, signal.astype(np.float32))
 
 
-def _join(first: _Part, second: _Part, margin: int, *, upright: bool) -> _Part:
+def _join(
+    first: _JoinedSensors, second: _JoinedSensors, margin: int, *, upright: bool
+) -> _JoinedSensors:
     """Join two parts, the second right of the first (`upright` seam) or below it."""
     if not first.labels.size or not second.labels.size:
         return first if first.labels.size else second
@@ -162,11 +167,11 @@ def _join(first: _Part, second: _Part, margin: int, *, upright: bool) -> _Part:
     signal[:, window] = np.where(left, a, b)
     of_a, of_b = (_labels_in(part, row, end_row, low, high) for part in (first, second))
     labels[:, window] = np.where(left, of_a, of_b)
-    return _Part(row, column, labels, signal)
+    return _JoinedSensors(row, column, labels, signal)
 
 
-def _transposed(part: _Part) -> _Part:
-    return _Part(
+def _transposed(part: _JoinedSensors) -> _JoinedSensors:
+    return _JoinedSensors(
         part.column,
         part.row,
         np.ascontiguousarray(part.labels.T),
@@ -174,7 +179,9 @@ def _transposed(part: _Part) -> _Part:
     )
 
 
-def _window(first: _Part, second: _Part, column: int, end_column: int) -> tuple[int, int]:
+def _window(
+    first: _JoinedSensors, second: _JoinedSensors, column: int, end_column: int
+) -> tuple[int, int]:
     """Columns between which the seam must run: from where b begins to where a ends."""
     columns_a = first.column + np.flatnonzero((first.signal != np.float32(NOT_COVERED)).any(axis=0))
     columns_b = second.column + np.flatnonzero(
@@ -186,16 +193,18 @@ def _window(first: _Part, second: _Part, column: int, end_column: int) -> tuple[
     return max(low - 1, column), min(high + 1, end_column)
 
 
-def _signal_in(part: _Part, row: int, end_row: int, low: int, high: int) -> Array:
+def _signal_in(part: _JoinedSensors, row: int, end_row: int, low: int, high: int) -> Array:
     """A part's signal in a window of nodes, `NOT_COVERED` beyond its box."""
     return _laid_out(part, part.signal, (row, end_row, low, high), NOT_COVERED)
 
 
-def _labels_in(part: _Part, row: int, end_row: int, low: int, high: int) -> Array:
+def _labels_in(part: _JoinedSensors, row: int, end_row: int, low: int, high: int) -> Array:
     return _laid_out(part, part.labels, (row, end_row, low, high), int(part.labels.flat[0]))
 
 
-def _laid_out(part: _Part, values: Array, window: tuple[int, int, int, int], fill: float) -> Array:
+def _laid_out(
+    part: _JoinedSensors, values: Array, window: tuple[int, int, int, int], fill: float
+) -> Array:
     row, end_row, low, high = window
     out = np.full((end_row - row, high - low), fill, values.dtype)
     begin, end = max(low, part.column), min(high, part.end_column)
@@ -240,9 +249,9 @@ def _cheapest_path(cost, step_cost):
     rows, positions = cost.shape
     total = cost[0].astype(np.float64)
     middle = (positions - 1) / 2.0
-    come_from = np.zeros((rows, positions), np.int8)
+    predecessor = np.zeros((rows, positions), np.int8)
     for i in range(1, rows):
-        fresh = np.empty(positions, np.float64)
+        start_cost = np.empty(positions, np.float64)
         for k in range(positions):
             best = total[k]
             move = 0
@@ -253,13 +262,13 @@ def _cheapest_path(cost, step_cost):
                 best = total[k + 1] + step_cost
                 move = 1
             # Among equals the middle: 1e-3 is far below any real difference.
-            fresh[k] = best + cost[i, k] + 1e-3 * abs(k - middle)
-            come_from[i, k] = move
-        total = fresh
+            start_cost[k] = best + cost[i, k] + 1e-3 * abs(k - middle)
+            predecessor[i, k] = move
+        total = start_cost
     path = np.zeros(rows, np.int64)
     path[rows - 1] = np.argmin(total)
     for i in range(rows - 1, 0, -1):
-        path[i - 1] = path[i] + come_from[i, path[i]]
+        path[i - 1] = path[i] + predecessor[i, path[i]]
     return path
 
 
@@ -274,11 +283,11 @@ def _feather(labels, kernel, out):
         shares = np.zeros(out.shape[0], np.float32)
         for j in range(columns):
             own = labels[i, j]
-            alone = True
+            single = True
             for y in range(max(i - reach, 0), min(i + reach + 1, rows)):
                 for x in range(max(j - reach, 0), min(j + reach + 1, columns)):
-                    alone &= labels[y, x] == own
-            if alone:
+                    single &= labels[y, x] == own
+            if single:
                 out[own, i, j] = WEIGHT_UNIT
                 continue
             shares[:] = 0.0

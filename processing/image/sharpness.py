@@ -16,8 +16,8 @@ Array = NDArray[Any]
 
 _EVERY_ROW: Final = 16
 _BUNDLE: Final = 32
-_LEAST_LENGTH: Final = 34
-_LEAST_SIGNAL: Final = 4.0
+_MIN_LENGTH: Final = 34
+_MIN_SIGNAL: Final = 4.0
 """Detail at two pixels' distance must exceed its noise so many times before sharpness is told."""
 
 
@@ -36,7 +36,7 @@ def sharpness(
         rows: first and last exposed row.
     """
     first, last = rows
-    if last - first + 1 < _LEAST_LENGTH or frame.shape[1] < _LEAST_LENGTH:
+    if last - first + 1 < _MIN_LENGTH or frame.shape[1] < _MIN_LENGTH:
         return None, None
     sums = np.zeros((last - first + 1, 2, 4))
     _difference_sums(frame[first : last + 1], sums)
@@ -67,7 +67,7 @@ def _share(sensor: Sensor, sums: Array, counts: float) -> float | None:
     # Black and rounding are part of the read noise; a calibrated gain is near one here.
     noise_dn2 = (electrons + sensor.read_noise_e**2) / sensor.electrons_per_dn**2
     noise = 2.0 * noise_dn2 * counts**2
-    if far < _LEAST_SIGNAL * noise or far - noise <= 0.0:
+    if far < _MIN_SIGNAL * noise or far - noise <= 0.0:
         return None
     return (near - noise) / (far - noise)
 
@@ -86,23 +86,23 @@ def _difference_sums(frame, sums):
             near = far = signal = 0.0
             for first in range(0, width - _BUNDLE + 1, _BUNDLE * _EVERY_ROW):
                 for c in range(first, first + _BUNDLE):
-                    word = np.int32(here[c])
-                    one = np.float64(np.int32(next_row[c]) - word)
-                    two = np.float64(np.int32(after[c]) - word)
+                    signal_here = np.int32(here[c])
+                    one = np.float64(np.int32(next_row[c]) - signal_here)
+                    two = np.float64(np.int32(after[c]) - signal_here)
                     near += one * one
                     far += two * two
-                    signal += np.float64(word)
+                    signal += np.float64(signal_here)
                 sums[r, 0, 3] += _BUNDLE
             sums[r, 0, 0], sums[r, 0, 1], sums[r, 0, 2] = near, far, signal
         if r % _EVERY_ROW == 0:
             line = frame[r]
             near = far = signal = 0.0
             for c in range(width - 2):
-                word = np.int32(line[c])
-                one = np.float64(np.int32(line[c + 1]) - word)
-                two = np.float64(np.int32(line[c + 2]) - word)
+                signal_here = np.int32(line[c])
+                one = np.float64(np.int32(line[c + 1]) - signal_here)
+                two = np.float64(np.int32(line[c + 2]) - signal_here)
                 near += one * one
                 far += two * two
-                signal += np.float64(word)
+                signal += np.float64(signal_here)
             sums[r, 1, 0], sums[r, 1, 1], sums[r, 1, 2] = near, far, signal
             sums[r, 1, 3] = width - 2

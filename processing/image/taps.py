@@ -18,12 +18,12 @@ SATURATED: Final = 1
 MISSING: Final = 2
 """Bits of a pixel's flag: one of the four nearest raw pixels saturated; no value at all."""
 
-LINE_WORDS: Final = 96
+LINE_LENGTH: Final = 96
 """Words from one scratch row to the next: known to the compiler, which else would not vectorise."""
 _SPAN: Final = np.float32(0.08)
 """Phases, in px, over which weights go in a straight line. At its ends a weight is then off by
 0.0008 of its second derivative: the phase error grows by 0.0004 px."""
-_LANES: Final = 8
+_VECTOR_WIDTH: Final = 8
 """Words of a vector."""
 
 
@@ -42,7 +42,7 @@ def _piece(span, n):
     if span <= _SPAN:
         return n
     pieces = np.int64(np.ceil(span / _SPAN))
-    return min(n, (n + pieces * _LANES - 1) // (pieces * _LANES) * _LANES)
+    return min(n, (n + pieces * _VECTOR_WIDTH - 1) // (pieces * _VECTOR_WIDTH) * _VECTOR_WIDTH)
 
 
 @njit(cache=True, fastmath=True, nogil=True, inline="always")
@@ -104,12 +104,12 @@ def middle_and_span(phases, steps, rows, n):
 def down_strip(flat, start, width, phases, steps, table, lines, rows, n):
     """As `down` for target rows whose taps lie one raw row apart, with one row of the table.
 
-    Row y has the phases phases[y] + steps[y] * j and goes to `lines` from y * `LINE_WORDS` on.
+    Row y has the phases phases[y] + steps[y] * j and goes to `lines` from y * `LINE_LENGTH` on.
     """
     middle, span = middle_and_span(phases, steps, rows, n)
     if span > _SPAN:
         for y in range(rows):
-            line = lines[y * LINE_WORDS :]
+            line = lines[y * LINE_LENGTH :]
             down(flat, start + y * width, width, phases[y], steps[y], table, line, n)
         return
     row, beyond = weights_at(table, middle)
@@ -125,7 +125,7 @@ def down_strip(flat, start, width, phases, steps, table, lines, rows, n):
         a4 = flat[begin + 4 * width : begin + 4 * width + n]
         a5 = flat[begin + 5 * width : begin + 5 * width + n]
         a6 = flat[begin + 6 * width : begin + 6 * width + n]
-        line = lines[y * LINE_WORDS :]
+        line = lines[y * LINE_LENGTH :]
         p0 = phases[y] - at
         p1 = phases[y + 1] - at
         s0 = steps[y]
@@ -143,10 +143,10 @@ def down_strip(flat, start, width, phases, steps, table, lines, rows, n):
             upper = _sum6(w, b0, b1, b2, b3, b4, b5)
             lower = _sum6(w, b1, b2, b3, b4, b5, b6)
             line[j] = upper + x * _sum6(s, b0, b1, b2, b3, b4, b5)
-            line[j + LINE_WORDS] = lower + z * _sum6(s, b1, b2, b3, b4, b5, b6)
+            line[j + LINE_LENGTH] = lower + z * _sum6(s, b1, b2, b3, b4, b5, b6)
     if rows % 2:
         y = rows - 1
-        line = lines[y * LINE_WORDS :]
+        line = lines[y * LINE_LENGTH :]
         down(flat, start + y * width, width, phases[y], steps[y], table, line, n)
 
 
@@ -173,7 +173,7 @@ def along(line, first, step, table, out, n):
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def words_strip(lines, phases, steps, table, gain, offset, out, y0, x0, rows, n):
+def values_strip(lines, phases, steps, table, gain, offset, out, y0, x0, rows, n):
     """As `along` row by row, times gain plus offset, rounded to words that are signal.
 
     Behind the rows, `lines` has one more.
@@ -181,9 +181,9 @@ def words_strip(lines, phases, steps, table, gain, offset, out, y0, x0, rows, n)
     rise = offset + np.float32(0.5)
     middle, span = middle_and_span(phases, steps, rows, n)
     if span > _SPAN:
-        values = lines[rows * LINE_WORDS :]
+        values = lines[rows * LINE_LENGTH :]
         for y in range(rows):
-            along(lines[y * LINE_WORDS :], phases[y], steps[y], table, values, n)
+            along(lines[y * LINE_LENGTH :], phases[y], steps[y], table, values, n)
             target = out[y0 + y, x0 : x0 + n]
             for k in range(n):
                 v = min(max(values[k] * gain + rise, np.float32(1.0)), np.float32(65535.0))
@@ -193,7 +193,7 @@ def words_strip(lines, phases, steps, table, gain, offset, out, y0, x0, rows, n)
     at = middle - beyond
     w, s = _spread(table[row])
     for y in range(rows):
-        a = lines[y * LINE_WORDS : (y + 1) * LINE_WORDS]
+        a = lines[y * LINE_LENGTH : (y + 1) * LINE_LENGTH]
         target = out[y0 + y, x0 : x0 + n]
         phase = phases[y] - at
         step = steps[y]
@@ -209,13 +209,13 @@ def words_strip(lines, phases, steps, table, gain, offset, out, y0, x0, rows, n)
 def is_clean(flat, start, width, rows, columns):
     """Whether a box of raw words holds neither saturated pixels nor holes."""
     least = np.uint16(65535)
-    odd = np.uint16(0)
+    odd_bits = np.uint16(0)
     for r in range(rows):
         a = flat[start + r * width : start + r * width + columns]
         for j in range(len(a)):
             least = min(least, a[j])
-            odd |= a[j]
-    return least != 0 and (odd & np.uint16(1)) == 0
+            odd_bits |= a[j]
+    return least != 0 and (odd_bits & np.uint16(1)) == 0
 
 
 @njit(cache=True, nogil=True)

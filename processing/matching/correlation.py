@@ -114,19 +114,19 @@ def _products(flat: Array, first: int, wide: int, template: Array, products: Arr
     it has a margin below.
     """
     products[:] = np.float32(0.0)
-    count, lanes = products.shape
+    count, vector_count = products.shape
     for r in range(template.shape[0]):
         for c in range(0, template.shape[1], _TAPS):
             t = template[r, c : c + _TAPS]
             taps = (t[0], t[1], t[2], t[3], t[4], t[5], t[6], t[7])
             for k in range(count):
                 start = first + (r + k) * wide + c
-                source = flat[start : start + lanes + _TAPS - 1]
+                source = flat[start : start + vector_count + _TAPS - 1]
                 # A count known to the compiler: two vectors and nothing left over.
-                if lanes == 16:
+                if vector_count == 16:
                     _add_taps(source, taps, products[k], 16)
                 else:
-                    _add_taps(source, taps, products[k], lanes)
+                    _add_taps(source, taps, products[k], vector_count)
 
 
 @njit(cache=True, fastmath=True, inline="always")

@@ -23,7 +23,7 @@ _MATHEMATICS: Final = {"contract", "reassoc"}
 
 @njit(cache=True, parallel=True, nogil=True)
 def select_features(
-    frame: Array, cells: Array, half_window: int, stride: int, words: bool
+    frame: Array, cells: Array, half_window: int, stride: int, is_uint16: bool
 ) -> Array:
     """The most feature-rich position of each cell: the structure tensor's smaller eigenvalue peaks.
 
@@ -71,10 +71,10 @@ def select_features(
             )
             wide = columns + two
             n = rows * wide
-            marred = _products(sides, heres, uppers, two, wide, n, words, planes)
-            for k in range(4 if marred else 3):
+            unusable = _products(sides, heres, uppers, two, wide, n, is_uint16, planes)
+            for k in range(4 if unusable else 3):
                 _box_sums(planes[k], wide, n, reach, spare)
-            if not marred:
+            if not unusable:
                 planes[3, :n] = np.float32(0.0)
             best, place = _best(planes, wide, rows - reach + 1, columns - reach + 1)
             result[i, 0] = cells[i, 0] + place % wide * stride
@@ -108,7 +108,7 @@ def _load(frame, row, column, stride, rows, columns, sides, heres, uppers):
 
 
 @njit(cache=True, fastmath=_MATHEMATICS, nogil=True)
-def _products(sides, heres, uppers, two, wide, n, words, planes):
+def _products(sides, heres, uppers, two, wide, n, is_uint16, planes):
     """Products of the gradients xx, xy, yy, and where they cannot be used; whether that is any.
 
     What lies beyond the last sample of a row is filled somehow and never looked at.
@@ -128,7 +128,7 @@ def _products(sides, heres, uppers, two, wide, n, words, planes):
     for p in range(size, n):
         xx[p] = xy[p] = yy[p] = bad[p] = np.float32(0.0)
     some = np.int32(0)
-    if words:
+    if is_uint16:
         for p in range(size):
             a, b = np.int32(left[p]), np.int32(right[p])
             c, d = np.int32(up[p]), np.int32(down[p])

@@ -37,7 +37,7 @@ Array = NDArray[Any]
 
 _STEPS: Final = 8
 _CONVERGED_PX: Final = 0.004
-_LARGEST_SHIFT_PX: Final = 1.2
+_MAX_SHIFT_PX: Final = 1.2
 
 
 @njit(cache=True)
@@ -75,7 +75,7 @@ def _dot(a: Array, b: Array) -> float:
 
 
 @njit(cache=True, fastmath=True)
-def _take_away(values: Array, direction: Array, square: float) -> None:
+def _orthogonalise(values: Array, direction: Array, square: float) -> None:
     """Leave what is orthogonal to a direction, whose sum of squares is given."""
     share = np.float32(_dot(values, direction) / max(square, 1e-12))
     for p in range(values.shape[0]):
@@ -195,8 +195,8 @@ def refine(
         _centre(ax, side, stride)
         _centre(ay, side, stride)
         signal = _dot(lean, lean)
-        _take_away(ax, lean, signal)
-        _take_away(ay, lean, signal)
+        _orthogonalise(ax, lean, signal)
+        _orthogonalise(ay, lean, signal)
         nxx, nxy, nyy = _dot(ax, ax), _dot(ax, ay), _dot(ay, ay)
         determinant = nxx * nyy - nxy * nxy
         if determinant <= 1e-9 * nxx * nyy:
@@ -210,7 +210,7 @@ def refine(
             return False
         dx += step_x
         dy += step_y
-        if abs(dx) > _LARGEST_SHIFT_PX or abs(dy) > _LARGEST_SHIFT_PX:
+        if abs(dx) > _MAX_SHIFT_PX or abs(dy) > _MAX_SHIFT_PX:
             return False
     # The last step once more, with the difference in sharpness beside the shift. Noise is in the
     # Laplacian too; weighed by what is behind a sample it agrees with neither image.
@@ -221,11 +221,11 @@ def refine(
     add_laplacian(patches[0], widths[0], corner_a, back, side, table, rows, wa, bx, part_a, bent)
     add_laplacian(patches[1], widths[1], corner_b, forth, side, table, rows, wb, bx, part_b, bent)
     _centre(bent, side, stride)
-    _take_away(bent, lean, signal)
+    _orthogonalise(bent, lean, signal)
     bend = _dot(bent, bent)
-    _take_away(ax, bent, bend)
-    _take_away(ay, bent, bend)
-    _take_away(fa, bent, bend)
+    _orthogonalise(ax, bent, bend)
+    _orthogonalise(ay, bent, bend)
+    _orthogonalise(fa, bent, bend)
     nxx, nxy, nyy = _dot(ax, ax), _dot(ax, ay), _dot(ay, ay)
     determinant = nxx * nyy - nxy * nxy
     if determinant <= 1e-9 * nxx * nyy:
@@ -235,7 +235,7 @@ def refine(
     step_y = (nxx * hy - nxy * hx) / determinant
     dx += step_x
     dy += step_y
-    if abs(dx) > _LARGEST_SHIFT_PX or abs(dy) > _LARGEST_SHIFT_PX:
+    if abs(dx) > _MAX_SHIFT_PX or abs(dy) > _MAX_SHIFT_PX:
         return False
     squares = _dot(fa, fa) - (hx * step_x + hy * step_y)
     # Neighbouring samples share raw pixels: the variance of the shift comes from the raw pixels.

@@ -36,7 +36,7 @@ _BLOCK: Final = 32
 
 
 @njit(cache=True)
-def _load(frame: Array, col: int, row: int, ratio: int, words: bool, patch: Array) -> bool:
+def _load(frame: Array, col: int, row: int, ratio: int, is_uint16: bool, patch: Array) -> bool:
     """Fill a patch with box means of ratio x ratio pixels, the first box beginning at (col, row).
 
     The patch is left with a mean near zero, so that single precision suffices. False: bad pixels.
@@ -49,10 +49,10 @@ def _load(frame: Array, col: int, row: int, ratio: int, words: bool, patch: Arra
     bad = np.int32(0)
     for r in range(height):
         first = row + r * ratio
-        if words and ratio == 1:
-            bad = _words_of_one(frame[first, col : col + n], np.int32(origin), patch[r])
-        elif words and ratio == 3:
-            bad = _words_of_three(
+        if is_uint16 and ratio == 1:
+            bad = _load_row(frame[first, col : col + n], np.int32(origin), patch[r])
+        elif is_uint16 and ratio == 3:
+            bad = _load_row_sums(
                 frame[first, col : col + n],
                 frame[first + 1, col : col + n],
                 frame[first + 2, col : col + n],
@@ -65,10 +65,10 @@ def _load(frame: Array, col: int, row: int, ratio: int, words: bool, patch: Arra
             line[:] = np.float32(0.0)
             for i in range(ratio):
                 source = frame[first + i, col : col + n]
-                if words:
+                if is_uint16:
                     for k in range(n):
-                        word = np.int32(source[k])
-                        bad |= (word & 1) | np.int32(word == 0)
+                        value = np.int32(source[k])
+                        bad |= (value & 1) | np.int32(value == 0)
                 for k in range(n):
                     line[k] += np.float32(source[k]) - np.float32(origin)
             for c in range(width):
@@ -82,18 +82,18 @@ def _load(frame: Array, col: int, row: int, ratio: int, words: bool, patch: Arra
 
 
 @njit(cache=True)
-def _words_of_one(source: Array, origin: Any, line: Array) -> Any:
+def _load_row(source: Array, origin: Any, line: Array) -> Any:
     """A row of words less the origin; not zero where one is bad."""
     bad = np.int32(0)
     for k in range(len(line)):
-        word = np.int32(source[k])
-        bad |= (word & np.int32(1)) | np.int32(word == 0)
-        line[k] = np.float32(np.int32(word - origin))
+        value = np.int32(source[k])
+        bad |= (value & np.int32(1)) | np.int32(value == 0)
+        line[k] = np.float32(np.int32(value - origin))
     return bad
 
 
 @njit(cache=True)
-def _words_of_three(upper: Array, middle: Array, lower: Array, origin: Any, line: Array) -> Any:
+def _load_row_sums(upper: Array, middle: Array, lower: Array, origin: Any, line: Array) -> Any:
     """Sums of three rows of words less the origin; not zero where one is bad."""
     bad = np.int32(0)
     for k in range(len(line)):
@@ -122,7 +122,7 @@ def match_patches(
     ratio: int,
     half_window: int,
     search: int,
-    words: bool,
+    is_uint16: bool,
     table: Array,
 ) -> Array:
     """Find windows of frame a, reduced by `ratio`, in frame b.
@@ -165,42 +165,44 @@ def match_patches(
         reach = np.empty(4, np.int64)
         for i in range(block * _BLOCK, min((block + 1) * _BLOCK, count)):
             col_b, row_b = at_b[i, 0], at_b[i, 1]
-            room = half_window + margin
+            margin_px = half_window + margin
             if i + 1 < count:
                 fetch_ahead(
                     frame_a,
-                    at_a[i + 1, 0] - ratio * room,
-                    at_a[i + 1, 1] - ratio * room,
+                    at_a[i + 1, 0] - ratio * margin_px,
+                    at_a[i + 1, 1] - ratio * margin_px,
                     ratio * size_a,
                     ratio * size_a,
                 )
                 fetch_ahead(
                     frame_b,
-                    at_b[i + 1, 0] - room - search,
-                    at_b[i + 1, 1] - room - search,
+                    at_b[i + 1, 0] - margin_px - search,
+                    at_b[i + 1, 1] - margin_px - search,
                     size_b,
                     size_b,
                 )
-            reach[0] = max(-search, limits_b[0] + room - col_b)
-            reach[1] = min(search, limits_b[1] - room - col_b)
-            reach[2] = max(-search, limits_b[2] + room - row_b)
-            reach[3] = min(search, limits_b[3] - room - row_b)
+            reach[0] = max(-search, limits_b[0] + margin_px - col_b)
+            reach[1] = min(search, limits_b[1] - margin_px - col_b)
+            reach[2] = max(-search, limits_b[2] + margin_px - row_b)
+            reach[3] = min(search, limits_b[3] - margin_px - row_b)
             if reach[1] - reach[0] < 2 or reach[3] - reach[2] < 2:
                 continue
-            col_a = at_a[i, 0] - ratio * room
-            row_a = at_a[i, 1] - ratio * room
-            if not _load(frame_a, col_a, row_a, ratio, words, a) or not (words or _all_finite(a)):
+            col_a = at_a[i, 0] - ratio * margin_px
+            row_a = at_a[i, 1] - ratio * margin_px
+            if not _load(frame_a, col_a, row_a, ratio, is_uint16, a) or not (
+                is_uint16 or _all_finite(a)
+            ):
                 continue
             # Only what lies in the frame is loaded; the rest of b is never looked at.
-            rows_b = 2 * room + 1 + reach[3] - reach[2]
-            cols_b = 2 * room + 1 + reach[1] - reach[0]
+            rows_b = 2 * margin_px + 1 + reach[3] - reach[2]
+            cols_b = 2 * margin_px + 1 + reach[1] - reach[0]
             part = b[
                 search + reach[2] : search + reach[2] + rows_b,
                 search + reach[0] : search + reach[0] + cols_b,
             ]
-            first_col, first_row = col_b - room + reach[0], row_b - room + reach[2]
-            if not _load(frame_b, first_col, first_row, 1, words, part) or not (
-                words or _all_finite(part)
+            first_col, first_row = col_b - margin_px + reach[0], row_b - margin_px + reach[2]
+            if not _load(frame_b, first_col, first_row, 1, is_uint16, part) or not (
+                is_uint16 or _all_finite(part)
             ):
                 continue
             correlate(a, b, half_window, reach, correlation, surface)
@@ -221,8 +223,8 @@ def match_patches(
                         or row + ratio * size_a > frame_a.shape[0]
                     ):
                         continue
-                    if not _load(frame_a, col, row, ratio, words, a) or not (
-                        words or _all_finite(a)
+                    if not _load(frame_a, col, row, ratio, is_uint16, a) or not (
+                        is_uint16 or _all_finite(a)
                     ):
                         continue
                 shift = (best[2] + moved_col / ratio, best[3] + moved_row / ratio)

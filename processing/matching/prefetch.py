@@ -30,13 +30,13 @@ def _fetch(typing_context: Any, array: Any, row: Any, column: Any) -> Any:
         )
         base = builder.ptrtoint(view.data, offset.type)
         place = builder.inttoptr(builder.add(base, offset), ir.IntType(8).as_pointer())
-        word = ir.IntType(32)
+        int32 = ir.IntType(32)
         prefetch = builder.module.declare_intrinsic(
             "llvm.prefetch",
             [place.type],
-            ir.FunctionType(ir.VoidType(), [place.type, word, word, word]),
+            ir.FunctionType(ir.VoidType(), [place.type, int32, int32, int32]),
         )
-        builder.call(prefetch, [place, word(0), word(3), word(1)])
+        builder.call(prefetch, [place, int32(0), int32(3), int32(1)])
         return context.get_dummy_value()
 
     return types.void(array, types.intp, types.intp), lower

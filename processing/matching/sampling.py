@@ -165,12 +165,12 @@ def sample_window(
     """
     dx, dy = shift
     stride = window_stride(side)
-    whole_x, whole_y = int(np.floor(dx)), int(np.floor(dy))
-    _tap_weights(table, 0, dx - whole_x, w[0])
-    _tap_weights(table, 1, dx - whole_x, w[1])
-    _tap_weights(table, 0, dy - whole_y, w[2])
-    _tap_weights(table, 1, dy - whole_y, w[3])
-    first = (corner[0] + whole_y - 3) * width + corner[1] + whole_x - 3
+    integer_x, integer_y = int(np.floor(dx)), int(np.floor(dy))
+    _tap_weights(table, 0, dx - integer_x, w[0])
+    _tap_weights(table, 1, dx - integer_x, w[1])
+    _tap_weights(table, 0, dy - integer_y, w[2])
+    _tap_weights(table, 1, dy - integer_y, w[3])
+    first = (corner[0] + integer_y - 3) * width + corner[1] + integer_x - 3
     _along_rows(patch, width, first, w[0], rows[0], stride, side + 7)
     _along_rows(patch, width, first, w[1], rows[1], stride, side + 7)
     _along_columns(rows[0], w[2], value, side, stride)
@@ -205,10 +205,10 @@ def add_laplacian(
     """
     dx, dy = shift
     stride = window_stride(side)
-    whole_x, whole_y = int(np.floor(dx)), int(np.floor(dy))
-    _tap_weights(table, 2, dx - whole_x, w[1])
-    _tap_weights(table, 2, dy - whole_y, w[3])
-    first = (corner[0] + whole_y - 3) * width + corner[1] + whole_x - 3
+    integer_x, integer_y = int(np.floor(dx)), int(np.floor(dy))
+    _tap_weights(table, 2, dx - integer_x, w[1])
+    _tap_weights(table, 2, dy - integer_y, w[3])
+    first = (corner[0] + integer_y - 3) * width + corner[1] + integer_x - 3
     for along_x in range(2):
         _along_rows(patch, width, first, w[along_x], rows[0], stride, side + 7)
         _along_columns(rows[0], w[3 - along_x], spare, side, stride)

@@ -14,8 +14,8 @@ from processing.radiometry.level1 import level1_counts_per_dn
 from processing.rig import Sensor
 
 TEXTURE_OVER_NOISE: Final = 3.0
-"""Mean square of the differences of pixels `APART_PX` apart over that of photons and read-out."""
-APART_PX: Final = 2
+"""Mean square of the differences of pixels `PIXEL_SPACING_PX` apart over that of photons and read-out."""
+PIXEL_SPACING_PX: Final = 2
 
 
 def has_texture(
@@ -39,12 +39,12 @@ def has_texture(
         rows = slice(max(row - half, 0), max(row + half + 1, 0))
         columns = slice(max(column - half, 0), max(column + half + 1, 0))
         window = frame[rows, columns].astype(np.float32)
-        if min(window.shape) > APART_PX:
+        if min(window.shape) > PIXEL_SPACING_PX:
             photons = float(window.mean()) / per_dn / sensor.electrons_per_dn
             read_dn = sensor.read_noise_e / sensor.electrons_per_dn
             noise_dn2 = 2.0 * (max(photons, 0.0) + read_dn**2)
-            across = np.mean((window[:, APART_PX:] - window[:, :-APART_PX]) ** 2)
-            along = np.mean((window[APART_PX:] - window[:-APART_PX]) ** 2)
+            across = np.mean((window[:, PIXEL_SPACING_PX:] - window[:, :-PIXEL_SPACING_PX]) ** 2)
+            along = np.mean((window[PIXEL_SPACING_PX:] - window[:-PIXEL_SPACING_PX]) ** 2)
             seen_dn2 = 0.5 * float(across + along) / per_dn**2
             result[i] = seen_dn2 > TEXTURE_OVER_NOISE * noise_dn2
     return result

@@ -1,8 +1,8 @@
 """Tie points: the same ground in two sensors, PAN to PAN and PAN to the colour master.
 
-They are matched here, in Level-1 frames of raw geometry, where `processing.matching.tie_places`
-seeks them; the compiled kernels are in `processing.matching.patches`, what the points are good for
-in `processing.mosaic.free`.
+They are matched here, in Level-1 frames of raw geometry, where
+`processing.matching.tie_point_search` seeks them; the compiled kernels are in
+`processing.matching.patches`, what the points are good for in `processing.mosaic.free_mosaic`.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from processing.geometry.placement import SensorPlacement
 from processing.geometry.topology import exact_colour_ratio
-from processing.image.as_seen import as_seen_by
+from processing.image.rectification import rectify_to_sensor
 from processing.matching.patches import INTERPOLATION, match_patches
-from processing.matching.tie_places import (
+from processing.matching.tie_point_search import (
     PAN_TO_COLOUR,
     PAN_TO_PAN,
     TiePointSettings,
@@ -46,7 +46,7 @@ class TiePoints:
 
     names: tuple[str, ...]
     pairs: tuple[tuple[str, str], ...]
-    sought: tuple[int, ...]
+    attempted: tuple[int, ...]
     sensor_a: NDArray[np.int64]
     sensor_b: NDArray[np.int64]
     raw_a: Array
@@ -62,8 +62,8 @@ class TiePoints:
     def only(self, keep: NDArray[np.bool_]) -> TiePoints:
         """The points whose rows `keep` (n,) marks; `pairs` and `sought` stay."""
         columns = ("sensor_a", "sensor_b", "raw_a", "raw_b", "sigma_px", "correlation", "kind")
-        kept = {name: getattr(self, name)[keep] for name in (*columns, "overlap")}
-        return replace(self, **kept)
+        selected = {name: getattr(self, name)[keep] for name in (*columns, "overlap")}
+        return replace(self, **selected)
 
     def counts(self) -> dict[tuple[str, str], int]:
         """Points found per pair of sensors; pairs without any included."""
@@ -111,10 +111,10 @@ def match_tie_points(
         window = settings.window_pp_px if to_pan else settings.window_pc_px
         frame_a, at_a, seen, step = frames[a], search.at_a, None, search.step
         if search.region is not None:
-            seen = as_seen_by(
+            seen = rectify_to_sensor(
                 placements[a], placements[b], frame_a, region=search.region, step=step
             )
-            frame_a, at_a = seen.words, seen.at(search.at_b)
+            frame_a, at_a = seen.pixels, seen.at(search.at_b)
         found = match_patches(
             frame_a,
             frames[b],
@@ -148,7 +148,7 @@ def match_tie_points(
     return TiePoints(
         names=names,
         pairs=tuple(search.pair for search in searches),
-        sought=tuple(len(search.at_a) for search in searches),
+        attempted=tuple(len(search.at_a) for search in searches),
         sensor_a=table[:, 0].astype(np.int64),
         sensor_b=table[:, 1].astype(np.int64),
         raw_a=table[:, 2:4].copy(),

@@ -24,7 +24,7 @@ _PART = 2048
 
 
 @dataclass(frozen=True)
-class Block:
+class ObservationBlock:
     """m observation equations dp @ design = misclosure + v that touch the unknowns `columns` (k).
 
     `design` is (k, m), a row of derivatives for each unknown (the usual matrix transposed, so that
@@ -39,7 +39,7 @@ class Block:
 
 
 @dataclass(frozen=True)
-class Solution:
+class ConstrainedSolution:
     """Corrections dp and what is known of them.
 
     `cofactor` is the (u, u) inverse belonging to unit weight. `rank` is that of the normal matrix
@@ -54,7 +54,7 @@ class Solution:
     undetermined: Array
 
 
-def normal_equations(blocks: Sequence[Block], unknowns: int) -> tuple[Array, Array]:
+def normal_equations(blocks: Sequence[ObservationBlock], unknowns: int) -> tuple[Array, Array]:
     """Normal matrix (u, u) and right-hand side (u,) of all blocks."""
     normal = np.zeros((unknowns, unknowns))
     right = np.zeros(unknowns)
@@ -74,22 +74,22 @@ def solve(
     constraints: Array,
     misclosure: Array,
     *,
-    held_at: Array,
-    least_information: float,
-) -> Solution:
+    fixed_at: Array,
+    min_information: float,
+) -> ConstrainedSolution:
     """Solve the normal equations, bordered with constraints @ dp = misclosure.
 
     Unknowns must be scaled alike. Directions with less information (eigenvalue of the normal
-    matrix, constraints included) than `least_information` count as undetermined: these alone get a
-    pseudo-observation of that information that draws them to `held_at` (as a correction dp).
+    matrix, constraints included) than `min_information` count as undetermined: these alone get a
+    pseudo-observation of that information that draws them to `fixed_at` (as a correction dp).
 
     Args:
         normal: (u, u).
         right: (u,).
         constraints: (c, u), linearly independent rows.
         misclosure: (c,).
-        held_at: (u,).
-        least_information: in units of the normal matrix.
+        fixed_at: (u,).
+        min_information: in units of the normal matrix.
 
     Raises:
         ValueError: constraints that depend on each other.
@@ -100,10 +100,10 @@ def solve(
         raise ValueError("constraints depend on each other; give each condition once")
     eigenvalues = np.linalg.eigvalsh(normal)
     top = max(float(eigenvalues[-1]), np.finfo(float).tiny)
-    strength = max(top, least_information)
+    strength = max(top, min_information)
     fixed_values, directions = np.linalg.eigh(normal + strength * (rows.T @ rows))
-    free = directions[:, fixed_values < least_information]
-    held = normal + least_information * (free @ free.T)
+    free = directions[:, fixed_values < min_information]
+    held = normal + min_information * (free @ free.T)
     # Balanced against the border, so that the inversion stays well conditioned.
     border = rows * np.sqrt(strength)
     bordered = np.zeros((unknowns + conditions, unknowns + conditions))
@@ -111,12 +111,12 @@ def solve(
     bordered[:unknowns, unknowns:] = border.T
     bordered[unknowns:, :unknowns] = border
     target = np.zeros(unknowns + conditions)
-    target[:unknowns] = right + least_information * (free @ (free.T @ held_at))
+    target[:unknowns] = right + min_information * (free @ (free.T @ fixed_at))
     if conditions:
         target[unknowns:] = misclosure / np.linalg.norm(constraints, axis=1) * np.sqrt(strength)
     inverse = np.linalg.inv(bordered)
     cofactor = inverse[:unknowns, :unknowns]
-    return Solution(
+    return ConstrainedSolution(
         dp=(inverse @ target)[:unknowns],
         cofactor=0.5 * (cofactor + cofactor.T),
         rank=int(np.sum(eigenvalues > _RANK_TOLERANCE * top)),
@@ -125,7 +125,7 @@ def solve(
     )
 
 
-def redundancy_numbers(block: Block, cofactor: Array) -> Array:
+def redundancy_numbers(block: ObservationBlock, cofactor: Array) -> Array:
     """r_i = 1 - p_i a_i Q a_i' of each observation of a block, weightless ones too (r_i = 1)."""
     q = cofactor[np.ix_(block.columns, block.columns)]
     numbers = np.empty(len(block.weight))
@@ -137,7 +137,7 @@ def redundancy_numbers(block: Block, cofactor: Array) -> Array:
     return np.asarray(np.clip(numbers, 0.0, 1.0, out=numbers))
 
 
-def _parts(block: Block) -> Iterator[slice]:
+def _parts(block: ObservationBlock) -> Iterator[slice]:
     """Observations so many at a time that their derivatives stay in the cache."""
     for first in range(0, len(block.weight), _PART):
         yield slice(first, first + _PART)

@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.matching.tie_points import PAN_TO_COLOUR
-from processing.mosaic.adjustment import Block, normal_equations
-from processing.mosaic.weights import CLASSES, Group
+from processing.mosaic.adjustment import ObservationBlock, normal_equations
+from processing.mosaic.weights import CLASSES, TiePointGroup
 
 Array = NDArray[np.float64]
 
 _POINTS_PER_CLUSTER: Final = 30.0
-_LEAST_CLUSTERS: Final = 30
+_MIN_CLUSTERS: Final = 30
 """Fewer sums of residuals tell their variance to no better than a quarter."""
 _REACH_PX: Final = 93.0
 """How far, in colour pixels, P/C points err alike: sums over cells of area a show a / (a + reach^2)
@@ -32,8 +32,8 @@ of what sums over whole sensors have. Measured on rendered exposures (docs/match
 
 
 def clustered_cofactor(
-    groups: Sequence[Group],
-    blocks: Sequence[Block],
+    groups: Sequence[TiePointGroup],
+    blocks: Sequence[ObservationBlock],
     cofactor: Array,
     scale: Array,
     sigma0: float,
@@ -73,8 +73,8 @@ def clustered_cofactor(
 
 
 def _variance_ratio(
-    groups: Sequence[Group],
-    blocks: Sequence[Block],
+    groups: Sequence[TiePointGroup],
+    blocks: Sequence[ObservationBlock],
     cofactor: Array,
     scale: Array,
     sigma0: float,
@@ -109,7 +109,7 @@ def _variance_ratio(
             expected += float(np.sum(left))
             shown += float(np.sum(left)) * area_mm2 / (area_mm2 + reach_mm**2)
         clusters += 2 * len(amount)
-    if clusters < _LEAST_CLUSTERS or expected <= 0.0:
+    if clusters < _MIN_CLUSTERS or expected <= 0.0:
         return 1.0
     return 1.0 + (found - expected) / shown
 

@@ -1,6 +1,6 @@
 """What fixes the datum of a mosaic: inner constraints between its unknowns.
 
-The adjustment they go into is in `processing.mosaic.free`.
+The adjustment they go into is in `processing.mosaic.free_mosaic`.
 
 Source: docs/mathematics/mosaicking.md#datum-by-inner-constraints; Ladstädter et al. (2010), eq. 6
 and 7; Heier et al. (2002), 6.1.
@@ -21,7 +21,7 @@ _SIMILARITY = ("x", "y", "rotation", "scale")
 
 
 @dataclass(frozen=True)
-class Constraint:
+class DatumConstraint:
     """sum(coefficient * unknown) = 0 over named unknowns."""
 
     coefficients: Mapping[str, float]
@@ -34,16 +34,16 @@ def datum_candidates(rig: Rig) -> tuple[Sensor, ...]:
     return tuple(sensor for cone in rig.pan_cones for sensor in cone.sensors)
 
 
-def mounting_constraints(cones: Collection[str]) -> list[Constraint]:
+def mounting_constraints(cones: Collection[str]) -> list[DatumConstraint]:
     """The mean turn of the heads against their construction is zero, about each axis."""
     if not cones:
         return []
-    return [Constraint({f"{cone}.{axis}": 1.0 for cone in cones}) for axis in ROTATION_NAMES]
+    return [DatumConstraint({f"{cone}.{axis}": 1.0 for cone in cones}) for axis in ROTATION_NAMES]
 
 
 def datum_constraints(
     start: Mapping[str, SensorPlacement], sensors: Sequence[str]
-) -> list[Constraint]:
+) -> list[DatumConstraint]:
     """Eq. 6a, 6b, 6c over the given sensors of the master cone.
 
     One sensor alone gives neither scale nor rotation by its place: its own are held instead. The
@@ -52,7 +52,7 @@ def datum_constraints(
     if not sensors:
         return []
     if len(sensors) == 1:
-        return [Constraint({f"{sensors[0]}.{what}": 1.0}) for what in _SIMILARITY]
+        return [DatumConstraint({f"{sensors[0]}.{what}": 1.0}) for what in _SIMILARITY]
     x = np.array([start[name].similarity.x_mm for name in sensors])
     y = np.array([start[name].similarity.y_mm for name in sensors])
     x, y = x - x.mean(), y - y.mean()
@@ -63,9 +63,9 @@ def datum_constraints(
     for name, xc, yc in zip(sensors, x, y, strict=True):
         scale |= {f"{name}.x": float(xc), f"{name}.y": float(yc)}
         rotation |= {f"{name}.x": float(-yc), f"{name}.y": float(xc)}
-    return [Constraint(c) for c in (shift_x, shift_y, scale, rotation)]
+    return [DatumConstraint(c) for c in (shift_x, shift_y, scale, rotation)]
 
 
-def layer_constraints(sensors: Sequence[str]) -> list[Constraint]:
+def layer_constraints(sensors: Sequence[str]) -> list[DatumConstraint]:
     """Eq. 6a, 7a, 7b over the sensors of one other cone: they separate S from P."""
-    return [Constraint({f"{name}.{what}": 1.0 for name in sensors}) for what in _SIMILARITY]
+    return [DatumConstraint({f"{name}.{what}": 1.0 for name in sensors}) for what in _SIMILARITY]

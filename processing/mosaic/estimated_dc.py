@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.geometry.drift import sensor_dc
-from processing.mosaic.free import Mosaic
+from processing.mosaic.free_mosaic import Mosaic
 from processing.rig import Rig, Sensor
 
 Array = NDArray[np.float64]
@@ -28,15 +28,15 @@ class EstimateSettings:
     """What the estimate assumes and the test demands.
 
     `probe_sigma_k` is a measured dC's standard deviation. An estimate whose own is above
-    `largest_sigma_k` is none. The flag is raised at `limit` standard deviations of the difference
+    `max_sigma_k` is none. The flag is raised at `limit` standard deviations of the difference
     (0.1 % of one test at 3.29; 4.5 allows for a flight of ten thousand) if it is also more than
-    `least_difference_k`.
+    `min_difference_k`.
     """
 
     probe_sigma_k: float = 0.1
-    largest_sigma_k: float = 10.0
+    max_sigma_k: float = 10.0
     limit: float = 4.5
-    least_difference_k: float = 1.0
+    min_difference_k: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -131,12 +131,12 @@ def _estimate(
     sensors: Sequence[Sensor],
     mosaic: Mosaic,
     temperatures_c: Mapping[str, float],
-    read_c: Mapping[str, float],
+    readings_c: Mapping[str, float],
     displaced: Collection[str],
     settings: EstimateSettings,
 ) -> EstimatedDc:
-    told = [sensor_dc(s, read_c) for s in sensors if s.probe in read_c]
-    measured = float(np.mean(told)) if told else None
+    estimable = [sensor_dc(s, readings_c) for s in sensors if s.probe in readings_c]
+    measured = float(np.mean(estimable)) if estimable else None
     found = [s for s in sensors if _is_found(mosaic, s.name) and s.name not in displaced]
     if len(found) < 2:
         return EstimatedDc(cone, None, None, measured, None, expansion_rate(sensors)[0], False)
@@ -161,12 +161,12 @@ def _estimate(
         estimated = start_k + grown_ppm / rate
         # The rate's own uncertainty turns what was seen, not what was assumed, into kelvin.
         sigma = math.sqrt(variance + (rate_sigma * estimated) ** 2) / abs(rate)
-        if sigma > settings.largest_sigma_k:
+        if sigma > settings.max_sigma_k:
             estimated = sigma = None
     if estimated is not None and sigma is not None and measured is not None:
         difference = abs(estimated - measured)
         limit = settings.limit * math.hypot(sigma, settings.probe_sigma_k)
-        disagrees = difference > max(limit, settings.least_difference_k)
+        disagrees = difference > max(limit, settings.min_difference_k)
     return EstimatedDc(cone, estimated, sigma, measured, expected_ppm + grown_ppm, rate, disagrees)
 
 

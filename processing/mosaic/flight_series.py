@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from processing.mosaic.misfit import (
-    PLACE,
-    beside_directions,
+    POSITION,
+    orthogonal_complement,
     per_kelvin,
     similarity_directions,
 )
@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class View:
+class ConeContrasts:
     """Contrasts (c, n) of what records call `names` (n,), and what is known of them.
 
     `moved` (c, 2 m) is what a px of each sensor's x and y makes of them, `warmed` (c,) what a
@@ -39,14 +39,14 @@ class View:
     sensors: tuple[Sensor, ...]
     names: tuple[str, ...]
     contrasts: Array
-    moved: Array
-    warmed: Mapping[str, Array]
+    displacement: Array
+    thermal_design: Mapping[str, Array]
     place: Array
     drift: Array
 
 
 @dataclass(frozen=True)
-class Series:
+class ContrastSeries:
     """Contrasts of one cone over a flight: y (t, c), covariance (t, c, c), dC (t,).
 
     `factor` is by how much exposures differ more from their neighbours than their covariance says.
@@ -63,7 +63,7 @@ def is_master(rig: Rig, cone: Cone) -> bool:
     return cone.name == rig.master_cone
 
 
-def view_of(rig: Rig, cone: Cone, *, quantities: Sequence[str] = PLACE) -> View:
+def contrasts_of(rig: Rig, cone: Cone, *, quantities: Sequence[str] = POSITION) -> ConeContrasts:
     """The master's sensors beside a similarity in common, two sensors of others by difference."""
     relative = not is_master(rig, cone)
     sensors = cone.sensors[:2] if relative else cone.sensors
@@ -71,7 +71,9 @@ def view_of(rig: Rig, cone: Cone, *, quantities: Sequence[str] = PLACE) -> View:
     places = [(s.x_mm, s.y_mm) for s in sensors]
     contrasts = np.hstack([np.eye(2), -np.eye(2)])
     if not relative:
-        contrasts = beside_directions(similarity_directions(places, pitch_um * 1e-3, quantities))
+        contrasts = orthogonal_complement(
+            similarity_directions(places, pitch_um * 1e-3, quantities)
+        )
     unit = np.array([1.0 if q == "scale" else 1.0 / pitch_um for q in quantities])
     # A calibrated scale is as good as places of the same sigma half a diagonal from the centre.
     half_mm = [math.hypot(s.width_px, s.height_px) / 2.0 * s.pitch_mm for s in sensors]
@@ -85,23 +87,23 @@ def view_of(rig: Rig, cone: Cone, *, quantities: Sequence[str] = PLACE) -> View:
             [s.drift.sigma_um_per_k for s in sensors],
         )
     ]
-    warmed = {}
+    thermal_design = {}
     for probe in dict.fromkeys(s.probe for s in sensors):
         own = [s.probe == probe for s in sensors]
         moves = np.array([per_kelvin(s, quantities, pitch_um) for s in sensors])
         moves *= np.array(own)[:, None]
         if relative:
             moves -= _of_layer(sensors, own) / pitch_um
-        warmed[probe] = contrasts @ moves.ravel()
+        thermal_design[probe] = contrasts @ moves.ravel()
     units = {"x": "x_um", "y": "y_um", "scale": "scale_ppm"}
     width = len(quantities)
     axes = [i * width + k for i in range(len(sensors)) for k in (0, 1)]
-    return View(
+    return ConeContrasts(
         sensors=sensors,
         names=tuple(f"{s.name}.{units[q]}" for s in sensors for q in quantities),
         contrasts=contrasts * np.tile(unit, len(sensors)),
-        moved=contrasts[:, axes],
-        warmed=warmed,
+        displacement=contrasts[:, axes],
+        thermal_design=thermal_design,
         place=contrasts * variances[0] @ contrasts.T,
         drift=contrasts * variances[1] @ contrasts.T,
     )
@@ -111,13 +113,13 @@ def _of_layer(sensors: Sequence[Sensor], own: Sequence[bool]) -> Array:
     """What their scales and rotations make of the sensors' places per kelvin, um: the layer's."""
     drifts = [s.drift for s, mine in zip(sensors, own, strict=True) if mine]
     scale = sum(d.scale_ppm_per_k for d in drifts) / len(sensors) * 1e-3
-    turn = sum(d.rotation_urad_per_k for d in drifts) / len(sensors) * 1e-3
+    rotation = sum(d.rotation_urad_per_k for d in drifts) / len(sensors) * 1e-3
     return np.array(
-        [[scale * s.x_mm - turn * s.y_mm, scale * s.y_mm + turn * s.x_mm] for s in sensors]
+        [[scale * s.x_mm - rotation * s.y_mm, scale * s.y_mm + rotation * s.x_mm] for s in sensors]
     )
 
 
-def series_of(rig: Rig, view: View, records: Mapping[int, StitchRecord]) -> Series:
+def series_of(rig: Rig, view: ConeContrasts, records: Mapping[int, StitchRecord]) -> ContrastSeries:
     """The exposures that tell of all of the view's sensors, with the rig's own calibration."""
     numbers, y, covariance, dc = [], [], [], []
     for number in sorted(records):
@@ -130,7 +132,7 @@ def series_of(rig: Rig, view: View, records: Mapping[int, StitchRecord]) -> Seri
         covariance.append(view.contrasts @ record.covariance[np.ix_(at, at)] @ view.contrasts.T)
         dc.append(float(np.mean([record.dc_k[s.name] for s in view.sensors])))
     size = len(view.contrasts)
-    return Series(
+    return ContrastSeries(
         tuple(numbers),
         np.array(y).reshape(-1, size),
         np.array(covariance).reshape(-1, size, size),
@@ -138,7 +140,7 @@ def series_of(rig: Rig, view: View, records: Mapping[int, StitchRecord]) -> Seri
     )
 
 
-def variance_factor(series: Series) -> float:
+def variance_factor(series: ContrastSeries) -> float:
     """By how much exposures differ more from their neighbours than their covariance says; >= 1."""
     size = series.y.shape[1]
     if len(series.numbers) < 4:
@@ -149,22 +151,22 @@ def variance_factor(series: Series) -> float:
     return max(1.0, float(np.median(q)) / float(chi2.ppf(0.5, size)))
 
 
-def read_too_much(view: View, series: Series, probe: str) -> Array:
+def probe_bias_series(view: ConeContrasts, series: ContrastSeries, probe: str) -> Array:
     """What a probe reads too much in each exposure (t,), K, as far as places and scales tell."""
-    design = -view.warmed[probe]
+    design = -view.thermal_design[probe]
     weight = np.linalg.inv(series.covariance + view.place)
-    pull = np.einsum("i,tij,tj->t", design, weight, series.y)
-    return np.asarray(pull / np.einsum("i,tij,j->t", design, weight, design), np.float64)
+    normal_vector = np.einsum("i,tij,tj->t", design, weight, series.y)
+    return np.asarray(normal_vector / np.einsum("i,tij,j->t", design, weight, design), np.float64)
 
 
-def not_believing(
-    view: View, series: Series, probe: str, *, off_k: Array, sigma_k: float
-) -> Series:
-    """The series where a probe's readings, found `off_k` (t,) too large, count for nothing."""
-    warmed = view.warmed[probe]
+def with_probe_ignored(
+    view: ConeContrasts, series: ContrastSeries, probe: str, *, bias_k: Array, sigma_k: float
+) -> ContrastSeries:
+    """The series where a probe's readings, found `bias_k` (t,) too large, count for nothing."""
+    thermal_design = view.thermal_design[probe]
     share = sum(s.probe == probe for s in view.sensors) / len(view.sensors)
     return replace(
         series,
-        covariance=series.covariance + np.outer(warmed, warmed) * sigma_k**2,
-        dc_k=series.dc_k - share * off_k,
+        covariance=series.covariance + np.outer(thermal_design, thermal_design) * sigma_k**2,
+        dc_k=series.dc_k - share * bias_k,
     )

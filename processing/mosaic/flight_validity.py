@@ -22,16 +22,16 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from processing.mosaic.flight_series import (
-    Series,
-    View,
+    ConeContrasts,
+    ContrastSeries,
+    contrasts_of,
     is_master,
-    not_believing,
-    read_too_much,
+    probe_bias_series,
     series_of,
     variance_factor,
-    view_of,
+    with_probe_ignored,
 )
-from processing.mosaic.misfit import PLACE_AND_SCALE, Misread
+from processing.mosaic.misfit import POSITION_AND_SCALE, ProbeBias
 from processing.mosaic.stitch_record import StitchRecord
 from processing.rig import Cone, Rig
 
@@ -44,23 +44,23 @@ class FlightSettings:
     """What is assumed and demanded.
 
     `family_alpha` is the probability of telling of any step in a healthy flight, all cones and
-    exposures together. A step is told from `least_exposures` on either side of it, for one
+    exposures together. A step is told from `min_exposures` on either side of it, for one
     exposure may be wrong. Sensors, probes and exposures within `odds` of the best are alternatives.
     What a probe that misreads says is worth `unknown_sigma_k`.
     """
 
     family_alpha: float = 0.001
-    odds: float = 19.0
+    odds_limit: float = 19.0
     probe_sigma_k: float = 0.1
     unknown_sigma_k: float = 10.0
-    least_exposures: int = 3
-    most_steps: int = 4
+    min_exposures: int = 3
+    max_displacements: int = 4
     outlier_alpha: float = 1e-4
     neighbours: int = 3
 
 
 @dataclass(frozen=True)
-class Step:
+class FlightDisplacement:
     """A sensor that has been displaced since an exposure, (x right, y up), PAN px.
 
     "named": it is `sensor`, unless one of `alternatives`. "several": more than one sensor of the
@@ -86,7 +86,7 @@ class Step:
     sigma_px: float
     statistic: float
     limit: float
-    misread: Misread | None = None
+    probe_bias: ProbeBias | None = None
 
     @property
     def length_px(self) -> float:
@@ -102,18 +102,18 @@ class Step:
         elif self.earliest != self.latest:
             since += f" (it began between {self.earliest} and {self.latest})"
         probe = ""
-        if self.misread is not None:
-            way = "high" if self.misread.off_k > 0.0 else "low"
-            off = f"{abs(self.misread.off_k):.1f} +- {self.misread.sigma_k:.1f} K too {way}"
-            probe = f"probe {self.misread.probe} has read {off}"
+        if self.probe_bias is not None:
+            way = "high" if self.probe_bias.bias_k > 0.0 else "low"
+            off = f"{abs(self.probe_bias.bias_k):.1f} +- {self.probe_bias.sigma_k:.1f} K too {way}"
+            probe = f"probe {self.probe_bias.probe} has read {off}"
         if self.kind == "misread":
             earlier = "" if self.from_start else " or earlier"
             return f"P{probe[1:]} on average since exposure {self.since}{earlier}; check it."
         if self.kind == "relative":
-            culprit = f"or {probe}; what it was" if probe else "which of them moved"
+            cause_text = f"or {probe}; what it was" if probe else "which of them moved"
             return (
                 f"{self.sensor} and {self.alternatives[0]} have been displaced against each other "
-                f"by {size} {since}{', ' if probe else '; '}{culprit} cannot be told."
+                f"by {size} {since}{', ' if probe else '; '}{cause_text} cannot be told."
             )
         if self.kind == "several":
             return (
@@ -129,12 +129,12 @@ class Step:
 class FlightValidity:
     """The judgement on a flight; `exposures` counts those used, by cone."""
 
-    steps: tuple[Step, ...]
+    steps: tuple[FlightDisplacement, ...]
     exposures: Mapping[str, int]
     left_out: Mapping[str, tuple[int, ...]]
 
 
-def judge_flight(
+def evaluate_flight(
     rig: Rig,
     records: Mapping[int, StitchRecord],
     *,
@@ -151,24 +151,26 @@ def judge_flight(
         settings: None takes the defaults.
     """
     settings = settings or FlightSettings()
-    judged = [c for c in rig.pan_cones if len(c.sensors) >= (3 if is_master(rig, c) else 2)]
-    steps: list[Step] = []
+    evaluated = [c for c in rig.pan_cones if len(c.sensors) >= (3 if is_master(rig, c) else 2)]
+    steps: list[FlightDisplacement] = []
     used, left_out = {}, {}
-    for cone in judged:
-        view = view_of(rig, cone)
+    for cone in evaluated:
+        view = contrasts_of(rig, cone)
         series, dropped = _without_outliers(series_of(rig, view, records), settings)
         used[cone.name], left_out[cone.name] = len(series.numbers), dropped
-        if len(series.numbers) >= 2 * settings.least_exposures:
+        if len(series.numbers) >= 2 * settings.min_exposures:
             wide = view
             if is_master(rig, cone):
-                wide = view_of(rig, cone, quantities=PLACE_AND_SCALE)
-            kept = {number: records[number] for number in series.numbers}
-            both = (view, series), (wide, series_of(rig, wide, kept))
-            steps += _steps(rig, cone, both, settings, len(judged))
+                wide = contrasts_of(rig, cone, quantities=POSITION_AND_SCALE)
+            retained = {number: records[number] for number in series.numbers}
+            both = (view, series), (wide, series_of(rig, wide, retained))
+            steps += _steps(rig, cone, both, settings, len(evaluated))
     return FlightValidity(tuple(steps), used, left_out)
 
 
-def _without_outliers(series: Series, settings: FlightSettings) -> tuple[Series, tuple[int, ...]]:
+def _without_outliers(
+    series: ContrastSeries, settings: FlightSettings
+) -> tuple[ContrastSeries, tuple[int, ...]]:
     """Leave out exposures that agree with neither their neighbours before nor those after."""
     count, size = series.y.shape
     limit = float(chi2.isf(settings.outlier_alpha, size))
@@ -185,9 +187,9 @@ def _without_outliers(series: Series, settings: FlightSettings) -> tuple[Series,
                 distances.append(float(off @ np.linalg.solve(spread, off)))
         good[t] = not distances or min(distances) <= limit
     dropped = tuple(n for n, is_good in zip(series.numbers, good, strict=True) if not is_good)
-    kept = tuple(n for n, is_good in zip(series.numbers, good, strict=True) if is_good)
+    retained = tuple(n for n, is_good in zip(series.numbers, good, strict=True) if is_good)
     return (
-        Series(kept, series.y[good], series.covariance[good], series.dc_k[good]),
+        ContrastSeries(retained, series.y[good], series.covariance[good], series.dc_k[good]),
         dropped,
     )
 
@@ -195,10 +197,10 @@ def _without_outliers(series: Series, settings: FlightSettings) -> tuple[Series,
 def _steps(
     rig: Rig,
     cone: Cone,
-    views: tuple[tuple[View, Series], tuple[View, Series]],
+    views: tuple[tuple[ConeContrasts, ContrastSeries], tuple[ConeContrasts, ContrastSeries]],
     settings: FlightSettings,
     cones: int,
-) -> list[Step]:
+) -> list[FlightDisplacement]:
     """Steps one after the other, each with those before it taken out, in order of strength.
 
     They are sought by the first view, and weighed by the second. Where a probe misreads, the rest
@@ -207,13 +209,13 @@ def _steps(
     (view, series), wide = ((v, replace(s, factor=variance_factor(s))) for v, s in views)
     count, size = series.y.shape
     limit = float(chi2.isf(settings.family_alpha / count / cones, size))
-    reach = settings.least_exposures
+    reach = settings.min_exposures
     places = np.array([0, *range(reach, count - reach + 1)])
-    found: list[Step] = []
-    misread: list[Step] = []
+    found: list[FlightDisplacement] = []
+    probe_bias: list[FlightDisplacement] = []
     taken: list[int] = []
-    doubted: set[str] = set()
-    while len(found) < settings.most_steps:
+    is_ambiguous: set[str] = set()
+    while len(found) < settings.max_displacements:
         information, right = _scan(view, series, settings, taken)
         statistics = np.full(count, -np.inf)
         for t in places:
@@ -225,10 +227,10 @@ def _steps(
         normal = information[best], right[best]
         weighed = normal
         if wide[0] is not view:
-            known, pull = _scan(*wide, settings, taken)
-            weighed = known[best], pull[best]
+            known, normal_vector = _scan(*wide, settings, taken)
+            weighed = known[best], normal_vector[best]
         taken.append(best)
-        near = np.flatnonzero(statistics > statistics[best] - 2.0 * math.log(settings.odds))
+        near = np.flatnonzero(statistics > statistics[best] - 2.0 * math.log(settings.odds_limit))
         step = _step(
             cone,
             (view, normal),
@@ -239,23 +241,23 @@ def _steps(
             from_start=best == 0,
             relative=not is_master(rig, cone),
         )
-        probe = step.misread.probe if step.misread else ""
-        if step.kind == "misread" and probe not in doubted:
-            doubted.add(probe)
-            off_k = read_too_much(*wide, probe)
+        probe = step.probe_bias.probe if step.probe_bias else ""
+        if step.kind == "misread" and probe not in is_ambiguous:
+            is_ambiguous.add(probe)
+            bias_k = probe_bias_series(*wide, probe)
             unknown = settings.unknown_sigma_k
-            series = not_believing(view, series, probe, off_k=off_k, sigma_k=unknown)
-            believed = not_believing(*wide, probe, off_k=off_k, sigma_k=unknown)
-            wide = wide[0], believed
-            misread, found, taken = [*misread, step], [], []
+            series = with_probe_ignored(view, series, probe, bias_k=bias_k, sigma_k=unknown)
+            is_trusted = with_probe_ignored(*wide, probe, bias_k=bias_k, sigma_k=unknown)
+            wide = wide[0], is_trusted
+            probe_bias, found, taken = [*probe_bias, step], [], []
         else:
             found.append(step)
-    return sorted(misread + found, key=lambda step: step.since)
+    return sorted(probe_bias + found, key=lambda step: step.since)
 
 
 def _scan(
-    view: View,
-    series: Series,
+    view: ConeContrasts,
+    series: ContrastSeries,
     settings: FlightSettings,
     taken: Sequence[int],
 ) -> tuple[Array, Array]:
@@ -264,8 +266,8 @@ def _scan(
     Everything else (calibration, drift, steps taken) is eliminated.
     """
     count, size = series.y.shape
-    warmed = np.array(list(view.warmed.values()))
-    probe = warmed.T @ warmed * settings.probe_sigma_k**2
+    thermal_design = np.array(list(view.thermal_design.values()))
+    probe = thermal_design.T @ thermal_design * settings.probe_sigma_k**2
     weight = np.linalg.inv((series.covariance + probe) * series.factor)
     known = [covariance + 1e-12 * np.eye(size) for covariance in (view.place, view.drift)]
     # Columns of the nuisance: offset, drift by dC, and the steps already taken.
@@ -297,35 +299,39 @@ _Normal = tuple[Array, Array]
 
 def _step(
     cone: Cone,
-    narrow: tuple[View, _Normal],
-    wide: tuple[View, _Normal],
+    narrow: tuple[ConeContrasts, _Normal],
+    wide: tuple[ConeContrasts, _Normal],
     test: tuple[float, float],
     numbers: Sequence[int],
     settings: FlightSettings,
     *,
     from_start: bool,
     relative: bool,
-) -> Step:
-    odds = 2.0 * math.log(settings.odds)
+) -> FlightDisplacement:
+    odds_limit = 2.0 * math.log(settings.odds_limit)
     fits = _moved(*narrow)
     kind: Kind = "relative" if relative else "named"
-    misread = max((_misread(*wide, probe) for probe in wide[0].warmed), key=lambda m: m.statistic)
-    lead = misread.statistic - _moved(*wide)[0][0]
+    probe_bias = max(
+        (_misread(*wide, probe) for probe in wide[0].thermal_design), key=lambda m: m.statistic
+    )
+    lead = probe_bias.statistic - _moved(*wide)[0][0]
     freedom = len(narrow[1][1]) - 2
-    if not relative and lead >= -odds:
+    if not relative and lead >= -odds_limit:
         # Where sensors have moved, too, that is sought again without the probe.
-        beside = _moved(wide[0], _freed(*wide, misread.probe))
-        moved = beside[0][0] > chi2.isf(settings.family_alpha / len(beside), 2)
-        if lead > odds or moved:
+        with_free_probe = _moved(wide[0], _with_free_probe(*wide, probe_bias.probe))
+        displacement = with_free_probe[0][0] > chi2.isf(
+            settings.family_alpha / len(with_free_probe), 2
+        )
+        if lead > odds_limit or displacement:
             kind = "misread"
     statistic, name, delta, cofactor = fits[0]
     several = freedom > 0 and test[0] - statistic > chi2.isf(settings.family_alpha, freedom)
     if kind == "named" and several:
         kind = "several"
-    near = [f[1] for f in fits[1:] if statistic - f[0] < odds]
+    near = [f[1] for f in fits[1:] if statistic - f[0] < odds_limit]
     length = max(float(np.hypot(*delta)), 1e-12)
     sigma = math.sqrt(float(delta @ cofactor @ delta)) / length
-    return Step(
+    return FlightDisplacement(
         cone=cone.name,
         kind=kind,
         sensor="" if kind == "misread" else name,
@@ -339,34 +345,34 @@ def _step(
         sigma_px=sigma,
         statistic=test[0],
         limit=test[1],
-        misread=misread if lead >= -odds else None,
+        probe_bias=probe_bias if lead >= -odds_limit else None,
     )
 
 
-def _moved(view: View, normal: _Normal) -> list[tuple[float, str, Array, Array]]:
+def _moved(view: ConeContrasts, normal: _Normal) -> list[tuple[float, str, Array, Array]]:
     """Each sensor, if it alone had moved: chi-square, name, displacement and its cofactor."""
     information, right = normal
     fits = []
     for i, sensor in enumerate(view.sensors):
-        design = view.moved[:, 2 * i : 2 * i + 2]
+        design = view.displacement[:, 2 * i : 2 * i + 2]
         cofactor = np.asarray(np.linalg.inv(design.T @ information @ design), np.float64)
         delta = cofactor @ design.T @ right
         fits.append((float(delta @ design.T @ right), sensor.name, delta, cofactor))
     return sorted(fits, key=lambda fit: -fit[0])
 
 
-def _misread(view: View, normal: _Normal, probe: str) -> Misread:
+def _misread(view: ConeContrasts, normal: _Normal, probe: str) -> ProbeBias:
     information, right = normal
-    design = -view.warmed[probe]
+    design = -view.thermal_design[probe]
     known = float(design @ information @ design)
-    pull = float(design @ right)
-    return Misread(probe, pull / known, 1.0 / math.sqrt(known), pull**2 / known)
+    normal_vector = float(design @ right)
+    return ProbeBias(probe, normal_vector / known, 1.0 / math.sqrt(known), normal_vector**2 / known)
 
 
-def _freed(view: View, normal: _Normal, probe: str) -> _Normal:
+def _with_free_probe(view: ConeContrasts, normal: _Normal, probe: str) -> _Normal:
     """The same where the probe may read anything since then."""
     information, right = normal
-    design = view.warmed[probe]
+    design = view.thermal_design[probe]
     taken = information @ design / float(design @ information @ design)
-    pull = float(design @ right)
-    return information - np.outer(taken, design @ information), right - taken * pull
+    normal_vector = float(design @ right)
+    return information - np.outer(taken, design @ information), right - taken * normal_vector

@@ -20,7 +20,7 @@ from processing.geometry.projective import projective_jacobian
 from processing.geometry.similarity import apply_similarity
 from processing.matching.tie_points import PAN_TO_COLOUR, TiePoints
 from processing.mosaic.datum import mounting_constraints
-from processing.mosaic.free import Mosaic
+from processing.mosaic.free_mosaic import Mosaic
 from processing.mosaic.model import vip_and_design
 from processing.quality.report import Figure
 from processing.rig import Cone, Rig

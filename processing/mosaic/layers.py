@@ -25,7 +25,7 @@ from scipy.stats import chi2
 from processing.geometry.drift import sensor_dc
 from processing.geometry.topology import mosaic_cones
 from processing.mosaic.estimated_dc import expansion_rate
-from processing.mosaic.free import Mosaic
+from processing.mosaic.free_mosaic import Mosaic
 from processing.mosaic.mounting import rotation_of_layer
 from processing.mosaic.precision import BLIND_SIGMA_K, PROBE_SIGMA_K, UNKNOWN_SIGMA_K
 from processing.mosaic.stitch_record import layer_scale_design
@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 
 ALPHA: Final = 1e-5
 """Probability of a finding in a healthy exposure: it changes the verdict."""
-ODDS: Final = 19.0
+ODDS_LIMIT: Final = 19.0
 QUANTITIES: Final = ("scale_ppm", "rotation_x_urad", "rotation_y_urad", "rotation_z_urad")
 
 
@@ -198,13 +198,13 @@ def _known(cone: Cone, temperatures_c: Mapping[str, float]) -> Array:
     else:
         spread_mm2 = (sensors[0].height_px / 2.0 * sensors[0].pitch_mm) ** 2
         rate = sensors[0].drift.scale_ppm_per_k
-    turned = variance_um2 / spread_mm2 * 1e6
+    rotation_variance = variance_um2 / spread_mm2 * 1e6
     shifted = variance_um2 / len(sensors) / cone.lens.f_mm**2 * 1e6
     unknown_k = UNKNOWN_SIGMA_K if temperatures_c else BLIND_SIGMA_K
     sigma_k = PROBE_SIGMA_K if cone.probe in temperatures_c else unknown_k
     warmed = ((rate - cone.lens.f_ppm_per_k) * sigma_k) ** 2
-    scale = turned + cone.lens.f_sigma_ppm**2 + warmed
-    return np.array([scale, shifted, shifted, turned])
+    scale = rotation_variance + cone.lens.f_sigma_ppm**2 + warmed
+    return np.array([scale, shifted, shifted, rotation_variance])
 
 
 def _repeated(which: Array) -> Array:
@@ -227,7 +227,7 @@ def _causes(
         }
         best = min(left, key=lambda name: left[name])
         if not causes:
-            near = left[best] + 2.0 * math.log(ODDS)
+            near = left[best] + 2.0 * math.log(ODDS_LIMIT)
             alternatives = tuple(n for n, rest in left.items() if n != best and rest < near)
         causes.append(best)
         taken = np.hstack([taken, designs[best]])
@@ -240,5 +240,8 @@ def _causes(
 def _remaining(values: Array, weight: Array, design: Array) -> float:
     """Chi-square that a cause of any size with this design leaves."""
     normal = design.T @ weight @ design
-    pull = design.T @ weight @ values
-    return float(values @ weight @ values - pull @ np.linalg.lstsq(normal, pull, rcond=None)[0])
+    normal_vector = design.T @ weight @ values
+    return float(
+        values @ weight @ values
+        - normal_vector @ np.linalg.lstsq(normal, normal_vector, rcond=None)[0]
+    )

@@ -17,19 +17,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.geometry.drift import sensor_dc
-from processing.mosaic.free import Mosaic
+from processing.mosaic.free_mosaic import Mosaic
 from processing.rig import Rig, Sensor
 
 Array = NDArray[np.float64]
 
-PLACE = ("x", "y")
-PLACE_AND_SCALE = ("x", "y", "scale")
+POSITION = ("x", "y")
+POSITION_AND_SCALE = ("x", "y", "scale")
 """Quantities of a sensor: px, px, ppm. A displaced sensor keeps its scale, a warm one does not."""
 _UNKNOWN = {"x": 0, "y": 1, "scale": 3}
 
 
 @dataclass(frozen=True)
-class Knowledge:
+class PriorSigmas:
     """Standard deviations of what is known besides the rig file's.
 
     `probe_sigma_k` is common to all sensors of a probe; a probe without a temperature has
@@ -41,20 +41,20 @@ class Knowledge:
 
 
 @dataclass(frozen=True)
-class Misread:
-    """A probe that reads `off_k` too much, if that alone were wrong.
+class ProbeBias:
+    """A probe that reads `bias_k` too much, if that alone were wrong.
 
     `statistic` is chi-square with one degree of freedom where it reads right.
     """
 
     probe: str
-    off_k: float
+    bias_k: float
     sigma_k: float
     statistic: float
 
 
 @dataclass(frozen=True)
-class Fit:
+class CauseFit:
     """A cause's best size (k,), its cofactor (k, k), and the chi-square with k it explains."""
 
     size: Array
@@ -81,26 +81,26 @@ class Misfit:
         """Chi-square of nothing being wrong."""
         return float(self.y @ self.weight @ self.y)
 
-    def moved(self, index: int) -> Array:
+    def displacement(self, index: int) -> Array:
         """Design (c, 2) of a displacement, px, of one of the sensors."""
         first = index * len(self.quantities)
         return self.contrasts[:, first : first + 2]
 
-    def misread(self, probe: str) -> Array:
+    def probe_bias(self, probe: str) -> Array:
         """Design (c, 1) of what one kelvin read too much makes of the sensors of a probe."""
         warmed = [
             per_kelvin(s, self.quantities, self.pitch_um) * (s.probe == probe) for s in self.sensors
         ]
         return -self.contrasts @ np.concatenate(warmed)[:, None]
 
-    def fit(self, design: Array) -> Fit:
+    def fit(self, design: Array) -> CauseFit:
         """The best size of a cause with the given design (c, k)."""
         cofactor = np.asarray(np.linalg.inv(design.T @ self.weight @ design), np.float64)
-        pull = design.T @ self.weight @ self.y
-        size = cofactor @ pull
-        return Fit(size, cofactor, float(size @ pull))
+        normal_vector = design.T @ self.weight @ self.y
+        size = cofactor @ normal_vector
+        return CauseFit(size, cofactor, float(size @ normal_vector))
 
-    def beside(self, design: Array) -> Misfit:
+    def with_free_cause(self, design: Array) -> Misfit:
         """The same where a cause with this design may have any size."""
         weighted = self.weight @ design
         taken = weighted @ np.linalg.inv(design.T @ weighted) @ weighted.T
@@ -113,8 +113,8 @@ def misfit(
     sensors: Sequence[str],
     temperatures_c: Mapping[str, float],
     *,
-    quantities: tuple[str, ...] = PLACE,
-    knowledge: Knowledge | None = None,
+    quantities: tuple[str, ...] = POSITION,
+    prior_sigmas: PriorSigmas | None = None,
 ) -> Misfit:
     """The misfit of sensors of one cone, three at least.
 
@@ -123,18 +123,18 @@ def misfit(
         mosaic: a free mosaic, in any datum.
         sensors: by name; the stitching has found them.
         temperatures_c: temperature by probe name, as the mosaic's start was made with.
-        quantities: `PLACE` or `PLACE_AND_SCALE`.
+        quantities: `PLACE` or `POSITION_AND_SCALE`.
         knowledge: None takes the defaults.
     """
     found, stitching = found_quantities(mosaic, sensors, quantities)
     expected = expected_covariance(
-        rig, mosaic, sensors, temperatures_c, quantities=quantities, knowledge=knowledge
+        rig, mosaic, sensors, temperatures_c, quantities=quantities, prior_sigmas=prior_sigmas
     )
     covariance = stitching + expected
     places = [mosaic.start[name].similarity for name in sensors]
     pitch_mm = mosaic.model.pitch_mm
     directions = similarity_directions([(p.x_mm, p.y_mm) for p in places], pitch_mm, quantities)
-    contrasts = beside_directions(directions)
+    contrasts = orthogonal_complement(directions)
     return Misfit(
         sensors=tuple(rig.sensor(name) for name in sensors),
         quantities=quantities,
@@ -146,7 +146,7 @@ def misfit(
 
 
 def found_quantities(
-    mosaic: Mosaic, sensors: Sequence[str], quantities: Sequence[str] = PLACE
+    mosaic: Mosaic, sensors: Sequence[str], quantities: Sequence[str] = POSITION
 ) -> tuple[Array, Array]:
     """Corrections of sensors one after the other (n,), and their stitching covariance (n, n)."""
     rows = [mosaic.model.sensors[name] + _UNKNOWN[q] for name in sensors for q in quantities]
@@ -160,20 +160,20 @@ def expected_covariance(
     sensors: Sequence[str],
     temperatures_c: Mapping[str, float],
     *,
-    quantities: Sequence[str] = PLACE,
-    knowledge: Knowledge | None = None,
+    quantities: Sequence[str] = POSITION,
+    prior_sigmas: PriorSigmas | None = None,
 ) -> Array:
     """Covariance (n, n) of where calibration + TDM expect the sensors.
 
     A calibrated scale is as good as places of the same sigma half a diagonal from the centre.
     """
-    knowledge = knowledge or Knowledge()
+    prior_sigmas = prior_sigmas or PriorSigmas()
     pitch_um = mosaic.model.pitch_mm * 1e3
     expected = [rig.sensor(name) for name in sensors]
     variances = []
     for sensor in expected:
         dc = sensor_dc(sensor, temperatures_c)
-        unknown = 0.0 if sensor.probe in temperatures_c else knowledge.unknown_sigma_k
+        unknown = 0.0 if sensor.probe in temperatures_c else prior_sigmas.unknown_sigma_k
         tdm_um = sensor.drift.sigma_um_per_k * math.hypot(dc, unknown)
         place_px = math.hypot(sensor.position_sigma_um, tdm_um) / pitch_um
         half_mm = math.hypot(sensor.width_px, sensor.height_px) / 2.0 * sensor.pitch_mm
@@ -182,11 +182,11 @@ def expected_covariance(
     covariance = np.diag(variances)
     for probe in dict.fromkeys(sensor.probe for sensor in expected):
         known = probe in temperatures_c
-        sigma_k = knowledge.probe_sigma_k if known else knowledge.unknown_sigma_k
-        moved = np.concatenate(
+        sigma_k = prior_sigmas.probe_sigma_k if known else prior_sigmas.unknown_sigma_k
+        displacement = np.concatenate(
             [per_kelvin(s, quantities, pitch_um) * (s.probe == probe) for s in expected]
         )
-        covariance += np.outer(moved, moved) * sigma_k**2
+        covariance += np.outer(displacement, displacement) * sigma_k**2
     return covariance
 
 
@@ -202,7 +202,7 @@ def per_kelvin(sensor: Sensor, quantities: Sequence[str], pitch_um: float) -> Ar
 
 
 def similarity_directions(
-    places_mm: Sequence[tuple[float, float]], pitch_mm: float, quantities: Sequence[str] = PLACE
+    places_mm: Sequence[tuple[float, float]], pitch_mm: float, quantities: Sequence[str] = POSITION
 ) -> Array:
     """How a common shift, scale and rotation moves the sensors at these places: (n, 4)."""
     rows = []
@@ -217,7 +217,7 @@ def similarity_directions(
     return np.array(rows)
 
 
-def beside_directions(directions: Array) -> Array:
+def orthogonal_complement(directions: Array) -> Array:
     """An orthonormal basis of what the directions cannot produce, as rows."""
     full, _, _ = np.linalg.svd(directions, full_matrices=True)
     return np.asarray(full[:, directions.shape[1] :].T)

@@ -1,7 +1,7 @@
 """The model of a mosaic: which S and P are free, and how VIP points depend on them.
 
 The unknowns are accumulated corrections against the start (calibration + TDM), never increments;
-their adjustment is in `processing.mosaic.free`.
+their adjustment is in `processing.mosaic.free_mosaic`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.bundle.rotations import exponential, skew
+from processing.bundle.rotations import rotations_from_vectors, skew
 from processing.geometry.placement import SensorPlacement, vip_mm_from_raw
 from processing.geometry.projective import (
     apply_projective,
@@ -143,11 +143,11 @@ def vip_and_design(
     vip_mm = start_mm
     if first_mounting is not None:
         rotation = values[first_mounting : first_mounting + 3]
-        turned = _turn(rotation, model.f_mm)
-        vip_mm = apply_projective(turned, start_mm)
-        further = further_turn(vip_mm, model.f_mm)
+        homography = _rotation_homography(rotation, model.f_mm)
+        vip_mm = apply_projective(homography, start_mm)
+        further = small_rotation_design(vip_mm, model.f_mm)
         design[-3:] = np.einsum("ajn,jk->kan", further, _left_jacobian(rotation))
-        jacobian = projective_jacobian(turned, start_mm) @ jacobian
+        jacobian = projective_jacobian(homography, start_mm) @ jacobian
     if first_layer is not None:
         x, y = start_mm[:, 0] / size, start_mm[:, 1] / size
         scaled = np.stack([x, y], axis=1)
@@ -185,10 +185,10 @@ def residuals_px(
     residuals = np.full((len(tie_points), 2), np.nan)
     for number, (a, b) in enumerate(tie_points.pairs):
         rows = np.flatnonzero(tie_points.overlap == number)
-        apart = vip_mm_from_raw(placements[a], tie_points.raw_a[rows]) - vip_mm_from_raw(
+        separation = vip_mm_from_raw(placements[a], tie_points.raw_a[rows]) - vip_mm_from_raw(
             placements[b], tie_points.raw_b[rows]
         )
-        residuals[rows] = apart / model.pitch_mm
+        residuals[rows] = separation / model.pitch_mm
     return residuals
 
 
@@ -204,7 +204,7 @@ def _similarity(model: MosaicModel, start: SensorPlacement, values: Array) -> Si
 def _layer_correction(model: MosaicModel, start: SensorPlacement, values: Array) -> Array:
     mounting = model.mountings.get(start.cone.name)
     if mounting is not None:
-        return _turn(values[mounting : mounting + 3], model.f_mm)
+        return _rotation_homography(values[mounting : mounting + 3], model.f_mm)
     first = model.layers.get(start.cone.name)
     if first is None:
         return np.eye(3)
@@ -213,7 +213,7 @@ def _layer_correction(model: MosaicModel, start: SensorPlacement, values: Array)
     return np.asarray(grow @ _scaled_correction(values[first : first + 8]) @ shrink)
 
 
-def further_turn(vip_mm: Array, f_mm: float) -> Array:
+def small_rotation_design(vip_mm: Array, f_mm: float) -> Array:
     """How points (n, 2) of the virtual image move by a small turn of their rays, (2, 3, n), mm/rad.
 
     The ray (x, y, -f) turned by w moves by w x (x, y, -f).
@@ -227,9 +227,9 @@ def further_turn(vip_mm: Array, f_mm: float) -> Array:
     )
 
 
-def _turn(rotation: Array, f_mm: float) -> Array:
+def _rotation_homography(rotation: Array, f_mm: float) -> Array:
     """The homography of the virtual image that a turn of the head makes, (3, 3), mm."""
-    return rotation_homography(exponential(rotation[None])[0], f_mm, f_mm)
+    return rotation_homography(rotations_from_vectors(rotation[None])[0], f_mm, f_mm)
 
 
 def _left_jacobian(rotation: Array) -> Array:

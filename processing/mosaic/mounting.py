@@ -2,7 +2,7 @@
 
 Turns are small rotation vectors (rad) about the axes of the virtual image (x right, y forward, z
 up), found against the platform calibration; the adjustment that finds them is in
-`processing.mosaic.free`.
+`processing.mosaic.free_mosaic`.
 
 Source: docs/mathematics/virtual-camera.md#mounting-angles; Heier et al. (2002), 6.1. Eq. 6 is that
 of Ladstädter et al. (2010).
@@ -23,8 +23,8 @@ from scipy.stats import chi2
 
 from processing.bundle.rotations import (
     angles_by_rotation_vector,
-    exponential,
     omega_phi_kappa,
+    rotations_from_vectors,
 )
 from processing.geometry.drift import sensor_dc
 from processing.geometry.placement import corrected_mm_from_raw, vip_mm_from_raw
@@ -32,8 +32,13 @@ from processing.geometry.projective import apply_projective
 from processing.geometry.rotation import rotation_matrix
 from processing.image.colour import BandRegistration
 from processing.matching.tie_points import PAN_TO_PAN, TiePoints
-from processing.mosaic.free import Mosaic
-from processing.mosaic.model import further_turn, placement_at, residuals_px, vip_and_design
+from processing.mosaic.free_mosaic import Mosaic
+from processing.mosaic.model import (
+    placement_at,
+    residuals_px,
+    small_rotation_design,
+    vip_and_design,
+)
 from processing.quality.report import Figure
 from processing.rig import Cone, Rig, Sensor
 
@@ -41,8 +46,8 @@ Array = NDArray[np.float64]
 
 FAMILY_ALPHA: Final = 1e-5
 """Probability of calling a healthy platform expired: it changes the verdict."""
-LEAST_SHIFT_PX: Final = 0.01
-LEAST_POINTS: Final = 24
+MIN_SHIFT_PX: Final = 0.01
+MIN_POINTS: Final = 24
 SCALED_PPM: Final = 100.0
 ALTERNATIVE_SHARE: Final = 0.5
 """Of the largest shift, above which another head may be the one that moved: of one head that turned
@@ -51,22 +56,22 @@ _ROUNDS: Final = 12
 
 
 @dataclass(frozen=True)
-class Mounting:
+class EstimatedMounting:
     """One head: the angles of the platform calibration, turned as the tie points say.
 
     `angles_rad` are omega, phi, kappa of virtual_from_head with their `covariance` (3, 3), by tie
-    points and by how well the sensors' places are known; `turn_rad`, `turn_sigma_rad` the same
-    against calibration, about the axes of the virtual image; the mean of all heads is zero.
-    `shift_px` is how far the head's middle went by it, (x right, y up).
-    `residual_px` is the shift that an affine transformation still finds between this head's tie
-    points and its neighbours', `affine` (2, 2) the rest of it, px per px, `points` their number.
+    points and by how well the sensors' places are known; `correction_rad`, `correction_sigma_rad`
+    the same against calibration, about the axes of the virtual image; the mean of all heads is
+    zero. `shift_px` is how far the head's middle went by it, (x right, y up). `residual_px` is the
+    shift that an affine transformation still finds between this head's tie points and its
+    neighbours', `affine` (2, 2) the rest of it, px per px, `points` their number.
     """
 
     cone: str
     angles_rad: tuple[float, float, float]
     covariance: Array
-    turn_rad: tuple[float, float, float]
-    turn_sigma_rad: tuple[float, float, float]
+    correction_rad: tuple[float, float, float]
+    correction_sigma_rad: tuple[float, float, float]
     shift_px: tuple[float, float]
     residual_px: tuple[float, float]
     residual_sigma_px: tuple[float, float]
@@ -89,18 +94,18 @@ class PlatformCheck:
     all heads turned together does not count, it cannot be seen.
     """
 
-    heads: tuple[Mounting, ...]
+    heads: tuple[EstimatedMounting, ...]
     covariance: Array
     statistic: float
-    freedom: int
+    degrees_of_freedom: int
     limit: float
 
     @property
-    def expired(self) -> bool:
-        return self.freedom > 0 and self.statistic > self.limit
+    def is_expired(self) -> bool:
+        return self.degrees_of_freedom > 0 and self.statistic > self.limit
 
     @property
-    def scaled(self) -> Mounting:
+    def scaled(self) -> EstimatedMounting:
         """The head whose scale differs most from its neighbours'."""
         return max(self.heads, key=lambda head: abs(head.scale_ppm))
 
@@ -111,11 +116,11 @@ class PlatformCheck:
         return tuple(
             head.cone
             for head in self.heads
-            if self.expired and head is not self.farthest and math.hypot(*head.shift_px) > far
+            if self.is_expired and head is not self.farthest and math.hypot(*head.shift_px) > far
         )
 
     @property
-    def farthest(self) -> Mounting:
+    def farthest(self) -> EstimatedMounting:
         """The head whose middle moved most."""
         return max(self.heads, key=lambda head: math.hypot(*head.shift_px))
 
@@ -125,7 +130,7 @@ def verified_mosaic(rig: Rig, mosaic: Mosaic, tie_points: TiePoints) -> Mosaic:
 
     Each head's tie points are compared with its neighbours' by an affine transformation; as a rule
     the adjustment has left no shift. Where one is left (over three standard deviations and
-    `LEAST_SHIFT_PX`), the head goes half of the way: its neighbour is found as far off.
+    `MIN_SHIFT_PX`), the head goes half of the way: its neighbour is found as far off.
     """
     if not mosaic.model.mountings:
         return mosaic
@@ -134,10 +139,10 @@ def verified_mosaic(rig: Rig, mosaic: Mosaic, tie_points: TiePoints) -> Mosaic:
         moved = False
         for name, first in mosaic.model.mountings.items():
             shift, sigma, _, points = _affine_shift(rig, mosaic, tie_points, name)
-            significant = np.abs(shift) > np.maximum(3.0 * sigma, LEAST_SHIFT_PX)
-            if points >= LEAST_POINTS and significant.any():
+            significant = np.abs(shift) > np.maximum(3.0 * sigma, MIN_SHIFT_PX)
+            if points >= MIN_POINTS and significant.any():
                 middle = _middle_mm(rig, mosaic, name)
-                jacobian = further_turn(middle, mosaic.model.f_mm)[:, :2, 0]
+                jacobian = small_rotation_design(middle, mosaic.model.f_mm)[:, :2, 0]
                 step = np.linalg.solve(jacobian, shift * mosaic.model.pitch_mm)
                 values[first : first + 2] += 0.5 * step
                 moved = True
@@ -159,7 +164,7 @@ def has_scaled_head(rig: Rig, mosaic: Mosaic, tie_points: TiePoints) -> bool:
         _, _, affine, points = _affine_shift(rig, mosaic, tie_points, name)
         along, across = affine[0, 0], affine[1, 1]
         least = min(abs(along), abs(across))
-        if points >= LEAST_POINTS and along * across > 0.0 and least > SCALED_PPM * 1e-6:
+        if points >= MIN_POINTS and along * across > 0.0 and least > SCALED_PPM * 1e-6:
             return True
     return False
 
@@ -203,7 +208,7 @@ def check_platform(
         heads=heads,
         covariance=known,
         statistic=float(y @ np.linalg.solve(covariance, y)),
-        freedom=len(y),
+        degrees_of_freedom=len(y),
         limit=float(chi2.ppf(1.0 - FAMILY_ALPHA, len(y))),
     )
 
@@ -240,7 +245,7 @@ def rotation_of_layer(rig: Rig, mosaic: Mosaic, cone: Cone) -> Array | None:
     if cone.name not in model.layers:
         return None
     first = model.layers[cone.name]
-    turns, moves = [], []
+    rotation_columns, moves = [], []
     for sensor in cone.sensors:
         start = mosaic.start[sensor.name]
         corrected = corrected_mm_from_raw(start, _grid(sensor))
@@ -248,13 +253,15 @@ def rotation_of_layer(rig: Rig, mosaic: Mosaic, cone: Cone) -> Array | None:
         layer = design[np.isin(columns, np.arange(first, first + 8))] * model.pitch_mm
         moves.append(layer.transpose(2, 1, 0).reshape(-1, 8))
         place = vip_mm_from_raw(start, _grid(sensor))
-        turns.append(further_turn(place, model.f_mm).transpose(2, 0, 1).reshape(-1, 3))
-    fit = np.linalg.pinv(np.concatenate(turns)) @ np.concatenate(moves)
+        rotation_columns.append(
+            small_rotation_design(place, model.f_mm).transpose(2, 0, 1).reshape(-1, 3)
+        )
+    fit = np.linalg.pinv(np.concatenate(rotation_columns)) @ np.concatenate(moves)
     rows[:, first : first + 8] = fit
     return rows
 
 
-def turn_of_band(rig: Rig, mosaic: Mosaic, band: BandRegistration) -> tuple[Array, Array]:
+def rotation_of_band(rig: Rig, mosaic: Mosaic, band: BandRegistration) -> tuple[Array, Array]:
     """The turn of a colour head that its registration to green says, and its sigma, (3,) rad each.
 
     The rotation nearest to the projective transformation over the head's sensor; green itself has
@@ -263,30 +270,35 @@ def turn_of_band(rig: Rig, mosaic: Mosaic, band: BandRegistration) -> tuple[Arra
     model, sensor = mosaic.model, rig.sensor(band.sensor)
     seen = vip_mm_from_raw(mosaic.start[band.sensor], _grid(sensor))
     belongs = apply_projective(np.asarray(np.linalg.inv(band.band_from_green), np.float64), seen)
-    design = further_turn(seen, model.f_mm).transpose(2, 0, 1).reshape(-1, 3)
-    turn, *_ = np.linalg.lstsq(design, (belongs - seen).reshape(-1), rcond=None)
+    design = small_rotation_design(seen, model.f_mm).transpose(2, 0, 1).reshape(-1, 3)
+    rotation_vector, *_ = np.linalg.lstsq(design, (belongs - seen).reshape(-1), rcond=None)
     unit_mm = sensor.pitch_mm * model.f_mm / rig.cone_of(band.sensor).lens.f_mm
     per_point = (band.rms_px or 0.0) / math.sqrt(2.0) * unit_mm
     cofactor = np.linalg.inv(design.T @ design) * len(seen) / max(band.points, 1)
-    return np.asarray(turn), np.asarray(per_point * np.sqrt(np.diag(cofactor)), np.float64)
+    return np.asarray(rotation_vector), np.asarray(
+        per_point * np.sqrt(np.diag(cofactor)), np.float64
+    )
 
 
 def _mounting(
     rig: Rig, mosaic: Mosaic, tie_points: TiePoints, name: str, covariance: Array
-) -> Mounting:
+) -> EstimatedMounting:
     cone, first = rig.cone(name), mosaic.model.mountings[name]
-    turn = mosaic.values[first : first + 3]
-    rotation = turned(cone, turn)
+    rotation_vector = mosaic.values[first : first + 3]
+    rotation = rotated_mounting(cone, rotation_vector)
     # A turn w before the rotation is one of R'w behind it.
     jacobian = angles_by_rotation_vector(rotation[None])[0] @ rotation.T
-    moved = further_turn(_middle_mm(rig, mosaic, name), mosaic.model.f_mm)[:, :, 0] @ turn
+    moved = (
+        small_rotation_design(_middle_mm(rig, mosaic, name), mosaic.model.f_mm)[:, :, 0]
+        @ rotation_vector
+    )
     shift, sigma, affine, points = _affine_shift(rig, mosaic, tie_points, name)
-    return Mounting(
+    return EstimatedMounting(
         cone=name,
         angles_rad=_triple(omega_phi_kappa(rotation[None])[0]),
         covariance=jacobian @ covariance @ jacobian.T,
-        turn_rad=_triple(turn),
-        turn_sigma_rad=_triple(np.sqrt(np.maximum(np.diag(covariance), 0.0))),
+        correction_rad=_triple(rotation_vector),
+        correction_sigma_rad=_triple(np.sqrt(np.maximum(np.diag(covariance), 0.0))),
         shift_px=_pair(moved / mosaic.model.pitch_mm),
         residual_px=_pair(shift),
         residual_sigma_px=_pair(sigma),
@@ -295,9 +307,11 @@ def _mounting(
     )
 
 
-def turned(cone: Cone, turn_rad: Array) -> Array:
+def rotated_mounting(cone: Cone, correction_rad: Array) -> Array:
     """virtual_from_head (3, 3) of a cone turned further about the axes of the virtual image."""
-    return np.asarray(exponential(turn_rad[None])[0] @ rotation_matrix(*cone.rotation_rad))
+    return np.asarray(
+        rotations_from_vectors(correction_rad[None])[0] @ rotation_matrix(*cone.rotation_rad)
+    )
 
 
 def place_covariance(cone: Cone, dc_k: Mapping[str, float], *, is_datum: bool = False) -> Array:
@@ -332,7 +346,7 @@ def _affine_shift(
     sensors = [s.name for s in rig.cone(name).sensors]
     numbers = [i for i, n in enumerate(tie_points.names) if n in sensors]
     good = ~mosaic.outliers & (tie_points.kind == PAN_TO_PAN)
-    places, apart, sigmas = [], [], []
+    places, separation, sigmas = [], [], []
     for side, sign in ((tie_points.sensor_a, -1.0), (tie_points.sensor_b, 1.0)):
         raw = tie_points.raw_a if sign < 0 else tie_points.raw_b
         for number in numbers:
@@ -340,13 +354,13 @@ def _affine_shift(
             if rows.any():
                 placement = mosaic.placements[tie_points.names[number]]
                 places.append(vip_mm_from_raw(placement, raw[rows]) / mosaic.model.pitch_mm)
-                apart.append(sign * mosaic.residuals_px[rows])
+                separation.append(sign * mosaic.residuals_px[rows])
                 sigmas.append(tie_points.sigma_px[rows])
     points = sum(map(len, places))
     nothing = np.zeros(2), np.full(2, math.inf), np.zeros((2, 2)), points
-    if points < LEAST_POINTS:
+    if points < MIN_POINTS:
         return nothing
-    at, d = np.concatenate(places), np.concatenate(apart)
+    at, d = np.concatenate(places), np.concatenate(separation)
     arm = at - _middle_mm(rig, mosaic, name)[0] / mosaic.model.pitch_mm
     design = np.column_stack([np.ones(points), arm])
     weight = 1.0 / np.concatenate(sigmas)

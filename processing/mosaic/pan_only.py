@@ -17,8 +17,8 @@ from processing.geometry.placement import SensorPlacement
 from processing.geometry.projective import rotation_homography
 from processing.geometry.topology import free_cones
 from processing.matching.tie_points import PAN_TO_PAN, TiePoints
-from processing.mosaic.datum import Constraint, datum_candidates, mounting_constraints
-from processing.mosaic.free import (
+from processing.mosaic.datum import DatumConstraint, datum_candidates, mounting_constraints
+from processing.mosaic.free_mosaic import (
     Mosaic,
     MosaicSettings,
     adjust_mosaic,
@@ -72,8 +72,8 @@ def pan_only_mosaic(
         precorrected: keep the calibrated rotations of the PAN cones; the experiment did not.
         settings: None takes the defaults.
     """
-    kept = precorrected or rig.master_cone is None
-    start = dict(placements) if kept else without_precorrection(rig, placements)
+    keeps_precorrection = precorrected or rig.master_cone is None
+    start = dict(placements) if keeps_precorrection else without_precorrection(rig, placements)
     mountings = free_cones(rig)[1]
     layers = [c.name for c in rig.pan_cones if c.name not in (rig.master_cone, *mountings)]
     constraints = [c for name in layers for c in similarity_constraints(name)]
@@ -92,11 +92,11 @@ def pan_only_mosaic(
     )
 
 
-def similarity_constraints(layer: str) -> list[Constraint]:
+def similarity_constraints(layer: str) -> list[DatumConstraint]:
     """What makes a layer transformation of eight parameters one of four."""
     return [
-        Constraint({f"{layer}.p11": 1.0, f"{layer}.p22": -1.0}),
-        Constraint({f"{layer}.p12": 1.0, f"{layer}.p21": 1.0}),
-        Constraint({f"{layer}.p31": 1.0}),
-        Constraint({f"{layer}.p32": 1.0}),
+        DatumConstraint({f"{layer}.p11": 1.0, f"{layer}.p22": -1.0}),
+        DatumConstraint({f"{layer}.p12": 1.0, f"{layer}.p21": 1.0}),
+        DatumConstraint({f"{layer}.p31": 1.0}),
+        DatumConstraint({f"{layer}.p32": 1.0}),
     ]

@@ -1,8 +1,8 @@
 """The stated accuracy of a stitched image: tie points, and the calibration its datum rests on.
 
-Three parts: the adjustment's covariance, which `processing.mosaic.free` makes; calibration and
-drift coefficients of the master sensors the datum rests on; and the temperature of the master cone,
-which a common expansion hides in. Whether the calibration holds is judged in
+Three parts: the adjustment's covariance, which `processing.mosaic.free_mosaic` makes; calibration
+and drift coefficients of the master sensors the datum rests on; and the temperature of the master
+cone, which a common expansion hides in. Whether the calibration holds is judged in
 `processing.mosaic.validity`.
 
 Source: docs/mathematics/mosaicking.md#accuracy-of-the-image. Eq. 6 is that of Ladstädter et al.
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from processing.geometry.drift import sensor_dc
 from processing.geometry.placement import corrected_mm_from_raw, vip_mm_from_raw
 from processing.mosaic.datum import datum_candidates
-from processing.mosaic.free import Mosaic, vip_precision_px
+from processing.mosaic.free_mosaic import Mosaic, vip_precision_px
 from processing.mosaic.held import HeldPart
 from processing.mosaic.model import vip_and_design
 from processing.quality.report import Figure
@@ -35,8 +35,8 @@ BLIND_SIGMA_K = 15.0
 
 
 @dataclass(frozen=True)
-class Disturbance:
-    """Covariance beside that of tie points and datum (`processing.mosaic.disturbance`).
+class UncertaintyContribution:
+    """Covariance beside that of tie points and datum (`processing.mosaic.uncertainty_contribution`).
 
     `datum` (4, 4) is that of shift x, y (px), scale and rotation (px per mm) of the whole image;
     `frames` (2,) the variance of a coordinate, px squared, of one sensor's pixels, by its name;
@@ -53,7 +53,7 @@ def precision_figures(
     mosaic: Mosaic,
     present: Collection[str],
     measured_c: Mapping[str, float],
-    disturbance: Disturbance | None = None,
+    uncertainty_contribution: UncertaintyContribution | None = None,
 ) -> dict[str, Figure]:
     """How well centre and corners of the PAN sensors that are there are placed, in figures.
 
@@ -76,7 +76,7 @@ def precision_figures(
                     sensor.name,
                     np.array(points, np.float64),
                     measured_c,
-                    disturbance,
+                    uncertainty_contribution,
                 )
                 by_sensor[sensor.name] = float(np.sqrt(np.mean(sigma**2)))
     if not by_sensor:
@@ -95,7 +95,7 @@ def placed_sigma_px(
     sensor: str,
     colrow: Array,
     measured_c: Mapping[str, float],
-    disturbance: Disturbance | None = None,
+    uncertainty_contribution: UncertaintyContribution | None = None,
 ) -> Array:
     """Standard deviation (n, 2), px, of where raw pixels (n, 2) lie in the virtual image.
 
@@ -107,11 +107,11 @@ def placed_sigma_px(
         tie_points = tie_points * max(1.0, 1.0 / max(mosaic.sigma0, 1e-6))
     placed_mm = vip_mm_from_raw(mosaic.placements[sensor], colrow)
     datum = moved_datum_design(rig, mosaic, placed_mm)
-    disturbance = disturbance or Disturbance()
-    of_datum = datum_covariance(rig, mosaic, measured_c) + disturbance.datum
+    uncertainty_contribution = uncertainty_contribution or UncertaintyContribution()
+    of_datum = datum_covariance(rig, mosaic, measured_c) + uncertainty_contribution.datum
     variance = np.sum((datum @ of_datum) * datum, axis=1).reshape(-1, 2)
-    variance = variance + disturbance.frames.get(sensor, np.zeros(2))
-    for part in disturbance.parts:
+    variance = variance + uncertainty_contribution.frames.get(sensor, np.zeros(2))
+    for part in uncertainty_contribution.parts:
         variance = variance + part.at(mosaic, sensor, colrow) ** 2
     return np.asarray(np.sqrt(tie_points**2 + variance))
 
@@ -152,7 +152,10 @@ def placed_covariance_px(
 
 
 def disturbance_covariance_px(
-    rig: Rig, mosaic: Mosaic, points: Mapping[str, Array], disturbance: Disturbance
+    rig: Rig,
+    mosaic: Mosaic,
+    points: Mapping[str, Array],
+    uncertainty_contribution: UncertaintyContribution,
 ) -> Array:
     """Covariance (2 n, 2 n) that a disturbance adds, px squared, as in `placed_covariance_px`."""
     designs = [
@@ -160,12 +163,12 @@ def disturbance_covariance_px(
         for name, colrow in points.items()
     ]
     own = [
-        np.tile(disturbance.frames.get(name, np.zeros(2)), len(colrow))
+        np.tile(uncertainty_contribution.frames.get(name, np.zeros(2)), len(colrow))
         for name, colrow in points.items()
     ]
     design = np.concatenate(designs)
-    covariance = design @ disturbance.datum @ design.T + np.diag(np.concatenate(own))
-    for part in disturbance.parts:
+    covariance = design @ uncertainty_contribution.datum @ design.T + np.diag(np.concatenate(own))
+    for part in uncertainty_contribution.parts:
         errors = [part.at(mosaic, name, colrow).reshape(-1) for name, colrow in points.items()]
         error = np.concatenate(errors)
         covariance += np.outer(error, error)
@@ -242,9 +245,12 @@ def _moved_um_per_kelvin(rig: Rig, sensors: Sequence[Sensor], place_mm: Array) -
             for k in range(i * times, (i + 1) * times):
                 if s.probe == probe:
                     x, y = place_mm[k] - place_mm[i * times]
-                    scale, turn = s.drift.scale_ppm_per_k * 1e-3, s.drift.rotation_urad_per_k * 1e-3
+                    scale, rotation = (
+                        s.drift.scale_ppm_per_k * 1e-3,
+                        s.drift.rotation_urad_per_k * 1e-3,
+                    )
                     moved[k] += (s.drift.x_um_per_k, s.drift.y_um_per_k)
-                    moved[k] += (scale * x - turn * y, scale * y + turn * x)
+                    moved[k] += (scale * x - rotation * y, scale * y + rotation * x)
                 if cone.probe == probe:
                     moved[k] -= cone.lens.f_ppm_per_k * 1e-3 * place_mm[k]
         result[probe] = moved.reshape(-1)

@@ -1,6 +1,6 @@
 """Residuals of the stitching as few numbers: vectors to lay over a picture, figures per overlap.
 
-The full drawing is in `processing.mosaic.drawing`.
+The full drawing is in `processing.mosaic.mosaic_plots`.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ import numpy as np
 
 from processing.geometry.placement import vip_mm_from_raw, vip_px_from_mm
 from processing.matching.tie_points import PAN_TO_PAN, TiePoints
-from processing.mosaic.free import Mosaic
+from processing.mosaic.free_mosaic import Mosaic
 from processing.rig import Rig
 
-VECTORS_MOST: Final = 600
+VECTORS_MAX: Final = 600
 
 
 def residual_vectors(rig: Rig, tie_points: TiePoints, mosaic: Mosaic) -> dict[str, Any]:
@@ -24,7 +24,7 @@ def residual_vectors(rig: Rig, tie_points: TiePoints, mosaic: Mosaic) -> dict[st
     Returns:
         `width_px`, `height_px` of the virtual image; `overlaps`, for every pair of sensors where
         points were sought: `sensors`, `sought`, `found`, `used`, `rms_px` (of used points, null
-        without any); `vectors`, at most VECTORS_MOST, evenly thinned: [column, row, right, down,
+        without any); `vectors`, at most VECTORS_MAX, evenly thinned: [column, row, right, down,
         kind], pixels of the virtual image, kind 0 between PAN sensors, 1 PAN to colour, 2 left out
         by data snooping.
 
@@ -36,7 +36,7 @@ def residual_vectors(rig: Rig, tie_points: TiePoints, mosaic: Mosaic) -> dict[st
         raise ValueError(f"rig {rig.name} has no virtual image to lay residuals over")
     known = np.isfinite(mosaic.residuals_px).all(axis=1)
     used = known & ~mosaic.outliers
-    step = max(1, math.ceil(int(known.sum()) / VECTORS_MOST))
+    step = max(1, math.ceil(int(known.sum()) / VECTORS_MAX))
     chosen = np.flatnonzero(known)[::step]
     at = np.zeros((len(chosen), 2))
     for index in np.unique(tie_points.sensor_a[chosen]):
@@ -67,7 +67,7 @@ def _overlap(tie_points: TiePoints, mosaic: Mosaic, index: int, used: Any) -> di
     rms = float(np.sqrt(np.mean(np.sum(residuals**2, axis=1)))) if len(residuals) else None
     return {
         "sensors": list(tie_points.pairs[index]),
-        "sought": int(tie_points.sought[index]),
+        "sought": int(tie_points.attempted[index]),
         "found": int(rows.sum()),
         "used": len(residuals),
         "rms_px": None if rms is None else round(rms, 4),

@@ -18,8 +18,8 @@ from processing.geometry.drift import sensor_dc
 from processing.geometry.topology import mosaic_cones
 from processing.image.colour import BandRegistration
 from processing.mosaic.estimated_dc import EstimatedDc
-from processing.mosaic.free import Mosaic
-from processing.mosaic.mounting import rotation_of_layer, turn_of_band
+from processing.mosaic.free_mosaic import Mosaic
+from processing.mosaic.mounting import rotation_of_band, rotation_of_layer
 from processing.rig import Cone, Rig
 
 Array = NDArray[np.float64]
@@ -28,7 +28,7 @@ STITCH_FORMAT = 1
 SENSOR_UNITS = {"x_um": 1e3, "y_um": 1e3, "rotation_urad": 1e6, "scale_ppm": 1e6}
 """Quantities of a sensor, and what turns the adjustment's own units (mm, rad, 1) into theirs."""
 LAYER_SCALE = "layer_scale_ppm"
-TURNS = ("rotation_x_urad", "rotation_y_urad", "rotation_z_urad")
+ROTATIONS = ("rotation_x_urad", "rotation_y_urad", "rotation_z_urad")
 """How a cone stands turned against its calibration, about the axes of the virtual image."""
 
 
@@ -102,19 +102,21 @@ def stitch_record(
         rows.append(layer_scale_design(mosaic, cone, first))
         names.append(f"{cone.name}.{LAYER_SCALE}")
     for cone in mosaic_cones(rig):
-        turn = rotation_of_layer(rig, mosaic, cone)
-        if turn is not None and not any(name.startswith(f"{cone.name}.") for name in held):
-            rows += list(turn * 1e6)
-            names += [f"{cone.name}.{what}" for what in TURNS]
+        rotation_vector = rotation_of_layer(rig, mosaic, cone)
+        if rotation_vector is not None and not any(
+            name.startswith(f"{cone.name}.") for name in held
+        ):
+            rows += list(rotation_vector * 1e6)
+            names += [f"{cone.name}.{what}" for what in ROTATIONS]
     design = np.array(rows).reshape(len(rows), len(mosaic.model.names))
     values = [design @ mosaic.values]
     covariances = [design @ mosaic.covariance @ design.T]
     for band in bands:
         if band.registered:
-            turn, sigma = turn_of_band(rig, mosaic, band)
-            values.append(turn * 1e6)
+            rotation_vector, sigma = rotation_of_band(rig, mosaic, band)
+            values.append(rotation_vector * 1e6)
             covariances.append(np.diag((sigma * 1e6) ** 2))
-            names += [f"{rig.cone_of(band.sensor).name}.{what}" for what in TURNS]
+            names += [f"{rig.cone_of(band.sensor).name}.{what}" for what in ROTATIONS]
     return StitchRecord(
         rig=rig.name,
         calibration_id=rig.calibration_id,

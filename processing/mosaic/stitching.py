@@ -1,7 +1,8 @@
 """Tie points in, judged placements out: which mosaic an image is made with, and why.
 
 The order of adjustment, judgement, robust datum and support is decided here; each has a room of
-its own (`processing.mosaic.free`, `processing.mosaic.validity`, `processing.mosaic.support`).
+its own (`processing.mosaic.free_mosaic`, `processing.mosaic.validity`,
+`processing.mosaic.calibration_support`).
 """
 
 from __future__ import annotations
@@ -12,14 +13,18 @@ from typing import Final, Literal
 
 from processing.geometry.placement import SensorPlacement
 from processing.matching.tie_points import TiePoints
-from processing.mosaic.fixed import fixed_mosaic
-from processing.mosaic.free import Mosaic, MosaicSettings, free_mosaic
+from processing.mosaic.calibration_support import (
+    contradicted_colour,
+    supported_mosaic,
+    weakly_determined_sensors,
+)
+from processing.mosaic.fixed_mosaic import fixed_mosaic
+from processing.mosaic.free_mosaic import Mosaic, MosaicSettings, free_mosaic
 from processing.mosaic.model import residuals_px
 from processing.mosaic.mounting import has_scaled_head, verified_mosaic
 from processing.mosaic.pan_only import pan_only_mosaic
-from processing.mosaic.slips import Slip, find_slips, inside_slips, of_sensor, slip_of
-from processing.mosaic.support import contradicted_colour, supported_mosaic, weakly_placed
-from processing.mosaic.validity import Validity, judge_master, robust_datum
+from processing.mosaic.readout_slips import Slip, find_slips, inside_slips, of_sensor, slip_of
+from processing.mosaic.validity import Validity, evaluate_master, robust_datum
 from processing.rig import Rig
 
 SLIP_ROUNDS: Final = 4
@@ -38,7 +43,7 @@ class Stitching:
     """
 
     tie_points: TiePoints
-    equal: Mosaic
+    equal_datum: Mosaic
     free: Mosaic
     image: Mosaic
     validity: Validity | None
@@ -75,18 +80,18 @@ def stitch(
         return Stitching(tie_points, mosaic, mosaic, mosaic, None, ())
     mosaic = free_mosaic(rig, start, tie_points, settings=settings)
     tie_points, mosaic, slips = _without_slips(rig, start, tie_points, mosaic, settings)
-    validity = judge_master(rig, mosaic, temperatures_c)
+    validity = evaluate_master(rig, mosaic, temperatures_c)
     contradicted = contradicted_colour(rig, tie_points, mosaic, validity)
     if contradicted.any():
         fewer = tie_points.only(~contradicted)
         without = free_mosaic(rig, start, fewer, settings=settings)
-        judged = judge_master(rig, without, temperatures_c)
-        if not contradicted_colour(rig, tie_points, without, judged).any():
+        evaluated = evaluate_master(rig, without, temperatures_c)
+        if not contradicted_colour(rig, tie_points, without, evaluated).any():
             # P/P points do not say so: it was a cloud, or something else that is nearer.
-            tie_points, mosaic, validity = fewer, without, judged
+            tie_points, mosaic, validity = fewer, without, evaluated
     mosaic = verified_mosaic(rig, mosaic, tie_points)
     robust = robust_datum(rig, start, tie_points, mosaic, validity, settings=settings)
-    weak = weakly_placed(rig, robust, present)
+    weak = weakly_determined_sensors(rig, robust, present)
     image = robust
     if weak:
         image = supported_mosaic(
@@ -114,11 +119,11 @@ def _without_slips(
         found = find_slips(rig, tie_points, mosaic.residuals_px)
         if not found:
             break
-        suspect = found[0].sensor
-        others = tie_points.only(~of_sensor(tie_points, suspect))
+        candidate = found[0].sensor
+        others = tie_points.only(~of_sensor(tie_points, candidate))
         without = free_mosaic(rig, start, others, settings=settings)
         seen = residuals_px(without.model, without.placements, tie_points)
-        slip = slip_of(rig, tie_points, seen, suspect) or found[0]
+        slip = slip_of(rig, tie_points, seen, candidate) or found[0]
         slip = replace(slip, alternatives=found[0].alternatives)
         slips += (slip,)
         tie_points = tie_points.only(~inside_slips(tie_points, (slip,)))

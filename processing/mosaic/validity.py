@@ -1,7 +1,7 @@
 """Does the calibration still hold? Sensors as the stitching finds them against calibration + TDM.
 
 Only the judgement and the datum that follows from it live here; the adjustment is in
-`processing.mosaic.free`. Displacements are (x right, y up), found minus expected, in PAN px.
+`processing.mosaic.free_mosaic`. Displacements are (x right, y up), found minus expected, in PAN px.
 
 Source: docs/mathematics/validity.md#one-displaced-sensor; Ladstädter et al. (2010), "Optimal IO
 reconstruction", fig. 5 and 6.
@@ -21,13 +21,13 @@ from scipy.stats import chi2
 
 from processing.geometry.placement import SensorPlacement
 from processing.matching.tie_points import TiePoints
-from processing.mosaic.free import Mosaic, MosaicSettings, datum_constraints, free_mosaic
+from processing.mosaic.free_mosaic import Mosaic, MosaicSettings, datum_constraints, free_mosaic
 from processing.mosaic.misfit import (
-    PLACE,
-    PLACE_AND_SCALE,
-    Knowledge,
+    POSITION,
+    POSITION_AND_SCALE,
     Misfit,
-    Misread,
+    PriorSigmas,
+    ProbeBias,
     expected_covariance,
     found_quantities,
     misfit,
@@ -37,7 +37,7 @@ from processing.rig import Rig
 
 Array = NDArray[np.float64]
 
-LEAST_PAN_POINTS = 24
+MIN_PAN_POINTS = 24
 """P/P points used below which a sensor's place is not the stitching's to tell."""
 
 Observability = Literal["named", "relative", "unobservable"]
@@ -51,9 +51,9 @@ class ValiditySettings:
     alternative to the named one unless it is `odds` times less likely; so is a probe.
     """
 
-    knowledge: Knowledge = field(default_factory=Knowledge)
+    prior_sigmas: PriorSigmas = field(default_factory=PriorSigmas)
     family_alpha: float = 0.001
-    odds: float = 19.0
+    odds_limit: float = 19.0
 
 
 @dataclass(frozen=True)
@@ -121,23 +121,23 @@ class Validity:
     observability: Mapping[str, Observability]
     residuals: tuple[Residual, ...]
     global_statistic: float
-    global_freedom: int
+    global_degrees_of_freedom: int
     global_limit: float
     hypotheses: tuple[Displacement, ...]
     limit: float
     displaced: Displacement | None
     alternatives: tuple[str, ...]
-    several: bool
+    several_displaced: bool
     relative: tuple[RelativeDisplacement, ...]
-    misread: Misread | None = None
-    unproven: Displacement | None = None
+    probe_bias: ProbeBias | None = None
+    insignificant_displacement: Displacement | None = None
 
     @property
     def consistent(self) -> bool:
         return self.global_statistic <= self.global_limit
 
 
-def judge_master(
+def evaluate_master(
     rig: Rig,
     mosaic: Mosaic,
     temperatures_c: Mapping[str, float],
@@ -167,36 +167,38 @@ def judge_master(
     places = None
     limit = math.inf
     if len(master) >= 3:
-        places = misfit(rig, mosaic, master, temperatures_c, knowledge=settings.knowledge)
+        places = misfit(rig, mosaic, master, temperatures_c, prior_sigmas=settings.prior_sigmas)
         limit = float(chi2.ppf(1.0 - settings.family_alpha / len(master), 2))
         cause = _cause(rig, mosaic, places, temperatures_c, settings, limit)
-    freedom = 0 if places is None else len(places.y)
+    degrees_of_freedom = 0 if places is None else len(places.y)
     hypotheses = cause.hypotheses
-    accused = cause.displaced or cause.unproven
+    explanation = cause.displaced or cause.insignificant_displacement
     fits = [
         h.sensor
         for h in hypotheses[1:]
-        if hypotheses[0].statistic - h.statistic < 2.0 * math.log(settings.odds)
+        if hypotheses[0].statistic - h.statistic < 2.0 * math.log(settings.odds_limit)
     ]
-    several = bool(
-        accused
-        and cause.freedom > 0
-        and cause.remainder > chi2.ppf(1.0 - settings.family_alpha, cause.freedom)
+    several_displaced = bool(
+        explanation
+        and cause.degrees_of_freedom > 0
+        and cause.remainder > chi2.ppf(1.0 - settings.family_alpha, cause.degrees_of_freedom)
     )
     return Validity(
         observability=_observability(rig, mosaic),
         residuals=_residuals(rig, mosaic, master, temperatures_c, settings),
         global_statistic=0.0 if places is None else places.statistic,
-        global_freedom=freedom,
-        global_limit=float(chi2.ppf(1.0 - settings.family_alpha, freedom)) if freedom else 0.0,
+        global_degrees_of_freedom=degrees_of_freedom,
+        global_limit=float(chi2.ppf(1.0 - settings.family_alpha, degrees_of_freedom))
+        if degrees_of_freedom
+        else 0.0,
         hypotheses=hypotheses,
         limit=limit,
         displaced=cause.displaced,
-        alternatives=tuple(fits) if accused else (),
-        several=several,
+        alternatives=tuple(fits) if explanation else (),
+        several_displaced=several_displaced,
         relative=_relative(rig, mosaic, temperatures_c, settings),
-        misread=cause.misread,
-        unproven=cause.unproven,
+        probe_bias=cause.probe_bias,
+        insignificant_displacement=cause.insignificant_displacement,
     )
 
 
@@ -206,10 +208,10 @@ class _Cause:
 
     hypotheses: tuple[Displacement, ...] = ()
     displaced: Displacement | None = None
-    unproven: Displacement | None = None
-    misread: Misread | None = None
+    insignificant_displacement: Displacement | None = None
+    probe_bias: ProbeBias | None = None
     remainder: float = 0.0
-    freedom: int = 0
+    degrees_of_freedom: int = 0
 
 
 def _cause(
@@ -227,13 +229,13 @@ def _cause(
     """
     hypotheses = _hypotheses(places)
     best = hypotheses[0]
-    remainder, freedom = places.statistic - best.statistic, len(places.y) - 2
-    healthy = _Cause(hypotheses, remainder=remainder, freedom=freedom)
+    remainder, degrees_of_freedom = places.statistic - best.statistic, len(places.y) - 2
+    is_undisplaced = _Cause(hypotheses, remainder=remainder, degrees_of_freedom=degrees_of_freedom)
     if best.statistic <= limit:
-        return healthy
-    if pan_points(rig, mosaic)[best.sensor] < LEAST_PAN_POINTS:
-        return replace(healthy, unproven=best)
-    moved = replace(healthy, displaced=best)
+        return is_undisplaced
+    if pan_points(rig, mosaic)[best.sensor] < MIN_PAN_POINTS:
+        return replace(is_undisplaced, insignificant_displacement=best)
+    displacement = replace(is_undisplaced, displaced=best)
     names = [s.name for s in places.sensors]
     scaled = all(f"{name}.scale" not in mosaic.undetermined for name in names)
     wide = misfit(
@@ -241,31 +243,33 @@ def _cause(
         mosaic,
         names,
         temperatures_c,
-        quantities=PLACE_AND_SCALE if scaled else PLACE,
-        knowledge=settings.knowledge,
+        quantities=POSITION_AND_SCALE if scaled else POSITION,
+        prior_sigmas=settings.prior_sigmas,
     )
     read = [p for p in dict.fromkeys(s.probe for s in wide.sensors) if p in temperatures_c]
     if not read:
-        return moved
-    misread = max((_misread(wide, probe) for probe in read), key=lambda m: m.statistic)
-    lead = misread.statistic - _hypotheses(wide)[0].statistic
-    near = 2.0 * math.log(settings.odds)
+        return displacement
+    probe_bias = max((_misread(wide, probe) for probe in read), key=lambda m: m.statistic)
+    lead = probe_bias.statistic - _hypotheses(wide)[0].statistic
+    near = 2.0 * math.log(settings.odds_limit)
     if lead < -near:
-        return moved
-    beside = wide.beside(wide.misread(misread.probe))
-    still = _hypotheses(beside)
+        return displacement
+    with_free_cause = wide.with_free_cause(wide.probe_bias(probe_bias.probe))
+    still = _hypotheses(with_free_cause)
     if still[0].statistic > limit:
         # However wrong the probe may be, a sensor has moved, too.
-        left = beside.statistic - still[0].statistic
-        return _Cause(still, still[0], remainder=left, freedom=len(beside.y) - 3)
-    return replace(moved if lead <= near else healthy, misread=misread)
+        left = with_free_cause.statistic - still[0].statistic
+        return _Cause(
+            still, still[0], remainder=left, degrees_of_freedom=len(with_free_cause.y) - 3
+        )
+    return replace(displacement if lead <= near else is_undisplaced, probe_bias=probe_bias)
 
 
 def _hypotheses(found: Misfit) -> tuple[Displacement, ...]:
     """Each sensor, if it alone had moved; the likeliest first."""
     result = []
     for i, sensor in enumerate(found.sensors):
-        fit = found.fit(found.moved(i))
+        fit = found.fit(found.displacement(i))
         result.append(
             Displacement(
                 sensor=sensor.name,
@@ -279,10 +283,10 @@ def _hypotheses(found: Misfit) -> tuple[Displacement, ...]:
     return tuple(sorted(result, key=lambda h: -h.statistic))
 
 
-def _misread(found: Misfit, probe: str) -> Misread:
-    fit = found.fit(found.misread(probe))
+def _misread(found: Misfit, probe: str) -> ProbeBias:
+    fit = found.fit(found.probe_bias(probe))
     sigma_k = math.sqrt(float(fit.cofactor[0, 0]))
-    return Misread(probe, float(fit.size[0]), sigma_k, fit.statistic)
+    return ProbeBias(probe, float(fit.size[0]), sigma_k, fit.statistic)
 
 
 def pan_points(rig: Rig, mosaic: Mosaic) -> dict[str, int]:
@@ -312,15 +316,15 @@ def robust_datum(
     """
     if validity.displaced is None:
         return mosaic
-    suspects = (validity.displaced.sensor, *validity.alternatives)
-    if len(set(mosaic.datum_sensors) - set(suspects)) < 2:
-        suspects = suspects[:1]
+    candidates = (validity.displaced.sensor, *validity.alternatives)
+    if len(set(mosaic.datum_sensors) - set(candidates)) < 2:
+        candidates = candidates[:1]
     return free_mosaic(
         rig,
         placements,
         tie_points,
         settings=settings,
-        excluded_datum_sensors=suspects,
+        excluded_datum_sensors=candidates,
         begin=mosaic,
     )
 
@@ -353,7 +357,9 @@ def _residuals(
     if not sensors:
         return ()
     found, stitching = found_quantities(mosaic, sensors)
-    prior = expected_covariance(rig, mosaic, sensors, temperatures_c, knowledge=settings.knowledge)
+    prior = expected_covariance(
+        rig, mosaic, sensors, temperatures_c, prior_sigmas=settings.prior_sigmas
+    )
     datum = [name for name in mosaic.datum_sensors if name in sensors]
     if len(datum) >= 2:
         places = [mosaic.start[name].similarity for name in sensors]
@@ -394,7 +400,7 @@ def _relative(
     for cone_name, a, b in pairs:
         found, stitching = found_quantities(mosaic, (a, b))
         prior = expected_covariance(
-            rig, mosaic, (a, b), temperatures_c, knowledge=settings.knowledge
+            rig, mosaic, (a, b), temperatures_c, prior_sigmas=settings.prior_sigmas
         )
         delta = difference @ found
         covariance = difference @ (stitching + prior) @ difference.T

@@ -1,7 +1,7 @@
 """What the observations of a mosaic weigh: classes of points, shared corners, blunders.
 
 A-priori accuracy, variance components and data snooping; the adjustment that asks for them is in
-`processing.mosaic.free`.
+`processing.mosaic.free_mosaic`.
 
 Source: docs/mathematics/mosaicking.md#weights.
 """
@@ -19,7 +19,7 @@ from processing.geometry.placement import SensorPlacement, corrected_mm_from_raw
 from processing.geometry.projective import apply_projective
 from processing.geometry.topology import corners
 from processing.matching.tie_points import PAN_TO_COLOUR, PAN_TO_PAN, TiePoints
-from processing.mosaic.adjustment import Block
+from processing.mosaic.adjustment import ObservationBlock
 from processing.mosaic.model import MosaicModel, vip_and_design
 from processing.rig import Rig
 
@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 CLASSES = (PAN_TO_PAN, PAN_TO_COLOUR)
 
 _HUBER = 2.0
-_SPREAD_OF_MEDIAN = 1.4826
+_MAD_TO_SIGMA = 1.4826
 
 
 @dataclass(frozen=True)
@@ -49,12 +49,12 @@ class MosaicSettings:
     max_iterations: int = 12
     min_iterations: int = 3
     converged_px: float = 1e-3
-    least_class_redundancy: float = 30.0
+    min_class_redundancy: float = 30.0
     undetermined_px: float = 1.0
 
 
 @dataclass
-class Group:
+class TiePointGroup:
     """The tie points of one pair of sensors, ready for linearisation."""
 
     a: str
@@ -75,7 +75,7 @@ def groups_of(
     tie_points: TiePoints,
     settings: MosaicSettings,
     kinds: Sequence[int],
-) -> list[Group]:
+) -> list[TiePointGroup]:
     typical = {}
     for kind in CLASSES:
         sigmas = tie_points.sigma_px[tie_points.kind == kind]
@@ -109,7 +109,7 @@ def groups_of(
                 inside = corner.rectangle.contains(xy)
                 sigma[inside] *= math.sqrt(max(1.0, meeting / (len(corner.sensors) - 1)))
         groups.append(
-            Group(
+            TiePointGroup(
                 a=a,
                 b=b,
                 kind=kind,
@@ -122,13 +122,15 @@ def groups_of(
     return groups
 
 
-def first_look(model: MosaicModel, start: Mapping[str, SensorPlacement], group: Group) -> Array:
+def initial_weights(
+    model: MosaicModel, start: Mapping[str, SensorPlacement], group: TiePointGroup
+) -> Array:
     """Weight factors before any adjustment: points far from their pair's median are left out."""
     a = _started_px(model, start[group.a], group.corrected_a)
     b = _started_px(model, start[group.b], group.corrected_b)
     off = a - b
     off = np.abs(off - np.median(off, axis=0))
-    spread = np.maximum(_SPREAD_OF_MEDIAN * np.median(off, axis=0), 0.2)
+    spread = np.maximum(_MAD_TO_SIGMA * np.median(off, axis=0), 0.2)
     group.difference = a - b
     group.redundancy = np.ones((len(a), 2))
     return np.asarray((off < 6.0 * spread).all(axis=1), dtype=np.float64)
@@ -139,17 +141,17 @@ def _started_px(model: MosaicModel, start: SensorPlacement, corrected_mm: Array)
     return np.asarray(xy / model.pitch_mm)
 
 
-def full_weight(group: Group, class_scale: Mapping[int, float]) -> Array:
+def full_weight(group: TiePointGroup, class_scale: Mapping[int, float]) -> Array:
     return np.tile(1.0 / (group.sigma * class_scale[group.kind]) ** 2, 2)
 
 
 def block_of(
     model: MosaicModel,
     start: Mapping[str, SensorPlacement],
-    group: Group,
+    group: TiePointGroup,
     values: Array,
     scale: float,
-) -> Block:
+) -> ObservationBlock:
     a, columns_a, design_a = vip_and_design(model, start[group.a], group.corrected_a, values)
     b, columns_b, design_b = vip_and_design(model, start[group.b], group.corrected_b, values)
     columns = np.concatenate([columns_a, columns_b])
@@ -158,7 +160,7 @@ def block_of(
     units = model.units[columns][:, None]
     np.multiply(design_a.reshape(k, 2 * len(a)), units[:k], out=design[:k])
     np.multiply(design_b.reshape(len(columns_b), 2 * len(b)), -units[k:], out=design[k:])
-    return Block(
+    return ObservationBlock(
         columns=columns,
         design=design,
         misclosure=(b - a).T.reshape(-1),
@@ -166,7 +168,9 @@ def block_of(
     )
 
 
-def moved_on(block: Block, group: Group, scale: float) -> Block:
+def block_after_step(
+    block: ObservationBlock, group: TiePointGroup, scale: float
+) -> ObservationBlock:
     """A block after a step along its derivatives that left `group.difference`, newly weighed."""
     return replace(
         block,
@@ -176,7 +180,7 @@ def moved_on(block: Block, group: Group, scale: float) -> Block:
 
 
 def class_scales(
-    groups: Sequence[Group], before: Mapping[int, float], settings: MosaicSettings
+    groups: Sequence[TiePointGroup], before: Mapping[int, float], settings: MosaicSettings
 ) -> tuple[dict[int, float], bool]:
     """Variance components: P/P and P/C sigmas that make both classes fit their residuals.
 
@@ -191,7 +195,7 @@ def class_scales(
                 w = group.factor[:, None]
                 squares += float(np.sum(w * (group.difference / group.sigma[:, None]) ** 2))
                 redundancy += float(np.sum((w > 0.0) * group.redundancy))
-        if redundancy < settings.least_class_redundancy or squares <= 0.0:
+        if redundancy < settings.min_class_redundancy or squares <= 0.0:
             return dict(before), False
         variance[kind] = squares / redundancy
     ratio = math.sqrt(variance[PAN_TO_COLOUR] / variance[PAN_TO_PAN])
@@ -199,7 +203,9 @@ def class_scales(
     return after, abs(ratio / before[PAN_TO_COLOUR] - 1.0) > 0.002
 
 
-def weight_factors(groups: Sequence[Group], settings: MosaicSettings, *, soft: bool) -> list[Array]:
+def weight_factors(
+    groups: Sequence[TiePointGroup], settings: MosaicSettings, *, soft: bool
+) -> list[Array]:
     """Weight factors of each group from normalised residuals, the larger of both coordinates.
 
     Soft: Huber about the group's median, for rounds in which the model does not fit yet. Else zero
@@ -214,7 +220,7 @@ def weight_factors(groups: Sequence[Group], settings: MosaicSettings, *, soft: b
     for kind in CLASSES:
         every = [n.ravel() for n, g in zip(normalised, groups, strict=True) if g.kind == kind]
         if every:
-            spread[kind] = max(_SPREAD_OF_MEDIAN * float(np.median(np.concatenate(every))), 1e-9)
+            spread[kind] = max(_MAD_TO_SIGMA * float(np.median(np.concatenate(every))), 1e-9)
     factors = []
     for w, group in zip(normalised, groups, strict=True):
         largest = w.max(axis=1) / spread[group.kind]

@@ -32,14 +32,14 @@ from processing.image.band_registration import (
     reference_image,
     register_to_reference,
 )
-from processing.pipelines.rehearsal import plain_frames
+from processing.pipelines.synthetic_frames import synthetic_head_frames
+from processing.quality.evaluation import evaluate
 from processing.quality.figures import valid_area_figures
-from processing.quality.judgement import judge
-from processing.quality.read_out import blank_unread
+from processing.quality.readout import blank_unread
 from processing.quality.report import Figure, QualityReport, Thresholds
-from processing.quality.specification import Asked
+from processing.quality.requirements import QualityRequirements
 from processing.quality.valid_area import ValidArea, area_of, gap_cells, grid_of
-from processing.radiometry.radiance import RadianceCalibration, radiance_from_words, saturated_words
+from processing.radiometry.radiance import RadianceCalibration, radiance_from_raw, saturated_pixels
 from processing.rig import Rig, Sensor, VirtualImage
 
 Array = NDArray[Any]
@@ -111,7 +111,7 @@ class BandPipeline:
         settings: BandSettings | None = None,
         threads: int = 2,
         thresholds: Thresholds | None = None,
-        asked: Asked | None = None,
+        requirements: QualityRequirements | None = None,
     ) -> None:
         single = all(len(c.sensors) == 1 and len(c.bands) == 1 for c in rig.cones)
         bands = [cone.bands[0] for cone in rig.cones if cone.bands]
@@ -125,7 +125,7 @@ class BandPipeline:
         self.thresholds = thresholds or replace(
             Thresholds(), saturated_fraction=0.0005, saturated_refly_fraction=0.01
         )
-        self._asked = asked or Asked()
+        self._requirements = requirements or QualityRequirements()
         self._threads = threads
         self._radiance = dict(radiance or {})
         self._image = reference_image(rig)
@@ -133,14 +133,14 @@ class BandPipeline:
         assert rig.colour_master_cone is not None
         self._reference = rig.cone(rig.colour_master_cone).sensors[0].name
 
-    def twin(self) -> BandPipeline:
+    def clone(self) -> BandPipeline:
         """Another for an exposure at the same time; calibrations are shared."""
         return copy.copy(self)
 
     def warm_up(self) -> None:
         """Compile every kernel a flight will need, from the cache where there is one."""
         exposure_time_s = {sensor.name: 0.001 for sensor in self.rig.sensors}
-        self.process(plain_frames(self.rig), Conditions(exposure_time_s=exposure_time_s))
+        self.process(synthetic_head_frames(self.rig), Conditions(exposure_time_s=exposure_time_s))
 
     def process(
         self,
@@ -171,16 +171,18 @@ class BandPipeline:
         linear, saturated, read, units = {}, {}, {}, {}
         for name in (name for name in self._band_of if name in frames):
             sensor = self.rig.sensor(name)
-            told = (heads or {}).get(name, FrameSettings())
-            linear[name], units[name] = self._linear(sensor, frames[name], conditions, told)
-            saturated[name] = saturated_words(sensor, frames[name])
+            head_settings = (heads or {}).get(name, FrameSettings())
+            linear[name], units[name] = self._linear(
+                sensor, frames[name], conditions, head_settings
+            )
+            saturated[name] = saturated_pixels(sensor, frames[name])
             read[name] = np.ones(frames[name].shape, np.uint8)
             blank_unread(sensor, frames[name], read[name])
         if frames_read is not None:
             frames_read()
         seconds["radiometry"] = time.perf_counter() - began
         began = time.perf_counter()
-        placements = band_placements(self.rig, temperatures.placing_c)
+        placements = band_placements(self.rig, temperatures.placement_temperatures_c)
         found = self._register(
             placements, linear, {name: saturated[name] | (read[name] == 0) for name in linear}
         )
@@ -198,7 +200,7 @@ class BandPipeline:
         figures |= self._figures(found, saturated, masks, missing)
         area = self._valid_area(masks)
         figures |= valid_area_figures(area)
-        report = judge(
+        report = evaluate(
             figures,
             capture_flags=conditions.flags,
             missing_sensors=missing,
@@ -206,7 +208,7 @@ class BandPipeline:
             probes_out_of_range=temperatures.out_of_range,
             nominal_bands=[f.band for f in found.values() if not f.registered],
             thresholds=self.thresholds,
-            asked=self._asked,
+            requirements=self._requirements,
         )
         return BandProduct(
             image=self._image,
@@ -233,21 +235,25 @@ class BandPipeline:
         )
 
     def _linear(
-        self, sensor: Sensor, words: Array, conditions: Conditions, told: FrameSettings
+        self, sensor: Sensor, raw: Array, conditions: Conditions, head_settings: FrameSettings
     ) -> tuple[Array, str]:
         """Radiance, or DN above black where the head has no absolute calibration."""
         calibration = self._radiance.get(sensor.name)
         if calibration is None:
-            black = sensor.black_dn * sensor.words_per_dn if told.black is None else told.black
-            dn = (np.asarray(words, np.float32) - np.float32(black)) / sensor.words_per_dn
+            black = (
+                sensor.black_dn * sensor.raw_units_per_dn
+                if head_settings.black is None
+                else head_settings.black
+            )
+            dn = (np.asarray(raw, np.float32) - np.float32(black)) / sensor.raw_units_per_dn
             return dn.astype(np.float32), SIGNAL_UNIT
-        radiance = radiance_from_words(
+        radiance = radiance_from_raw(
             sensor,
             calibration,
-            words,
+            raw,
             exposure_time_s=conditions.exposure_time_s.get(sensor.name, 0.0),
-            gain=told.gain,
-            black=told.black,
+            gain=head_settings.gain,
+            black=head_settings.black,
         )
         return radiance, RADIANCE_UNIT
 
@@ -314,7 +320,7 @@ def _resampled(frame: Array, saturated: Array, read: Array, at: Array) -> tuple[
     """A band on the reference raster (cubic), and its mask."""
     height, width = frame.shape
     raster = cv2.remap(frame, at, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    burnt = cv2.remap(
+    saturated_here = cv2.remap(
         saturated.astype(np.float32), at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT
     )
     inside = (
@@ -325,6 +331,6 @@ def _resampled(frame: Array, saturated: Array, read: Array, at: Array) -> tuple[
         & (cv2.remap(read, at, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT) != 0)
     )
     mask = np.where(inside, np.uint8(VALID), np.uint8(0))
-    mask[inside & (burnt > 0.0)] |= SATURATED
+    mask[inside & (saturated_here > 0.0)] |= SATURATED
     raster[~inside] = np.nan
     return raster, mask

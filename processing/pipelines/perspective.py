@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from processing.geometry.conditions import (
     Conditions,
-    Temperatures,
+    UsableTemperatures,
     condition_figures,
     usable_temperatures,
 )
@@ -37,15 +37,15 @@ from processing.image.resampling import (
     resample,
 )
 from processing.image.sharpness import bright_level
-from processing.pipelines.rehearsal import plain_frames
+from processing.pipelines.synthetic_frames import synthetic_head_frames
+from processing.quality.evaluation import evaluate
 from processing.quality.figures import valid_area_figures
-from processing.quality.judgement import judge
-from processing.quality.read_out import blank_unread, unread_figures
+from processing.quality.readout import blank_unread, unread_figures
 from processing.quality.report import Figure, QualityReport, Thresholds
-from processing.quality.specification import Asked
-from processing.quality.uniformity import line_means_of, signal_steps, step_figures
+from processing.quality.requirements import QualityRequirements
+from processing.quality.signal_steps import line_means_of, signal_steps, step_figures
 from processing.quality.valid_area import ValidArea, area_of, gap_cells, grid_of
-from processing.quality.words import word_figures
+from processing.quality.word_format import word_format_figures
 from processing.radiometry.calibration import RadiometricCalibration
 from processing.radiometry.demosaic import BAYER_BANDS, demosaic, is_bayer
 from processing.radiometry.level1 import (
@@ -59,7 +59,7 @@ from processing.rig import Cone, Rig, VirtualImage
 
 Array = NDArray[Any]
 
-LOOKS_APART_RAD: Final = math.radians(15.0)
+DIVERGING_AXES_RAD: Final = math.radians(15.0)
 _CELL_PX: Final = 16
 """The mapping is exact at every sixteenth pixel and linear between: 14 px of distortion at the
 corner bend by less than 1e-3 px over that."""
@@ -88,14 +88,14 @@ class HeadsProduct:
     timings_s: Mapping[str, float] = field(default_factory=dict)
 
 
-def looks_apart(rig: Rig) -> bool:
+def has_diverging_axes(rig: Rig) -> bool:
     """Whether a rig without a virtual image has heads of which each is an image of its own."""
     if rig.virtual_image is not None:
         return False
     if any(len(cone.bands) > 1 for cone in rig.cones):
         return True
     axes = np.array([rotation_matrix(*c.rotation_rad)[:, 2] for c in rig.cones])
-    return bool(np.arccos(np.clip(axes @ axes.T, -1.0, 1.0)).max() > LOOKS_APART_RAD)
+    return bool(np.arccos(np.clip(axes @ axes.T, -1.0, 1.0)).max() > DIVERGING_AXES_RAD)
 
 
 def perspective_of(cone: Cone) -> VirtualImage:
@@ -134,7 +134,7 @@ class HeadPipeline:
         interpolation: Interpolation = DEFAULT_INTERPOLATION,
         threads: int = 2,
         thresholds: Thresholds | None = None,
-        asked: Asked | None = None,
+        requirements: QualityRequirements | None = None,
     ) -> None:
         if rig.virtual_image is not None or any(len(c.sensors) != 1 for c in rig.cones):
             raise ValueError(
@@ -149,16 +149,16 @@ class HeadPipeline:
         self._interpolation = interpolation
         self._threads = threads
         self._thresholds = thresholds or Thresholds()
-        self._asked = asked or Asked()
+        self._requirements = requirements or QualityRequirements()
         self._lattices: dict[str, tuple[tuple[float | None, float | None], Array]] = {}
 
-    def twin(self) -> HeadPipeline:
+    def clone(self) -> HeadPipeline:
         """Another for an exposure at the same time; calibrations and lattices are shared."""
         return copy.copy(self)
 
     def warm_up(self) -> None:
         """Compile every kernel a flight will need, from the cache where there is one."""
-        frames = plain_frames(self.rig)
+        frames = synthetic_head_frames(self.rig)
         self.process(frames, Conditions())
         # Frames in memory may be read-only to the kernels: that is another variant of one of them.
         for sensor in self.rig.sensors:
@@ -193,7 +193,7 @@ class HeadPipeline:
         numba.set_num_threads(max(1, min(self._threads, int(numba.config.NUMBA_NUM_THREADS))))
         seconds = {"radiometry": 0.0, "resampling": 0.0}
         temperatures = usable_temperatures(self.rig, conditions, self._thresholds)
-        known = temperatures.placing_c
+        known = temperatures.placement_temperatures_c
         heads: dict[str, HeadImage] = {}
         level1: dict[str, Array] = {}
         planes: dict[str, dict[str, Array]] = {}
@@ -214,7 +214,7 @@ class HeadPipeline:
             planes[cone.name] = _planes(cone, level1[sensor.name])
             blank_unread(sensor, frames[sensor.name], *planes[cone.name].values())
             seconds["radiometry"] += time.perf_counter() - began
-        seen = {**unread_figures(self.rig, frames), **word_figures(self.rig, frames)}
+        seen = {**unread_figures(self.rig, frames), **word_format_figures(self.rig, frames)}
         if frames_read is not None:
             frames_read()
         for cone in present:
@@ -227,7 +227,7 @@ class HeadPipeline:
             seconds["resampling"] += time.perf_counter() - began
         area = self._valid_area(heads)
         seen |= self._step_figures(planes)
-        report = self._judged(conditions, temperatures, level1, statistics, area, seen)
+        report = self._quality_report(conditions, temperatures, level1, statistics, area, seen)
         return HeadsProduct(heads, area, report, seconds)
 
     def _valid_area(self, heads: Mapping[str, HeadImage]) -> ValidArea:
@@ -235,20 +235,20 @@ class HeadPipeline:
         image = perspective_of(cone)
         columns, rows = grid_of(image.width_px, image.height_px)
         nothing = np.ones((rows, columns), np.bool_)
-        made = heads[cone.name].bands if cone.name in heads else {}
+        product = heads[cone.name].bands if cone.name in heads else {}
         return area_of(
             {
-                band: gap_cells(made[band], columns, rows, saturated_bit=1)
-                if band in made
+                band: gap_cells(product[band], columns, rows, saturated_bit=1)
+                if band in product
                 else nothing
                 for band in _bands(cone)
             }
         )
 
-    def _judged(
+    def _quality_report(
         self,
         conditions: Conditions,
-        temperatures: Temperatures,
+        temperatures: UsableTemperatures,
         level1: Mapping[str, Array],
         statistics: Mapping[str, FrameStatistics],
         area: ValidArea,
@@ -270,14 +270,14 @@ class HeadPipeline:
                     [self.rig.sensor(name) for name in level1], list(level1.values())
                 ),
             }
-        return judge(
+        return evaluate(
             figures,
             capture_flags=conditions.flags,
             missing_sensors=missing,
             missing_probes=temperatures.missing,
             probes_out_of_range=temperatures.out_of_range,
             thresholds=self._thresholds,
-            asked=self._asked,
+            requirements=self._requirements,
         )
 
     def _step_figures(self, planes: Mapping[str, Mapping[str, Array]]) -> dict[str, Figure]:
@@ -294,11 +294,11 @@ class HeadPipeline:
     def _lattice(self, cone: Cone, known: Mapping[str, float]) -> Array:
         """Raw (column, row) at every `_CELL_PX`-th pixel; kept while temperatures stay."""
         key = (known.get(cone.probe), known.get(cone.sensors[0].probe))
-        kept = self._lattices.get(cone.name)
-        if kept is None or kept[0] != key:
-            kept = (key, _lattice_of(cone, known))
-            self._lattices[cone.name] = kept
-        return kept[1]
+        cached = self._lattices.get(cone.name)
+        if cached is None or cached[0] != key:
+            cached = (key, _lattice_of(cone, known))
+            self._lattices[cone.name] = cached
+        return cached[1]
 
     def _resampled(self, plane: Array, lattice: Array) -> NDArray[np.uint16]:
         height, width = plane.shape
@@ -337,7 +337,9 @@ def _bands(cone: Cone) -> Sequence[str]:
 
 def _placement(cone: Cone, temperatures_c: Mapping[str, float]) -> Any:
     """The head as if it alone were the rig: no rotation, its own perspective."""
-    alone = replace(cone, role="pan", rotation_rad=(0.0, 0.0, 0.0), position_mm=(0.0, 0.0, 0.0))
+    single_cone = replace(
+        cone, role="pan", rotation_rad=(0.0, 0.0, 0.0), position_mm=(0.0, 0.0, 0.0)
+    )
     rig = Rig(
         name=cone.name,
         title="",
@@ -349,7 +351,7 @@ def _placement(cone: Cone, temperatures_c: Mapping[str, float]) -> Any:
         calibration_id="",
         calibration_date="",
         virtual_image=perspective_of(cone),
-        cones=(alone,),
+        cones=(single_cone,),
     )
     return nominal_placements(rig, temperatures_c, {})[cone.sensors[0].name]
 

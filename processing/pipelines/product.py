@@ -8,27 +8,27 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from processing.geometry.conditions import Temperatures
+from processing.geometry.conditions import UsableTemperatures
 from processing.geometry.virtual_camera import GroundPlane
 from processing.image.balance import Balance
 from processing.image.colour import BandRegistration, ColourSettings
 from processing.image.kernels import DEFAULT_INTERPOLATION, Interpolation
 from processing.matching.tie_points import TiePoints, TiePointSettings
 from processing.mosaic.estimated_dc import EstimatedDc
-from processing.mosaic.free import Mosaic, MosaicSettings
+from processing.mosaic.free_mosaic import Mosaic, MosaicSettings
 from processing.mosaic.mounting import PlatformCheck
-from processing.mosaic.precision import Disturbance
+from processing.mosaic.precision import UncertaintyContribution
 from processing.mosaic.stitching import Method
 from processing.mosaic.validity import Validity
 from processing.quality.report import QualityReport, Thresholds
-from processing.quality.specification import Asked
+from processing.quality.requirements import QualityRequirements
 from processing.quality.valid_area import ValidArea
 
 Array = NDArray[Any]
 
 
 @dataclass(frozen=True)
-class Settings:
+class PipelineSettings:
     """How exposures are processed.
 
     `method` "fixed" is the earlier method, "pan-only" the experiment without the colour master:
@@ -49,7 +49,7 @@ class Settings:
     relief_fraction: float = 0.01
     threads: int = 2
     thresholds: Thresholds = field(default_factory=Thresholds)
-    asked: Asked = field(default_factory=Asked)
+    requirements: QualityRequirements = field(default_factory=QualityRequirements)
     tie_points: TiePointSettings = field(default_factory=TiePointSettings)
     mosaic: MosaicSettings = field(default_factory=MosaicSettings)
     colour: ColourSettings = field(default_factory=ColourSettings)
@@ -93,11 +93,11 @@ class Product:
     equal_datum: Mosaic
     free: Mosaic
     validity: Validity | None
-    disturbance: Disturbance
+    uncertainty_contribution: UncertaintyContribution
     estimated_dc: tuple[EstimatedDc, ...]
     platform: PlatformCheck | None
     ground: GroundPlane | None
-    temperatures: Temperatures
+    temperatures: UsableTemperatures
     balance: Balance
     bands: tuple[BandRegistration, ...]
     baselines: Mapping[str, Mosaic]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from processing.geometry.conditions import (
     Conditions,
-    Temperatures,
+    UsableTemperatures,
     condition_figures,
     exposure_scale_figures,
     exposure_scales,
@@ -39,31 +39,32 @@ from processing.image.composition import ColourComposer, PanComposer, pan_cell_p
 from processing.image.kernels import Interpolation
 from processing.image.quicklook import quicklook
 from processing.image.resampling import SATURATED_SOURCE
-from processing.matching.content import (
-    LEAST_TEXTURED,
+from processing.matching.content_check import (
+    MIN_TEXTURED,
     check_content,
     content_figures,
     moved_placements,
 )
-from processing.matching.tie_places import burnt_share
+from processing.matching.tie_point_search import saturated_window_fraction
 from processing.matching.tie_points import TiePoints, match_tie_points
-from processing.mosaic.disturbance import disturbance_of
 from processing.mosaic.estimated_dc import EstimatedDc, estimate_dc
-from processing.mosaic.fixed import fixed_mosaic
-from processing.mosaic.free import Mosaic, MosaicSettings
+from processing.mosaic.fixed_mosaic import fixed_mosaic
+from processing.mosaic.free_mosaic import Mosaic, MosaicSettings
 from processing.mosaic.held import held_quantities, scale_figures
 from processing.mosaic.layers import check_layers, layer_figures
 from processing.mosaic.mounting import check_platform, platform_figures
 from processing.mosaic.precision import precision_figures
-from processing.mosaic.slips import slip_figures
+from processing.mosaic.readout_slips import slip_figures
 from processing.mosaic.stitching import Method, stitch
+from processing.mosaic.uncertainty_contribution import uncertainty_contribution_of
 from processing.mosaic.validity import Validity
-from processing.pipelines.product import Product, Settings
-from processing.pipelines.rehearsal import rehearsal_frames
+from processing.pipelines.product import PipelineSettings, Product
 from processing.pipelines.stopwatch import Stopwatch
+from processing.pipelines.synthetic_frames import synthetic_frames
 from processing.quality.band_levels import level_figures
 from processing.quality.clipping import clipping_figures
-from processing.quality.common_ground import common_ground
+from processing.quality.common_windows import measure_common_windows
+from processing.quality.evaluation import evaluate
 from processing.quality.figures import (
     estimated_dc_figures,
     frame_figures,
@@ -76,14 +77,13 @@ from processing.quality.frame_identity import (
     heads_by_pattern,
     identity_figures,
 )
-from processing.quality.judgement import judge
 from processing.quality.local_sharpness import local_blur_figures
-from processing.quality.read_out import blank_unread, unread_figures
+from processing.quality.readout import blank_unread, unread_figures
 from processing.quality.relative_sharpness import relative_sharpness_figures
 from processing.quality.report import Figure
-from processing.quality.uniformity import line_means_of, signal_steps, step_figures
+from processing.quality.signal_steps import line_means_of, signal_steps, step_figures
 from processing.quality.valid_area import Mask, area_of, gap_cells, grid_of
-from processing.quality.words import word_figures
+from processing.quality.word_format import word_format_figures
 from processing.radiometry.calibration import RadiometricCalibration
 from processing.radiometry.level1 import (
     FrameStatistics,
@@ -94,7 +94,7 @@ from processing.radiometry.level1 import (
 )
 from processing.rig import Rig
 
-__all__ = ["Conditions", "Interpolation", "Method", "Pipeline", "Product", "Settings"]
+__all__ = ["Conditions", "Interpolation", "Method", "Pipeline", "PipelineSettings", "Product"]
 
 Array = NDArray[Any]
 Placements = Mapping[str, SensorPlacement]
@@ -111,7 +111,7 @@ class Pipeline:
         self,
         rig: Rig,
         radiometry: Mapping[str, RadiometricCalibration] | None = None,
-        settings: Settings | None = None,
+        settings: PipelineSettings | None = None,
     ) -> None:
         """Allocate all buffers and make the calibrations ready.
 
@@ -127,7 +127,7 @@ class Pipeline:
         if rig.virtual_image is None or not rig.pan_cones:
             raise ValueError(f"rig {rig.name} has no virtual image of PAN sensors to compose")
         self.rig = rig
-        self.settings = settings or Settings()
+        self.settings = settings or PipelineSettings()
         pan = [sensor for cone in rig.pan_cones for sensor in cone.sensors]
         self._heads = colour_heads(rig)
         self._grid = grid_of(rig.virtual_image.width_px, rig.virtual_image.height_px)
@@ -148,7 +148,7 @@ class Pipeline:
             None,
         )
 
-    def twin(self) -> Pipeline:
+    def clone(self) -> Pipeline:
         """A second pipeline with buffers of its own, for another exposure at the same time.
 
         Calibrations, the larger part of the memory, are shared.
@@ -164,7 +164,7 @@ class Pipeline:
         A rehearsal exposure goes through all steps, twice where the steps can see the pixels in
         read-only memory.
         """
-        frames = rehearsal_frames(self.rig)
+        frames = synthetic_frames(self.rig)
         conditions = Conditions(
             temperatures_c=dict.fromkeys(self.rig.probes, 20.0),
             exposure_time_s={sensor.name: 0.005 for sensor in self.rig.sensors},
@@ -209,14 +209,14 @@ class Pipeline:
         ground = ground_plane(rig, conditions)
         start = nominal_placements(
             rig,
-            temperatures.placing_c,
+            temperatures.placement_temperatures_c,
             conditions.tdi_shifts,
             use_drift=settings.use_drift,
             ground=ground,
         )
         with clock.stage("radiometry"):
             level1, statistics = self._correct(frames, conditions, temperatures)
-            unread = unread_figures(rig, frames) | word_figures(rig, frames)
+            unread = unread_figures(rig, frames) | word_format_figures(rig, frames)
             unread |= clipping_figures(rig, frames)
             by_pattern = heads_by_pattern(rig, frames, self._patterns, start)
         if frames_read is not None:
@@ -247,7 +247,7 @@ class Pipeline:
                 parallax_px=self._mosaic_settings(conditions).parallax_px,
             )
             held = held_quantities(mosaic, tie_points)
-            disturbance = disturbance_of(
+            uncertainty_contribution = uncertainty_contribution_of(
                 rig,
                 mosaic,
                 validity=validity,
@@ -293,7 +293,7 @@ class Pipeline:
                 bands=registrations,
                 present=level1,
             )
-            figures |= self._burnt_overlap(figures, tie_points, start, level1)
+            figures |= self._saturated_overlap(figures, tie_points, start, level1)
             figures["resting_on_calibration"] = ", ".join(stitched.weak) or None
             figures |= estimated_dc_figures(estimated) | platform_figures(platform)
             figures |= scale_figures(held)
@@ -308,27 +308,29 @@ class Pipeline:
             means = line_means_of(rig.sensors, level1, exposed)
             figures |= step_figures(signal_steps(rig.sensors, means))
             figures |= block_figures(block_edges(rig, mosaic.placements, level1, means))
-            shared = common_ground(rig, mosaic.placements, level1)
+            shared = measure_common_windows(rig, mosaic.placements, level1)
             figures |= local_blur_figures(rig, shared) | level_figures(rig, shared)
             figures |= identity_figures(rig, by_pattern, start, tie_points, registrations)
             figures |= layer_figures(layers) | slip_figures(rig, stitched.slips)
-            figures |= precision_figures(rig, mosaic, level1, temperatures.usable_c, disturbance)
-            figures |= self._whole_figures(image.source, frames, conditions)
+            figures |= precision_figures(
+                rig, mosaic, level1, temperatures.usable_c, uncertainty_contribution
+            )
+            figures |= self._product_figures(image.source, frames, conditions)
             figures |= valid_area_figures(area)
-            report = judge(
+            report = evaluate(
                 figures,
                 capture_flags=conditions.flags,
                 missing_sensors=self._missing(frames),
                 missing_probes=temperatures.missing,
                 probes_out_of_range=temperatures.out_of_range,
                 mismatched_bands=[
-                    r.band for r in registrations if r.textured >= LEAST_TEXTURED and r.points == 0
+                    r.band for r in registrations if r.textured >= MIN_TEXTURED and r.points == 0
                 ],
                 nominal_bands=[
                     r.band for r in registrations if not r.registered and r.sensor in level1
                 ],
                 thresholds=settings.thresholds,
-                asked=settings.asked,
+                requirements=settings.requirements,
             )
         return Product(
             sensors=self._pan.names,
@@ -341,10 +343,10 @@ class Pipeline:
             start=start,
             tie_points=tie_points,
             mosaic=mosaic,
-            equal_datum=stitched.equal,
+            equal_datum=stitched.equal_datum,
             free=stitched.free,
             validity=validity,
-            disturbance=disturbance,
+            uncertainty_contribution=uncertainty_contribution,
             estimated_dc=estimated,
             platform=platform,
             ground=ground,
@@ -358,7 +360,7 @@ class Pipeline:
         )
 
     def _correct(
-        self, frames: Mapping[str, Array], conditions: Conditions, temperatures: Temperatures
+        self, frames: Mapping[str, Array], conditions: Conditions, temperatures: UsableTemperatures
     ) -> tuple[dict[str, Array], dict[str, FrameStatistics]]:
         """Level-1 frames by sensor, in this object's buffers, and what the pass saw."""
         places = {name: self._pan.frame(name) for name in self._pan.names}
@@ -373,19 +375,19 @@ class Pipeline:
             statistics[name] = level1_from_level0(
                 corrector,
                 np.ascontiguousarray(frames[name]),
-                temperature_c=temperatures.placing_c.get(corrector.sensor.probe),
+                temperature_c=temperatures.placement_temperatures_c.get(corrector.sensor.probe),
                 exposure_time_s=conditions.exposure_time_s.get(name, 0.0),
                 tdi_shifts=conditions.tdi_shifts.get(name, 0),
                 scale=scales.get(name, 1.0),
                 out=out,
             )
             level1[name] = self._colour.leading(heads[name]) if name in heads else out
-            made = self._colour.planes(heads[name]) if name in heads else (out,)
-            blank_unread(corrector.sensor, frames[name], *made)
+            level1_frame = self._colour.planes(heads[name]) if name in heads else (out,)
+            blank_unread(corrector.sensor, frames[name], *level1_frame)
         return level1, statistics
 
     def _estimate_dc(
-        self, mosaic: Mosaic, validity: Validity | None, temperatures: Temperatures
+        self, mosaic: Mosaic, validity: Validity | None, temperatures: UsableTemperatures
     ) -> tuple[EstimatedDc, ...]:
         if validity is None:
             return ()
@@ -394,7 +396,7 @@ class Pipeline:
         return estimate_dc(
             self.rig,
             mosaic,
-            temperatures.placing_c if self.settings.use_drift else {},
+            temperatures.placement_temperatures_c if self.settings.use_drift else {},
             measured=temperatures.usable_c,
             displaced=displaced,
         )
@@ -412,10 +414,10 @@ class Pipeline:
         gaps: dict[str, Mask] = {}
         columns, rows = self._grid
         green = None if self._green is None else self._green.sensor.name
-        wished = self.settings.colour
+        intervals = self.settings.colour
         positions = None
         if green is not None and green in level1:
-            positions = green_positions(mosaic.placements[green], level1[green], wished)
+            positions = green_positions(mosaic.placements[green], level1[green], intervals)
         for head in self._heads:
             name, leading = head.sensor.name, head.leading
             if name not in level1:
@@ -434,7 +436,7 @@ class Pipeline:
                         level1[green],
                         level1[name],
                         positions=positions,
-                        settings=wished,
+                        settings=intervals,
                     )
                 registrations.append(found)
                 homography = found.band_from_green if found.registered else None
@@ -448,7 +450,7 @@ class Pipeline:
         return tuple(registrations), rasters, gaps
 
     def _baselines(
-        self, tie_points: TiePoints, temperatures: Temperatures, conditions: Conditions
+        self, tie_points: TiePoints, temperatures: UsableTemperatures, conditions: Conditions
     ) -> dict[str, Mosaic]:
         """The fixed method with and without TDM, from the same tie points."""
         if not self.settings.baselines:
@@ -458,7 +460,7 @@ class Pipeline:
         for name, use_drift in (("fixed", True), ("fixed-no-tdm", False)):
             places = nominal_placements(
                 self.rig,
-                temperatures.placing_c,
+                temperatures.placement_temperatures_c,
                 conditions.tdi_shifts,
                 use_drift=use_drift,
                 ground=ground_plane(self.rig, conditions),
@@ -488,7 +490,7 @@ class Pipeline:
             [statistics[s.name] for s in present],
         )
 
-    def _burnt_overlap(
+    def _saturated_overlap(
         self,
         figures: Mapping[str, Figure],
         tie_points: TiePoints,
@@ -502,10 +504,12 @@ class Pipeline:
         pair = pairs.get(str(figures.get("tie_points_min_overlap_name")))
         if pair is None or not isinstance(points, int) or points >= few:
             return {}
-        burnt = burnt_share(self.rig, start, level1, pair, settings=self.settings.tie_points)
-        return {"tie_points_min_overlap_burnt": burnt}
+        saturated_fraction = saturated_window_fraction(
+            self.rig, start, level1, pair, settings=self.settings.tie_points
+        )
+        return {"tie_points_min_overlap_burnt": saturated_fraction}
 
-    def _whole_figures(
+    def _product_figures(
         self, source: Array, frames: Mapping[str, Array], conditions: Conditions
     ) -> dict[str, Figure]:
         return {

@@ -15,17 +15,17 @@ from typing import Final
 
 import numpy as np
 
-from processing.quality.common_ground import CommonGround
+from processing.quality.common_windows import CommonWindows
 from processing.quality.report import Figure
 from processing.rig import Rig
 
-LEAST_WINDOWS: Final = 200
-LEAST_CHANGE: Final = 0.5
+MIN_WINDOWS: Final = 200
+MIN_CHANGE: Final = 0.5
 """Natural logarithm of the change of one ratio: a factor of 1.65."""
-MOST_OTHERS: Final = 0.06
+MAX_OTHERS: Final = 0.06
 """Of every other ratio meanwhile."""
-LEAST_OTHERS: Final = 2
-ENDING: Final = "_over_pan"
+MIN_OTHERS: Final = 2
+FIGURE_SUFFIX: Final = "_over_pan"
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class LevelStep:
         )
 
 
-def level_figures(rig: Rig, ground: CommonGround | None) -> dict[str, Figure]:
+def level_figures(rig: Rig, ground: CommonWindows | None) -> dict[str, Figure]:
     """The median signal of each band over that of PAN on the same ground."""
     if ground is None or not ground.pan.any():
         return {}
@@ -59,17 +59,17 @@ def level_figures(rig: Rig, ground: CommonGround | None) -> dict[str, Figure]:
     for name, mean, of_pan in zip(ground.names, ground.mean, ground.pan, strict=True):
         both = np.isfinite(mean) & np.isfinite(pan) & (pan > 0.0)
         bands = rig.cone_of(name).bands
-        if not of_pan and len(bands) == 1 and np.count_nonzero(both) >= LEAST_WINDOWS:
-            figures[f"{bands[0]}{ENDING}"] = float(np.median(mean[both] / pan[both]))
+        if not of_pan and len(bands) == 1 and np.count_nonzero(both) >= MIN_WINDOWS:
+            figures[f"{bands[0]}{FIGURE_SUFFIX}"] = float(np.median(mean[both] / pan[both]))
     return figures
 
 
 def levels_of(figures: Mapping[str, Figure]) -> dict[str, float]:
     """Signal over that of PAN by band, from the figures of a quality report."""
     return {
-        name.removesuffix(ENDING): float(value)
+        name.removesuffix(FIGURE_SUFFIX): float(value)
         for name, value in figures.items()
-        if name.endswith(ENDING) and isinstance(value, int | float)
+        if name.endswith(FIGURE_SUFFIX) and isinstance(value, int | float)
     }
 
 
@@ -91,8 +91,8 @@ def level_steps(levels: Mapping[int, Mapping[str, float]]) -> tuple[LevelStep, .
         }
         for band, moved in change.items():
             others = [abs(other) for name, other in change.items() if name != band]
-            if len(others) < LEAST_OTHERS or max(others) > MOST_OTHERS:
+            if len(others) < MIN_OTHERS or max(others) > MAX_OTHERS:
                 continue
-            if abs(moved) >= LEAST_CHANGE:
+            if abs(moved) >= MIN_CHANGE:
                 steps.append(LevelStep(band, before, exposure, math.exp(moved)))
     return tuple(steps)

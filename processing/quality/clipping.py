@@ -19,12 +19,12 @@ Array = NDArray[Any]
 
 STEP: Final = (16, 8)
 """Of the rows and columns looked at."""
-LEAST_SHARE: Final = 0.003
+MIN_SHARE: Final = 0.003
 """Of the pixels of a frame at the value where it ends."""
-LEAST_PILE: Final = 8.0
+MIN_PILE: Final = 8.0
 """Pixels there over those of the values below it, each."""
 BELOW_DN: Final = 40
-MOST_ABOVE: Final = 0.001
+MAX_SHARE_ABOVE: Final = 0.001
 """Of the pixels: defects may lie beyond the level."""
 
 
@@ -58,16 +58,16 @@ def clipped_at(sensor: Sensor, frame: Array) -> tuple[int, float] | None:
         sensor: what the rig file says.
         frame: Level-0, (h, w) uint16.
     """
-    sample = frame[:: STEP[0], :: STEP[1]].ravel() // sensor.words_per_dn
+    sample = frame[:: STEP[0], :: STEP[1]].ravel() // sensor.raw_units_per_dn
     counts = np.bincount(sample, minlength=sensor.full_scale_dn + 1)
     above = np.cumsum(counts[::-1])[::-1]
     # The highest value that more than a few defects reach.
-    top = int(np.flatnonzero(above > MOST_ABOVE * len(sample))[-1])
+    top = int(np.flatnonzero(above > MAX_SHARE_ABOVE * len(sample))[-1])
     share = float(counts[top]) / len(sample)
-    if top >= sensor.full_scale_dn - 1 or share < LEAST_SHARE:
+    if top >= sensor.full_scale_dn - 1 or share < MIN_SHARE:
         return None
     below = counts[max(top - BELOW_DN, 0) : top]
     # Frames of one value throughout are no images: nothing is cut off them.
-    if not below.any() or counts[top] < LEAST_PILE * max(float(below.mean()), 1.0):
+    if not below.any() or counts[top] < MIN_PILE * max(float(below.mean()), 1.0):
         return None
     return top, share

@@ -17,7 +17,7 @@ from processing.image.colour import BandRegistration
 from processing.image.sharpness import bright_level, sharpness
 from processing.matching.tie_points import PAN_TO_COLOUR, PAN_TO_PAN, TiePoints
 from processing.mosaic.estimated_dc import EstimatedDc, combined_dc
-from processing.mosaic.free import Mosaic
+from processing.mosaic.free_mosaic import Mosaic
 from processing.mosaic.validity import Validity
 from processing.quality.report import Figure
 from processing.quality.valid_area import ValidArea
@@ -72,13 +72,13 @@ def stitching_figures(
 
     Overlaps of sensors that are not `present` do not count as poor in tie points.
     """
-    told = mosaic.redundancy > 0
+    displacement_figures = mosaic.redundancy > 0
     unknowns = dict.fromkeys(name.split(".")[0] for name in mosaic.undetermined)
     figures: dict[str, Figure] = {
         "method": mosaic.method,
-        "sigma0": mosaic.sigma0 if told else None,
-        "sigma0_px": mosaic.sigma0_px if told else None,
-        "sigma0_um": mosaic.sigma0_um if told else None,
+        "sigma0": mosaic.sigma0 if displacement_figures else None,
+        "sigma0_px": mosaic.sigma0_px if displacement_figures else None,
+        "sigma0_um": mosaic.sigma0_um if displacement_figures else None,
         "redundancy": mosaic.redundancy,
         "outliers": int(np.count_nonzero(mosaic.outliers)),
         "undetermined": ", ".join(unknowns) or None,
@@ -149,17 +149,17 @@ def _displacement(validity: Validity | None) -> Mapping[str, Figure]:
         )
         or None,
     }
-    if validity.misread is not None:
+    if validity.probe_bias is not None:
         figures |= {
-            "misread_probe": validity.misread.probe,
-            "misread_k": validity.misread.off_k,
-            "misread_sigma_k": validity.misread.sigma_k,
+            "misread_probe": validity.probe_bias.probe,
+            "misread_k": validity.probe_bias.bias_k,
+            "misread_sigma_k": validity.probe_bias.sigma_k,
         }
     if validity.displaced is not None:
         figures |= {
-            "displaced_sensor": None if validity.several else validity.displaced.sensor,
+            "displaced_sensor": None if validity.several_displaced else validity.displaced.sensor,
             "displaced_alternatives": ", ".join(validity.alternatives) or None,
-            "displaced_several": 1 if validity.several else None,
+            "displaced_several": 1 if validity.several_displaced else None,
             "displacement_x_px": validity.displaced.dx_px,
             "displacement_y_px": validity.displaced.dy_px,
             "displacement_sigma_px": max(

@@ -17,7 +17,7 @@ from processing.geometry.placement import SensorPlacement, raw_from_vip_mm, vip_
 from processing.geometry.topology import exact_colour_ratio
 from processing.image.line_means import BUNDLE_PX
 from processing.quality.report import Figure
-from processing.quality.uniformity import LineMeans
+from processing.quality.signal_steps import LineMeans
 from processing.radiometry.level1 import exposed_rows, level1_counts_per_dn
 from processing.rig import Rig, Sensor
 
@@ -25,28 +25,28 @@ Array = NDArray[Any]
 
 RUN: Final = 5
 """Neighbouring bundles of pixels that step alike."""
-LEAST_STEP_DN: Final = 12.0
+MIN_STEP_DN: Final = 12.0
 """Of 12 bits, in each of them."""
 OVER_TEXTURE: Final = 1.0
 """Over the RMS change from line to line of the frame."""
-MOST_BLUR: Final = 0.2
+MAX_BLUR: Final = 0.2
 """Of the step, in the lines before and after it: a lens leaves a quarter and more."""
 NEAR_PX: Final = 3 * BUNDLE_PX
 """How far from a corner edges may seem to end."""
-MOST_FRAMES: Final = 3
+MAX_FRAMES: Final = 3
 """Such edges in more frames of one exposure are roofs or rows of plants along the track."""
 CANDIDATES: Final = 6
 """Edges of a frame that are compared with other heads, the largest."""
-MOST_SHARED: Final = 0.5
+MAX_SHARED: Final = 0.5
 """Of the step that another head may show."""
-LEAST_HEADS: Final = 2
+MIN_HEADS: Final = 2
 SAMPLES: Final = 120
 """Places along an edge, at most."""
 _RELATIVE: Final = 0.02
 
 
 @dataclass(frozen=True)
-class Block:
+class BlockEdge:
     """An edge of a changed block: between line `at` and the next along `axis` of a frame.
 
     It runs from pixel `first` to `last` of these lines; the signal changes by `step_dn`, by
@@ -68,7 +68,7 @@ def block_edges(
     placements: Mapping[str, SensorPlacement],
     frames: Mapping[str, Array],
     means: Mapping[str, LineMeans],
-) -> tuple[Block, ...]:
+) -> tuple[BlockEdge, ...]:
     """Search all frames for edges of changed blocks.
 
     Args:
@@ -81,7 +81,7 @@ def block_edges(
         The largest edge of each frame that has one, the largest first.
     """
     edges = {name: _cornered(_candidates(rig.sensor(name), lines)) for name, lines in means.items()}
-    if sum(1 for of_frame in edges.values() if of_frame) > MOST_FRAMES:
+    if sum(1 for of_frame in edges.values() if of_frame) > MAX_FRAMES:
         return ()
     found = []
     for name, of_frame in edges.items():
@@ -94,7 +94,7 @@ def block_edges(
     return tuple(sorted(found, key=lambda block: -abs(block.relative)))
 
 
-def block_figures(blocks: tuple[Block, ...]) -> dict[str, Figure]:
+def block_figures(blocks: tuple[BlockEdge, ...]) -> dict[str, Figure]:
     """The largest edge in figures of the quality report."""
     worst = blocks[0] if blocks else None
     return {
@@ -119,7 +119,7 @@ class _Edge:
 
 def _candidates(sensor: Sensor, lines: LineMeans) -> list[_Edge]:
     """Runs of bundles that step alike between two lines, the largest first."""
-    least = LEAST_STEP_DN * level1_counts_per_dn(sensor.bits)
+    least = MIN_STEP_DN * level1_counts_per_dn(sensor.bits)
     edges: list[_Edge] = []
     axes: tuple[tuple[Literal["rows", "columns"], Array, int, int], ...] = (
         ("rows", lines.by_row, lines.first_row, sensor.width_px),
@@ -142,7 +142,7 @@ def _candidates(sensor: Sensor, lines: LineMeans) -> list[_Edge]:
                 while stop < len(steps) and steps[stop, at]:
                     stop += 1
                 step = float(np.median(change[start:stop, at]))
-                if _blur(change[start:stop], int(at)) > MOST_BLUR * abs(step):
+                if _blur(change[start:stop], int(at)) > MAX_BLUR * abs(step):
                     continue
                 first, last = start * pace, min((stop - 1) * pace + BUNDLE_PX, length) - 1
                 edges.append(_Edge(axis, int(at) + offset, first, last, step))
@@ -168,8 +168,8 @@ def _cornered(edges: list[_Edge]) -> list[_Edge]:
 
 def _blur(change: Array, at: int) -> float:
     """The larger change to either side of a step: a lens spreads edges on the ground over lines."""
-    beside = [k for k in (at - 1, at + 1) if 0 <= k < change.shape[1]]
-    return max(abs(float(np.median(change[:, k]))) for k in beside)
+    adjacent = [k for k in (at - 1, at + 1) if 0 <= k < change.shape[1]]
+    return max(abs(float(np.median(change[:, k]))) for k in adjacent)
 
 
 def _unshared(
@@ -178,7 +178,7 @@ def _unshared(
     frames: Mapping[str, Array],
     sensor: Sensor,
     edge: _Edge,
-) -> Block | None:
+) -> BlockEdge | None:
     """The edge as a block where no other head shows half of it; None where one does, or too few see
     it."""
     pan = {s.name for cone in rig.pan_cones for s in cone.sensors}
@@ -203,10 +203,10 @@ def _unshared(
         seen = _step(frame, placements[name], places, 1 if name in pan else 0)
         if seen is not None:
             others.append(seen * np.sign(own))
-    if len(others) < LEAST_HEADS or max(others) > MOST_SHARED * abs(own):
+    if len(others) < MIN_HEADS or max(others) > MAX_SHARED * abs(own):
         return None
     counts = level1_counts_per_dn(sensor.bits)
-    return Block(
+    return BlockEdge(
         sensor.name,
         edge.axis,
         edge.at,
@@ -236,9 +236,9 @@ def _step(
         inside &= (at[:, 0] >= 2) & (at[:, 0] < sensor.width_px - 2)
         inside &= (at[:, 1] >= first + 2) & (at[:, 1] <= last - 2)
         at = np.where(inside[:, None], at, 2)
-        words = np.stack([frame[at[:, 1] + y, at[:, 0] + x] for y in around for x in around])
-        inside &= ((words & 1) == 0).all(axis=0) & (words > 0).all(axis=0)
-        values.append(np.where(inside, words.mean(axis=0), np.nan))
+        pixels = np.stack([frame[at[:, 1] + y, at[:, 0] + x] for y in around for x in around])
+        inside &= ((pixels & 1) == 0).all(axis=0) & (pixels > 0).all(axis=0)
+        values.append(np.where(inside, pixels.mean(axis=0), np.nan))
     both = np.isfinite(values[0]) & np.isfinite(values[1])
     if np.count_nonzero(both) < 0.8 * len(sides[0]):
         return None

@@ -23,18 +23,18 @@ from processing.rig import Rig, Sensor
 Array = NDArray[Any]
 
 PIXELS: Final = 30_000
-LEAST_ROWS: Final = 8
+MIN_ROWS: Final = 8
 """Of a frame, evenly over its height, that are looked at."""
-OWN: Final = 6.0
-OTHER: Final = 8.0
+OWN_PATTERN_LIMIT: Final = 6.0
+OTHER_PATTERN_LIMIT: Final = 8.0
 """Correlation with a pattern over its standard deviation: below `OWN` it is not the frame's, above
 `OTHER` it is."""
-MOST_TEXTURE: Final = 3.0
+MAX_TEXTURE: Final = 3.0
 """Times the usual change between pixels: edges count no more."""
-LEAST_POINTS: Final = 100
-LEAST_OFF_PX: Final = 1.5
-MOST_SHARE: Final = 0.4
-MOST_OFF_PX: Final = 1.3
+MIN_POINTS: Final = 100
+MIN_OFFSET_PX: Final = 1.5
+MAX_OFFSET_SHARE: Final = 0.4
+MAX_OFFSET_PX: Final = 1.3
 """How far points of green may lie off by the calibration of the head they came from: PAN pixels,
 three sigmas of a mounting, and of what they do by their own one."""
 
@@ -94,18 +94,18 @@ def heads_by_pattern(
         if own is None:
             continue
         signal = frames[name][_rows(sensor, shifts)].astype(np.float32)
-        change = _relative_change(signal / sensor.words_per_dn - sensor.black_dn)
-        if _likeness(change, own) >= OWN:
+        change = _relative_change(signal / sensor.raw_units_per_dn - sensor.black_dn)
+        if _correlation_significance(change, own) >= OWN_PATTERN_LIMIT:
             continue
         others = {
-            other.name: _likeness(change, pattern)
+            other.name: _correlation_significance(change, pattern)
             for other in rig.sensors
             if other.name != name
             and (sensor.width_px, sensor.height_px) == (other.width_px, other.height_px)
             and (pattern := patterns.of(other.name, shifts)) is not None
         }
         best = max(others, key=lambda n: others[n], default=None)
-        if best is not None and others[best] > OTHER:
+        if best is not None and others[best] > OTHER_PATTERN_LIMIT:
             found[name] = best
     return found
 
@@ -136,7 +136,7 @@ def identity_figures(
 
 def _rows(sensor: Sensor, shifts: int) -> Array:
     first, last = exposed_rows(sensor, shifts)
-    count = max(LEAST_ROWS, PIXELS // sensor.width_px)
+    count = max(MIN_ROWS, PIXELS // sensor.width_px)
     rows: Array = np.linspace(first, last, count).astype(np.int64)
     return rows
 
@@ -145,12 +145,12 @@ def _relative_change(lines: Array) -> Array:
     """Second differences along lines over what they are of, edges cut off."""
     middle = lines[:, 1:-1]
     change = (lines[:, 2:] - 2.0 * middle + lines[:, :-2]) / np.maximum(middle, np.float32(20.0))
-    most = MOST_TEXTURE * np.float32(np.median(np.abs(change)))
+    most = MAX_TEXTURE * np.float32(np.median(np.abs(change)))
     limited: Array = np.clip(change, -most, most)
     return limited
 
 
-def _likeness(change: Array, pattern: Array) -> float:
+def _correlation_significance(change: Array, pattern: Array) -> float:
     """Correlation of two fields over its standard deviation."""
     product = float(np.sum(change * pattern, dtype=np.float64))
     squares = np.sum(change * change, dtype=np.float64) * np.sum(pattern**2, dtype=np.float64)
@@ -169,7 +169,7 @@ def _by_place(
         return {}
     green = rig.cone(rig.colour_master_cone).sensors[0]
     to_green = tie_points.kind == PAN_TO_COLOUR
-    if np.count_nonzero(to_green) < LEAST_POINTS:
+    if np.count_nonzero(to_green) < MIN_POINTS:
         return {}
     points = tie_points.only(to_green)
     pan_mm = np.empty_like(points.raw_a)
@@ -178,21 +178,21 @@ def _by_place(
         pan_mm[here] = vip_mm_from_raw(placements[points.names[k]], points.raw_a[here])
 
     def off_px(name: str) -> float:
-        apart = vip_mm_from_raw(placements[name], points.raw_b) - pan_mm
-        return float(np.median(np.hypot(apart[:, 0], apart[:, 1]))) / image.pitch_mm
+        separation_px = vip_mm_from_raw(placements[name], points.raw_b) - pan_mm
+        return float(np.median(np.hypot(separation_px[:, 0], separation_px[:, 1]))) / image.pitch_mm
 
     own = off_px(green.name)
-    if own < LEAST_OFF_PX:
+    if own < MIN_OFFSET_PX:
         return {}
     moved = {b.sensor: float(np.hypot(*b.band_from_green[:2, 2])) / image.pitch_mm for b in bands}
     others = {
         sensor.name: off_px(sensor.name)
         for cone in rig.colour_cones
         for sensor in cone.sensors
-        if moved.get(sensor.name, 0.0) > LEAST_OFF_PX
+        if moved.get(sensor.name, 0.0) > MIN_OFFSET_PX
         and (sensor.width_px, sensor.height_px) == (green.width_px, green.height_px)
     }
     best = min(others, key=lambda n: others[n], default=None)
-    if best is None or others[best] > min(MOST_OFF_PX, MOST_SHARE * own):
+    if best is None or others[best] > min(MAX_OFFSET_PX, MAX_OFFSET_SHARE * own):
         return {}
     return {green.name: best, best: green.name}

@@ -48,16 +48,16 @@ def identity_findings(figures: Mapping[str, Figure]) -> list[Finding]:
     ]
 
 
-def words_findings(figures: Mapping[str, Figure]) -> list[Finding]:
+def word_format_findings(figures: Mapping[str, Figure]) -> list[Finding]:
     """Words that have another format than the rig file says."""
-    words = figures.get("word_format")
-    if not words:
+    word_format = figures.get("word_format")
+    if not word_format:
         return []
     return [
         Finding(
             Flag.FRAME_CORRUPT,
             Verdict.REFLY,
-            f"The words of {figures.get('word_format_sensors')} are {words}, not as the rig "
+            f"The words of {figures.get('word_format_sensors')} are {word_format}, not as the rig "
             "file says: set the pixel format of the head, or `bits` and `justified` in the rig "
             "file. The pixels stored are good; process them again with the right rig file.",
         )

@@ -13,7 +13,7 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.quality.common_ground import CommonGround
+from processing.quality.common_windows import CommonWindows
 from processing.quality.report import Figure
 from processing.rig import Rig
 
@@ -21,9 +21,9 @@ Array = NDArray[Any]
 
 CELLS: Final = 4
 """A frame is divided into so many cells each way; a region is two by two of them."""
-LEAST_WINDOWS: Final = 24
-LEAST_FRAMES: Final = 3
-ALONE_DEFICIT: Final = 0.1
+MIN_WINDOWS: Final = 24
+MIN_FRAMES: Final = 3
+SINGLE_AXIS_DEFICIT: Final = 0.1
 """A band that only PAN can be compared with may hold so much less: near infrared, of vegetation."""
 OVER_NOISE: Final = 2.0
 """Detail counts where it is so many times that of noise."""
@@ -47,7 +47,7 @@ class LocalBlur:
     along: Literal["columns", "rows"]
 
 
-def local_blurs(ground: CommonGround) -> tuple[LocalBlur, ...]:
+def local_blurs(ground: CommonWindows) -> tuple[LocalBlur, ...]:
     """The least sharp region of every frame that can be compared."""
     colour, pan = _colour_deficits(ground), _pan_deficits(ground)
     found = []
@@ -59,7 +59,7 @@ def local_blurs(ground: CommonGround) -> tuple[LocalBlur, ...]:
     return tuple(found)
 
 
-def local_blur_figures(rig: Rig, ground: CommonGround | None) -> dict[str, Figure]:
+def local_blur_figures(rig: Rig, ground: CommonWindows | None) -> dict[str, Figure]:
     """The colour head and the PAN head with the least sharp region, in figures of the report.
 
     Of PAN only what the next frame does not have counts: grounds differ in how their detail goes on
@@ -90,17 +90,17 @@ def _pixels(rig: Rig, blur: LocalBlur) -> str:
     return f"columns {left} to {right - 1}, rows {top} to {bottom - 1}"
 
 
-def _colour_deficits(ground: CommonGround) -> Array:
+def _colour_deficits(ground: CommonWindows) -> Array:
     """How much less of the finest detail each window (f, n, 2) holds than the median frame's."""
     with np.errstate(invalid="ignore", divide="ignore"):
         clear = ground.far > OVER_NOISE * 2.0 * ground.noise_reduced[..., None]
         share = np.where(clear, ground.near / ground.far, np.nan)
-    several = np.isfinite(share).sum(axis=0) >= LEAST_FRAMES
-    alone = np.isfinite(share[~ground.pan]).sum(axis=0) < 2
-    return np.where(several, _median(share) - share - ALONE_DEFICIT * alone, np.nan)
+    several = np.isfinite(share).sum(axis=0) >= MIN_FRAMES
+    single_axis = np.isfinite(share[~ground.pan]).sum(axis=0) < 2
+    return np.where(several, _median(share) - share - SINGLE_AXIS_DEFICIT * single_axis, np.nan)
 
 
-def _pan_deficits(ground: CommonGround) -> Array:
+def _pan_deficits(ground: CommonWindows) -> Array:
     """Logarithms of how much energy of detail of own pixels is missing, (f, n, 2)."""
     mean = ground.mean[..., None]
     seen = ~ground.pan
@@ -132,7 +132,7 @@ def _worst_region(
             for k, along in enumerate(_AXES):
                 values = deficits[here, k]
                 values = values[np.isfinite(values)]
-                if len(values) < LEAST_WINDOWS:
+                if len(values) < MIN_WINDOWS:
                     continue
                 deficit = float(np.median(values))
                 if worst is None or deficit > worst[0]:

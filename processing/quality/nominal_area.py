@@ -67,6 +67,8 @@ def _inside(outline: np.ndarray, points: np.ndarray) -> Mask:
     """Which points lie inside a convex polygon, whichever way round it is given."""
     sides = np.roll(outline, -1, axis=0) - outline
     away = points[:, None, :] - outline
-    turns = sides[:, 0] * away[..., 1] - sides[:, 1] * away[..., 0]
-    inside: Mask = np.all(turns >= 0.0, axis=1) | np.all(turns <= 0.0, axis=1)
+    orientation_signs = sides[:, 0] * away[..., 1] - sides[:, 1] * away[..., 0]
+    inside: Mask = np.all(orientation_signs >= 0.0, axis=1) | np.all(
+        orientation_signs <= 0.0, axis=1
+    )
     return inside

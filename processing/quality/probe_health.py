@@ -51,7 +51,7 @@ class ProbeSample:
 class ProbeSettings:
     """What a probe of a camera may do.
 
-    A cone of several kilograms changes by less than `fastest_k_per_s`; a step beyond that and
+    A cone of several kilograms changes by less than `max_rate_k_per_s`; a step beyond that and
     `jump_k` is no temperature. A probe that stays within `stuck_k` over `stuck_s` while the others'
     median moves by `others_moved_k` is stuck. `sigma_k` is a good probe's standard deviation. A
     bridge without any history of the probe is worth `unknown_sigma_k`; each minute since the last
@@ -61,7 +61,7 @@ class ProbeSettings:
     low_c: float = -40.0
     high_c: float = 70.0
     missing_s: float = 30.0
-    fastest_k_per_s: float = 0.1
+    max_rate_k_per_s: float = 0.1
     jump_k: float = 2.0
     stuck_s: float = 600.0
     stuck_k: float = 0.05
@@ -110,7 +110,7 @@ def calibration_temperatures(rig: Rig) -> dict[str, float]:
     return {probe: result[probe] for probe in rig.probes}
 
 
-def judge_probes(
+def evaluate_probes(
     histories: Mapping[str, Sequence[ProbeSample]],
     at_s: float,
     calibration_c: Mapping[str, float],
@@ -146,9 +146,9 @@ def judge_probes(
             value = past[probe][-1].value_c
             result[probe] = ProbeReading(state, value, settings.sigma_k)
         else:
-            told = (estimates or {}).get(probe)
+            by_stitching = (estimates or {}).get(probe)
             result[probe] = _bridge(
-                probe, state, trusted, past, at_s, calibration_c, told, settings
+                probe, state, trusted, past, at_s, calibration_c, by_stitching, settings
             )
     return result
 
@@ -162,37 +162,37 @@ def _own_state(samples: Sequence[ProbeSample], at_s: float, settings: ProbeSetti
         return ProbeState.OPEN
     if not settings.low_c <= last <= settings.high_c:
         return ProbeState.OUT_OF_RANGE
-    believed = _believed(samples, settings)
-    return ProbeState.GOOD if believed and believed[-1] is samples[-1] else ProbeState.JUMP
+    plausible = _plausible_readings(samples, settings)
+    return ProbeState.GOOD if plausible and plausible[-1] is samples[-1] else ProbeState.JUMP
 
 
-def _believed(samples: Sequence[ProbeSample], settings: ProbeSettings) -> list[ProbeSample]:
+def _plausible_readings(
+    samples: Sequence[ProbeSample], settings: ProbeSettings
+) -> list[ProbeSample]:
     """Readings that can follow each other; what jumps away is left out until it comes back.
 
     What is possible counts from reading to reading: a probe that stays away is not believed for
     staying long.
     """
-    kept: list[ProbeSample] = []
+    plausible_samples: list[ProbeSample] = []
     before_s = -math.inf
     for sample in samples:
         value = sample.value_c
         if value is None or not settings.low_c <= value <= settings.high_c:
             continue
-        if kept:
-            last = kept[-1].value_c
+        if plausible_samples:
+            last = plausible_samples[-1].value_c
             assert last is not None
-            possible = settings.fastest_k_per_s * (sample.time_s - before_s)
+            possible = settings.max_rate_k_per_s * (sample.time_s - before_s)
             before_s = sample.time_s
             if abs(value - last) > max(settings.jump_k, possible):
                 continue
         before_s = sample.time_s
-        kept.append(sample)
-    return kept
+        plausible_samples.append(sample)
+    return plausible_samples
 
 
-def _before_it_stood_still(
-    samples: Sequence[ProbeSample], settings: ProbeSettings
-) -> list[ProbeSample]:
+def _before_stuck(samples: Sequence[ProbeSample], settings: ProbeSettings) -> list[ProbeSample]:
     values = [s.value_c for s in samples if s.value_c is not None]
     k = len(samples)
     while k and abs(values[k - 1] - values[-1]) <= settings.stuck_k:
@@ -227,7 +227,7 @@ def _bridge(
     past: Mapping[str, Sequence[ProbeSample]],
     at_s: float,
     calibration_c: Mapping[str, float],
-    told: tuple[float, float] | None,
+    by_stitching: tuple[float, float] | None,
     settings: ProbeSettings,
 ) -> ProbeReading:
     """Where the others stand, by the distance this probe kept from them while it was good."""
@@ -236,9 +236,9 @@ def _bridge(
     now = [_above(past[p], at_s, calibration_c[p]) for p in trusted]
     known = [k for k in now if k is not None]
     if known:
-        good = _believed(past[probe], settings)
+        good = _plausible_readings(past[probe], settings)
         if state is ProbeState.STUCK:
-            good = _before_it_stood_still(good, settings)
+            good = _before_stuck(good, settings)
         good = good[-60:]
         distances = []
         for sample in good:
@@ -255,8 +255,8 @@ def _bridge(
             sigma = min(settings.unknown_sigma_k, math.hypot(2.0 * settings.sigma_k, spread))
         parts.append((calibration_c[probe] + statistics.median(known) + distance, sigma))
         sources += trusted
-    if told is not None:
-        parts.append(told)
+    if by_stitching is not None:
+        parts.append(by_stitching)
         sources.append("stitching")
     if not parts:
         return ProbeReading(state, None, math.inf)

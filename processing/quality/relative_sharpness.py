@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from processing.geometry.placement import SensorPlacement
 from processing.geometry.topology import overlaps
 from processing.image.sharpness import sharpness
-from processing.matching.tie_places import overlap_pixels
+from processing.matching.tie_point_search import overlap_pixels
 from processing.quality.report import Figure
 from processing.rig import Rig
 
@@ -24,9 +24,9 @@ Array = NDArray[Any]
 
 SMOOTH: Final = 0.25
 """The share of the finest detail of a surface without any (`processing.image.sharpness`)."""
-LEAST_RATIO: Final = 0.6
+MIN_RATIO: Final = 0.6
 """Of its neighbours' fine detail. Lenses differ by a tenth from axis to corner."""
-LEAST_DETAIL: Final = 0.05
+MIN_DETAIL: Final = 0.05
 """Beyond a smooth surface, that the sharper head shows: below, there is nothing to compare."""
 
 
@@ -54,7 +54,7 @@ def relative_sharpness_figures(
             if of_a is None or of_b is None:
                 continue
             detail_a, detail_b = max(of_a - SMOOTH, 1e-3), max(of_b - SMOOTH, 1e-3)
-            if max(detail_a, detail_b) > LEAST_DETAIL:
+            if max(detail_a, detail_b) > MIN_DETAIL:
                 ratios.setdefault(a, []).append(detail_a / detail_b)
                 ratios.setdefault(b, []).append(detail_b / detail_a)
     # Blurred is who is so against most neighbours; along one direction is enough.
@@ -62,7 +62,7 @@ def relative_sharpness_figures(
     if not worst:
         return {}
     name = min(worst, key=lambda n: worst[n])
-    if worst[name] >= LEAST_RATIO:
+    if worst[name] >= MIN_RATIO:
         return {"blurred_sensor": None, "blurred_ratio": None}
     return {"blurred_sensor": name, "blurred_ratio": worst[name]}
 

@@ -1,7 +1,7 @@
 """The quality report of one exposure: flags, the figures behind them, and the verdict.
 
 Every figure has one documented name (`FIGURES`). How figures become findings is in
-`processing.quality.judgement`.
+`processing.quality.evaluation`.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ class Thresholds:
     temperature_high_c: float = 70.0
     tie_points_per_overlap: int = 12
     tie_points_pp_refly: int = 20
-    burnt_overlap_fraction: float = 0.5
+    saturated_overlap_fraction: float = 0.5
     """Share of an overlap's matching windows that saturation spoils, above which it is the cause of
     too few tie points."""
     sigma0_px: float = 0.3

@@ -32,7 +32,7 @@ def number(figures: Mapping[str, Figure], name: str) -> float | None:
     return float(value)
 
 
-def misreading(figures: Mapping[str, Figure]) -> str | None:
+def probe_bias_phrase(figures: Mapping[str, Figure]) -> str | None:
     """The probe that may be wrong, and by how much, as part of a sentence."""
     off, probe = number(figures, "misread_k"), figures.get("misread_probe")
     if off is None or not probe:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from processing.quality.report import Figure, Finding, Flag, Thresholds, Verdict
-from processing.quality.rules import above, misreading, number
+from processing.quality.rules import above, number, probe_bias_phrase
 
 
 def stitching_findings(
@@ -22,14 +22,14 @@ def stitching_findings(
         where = figures.get("tie_points_min_overlap_name") or "an overlap"
         total = number(figures, "tie_points_pp") or 0.0
         too_few = total < t.tie_points_pp_refly
-        burnt = number(figures, "tie_points_min_overlap_burnt") or 0.0
+        saturated_fraction = number(figures, "tie_points_min_overlap_burnt") or 0.0
         sentence = (
             f"Few tie points in {where} (water, snow, desert or cloud?): look at the quick look; "
             "fly again if it should have had detail."
         )
-        if burnt > t.burnt_overlap_fraction:
+        if saturated_fraction > t.saturated_overlap_fraction:
             sentence = (
-                f"Few tie points in {where} because it is burnt out: {burnt:.0%} of the places "
+                f"Few tie points in {where} because it is burnt out: {saturated_fraction:.0%} of the places "
                 "where points are sought hold saturated pixels. Shorten the exposure."
             )
         findings.append(
@@ -43,13 +43,13 @@ def stitching_findings(
         )
     elsewhere = str(figures.get("mismatched_sensors") or "").split(", ")
     weak = str(figures.get("resting_on_calibration") or "").split(", ")
-    resting = ", ".join(name for name in weak if name and name not in elsewhere)
-    if resting and not figures.get("slip_sensor"):
+    supported = ", ".join(name for name in weak if name and name not in elsewhere)
+    if supported and not figures.get("slip_sensor"):
         findings.append(
             Finding(
                 Flag.TIE_POINTS,
                 Verdict.USABLE,
-                f"Too little detail to place {resting}: calibration and temperature help to place "
+                f"Too little detail to place {supported}: calibration and temperature help to place "
                 "them. Look at the quick look; fly again if there should have been detail.",
                 number(figures, "stitched_sigma_worst_px"),
             )
@@ -82,7 +82,7 @@ def stitching_findings(
             f"Sensor {displaced} sits {size:.2f} px off its calibrated place; the image is "
             "corrected for it. Go on, and have the camera calibrated."
         )
-        alternatives, misread = figures.get("displaced_alternatives"), misreading(figures)
+        alternatives, misread = figures.get("displaced_alternatives"), probe_bias_phrase(figures)
         if figures.get("displaced_several"):
             sentence = (
                 "More than one sensor of the master cone sits off its calibrated place, and which "
@@ -102,8 +102,8 @@ def stitching_findings(
                 f"{alternatives}; the image fits together. Go on, and have the camera calibrated."
             )
         test = number(figures, "displacement_test")
-        grave = test is None or test > t.displacement_verdict
-        verdict = Verdict.USABLE if grave else Verdict.GOOD
+        verdict_level = test is None or test > t.displacement_verdict
+        verdict = Verdict.USABLE if verdict_level else Verdict.GOOD
         findings.append(Finding(Flag.DISPLACED_SENSOR, verdict, sentence, size))
     return findings
 
@@ -175,15 +175,15 @@ def _slip(figures: Mapping[str, Figure], t: Thresholds) -> list[Finding]:
     also = f" Also shifted: {', '.join(dict.fromkeys(others))}." if others else ""
     alternatives = figures.get("slip_alternatives")
     instead = f" (or {alternatives}, which sees the same ground)" if alternatives else ""
-    grave = shift_px >= t.slip_refly_px
+    verdict_level = shift_px >= t.slip_refly_px
     return [
         Finding(
             Flag.FRAME_CORRUPT,
-            Verdict.REFLY if grave else Verdict.USABLE,
+            Verdict.REFLY if verdict_level else Verdict.USABLE,
             f"In the frame of {figures.get('slip_sensor')}{instead}, {figures.get('slip_axis')} "
             f"{figures.get('slip_first')} to {figures.get('slip_last')} lie {shift_px:.1f} px off "
             f"the rest: lines were lost or repeated in read-out.{also} Check the head and its "
-            "cable." + (" Fly this exposure again." if grave else ""),
+            "cable." + (" Fly this exposure again." if verdict_level else ""),
             shift_px,
             t.slip_refly_px,
         )

@@ -22,7 +22,7 @@ CELLS: Final = 240
 """Along the longer side: a cell is 0.4 % of it."""
 SAMPLES: Final = 4
 """Pixels looked at in each direction of a cell."""
-BURNT_WINDOW: Final = 5
+SATURATION_WINDOW: Final = 5
 """Saturated cells count where they are the majority of so many cells squared: a white roof is no
 gap, a burnt-out field is."""
 BOXES_MAX: Final = 24
@@ -143,10 +143,12 @@ def _is_box(box: object, columns: int, rows: int) -> bool:
 
 def _smoothed(cells: Mask) -> Mask:
     """The majority of the window around each cell; outside the image is not saturated."""
-    reach = BURNT_WINDOW // 2
+    reach = SATURATION_WINDOW // 2
     padded = np.pad(cells.astype(np.int64), reach)
-    windows = np.lib.stride_tricks.sliding_window_view(padded, (BURNT_WINDOW, BURNT_WINDOW))
-    majority: Mask = windows.sum(axis=(2, 3)) * 2 > BURNT_WINDOW**2
+    windows = np.lib.stride_tricks.sliding_window_view(
+        padded, (SATURATION_WINDOW, SATURATION_WINDOW)
+    )
+    majority: Mask = windows.sum(axis=(2, 3)) * 2 > SATURATION_WINDOW**2
     return majority
 
 

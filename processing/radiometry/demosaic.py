@@ -84,7 +84,7 @@ _GREEN_TAPS: Final = _green_taps()
 
 
 @njit(cache=True)
-def _word(value, saturated, floor, ceiling):
+def _saturating_value(value, saturated, floor, ceiling):
     half = int(0.5 * value + 0.5)
     half = min(max(half, floor // 2), ceiling // 2)
     return np.uint16(2 * half + saturated)
@@ -95,9 +95,9 @@ def _green(level1, letters, taps, out):
     height, width = level1.shape
     for row in prange(height):
         for col in range(width):
-            word = level1[row, col]
-            if word == 0 or letters[row % 2, col % 2] == 1:
-                out[row, col] = word
+            pixel_value = level1[row, col]
+            if pixel_value == 0 or letters[row % 2, col % 2] == 1:
+                out[row, col] = pixel_value
                 continue
             total = 0.0
             weight = 0.0
@@ -121,7 +121,9 @@ def _green(level1, letters, taps, out):
                 # A corner of the frame: no pair of neighbours is there.
                 out[row, col] = 0
                 continue
-            out[row, col] = _word(total / weight, saturated, LEVEL1_FLOOR, LEVEL1_CEILING)
+            out[row, col] = _saturating_value(
+                total / weight, saturated, LEVEL1_FLOOR, LEVEL1_CEILING
+            )
 
 
 @njit(cache=True, parallel=True, nogil=True)
@@ -151,15 +153,17 @@ def _red_and_blue(level1, letters, out):
                             continue
                         if col - abs(c) < 0 or col + abs(c) >= width:
                             continue
-                        word = level1[y, x]
+                        pixel_value = level1[y, x]
                         mirror = level1[row - r, col - c]
-                        if word == 0 or mirror == 0 or green[y, x] == 0:
+                        if pixel_value == 0 or mirror == 0 or green[y, x] == 0:
                             continue
-                        total += float(word & 0xFFFE) - float(green[y, x] & 0xFFFE)
+                        total += float(pixel_value & 0xFFFE) - float(green[y, x] & 0xFFFE)
                         count += 1
-                        saturated |= word & 1
+                        saturated |= pixel_value & 1
                 if count == 0:
                     out[colour, row, col] = 0
                     continue
                 value = float(middle & 0xFFFE) + total / count
-                out[colour, row, col] = _word(value, saturated, LEVEL1_FLOOR, LEVEL1_CEILING)
+                out[colour, row, col] = _saturating_value(
+                    value, saturated, LEVEL1_FLOOR, LEVEL1_CEILING
+                )

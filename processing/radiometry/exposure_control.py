@@ -15,7 +15,7 @@ from typing import Final
 BRIGHT_SHARE: Final = 0.99
 """Where the brightest hundredth begins is what is steered: of bright roofs little is lost."""
 
-STEP_MOST: Final = 2.0
+MAX_STEP_FACTOR: Final = 2.0
 """The most that light is changed at once, up or down: one odd image must not spoil the next."""
 
 SATURATED_STEP: Final = 0.5
@@ -43,15 +43,15 @@ class ExposureLimits:
     `rows_per_s` is how fast the image moves over the rows of the sensor: ground speed over GSD;
     None where height or speed are not known, then the exposure time may only become shorter.
     `smear_px` is the motion that may be left, along track after TDI and, by `crab_rad`, across.
-    `gain_most_db` is the noise limit. `black` is the black level as a share of the full scale,
+    `gain_max_db` is the noise limit. `black` is the black level as a share of the full scale,
     `target` where the brightest hundredth of the pixels should begin, `deadband` how far off that
     is left alone.
     """
 
-    time_least_us: float
-    time_most_us: float
-    gain_most_db: float
-    tdi_most: int
+    exposure_time_min_us: float
+    exposure_time_max_us: float
+    gain_max_db: float
+    tdi_shifts_max: int
     rows_per_s: float | None
     smear_px: float = 0.5
     crab_rad: float = 0.0
@@ -71,8 +71,8 @@ def next_settings(
         limits: what is allowed.
     """
     factor = light_factor(counts, limits)
-    keeps_still = smear_px(now, limits) <= limits.smear_px + 1e-9
-    if abs(math.log(factor)) <= math.log1p(limits.deadband) and keeps_still:
+    is_unchanged = smear_px(now, limits) <= limits.smear_px + 1e-9
+    if abs(math.log(factor)) <= math.log1p(limits.deadband) and is_unchanged:
         return now
     return settings_for(now.light * factor, now, limits)
 
@@ -92,19 +92,19 @@ def light_factor(counts: Sequence[int], limits: ExposureLimits) -> float:
         seen += count
     signal = max(level - limits.black, 1e-6)
     factor = (limits.target - limits.black) / signal
-    return min(max(factor, 1.0 / STEP_MOST), STEP_MOST)
+    return min(max(factor, 1.0 / MAX_STEP_FACTOR), MAX_STEP_FACTOR)
 
 
 def settings_for(light: float, now: ExposureSettings, limits: ExposureLimits) -> ExposureSettings:
     """The settings that give an amount of light, or as much of it as the limits allow."""
-    longest_us = min(limits.time_most_us, _longest_still_us(now, limits))
-    time_us = min(max(light, limits.time_least_us), longest_us)
+    longest_us = min(limits.exposure_time_max_us, _max_sharp_time_us(now, limits))
+    time_us = min(max(light, limits.exposure_time_min_us), longest_us)
     tdi_shifts = _tdi_shifts(time_us, longest_us, now, limits)
-    time_us = _stilled_us(time_us, tdi_shifts, limits)
+    time_us = _time_for_shifts_us(time_us, tdi_shifts, limits)
     gain_db = 20 * math.log10(max(light / time_us, 1.0))
     return ExposureSettings(
         exposure_time_us=round(time_us, 1),
-        gain_db=round(min(gain_db, limits.gain_most_db), 2),
+        gain_db=round(min(gain_db, limits.gain_max_db), 2),
         tdi_shifts=tdi_shifts,
     )
 
@@ -118,10 +118,10 @@ def smear_px(settings: ExposureSettings, limits: ExposureLimits) -> float:
     return max(along, moved_px * abs(math.sin(limits.crab_rad)))
 
 
-def _longest_still_us(now: ExposureSettings, limits: ExposureLimits) -> float:
+def _max_sharp_time_us(now: ExposureSettings, limits: ExposureLimits) -> float:
     if limits.rows_per_s is None:
         return now.exposure_time_us
-    along_px = limits.tdi_most + limits.smear_px
+    along_px = limits.tdi_shifts_max + limits.smear_px
     across_px = limits.smear_px / max(abs(math.sin(limits.crab_rad)), 1e-9)
     return min(along_px / math.cos(limits.crab_rad), across_px) / limits.rows_per_s * 1e6
 
@@ -133,15 +133,15 @@ def _tdi_shifts(
     if limits.rows_per_s is None:
         return now.tdi_shifts
     rows_per_us = limits.rows_per_s * 1e-6 * math.cos(limits.crab_rad)
-    shifts = min(round(time_us * rows_per_us), limits.tdi_most)
+    shifts = min(round(time_us * rows_per_us), limits.tdi_shifts_max)
     return shifts if shifts - limits.smear_px <= longest_us * rows_per_us else shifts - 1
 
 
-def _stilled_us(time_us: float, tdi_shifts: int, limits: ExposureLimits) -> float:
+def _time_for_shifts_us(time_us: float, tdi_shifts: int, limits: ExposureLimits) -> float:
     """The time nearest to this at which so many shifts leave no more motion than is allowed."""
     if limits.rows_per_s is None:
         return time_us
     along_per_us = limits.rows_per_s * 1e-6 * math.cos(limits.crab_rad)
     least_us = (tdi_shifts - limits.smear_px) / along_per_us
     most_us = (tdi_shifts + limits.smear_px) / along_per_us
-    return min(max(time_us, least_us, limits.time_least_us), most_us)
+    return min(max(time_us, least_us, limits.exposure_time_min_us), most_us)

@@ -12,16 +12,16 @@ EVERY: Final = 8
 """Every eighth pixel of every eighth row: 65,000 of a frame of 4 million."""
 
 
-def sampled_histogram(frame: NDArray[Any], word_bits: int) -> tuple[int, ...]:
+def sampled_histogram(frame: NDArray[Any], bits: int) -> tuple[int, ...]:
     """Counts of DN in BINS equal bins of the converter's range.
 
     Args:
         frame: (h, w) uint16.
-        word_bits: how many of the 16 bits count, from below: all where DN are left-justified.
+        bits: how many of the 16 bits count, from below: all where DN are left-justified.
 
     Returns:
         BINS counts; the last holds what is saturated or within a 64th of it.
     """
     sample = frame[EVERY // 2 :: EVERY, EVERY // 2 :: EVERY]
-    bins = np.minimum(sample.astype(np.int64) * BINS >> word_bits, BINS - 1)
+    bins = np.minimum(sample.astype(np.int64) * BINS >> bits, BINS - 1)
     return tuple(int(count) for count in np.bincount(bins.ravel(), minlength=BINS))

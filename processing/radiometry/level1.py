@@ -78,8 +78,8 @@ class Corrector:
     response: Array | None
     bias_unit_dn: float
     dark_unit_dn_per_s: float
-    least_bias_dn: float
-    least_dark_dn_per_s: float
+    min_bias_dn: float
+    min_dark_dn_per_s: float
     flat_gain: float
     doubling_k: float
     reference_c: float
@@ -108,8 +108,10 @@ def corrector_for(sensor: Sensor, calibration: RadiometricCalibration | None) ->
     least_dark, dark_unit = float(calibration.dark_dn_per_s.flat[0]), 0.0
     if not flat:
         good = calibration.defect == 0
-        bias, least_bias, bias_unit = _words(calibration.bias_dn, good, _BIAS_STEP_DN)
-        dark, least_dark, dark_unit = _words(calibration.dark_dn_per_s, good, _DARK_STEP_DN_PER_S)
+        bias, least_bias, bias_unit = _quantised(calibration.bias_dn, good, _BIAS_STEP_DN)
+        dark, least_dark, dark_unit = _quantised(
+            calibration.dark_dn_per_s, good, _DARK_STEP_DN_PER_S
+        )
         response = _fixed_point(1.0 / calibration.gain, 1.0 / _RESPONSE_UNIT)
     return Corrector(
         sensor=sensor,
@@ -118,8 +120,8 @@ def corrector_for(sensor: Sensor, calibration: RadiometricCalibration | None) ->
         response=response,
         bias_unit_dn=bias_unit,
         dark_unit_dn_per_s=dark_unit,
-        least_bias_dn=least_bias,
-        least_dark_dn_per_s=least_dark,
+        min_bias_dn=least_bias,
+        min_dark_dn_per_s=least_dark,
         flat_gain=float(calibration.gain.flat[0]),
         doubling_k=calibration.doubling_k,
         reference_c=calibration.reference_c,
@@ -164,7 +166,7 @@ def level1_from_level0(
     shifts = min(max(int(tdi_shifts), 0), sensor.height_px)
     warmth = 0.0 if temperature_c is None else temperature_c - corrector.reference_c
     dark_time_s = exposure_time_s * 2.0 ** min(max(warmth / corrector.doubling_k, -30.0), 30.0)
-    offset_dn = corrector.least_bias_dn + corrector.least_dark_dn_per_s * dark_time_s
+    offset_dn = corrector.min_bias_dn + corrector.min_dark_dn_per_s * dark_time_s
     counts = level1_counts_per_dn(sensor.bits)
     by_gain = scale * 0.5 * counts / max(1.0 + corrector.response_per_k * warmth, 0.5)
     bands = (sensor.height_px + _BAND_ROWS - 1) // _BAND_ROWS
@@ -219,11 +221,13 @@ def exposed_rows(sensor: Sensor, tdi_shifts: int) -> tuple[int, int]:
 def _fixed_point(
     values: Array, unit: float, kind: type[np.unsignedinteger[Any]] = np.uint16
 ) -> Array:
-    words: Array = np.clip(np.rint(np.asarray(values) / np.float32(unit)), 0, np.iinfo(kind).max)
-    return np.ascontiguousarray(words.astype(kind))
+    quantised: Array = np.clip(
+        np.rint(np.asarray(values) / np.float32(unit)), 0, np.iinfo(kind).max
+    )
+    return np.ascontiguousarray(quantised.astype(kind))
 
 
-def _words(values: Array, good: Array, coarsest: float) -> tuple[Array, float, float]:
+def _quantised(values: Array, good: Array, coarsest: float) -> tuple[Array, float, float]:
     """A map as words above its least value, in 8 bits where steps stay below the coarsest allowed.
 
     Half the bytes are half the time: the pass waits for memory. Words of defects, which nobody

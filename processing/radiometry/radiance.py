@@ -23,7 +23,7 @@ from processing.rig import Sensor
 Array = NDArray[Any]
 
 RADIANCE_FILE_MAX_BYTES: Final = 100_000
-_WORDS: Final = 65536.0
+_VALUE_RANGE: Final = 65536.0
 
 
 @dataclass(frozen=True)
@@ -44,10 +44,10 @@ class RadianceCalibration:
     bandwidth_nm: float
 
 
-def radiance_from_words(
+def radiance_from_raw(
     sensor: Sensor,
     calibration: RadianceCalibration,
-    words: Array,
+    raw: Array,
     *,
     exposure_time_s: float,
     gain: float = 1.0,
@@ -68,9 +68,9 @@ def radiance_from_words(
         ValueError: a frame of the wrong shape or type, or a time or gain that is not positive.
     """
     shape = (sensor.height_px, sensor.width_px)
-    if words.shape != shape or words.dtype != np.uint16:
+    if raw.shape != shape or raw.dtype != np.uint16:
         raise ValueError(
-            f"frame of {sensor.name} is {words.dtype} of shape {words.shape}; uint16 of {shape}"
+            f"frame of {sensor.name} is {raw.dtype} of shape {raw.shape}; uint16 of {shape}"
         )
     if not (exposure_time_s > 0.0 and gain > 0.0):
         raise ValueError(
@@ -78,23 +78,23 @@ def radiance_from_words(
             f"both, and positive"
         )
     if black is None:
-        black = sensor.black_dn * sensor.words_per_dn
+        black = sensor.black_dn * sensor.raw_units_per_dn
     # A right-justified word is carried to the 16 bits the calibration is made for.
-    unit = (1 << (16 - sensor.bits)) / sensor.words_per_dn
+    unit = (1 << (16 - sensor.bits)) / sensor.raw_units_per_dn
     column = np.arange(sensor.width_px, dtype=np.float64)[None, :]
     row = np.arange(sensor.height_px, dtype=np.float64)[:, None]
     centre = calibration.vignetting_centre_px
     r = np.hypot(column - centre[0], row - centre[1])
     fall_off = np.polynomial.polynomial.polyval(r, (1.0, *calibration.vignetting))
     rows = 1.0 + calibration.a2 * row / exposure_time_s - calibration.a3 * row
-    scale = unit * calibration.a1 / (gain * exposure_time_s * _WORDS)
-    radiance: Array = ((words - black) * scale / (fall_off * rows)).astype(np.float32)
+    scale = unit * calibration.a1 / (gain * exposure_time_s * _VALUE_RANGE)
+    radiance: Array = ((raw - black) * scale / (fall_off * rows)).astype(np.float32)
     return radiance
 
 
-def saturated_words(sensor: Sensor, words: Array) -> Array:
+def saturated_pixels(sensor: Sensor, raw: Array) -> Array:
     """Where a raw frame is at full scale, (h, w) bool."""
-    full: Array = words >= sensor.full_scale_dn * sensor.words_per_dn
+    full: Array = raw >= sensor.full_scale_dn * sensor.raw_units_per_dn
     return full
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[Any]
 
-WORDS: Final = 65536
+VALUE_COUNT: Final = 65536
 LOW_PERCENT: Final = 0.1
 HIGH_PERCENT: Final = 99.7
 MIDDLE: Final = 0.40
@@ -45,19 +45,19 @@ def histogram(band: Array, scale: float = 1.0) -> Array:
 
     Args:
         band: uint16.
-        scale: multiplies the signal first, see `scaled_words`.
+        scale: multiplies the signal first, see `scaled_value_table`.
     """
-    counts: Array = np.bincount(band.ravel(), minlength=WORDS).astype(np.int64)
+    counts: Array = np.bincount(band.ravel(), minlength=VALUE_COUNT).astype(np.int64)
     counts[0] = 0
     if scale == 1.0:
         return counts
-    moved = np.zeros(WORDS, np.int64)
-    np.add.at(moved, scaled_words(scale), counts)
+    moved = np.zeros(VALUE_COUNT, np.int64)
+    np.add.at(moved, scaled_value_table(scale), counts)
     moved[0] = 0
     return moved
 
 
-def scaled_words(scale: float) -> Array:
+def scaled_value_table(scale: float) -> Array:
     """What each of the 65536 words becomes when signal is multiplied by `scale`: data stay data.
 
     Raises:
@@ -65,9 +65,11 @@ def scaled_words(scale: float) -> Array:
     """
     if not (math.isfinite(scale) and scale > 0.0):
         raise ValueError(f"scale is {scale}; signal is multiplied by a positive number")
-    words: Array = np.clip(np.rint(np.arange(WORDS) * scale), 1, WORDS - 1).astype(np.int64)
-    words[0] = 0
-    return words
+    scaled_values: Array = np.clip(
+        np.rint(np.arange(VALUE_COUNT) * scale), 1, VALUE_COUNT - 1
+    ).astype(np.int64)
+    scaled_values[0] = 0
+    return scaled_values
 
 
 def mission_curve(histograms: Mapping[str, Array]) -> ToneCurve:
@@ -95,8 +97,8 @@ def mission_curve(histograms: Mapping[str, Array]) -> ToneCurve:
 
 def lookup_table(curve: ToneCurve, band: str, scale: float = 1.0) -> Array:
     """The 8-bit value of each word of a band, (65536,) uint8, for signal times `scale`."""
-    words = scaled_words(scale).astype(np.float64)
-    unit = (words - curve.low[band]) / (curve.high[band] - curve.low[band])
+    scaled_values = scaled_value_table(scale).astype(np.float64)
+    unit = (scaled_values - curve.low[band]) / (curve.high[band] - curve.low[band])
     table = np.rint(1.0 + 254.0 * np.clip(unit, 0.0, 1.0) ** curve.exponent).astype(np.uint8)
     table[0] = 0
     return np.asarray(table)

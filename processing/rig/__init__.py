@@ -5,38 +5,38 @@ in `processing.geometry.topology`; where a sensor's pixels fall in the virtual i
 `processing.geometry.placement`.
 """
 
-from processing.rig.file import (
+from processing.rig.model import (
+    VIRTUAL_CAMERA,
+    Cone,
+    Lens,
+    LensGrid,
+    Rig,
+    Role,
+    Sensor,
+    ThermalDrift,
+    Timing,
+    VirtualImage,
+)
+from processing.rig.rig_file import (
     RIG_FORMAT,
     find_rig,
     load_rig,
     rig_from_mapping,
     shipped_rigs,
 )
-from processing.rig.model import (
-    VIRTUAL_CAMERA,
-    Cone,
-    Drift,
-    Lens,
-    LensGrid,
-    Rig,
-    Role,
-    Sensor,
-    Timing,
-    VirtualImage,
-)
-from processing.rig.table import RigError
+from processing.rig.toml_table import RigError
 
 __all__ = [
     "RIG_FORMAT",
     "VIRTUAL_CAMERA",
     "Cone",
-    "Drift",
     "Lens",
     "LensGrid",
     "Rig",
     "RigError",
     "Role",
     "Sensor",
+    "ThermalDrift",
     "Timing",
     "VirtualImage",
     "find_rig",

@@ -3,7 +3,7 @@
 Units and signs: image plane in mm, x right, y up, origin at the calibrated principal point,
 nominal flight direction +y. Body axes x forward, y right, z down. Angles omega, phi, kappa in
 radians with R = Rx(omega) Ry(phi) Rz(kappa), camera to object. How a file becomes a rig is in
-`processing.rig.file`.
+`processing.rig.rig_file`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Role = Literal["pan", "colour"]
 
 
 @dataclass(frozen=True)
-class Drift:
+class ThermalDrift:
     """What one kelvin of dC does to a sensor's place in its cone.
 
     Source: docs/mathematics/drift.md#linear-model.
@@ -47,7 +47,7 @@ class Sensor:
     deviation of each calibrated coordinate. Perspective skew: what without it lay (x, y) mm from
     the centre, along the axes of the layer, lies at (x, y) * (1 + 1e-6 * (skew_x_ppm_per_mm * x +
     skew_y_ppm_per_mm * y)). A left-justified sensor keeps its DN in the highest bits of a 16-bit
-    word: word = DN * `words_per_dn`.
+    word: word = DN * `raw_units_per_dn`.
     """
 
     name: str
@@ -62,7 +62,7 @@ class Sensor:
     position_sigma_um: float
     calibration_c: float
     probe: str
-    drift: Drift
+    drift: ThermalDrift
     bits: int
     black_dn: float
     electrons_per_dn: float
@@ -86,7 +86,7 @@ class Sensor:
         return (1 << self.bits) - 1
 
     @property
-    def words_per_dn(self) -> int:
+    def raw_units_per_dn(self) -> int:
         """What one DN adds to a stored word: 1, or 2^(16 - bits) where DN are left-justified."""
         return 1 << (16 - self.bits) if self.justified == "left" else 1
 

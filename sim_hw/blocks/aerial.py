@@ -3,8 +3,8 @@
 Nothing is rendered: image coordinates are where the true camera sees ground points, by projection
 code of the emulator's own, plus noise and a systematic pattern that no calibration knows.
 
-Conventions as in `sim_hw.world.camera`; object coordinates are local Cartesian metres, x east, y
-north.
+Conventions as in `sim_hw.world.true_camera`; object coordinates are local Cartesian metres, x east,
+y north.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.rig import Rig
-from sim_hw.world.camera import rotation_opk
 from sim_hw.world.seeding import random_stream
+from sim_hw.world.true_camera import rotation_opk
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -26,7 +26,7 @@ _PATTERN_GRID = 25
 
 
 @dataclass(frozen=True)
-class Strip:
+class FlightLine:
     """One flight line: start, heading (degrees, clockwise from north), frames, height."""
 
     name: str
@@ -38,7 +38,7 @@ class Strip:
 
 
 @dataclass(frozen=True)
-class Frame:
+class ImageFormat:
     """The stitched image: half sides mm, principal distance mm, pixel mm."""
 
     half_width_mm: float
@@ -48,7 +48,7 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Errors:
+class MeasurementErrors:
     """Standard deviations of what is measured, and the size of what nobody knows.
 
     Attributes:
@@ -71,11 +71,11 @@ class Errors:
 
 
 @dataclass(frozen=True)
-class Plan:
+class AerialBlockPlan:
     """Strips, ground, and how densely tie points are matched."""
 
-    strips: tuple[Strip, ...]
-    frame: Frame
+    strips: tuple[FlightLine, ...]
+    frame: ImageFormat
     spacing_m: float
     relief_m: float
     control: int
@@ -83,11 +83,11 @@ class Plan:
     rig: str = "ultracam-l"
     speed_mps: float = 65.0
     lever_m: tuple[float, float, float] = (0.2, -0.3, 1.6)
-    errors: Errors = field(default_factory=Errors)
+    errors: MeasurementErrors = field(default_factory=MeasurementErrors)
 
 
 @dataclass(frozen=True)
-class Pattern:
+class DistortionPattern:
     """What the right half of the image (x > 0) suffers: a projective distortion; and radial.
 
     The right half's layer was joined to the left one by fewer parameters than its distortion has,
@@ -111,7 +111,7 @@ class Pattern:
 
 
 @dataclass(frozen=True)
-class CcdPattern:
+class CcdDistortionPattern:
     """Every CCD of a rig off on its own: shifts, and a small affine and perspective distortion.
 
     `parts_mm` (n, 4) are x_min, y_min, x_max, y_max in the stitched image, nominally; `projective`
@@ -135,7 +135,7 @@ class CcdPattern:
 
 
 @dataclass(frozen=True)
-class Block:
+class AerialBlock:
     """What was measured, and beside it the truth.
 
     Attributes:
@@ -151,7 +151,7 @@ class Block:
         pattern: what was planted.
     """
 
-    plan: Plan
+    plan: AerialBlockPlan
     names: tuple[str, ...]
     strip: Indices
     time_s: Array
@@ -164,28 +164,28 @@ class Block:
     image: Indices
     point: Indices
     xy_mm: Array
-    pattern: Pattern | CcdPattern
+    pattern: DistortionPattern | CcdDistortionPattern
 
 
-ULTRACAM_L = Frame(9735 * 3.6e-3, 6588 * 3.6e-3, 70.0, 7.2e-3)
+ULTRACAM_L = ImageFormat(9735 * 3.6e-3, 6588 * 3.6e-3, 70.0, 7.2e-3)
 """9735 x 6588 pixels of 7.2 um."""
 
 
-def ultracam_l_plan() -> Plan:
+def ultracam_l_plan() -> AerialBlockPlan:
     """The UltraCam L flight: 296 frames, six lines and three cross strips, GSD 10 cm.
 
     Ladstädter et al. (2010) give counts and GSD; overlaps of 80 and 40 % are ours.
     """
-    height, base, apart = 972.2, 131.8, 584.0
+    height, base, line_spacing = 972.2, 131.8, 584.0
     strips = []
     for k in range(6):
         frames = 37 if k in (2, 3) else 36
         north = k % 2 == 0
         y = -(frames - 1) / 2 * base * (1 if north else -1)
         strips.append(
-            Strip(
+            FlightLine(
                 f"line {k + 1}",
-                ((k - 2.5) * apart, y),
+                ((k - 2.5) * line_spacing, y),
                 0.0 if north else 180.0,
                 frames,
                 base,
@@ -196,22 +196,24 @@ def ultracam_l_plan() -> Plan:
         east = k % 2 == 0
         x = -12.5 * base * (1 if east else -1)
         strips.append(
-            Strip(
+            FlightLine(
                 f"cross {k + 1}", (x, (k - 1) * 1900.0), 90.0 if east else 270.0, 26, base, height
             )
         )
-    return Plan(tuple(strips), ULTRACAM_L, spacing_m=41.5, relief_m=40.0, control=24, checks=40)
+    return AerialBlockPlan(
+        tuple(strips), ULTRACAM_L, spacing_m=41.5, relief_m=40.0, control=24, checks=40
+    )
 
 
-def small_plan(frame: Frame = ULTRACAM_L, rig: str = "ultracam-l") -> Plan:
+def small_plan(frame: ImageFormat = ULTRACAM_L, rig: str = "ultracam-l") -> AerialBlockPlan:
     """Three lines of eight frames and a cross strip of six, GSD 10 cm: for tests."""
     height = 0.1 * frame.f_mm / frame.pixel_mm
     scale = height / frame.f_mm
-    base, apart = 0.4 * frame.half_height_mm * scale, 1.2 * frame.half_width_mm * scale
+    base, line_spacing = 0.4 * frame.half_height_mm * scale, 1.2 * frame.half_width_mm * scale
     strips = [
-        Strip(
+        FlightLine(
             f"line {k + 1}",
-            ((k - 1) * apart, -3.5 * base * (1 if k % 2 == 0 else -1)),
+            ((k - 1) * line_spacing, -3.5 * base * (1 if k % 2 == 0 else -1)),
             0.0 if k % 2 == 0 else 180.0,
             8,
             base,
@@ -219,21 +221,23 @@ def small_plan(frame: Frame = ULTRACAM_L, rig: str = "ultracam-l") -> Plan:
         )
         for k in range(3)
     ]
-    strips.append(Strip("cross 1", (-2.5 * base, 0.0), 90.0, 6, base, height))
+    strips.append(FlightLine("cross 1", (-2.5 * base, 0.0), 90.0, 6, base, height))
     spacing = 0.077 * frame.half_width_mm * scale * 2.0
-    return Plan(tuple(strips), frame, spacing, relief_m=40.0, control=12, checks=20, rig=rig)
+    return AerialBlockPlan(
+        tuple(strips), frame, spacing, relief_m=40.0, control=12, checks=20, rig=rig
+    )
 
 
-def frame_of(rig: Rig) -> Frame:
+def frame_of(rig: Rig) -> ImageFormat:
     """The stitched image of a rig."""
     image = rig.virtual_image
     if image is None:
         raise ValueError(f"rig {rig.name} has no stitched image")
     half = image.pitch_mm / 2.0
-    return Frame(image.width_px * half, image.height_px * half, image.f_mm, image.pitch_mm)
+    return ImageFormat(image.width_px * half, image.height_px * half, image.f_mm, image.pitch_mm)
 
 
-def ccd_pattern(rig: Rig, seed: int, size_mm: float) -> CcdPattern:
+def ccd_pattern(rig: Rig, seed: int, size_mm: float) -> CcdDistortionPattern:
     """Every PAN CCD but the master cone's first off by `size_mm` or so at its edges."""
     random = random_stream(seed, "ccd pattern")
     parts, projective = [], []
@@ -249,14 +253,16 @@ def ccd_pattern(rig: Rig, seed: int, size_mm: float) -> CcdPattern:
     masters = [k for k, c in enumerate(_cones(rig)) if c == rig.master_cone]
     # What the master cone's CCDs have in common nobody could tell from the orientation.
     table[:, :6] -= table[masters, :6].mean(axis=0)
-    return CcdPattern(np.array(parts), table)
+    return CcdDistortionPattern(np.array(parts), table)
 
 
 def _cones(rig: Rig) -> list[str]:
     return [cone.name for cone in rig.pan_cones for _ in cone.sensors]
 
 
-def flown(plan: Plan, seed: int, pattern: CcdPattern | None = None) -> Block:
+def simulate_block(
+    plan: AerialBlockPlan, seed: int, pattern: CcdDistortionPattern | None = None
+) -> AerialBlock:
     """Fly a plan: one seed, one block; a pattern of one's own in place of the paper's."""
     station, rotation, strip, time, names = _exposures(plan, seed)
     points = _ground(plan, station, seed)
@@ -284,7 +290,7 @@ def flown(plan: Plan, seed: int, pattern: CcdPattern | None = None) -> Block:
     start = np.array(
         [r @ rotation_opk((a[0], a[1], a[2])) for r, a in zip(rotation, off, strict=True)]
     )
-    return Block(
+    return AerialBlock(
         plan=plan,
         names=names,
         strip=strip,
@@ -302,7 +308,7 @@ def flown(plan: Plan, seed: int, pattern: CcdPattern | None = None) -> Block:
     )
 
 
-def orientation_design(frame: Frame, xy_mm: Array) -> Array:
+def orientation_design(frame: ImageFormat, xy_mm: Array) -> Array:
     """What the six of an image's orientation do to coordinates over flat ground, (6, n, 2)."""
     x, y, f = xy_mm[:, 0], xy_mm[:, 1], frame.f_mm
     one, none = np.ones_like(x), np.zeros_like(x)
@@ -313,21 +319,23 @@ def orientation_design(frame: Frame, xy_mm: Array) -> Array:
     return np.array([np.stack(c, axis=1) for c in columns])
 
 
-def image_grid(frame: Frame, columns: int, rows: int) -> Array:
+def image_grid(frame: ImageFormat, columns: int, rows: int) -> Array:
     """Places spread over the image, (columns * rows, 2) mm, none on its middle column line."""
     x = ((np.arange(columns) + 0.5) / columns * 2.0 - 1.0) * frame.half_width_mm
     y = ((np.arange(rows) + 0.5) / rows * 2.0 - 1.0) * frame.half_height_mm
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
-def left_after_orientation(frame: Frame, xy_mm: Array, vectors_mm: Array) -> Array:
+def residuals_after_orientation(frame: ImageFormat, xy_mm: Array, vectors_mm: Array) -> Array:
     """Vectors (n, 2) less what the six of an image's orientation would take of them."""
     design = orientation_design(frame, xy_mm).reshape(6, -1).T
     step, *_ = np.linalg.lstsq(design, vectors_mm.ravel(), rcond=None)
     return np.asarray((vectors_mm.ravel() - design @ step).reshape(-1, 2))
 
 
-def _exposures(plan: Plan, seed: int) -> tuple[Array, Array, Indices, Array, tuple[str, ...]]:
+def _exposures(
+    plan: AerialBlockPlan, seed: int
+) -> tuple[Array, Array, Indices, Array, tuple[str, ...]]:
     random = random_stream(seed, "exposures")
     station, rotation, strip, time, names = [], [], [], [], []
     clock = 0.0
@@ -346,7 +354,7 @@ def _exposures(plan: Plan, seed: int) -> tuple[Array, Array, Indices, Array, tup
     return np.array(station), np.array(rotation), np.array(strip), np.array(time), tuple(names)
 
 
-def _ground(plan: Plan, station: Array, seed: int) -> Array:
+def _ground(plan: AerialBlockPlan, station: Array, seed: int) -> Array:
     """Control and check points first, then tie points on a jittered lattice."""
     random = random_stream(seed, "ground")
     scale = station[:, 2].max() / plan.frame.f_mm
@@ -374,19 +382,19 @@ def _spread(count: int, random: np.random.Generator) -> Array:
     return np.asarray(0.02 + 0.96 * places[chosen])
 
 
-def _height(plan: Plan, xy: Array, seed: int) -> Array:
+def _height(plan: AerialBlockPlan, xy: Array, seed: int) -> Array:
     random = random_stream(seed, "relief")
     height = np.zeros(len(xy))
     for wave in range(6):
         length = 2500.0 / 1.7**wave
-        turn, phase = random.uniform(0.0, 2.0 * math.pi, 2)
-        along = xy @ np.array([math.cos(turn), math.sin(turn)])
+        azimuth, phase = random.uniform(0.0, 2.0 * math.pi, 2)
+        along = xy @ np.array([math.cos(azimuth), math.sin(azimuth)])
         height += np.sin(2.0 * math.pi * along / length + phase) / 1.5**wave
     return np.asarray(plan.relief_m * height / 2.0)
 
 
 def _antenna(
-    plan: Plan, seed: int, station: Array, rotation: Array, strip: Indices, time: Array
+    plan: AerialBlockPlan, seed: int, station: Array, rotation: Array, strip: Indices, time: Array
 ) -> Array:
     random = random_stream(seed, "gnss")
     e = plan.errors
@@ -401,12 +409,12 @@ def _antenna(
     )
 
 
-def _pattern(plan: Plan, seed: int) -> Pattern:
+def _pattern(plan: AerialBlockPlan, seed: int) -> DistortionPattern:
     """A projective distortion of the right half and some radial one, of the size asked for."""
     frame = plan.frame
     centre = (frame.half_width_mm / 2.0, 0.0)
     if plan.errors.pattern_mm == 0.0:
-        return Pattern(centre, (0.0,) * 8, 0.0)
+        return DistortionPattern(centre, (0.0,) * 8, 0.0)
     random = random_stream(seed, "pattern")
     size = np.array([1.0, 1.0, *(4 * [1.0 / frame.half_height_mm]), *(2 * [1.0 / 400.0])])
     drawn = random.uniform(0.5, 1.0, 8) * random.choice([-1.0, 1.0], 8) * size
@@ -414,7 +422,7 @@ def _pattern(plan: Plan, seed: int) -> Pattern:
     radial = 0.5 / frame.half_width_mm**3
     scale = 1e-3
     for _ in range(20):
-        pattern = Pattern(centre, tuple(float(v) for v in drawn * scale), radial * scale)
-        left = left_after_orientation(frame, places, pattern.at(places))
+        pattern = DistortionPattern(centre, tuple(float(v) for v in drawn * scale), radial * scale)
+        left = residuals_after_orientation(frame, places, pattern.at(places))
         scale *= plan.errors.pattern_mm / float(np.hypot(*left.T).max())
     return pattern

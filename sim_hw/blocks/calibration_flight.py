@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_hw.world.camera import BODY_FROM_CAMERA, rotation_opk
 from sim_hw.world.seeding import random_stream
+from sim_hw.world.true_camera import BODY_FROM_CAMERA, rotation_opk
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -27,7 +27,7 @@ STEP_S = 1e-4
 
 
 @dataclass(frozen=True)
-class Line:
+class CalibrationLine:
     """One pass over the middle of the field."""
 
     heading_deg: float
@@ -36,7 +36,7 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Spread:
+class MeasurementSigmas:
     """Standard deviations of what is measured, mm, m and rad about forward, right, down."""
 
     image_mm: float = 1.5e-3
@@ -46,16 +46,20 @@ class Spread:
 
 
 FULL = (
-    Line(0.0, 700.0, 50.0),
-    Line(180.0, 700.0, 80.0),
-    Line(90.0, 700.0, 80.0),
-    Line(270.0, 700.0, 50.0),
-    Line(0.0, 1100.0, 80.0),
-    Line(90.0, 1100.0, 50.0),
+    CalibrationLine(0.0, 700.0, 50.0),
+    CalibrationLine(180.0, 700.0, 80.0),
+    CalibrationLine(90.0, 700.0, 80.0),
+    CalibrationLine(270.0, 700.0, 50.0),
+    CalibrationLine(0.0, 1100.0, 80.0),
+    CalibrationLine(90.0, 1100.0, 50.0),
 )
 """Two heights, opposite and crossing lines, two speeds."""
 
-ONE_WAY = (Line(0.0, 700.0, 65.0), Line(0.0, 700.0, 65.0), Line(0.0, 700.0, 65.0))
+ONE_WAY = (
+    CalibrationLine(0.0, 700.0, 65.0),
+    CalibrationLine(0.0, 700.0, 65.0),
+    CalibrationLine(0.0, 700.0, 65.0),
+)
 """The flight that parts least: one direction, one height, one speed."""
 
 
@@ -86,22 +90,22 @@ class CalibrationFlight:
     antenna_m: Array
     time_offset_s: float
     shift_m: Array
-    spread: Spread = field(default_factory=Spread)
+    spread: MeasurementSigmas = field(default_factory=MeasurementSigmas)
 
 
-def flown_for_boresight(
+def simulate_calibration_flight(
     seed: int,
-    lines: tuple[Line, ...] = FULL,
+    lines: tuple[CalibrationLine, ...] = FULL,
     *,
     frames: int = 5,
     swing_deg: tuple[float, float] = (0.4, 1.2),
-    spread: Spread | None = None,
+    spread: MeasurementSigmas | None = None,
 ) -> CalibrationFlight:
     """Fly `lines` of `frames` exposures each over a field with 20 control points.
 
     Roll, pitch and heading swing by an angle within `swing_deg`.
     """
-    spread = spread or Spread()
+    spread = spread or MeasurementSigmas()
     random = random_stream(seed, "boresight")
     boresight = random.normal(0.0, math.radians(0.3), 3)
     unit_from_body = _level_from_body(boresight)
@@ -125,19 +129,19 @@ def flown_for_boresight(
             centre.append(here)
             rotation.append(EAST_NORTH_UP_FROM_LEVEL @ body @ BODY_FROM_CAMERA)
             unit = level_from_body @ unit_from_body.T
-            turned = unit.T @ _pose(motion, t + STEP_S)[1] @ unit_from_body.T
+            rotation_noise = unit.T @ _pose(motion, t + STEP_S)[1] @ unit_from_body.T
             back = unit.T @ _pose(motion, t - STEP_S)[1] @ unit_from_body.T
-            rate.append(_vector(turned - back) / (2.0 * STEP_S))
+            rate.append(_vector(rotation_noise - back) / (2.0 * STEP_S))
             arm = EAST_NORTH_UP_FROM_LEVEL @ level_from_body @ antenna
             ahead = _pose(motion, t + STEP_S)[1] - _pose(motion, t - STEP_S)[1]
-            whirl = EAST_NORTH_UP_FROM_LEVEL @ ahead @ antenna / (2.0 * STEP_S)
+            angular_rate = EAST_NORTH_UP_FROM_LEVEL @ ahead @ antenna / (2.0 * STEP_S)
             position.append(place + arm + shift + random.normal(0.0, spread.position_m))
-            velocity.append(speed + whirl)
-            shaken = unit @ _level_from_body(random.normal(0.0, spread.attitude_rad))
-            angles.append(_angles(shaken))
+            velocity.append(speed + angular_rate)
+            disturbed_rotation = unit @ _level_from_body(random.normal(0.0, spread.attitude_rad))
+            angles.append(_angles(disturbed_rotation))
             which.append(k)
             time.append(400.0 * k + t)
-    centres, turns = np.array(centre), np.array(rotation)
+    centres, rotations = np.array(centre), np.array(rotation)
     control = 20
     places = np.concatenate(
         [_lattice(5, 4) * [900.0, 800.0], random.uniform(-1.0, 1.0, (260, 2)) * [1100.0, 1000.0]]
@@ -146,7 +150,7 @@ def flown_for_boresight(
     points = np.column_stack([places, relief])
     image, point, xy = [], [], []
     for i in range(len(centres)):
-        seen = (points - centres[i]) @ turns[i]
+        seen = (points - centres[i]) @ rotations[i]
         with np.errstate(all="ignore"):
             where = -F_MM * seen[:, :2] / seen[:, 2:]
         inside = np.flatnonzero((seen[:, 2] < 0.0) & (np.abs(where) < HALF_MM).all(axis=1))
@@ -158,7 +162,7 @@ def flown_for_boresight(
         line=np.array(which),
         time_s=np.array(time),
         centre_m=centres,
-        rotation=turns,
+        rotation=rotations,
         points=points,
         surveyed_m=surveyed,
         control=control,
@@ -178,14 +182,14 @@ def flown_for_boresight(
 
 
 def _pose(
-    motion: tuple[Line, Array, Array, Array, float], t_s: float
+    motion: tuple[CalibrationLine, Array, Array, Array, float], t_s: float
 ) -> tuple[Array, Array, Array]:
     """Place (east, north, up), level from body, velocity, at an instant of a line."""
     line, swing, pace, phase, aside = motion
     heading = math.radians(line.heading_deg)
     ahead = np.array([math.sin(heading), math.cos(heading), 0.0])
-    beside = np.array([math.cos(heading), -math.sin(heading), 0.0])
-    place = ahead * line.speed_mps * t_s + beside * aside + [0.0, 0.0, line.height_m]
+    right = np.array([math.cos(heading), -math.sin(heading), 0.0])
+    place = ahead * line.speed_mps * t_s + right * aside + [0.0, 0.0, line.height_m]
     roll, pitch, yaw = swing * np.sin(2.0 * math.pi * pace * t_s + phase)
     return place, _level_from_body((roll, pitch, heading + yaw)), ahead * line.speed_mps
 

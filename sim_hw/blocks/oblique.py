@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_hw.world.camera import rotation_opk
 from sim_hw.world.seeding import random_stream
+from sim_hw.world.true_camera import rotation_opk
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -38,7 +38,7 @@ F_MM = {NADIR: 23.8, **dict.fromkeys(TABLE_2_GRAD, 51.0)}
 
 
 @dataclass(frozen=True)
-class Noise:
+class MeasurementNoise:
     """Standard deviations of what is measured.
 
     `image_mm` of nadir and oblique coordinates (1.4 px is what the paper's nadir images show),
@@ -79,7 +79,7 @@ class ObliqueBlock:
     image: Indices
     point: Indices
     xy_mm: Array
-    noise: Noise = field(default_factory=Noise)
+    noise: MeasurementNoise = field(default_factory=MeasurementNoise)
 
 
 def table_2_rotation(name: str) -> Array:
@@ -94,23 +94,25 @@ def table_2_rotation(name: str) -> Array:
     )
 
 
-def flown_obliquely(seed: int, *, noise: Noise | None = None, checks: int = 40) -> ObliqueBlock:
+def simulate_oblique_block(
+    seed: int, *, noise: MeasurementNoise | None = None, checks: int = 40
+) -> ObliqueBlock:
     """Three lines of four stations, the middle one flown the other way, 32 control points."""
-    noise = noise or Noise()
+    noise = noise or MeasurementNoise()
     control = 32
     random = random_stream(seed, "oblique")
-    height, base, apart = 562.0, 226.0, 500.0
+    height, base, line_spacing = 562.0, 226.0, 500.0
     station, rotation, line, time = [], [], [], []
     for k in range(3):
         north = k == 1
         for j in range(4):
             y = (j - 1.5) * base * (1.0 if north else -1.0)
-            station.append(np.array([(k - 1) * apart, y, height]) + random.normal(0, 4.0, 3))
+            station.append(np.array([(k - 1) * line_spacing, y, height]) + random.normal(0, 4.0, 3))
             tilt = random.normal(0.0, math.radians(1.5), 3)
             rotation.append(rotation_opk((tilt[0], tilt[1], tilt[2] + (0.0 if north else math.pi))))
             line.append(k)
             time.append(300.0 * k + j * base / 60.0)
-    centres, turns = np.array(station), np.array(rotation)
+    centres, rotations = np.array(station), np.array(rotation)
     # Mounted about as in table 2, to a few milligrads of the calibration before.
     mounted = np.array([table_2_rotation(name) for name in HEADS])
     f = np.array([F_MM[n] + random.normal(0.0, noise.principal_mm) for n in HEADS])
@@ -130,7 +132,7 @@ def flown_obliquely(seed: int, *, noise: Noise | None = None, checks: int = 40) 
     image, point, xy = [], [], []
     for e in range(len(centres)):
         for h in range(5):
-            seen = (points - centres[e]) @ turns[e] @ mounted[h]
+            seen = (points - centres[e]) @ rotations[e] @ mounted[h]
             with np.errstate(all="ignore"):
                 ideal = -f[h] * seen[:, :2] / seen[:, 2:]
             front = seen[:, 2] < 0.0
@@ -144,13 +146,13 @@ def flown_obliquely(seed: int, *, noise: Noise | None = None, checks: int = 40) 
     spread = [noise.control_m[0], noise.control_m[0], noise.control_m[1]]
     surveyed = points[: control + checks]
     boresight = rotation_opk((0.012, -0.008, 0.02))
-    shaken = np.array([rotation_opk((a, b, c)) for a, b, c in random.normal(
+    disturbed_rotation = np.array([rotation_opk((a, b, c)) for a, b, c in random.normal(
         0.0, noise.inertial_rad, (len(centres), 3))])  # fmt: skip
     return ObliqueBlock(
         station=centres,
-        rotation=turns,
+        rotation=rotations,
         gnss_m=centres + random.normal(0.0, noise.gnss_m, centres.shape),
-        inertial=turns @ shaken @ boresight.T,
+        inertial=rotations @ disturbed_rotation @ boresight.T,
         boresight=boresight,
         line=np.array(line),
         time_s=np.array(time),

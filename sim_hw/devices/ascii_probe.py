@@ -6,8 +6,8 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 
+from sim_hw.devices.device_loop import DeviceLine, LineDevice
 from sim_hw.devices.pseudo_terminal import PseudoTerminal
-from sim_hw.devices.serving import Line, LineDevice
 from sim_hw.world.world_clock import NS_PER_S
 
 _COMMAND_MAX_BYTES = 64
@@ -17,9 +17,9 @@ class AsciiProbe(LineDevice):
     """The instrument, from `start()` to `close()`; a host opens `port`.
 
     `templates` are the lines of one reading in the manner of `str.format`: `{0}` is the first
-    channel's value, written as `value_format` says, or `open_word` where the channel says None: an
-    open sensor. It speaks every `interval_s`, or, with a `command`, only when that is heard,
-    followed by CR or LF.
+    channel's value, written as `value_format` says, or `open_sensor_text` where the channel says
+    None: an open sensor. It speaks every `interval_s`, or, with a `command`, only when that is
+    heard, followed by CR or LF.
 
     Example:
         >>> probe = AsciiProbe([lambda: 21.34, lambda: None], ["T1={0} T2={1}"])
@@ -34,17 +34,17 @@ class AsciiProbe(LineDevice):
         templates: Sequence[str],
         *,
         value_format: str = "{:+.2f}",
-        open_word: str = "OPEN",
+        open_sensor_text: str = "OPEN",
         end: str = "\r\n",
         interval_s: float = 1.0,
         command: str = "",
-        line: Line | None = None,
+        line: DeviceLine | None = None,
     ) -> None:
         super().__init__("ascii-probe", line or PseudoTerminal())
         self._channels = tuple(channels)
         self._templates = tuple(templates)
         self._value_format = value_format
-        self._open_word = open_word
+        self._open_sensor_text = open_sensor_text
         self._end = end
         self._interval_ns = round(interval_s * NS_PER_S)
         self._command = command.encode("ascii")
@@ -58,32 +58,32 @@ class AsciiProbe(LineDevice):
     def reading(self) -> bytes:
         """The lines of one reading."""
         self.counts["readings"] += 1
-        words = [self._word(channel()) for channel in self._channels]
-        lines = [template.format(*words) + self._end for template in self._templates]
+        values = [self._format_value(channel()) for channel in self._channels]
+        lines = [template.format(*values) + self._end for template in self._templates]
         return "".join(lines).encode("latin-1")
 
     def due_mono_ns(self) -> int | None:
         return None if self._command else self._next_ns
 
-    def speak(self) -> bytes:
+    def emit_due(self) -> bytes:
         self._next_ns += self._interval_ns
         return self.reading()
 
-    def hear(self, data: bytes) -> bytes:
+    def on_received(self, data: bytes) -> bytes:
         if not self._command:
             return b""
-        said = (self._pending + data).replace(b"\n", b"\r").split(b"\r")
-        self._pending = said.pop()[-_COMMAND_MAX_BYTES:]
+        answer_bytes = (self._pending + data).replace(b"\n", b"\r").split(b"\r")
+        self._pending = answer_bytes.pop()[-_COMMAND_MAX_BYTES:]
         answer = b""
-        for words in filter(None, said):
-            if words == self._command:
+        for values in filter(None, answer_bytes):
+            if values == self._command:
                 self.counts["commands"] += 1
                 answer += self.reading()
             else:
                 self.counts["unknown_commands"] += 1
         return answer
 
-    def _word(self, value_c: float | None) -> str:
+    def _format_value(self, value_c: float | None) -> str:
         if value_c is None or not math.isfinite(value_c):
-            return self._open_word
+            return self._open_sensor_text
         return self._value_format.format(value_c)

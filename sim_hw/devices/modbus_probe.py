@@ -9,8 +9,8 @@ import math
 import struct
 from collections.abc import Callable, Mapping, Sequence
 
+from sim_hw.devices.device_loop import DRAIN_S, DeviceLine, LineDevice
 from sim_hw.devices.pseudo_terminal import PseudoTerminal
-from sim_hw.devices.serving import DRAIN_S, Line, LineDevice
 
 OPEN_SENSOR = 0x7FFF
 READ_HOLDING_REGISTERS = 3
@@ -41,7 +41,7 @@ class ModbusProbe(LineDevice):
         channels: Sequence[Callable[[], float | None]],
         unit: int = 1,
         first_register: int = 0,
-        line: Line | None = None,
+        line: DeviceLine | None = None,
     ) -> None:
         if not 1 <= unit <= 247:
             raise ValueError(f"unit is {unit}; a Modbus slave has an address from 1 to 247")
@@ -76,25 +76,25 @@ class ModbusProbe(LineDevice):
         first = start - self._first_register
         if first < 0 or first + count > len(self._channels):
             return self._exception(function, ILLEGAL_DATA_ADDRESS)
-        words = [_register(channel()) for channel in self._channels[first : first + count]]
-        return _framed(struct.pack(f">BBB{count}H", unit, function, 2 * count, *words))
+        registers = [_register(channel()) for channel in self._channels[first : first + count]]
+        return _framed(struct.pack(f">BBB{count}H", unit, function, 2 * count, *registers))
 
     def _exception(self, function: int, code: int) -> bytes:
         self.counts["exceptions"] += 1
         return _framed(bytes((self._unit, (function | 0x80) & 0xFF, code)))
 
-    def hear(self, data: bytes) -> bytes:
+    def on_received(self, data: bytes) -> bytes:
         # A babbling line never falls silent; its bytes are not worth keeping.
         self._frame = (self._frame + data)[: _FRAME_MAX_BYTES + 1]
         if len(self._frame) == _REQUEST_BYTES and crc16(self._frame) == 0:
-            return self.pause()
-        self.patience_s = SILENCE_S
+            return self.on_idle()
+        self.idle_timeout_s = SILENCE_S
         return b""
 
-    def pause(self) -> bytes:
+    def on_idle(self) -> bytes:
         """The line has fallen silent: what was received is a frame."""
         frame, self._frame = self._frame, b""
-        self.patience_s = DRAIN_S
+        self.idle_timeout_s = DRAIN_S
         return (self.answer(frame) or b"") if frame else b""
 
 

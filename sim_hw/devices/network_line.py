@@ -1,6 +1,6 @@
 """The device's end of a network connection: a TCP server, or a UDP sender that hears answers.
 
-They stand in for a pseudo-terminal, see `sim_hw.devices.serving.Line`.
+They stand in for a pseudo-terminal, see `sim_hw.devices.device_loop.Line`.
 """
 
 from __future__ import annotations
@@ -38,28 +38,28 @@ class TcpLine:
             except BlockingIOError:
                 least = 0
             except OSError:
-                self._forget(host)
+                self._drop_host(host)
         return least
 
     def read(self, timeout_s: float) -> bytes:
         deadline = time.monotonic() + timeout_s
-        heard = b""
-        while not heard and (left_s := deadline - time.monotonic()) > 0:
+        received = b""
+        while not received and (left_s := deadline - time.monotonic()) > 0:
             for key, _ in self._selector.select(left_s):
                 if key.fileobj is self._server:
-                    self._greet()
+                    self._accept_host()
                 elif isinstance(key.fileobj, socket.socket):
-                    heard += self._read_from(key.fileobj)
-        return heard
+                    received += self._read_from(key.fileobj)
+        return received
 
     def close(self) -> None:
         """Hang up. May be called twice."""
         for host in list(self._hosts):
-            self._forget(host)
+            self._drop_host(host)
         self._selector.close()
         self._server.close()
 
-    def _greet(self) -> None:
+    def _accept_host(self) -> None:
         try:
             host, _ = self._server.accept()
         except OSError:
@@ -76,10 +76,10 @@ class TcpLine:
         except OSError:
             data = b""
         if not data:
-            self._forget(host)
+            self._drop_host(host)
         return data
 
-    def _forget(self, host: socket.socket) -> None:
+    def _drop_host(self, host: socket.socket) -> None:
         self._hosts.remove(host)
         self._selector.unregister(host)
         host.close()

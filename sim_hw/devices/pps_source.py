@@ -56,10 +56,10 @@ class PpsSource:
         for thread in self._threads:
             thread.start()
 
-    def silence(self) -> None:
+    def suspend(self) -> None:
         self._silent.set()
 
-    def speak(self) -> None:
+    def resume(self) -> None:
         self._silent.clear()
 
     def close(self) -> None:
@@ -97,10 +97,10 @@ class PpsSource:
                 return
             self._counts["edges"] += 1
             if not self._silent.is_set():
-                self._tell(edge_mono_ns)
+                self._send_edge(edge_mono_ns)
             second += 1
 
-    def _tell(self, edge_mono_ns: int) -> None:
+    def _send_edge(self, edge_mono_ns: int) -> None:
         late_ns = self._random.gammavariate(2.0, self._latency_ns / 2)
         if self._random.random() < 0.01:
             late_ns += self._random.expovariate(1.0 / self._rare_ns)

@@ -57,9 +57,16 @@ class PulseBus:
         address: tuple[str, int] = ("127.0.0.1", 0),
         faults: Channel[bytes] | None = None,
     ) -> None:
-        for word in (name, *outputs):
-            if not word.isascii() or not word.isprintable() or " " in word or not word:
-                raise ValueError(f"{word!r} cannot be a name on the pulse bus; use ASCII words")
+        for name_part in (name, *outputs):
+            if (
+                not name_part.isascii()
+                or not name_part.isprintable()
+                or " " in name_part
+                or not name_part
+            ):
+                raise ValueError(
+                    f"{name_part!r} cannot be a name on the pulse bus; use ASCII words"
+                )
         self._name = name
         self._delays_ns = dict.fromkeys(outputs, 0)
         self._on_fire = on_fire
@@ -130,7 +137,7 @@ class PulseBus:
                 watched = self._owner
                 if watched is not None:
                     selector.register(watched, selectors.EVENT_READ)
-                ready = [key.fileobj for key, _ in selector.select(self._patience_s())]
+                ready = [key.fileobj for key, _ in selector.select(self._wait_timeout_s())]
                 if not self._is_reachable():
                     if watched is not None:
                         selector.unregister(watched)
@@ -145,13 +152,13 @@ class PulseBus:
                 if self._listener in ready:
                     self._accept(self._listener)
 
-    def _patience_s(self) -> float:
+    def _wait_timeout_s(self) -> float:
         return _POLL_S if self._faults.is_faultless else _FAULT_POLL_S
 
     def _is_reachable(self) -> bool:
         """Whether cable and power are there; what came meanwhile dies with its connection."""
         now_ns = time.monotonic_ns()
-        if self._faults.comes_back_from_power_off(now_ns):
+        if self._faults.has_power_cycled(now_ns):
             self._count = 0
             self._delays_ns = dict.fromkeys(self._delays_ns, 0)
         if not self._faults.is_connected(now_ns):
@@ -186,7 +193,7 @@ class PulseBus:
         self._counts["connections"] += 1
         self._owner, self._owner_address, self._line = connection, f"{peer[0]}:{peer[1]}", b""
         greeting = ["PULSEBUS", str(PROTOCOL_VERSION), self._name, *self._delays_ns]
-        if not self._say(connection, " ".join(greeting)):
+        if not self._send_line(connection, " ".join(greeting)):
             self._drop_owner()
 
     def _read_owner(self, owner: socket.socket) -> None:
@@ -194,14 +201,14 @@ class PulseBus:
             received = owner.recv(_RECEIVE_BYTES)
         except OSError:
             received = b""
-        heard_mono_ns = time.monotonic_ns()
+        received_mono_ns = time.monotonic_ns()
         if not received:
             self._drop_owner()
             return
         *lines, self._line = (self._line + received).split(b"\n")
         for line in lines:
-            answer, firing = self._obey(line, heard_mono_ns)
-            if not self._say(owner, answer):
+            answer, firing = self._execute(line, received_mono_ns)
+            if not self._send_line(owner, answer):
                 self._drop_owner()
             if firing is not None:
                 self._firings.put(firing)
@@ -210,22 +217,22 @@ class PulseBus:
             self._counts["refused_lines"] += 1
             self._send(owner, f"ERR a line has at most {LINE_MAX_BYTES} bytes")
 
-    def _obey(self, line: bytes, heard_mono_ns: int) -> tuple[str, Firing | None]:
+    def _execute(self, line: bytes, received_mono_ns: int) -> tuple[str, Firing | None]:
         """The answer to a line, and the firing it asks for."""
         self._counts["lines"] += 1
-        words = line.decode("ascii", errors="replace").rstrip("\r").split(" ")
-        match words:
+        fields = line.decode("ascii", errors="replace").rstrip("\r").split(" ")
+        match fields:
             case ["STATUS"]:
                 return f"STATUS {self._count}", None
             case ["FIRE", text]:
                 sequence = _number(text, SEQUENCE_MAX)
                 if sequence is None:
                     return self._refuse("a sequence is an unsigned 64-bit number"), None
-                if self._faults.counter_restarts(heard_mono_ns):
+                if self._faults.counter_restarts(received_mono_ns):
                     self._count = 0
                 self._count += 1
                 pulses = {
-                    output: heard_mono_ns + delay for output, delay in self._delays_ns.items()
+                    output: received_mono_ns + delay for output, delay in self._delays_ns.items()
                 }
                 firing = Firing(sequence, self._count, pulses)
                 return f"FIRED {sequence} {self._count}", firing
@@ -244,7 +251,7 @@ class PulseBus:
         self._counts["refused_lines"] += 1
         return f"ERR {sentence}"
 
-    def _say(self, owner: socket.socket, line: str) -> bool:
+    def _send_line(self, owner: socket.socket, line: str) -> bool:
         """Send a line to the owner, as far as the faults let it pass."""
         data = line.encode("ascii", errors="replace") + b"\n"
         now_ns = time.monotonic_ns()

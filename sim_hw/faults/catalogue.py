@@ -28,16 +28,16 @@ _ALL: Final = frozenset((HEAD, RECEIVER, THERMOMETER, TRIGGER))
 class FaultKind:
     """One name. A *message* is what a device says at once: a frame, an epoch, an answer, a line.
 
-    `lasts_s` is how long it lasts where no duration is given; None means that it hits the next
+    `duration_s` is how long it lasts where no duration is given; None means that it hits the next
     message only (level message and content) or lasts until the end (level clock). `amount` is what
     a scenario may change, with its unit in `amount_key`.
     """
 
     name: str
     level: Level
-    says: str
+    description: str
     devices: frozenset[DeviceKind] = _ALL
-    lasts_s: float | None = None
+    duration_s: float | None = None
     amount_key: str = ""
     amount: float = 0.0
 
@@ -54,14 +54,14 @@ _KINDS: Final = (
     ),
     FaultKind("truncated", "message", "the message breaks off"),
     FaultKind(
-        "stuck", "message", "the last message is said again instead of a new one", lasts_s=5.0
+        "stuck", "message", "the last message is said again instead of a new one", duration_s=5.0
     ),
-    FaultKind("silent", "message", "powered and connected, but nothing is said", lasts_s=5.0),
+    FaultKind("silent", "message", "powered and connected, but nothing is said", duration_s=5.0),
     FaultKind(
         "flooding",
         "link",
         "far more is said than was asked for: noise, and frames nobody triggered",
-        lasts_s=5.0,
+        duration_s=5.0,
     ),
     FaultKind(
         "counter-reset",
@@ -90,13 +90,15 @@ _KINDS: Final = (
         "clock",
         "the receiver's week is off, as after a rollover",
         frozenset((RECEIVER,)),
-        lasts_s=10.0,
+        duration_s=10.0,
         amount_key="weeks",
         amount=-1024.0,
     ),
-    FaultKind("cable-pulled", "link", "nothing passes either way, then all is back", lasts_s=5.0),
     FaultKind(
-        "power-cycle", "link", "off, and back with counts, clocks and settings anew", lasts_s=3.0
+        "cable-pulled", "link", "nothing passes either way, then all is back", duration_s=5.0
+    ),
+    FaultKind(
+        "power-cycle", "link", "off, and back with counts, clocks and settings anew", duration_s=3.0
     ),
     FaultKind(
         "older-frame",
@@ -115,7 +117,7 @@ _KINDS: Final = (
         "content",
         "the probe's wire is broken; the module says so",
         frozenset((THERMOMETER,)),
-        lasts_s=5.0,
+        duration_s=5.0,
     ),
 )
 

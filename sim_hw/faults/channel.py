@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
 from sim_hw.faults.catalogue import CATALOGUE
-from sim_hw.faults.plan import Planned
+from sim_hw.faults.plan import PlannedFault
 from sim_hw.world.world_clock import NS_PER_S, NS_PER_WEEK
 
 T = TypeVar("T")
@@ -21,40 +21,40 @@ T = TypeVar("T")
 FLOOD_PERIOD_NS = 100_000_000
 """A flooding device says something unasked so often."""
 DUPLICATE_AFTER_NS = 1_000_000
-OVERTAKEN_AFTER_NS = 5_000_000
-TOLD_AGAIN_NS = 5 * NS_PER_S
+REORDER_TIMEOUT_NS = 5_000_000
+NOTIFY_INTERVAL_NS = 5 * NS_PER_S
 """A fault that hits again so much later is told again."""
-NOTED_EVERY_NS = NS_PER_S // 2
+RECORD_INTERVAL_NS = NS_PER_S // 2
 """A fault that lasts is a hit so often."""
 
 
 class Damage(Protocol[T]):
     """How a message is damaged."""
 
-    def corrupt(self, message: T, chance: random.Random) -> T:
+    def corrupt(self, message: T, rng: random.Random) -> T:
         """With wrong content: same length, other bits; or a frame of another size."""
 
-    def truncated(self, message: T, chance: random.Random) -> T:
+    def truncated(self, message: T, rng: random.Random) -> T:
         """Broken off somewhere."""
 
-    def half(self, message: T) -> T:
+    def first_half(self, message: T) -> T:
         """Its first half only."""
 
 
 class BytesDamage:
     """Damage of what is said in bytes."""
 
-    def corrupt(self, message: bytes, chance: random.Random) -> bytes:
+    def corrupt(self, message: bytes, rng: random.Random) -> bytes:
         damaged = bytearray(message)
-        for _ in range(chance.randint(1, 8)):
+        for _ in range(rng.randint(1, 8)):
             if damaged:
-                damaged[chance.randrange(len(damaged))] ^= 1 << chance.randrange(8)
+                damaged[rng.randrange(len(damaged))] ^= 1 << rng.randrange(8)
         return bytes(damaged)
 
-    def truncated(self, message: bytes, chance: random.Random) -> bytes:
-        return message[: chance.randrange(max(len(message), 1))]
+    def truncated(self, message: bytes, rng: random.Random) -> bytes:
+        return message[: rng.randrange(max(len(message), 1))]
 
-    def half(self, message: bytes) -> bytes:
+    def first_half(self, message: bytes) -> bytes:
         return message[: len(message) // 2]
 
 
@@ -67,7 +67,7 @@ class Delivery(Generic[T]):
 
 
 @dataclass(frozen=True)
-class Hit:
+class FaultOccurrence:
     """A fault did something: `what` is the message's own name, or "" where it hit the device."""
 
     fault: str
@@ -76,8 +76,8 @@ class Hit:
 
 
 @dataclass
-class _Armed:
-    planned: Planned
+class _ArmedFault:
+    planned: PlannedFault
     begins_ns: int | None = None
     is_spent: bool = False
     was_on: bool = False
@@ -98,22 +98,22 @@ class Channel(Generic[T]):
 
     def __init__(
         self,
-        planned: Iterable[Planned],
+        planned: Iterable[PlannedFault],
         damage: Damage[T],
         *,
         seed: int | str,
-        tell: Callable[[str], None] | None = None,
+        report: Callable[[str], None] | None = None,
     ) -> None:
-        self._armed = [_Armed(fault) for fault in planned]
+        self._armed = [_ArmedFault(fault) for fault in planned]
         self._damage = damage
-        self._chance = random.Random(f"faults-{seed}")
+        self._rng = random.Random(f"faults-{seed}")
         self._lock = threading.RLock()
         self._last: dict[str, T] = {}
-        self._held: list[tuple[str, T]] = []
+        self._reordered: list[tuple[str, T]] = []
         self._next_flood_ns = 0
-        self._tell = tell
-        self._noted_ns: dict[str, int] = {}
-        self.hits: list[Hit] = []
+        self._report = report
+        self._recorded_ns: dict[str, int] = {}
+        self.occurrences: list[FaultOccurrence] = []
 
     @property
     def is_faultless(self) -> bool:
@@ -151,7 +151,7 @@ class Channel(Generic[T]):
         """Whether the power is on."""
         return not self._is_on("power-cycle", now_ns)
 
-    def comes_back_from_power_off(self, now_ns: int) -> bool:
+    def has_power_cycled(self, now_ns: int) -> bool:
         """True once after each power cycle: counts, clocks and settings are to be as new."""
         return self._ended_once("power-cycle", now_ns)
 
@@ -161,7 +161,7 @@ class Channel(Generic[T]):
             for armed in self._armed:
                 if armed.planned.name == "counter-reset" and armed.is_on(now_ns):
                     armed.is_spent = True
-                    self._note("counter-reset", now_ns)
+                    self._record("counter-reset", now_ns)
                     return True
         return False
 
@@ -181,7 +181,7 @@ class Channel(Generic[T]):
                 # A step is one at its beginning and at its end, a wrong week as long as it lasts.
                 if is_on != armed.was_on or (is_on and fault.name == "wrong-week"):
                     armed.was_on = is_on
-                    self._note(fault.name, now_ns)
+                    self._record(fault.name, now_ns)
                 if not is_on:
                     continue
                 if fault.name == "clock-step":
@@ -201,7 +201,7 @@ class Channel(Generic[T]):
 
     def noise(self, length: int) -> bytes:
         """Bytes of a flood."""
-        return self._chance.randbytes(length)
+        return self._rng.randbytes(length)
 
     # What becomes of a message
 
@@ -214,20 +214,22 @@ class Channel(Generic[T]):
         """
         with self._lock:
             released = [
-                Delivery(now_ns + OVERTAKEN_AFTER_NS, m) for _, m in self._held if m is not message
+                Delivery(now_ns + REORDER_TIMEOUT_NS, m)
+                for _, m in self._reordered
+                if m is not message
             ]
-            self._held.clear()
+            self._reordered.clear()
             for name in ("cable-pulled", "power-cycle", "silent"):
                 if self._is_on(name, now_ns):
-                    self._note(name, now_ns, what)
+                    self._record(name, now_ns, what)
                     return []
             return [*self._sent(message, now_ns, topic, what), *released]
 
     def overdue(self, now_ns: int) -> list[Delivery[T]]:
         """Reordered messages that nothing has followed; ask now and then."""
         with self._lock:
-            due = [Delivery(now_ns, message) for _, message in self._held]
-            self._held.clear()
+            due = [Delivery(now_ns, message) for _, message in self._reordered]
+            self._reordered.clear()
             return due
 
     def _sent(self, message: T, now_ns: int, topic: str, what: str) -> list[Delivery[T]]:
@@ -243,15 +245,15 @@ class Channel(Generic[T]):
         else:
             self._last[topic] = message
         if self._take("corrupt", now_ns, topic, what) is not None:
-            message = self._damage.corrupt(message, self._chance)
+            message = self._damage.corrupt(message, self._rng)
         if self._take("truncated", now_ns, topic, what) is not None:
-            message = self._damage.truncated(message, self._chance)
+            message = self._damage.truncated(message, self._rng)
         if self._take("half-frame", now_ns, topic, what) is not None:
-            message = self._damage.half(message)
+            message = self._damage.first_half(message)
         if self._take("lost", now_ns, topic, what) is not None:
             return []
         if self._take("reordered", now_ns, topic, what) is not None:
-            self._held.append((topic, message))
+            self._reordered.append((topic, message))
             return []
         late = self._take("late", now_ns, topic, what)
         at_ns = now_ns + (round(late.amount * NS_PER_S) if late is not None else 0)
@@ -260,7 +262,7 @@ class Channel(Generic[T]):
             sent.append(Delivery(at_ns + DUPLICATE_AFTER_NS, message))
         return sent
 
-    def _take(self, name: str, now_ns: int, topic: str = "", what: str = "") -> Planned | None:
+    def _take(self, name: str, now_ns: int, topic: str = "", what: str = "") -> PlannedFault | None:
         """A fault of that name that is on; one without a duration is spent by this."""
         with self._lock:
             for armed in self._armed:
@@ -273,7 +275,7 @@ class Channel(Generic[T]):
                 if fault.at_pulse is not None and what.isdecimal() and int(what) < fault.at_pulse:
                     continue
                 armed.is_spent = fault.duration_s is None
-                self._note(name, now_ns, what)
+                self._record(name, now_ns, what)
                 return fault
         return None
 
@@ -287,7 +289,7 @@ class Channel(Generic[T]):
                 for a in self._armed
             )
             if on and note:
-                self._note(name, now_ns)
+                self._record(name, now_ns)
             return on
 
     def _ended_once(self, name: str, now_ns: int) -> bool:
@@ -300,16 +302,16 @@ class Channel(Generic[T]):
                     return True
         return False
 
-    def _note(self, name: str, now_ns: int, what: str = "") -> None:
+    def _record(self, name: str, now_ns: int, what: str = "") -> None:
         """Keep a hit; what only lasts is kept once in a while."""
-        last_ns = self._noted_ns.get(name)
-        if self._tell is not None and (last_ns is None or now_ns - last_ns >= TOLD_AGAIN_NS):
-            self._tell(f"fault {name}: {CATALOGUE[name].says}")
-        if what or last_ns is None or now_ns - last_ns >= NOTED_EVERY_NS:
-            self._noted_ns[name] = now_ns
-            self.hits.append(Hit(name, now_ns, what))
+        last_ns = self._recorded_ns.get(name)
+        if self._report is not None and (last_ns is None or now_ns - last_ns >= NOTIFY_INTERVAL_NS):
+            self._report(f"fault {name}: {CATALOGUE[name].description}")
+        if what or last_ns is None or now_ns - last_ns >= RECORD_INTERVAL_NS:
+            self._recorded_ns[name] = now_ns
+            self.occurrences.append(FaultOccurrence(name, now_ns, what))
 
 
-def for_device(planned: Sequence[Planned], device: str) -> tuple[Planned, ...]:
+def for_device(planned: Sequence[PlannedFault], device: str) -> tuple[PlannedFault, ...]:
     """The faults of one device."""
     return tuple(fault for fault in planned if fault.device == device)

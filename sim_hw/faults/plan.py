@@ -32,7 +32,7 @@ class FaultPlanError(ValueError):
 
 
 @dataclass(frozen=True)
-class Planned:
+class PlannedFault:
     """One fault of one device.
 
     It begins `at_s` seconds after the devices are ready, or with pulse `at_pulse` of the trigger
@@ -55,7 +55,7 @@ class Planned:
 
 def read_plan(
     texts: Iterable[str], scenario: Path | None, devices: Mapping[str, DeviceKind]
-) -> tuple[Planned, ...]:
+) -> tuple[PlannedFault, ...]:
     """Faults of the command line and of a scenario file.
 
     Args:
@@ -67,7 +67,7 @@ def read_plan(
         FaultPlanError: with a sentence for every mistake in any of them.
     """
     problems: list[str] = []
-    planned: list[Planned] = []
+    planned: list[PlannedFault] = []
     for text in texts:
         entry = _entry_of_text(text, problems)
         if entry is not None:
@@ -144,7 +144,7 @@ def _planned(
     entry: Mapping[str, Any],
     devices: Mapping[str, DeviceKind],
     problems: list[str],
-) -> list[Planned]:
+) -> list[PlannedFault]:
     """The faults an entry asks for: one, or one for every device that can have it."""
     before = len(problems)
     kind = CATALOGUE.get(entry.get("fault", ""))
@@ -167,7 +167,7 @@ def _planned(
         problems.append(f"{where}.at_s is {at_s!r}; seconds from the start, 0 or more")
     elif at_pulse is not None and not (_is_integer(at_pulse) and at_pulse >= 1):
         problems.append(f"{where}.at_pulse is {at_pulse!r}; the number of a pulse, from 1")
-    duration_s = entry.get("duration_s", kind.lasts_s)
+    duration_s = entry.get("duration_s", kind.duration_s)
     if duration_s is not None and not (_is_number(duration_s, least=0.0) and duration_s > 0):
         problems.append(f"{where}.duration_s is {duration_s!r}; a number of seconds above 0")
     amount = entry.get(kind.amount_key, kind.amount) if kind.amount_key else 0.0
@@ -181,7 +181,7 @@ def _planned(
     if len(problems) > before:
         return []
     return [
-        Planned(kind.name, device, at_s, at_pulse, duration_s, float(amount), topic)
+        PlannedFault(kind.name, device, at_s, at_pulse, duration_s, float(amount), topic)
         for device, topic in targets
     ]
 

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from sim_hw.faults.channel import Channel
 from sim_hw.gige import features as at
-from sim_hw.gige.faults import HeadClock, TakenFrame, WireFaults
 from sim_hw.gige.gvcp import Status
 from sim_hw.gige.gvsp import Destination, FrameHeader, FramePackets, chunk_data
+from sim_hw.gige.head_faults import ExposedFrame, HeadClock, WireFaults
 from sim_hw.gige.packing import wire_pixels
 from sim_hw.gige.registers import FrameSize, RegisterMemory
 from sim_hw.gige.stream import StreamChannel
@@ -89,7 +89,7 @@ class Acquisition:
         temperature_c: Callable[[int], float],
         clock: HeadClock,
         faults: WireFaults,
-        channel: Channel[TakenFrame],
+        channel: Channel[ExposedFrame],
     ) -> None:
         self._registers = registers
         self._stream = stream
@@ -99,7 +99,7 @@ class Acquisition:
         self._clock = clock
         self._faults = faults
         self._channel = channel
-        self._later: list[tuple[int, int, _Pending, TakenFrame]] = []
+        self._later: list[tuple[int, int, _Pending, ExposedFrame]] = []
         self._order = itertools.count()
         self._pending: queue.Queue[_Pending | None] = queue.Queue()
         self._lock = threading.Lock()
@@ -181,7 +181,7 @@ class Acquisition:
             return
         self._start_exposure(time.monotonic_ns(), NO_PULSE)
 
-    def act(self, device_ns: int | None) -> Status:
+    def execute_action(self, device_ns: int | None) -> Status:
         """An action command: expose now, or when the head's clock shows `device_ns`.
 
         One whose time has passed is taken at once, and says that it is late.
@@ -207,15 +207,15 @@ class Acquisition:
     def destination(self) -> Destination | None:
         """Where frames go, or None while no stream is open."""
         registers = self._registers
-        port = registers.word(at.STREAM_PORT) & 0xFFFF
-        address = registers.word(at.STREAM_DESTINATION)
+        port = registers.register(at.STREAM_PORT) & 0xFFFF
+        address = registers.register(at.STREAM_DESTINATION)
         if not port or not address:
             return None
         return Destination(
             address=".".join(str(byte) for byte in struct.pack(">I", address)),
             port=port,
             packet_size=registers.integer("GevSCPSPacketSize"),
-            packet_delay_ns=registers.word(at.STREAM_PACKET_DELAY),
+            packet_delay_ns=registers.register(at.STREAM_PACKET_DELAY),
         )
 
     def _is_waiting_for(self, source: str) -> bool:
@@ -280,7 +280,7 @@ class Acquisition:
             self._free_run()
             self._send_what_is_due()
             try:
-                pending = self._pending.get(timeout=self._patience_s())
+                pending = self._pending.get(timeout=self._wait_timeout_s())
             except queue.Empty:
                 continue
             if pending is not None:
@@ -289,7 +289,7 @@ class Acquisition:
     def _is_free_running(self) -> bool:
         return self._acquiring and not self._registers.integer("TriggerMode")
 
-    def _patience_s(self) -> float:
+    def _wait_timeout_s(self) -> float:
         if not self._is_free_running():
             return _POLL_S if self._channel.is_faultless else _FAULT_POLL_S
         until_next_s = (self._next_free_run_ns - time.monotonic_ns()) / _NS_PER_S
@@ -327,7 +327,7 @@ class Acquisition:
         start_ns = self._clock.device_ns(request.start_mono_ns)
         now_ns = time.monotonic_ns()
         sent = self._channel.send(
-            TakenFrame(image, start_ns, request.counter), now_ns, what=str(request.pulse_count)
+            ExposedFrame(image, start_ns, request.counter), now_ns, what=str(request.pulse_count)
         )
         self.counts["frames_dropped_by_fault"] += not sent
         for delivery in sent:
@@ -336,7 +336,7 @@ class Acquisition:
             )
         self._send_what_is_due()
 
-    def _hand_over(self, pending: _Pending, taken: TakenFrame) -> None:
+    def _hand_over(self, pending: _Pending, taken: ExposedFrame) -> None:
         """To the stream, where somebody wants it."""
         destination = self.destination()
         with self._lock:
@@ -355,7 +355,7 @@ class Acquisition:
     def _frame(
         self,
         pending: _Pending,
-        taken: TakenFrame,
+        taken: ExposedFrame,
         block_id: int,
         destination: Destination,
     ) -> FramePackets:

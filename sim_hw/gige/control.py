@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from sim_hw.gige import features as at
 from sim_hw.gige.gvcp import (
     READ_MAX,
-    Code,
-    Command,
+    CommandCode,
+    GvcpCommand,
     ResendRequest,
     Status,
     acknowledgement,
@@ -33,7 +33,7 @@ _NS_PER_MS = 1_000_000
 
 
 @dataclass(frozen=True)
-class Actions:
+class HeadActions:
     """What the head does when the control channel is told to.
 
     `written` hears the address of every register that was written. `control_lost` is called when
@@ -42,7 +42,7 @@ class Actions:
 
     written: Callable[[int], None]
     resend: Callable[[ResendRequest], None]
-    act: Callable[[int | None], Status]
+    execute_action: Callable[[int | None], Status]
     """An action command that meant this head: now, or when its clock shows so many ns."""
     control_lost: Callable[[], None]
     is_acquiring: Callable[[], bool]
@@ -51,11 +51,11 @@ class Actions:
 class ControlChannel:
     """Answers GVCP packets. Never raises, whatever arrives: what is not GVCP is counted."""
 
-    def __init__(self, registers: RegisterMemory, actions: Actions) -> None:
+    def __init__(self, registers: RegisterMemory, actions: HeadActions) -> None:
         self._registers = registers
         self._actions = actions
         self._controller: Peer | None = None
-        self._last_heard_ns = 0
+        self._last_command_ns = 0
         self._last_command: tuple[Peer, bytes, bytes] | None = None
         self._lock = threading.RLock()
         self.counts: Counter[str] = Counter()
@@ -78,7 +78,7 @@ class ControlChannel:
             self.counts["commands"] += 1
             self._expire(now_ns)
             if peer == self._controller:
-                self._last_heard_ns = now_ns
+                self._last_command_ns = now_ns
                 if self._last_command is not None and self._last_command[:2] == (peer, packet):
                     # The acknowledgement was lost and the command came again: done already.
                     self.counts["commands_repeated"] += 1
@@ -102,65 +102,65 @@ class ControlChannel:
     def release(self) -> None:
         """Forget the controller, as a reset does."""
         with self._lock:
-            self._let_go()
+            self._release_control()
 
     def _expire(self, now_ns: int) -> None:
         if self._controller is None:
             return
-        timeout_ns = self._registers.word(at.HEARTBEAT_TIMEOUT) * _NS_PER_MS
-        if now_ns - self._last_heard_ns > timeout_ns:
+        timeout_ns = self._registers.register(at.HEARTBEAT_TIMEOUT) * _NS_PER_MS
+        if now_ns - self._last_command_ns > timeout_ns:
             self.counts["heartbeats_lost"] += 1
-            self._let_go()
+            self._release_control()
 
-    def _let_go(self) -> None:
+    def _release_control(self) -> None:
         held = self._controller is not None
         self._controller = None
         self._last_command = None
-        self._registers.set_word(at.CONTROL_PRIVILEGE, 0)
+        self._registers.set_register(at.CONTROL_PRIVILEGE, 0)
         if held:
             self._actions.control_lost()
 
-    def _execute(self, command: Command, peer: Peer, now_ns: int) -> bytes | None:
+    def _execute(self, command: GvcpCommand, peer: Peer, now_ns: int) -> bytes | None:
         match command.code:
-            case Code.DISCOVERY:
+            case CommandCode.DISCOVERY:
                 return acknowledgement(command, self._registers.read(0, at.DISCOVERY_LENGTH))
-            case Code.READREG:
+            case CommandCode.READREG:
                 return self._read_registers(command, peer)
-            case Code.WRITEREG:
+            case CommandCode.WRITEREG:
                 return self._write_registers(command, peer, now_ns)
-            case Code.READMEM:
+            case CommandCode.READMEM:
                 return self._read_memory(command, peer)
-            case Code.WRITEMEM:
+            case CommandCode.WRITEMEM:
                 return self._write_memory(command, peer, now_ns)
-            case Code.ACTION:
+            case CommandCode.ACTION:
                 return self._act(command)
-            case Code.PACKETRESEND:
+            case CommandCode.PACKETRESEND:
                 self._resend(command, peer)
                 return None
             case _:
                 self.counts["commands_unknown"] += 1
                 return acknowledgement(command, status=Status.NOT_IMPLEMENTED)
 
-    def _read_registers(self, command: Command, peer: Peer) -> bytes:
+    def _read_registers(self, command: GvcpCommand, peer: Peer) -> bytes:
         if not command.body or len(command.body) % 4 or len(command.body) > READ_MAX:
             raise RegisterRefusedError(Status.INVALID_HEADER)
         addresses = struct.unpack(f">{len(command.body) // 4}I", command.body)
         if addresses != (at.CONTROL_PRIVILEGE,):
-            self._must_be_let_read(peer)
-        words = b"".join(self._registers.read(address, 4) for address in addresses)
-        return acknowledgement(command, words)
+            self._may_read(peer)
+        register_bytes = b"".join(self._registers.read(address, 4) for address in addresses)
+        return acknowledgement(command, register_bytes)
 
-    def _read_memory(self, command: Command, peer: Peer) -> bytes:
+    def _read_memory(self, command: GvcpCommand, peer: Peer) -> bytes:
         if len(command.body) != 8:
             raise RegisterRefusedError(Status.INVALID_HEADER)
         address, _reserved, length = struct.unpack(">IHH", command.body)
         if length > READ_MAX:
             raise RegisterRefusedError(Status.INVALID_PARAMETER)
-        self._must_be_let_read(peer)
+        self._may_read(peer)
         data = self._registers.read(address, length)
         return acknowledgement(command, command.body[:4] + data)
 
-    def _write_registers(self, command: Command, peer: Peer, now_ns: int) -> bytes:
+    def _write_registers(self, command: GvcpCommand, peer: Peer, now_ns: int) -> bytes:
         if not command.body or len(command.body) % 8 or len(command.body) > READ_MAX:
             raise RegisterRefusedError(Status.INVALID_HEADER)
         written, status = 0, Status.SUCCESS
@@ -175,7 +175,7 @@ class ControlChannel:
             written += 1
         return acknowledgement(command, struct.pack(">HH", 0, written), status)
 
-    def _write_memory(self, command: Command, peer: Peer, now_ns: int) -> bytes:
+    def _write_memory(self, command: GvcpCommand, peer: Peer, now_ns: int) -> bytes:
         if len(command.body) < 8 or len(command.body) > READ_MAX + 4:
             raise RegisterRefusedError(Status.INVALID_HEADER)
         (address,) = struct.unpack_from(">I", command.body)
@@ -194,17 +194,17 @@ class ControlChannel:
     def _change_privilege(self, data: bytes, peer: Peer, now_ns: int) -> None:
         if len(data) != 4:
             raise RegisterRefusedError(Status.INVALID_PARAMETER)
-        (asked,) = struct.unpack(">I", data)
+        (requested_privilege,) = struct.unpack(">I", data)
         if self._controller not in (None, peer):
             raise RegisterRefusedError(Status.ACCESS_DENIED)
-        if not asked & _PRIVILEGES:
-            self._let_go()
+        if not requested_privilege & _PRIVILEGES:
+            self._release_control()
             return
         self._controller = peer
-        self._last_heard_ns = now_ns
-        self._registers.set_word(at.CONTROL_PRIVILEGE, asked & _PRIVILEGES)
+        self._last_command_ns = now_ns
+        self._registers.set_register(at.CONTROL_PRIVILEGE, requested_privilege & _PRIVILEGES)
 
-    def _act(self, command: Command) -> bytes | None:
+    def _act(self, command: GvcpCommand) -> bytes | None:
         """An action command, from whom ever; who is not meant says nothing."""
         request = parse_action(command)
         if request is None:
@@ -212,23 +212,23 @@ class ControlChannel:
         registers = self._registers
         is_meant = (
             self._controller is not None
-            and request.device_key == registers.word(at.ACTION_DEVICE_KEY)
-            and request.group_key == registers.word(at.ACTION_GROUP_KEY)
-            and request.group_mask & registers.word(at.ACTION_GROUP_MASK)
+            and request.device_key == registers.register(at.ACTION_DEVICE_KEY)
+            and request.group_key == registers.register(at.ACTION_GROUP_KEY)
+            and request.group_mask & registers.register(at.ACTION_GROUP_MASK)
         )
         if not is_meant:
             self.counts["actions_ignored"] += 1
             return None
         self.counts["actions"] += 1
-        return acknowledgement(command, status=self._actions.act(request.device_ns))
+        return acknowledgement(command, status=self._actions.execute_action(request.device_ns))
 
-    def _must_be_let_read(self, peer: Peer) -> None:
+    def _may_read(self, peer: Peer) -> None:
         if self._controller in (None, peer):
             return
-        if self._registers.word(at.CONTROL_PRIVILEGE) & at.EXCLUSIVE_ACCESS:
+        if self._registers.register(at.CONTROL_PRIVILEGE) & at.EXCLUSIVE_ACCESS:
             raise RegisterRefusedError(Status.ACCESS_DENIED)
 
-    def _resend(self, command: Command, peer: Peer) -> None:
+    def _resend(self, command: GvcpCommand, peer: Peer) -> None:
         request = parse_resend(command.body)
         # The request comes from the controller's stream socket, so its port is another one.
         if request is None or self._controller is None or peer[0] != self._controller[0]:

@@ -39,7 +39,7 @@ class Status(enum.IntEnum):
     ACTION_LATE = 0x8016
 
 
-class Code(enum.IntEnum):
+class CommandCode(enum.IntEnum):
     """Commands; the acknowledgement of one is its code plus one."""
 
     DISCOVERY = 0x0002
@@ -53,7 +53,7 @@ class Code(enum.IntEnum):
 
 
 @dataclass(frozen=True)
-class Command:
+class GvcpCommand:
     code: int
     flags: int
     request_id: int
@@ -83,7 +83,7 @@ class ActionRequest:
     device_ns: int | None
 
 
-def parse_action(command: Command) -> ActionRequest | None:
+def parse_action(command: GvcpCommand) -> ActionRequest | None:
     """The request in an ACTION command; None where it makes no sense."""
     is_scheduled = bool(command.flags & SCHEDULED)
     if len(command.body) != (20 if is_scheduled else 12):
@@ -93,7 +93,7 @@ def parse_action(command: Command) -> ActionRequest | None:
     return ActionRequest(device_key, group_key, group_mask, at_ns)
 
 
-def parse_command(packet: bytes) -> Command | None:
+def parse_command(packet: bytes) -> GvcpCommand | None:
     """The command in a datagram; None for anything that is not one."""
     if len(packet) < HEADER_LENGTH:
         return None
@@ -103,10 +103,12 @@ def parse_command(packet: bytes) -> Command | None:
         return None
     if length != len(packet) - HEADER_LENGTH:
         return None
-    return Command(code, flags, request_id, packet[HEADER_LENGTH:])
+    return GvcpCommand(code, flags, request_id, packet[HEADER_LENGTH:])
 
 
-def acknowledgement(command: Command, body: bytes = b"", status: Status = Status.SUCCESS) -> bytes:
+def acknowledgement(
+    command: GvcpCommand, body: bytes = b"", status: Status = Status.SUCCESS
+) -> bytes:
     """The answer to a command."""
     return _ACK_HEADER.pack(status, command.code + 1, len(body), command.request_id) + body
 

@@ -99,11 +99,11 @@ class Destination:
 
 
 @dataclass(frozen=True)
-class Batch:
+class PacketBatch:
     """Some datagrams of a frame, ready for the kernel. Holds what its pointers point to."""
 
     messages: NDArray[np.void]
-    keeps_alive: tuple[Any, ...]
+    referenced_arrays: tuple[Any, ...]
 
     def __len__(self) -> int:
         return len(self.messages)
@@ -174,20 +174,20 @@ class FramePackets:
         self._vectors[:, 1:] = bodies
         self._messages = self._point(self._headers, self._vectors)
 
-    def batch(self, first: int, last: int) -> Batch:
+    def batch(self, first: int, last: int) -> PacketBatch:
         """Packets `first` to `last`, both included."""
-        return Batch(self._messages[first : last + 1], (self,))
+        return PacketBatch(self._messages[first : last + 1], (self,))
 
-    def only(self, packets: NDArray[np.intp]) -> Batch:
+    def only(self, packets: NDArray[np.intp]) -> PacketBatch:
         """Chosen packets, in the order given."""
-        return Batch(self._messages[packets], (self,))
+        return PacketBatch(self._messages[packets], (self,))
 
-    def resent(self, packets: NDArray[np.intp]) -> Batch:
+    def resent(self, packets: NDArray[np.intp]) -> PacketBatch:
         """Chosen packets, marked as answers to a resend request."""
         headers = self._headers[packets]
         headers["status"] = Status.PACKET_RESEND
         vectors = self._vectors[packets]
-        return Batch(self._point(headers, vectors), (self, headers, vectors))
+        return PacketBatch(self._point(headers, vectors), (self, headers, vectors))
 
     def _bodies(
         self, step: int, data_count: int, chunk_bytes: int, leader_bytes: int, trailer_bytes: int
@@ -221,7 +221,7 @@ class FramePackets:
         return messages
 
 
-def send(descriptor: int, batch: Batch) -> tuple[int, int]:
+def send(descriptor: int, batch: PacketBatch) -> tuple[int, int]:
     """Give a batch to the kernel. Returns how many it took and how many it refused."""
     messages = batch.messages
     count, done, refused = len(messages), 0, 0

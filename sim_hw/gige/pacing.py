@@ -13,7 +13,7 @@ RECEIVE_BUFFER_LIMIT = Path("/proc/sys/net/core/rmem_max")
 RECEIVE_BUFFER_DEFAULT = 212_992
 """rmem_max of a plain Debian, taken where the file cannot be read."""
 
-LATENCY_S = 0.020
+DRAIN_LATENCY_S = 0.020
 """How long a receiver may be kept from its socket by the scheduler."""
 
 BURST_PART = 0.25
@@ -48,7 +48,7 @@ class Pacing:
     def for_receive_buffer(cls, buffer_bytes: int) -> Pacing:
         """Pacing for receivers whose sockets ask for that many bytes (SO_RCVBUF)."""
         burst = min(int(buffer_bytes * BURST_PART), BURST_MAX_BYTES)
-        rate = (buffer_bytes - burst) / LATENCY_S
+        rate = (buffer_bytes - burst) / DRAIN_LATENCY_S
         return cls(min(rate, RATE_MAX_BYTES_PER_S), burst)
 
     @classmethod

@@ -126,22 +126,22 @@ class RegisterMemory:
                 _check(feature, address, data)
             block[address - start : address - start + len(data)] = data
 
-    def word(self, address: int) -> int:
+    def register(self, address: int) -> int:
         """The 32-bit register at an address."""
         return int(struct.unpack(">I", self.read(address, 4))[0])
 
-    def set_word(self, address: int, value: int) -> None:
+    def set_register(self, address: int, value: int) -> None:
         """Set a register from inside, whoever may write it from outside."""
         self._store(address, struct.pack(">I", value & 0xFFFF_FFFF))
 
-    def set_long(self, address: int, value: int) -> None:
+    def set_register64(self, address: int, value: int) -> None:
         """Set a 64-bit register from inside."""
         self._store(address, struct.pack(">Q", value & 0xFFFF_FFFF_FFFF_FFFF))
 
     def integer(self, name: str) -> int:
         """Value of an integer, enumeration or boolean feature."""
         feature = self._by_name[name]
-        value = self.word(feature.address)
+        value = self.register(feature.address)
         if isinstance(feature, IntegerFeature) and feature.bits is not None:
             lowest, highest = feature.bits
             value = (value >> lowest) & ((1 << (highest - lowest + 1)) - 1)
@@ -157,30 +157,35 @@ class RegisterMemory:
     def chunk_is_enabled(self, chunk: str) -> bool:
         """Whether ChunkEnable is set for that entry of ChunkSelector."""
         base = self.address_of("ChunkEnable")
-        return bool(self.word(base + 4 * at.CHUNKS[chunk]))
+        return bool(self.register(base + 4 * at.CHUNKS[chunk]))
 
     def bits_per_pixel(self) -> int:
         return (self.integer("PixelFormat") >> 16) & 0xFF
 
     def _readable_blocks(self) -> dict[int, int]:
-        words = set(range(0, at.DISCOVERY_LENGTH, 4))
-        words |= set(range(at.XML_URL, at.XML_URL + at.XML_URL_LENGTH, 4))
-        words |= {at.INTERFACES, at.MESSAGE_CHANNELS, at.STREAM_CHANNELS, at.STREAM_CAPABILITY}
-        words |= {
+        word_addresses = set(range(0, at.DISCOVERY_LENGTH, 4))
+        word_addresses |= set(range(at.XML_URL, at.XML_URL + at.XML_URL_LENGTH, 4))
+        word_addresses |= {
+            at.INTERFACES,
+            at.MESSAGE_CHANNELS,
+            at.STREAM_CHANNELS,
+            at.STREAM_CAPABILITY,
+        }
+        word_addresses |= {
             at.ACTION_SIGNALS,
             at.CONTROL_CAPABILITY,
             at.CONTROL_PRIVILEGE,
             at.STREAM_SOURCE_PORT,
         }
         for feature in self._features:
-            words |= set(range(feature.address, feature.address + feature.length, 4))
+            word_addresses |= set(range(feature.address, feature.address + feature.length, 4))
         blocks: dict[int, int] = {}
         start = previous = -8
-        for word in sorted(words):
-            if word != previous + 4:
-                start = word
-            blocks[start] = word + 4 - start
-            previous = word
+        for register in sorted(word_addresses):
+            if register != previous + 4:
+                start = register
+            blocks[start] = register + 4 - start
+            previous = register
         blocks[at.XML_START] = len(self._xml)
         return blocks
 
@@ -219,7 +224,7 @@ class RegisterMemory:
                 _USER_NAME_AND_SERIAL | _RESEND_WRITEMEM_CONCATENATION | _ACTION_AND_SCHEDULED,
             ),
         ):
-            self.set_word(address, value)
+            self.set_register(address, value)
         for address, text, length in (
             (at.MANUFACTURER, identity.vendor, 32),
             (at.MODEL, identity.model, 32),
@@ -234,17 +239,17 @@ class RegisterMemory:
             ),
         ):
             self._text(address, text, length)
-        self.set_long(at.TICK_FREQUENCY_HIGH, TICKS_PER_SECOND)
+        self.set_register64(at.TICK_FREQUENCY_HIGH, TICKS_PER_SECOND)
 
     def _write_default(self, feature: Feature) -> None:
         match feature:
             case IntegerFeature() if feature.default:
-                self.set_word(feature.address, feature.default)
+                self.set_register(feature.address, feature.default)
             case EnumerationFeature():
-                self.set_word(feature.address, feature.default)
+                self.set_register(feature.address, feature.default)
             case BooleanFeature() if feature.default:
-                for word in range(feature.address, feature.address + feature.length, 4):
-                    self.set_word(word, feature.default)
+                for register in range(feature.address, feature.address + feature.length, 4):
+                    self.set_register(register, feature.default)
             case FloatFeature():
                 self._store(feature.address, struct.pack(">d", feature.default))
 

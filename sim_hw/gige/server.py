@@ -23,15 +23,15 @@ class ControlServer:
     """Serves one control channel on (address, 3956), and discovery by broadcast beside it."""
 
     def __init__(
-        self, address: str, channel: ControlChannel, is_hearing: Callable[[], bool] = lambda: True
+        self, address: str, channel: ControlChannel, is_listening: Callable[[], bool] = lambda: True
     ) -> None:
-        self._is_hearing = is_hearing
+        self._is_listening = is_listening
         self._address = address
         self._channel = channel
         self._sockets: list[socket.socket] = []
         self._wake: tuple[socket.socket, socket.socket] | None = None
         self._thread: threading.Thread | None = None
-        self._deaf_until_ns = 0
+        self._ignore_until_ns = 0
         self.counts: Counter[str] = Counter()
 
     def start(self) -> None:
@@ -65,9 +65,9 @@ class ControlServer:
             self._wake = None
         self._close_sockets()
 
-    def be_deaf(self, until_mono_ns: int) -> None:
+    def ignore_until(self, until_mono_ns: int) -> None:
         """Hear nothing until then, as a device that restarts."""
-        self._deaf_until_ns = until_mono_ns
+        self._ignore_until_ns = until_mono_ns
 
     def _bind(self) -> None:
         control = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -99,7 +99,7 @@ class ControlServer:
                 for readable in self._sockets:
                     if readable in ready:
                         self._receive(readable)
-                self._is_hearing()
+                self._is_listening()
                 self._channel.expire(time.monotonic_ns())
 
     def _receive(self, readable: socket.socket) -> None:
@@ -112,7 +112,7 @@ class ControlServer:
         control = self._sockets[0]
         # An emulated head never answers a broadcast from outside this machine.
         is_foreign = readable is not control and not ipaddress.IPv4Address(peer[0]).is_loopback
-        if now_ns < self._deaf_until_ns or is_foreign or not self._is_hearing():
+        if now_ns < self._ignore_until_ns or is_foreign or not self._is_listening():
             return
         answer = self._channel.answer(packet, (peer[0], peer[1]), now_ns)
         if answer is None:

@@ -16,19 +16,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim_hw.gige.faults import WireFaults
 from sim_hw.gige.gvcp import ResendRequest
 from sim_hw.gige.gvsp import (
     UDP_OVERHEAD,
-    Batch,
     Destination,
     FramePackets,
+    PacketBatch,
     send,
     unavailable_packet,
 )
+from sim_hw.gige.head_faults import WireFaults
 from sim_hw.gige.pacing import Pacing, TokenBucket
 
-KEPT_FRAMES = 2
+RETAINED_FRAMES = 2
 """Frames whose packets can be asked for again: the one on its way and the one before."""
 
 FRAMES_WAITING_MAX = 2
@@ -46,7 +46,7 @@ _IP_PMTUDISC_DONT, _IP_PMTUDISC_DO = 0, 2
 @dataclass
 class _Outgoing:
     frame: FramePackets
-    is_wanted: Callable[[], bool]
+    is_requested: Callable[[], bool]
     sent_packets: int = 0
     share: float = 1.0
 
@@ -77,7 +77,7 @@ class StreamChannel:
         self._loss = faults.packet_loss
         self._random = np.random.default_rng(seed)
         self._waiting: queue.Queue[_Outgoing | None] = queue.Queue(FRAMES_WAITING_MAX)
-        self._kept: deque[_Outgoing] = deque(maxlen=KEPT_FRAMES)
+        self._retained: deque[_Outgoing] = deque(maxlen=RETAINED_FRAMES)
         self._bucket = TokenBucket(pacing, time.monotonic_ns())
         self._stop = threading.Event()
         self._lock = threading.Lock()
@@ -104,15 +104,15 @@ class StreamChannel:
         if self._socket is not None:
             self._socket.close()
 
-    def put(self, frame: FramePackets, share: float, is_wanted: Callable[[], bool]) -> bool:
+    def put(self, frame: FramePackets, share: float, is_requested: Callable[[], bool]) -> bool:
         """Queue a frame; waits while two are queued. False where it is not wanted any more.
 
-        Only the first `share` of its packets is sent, also on request. `is_wanted` is asked again
-        and again while the frame is being sent.
+        Only the first `share` of its packets is sent, also on request. `is_requested` is asked
+        again and again while the frame is being sent.
         """
-        while is_wanted() and not self._stop.is_set():
+        while is_requested() and not self._stop.is_set():
             try:
-                self._waiting.put(_Outgoing(frame, is_wanted, share=share), timeout=_POLL_S)
+                self._waiting.put(_Outgoing(frame, is_requested, share=share), timeout=_POLL_S)
             except queue.Full:
                 continue
             return True
@@ -121,7 +121,9 @@ class StreamChannel:
     def resend(self, request: ResendRequest) -> None:
         """Send packets again at once; what they take is saved from the frame on its way."""
         with self._lock:
-            outgoing = next((o for o in self._kept if o.frame.block_id == request.block_id), None)
+            outgoing = next(
+                (o for o in self._retained if o.frame.block_id == request.block_id), None
+            )
         if outgoing is None:
             self._answer_unavailable(request)
             return
@@ -131,11 +133,11 @@ class StreamChannel:
         packets = np.arange(request.first, last + 1, dtype=np.intp)
         fits = np.searchsorted(np.cumsum(frame.sizes[packets]), self._pacing.burst_bytes, "right")
         packets = packets[: max(int(fits), 1)]
-        kept = packets[self._random.random(len(packets)) >= self._loss]
-        self._count("packets_lost_by_fault", len(packets) - len(kept))
-        if len(kept):
-            self._count("packets_resent", self._send(frame.resent(kept)))
-            self._bucket.spend(int(frame.sizes[kept].sum()))
+        retained = packets[self._random.random(len(packets)) >= self._loss]
+        self._count("packets_lost_by_fault", len(packets) - len(retained))
+        if len(retained):
+            self._count("packets_resent", self._send(frame.resent(retained)))
+            self._bucket.spend(int(frame.sizes[retained].sum()))
 
     def fire_test_packet(self, destination: Destination, *, may_fragment: bool) -> None:
         """Send one packet of the size asked for, so that the receiver learns whether it passes."""
@@ -154,10 +156,10 @@ class StreamChannel:
         except OSError:
             self._count("send_errors", 1)
 
-    def forget(self) -> None:
+    def discard_retained(self) -> None:
         """Let go of the frames kept for resending."""
         with self._lock:
-            self._kept.clear()
+            self._retained.clear()
 
     def _run(self) -> None:
         while not self._stop.is_set():
@@ -168,9 +170,9 @@ class StreamChannel:
             if outgoing is None:
                 continue
             with self._lock:
-                self._kept.append(outgoing)
-            whole = self._transmit(outgoing)
-            self._count("frames_sent" if whole else "frames_aborted", 1)
+                self._retained.append(outgoing)
+            frame_count = self._transmit(outgoing)
+            self._count("frames_sent" if frame_count else "frames_aborted", 1)
 
     def _transmit(self, outgoing: _Outgoing) -> bool:
         frame = outgoing.frame
@@ -185,7 +187,7 @@ class StreamChannel:
             outgoing.sent_packets, done = 1, int(ends[0])
             self._stop.wait(FIRST_LEADER_AHEAD_S)
         while done < total:
-            if self._stop.is_set() or not outgoing.is_wanted():
+            if self._stop.is_set() or not outgoing.is_requested():
                 return False
             available = self._bucket.available(time.monotonic_ns(), limit)
             # Half a burst at a time: few wake-ups, and room left to catch up after a late one.
@@ -207,12 +209,12 @@ class StreamChannel:
             self._count("packets_sent", self._send(frame.batch(first, last)))
             return
         packets = np.arange(first, last + 1, dtype=np.intp)
-        kept = packets[self._random.random(len(packets)) >= self._loss]
-        self._count("packets_lost_by_fault", len(packets) - len(kept))
-        if len(kept):
-            self._count("packets_sent", self._send(frame.only(kept)))
+        retained = packets[self._random.random(len(packets)) >= self._loss]
+        self._count("packets_lost_by_fault", len(packets) - len(retained))
+        if len(retained):
+            self._count("packets_sent", self._send(frame.only(retained)))
 
-    def _send(self, batch: Batch) -> int:
+    def _send(self, batch: PacketBatch) -> int:
         if self._socket is None or not self._is_connected():
             self._count("packets_lost_by_fault", len(batch))
             return 0
@@ -227,7 +229,7 @@ class StreamChannel:
 
     def _answer_unavailable(self, request: ResendRequest) -> None:
         with self._lock:
-            newest = self._kept[-1] if self._kept else None
+            newest = self._retained[-1] if self._retained else None
         self._count("resends_unavailable", 1)
         if newest is None or self._socket is None or not self._is_connected():
             return

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from processing.rig import Cone, Lens, Rig, Sensor
-from sim_hw.laboratory.series import command, new_series, run, write_list
-from sim_hw.world.camera import rotation_opk, skewed_by, undistorted
+from sim_hw.laboratory.instrument_series import command, new_series, run, write_list
 from sim_hw.world.seeding import random_stream
+from sim_hw.world.true_camera import rotation_opk, skewed_by, undistorted
 
 Array = NDArray[np.float64]
 
@@ -109,9 +109,9 @@ def target(u: Array, v: Array, edge: float) -> Array:
         return np.asarray(np.clip(0.5 + (width - distance) / edge, 0.0, 1.0))
 
     r = np.hypot(u, v)
-    whole = within(r, 0.95)
+    is_inside = within(r, 0.95)
     rings = within(r, 0.2) + within(np.abs(r - 0.52), 0.1) + within(np.abs(r - 0.875), 0.075)
-    cross = np.maximum(within(np.abs(u), 0.06), within(np.abs(v), 0.06)) * whole
+    cross = np.maximum(within(np.abs(u), 0.06), within(np.abs(v), 0.06)) * is_inside
     mark = within(np.hypot(u - 0.5, v - 0.5), 0.09)
     light = rings + cross - 2 * rings * cross
     light = light + mark - 2 * light * mark
@@ -174,7 +174,9 @@ def holder_rotations(seed: int, name: str, count: int) -> list[Array]:
     ]
 
 
-def angles_of(head: TrueHead, columns: int, rows: int, turned: int) -> list[tuple[float, float]]:
+def angles_of(
+    head: TrueHead, columns: int, rows: int, quarter_rotations: int
+) -> list[tuple[float, float]]:
     """A grid of collimator angles that fills the field in a series turned by so many quarters."""
     f = head.cone.lens.f_mm
     pitch = head.sensor.pitch_um * 1e-3
@@ -182,7 +184,7 @@ def angles_of(head: TrueHead, columns: int, rows: int, turned: int) -> list[tupl
         math.atan((n * pitch / 2 - 0.6 * CUT_PX * pitch) / f)
         for n in (head.sensor.width_px, head.sensor.height_px)
     ]
-    if turned % 2:
+    if quarter_rotations % 2:
         half.reverse()
         columns, rows = rows, columns
     return [
@@ -201,7 +203,7 @@ def write_series(
     seed: int,
     take: int = 1,
     grid: tuple[int, int] = (11, 7),
-    turns: int = 4,
+    orientations: int = 4,
     extra_um: float = EXTRA_UM,
 ) -> Path:
     """Take the series of the named sensors; returns the folder with `series.json`.
@@ -214,10 +216,10 @@ def write_series(
         head = true_head(rig, name, seed, extra_um=extra_um)
         random = random_stream(seed, "collimator", take, name)
         (series / name).mkdir()
-        rotations = holder_rotations(seed + take, name, turns)
+        rotations = holder_rotations(seed + take, name, orientations)
         centres: list[Array] = []
-        for turn, rotation in enumerate(rotations):
-            for angles in angles_of(head, *grid, turn):
+        for orientation, rotation in enumerate(rotations):
+            for angles in angles_of(head, *grid, orientation):
                 set_to = tuple(a + float(random.normal(0, ANGLE_SIGMA_RAD)) for a in angles)
                 at = seen_at(head, rotation, set_to[0], set_to[1])
                 if at is None:
@@ -232,8 +234,8 @@ def write_series(
                     {
                         "file": file,
                         "sensor": name,
-                        "series": f"{name} turned {90 * turn}",
-                        "turned_deg": 90 * turn,
+                        "series": f"{name} turned {90 * orientation}",
+                        "rotation_deg": 90 * orientation,
                         "origin_px": [int(origin[0]), int(origin[1])],
                         "alpha_rad": angles[0],
                         "beta_rad": angles[1],

@@ -20,7 +20,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from processing.rig import Cone, Rig, Sensor
-from sim_hw.laboratory.series import command, new_series, run, write_list
+from sim_hw.laboratory.instrument_series import command, new_series, run, write_list
 from sim_hw.world import electronics
 from sim_hw.world.electronics import Map, over_tdi_path, true_sensor, vignetting
 from sim_hw.world.seeding import random_stream
@@ -42,7 +42,22 @@ REFERENCE_TIME_S: Final = 8e-3
 STOPS: Final = (1.0, 1.4286, 2.0)
 """Apertures, as multiples of the f-number the head flies with."""
 DARK_TIMES_S: Final = (0.001, 0.5, 2.0)
-LADDER: Final = (0.015, 0.04, 0.08, 0.14, 0.2, 0.28, 0.36, 0.44, 0.52, 0.6, 0.68, 0.76, 0.84, 0.9)
+EXPOSURE_SHARES: Final = (
+    0.015,
+    0.04,
+    0.08,
+    0.14,
+    0.2,
+    0.28,
+    0.36,
+    0.44,
+    0.52,
+    0.6,
+    0.68,
+    0.76,
+    0.84,
+    0.9,
+)
 NEAR_FULL: Final = (0.94, 0.96, 0.98, 1.0, 1.02, 1.05, 1.1)
 CHECKS: Final = (0.2, 0.5, 0.8)
 TDI_SHIFTS: Final = (6, 12, 24)
@@ -145,7 +160,7 @@ def _plant_columns(
 
 
 @dataclass(frozen=True)
-class Shot:
+class SphereExposure:
     """One condition of a series and how many frames are taken in it."""
 
     light: str
@@ -158,7 +173,7 @@ class Shot:
     use: str = "fit"
 
 
-def shots(sensor: Sensor, frames: float) -> Iterator[Shot]:
+def sphere_exposures(sensor: Sensor, frames: float) -> Iterator[SphereExposure]:
     """The series of one head. `frames` scales how many frames a condition has."""
 
     def of(count: int) -> int:
@@ -168,26 +183,26 @@ def shots(sensor: Sensor, frames: float) -> Iterator[Shot]:
     half = 0.5 * REFERENCE_TIME_S
     for temperature in (base - 10, base, base + 15):
         for time in DARK_TIMES_S:
-            yield Shot("dark", 0.0, time, 1.0, 0, temperature, of(8))
-    for share in (*LADDER, *NEAR_FULL):
-        yield Shot("flat", 1.0, share * REFERENCE_TIME_S, 1.0, 0, base, of(4))
-    yield Shot("flat", 1.0, half, 1.0, 0, base, of(48))
+            yield SphereExposure("dark", 0.0, time, 1.0, 0, temperature, of(8))
+    for share in (*EXPOSURE_SHARES, *NEAR_FULL):
+        yield SphereExposure("flat", 1.0, share * REFERENCE_TIME_S, 1.0, 0, base, of(4))
+    yield SphereExposure("flat", 1.0, half, 1.0, 0, base, of(48))
     for stop in STOPS[1:]:
-        yield Shot("flat", 1.0, half * stop * stop, stop, 0, base, of(6))
+        yield SphereExposure("flat", 1.0, half * stop * stop, stop, 0, base, of(6))
     for temperature in (base - 10, base + 15):
-        yield Shot("flat", 1.0, half, 1.0, 0, temperature, of(6))
+        yield SphereExposure("flat", 1.0, half, 1.0, 0, temperature, of(6))
     # A head of a Bayer sensor has no TDI: it would mix the colours.
     for shifts in TDI_SHIFTS if sensor.colour_filter_array == "none" else ():
-        yield Shot("flat", 1.0, half, 1.0, shifts, base + 5, 3, "check")
+        yield SphereExposure("flat", 1.0, half, 1.0, shifts, base + 5, 3, "check")
     for share in CHECKS:
-        yield Shot("flat", 1.0, share * REFERENCE_TIME_S, 1.0, 0, base + 5, 3, "check")
-    yield Shot("flat", 1.0, half * STOPS[1] ** 2, STOPS[1], 0, base + 5, 3, "check")
+        yield SphereExposure("flat", 1.0, share * REFERENCE_TIME_S, 1.0, 0, base + 5, 3, "check")
+    yield SphereExposure("flat", 1.0, half * STOPS[1] ** 2, STOPS[1], 0, base + 5, 3, "check")
 
 
 def frame(
     sensor: Sensor,
     truth: HeadTruth,
-    shot: Shot,
+    shot: SphereExposure,
     random: np.random.Generator,
     *,
     temperature_c: float,
@@ -240,7 +255,7 @@ def write_series(
         random = random_stream(seed, "sphere frames", take, name)
         (series / name).mkdir()
         number = 0
-        for index, shot in enumerate(shots(sensor, frames)):
+        for index, shot in enumerate(sphere_exposures(sensor, frames)):
             for _ in range(shot.frames):
                 temperature = shot.temperature_c + float(random.uniform(-0.3, 0.3))
                 lamp = 1 + float(random.normal(0, 0.003))

@@ -17,17 +17,17 @@ import tifffile
 
 from processing.rig import RigError
 from sim_hw.__main__ import displacement, rig_file
-from sim_hw.world import laboratory
+from sim_hw.world import sensor_calibration
+from sim_hw.world.atomic_file import atomic_file
 from sim_hw.world.electronics import Electronics, true_sensor
-from sim_hw.world.grounds import GROUNDS
-from sim_hw.world.post_processed import marks_of_lines, write_trajectory
-from sim_hw.world.rendering import Look, light_on_sensor
+from sim_hw.world.ground_types import GROUNDS
+from sim_hw.world.post_processed_trajectory import marks_of_lines, write_trajectory
+from sim_hw.world.rendering import ExposureParameters, light_on_sensor
 from sim_hw.world.scene import open_scene
 from sim_hw.world.seeding import random_stream
-from sim_hw.world.snapshots import PROBE_SIGMA_C, look_of
-from sim_hw.world.surveyed import write_surveyed
-from sim_hw.world.truth import Taken, TruthWriter
-from sim_hw.world.whole_file import whole_file
+from sim_hw.world.snapshots import PROBE_SIGMA_C, exposure_parameters_of
+from sim_hw.world.surveyed_points import write_surveyed
+from sim_hw.world.truth import SensorExposure, TruthWriter
 from sim_hw.world.world import World, WorldSettings
 
 EPOCH_GPS_NS = 1_447_000_000_000_000_000
@@ -52,7 +52,7 @@ def write_exposures(world: World, out: Path, *, count: int, scenes: Path, lines:
     first_ns = EPOCH_GPS_NS + FIRST_AFTER_S * 1_000_000_000
     flight = world.flight.beginning_first_line_at(world.flight.distance_flown_m(first_ns))
     marks = marks_of_lines(world, flight, first_ns, count, lines)
-    laboratory.write_rig(Path(world.settings.rig_file), mission)
+    sensor_calibration.write_rig(Path(world.settings.rig_file), mission)
     _write_plan(world, mission, calibration / "radiometry")
     write_trajectory(out / "trajectory.csv", flight, marks, seed=seed)
     if rig.virtual_image is not None and len(marks) >= LEAST_BLOCK:
@@ -63,44 +63,48 @@ def write_exposures(world: World, out: Path, *, count: int, scenes: Path, lines:
     truth = None if rig.virtual_image is None else TruthWriter(world, out / "truth")
     if truth is not None:
         truth.write_parameters()
-    looks: list[dict[str, Look]] = [{} for _ in marks]
+    parameters_by_sensor: list[dict[str, ExposureParameters]] = [{} for _ in marks]
     for number in range(1, len(marks) + 1):
         (mission / "L0" / f"{number:06d}").mkdir(parents=True, exist_ok=True)
     for cone in rig.cones:
         for sensor in cone.sensors:
             faults = true_sensor(cone, sensor, seed, field_radius_mm=world.field_radius_mm(cone))
-            laboratory.write_radiometry(
-                calibration, sensor, laboratory.measure(sensor, faults, seed)
+            sensor_calibration.write_radiometry(
+                calibration, sensor, sensor_calibration.measure(sensor, faults, seed)
             )
             head = Electronics(sensor, faults, world.electrons_per_radiance_s(cone))
             for k, mark_ns in enumerate(marks):
-                look = look_of(world, cone, mark_ns)
+                parameters = exposure_parameters_of(world, cone, mark_ns)
                 frame = head.frame(
-                    light_on_sensor(world, scene, flight, cone, sensor, look),
-                    exposure_time_us=look.exposure_time_us,
-                    tdi_shifts=look.tdi_shifts,
+                    light_on_sensor(world, scene, flight, cone, sensor, parameters),
+                    exposure_time_us=parameters.exposure_time_us,
+                    tdi_shifts=parameters.tdi_shifts,
                     gain_db=0.0,
-                    temperature_c=world.temperature_c(sensor.probe, look.mid_gps_ns),
+                    temperature_c=world.temperature_c(sensor.probe, parameters.mid_gps_ns),
                     random=random_stream(seed, "noise", sensor.name, k + 1),
                 )
                 path = mission / "L0" / f"{k + 1:06d}" / f"{sensor.name}.tif"
-                with whole_file(path) as part:
+                with atomic_file(path) as part:
                     tifffile.imwrite(part, frame)
-                looks[k][sensor.name] = look
+                parameters_by_sensor[k][sensor.name] = parameters
                 if truth is not None:
-                    truth.add(Taken(sensor.name, k + 1, look), flight)
+                    truth.add(SensorExposure(sensor.name, k + 1, parameters), flight)
             print(sensor.name, file=sys.stderr, flush=True)
     for k, mark_ns in enumerate(marks):
         path = mission / "L0" / f"{k + 1:06d}" / "exposure.json"
-        record = _record(world, k + 1, mark_ns, looks[k]) | {"line_id": f"line {k // count + 1}"}
-        with whole_file(path) as part:
+        record = _record(world, k + 1, mark_ns, parameters_by_sensor[k]) | {
+            "line_id": f"line {k // count + 1}"
+        }
+        with atomic_file(path) as part:
             part.write_text(json.dumps(record, indent=1))
-    with whole_file(out / "ready.json") as part:
+    with atomic_file(out / "ready.json") as part:
         part.write_text(json.dumps({"exposures": len(marks)}))
     return mission
 
 
-def _record(world: World, number: int, mark_ns: int, looks: dict[str, Look]) -> dict[str, Any]:
+def _record(
+    world: World, number: int, mark_ns: int, parameters_by_sensor: dict[str, ExposureParameters]
+) -> dict[str, Any]:
     random = random_stream(world.settings.seed, "probes of exposure", number)
     return {
         "number": number,
@@ -119,10 +123,10 @@ def _record(world: World, number: int, mark_ns: int, looks: dict[str, Look]) -> 
         "frames": [
             {
                 "sensor": name,
-                "exposure_time_us": look.exposure_time_us,
-                "settings": {"TdiShifts": look.tdi_shifts},
+                "exposure_time_us": parameters.exposure_time_us,
+                "settings": {"TdiShifts": parameters.tdi_shifts},
             }
-            for name, look in looks.items()
+            for name, parameters in parameters_by_sensor.items()
         ],
     }
 
@@ -137,7 +141,7 @@ def _write_plan(world: World, mission: Path, radiometry: Path) -> None:
         "[mission]\n"
         f"radiometry = {json.dumps(str(radiometry.resolve()))}\n"
     )
-    with whole_file(mission / "service.toml") as part:
+    with atomic_file(mission / "service.toml") as part:
         part.write_text(text, encoding="utf-8")
 
 

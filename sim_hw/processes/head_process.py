@@ -23,28 +23,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.rig import Cone, Sensor
-from sim_hw.faults.plan import Planned
-from sim_hw.gige.faults import WireFaults
-from sim_hw.gige.head import NO_PULSE, ExposureRequest, FrameSize, GigeHead, HeadIdentity
-from sim_hw.processes.ending import end_with_parent
-from sim_hw.world import laboratory
+from sim_hw.faults.plan import PlannedFault
+from sim_hw.gige.gige_head import NO_PULSE, ExposureRequest, FrameSize, GigeHead, HeadIdentity
+from sim_hw.gige.head_faults import WireFaults
+from sim_hw.processes.parent_death import terminate_with_parent
+from sim_hw.world import sensor_calibration
 from sim_hw.world.electronics import Electronics, true_sensor
-from sim_hw.world.flight import Flight
-from sim_hw.world.rendering import Look, Map, light_on_sensor
+from sim_hw.world.flight import SimulatedFlight
+from sim_hw.world.rendering import ExposureParameters, Map, light_on_sensor
 from sim_hw.world.scene import Scene, open_scene
 from sim_hw.world.seeding import random_stream
-from sim_hw.world.snapshots import look_of
-from sim_hw.world.truth import Taken
+from sim_hw.world.snapshots import exposure_parameters_of
+from sim_hw.world.truth import SensorExposure
 from sim_hw.world.world import World, WorldSettings
-from sim_hw.world.world_clock import DeviceClock, WorldClock
+from sim_hw.world.world_clock import FreeRunningClock, WorldClock
 
 VENDOR = "Syntopic emulator"
-WARM_UP = Look(mid_gps_ns=0, exposure_time_us=4000.0, tdi_shifts=1)
+WARM_UP = ExposureParameters(mid_gps_ns=0, exposure_time_us=4000.0, tdi_shifts=1)
 POLL_S = 0.5
-STRAIGHT_ON_M = 1e7
+DISTANT_FIRST_LINE_M = 1e7
 """A first line so far ahead that the aircraft does not turn for two days."""
 HEAD_TEMPERATURE_SIGMA_C = 0.1
-STILL_AFTER_NS = 20_000_000_000
+FREEZE_AFTER_NS = 20_000_000_000
 """Flown so far when the one exposure that heads hold still is taken."""
 
 
@@ -55,7 +55,7 @@ class HeadPlan:
     sensor: str
     address: str
     packet_loss: float
-    faults: tuple[Planned, ...] = ()
+    faults: tuple[PlannedFault, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -67,13 +67,13 @@ class WorkerPlan:
     scene_cache: Path
     calibration: Path
     heads: tuple[HeadPlan, ...]
-    is_still: bool = False
+    is_frozen: bool = False
     sent: Path | None = None
     """Where the digests of frames are written, `SENSOR.jsonl`."""
 
 
 @dataclass(frozen=True)
-class Pulse:
+class PulseMessage:
     """Told to a worker: a pulse of the bus, with the start of exposure of every sensor."""
 
     count: int
@@ -81,14 +81,14 @@ class Pulse:
 
 
 @dataclass(frozen=True)
-class Begin:
+class FaultClockStart:
     """Told to a worker: everything answers, and the seconds of the faults count from then."""
 
     mono_ns: int
 
 
 @dataclass(frozen=True)
-class Said:
+class WorkerStatus:
     """Told by a worker: that its heads answer, or why they cannot."""
 
     event: Literal["ready", "failed"]
@@ -102,9 +102,9 @@ class FirstLine:
     the first exposure finds the aircraft. Until then it flies straight on.
     """
 
-    def __init__(self, flight: Flight, shared: Synchronized[float]) -> None:
-        self._waiting = flight.beginning_first_line_at(STRAIGHT_ON_M)
-        self._begun: Flight | None = None
+    def __init__(self, flight: SimulatedFlight, shared: Synchronized[float]) -> None:
+        self._waiting = flight.beginning_first_line_at(DISTANT_FIRST_LINE_M)
+        self._begun: SimulatedFlight | None = None
         self._shared = shared
 
     def begin(self, gps_ns: int) -> None:
@@ -114,7 +114,7 @@ class FirstLine:
                 self._shared.value = self._waiting.distance_flown_m(gps_ns)
 
     @property
-    def flight(self) -> Flight:
+    def flight(self) -> SimulatedFlight:
         """The flight as it is known now."""
         if self._begun is not None:
             return self._begun
@@ -135,7 +135,7 @@ class RenderedHead:
         line: FirstLine,
         clock: WorldClock,
         plan: HeadPlan,
-        report: Callable[[Taken], None],
+        report: Callable[[SensorExposure], None],
         sent: Path | None = None,
     ) -> None:
         self._sent = None if sent is None else sent / f"{plan.sensor}.jsonl"
@@ -145,7 +145,7 @@ class RenderedHead:
         self._clock = clock
         self._report = report
         self._still: Map | None = None
-        self._held: tuple[tuple[float, int, float], NDArray[np.uint16]] | None = None
+        self._frozen: tuple[tuple[float, int, float], NDArray[np.uint16]] | None = None
         self.sensor: Sensor = world.rig.sensor(plan.sensor)
         self.cone: Cone = world.rig.cone_of(plan.sensor)
         seed = world.settings.seed
@@ -168,7 +168,7 @@ class RenderedHead:
             FrameSize(self.sensor.width_px, self.sensor.height_px),
             expose=self.expose,
             temperature_c=self.temperature_c,
-            clock=DeviceClock(
+            clock=FreeRunningClock(
                 offset_ns=int(random.integers(0, 10**12)), drift_ppm=float(random.normal(0, 10))
             ),
             faults=WireFaults(packet_loss=plan.packet_loss, planned=plan.faults),
@@ -182,18 +182,18 @@ class RenderedHead:
     def expose(self, request: ExposureRequest) -> NDArray[np.uint16]:
         """Take a frame; on a pulse of the bus, report it for the truth and for the strobe."""
         half_ns = round(request.exposure_time_us * 500)
-        look = Look(
+        parameters = ExposureParameters(
             mid_gps_ns=self._clock.gps_ns(request.start_mono_ns) + half_ns,
             exposure_time_us=request.exposure_time_us,
             tdi_shifts=request.tdi_shifts,
         )
-        self._line.begin(look.mid_gps_ns)
+        self._line.begin(parameters.mid_gps_ns)
         if request.pulse_count != NO_PULSE:
-            self._report(Taken(self.sensor.name, request.pulse_count, look))
+            self._report(SensorExposure(self.sensor.name, request.pulse_count, parameters))
         if self._still is None:
-            pixels = self.frame(look, gain_db=request.gain_db, number=request.start_mono_ns)
+            pixels = self.frame(parameters, gain_db=request.gain_db, number=request.start_mono_ns)
         else:
-            pixels = self._held_still(look, request.gain_db)
+            pixels = self._frozen_frame(parameters, request.gain_db)
         self._write_digest(request.pulse_count, pixels)
         return pixels
 
@@ -205,71 +205,79 @@ class RenderedHead:
         with self._sent.open("a") as file:
             file.write(json.dumps({"pulse": pulse_count, "sha256": digest}) + "\n")
 
-    def hold_still(self) -> None:
+    def freeze_scene(self) -> None:
         """From now on show the same ground in the same light: nothing is rendered any more."""
         world = self._world
-        mark_ns = world.settings.epoch_gps_ns + STILL_AFTER_NS
+        mark_ns = world.settings.epoch_gps_ns + FREEZE_AFTER_NS
         flight = world.flight.beginning_first_line_at(world.flight.distance_flown_m(mark_ns))
-        look = look_of(world, self.cone, mark_ns)
-        self._still = light_on_sensor(world, self._scene, flight, self.cone, self.sensor, look)
-        self._held_still(look, 0.0)
+        parameters = exposure_parameters_of(world, self.cone, mark_ns)
+        self._still = light_on_sensor(
+            world, self._scene, flight, self.cone, self.sensor, parameters
+        )
+        self._frozen_frame(parameters, 0.0)
 
-    def _held_still(self, look: Look, gain_db: float) -> NDArray[np.uint16]:
+    def _frozen_frame(self, parameters: ExposureParameters, gain_db: float) -> NDArray[np.uint16]:
         """The frame that is sent again and again; made anew where the settings have changed."""
-        settings = (look.exposure_time_us, look.tdi_shifts, gain_db)
-        if self._held is None or self._held[0] != settings:
+        settings = (parameters.exposure_time_us, parameters.tdi_shifts, gain_db)
+        if self._frozen is None or self._frozen[0] != settings:
             assert self._still is not None
-            self._held = settings, self._read_out(self._still, look, gain_db, number=0)
-        return self._held[1]
+            self._frozen = settings, self._read_out(self._still, parameters, gain_db, number=0)
+        return self._frozen[1]
 
-    def frame(self, look: Look, *, gain_db: float, number: int) -> NDArray[np.uint16]:
+    def frame(
+        self, parameters: ExposureParameters, *, gain_db: float, number: int
+    ) -> NDArray[np.uint16]:
         """Render a frame; `number` chooses its noise."""
         world = self._world
-        light = light_on_sensor(world, self._scene, self._line.flight, self.cone, self.sensor, look)
-        return self._read_out(light, look, gain_db, number=number)
+        light = light_on_sensor(
+            world, self._scene, self._line.flight, self.cone, self.sensor, parameters
+        )
+        return self._read_out(light, parameters, gain_db, number=number)
 
     def _read_out(
-        self, light: Map, look: Look, gain_db: float, *, number: int
+        self, light: Map, parameters: ExposureParameters, gain_db: float, *, number: int
     ) -> NDArray[np.uint16]:
         world = self._world
         return self._electronics.frame(
             light,
-            exposure_time_us=look.exposure_time_us,
-            tdi_shifts=look.tdi_shifts,
+            exposure_time_us=parameters.exposure_time_us,
+            tdi_shifts=parameters.tdi_shifts,
             gain_db=gain_db,
-            temperature_c=world.temperature_c(self.sensor.probe, look.mid_gps_ns),
+            temperature_c=world.temperature_c(self.sensor.probe, parameters.mid_gps_ns),
             random=random_stream(world.settings.seed, "noise", self.sensor.name, number),
         )
 
 
 def run(plan: WorkerPlan, pipe: Connection, first_line_m: Synchronized[float]) -> None:
     """Body of a worker process: until the pipe closes, or a signal comes."""
-    ending = threading.Event()
-    signal.signal(signal.SIGTERM, lambda *_: ending.set())
+    stopping = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: stopping.set())
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with_parent()
+    terminate_with_parent()
     cv2.setNumThreads(1)
     sending = threading.Lock()
 
-    def say(message: Said | Taken) -> None:
+    def send_status(message: WorkerStatus | SensorExposure) -> None:
         with sending:
             pipe.send(message)
 
     try:
-        heads = _open(plan, first_line_m, say)
+        heads = _open(plan, first_line_m, send_status)
     except (OSError, ValueError) as error:
-        say(Said("failed", f"{type(error).__name__}: {error}"))
+        send_status(WorkerStatus("failed", f"{type(error).__name__}: {error}"))
         return
     try:
-        say(Said("ready"))
-        _serve(pipe, heads, ending)
+        send_status(WorkerStatus("ready"))
+        _serve(pipe, heads, stopping)
     finally:
         for head in heads:
             head.head.close()
 
 
 def _open(
-    plan: WorkerPlan, first_line_m: Synchronized[float], say: Callable[[Taken], None]
+    plan: WorkerPlan,
+    first_line_m: Synchronized[float],
+    send_status: Callable[[SensorExposure], None],
 ) -> Sequence[RenderedHead]:
     world = World(plan.settings)
     scene = open_scene(world.scene_settings, plan.scene_cache)
@@ -277,16 +285,17 @@ def _open(
     if plan.sent is not None:
         plan.sent.mkdir(parents=True, exist_ok=True)
     heads = [
-        RenderedHead(world, scene, line, plan.clock, head, say, plan.sent) for head in plan.heads
+        RenderedHead(world, scene, line, plan.clock, head, send_status, plan.sent)
+        for head in plan.heads
     ]
     for head in heads:
-        radiometry = laboratory.measure(head.sensor, head.truth, plan.settings.seed)
-        laboratory.write_radiometry(plan.calibration, head.sensor, radiometry)
+        radiometry = sensor_calibration.measure(head.sensor, head.truth, plan.settings.seed)
+        sensor_calibration.write_radiometry(plan.calibration, head.sensor, radiometry)
     # Kernels are compiled, or read from their cache, before anyone waits for a frame.
     heads[0].frame(WARM_UP, gain_db=0.0, number=0)
-    if plan.is_still:
+    if plan.is_frozen:
         for head in heads:
-            head.hold_still()
+            head.freeze_scene()
     started: list[RenderedHead] = []
     try:
         for head in heads:
@@ -299,19 +308,19 @@ def _open(
     return heads
 
 
-def _serve(pipe: Connection, heads: Sequence[RenderedHead], ending: threading.Event) -> None:
-    while not ending.is_set():
+def _serve(pipe: Connection, heads: Sequence[RenderedHead], stopping: threading.Event) -> None:
+    while not stopping.is_set():
         try:
             if not pipe.poll(POLL_S):
                 continue
             pulse = pipe.recv()
         except (EOFError, OSError):
             return
-        if isinstance(pulse, Begin):
+        if isinstance(pulse, FaultClockStart):
             for head in heads:
                 head.head.channel.begin(pulse.mono_ns)
             continue
-        if not isinstance(pulse, Pulse):
+        if not isinstance(pulse, PulseMessage):
             return
         for head in heads:
             start_ns = pulse.start_mono_ns.get(head.sensor.name)

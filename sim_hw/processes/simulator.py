@@ -25,30 +25,30 @@ from typing import Any
 from sim_hw.devices.pps_source import PpsSource
 from sim_hw.devices.pulse_bus import Firing, PulseBus
 from sim_hw.faults.channel import BytesDamage, Channel, for_device
+from sim_hw.faults.faulty_line import FaultyWire, FaultyWorldClock
 from sim_hw.faults.plan import read_plan
-from sim_hw.faults.wire import FaultyWire, FaultyWorldClock
-from sim_hw.processes.clockwork import PROBES_NAME, RECEIVER_NAME, TRIGGER_NAME, devices_of
-from sim_hw.processes.ending import end_with_parent
+from sim_hw.processes.discrete_event_rig import PROBES_NAME, RECEIVER_NAME, TRIGGER_NAME, devices_of
 from sim_hw.processes.head_process import (
-    Begin,
+    FaultClockStart,
     FirstLine,
     HeadPlan,
-    Pulse,
-    Said,
+    PulseMessage,
     WorkerPlan,
+    WorkerStatus,
     run,
 )
-from sim_hw.receivers import kinds as receivers
-from sim_hw.receivers.kinds import Emulated
-from sim_hw.receivers.receiver import ReceiverState
-from sim_hw.world import laboratory, scene, world
+from sim_hw.processes.parent_death import terminate_with_parent
+from sim_hw.receivers import device_kinds as receivers
+from sim_hw.receivers.device_kinds import EmulatedDevice
+from sim_hw.receivers.emulated_receiver import ReceiverState
+from sim_hw.world import scene, sensor_calibration, world
 from sim_hw.world.seeding import random_stream
-from sim_hw.world.truth import Taken, TruthWriter
+from sim_hw.world.truth import SensorExposure, TruthWriter
 from sim_hw.world.world import World, WorldSettings
 from sim_hw.world.world_clock import WorldClock
 
-READY_WITHIN_S = 180.0
-WORKER_ENDS_WITHIN_S = 5.0
+READY_TIMEOUT_S = 180.0
+WORKER_STOP_TIMEOUT_S = 5.0
 REPORT_POLL_S = 0.5
 PROBE_DRIVERS = {"modbus": "modbus-rtu", "ascii": "ascii-line"}
 PROBE_OFFSET_SIGMA_C = 0.07
@@ -74,7 +74,7 @@ class SimulatorSettings:
     receiver: str = "ublox"
     probe: str = "modbus"
     has_pps: bool = False
-    is_still: bool = False
+    is_frozen: bool = False
     has_digests: bool = False
 
 
@@ -86,12 +86,12 @@ class Simulator:
         settings: SimulatorSettings,
         world_: World,
         clock: WorldClock,
-        tell: Callable[[str], None],
+        report: Callable[[str], None],
     ) -> None:
         self._settings = settings
         self._world = world_
         self._clock = clock
-        self._tell = tell
+        self._report = report
         context = multiprocessing.get_context("spawn")
         self._first_line_m = context.Value("d", math.nan)
         self._line = FirstLine(world_.flight, self._first_line_m)
@@ -111,7 +111,7 @@ class Simulator:
                 for_device(self.planned, name),
                 BytesDamage(),
                 seed=f"{world_.settings.seed}-{name}",
-                tell=functools.partial(_tell_of, tell, name),
+                report=functools.partial(_report_device_fault, report, name),
             )
             for name in (TRIGGER_NAME, RECEIVER_NAME, PROBES_NAME)
         }
@@ -139,15 +139,15 @@ class Simulator:
         """
         out = self._settings.out
         try:
-            self._tell("scene: reading or building it")
+            self._report("scene: reading or building it")
             built = scene.open_scene(self._world.scene_settings, self._settings.scene_cache)
         except (scene.SceneError, OSError) as error:
             raise SimulatorError(str(error)) from error
         for sentence in scene.describe(built):
-            self._tell(sentence)
-        laboratory.write_rig(Path(self._world.settings.rig_file), out / "calibration")
+            self._report(sentence)
+        sensor_calibration.write_rig(Path(self._world.settings.rig_file), out / "calibration")
         self._truth.write_parameters()
-        self._tell("heads: measuring their calibration and opening them")
+        self._report("heads: measuring their calibration and opening them")
         self._start_workers()
         self._bus.start()
         self._receiver.device.start()
@@ -163,14 +163,14 @@ class Simulator:
         self._closing.set()
         self._bus.close()
         if self._reports is not None:
-            self._reports.join(WORKER_ENDS_WITHIN_S)
+            self._reports.join(WORKER_STOP_TIMEOUT_S)
         for pipe in self._pipes:
             pipe.close()
         for worker in self._workers:
-            worker.join(WORKER_ENDS_WITHIN_S)
+            worker.join(WORKER_STOP_TIMEOUT_S)
             if worker.is_alive():
                 worker.kill()
-                worker.join(WORKER_ENDS_WITHIN_S)
+                worker.join(WORKER_STOP_TIMEOUT_S)
         self._receiver.device.close()
         self._probes.device.close()
         if self._pps is not None:
@@ -203,7 +203,7 @@ class Simulator:
             "faults": [asdict(fault) for fault in self.planned],
         }
 
-    def _faulty_receiver(self, port: Path) -> Emulated:
+    def _faulty_receiver(self, port: Path) -> EmulatedDevice:
         """The receiver, with a clock of its own: what goes in and out is in times of the world."""
         clock = FaultyWorldClock(self._clock, self._channels[RECEIVER_NAME])
         self._receiver_clock = clock
@@ -216,9 +216,9 @@ class Simulator:
         self._put_faults_on(receiver, RECEIVER_NAME)
         return receiver
 
-    def _put_faults_on(self, emulated: Emulated, name: str) -> None:
+    def _put_faults_on(self, emulated: EmulatedDevice, name: str) -> None:
         device = emulated.device
-        device.wire = FaultyWire(device, self._channels[name], emulated.cable)
+        device.byte_filter = FaultyWire(device, self._channels[name], emulated.cable)
 
     def _begin_faults(self, mono_ns: int) -> None:
         """Everything answers: the seconds of the faults count from now."""
@@ -226,7 +226,7 @@ class Simulator:
             channel.begin(mono_ns)
         with self._sending:
             for pipe in self._pipes:
-                pipe.send(Begin(mono_ns))
+                pipe.send(FaultClockStart(mono_ns))
 
     def _start_workers(self) -> None:
         sensors = self._world.rig.sensors
@@ -246,7 +246,7 @@ class Simulator:
                     )
                     for s in group
                 ),
-                is_still=self._settings.is_still,
+                is_frozen=self._settings.is_frozen,
                 sent=self._settings.out / "sent" if self._settings.has_digests else None,
             )
             ours, theirs = self._context.Pipe()
@@ -260,19 +260,19 @@ class Simulator:
             theirs.close()
             self._workers.append(worker)
             self._pipes.append(ours)
-        deadline_s = time.monotonic() + READY_WITHIN_S
+        deadline_s = time.monotonic() + READY_TIMEOUT_S
         for pipe in self._pipes:
             self._wait_until_ready(pipe, deadline_s)
 
     def _wait_until_ready(self, pipe: Connection, deadline_s: float) -> None:
         if not pipe.poll(max(0.0, deadline_s - time.monotonic())):
-            raise SimulatorError(f"heads were not ready within {READY_WITHIN_S:.0f} s")
+            raise SimulatorError(f"heads were not ready within {READY_TIMEOUT_S:.0f} s")
         try:
-            said = pipe.recv()
+            status = pipe.recv()
         except EOFError:
             raise SimulatorError("a process of heads died while it was opening them") from None
-        if not isinstance(said, Said) or said.event != "ready":
-            raise SimulatorError(f"heads cannot be opened: {said.sentence}")
+        if not isinstance(status, WorkerStatus) or status.event != "ready":
+            raise SimulatorError(f"heads cannot be opened: {status.sentence}")
 
     def _on_fire(self, firing: Firing) -> None:
         """Hand a firing of the bus to the heads of every cone."""
@@ -290,9 +290,9 @@ class Simulator:
         with self._sending:
             for pipe in self._pipes:
                 try:
-                    pipe.send(Pulse(firing.count, starts))
+                    pipe.send(PulseMessage(firing.count, starts))
                 except OSError:
-                    self._tell("a process of heads is gone; its pulses are lost")
+                    self._report("a process of heads is gone; its pulses are lost")
 
     def _follow_reports(self) -> None:
         """Strobes to the receiver, exposures to the truth, until the end."""
@@ -305,18 +305,18 @@ class Simulator:
                 except (EOFError, OSError):
                     open_pipes.remove(pipe)
                     if not self._closing.is_set():
-                        self._tell("a process of heads has ended")
+                        self._report("a process of heads has ended")
                     continue
-                if isinstance(message, Taken):
-                    self._taken(message)
+                if isinstance(message, SensorExposure):
+                    self._on_exposure(message)
             if not open_pipes:
                 self._closing.wait(REPORT_POLL_S)
             self._truth.write_overdue(self._line.flight)
 
-    def _taken(self, taken: Taken) -> None:
+    def _on_exposure(self, taken: SensorExposure) -> None:
         if taken.sensor == self._strobe:
-            self._receiver.device.mark(self._receiver_clock.own_gps_ns(taken.look.mid_gps_ns))
-        if not self._settings.is_still:
+            self._receiver.device.mark(self._receiver_clock.own_gps_ns(taken.parameters.mid_gps_ns))
+        if not self._settings.is_frozen:
             self._truth.add(taken, self._line.flight)
 
     def _receiver_state(self, gps_ns: int) -> ReceiverState:
@@ -349,8 +349,8 @@ class Simulator:
         return reading
 
 
-def _tell_of(tell: Callable[[str], None], device: str, sentence: str) -> None:
-    tell(f"{device}: {sentence}")
+def _report_device_fault(report: Callable[[str], None], device: str, sentence: str) -> None:
+    report(f"{device}: {sentence}")
 
 
 def head_addresses(world_: World, first_address: str) -> dict[str, str]:
@@ -371,36 +371,36 @@ def head_addresses(world_: World, first_address: str) -> dict[str, str]:
 def simulate(settings: SimulatorSettings, world_settings: WorldSettings, clock: WorldClock) -> int:
     """Run an emulated rig until a signal ends it or its parent dies; say "ready" on stdout."""
 
-    def tell(sentence: str) -> None:
+    def report(sentence: str) -> None:
         print(f"sim_hw: {sentence}", file=sys.stderr, flush=True)
 
-    ending = threading.Event()
+    stopping = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: ending.set())
-    end_with_parent()
+        signal.signal(number, lambda *_: stopping.set())
+    terminate_with_parent()
     settings.out.mkdir(parents=True, exist_ok=True)
     try:
-        simulator = Simulator(settings, World(world_settings), clock, tell)
+        simulator = Simulator(settings, World(world_settings), clock, report)
     except (SimulatorError, ValueError) as error:
         for sentence in str(error).splitlines():
-            tell(sentence)
+            report(sentence)
         return 1
-    describe(simulator, tell)
+    describe(simulator, report)
     try:
         simulator.start()
         print(json.dumps(simulator.ready_message()), flush=True)
-        while not ending.wait(1.0):
+        while not stopping.wait(1.0):
             pass
     except SimulatorError as error:
-        tell(str(error))
+        report(str(error))
         return 1
     finally:
         simulator.close()
     return 0
 
 
-def describe(simulator: Simulator, tell: Callable[[str], None]) -> None:
+def describe(simulator: Simulator, report: Callable[[str], None]) -> None:
     """Say what is going to be flown."""
     sentences: Sequence[str] = world.describe(simulator._world)
     for sentence in sentences:
-        tell(sentence)
+        report(sentence)

@@ -14,17 +14,23 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from sim_hw.devices.device_loop import DeviceLine, LineDevice
 from sim_hw.devices.pseudo_terminal import PseudoTerminal
-from sim_hw.devices.serving import Line, LineDevice
 from sim_hw.faults.catalogue import MARK, NAVIGATION
-from sim_hw.receivers.mavlink_messages import Listener, Received, by_number, message, messages_in
+from sim_hw.receivers.emulated_receiver import BOOT_NS, ReceiverAccuracy, ReceiverState
+from sim_hw.receivers.mavlink_messages import (
+    MavlinkStreamParser,
+    ReceivedMessage,
+    by_number,
+    message,
+    messages_in,
+)
 from sim_hw.receivers.nmea_sentences import GEOID_UNDULATION_M, course_deg, longitude_deg, speed_mps
-from sim_hw.receivers.receiver import BOOT_NS, ReceiverAccuracy, ReceiverState
 from sim_hw.receivers.utc_jitter import UtcErrors, UtcJitter
 from sim_hw.world.world_clock import (
     LEAP_SECONDS,
     NS_PER_S,
-    DeviceClock,
+    FreeRunningClock,
     WorldClock,
     unix_ns_from_gps_ns,
 )
@@ -68,7 +74,7 @@ STREAMS = {
 }
 """By MAV_DATA_STREAM; 0 is all."""
 TRIGGER_LATENCY_NS = 4_000_000
-FASTEST_NS = 1_000_000
+MIN_PERIOD_NS = 1_000_000
 REAL32 = 9
 """MAV_PARAM_TYPE of the parameters here."""
 
@@ -97,7 +103,7 @@ class MavlinkAutopilot(LineDevice):
         utc_jitter: UtcJitter | None = None,
         sends_angles: bool = False,
         first_edge_count: int = 0,
-        line: Line | None = None,
+        line: DeviceLine | None = None,
     ) -> None:
         super().__init__("mavlink-autopilot", line or PseudoTerminal())
         self._clock = clock
@@ -105,11 +111,11 @@ class MavlinkAutopilot(LineDevice):
         self._leap_seconds = leap_seconds
         self._accuracy = accuracy
         self._system = system
-        self._device_clock = DeviceClock(boot_ns, drift_ppm)
+        self._device_clock = FreeRunningClock(boot_ns, drift_ppm)
         self._triggers_in_utc = triggers_in_utc
         self.utc = UtcErrors(utc_jitter)
         self._default_hz = ANGLES_HZ if sends_angles else DEFAULT_HZ
-        self._listener = Listener()
+        self._listener = MavlinkStreamParser()
         self._sequence = 0
         self._lock = threading.Lock()
         self._edges: list[tuple[int, int]] = []
@@ -142,8 +148,8 @@ class MavlinkAutopilot(LineDevice):
 
     def parts(self, data: bytes) -> list[tuple[str, bytes]]:
         return [
-            (MARK if name == "CAMERA_TRIGGER" else NAVIGATION, said)
-            for name, said in messages_in(data)
+            (MARK if name == "CAMERA_TRIGGER" else NAVIGATION, received)
+            for name, received in messages_in(data)
         ]
 
     def restart_count(self) -> None:
@@ -157,7 +163,7 @@ class MavlinkAutopilot(LineDevice):
             self._edge_count = 0
             self._edges.clear()
         elapsed_ns = self._clock.gps_ns(now_ns) - self._clock.gps_ns_at_start
-        self._device_clock = DeviceClock(
+        self._device_clock = FreeRunningClock(
             self._device_clock.offset_ns - self._device_clock.device_ns(elapsed_ns),
             self._device_clock.drift_ppm,
         )
@@ -173,23 +179,23 @@ class MavlinkAutopilot(LineDevice):
                 due.append(self._clock.mono_ns(self._edges[0][0]) + TRIGGER_LATENCY_NS)
         return min(due, default=time.monotonic_ns() + NS_PER_S)
 
-    def speak(self) -> bytes:
+    def emit_due(self) -> bytes:
         now_ns = time.monotonic_ns()
-        return self.said_until(now_ns)
+        return self.messages_until(now_ns)
 
-    def said_until(self, mono_ns: int) -> bytes:
+    def messages_until(self, mono_ns: int) -> bytes:
         """Everything due at a moment of the host's clock."""
         gps_ns = self._clock.gps_ns(mono_ns)
-        said = b""
+        received = b""
         while (edge := self._take_edge(mono_ns)) is not None:
             self.counts["marks"] += 1
-            said += self._trigger(*edge)
+            received += self._trigger(*edge)
         for name, period_ns in self._period_ns.items():
             if period_ns and self._next_ns[name] <= mono_ns:
-                said += self._stream(name, gps_ns)
+                received += self._stream(name, gps_ns)
                 behind = (mono_ns - self._next_ns[name]) // period_ns
                 self._next_ns[name] += (behind + 1) * period_ns
-        return said
+        return received
 
     def _take_edge(self, mono_ns: int) -> tuple[int, int] | None:
         with self._lock:
@@ -199,7 +205,7 @@ class MavlinkAutopilot(LineDevice):
                 return None
             return self._edges.pop(0)
 
-    def _say(self, name: str, **values: Any) -> bytes:
+    def _pack_message(self, name: str, **values: Any) -> bytes:
         self._sequence += 1
         return message(name, self._sequence, self._system, AUTOPILOT_COMPONENT, **values)
 
@@ -209,12 +215,12 @@ class MavlinkAutopilot(LineDevice):
             stamp_ns += self.utc.error_ns(self.boot_ns(gps_ns))
         else:
             stamp_ns = self.boot_ns(gps_ns)
-        return self._say("CAMERA_TRIGGER", time_usec=stamp_ns // 1000, seq=number)
+        return self._pack_message("CAMERA_TRIGGER", time_usec=stamp_ns // 1000, seq=number)
 
     def _stream(self, name: str, gps_ns: int) -> bytes:
         boot_ns = self.boot_ns(gps_ns)
         if name == "HEARTBEAT":
-            return self._say(
+            return self._pack_message(
                 name,
                 type=FIXED_WING,
                 autopilot=PX4,
@@ -225,7 +231,7 @@ class MavlinkAutopilot(LineDevice):
         if name == "SYSTEM_TIME":
             unix_ns = unix_ns_from_gps_ns(gps_ns, self._leap_seconds)
             unix_ns += self.utc.error_ns(boot_ns)
-            return self._say(
+            return self._pack_message(
                 name, time_unix_usec=unix_ns // 1000, time_boot_ms=boot_ns // 1_000_000
             )
         state = self._state(gps_ns)
@@ -238,19 +244,19 @@ class MavlinkAutopilot(LineDevice):
             degrees = (state.roll_deg, state.pitch_deg, state.heading_deg)
             roll, pitch, yaw = (math.remainder(math.radians(angle), math.tau) for angle in degrees)
             spins = dict(zip(("rollspeed", "pitchspeed", "yawspeed"), rates, strict=True))
-            return self._say(
+            return self._pack_message(
                 name, time_boot_ms=boot_ns // 1_000_000, roll=roll, pitch=pitch, yaw=yaw, **spins
             )
         if name == "ATTITUDE_QUATERNION":
             q = quaternion(state)
             values = dict(zip(("q1", "q2", "q3", "q4"), q, strict=True))
             spins = dict(zip(("rollspeed", "pitchspeed", "yawspeed"), rates, strict=True))
-            return self._say(name, time_boot_ms=boot_ns // 1_000_000, **values, **spins)
+            return self._pack_message(name, time_boot_ms=boot_ns // 1_000_000, **values, **spins)
         return self._imu(state, rates, boot_ns)
 
     def _gps(self, state: ReceiverState, boot_ns: int) -> bytes:
         accuracy = self._accuracy
-        return self._say(
+        return self._pack_message(
             "GPS_RAW_INT",
             time_usec=boot_ns // 1000,
             fix_type=FIX_RTK_FIXED,
@@ -274,7 +280,7 @@ class MavlinkAutopilot(LineDevice):
         if self._height_at_start_m is None:
             self._height_at_start_m = state.height_m
         north, east, down = state.velocity_ned_mps
-        return self._say(
+        return self._pack_message(
             "GLOBAL_POSITION_INT",
             time_boot_ms=boot_ns // 1_000_000,
             lat=round(state.latitude_deg * 1e7),
@@ -291,7 +297,7 @@ class MavlinkAutopilot(LineDevice):
         """Of level flight without acceleration: gravity as the leaning body feels it."""
         roll, pitch = math.radians(state.roll_deg), math.radians(state.pitch_deg)
         all_of_accelerations_rates_and_temperature = 0x103F
-        return self._say(
+        return self._pack_message(
             "HIGHRES_IMU",
             time_usec=boot_ns // 1000,
             xacc=GRAVITY_MPS2 * math.sin(pitch),
@@ -313,51 +319,51 @@ class MavlinkAutopilot(LineDevice):
 
     # What it answers
 
-    def hear(self, data: bytes) -> bytes:
+    def on_received(self, data: bytes) -> bytes:
         now_ns = time.monotonic_ns()
-        return b"".join(self.answer(said, now_ns) for said in self._listener.feed(data))
+        return b"".join(self.answer(received, now_ns) for received in self._listener.feed(data))
 
-    def answer(self, said: Received, mono_ns: int) -> bytes:
+    def answer(self, received: ReceivedMessage, mono_ns: int) -> bytes:
         """The answer to one message heard at that moment of the host's clock; maybe nothing."""
         self.counts["messages_heard"] += 1
-        values = said.values
-        if said.name == "TIMESYNC":
+        values = received.values
+        if received.name == "TIMESYNC":
             if values["tc1"] != 0:
                 return b""
             self.counts["timesyncs"] += 1
             own_ns = self.boot_ns(self._clock.gps_ns(mono_ns))
-            return self._say("TIMESYNC", tc1=own_ns, ts1=values["ts1"])
+            return self._pack_message("TIMESYNC", tc1=own_ns, ts1=values["ts1"])
         if values.get("target_system", self._system) not in (0, self._system):
             return b""
-        if said.name == "COMMAND_LONG":
+        if received.name == "COMMAND_LONG":
             self.counts["commands"] += 1
-            return self._on_command(said, mono_ns)
-        if said.name == "REQUEST_DATA_STREAM":
+            return self._on_command(received, mono_ns)
+        if received.name == "REQUEST_DATA_STREAM":
             hertz = values["req_message_rate"] if values["start_stop"] else 0
             for name in self._default_hz.keys() & set(STREAMS.get(values["req_stream_id"], ())):
                 self._set_period(name, round(NS_PER_S / hertz) if hertz else 0, mono_ns)
             return b""
-        if said.name == "PARAM_REQUEST_LIST":
+        if received.name == "PARAM_REQUEST_LIST":
             return b"".join(self._parameter(name) for name in self.parameters)
-        if said.name in ("PARAM_REQUEST_READ", "PARAM_SET"):
-            return self._on_parameter(said)
+        if received.name in ("PARAM_REQUEST_READ", "PARAM_SET"):
+            return self._on_parameter(received)
         return b""
 
-    def _on_parameter(self, said: Received) -> bytes:
-        index = said.values.get("param_index", -1)
+    def _on_parameter(self, received: ReceivedMessage) -> bytes:
+        index = received.values.get("param_index", -1)
         if 0 <= index < len(self.parameters):
             name = list(self.parameters)[index]
         else:
-            name = said.values["param_id"].rstrip(b"\x00").decode("ascii", "replace")
+            name = received.values["param_id"].rstrip(b"\x00").decode("ascii", "replace")
         if name not in self.parameters:
             return b""
-        if said.name == "PARAM_SET" and math.isfinite(said.values["param_value"]):
-            self.parameters[name] = said.values["param_value"]
+        if received.name == "PARAM_SET" and math.isfinite(received.values["param_value"]):
+            self.parameters[name] = received.values["param_value"]
         return self._parameter(name)
 
     def _parameter(self, name: str) -> bytes:
         self.counts["parameters_sent"] += 1
-        return self._say(
+        return self._pack_message(
             "PARAM_VALUE",
             param_id=name.encode("ascii"),
             param_value=self.parameters[name],
@@ -366,8 +372,8 @@ class MavlinkAutopilot(LineDevice):
             param_index=list(self.parameters).index(name),
         )
 
-    def _on_command(self, said: Received, mono_ns: int) -> bytes:
-        number, first, second = (said.values[name] for name in ("command", "param1", "param2"))
+    def _on_command(self, received: ReceivedMessage, mono_ns: int) -> bytes:
+        number, first, second = (received.values[name] for name in ("command", "param1", "param2"))
         named = by_number().get(round(first)) if math.isfinite(first) else None
         name = "" if named is None else named.name
         extra = b""
@@ -383,7 +389,7 @@ class MavlinkAutopilot(LineDevice):
             result = ACCEPTED if name in self._default_hz else UNSUPPORTED
             if named is not None and result == ACCEPTED:
                 period_us = self._period_ns[name] // 1000
-                extra = self._say(
+                extra = self._pack_message(
                     "MESSAGE_INTERVAL", message_id=named.number, interval_us=period_us or -1
                 )
         elif number == REQUEST_MESSAGE and name == "AUTOPILOT_VERSION":
@@ -392,17 +398,17 @@ class MavlinkAutopilot(LineDevice):
             result, extra = ACCEPTED, self._stream(name, self._clock.gps_ns(mono_ns))
         else:
             result = UNSUPPORTED
-        acknowledgement = self._say(
+        acknowledgement = self._pack_message(
             "COMMAND_ACK",
             command=number,
             result=result,
-            target_system=said.system,
-            target_component=said.component,
+            target_system=received.system,
+            target_component=received.component,
         )
         return acknowledgement + extra
 
     def _version(self) -> bytes:
-        return self._say(
+        return self._pack_message(
             "AUTOPILOT_VERSION",
             capabilities=CAPABILITY_MAVLINK2_COMMAND_INT_FLOAT,
             flight_sw_version=0x010F00FF,
@@ -411,7 +417,7 @@ class MavlinkAutopilot(LineDevice):
         )
 
     def _set_period(self, name: str, period_ns: int, mono_ns: int) -> None:
-        self._period_ns[name] = max(period_ns, FASTEST_NS) if period_ns else 0
+        self._period_ns[name] = max(period_ns, MIN_PERIOD_NS) if period_ns else 0
         self._next_ns[name] = mono_ns
 
 

@@ -76,7 +76,7 @@ _FIELD = re.compile(r"(\w+)(?:\[(\d+)\])? (\w+)")
 
 
 @dataclass(frozen=True)
-class Field:
+class MessageField:
     """One field: `length` is that of an array, 0 for a single value."""
 
     kind: str
@@ -93,12 +93,12 @@ class Field:
 
 
 @dataclass(frozen=True)
-class Definition:
+class MessageDefinition:
     """A message: fields in their order on the wire, and what its definition adds to its CRC."""
 
     number: int
     name: str
-    fields: tuple[Field, ...]
+    fields: tuple[MessageField, ...]
     crc_extra: int
 
     @functools.cached_property
@@ -132,7 +132,7 @@ class Definition:
 
 
 @dataclass(frozen=True)
-class Received:
+class ReceivedMessage:
     """A message somebody sent."""
 
     name: str
@@ -151,7 +151,7 @@ def x25(data: bytes, crc: int = 0xFFFF) -> int:
 
 
 @functools.cache
-def definitions() -> dict[str, Definition]:
+def definitions() -> dict[str, MessageDefinition]:
     """Every message of `DEFINITIONS` by name."""
     found = {}
     for text in re.split(r"\n(?=\d)", DEFINITIONS.strip()):
@@ -166,12 +166,12 @@ def definitions() -> dict[str, Definition]:
             if field.length:
                 seed = x25(bytes((field.length,)), seed)
         extra = seed & 0xFF ^ seed >> 8
-        found[name] = Definition(int(number), name, (*ordered, *_fields(extensions)), extra)
+        found[name] = MessageDefinition(int(number), name, (*ordered, *_fields(extensions)), extra)
     return found
 
 
 @functools.cache
-def by_number() -> dict[int, Definition]:
+def by_number() -> dict[int, MessageDefinition]:
     return {definition.number: definition for definition in definitions().values()}
 
 
@@ -197,13 +197,13 @@ def messages_in(data: bytes) -> list[tuple[str, bytes]]:
     return found
 
 
-class Listener:
+class MavlinkStreamParser:
     """Takes messages of version 2 out of what a host writes; others and damage are skipped."""
 
     def __init__(self) -> None:
         self._buffer = b""
 
-    def feed(self, data: bytes) -> list[Received]:
+    def feed(self, data: bytes) -> list[ReceivedMessage]:
         buffer = self._buffer + data
         found = []
         while (start := buffer.find(MAGIC)) >= 0:
@@ -212,8 +212,8 @@ class Listener:
                 break
             length, flags = buffer[1], buffer[2]
             end = _HEADER_NBYTES + length
-            whole = end + _CRC_NBYTES + (_SIGNATURE_NBYTES if flags & _SIGNED else 0)
-            if len(buffer) < whole:
+            message_end = end + _CRC_NBYTES + (_SIGNATURE_NBYTES if flags & _SIGNED else 0)
+            if len(buffer) < message_end:
                 break
             definition = by_number().get(int.from_bytes(buffer[7:10], "little"))
             checked = None
@@ -224,13 +224,15 @@ class Listener:
                 buffer = buffer[1:]
                 continue
             values = definition.values(buffer[_HEADER_NBYTES:end])
-            found.append(Received(definition.name, buffer[5], buffer[6], values))
-            buffer = buffer[whole:]
+            found.append(ReceivedMessage(definition.name, buffer[5], buffer[6], values))
+            buffer = buffer[message_end:]
         else:
             buffer = b""
         self._buffer = buffer
         return found
 
 
-def _fields(text: str) -> tuple[Field, ...]:
-    return tuple(Field(kind, name, int(length or 0)) for kind, length, name in _FIELD.findall(text))
+def _fields(text: str) -> tuple[MessageField, ...]:
+    return tuple(
+        MessageField(kind, name, int(length or 0)) for kind, length, name in _FIELD.findall(text)
+    )

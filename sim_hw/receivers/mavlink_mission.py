@@ -17,17 +17,17 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from sim_hw.receivers.mavlink_messages import Listener, message
+from sim_hw.receivers.mavlink_messages import MavlinkStreamParser, message
 
 HEADER = "QGC WPL 110"
 WAYPOINT = 16
 CAMERA_COMMANDS = (206, 2000, 2001)
 """Trigger distance, start and stop of capture."""
 AUTOPILOT_COMPONENT, CAMERA_COMPONENT = 1, 100
-LOOK_S = 0.02
+POSITION_INTERVAL_S = 0.02
 METRES_PER_DEGREE = 111_320.0
 
-Place = tuple[float, float]
+LatLon = tuple[float, float]
 """Latitude and longitude, degrees."""
 
 
@@ -39,7 +39,7 @@ class MissionItem:
     parameters: tuple[float, ...]
 
     @property
-    def place(self) -> Place:
+    def place(self) -> LatLon:
         return self.parameters[4], self.parameters[5]
 
 
@@ -67,7 +67,7 @@ class MissionAutopilot:
     def __init__(
         self,
         items: Sequence[MissionItem],
-        place: Callable[[int], Place],
+        place: Callable[[int], LatLon],
         camera: tuple[str, int],
         *,
         system: int = 1,
@@ -77,9 +77,9 @@ class MissionAutopilot:
         self._camera = camera
         self._system = system
         self._sequence = 0
-        self._before: Place | None = None
+        self._before: LatLon | None = None
         self._closing = threading.Event()
-        self._listener = Listener()
+        self._listener = MavlinkStreamParser()
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         self._thread = threading.Thread(target=self._fly, name="autopilot", daemon=True)
@@ -96,11 +96,11 @@ class MissionAutopilot:
         self._socket.close()
 
     def _fly(self) -> None:
-        while not self._closing.wait(LOOK_S):
-            self._look(time.monotonic_ns())
-            self._hear()
+        while not self._closing.wait(POSITION_INTERVAL_S):
+            self._update_position(time.monotonic_ns())
+            self._receive()
 
-    def _look(self, mono_ns: int) -> None:
+    def _update_position(self, mono_ns: int) -> None:
         """Go past the waypoint, if it lies behind by now, and do what stands behind it."""
         if not self._items or self._before is None:
             return
@@ -112,7 +112,7 @@ class MissionAutopilot:
                 return
             self._before = item.place
             self.reached.append((index, mono_ns))
-            self._say("MISSION_ITEM_REACHED", seq=index)
+            self._send_message("MISSION_ITEM_REACHED", seq=index)
         self._items.popleft()
         while self._items and self._items[0][1].command in CAMERA_COMMANDS:
             _, todo = self._items.popleft()
@@ -121,24 +121,24 @@ class MissionAutopilot:
     def _command(self, item: MissionItem) -> None:
         parameters = {f"param{k}": value for k, value in enumerate(item.parameters, start=1)}
         target = {"target_system": self._system, "target_component": CAMERA_COMPONENT}
-        self._say("COMMAND_LONG", command=item.command, **target, **parameters)
+        self._send_message("COMMAND_LONG", command=item.command, **target, **parameters)
 
-    def _say(self, name: str, **values: float) -> None:
+    def _send_message(self, name: str, **values: float) -> None:
         self._sequence += 1
         data = message(name, self._sequence, self._system, AUTOPILOT_COMPONENT, **values)
         self._socket.sendto(data, self._camera)
 
-    def _hear(self) -> None:
+    def _receive(self) -> None:
         try:
             while data := self._socket.recv(2048):
-                for said in self._listener.feed(data):
-                    if said.name == "COMMAND_ACK":
-                        self.results.append(int(said.values["result"]))
+                for received in self._listener.feed(data):
+                    if received.name == "COMMAND_ACK":
+                        self.results.append(int(received.values["result"]))
         except (BlockingIOError, ConnectionRefusedError):
             return
 
 
-def _metres(start: Place, end: Place) -> tuple[float, float]:
+def _metres(start: LatLon, end: LatLon) -> tuple[float, float]:
     """North and east from one place to another nearby."""
     north_m = (end[0] - start[0]) * METRES_PER_DEGREE
     east_m = (end[1] - start[1]) * METRES_PER_DEGREE * math.cos(math.radians(start[0]))

@@ -5,8 +5,8 @@ What its sentences look like is in `nmea_sentences`; epochs and edges are those 
 
 from __future__ import annotations
 
-from sim_hw.receivers import nmea_sentences as said
-from sim_hw.receivers.receiver import Edge, EmulatedReceiver
+from sim_hw.receivers import nmea_sentences as sentences
+from sim_hw.receivers.emulated_receiver import Edge, EmulatedReceiver
 
 SATELLITES = 17
 RTK = 4
@@ -22,21 +22,21 @@ class NmeaReceiver(EmulatedReceiver):
     def epoch_bytes(self, epoch_gps_ns: int) -> bytes:
         state, leap_seconds, accuracy = self.state(epoch_gps_ns), self.leap_seconds, self.accuracy
         parts = [
-            said.rmc(epoch_gps_ns, state, leap_seconds),
-            said.gga(epoch_gps_ns, state, SATELLITES, leap_seconds, quality=RTK),
-            said.gst(epoch_gps_ns, accuracy.horizontal_m, accuracy.vertical_m, leap_seconds),
-            said.vtg(state),
-            said.hdt(state),
-            said.pashr(
+            sentences.rmc(epoch_gps_ns, state, leap_seconds),
+            sentences.gga(epoch_gps_ns, state, SATELLITES, leap_seconds, quality=RTK),
+            sentences.gst(epoch_gps_ns, accuracy.horizontal_m, accuracy.vertical_m, leap_seconds),
+            sentences.vtg(state),
+            sentences.hdt(state),
+            sentences.pashr(
                 epoch_gps_ns, state, accuracy.roll_pitch_deg, accuracy.heading_deg, leap_seconds
             ),
         ]
         if self.is_first_of_second(epoch_gps_ns):
-            parts.append(said.zda(epoch_gps_ns, leap_seconds))
+            parts.append(sentences.zda(epoch_gps_ns, leap_seconds))
         return b"".join(parts)
 
     def event_bytes(self, edge: Edge) -> bytes:
         if not edge.is_rising:
             return b""
         self.counts["mark_messages"] += 1
-        return said.ptnl_event(edge.gps_ns, edge.number, self.leap_seconds)
+        return sentences.ptnl_event(edge.gps_ns, edge.number, self.leap_seconds)

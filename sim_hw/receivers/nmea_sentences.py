@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
-from sim_hw.receivers.receiver import ReceiverState
+from sim_hw.receivers.emulated_receiver import ReceiverState
 from sim_hw.world.world_clock import (
     LEAP_SECONDS,
     NS_PER_S,
@@ -25,7 +25,7 @@ _NS_PER_US = 1_000
 
 
 @dataclass(frozen=True)
-class UtcFields:
+class BrokenDownUtc:
     """UTC as u-blox splits it: rounded to 10 ms, and the signed rest in `nano`.
 
     Source: interface description, "UTC representation": nano lies in -5,000,000 .. 994,999,999.
@@ -41,13 +41,13 @@ class UtcFields:
     centisecond: int
 
 
-def utc_fields(gps_ns: int, leap_seconds: int = LEAP_SECONDS) -> UtcFields:
+def broken_down_utc(gps_ns: int, leap_seconds: int = LEAP_SECONDS) -> BrokenDownUtc:
     """Split a GPS instant into UTC."""
     unix_ns = unix_ns_from_gps_ns(gps_ns, leap_seconds)
     rounded_cs = (unix_ns + _NS_PER_CS // 2) // _NS_PER_CS
     second, centisecond = divmod(rounded_cs, 100)
     utc = datetime.fromtimestamp(second, UTC)
-    return UtcFields(
+    return BrokenDownUtc(
         utc.year,
         utc.month,
         utc.day,
@@ -71,7 +71,7 @@ def gga(
     gps_ns: int, state: ReceiverState, satellites: int, leap_seconds: int, *, quality: int = 1
 ) -> bytes:
     """GGA: fix, position and height above the geoid."""
-    utc = utc_fields(gps_ns, leap_seconds)
+    utc = broken_down_utc(gps_ns, leap_seconds)
     return nmea(
         f"GNGGA,{_clock(utc)},{_position(state)},{quality},{min(satellites, 12):02d},0.80,"
         f"{state.height_m - GEOID_UNDULATION_M:.1f},M,{GEOID_UNDULATION_M:.1f},M,,"
@@ -80,7 +80,7 @@ def gga(
 
 def rmc(gps_ns: int, state: ReceiverState, leap_seconds: int) -> bytes:
     """RMC: position, speed over ground and date."""
-    utc = utc_fields(gps_ns, leap_seconds)
+    utc = broken_down_utc(gps_ns, leap_seconds)
     return nmea(
         f"GNRMC,{_clock(utc)},A,{_position(state)},{speed_mps(state) * 3600.0 / 1852.0:.3f},"
         f"{course_deg(state):.2f},{utc.day:02d}{utc.month:02d}{utc.year % 100:02d},,,A"
@@ -89,7 +89,7 @@ def rmc(gps_ns: int, state: ReceiverState, leap_seconds: int) -> bytes:
 
 def zda(gps_ns: int, leap_seconds: int) -> bytes:
     """ZDA: time and date with its century; local zone offset zero."""
-    utc = utc_fields(gps_ns, leap_seconds)
+    utc = broken_down_utc(gps_ns, leap_seconds)
     return nmea(f"GNZDA,{_clock(utc)},{utc.day:02d},{utc.month:02d},{utc.year:04d},00,00")
 
 
@@ -110,7 +110,7 @@ def gst(gps_ns: int, horizontal_m: float, vertical_m: float, leap_seconds: int) 
     """GST: standard deviations of north, east and height; the error ellipse is a circle."""
     axis = horizontal_m / math.sqrt(2.0)
     return nmea(
-        f"GNGST,{_clock(utc_fields(gps_ns, leap_seconds))},{axis:.3f},{axis:.3f},{axis:.3f},0.0,"
+        f"GNGST,{_clock(broken_down_utc(gps_ns, leap_seconds))},{axis:.3f},{axis:.3f},{axis:.3f},0.0,"
         f"{axis:.3f},{axis:.3f},{vertical_m:.3f}"
     )
 
@@ -124,7 +124,7 @@ def pashr(
 ) -> bytes:
     """PASHR: heading, roll and pitch with their standard deviations, of inertial systems."""
     return nmea(
-        f"PASHR,{_clock(utc_fields(gps_ns, leap_seconds))},{state.heading_deg % 360.0:.3f},T,"
+        f"PASHR,{_clock(broken_down_utc(gps_ns, leap_seconds))},{state.heading_deg % 360.0:.3f},T,"
         f"{state.roll_deg:+.3f},{state.pitch_deg:+.3f},+0.00,"
         f"{tilt_sigma_deg:.3f},{tilt_sigma_deg:.3f},{heading_sigma_deg:.3f},2,1"
     )
@@ -161,7 +161,7 @@ def longitude_deg(degrees: float) -> float:
     return degrees if -180.0 <= degrees < 180.0 else (degrees + 180.0) % 360.0 - 180.0
 
 
-def _clock(utc: UtcFields) -> str:
+def _clock(utc: BrokenDownUtc) -> str:
     return f"{utc.hour:02d}{utc.minute:02d}{utc.second:02d}.{utc.centisecond:02d}"
 
 
@@ -176,5 +176,5 @@ def _position(state: ReceiverState) -> str:
 def _degrees_minutes(degrees: float, width: int) -> str:
     # In units of the last digit first, so that 59.999996 minutes become a whole degree.
     units = round(abs(degrees) * 60.0 * 1e5)
-    whole, rest = divmod(units, 60 * 100_000)
-    return f"{whole:0{width}d}{rest / 1e5:08.5f}"
+    degrees_minutes, rest = divmod(units, 60 * 100_000)
+    return f"{degrees_minutes:0{width}d}{rest / 1e5:08.5f}"

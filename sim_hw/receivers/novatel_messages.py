@@ -10,8 +10,8 @@ import math
 import struct
 from datetime import UTC, datetime
 
+from sim_hw.receivers.emulated_receiver import ReceiverAccuracy, ReceiverState
 from sim_hw.receivers.nmea_sentences import GEOID_UNDULATION_M, course_deg, longitude_deg, speed_mps
-from sim_hw.receivers.receiver import ReceiverAccuracy, ReceiverState
 from sim_hw.world.world_clock import NS_PER_S, gps_week_and_tow_ns, unix_ns_from_gps_ns
 
 HEADER_NBYTES = 28

@@ -6,7 +6,7 @@ What its logs look like is in `novatel_messages`; epochs and edges are those of 
 from __future__ import annotations
 
 from sim_hw.receivers import novatel_messages as oem7
-from sim_hw.receivers.receiver import Edge, EmulatedReceiver
+from sim_hw.receivers.emulated_receiver import Edge, EmulatedReceiver
 
 SATELLITES = 18
 CLOCK_OFFSET_MAX_NS = 200

@@ -10,8 +10,8 @@ import math
 import struct
 from datetime import UTC, datetime
 
+from sim_hw.receivers.emulated_receiver import ReceiverAccuracy, ReceiverState
 from sim_hw.receivers.nmea_sentences import GEOID_UNDULATION_M, course_deg, longitude_deg
-from sim_hw.receivers.receiver import ReceiverAccuracy, ReceiverState
 from sim_hw.world.world_clock import NS_PER_S, gps_week_and_tow_ns, unix_ns_from_gps_ns
 
 DO_NOT_USE = -2e10
@@ -146,17 +146,17 @@ def receiver_time(rx_ns: int, leap_seconds: int) -> bytes:
 
 def ext_event(rx_ns: int, bias_ns: int, *, source: int, polarity: int) -> bytes:
     """ExtEvent (5924), revision 1: an edge at receiver time `rx_ns`, to parts of a nanosecond."""
-    whole_ns = rx_ns // _NS_PER_MS * _NS_PER_MS
+    integer_ns = rx_ns // _NS_PER_MS * _NS_PER_MS
     body = struct.pack(
-        "<BBfdH", source, polarity, (rx_ns - whole_ns) / NS_PER_S, bias_ns / NS_PER_S, 0
+        "<BBfdH", source, polarity, (rx_ns - integer_ns) / NS_PER_S, bias_ns / NS_PER_S, 0
     )
-    return block(5924, 1, whole_ns, body)
+    return block(5924, 1, integer_ns, body)
 
 
 def ext_event_pvt_geodetic(
     rx_ns: int, bias_ns: int, state: ReceiverState, accuracy: ReceiverAccuracy, satellites: int
 ) -> bytes:
     """ExtEventPVTGeodetic (4038): a PVTGeodetic of the edge, stamped as its ExtEvent."""
-    whole_ns = rx_ns // _NS_PER_MS * _NS_PER_MS
-    same = pvt_geodetic(whole_ns, bias_ns, state, accuracy, satellites)
-    return block(4038, 2, whole_ns, same[14:])
+    integer_ns = rx_ns // _NS_PER_MS * _NS_PER_MS
+    same = pvt_geodetic(integer_ns, bias_ns, state, accuracy, satellites)
+    return block(4038, 2, integer_ns, same[14:])

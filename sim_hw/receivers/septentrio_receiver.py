@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from sim_hw.receivers import septentrio_messages as sbf
-from sim_hw.receivers.receiver import Edge, EmulatedReceiver
+from sim_hw.receivers.emulated_receiver import Edge, EmulatedReceiver
 
 SATELLITES = 24
 EVENT_A = 1
@@ -50,7 +50,7 @@ class SeptentrioReceiver(EmulatedReceiver):
         bias_ns = -self.bias_ns(edge.gps_ns)
         rx_ns = edge.gps_ns + bias_ns
         self.counts["mark_messages"] += 1
-        said = sbf.ext_event(rx_ns, bias_ns, source=EVENT_A, polarity=polarity)
-        return said + sbf.ext_event_pvt_geodetic(
+        received = sbf.ext_event(rx_ns, bias_ns, source=EVENT_A, polarity=polarity)
+        return received + sbf.ext_event_pvt_geodetic(
             rx_ns, bias_ns, self.state(edge.gps_ns), self.accuracy, SATELLITES
         )

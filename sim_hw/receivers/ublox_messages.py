@@ -10,14 +10,14 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from sim_hw.receivers.emulated_receiver import ReceiverAccuracy, ReceiverState
 from sim_hw.receivers.nmea_sentences import (
     GEOID_UNDULATION_M,
+    broken_down_utc,
     course_deg,
     longitude_deg,
     speed_mps,
-    utc_fields,
 )
-from sim_hw.receivers.receiver import ReceiverAccuracy, ReceiverState
 from sim_hw.world.world_clock import NS_PER_WEEK, gps_week_and_tow_ns
 
 _NS_PER_MS = 1_000_000
@@ -58,7 +58,7 @@ def nav_pvt(
     leap_seconds: int,
 ) -> bytes:
     """UBX-NAV-PVT, 92 bytes: position, velocity, time."""
-    utc = utc_fields(gps_ns, leap_seconds)
+    utc = broken_down_utc(gps_ns, leap_seconds)
     north, east, down = state.velocity_ned_mps
     valid_date_time_resolved = 0x07
     fix_3d = 3

@@ -9,14 +9,14 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 from sim_hw.faults.catalogue import MARK, NAVIGATION
-from sim_hw.receivers.nmea_sentences import gga, rmc
-from sim_hw.receivers.receiver import (
+from sim_hw.receivers.emulated_receiver import (
     LATENCY_NS,
     STROBE_WIDTH_NS,
     EmulatedReceiver,
     ReceiverAccuracy,
     ReceiverState,
 )
+from sim_hw.receivers.nmea_sentences import gga, rmc
 from sim_hw.receivers.ublox_messages import (
     Satellite,
     mon_ver,
@@ -60,7 +60,7 @@ class UbloxReceiver(EmulatedReceiver):
     epoch after them, the last edge of each kind only. Whatever the host writes is swallowed.
     """
 
-    tells_events_at_once: ClassVar[bool] = False
+    sends_events_immediately: ClassVar[bool] = False
     clock_bias_max_ns: ClassVar[int] = CLOCK_BIAS_MAX_NS
 
     def __init__(
@@ -73,7 +73,7 @@ class UbloxReceiver(EmulatedReceiver):
     ) -> None:
         super().__init__(clock, state, **settings)
         self._chatter = chatter
-        self._has_said_its_version = False
+        self._has_sent_version = False
         self._rising_count = self._edge_count
         self._last_rising_ns = 0
         self._last_falling_ns = 0
@@ -97,8 +97,8 @@ class UbloxReceiver(EmulatedReceiver):
             parts.append(nav_timels(epoch_gps_ns, leap_seconds))
         if self._chatter and is_first_of_second:
             parts.append(nav_sat(epoch_gps_ns, _SATELLITES))
-        if self._chatter and not self._has_said_its_version:
-            self._has_said_its_version = True
+        if self._chatter and not self._has_sent_version:
+            self._has_sent_version = True
             parts.append(
                 mon_ver("EXT CORE 1.00 (emulated)", "00190000", ("PROTVER=33.20", "MOD=EMULATED"))
             )

@@ -13,16 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_hw.world import spline
-from sim_hw.world.grounds import rough
+from sim_hw.world.ground_types import rough
 from sim_hw.world.seeding import random_stream
 
 Array = NDArray[np.float64]
 
 SIDE = 2048
 """Samples of the fields; a cloud is surrounded by clear air to their edge."""
-SHARE_OF_HEIGHT = 0.5
+HEIGHT_FRACTION = 0.5
 """How high it hangs, as a share of the flying height."""
-WHITE = 1.05
+CLOUD_REFLECTANCE = 1.05
 """Radiance of a sunlit cloud against a landscape's white."""
 TONE = 0.06
 SOFTNESS = 0.25
@@ -75,7 +75,7 @@ def cloud_over(
         size_m: across and along track.
     """
     random = random_stream(seed, "cloud")
-    nearer = 1.0 - SHARE_OF_HEIGHT
+    nearer = 1.0 - HEIGHT_FRACTION
     sample = gsd_m * 2.0
     r, c = np.mgrid[0:SIDE, 0:SIDE] - (SIDE - 1) / 2
     across, along = (nearer * size / 2 / sample for size in size_m)
@@ -86,12 +86,12 @@ def cloud_over(
     opacity[np.maximum(np.abs(c) / across, np.abs(r) / along) > 1.8] = 0.0
     tone = rough((SIDE, SIDE), random, exponent=11 / 6, waves_px=(6.0, 600.0))
     return Cloud(
-        height_m=SHARE_OF_HEIGHT * flying_height_m,
+        height_m=HEIGHT_FRACTION * flying_height_m,
         right_m=nearer * place_m[0],
         along_m=nearer * place_m[1],
         sample_m=sample,
         opacity=_coefficients(opacity),
-        radiance=_coefficients(WHITE * (1.0 + TONE * tone)),
+        radiance=_coefficients(CLOUD_REFLECTANCE * (1.0 + TONE * tone)),
     )
 
 

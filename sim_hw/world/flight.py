@@ -46,7 +46,7 @@ class FlightPlan:
     drift_correction: float = 0.8
     attitude_rms_deg: float = 0.2
     rate_rms_dps: float = 0.3
-    wander_rms_m: float = 1.2
+    track_deviation_rms_m: float = 1.2
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Pose:
 
 
 @dataclass(frozen=True)
-class Tremor:
+class RandomMotion:
     """A smooth random motion as a sum of sinusoids; its rates are known exactly."""
 
     amplitude: Matrix
@@ -90,7 +90,7 @@ class Tremor:
 
 
 @dataclass(frozen=True)
-class Flight:
+class SimulatedFlight:
     """A plan flown in one certain way.
 
     `epoch_gps_ns` is when the aircraft passes the origin. The first line begins
@@ -102,12 +102,12 @@ class Flight:
     seed: int
     epoch_gps_ns: int
     first_line_at_m: float = 0.0
-    _motion: dict[str, Tremor] = field(init=False, repr=False, compare=False)
+    _motion: dict[str, RandomMotion] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         plan = self.plan
         motion = {
-            name: attitude_tremor(
+            name: random_attitude_motion(
                 random_stream(self.seed, "attitude", name),
                 rms=math.radians(plan.attitude_rms_deg),
                 rate_rms=math.radians(plan.rate_rms_dps),
@@ -115,10 +115,12 @@ class Flight:
             for name in ("roll", "pitch", "heading")
         }
         for name in ("east", "north", "up"):
-            motion[name] = wander(random_stream(self.seed, "wander", name), rms=plan.wander_rms_m)
+            motion[name] = random_track_deviation(
+                random_stream(self.seed, "wander", name), rms=plan.track_deviation_rms_m
+            )
         object.__setattr__(self, "_motion", motion)
 
-    def beginning_first_line_at(self, distance_m: float) -> Flight:
+    def beginning_first_line_at(self, distance_m: float) -> SimulatedFlight:
         """The same flight, its first line begun at that distance flown."""
         return replace(self, first_line_at_m=distance_m)
 
@@ -197,7 +199,9 @@ class Flight:
         return np.asarray(ecef_from_enu_rotation(latitude, longitude).T @ ecef)
 
 
-def attitude_tremor(random: np.random.Generator, *, rms: float, rate_rms: float) -> Tremor:
+def random_attitude_motion(
+    random: np.random.Generator, *, rms: float, rate_rms: float
+) -> RandomMotion:
     """Residual motion of a stabilised mount with the given rms of angle and of angular rate.
 
     Slow terms (0.02 to 0.1 Hz) carry the angle, fast ones (0.3 to 1.5 Hz) the rate.
@@ -211,17 +215,17 @@ def attitude_tremor(random: np.random.Generator, *, rms: float, rate_rms: float)
     left_for_slow = max(rms**2 - float(np.sum(fast_amplitude**2) / 2), 0.0)
     slow_amplitude *= math.sqrt(left_for_slow) / rms if rms > 0 else 0.0
     omega = np.concatenate([slow, fast])
-    return Tremor(
+    return RandomMotion(
         amplitude=np.concatenate([slow_amplitude, fast_amplitude]),
         omega=omega,
         phase=random.uniform(0, 2 * math.pi, omega.size),
     )
 
 
-def wander(random: np.random.Generator, *, rms: float) -> Tremor:
+def random_track_deviation(random: np.random.Generator, *, rms: float) -> RandomMotion:
     """Slow departure from the planned path, periods of 20 to 90 s."""
     omega = 2 * math.pi / np.geomspace(20.0, 90.0, 5) * random.uniform(0.9, 1.1, 5)
-    return Tremor(
+    return RandomMotion(
         amplitude=rms * math.sqrt(2 / 5) * np.ones(5),
         omega=omega,
         phase=random.uniform(0, 2 * math.pi, 5),
@@ -244,21 +248,21 @@ def path_point(plan: FlightPlan, distance_m: float) -> tuple[float, float, float
     away = math.acos(spacing / (2 * radius)) if spacing < 2 * radius else 0.0
     radius = max(radius, spacing / 2)
     overshoot = 2 * radius * math.sin(away)
-    turn_length = radius * (math.pi + 2 * away)
-    period = turn_length + length + overshoot
-    turn = int((distance_m - length) // period)
-    rest = (distance_m - length) - turn * period
-    if rest < turn_length:
+    turn_length_m = radius * (math.pi + 2 * away)
+    period = turn_length_m + length + overshoot
+    turn_index = int((distance_m - length) // period)
+    rest = (distance_m - length) - turn_index * period
+    if rest < turn_length_m:
         right, along, course, bank = _turn_point(plan, radius, away, rest)
     else:
         right, along, course, bank = (
             spacing,
-            overshoot - (rest - turn_length),
+            overshoot - (rest - turn_length_m),
             math.pi,
             0.0,
         )
-    right += turn * spacing
-    if turn % 2 == 0:
+    right += turn_index * spacing
+    if turn_index % 2 == 0:
         return right, length + along, course, bank
     return right, -along, math.pi - course, -bank
 

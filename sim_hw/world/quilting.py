@@ -23,13 +23,13 @@ OVERLAP_PX = 48
 THUMB = 16
 """Candidates are compared on thumbnails reduced by this factor; it divides the two above."""
 CANDIDATES = 160
-KEEP_APART = 2
+MIN_REPEAT_DISTANCE = 2
 """A cell is not used again, in whatever orientation, within this many patches."""
 ORIENTATIONS = 8
 
 
 @dataclass(frozen=True)
-class Patch:
+class ImagePatch:
     """Where a patch comes from: source picture, upper left corner of its cell, orientation 0-7."""
 
     source: int
@@ -46,17 +46,17 @@ class Patch:
 class Quilt:
     """A plan of patches, row by row. `reused` counts patches that had to be taken a second time."""
 
-    rows: tuple[tuple[Patch, ...], ...]
+    rows: tuple[tuple[ImagePatch, ...], ...]
     reused: int
 
 
 def oriented(picture: NDArray[np.generic], orientation: int) -> NDArray[np.generic]:
     """One of the eight orientations of a square: quarter turns, then mirrored."""
-    turned = np.rot90(picture, orientation % 4)
-    return turned[:, ::-1] if orientation >= 4 else turned
+    rotated = np.rot90(picture, orientation % 4)
+    return rotated[:, ::-1] if orientation >= 4 else rotated
 
 
-def patches_of(sources: Sequence[Picture]) -> list[Patch]:
+def patches_of(sources: Sequence[Picture]) -> list[ImagePatch]:
     """All patches that the sources hold: cells do not overlap."""
     found = []
     for index, source in enumerate(sources):
@@ -67,7 +67,7 @@ def patches_of(sources: Sequence[Picture]) -> list[Patch]:
             )
         for row in range(0, height - PATCH_PX + 1, PATCH_PX):
             for column in range(0, width - PATCH_PX + 1, PATCH_PX):
-                found += [Patch(index, row, column, o) for o in range(ORIENTATIONS)]
+                found += [ImagePatch(index, row, column, o) for o in range(ORIENTATIONS)]
     return found
 
 
@@ -92,7 +92,8 @@ def plan_quilt(
             elif reused:
                 reused += 1
             near = chosen[
-                max(0, r - KEEP_APART) : r + 1, max(0, c - KEEP_APART) : c + KEEP_APART + 1
+                max(0, r - MIN_REPEAT_DISTANCE) : r + 1,
+                max(0, c - MIN_REPEAT_DISTANCE) : c + MIN_REPEAT_DISTANCE + 1,
             ]
             allowed = free & ~np.isin(cells, cells[near[near >= 0]])
             pool = np.flatnonzero(allowed if allowed.any() else free)
@@ -111,7 +112,7 @@ def plan_quilt(
     )
 
 
-def sew(sources: Sequence[Picture], quilt: Quilt, *, height_px: int, width_px: int) -> Picture:
+def assemble(sources: Sequence[Picture], quilt: Quilt, *, height_px: int, width_px: int) -> Picture:
     """Lay the patches of a plan out and cut them together, shape (height, width, bands)."""
     step = PATCH_PX - OVERLAP_PX
     rows, columns = len(quilt.rows), len(quilt.rows[0])
@@ -172,7 +173,9 @@ def _difference(a: Picture, b: Picture) -> NDArray[np.float32]:
     return np.asarray(np.einsum("ijk,ijk->ij", difference, difference), dtype=np.float32)
 
 
-def _edges(sources: Sequence[Picture], patches: Sequence[Patch]) -> dict[str, NDArray[np.float32]]:
+def _edges(
+    sources: Sequence[Picture], patches: Sequence[ImagePatch]
+) -> dict[str, NDArray[np.float32]]:
     """The four overlap strips of every patch on thumbnails, shape (patches, values)."""
     size = PATCH_PX // THUMB
     width = OVERLAP_PX // THUMB

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.rig import Cone, Sensor
-from sim_hw.world import camera, spline, traffic
+from sim_hw.world import spline, traffic, true_camera
 from sim_hw.world.cloud import Cloud
-from sim_hw.world.flight import Flight, Pose
+from sim_hw.world.flight import Pose, SimulatedFlight
 from sim_hw.world.scene import COLOURS, Scene
 from sim_hw.world.world import END_MARGIN, World
 
@@ -34,7 +34,7 @@ SMEAR_STEPS = 33
 
 
 @dataclass(frozen=True)
-class Look:
+class ExposureParameters:
     """One exposure of one sensor: its mid-exposure in GPS time and how long it looks."""
 
     mid_gps_ns: int
@@ -62,16 +62,22 @@ def content_rows(sensor: Sensor, rows: Array, tdi_shifts: int) -> Array:
 
 
 def ground_points(
-    world: World, cone: Cone, sensor: Sensor, columns: Array, rows: Array, look: Look, pose: Pose
+    world: World,
+    cone: Cone,
+    sensor: Sensor,
+    columns: Array,
+    rows: Array,
+    parameters: ExposureParameters,
+    pose: Pose,
 ) -> Array:
     """Ground points that raw pixels see at mid-exposure, east, north, up, shape (..., 3)."""
-    at = content_rows(sensor, rows, look.tdi_shifts)
-    directions = sensor_directions(world, cone, sensor, columns, at, look.mid_gps_ns)
-    rays = camera.world_directions(directions, pose)
-    return world.terrain.intersect(camera.projection_centre_m(cone, pose), rays)
+    at = content_rows(sensor, rows, parameters.tdi_shifts)
+    directions = sensor_directions(world, cone, sensor, columns, at, parameters.mid_gps_ns)
+    rays = true_camera.world_directions(directions, pose)
+    return world.terrain.intersect(true_camera.projection_centre_m(cone, pose), rays)
 
 
-def scene_positions(world: World, scene: Scene, flight: Flight, ground_m: Array) -> Array:
+def scene_positions(world: World, scene: Scene, flight: SimulatedFlight, ground_m: Array) -> Array:
     """Columns and rows in the scene of ground points, shape (..., 2).
 
     The scene lies where the first line begins: its first image is centred END_MARGIN and half an
@@ -94,7 +100,12 @@ def grid_axis(length_px: int, spacing_px: int) -> Array:
 
 
 def light_on_sensor(
-    world: World, scene: Scene, flight: Flight, cone: Cone, sensor: Sensor, look: Look
+    world: World,
+    scene: Scene,
+    flight: SimulatedFlight,
+    cone: Cone,
+    sensor: Sensor,
+    parameters: ExposureParameters,
 ) -> Map:
     """Radiance on the pixels of a raw frame, shape (height, width), forward motion included.
 
@@ -104,13 +115,13 @@ def light_on_sensor(
     columns = np.arange(-(-sensor.width_px // GRID_PX) + 1, dtype=np.float64) * GRID_PX
     rows = np.arange(-(-sensor.height_px // GRID_PX) + 1, dtype=np.float64) * GRID_PX
     c, r = np.meshgrid(columns, rows)
-    pose = flight.pose(look.mid_gps_ns)
-    ground = ground_points(world, cone, sensor, c, r, look, pose)
+    pose = flight.pose(parameters.mid_gps_ns)
+    ground = ground_points(world, cone, sensor, c, r, parameters, pose)
     positions = scene_positions(world, scene, flight, ground)
     size = (sensor.height_px, sensor.width_px)
-    smear = residual_smear_px(world, flight, cone, sensor, look)
+    smear = residual_smear_px(world, flight, cone, sensor, parameters)
     if world.cars:
-        t_s = (look.mid_gps_ns - world.settings.epoch_gps_ns) * 1e-9
+        t_s = (parameters.mid_gps_ns - world.settings.epoch_gps_ns) * 1e-9
         t_s -= flight.first_line_at_m / flight.plan.ground_speed_mps
         bands = [band for band, _ in _mix_of(cone, scene)]
         scene = traffic.scene_with(world.cars, scene, t_s, bands)
@@ -119,7 +130,7 @@ def light_on_sensor(
     else:
         total = smeared(_mixed(cone, scene, positions, size), smear)
     if world.cloud is not None:
-        _hide(total, world, world.cloud, flight, cone, sensor, (c, r), look)
+        _overlay_cloud(total, world, world.cloud, flight, cone, sensor, (c, r), parameters)
     return np.asarray(total * np.float32(world.ground.light), dtype=np.float32)
 
 
@@ -133,24 +144,24 @@ def _mixed(cone: Cone, scene: Scene, positions: Array, size: tuple[int, int]) ->
     return total
 
 
-def _hide(
+def _overlay_cloud(
     light: Map,
     world: World,
     cloud: Cloud,
-    flight: Flight,
+    flight: SimulatedFlight,
     cone: Cone,
     sensor: Sensor,
     grid: tuple[Array, Array],
-    look: Look,
+    parameters: ExposureParameters,
 ) -> None:
     """Put a cloud before the ground, seen from where the cone is at mid-exposure."""
     columns, rows = grid
-    pose = flight.pose(look.mid_gps_ns)
-    at = content_rows(sensor, rows, look.tdi_shifts)
-    directions = sensor_directions(world, cone, sensor, columns, at, look.mid_gps_ns)
+    pose = flight.pose(parameters.mid_gps_ns)
+    at = content_rows(sensor, rows, parameters.tdi_shifts)
+    directions = sensor_directions(world, cone, sensor, columns, at, parameters.mid_gps_ns)
     places = cloud.positions(
-        camera.projection_centre_m(cone, pose),
-        camera.world_directions(directions, pose),
+        true_camera.projection_centre_m(cone, pose),
+        true_camera.world_directions(directions, pose),
         heading=math.radians(flight.plan.heading_deg),
         along_m=flight.first_line_at_m,
     )
@@ -192,7 +203,11 @@ def _mix_of(cone: Cone, scene: Scene) -> Sequence[tuple[str, float]]:
 
 
 def residual_smear_px(
-    world: World, flight: Flight, cone: Cone, sensor: Sensor, look: Look
+    world: World,
+    flight: SimulatedFlight,
+    cone: Cone,
+    sensor: Sensor,
+    parameters: ExposureParameters,
 ) -> tuple[float, float]:
     """How far the image moves over the pixels during an exposure, less what TDI follows.
 
@@ -202,20 +217,20 @@ def residual_smear_px(
         (columns, rows) in pixels.
     """
     centre = (np.array([(sensor.width_px - 1) / 2]), np.array([(sensor.height_px - 1) / 2]))
-    half_ns = round(look.exposure_time_us * 500)
+    half_ns = round(parameters.exposure_time_us * 500)
     ground = []
     for offset_ns in (-half_ns, half_ns):
-        gps_ns = look.mid_gps_ns + offset_ns
+        gps_ns = parameters.mid_gps_ns + offset_ns
         pose = flight.pose(gps_ns)
-        directions = sensor_directions(world, cone, sensor, *centre, look.mid_gps_ns)
-        rays = camera.world_directions(directions, pose)
-        ground.append(world.terrain.intersect(camera.projection_centre_m(cone, pose), rays)[0])
-    pose = flight.pose(look.mid_gps_ns)
-    moved = (ground[1] - ground[0]) @ (pose.enu_from_body @ camera.BODY_FROM_CAMERA)
+        directions = sensor_directions(world, cone, sensor, *centre, parameters.mid_gps_ns)
+        rays = true_camera.world_directions(directions, pose)
+        ground.append(world.terrain.intersect(true_camera.projection_centre_m(cone, pose), rays)[0])
+    pose = flight.pose(parameters.mid_gps_ns)
+    moved = (ground[1] - ground[0]) @ (pose.enu_from_body @ true_camera.BODY_FROM_CAMERA)
     gsd = pose.position_enu_m[2] * sensor.pitch_um * 1e-3 / cone.lens.f_mm
     # The footprint moves forward by `moved`, so a ground point moves back over the pixels: down,
     # to higher rows, and the charge with it where the sign of TDI is that of the flight.
-    follows = sensor.tdi_row_sign * look.tdi_shifts
+    follows = sensor.tdi_row_sign * parameters.tdi_shifts
     return float(-moved[0] / gsd), float(moved[1] / gsd - follows)
 
 
@@ -333,7 +348,7 @@ def _sample(
 def render_ideal(
     world: World,
     scene: Scene,
-    flight: Flight,
+    flight: SimulatedFlight,
     mid_gps_ns: int,
     *,
     columns: tuple[int, int] | None = None,
@@ -364,7 +379,7 @@ def render_ideal(
         axis=-1,
     )
     pose = flight.pose(mid_gps_ns)
-    centre = camera.image_centre_m(world.rig, pose)
-    ground = world.terrain.intersect(centre, camera.world_directions(seen, pose))
+    centre = true_camera.image_centre_m(world.rig, pose)
+    ground = world.terrain.intersect(centre, true_camera.world_directions(seen, pose))
     positions = scene_positions(world, scene, flight, ground)
     return sample_scene(scene, "pan", positions, (r1 - r0, c1 - c0))

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_hw.world import quilting, spline
-from sim_hw.world.grounds import GROUNDS
+from sim_hw.world.ground_types import GROUNDS
 from sim_hw.world.seeding import random_stream
 
 Band = NDArray[np.uint16]
@@ -155,7 +155,7 @@ def _quilted(settings: SceneSettings) -> tuple[quilting.Picture, int, int]:
     sources = [radiance(path) for path in shipped_pictures()]
     size = {"height_px": settings.height_px, "width_px": settings.width_px}
     quilt = quilting.plan_quilt(sources, **size, random=random_stream(settings.seed, "quilt"))
-    return quilting.sew(sources, quilt, **size), sum(map(len, quilt.rows)), quilt.reused
+    return quilting.assemble(sources, quilt, **size), sum(map(len, quilt.rows)), quilt.reused
 
 
 def shipped_pictures() -> list[Path]:

@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.rig import Cone, Sensor
-from sim_hw.world import laboratory
+from sim_hw.world import sensor_calibration
 from sim_hw.world.electronics import Electronics, true_sensor
-from sim_hw.world.flight import Flight
-from sim_hw.world.laboratory import Radiometry
-from sim_hw.world.rendering import Look, Map, light_on_sensor
+from sim_hw.world.flight import SimulatedFlight
+from sim_hw.world.rendering import ExposureParameters, Map, light_on_sensor
 from sim_hw.world.scene import Scene
 from sim_hw.world.seeding import random_stream
-from sim_hw.world.truth import Taken, exposure_truth
+from sim_hw.world.sensor_calibration import Radiometry
+from sim_hw.world.truth import SensorExposure, exposure_truth
 from sim_hw.world.world import World
 
 PROBE_SIGMA_C = 0.1
@@ -36,11 +36,11 @@ class Snapshot:
 
     mark_gps_ns: int
     light: Mapping[str, Map]
-    looks: Mapping[str, Look]
+    parameters_by_sensor: Mapping[str, ExposureParameters]
     truth: Mapping[str, Any]
 
 
-class Heads:
+class RigElectronics:
     """The electronics of the rig's sensors, and what the laboratory measured of each.
 
     Keeps the maps of all sensors, about 20 bytes a pixel; unless `keep` says to draw them anew for
@@ -51,13 +51,13 @@ class Heads:
         self, world: World, *, seed: int, without: Collection[str] = (), keep: bool = True
     ) -> None:
         self._seed = seed
-        self._kept: dict[str, Electronics] = {}
+        self._electronics: dict[str, Electronics] = {}
         self.radiometry: dict[str, Radiometry] = {}
         for cone, sensor in sensors_of(world, without):
             head = self._drawn(world, cone, sensor)
-            self.radiometry[sensor.name] = laboratory.measure(sensor, head.truth, seed)
+            self.radiometry[sensor.name] = sensor_calibration.measure(sensor, head.truth, seed)
             if keep:
-                self._kept[sensor.name] = head
+                self._electronics[sensor.name] = head
 
     def frames(
         self, world: World, snapshot: Snapshot, *, seed: int
@@ -65,15 +65,15 @@ class Heads:
         """What the sensors make of the light, with noise that follows from `seed`."""
         frames = {}
         for name, light in snapshot.light.items():
-            look = snapshot.looks[name]
+            parameters = snapshot.parameters_by_sensor[name]
             cone, sensor = world.rig.cone_of(name), world.rig.sensor(name)
-            head = self._kept.get(name) or self._drawn(world, cone, sensor)
+            head = self._electronics.get(name) or self._drawn(world, cone, sensor)
             frames[name] = head.frame(
                 light,
-                exposure_time_us=look.exposure_time_us,
-                tdi_shifts=look.tdi_shifts,
+                exposure_time_us=parameters.exposure_time_us,
+                tdi_shifts=parameters.tdi_shifts,
                 gain_db=0.0,
-                temperature_c=world.temperature_c(sensor.probe, look.mid_gps_ns),
+                temperature_c=world.temperature_c(sensor.probe, parameters.mid_gps_ns),
                 random=random_stream(seed, "noise", name),
             )
         return frames
@@ -93,25 +93,30 @@ def sensors_of(world: World, without: Collection[str] = ()) -> Iterator[tuple[Co
 
 
 def take(
-    world: World, scene: Scene, flight: Flight, mark_gps_ns: int, *, without: Collection[str] = ()
+    world: World,
+    scene: Scene,
+    flight: SimulatedFlight,
+    mark_gps_ns: int,
+    *,
+    without: Collection[str] = (),
 ) -> Snapshot:
     """Let every sensor look at its own instant of the exposure whose strobe is at `mark_gps_ns`."""
-    light, looks, taken = {}, {}, {}
+    light, parameters_by_sensor, taken = {}, {}, {}
     for cone, sensor in sensors_of(world, without):
-        look = look_of(world, cone, mark_gps_ns)
-        light[sensor.name] = light_on_sensor(world, scene, flight, cone, sensor, look)
-        looks[sensor.name] = look
-        taken[sensor.name] = Taken(sensor.name, 1, look)
-    return Snapshot(mark_gps_ns, light, looks, exposure_truth(world, flight, taken))
+        parameters = exposure_parameters_of(world, cone, mark_gps_ns)
+        light[sensor.name] = light_on_sensor(world, scene, flight, cone, sensor, parameters)
+        parameters_by_sensor[sensor.name] = parameters
+        taken[sensor.name] = SensorExposure(sensor.name, 1, parameters)
+    return Snapshot(mark_gps_ns, light, parameters_by_sensor, exposure_truth(world, flight, taken))
 
 
-def look_of(world: World, cone: Cone, mark_gps_ns: int) -> Look:
+def exposure_parameters_of(world: World, cone: Cone, mark_gps_ns: int) -> ExposureParameters:
     """Syntopic: every cone looks when it is where the reference cone is at the mark."""
     reference_mm = world.rig.cone(world.rig.reference_cone).position_mm[0]
     ahead_m = (cone.position_mm[0] - reference_mm) * 1e-3
     if world.rig.timing != "syntopic":
         ahead_m = 0.0
-    return Look(
+    return ExposureParameters(
         mid_gps_ns=mark_gps_ns - round(ahead_m / world.plan.ground_speed_mps * 1e9),
         exposure_time_us=world.plan.exposure_time_us[cone.name],
         tdi_shifts=world.plan.tdi_shifts[cone.name],

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_hw.world import spline
-from sim_hw.world.grounds import motorways_px
+from sim_hw.world.ground_types import motorways_px
 from sim_hw.world.scene import COLOURS, PAN_MIX, Scene, SceneSettings
 from sim_hw.world.seeding import random_stream
 

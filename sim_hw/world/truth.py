@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.rig import Cone, Sensor
-from sim_hw.world import camera
-from sim_hw.world.flight import Flight
-from sim_hw.world.rendering import Look, content_rows, grid_axis, sensor_directions
-from sim_hw.world.whole_file import whole_file
+from sim_hw.world import true_camera
+from sim_hw.world.atomic_file import atomic_file
+from sim_hw.world.flight import SimulatedFlight
+from sim_hw.world.rendering import ExposureParameters, content_rows, grid_axis, sensor_directions
 from sim_hw.world.world import CABIN_C, World, WorldSettings
 
 Array = NDArray[np.float64]
@@ -30,19 +30,19 @@ WAIT_FOR_SENSORS_S = 3.0
 
 
 @dataclass(frozen=True)
-class Taken:
+class SensorExposure:
     """An exposure that one sensor took on a pulse of the bus."""
 
     sensor: str
     pulse_count: int
-    look: Look
+    parameters: ExposureParameters
 
 
 def true_vip(
     world: World,
-    flight: Flight,
+    flight: SimulatedFlight,
     sensor_name: str,
-    look: Look,
+    parameters: ExposureParameters,
     *,
     columns: Array,
     rows: Array,
@@ -61,12 +61,12 @@ def true_vip(
         (columns, rows) in the virtual image, same shape.
     """
     cone, sensor = world.rig.cone_of(sensor_name), world.rig.sensor(sensor_name)
-    at = content_rows(sensor, rows, look.tdi_shifts)
-    pose = flight.pose(look.mid_gps_ns)
-    directions = sensor_directions(world, cone, sensor, columns, at, look.mid_gps_ns)
-    rays = camera.world_directions(directions, pose)
-    ground = on_flat_ground(camera.projection_centre_m(cone, pose), rays)
-    return camera.ideal_pixels(ground, world.rig, flight.pose(master_mid_gps_ns))
+    at = content_rows(sensor, rows, parameters.tdi_shifts)
+    pose = flight.pose(parameters.mid_gps_ns)
+    directions = sensor_directions(world, cone, sensor, columns, at, parameters.mid_gps_ns)
+    rays = true_camera.world_directions(directions, pose)
+    ground = on_flat_ground(true_camera.projection_centre_m(cone, pose), rays)
+    return true_camera.ideal_pixels(ground, world.rig, flight.pose(master_mid_gps_ns))
 
 
 def on_flat_ground(origin_m: Array, directions: Array) -> Array:
@@ -80,7 +80,7 @@ class TruthWriter:
     def __init__(self, world: World, folder: Path) -> None:
         self._world = world
         self._folder = folder
-        self._open: dict[int, dict[str, Taken]] = {}
+        self._open: dict[int, dict[str, SensorExposure]] = {}
         self._touched_s: dict[int, float] = {}
         folder.mkdir(parents=True, exist_ok=True)
 
@@ -91,7 +91,7 @@ class TruthWriter:
             json.dumps(true_parameters(self._world), indent=1).encode(),
         )
 
-    def add(self, taken: Taken, flight: Flight) -> None:
+    def add(self, taken: SensorExposure, flight: SimulatedFlight) -> None:
         """Note a sensor's exposure; the file is written once all sensors of the rig are in."""
         sensors = self._open.setdefault(taken.pulse_count, {})
         sensors[taken.sensor] = taken
@@ -99,27 +99,29 @@ class TruthWriter:
         if len(sensors) == len(self._world.rig.sensors):
             self._write(taken.pulse_count, flight)
 
-    def write_overdue(self, flight: Flight, *, wait_s: float = WAIT_FOR_SENSORS_S) -> None:
+    def write_overdue(self, flight: SimulatedFlight, *, wait_s: float = WAIT_FOR_SENSORS_S) -> None:
         """Write exposures whose missing sensors are not coming any more."""
         now_s = time.monotonic()
         for count in [c for c, t in self._touched_s.items() if now_s - t >= wait_s]:
             self._write(count, flight)
 
-    def _write(self, count: int, flight: Flight) -> None:
+    def _write(self, count: int, flight: SimulatedFlight) -> None:
         taken = self._open.pop(count)
         del self._touched_s[count]
         content = exposure_truth(self._world, flight, taken)
         path = self._folder / f"{count:06d}.npz"
-        with whole_file(path) as part, part.open("wb") as file:
+        with atomic_file(path) as part, part.open("wb") as file:
             np.savez(file, **content)
 
 
-def exposure_truth(world: World, flight: Flight, taken: Mapping[str, Taken]) -> dict[str, Any]:
+def exposure_truth(
+    world: World, flight: SimulatedFlight, taken: Mapping[str, SensorExposure]
+) -> dict[str, Any]:
     """The arrays of one exposure's file; see docs/emulator.md for each."""
     mark = _mid_of_cone(world, world.rig.reference_cone, taken)
     master = _mid_of_cone(world, world.rig.master_cone, taken)
     known = [m for m in (mark, master) if m is not None]
-    any_mid = known[0] if known else next(iter(taken.values())).look.mid_gps_ns
+    any_mid = known[0] if known else next(iter(taken.values())).parameters.mid_gps_ns
     mark_ns = any_mid if mark is None else mark
     master_ns = any_mid if master is None else master
     pose = flight.pose(mark_ns)
@@ -142,19 +144,21 @@ def exposure_truth(world: World, flight: Flight, taken: Mapping[str, Taken]) -> 
         content["image"] = np.array(_image(world))
         content["inner"] = np.array("similarity" if world.rig.master_cone else "rotations")
     for name, exposure in taken.items():
-        sensor, look = world.rig.sensor(name), exposure.look
+        sensor, parameters = world.rig.sensor(name), exposure.parameters
         content |= {
-            f"{name}.mid_gps_ns": np.array(look.mid_gps_ns, dtype=np.int64),
-            f"{name}.exposure_time_us": np.array(look.exposure_time_us),
-            f"{name}.tdi_shifts": np.array(look.tdi_shifts),
+            f"{name}.mid_gps_ns": np.array(parameters.mid_gps_ns, dtype=np.int64),
+            f"{name}.exposure_time_us": np.array(parameters.exposure_time_us),
+            f"{name}.tdi_shifts": np.array(parameters.tdi_shifts),
         }
         if not is_stitched:
-            content |= _head(world, flight, name, look)
+            content |= _head(world, flight, name, parameters)
             continue
         columns = grid_axis(sensor.width_px, GRID_PX)
         rows = grid_axis(sensor.height_px, GRID_PX)
         c, r = np.meshgrid(columns, rows)
-        vip = true_vip(world, flight, name, look, columns=c, rows=r, master_mid_gps_ns=master_ns)
+        vip = true_vip(
+            world, flight, name, parameters, columns=c, rows=r, master_mid_gps_ns=master_ns
+        )
         content |= {
             f"{name}.columns": columns,
             f"{name}.rows": rows,
@@ -164,23 +168,29 @@ def exposure_truth(world: World, flight: Flight, taken: Mapping[str, Taken]) -> 
     return content
 
 
-def _head(world: World, flight: Flight, name: str, look: Look) -> dict[str, Any]:
+def _head(
+    world: World, flight: SimulatedFlight, name: str, parameters: ExposureParameters
+) -> dict[str, Any]:
     """Where a head that is an image of its own stood and looked."""
-    cone, pose = world.rig.cone_of(name), flight.pose(look.mid_gps_ns)
-    centre = camera.projection_centre_m(cone, pose)
-    turn = pose.enu_from_body @ camera.BODY_FROM_CAMERA @ world.camera.master_from_cone(cone)
+    cone, pose = world.rig.cone_of(name), flight.pose(parameters.mid_gps_ns)
+    centre = true_camera.projection_centre_m(cone, pose)
+    rotation = (
+        pose.enu_from_body @ true_camera.BODY_FROM_CAMERA @ world.camera.master_from_cone(cone)
+    )
     return {
         f"{name}.latitude_longitude_height": np.array(flight.geodetic(centre)),
-        f"{name}.enu_from_camera": turn,
+        f"{name}.enu_from_camera": rotation,
     }
 
 
-def _mid_of_cone(world: World, cone_name: str | None, taken: Mapping[str, Taken]) -> int | None:
+def _mid_of_cone(
+    world: World, cone_name: str | None, taken: Mapping[str, SensorExposure]
+) -> int | None:
     if cone_name is None:
         return None
     for sensor in world.rig.cone(cone_name).sensors:
         if sensor.name in taken:
-            return taken[sensor.name].look.mid_gps_ns
+            return taken[sensor.name].parameters.mid_gps_ns
     return None
 
 
@@ -228,7 +238,7 @@ def _true_place(world: World, cone: Cone, sensor: Sensor) -> dict[str, Any]:
         "drift": asdict(sensor.drift),
         "x_at_base_temperature_mm": float(placed[0]),
         "y_at_base_temperature_mm": float(placed[1]),
-        "f_at_base_temperature_mm": camera.principal_distance_mm(
+        "f_at_base_temperature_mm": true_camera.principal_distance_mm(
             cone, world.temperatures.base_c.get(cone.probe, CABIN_C)
         ),
     }
@@ -243,5 +253,5 @@ def world_of(folder: Path) -> World:
 
 
 def _write_atomically(path: Path, content: bytes) -> None:
-    with whole_file(path) as part:
+    with atomic_file(path) as part:
         part.write_bytes(content)

@@ -13,10 +13,10 @@ from functools import cached_property
 from pathlib import Path
 
 from processing.rig import Cone, Rig, VirtualImage, load_rig
-from sim_hw.world import camera, scene, terrain
+from sim_hw.world import scene, terrain, true_camera
 from sim_hw.world.cloud import Cloud, cloud_over
-from sim_hw.world.flight import Flight, FlightPlan
-from sim_hw.world.grounds import GROUNDS, Ground
+from sim_hw.world.flight import FlightPlan, SimulatedFlight
+from sim_hw.world.ground_types import GROUNDS, GroundType
 from sim_hw.world.traffic import Car, cars_of
 
 FORWARD_OVERLAP = 0.6
@@ -30,7 +30,7 @@ SIDE_MARGIN = 0.11
 """Share of the image width that the scene is wider on either side: tremor, crab and wander."""
 END_MARGIN = 0.16
 """Likewise at the ends of a line, in image heights."""
-SCENE_LARGEST_PX = 250_000_000
+SCENE_MAX_PX = 250_000_000
 WHITE_LEVEL = 0.8
 """Where white comes in the planned exposure, as a share of the converter's range."""
 
@@ -92,7 +92,7 @@ class World:
                 f"ground {settings.ground!r} is not known; give one of: {', '.join(GROUNDS)}"
             )
         self.plan = survey_plan(self.rig, settings)
-        self.flight = Flight(
+        self.flight = SimulatedFlight(
             plan=_flight_plan(self.image, self.plan, settings),
             seed=settings.seed,
             epoch_gps_ns=settings.epoch_gps_ns,
@@ -102,10 +102,12 @@ class World:
             flying_height_m=self.plan.height_above_ground_m,
             relative_relief=settings.relative_relief,
         )
-        self.camera = camera.true_camera(
+        self.camera = true_camera.true_camera(
             self.rig, settings.seed, displaced_px=settings.displaced_px
         )
-        self.temperatures = camera.true_temperatures(self.rig, settings.seed, dc_k=settings.dc_k)
+        self.temperatures = true_camera.true_temperatures(
+            self.rig, settings.seed, dc_k=settings.dc_k
+        )
 
     @property
     def image(self) -> VirtualImage:
@@ -140,7 +142,7 @@ class World:
         width = round(image.width_px * (1 + 2 * SIDE_MARGIN))
         along = (settings.exposures - 1) * plan.distance_m / plan.gsd_m
         height = round(along + image.height_px * (1 + 2 * END_MARGIN))
-        height = min(height, SCENE_LARGEST_PX // width)
+        height = min(height, SCENE_MAX_PX // width)
         return scene.SceneSettings(
             seed=settings.seed,
             width_px=width,
@@ -152,7 +154,7 @@ class World:
         )
 
     @property
-    def ground(self) -> Ground:
+    def ground(self) -> GroundType:
         """What kind of ground is flown over."""
         return GROUNDS[self.settings.ground]
 

@@ -31,7 +31,7 @@ class WorldClock:
     mono_ns_at_start: int
 
     @classmethod
-    def starting_now(cls) -> WorldClock:
+    def from_wall_clock(cls) -> WorldClock:
         """A world whose GPS time is this machine's wall clock: right week, right second."""
         mono_ns = time.monotonic_ns()
         return cls(gps_ns_from_unix_ns(time.time_ns()), mono_ns)
@@ -44,7 +44,7 @@ class WorldClock:
 
 
 @dataclass(frozen=True)
-class DeviceClock:
+class FreeRunningClock:
     """A device's free-running clock: device = offset + mono * (1 + drift), in ns.
 
     Reckoned in integers, so that a long uptime costs no digits; `drift_ppm` is resolved to 1e-12.

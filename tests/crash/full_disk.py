@@ -16,10 +16,10 @@ from typing import Any
 
 from daemon.mission.exposure import Exposure
 from daemon.mission.store.level0_folder import read_sealed
-from daemon.onboard.service.messages import Seal, Sealed, Told, WriteFailed
+from daemon.onboard.service.messages import Seal, Sealed, ServiceEvent, WriteFailed
 from daemon.onboard.storage import writer
-from tests.crash import judging
-from tests.crash.flight import Flown, Ring
+from tests.crash import invariants
+from tests.crash.scripted_flight import Ring, ScriptedService
 from tests.daemon.small_camera import SENSORS, new_mission
 
 DISK = "size=4m"
@@ -28,7 +28,7 @@ FULL_AFTER = 4
 FREED_AFTER_REFUSALS = 8
 
 
-class OnASmallDisk(Flown):
+class SmallDiskService(ScriptedService):
     """Fills the disk after some exposures, and frees it after so many refused records."""
 
     filler = Path()
@@ -43,9 +43,9 @@ class OnASmallDisk(Flown):
             _fill(self.filler)
         if isinstance(message, WriteFailed):
             assert "No space left" in message.sentence, message.sentence
-            self.refused_frames += not message.may_pass
-            self.refused_records += message.may_pass
-        if isinstance(message, Told):
+            self.refused_frames += not message.is_transient
+            self.refused_records += message.is_transient
+        if isinstance(message, ServiceEvent):
             self.behind = max(self.behind, message.event["behind"])
         if self.refused_records == FREED_AFTER_REFUSALS:
             self.filler.unlink(missing_ok=True)
@@ -78,23 +78,25 @@ def main() -> None:
     acks = os.open(acks_path, os.O_WRONLY | os.O_CREAT, 0o644)
     root = folder / "root"
     mission = new_mission(root)
-    link: Any = OnASmallDisk(mission, acks, range(1, EXPOSURES + 1), lands=True, keeps="not all")
+    link: Any = SmallDiskService(
+        mission, acks, range(1, EXPOSURES + 1), lands=True, durability="not all"
+    )
     link.filler = folder / "filler"
     with mission.held():
         writer.main(link, mission.path, tuple(Ring(sensor) for sensor in SENSORS))
-    told = judging.Told(mission=mission.id)
+    acknowledged = invariants.Acknowledged(mission=mission.id)
     for line in acks_path.read_text().splitlines():
-        told.hear(line)
+        acknowledged.add_line(line)
     lost = [
         number
         for number in mission.numbers()
         if (record := read_sealed(mission.level0(number))) and record.exposure.state == "lost"
     ]
-    outcome = judging.judge(root, told, flies_on=True)
+    outcome = invariants.check_invariants(root, acknowledged, flies_on=True)
     figures = {
         "exposures": outcome.exposures - 1,
-        "stored": sorted(told.stored),
-        "sealed": sorted(told.sealed),
+        "stored": sorted(acknowledged.stored),
+        "sealed": sorted(acknowledged.sealed),
         "lost": lost,
         "refused_frames": link.refused_frames,
         "refused_records": link.refused_records,

@@ -43,30 +43,30 @@ def run_to_call(
         os.close(reading)
         _child(action, last, writing, torn=torn, by=by)
     os.close(writing)
-    said = b""
+    output = b""
     while piece := os.read(reading, 65536):
-        said += piece
+        output += piece
     os.close(reading)
     _, status = os.waitpid(child, 0)
     if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL:
         assert last is not None
         return []
-    assert os.waitstatus_to_exitcode(status) == 0, said.decode()
-    return said.decode().split()
+    assert os.waitstatus_to_exitcode(status) == 0, output.decode()
+    return output.decode().split()
 
 
 def _child(
     action: Callable[[], object], last: int | None, writing: int, *, torn: bool, by: signal.Signals
 ) -> None:
     write, kill, exit_now = os.write, os.kill, os._exit
-    made: list[str] = []
+    calls: list[str] = []
 
     def counted(name: str, real: Callable[..., Any]) -> Callable[..., Any]:
         def call(*arguments: Any, **keywords: Any) -> Any:
             if name == "open" and not arguments[1] & (os.O_CREAT | os.O_TRUNC):
                 return real(*arguments, **keywords)
-            made.append(name)
-            if len(made) == last:
+            calls.append(name)
+            if len(calls) == last:
                 if torn and name in WRITES:
                     data = arguments[1] if name == "write" else b"".join(arguments[1])
                     write(arguments[0], data[: len(data) // 2])
@@ -83,5 +83,5 @@ def _child(
     except BaseException:  # noqa: BLE001 - whatever it raises is a finding
         write(writing, traceback.format_exc().encode())
         exit_now(1)
-    write(writing, " ".join(made).encode())
+    write(writing, " ".join(calls).encode())
     exit_now(0)

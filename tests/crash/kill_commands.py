@@ -40,7 +40,7 @@ CALLS = (
     "openat,write,writev,pwrite64,fsync,fdatasync,ftruncate,fallocate,mkdir,mkdirat,rename,"
     "renameat,renameat2,unlink,unlinkat,rmdir,link,fchmod,utimensat,flock"
 )
-MOST_IN_A_ROW = 3
+MAX_IN_A_ROW = 3
 LIMIT_S = 240.0
 PRODUCTS = {"LEFT.tif", "RIGHT.tif", "quality.json", "quicklook.jpg", "thumbnail.jpg"}
 
@@ -64,19 +64,19 @@ class Figures:
         return sum(self.kills.values())
 
 
-class Bench:
+class CommandBench:
     """A mission below `folder`, as before a command, and what of it must never be lost."""
 
     def __init__(self, folder: Path) -> None:
-        self._pristine = flown_mission(folder / "pristine", (1, 2, 3)).path
-        self._trial = folder / "trial"
-        self.mission = self._trial / "flown" / self._pristine.name
-        self.disk = self._trial / "disk"
-        self.said = folder / "said.txt"
-        self._run_on_pristine("process")
-        self._run_on_pristine("report")
-        self.captured = _captured(self._pristine)
-        self.all = content_of(self._pristine)
+        self._original = flown_mission(folder / "pristine", (1, 2, 3)).path
+        self._work_folder = folder / "trial"
+        self.mission = self._work_folder / "flown" / self._original.name
+        self.disk = self._work_folder / "disk"
+        self.output_file = folder / "said.txt"
+        self._run_on_original("process")
+        self._run_on_original("report")
+        self.captured = _captured(self._original)
+        self.all = content_of(self._original)
 
     def arguments(self, command: str) -> list[str]:
         """The command line."""
@@ -89,9 +89,9 @@ class Bench:
 
     def begin(self, command: str) -> None:
         """The mission as before the command."""
-        shutil.rmtree(self._trial, ignore_errors=True)
+        shutil.rmtree(self._work_folder, ignore_errors=True)
         self.disk.mkdir(parents=True)
-        shutil.copytree(self._pristine, self.mission)
+        shutil.copytree(self._original, self.mission)
         if command == "repair":  # what a crash left
             part = self.mission / f"L0/000004{durable.PART_SUFFIX}"
             part.mkdir()
@@ -120,18 +120,20 @@ class Bench:
         problems = verify(Mission.open(place)).problems
         assert problems == (), problems
         assert sorted(p.name for p in (place / "L2").iterdir()) == ["000001", "000002", "000003"]
-        left = [str(p) for p in self._trial.rglob("*.part") if ".discarded" not in p.parts]
+        left = [str(p) for p in self._work_folder.rglob("*.part") if ".discarded" not in p.parts]
         assert left == [], left
         if command == "transfer":
             assert not self.mission.exists() and not removing_path(self.mission).exists()
 
     def _is_complete(self, folder: Path) -> bool:
         content = {n: s for n, s in content_of(folder).items() if not n.endswith(".part")}
-        return content == self.all and verify(Mission.open(folder)).is_well
+        return content == self.all and verify(Mission.open(folder)).is_intact
 
-    def _run_on_pristine(self, command: str) -> None:
-        status = _status(_started([*self.arguments(command)[:1], str(self._pristine)], self.said))
-        assert status == 0, self.said.read_text()
+    def _run_on_original(self, command: str) -> None:
+        status = _status(
+            _started([*self.arguments(command)[:1], str(self._original)], self.output_file)
+        )
+        assert status == 0, self.output_file.read_text()
 
 
 def _captured(mission: Path) -> dict[str, str]:
@@ -151,7 +153,7 @@ class _Child:
     go: int
 
 
-def _started(arguments: Sequence[str], said: Path) -> _Child:
+def _started(arguments: Sequence[str], output_file: Path) -> _Child:
     """A child that runs a command as soon as it may."""
     waits, go = os.pipe()
     child = os.fork()
@@ -170,7 +172,7 @@ def _started(arguments: Sequence[str], said: Path) -> _Child:
         status = ended.code
     except BaseException as error:  # noqa: BLE001 - a traceback is a finding
         output.write(repr(error))
-    said.write_text(output.getvalue())
+    output_file.write_text(output.getvalue())
     os._exit(status if isinstance(status, int) else 1)
 
 
@@ -206,12 +208,12 @@ def _traced(child: _Child, options: Sequence[str]) -> int:
         tracer.wait(LIMIT_S)
 
 
-def calls_of(bench: Bench, command: str, log: Path) -> list[Call]:
+def calls_of(bench: CommandBench, command: str, log: Path) -> list[Call]:
     """The calls that a command makes when nobody interrupts it."""
     bench.begin(command)
-    child = _started(bench.arguments(command), bench.said)
+    child = _started(bench.arguments(command), bench.output_file)
     status = _traced(child, ["-o", str(log), "-e", f"trace={CALLS}"])
-    assert status == 0, bench.said.read_text()
+    assert status == 0, bench.output_file.read_text()
     counts: Counter[tuple[str, str]] = Counter()
     calls = []
     for line in log.read_text().splitlines():
@@ -226,14 +228,14 @@ def kill(folder: Path, kills: int, seed: int) -> Figures:
     """Kill so often; findings are in `wrong`."""
     begun_s = time.monotonic()
     figures = Figures()
-    bench = Bench(folder)
+    bench = CommandBench(folder)
     calls = {command: calls_of(bench, command, folder / "trace") for command in COMMANDS}
-    figures.calls = {command: len(made) for command, made in calls.items()}
-    dice = random.Random(seed)
+    figures.calls = {command: len(made_calls) for command, made_calls in calls.items()}
+    rng = random.Random(seed)
     while figures.all_kills < kills:
         command = COMMANDS[figures.rounds % len(COMMANDS)]
         figures.rounds += 1
-        chosen = [dice.choice(calls[command]) for _ in range(dice.randint(1, MOST_IN_A_ROW))]
+        chosen = [rng.choice(calls[command]) for _ in range(rng.randint(1, MAX_IN_A_ROW))]
         try:
             _round(bench, command, chosen, figures)
         except Exception as error:  # noqa: BLE001 - whatever a check raises is a finding
@@ -244,20 +246,20 @@ def kill(folder: Path, kills: int, seed: int) -> Figures:
     return figures
 
 
-def _round(bench: Bench, command: str, chosen: Sequence[Call], figures: Figures) -> None:
+def _round(bench: CommandBench, command: str, chosen: Sequence[Call], figures: Figures) -> None:
     bench.begin(command)
     for name, number in chosen:
-        child = _started(bench.arguments(command), bench.said)
+        child = _started(bench.arguments(command), bench.output_file)
         inject = f"inject={name}:signal=KILL:when={number}"
         status = _traced(child, ["-o", "/dev/null", "-e", f"trace={name}", "-e", inject])
         if status == -9:
             figures.kills[command] += 1
         else:  # a later run makes fewer calls than the first
-            assert status == 0, bench.said.read_text()
+            assert status == 0, bench.output_file.read_text()
             figures.ended_before += 1
         bench.check_interrupted(command)
-    status = _status(_started(bench.arguments(command), bench.said))
-    assert status == 0, bench.said.read_text()
+    status = _status(_started(bench.arguments(command), bench.output_file))
+    assert status == 0, bench.output_file.read_text()
     bench.check_finished(command)
 
 

@@ -27,7 +27,7 @@ from daemon.mission.store import durable
 from daemon.mission.store.level2 import write_level2
 from daemon.mission.store.store import Level0Writer
 from daemon.mission.transfer.transfer import finish_transfer, transfer
-from daemon.mission.transfer.transfer_note import LEFT_OUT, NOTE_FILE
+from daemon.mission.transfer.transfer_manifest import EXCLUDED_FILES, MANIFEST_FILE
 from daemon.mission.transfer.transfer_removal import removing_path
 from daemon.mission.verification.verification import verify
 from tests.crash.kill_at_call import WRITES, run_to_call
@@ -87,7 +87,7 @@ def content_of(folder: Path) -> Content:
     return {
         str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in sorted(folder.rglob("*"))
-        if path.is_file() and path.name not in {*LEFT_OUT, INDEX}
+        if path.is_file() and path.name not in {*EXCLUDED_FILES, INDEX}
     }
 
 
@@ -97,11 +97,11 @@ def is_complete(folder: Path, original: Content) -> bool:
         (folder / "L0").is_dir()
         and content_of(folder) == original
         and (folder / INDEX).is_file()
-        and verify(Mission.open(folder)).is_well
+        and verify(Mission.open(folder)).is_intact
     )
 
 
-class Trial:
+class TransferCase:
     """A mission on one disk, and the folder of another."""
 
     def __init__(self, source: Path, disk: Path, original: Content | None = None) -> None:
@@ -110,9 +110,9 @@ class Trial:
         self.target = disk / source.name
         self.original = original or content_of(source)
 
-    def moved_to(self, folder: Path) -> Trial:
+    def moved_to(self, folder: Path) -> TransferCase:
         """The same trial with both disks below another folder."""
-        return Trial(folder / FLOWN / self.source.name, folder / OTHER_DISK, self.original)
+        return TransferCase(folder / FLOWN / self.source.name, folder / OTHER_DISK, self.original)
 
     def run(self) -> None:
         """What the command does."""
@@ -138,10 +138,10 @@ class Trial:
 
     def seal(self) -> Content | None:
         """All of the copy, once it is sealed."""
-        note = self.target / NOTE_FILE
+        note = self.target / MANIFEST_FILE
         if not note.exists() or json.loads(note.read_text())["state"] != "sealed":
             return None
-        return {**content_of(self.target), NOTE_FILE: note.read_text()}
+        return {**content_of(self.target), MANIFEST_FILE: note.read_text()}
 
     def check_finished(self) -> None:
         """What holds after a run that came to its end."""
@@ -151,28 +151,28 @@ class Trial:
         assert not list(self.disk.parent.rglob("*.part")), "unfinished files are left"
 
 
-def kill_at(pristine: Trial, scratch: Path, positions: list[tuple[int, bool]]) -> None:
+def kill_at(pristine: TransferCase, scratch: Path, positions: list[tuple[int, bool]]) -> None:
     """Kill one run after the other, then let one finish.
 
     Raises:
         AssertionError: something was lost, or a run does not finish.
     """
-    trial = _begin(pristine, scratch)
+    case = _begin(pristine, scratch)
     sealed: Content | None = None
     for last, torn in positions:
-        run_to_call(trial.run, last, torn=torn)
-        assert sealed in (None, trial.seal()), "a sealed copy was changed"
-        sealed = trial.seal()
-        trial.check_interrupted(reruns=False)
-    trial.check_interrupted(reruns=True)
+        run_to_call(case.run, last, torn=torn)
+        assert sealed in (None, case.seal()), "a sealed copy was changed"
+        sealed = case.seal()
+        case.check_interrupted(reruns=False)
+    case.check_interrupted(reruns=True)
 
 
-def _begin(pristine: Trial, scratch: Path) -> Trial:
+def _begin(pristine: TransferCase, scratch: Path) -> TransferCase:
     shutil.rmtree(scratch, ignore_errors=True)
-    trial = pristine.moved_to(scratch)
-    trial.disk.mkdir(parents=True)
-    shutil.copytree(pristine.source, trial.source)
-    return trial
+    case = pristine.moved_to(scratch)
+    case.disk.mkdir(parents=True)
+    shutil.copytree(pristine.source, case.source)
+    return case
 
 
 def run_once(folder: Path, forgets: str) -> None:
@@ -181,7 +181,7 @@ def run_once(folder: Path, forgets: str) -> None:
     (folder / BEGUN).touch()
     if forgets != "nothing":
         _forget(is_folder=forgets == "folders")
-    Trial(mission.path, folder / OTHER_DISK).run()
+    TransferCase(mission.path, folder / OTHER_DISK).run()
 
 
 def _forget(*, is_folder: bool) -> None:
@@ -200,18 +200,18 @@ def main() -> None:
         run_once(folder, given[0])
         return
     figures = Figures()
-    pristine = Trial(three_exposures(folder / FLOWN).path, folder / OTHER_DISK)
-    trial = _begin(pristine, folder / "trial")
-    calls = run_to_call(trial.run, None)
-    trial.check_finished()
+    pristine = TransferCase(three_exposures(folder / FLOWN).path, folder / OTHER_DISK)
+    case = _begin(pristine, folder / "trial")
+    calls = run_to_call(case.run, None)
+    case.check_finished()
     figures.calls = len(calls)
     if what == "every":
         rounds = [[(number, False)] for number in range(1, len(calls) + 1)]
         rounds += [[(n, True)] for n, call in enumerate(calls, 1) if call in WRITES]
     else:
-        dice = random.Random(int(given[1]))
+        rng = random.Random(int(given[1]))
         rounds = [
-            [(dice.randint(1, len(calls)), dice.random() < 0.2) for _ in range(2)]
+            [(rng.randint(1, len(calls)), rng.random() < 0.2) for _ in range(2)]
             for _ in range(int(given[0]))
         ]
     for positions in rounds:

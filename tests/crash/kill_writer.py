@@ -18,13 +18,13 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from daemon.mission.layout import Mission
-from tests.crash.flight import live
-from tests.crash.judging import Told, judge
+from tests.crash.invariants import Acknowledged, check_invariants
+from tests.crash.scripted_flight import run_until_end
 from tests.daemon.small_camera import new_mission
 
-JUDGED_EVERY = 10
-LIVES_OF_A_MISSION = 50
-LIFE_LIMIT_S = 30.0
+CHECK_EVERY = 10
+RUNS_PER_MISSION = 50
+RUN_LIMIT_S = 30.0
 SHARE_KILLED_EARLY = 0.3
 EARLY_S = 0.03
 """Of a life that is killed while it recovers, or soon after; recovery takes some 10 ms."""
@@ -40,84 +40,84 @@ class Figures:
     stored: int = 0
     sealed: int = 0
     exposures: int = 0
-    set_aside: int = 0
+    discarded: int = 0
     wrong: list[str] = field(default_factory=list)
 
 
 def kill(folder: Path, kills: int, seed: int) -> Figures:
     """Kill so often; findings are in `wrong`."""
-    dice = random.Random(seed)
+    rng = random.Random(seed)
     figures = Figures()
     while figures.kills < kills:
         figures.missions += 1
         root = folder / str(figures.missions)
         mission = new_mission(root)
-        told = Told(mission=mission.id)
-        lives = min(LIVES_OF_A_MISSION, kills - figures.kills)
-        for life in range(1, lives + 1):
-            figures.killed_in_recovery += not _live_and_die(mission, told, dice)
+        acknowledged = Acknowledged(mission=mission.id)
+        runs = min(RUNS_PER_MISSION, kills - figures.kills)
+        for run_number in range(1, runs + 1):
+            figures.killed_in_recovery += not _run_until_killed(mission, acknowledged, rng)
             figures.kills += 1
-            if life % JUDGED_EVERY == 0 or life == lives:
+            if run_number % CHECK_EVERY == 0 or run_number == runs:
                 try:
-                    outcome = judge(root, told, flies_on=False)
+                    outcome = check_invariants(root, acknowledged, flies_on=False)
                 except AssertionError as error:
-                    figures.wrong.append(f"{mission.path}, life {life}: {error}")
+                    figures.wrong.append(f"{mission.path}, life {run_number}: {error}")
                     break
         else:
             figures.exposures += outcome.exposures
-            figures.set_aside += outcome.discarded
-        figures.stored += len(told.stored)
-        figures.sealed += len(told.sealed)
+            figures.discarded += outcome.discarded
+        figures.stored += len(acknowledged.stored)
+        figures.sealed += len(acknowledged.sealed)
     return figures
 
 
-def _live_and_die(mission: Mission, told: Told, dice: random.Random) -> bool:
+def _run_until_killed(mission: Mission, acknowledged: Acknowledged, rng: random.Random) -> bool:
     """One life; whether it came out of recovery before it was killed."""
-    heard, says = os.pipe()
+    read_end, write_end = os.pipe()
     child = os.fork()
     if not child:
-        os.close(heard)
+        os.close(read_end)
         with mission.held():
-            live(mission, says, None, lands=False, keeps="handed over")
-    os.close(says)
+            run_until_end(mission, write_end, None, lands=False, durability="handed over")
+    os.close(write_end)
     try:
-        lines = _hear(heard, dice)
+        lines = _read_some(read_end, rng)
         # Between two words anything is under way: files, folder, rename, commit, record.
-        _spin(dice.uniform(0.0, 0.004))
+        _spin(rng.uniform(0.0, 0.004))
     finally:
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
-    lines += _rest(heard)
-    os.close(heard)
+    lines += _read_rest(read_end)
+    os.close(read_end)
     for line in lines.decode().splitlines():
-        told.hear(line)
+        acknowledged.add_line(line)
     return b"flying 0\n" in lines
 
 
-def _hear(heard: int, dice: random.Random) -> bytes:
+def _read_some(read_end: int, rng: random.Random) -> bytes:
     """What the life says until it has said enough or a moment has passed, both by chance."""
-    words = b""
-    is_early = dice.random() < SHARE_KILLED_EARLY
-    wanted = 0 if is_early else dice.randrange(1, 16)
-    limit_s = dice.uniform(0.0, EARLY_S) if is_early else LIFE_LIMIT_S
+    received = b""
+    is_early = rng.random() < SHARE_KILLED_EARLY
+    wanted = 0 if is_early else rng.randrange(1, 16)
+    limit_s = rng.uniform(0.0, EARLY_S) if is_early else RUN_LIMIT_S
     end_s = time.monotonic() + limit_s
-    while is_early or words.partition(b"flying 0\n")[2].count(b"\n") < wanted:
+    while is_early or received.partition(b"flying 0\n")[2].count(b"\n") < wanted:
         left_s = end_s - time.monotonic()
-        readable = select.select([heard], [], [], max(0.0, left_s))[0]
+        readable = select.select([read_end], [], [], max(0.0, left_s))[0]
         if not readable:
             assert is_early, "a life hangs"
             break
-        word = os.read(heard, 65536)
-        assert word, "a life ended by itself"
-        words += word
-    return words
+        chunk = os.read(read_end, 65536)
+        assert chunk, "a life ended by itself"
+        received += chunk
+    return received
 
 
-def _rest(heard: int) -> bytes:
-    words = b""
-    while word := os.read(heard, 65536):
-        words += word
-    return words
+def _read_rest(read_end: int) -> bytes:
+    received = b""
+    while chunk := os.read(read_end, 65536):
+        received += chunk
+    return received
 
 
 def _spin(seconds: float) -> None:

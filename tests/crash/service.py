@@ -13,9 +13,9 @@ from typing import Any
 import typer
 
 from daemon.cli.run import run
-from daemon.onboard.service import departure, service
+from daemon.onboard.service import service, startup
 from daemon.onboard.service.messages import (
-    Begin,
+    BeginProcessing,
     FramesRead,
     Ping,
     Pong,
@@ -25,16 +25,16 @@ from daemon.onboard.service.messages import (
     WorkerBuilt,
     WorkerReady,
 )
-from daemon.onboard.service.processes import Link
+from daemon.onboard.service.processes import ServiceConnection
 
 
-def idle_worker(link: Link, _settings: Any, _rings: Any) -> None:
+def idle_worker(link: ServiceConnection, _settings: Any, _rings: Any) -> None:
     """In the place of `daemon.onboard.pipeline.worker.main`."""
     link.send(WorkerBuilt())
     while not isinstance(order := link.receive(timeout_s=1.0), Stop):
         if isinstance(order, Ping):
             link.send(Pong({}))
-        elif isinstance(order, Begin):
+        elif isinstance(order, BeginProcessing):
             link.send(WorkerReady(0.0))
         elif isinstance(order, Process):
             number = order.exposure.number
@@ -42,8 +42,8 @@ def idle_worker(link: Link, _settings: Any, _rings: Any) -> None:
             link.send(ProcessFailed(number, f"exposure {number}: no pipeline flies here"))
 
 
-def _with_idle_worker(*arguments: Any) -> departure.ProcessPlan:
-    plan = departure.worker_process(*arguments)
+def _with_idle_worker(*arguments: Any) -> startup.ProcessPlan:
+    plan = startup.worker_process(*arguments)
     return plan._replace(target="tests.crash.service:idle_worker")
 
 

@@ -14,11 +14,11 @@ import pytest
 from daemon.mission.layout import Mission
 from daemon.mission.store import durable
 from daemon.mission.store.level0_folder import read_sealed
-from tests.crash.flight import ILL
-from tests.crash.judging import Told, judge
+from tests.crash.invariants import Acknowledged, check_invariants
 from tests.crash.prefixes import ACKS, FLOWN, ROOT
+from tests.crash.scripted_flight import REFUSING_DISK
 from tests.crash.test_prefixes import MEMORY
-from tests.crash.write_log import needs_strace, run_ill
+from tests.crash.write_log import needs_strace, run_with_faults
 
 pytestmark = needs_strace
 
@@ -45,21 +45,21 @@ FAULTS = {
 
 @pytest.fixture
 def folder() -> Iterator[Path]:
-    made = Path(mkdtemp(prefix="syntopic-", dir=MEMORY if MEMORY.is_dir() else None))
-    yield made
-    durable.remove_tree(made)
+    created = Path(mkdtemp(prefix="syntopic-", dir=MEMORY if MEMORY.is_dir() else None))
+    yield created
+    durable.remove_tree(created)
 
 
-def fly(folder: Path, faults: list[str], exposures: int) -> tuple[int, Told, Mission]:
+def fly(folder: Path, faults: list[str], exposures: int) -> tuple[int, Acknowledged, Mission]:
     """How many calls failed, what was told, and the mission as it landed."""
-    program = [sys.executable, "-m", "tests.crash.flight", str(folder / FLOWN)]
-    command = [*program, str(folder / ACKS), str(exposures), ILL]
-    count = run_ill(command, faults, folder / "trace", cwd=ROOT)
-    told = Told()
+    program = [sys.executable, "-m", "tests.crash.scripted_flight", str(folder / FLOWN)]
+    command = [*program, str(folder / ACKS), str(exposures), REFUSING_DISK]
+    count = run_with_faults(command, faults, folder / "trace", cwd=ROOT)
+    acknowledged = Acknowledged()
     for line in (folder / ACKS).read_text().splitlines():
-        told.hear(line)
+        acknowledged.add_line(line)
     (path,) = (folder / FLOWN).glob("2*")
-    return count, told, Mission.open(path)
+    return count, acknowledged, Mission.open(path)
 
 
 IN_CI = ("frames and records are not synced", "everything now and then")
@@ -69,28 +69,28 @@ IN_CI = ("frames and records are not synced", "everything now and then")
     "fault", [pytest.param(f, marks=[] if f in IN_CI else pytest.mark.soak) for f in FAULTS]
 )
 def test_what_was_acknowledged_on_a_failing_disk_is_there(folder: Path, fault: str) -> None:
-    count, told, mission = fly(folder, FAULTS[fault], EXPOSURES)
+    count, acknowledged, mission = fly(folder, FAULTS[fault], EXPOSURES)
     assert count >= 4, "nothing failed"
-    assert told.is_closed, "the flight did not go on to its end"
+    assert acknowledged.is_closed, "the flight did not go on to its end"
     states = {}
     for number in mission.numbers():
         record = read_sealed(mission.level0(number))
         states[number] = record.exposure.state if record else "not sealed"
     # Every trigger ends in one record; what was called lost is not on the disk as well.
     assert sorted(states) == list(range(1, 2 * EXPOSURES + 1))
-    kept = {number for number, state in states.items() if state in ("complete", "degraded")}
-    assert kept >= told.stored
-    assert set(told.sealed) == set(states)
-    judge(folder / FLOWN, told, flies_on=True)
-    print(json.dumps({"fault": fault, "failed": count, "kept": len(kept), "of": len(states)}))
+    present = {number for number, state in states.items() if state in ("complete", "degraded")}
+    assert present >= acknowledged.stored
+    assert set(acknowledged.sealed) == set(states)
+    check_invariants(folder / FLOWN, acknowledged, flies_on=True)
+    print(json.dumps({"fault": fault, "failed": count, "kept": len(present), "of": len(states)}))
 
 
 def test_a_disk_that_stalls_for_seconds_costs_time_and_nothing_else(folder: Path) -> None:
     faults = ["fsync:delay_enter=1500000:when=20+40", "fdatasync:delay_enter=1000000:when=15+40"]
     begun_s = time.monotonic()
-    count, told, mission = fly(folder, faults, EXPOSURES)
+    count, acknowledged, mission = fly(folder, faults, EXPOSURES)
     assert count >= 3 and time.monotonic() - begun_s > 3.0
-    assert told.is_closed and len(mission.numbers()) == 2 * EXPOSURES
+    assert acknowledged.is_closed and len(mission.numbers()) == 2 * EXPOSURES
     triggered = set(range(1, 2 * EXPOSURES + 1))
-    assert told.stored == {number for number in triggered if number % 4}
-    judge(folder / FLOWN, told, flies_on=True)
+    assert acknowledged.stored == {number for number in triggered if number % 4}
+    check_invariants(folder / FLOWN, acknowledged, flies_on=True)

@@ -14,9 +14,18 @@ from tempfile import mkdtemp
 import pytest
 
 from daemon.mission.store import durable
-from tests.crash.disk import DROPPED, KEPT, VARIANTS, ZEROS, Disk, at_random, put, variants
-from tests.crash.kill_transfer import BEGUN, FLOWN, OTHER_DISK, Trial, content_of
+from tests.crash.kill_transfer import BEGUN, FLOWN, OTHER_DISK, TransferCase, content_of
 from tests.crash.prefixes import ROOT, key_of
+from tests.crash.simulated_disk import (
+    ALL_WRITTEN,
+    DROPPED,
+    VARIANTS,
+    ZEROS,
+    Disk,
+    at_random,
+    put,
+    variants,
+)
 from tests.crash.test_prefixes import MEMORY
 from tests.crash.write_log import Operation, needs_strace, record
 
@@ -26,9 +35,9 @@ PAIRS = int(os.environ.get("SYNTOPIC_TRANSFER_PAIRS", "1000"))
 
 @pytest.fixture
 def folder() -> Iterator[Path]:
-    made = Path(mkdtemp(prefix="syntopic-", dir=MEMORY if MEMORY.is_dir() else None))
-    yield made
-    durable.remove_tree(made)
+    created = Path(mkdtemp(prefix="syntopic-", dir=MEMORY if MEMORY.is_dir() else None))
+    yield created
+    durable.remove_tree(created)
 
 
 def killed(folder: Path, what: str) -> dict[str, object]:
@@ -62,13 +71,13 @@ def test_many_pairs_of_kills_leave_a_complete_copy(folder: Path) -> None:
 
 
 def cut(
-    operations: list[Operation], folder: Path, names: frozenset[str], *, most_wrong: int, seed: int
+    operations: list[Operation], folder: Path, names: frozenset[str], *, max_wrong: int, seed: int
 ) -> tuple[int, list[str]]:
     """Judge what power cuts after every operation leave; the number of states, and findings."""
     copy = next((folder / OTHER_DISK).iterdir())
-    trial = Trial(folder / FLOWN / copy.name, folder / OTHER_DISK, content_of(copy))
+    case = TransferCase(folder / FLOWN / copy.name, folder / OTHER_DISK, content_of(copy))
     disk = Disk(folder)
-    dice = random.Random(seed)
+    rng = random.Random(seed)
     seen: set[bytes] = set()
     wrong: list[str] = []
     has_begun = False
@@ -79,17 +88,17 @@ def cut(
         disk.apply(operation)
         if not has_begun:
             continue
-        for name, tree in [*variants(disk, names), *at_random(disk, dice, 1)]:
+        for name, tree in [*variants(disk, names), *at_random(disk, rng, 1)]:
             if (key := key_of(tree)) in seen:
                 continue
             seen.add(key)
             scratch = folder / "cut"
             put(tree, scratch)
             try:
-                trial.moved_to(scratch).check_interrupted(reruns=len(seen) % 3 == 0)
+                case.moved_to(scratch).check_interrupted(reruns=len(seen) % 3 == 0)
             except Exception as error:  # noqa: BLE001 - whatever a rerun raises is a finding
                 wrong.append(f"{operation.kind} {operation.path}, {name}: {error}")
-                if len(wrong) == most_wrong:
+                if len(wrong) == max_wrong:
                     return len(seen), wrong
             finally:
                 durable.remove_tree(scratch)
@@ -105,7 +114,7 @@ def recorded(folder: Path, forgets: str = "nothing") -> list[Operation]:
 @needs_strace
 def test_power_loss_after_every_call_of_a_transfer_leaves_a_complete_copy(folder: Path) -> None:
     names = frozenset({DROPPED, ZEROS})
-    states, wrong = cut(recorded(folder), folder, names, most_wrong=5, seed=1)
+    states, wrong = cut(recorded(folder), folder, names, max_wrong=5, seed=1)
     assert wrong == []
     assert states > 150
 
@@ -114,14 +123,14 @@ def test_power_loss_after_every_call_of_a_transfer_leaves_a_complete_copy(folder
 @pytest.mark.parametrize("forgotten", ["files", "folders"])
 def test_a_sync_that_a_transfer_leaves_out_is_found(folder: Path, forgotten: str) -> None:
     operations = recorded(folder, forgotten)
-    assert cut(operations, folder, frozenset({DROPPED}), most_wrong=1, seed=1)[1]
+    assert cut(operations, folder, frozenset({DROPPED}), max_wrong=1, seed=1)[1]
 
 
 @pytest.mark.soak
 @needs_strace
 @pytest.mark.timeout(3600)
 def test_power_loss_in_a_transfer_in_all_variants(folder: Path) -> None:
-    names = frozenset({KEPT, *VARIANTS})
-    states, wrong = cut(recorded(folder), folder, names, most_wrong=5, seed=2)
+    names = frozenset({ALL_WRITTEN, *VARIANTS})
+    states, wrong = cut(recorded(folder), folder, names, max_wrong=5, seed=2)
     print(states)
     assert wrong == []

@@ -12,13 +12,13 @@ from tests.crash.verified_flight import verify_in_flight
 
 @pytest.mark.trust
 def test_verification_in_flight_raises_no_false_alarm(tmp_path: Path) -> None:
-    told = verify_in_flight(tmp_path, 40, 1)
-    assert told.problems == []
-    assert told.states["flown"] > 10
+    verified = verify_in_flight(tmp_path, 40, 1)
+    assert verified.problems == []
+    assert verified.states["flown"] > 10
 
 
 @pytest.mark.soak
 def test_thousands_of_verifications_in_flight_raise_no_false_alarm(tmp_path: Path) -> None:
-    told = verify_in_flight(tmp_path, int(os.environ.get("SYNTOPIC_VERIFICATIONS", "2000")), 2)
-    assert told.problems == []
-    assert told.states["flown"] > 1000
+    verified = verify_in_flight(tmp_path, int(os.environ.get("SYNTOPIC_VERIFICATIONS", "2000")), 2)
+    assert verified.problems == []
+    assert verified.states["flown"] > 1000

@@ -96,13 +96,13 @@ def record(command: Sequence[str], folder: Path, log: Path, *, cwd: Path) -> lis
     ]
 
 
-def run_ill(
+def run_with_faults(
     command: Sequence[str],
     faults: Sequence[str],
     trace: Path,
     *,
     cwd: Path,
-    said: Path = Path("/dev/stdout"),
+    stdout: Path = Path("/dev/stdout"),
 ) -> int:
     """Run a program some of whose calls fail or wait; how many did.
 
@@ -119,7 +119,7 @@ def run_ill(
     traced = [STRACE, "-f", "--seccomp-bpf", "-qq", "-o", str(trace), "-e", f"trace={calls}"]
     for fault in faults:
         traced += ["-e", f"inject={fault}"]
-    with said.open("w") as out:
+    with stdout.open("w") as out:
         subprocess.run([*traced, *command], cwd=cwd, stdout=out, check=True, timeout=300)
     return sum("INJECTED" in line or "DELAYED" in line for line in trace.open())
 

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from daemon.mission.exposure import Capture, FrameRecord, NavigationRecord, TemperatureRecord
+from daemon.mission.canonical_json import sha256_hex
+from daemon.mission.exposure import CaptureRecord, FrameRecord, NavigationRecord, TemperatureRecord
 from daemon.mission.layout import Mission
-from daemon.mission.records import sha256_hex
 from daemon.mission.store.store import Level0Writer
 from tests.daemon.small_camera import final_record
 
@@ -78,7 +78,7 @@ def flown_mission(root: Path, numbers: Sequence[int] = (1, 2, 3, 4)) -> Mission:
             head: seed.integers(200, 4000, (HEIGHT_PX, WIDTH_PX)).astype(np.uint16)
             for head in HEADS
         }
-        capture = Capture(
+        capture = CaptureRecord(
             number=number,
             trigger_sequence=number,
             frames=tuple(frame_of(head, number) for head in HEADS),

@@ -48,6 +48,6 @@ def packet(band="Blue", capture="c1", extra="", **changes):
 
 def write_tiff(path, xmp, *, black=4800):
     """A small image with an XMP packet and a black level, but without EXIF."""
-    words = np.full((120, 160), 8000, np.uint16)
+    pixels = np.full((120, 160), 8000, np.uint16)
     tags = [(700, 7, len(xmp), xmp, True), (50714, 3, 4, (black,) * 4, True)]
-    tifffile.imwrite(path, words, photometric="minisblack", metadata=None, extratags=tags)
+    tifffile.imwrite(path, pixels, photometric="minisblack", metadata=None, extratags=tags)

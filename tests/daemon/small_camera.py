@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.mission.exposure import Capture, Exposure, FrameRecord, TemperatureRecord
+from daemon.mission.exposure import CaptureRecord, Exposure, FrameRecord, TemperatureRecord
 from daemon.mission.layout import Mission
 from daemon.mission.log.log_records import LoggedRecord
-from daemon.mission.store.level0_folder import exposure_of
+from daemon.mission.store.level0_folder import unsealed_exposure
 from daemon.mission.store.store import Level0Writer
 from drivers.contract import EventMark, TemperatureSample
 from processing.rig import Rig, rig_from_mapping
@@ -114,9 +114,9 @@ def frame_record(sensor: str, number: int) -> FrameRecord:
     )
 
 
-def capture_of(number: int, sensors: Sequence[str] = SENSORS) -> Capture:
+def capture_of(number: int, sensors: Sequence[str] = SENSORS) -> CaptureRecord:
     """An exposure whose frames are here, and not on the disk yet."""
-    return Capture(
+    return CaptureRecord(
         number=number,
         trigger_sequence=number,
         trigger_mono_ns=number * 1_000_000_000,
@@ -131,10 +131,10 @@ def capture_of(number: int, sensors: Sequence[str] = SENSORS) -> Capture:
     )
 
 
-def final_record(stored: Capture, gps_ns: int = 1_447_000_000_000_000_000) -> Exposure:
+def final_record(stored: CaptureRecord, gps_ns: int = 1_447_000_000_000_000_000) -> Exposure:
     """The record of a stored exposure, with its mark and temperatures."""
     return replace(
-        exposure_of(stored),
+        unsealed_exposure(stored),
         mark_gps_ns=gps_ns + stored.number * 1_000_000_000,
         mark_sigma_ns=60,
         mark_source="event-mark",
@@ -143,7 +143,7 @@ def final_record(stored: Capture, gps_ns: int = 1_447_000_000_000_000_000) -> Ex
     )
 
 
-def store_one(writer: Level0Writer, number: int, sensors: Sequence[str] = SENSORS) -> Capture:
+def store_one(writer: Level0Writer, number: int, sensors: Sequence[str] = SENSORS) -> CaptureRecord:
     """Store an exposure and say how it is stored."""
     capture = capture_of(number, sensors)
     return replace(capture, frames=writer.write(capture, pixels_of(number, sensors)))
@@ -178,9 +178,9 @@ def mark_of(number: int) -> EventMark:
     )
 
 
-def complete_from_log(stored: Capture, records: Sequence[LoggedRecord]) -> Exposure:
+def complete_from_log(stored: CaptureRecord, records: Sequence[LoggedRecord]) -> Exposure:
     """A stand-in for the matching: the mark of the same count, the last temperature of a probe."""
-    exposure = exposure_of(stored)
+    exposure = unsealed_exposure(stored)
     probes = {r.probe: r for r in records if isinstance(r, TemperatureSample)}
     temperatures = tuple(
         TemperatureRecord(p, r.value_c, stored.trigger_mono_ns - r.mono_ns)

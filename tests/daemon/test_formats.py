@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from daemon.mission.canonical_json import RecordError, parse_record
 from daemon.mission.exposure import Exposure, NavigationRecord, capture_bytes, from_json, to_json
 from daemon.mission.layout import Mission
-from daemon.mission.records import RecordError, parse_record
 from daemon.mission.store.store import load_level0, verify
 from processing.quality.report import FIGURES, Flag, Thresholds
-from processing.rig import Cone, Drift, Lens, Rig, Sensor, VirtualImage, load_rig
+from processing.rig import Cone, Lens, Rig, Sensor, ThermalDrift, VirtualImage, load_rig
 from tests.daemon.small_camera import (
     HEIGHT_PX,
     RIG_TOML,
@@ -93,11 +93,11 @@ def test_a_frame_with_another_suffix_is_taken_or_its_name_corrected(by_hand):
 
 
 def test_every_key_of_the_records_is_named(page):
-    told = named(page, "## exposure.json and capture.json")
+    output = named(page, "## exposure.json and capture.json")
     record = to_json(final_record(capture_of(1)))
     written = set(record) | set(record["frames"][0]) | {"sensor", "cause", "probe", "value_c"}
     written |= {field.name for field in fields(NavigationRecord)}
-    single = {word for text in told for word in re.findall(r"[a-z_0-9]+", text)}
+    single = {word for text in output for word in re.findall(r"[a-z_0-9]+", text)}
     assert written - single == set()
 
 
@@ -107,9 +107,9 @@ def test_the_keys_of_a_capture_are_those_marked(page):
     assert marked == set(parse_record(capture_bytes(capture_of(1)), "capture.json"))
 
 
-def test_the_defaults_told_are_the_defaults_taken(page):
+def test_the_documented_defaults_are_the_defaults_used(page):
     taken = to_json(from_json({"number": 1}))
-    told = dict(re.findall(r"^\| `(\w+)` \|(?: c)? ?\|.*\| ([^|]+) \|$", page, re.MULTILINE))
+    output = dict(re.findall(r"^\| `(\w+)` \|(?: c)? ?\|.*\| ([^|]+) \|$", page, re.MULTILINE))
     for key, default in (
         ("trigger_sequence", 0),
         ("trigger_mono_ns", '`"0"`'),
@@ -120,7 +120,7 @@ def test_the_defaults_told_are_the_defaults_taken(page):
         ("simulated", "false"),
         ("flags", 0),
     ):
-        assert told[key] == str(default)
+        assert output[key] == str(default)
         plain = str(default).strip("`").strip('"')
         assert str(taken[key]).replace("None", "null").replace("False", "false") == (
             "null" if plain == "null" else plain
@@ -130,11 +130,11 @@ def test_the_defaults_told_are_the_defaults_taken(page):
 
 def test_every_threshold_is_named_with_its_default(page):
     table = page.partition("| threshold |")[2].split("\n\n")[0].splitlines()
-    told = {}
+    output = {}
     for row in (line.split("|") for line in table[2:]):
         values = row[3].split("(")[0].split(",")
-        told |= dict(zip(re.findall(r"`(\w+)`", row[1]), map(float, values), strict=True))
-    assert told == pytest.approx(asdict(Thresholds()), rel=1e-3)
+        output |= dict(zip(re.findall(r"`(\w+)`", row[1]), map(float, values), strict=True))
+    assert output == pytest.approx(asdict(Thresholds()), rel=1e-3)
 
 
 def test_every_figure_and_every_flag_is_named_with_its_meaning_and_place(page):
@@ -145,21 +145,21 @@ def test_every_figure_and_every_flag_is_named_with_its_meaning_and_place(page):
 
 
 def test_every_key_of_a_rig_file_is_named(page):
-    told = {w for text in named(page, "## Rig files") for w in re.findall(r"[a-z_0-9]+", text)}
+    output = {w for text in named(page, "## Rig files") for w in re.findall(r"[a-z_0-9]+", text)}
     keys = {
         field.name
-        for kind in (Rig, VirtualImage, Cone, Lens, Sensor, Drift)
+        for kind in (Rig, VirtualImage, Cone, Lens, Sensor, ThermalDrift)
         for field in fields(kind)
     }
     keys -= {"calibration_id", "calibration_date", "calibration_valid_days"}
     keys -= {"cones", "sensors", "lens", "drift"}
-    assert keys - told == set()
+    assert keys - output == set()
 
 
 def test_a_hand_written_exposure_with_mistakes_is_refused_with_all_of_them(tmp_path):
     import tifffile
 
-    from daemon.mission.records import RecordError
+    from daemon.mission.canonical_json import RecordError
 
     folder = tmp_path / "m" / "L0" / "000001"
     folder.mkdir(parents=True)

@@ -22,8 +22,8 @@ from typing import Any
 
 import numpy as np
 
+from drivers.cameras.aravis.aravis_head import AravisHead
 from drivers.cameras.aravis.gvcp import control_privilege
-from drivers.cameras.aravis.head import AravisHead
 from drivers.contract import (
     CHUNK_ALLOWANCE_NBYTES,
     DeviceError,
@@ -231,19 +231,21 @@ def a_dead_controllers_hold_is_waited_out() -> dict[str, object]:
     ):
         assert holder.stdout is not None
         controls = holder.stdout.readline().strip().decode()
-        impatient = Flight(held_limit_s=1)
+        impatient = Flight(control_wait_limit_s=1)
         try:
             impatient.head.bind()
             refused = ""
         except DeviceError as error:
             refused = str(error)
         flight = Flight()
-        told: list[str] = []
+        event_names: list[str] = []
         holder.kill()
         holder.wait(5)
         killed = time.monotonic()
         flight.head.bind(
-            lambda record: told.append(record.name) if isinstance(record, DeviceEvent) else None
+            lambda record: (
+                event_names.append(record.name) if isinstance(record, DeviceEvent) else None
+            )
         )
         waited_s = time.monotonic() - killed
         flight.thread.start()
@@ -254,7 +256,7 @@ def a_dead_controllers_hold_is_waited_out() -> dict[str, object]:
     return {
         "controls": controls,
         "refused": refused,
-        "told": told,
+        "told": event_names,
         "waited_s": waited_s,
         "frames": len(flight.frames),
     }
@@ -366,8 +368,8 @@ def a_head_that_waits_for_its_line_refuses_a_software_trigger() -> dict[str, obj
 
 def packets_fit_the_network() -> dict[str, object]:
     """A network that carries 1500 bytes; only in a namespace of our own, where nobody minds."""
-    from sim_hw.gige.head import ExposureRequest, FrameSize, GigeHead, HeadIdentity
-    from sim_hw.world.world_clock import DeviceClock
+    from sim_hw.gige.gige_head import ExposureRequest, FrameSize, GigeHead, HeadIdentity
+    from sim_hw.world.world_clock import FreeRunningClock
 
     set_mtu = 0x8922
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
@@ -382,7 +384,7 @@ def packets_fit_the_network() -> dict[str, object]:
         FrameSize(SIZE, SIZE),
         expose,
         lambda _mono_ns: 30.0,
-        DeviceClock(),
+        FreeRunningClock(),
     )
     head.start()
     flight = Flight(frame_retention_ms=2000.0)
@@ -407,18 +409,18 @@ def light_that_changes_is_followed() -> dict[str, object]:
         next_settings,
     )
     from processing.radiometry.histogram import sampled_histogram
-    from sim_hw.gige.head import ExposureRequest, FrameSize, GigeHead, HeadIdentity
-    from sim_hw.world.world_clock import DeviceClock
+    from sim_hw.gige.gige_head import ExposureRequest, FrameSize, GigeHead, HeadIdentity
+    from sim_hw.world.world_clock import FreeRunningClock
 
     random = np.random.default_rng(4)
     ground = np.minimum(random.lognormal(-1.4, 0.5, (SIZE, SIZE)), 2.0)
-    asked: list[ExposureRequest] = []
+    requests: list[ExposureRequest] = []
     sun = [*(0.88**k for k in range(18)), *(0.88 ** (17 - k) for k in range(18))]
 
     def expose(request: ExposureRequest) -> np.ndarray[Any, np.dtype[np.uint16]]:
-        asked.append(request)
+        requests.append(request)
         light = request.exposure_time_us / 4000.0 * 10 ** (request.gain_db / 20)
-        dn = 200.0 + 3300.0 * ground * sun[min(len(asked), len(sun)) - 1] * light
+        dn = 200.0 + 3300.0 * ground * sun[min(len(requests), len(sun)) - 1] * light
         return np.minimum(dn, 4095.0).astype(np.uint16)
 
     head = GigeHead(
@@ -426,7 +428,7 @@ def light_that_changes_is_followed() -> dict[str, object]:
         FrameSize(SIZE, SIZE),
         expose,
         lambda _mono_ns: 30.0,
-        DeviceClock(),
+        FreeRunningClock(),
     )
     head.start()
     limits = ExposureLimits(*(100.0, 30_000.0, 12.0, 4, 256.0), smear_px=0.5, black=200.0 / 4095.0)
@@ -447,7 +449,7 @@ def light_that_changes_is_followed() -> dict[str, object]:
     flight.thread.join(3)
     head.close()
     return {
-        "asked": [[r.exposure_time_us, r.gain_db, r.tdi_shifts] for r in asked],
+        "asked": [[r.exposure_time_us, r.gain_db, r.tdi_shifts] for r in requests],
         "told": [
             [f.exposure_time_us, f.settings["Gain"], f.settings["TdiShifts"]] for f in flight.frames
         ],

@@ -43,7 +43,7 @@ QUIET_S: Final = 0.4
 OTHER_POSITION: Final = "other position"
 NOT_MEASURED: Final = (7, 8)
 """`status` of TPV: a surveyed position, a simulated one."""
-SETTLE_S: Final = 1.0
+STARTUP_S: Final = 1.0
 """gpsd empties the line when it has opened it, and opens it when somebody watches."""
 
 Report = Mapping[str, Any]
@@ -104,7 +104,7 @@ def read_through_gpsd(recording: Path, *, patience: float = 1.0) -> list[NavSamp
             connection.settimeout(0.02)
             os.set_blocking(gpsd.receiver, False)
             began = time.monotonic()
-            while not reports.devices or time.monotonic() - began < patience * SETTLE_S:
+            while not reports.devices or time.monotonic() - began < patience * STARTUP_S:
                 with suppress(TimeoutError):
                     reports.feed(connection.recv(65_536), 0)
             at, quiet_since = 0, time.monotonic()
@@ -113,10 +113,10 @@ def read_through_gpsd(recording: Path, *, patience: float = 1.0) -> list[NavSamp
                     at += _written(gpsd.receiver, data[at : at + 2048])
                     quiet_since = time.monotonic()
                 try:
-                    heard = connection.recv(65_536)
+                    received = connection.recv(65_536)
                 except TimeoutError:
                     continue
-                samples += reports.feed(heard, 0)
+                samples += reports.feed(received, 0)
                 quiet_since = time.monotonic()
     return samples
 
@@ -192,8 +192,8 @@ def _written(descriptor: int, data: bytes) -> int:
 
 
 def _utc_ms(text: str) -> int:
-    whole = datetime.datetime.strptime(text[:19], "%Y-%m-%dT%H:%M:%S") - EPOCH
-    return (whole.days * 86_400 + whole.seconds) * 1000 + int(text[20:23])
+    seconds_part = datetime.datetime.strptime(text[:19], "%Y-%m-%dT%H:%M:%S") - EPOCH
+    return (seconds_part.days * 86_400 + seconds_part.seconds) * 1000 + int(text[20:23])
 
 
 def recordings(names: Iterable[str] | None = None) -> list[Path]:

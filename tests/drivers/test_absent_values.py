@@ -54,8 +54,10 @@ def test_ublox_accuracies_of_all_ones_are_not_known() -> None:
 
 
 def test_septentrio_values_that_are_not_to_be_used_are_absent() -> None:
-    said = septentrio.pvt(1000, error=1) + septentrio.pvt(1200, mode=0x84) + septentrio.pvt(1400)
-    none, flat = septentrio.samples(said)[:2]
+    stream_bytes = (
+        septentrio.pvt(1000, error=1) + septentrio.pvt(1200, mode=0x84) + septentrio.pvt(1400)
+    )
+    none, flat = septentrio.samples(stream_bytes)[:2]
     assert_no_position(none)
     assert (flat.fix, flat.height_m, flat.vertical_sigma_m) == ("2d", None, None)
     body = bytearray(septentrio.pvt(1000)[14:])
@@ -93,12 +95,12 @@ def test_novatel_solutions_without_any_log_of_sigmas_have_none() -> None:
 def test_mavlink_markers_are_absent() -> None:
     def flown(*, fix: int = 3, ellipsoid_mm: int = 1_000_000, accuracy: int = 20, seen: int = 17):
         bus = mavlink.Bus()
-        gps = bus.say(mavlink.dialect.MAVLink_gps_raw_int_message(
+        gps = bus.pack_message(mavlink.dialect.MAVLink_gps_raw_int_message(
             mavlink.BOOT_MS * 1000, fix, 475_000_000, 85_000_000, 952_500, 65_535, 65_535, 65_535,
             0, seen, ellipsoid_mm, accuracy, accuracy, accuracy, 0, 0,
         ))  # fmt: skip
-        said = bus.heartbeat() + bus.system_time() + gps + bus.position()
-        (sample,) = mavlink.samples(said)
+        stream_bytes = bus.heartbeat() + bus.system_time() + gps + bus.position()
+        (sample,) = mavlink.samples(stream_bytes)
         return sample
 
     assert_no_position(flown(fix=1))
@@ -110,7 +112,7 @@ def test_mavlink_markers_are_absent() -> None:
     assert not math.isnan(unknown.latitude_deg)
 
 
-def test_mavlink_before_the_gps_was_heard_has_no_position() -> None:
+def test_mavlink_before_the_gps_was_received_has_no_position() -> None:
     bus = mavlink.Bus()
     (sample,) = mavlink.samples(bus.heartbeat() + bus.system_time() + bus.position())
     assert_no_position(sample)

@@ -20,14 +20,14 @@ from typer.testing import CliRunner
 from daemon.cli import app
 from daemon.cli.find_heads import found_heads
 from drivers.cameras.aravis import gvcp
-from drivers.cameras.aravis.senders import NewSockets
+from drivers.cameras.aravis.packet_filter import SocketCapture
 from drivers.contract import DeviceError, FrameStatus
 from drivers.transport.udp_port import open_udp_port
-from sim_hw.faults.plan import Planned
+from sim_hw.faults.plan import PlannedFault
 from sim_hw.gige import features
+from sim_hw.gige.gige_head import FrameSize, GigeHead, HeadIdentity, Pacing, WireFaults
 from sim_hw.gige.gvsp import PAYLOAD_IMAGE
-from sim_hw.gige.head import FrameSize, GigeHead, HeadIdentity, Pacing, WireFaults
-from sim_hw.world.world_clock import DeviceClock
+from sim_hw.world.world_clock import FreeRunningClock
 from tests.daemon.onboard.monitoring.test_mavsdk_camera import free_port
 from tests.drivers.test_aravis_head import NETWORK, PATTERN, SHAPE, Pair, flying
 
@@ -35,7 +35,7 @@ pytest.importorskip("gi", reason="needs PyGObject (extra aravis) and gir1.2-arav
 pytestmark = [pytest.mark.timeout(240), pytest.mark.trust, pytest.mark.attack]
 
 HEAD = f"{NETWORK}.1"
-STRANGER = f"{NETWORK}.66"
+ATTACKER_ADDRESS = f"{NETWORK}.66"
 MONO16 = 0x0110_0007
 FORGED = np.full(SHAPE, 0x0ABC, np.uint16)
 AHEAD = 30
@@ -82,7 +82,7 @@ def wait_counted(pair: Pair, name: str, count: int) -> None:
 
 
 @contextlib.contextmanager
-def stranger(address: str = STRANGER) -> Iterator[socket.socket]:
+def attacker_socket(address: str = ATTACKER_ADDRESS) -> Iterator[socket.socket]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
         udp.bind((address, 0))
         yield udp
@@ -103,7 +103,7 @@ def fly_attacked(pair: Pair, attacker: socket.socket, count: int = 6) -> int:
     return sent
 
 
-def assert_unharmed(pair: Pair, count: int = 6) -> None:
+def assert_unaffected(pair: Pair, count: int = 6) -> None:
     assert [f.status for f in pair.frames] == [FrameStatus.COMPLETE] * count
     assert [f.counter for f in pair.frames] == list(range(1, count + 1))
     for picture in pair.pictures:
@@ -117,12 +117,12 @@ def test_forged_frames_and_block_numbers_of_another_address_cost_nothing(
 ) -> None:
     if packet_socket and not has_packet_sockets():
         pytest.skip("packet sockets need CAP_NET_RAW")
-    with flying(packet_socket=packet_socket) as (pair,), stranger() as attacker:
+    with flying(packet_socket=packet_socket) as (pair,), attacker_socket() as attacker:
         sent = fly_attacked(pair, attacker)
         wait_counted(pair, "other_senders", sent)
         source = "{}:{}".format(*attacker.getsockname())
         accepted = f"{HEAD}:{pair.emulated._stream_port}"
-    assert_unharmed(pair)
+    assert_unaffected(pair)
     assert pair.driver.statistics()["other_senders"] == sent
     (event,) = [e for e in pair.events if e.name == "other-sender"]
     assert event.is_fault
@@ -131,29 +131,29 @@ def test_forged_frames_and_block_numbers_of_another_address_cost_nothing(
 
 
 def test_another_port_of_the_heads_address_is_another_sender() -> None:
-    with flying() as (pair,), stranger(HEAD) as attacker:
+    with flying() as (pair,), attacker_socket(HEAD) as attacker:
         sent = fly_attacked(pair, attacker)
         wait_counted(pair, "other_senders", sent)
-    assert_unharmed(pair)
+    assert_unaffected(pair)
 
 
 @pytest.mark.skipif(not has_packet_sockets(), reason="packet sockets need CAP_NET_RAW")
 def test_a_packet_socket_takes_the_heads_port_only() -> None:
-    with flying(packet_socket=True) as (pair,), stranger(HEAD) as attacker:
+    with flying(packet_socket=True) as (pair,), attacker_socket(HEAD) as attacker:
         fly_attacked(pair, attacker)
-    assert_unharmed(pair)
+    assert_unaffected(pair)
 
 
 @contextlib.contextmanager
-def head_that_says(port: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Pair]:
+def head_reporting_port(port: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Pair]:
     """A head whose register for its stream's source port holds something else."""
     start = GigeHead.start
 
-    def start_and_say(head: GigeHead) -> None:
+    def start_and_report(head: GigeHead) -> None:
         start(head)
-        head._registers.set_word(features.STREAM_SOURCE_PORT, port)
+        head._registers.set_register(features.STREAM_SOURCE_PORT, port)
 
-    monkeypatch.setattr(GigeHead, "start", start_and_say)
+    monkeypatch.setattr(GigeHead, "start", start_and_report)
     with flying() as (pair,):
         yield pair
 
@@ -161,25 +161,25 @@ def head_that_says(port: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Pair]
 def test_a_head_that_does_not_say_its_port_is_held_to_the_first(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    with head_that_says(0, monkeypatch) as pair, stranger() as attacker:
+    with head_reporting_port(0, monkeypatch) as pair, attacker_socket() as attacker:
         fly_attacked(pair, attacker, 3)
-        with stranger(HEAD) as other_port:
+        with attacker_socket(HEAD) as other_port:
             for number in range(4, 7):
                 other_port.sendto(packet(number + AHEAD, 3, 1), stream_of(pair))
                 for datagram in forged_frame(number, 8000):
                     other_port.sendto(datagram, stream_of(pair))
                 pair.pulse(number)
                 pair.wait_frames(number)
-    assert_unharmed(pair)
+    assert_unaffected(pair)
 
 
-def test_a_head_that_says_a_wrong_port_loses_no_frame_for_that(
+def test_a_head_that_reports_a_wrong_port_loses_no_frame_for_that(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    with head_that_says(9, monkeypatch) as pair, stranger() as attacker:
+    with head_reporting_port(9, monkeypatch) as pair, attacker_socket() as attacker:
         # Its test packet shows where it really sends from.
         fly_attacked(pair, attacker)
-    assert_unharmed(pair)
+    assert_unaffected(pair)
 
 
 def test_a_head_that_skips_block_numbers_loses_one_exposure_at_most() -> None:
@@ -194,8 +194,8 @@ def test_a_head_that_skips_block_numbers_loses_one_exposure_at_most() -> None:
             pair.pulse(number)
             pause.wait(0.4)
         pair.wait(lambda: pair.frames[-1].counter == 8, "the last frame")
-    whole = [f.counter for f in pair.frames if f.status is FrameStatus.COMPLETE]
-    assert whole == [1, 2, 4, 5, 6, 7, 8]
+    complete = [f.counter for f in pair.frames if f.status is FrameStatus.COMPLETE]
+    assert complete == [1, 2, 4, 5, 6, 7, 8]
     assert pair.driver.statistics()["stream_restarts"] == 1
     assert "stream-restarted" in [e.name for e in pair.events]
 
@@ -214,9 +214,9 @@ def forged_answers() -> list[bytes]:
     ] + [acknowledgement(0x0089, n, struct.pack(">HH", 0, 65_535)) for n in range(1, 20)]
 
 
-@pytest.mark.parametrize("address", [STRANGER, HEAD], ids=["another", "another port"])
+@pytest.mark.parametrize("address", [ATTACKER_ADDRESS, HEAD], ids=["another", "another port"])
 def test_forged_answers_to_control_commands_change_nothing(address: str) -> None:
-    with flying(latch_interval_s=0.5) as (pair,), stranger(address) as attacker:
+    with flying(latch_interval_s=0.5) as (pair,), attacker_socket(address) as attacker:
         control = pair.emulated._control.controller
         assert control is not None
         over = threading.Event()
@@ -237,7 +237,7 @@ def test_forged_answers_to_control_commands_change_nothing(address: str) -> None
         finally:
             over.set()
             thread.join()
-    assert_unharmed(pair, 1)
+    assert_unaffected(pair, 1)
     assert pair.frames[0].temperature_c == 36.5
     assert abs(pair.start_on_host_ns(pair.frames[0]) - pair.starts_ns[0]) < 50_000_000
     assert pair.driver.statistics()["other_senders"] > 0
@@ -245,8 +245,8 @@ def test_forged_answers_to_control_commands_change_nothing(address: str) -> None
 
 
 def test_pending_acknowledgements_of_others_do_not_keep_a_lost_head_away() -> None:
-    silent = WireFaults(planned=(Planned("silent", "SU00", None, 1, 6.0, 0.0),))
-    with flying(faults=silent) as (pair,), stranger() as attacker:
+    silent = WireFaults(planned=(PlannedFault("silent", "SU00", None, 1, 6.0, 0.0),))
+    with flying(faults=silent) as (pair,), attacker_socket() as attacker:
         control = pair.emulated._control.controller
         assert control is not None
         over = threading.Event()
@@ -266,11 +266,11 @@ def test_pending_acknowledgements_of_others_do_not_keep_a_lost_head_away() -> No
             thread.join()
 
 
-def heard_by(udp: socket.socket) -> set[str]:
+def accepted_by(udp: socket.socket) -> set[str]:
     """Who of head and stranger gets through to a socket."""
     udp.settimeout(0.2)
-    for address in (HEAD, STRANGER):
-        with stranger(address) as sender:
+    for address in (HEAD, ATTACKER_ADDRESS):
+        with attacker_socket(address) as sender:
             sender.sendto(b"?", ("127.0.0.1", udp.getsockname()[1]))
     found = set()
     with contextlib.suppress(TimeoutError):
@@ -284,19 +284,19 @@ def test_a_socket_is_held_to_the_head_as_soon_as_aravis_binds_it() -> None:
     with contextlib.ExitStack() as stack:
         before = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
         before.bind(("127.0.0.1", 0))
-        sockets = stack.enter_context(NewSockets("127.0.0.1", HEAD))
+        sockets = stack.enter_context(SocketCapture("127.0.0.1", HEAD))
         elsewhere = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
         elsewhere.bind(("127.0.0.2", 0))
         receiver = open_udp_port(f"udpin://127.0.0.1:{free_port()}")
         stack.callback(receiver.close)
-        made = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-        made.bind(("127.0.0.1", 0))
+        forger = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        forger.bind(("127.0.0.1", 0))
         pause = threading.Event()
         pause.wait(0.2)
-        assert heard_by(made) == {HEAD}
-        assert heard_by(before) == heard_by(receiver._socket) == {HEAD, STRANGER}
+        assert accepted_by(forger) == {HEAD}
+        assert accepted_by(before) == accepted_by(receiver._socket) == {HEAD, ATTACKER_ADDRESS}
         with sockets.take() as taken:
-            assert taken.getsockname() == made.getsockname()
+            assert taken.getsockname() == forger.getsockname()
         with pytest.raises(DeviceError, match="control socket"):
             sockets.take()
 
@@ -357,7 +357,7 @@ def impostor(serial: str, model: str, user_id: str) -> Iterator[None]:
         FrameSize(SHAPE[1], SHAPE[0]),
         lambda _request: FORGED,
         lambda _mono_ns: 0.0,
-        DeviceClock(),
+        FreeRunningClock(),
         WireFaults(),
         Pacing.for_receive_buffer(4 << 20),
     )
@@ -386,4 +386,4 @@ def test_who_answers_discovery_in_a_heads_name_is_not_opened() -> None:
             pair.pulse(1)
             pair.wait_frames(1)
             assert pair.driver.bind()["serial"] == "E-0"
-    assert_unharmed(pair, 1)
+    assert_unaffected(pair, 1)

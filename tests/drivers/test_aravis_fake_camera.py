@@ -58,55 +58,55 @@ def _scenario(name: str) -> dict[str, Any]:
 
 
 def test_frames_land_in_the_memory_we_gave_pixel_by_pixel() -> None:
-    told = _scenario("frames_land_in_our_memory")
-    assert told["statuses"] == ["complete"] * 8
-    assert told["slots"] == [0, 1, 2, 3, 0, 1, 2, 3], "slots are used in turn"
-    assert [b - a for a, b in zip(told["ids"], told["ids"][1:], strict=False)] == [1] * 7
-    assert told["is_diagonal_ramp"] == [True] * 8
-    assert told["next_is_shifted_by_one"] == [True] * 7
-    assert told["behind_the_pixels_untouched"]
-    assert told["size"] == [512, 512]
-    assert told["settings"]["ExposureTime"] == 2000.0
-    assert told["settings"]["PixelFormat"] == "Mono16"
-    assert told["settings"]["GevSCPSPacketSize"] >= 576
-    assert told["found"]["model"] == "Fake"
-    assert told["found"]["serial"] == "T1"
-    assert told["statistics"]["frames"] == 8
-    assert told["statistics"]["missing_packets"] == 0
-    assert (told["state"], told["thread_ended"]) == ("inactive", True)
+    outcome = _scenario("frames_land_in_our_memory")
+    assert outcome["statuses"] == ["complete"] * 8
+    assert outcome["slots"] == [0, 1, 2, 3, 0, 1, 2, 3], "slots are used in turn"
+    assert [b - a for a, b in zip(outcome["ids"], outcome["ids"][1:], strict=False)] == [1] * 7
+    assert outcome["is_diagonal_ramp"] == [True] * 8
+    assert outcome["next_is_shifted_by_one"] == [True] * 7
+    assert outcome["behind_the_pixels_untouched"]
+    assert outcome["size"] == [512, 512]
+    assert outcome["settings"]["ExposureTime"] == 2000.0
+    assert outcome["settings"]["PixelFormat"] == "Mono16"
+    assert outcome["settings"]["GevSCPSPacketSize"] >= 576
+    assert outcome["found"]["model"] == "Fake"
+    assert outcome["found"]["serial"] == "T1"
+    assert outcome["statistics"]["frames"] == 8
+    assert outcome["statistics"]["missing_packets"] == 0
+    assert (outcome["state"], outcome["thread_ended"]) == ("inactive", True)
     # The fake camera exposes on a grid of 40 ms, so this bounds our share from above.
-    assert statistics.median(told["delays_ms"]) < 100
+    assert statistics.median(outcome["delays_ms"]) < 100
 
 
 def test_a_killed_head_is_noticed_within_five_seconds_and_opened_again() -> None:
-    told = _scenario("a_killed_head_is_found_again")
-    assert told["events"] == ["opened", "lost", "opened"]
-    assert told["faults"] == [False, True, False]
-    assert told["lost_after_s"] < 5
-    assert told["reopened_after_s"] < 12
-    assert told["frames"] == 4
-    assert told["opened"] == 2
+    outcome = _scenario("a_killed_head_is_found_again")
+    assert outcome["events"] == ["opened", "lost", "opened"]
+    assert outcome["faults"] == [False, True, False]
+    assert outcome["lost_after_s"] < 5
+    assert outcome["reopened_after_s"] < 12
+    assert outcome["frames"] == 4
+    assert outcome["opened"] == 2
 
 
 def test_a_head_that_restarts_at_once_is_noticed_too() -> None:
-    told = _scenario("a_quick_restart_is_noticed")
-    assert told["events"] == ["opened", "lost", "opened"]
-    assert told["back_after_s"] < 8
-    assert told["frames"] == 3
+    outcome = _scenario("a_quick_restart_is_noticed")
+    assert outcome["events"] == ["opened", "lost", "opened"]
+    assert outcome["back_after_s"] < 8
+    assert outcome["frames"] == 3
 
 
 def test_the_hold_of_a_dead_controller_is_waited_out_and_shown() -> None:
-    told = _scenario("a_dead_controllers_hold_is_waited_out")
-    assert told["controls"] == "True"
-    assert "another program has held the head for 1 s" in told["refused"]
-    assert told["told"] == ["held-by-another"]
-    assert told["waited_s"] < 8, "the fake camera lets go 3 s after the last heartbeat"
-    assert told["frames"] == 2
+    outcome = _scenario("a_dead_controllers_hold_is_waited_out")
+    assert outcome["controls"] == "True"
+    assert "another program has held the head for 1 s" in outcome["refused"]
+    assert outcome["told"] == ["held-by-another"]
+    assert outcome["waited_s"] < 8, "the fake camera lets go 3 s after the last heartbeat"
+    assert outcome["frames"] == 2
 
 
 def test_settings_that_the_head_refuses_come_all_at_once_and_let_it_go() -> None:
-    told = _scenario("refused_settings_come_together")
-    four, serial, line, small, absent = told["refusals"]
+    outcome = _scenario("refused_settings_come_together")
+    four, serial, line, small, absent = outcome["refusals"]
     assert "pixel_format is 'Mono12p'; the head has" in four
     assert "exposure_time_us is 5e+07; the head takes 10 to 1e+07" in four
     assert "gain_db is 6; the head has no feature Gain in dB, set 0" in four
@@ -115,13 +115,13 @@ def test_settings_that_the_head_refuses_come_all_at_once_and_let_it_go() -> None
     assert "trigger_line = 'Line7' is refused" in line
     assert "a frame has 524288 bytes, its slot 1000" in small
     assert "nothing answers at 127.0.0.1; check the head's power, cable" in absent
-    assert told["privilege_afterwards"] == 0
+    assert outcome["privilege_afterwards"] == 0
 
 
 def test_lost_packets_give_an_incomplete_frame_and_its_reason() -> None:
-    told = _scenario("lost_packets_make_incomplete_frames")
-    counted = told["statistics"]
-    assert told["statuses"].count("incomplete") == counted["frames_incomplete"] > 0
+    outcome = _scenario("lost_packets_make_incomplete_frames")
+    counted = outcome["statistics"]
+    assert outcome["statuses"].count("incomplete") == counted["frames_incomplete"] > 0
     assert (
         counted["incomplete_timeout"] + counted.get("incomplete_missing_packets", 0)
         == (counted["frames_incomplete"])
@@ -130,49 +130,49 @@ def test_lost_packets_give_an_incomplete_frame_and_its_reason() -> None:
     assert counted["resend_requests"] > 0
 
 
-def test_frames_that_come_while_all_slots_are_taken_are_counted_and_told() -> None:
-    told = _scenario("taken_slots_lose_frames_at_the_stream")
-    assert told["underruns"] == 2
-    assert told["events"] == ["opened", "underrun"]
-    assert told["frames"] == 5, "three before, two after the slots were handed back"
-    assert "slot 0 was not handed out" in told["twice"]
+def test_frames_that_come_while_all_slots_are_taken_are_counted_and_reported() -> None:
+    outcome = _scenario("taken_slots_lose_frames_at_the_stream")
+    assert outcome["underruns"] == 2
+    assert outcome["events"] == ["opened", "underrun"]
+    assert outcome["frames"] == 5, "three before, two after the slots were handed back"
+    assert "slot 0 was not handed out" in outcome["twice"]
 
 
 def test_closing_a_dead_head_takes_two_seconds_at_most() -> None:
-    told = _scenario("closing_a_dead_head_takes_two_seconds_at_most")
-    assert told["closed_s"] < 2.1
-    assert told["ended_s"] < 2.1
-    assert told["state"] == "inactive"
+    outcome = _scenario("closing_a_dead_head_takes_two_seconds_at_most")
+    assert outcome["closed_s"] < 2.1
+    assert outcome["ended_s"] < 2.1
+    assert outcome["state"] == "inactive"
 
 
 def test_a_head_that_waits_for_its_line_refuses_a_software_trigger() -> None:
-    told = _scenario("a_head_that_waits_for_its_line_refuses_a_software_trigger")
-    assert 'set trigger_source = "software"' in told["refused"]
-    assert told["frames"] == 0
+    outcome = _scenario("a_head_that_waits_for_its_line_refuses_a_software_trigger")
+    assert 'set trigger_source = "software"' in outcome["refused"]
+    assert outcome["frames"] == 0
 
 
 def test_the_packet_size_is_negotiated_down_to_what_the_network_carries() -> None:
     if not _namespace():
         pytest.skip("needs unshare and user namespaces: the loopback's own MTU is not touched")
-    told = _scenario("packets_fit_the_network")
-    assert told["statuses"] == ["complete", "complete"]
-    assert told["equal"] == [True, True]
-    assert all(1000 < size <= 1500 for size in told["packet_sizes"]), told["packet_sizes"]
+    outcome = _scenario("packets_fit_the_network")
+    assert outcome["statuses"] == ["complete", "complete"]
+    assert outcome["equal"] == [True, True]
+    assert all(1000 < size <= 1500 for size in outcome["packet_sizes"]), outcome["packet_sizes"]
 
 
-def test_light_that_changes_is_followed_and_every_frame_says_what_it_was_exposed_with() -> None:
-    told = _scenario("light_that_changes_is_followed")
-    count = len(told["sun"])
-    assert len(told["told"]) == len(told["asked"]) == count
-    for asked, said in zip(told["asked"], told["told"], strict=True):
+def test_light_that_changes_is_followed_and_every_frame_states_what_it_was_exposed_with() -> None:
+    outcome = _scenario("light_that_changes_is_followed")
+    count = len(outcome["sun"])
+    assert len(outcome["told"]) == len(outcome["asked"]) == count
+    for asked, said in zip(outcome["asked"], outcome["told"], strict=True):
         assert said == pytest.approx(asked, rel=1e-4, abs=1e-3)
-    times_us, gains_db, shifts = zip(*told["told"], strict=True)
+    times_us, gains_db, shifts = zip(*outcome["told"], strict=True)
     assert max(times_us) / min(times_us) > 3.0
     assert max(gains_db) <= 12.0
     assert len(set(shifts)) >= 3
-    assert min(told["bright"][5:]) > 0.42
-    assert max(told["bright"][5:]) < 0.8
+    assert min(outcome["bright"][5:]) > 0.42
+    assert max(outcome["bright"][5:]) < 0.8
     # Divided by what was really used, the pictures say how bright the light was.
-    ratios = [r / s for r, s in zip(told["radiance"], told["sun"], strict=True)]
+    ratios = [r / s for r, s in zip(outcome["radiance"], outcome["sun"], strict=True)]
     assert max(ratios[5:]) / min(ratios[5:]) < 1.03
-    assert "are refused" in told["refused"]
+    assert "are refused" in outcome["refused"]

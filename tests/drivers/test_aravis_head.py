@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.cameras.aravis.action_trigger import ActionTrigger
-from drivers.cameras.aravis.head import AravisHead
+from drivers.cameras.aravis.aravis_head import AravisHead
 from drivers.contract import (
     CHUNK_ALLOWANCE_NBYTES,
     DeviceError,
@@ -24,8 +24,8 @@ from drivers.contract import (
     LifeCycle,
     Record,
 )
-from sim_hw.faults.plan import Planned
-from sim_hw.gige.head import (
+from sim_hw.faults.plan import PlannedFault
+from sim_hw.gige.gige_head import (
     ExposureRequest,
     FrameSize,
     GigeHead,
@@ -33,7 +33,7 @@ from sim_hw.gige.head import (
     Pacing,
     WireFaults,
 )
-from sim_hw.world.world_clock import DeviceClock
+from sim_hw.world.world_clock import FreeRunningClock
 
 pytest.importorskip("gi", reason="needs PyGObject (extra aravis) and gir1.2-aravis-0.8")
 pytestmark = pytest.mark.timeout(240)
@@ -79,7 +79,7 @@ class Pair:
     """An emulated head, and the driver in its thread."""
 
     def __init__(self, number: int, faults: WireFaults, section: dict[str, object]) -> None:
-        self.clock = DeviceClock(offset_ns=number * 10**12, drift_ppm=15.0 * number)
+        self.clock = FreeRunningClock(offset_ns=number * 10**12, drift_ppm=15.0 * number)
         self.starts_ns: list[int] = []
         address = f"{NETWORK}.{number + 1}"
         self.emulated = GigeHead(
@@ -165,7 +165,7 @@ def flying(
 
 
 @pytest.mark.parametrize("pixel_format", FORMATS)
-def test_every_format_comes_as_right_justified_words_bit_for_bit(pixel_format: str) -> None:
+def test_every_format_comes_as_right_justified_values_bit_for_bit(pixel_format: str) -> None:
     with flying(pixel_format=pixel_format, gain_db=6.5) as (pair,):
         for number in (1, 2):
             pair.pulse(number)
@@ -247,19 +247,19 @@ def test_scheduled_actions_expose_heads_at_their_delays_whatever_their_clocks() 
     assert [pulse.count for pulse in pulses] == [1, 2, 3]
 
 
-def test_an_action_that_comes_after_its_time_is_said_to_be_late() -> None:
+def test_an_action_that_comes_after_its_time_is_reported_as_late() -> None:
     with flying(trigger_source="action") as (pair,):
         now_ns = pair.clock.device_ns(time.monotonic_ns())
         with pytest.raises(DeviceError, match="came after its time; lengthen lead_ms"):
-            pair.driver.act(now_ns - 1_000_000_000)
+            pair.driver.send_action_command(now_ns - 1_000_000_000)
         pair.wait_frames(1)
     assert pair.driver.statistics()["actions_late"] == 1
 
 
-def test_an_action_that_means_other_heads_is_told_as_not_taken() -> None:
+def test_an_action_that_means_other_heads_is_reported_as_not_taken() -> None:
     with flying(trigger_source="action", action_group_mask=0b100) as (pair,):
         # Somebody else has given the head another group.
-        pair.emulated._registers.set_word(0x9804, 0b010)
+        pair.emulated._registers.set_register(0x9804, 0b010)
         with pytest.raises(DeviceError, match="was not taken"):
             pair.driver.trigger()
     assert pair.emulated.statistics()["actions_ignored"] == 1
@@ -271,7 +271,7 @@ def test_a_trigger_of_actions_refuses_heads_that_wait_for_something_else() -> No
         ActionTrigger("trigger", {}, heads={"A": [head]})
 
 
-def test_lost_packets_are_asked_for_again_and_counted() -> None:
+def test_lost_packets_are_requested_again_and_counted() -> None:
     faults = WireFaults(packet_loss=0.02)
     with flying(faults=faults, packet_size=1500, pixel_format="Mono12p") as (pair,):
         for number in range(1, 9):
@@ -301,7 +301,7 @@ def test_packets_have_the_size_that_was_given_or_passes(
 
 
 def fault(name: str, at_pulse: int) -> WireFaults:
-    return WireFaults(planned=(Planned(name, "SU00", None, at_pulse, None, 0.0),))
+    return WireFaults(planned=(PlannedFault(name, "SU00", None, at_pulse, None, 0.0),))
 
 
 def test_a_half_frame_is_incomplete_and_the_next_one_is_itself() -> None:
@@ -318,7 +318,7 @@ def test_a_half_frame_is_incomplete_and_the_next_one_is_itself() -> None:
     assert pair.driver.statistics()["frames_incomplete"] == 1
 
 
-def test_a_frame_older_than_its_trigger_says_so_by_time_and_count() -> None:
+def test_a_frame_older_than_its_trigger_reports_it_by_time_and_count() -> None:
     with flying(faults=fault("older-frame", 3)) as (pair,):
         for number in (1, 2, 3, 4):
             pair.pulse(number)

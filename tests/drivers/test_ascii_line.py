@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from drivers.contract import DeviceError, TemperatureSample
 from drivers.thermometers.ascii_line.thermometer import AsciiLineThermometer
-from tests.drivers.lines import PtyLine
-from tests.drivers.stand_ins import FakeClock, FakePort, Notebook
+from tests.drivers.fakes import FakeClock, FakePort, RecordingSink
+from tests.drivers.pty_line import PtyLine
 
 TWO = r"^T1=\s*(?P<a>\S+) T2=\s*(?P<b>\S+)$"
 ONE = r"^CH(?P<channel>\d+): *(?P<value>\S+)"
@@ -28,7 +28,9 @@ def thermometer(
     )
 
 
-def heard(data: bytes, **more: object) -> tuple[list[TemperatureSample], dict[str, int], Notebook]:
+def readings(
+    data: bytes, **more: object
+) -> tuple[list[TemperatureSample], dict[str, int], RecordingSink]:
     """What a thermometer makes of bytes that come once; it is closed when the line falls still."""
     left = [data]
     device: AsciiLineThermometer
@@ -40,14 +42,14 @@ def heard(data: bytes, **more: object) -> tuple[list[TemperatureSample], dict[st
         return b""
 
     device = thermometer(FakeClock(), answer, **more)
-    notebook = Notebook()
-    device.run(notebook)
-    samples = [r for r in notebook.records if isinstance(r, TemperatureSample)]
-    return samples, dict(device.statistics()), notebook
+    recorder = RecordingSink()
+    device.run(recorder)
+    samples = [r for r in recorder.records if isinstance(r, TemperatureSample)]
+    return samples, dict(device.statistics()), recorder
 
 
 def values(data: bytes, **more: object) -> list[tuple[str, float | None]]:
-    return [(sample.probe, sample.value_c) for sample in heard(data, **more)[0]]
+    return [(sample.probe, sample.value_c) for sample in readings(data, **more)[0]]
 
 
 def test_a_line_holds_the_readings_of_several_channels() -> None:
@@ -56,13 +58,13 @@ def test_a_line_holds_the_readings_of_several_channels() -> None:
 
 def test_a_line_per_channel_names_its_probe() -> None:
     data = b"CH1: 20.5\rCH7: 99\rCH2: 1e1\r"
-    found, counted, _ = heard(data, pattern=ONE, channel_words=["1", "2"])
+    found, counted, _ = readings(data, pattern=ONE, channel_labels=["1", "2"])
     assert [(s.probe, s.value_c) for s in found] == [("0", 20.5), ("G", 10.0)]
     assert counted["other_channels"] == 1
 
 
 def test_an_open_sensor_is_a_sample_without_a_value() -> None:
-    found = values(b"T1=open T2=----\n", open_words=["OPEN", "----"])
+    found = values(b"T1=open T2=----\n", open_sensor_labels=["OPEN", "----"])
     assert found == [("0", None), ("G", None)]
 
 
@@ -74,14 +76,14 @@ def test_units_end_in_degrees_celsius(unit: str, expected: float) -> None:
 
 @pytest.mark.parametrize("reading", [b"nan", b"inf", b"-274", b"1_0", b"9e99", b"0x10", b"2001"])
 def test_what_is_no_temperature_is_no_sample_and_harms_no_neighbour(reading: bytes) -> None:
-    found, counted, notebook = heard(b"T1=" + reading + b" T2=21\n")
+    found, counted, recorder = readings(b"T1=" + reading + b" T2=21\n")
     assert [(s.probe, s.value_c) for s in found] == [("G", 21.0)]
     assert counted["bad_messages"] == 1
-    assert "unreadable" in notebook.event_names
+    assert "unreadable" in recorder.event_names
 
 
 def test_a_line_without_an_end_is_dropped_and_the_next_one_is_read() -> None:
-    found, counted, _ = heard(b"x" * 100_000 + b"\nT1=1 T2=2\n")
+    found, counted, _ = readings(b"x" * 100_000 + b"\nT1=1 T2=2\n")
     assert [s.value_c for s in found] == [1.0, 2.0]
     assert counted["bad_bytes"] >= 100_000
     assert counted["lines"] == 1
@@ -95,23 +97,23 @@ def test_random_bytes_neither_raise_nor_harm_the_next_line(data: bytes) -> None:
 
 def test_a_command_is_sent_at_its_interval() -> None:
     clock = FakeClock()
-    asked: list[tuple[int, bytes]] = []
+    commands: list[tuple[int, bytes]] = []
     device: AsciiLineThermometer
 
     def answer(port: FakePort) -> bytes:
         if not port.written:
             return b""
-        asked.append((clock.now_ns, port.written))
+        commands.append((clock.now_ns, port.written))
         port.written = b""
-        if len(asked) == 4:
+        if len(commands) == 4:
             device._closing.set()
         return b"T1=1 T2=2\r"
 
     device = thermometer(clock, answer, command="*T?", command_end="crlf", interval_s=0.5)
-    notebook = Notebook()
-    device.run(notebook)
-    assert {command for _, command in asked} == {b"*T?\r\n"}
-    gaps_s = [(b - a) / 1e9 for (a, _), (b, _) in itertools.pairwise(asked)]
+    recorder = RecordingSink()
+    device.run(recorder)
+    assert {command for _, command in commands} == {b"*T?\r\n"}
+    gaps_s = [(b - a) / 1e9 for (a, _), (b, _) in itertools.pairwise(commands)]
     assert gaps_s == pytest.approx([0.5] * 3, abs=0.01)
     assert device.statistics()["readings"] == 8
 
@@ -125,7 +127,7 @@ def test_a_command_is_sent_at_its_interval() -> None:
         (b"T1=1 T2=?\n", "no reading of G"),
     ],
 )
-def test_binding_says_what_is_wrong(said: bytes, cure: str) -> None:
+def test_binding_states_what_is_wrong(said: bytes, cure: str) -> None:
     left = [said]
     device = thermometer(FakeClock(), lambda port: left.pop() if left else b"")
     with pytest.raises(DeviceError, match=cure):
@@ -141,8 +143,8 @@ def test_contradicting_settings_are_refused_with_a_sentence() -> None:
     assert "(?P<x>'; it does not compile" in said(pattern="(?P<x>")
     assert "pattern has 0 named groups; 2 are needed" in said(pattern=r"T=\d+")
     assert "channels names 0 twice" in said(channels=["0", "0"])
-    assert "channel_words is given; only" in said(channel_words=["a", "b"])
-    assert "has 1 words; channels has 2" in said(pattern=ONE, channel_words=["a"])
+    assert "channel_labels is given; only" in said(channel_labels=["a", "b"])
+    assert "has 1 words; channels has 2" in said(pattern=ONE, channel_labels=["a"])
     assert "at least twice interval_s = 20" in said(command="T?", interval_s=10.0)
 
 
@@ -151,7 +153,7 @@ def test_an_instrument_on_a_real_line_is_bound_and_read() -> None:
         device = AsciiLineThermometer(
             "probes", {"port": line.near, "pattern": TWO, "channels": ["0", "G"]}
         )
-        threading.Timer(0.1, line.say, (b"garbage\r\nT1=20.0 T2=OPEN\r\n",)).start()
+        threading.Timer(0.1, line.inject, (b"garbage\r\nT1=20.0 T2=OPEN\r\n",)).start()
         found = device.bind()
         device.close()
     assert (found["probe 0"], found["probe G"]) == ("20.00 degC", "open")

@@ -20,16 +20,16 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from daemon.cli import app
-from daemon.cli.find import toml_sections
+from daemon.cli.find_ports import toml_sections
 from drivers.base import registry
-from drivers.detection.evidence import Evidence
-from drivers.detection.lines import lines_in
-from drivers.detection.search import Found, search
+from drivers.detection.line_format import line_format_of
+from drivers.detection.port_search import DetectionResult, search
+from drivers.detection.protocol_detection import ProtocolDetector
 from drivers.thermometers.ascii_line.pattern import LinePattern
 from sim_hw.devices.ascii_probe import AsciiProbe
+from sim_hw.devices.device_loop import LineDevice
 from sim_hw.devices.modbus_probe import ModbusProbe
 from sim_hw.devices.network_line import TcpLine, UdpLine
-from sim_hw.devices.serving import LineDevice
 from sim_hw.receivers.mavlink_autopilot import MavlinkAutopilot
 from sim_hw.receivers.nmea_receiver import NmeaReceiver
 from sim_hw.receivers.novatel_receiver import NovatelReceiver
@@ -38,7 +38,7 @@ from sim_hw.receivers.ublox_receiver import UbloxReceiver
 from sim_hw.world.world_clock import WorldClock
 from tests.drivers.uart_relay import UartRelay, sampled
 from tests.sim_hw.receiver_state import state_at
-from tests.system.flown import syntopic
+from tests.system.demo_mission import syntopic
 
 DEVICES: dict[str, tuple[Callable[[], LineDevice], str, int]] = {
     # The u-blox sends NMEA beside its own: it is a u-blox all the same.
@@ -55,7 +55,7 @@ DEVICES: dict[str, tuple[Callable[[], LineDevice], str, int]] = {
 
 
 def _clock() -> WorldClock:
-    return WorldClock.starting_now()
+    return WorldClock.from_wall_clock()
 
 
 @contextmanager
@@ -82,7 +82,7 @@ def test_at_the_right_speed_a_line_carries_every_byte_and_at_a_wrong_one_garbage
 
 def test_every_device_is_found_with_its_protocol_and_its_speed() -> None:
     """All at once, each behind a line of its own speed; a wrong one gives what a UART gives."""
-    told: dict[str, list[str]] = {}
+    progress: dict[str, list[str]] = {}
     with ExitStack() as stack:
         relays, devices = {}, {}
         for kind, (make, _, baudrate) in DEVICES.items():
@@ -91,16 +91,16 @@ def test_every_device_is_found_with_its_protocol_and_its_speed() -> None:
             relays[kind] = stack.enter_context(UartRelay(devices[kind].port, baudrate))
         found = search(
             [relay.port for relay in relays.values()],
-            tell=lambda port, sentence: told.setdefault(port, []).append(sentence),
+            on_progress=lambda port, sentence: progress.setdefault(port, []).append(sentence),
         )
         speeds = {kind: set(relay.speeds) for kind, relay in relays.items()}
     assert speeds["nmea"] >= {115_200, 9_600}, "it was heard at a wrong speed, too"
     by_kind = dict(zip(relays, found, strict=True))
     for kind, (_, driver, baudrate) in DEVICES.items():
         one = by_kind[kind]
-        assert one.speaker is not None, (kind, one.sentence, told[one.port])
-        assert (one.speaker.driver, one.baudrate) == (driver, baudrate)
-        assert told[one.port][0] == "listening at 115200"
+        assert one.detected is not None, (kind, one.sentence, progress[one.port])
+        assert (one.detected.driver, one.baudrate) == (driver, baudrate)
+        assert progress[one.port][0] == "listening at 115200"
     sections = tomllib.loads(toml_sections(found))
     assert [s["name"] for s in sections["navigator"]] == [
         "gnss",
@@ -113,8 +113,8 @@ def test_every_device_is_found_with_its_protocol_and_its_speed() -> None:
         for section in written:
             own = {key: value for key, value in section.items() if key not in ("name", "driver")}
             assert registry.problems(kind, section["driver"], own) == []
-    assert by_kind["modbus"].speaker.settings["unit"] == 2
-    assert by_kind["ascii"].speaker.settings["channels"] == ["0", "1"]
+    assert by_kind["modbus"].detected.settings["unit"] == 2
+    assert by_kind["ascii"].detected.settings["channels"] == ["0", "1"]
 
 
 def test_devices_on_the_network_are_found_without_a_speed() -> None:
@@ -126,7 +126,7 @@ def test_devices_on_the_network_are_found_without_a_speed() -> None:
     with socket.create_server(("127.0.0.1", 0)) as mute, running(receiver, autopilot):
         silent = f"tcp://127.0.0.1:{mute.getsockname()[1]}"
         found = search([receiver.port, autopilot.port, silent, "tcp://127.0.0.1:9"])
-    assert [one.speaker and one.speaker.driver for one in found] == [
+    assert [one.detected and one.detected.driver for one in found] == [
         "septentrio",
         "mavlink",
         None,
@@ -139,17 +139,17 @@ def test_devices_on_the_network_are_found_without_a_speed() -> None:
     assert "baudrate" not in section
 
 
-def test_the_command_prints_what_to_paste_and_says_whether_anything_was_found() -> None:
+def test_the_command_prints_what_to_paste_and_reports_whether_anything_was_found() -> None:
     receiver = UbloxReceiver(_clock(), state_at)
     with running(receiver):
         done = syntopic("check", "--find", receiver.port, "/dev/no-such-port", "--json")
         shown = CliRunner().invoke(app, ["check", "--find", receiver.port])
     assert done.returncode == 0, done.stderr
-    said = json.loads(done.stdout)
-    assert [port["found"] for port in said["ports"]] == [True, False]
-    assert said["ports"][0]["protocol"] == "UBX"
-    assert "NAV-PVT" in said["ports"][0]["heard"]
-    assert tomllib.loads(said["toml"]) == {"navigator": [{
+    report = json.loads(done.stdout)
+    assert [port["found"] for port in report["ports"]] == [True, False]
+    assert report["ports"][0]["protocol"] == "UBX"
+    assert "NAV-PVT" in report["ports"][0]["heard"]
+    assert tomllib.loads(report["toml"]) == {"navigator": [{
         "name": "gnss", "driver": "ublox", "port": receiver.port, "baudrate": 115_200,
         "parity": "N",
     }]}  # fmt: skip
@@ -172,27 +172,27 @@ def test_listening_only_sends_nothing() -> None:
     finally:
         os.close(master)
         os.close(slave)
-    assert found.speaker is None
+    assert found.detected is None
     assert "nothing speaks there; check power, cable and the port's name" in found.sentence
 
 
-def test_a_port_that_is_not_there_is_told_with_its_cure() -> None:
+def test_a_port_that_is_not_there_is_reported_with_its_remedy() -> None:
     (found,) = search(["/dev/no-such-port"])
     assert found.sentence == (
         "cannot be opened: there is no such port; check the cable and the port's name"
     )
 
 
-@pytest.mark.parametrize(("said", "pattern", "readings"), [
+@pytest.mark.parametrize(("report", "pattern", "readings"), [
     (b"21.5 22.5\r\n21.6 -3.0\r\n21.7 1\r\n", r"^(?P<t0>\S+) (?P<t1>\S+)$", 2),
     (b"TEMP: 20.1 C\n" * 3, r"^TEMP:\s*(?P<t0>\S+) C$", 1),
     (b"A=1,B=OPEN\r" * 3, r"^A=(?P<t0>\S+),B=(?P<t1>\S+)$", 2),
     (b"CH1: 20.1\r\nCH2: 20.2\r\nCH3: 9\r\n", None, 1),
 ])  # fmt: skip
 def test_a_pattern_is_proposed_where_lines_agree(
-    said: bytes, pattern: str | None, readings: int
+    report: bytes, pattern: str | None, readings: int
 ) -> None:
-    found = lines_in(said)
+    found = line_format_of(report)
     assert found is not None
     assert (found.pattern, found.readings) == (pattern, readings)
     if pattern is not None:
@@ -201,20 +201,20 @@ def test_a_pattern_is_proposed_where_lines_agree(
 
 
 @pytest.mark.parametrize(
-    "said", [b"", b"hello\r\nworld\r\n", b"$GNTXT,1*00\r\n" * 3, bytes(range(256)) * 4]
+    "report", [b"", b"hello\r\nworld\r\n", b"$GNTXT,1*00\r\n" * 3, bytes(range(256)) * 4]
 )
-def test_what_is_no_reading_is_no_instrument(said: bytes) -> None:
-    assert lines_in(said) is None
+def test_what_is_no_reading_is_no_instrument(report: bytes) -> None:
+    assert line_format_of(report) is None
 
 
 @settings(max_examples=40, deadline=None)
 @given(data=st.binary(max_size=3000))
 def test_noise_is_nobody(data: bytes) -> None:
-    evidence = Evidence()
+    evidence = ProtocolDetector()
     for at in range(0, len(data), 97):
         evidence.feed(data[at : at + 97], at)
     if not evidence.looks_like_text:
-        assert evidence.speaker() is None
+        assert evidence.detected() is None
 
 
 @pytest.mark.peer
@@ -234,15 +234,15 @@ def test_a_gpsd_is_known_by_its_greeting() -> None:
         finally:
             gpsd.terminate()
             gpsd.wait(timeout=10)
-    assert found.speaker is not None
-    assert found.speaker.driver == "gpsd"
+    assert found.detected is not None
+    assert found.detected.driver == "gpsd"
     section: dict[str, Any] = tomllib.loads(toml_sections([found]))["navigator"][0]
     assert section["port"] == f"127.0.0.1:{number}"
 
 
-def _until_open(address: str) -> list[Found]:
+def _until_open(address: str) -> list[DetectionResult]:
     deadline = time.monotonic() + 20
     while True:
         found = search([address])
-        if found[0].speaker is not None or time.monotonic() > deadline:
+        if found[0].detected is not None or time.monotonic() > deadline:
             return found

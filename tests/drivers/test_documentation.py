@@ -45,7 +45,7 @@ def row(setting: Setting[object]) -> str:
         allowed = f"{setting.minimum:g} to " + (
             "any" if setting.maximum is None else f"{setting.maximum:g}"
         )
-    return f"| `{setting.name}` | {setting.type_name} | {default} | {allowed} | {setting.says} |"
+    return f"| `{setting.name}` | {setting.type_name} | {default} | {allowed} | {setting.help} |"
 
 
 @pytest.mark.parametrize(("kind", "driver", "page"), PAGES)

@@ -17,18 +17,18 @@ import pytest
 from drivers.contract import EventMark, NavSample
 from drivers.receivers.nmea.navigator import NmeaNavigator
 from drivers.receivers.novatel.navigator import NovatelNavigator
-from drivers.receivers.receiver import ListeningNavigator
 from drivers.receivers.septentrio.navigator import SeptentrioNavigator
+from drivers.receivers.streaming_navigator import StreamingNavigator
 from drivers.receivers.ublox.navigator import UbloxNavigator
 from sim_hw.devices.network_line import TcpLine, UdpLine
 from sim_hw.devices.pseudo_terminal import PseudoTerminal
+from sim_hw.receivers.emulated_receiver import EmulatedReceiver, ReceiverState
 from sim_hw.receivers.nmea_receiver import NmeaReceiver
 from sim_hw.receivers.novatel_receiver import NovatelReceiver
-from sim_hw.receivers.receiver import EmulatedReceiver, ReceiverState
 from sim_hw.receivers.septentrio_receiver import SeptentrioReceiver
 from sim_hw.receivers.ublox_receiver import UbloxReceiver
 from sim_hw.world.world_clock import WorldClock
-from tests.drivers.stand_ins import Notebook, running
+from tests.drivers.fakes import RecordingSink, running
 from tests.sim_hw.receiver_state import NS, STATE, WEEK_NS
 
 WITHIN_S = 30.0
@@ -56,7 +56,7 @@ def flying(gps_ns: int) -> ReceiverState:
     )
 
 
-def pair(kind: str, line: str, clock: WorldClock) -> tuple[EmulatedReceiver, ListeningNavigator]:
+def pair(kind: str, line: str, clock: WorldClock) -> tuple[EmulatedReceiver, StreamingNavigator]:
     receiver_class, navigator_class = PAIRS[kind]
     receiver: EmulatedReceiver = receiver_class(
         clock, flying, rate_hz=10.0, line=PseudoTerminal() if line == "pty" else TcpLine()
@@ -69,7 +69,7 @@ def test_places_and_marks_of_the_emulated_receiver_come_out_right(kind: str, lin
     # A week's end lies 1.1 s ahead, so the flight goes through it.
     clock = WorldClock(2444 * WEEK_NS - 1_100_000_000, time.monotonic_ns())
     receiver, navigator = pair(kind, line, clock)
-    notebook, enough = Notebook(), threading.Event()
+    recorder, enough = RecordingSink(), threading.Event()
     receiver.start()
     try:
         found = navigator.bind()
@@ -79,22 +79,22 @@ def test_places_and_marks_of_the_emulated_receiver_come_out_right(kind: str, lin
             receiver.mark(at_ns)
 
         def watch(_: object) -> None:
-            told = [r for r in notebook.records if isinstance(r, EventMark)]
-            after = [r for r in notebook.records if isinstance(r, NavSample)]
-            if len(told) == 5 and after and after[-1].gps_ns > given[-1] + 200_000_000:
+            event_marks = [r for r in recorder.records if isinstance(r, EventMark)]
+            after = [r for r in recorder.records if isinstance(r, NavSample)]
+            if len(event_marks) == 5 and after and after[-1].gps_ns > given[-1] + 200_000_000:
                 enough.set()
 
-        notebook.stop = watch
-        with running(navigator, notebook):
+        recorder.stop = watch
+        with running(navigator, recorder):
             assert enough.wait(WITHIN_S), navigator.statistics()
     finally:
         receiver.close()
     assert found["port"] == receiver.port
-    marks = [r for r in notebook.records if isinstance(r, EventMark)]
+    marks = [r for r in recorder.records if isinstance(r, EventMark)]
     away_ns = [abs(m.gps_ns - at) for m, at in zip(marks, given, strict=True)]
     assert max(away_ns) <= MARKS_WITHIN_NS[kind]
     assert all(m.time_valid for m in marks)
-    samples = [r for r in notebook.records if isinstance(r, NavSample)]
+    samples = [r for r in recorder.records if isinstance(r, NavSample)]
     timed = [s for s in samples if s.time_valid]
     assert len(timed) >= 6
     assert timed[-1].gps_ns >= 2444 * WEEK_NS
@@ -118,44 +118,44 @@ def test_places_and_marks_of_the_emulated_receiver_come_out_right(kind: str, lin
 
 
 @pytest.mark.parametrize("kind", list(PAIRS))
-def test_a_receiver_behind_a_noisy_line_is_heard_and_its_damage_counted(kind: str) -> None:
-    clock = WorldClock.starting_now()
+def test_a_receiver_behind_a_noisy_line_is_received_and_its_damage_counted(kind: str) -> None:
+    clock = WorldClock.from_wall_clock()
     receiver, navigator = pair(kind, "pty", clock)
-    spoilt = iter(range(1_000_000))
+    read_count = iter(range(1_000_000))
 
-    def wire(data: bytes, _mono_ns: int) -> bytes:
+    def byte_filter(data: bytes, _mono_ns: int) -> bytes:
         """A bit of every third piece turns over."""
-        if not data or next(spoilt) % 3:
+        if not data or next(read_count) % 3:
             return data
         at = len(data) // 2
         return data[:at] + bytes((data[at] ^ 0x10,)) + data[at + 1 :]
 
-    receiver.wire = wire
-    notebook, enough = Notebook(), threading.Event()
+    receiver.byte_filter = byte_filter
+    recorder, enough = RecordingSink(), threading.Event()
 
     def watch(_: object) -> None:
-        if sum(isinstance(r, NavSample) for r in notebook.records) >= 12:
+        if sum(isinstance(r, NavSample) for r in recorder.records) >= 12:
             enough.set()
 
-    notebook.stop = watch
+    recorder.stop = watch
     receiver.start()
     try:
-        with running(navigator, notebook):
+        with running(navigator, recorder):
             assert enough.wait(WITHIN_S), navigator.statistics()
     finally:
         receiver.close()
     assert navigator.statistics()["bad_messages"] >= 3
-    for sample in (r for r in notebook.records if isinstance(r, NavSample)):
+    for sample in (r for r in recorder.records if isinstance(r, NavSample)):
         if sample.time_valid:
             there = flying(sample.gps_ns).latitude_deg
             assert abs(sample.latitude_deg - there) * METRES_PER_DEGREE < PLACE_WITHIN_M[kind]
 
 
-def test_a_receiver_that_sends_datagrams_is_heard_like_one_on_a_line() -> None:
+def test_a_receiver_that_sends_datagrams_is_received_like_one_on_a_line() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         here = probe.getsockname()
-    receiver = SeptentrioReceiver(WorldClock.starting_now(), flying, line=UdpLine(here))
+    receiver = SeptentrioReceiver(WorldClock.from_wall_clock(), flying, line=UdpLine(here))
     navigator = SeptentrioNavigator("gnss", {"port": receiver.port})
     receiver.start()
     try:

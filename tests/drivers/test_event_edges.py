@@ -10,49 +10,49 @@ import pytest
 
 from drivers.base import registry
 from drivers.contract import DeviceEvent, EventMark, NavSample
-from sim_hw.receivers.receiver import STROBE_WIDTH_NS, EmulatedReceiver
+from sim_hw.receivers.emulated_receiver import STROBE_WIDTH_NS, EmulatedReceiver
 from sim_hw.receivers.septentrio_messages import FALLING, RISING
 from sim_hw.receivers.septentrio_receiver import SeptentrioReceiver
 from sim_hw.receivers.ublox_receiver import UbloxReceiver
 from sim_hw.world.world_clock import WorldClock
-from tests.drivers.stand_ins import FakeClock, FakePort, Notebook, running
+from tests.drivers.fakes import FakeClock, FakePort, RecordingSink, running
 from tests.drivers.ubx_frames import nav_pvt, tim_tm2
 from tests.sim_hw.receiver_state import state_at
 
 WITHIN_S = 30.0
 STROBES = 4
-APART_NS = 310_000_000
+STROBE_INTERVAL_NS = 310_000_000
 UTC = (2026, 11, 21, 9, 0, 0)
 
 
 def fly(
     driver: str, receiver: EmulatedReceiver, clock: WorldClock, enough: type[Any], **settings: Any
-) -> tuple[list[int], Notebook, Any]:
+) -> tuple[list[int], RecordingSink, Any]:
     """Strobes at a receiver that the driver reads, until so many marks or one event came."""
     navigator = registry.driver_for("navigator", driver)(
         "gnss", {"port": receiver.port, **settings}
     )
-    notebook, done = Notebook(), threading.Event()
+    recorder, done = RecordingSink(), threading.Event()
 
     def watch(_: object) -> None:
-        marks = sum(isinstance(r, EventMark) for r in notebook.records)
-        reported = any(e.name == "other-edge" for e in notebook.events)
+        marks = sum(isinstance(r, EventMark) for r in recorder.records)
+        reported = any(e.name == "other-edge" for e in recorder.events)
         if marks == STROBES if enough is EventMark else reported:
             done.set()
 
-    notebook.stop = watch
+    recorder.stop = watch
     receiver.start()
     try:
         navigator.bind()
         first_ns = clock.gps_ns(time.monotonic_ns()) + 200_000_000
-        strobes = [first_ns + n * APART_NS for n in range(STROBES)]
+        strobes = [first_ns + n * STROBE_INTERVAL_NS for n in range(STROBES)]
         for strobe_ns in strobes:
             receiver.mark(strobe_ns)
-        with running(navigator, notebook):
+        with running(navigator, recorder):
             assert done.wait(WITHIN_S), navigator.statistics()
     finally:
         receiver.close()
-    return strobes, notebook, navigator
+    return strobes, recorder, navigator
 
 
 @pytest.mark.trust
@@ -61,7 +61,7 @@ def fly(
 def test_the_configured_edge_of_a_strobe_is_its_mark(
     driver: str, within_ns: int, edge: str
 ) -> None:
-    clock = WorldClock.starting_now()
+    clock = WorldClock.from_wall_clock()
     receiver: EmulatedReceiver
     # A strobe that is high in rest: it falls at mid-exposure and rises at its end.
     if driver == "ublox":
@@ -69,25 +69,25 @@ def test_the_configured_edge_of_a_strobe_is_its_mark(
     else:
         receiver = SeptentrioReceiver(clock, state_at, is_active_low=True)
         receiver.reported_edges = frozenset((RISING, FALLING))
-    strobes, notebook, _ = fly(driver, receiver, clock, EventMark, edge=edge)
+    strobes, recorder, _ = fly(driver, receiver, clock, EventMark, edge=edge)
     late_ns = STROBE_WIDTH_NS if edge == "rising" else 0
-    marks = [r for r in notebook.records if isinstance(r, EventMark)]
+    marks = [r for r in recorder.records if isinstance(r, EventMark)]
     for mark, strobe_ns in zip(marks, strobes, strict=True):
         assert abs(mark.gps_ns - strobe_ns - late_ns) <= within_ns
         assert mark.time_valid
     has_count = driver == "ublox" and edge == "rising"
     assert {mark.count_bits for mark in marks} == {16 if has_count else 0}
-    assert "other-edge" not in notebook.event_names, "both edges of a strobe are its own"
+    assert "other-edge" not in recorder.event_names, "both edges of a strobe are its own"
 
 
 @pytest.mark.trust
 def test_a_septentrio_that_reports_the_other_edge_only_is_named_with_the_cure() -> None:
-    clock = WorldClock.starting_now()
+    clock = WorldClock.from_wall_clock()
     receiver = SeptentrioReceiver(clock, state_at)
     receiver.reported_edges = frozenset((FALLING,))
-    _, notebook, navigator = fly("septentrio", receiver, clock, DeviceEvent)
-    assert not [r for r in notebook.records if isinstance(r, EventMark)]
-    (event,) = [e for e in notebook.events if e.name == "other-edge"]
+    _, recorder, navigator = fly("septentrio", receiver, clock, DeviceEvent)
+    assert not [r for r in recorder.records if isinstance(r, EventMark)]
+    (event,) = [e for e in recorder.events if e.name == "other-edge"]
     assert event.is_fault
     assert "reported 3 event marks of the falling edge" in event.sentence
     assert 'Set edge = "falling"' in event.sentence
@@ -96,11 +96,11 @@ def test_a_septentrio_that_reports_the_other_edge_only_is_named_with_the_cure() 
 
 def ublox_events(edges: list[tuple[bool, bool]], **settings: Any) -> tuple[list[Any], Any]:
     """What a u-blox with these new edges (rising, falling), one message each, makes."""
-    clock, sink = FakeClock(), Notebook()
-    said = [nav_pvt(0, UTC)]
+    clock, sink = FakeClock(), RecordingSink()
+    messages = [nav_pvt(0, UTC)]
     for n, (rising, falling) in enumerate(edges):
-        said.append(tim_tm2(2445, 1000 * n, 7, rising=rising, falling=falling))
-    waiting = iter(said)
+        messages.append(tim_tm2(2445, 1000 * n, 7, rising=rising, falling=falling))
+    waiting = iter(messages)
     port = FakePort(clock, lambda _: next(waiting, b""))
     navigator = registry.driver_for("navigator", "ublox")(
         "gnss",
@@ -108,9 +108,9 @@ def ublox_events(edges: list[tuple[bool, bool]], **settings: Any) -> tuple[list[
         clock=clock,
         open_port=lambda *_: port,
     )
-    navigator.teller.sink = sink
+    navigator.emitter.sink = sink
     line = navigator._open()
-    for _ in said:
+    for _ in messages:
         for record in navigator.step(line):
             sink(record)
     return sink.records, navigator

@@ -17,10 +17,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from daemon.mission.store.level0 import tiff_parts
+from drivers.cameras.folder.folder_head import FolderHead
 from drivers.cameras.folder.frames import FrameFileError, read_frame
-from drivers.cameras.folder.head import FolderHead
 from drivers.contract import CHUNK_ALLOWANCE_NBYTES, DeviceError, Frame, FrameStatus, Record
-from tests.drivers.stand_ins import FakeClock, Notebook
+from tests.drivers.fakes import FakeClock, RecordingSink
 
 HEIGHT, WIDTH = 6, 8
 KNOWN: dict[str, object] = {
@@ -74,12 +74,12 @@ class Player:
         self.clock = FakeClock()
         line = {"trigger_source": "line", **section}
         self.head = FolderHead("SU00", line, memory=self.memory, clock=self.clock)
-        self.notebook = Notebook()
+        self.recorder = RecordingSink()
         self.pixels: list[NDArray[np.uint16]] = []
 
     @property
     def frames(self) -> list[Frame]:
-        return [record for record in self.notebook.records if isinstance(record, Frame)]
+        return [record for record in self.recorder.records if isinstance(record, Frame)]
 
     def play(self, until: Callable[[Player], bool], *, recycle: bool = True) -> Player:
         def watch(record: Record) -> None:
@@ -90,13 +90,13 @@ class Player:
             if until(self):
                 self.head._closing.set()
 
-        self.notebook.stop = watch
-        self.head.run(self.notebook)
+        self.recorder.stop = watch
+        self.head.run(self.recorder)
         return self
 
 
 def played_out(player: Player) -> bool:
-    return "played-out" in player.notebook.event_names
+    return "played-out" in player.recorder.event_names
 
 
 def test_a_mission_is_played_in_order_with_what_its_capture_knew(tmp_path: Path) -> None:
@@ -136,7 +136,7 @@ def test_without_a_free_slot_a_frame_is_lost_and_counted(tmp_path: Path) -> None
     player = Player(section, slot_count=2).play(played_out, recycle=False)
     assert [frame.counter for frame in player.frames] == [1, 2]
     assert player.head.statistics()["underruns"] == 2
-    assert "underrun" in player.notebook.event_names
+    assert "underrun" in player.recorder.event_names
     with pytest.raises(ValueError, match="slot 7 was not handed out"):
         player.head.recycle(7)
 
@@ -159,7 +159,7 @@ def test_a_frame_larger_than_the_memory_is_never_unpacked(tmp_path: Path) -> Non
     path = tmp_path / "huge.tif"
     tifffile.imwrite(path, np.zeros((3000, 3000), np.uint16), compression="zlib")
     with pytest.raises(FrameFileError, match="3000 x 3000 px; the head's memory holds 1000"):
-        read_frame(path, room_nbytes=2000)
+        read_frame(path, max_nbytes=2000)
 
 
 @pytest.mark.parametrize(
@@ -169,7 +169,7 @@ def test_only_one_plane_of_16_bits_is_a_frame(tmp_path: Path, array: NDArray[np.
     planes = {"photometric": "rgb", "planarconfig": "separate"} if array.ndim == 3 else {}
     tifffile.imwrite(tmp_path / "a.tif", array, **planes)
     with pytest.raises(FrameFileError, match="one plane of uint16 is needed"):
-        read_frame(tmp_path / "a.tif", room_nbytes=10_000)
+        read_frame(tmp_path / "a.tif", max_nbytes=10_000)
 
 
 @settings(max_examples=150, deadline=None)
@@ -187,7 +187,7 @@ def test_a_mutated_file_is_a_frame_of_its_size_or_is_refused(
         path = Path(folder) / "a.tif"
         path.write_bytes(data[:end] if end < 4000 else data)
         try:
-            frame = read_frame(path, room_nbytes=10_000)
+            frame = read_frame(path, max_nbytes=10_000)
         except FrameFileError:
             return
     assert frame.pixels.dtype == np.uint16
@@ -201,7 +201,7 @@ def test_software_triggers_play_one_file_each_and_say_when_there_are_no_more(
     head = FolderHead("SU00", {"folder": str(mission(tmp_path, range(1, 3)))}, memory=memory)
     with pytest.raises(DeviceError, match="not running"):
         head.trigger()
-    notebook = Notebook()
+    recorder = RecordingSink()
     opened, came = threading.Event(), threading.Semaphore(0)
 
     def watch(record: Record) -> None:
@@ -209,8 +209,8 @@ def test_software_triggers_play_one_file_each_and_say_when_there_are_no_more(
         if isinstance(record, Frame):
             came.release()
 
-    notebook.stop = watch
-    thread = threading.Thread(target=head.run, args=(notebook,))
+    recorder.stop = watch
+    thread = threading.Thread(target=head.run, args=(recorder,))
     thread.start()
     try:
         assert opened.wait(5)
@@ -223,7 +223,7 @@ def test_software_triggers_play_one_file_each_and_say_when_there_are_no_more(
         head.close()
         thread.join(5)
     assert not thread.is_alive()
-    frames = [record for record in notebook.records if isinstance(record, Frame)]
+    frames = [record for record in recorder.records if isinstance(record, Frame)]
     assert [int(memory.pixels(frame)[0, 0]) for frame in frames] == [1000, 2000]
 
 
@@ -233,7 +233,7 @@ def test_a_head_that_plays_by_its_interval_takes_no_trigger(tmp_path: Path) -> N
         head.trigger()
 
 
-def test_binding_says_what_is_there_or_missing(tmp_path: Path) -> None:
+def test_binding_states_what_is_there_or_missing(tmp_path: Path) -> None:
     folder = mission(tmp_path)
     found = Player({"folder": str(folder)}).head.bind()
     assert (found["files"], found["serial"], found["frame"]) == ("4", "SN-7", "8 x 6 Mono12")
@@ -252,12 +252,12 @@ def test_a_folder_that_comes_later_is_found(tmp_path: Path) -> None:
     player = Player({"folder": str(tmp_path / "L0")})
 
     def create(player: Player) -> bool:
-        if player.notebook.event_names == ["lost"]:
+        if player.recorder.event_names == ["lost"]:
             mission(tmp_path)
         return played_out(player)
 
     player.play(create)
-    assert player.notebook.event_names == ["lost", "opened", "played-out"]
+    assert player.recorder.event_names == ["lost", "opened", "played-out"]
     assert len(player.frames) == 4
 
 

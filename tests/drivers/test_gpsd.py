@@ -18,8 +18,8 @@ from drivers.receivers.gpsd.navigator import GpsdNavigator
 from drivers.receivers.gpsd.reports import MAX_LINE, GpsdReports
 from drivers.receivers.ublox.decoder import UbxDecoder
 from drivers.timescales.gps_time import SECOND_NS, UtcFields, utc_ns
+from tests.drivers.fakes import RecordingSink
 from tests.drivers.real_gpsd import PROGRAM, RealGpsd, running_gpsd
-from tests.drivers.stand_ins import Notebook
 
 EXCERPT = Path(__file__).parent / "data" / "ublox-neo-m8l-excerpt.ubx"
 TPV: dict[str, object] = {
@@ -78,7 +78,7 @@ def test_an_attitude_of_another_instant_is_not_taken() -> None:
 
 
 @pytest.mark.trust
-def test_without_leap_seconds_time_comes_from_the_table_and_says_so() -> None:
+def test_without_leap_seconds_time_comes_from_the_table_and_reports_it() -> None:
     before = {key: value for key, value in TPV.items() if key != "leapseconds"}
     first, second, third = samples(before, TPV, before)
     assert [s.time_valid for s in (first, second, third)] == [True] * 3
@@ -93,7 +93,7 @@ def test_without_leap_seconds_time_comes_from_the_table_and_says_so() -> None:
     ("change", "fix"),
     [({"mode": 2}, "2d"), ({"status": 5}, "dead-reckoning"), ({"status": 3}, "3d")],
 )
-def test_the_fix_is_gpsds_word(change: dict[str, object], fix: str) -> None:
+def test_the_fix_is_gpsds_value(change: dict[str, object], fix: str) -> None:
     assert [sample.fix for sample in samples({**TPV, **change})] == [fix]
 
 
@@ -141,7 +141,7 @@ def test_a_height_that_is_held_in_two_dimensions_is_absent() -> None:
     assert (sample.fix, sample.height_m, sample.vertical_sigma_m) == ("2d", None, None)
 
 
-def test_only_the_device_asked_for_is_heard() -> None:
+def test_only_the_requested_device_is_read() -> None:
     reports = GpsdReports("gnss", "/dev/ttyACM0")
     found = reports.feed(lines({**TPV, "device": "/dev/ttyACM1"}, TPV), 0)
     assert len(found) == 1
@@ -188,7 +188,7 @@ class StubGpsd:
         self._listener = socket.create_server(("127.0.0.1", 0))
         self._listener.settimeout(10)
         self.port = f"127.0.0.1:{self._listener.getsockname()[1]}"
-        self.asked: list[bytes] = []
+        self.requests: list[bytes] = []
         self._scripts = scripts
         self._hold = threading.Event()
         self._thread = threading.Thread(target=self._serve, daemon=True)
@@ -203,7 +203,7 @@ class StubGpsd:
             with connection:
                 connection.settimeout(5)
                 connection.sendall(lines(VERSION, DEVICES))
-                self.asked.append(connection.recv(1000))
+                self.requests.append(connection.recv(1000))
                 connection.sendall(script)
                 if number == len(self._scripts):
                     self._hold.wait(10)
@@ -214,36 +214,36 @@ class StubGpsd:
         self._thread.join(5)
 
 
-def flown(navigator: GpsdNavigator, wanted: int) -> Notebook:
+def flown(navigator: GpsdNavigator, wanted: int) -> RecordingSink:
     """Run until so many samples have come."""
-    notebook = Notebook()
+    recorder = RecordingSink()
     done = threading.Event()
 
     def watch(_: object) -> None:
-        if sum(isinstance(record, NavSample) for record in notebook.records) >= wanted:
+        if sum(isinstance(record, NavSample) for record in recorder.records) >= wanted:
             done.set()
 
-    notebook.stop = watch
-    thread = threading.Thread(target=navigator.run, args=(notebook,))
+    recorder.stop = watch
+    thread = threading.Thread(target=navigator.run, args=(recorder,))
     thread.start()
     try:
-        assert done.wait(20), notebook.events
+        assert done.wait(20), recorder.events
     finally:
         navigator.close()
         thread.join(5)
-    return notebook
+    return recorder
 
 
-def test_a_gpsd_that_ends_is_found_again_and_asked_again() -> None:
+def test_a_gpsd_that_ends_is_found_again_and_watched_again() -> None:
     stub = StubGpsd(lines(TPV), lines(TPV, TPV))
     try:
         navigator = GpsdNavigator("gnss", {"port": stub.port, "device": "/dev/ttyACM0"})
-        notebook = flown(navigator, 3)
+        recorder = flown(navigator, 3)
     finally:
         stub.close()
-    assert notebook.event_names == ["opened", "lost", "opened"]
-    assert len(stub.asked) == 2
-    watch = json.loads(stub.asked[1].removeprefix(b"?WATCH=").rstrip(b";\n"))
+    assert recorder.event_names == ["opened", "lost", "opened"]
+    assert len(stub.requests) == 2
+    watch = json.loads(stub.requests[1].removeprefix(b"?WATCH=").rstrip(b";\n"))
     assert watch == {"enable": True, "json": True, "pps": True, "device": "/dev/ttyACM0"}
     assert navigator.statistics()["opened"] == 2
 
@@ -256,7 +256,7 @@ def test_a_gpsd_that_ends_is_found_again_and_asked_again() -> None:
         (b"", "", "said nothing in 0.5 s"),
     ],
 )
-def test_binding_says_what_is_wrong_with_the_gpsd(script: bytes, device: str, cure: str) -> None:
+def test_binding_states_what_is_wrong_with_the_gpsd(script: bytes, device: str, cure: str) -> None:
     stub = StubGpsd(script)
     try:
         navigator = GpsdNavigator("gnss", {"port": stub.port, "device": device, "silence_s": 0.5})
@@ -290,13 +290,13 @@ def real_gpsd() -> Iterator[RealGpsd]:
 
 
 @pytest.mark.peer
-def test_the_real_gpsd_says_what_our_own_decoder_reads(real_gpsd: RealGpsd) -> None:
+def test_the_real_gpsd_states_what_our_own_decoder_reads(real_gpsd: RealGpsd) -> None:
     recorded = EXCERPT.read_bytes()
     own = [r for r in UbxDecoder("m8l").feed(recorded, 0) if isinstance(r, NavSample)]
     with real_gpsd.playing(recorded):
         navigator = GpsdNavigator("gnss", {"port": real_gpsd.address})
-        notebook = flown(navigator, len(own) + 2)
-    samples = [r for r in notebook.records if isinstance(r, NavSample)]
+        recorder = flown(navigator, len(own) + 2)
+    samples = [r for r in recorder.records if isinstance(r, NavSample)]
     found = [r for r in samples if r.time_valid]
     # gpsd writes milliseconds: the same epoch is the one within one of them.
     pairs = [(f, o) for f in found for o in own if abs(f.gps_ns - o.gps_ns) < 1_000_000]

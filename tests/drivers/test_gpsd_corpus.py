@@ -182,7 +182,7 @@ def test_our_decoders_read_what_gpsd_read_or_differ_for_a_reason() -> None:
 
 @pytest.mark.peer
 @pytest.mark.skipif(PROGRAM is None, reason="gpsd is absent; install Debian's gpsd")
-def test_through_the_real_gpsd_every_receiver_says_what_gpsd_read() -> None:
+def test_through_the_real_gpsd_every_receiver_states_what_gpsd_read() -> None:
     paths = recordings()
     with ThreadPoolExecutor(AT_ONCE) as pool:
         found = dict(

@@ -18,9 +18,9 @@ def one(**changes: Any) -> NavSample:
 
 
 def fed(*reports: dict[str, Any], device: str = "") -> GpsdReports:
-    made = GpsdReports("gnss", device)
-    made.feed(lines(*reports), 7)
-    return made
+    decoder = GpsdReports("gnss", device)
+    decoder.feed(lines(*reports), 7)
+    return decoder
 
 
 @pytest.mark.parametrize(
@@ -64,16 +64,16 @@ def test_mode_and_status_are_the_fix(
 def test_a_report_without_time_and_place_is_no_sample(
     changes: dict[str, Any], fix: str | None
 ) -> None:
-    made = fed({k: v for k, v in (TPV | changes).items() if v is not None})
-    assert (made.counters["samples"], made.counters["reports_without_fix"]) == (0, 1)
-    assert made.fix == fix
+    decoder = fed({k: v for k, v in (TPV | changes).items() if v is not None})
+    assert (decoder.counters["samples"], decoder.counters["reports_without_fix"]) == (0, 1)
+    assert decoder.fix == fix
 
 
 @pytest.mark.parametrize(
     ("latitude", "longitude", "expected"),
     [(90, 360, 0), (-90, -180, -180), (0, 180, 180), (0, 180.5, -179.5), (0, 270, -90)],
 )
-def test_a_longitude_is_within_half_a_turn(
+def test_a_longitude_is_within_180_degrees(
     latitude: float, longitude: float, expected: float
 ) -> None:
     sample = one(lat=latitude, lon=longitude)
@@ -114,17 +114,19 @@ def test_a_sigma_of_the_speed_is_below_1000_mps_and_one_of_the_place_may_be_by_a
 
 
 @pytest.mark.parametrize(
-    ("told", "leap", "source"),
+    ("leap_field", "leap", "source"),
     [(18, 18, "receiver"), (1, 1, "receiver"), (99, 99, "receiver"), (100, 18, "table"),
      (0, 18, "table"), (None, 18, "table")],
 )  # fmt: skip
-def test_leap_seconds_are_told_or_of_the_table(told: int | None, leap: int, source: str) -> None:
-    sample = one(leapseconds=told)
+def test_leap_seconds_are_reported_or_of_the_table(
+    leap_field: int | None, leap: int, source: str
+) -> None:
+    sample = one(leapseconds=leap_field)
     assert (sample.leap_seconds, sample.leap_source) == (leap, source)
     assert sample.gps_ns == one(leapseconds=18).gps_ns + (leap - 18) * 10**9
-    made = fed({k: v for k, v in (TPV | {"leapseconds": told}).items() if v is not None})
-    assert made.counters["samples_by_leap_table"] == (source == "table")
-    assert made.leap_seconds == (str(leap) if source == "receiver" else (
+    decoder = fed({k: v for k, v in (TPV | {"leapseconds": leap_field}).items() if v is not None})
+    assert decoder.counters["samples_by_leap_table"] == (source == "table")
+    assert decoder.leap_seconds == (str(leap) if source == "receiver" else (
         "by our table, gpsd sends none"
     ))  # fmt: skip
     assert GpsdReports("gnss").leap_seconds == "unknown"
@@ -140,32 +142,32 @@ def test_an_attitude_is_of_the_instant_within_a_millisecond(time_s: str, is_know
 
 
 def test_reports_are_counted_by_class_and_what_is_none_is_bad() -> None:
-    made = fed({"class": "SKY"}, {"class": "SKY"}, {"class": "GST"}, {"class": "ODD"}, TPV)
-    assert dict(made.seen) == {"SKY": 2, "GST": 1, "other": 1, "TPV": 1}
-    assert dict(made.counters) == {
+    decoder = fed({"class": "SKY"}, {"class": "SKY"}, {"class": "GST"}, {"class": "ODD"}, TPV)
+    assert dict(decoder.seen) == {"SKY": 2, "GST": 1, "other": 1, "TPV": 1}
+    assert dict(decoder.counters) == {
         "samples": 1, "samples_by_leap_table": 0, "reports_without_fix": 0, "pps": 0,
     }  # fmt: skip
-    made = fed({"class": "x" * 16}, {"class": "x" * 17}, {"class": 3}, {"device": "a"})
-    assert (dict(made.seen), made.bad_messages) == ({"other": 1}, 3)
-    made.feed(b"[1]\nno json\n\n  \r\n", 7)
-    assert made.bad_messages == 5
+    decoder = fed({"class": "x" * 16}, {"class": "x" * 17}, {"class": 3}, {"device": "a"})
+    assert (dict(decoder.seen), decoder.bad_messages) == ({"other": 1}, 3)
+    decoder.feed(b"[1]\nno json\n\n  \r\n", 7)
+    assert decoder.bad_messages == 5
     assert fed({"class": "PPS"}, {"class": "PPS"}).counters["pps"] == 2
 
 
 def test_a_line_of_64_kib_is_read_and_a_longer_one_is_bad() -> None:
     report = lines({"class": "PPS"}).strip()
     for size, pps, bad in ((65_536, 1, 0), (65_537, 0, 1)):
-        made = GpsdReports("gnss")
-        made.feed(report.ljust(size) + b"\n", 7)
-        assert (made.counters["pps"], made.bad_messages) == (pps, bad)
-        assert made.bad_bytes == bad * size
-    made = GpsdReports("gnss")
-    made.feed(b"x" * 65_536, 7)
-    assert made.bad_bytes == 0
-    made.feed(b"x", 7)
-    assert made.bad_bytes == 65_537
-    made.feed(b"yz\n" + report + b"\n", 7)
-    assert (made.bad_messages, made.bad_bytes, made.counters["pps"]) == (1, 65_539, 1)
+        decoder = GpsdReports("gnss")
+        decoder.feed(report.ljust(size) + b"\n", 7)
+        assert (decoder.counters["pps"], decoder.bad_messages) == (pps, bad)
+        assert decoder.bad_bytes == bad * size
+    decoder = GpsdReports("gnss")
+    decoder.feed(b"x" * 65_536, 7)
+    assert decoder.bad_bytes == 0
+    decoder.feed(b"x", 7)
+    assert decoder.bad_bytes == 65_537
+    decoder.feed(b"yz\n" + report + b"\n", 7)
+    assert (decoder.bad_messages, decoder.bad_bytes, decoder.counters["pps"]) == (1, 65_539, 1)
 
 
 def test_satellites_are_those_used_and_devices_those_listed() -> None:
@@ -182,5 +184,5 @@ def test_satellites_are_those_used_and_devices_those_listed() -> None:
 
 
 def test_reports_of_another_device_are_left_alone() -> None:
-    made = fed(TPV, TPV | {"device": "/dev/other"}, device="/dev/other")
-    assert (made.counters["samples"], made.counters["other_devices"]) == (1, 1)
+    decoder = fed(TPV, TPV | {"device": "/dev/other"}, device="/dev/other")
+    assert (decoder.counters["samples"], decoder.counters["other_devices"]) == (1, 1)

@@ -9,28 +9,28 @@ import pytest
 
 from drivers.contract import DeviceError, Record, TemperatureSample
 from drivers.thermometers.host.thermometer import HostThermometer
-from tests.drivers.stand_ins import FakeClock, Notebook
+from tests.drivers.fakes import FakeClock, RecordingSink
 
 
 def chip(root: Path, number: int, name: str, device: str, **files: str) -> Path:
     """A chip as the kernel shows it: class/hwmon/hwmonN -> devices/.../hwmon/hwmonN."""
-    home = root / "devices" / device / "hwmon" / f"hwmon{number}"
-    home.mkdir(parents=True)
-    (home / "device").symlink_to("../..")
+    device_folder = root / "devices" / device / "hwmon" / f"hwmon{number}"
+    device_folder.mkdir(parents=True)
+    (device_folder / "device").symlink_to("../..")
     for file, text in {"name": name, **files}.items():
-        (home / file).write_text(text + "\n", encoding="utf-8")
+        (device_folder / file).write_text(text + "\n", encoding="utf-8")
     link = root / "class" / "hwmon" / f"hwmon{number}"
     link.parent.mkdir(parents=True, exist_ok=True)
-    link.symlink_to(home)
-    return home
+    link.symlink_to(device_folder)
+    return device_folder
 
 
 def iio(root: Path, number: int, name: str, **files: str) -> Path:
-    home = root / "bus" / "iio" / "devices" / f"iio:device{number}"
-    home.mkdir(parents=True)
+    device_folder = root / "bus" / "iio" / "devices" / f"iio:device{number}"
+    device_folder.mkdir(parents=True)
     for file, text in {"name": name, **files}.items():
-        (home / file).write_text(text + "\n", encoding="utf-8")
-    return home
+        (device_folder / file).write_text(text + "\n", encoding="utf-8")
+    return device_folder
 
 
 @pytest.fixture
@@ -56,15 +56,15 @@ def read_once(root: Path, *sensors: str) -> dict[str, float | None]:
     settings = {"sensors": sensors, "channels": [str(i) for i in range(len(sensors))]}
     device = HostThermometer("host", settings, root=root, clock=FakeClock())
     device.bind()
-    notebook = Notebook()
+    recorder = RecordingSink()
 
     def stop(record: Record) -> None:
         if isinstance(record, TemperatureSample) and record.probe == str(len(sensors) - 1):
             device._closing.set()
 
-    notebook.stop = stop
-    device.run(notebook)
-    return {r.probe: r.value_c for r in notebook.records if isinstance(r, TemperatureSample)}
+    recorder.stop = stop
+    device.run(recorder)
+    return {r.probe: r.value_c for r in recorder.records if isinstance(r, TemperatureSample)}
 
 
 def test_chips_are_named_by_channel_label_or_device(root: Path) -> None:
@@ -92,7 +92,7 @@ def test_a_name_that_is_not_unique_or_not_there_is_refused_with_the_choices(root
     assert "k10temp/temp1 is not there; the host has coretemp/temp1, coretemp/temp2" in absent
 
 
-def test_a_host_without_sensors_says_so(tmp_path: Path) -> None:
+def test_a_host_without_sensors_reports_it(tmp_path: Path) -> None:
     device = HostThermometer("host", {"sensors": ["a/temp1"], "channels": ["a"]}, root=tmp_path)
     with pytest.raises(DeviceError, match="the host has none at all"):
         device.bind()
@@ -102,7 +102,7 @@ def test_a_sensor_that_vanishes_is_found_again_under_another_number(root: Path) 
     clock = FakeClock()
     settings = {"sensors": ["bme280/temp", "coretemp/temp2"], "channels": ["air", "cpu"]}
     device = HostThermometer("host", settings, root=root, clock=clock)
-    notebook = Notebook()
+    recorder = RecordingSink()
     cpu: list[float | None] = []
 
     def play(record: Record) -> None:
@@ -116,13 +116,13 @@ def test_a_sensor_that_vanishes_is_found_again_under_another_number(root: Path) 
         elif len(cpu) == 7:
             device._closing.set()
 
-    notebook.stop = play
-    device.run(notebook)
-    samples = [r for r in notebook.records if isinstance(r, TemperatureSample)]
-    air = [sample.value_c for sample in samples if sample.probe == "air"]
-    assert air == pytest.approx([21.34, 21.34, 22.0, 22.0])
+    recorder.stop = play
+    device.run(recorder)
+    samples = [r for r in recorder.records if isinstance(r, TemperatureSample)]
+    air_c = [sample.value_c for sample in samples if sample.probe == "air"]
+    assert air_c == pytest.approx([21.34, 21.34, 22.0, 22.0])
     assert cpu == [-5.2] * 7, "the neighbour is read all the time"
-    assert notebook.event_names == ["opened", "lost", "recovered"]
+    assert recorder.event_names == ["opened", "lost", "recovered"]
     assert device.statistics() == {"readings": 11, "failures": 3, "open_sensors": 0, "losses": 1}
     assert clock.waits_s == pytest.approx([1.0] * 7)
 

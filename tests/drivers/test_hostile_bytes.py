@@ -19,10 +19,10 @@ from drivers.receivers.nmea.decoder import NmeaDecoder
 from drivers.receivers.novatel.decoder import NovatelDecoder
 from drivers.receivers.septentrio.decoder import SbfDecoder
 from drivers.receivers.ublox.decoder import UbxDecoder
+from sim_hw.receivers.emulated_receiver import Edge, EmulatedReceiver
 from sim_hw.receivers.mavlink_autopilot import MavlinkAutopilot
 from sim_hw.receivers.nmea_receiver import NmeaReceiver
 from sim_hw.receivers.novatel_receiver import NovatelReceiver
-from sim_hw.receivers.receiver import Edge, EmulatedReceiver
 from sim_hw.receivers.septentrio_receiver import SeptentrioReceiver
 from sim_hw.receivers.ublox_receiver import UbloxReceiver
 from sim_hw.world.world_clock import WorldClock
@@ -38,11 +38,11 @@ class Protocol:
     """A decoder, what its receiver says, and what it may keep of a message that is not whole."""
 
     decoder: Callable[[str], MessageDecoder]
-    said: Callable[[], bytes]
-    kept_nbytes: int
+    source: Callable[[], bytes]
+    max_pending_nbytes: int
 
 
-def said_by(kind: type[EmulatedReceiver]) -> bytes:
+def bytes_of(kind: type[EmulatedReceiver]) -> bytes:
     """A few seconds of a receiver with marks."""
     receiver = kind(WorldClock(START_GPS_NS, 0), state_at, rate_hz=5.0, seed=3)
     epoch_ns, parts = START_GPS_NS, []
@@ -57,21 +57,21 @@ def said_by(kind: type[EmulatedReceiver]) -> bytes:
     return b"".join(parts)
 
 
-def said_by_an_autopilot() -> bytes:
+def bytes_of_autopilot() -> bytes:
     autopilot = MavlinkAutopilot(WorldClock(START_GPS_NS, 0), state_at)
     for second in range(4):
         autopilot.mark(START_GPS_NS + second * NS)
-    data = b"".join(autopilot.said_until(n * NS // 20) for n in range(80))
+    data = b"".join(autopilot.messages_until(n * NS // 20) for n in range(80))
     autopilot.close()
     return data
 
 
 PROTOCOLS = {
-    "ublox": Protocol(UbxDecoder, lambda: said_by(UbloxReceiver), 8_200),
-    "novatel": Protocol(NovatelDecoder, lambda: said_by(NovatelReceiver), 8_500),
-    "septentrio": Protocol(SbfDecoder, lambda: said_by(SeptentrioReceiver), 16_384),
-    "nmea": Protocol(NmeaDecoder, lambda: said_by(NmeaReceiver), 256),
-    "mavlink": Protocol(MavlinkDecoder, said_by_an_autopilot, 300),
+    "ublox": Protocol(UbxDecoder, lambda: bytes_of(UbloxReceiver), 8_200),
+    "novatel": Protocol(NovatelDecoder, lambda: bytes_of(NovatelReceiver), 8_500),
+    "septentrio": Protocol(SbfDecoder, lambda: bytes_of(SeptentrioReceiver), 16_384),
+    "nmea": Protocol(NmeaDecoder, lambda: bytes_of(NmeaReceiver), 256),
+    "mavlink": Protocol(MavlinkDecoder, bytes_of_autopilot, 300),
 }
 
 
@@ -109,7 +109,7 @@ def pieces(data: bytes, chance: random.Random) -> Iterator[bytes]:
 
 def survive(name: str, total: int) -> None:
     protocol = PROTOCOLS[name]
-    clean = protocol.said()
+    clean = protocol.source()
     reference = protocol.decoder("gnss")
     reference.feed(clean, 0)
     per_clean_stream = reference.frames
@@ -123,7 +123,7 @@ def survive(name: str, total: int) -> None:
         for piece in pieces(hostile, chance):
             decoder.feed(piece, fed)
             fed += len(piece)
-            assert decoder.pending <= protocol.kept_nbytes + 4096
+            assert decoder.pending <= protocol.max_pending_nbytes + 4096
         before = decoder.frames
         for piece in pieces(clean, chance):
             decoder.feed(piece, fed)
@@ -132,7 +132,9 @@ def survive(name: str, total: int) -> None:
         assert decoder.frames - before >= per_clean_stream - 2, f"after {fed} bytes"
     assert decoder.bad_messages > 0
     assert all(
-        len(kept) < 1000 for kept in vars(decoder).values() if isinstance(kept, list | dict)
+        len(buffered) < 1000
+        for buffered in vars(decoder).values()
+        if isinstance(buffered, list | dict)
     ), "nothing grows"
 
 

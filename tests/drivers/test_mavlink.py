@@ -19,17 +19,22 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from drivers.contract import ClockReading, DeviceError, EventMark, NavSample
 from drivers.receivers.mavlink.boot_clock import GPS_EPOCH_UNIX_NS
-from drivers.receivers.mavlink.decoder import MavlinkDecoder, Timesync, angles_of, between
+from drivers.receivers.mavlink.decoder import (
+    MavlinkDecoder,
+    Timesync,
+    angles_of,
+    interpolated_quaternion,
+)
 from drivers.receivers.mavlink.navigator import MavlinkNavigator
 from drivers.receivers.message_decoder import Nav
 from drivers.timescales.gps_time import SECOND_NS, WEEK_NS
+from sim_hw.devices.device_loop import DeviceLine
 from sim_hw.devices.network_line import TcpLine, UdpLine
 from sim_hw.devices.pseudo_terminal import PseudoTerminal
-from sim_hw.devices.serving import Line
+from sim_hw.receivers.emulated_receiver import ReceiverState
 from sim_hw.receivers.mavlink_autopilot import MavlinkAutopilot
-from sim_hw.receivers.receiver import ReceiverState
 from sim_hw.world.world_clock import WorldClock
-from tests.drivers.stand_ins import FakeClock, FakePort, Notebook, running
+from tests.drivers.fakes import FakeClock, FakePort, RecordingSink, running
 from tests.sim_hw.receiver_state import STATE
 
 WITHIN_S = 30.0
@@ -48,36 +53,36 @@ class Bus:
         self._packer = dialect.MAVLink(None, system, component)
         self._is_v1 = version == 1
 
-    def say(self, message: Any) -> bytes:
+    def pack_message(self, message: Any) -> bytes:
         packed = bytes(message.pack(self._packer, force_mavlink1=self._is_v1))
         self._packer.seq = (self._packer.seq + 1) % 256
         return packed
 
     def heartbeat(self, autopilot: int = 12) -> bytes:
-        return self.say(dialect.MAVLink_heartbeat_message(1, autopilot, 0, 0, 4, 3))
+        return self.pack_message(dialect.MAVLink_heartbeat_message(1, autopilot, 0, 0, 4, 3))
 
     def system_time(self, unix_us: int = UNIX_US, boot_ms: int = BOOT_MS) -> bytes:
-        return self.say(dialect.MAVLink_system_time_message(unix_us, boot_ms))
+        return self.pack_message(dialect.MAVLink_system_time_message(unix_us, boot_ms))
 
     def gps(self, *, fix: int = 3, ellipsoid_mm: int = 1_000_000) -> bytes:
-        return self.say(dialect.MAVLink_gps_raw_int_message(
+        return self.pack_message(dialect.MAVLink_gps_raw_int_message(
             BOOT_MS * 1000, fix, 475_000_000, 85_000_000, 952_500, 80, 90, 6000, 0, 17,
             ellipsoid_mm, 20, 30, 40, 0, 0,
         ))  # fmt: skip
 
     def position(self, boot_ms: int = BOOT_MS, *, latitude: int = 475_000_000) -> bytes:
-        return self.say(dialect.MAVLink_global_position_int_message(
+        return self.pack_message(dialect.MAVLink_global_position_int_message(
             boot_ms, latitude, 85_000_000, 952_500, 500_000, 6000, 300, -100, 1000,
         ))  # fmt: skip
 
     def attitude(self, boot_ms: int, heading_deg: float = 90.0) -> bytes:
         half = math.radians(heading_deg) / 2
-        return self.say(dialect.MAVLink_attitude_quaternion_message(
+        return self.pack_message(dialect.MAVLink_attitude_quaternion_message(
             boot_ms, math.cos(half), 0, 0, math.sin(half), 0, 0, 0,
         ))  # fmt: skip
 
     def trigger(self, time_us: int, number: int) -> bytes:
-        return self.say(dialect.MAVLink_camera_trigger_message(time_us, number))
+        return self.pack_message(dialect.MAVLink_camera_trigger_message(time_us, number))
 
 
 def decode(data: bytes, piece: int = 0, **settings: Any) -> tuple[MavlinkDecoder, list[Nav]]:
@@ -114,17 +119,19 @@ def test_a_position_comes_out_in_si_units_at_its_gps_time(version: int) -> None:
 
 def test_without_an_ellipsoidal_height_the_configured_undulation_is_added() -> None:
     bus = Bus()
-    said = bus.heartbeat() + bus.system_time() + bus.gps(ellipsoid_mm=0) + bus.position()
-    (sample,) = decode(said, undulation_m=47.0)[1]
+    stream_bytes = bus.heartbeat() + bus.system_time() + bus.gps(ellipsoid_mm=0) + bus.position()
+    (sample,) = decode(stream_bytes, undulation_m=47.0)[1]
     assert isinstance(sample, NavSample)
     assert sample.height_m == pytest.approx(999.5)
 
 
 def test_attitude_is_interpolated_to_the_instant_of_the_position() -> None:
     bus = Bus()
-    said = bus.heartbeat() + bus.system_time() + bus.attitude(BOOT_MS - 20, 358.0)
+    stream_bytes = bus.heartbeat() + bus.system_time() + bus.attitude(BOOT_MS - 20, 358.0)
     decoder = MavlinkDecoder("fc")
-    assert decoder.feed(said + bus.position(), 0) == [], "the attitude after it is waited for"
+    assert decoder.feed(stream_bytes + bus.position(), 0) == [], (
+        "the attitude after it is waited for"
+    )
     (sample,) = decoder.feed(bus.attitude(BOOT_MS + 20, 2.0), 0)
     assert isinstance(sample, NavSample)
     assert sample.heading_rad is not None
@@ -135,8 +142,8 @@ def test_attitude_is_interpolated_to_the_instant_of_the_position() -> None:
 def test_a_position_does_not_wait_for_an_attitude_that_no_longer_comes() -> None:
     bus = Bus()
     begun = bus.heartbeat() + bus.system_time() + bus.attitude(BOOT_MS - 20)
-    told = samples(begun + bus.position(BOOT_MS) + bus.position(BOOT_MS + 100))
-    assert [s.heading_rad for s in told] == [None]
+    decoded = samples(begun + bus.position(BOOT_MS) + bus.position(BOOT_MS + 100))
+    assert [s.heading_rad for s in decoded] == [None]
     late = samples(begun + bus.position(BOOT_MS + 2000))
     assert [s.heading_rad for s in late] == [None]
 
@@ -177,17 +184,19 @@ def test_a_restart_of_the_autopilot_is_noticed_and_time_goes_on() -> None:
 
 def test_others_on_the_bus_are_not_taken_for_the_autopilot() -> None:
     bus, camera, other = Bus(), Bus(component=100), Bus(system=2)
-    said = camera.heartbeat(8) + other.say(dialect.MAVLink_system_time_message(UNIX_US, 5))
-    said += bus.heartbeat() + bus.system_time() + bus.position()
-    said += camera.trigger(UNIX_US, 1) + other.heartbeat() + other.position(latitude=1)
-    decoder, records = decode(said)
+    stream_bytes = camera.heartbeat(8) + other.pack_message(
+        dialect.MAVLink_system_time_message(UNIX_US, 5)
+    )
+    stream_bytes += bus.heartbeat() + bus.system_time() + bus.position()
+    stream_bytes += camera.trigger(UNIX_US, 1) + other.heartbeat() + other.position(latitude=1)
+    decoder, records = decode(stream_bytes)
     assert (decoder.system, decoder.component, len(records)) == (1, 1, 1)
     assert decoder.counters["messages_of_others"] == 5
     chosen, _ = decode(bus.heartbeat() + other.heartbeat(), system=2)
     assert chosen.system == 2
 
 
-def test_after_the_line_was_opened_anew_another_autopilot_may_be_there() -> None:
+def test_after_the_line_was_reopened_another_autopilot_may_be_there() -> None:
     bus, other = Bus(), Bus(system=7)
     decoder, _ = decode(bus.heartbeat() + bus.system_time())
     assert len(decoder.feed(other.heartbeat() + other.position() + bus.position(), 0)) == 1
@@ -199,9 +208,9 @@ def test_after_the_line_was_opened_anew_another_autopilot_may_be_there() -> None
 
 def test_lost_messages_are_counted_by_their_sequence() -> None:
     bus = Bus()
-    said = bus.heartbeat() + bus.system_time()
+    stream_bytes = bus.heartbeat() + bus.system_time()
     bus.position(), bus.position()
-    decoder, _ = decode(said + bus.position())
+    decoder, _ = decode(stream_bytes + bus.position())
     assert decoder.counters["messages_lost"] == 2
 
 
@@ -217,19 +226,21 @@ def test_a_signed_message_is_read() -> None:
 @given(data=st.data())
 def test_damage_and_noise_raise_nothing_and_cost_no_later_message(data: st.DataObject) -> None:
     bus = Bus()
-    said = bus.heartbeat() + bus.system_time() + bus.gps() + bus.attitude(BOOT_MS) + bus.position()
-    stream = bytearray(said)
+    stream_bytes = (
+        bus.heartbeat() + bus.system_time() + bus.gps() + bus.attitude(BOOT_MS) + bus.position()
+    )
+    stream = bytearray(stream_bytes)
     for _ in range(data.draw(st.integers(0, 6))):
         stream[data.draw(st.integers(0, len(stream) - 1))] = data.draw(st.integers(0, 255))
     noise = data.draw(st.binary(max_size=200))
     last = Bus()
     tail = last.heartbeat() + last.trigger(UNIX_US, 41) + last.trigger(UNIX_US, 42)
-    whole, records = decode(bytes(stream) + noise + tail)
+    decoder_whole, records = decode(bytes(stream) + noise + tail)
     assert [r.count for r in records[-1:] if isinstance(r, EventMark)] == [42]
     pieces, same = decode(bytes(stream) + noise + tail, data.draw(st.integers(1, 50)))
     assert same == records
-    assert (pieces.frames, pieces.bad_bytes) == (whole.frames, whole.bad_bytes)
-    assert whole.pending <= 300
+    assert (pieces.frames, pieces.bad_bytes) == (decoder_whole.frames, decoder_whole.bad_bytes)
+    assert decoder_whole.pending <= 300
 
 
 @settings(max_examples=100, deadline=None)
@@ -245,8 +256,8 @@ def test_a_checked_message_of_nonsense_raises_nothing(payload: bytes, name: str)
     filled = payload[:size].ljust(size, b"\x7f")
     head = bytes((len(filled), 0, 0, 1, 1, 1)) + number.to_bytes(3, "little")
     crc = dialect.x25crc(bytearray(head + filled + bytes((kind.crc_extra,)))).crc
-    said = b"\xfd" + head + filled + crc.to_bytes(2, "little")
-    decoder, _ = decode(bus.heartbeat() + bus.system_time() + said)
+    stream_bytes = b"\xfd" + head + filled + crc.to_bytes(2, "little")
+    decoder, _ = decode(bus.heartbeat() + bus.system_time() + stream_bytes)
     assert decoder.frames == 3
 
 
@@ -256,7 +267,7 @@ def test_rotations_are_interpolated_along_the_shorter_arc() -> None:
         return math.cos(half), 0.0, 0.0, math.sin(half)
 
     there = tuple(-n for n in heading(20.0))
-    _, _, angle = angles_of(between(heading(10.0), there, 0.25))
+    _, _, angle = angles_of(interpolated_quaternion(heading(10.0), there, 0.25))
     assert math.degrees(angle) == pytest.approx(12.5)
 
 
@@ -279,7 +290,7 @@ def free_udp_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def new_line(kind: str) -> Line:
+def new_line(kind: str) -> DeviceLine:
     if kind == "udp":
         return UdpLine(("127.0.0.1", free_udp_port()))
     return TcpLine() if kind == "tcp" else PseudoTerminal()
@@ -287,35 +298,35 @@ def new_line(kind: str) -> Line:
 
 @pytest.mark.parametrize("line", ["pty", "udp", "tcp"])
 def test_places_attitudes_and_triggers_of_the_emulated_autopilot_come_out_right(line: str) -> None:
-    clock = WorldClock.starting_now()
+    clock = WorldClock.from_wall_clock()
     autopilot = MavlinkAutopilot(clock, flying, line=new_line(line))
     navigator = MavlinkNavigator("fc", {"port": autopilot.port, "imu_hz": 20.0})
-    notebook, enough = Notebook(), threading.Event()
+    recorder, enough = RecordingSink(), threading.Event()
     given: list[int] = []
 
     def watch(_: object) -> None:
-        leaning = sum(isinstance(r, NavSample) and r.roll_rad is not None for r in notebook.records)
-        told = sum(isinstance(r, EventMark) for r in notebook.records)
-        if told == 4 and leaning >= 15:
+        leaning = sum(isinstance(r, NavSample) and r.roll_rad is not None for r in recorder.records)
+        decoded = sum(isinstance(r, EventMark) for r in recorder.records)
+        if decoded == 4 and leaning >= 15:
             enough.set()
 
-    notebook.stop = watch
+    recorder.stop = watch
     autopilot.start()
     try:
         found = navigator.bind()
         given += [clock.gps_ns(time.monotonic_ns()) + n * 200_000_003 for n in range(1, 5)]
         for at_ns in given:
             autopilot.mark(at_ns)
-        with running(navigator, notebook):
+        with running(navigator, recorder):
             assert enough.wait(WITHIN_S), navigator.statistics()
     finally:
         autopilot.close()
     assert (found["autopilot"], found["system"]) == ("PX4", "1")
-    marks = [r for r in notebook.records if isinstance(r, EventMark)]
+    marks = [r for r in recorder.records if isinstance(r, EventMark)]
     assert [m.count for m in marks] == [0, 1, 2, 3]
     assert max(abs(m.gps_ns - at) for m, at in zip(marks, given, strict=True)) < 1_000_000
     assert all(m.time_valid for m in marks)
-    samples = [r for r in notebook.records if isinstance(r, NavSample)]
+    samples = [r for r in recorder.records if isinstance(r, NavSample)]
     for sample in samples:
         away_m = (sample.latitude_deg - flying(sample.gps_ns).latitude_deg) * METRES_PER_DEGREE
         assert abs(away_m) < 0.08, "a millisecond of flight, and the last digit"
@@ -333,29 +344,29 @@ def test_places_attitudes_and_triggers_of_the_emulated_autopilot_come_out_right(
 
 
 def test_the_port_for_timesync_measures_the_autopilots_clock() -> None:
-    clock = WorldClock.starting_now()
+    clock = WorldClock.from_wall_clock()
     autopilot = MavlinkAutopilot(clock, flying, line=new_line("udp"), drift_ppm=0.0)
     navigator = MavlinkNavigator("fc", {"port": autopilot.port, "timesync_hz": 20})
-    heard: list[Timesync] = []
+    timesyncs: list[Timesync] = []
     answered, read = threading.Event(), threading.Event()
-    notebook, sent = Notebook(), list[int]()
+    recorder, sent = RecordingSink(), list[int]()
 
     def watch(_: object) -> None:
-        if sum(isinstance(r, ClockReading) for r in notebook.records) >= 5:
+        if sum(isinstance(r, ClockReading) for r in recorder.records) >= 5:
             read.set()
 
-    notebook.stop = watch
+    recorder.stop = watch
 
     def listen(timesync: Timesync) -> None:
-        heard.append(timesync)
+        timesyncs.append(timesync)
         answered.set()
 
     assert not navigator.send_timesync(tc1_ns=0, ts1_ns=1), "nothing is open yet"
-    navigator.listen_for_timesync(listen)
+    navigator.subscribe_timesync(listen)
     autopilot.start()
     try:
         navigator.bind()
-        with running(navigator, notebook):
+        with running(navigator, recorder):
             for _ in range(5):
                 answered.clear()
                 sent.append(time.monotonic_ns())
@@ -364,13 +375,13 @@ def test_the_port_for_timesync_measures_the_autopilots_clock() -> None:
             assert read.wait(WITHIN_S)
     finally:
         autopilot.close()
-    readings = [r for r in notebook.records if isinstance(r, ClockReading)]
+    readings = [r for r in recorder.records if isinstance(r, ClockReading)]
     for reading in readings:
         there_ns = autopilot.boot_ns(clock.gps_ns(reading.mono_ns))
         assert abs(reading.device_ns - there_ns) <= reading.half_width_ns
         assert reading.device == "fc"
-    assert not {t.ts1_ns for t in heard} <= set(sent), "the driver asks by itself, too"
-    best = min(heard, key=lambda t: t.mono_ns - t.ts1_ns)
+    assert not {t.ts1_ns for t in timesyncs} <= set(sent), "the driver asks by itself, too"
+    best = min(timesyncs, key=lambda t: t.mono_ns - t.ts1_ns)
     round_trip_ns = best.mono_ns - best.ts1_ns
     true_ns = autopilot.boot_ns(clock.gps_ns(best.ts1_ns + round_trip_ns // 2))
     assert abs(best.tc1_ns - true_ns) <= round_trip_ns // 2 + 1
@@ -378,16 +389,16 @@ def test_the_port_for_timesync_measures_the_autopilots_clock() -> None:
     assert not navigator.send_timesync(tc1_ns=0, ts1_ns=1), "it is closed"
 
 
-def test_binding_says_what_was_heard_or_what_to_switch_on() -> None:
+def test_binding_states_what_was_received_or_what_to_switch_on() -> None:
     clock = FakeClock()
     bus = Bus()
 
-    def bind(said: bytes) -> str:
-        def speak(_: FakePort) -> bytes:
-            clock.now_ns += 10**8 if said else 0
-            return said
+    def bind(stream_bytes: bytes) -> str:
+        def answer(_: FakePort) -> bytes:
+            clock.now_ns += 10**8 if stream_bytes else 0
+            return stream_bytes
 
-        port = FakePort(clock, speak)
+        port = FakePort(clock, answer)
         navigator = MavlinkNavigator("f", {"port": "x"}, clock=clock, open_port=lambda *_: port)
         return navigator.bind()["messages"]
 
@@ -400,28 +411,28 @@ def test_binding_says_what_was_heard_or_what_to_switch_on() -> None:
         bind(b"$GNTXT,hello*00\r\n")
 
 
-def test_it_says_that_it_is_there_and_asks_for_what_does_not_come() -> None:
+def test_it_announces_itself_and_requests_what_does_not_come() -> None:
     clock = FakeClock()
     bus = Bus()
 
-    def speak(_: FakePort) -> bytes:
+    def answer(_: FakePort) -> bytes:
         clock.now_ns += 10**8
         return bus.position() if clock.now_ns > 15 * 10**9 else bus.heartbeat()
 
-    port = FakePort(clock, speak)
+    port = FakePort(clock, answer)
     navigator = MavlinkNavigator(
         "f", {"port": "x", "silence_s": 60}, clock=clock, open_port=lambda *_: port
     )
     navigator.bind()
-    said = dialect.MAVLink(None).parse_buffer(bytearray(port.written))
-    assert {(m.get_srcSystem(), m.get_srcComponent()) for m in said} == {(1, 191)}
-    names = [m.get_type() for m in said]
+    stream_bytes = dialect.MAVLink(None).parse_buffer(bytearray(port.written))
+    assert {(m.get_srcSystem(), m.get_srcComponent()) for m in stream_bytes} == {(1, 191)}
+    names = [m.get_type() for m in stream_bytes]
     assert 13 <= names.count("HEARTBEAT") <= 16
     assert 13 <= names.count("TIMESYNC") <= 16
-    asked = [m for m in said if m.get_type() == "COMMAND_LONG"]
-    assert {(m.command, m.target_system, m.target_component) for m in asked} == {(511, 1, 1)}
-    assert {(m.param1, m.param2) for m in asked} == {
+    requests = [m for m in stream_bytes if m.get_type() == "COMMAND_LONG"]
+    assert {(m.command, m.target_system, m.target_component) for m in requests} == {(511, 1, 1)}
+    assert {(m.param1, m.param2) for m in requests} == {
         (2.0, 1e6), (24.0, 1e6), (33.0, 1e5), (31.0, 2e4), (30.0, 2e4),
     }  # fmt: skip
     # Every five seconds, while they do not come; ATTITUDE once ATTITUDE_QUATERNION did not.
-    assert len(asked) == 14
+    assert len(requests) == 14

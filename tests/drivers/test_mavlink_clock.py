@@ -18,7 +18,7 @@ from drivers.timescales.gps_time import SECOND_NS
 from sim_hw.receivers.mavlink_autopilot import MavlinkAutopilot
 from sim_hw.receivers.utc_jitter import UtcErrors, UtcJitter
 from sim_hw.world.world_clock import WorldClock
-from tests.drivers.stand_ins import FakeClock, FakePort, Notebook, running
+from tests.drivers.fakes import FakeClock, FakePort, RecordingSink, running
 from tests.drivers.test_mavlink import BOOT_MS, GPS_NS, UNIX_US, Bus, decode, flying, new_line
 from tests.drivers.test_udp_port import WITHIN_S
 from tests.sim_hw.receiver_state import STATE
@@ -50,14 +50,14 @@ def said(
         boot_ns = 754 * SECOND_NS + n * 1_000 * MS + (n * 7_654_321 + seed * 123_457) % (20 * MS)
         true_gps_ns = GPS_NS + round((boot_ns - 754 * SECOND_NS) * rate)
         error_ns = errors.error_ns(boot_ns)
-        clock.tell(UNIX_US + (true_gps_ns - GPS_NS + error_ns) // 1000, boot_ns // MS)
-        asked_ns = boot_ns + 350 * MS
-        stated = clock.gps_ns(asked_ns)
+        clock.add_system_time(UNIX_US + (true_gps_ns - GPS_NS + error_ns) // 1000, boot_ns // MS)
+        requested_ns = boot_ns + 350 * MS
+        stated = clock.gps_ns(requested_ns)
         assert stated is not None
-        true_ns = GPS_NS + round((asked_ns - 754 * SECOND_NS) * rate) + errors.steps_ns(boot_ns)
+        true_ns = GPS_NS + round((requested_ns - 754 * SECOND_NS) * rate) + errors.steps_ns(boot_ns)
         yield At(
             stated - true_ns,
-            clock.sigma_ns(asked_ns),
+            clock.sigma_ns(requested_ns),
             error_ns - errors.steps_ns(boot_ns),
             clock.utc_sigma_ns,
         )
@@ -124,27 +124,29 @@ def test_one_message_far_off_is_doubted_and_no_step() -> None:
     clock = BootClock()
     before = list(said(clock, EVEN, 3, count=40))[-1]
     boot_ms = 754_000 + 40_000
-    clock.tell(UNIX_US + 40_000_000 + 200_000, boot_ms)
+    clock.add_system_time(UNIX_US + 40_000_000 + 200_000, boot_ms)
     assert clock.steps == 0
     assert clock.sigma_ns(boot_ms * MS) > 150 * MS, "it may be the first after a step"
-    clock.tell(UNIX_US + 41_000_000, boot_ms + 1000)
+    clock.add_system_time(UNIX_US + 41_000_000, boot_ms + 1000)
     assert clock.sigma_ns(boot_ms * MS) < 2 * before.sigma_ns
     assert clock.steps == 0
 
 
 @pytest.mark.trust
-def test_a_step_is_told_as_an_event_with_its_size_and_what_the_time_is_worth() -> None:
-    clock, sink, bus = FakeClock(), Notebook(), Bus()
-    says = [bus.heartbeat()]
+def test_a_step_is_reported_as_an_event_with_its_size_and_what_the_time_is_worth() -> None:
+    clock, sink, bus = FakeClock(), RecordingSink(), Bus()
+    stream = [bus.heartbeat()]
     for n in range(60):
         unix_us = UNIX_US + n * 1_000_000 + (75_000 if n >= 40 else 0)
-        says.append(bus.system_time(unix_us, BOOT_MS + n * 1000) + bus.position(BOOT_MS + n * 1000))
-    waiting = iter(says)
+        stream.append(
+            bus.system_time(unix_us, BOOT_MS + n * 1000) + bus.position(BOOT_MS + n * 1000)
+        )
+    waiting = iter(stream)
     port = FakePort(clock, lambda _: next(waiting, b""))
     navigator = MavlinkNavigator("fc", {"port": "x"}, clock=clock, open_port=lambda *_: port)
-    navigator.teller.sink = sink
+    navigator.emitter.sink = sink
     line = navigator._open()
-    for _ in says:
+    for _ in stream:
         for record in navigator.step(line):
             sink(record)
     (event,) = [e for e in sink.events if e.name == "receiver-stepped"]
@@ -156,10 +158,10 @@ def test_a_step_is_told_as_an_event_with_its_size_and_what_the_time_is_worth() -
 
 def test_a_message_that_was_overtaken_is_no_restart() -> None:
     clock = BootClock()
-    clock.tell(UNIX_US, BOOT_MS)
-    clock.tell(UNIX_US - 500_000, BOOT_MS - 500)
+    clock.add_system_time(UNIX_US, BOOT_MS)
+    clock.add_system_time(UNIX_US - 500_000, BOOT_MS - 500)
     assert clock.steps == 0
-    clock.tell(UNIX_US + 60_000_000, 2_000)
+    clock.add_system_time(UNIX_US + 60_000_000, 2_000)
     assert (clock.steps, clock.last_step_ns) == (1, None)
 
 
@@ -184,7 +186,7 @@ def test_attitude_is_read_from_angles_where_no_quaternion_comes() -> None:
 
     def angles(boot_ms: int, yaw_deg: float) -> bytes:
         values = (math.radians(10.0), math.radians(-5.0), math.radians(yaw_deg), 0, 0, 0)
-        return bus.say(dialect.MAVLink_attitude_message(boot_ms, *values))
+        return bus.pack_message(dialect.MAVLink_attitude_message(boot_ms, *values))
 
     begun = bus.heartbeat() + bus.system_time()
     said = begun + angles(BOOT_MS - 20, -2.0) + bus.position() + angles(BOOT_MS + 20, 2.0)
@@ -211,31 +213,31 @@ def test_attitude_is_read_from_angles_where_no_quaternion_comes() -> None:
 
 @pytest.mark.trust
 def test_an_autopilot_with_angles_and_jitter_gives_places_within_what_it_states() -> None:
-    clock = WorldClock.starting_now()
+    clock = WorldClock.from_wall_clock()
     autopilot = MavlinkAutopilot(
         clock, flying, line=new_line("udp"), utc_jitter=UtcJitter(seed=8), sends_angles=True
     )
     navigator = MavlinkNavigator("fc", {"port": autopilot.port, "position_hz": 20.0})
-    notebook, enough = Notebook(), threading.Event()
+    recorder, enough = RecordingSink(), threading.Event()
 
     def watch(_: object) -> None:
-        leaning = sum(isinstance(r, NavSample) and r.roll_rad is not None for r in notebook.records)
-        marks = sum(isinstance(r, EventMark) for r in notebook.records)
+        leaning = sum(isinstance(r, NavSample) and r.roll_rad is not None for r in recorder.records)
+        marks = sum(isinstance(r, EventMark) for r in recorder.records)
         if leaning >= 20 and marks == 2:
             enough.set()
 
-    notebook.stop = watch
+    recorder.stop = watch
     autopilot.start()
     try:
         navigator.bind()
         given = [clock.gps_ns(time.monotonic_ns()) + n * 400 * MS for n in (1, 2)]
         for at_ns in given:
             autopilot.mark(at_ns)
-        with running(navigator, notebook):
+        with running(navigator, recorder):
             assert enough.wait(WITHIN_S), navigator.statistics()
     finally:
         autopilot.close()
-    samples = [r for r in notebook.records if isinstance(r, NavSample)]
+    samples = [r for r in recorder.records if isinstance(r, NavSample)]
     for sample in samples:
         true = flying(sample.gps_ns)
         away_m = abs(sample.latitude_deg - true.latitude_deg) * 111_320.0
@@ -243,7 +245,7 @@ def test_an_autopilot_with_angles_and_jitter_gives_places_within_what_it_states(
         assert sample.horizontal_sigma_m > 0.02
     leaning = [s for s in samples if s.roll_rad is not None]
     assert leaning[-1].roll_rad == pytest.approx(math.radians(STATE.roll_deg), abs=1e-4)
-    marks = [r for r in notebook.records if isinstance(r, EventMark)]
+    marks = [r for r in recorder.records if isinstance(r, EventMark)]
     for mark, at_ns in zip(marks, given, strict=True):
         assert abs(mark.gps_ns - at_ns) < 4 * mark.accuracy_ns
         assert mark.accuracy_ns > MS

@@ -9,7 +9,12 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from drivers.contract import EventMark, NavSample
-from drivers.receivers.mavlink.decoder import MavlinkDecoder, angles_of, between, quaternion_of
+from drivers.receivers.mavlink.decoder import (
+    MavlinkDecoder,
+    angles_of,
+    interpolated_quaternion,
+    quaternion_of,
+)
 from tests.drivers.test_mavlink import BOOT_MS, UNIX_US, Bus, decode, marks, samples
 
 
@@ -23,7 +28,7 @@ def gps(bus: Bus, **changes: Any) -> bytes:
         "eph": 80, "epv": 90, "vel": 6000, "cog": 0, "satellites_visible": 17,
         "alt_ellipsoid": 1_000_000, "h_acc": 20, "v_acc": 30, "vel_acc": 40, "hdg_acc": 0, "yaw": 0,
     } | changes  # fmt: skip
-    return bus.say(dialect.MAVLink_gps_raw_int_message(**fields))
+    return bus.pack_message(dialect.MAVLink_gps_raw_int_message(**fields))
 
 
 def place(bus: Bus, boot_ms: int = BOOT_MS, **changes: Any) -> bytes:
@@ -31,16 +36,18 @@ def place(bus: Bus, boot_ms: int = BOOT_MS, **changes: Any) -> bytes:
         "time_boot_ms": boot_ms, "lat": 475_000_000, "lon": 85_000_000, "alt": 952_500,
         "relative_alt": 0, "vx": 6000, "vy": 300, "vz": -100, "hdg": 1000,
     } | changes  # fmt: skip
-    return bus.say(dialect.MAVLink_global_position_int_message(**fields))
+    return bus.pack_message(dialect.MAVLink_global_position_int_message(**fields))
 
 
 def quaternion(bus: Bus, boot_ms: int, *values: float) -> bytes:
     message = dialect.MAVLink_attitude_quaternion_message(boot_ms, *values, 0, 0, 0)
-    return bus.say(message)
+    return bus.pack_message(message)
 
 
 def angles(bus: Bus, boot_ms: int, roll: float, pitch: float, heading: float) -> bytes:
-    return bus.say(dialect.MAVLink_attitude_message(boot_ms, roll, pitch, heading, 0, 0, 0))
+    return bus.pack_message(
+        dialect.MAVLink_attitude_message(boot_ms, roll, pitch, heading, 0, 0, 0)
+    )
 
 
 def one(**changes: Any) -> NavSample:
@@ -62,16 +69,16 @@ def test_the_fix_type_is_the_fix(fix_type: int, fix: str) -> None:
     assert decode(started(bus) + gps(bus, fix_type=fix_type))[0].fix == fix
 
 
-def test_satellites_and_accuracies_that_are_not_told_stay_unknown() -> None:
+def test_satellites_and_accuracies_that_are_not_reported_stay_unknown() -> None:
     sample = one()
     assert (sample.satellites, sample.speed_sigma_mps) == (17, pytest.approx(0.04))
     bare = one(satellites_visible=255, h_acc=0, v_acc=0, vel_acc=0)
     assert (bare.satellites, bare.speed_sigma_mps) == (None, None)
     assert (bare.horizontal_sigma_m, bare.vertical_sigma_m) == (None, None)
     assert (sample.sigma_source, bare.sigma_source) == ("receiver", "none")
-    for told, known in ((254, 254), (255, None)):
+    for field_value, known in ((254, 254), (255, None)):
         bus = Bus()
-        decoder, _ = decode(started(bus) + gps(bus, satellites_visible=told))
+        decoder, _ = decode(started(bus) + gps(bus, satellites_visible=field_value))
         assert decoder.satellites == known
 
 
@@ -87,7 +94,7 @@ def test_sigmas_hold_what_is_flown_in_the_time_that_is_unsure() -> None:
     assert sample.vertical_sigma_m == pytest.approx(math.hypot(0.03, 1.0 * time_s))
 
 
-def test_the_height_is_over_the_ellipsoid_by_what_is_told_or_configured() -> None:
+def test_the_height_is_over_the_ellipsoid_by_what_is_reported_or_configured() -> None:
     assert one().height_m == pytest.approx(1000.0)
     assert one(alt_ellipsoid=0).height_m is None
     bus = Bus()
@@ -122,7 +129,7 @@ def test_a_quality_is_that_of_the_position_for_5_s(age_ms: int, fix: str) -> Non
         ({"lon": -1_800_000_001}, False),
     ],
 )
-def test_a_place_lies_between_the_poles_and_within_half_a_turn(
+def test_a_place_lies_between_the_poles_and_within_180_degrees(
     changes: dict[str, int], is_place: bool
 ) -> None:
     bus = Bus()
@@ -165,8 +172,8 @@ def test_a_quaternion_is_a_rotation_within_half_and_twice_its_norm(
     norm: float, is_rotation: bool
 ) -> None:
     bus = Bus()
-    turned = (norm * math.sqrt(0.5), 0.0, 0.0, norm * math.sqrt(0.5))
-    exact = (norm, 0.0, 0.0, 0.0) if norm in (0.5, 2.0) else turned
+    quarter_turn = (norm * math.sqrt(0.5), 0.0, 0.0, norm * math.sqrt(0.5))
+    exact = (norm, 0.0, 0.0, 0.0) if norm in (0.5, 2.0) else quarter_turn
     data = started(bus) + gps(bus) + quaternion(bus, BOOT_MS, *exact) + place(bus)
     decoder, (sample,) = decode(data)
     assert decoder.bad_messages == (not is_rotation)
@@ -187,7 +194,7 @@ def test_angles_are_read_from_1_s_after_the_last_quaternion(later_ms: int, is_re
 
 
 @pytest.mark.parametrize(("angle", "is_one"), [(6.25, True), (-6.25, True), (6.2833, False)])
-def test_an_angle_is_at_most_one_turn(angle: float, is_one: bool) -> None:
+def test_an_angle_is_at_most_360_degrees(angle: float, is_one: bool) -> None:
     for values in ((angle, 0.0, 0.0), (0.0, angle, 0.0), (0.0, 0.0, angle)):
         bus = Bus()
         decoder, _ = decode(started(bus) + angles(bus, BOOT_MS, *values))
@@ -206,7 +213,7 @@ def test_a_clock_more_than_1_s_behind_has_started_again(back_ms: int, is_known: 
     assert (heading_rad is not None) is is_known
 
 
-def test_component_1_is_read_before_a_heartbeat_says_which_it_is() -> None:
+def test_component_1_is_read_before_a_heartbeat_identifies_it() -> None:
     for component, lost in ((1, 0), (2, 1)):
         bus = Bus(1, component)
         decoder, _ = decode(bus.system_time(), system=1)
@@ -251,11 +258,11 @@ def test_a_mark_has_the_accuracy_of_trigger_and_clock_and_a_count_of_32_bits() -
     assert marks(Bus().heartbeat()) == []
 
 
-def test_refused_commands_are_kept_with_their_result() -> None:
+def test_refused_commands_are_stored_with_their_result() -> None:
     bus = Bus()
     data = bus.heartbeat()
     for command, result in ((203, 0), (206, 4)):
-        data += bus.say(dialect.MAVLink_command_ack_message(command, result))
+        data += bus.pack_message(dialect.MAVLink_command_ack_message(command, result))
     assert list(decode(data)[0].refusals) == [(206, 4)]
 
 
@@ -264,7 +271,7 @@ def test_a_measurement_that_is_no_number_is_bad(value: float) -> None:
     bus = Bus()
     good = dialect.MAVLink_highres_imu_message(0, *[0.5] * 13, 0)
     bad = dialect.MAVLink_highres_imu_message(0, *[0.5] * 5, value, *[0.5] * 7, 0)
-    decoder, _ = decode(bus.heartbeat() + bus.say(good) + bus.say(bad))
+    decoder, _ = decode(bus.heartbeat() + bus.pack_message(good) + bus.pack_message(bad))
     assert (decoder.bad_messages, decoder.seen["HIGHRES_IMU"]) == (1, 1)
 
 
@@ -284,6 +291,6 @@ def test_between_two_headings_the_shorter_arc_is_shared(share: float, sign: int)
     first = quaternion_of(0.0, 0.0, math.radians(350.0))
     w, x, y, z = quaternion_of(0.0, 0.0, math.radians(30.0))
     second = (sign * w, sign * x, sign * y, sign * z)
-    heading = math.degrees(angles_of(between(first, second, share))[2])
+    heading = math.degrees(angles_of(interpolated_quaternion(first, second, share))[2])
     assert heading == pytest.approx((350.0 + 40.0 * share) % 360.0, abs=1e-9)
-    assert between(first, first, share) == first
+    assert interpolated_quaternion(first, first, share) == first

@@ -22,81 +22,92 @@ def size_of(buffer: bytes, at: int) -> int | None:
 
 
 def framer() -> MessageFramer:
-    return MessageFramer(b"$!", size_of, lambda whole: sum(whole[:-1]) & 0xFF == whole[-1])
+    return MessageFramer(
+        b"$!", size_of, lambda message_bytes: sum(message_bytes[:-1]) & 0xFF == message_bytes[-1]
+    )
 
 
-def counted(made: MessageFramer) -> tuple[int, int, int, int]:
-    return made.frames, made.bad_frames, made.bad_bytes, made.pending
+def counted(framer_under_test: MessageFramer) -> tuple[int, int, int, int]:
+    return (
+        framer_under_test.frames,
+        framer_under_test.bad_frames,
+        framer_under_test.bad_bytes,
+        framer_under_test.pending,
+    )
 
 
 ONE, TWO = message(b"abc"), message(b"", b"!")
 
 
 def test_messages_between_noise_are_found_and_the_noise_is_counted() -> None:
-    made = framer()
-    assert made.feed(b"xy" + ONE + b"z" + TWO + b"w") == [ONE, TWO]
-    assert counted(made) == (2, 0, 4, 0)
+    framer_under_test = framer()
+    assert framer_under_test.feed(b"xy" + ONE + b"z" + TWO + b"w") == [ONE, TWO]
+    assert counted(framer_under_test) == (2, 0, 4, 0)
 
 
 @pytest.mark.parametrize("piece", [1, 2, 3, 5])
 def test_the_cuts_of_a_stream_change_nothing(piece: int) -> None:
-    made = framer()
+    framer_under_test = framer()
     stream = b"xy" + ONE + b"z" + TWO + b"w" + ONE[:4]
-    found = [m for at in range(0, len(stream), piece) for m in made.feed(stream[at : at + piece])]
+    found = [
+        m
+        for at in range(0, len(stream), piece)
+        for m in framer_under_test.feed(stream[at : at + piece])
+    ]
     assert found == [ONE, TWO]
-    assert counted(made) == (2, 0, 4, 4)
-    made.reset()
-    assert counted(made) == (2, 0, 8, 0)
-    assert made.feed(ONE[4:]) == []
-    assert counted(made) == (2, 0, 10, 0)
+    assert counted(framer_under_test) == (2, 0, 4, 4)
+    framer_under_test.reset()
+    assert counted(framer_under_test) == (2, 0, 8, 0)
+    assert framer_under_test.feed(ONE[4:]) == []
+    assert counted(framer_under_test) == (2, 0, 10, 0)
 
 
 def test_a_damaged_message_costs_itself_only() -> None:
-    made = framer()
+    framer_under_test = framer()
     damaged = bytearray(ONE)
     damaged[3] ^= 1
-    assert made.feed(bytes(damaged) + TWO) == [TWO]
-    assert counted(made) == (1, 1, 6, 0)
+    assert framer_under_test.feed(bytes(damaged) + TWO) == [TWO]
+    assert counted(framer_under_test) == (1, 1, 6, 0)
 
 
 def test_a_size_that_cannot_be_costs_one_byte_and_is_no_frame() -> None:
-    made = framer()
-    assert made.feed(b"$\x02" + TWO) == [TWO]
-    assert counted(made) == (1, 0, 2, 0)
+    framer_under_test = framer()
+    assert framer_under_test.feed(b"$\x02" + TWO) == [TWO]
+    assert counted(framer_under_test) == (1, 0, 2, 0)
 
 
-def test_a_start_that_waits_gives_way_to_a_whole_message_inside_it() -> None:
-    made = framer()
-    assert made.feed(b"$\x14" + b"ab" + ONE) == [ONE]
-    assert counted(made) == (1, 1, 4, 0)
+def test_a_start_that_waits_gives_way_to_a_complete_message_inside_it() -> None:
+    framer_under_test = framer()
+    assert framer_under_test.feed(b"$\x14" + b"ab" + ONE) == [ONE]
+    assert counted(framer_under_test) == (1, 1, 4, 0)
 
 
-def test_a_start_that_waits_is_kept_where_what_is_inside_is_not_whole_or_damaged() -> None:
-    made = framer()
+def test_a_start_that_waits_is_retained_where_what_is_inside_is_incomplete_or_damaged() -> None:
+    framer_under_test = framer()
     waiting = b"$\x14" + b"a" + ONE[:-1]
-    assert made.feed(waiting) == []
-    assert counted(made) == (0, 0, 0, 8)
-    made = framer()
+    assert framer_under_test.feed(waiting) == []
+    assert counted(framer_under_test) == (0, 0, 0, 8)
+    framer_under_test = framer()
     waiting = b"$\x14" + b"a" + ONE[:-1] + bytes([ONE[-1] ^ 1])
-    assert made.feed(waiting) == []
-    assert counted(made) == (0, 0, 0, 9)
+    assert framer_under_test.feed(waiting) == []
+    assert counted(framer_under_test) == (0, 0, 0, 9)
 
 
-def test_a_whole_message_that_holds_another_is_not_one() -> None:
-    made = framer()
-    assert made.feed(message(b"a" + TWO + b"b")) == [TWO]
-    assert counted(made) == (1, 1, 5, 0)
-    made = framer()
+def test_a_complete_message_that_holds_another_is_not_one() -> None:
+    framer_under_test = framer()
+    assert framer_under_test.feed(message(b"a" + TWO + b"b")) == [TWO]
+    assert counted(framer_under_test) == (1, 1, 5, 0)
+    framer_under_test = framer()
     inside_to_the_end = b"$\x07a" + b"!\x04q"
     inside_to_the_end += bytes([sum(b"!\x04q") & 0xFF])
-    assert made.feed(inside_to_the_end)[-1] == inside_to_the_end[3:]
+    assert framer_under_test.feed(inside_to_the_end)[-1] == inside_to_the_end[3:]
 
 
 def test_a_message_that_reaches_beyond_its_outer_one_is_not_inside_it() -> None:
-    made = framer()
+    framer_under_test = framer()
     outer = message(b"ab!\x09c")
-    assert made.feed(outer) == [outer]
-    assert counted(made) == (1, 0, 0, 0)
+    assert framer_under_test.feed(outer) == [outer]
+    assert counted(framer_under_test) == (1, 0, 0, 0)
 
 
 @pytest.mark.parametrize(

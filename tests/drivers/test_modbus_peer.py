@@ -10,8 +10,8 @@ import pytest
 
 from drivers.contract import DeviceError, TemperatureSample
 from drivers.thermometers.modbus_rtu.thermometer import ModbusThermometer
-from tests.drivers.lines import PtyLine
-from tests.drivers.stand_ins import Notebook
+from tests.drivers.fakes import RecordingSink
+from tests.drivers.pty_line import PtyLine
 
 pymodbus_server = pytest.importorskip("pymodbus.server", reason="needs pymodbus (group dev)")
 pymodbus_datastore = pytest.importorskip("pymodbus.datastore", reason="needs pymodbus")
@@ -64,31 +64,31 @@ def _thermometer(line: PtyLine, **more: object) -> ModbusThermometer:
     return ModbusThermometer("probes", section)
 
 
-def _run(thermometer: ModbusThermometer, enough: int) -> Notebook:
+def _run(thermometer: ModbusThermometer, enough: int) -> RecordingSink:
     """Run until that many samples have come, ten seconds at most."""
-    notebook = Notebook()
+    recorder = RecordingSink()
     done = threading.Event()
 
     def stop(_: object) -> None:
-        if sum(isinstance(r, TemperatureSample) for r in notebook.records) >= enough:
+        if sum(isinstance(r, TemperatureSample) for r in recorder.records) >= enough:
             done.set()
 
-    notebook.stop = stop
-    thread = threading.Thread(target=thermometer.run, args=(notebook,))
+    recorder.stop = stop
+    thread = threading.Thread(target=thermometer.run, args=(recorder,))
     thread.start()
     came = done.wait(10)
     thermometer.close()
     thread.join(5)
-    assert came, notebook.events
-    return notebook
+    assert came, recorder.events
+    return recorder
 
 
 def test_pymodbus_registers_come_out_as_degrees(line: PtyLine) -> None:
     thermometer = _thermometer(line)
     found = thermometer.bind()
     assert found["probe 0"] == "21.5 degC"
-    notebook = _run(thermometer, 8)
-    samples = [(r.probe, r.value_c) for r in notebook.records if isinstance(r, TemperatureSample)]
+    recorder = _run(thermometer, 8)
+    samples = [(r.probe, r.value_c) for r in recorder.records if isinstance(r, TemperatureSample)]
     assert samples[:4] == [("0", 21.5), ("1", -5.2), ("2", None), ("G", 30.1)]
     assert thermometer.statistics()["bad_bytes"] == 0
 
@@ -110,24 +110,24 @@ def test_a_unit_that_is_not_on_the_line_is_not_found(line: PtyLine) -> None:
 def test_noise_on_the_line_loses_no_reading(line: PtyLine) -> None:
     line.noise_to_near = b"\x03\x04\x00\xff\x03"
     thermometer = _thermometer(line)
-    notebook = _run(thermometer, 8)
+    recorder = _run(thermometer, 8)
     assert thermometer.statistics()["bad_bytes"] == 5
     assert thermometer.statistics()["timeouts"] == 0
-    assert "checksum" not in notebook.event_names
+    assert "checksum" not in recorder.event_names
 
 
 def test_a_cut_line_is_silent_and_recovers(line: PtyLine) -> None:
     thermometer = _thermometer(line)
-    notebook = Notebook()
+    recorder = RecordingSink()
     seen = {name: threading.Event() for name in ("opened", "silent", "recovered")}
 
     def note(_: object) -> None:
-        for name in notebook.event_names:
+        for name in recorder.event_names:
             if name in seen:
                 seen[name].set()
 
-    notebook.stop = note
-    thread = threading.Thread(target=thermometer.run, args=(notebook,))
+    recorder.stop = note
+    thread = threading.Thread(target=thermometer.run, args=(recorder,))
     thread.start()
     try:
         assert seen["opened"].wait(5)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from drivers.contract import DeviceError, TemperatureSample
 from drivers.thermometers.modbus_rtu.frames import crc16, find_reply, read_request
 from drivers.thermometers.modbus_rtu.thermometer import ModbusThermometer
-from tests.drivers.stand_ins import FakeClock, FakePort, Notebook
+from tests.drivers.fakes import FakeClock, FakePort, RecordingSink
 
 
 def reply(unit: int, registers: list[int]) -> bytes:
@@ -80,54 +80,54 @@ def _answers(*answers: bytes) -> Callable[[FakePort], bytes]:
     return answer
 
 
-def _run(thermometer: ModbusThermometer, polls: int) -> Notebook:
+def _run(thermometer: ModbusThermometer, polls: int) -> RecordingSink:
     """Run until that many samples or events have come."""
-    notebook = Notebook()
+    recorder = RecordingSink()
 
     def stop(_: object) -> None:
-        if len(notebook.records) >= polls:
+        if len(recorder.records) >= polls:
             thermometer._closing.set()
 
-    notebook.stop = stop
-    thermometer.run(notebook)
-    return notebook
+    recorder.stop = stop
+    thermometer.run(recorder)
+    return recorder
 
 
-def _samples(notebook: Notebook) -> list[tuple[str, float | None]]:
-    return [(r.probe, r.value_c) for r in notebook.records if isinstance(r, TemperatureSample)]
+def _samples(recorder: RecordingSink) -> list[tuple[str, float | None]]:
+    return [(r.probe, r.value_c) for r in recorder.records if isinstance(r, TemperatureSample)]
 
 
 def test_registers_are_signed_tenths_of_a_degree_in_the_order_of_the_channels() -> None:
     clock = FakeClock()
-    notebook = _run(_thermometer(clock, _answers(reply(1, [215, 65484, 0]))), 5)
-    assert _samples(notebook)[:3] == [("0", 21.5), ("1", -5.2), ("G", 0.0)]
+    recorder = _run(_thermometer(clock, _answers(reply(1, [215, 65484, 0]))), 5)
+    assert _samples(recorder)[:3] == [("0", 21.5), ("1", -5.2), ("G", 0.0)]
 
 
 def test_an_open_sensor_gives_a_sample_without_a_value() -> None:
     clock = FakeClock()
-    notebook = _run(_thermometer(clock, _answers(reply(1, [0x7FFF, 0x8000, 1]))), 5)
-    assert _samples(notebook)[:3] == [("0", None), ("1", -3276.8), ("G", 0.1)]
+    recorder = _run(_thermometer(clock, _answers(reply(1, [0x7FFF, 0x8000, 1]))), 5)
+    assert _samples(recorder)[:3] == [("0", None), ("1", -3276.8), ("G", 0.1)]
 
 
 def test_it_reads_once_a_second() -> None:
     clock = FakeClock()
     thermometer = _thermometer(clock, _answers(reply(1, [1, 2, 3])))
-    notebook = _run(thermometer, 30)
+    recorder = _run(thermometer, 30)
     times = [
-        r.mono_ns for r in notebook.records if isinstance(r, TemperatureSample) and r.probe == "0"
+        r.mono_ns for r in recorder.records if isinstance(r, TemperatureSample) and r.probe == "0"
     ]
     steps_s = [(b - a) * 1e-9 for a, b in itertools.pairwise(times)]
     assert steps_s == pytest.approx([1.0] * len(steps_s), abs=0.05)
 
 
-def test_an_exception_is_told_with_its_meaning_and_is_no_silence() -> None:
+def test_an_exception_is_reported_with_its_meaning_and_is_no_silence() -> None:
     clock = FakeClock()
     thermometer = _thermometer(clock, _answers(refusal(1, 2)))
-    notebook = _run(thermometer, 12)
-    assert _samples(notebook) == []
-    told = [event for event in notebook.events if event.name == "exception"]
-    assert "exception 2: it has no such registers; check first_register" in told[0].sentence
-    assert "silent" not in notebook.event_names
+    recorder = _run(thermometer, 12)
+    assert _samples(recorder) == []
+    exceptions = [event for event in recorder.events if event.name == "exception"]
+    assert "exception 2: it has no such registers; check first_register" in exceptions[0].sentence
+    assert "silent" not in recorder.event_names
     assert thermometer.statistics()["exceptions"] >= 5
 
 
@@ -136,9 +136,9 @@ def test_one_damaged_answer_costs_only_itself() -> None:
     damaged = bytearray(reply(1, [1, 2, 3]))
     damaged[4] ^= 0x10
     thermometer = _thermometer(clock, _answers(bytes(damaged), reply(1, [10, 20, 30])))
-    notebook = _run(thermometer, 8)
-    assert _samples(notebook)[:3] == [("0", 1.0), ("1", 2.0), ("G", 3.0)]
-    assert notebook.event_names[:2] == ["opened", "checksum"]
+    recorder = _run(thermometer, 8)
+    assert _samples(recorder)[:3] == [("0", 1.0), ("1", 2.0), ("G", 3.0)]
+    assert recorder.event_names[:2] == ["opened", "checksum"]
     assert thermometer.statistics()["bad_messages"] == 1
     assert thermometer.statistics()["bad_bytes"] == len(damaged)
 
@@ -153,18 +153,18 @@ def test_an_answer_that_comes_after_its_time_is_not_taken_for_the_next() -> None
             return b"" if late else reply(1, [1, 2, 3])
         return late.pop() if late and clock.now_ns > 1_900_000_000 else b""
 
-    notebook = _run(_thermometer(clock, answer), 6)
-    assert ("0", 99.9) not in _samples(notebook)
-    assert _samples(notebook)[0] == ("0", 0.1)
+    recorder = _run(_thermometer(clock, answer), 6)
+    assert ("0", 99.9) not in _samples(recorder)
+    assert _samples(recorder)[0] == ("0", 0.1)
 
 
-def test_a_module_that_says_nothing_is_silent_after_five_seconds() -> None:
+def test_a_module_that_sends_nothing_is_silent_after_five_seconds() -> None:
     clock = FakeClock()
     start_ns = clock.now_ns
     thermometer = _thermometer(clock, lambda port: b"")
-    notebook = _run(thermometer, 2)
-    assert notebook.event_names == ["opened", "silent"]
-    assert 5.0 <= (notebook.events[1].mono_ns - start_ns) * 1e-9 < 6.0
+    recorder = _run(thermometer, 2)
+    assert recorder.event_names == ["opened", "silent"]
+    assert 5.0 <= (recorder.events[1].mono_ns - start_ns) * 1e-9 < 6.0
     assert thermometer.statistics()["timeouts"] >= 4
 
 
@@ -180,7 +180,7 @@ def test_binding_reads_every_probe_once() -> None:
     }
 
 
-def test_binding_to_a_module_of_another_number_says_what_to_check() -> None:
+def test_binding_to_a_module_of_another_number_states_what_to_check() -> None:
     clock = FakeClock()
     with pytest.raises(DeviceError, match=r"unit 1 at /dev/probes gave no answer.*A and B swapped"):
         _thermometer(clock, _answers(reply(2, [1, 2, 3]))).bind()
@@ -188,7 +188,7 @@ def test_binding_to_a_module_of_another_number_says_what_to_check() -> None:
 
 @settings(max_examples=50, deadline=None)
 @given(st.lists(st.binary(max_size=30), min_size=1, max_size=8))
-def test_whatever_a_module_says_nothing_is_raised(answers: list[bytes]) -> None:
+def test_whatever_a_module_sends_nothing_is_raised(answers: list[bytes]) -> None:
     clock = FakeClock()
     left = list(answers)
 
@@ -200,7 +200,7 @@ def test_whatever_a_module_says_nothing_is_raised(answers: list[bytes]) -> None:
         return left.pop()
 
     thermometer = _thermometer(clock, answer)
-    thermometer.run(Notebook())
+    thermometer.run(RecordingSink())
     assert thermometer.statistics()["bytes"] == sum(len(a) for a in answers) - sum(
         len(a) for a in left
     )

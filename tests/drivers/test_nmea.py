@@ -18,7 +18,7 @@ from drivers.receivers.nmea.decoder import NmeaDecoder
 from drivers.receivers.nmea.navigator import NmeaNavigator
 from drivers.receivers.ublox.decoder import UbxDecoder
 from drivers.timescales.gps_time import WEEK_NS
-from tests.drivers.stand_ins import FakeClock, FakePort
+from tests.drivers.fakes import FakeClock, FakePort
 
 NAV = Path(__file__).parents[3] / "shared" / "data" / "nav"
 EXCERPT = Path(__file__).parent / "data" / "ublox-zed-f9r-excerpt.nmea"
@@ -173,12 +173,12 @@ def test_damage_and_noise_raise_nothing_and_cost_no_later_message(data: st.DataO
         stream[data.draw(st.integers(0, len(stream) - 1))] = data.draw(st.integers(0, 255))
     noise = data.draw(st.binary(max_size=300))
     # The first sentence behind noise may be swallowed by its last line; the next is not.
-    whole, records = decode(bytes(stream) + noise + EVENT + EVENT)
+    decoder_whole, records = decode(bytes(stream) + noise + EVENT + EVENT)
     assert sum(isinstance(r, EventMark) for r in records) >= 1
     pieces, same = decode(bytes(stream) + noise + EVENT + EVENT, data.draw(st.integers(1, 40)))
     assert same == records
-    assert (pieces.frames, pieces.bad_bytes) == (whole.frames, whole.bad_bytes)
-    assert whole._framer.pending <= 256
+    assert (pieces.frames, pieces.bad_bytes) == (decoder_whole.frames, decoder_whole.bad_bytes)
+    assert decoder_whole._framer.pending <= 256
 
 
 @pytest.mark.parametrize("path", [EXCERPT, NAV / "gpsd" / "ublox-zed-f9r.log"])
@@ -205,15 +205,15 @@ def test_every_recorded_sentence_is_that_of_pynmeagps_and_its_time_that_of_ubx(p
         assert min(abs(sample.gps_ns - at) for at in ubx) < 10_000_000, "no 18 s between them"
 
 
-def test_binding_says_what_was_heard_or_what_to_switch_on() -> None:
+def test_binding_states_what_was_received_or_what_to_switch_on() -> None:
     clock = FakeClock()
 
     def bind(said: bytes) -> str:
-        def speak(_: FakePort) -> bytes:
+        def answer(_: FakePort) -> bytes:
             clock.now_ns += 10**8 if said else 0
             return said
 
-        port = FakePort(clock, speak)
+        port = FakePort(clock, answer)
         navigator = NmeaNavigator("n", {"port": "x"}, clock=clock, open_port=lambda *_: port)
         return navigator.bind()["messages"]
 

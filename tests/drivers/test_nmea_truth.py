@@ -124,7 +124,7 @@ def test_a_damaged_gga_at_one_hertz_is_bridged_by_its_neighbours() -> None:
         assert record.gap_ns == 2 * SECOND_NS
 
 
-def test_sigma_comes_from_the_receiver_or_says_that_it_is_computed_from_dop() -> None:
+def test_sigma_comes_from_the_receiver_or_states_that_it_is_computed_from_dop() -> None:
     with_gst, without = decode(rmc(0), gga(0), gst(0), rmc(10), gga(10), rmc(20), gga(20))[:2]
     assert (with_gst.sigma_source, with_gst.horizontal_sigma_m) == ("receiver", 0.05)
     assert without.sigma_source == "dop"
@@ -183,7 +183,7 @@ def test_sentences_of_different_times_are_not_mixed() -> None:
         ((rmc(0), "GNGSA,A,2,01,02,,,,,,,,,,,1.5,0.8,1.2", gga(0)), "2d"),
     ],
 )
-def test_the_fix_is_the_worst_that_any_sentence_says(
+def test_the_fix_is_the_worst_that_any_sentence_states(
     bodies: tuple[str, ...], fix: str | None
 ) -> None:
     first = [s for s in decode(rmc(-10), gga(-10), *bodies, rmc(50)) if s.gps_ns % SECOND_NS == 0]
@@ -235,8 +235,10 @@ def test_every_line_end_and_binary_between_the_lines_is_read(end: bytes) -> None
         decoder = NmeaDecoder("gnss")
         samples = [s for i in range(len(stream)) for s in decoder.feed(stream[i : i + 1], 0)]
         # A CR may be followed by an LF: the last line is complete with the next byte.
-        whole = 4 if end == b"\r" and stream.endswith(end) else 5
-        assert [s.height_m for s in samples if isinstance(s, NavSample)] == [HEIGHT_M] * whole
+        sentence_count = 4 if end == b"\r" and stream.endswith(end) else 5
+        assert [s.height_m for s in samples if isinstance(s, NavSample)] == [
+            HEIGHT_M
+        ] * sentence_count
 
 
 def test_other_sentences_say_the_same_as_gga() -> None:

@@ -116,13 +116,15 @@ def test_damage_and_noise_raise_nothing_and_cost_no_later_message(data: st.DataO
     stream = bytearray(b"".join(pva(507, n / 10) + mark_time(n / 10) for n in range(4)))
     for _ in range(data.draw(st.integers(0, 8))):
         stream[data.draw(st.integers(0, len(stream) - 1))] = data.draw(st.integers(0, 255))
-    said = bytes(stream) + data.draw(st.binary(max_size=200)) + mark_time(50.0) + mark_time(51.0)
-    whole, records = decode(said)
+    stream_bytes = (
+        bytes(stream) + data.draw(st.binary(max_size=200)) + mark_time(50.0) + mark_time(51.0)
+    )
+    decoder_whole, records = decode(stream_bytes)
     seconds = [r.gps_ns - WEEK * WEEK_NS for r in records]
     assert seconds[-1:] == [51 * 10**9]
-    pieces, same = decode(said, data.draw(st.integers(1, 60)))
+    pieces, same = decode(stream_bytes, data.draw(st.integers(1, 60)))
     assert same == records
-    assert (pieces.frames, pieces.bad_bytes) == (whole.frames, whole.bad_bytes)
+    assert (pieces.frames, pieces.bad_bytes) == (decoder_whole.frames, decoder_whole.bad_bytes)
 
 
 @pytest.mark.parametrize("path", [EXCERPT, NAV / "novatel" / "ins2.gps"])
@@ -143,7 +145,7 @@ def test_every_recorded_solution_is_that_of_novatels_decoder(path: Path) -> None
         assert sample.roll_rad == math.radians(their.roll)
 
 
-def test_a_stream_that_is_nothing_but_sync_errors_gives_nothing_and_is_not_kept() -> None:
+def test_a_stream_that_is_nothing_but_sync_errors_gives_nothing_and_is_not_retained() -> None:
     path = NAV / "novatel" / "binary_sync_error.BIN"
     if not path.exists():
         pytest.skip("needs NovAtel's recording in ../shared/data/nav/novatel")
@@ -171,28 +173,28 @@ def test_without_an_inertial_solution_the_position_comes_from_bestpos() -> None:
 @pytest.mark.parametrize("name", ["TIME", "BESTPOS", "BESTVEL", "INSPVAX", "MARK1TIME", "INSPVA"])
 @pytest.mark.parametrize("body", ["a," * 30 + "a", "", "1e999," * 24 + "nan", "VALID," * 12 + "1"])
 def test_a_checked_line_of_nonsense_raises_nothing(name: str, body: str) -> None:
-    said = f"{name}A,COM1,0,1,FINESTEERING,2445,1.0,0,0,1;{body}".encode()
-    decoder, records = decode(b"#" + said + b"*%08x\r\n" % crc32(said))
+    stream_bytes = f"{name}A,COM1,0,1,FINESTEERING,2445,1.0,0,0,1;{body}".encode()
+    decoder, records = decode(b"#" + stream_bytes + b"*%08x\r\n" % crc32(stream_bytes))
     assert decoder.frames == 1
     assert records == []
 
 
-INSPVAX_WORDS = (
+INSPVAX_FIELDS = (
     "INS_SOLUTION_GOOD,INS_RTKFIXED,47.5,8.5,952.5,47.5000,60.0,3.0,1.0,1.5,-2.0,359.0,"
     "0.0300,0.0400,0.0900,0.01,0.01,1.0e-02,0.02,0.02,0.05,{status},0"
 )
 
 
 def line(name: str, body: str, *, week: str = str(WEEK), seconds: str = "360018.250") -> bytes:
-    said = f"{name}A,COM1,0,1.0,FINESTEERING,{week},{seconds},02000000,0,1;{body}".encode()
-    return b"#" + said + b"*%08x\r\n" % crc32(said)
+    stream_bytes = f"{name}A,COM1,0,1.0,FINESTEERING,{week},{seconds},02000000,0,1;{body}".encode()
+    return b"#" + stream_bytes + b"*%08x\r\n" % crc32(stream_bytes)
 
 
 @pytest.mark.trust
 @pytest.mark.parametrize("status", ["2e000343", "00000000", "1e5", "12345678", "e2000343", "nan"])
 def test_a_solution_in_text_is_read_whatever_its_hexadecimal_status(status: str) -> None:
-    said = line("INSPVAX", INSPVAX_WORDS.format(status=status))
-    decoder, records = decode(said)
+    stream_bytes = line("INSPVAX", INSPVAX_FIELDS.format(status=status))
+    decoder, records = decode(stream_bytes)
     (sample,) = records
     assert isinstance(sample, NavSample)
     assert sample.gps_ns == WEEK * WEEK_NS + 360_018_250_000_000
@@ -203,7 +205,7 @@ def test_a_solution_in_text_is_read_whatever_its_hexadecimal_status(status: str)
 
 
 TEXT = {
-    "INSPVAX": INSPVAX_WORDS.format(status="2e000343"),
+    "INSPVAX": INSPVAX_FIELDS.format(status="2e000343"),
     "INSPVA": f"{WEEK},360018.25,47.5,8.5,1000.0,60.0,3.0,1.0,1.5,-2.0,359.0,INS_SOLUTION_GOOD",
     "BESTPOS": 'SOL_COMPUTED,NARROW_INT,47.5,8.5,952.5,47.5,WGS84,0.03,0.04,0.09,"",0.0,0.0,17,16,'
     "16,16,0,2e,7f,37",
@@ -213,18 +215,18 @@ TEXT = {
     "MARK1PVA": f"{WEEK},360018.25,47.5,8.5,1000.0,60.0,3.0,1.0,1.5,-2.0,359.0,INS_SOLUTION_GOOD",
 }
 NOT_READ = {"INSPVAX": (21, 22), "BESTPOS": (6, 10, *range(15, 21)), "BESTVEL": (7,)}
-WORDS = {"BESTPOS": (0, 1), "BESTVEL": (0, 1), "INSPVAX": (0, 1), "TIME": (0, 10), "INSPVA": (11,),
+ENUMERATED_FIELDS = {"BESTPOS": (0, 1), "BESTVEL": (0, 1), "INSPVAX": (0, 1), "TIME": (0, 10), "INSPVA": (11,),
          "MARK1TIME": (5,), "MARK1PVA": (11,)}  # fmt: skip
 
 
 @pytest.mark.trust
 @pytest.mark.parametrize("name", TEXT)
 def test_a_number_in_text_that_is_none_makes_a_bad_log_and_never_a_value(name: str) -> None:
-    whole, records = decode(line(name, TEXT[name]))
-    assert (whole.bad_messages, whole.seen[name]) == (0, 1)
-    words = TEXT[name].split(",")
-    for position in range(len(words)):
-        is_read = position not in (*NOT_READ.get(name, ()), *WORDS[name])
+    decoder_whole, records = decode(line(name, TEXT[name]))
+    assert (decoder_whole.bad_messages, decoder_whole.seen[name]) == (0, 1)
+    fields = TEXT[name].split(",")
+    for position in range(len(fields)):
+        is_read = position not in (*NOT_READ.get(name, ()), *ENUMERATED_FIELDS[name])
         for damaged in (
             "",
             "nan",
@@ -237,12 +239,12 @@ def test_a_number_in_text_that_is_none_makes_a_bad_log_and_never_a_value(name: s
             " 1",
             "1.5.2",
         ):
-            said = [*words[:position], damaged, *words[position + 1 :]]
-            decoder, made = decode(line(name, ",".join(said)))
+            stream_bytes = [*fields[:position], damaged, *fields[position + 1 :]]
+            decoder, decoded = decode(line(name, ",".join(stream_bytes)))
             if is_read:
-                assert (decoder.bad_messages, made) == (1, []), (position, damaged)
-            elif position not in WORDS[name]:
-                assert (decoder.bad_messages, made) == (0, records), (position, damaged)
+                assert (decoder.bad_messages, decoded) == (1, []), (position, damaged)
+            elif position not in ENUMERATED_FIELDS[name]:
+                assert (decoder.bad_messages, decoded) == (0, records), (position, damaged)
 
 
 @pytest.mark.trust

@@ -144,7 +144,7 @@ def test_an_inertial_solution_with_sigmas_comes_out_in_si_units() -> None:
         ((0.0, 360.001), False),
     ],
 )
-def test_a_place_lies_between_the_poles_and_within_one_turn(
+def test_a_place_lies_between_the_poles_and_within_360_degrees(
     place: tuple[float, float], is_one: bool
 ) -> None:
     decoder, records = decode(pva_at(place))

@@ -57,20 +57,24 @@ def test_structures_and_requests_are_those_of_the_kernels_header(tmp_path: Path)
     )
     requests, sizes, offsets, bits, memory = done.stdout.splitlines()
     ours = (binding.GETPARAMS, binding.SETPARAMS, binding.GETCAP, binding.FETCH)
-    assert [int(word) for word in requests.split()] == list(ours)
-    assert [int(word) for word in sizes.split()] == [
+    assert [int(number_text) for number_text in requests.split()] == list(ours)
+    assert [int(number_text) for number_text in sizes.split()] == [
         binding.FDATA.size,
         binding.PARAMS.size,
         binding.KTIME.size,
     ]
-    assert [int(word) for word in offsets.split()] == [8, 24, 40, 48]
-    assert [int(word) for word in bits.split()] == [CAPTURE_ASSERT, CAPTURE_CLEAR, CAN_WAIT]
+    assert [int(number_text) for number_text in offsets.split()] == [8, 24, 40, 48]
+    assert [int(number_text) for number_text in bits.split()] == [
+        CAPTURE_ASSERT,
+        CAPTURE_CLEAR,
+        CAN_WAIT,
+    ]
     assert edges_of(bytes.fromhex(memory)) == Edges(
         7, 9, 1_790_000_001_123_456_789, 1_790_000_002_987_654_321
     )
 
 
-class Scripted:
+class ScriptedSource:
     """A source that says what it was told to, then nothing; OSError entries are raised.
 
     `unwaited` is what it answers who does not wait.
@@ -97,10 +101,10 @@ class Scripted:
         raise PermissionError(errno.EPERM, "Operation not permitted")
 
     def fetch(self, timeout_s: float) -> Edges | None:
-        said = self.script.pop(0) if self.script else None
-        if isinstance(said, OSError):
-            raise said
-        return said
+        scripted_value = self.script.pop(0) if self.script else None
+        if isinstance(scripted_value, OSError):
+            raise scripted_value
+        return scripted_value
 
     def latest(self) -> Edges | None:
         return self.unwaited.pop(0) if self.unwaited else None
@@ -112,7 +116,7 @@ class Scripted:
         self.is_closed = True
 
 
-class Wall:
+class FakeWallClock:
     """A wall clock that can be set; each look at it is a second later."""
 
     def __init__(self) -> None:
@@ -127,11 +131,11 @@ class Wall:
         return Edges(sequence, 0, self.mono_ns - age_ns + self.offset_ns, 0)
 
 
-def device(wall: Wall, **settings: object) -> PpsDevice:
+def device(wall: FakeWallClock, **settings: object) -> PpsDevice:
     return PpsDevice("pps", {"device": "/dev/pps9", **settings}, wall=wall)
 
 
-def told_until(sequence: int, pps: PpsDevice) -> list[Record]:
+def events_until(sequence: int, pps: PpsDevice) -> list[Record]:
     """What a driver tells in its thread up to that edge; it is closed then, and has ended."""
     got: list[Record] = []
     seen = threading.Event()
@@ -151,14 +155,14 @@ def told_until(sequence: int, pps: PpsDevice) -> list[Record]:
 
 
 def test_an_edge_is_carried_to_the_monotonic_clock_and_its_latency_taken_off() -> None:
-    wall = Wall()
+    wall = FakeWallClock()
     pps = device(wall, latency_ns=4_000, sigma_ns=1_500)
     edge = pps.edge_of(wall.edge(17))
     assert edge == PpsEdge("pps", 17, 101 * NS - 300_000 - 4_000, 1_500)
 
 
-def test_an_edge_told_twice_counts_once_and_missed_ones_are_counted_across_the_wrap() -> None:
-    wall = Wall()
+def test_an_edge_reported_twice_counts_once_and_missed_ones_are_counted_across_the_wrap() -> None:
+    wall = FakeWallClock()
     pps = device(wall)
     assert pps.edge_of(edges := wall.edge(2**32 - 2)) is not None
     assert pps.edge_of(edges) is None
@@ -168,7 +172,7 @@ def test_an_edge_told_twice_counts_once_and_missed_ones_are_counted_across_the_w
 
 
 def test_a_wall_clock_that_is_set_moves_no_edge() -> None:
-    wall = Wall()
+    wall = FakeWallClock()
     pps = device(wall)
     first = pps.edge_of(wall.edge(1))
     across = wall.edge(2)
@@ -181,7 +185,7 @@ def test_a_wall_clock_that_is_set_moves_no_edge() -> None:
 
 
 def test_a_slewed_wall_clock_is_followed() -> None:
-    wall = Wall()
+    wall = FakeWallClock()
     pps = device(wall)
     for sequence in range(1, 20):
         wall.offset_ns += 500_000
@@ -191,18 +195,18 @@ def test_a_slewed_wall_clock_is_followed() -> None:
 
 
 def test_an_old_edge_of_a_source_that_has_stopped_is_not_taken_for_a_new_one() -> None:
-    wall = Wall()
+    wall = FakeWallClock()
     pps = device(wall)
     assert pps.edge_of(wall.edge(5, age_ns=40 * NS)) is None
 
 
 def test_an_edge_that_came_between_two_waits_is_delivered_and_an_old_one_is_not() -> None:
-    wall = Wall()
+    wall = FakeWallClock()
     before = wall.edge(1)
     between = wall.edge(2)
-    source = Scripted(None, None, wall.edge(3), unwaited=[before, between, between])
-    pps = PpsDevice("pps", {"device": "/dev/pps9"}, opener=lambda _: source, wall=wall)
-    got = told_until(3, pps)
+    source = ScriptedSource(None, None, wall.edge(3), unwaited=[before, between, between])
+    pps = PpsDevice("pps", {"device": "/dev/pps9"}, source_opener=lambda _: source, wall=wall)
+    got = events_until(3, pps)
     assert [record.sequence for record in got if isinstance(record, PpsEdge)] == [2, 3]
     assert pps.statistics()["edges_repeated"] == pps.statistics()["edges_missed"] == 0
 
@@ -213,29 +217,31 @@ def test_what_cannot_be_opened_names_the_cure() -> None:
     wrong = PpsDevice(
         "pps",
         {"device": "/dev/pps9", "edge": "clear"},
-        opener=lambda _: Scripted(can=CAN_WAIT | CAPTURE_ASSERT),
+        source_opener=lambda _: ScriptedSource(can=CAN_WAIT | CAPTURE_ASSERT),
     )
     with pytest.raises(DeviceError, match='set edge = "assert"'):
         wrong.bind()
     refused = PpsDevice(
-        "pps", {"device": "/dev/pps9", "edge": "clear"}, opener=lambda _: Scripted(mode=1)
+        "pps",
+        {"device": "/dev/pps9", "edge": "clear"},
+        source_opener=lambda _: ScriptedSource(mode=1),
     )
     with pytest.raises(DeviceError, match="permission denied"):
         refused.bind()
 
 
-def test_it_goes_on_after_a_loss_and_says_what_happened() -> None:
-    wall = Wall()
-    lost = Scripted(wall.edge(1), OSError(errno.ENODEV, "No such device"))
-    again = Scripted(wall.edge(2))
+def test_it_goes_on_after_a_loss_and_states_what_happened() -> None:
+    wall = FakeWallClock()
+    lost = ScriptedSource(wall.edge(1), OSError(errno.ENODEV, "No such device"))
+    again = ScriptedSource(wall.edge(2))
     sources = [lost, again]
     pps = PpsDevice(
         "pps",
         {"device": "/dev/pps9"},
-        opener=lambda _: sources.pop(0) if sources else Scripted(),
+        source_opener=lambda _: sources.pop(0) if sources else ScriptedSource(),
         wall=lambda: (102 * NS, OFFSET_NS),
     )
-    got = told_until(2, pps)
+    got = events_until(2, pps)
     assert lost.is_closed and pps.state is LifeCycle.INACTIVE
     names = [record.name for record in got if isinstance(record, DeviceEvent)]
     assert names[:3] == ["opened", "lost", "opened"]

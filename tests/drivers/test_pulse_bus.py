@@ -21,7 +21,7 @@ class Unit:
 
     def __init__(self, port: int = 0) -> None:
         self.count = 0
-        self.heard: list[str] = []
+        self.received_lines: list[str] = []
         self.answer: Answer = self.by_the_book
         self.greeting = "PULSEBUS 1 sim 0 1 G"
         self._server = socket.create_server(("127.88.40.1", port))
@@ -68,7 +68,7 @@ class Unit:
         with contextlib.suppress(OSError), peer:
             peer.sendall(self.greeting.encode("ascii") + b"\n")
             for line in peer.makefile("r", encoding="ascii", newline="\n"):
-                self.heard.append(line.strip())
+                self.received_lines.append(line.strip())
                 answer = self.answer(line.strip())
                 if answer is not None:
                     peer.sendall(answer.encode("ascii") + b"\n")
@@ -88,7 +88,7 @@ def trigger(unit: Unit) -> Iterator[PulseBusTrigger]:
     trigger.close()
 
 
-def test_binding_tells_name_outputs_and_count(trigger: PulseBusTrigger) -> None:
+def test_binding_reports_name_outputs_and_count(trigger: PulseBusTrigger) -> None:
     found = trigger.bind()
     assert (found["unit"], found["outputs"], found["count"]) == ("sim", "0 1 G", "0")
 
@@ -107,7 +107,7 @@ def test_a_pulse_has_the_host_time_of_its_round_trip(trigger: PulseBusTrigger) -
 
 def test_delays_are_sent_for_every_output(trigger: PulseBusTrigger, unit: Unit) -> None:
     trigger.program({"0": 1_000_000, "1": 0, "G": 2_345_678})
-    assert unit.heard == ["DELAY 0 1000000", "DELAY 1 0", "DELAY G 2345678"]
+    assert unit.received_lines == ["DELAY 0 1000000", "DELAY 1 0", "DELAY G 2345678"]
 
 
 def test_outputs_and_delays_that_cannot_be_are_refused_together(trigger: PulseBusTrigger) -> None:
@@ -120,30 +120,30 @@ def test_outputs_and_delays_that_cannot_be_are_refused_together(trigger: PulseBu
     ]
 
 
-def test_after_a_broken_connection_the_delays_are_programmed_anew(
+def test_after_a_broken_connection_the_delays_are_programmed_again(
     trigger: PulseBusTrigger, unit: Unit
 ) -> None:
     trigger.program({"0": 5})
     assert trigger.fire(1).count == 1
     unit.hang_up()
-    unit.heard.clear()
+    unit.received_lines.clear()
     # The line was sent to nobody: the count is the same, and the pulse was not given.
     with pytest.raises(DeviceError, match="whether the heads fired is not known"):
         trigger.fire(2)
     pulse = trigger.fire(3)
-    assert unit.heard == ["DELAY 0 5", "STATUS", "FIRE 3"]
+    assert unit.received_lines == ["DELAY 0 5", "STATUS", "FIRE 3"]
     assert pulse.sequence == 3
 
 
 def test_a_pulse_without_an_answer_is_not_given_twice(trigger: PulseBusTrigger, unit: Unit) -> None:
     trigger.bind()
-    unit.heard.clear()
+    unit.received_lines.clear()
     unit.answer = lambda line: None
     with pytest.raises(DeviceError, match=r"no answer within 0\.2 s"):
         trigger.fire(4)
     unit.answer = unit.by_the_book
     assert trigger.fire(5).count == 1
-    assert unit.heard == ["FIRE 4", "STATUS", "FIRE 5"]
+    assert unit.received_lines == ["FIRE 4", "STATUS", "FIRE 5"]
 
 
 @pytest.mark.parametrize("gives", ["silence", "hang-up"])
@@ -151,9 +151,9 @@ def test_a_pulse_whose_answer_is_lost_is_known_by_its_count(
     trigger: PulseBusTrigger, unit: Unit, gives: str
 ) -> None:
     def without_answer(line: str) -> str | None:
-        said = unit.by_the_book(line)
+        answer_line = unit.by_the_book(line)
         if line != "FIRE 4":
-            return said
+            return answer_line
         if gives == "hang-up":
             unit.hang_up()
         return None
@@ -169,7 +169,7 @@ def test_a_pulse_whose_answer_is_lost_is_known_by_its_count(
     assert trigger.statistics()["answers_lost"] == 1
 
 
-def test_a_count_that_began_anew_proves_no_pulse(trigger: PulseBusTrigger, unit: Unit) -> None:
+def test_a_count_that_restarted_proves_no_pulse(trigger: PulseBusTrigger, unit: Unit) -> None:
     trigger.bind()
     trigger.fire(1)
     trigger.fire(2)
@@ -215,7 +215,7 @@ def test_something_else_behind_the_port_is_refused(
         trigger.bind()
 
 
-def test_a_refused_line_says_that_nothing_was_done(trigger: PulseBusTrigger, unit: Unit) -> None:
+def test_a_refused_line_states_that_nothing_was_done(trigger: PulseBusTrigger, unit: Unit) -> None:
     trigger.bind()
     unit.answer = lambda line: "ERR charge pump empty"
     with pytest.raises(DeviceError, match="charge pump empty; nothing was done"):
@@ -232,7 +232,7 @@ def test_an_answer_without_sense_is_no_pulse(
         trigger.fire(1)
 
 
-def test_no_unit_at_all_is_said_at_once() -> None:
+def test_no_unit_at_all_is_reported_at_once() -> None:
     trigger = PulseBusTrigger("bus", {"host": "127.88.40.1", "port": 9})
     with pytest.raises(DeviceError, match="check its power, cable, host and port"):
         trigger.bind()
@@ -241,7 +241,7 @@ def test_no_unit_at_all_is_said_at_once() -> None:
 def test_an_answer_that_comes_twice_is_not_taken_for_that_of_the_next_pulse() -> None:
     unit = Unit()
     twice = unit.by_the_book
-    unit.answer = lambda line: f"{(said := twice(line))}\n{said}"
+    unit.answer = lambda line: f"{(answer_line := twice(line))}\n{answer_line}"
     trigger = PulseBusTrigger("trigger", {"host": "127.88.40.1", "port": unit.port})
     try:
         trigger.program({"0": 5, "1": 7})

@@ -111,7 +111,7 @@ def test_positions_times_and_counts_of_a_ublox_log(name: str, frames: int, sampl
 
 
 @needs_recordings
-def test_the_m8t_announces_the_next_pulse_in_utc_and_is_not_taken_by_its_word() -> None:
+def test_the_m8t_announces_the_next_pulse_in_utc_and_is_not_trusted_without_a_check() -> None:
     """TIM-TP and NAV-TIMEGPS of one second: 18 s apart for UTC, one more for what is to come."""
     data = (NAV / "gpsd" / "u-blox-m8t-time.log").read_bytes()
     decoder = UbxDecoder("m8t")

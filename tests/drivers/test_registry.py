@@ -30,7 +30,7 @@ def test_every_driver_knows_its_kind_and_explains_its_settings(kind: str, name: 
     assert vars(driver)["kind"] == kind
     assert driver.__doc__
     for setting in driver.settings():
-        assert setting.says, setting.name
+        assert setting.help, setting.name
         if not setting.required:
             assert setting.convert(setting.default) == setting.default, setting.name
 
@@ -43,7 +43,7 @@ def test_a_driver_that_does_not_exist_is_named_with_those_that_do() -> None:
         registry.driver_for("barometer", "any")
 
 
-def test_mistakes_of_a_whole_section_come_at_once() -> None:
+def test_mistakes_of_an_entire_section_come_at_once() -> None:
     problems = registry.problems(
         "thermometer",
         "modbus-rtu",

@@ -6,20 +6,20 @@ from collections.abc import Callable
 
 import pytest
 
-from daemon.onboard.monitoring.state import FlightState
-from drivers.detection.evidence import Evidence
-from drivers.detection.search import search
+from daemon.onboard.monitoring.flight_state import FlightState
+from drivers.detection.port_search import search
+from drivers.detection.protocol_detection import ProtocolDetector
+from drivers.receivers.fix_monitor import fix_description
 from drivers.receivers.gpsd.navigator import GpsdNavigator
 from drivers.receivers.message_decoder import MessageDecoder
 from drivers.receivers.nmea.decoder import NmeaDecoder
 from drivers.receivers.nmea.navigator import NmeaNavigator
-from drivers.receivers.receiver_fix import fix_in_words
 from drivers.receivers.septentrio.decoder import SbfDecoder
 from drivers.receivers.ublox.decoder import UbxDecoder
 from tests.drivers import test_mavlink as mavlink
 from tests.drivers import test_septentrio as septentrio
+from tests.drivers.fakes import FakeClock, FakePort, RecordingSink
 from tests.drivers.real_gpsd import PROGRAM, running_gpsd
-from tests.drivers.stand_ins import FakeClock, FakePort, Notebook
 from tests.drivers.test_gpsd import TPV, StubGpsd, flown, lines
 from tests.drivers.test_nmea import EXCERPT, epoch, sentence
 from tests.drivers.ubx_frames import nav_pvt
@@ -75,12 +75,12 @@ class Replayed:
         return navigator
 
 
-def run(*pieces: bytes) -> tuple[NmeaNavigator, Notebook]:
+def run(*pieces: bytes) -> tuple[NmeaNavigator, RecordingSink]:
     line = Replayed(*pieces)
-    navigator, notebook = line.navigator(), Notebook()
+    navigator, recorder = line.navigator(), RecordingSink()
     navigator.bind()
-    navigator.run(notebook)
-    return navigator, notebook
+    navigator.run(recorder)
+    return navigator, recorder
 
 
 @pytest.mark.parametrize(("said", "satellites"), [(COLD, 0), (CLOCK_ONLY, 2)])
@@ -120,20 +120,20 @@ def test_what_a_receiver_without_a_fix_fills_in_is_not_read() -> None:
         ("dead-reckoning", None, "dead-reckoning"),
     ],
 )
-def test_a_fix_in_words(fix: str | None, satellites: int | None, words: str) -> None:
-    assert fix_in_words(fix, satellites) == words
+def test_a_fix_as_text(fix: str | None, satellites: int | None, words: str) -> None:
+    assert fix_description(fix, satellites) == words
 
 
-def test_it_binds_and_says_that_it_searches() -> None:
+def test_it_binds_and_states_that_it_searches() -> None:
     found = Replayed(COLD).navigator().bind()
     assert found["fix"] == "searching, 0 satellites"
 
 
 def test_it_is_reported_once_as_searching_and_then_as_fixed() -> None:
     times = [f"1000{n:02d}.00" for n in range(5)]
-    navigator, notebook = run(COLD, *[COLD] * 4, *[epoch(time) for time in times])
-    assert notebook.event_names == ["opened", "searching", "fixed"]
-    searching, fixed = notebook.events[1:]
+    navigator, recorder = run(COLD, *[COLD] * 4, *[epoch(time) for time in times])
+    assert recorder.event_names == ["opened", "searching", "fixed"]
+    searching, fixed = recorder.events[1:]
     assert not searching.is_fault and not fixed.is_fault
     assert searching.sentence == (
         "The receiver gnss is searching, 0 satellites. Wait; its antenna needs a clear view of "
@@ -145,19 +145,19 @@ def test_it_is_reported_once_as_searching_and_then_as_fixed() -> None:
 
 def test_a_fix_lost_for_a_moment_is_no_news_and_for_longer_is() -> None:
     void = sentence("GNRMC,,V,,,,,,,,,,N")
-    _, notebook = run(epoch("100000.00"), epoch("100001.00"), void, epoch("100003.00"))
-    assert notebook.event_names == ["opened"]
-    _, notebook = run(epoch("100000.00"), epoch("100001.00"), *[COLD] * 4)
-    assert notebook.event_names == ["opened", "searching"]
+    _, recorder = run(epoch("100000.00"), epoch("100001.00"), void, epoch("100003.00"))
+    assert recorder.event_names == ["opened"]
+    _, recorder = run(epoch("100000.00"), epoch("100001.00"), *[COLD] * 4)
+    assert recorder.event_names == ["opened", "searching"]
 
 
 def test_a_receiver_that_sends_no_date_or_an_old_one_is_reported_as_such() -> None:
     undated = [sentence(epoch_gga(f"1000{n:02d}.00")) for n in range(9)]
-    _, notebook = run(*undated)
-    assert notebook.event_names == ["opened", "no-date"]
+    _, recorder = run(*undated)
+    assert recorder.event_names == ["opened", "no-date"]
     old = [epoch(f"1000{n:02d}.00", "070407") for n in range(4)]
-    _, notebook = run(*old)
-    assert notebook.event_names == ["opened", "rolled-over"]
+    _, recorder = run(*old)
+    assert recorder.event_names == ["opened", "rolled-over"]
     assert run(*[epoch(f"1000{n:02d}.00") for n in range(9)])[1].event_names == ["opened"]
 
 
@@ -181,26 +181,26 @@ def test_every_decoder_knows_that_its_receiver_searches(
     assert (decoder.fix, decoder.satellites, decoder.bad_messages) == ("none", satellites, 0)
 
 
-def test_a_gpsd_whose_receiver_searches_says_so() -> None:
+def test_a_gpsd_whose_receiver_searches_reports_it() -> None:
     nothing = {"class": "TPV", "device": "/dev/ttyACM0", "mode": 1}
     sky = {"class": "SKY", "device": "/dev/ttyACM0", "uSat": 0, "satellites": []}
     stub = StubGpsd(lines(sky, nothing), lines(nothing), lines(TPV, TPV))
     try:
         navigator = GpsdNavigator("gnss", {"port": stub.port})
         assert navigator.bind()["fix"] == "searching, 0 satellites"
-        notebook = flown(navigator, 1)
+        recorder = flown(navigator, 1)
     finally:
         stub.close()
-    assert {"searching", "fixed"} & set(notebook.event_names) == {"searching"}
+    assert {"searching", "fixed"} & set(recorder.event_names) == {"searching"}
 
 
 def test_looking_for_devices_finds_a_receiver_that_searches() -> None:
-    evidence = Evidence()
+    evidence = ProtocolDetector()
     evidence.feed(COLD, 0)
-    speaker = evidence.speaker()
-    assert speaker is not None
-    assert (speaker.driver, speaker.missing) == ("nmea", "")
-    assert speaker.heard.endswith("; searching, 0 satellites")
+    detected = evidence.detected()
+    assert detected is not None
+    assert (detected.driver, detected.missing) == ("nmea", "")
+    assert detected.received.endswith("; searching, 0 satellites")
 
 
 def test_the_page_shows_a_receiver_that_searches_as_such() -> None:
@@ -219,7 +219,7 @@ def test_gpsd_is_found_at_its_address_by_its_greeting() -> None:
         (found,) = search([f"tcp://{stub.port}"])
     finally:
         stub.close()
-    assert found.speaker is not None and found.speaker.driver == "gpsd"
+    assert found.detected is not None and found.detected.driver == "gpsd"
 
 
 @pytest.mark.peer
@@ -227,8 +227,8 @@ def test_gpsd_is_found_at_its_address_by_its_greeting() -> None:
 def test_the_real_gpsd_with_an_nmea_receiver_gives_navigation_and_is_found() -> None:
     with running_gpsd() as gpsd, gpsd.playing(EXCERPT.read_bytes()):
         navigator = GpsdNavigator("gnss", {"port": gpsd.address})
-        notebook = flown(navigator, 5)
+        recorder = flown(navigator, 5)
         (found,) = search([f"tcp://{gpsd.address}"])
-    samples = [r for r in notebook.records if getattr(r, "fix", None)]
+    samples = [r for r in recorder.records if getattr(r, "fix", None)]
     assert {(s.time_valid, s.leap_source, s.leap_seconds) for s in samples} == {(True, "table", 18)}
-    assert found.speaker is not None and found.speaker.driver == "gpsd"
+    assert found.detected is not None and found.detected.driver == "gpsd"

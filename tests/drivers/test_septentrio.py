@@ -19,7 +19,7 @@ from drivers.receivers.septentrio.blocks import crc
 from drivers.receivers.septentrio.decoder import SbfDecoder
 from drivers.receivers.septentrio.navigator import SeptentrioNavigator
 from drivers.timescales.gps_time import WEEK_NS
-from tests.drivers.stand_ins import FakeClock, FakePort
+from tests.drivers.fakes import FakeClock, FakePort
 
 WEEK = 2445
 UNKNOWN = -2e10
@@ -29,10 +29,10 @@ MS = 1_000_000
 def block(
     number: int, body: bytes, *, tow_ms: int = 100_000, week: int = WEEK, revision: int = 0
 ) -> bytes:
-    said = struct.pack("<IH", tow_ms, week) + body
-    said += bytes(-len(said) % 4)
-    said = struct.pack("<HH", number | revision << 13, len(said) + 8) + said
-    return b"$@" + struct.pack("<H", crc(said)) + said
+    stream_bytes = struct.pack("<IH", tow_ms, week) + body
+    stream_bytes += bytes(-len(stream_bytes) % 4)
+    stream_bytes = struct.pack("<HH", number | revision << 13, len(stream_bytes) + 8) + stream_bytes
+    return b"$@" + struct.pack("<H", crc(stream_bytes)) + stream_bytes
 
 
 def pvt(
@@ -143,7 +143,7 @@ def test_from_the_second_epoch_on_a_sample_waits_for_nothing() -> None:
     assert len(decoder.feed(epoch(100_200), 1)) == 1 + 1
 
 
-def test_without_covariances_sigma_is_half_of_what_the_solution_itself_says() -> None:
+def test_without_covariances_sigma_is_half_of_what_the_solution_itself_states() -> None:
     # The guide: 2DRMS and two sigma.
     (sample,) = samples(pvt(1000, accuracies=(4, 6)) + pvt(1200))[:1]
     assert (sample.horizontal_sigma_m, sample.vertical_sigma_m) == (0.02, 0.03)
@@ -154,8 +154,8 @@ def test_without_covariances_sigma_is_half_of_what_the_solution_itself_says() ->
 
 
 def test_what_is_not_to_be_used_is_not_used() -> None:
-    said = pvt(1000, error=1, latitude=UNKNOWN, height=UNKNOWN, bias_ms=UNKNOWN) + pvt(1200)
-    none = samples(said)[0]
+    stream_bytes = pvt(1000, error=1, latitude=UNKNOWN, height=UNKNOWN, bias_ms=UNKNOWN) + pvt(1200)
+    none = samples(stream_bytes)[0]
     assert (none.fix, none.time_valid, none.latitude_deg) == ("none", False, None)
     single_baseline = pvt(1000) + attitude(1000, roll=UNKNOWN) + pvt(1200)
     leaning = samples(single_baseline)[0]
@@ -167,10 +167,10 @@ def test_what_is_not_to_be_used_is_not_used() -> None:
     assert decoder.counters["marks_without_time"] == 1
 
 
-def test_a_mark_without_clock_bias_or_of_an_old_solution_says_so() -> None:
+def test_a_mark_without_clock_bias_or_of_an_old_solution_reports_it() -> None:
     assert [m.time_valid for m in marks(event(bias_s=UNKNOWN))] == [False]
-    (fresh, old, early) = marks(event(age_s=0) + event(age_s=30) + event(revision=0))
-    assert (fresh.accuracy_ns, old.accuracy_ns, early.accuracy_ns) == (50, 3050, 50)
+    (recent, old, early) = marks(event(age_s=0) + event(age_s=30) + event(revision=0))
+    assert (recent.accuracy_ns, old.accuracy_ns, early.accuracy_ns) == (50, 3050, 50)
 
 
 def test_a_mark_of_the_week_before_keeps_its_own_week() -> None:
@@ -181,12 +181,12 @@ def test_a_mark_of_the_week_before_keeps_its_own_week() -> None:
 
 
 def test_a_rolled_over_week_and_an_unset_clock_are_not_valid() -> None:
-    told = pvt(100_000) + pvt(100_200)
-    decoder, records = decode(told + event(week=WEEK - 1024))
+    epochs = pvt(100_000) + pvt(100_200)
+    decoder, records = decode(epochs + event(week=WEEK - 1024))
     assert [r.time_valid for r in records if isinstance(r, EventMark)] == [False]
     assert decoder.counters["marks_far"] == 1
-    assert [m.time_valid for m in marks(told + receiver_time(level=1) + event())] == [False]
-    assert [m.time_valid for m in marks(told + receiver_time(level=3) + event())] == [True]
+    assert [m.time_valid for m in marks(epochs + receiver_time(level=1) + event())] == [False]
+    assert [m.time_valid for m in marks(epochs + receiver_time(level=3) + event())] == [True]
 
 
 def test_leap_seconds_come_from_receiver_time_once_known() -> None:
@@ -252,24 +252,24 @@ def test_damage_and_noise_raise_nothing_and_cost_no_later_message(data: st.DataO
     stream = bytearray(epoch(1000) + event(1100) + epoch(1200))
     for _ in range(data.draw(st.integers(0, 8))):
         stream[data.draw(st.integers(0, len(stream) - 1))] = data.draw(st.integers(0, 255))
-    said = bytes(stream) + data.draw(st.binary(max_size=200)) + event(5000) + event(6000)
-    whole, records = decode(said)
+    stream_bytes = bytes(stream) + data.draw(st.binary(max_size=200)) + event(5000) + event(6000)
+    decoder_whole, records = decode(stream_bytes)
     assert [r.gps_ns - WEEK * WEEK_NS for r in records[-1:]] == [6000 * MS + 250_000]
-    pieces, same = decode(said, data.draw(st.integers(1, 60)))
+    pieces, same = decode(stream_bytes, data.draw(st.integers(1, 60)))
     assert same == records
-    assert (pieces.frames, pieces.bad_bytes) == (whole.frames, whole.bad_bytes)
-    assert whole.pending <= 16_384
+    assert (pieces.frames, pieces.bad_bytes) == (decoder_whole.frames, decoder_whole.bad_bytes)
+    assert decoder_whole.pending <= 16_384
 
 
-def test_binding_says_what_was_heard_or_what_to_switch_on() -> None:
+def test_binding_states_what_was_received_or_what_to_switch_on() -> None:
     clock = FakeClock()
 
-    def bind(said: bytes) -> str:
-        def speak(_: FakePort) -> bytes:
-            clock.now_ns += 10**8 if said else 0
-            return said
+    def bind(stream_bytes: bytes) -> str:
+        def answer(_: FakePort) -> bytes:
+            clock.now_ns += 10**8 if stream_bytes else 0
+            return stream_bytes
 
-        port = FakePort(clock, speak)
+        port = FakePort(clock, answer)
         navigator = SeptentrioNavigator("s", {"port": "x"}, clock=clock, open_port=lambda *_: port)
         return navigator.bind()["messages"]
 

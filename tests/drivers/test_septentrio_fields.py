@@ -78,7 +78,7 @@ def test_the_mode_is_the_fix(mode: int, fix: str, height_m: float | None) -> Non
 
 
 @pytest.mark.parametrize("absent", ["latitude", "longitude", "height"])
-def test_a_solution_that_lacks_a_coordinate_is_none(absent: str) -> None:
+def test_a_solution_without_a_coordinate_is_none(absent: str) -> None:
     sample = one(**{absent: UNKNOWN})
     assert (sample.fix, sample.latitude_deg, sample.time_valid) == ("none", None, False)
     assert sample.velocity_ned_mps is None
@@ -107,7 +107,7 @@ def test_velocity_satellites_and_bias_that_are_not_there_stay_unknown() -> None:
         ({"longitude": math.nextafter(math.tau, 7)}, False),
     ],
 )
-def test_a_place_lies_between_the_poles_and_within_one_turn(
+def test_a_place_lies_between_the_poles_and_within_360_degrees(
     changes: dict[str, float], is_place: bool
 ) -> None:
     decoder, records = decode(solution(1000, **changes) + solution(1200) + solution(1400))
@@ -144,7 +144,7 @@ def test_covariances_that_are_in_error_or_unknown_are_not_used() -> None:
         assert (sample.horizontal_sigma_m, sample.speed_sigma_mps) == (None, None)
 
 
-def test_an_epoch_is_told_once_and_never_without_its_solution() -> None:
+def test_an_epoch_is_reported_once_and_never_without_its_solution() -> None:
     first = solution(1000) + attitude(1000)
     second = solution(1200) + attitude(1200)
     decoder, records = decode(first + second + attitude(1200) + solution(1200))
@@ -156,14 +156,14 @@ def test_an_epoch_is_told_once_and_never_without_its_solution() -> None:
 
 
 @pytest.mark.parametrize(("later_ms", "count"), [(9_999, 0), (10_000, 1), (10_001, 1)])
-def test_solutions_are_told_again_10_s_after_the_last_inertial_one(
+def test_solutions_are_reported_again_10_s_after_the_last_inertial_one(
     later_ms: int, count: int
 ) -> None:
     decoder = SbfDecoder("sept")
     decoder.feed(solution(900) + inertial(1000), 0)  # with the bias of the solution before
-    told = decoder.feed(solution(1000 + later_ms) + solution(200_000), 0)
+    emitted = decoder.feed(solution(1000 + later_ms) + solution(200_000), 0)
     at_ns = WEEK * WEEK_NS + (1000 + later_ms) * MS - 250_000
-    assert (at_ns in [record.gps_ns for record in told]) is bool(count)
+    assert (at_ns in [record.gps_ns for record in emitted]) is bool(count)
 
 
 def test_an_inertial_solution_has_its_own_accuracy_where_no_deviations_come() -> None:
@@ -223,9 +223,9 @@ def test_edges_are_counted_by_kind() -> None:
 def test_a_mark_lies_within_an_hour_of_the_last_epoch(
     side: int, beyond_ns: int, is_valid: bool
 ) -> None:
-    told = solution(4_000_000, bias_ms=0.0) + solution(4_000_200, bias_ms=0.0)
+    emitted = solution(4_000_000, bias_ms=0.0) + solution(4_000_200, bias_ms=0.0)
     at_ms = 4_000_200 + side * 3_600_000
-    decoder, records = decode(told + event(at_ms, side * beyond_ns * 1e-9))
+    decoder, records = decode(emitted + event(at_ms, side * beyond_ns * 1e-9))
     assert [r.time_valid for r in records if isinstance(r, EventMark)] == [is_valid]
     assert decoder.counters["marks_far"] == (not is_valid)
 

@@ -13,10 +13,10 @@ import serial
 
 from drivers.contract import DeviceError, LifeCycle, RawBytes, TemperatureSample
 from drivers.transport.serial_device import SerialDevice, SerialLine, open_serial_port
-from tests.drivers.stand_ins import FakeClock, FakePort, Notebook, refusing_port
+from tests.drivers.fakes import FakeClock, FakePort, RecordingSink, refusing_port
 
 
-class Parrot(SerialDevice):
+class EchoDevice(SerialDevice):
     """Understands the byte "!" and takes all else for noise."""
 
     what = "parrot"
@@ -30,24 +30,26 @@ class Parrot(SerialDevice):
         return {"voice": "loud"}
 
     def step(self, line: SerialLine) -> Iterable[TemperatureSample]:
-        said = line.read(0.2)
-        self.heard(messages=said.count(b"!"))
-        return [TemperatureSample("beak", 39.0, self.clock.mono_ns())] * said.count(b"!")
+        read_bytes = line.read(0.2)
+        self.count_messages(messages=read_bytes.count(b"!"))
+        return [TemperatureSample("beak", 39.0, self.clock.mono_ns())] * read_bytes.count(b"!")
 
 
-def _parrot(clock: FakeClock, *ports: FakePort) -> Parrot:
+def _echo_device(clock: FakeClock, *ports: FakePort) -> EchoDevice:
     """A parrot whose port is each of these in turn, and then none."""
     left = list(ports)
 
     def opener(path: str, baudrate: int, parity: str) -> FakePort:
         return left.pop(0) if left else refusing_port(path, baudrate, parity)
 
-    return Parrot("polly", {"port": "/dev/polly", "silence_s": 3}, clock=clock, open_port=opener)
+    return EchoDevice(
+        "polly", {"port": "/dev/polly", "silence_s": 3}, clock=clock, open_port=opener
+    )
 
 
-def _run_until(parrot: Parrot, clock: FakeClock, seconds: float) -> Notebook:
+def _run_until(echo_device: EchoDevice, clock: FakeClock, seconds: float) -> RecordingSink:
     """Run in this thread until the fake clock has passed that many seconds."""
-    notebook = Notebook()
+    recorder = RecordingSink()
     end_ns = clock.now_ns + round(seconds * 1e9)
     wait = clock.wait
 
@@ -58,16 +60,16 @@ def _run_until(parrot: Parrot, clock: FakeClock, seconds: float) -> Notebook:
         return event.is_set()
 
     clock.wait = wait_and_end
-    parrot.run(notebook)
-    return notebook
+    echo_device.run(recorder)
+    return recorder
 
 
 def test_a_port_that_cannot_be_opened_is_tried_after_02_04_08_up_to_5_s() -> None:
     clock = FakeClock()
-    notebook = _run_until(_parrot(clock), clock, 20)
+    recorder = _run_until(_echo_device(clock), clock, 20)
     assert clock.waits_s[:7] == [0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0]
-    assert notebook.event_names == ["lost"], "the operator is told once, not every time"
-    assert "check the cable" in notebook.events[0].sentence
+    assert recorder.event_names == ["lost"], "the operator is told once, not every time"
+    assert "check the cable" in recorder.events[0].sentence
 
 
 def test_silence_is_noticed_after_the_stated_time_and_its_end_too() -> None:
@@ -80,9 +82,9 @@ def test_silence_is_noticed_after_the_stated_time_and_its_end_too() -> None:
         return b"!" if clock.now_ns < 10_000_000_000 else b""
 
     talking = FakePort(clock, say_once_per_step)
-    notebook = _run_until(_parrot(clock, quiet, talking), clock, 15)
-    assert notebook.event_names[:3] == ["opened", "silent", "recovered"]
-    silent, recovered = notebook.events[1:3]
+    recorder = _run_until(_echo_device(clock, quiet, talking), clock, 15)
+    assert recorder.event_names[:3] == ["opened", "silent", "recovered"]
+    silent, recovered = recorder.events[1:3]
     assert 3.0 <= (silent.mono_ns - start_ns) * 1e-9 < 3.3
     assert silent.is_fault
     assert not recovered.is_fault
@@ -97,8 +99,8 @@ def test_noise_is_no_sign_of_life() -> None:
         clock.now_ns += 100_000_000
         return b"\xff\x00"
 
-    notebook = _run_until(_parrot(clock, FakePort(clock, noise)), clock, 4)
-    assert "silent" in notebook.event_names
+    recorder = _run_until(_echo_device(clock, FakePort(clock, noise)), clock, 4)
+    assert "silent" in recorder.event_names
 
 
 def test_a_port_that_fails_in_use_is_lost_and_opened_again() -> None:
@@ -111,62 +113,62 @@ def test_a_port_that_fails_in_use_is_lost_and_opened_again() -> None:
         clock.now_ns += 100_000_000
         return b"!"
 
-    notebook = Notebook()
-    parrot = _parrot(clock, FakePort(clock, fail), FakePort(clock, talk))
-    notebook.stop = lambda record: (
-        parrot._closing.set() if isinstance(record, TemperatureSample) else None
+    recorder = RecordingSink()
+    echo_device = _echo_device(clock, FakePort(clock, fail), FakePort(clock, talk))
+    recorder.stop = lambda record: (
+        echo_device._closing.set() if isinstance(record, TemperatureSample) else None
     )
-    parrot.run(notebook)
-    assert notebook.event_names == ["opened", "lost", "opened"]
-    assert parrot.statistics()["opened"] == 2
-    assert parrot.state is LifeCycle.INACTIVE
+    echo_device.run(recorder)
+    assert recorder.event_names == ["opened", "lost", "opened"]
+    assert echo_device.statistics()["opened"] == 2
+    assert echo_device.state is LifeCycle.INACTIVE
 
 
 def test_every_byte_goes_to_the_flight_log() -> None:
     clock = FakeClock()
-    said = [b"abc", b"!", b"\x00\xff!"]
+    read_bytes = [b"abc", b"!", b"\x00\xff!"]
 
     def talk(port: FakePort) -> bytes:
         clock.now_ns += 100_000_000
-        return said.pop(0) if said else b""
+        return read_bytes.pop(0) if read_bytes else b""
 
-    parrot = _parrot(clock, FakePort(clock, talk))
-    notebook = _run_until(parrot, clock, 4)
-    raw = b"".join(r.data for r in notebook.records if isinstance(r, RawBytes))
+    echo_device = _echo_device(clock, FakePort(clock, talk))
+    recorder = _run_until(echo_device, clock, 4)
+    raw = b"".join(r.data for r in recorder.records if isinstance(r, RawBytes))
     assert raw == b"abc!\x00\xff!"
-    assert parrot.statistics()["bytes"] == 7
-    assert parrot.statistics()["messages"] == 2
+    assert echo_device.statistics()["bytes"] == 7
+    assert echo_device.statistics()["messages"] == 2
 
 
-def test_binding_says_what_was_found_or_what_to_do() -> None:
+def test_binding_reports_what_was_found_or_what_to_do() -> None:
     clock = FakeClock()
-    parrot = _parrot(clock, FakePort(clock, lambda port: b"!"))
-    assert parrot.state is LifeCycle.CREATED
-    assert parrot.bind() == {"port": "/dev/polly", "voice": "loud"}
-    assert parrot.state is LifeCycle.BOUND
+    echo_device = _echo_device(clock, FakePort(clock, lambda port: b"!"))
+    assert echo_device.state is LifeCycle.CREATED
+    assert echo_device.bind() == {"port": "/dev/polly", "voice": "loud"}
+    assert echo_device.state is LifeCycle.BOUND
     with pytest.raises(DeviceError, match="feed it"):
-        _parrot(clock, FakePort(clock, lambda port: b"")).bind()
+        _echo_device(clock, FakePort(clock, lambda port: b"")).bind()
 
 
 def test_closing_ends_a_run_within_two_seconds_and_may_be_done_twice() -> None:
     master, slave = os.openpty()
     try:
-        parrot = Parrot("polly", {"port": os.ttyname(slave)})
-        thread = threading.Thread(target=parrot.run, args=(Notebook(),))
+        echo_device = EchoDevice("polly", {"port": os.ttyname(slave)})
+        thread = threading.Thread(target=echo_device.run, args=(RecordingSink(),))
         thread.start()
         start = time.monotonic()
-        parrot.close()
-        parrot.close()
+        echo_device.close()
+        echo_device.close()
         thread.join(2)
         assert not thread.is_alive()
         assert time.monotonic() - start < 1.0
-        assert parrot.state is LifeCycle.INACTIVE
+        assert echo_device.state is LifeCycle.INACTIVE
     finally:
         os.close(master)
         os.close(slave)
 
 
-def test_a_pseudo_terminal_that_refuses_parity_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_pseudo_terminal_that_refuses_parity_reports_it(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object, **__: object) -> None:
         raise termios.error(22, "Invalid argument")
 
@@ -175,7 +177,7 @@ def test_a_pseudo_terminal_that_refuses_parity_says_so(monkeypatch: pytest.Monke
         open_serial_port("/dev/pts/1", 9600, "E")
 
 
-def test_a_port_that_does_not_exist_says_so() -> None:
+def test_a_port_that_does_not_exist_reports_it() -> None:
     with pytest.raises(DeviceError, match="there is no such port; check the cable"):
         open_serial_port("/dev/there-is-none", 9600, "N")
 

@@ -8,51 +8,51 @@ from drivers.base.settings import Configured, Setting, SettingsError
 from drivers.contract import DeviceError
 
 
-class Lamp(Configured):
+class LampDevice(Configured):
     """A device for these tests."""
 
-    brightness = Setting(50, minimum=0, maximum=100, says="brightness in percent")
-    colour = Setting("white", choices=("white", "red"), says="colour of the light")
-    warm_up_s = Setting(0.5, minimum=0, says="time until it is bright")
-    steady = Setting(True, says="whether it burns steadily")
+    brightness = Setting(50, minimum=0, maximum=100, help="brightness in percent")
+    colour = Setting("white", choices=("white", "red"), help="colour of the light")
+    warm_up_s = Setting(0.5, minimum=0, help="time until it is bright")
+    steady = Setting(True, help="whether it burns steadily")
     sockets: Setting[tuple[str, ...]] = Setting(
-        (), required=True, minimum=1, says="names of the sockets"
+        (), required=True, minimum=1, help="names of the sockets"
     )
 
 
-class NavigationLamp(Lamp):
+class NavigationLamp(LampDevice):
     """Inherits, and changes one default."""
 
-    colour = Setting("red", choices=("red",), says="colour prescribed")
+    colour = Setting("red", choices=("red",), help="colour prescribed")
 
 
 def test_a_setting_that_is_not_given_has_its_default() -> None:
-    lamp = Lamp("nose", {"sockets": ["a"]})
+    lamp = LampDevice("nose", {"sockets": ["a"]})
     assert (lamp.brightness, lamp.colour, lamp.warm_up_s, lamp.steady) == (50, "white", 0.5, True)
     assert lamp.sockets == ("a",)
     assert lamp.name == "nose"
 
 
-def test_a_whole_number_will_do_where_a_float_is_meant() -> None:
-    lamp = Lamp("nose", {"sockets": ["a"], "warm_up_s": 2})
+def test_an_integer_will_do_where_a_float_is_meant() -> None:
+    lamp = LampDevice("nose", {"sockets": ["a"], "warm_up_s": 2})
     assert lamp.warm_up_s == 2.0
     assert isinstance(lamp.warm_up_s, float)
 
 
 def test_the_class_lists_its_settings_with_type_default_choices_and_sentence() -> None:
-    listed = {s.name: (s.type_name, s.default, s.choices, s.says) for s in Lamp.settings()}
+    listed = {s.name: (s.type_name, s.default, s.choices, s.help) for s in LampDevice.settings()}
     assert listed["colour"] == ("a text", "white", ("white", "red"), "colour of the light")
     assert listed["brightness"] == ("a whole number", 50, (), "brightness in percent")
     assert list(listed) == ["brightness", "colour", "warm_up_s", "steady", "sockets"]
 
 
-def test_a_subclass_may_declare_a_setting_anew() -> None:
+def test_a_subclass_may_redeclare_a_setting() -> None:
     assert NavigationLamp("left", {"sockets": ["a"]}).colour == "red"
     assert len(NavigationLamp.problems({"sockets": ["a"], "colour": "white"})) == 1
 
 
 def test_five_mistakes_give_five_sentences_each_with_key_value_and_cure() -> None:
-    problems = Lamp.problems(
+    problems = LampDevice.problems(
         {"brightness": 300, "colour": "blue", "warm_up_s": "long", "steady": 1, "brigthness": 3}
     )
     assert problems == [
@@ -67,7 +67,7 @@ def test_five_mistakes_give_five_sentences_each_with_key_value_and_cure() -> Non
 
 def test_a_device_with_wrong_settings_is_not_created() -> None:
     with pytest.raises(SettingsError) as caught:
-        Lamp("nose", {"brightness": True})
+        LampDevice("nose", {"brightness": True})
     assert isinstance(caught.value, DeviceError)
     assert len(caught.value.problems) == 2
     assert str(caught.value).startswith("nose: brightness is True")
@@ -75,9 +75,9 @@ def test_a_device_with_wrong_settings_is_not_created() -> None:
 
 @pytest.mark.parametrize("value", ["a", [], [""], [1], None, {"a": 1}])
 def test_a_list_of_names_holds_texts(value: object) -> None:
-    assert len(Lamp.problems({"sockets": value})) == 1
+    assert len(LampDevice.problems({"sockets": value})) == 1
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), True, None, "1"])
 def test_a_number_is_finite_and_neither_truth_nor_text(value: object) -> None:
-    assert len(Lamp.problems({"sockets": ["a"], "warm_up_s": value})) == 1
+    assert len(LampDevice.problems({"sockets": ["a"], "warm_up_s": value})) == 1

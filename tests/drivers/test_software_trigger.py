@@ -46,14 +46,14 @@ def test_all_heads_are_fired_at_once_and_sigma_holds_them() -> None:
     trigger.close()
 
 
-def test_delays_are_kept_and_taken_off_the_pulse() -> None:
+def test_delays_are_stored_and_taken_off_the_pulse() -> None:
     first, last = StubHead("first"), StubHead("last")
     trigger = _trigger(first=first, last=last)
     trigger.program({"last": 50_000_000})
     trigger.fire(1)
     pulse = trigger.fire(2)
-    apart_ns = last.fired_ns[1] - first.fired_ns[1]
-    assert abs(apart_ns - 50_000_000) < 1_000_000 + 2 * pulse.sigma_ns
+    spread_ns = last.fired_ns[1] - first.fired_ns[1]
+    assert abs(spread_ns - 50_000_000) < 1_000_000 + 2 * pulse.sigma_ns
     assert abs(last.fired_ns[1] - 50_000_000 - pulse.mono_ns) <= pulse.sigma_ns
     trigger.close()
 

@@ -13,7 +13,7 @@ from drivers.receivers.ublox.decoder import UbxDecoder
 from drivers.receivers.ublox.navigator import UbloxNavigator
 from drivers.transport.serial_device import open_serial_port
 from drivers.transport.tcp_port import TcpPort
-from tests.drivers.stand_ins import Notebook
+from tests.drivers.fakes import RecordingSink
 
 RECORDED = (Path(__file__).parent / "data" / "ublox-neo-m8l-excerpt.ubx").read_bytes()
 
@@ -23,15 +23,15 @@ def test_a_receiver_behind_tcp_gives_what_it_gives_on_a_cable_and_is_found_again
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(10)
         navigator = UbloxNavigator("m8l", {"port": f"tcp://127.0.0.1:{server.getsockname()[1]}"})
-        notebook = Notebook()
+        recorder = RecordingSink()
         enough = threading.Event()
 
         def watch(_: object) -> None:
-            if sum(isinstance(r, NavSample) for r in notebook.records) >= 2 * len(expected):
+            if sum(isinstance(r, NavSample) for r in recorder.records) >= 2 * len(expected):
                 enough.set()
 
-        notebook.stop = watch
-        thread = threading.Thread(target=navigator.run, args=(notebook,))
+        recorder.stop = watch
+        thread = threading.Thread(target=navigator.run, args=(recorder,))
         thread.start()
         connections: list[socket.socket] = []
         for _ in range(2):
@@ -45,8 +45,8 @@ def test_a_receiver_behind_tcp_gives_what_it_gives_on_a_cable_and_is_found_again
         thread.join(5)
         assert not thread.is_alive()
         connections[1].close()
-    assert [r.gps_ns for r in notebook.records if isinstance(r, NavSample)] == 2 * expected
-    names = [r.name for r in notebook.records if isinstance(r, DeviceEvent)]
+    assert [r.gps_ns for r in recorder.records if isinstance(r, NavSample)] == 2 * expected
+    names = [r.name for r in recorder.records if isinstance(r, DeviceEvent)]
     assert [name for name in names if name in ("opened", "lost")] == ["opened", "lost", "opened"]
 
 
@@ -64,7 +64,7 @@ def test_silence_on_tcp_is_waited_for_and_gives_nothing() -> None:
         port.close()
 
 
-def test_nobody_at_an_address_is_said_with_the_cure() -> None:
+def test_nobody_at_an_address_is_reported_with_the_remedy() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         number = server.getsockname()[1]
     with pytest.raises(DeviceError, match="check that the device is on the network"):

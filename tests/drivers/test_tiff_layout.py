@@ -9,7 +9,7 @@ import tifffile
 from daemon.mission.store.level0 import RasterError, check_tiff, read_frame, read_tiff
 from drivers.cameras.folder.frames import FrameFileError
 from drivers.cameras.folder.frames import read_frame as read_folder_frame
-from drivers.cameras.tiff_layout import MOST_PAGES, layout_problem
+from drivers.cameras.tiff_layout import MAX_PAGES, layout_problem
 
 pytestmark = pytest.mark.trust
 PIXELS = np.arange(48 * 64, dtype=np.uint16).reshape(48, 64)
@@ -35,7 +35,7 @@ REFUSED = [
     pytest.param({"photometric": "miniswhite"}, "MinIsWhite", id="min is white"),
     pytest.param({"pages": 2}, "several images .page 2", id="two pages"),
     pytest.param(
-        {"pages": MOST_PAGES + 2, "subfiletype": 1}, "more than 16 pages", id="endless overviews"
+        {"pages": MAX_PAGES + 2, "subfiletype": 1}, "more than 16 pages", id="endless overviews"
     ),
 ]
 
@@ -51,7 +51,7 @@ def test_a_tag_that_changes_the_meaning_is_refused(tmp_path, options, says):
         with pytest.raises(RasterError, match=f"SU30.tif: .*{says}"):
             read()
     with pytest.raises(FrameFileError, match=says):
-        read_folder_frame(path, room_nbytes=1 << 20)
+        read_folder_frame(path, max_nbytes=1 << 20)
 
 
 @pytest.mark.parametrize(
@@ -68,16 +68,16 @@ def test_a_tag_that_changes_the_meaning_is_refused(tmp_path, options, says):
 def test_a_frame_of_usual_tags_is_read(tmp_path, options):
     path = written(tmp_path / "SU30.tif", **options)
     assert np.array_equal(read_frame(path, width_px=64, height_px=48).pixels, PIXELS)
-    assert np.array_equal(read_folder_frame(path, room_nbytes=1 << 20).pixels, PIXELS)
+    assert np.array_equal(read_folder_frame(path, max_nbytes=1 << 20).pixels, PIXELS)
 
 
 def test_exactly_as_many_overviews_as_allowed_are_read():
     file = io.BytesIO()
     with tifffile.TiffWriter(file) as tiff:
         tiff.write(PIXELS, contiguous=False)
-        for _ in range(MOST_PAGES - 1):
+        for _ in range(MAX_PAGES - 1):
             tiff.write(PIXELS[::8, ::8], subfiletype=1, contiguous=False)
     file.seek(0)
     with tifffile.TiffFile(file) as tiff:
-        assert len(tiff.pages) == MOST_PAGES
+        assert len(tiff.pages) == MAX_PAGES
         assert layout_problem(tiff) is None

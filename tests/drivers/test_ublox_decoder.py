@@ -117,8 +117,8 @@ def test_an_old_nav_timegps_gives_no_valid_time() -> None:
 
 def test_a_fix_that_the_receiver_does_not_trust_is_none() -> None:
     assert _samples(nav_pvt(ITOW, TEN_UTC, flags=0))[0].fix == "none"
-    words = [_samples(nav_pvt(ITOW, TEN_UTC, fix_type=n))[0].fix for n in range(6)]
-    assert words == ["none", "dead-reckoning", "2d", "3d", "3d", "time"]
+    fixes = [_samples(nav_pvt(ITOW, TEN_UTC, fix_type=n))[0].fix for n in range(6)]
+    assert fixes == ["none", "dead-reckoning", "2d", "3d", "3d", "time"]
 
 
 # Attitude

@@ -59,19 +59,19 @@ def test_how_the_bytes_are_cut_on_arrival_makes_no_difference(
     parts: list[bytes], cuts: list[int]
 ) -> None:
     data = b"".join(parts)
-    whole, cut = UbxFramer(LENGTHS), UbxFramer(LENGTHS)
-    expected = whole.feed(data)
+    whole_framer, cut = UbxFramer(LENGTHS), UbxFramer(LENGTHS)
+    expected = whole_framer.feed(data)
     found: list[bytes] = []
     at = 0
-    turn = 0
+    cut_index = 0
     while at < len(data):
-        size = cuts[turn % len(cuts)]
+        size = cuts[cut_index % len(cuts)]
         found += cut.feed(data[at : at + size])
         at += size
-        turn += 1
+        cut_index += 1
     assert found == expected
-    assert cut.bad_bytes == whole.bad_bytes
-    assert _accounted(whole) == _accounted(cut) == len(data)
+    assert cut.bad_bytes == whole_framer.bad_bytes
+    assert _accounted(whole_framer) == _accounted(cut) == len(data)
 
 
 @given(st.binary(max_size=400))

@@ -14,8 +14,8 @@ from drivers.contract import DeviceError, NavSample, RawBytes
 from drivers.receivers.ublox.decoder import UbxDecoder
 from drivers.receivers.ublox.navigator import UbloxNavigator
 from drivers.timescales.gps_time import WEEK_NS
-from tests.drivers.lines import PtyLine
-from tests.drivers.stand_ins import Notebook
+from tests.drivers.fakes import RecordingSink
+from tests.drivers.pty_line import PtyLine
 from tests.drivers.ubx_frames import frame
 
 RECORDINGS = Path(__file__).parents[3] / "shared" / "data" / "nav" / "gpsd"
@@ -77,31 +77,31 @@ def test_attitude_of_the_recorded_m8l_is_that_of_the_same_time_of_week() -> None
     assert with_attitude == 18, "all but the first, whose attitude lies before the recording"
 
 
-def test_a_recording_played_over_a_line_comes_out_whole() -> None:
+def test_a_recording_played_over_a_line_comes_out_complete() -> None:
     recorded = EXCERPT.read_bytes()
     expected = [r.gps_ns for r in UbxDecoder("m8l").feed(recorded, 0) if isinstance(r, NavSample)]
     with PtyLine() as line:
         navigator = UbloxNavigator("m8l", {"port": line.near})
-        notebook = Notebook()
+        recorder = RecordingSink()
         done, opened = threading.Event(), threading.Event()
 
         def watch(_: object) -> None:
             opened.set()
-            got = [r for r in notebook.records if isinstance(r, NavSample)]
+            got = [r for r in recorder.records if isinstance(r, NavSample)]
             if len(got) == len(expected):
                 done.set()
 
-        notebook.stop = watch
-        thread = threading.Thread(target=navigator.run, args=(notebook,))
+        recorder.stop = watch
+        thread = threading.Thread(target=navigator.run, args=(recorder,))
         thread.start()
         assert opened.wait(5)
         for at in range(0, len(recorded), 500):
-            line.say(recorded[at : at + 500])
+            line.inject(recorded[at : at + 500])
         assert done.wait(10)
         navigator.close()
         thread.join(5)
-    got = [r.gps_ns for r in notebook.records if isinstance(r, NavSample)]
-    raw = b"".join(r.data for r in notebook.records if isinstance(r, RawBytes))
+    got = [r.gps_ns for r in recorder.records if isinstance(r, NavSample)]
+    raw = b"".join(r.data for r in recorder.records if isinstance(r, RawBytes))
     assert got == expected
     assert raw == recorded[: len(raw)]
     assert navigator.statistics()["samples"] == len(expected)
@@ -116,19 +116,19 @@ def test_a_recording_played_over_a_line_comes_out_whole() -> None:
         (frame(0x01, 0x35, bytes(8)), "sent no NAV-PVT"),
     ],
 )
-def test_binding_says_what_is_wrong_with_the_receiver(said: bytes, cure: str) -> None:
+def test_binding_states_what_is_wrong_with_the_receiver(said: bytes, cure: str) -> None:
     with PtyLine() as line:
         navigator = UbloxNavigator("gnss", {"port": line.near, "silence_s": 0.5})
         if said:
-            threading.Timer(0.1, line.say, (said,)).start()
+            threading.Timer(0.1, line.inject, (said,)).start()
         with pytest.raises(DeviceError, match=cure):
             navigator.bind()
 
 
-def test_binding_says_what_the_receiver_sends() -> None:
+def test_binding_lists_what_the_receiver_sends() -> None:
     with PtyLine() as line:
         navigator = UbloxNavigator("gnss", {"port": line.near})
-        threading.Timer(0.1, line.say, (EXCERPT.read_bytes()[:4000],)).start()
+        threading.Timer(0.1, line.inject, (EXCERPT.read_bytes()[:4000],)).start()
         found = navigator.bind()
         navigator.close()
     assert found["port"].startswith("/dev/")
@@ -138,22 +138,22 @@ def test_binding_says_what_the_receiver_sends() -> None:
 def test_a_receiver_that_is_unplugged_is_found_again(tmp_path: Path) -> None:
     """The port is a link, as udev makes one: first to one pseudo-terminal, then to another."""
     link = tmp_path / "gnss"
-    notebook = Notebook()
+    recorder = RecordingSink()
     names = {name: threading.Event() for name in ("opened", "lost")}
     again = threading.Event()
 
     def watch(_: object) -> None:
-        for name in notebook.event_names:
+        for name in recorder.event_names:
             if name in names:
                 names[name].set()
-        if notebook.event_names.count("opened") == 2:
+        if recorder.event_names.count("opened") == 2:
             again.set()
 
-    notebook.stop = watch
+    recorder.stop = watch
     master, slave = os.openpty()
     link.symlink_to(os.ttyname(slave))
     navigator = UbloxNavigator("gnss", {"port": str(link)})
-    thread = threading.Thread(target=navigator.run, args=(notebook,))
+    thread = threading.Thread(target=navigator.run, args=(recorder,))
     thread.start()
     try:
         assert names["opened"].wait(5)

@@ -13,8 +13,8 @@ import pytest
 from drivers.contract import DeviceError, NavSample
 from drivers.receivers.mavlink.navigator import MavlinkNavigator
 from drivers.transport import udp_port
-from drivers.transport.udp_port import Sender, open_udp_port
-from tests.drivers.stand_ins import Notebook, running
+from drivers.transport.udp_port import SenderFilter, open_udp_port
+from tests.drivers.fakes import RecordingSink, running
 from tests.drivers.test_mavlink import BOOT_MS, Bus, free_udp_port
 
 WITHIN_S = 30.0
@@ -23,7 +23,7 @@ OURS, FOREIGN = 475_000_000, 100_000_000
 """Latitudes, 1e-7 degrees."""
 
 
-class Speaker:
+class UdpAutopilot:
     """An autopilot at an address of the loopback network, from `start()` to `close()`."""
 
     def __init__(self, number: int, host: str, latitude: int = OURS, *, what: str = "autopilot"):
@@ -35,17 +35,17 @@ class Speaker:
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
-    def start(self) -> Speaker:
+    def start(self) -> UdpAutopilot:
         self._thread.start()
         return self
 
     def _run(self) -> None:
         while not self._stop.wait(0.01):
             self._boot_ms += 10
-            for datagram in self._said():
+            for datagram in self._message():
                 self.socket.sendto(datagram, self._to)
 
-    def _said(self) -> list[bytes]:
+    def _message(self) -> list[bytes]:
         if self._what == "garbage":
             return [b"\xfd\xff\x00\x00", bytes(range(200))]
         if self._what == "ground station":
@@ -65,7 +65,7 @@ class Speaker:
 
 
 @contextmanager
-def speaking(*speakers: Speaker) -> Iterator[None]:
+def running_autopilots(*speakers: UdpAutopilot) -> Iterator[None]:
     try:
         for speaker in speakers:
             speaker.start()
@@ -75,7 +75,7 @@ def speaking(*speakers: Speaker) -> Iterator[None]:
             speaker.close()
 
 
-class Watch(Notebook):
+class Watch(RecordingSink):
     """A sink that waits for what a test asks for."""
 
     def wait_for(self, what: str, is_so) -> None:
@@ -101,9 +101,9 @@ def test_who_speaks_first_without_being_the_autopilot_does_not_become_the_sender
 ) -> None:
     number = free_udp_port()
     device, sink = navigator(number), Watch()
-    other = Speaker(number, "127.0.0.2", what=first)
-    ours = Speaker(number, "127.0.0.1")
-    with speaking(other, ours):
+    other = UdpAutopilot(number, "127.0.0.2", what=first)
+    ours = UdpAutopilot(number, "127.0.0.1")
+    with running_autopilots(other, ours):
         device.bind()
         with running(device, sink):
             sink.wait_for("samples", lambda: len(sink.latitudes) > 5)
@@ -116,9 +116,9 @@ def test_who_speaks_first_without_being_the_autopilot_does_not_become_the_sender
 def test_another_autopilot_is_dropped_counted_and_reported_in_a_sentence() -> None:
     number = free_udp_port()
     device, sink = navigator(number), Watch()
-    with speaking(Speaker(number, "127.0.0.1")):
+    with running_autopilots(UdpAutopilot(number, "127.0.0.1")):
         device.bind()
-        with running(device, sink), speaking(Speaker(number, "127.0.0.2", FOREIGN)):
+        with running(device, sink), running_autopilots(UdpAutopilot(number, "127.0.0.2", FOREIGN)):
             sink.wait_for("the fault", lambda: "other-sender" in sink.event_names)
             at = len(sink.latitudes)
             sink.wait_for("more samples", lambda: len(sink.latitudes) > at + 10)
@@ -135,19 +135,19 @@ def test_another_autopilot_is_dropped_counted_and_reported_in_a_sentence() -> No
 def test_a_silent_autopilot_is_not_replaced_by_another_and_comes_back_from_a_new_port(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(udp_port, "NEW_PORT_AFTER_S", 0.3)
+    monkeypatch.setattr(udp_port, "PORT_CHANGE_TIMEOUT_S", 0.3)
     number = free_udp_port()
     device, sink = navigator(number, silence_s=0.5), Watch()
-    ours = Speaker(number, "127.0.0.1").start()
+    ours = UdpAutopilot(number, "127.0.0.1").start()
     device.bind()
-    with running(device, sink), speaking(Speaker(number, "127.0.0.2", FOREIGN)):
+    with running(device, sink), running_autopilots(UdpAutopilot(number, "127.0.0.2", FOREIGN)):
         sink.wait_for("samples", lambda: len(sink.latitudes) > 3)
         ours.close()
         opened = device.statistics()["opened"]
         sink.wait_for("two openings", lambda: device.statistics()["opened"] >= opened + 2)
         assert "silent" in sink.event_names
         at = len(sink.latitudes)
-        with speaking(Speaker(number, "127.0.0.1")):
+        with running_autopilots(UdpAutopilot(number, "127.0.0.1")):
             sink.wait_for("more samples", lambda: len(sink.latitudes) > at + 3)
     assert set(sink.latitudes) == {47.5}
 
@@ -156,46 +156,46 @@ def test_a_silent_autopilot_is_not_replaced_by_another_and_comes_back_from_a_new
 def test_the_configured_sender_is_taken_though_another_speaks_first() -> None:
     number = free_udp_port()
     device, sink = navigator(number, "?from=127.0.0.1"), Watch()
-    with speaking(Speaker(number, "127.0.0.2", FOREIGN)):
+    with running_autopilots(UdpAutopilot(number, "127.0.0.2", FOREIGN)):
         with pytest.raises(DeviceError) as failed:
             device.bind()
         assert "nothing came at udpin://" in str(failed.value)
         assert "dropped, the last from 127.0.0.2:" in str(failed.value)
         assert "only 127.0.0.1 is accepted" in str(failed.value)
         assert "correct ?from= in its port" in str(failed.value)
-        with speaking(Speaker(number, "127.0.0.1")), running(device, sink):
+        with running_autopilots(UdpAutopilot(number, "127.0.0.1")), running(device, sink):
             sink.wait_for("samples", lambda: len(sink.latitudes) > 5)
     assert set(sink.latitudes) == {47.5}
 
 
 def test_a_sender_keeps_its_port_until_it_was_silent_and_its_address_for_ever() -> None:
-    sender = Sender()
-    assert sender.takes(("10.0.0.5", 1), 10 * S)
-    assert sender.takes(("10.0.0.6", 1), 10 * S), "nobody was understood yet"
+    sender = SenderFilter()
+    assert sender.accepts(("10.0.0.5", 1), 10 * S)
+    assert sender.accepts(("10.0.0.6", 1), 10 * S), "nobody was understood yet"
     sender.lock()
     assert (sender.address, sender.port) == ("10.0.0.6", 1)
-    assert not sender.takes(("10.0.0.6", 2), 11 * S)
-    assert not sender.takes(("10.0.0.6", 2), 12 * S - 1)
-    assert sender.takes(("10.0.0.6", 2), 12 * S)
-    assert not sender.takes(("10.0.0.6", 1), 12 * S), "the port before is another one now"
-    assert not sender.takes(("10.0.0.5", 1), 999 * S)
+    assert not sender.accepts(("10.0.0.6", 2), 11 * S)
+    assert not sender.accepts(("10.0.0.6", 2), 12 * S - 1)
+    assert sender.accepts(("10.0.0.6", 2), 12 * S)
+    assert not sender.accepts(("10.0.0.6", 1), 12 * S), "the port before is another one now"
+    assert not sender.accepts(("10.0.0.5", 1), 999 * S)
     assert (sender.others, sender.last_other) == (4, "10.0.0.5:1")
 
 
-def test_what_is_read_and_written_is_whole_datagrams_of_the_sender() -> None:
+def test_what_is_read_and_written_is_complete_datagrams_of_the_sender() -> None:
     number = free_udp_port()
     port = open_udp_port(f"udpin://127.0.0.1:{number}")
     port.timeout = 0.05
     assert port.read(1) == b""
     assert port.write(b"to nobody") == 0
     speaker = open_udp_port(f"udpout://127.0.0.1:{number}")
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other_socket:
         speaker.timeout = port.timeout = 5.0
         assert speaker.write(b"hello") == 5
         assert port.read(1) + port.read(port.in_waiting) == b"hello"
         assert port.sender is not None
         port.sender.lock()
-        stranger.sendto(b"and me", ("127.0.0.1", number))
+        other_socket.sendto(b"and me", ("127.0.0.1", number))
         assert speaker.write(b"again") == 5
         assert port.read(5) == b"again", "a stranger's datagram takes nobody's turn"
         assert port.write(b"welcome") == 7

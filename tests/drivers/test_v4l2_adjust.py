@@ -35,14 +35,17 @@ class Node:
 
 def camera(node: Node, *, exposure: Control | None = EXPOSURE, **settings: Any) -> V4l2Camera:
     """One that was opened with the values of its node."""
-    made = V4l2Camera.__new__(V4l2Camera)
-    made._settings = V4l2Settings("cam", {"device": "/dev/video0", **settings})
-    made._who = "cam at /dev/video0"
-    made.node = cast(VideoNode, node)
-    made.controls = {c.name: c for c in (EXPOSURE, GAIN)}
-    made._exposure, made._exposure_unit_us = exposure, 100.0
-    made._gain_control, made._gain_at_0_db = made._find_gain(), node.values["gain"]
-    return made
+    v4l2_camera = V4l2Camera.__new__(V4l2Camera)
+    v4l2_camera._settings = V4l2Settings("cam", {"device": "/dev/video0", **settings})
+    v4l2_camera._who = "cam at /dev/video0"
+    v4l2_camera.node = cast(VideoNode, node)
+    v4l2_camera.controls = {c.name: c for c in (EXPOSURE, GAIN)}
+    v4l2_camera._exposure, v4l2_camera._exposure_unit_us = exposure, 100.0
+    v4l2_camera._gain_control, v4l2_camera._gain_at_0_db = (
+        v4l2_camera._find_gain(),
+        node.values["gain"],
+    )
+    return v4l2_camera
 
 
 def test_exposure_time_and_gain_are_written_in_the_units_of_the_head() -> None:
@@ -65,7 +68,7 @@ def test_what_the_head_refuses_leaves_it_as_it_was() -> None:
     assert node.values["exposure_time_absolute"] == 50
 
 
-def test_a_head_without_control_or_unit_says_what_to_set() -> None:
+def test_a_head_without_control_or_unit_states_what_to_set() -> None:
     node = Node({"exposure_time_absolute": 50, "gain": 10})
     with pytest.raises(DeviceError, match="no control of its exposure time"):
         camera(node, exposure=None).adjust(1000.0, 0.0)

@@ -22,7 +22,7 @@ STRUCTURES = {
     "v4l2_format": uapi.Format,
     "v4l2_requestbuffers": uapi.RequestBuffers,
     "v4l2_timecode": uapi.TimeCode,
-    "v4l2_plane": uapi.Plane,
+    "v4l2_plane": uapi.BufferPlane,
     "v4l2_buffer": uapi.Buffer,
     "v4l2_fract": uapi.Fract,
     "v4l2_captureparm": uapi.CaptureParm,
@@ -49,7 +49,7 @@ def header(tmp_path_factory: pytest.TempPathFactory) -> dict[str, int]:
         pytest.skip("needs gcc (Debian packages gcc, libc6-dev)")
     if not Path("/usr/include/linux/videodev2.h").exists():
         pytest.skip("needs linux/videodev2.h (Debian package linux-libc-dev)")
-    asked = {
+    definitions = {
         **{f"sizeof {name}": f"sizeof(struct {name})" for name in STRUCTURES},
         **{
             f"{name}.{field}": f"offsetof(struct {name}, "
@@ -67,7 +67,7 @@ def header(tmp_path_factory: pytest.TempPathFactory) -> dict[str, int]:
     }
     lines = [
         f'printf("%s\\"{key}\\": %lld\\n", c, (long long)({c})); c = ",";'
-        for key, c in asked.items()
+        for key, c in definitions.items()
     ]
     folder = tmp_path_factory.mktemp("layout")
     source = folder / "layout.c"
@@ -76,8 +76,8 @@ def header(tmp_path_factory: pytest.TempPathFactory) -> dict[str, int]:
         'int main(void) { const char *c = ""; puts("{");\n' + "\n".join(lines) + '\nputs("}"); }\n'
     )
     subprocess.run([compiler, "-o", folder / "layout", source], timeout=60, check=True)
-    told = subprocess.run([folder / "layout"], capture_output=True, timeout=10, check=True)
-    found: dict[str, int] = json.loads(told.stdout)
+    completed = subprocess.run([folder / "layout"], capture_output=True, timeout=10, check=True)
+    found: dict[str, int] = json.loads(completed.stdout)
     return found
 
 

@@ -47,7 +47,7 @@ def sampled(data: bytes, sent_baud: int, read_baud: int) -> bytes:
         """The line at a time in bits of the sender; idle is high."""
         return line[int(at)] if 0 <= at < len(line) else 1
 
-    heard = bytearray()
+    received = bytearray()
     at = 0.0
     while at < len(line):
         if level(at) == 1:
@@ -55,9 +55,9 @@ def sampled(data: bytes, sent_baud: int, read_baud: int) -> bytes:
             at = int(at) + 1.0
             continue
         bits = [level(at + (number + 1.5) * ratio) for number in range(9)]
-        heard.append(sum(bit << number for number, bit in enumerate(bits[:8])) if bits[8] else 0)
+        received.append(sum(bit << number for number, bit in enumerate(bits[:8])) if bits[8] else 0)
         at += 9.5 * ratio
-    return bytes(heard)
+    return bytes(received)
 
 
 class UartRelay:

@@ -33,7 +33,7 @@ from drivers.contract import (
     RawBytes,
     Record,
 )
-from sim_hw.processes.lone import HEIGHT_PX, KINDS, WIDTH_PX
+from sim_hw.processes.single_device import HEIGHT_PX, KINDS, WIDTH_PX
 
 ROOT = Path(__file__).parents[2]
 HEADS = ("head-1", "head-2")
@@ -44,20 +44,20 @@ READY_WITHIN_S = 180.0
 
 
 @dataclass(frozen=True)
-class Stated:
+class StatedTimes:
     """Within what a dead device is noticed, and back once it is there again, s."""
 
-    noticed_s: float
+    detected_s: float
     back_s: float
 
 
 SILENCE_S = 6.0
 """A machine that runs the tests beside other programs may starve a device for seconds."""
-SERIAL = Stated(noticed_s=SILENCE_S, back_s=5.0 + 3.0)
+SERIAL = StatedTimes(detected_s=SILENCE_S, back_s=5.0 + 3.0)
 """`silence_s` of the receivers; the longest back-off and a second of listening."""
-HEAD = Stated(noticed_s=4.5, back_s=5.0 + 2.5 + 3.0)
+HEAD = StatedTimes(detected_s=4.5, back_s=5.0 + 2.5 + 3.0)
 """Two seconds of suspicion beside a check every two; the longest back-off, and opening."""
-TRIGGER = Stated(noticed_s=EXPOSE_EVERY_S + 0.5, back_s=EXPOSE_EVERY_S + 1.0)
+TRIGGER = StatedTimes(detected_s=EXPOSE_EVERY_S + 0.5, back_s=EXPOSE_EVERY_S + 1.0)
 """It is asked twice a second here and answers within half of one."""
 
 
@@ -68,11 +68,11 @@ class Device:
     name: str
     kind: str
     at: str
-    stated: Stated
+    stated: StatedTimes
     driver: Any = None
     process: subprocess.Popen[str] | None = None
     thread: threading.Thread | None = None
-    heard_s: list[float] = field(default_factory=list)
+    received_s: list[float] = field(default_factory=list)
     events: list[tuple[float, DeviceEvent]] = field(default_factory=list)
     down: list[tuple[float, float]] = field(default_factory=list)
     """When it was killed, and when it said again that it is ready."""
@@ -82,7 +82,7 @@ class Device:
         if isinstance(record, DeviceEvent):
             self.events.append((now_s, record))
         elif not isinstance(record, RawBytes):
-            self.heard_s.append(now_s)
+            self.received_s.append(now_s)
         if isinstance(record, Frame):
             self.driver.recycle(record.slot)
 
@@ -101,38 +101,38 @@ class _Memory:
         return int(self._slots[slot].ctypes.data)
 
 
-class _Asked:
+class _PolledDevice:
     """The trigger unit's client in a thread that fires twice a second."""
 
     def __init__(self, device: Device) -> None:
         host, _, port = device.at.rpartition(":")
-        made = registry.driver_for("trigger", "pulse-bus")
-        self._client: Any = made(device.name, {"host": host, "port": int(port)})
+        started_devices = registry.driver_for("trigger", "pulse-bus")
+        self._client: Any = started_devices(device.name, {"host": host, "port": int(port)})
         self._device = device
         self._closing = threading.Event()
 
     def run(self, _sink: object) -> None:
         sequence = 0
-        was_well = True
+        was_working = True
         while not self._closing.wait(EXPOSE_EVERY_S):
             sequence += 1
             try:
                 self._client.fire(sequence)
             except DeviceError as error:
-                if was_well:
-                    self._tell("lost", str(error), is_fault=True)
-                was_well = False
+                if was_working:
+                    self._put_event("lost", str(error), is_fault=True)
+                was_working = False
             else:
-                if not was_well:
-                    self._tell("opened", "", is_fault=False)
-                was_well = True
-                self._device.heard_s.append(time.monotonic())
+                if not was_working:
+                    self._put_event("opened", "", is_fault=False)
+                was_working = True
+                self._device.received_s.append(time.monotonic())
 
     def close(self) -> None:
         self._closing.set()
         self._client.close()
 
-    def _tell(self, name: str, sentence: str, *, is_fault: bool) -> None:
+    def _put_event(self, name: str, sentence: str, *, is_fault: bool) -> None:
         event = DeviceEvent(self._device.name, name, is_fault, sentence, time.monotonic_ns())
         self._device.sink(event)
 
@@ -140,15 +140,15 @@ class _Asked:
 def devices(folder: Path, kinds: Iterator[str] | None = None) -> list[Device]:
     """One of each kind, and a second head."""
     chosen = list(kinds or KINDS)
-    made = []
+    started_devices = []
     for kind in chosen:
         if kind == "head":
-            made += [Device(name, "head", ADDRESSES[name], HEAD) for name in HEADS]
+            started_devices += [Device(name, "head", ADDRESSES[name], HEAD) for name in HEADS]
         elif kind == "trigger":
-            made.append(Device("trigger", "trigger", TRIGGER_AT, TRIGGER))
+            started_devices.append(Device("trigger", "trigger", TRIGGER_AT, TRIGGER))
         else:
-            made.append(Device(kind, kind, str(folder / kind), SERIAL))
-    return made
+            started_devices.append(Device(kind, kind, str(folder / kind), SERIAL))
+    return started_devices
 
 
 def driver_of(device: Device) -> Any:
@@ -167,7 +167,7 @@ def driver_of(device: Device) -> Any:
                 **port,
                 "pattern": r"(?P<channel>CH\d) = (?P<value>\S+)",
                 "channels": ["a", "b"],
-                "channel_words": ["CH1", "CH2"],
+                "channel_labels": ["CH1", "CH2"],
             },
         ),
         "head": (
@@ -177,21 +177,21 @@ def driver_of(device: Device) -> Any:
         ),
     }
     if device.kind == "trigger":
-        return _Asked(device)
+        return _PolledDevice(device)
     kind, name, settings = sections.get(device.kind, ("navigator", device.kind, port))
-    made: Any = registry.driver_for(kind, name)
+    started_devices: Any = registry.driver_for(kind, name)
     if kind == "head":
-        return made(device.name, settings, memory=_Memory())
-    return made(device.name, settings)
+        return started_devices(device.name, settings, memory=_Memory())
+    return started_devices(device.name, settings)
 
 
-NURSERY = ThreadPoolExecutor(1, thread_name_prefix="nursery")
+SPAWNER = ThreadPoolExecutor(1, thread_name_prefix="nursery")
 """A device dies with the thread that started it: one thread that stays starts them all."""
 
 
 def _popen(device: Device) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [sys.executable, "-m", "sim_hw.processes.lone", device.kind, "--at", device.at],
+        [sys.executable, "-m", "sim_hw.processes.single_device", device.kind, "--at", device.at],
         cwd=ROOT,
         stdout=subprocess.PIPE,
         text=True,
@@ -200,7 +200,7 @@ def _popen(device: Device) -> subprocess.Popen[str]:
 
 def start_process(device: Device) -> None:
     """Start the device and wait until it says that it is ready."""
-    process = NURSERY.submit(_popen, device).result(READY_WITHIN_S)
+    process = SPAWNER.submit(_popen, device).result(READY_WITHIN_S)
     assert process.stdout is not None
     device.process = process
     with selectors.DefaultSelector() as selector:
@@ -227,26 +227,26 @@ def kill_process(device: Device) -> float:
 @contextmanager
 def running(folder: Path) -> Iterator[list[Device]]:
     """All devices and their drivers."""
-    made = devices(folder)
-    ending = threading.Event()
-    exposing = threading.Thread(target=_expose, args=(made, ending))
+    started_devices = devices(folder)
+    stop = threading.Event()
+    exposing = threading.Thread(target=_expose, args=(started_devices, stop))
     try:
-        for device in made:
+        for device in started_devices:
             start_process(device)
-        for device in made:
+        for device in started_devices:
             device.driver = driver_of(device)
             device.thread = threading.Thread(
                 target=device.driver.run, args=(device.sink,), name=device.name
             )
             device.thread.start()
         exposing.start()
-        yield made
+        yield started_devices
     finally:
-        ending.set()
-        for device in made:
+        stop.set()
+        for device in started_devices:
             if device.driver is not None:
                 device.driver.close()
-        for device in made:
+        for device in started_devices:
             if device.thread is not None:
                 device.thread.join(20)
             if device.process is not None:
@@ -255,21 +255,21 @@ def running(folder: Path) -> Iterator[list[Device]]:
             exposing.join(20)
 
 
-def _expose(made: list[Device], ending: threading.Event) -> None:
-    heads = [device for device in made if device.kind == "head"]
-    while not ending.wait(EXPOSE_EVERY_S):
+def _expose(started_devices: list[Device], stop: threading.Event) -> None:
+    heads = [device for device in started_devices if device.kind == "head"]
+    while not stop.wait(EXPOSE_EVERY_S):
         for head in heads:
             # A head that is lost cannot be triggered; that it is, its driver says.
             with suppress(DeviceError):
                 head.driver.trigger()
 
 
-def wait_until_all_speak(made: list[Device], within_s: float) -> float:
+def wait_until_all_speak(started_devices: list[Device], within_s: float) -> float:
     """Wait until every device was heard from now on; how long that took."""
     began_s = time.monotonic()
-    waiting = list(made)
+    waiting = list(started_devices)
     while waiting:
-        waiting = [d for d in waiting if not d.heard_s or d.heard_s[-1] < began_s]
+        waiting = [d for d in waiting if not d.received_s or d.received_s[-1] < began_s]
         assert time.monotonic() - began_s < within_s, f"silent: {[d.name for d in waiting]}"
         time.sleep(0.05)
     return time.monotonic() - began_s
@@ -280,32 +280,32 @@ def descriptors() -> int:
     return len(list(Path("/proc/self/fd").iterdir()))
 
 
-def kill_at_random(made: list[Device], lasts_s: float, seed: int) -> int:
+def kill_at_random(started_devices: list[Device], lasts_s: float, seed: int) -> int:
     """Kill and restart devices at random, each on its own; how often."""
-    ending = threading.Event()
+    stop = threading.Event()
     mortals = [
-        threading.Thread(target=_live_and_die, args=(d, ending, random.Random(f"{seed}-{d.name}")))
-        for d in made
+        threading.Thread(target=_kill_repeatedly, args=(d, stop, random.Random(f"{seed}-{d.name}")))
+        for d in started_devices
     ]
     for mortal in mortals:
         mortal.start()
-    ending.wait(lasts_s)
-    ending.set()
+    stop.wait(lasts_s)
+    stop.set()
     for mortal in mortals:
         mortal.join(2 * READY_WITHIN_S)
         assert not mortal.is_alive()
-    return sum(len(device.down) for device in made)
+    return sum(len(device.down) for device in started_devices)
 
 
-def _live_and_die(device: Device, ending: threading.Event, chance: random.Random) -> None:
-    life_s = chance.uniform(1.0, 10.0)
-    while not ending.wait(life_s):
+def _kill_repeatedly(device: Device, stop: threading.Event, rng: random.Random) -> None:
+    run_s = rng.uniform(1.0, 10.0)
+    while not stop.wait(run_s):
         killed_s = kill_process(device)
         device.down.append((killed_s, float("inf")))
-        ending.wait(chance.uniform(0.2, 9.0))
+        stop.wait(rng.uniform(0.2, 9.0))
         start_process(device)
         device.down[-1] = (killed_s, time.monotonic())
-        life_s = chance.uniform(15.0, 45.0)
+        run_s = rng.uniform(15.0, 45.0)
 
 
 @dataclass
@@ -313,7 +313,7 @@ class Figures:
     """What was seen of one device."""
 
     kills: int
-    noticed_s: list[float]
+    detected_s: list[float]
     unnoticed: int
     """Restarted before there was anything to notice: it spoke again without having been lost."""
     back_s: list[float]
@@ -324,8 +324,8 @@ class Figures:
         cells = [
             device.name,
             str(self.kills),
-            _spread(self.noticed_s),
-            f"{device.stated.noticed_s:g}",
+            _spread(self.detected_s),
+            f"{device.stated.detected_s:g}",
             _spread(self.back_s),
             f"{device.stated.back_s:g}",
             str(len(self.disturbances)),
@@ -344,16 +344,17 @@ def figures(device: Device) -> Figures:
     found = Figures(len(device.down), [], 0, [], [])
     excused: list[tuple[float, float]] = []
     for killed_s, ready_s in device.down:
-        heard_s = next((s for s in device.heard_s if s > ready_s), float("inf"))
-        found.back_s.append(heard_s - ready_s)
-        told_s = next(
-            (s for s, event in device.events if event.is_fault and killed_s <= s <= heard_s), None
+        received_s = next((s for s in device.received_s if s > ready_s), float("inf"))
+        found.back_s.append(received_s - ready_s)
+        reported_s = next(
+            (s for s, event in device.events if event.is_fault and killed_s <= s <= received_s),
+            None,
         )
-        if told_s is None:
+        if reported_s is None:
             found.unnoticed += 1
         else:
-            found.noticed_s.append(told_s - killed_s)
-        excused.append((killed_s, max(heard_s, ready_s) + device.stated.noticed_s))
+            found.detected_s.append(reported_s - killed_s)
+        excused.append((killed_s, max(received_s, ready_s) + device.stated.detected_s))
     for at_s, event in device.events:
         if event.is_fault and not any(begin <= at_s <= end for begin, end in excused):
             found.disturbances.append(f"{event.name}: {event.sentence}")

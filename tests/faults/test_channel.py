@@ -5,31 +5,33 @@ from __future__ import annotations
 import pytest
 
 from sim_hw.faults.channel import BytesDamage, Channel
-from sim_hw.faults.plan import Planned
+from sim_hw.faults.plan import PlannedFault
 from sim_hw.world.world_clock import NS_PER_S, NS_PER_WEEK
 
 
 def channel(
     name: str, *, lasts_s: float | None = None, amount: float = 0.0, topic: str = ""
 ) -> Channel[bytes]:
-    made = Channel([Planned(name, "d", 2.0, None, lasts_s, amount, topic)], BytesDamage(), seed=1)
-    made.begin(0)
-    return made
+    faulty = Channel(
+        [PlannedFault(name, "d", 2.0, None, lasts_s, amount, topic)], BytesDamage(), seed=1
+    )
+    faulty.begin(0)
+    return faulty
 
 
-def said(made: Channel[bytes], seconds: int = 8) -> list[tuple[float, bytes]]:
+def delivered(faulty: Channel[bytes], seconds: int = 8) -> list[tuple[float, bytes]]:
     """One message a second, and when it goes out."""
     sent = []
     for second in range(seconds):
         sent += [
             (delivery.at_ns / NS_PER_S, delivery.message)
-            for delivery in made.send(b"message %d" % second, second * NS_PER_S)
+            for delivery in faulty.send(b"message %d" % second, second * NS_PER_S)
         ]
     return sent
 
 
-def numbers(made: Channel[bytes]) -> list[int]:
-    return [int(message.split()[1]) for _, message in said(made)]
+def numbers(faulty: Channel[bytes]) -> list[int]:
+    return [int(message.split()[1]) for _, message in delivered(faulty)]
 
 
 def test_without_a_duration_one_message_is_lost() -> None:
@@ -41,7 +43,7 @@ def test_with_a_duration_all_are_lost_as_long() -> None:
 
 
 def test_a_late_message_keeps_its_content_and_not_its_time() -> None:
-    assert said(channel("late", amount=2.5))[2] == (4.5, b"message 2")
+    assert delivered(channel("late", amount=2.5))[2] == (4.5, b"message 2")
 
 
 def test_a_duplicate_follows_its_original() -> None:
@@ -53,16 +55,16 @@ def test_a_reordered_message_comes_behind_the_next() -> None:
 
 
 def test_a_corrupt_message_has_its_length() -> None:
-    damaged = said(channel("corrupt"))[2][1]
+    damaged = delivered(channel("corrupt"))[2][1]
     assert len(damaged) == 9 and damaged != b"message 2"
 
 
 def test_a_truncated_message_breaks_off() -> None:
-    broken = said(channel("truncated"))[2][1]
+    broken = delivered(channel("truncated"))[2][1]
     assert b"message 2".startswith(broken) and len(broken) < 9
 
 
-def test_a_stuck_device_says_the_last_thing_again() -> None:
+def test_a_stuck_device_repeats_its_last_message() -> None:
     assert numbers(channel("stuck", lasts_s=3.0)) == [0, 1, 1, 1, 1, 5, 6, 7]
 
 
@@ -71,22 +73,22 @@ def test_an_older_message_is_sent_once() -> None:
 
 
 @pytest.mark.parametrize("name", ["silent", "cable-pulled", "power-cycle"])
-def test_nothing_is_said_for_a_while(name: str) -> None:
-    made = channel(name, lasts_s=3.0)
-    assert numbers(made) == [0, 1, 5, 6, 7]
-    assert {hit.fault for hit in made.hits} == {name}
+def test_a_silent_device_sends_nothing_for_a_while(name: str) -> None:
+    faulty = channel(name, lasts_s=3.0)
+    assert numbers(faulty) == [0, 1, 5, 6, 7]
+    assert {hit.fault for hit in faulty.occurrences} == {name}
 
 
 def test_power_comes_back_once() -> None:
-    made = channel("power-cycle", lasts_s=3.0)
-    assert [made.is_powered(s * NS_PER_S) for s in (1, 3, 6)] == [True, False, True]
-    back = [made.comes_back_from_power_off(s * NS_PER_S) for s in range(8)]
+    faulty = channel("power-cycle", lasts_s=3.0)
+    assert [faulty.is_powered(s * NS_PER_S) for s in (1, 3, 6)] == [True, False, True]
+    back = [faulty.has_power_cycled(s * NS_PER_S) for s in range(8)]
     assert back == [False] * 5 + [True, False, False]
 
 
 def test_a_counter_restarts_once_whatever_its_duration() -> None:
-    made = channel("counter-reset", lasts_s=5.0)
-    assert [made.counter_restarts(s * NS_PER_S) for s in range(5)] == [False] * 2 + [
+    faulty = channel("counter-reset", lasts_s=5.0)
+    assert [faulty.counter_restarts(s * NS_PER_S) for s in range(5)] == [False] * 2 + [
         True,
         False,
         False,
@@ -102,33 +104,33 @@ def test_clocks_step_drift_and_lose_weeks() -> None:
 
 
 def test_a_fault_of_marks_leaves_positions_alone() -> None:
-    made = channel("lost", topic="mark")
-    assert made.send(b"position", 3 * NS_PER_S, topic="navigation")
-    assert not made.send(b"mark", 3 * NS_PER_S, topic="mark")
-    assert made.send(b"mark", 4 * NS_PER_S, topic="mark")
+    faulty = channel("lost", topic="mark")
+    assert faulty.send(b"position", 3 * NS_PER_S, topic="navigation")
+    assert not faulty.send(b"mark", 3 * NS_PER_S, topic="mark")
+    assert faulty.send(b"mark", 4 * NS_PER_S, topic="mark")
 
 
 def test_silence_about_marks_leaves_positions_alone() -> None:
-    made = channel("silent", lasts_s=3.0, topic="mark")
-    assert not made.is_silent(3 * NS_PER_S)
-    assert not made.send(b"mark", 3 * NS_PER_S, topic="mark")
-    assert made.send(b"position", 3 * NS_PER_S, topic="navigation")
-    assert not made.send(b"mark", 4 * NS_PER_S, topic="mark")
-    assert made.send(b"mark", 5 * NS_PER_S, topic="mark")
-    assert {hit.fault for hit in made.hits} == {"silent"}
+    faulty = channel("silent", lasts_s=3.0, topic="mark")
+    assert not faulty.is_silent(3 * NS_PER_S)
+    assert not faulty.send(b"mark", 3 * NS_PER_S, topic="mark")
+    assert faulty.send(b"position", 3 * NS_PER_S, topic="navigation")
+    assert not faulty.send(b"mark", 4 * NS_PER_S, topic="mark")
+    assert faulty.send(b"mark", 5 * NS_PER_S, topic="mark")
+    assert {hit.fault for hit in faulty.occurrences} == {"silent"}
 
 
 def test_a_fault_that_waits_for_a_pulse_begins_with_it() -> None:
-    made = Channel([Planned("lost", "d", None, 3, None, 0.0)], BytesDamage(), seed=1)
-    made.begin(0)
+    faulty = Channel([PlannedFault("lost", "d", None, 3, None, 0.0)], BytesDamage(), seed=1)
+    faulty.begin(0)
     sent = []
     for count in range(1, 6):
-        made.pulse(count, count * NS_PER_S)
-        sent += [d.message for d in made.send(b"%d" % count, count * NS_PER_S)]
+        faulty.pulse(count, count * NS_PER_S)
+        sent += [d.message for d in faulty.send(b"%d" % count, count * NS_PER_S)]
     assert sent == [b"1", b"2", b"4", b"5"]
 
 
 def test_a_flood_comes_ten_times_a_second_while_it_lasts() -> None:
-    made = channel("flooding", lasts_s=3.0)
-    due = [t for t in range(0, 8 * NS_PER_S, 10_000_000) if made.flood_is_due(t)]
+    faulty = channel("flooding", lasts_s=3.0)
+    due = [t for t in range(0, 8 * NS_PER_S, 10_000_000) if faulty.flood_is_due(t)]
     assert len(due) == 30 and due[0] == 2 * NS_PER_S

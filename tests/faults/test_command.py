@@ -9,7 +9,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 
 
-def test_an_emulated_rig_with_impossible_faults_tells_all_of_them_and_does_not_start(
+def test_an_emulated_rig_with_impossible_faults_lists_all_of_them_and_does_not_start(
     tmp_path: Path,
 ) -> None:
     scenario = tmp_path / "night.toml"
@@ -34,13 +34,13 @@ def test_an_emulated_rig_with_impossible_faults_tells_all_of_them_and_does_not_s
     assert done.stdout == ""
 
 
-def test_a_lone_device_refuses_a_fault_it_cannot_have(tmp_path: Path) -> None:
+def test_a_single_device_refuses_a_fault_it_cannot_have(tmp_path: Path) -> None:
     done = subprocess.run(
         [
             *(
                 sys.executable,
                 "-m",
-                "sim_hw.processes.lone",
+                "sim_hw.processes.single_device",
                 "modbus",
                 "--at",
                 str(tmp_path / "port"),

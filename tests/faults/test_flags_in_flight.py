@@ -13,7 +13,7 @@ from benchmarks.pairing import SMALL_RIG, shortcomings
 from daemon.configuration.model import LimitsSection
 from daemon.onboard.pipeline.worker import report_unprocessed
 from processing.quality.report import Flag
-from sim_hw.faults.plan import Planned
+from sim_hw.faults.plan import PlannedFault
 
 EXPOSURES = 30
 STORED_WITHIN_S, LATE_S = 2.0, 2.5
@@ -22,14 +22,16 @@ STORED_WITHIN_S, LATE_S = 2.0, 2.5
 NO_IMAGE = Flag.SIMULATED | Flag.NOT_PROCESSED
 
 
-def hit(fault: str, device: str, pulse: int, amount: float = 0.0) -> Planned:
+def hit(fault: str, device: str, pulse: int, amount: float = 0.0) -> PlannedFault:
     name, _, topic = device.partition("/")
-    return Planned(fault, name, None, pulse, None, amount, topic)
+    return PlannedFault(fault, name, None, pulse, None, amount, topic)
 
 
-def lasting(fault: str, device: str, at_s: float, for_s: float, amount: float = 0.0) -> Planned:
+def lasting(
+    fault: str, device: str, at_s: float, for_s: float, amount: float = 0.0
+) -> PlannedFault:
     name, _, topic = device.partition("/")
-    return Planned(fault, name, at_s, None, for_s, amount, topic)
+    return PlannedFault(fault, name, at_s, None, for_s, amount, topic)
 
 
 FAULTS = (

@@ -13,9 +13,9 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.contract import CHUNK_ALLOWANCE_NBYTES, DeviceEvent, Frame, FrameStatus, Record
-from sim_hw.faults.plan import Planned
-from sim_hw.gige.head import ExposureRequest, FrameSize, GigeHead, HeadIdentity, WireFaults
-from sim_hw.world.world_clock import DeviceClock
+from sim_hw.faults.plan import PlannedFault
+from sim_hw.gige.gige_head import ExposureRequest, FrameSize, GigeHead, HeadIdentity, WireFaults
+from sim_hw.world.world_clock import FreeRunningClock
 
 pytest.importorskip("gi", reason="needs PyGObject (extra aravis)")
 pytestmark = pytest.mark.timeout(240)
@@ -52,7 +52,7 @@ class Host:
     """The driver in its thread, and what it yielded: frames with the pulse of their pixels."""
 
     def __init__(self) -> None:
-        from drivers.cameras.aravis.head import AravisHead
+        from drivers.cameras.aravis.aravis_head import AravisHead
 
         self.memory = Memory()
         self.driver = AravisHead(
@@ -88,13 +88,13 @@ class Host:
 
 
 @contextmanager
-def flying(*planned: Planned) -> Iterator[tuple[GigeHead, Host]]:
+def flying(*planned: PlannedFault) -> Iterator[tuple[GigeHead, Host]]:
     head = GigeHead(
         HeadIdentity(ADDRESS, "faulty-1", "test", "Syntopic emulator", "SU00"),
         FrameSize(WIDTH_PX, HEIGHT_PX),
         expose,
         lambda _: 30.0,
-        DeviceClock(),
+        FreeRunningClock(),
         faults=WireFaults(planned=planned),
     )
     head.start()
@@ -114,8 +114,8 @@ def flying(*planned: Planned) -> Iterator[tuple[GigeHead, Host]]:
         head.close()
 
 
-def at_pulse(name: str, pulse: int, amount: float = 0.0) -> Planned:
-    return Planned(name, "SU00", None, pulse, None, amount)
+def at_pulse(name: str, pulse: int, amount: float = 0.0) -> PlannedFault:
+    return PlannedFault(name, "SU00", None, pulse, None, amount)
 
 
 def test_each_fault_of_a_frame_is_seen_as_what_it_is_and_touches_no_other() -> None:
@@ -137,15 +137,15 @@ def test_each_fault_of_a_frame_is_seen_as_what_it_is_and_touches_no_other() -> N
             time.sleep(0.1)
         assert host.wait(lambda: len(host.frames) >= 19), "one is lost, one comes twice"
         frames = host.frames
-    whole = [(pulse, f) for pulse, f in frames if f.status is FrameStatus.COMPLETE]
+    complete = [(pulse, f) for pulse, f in frames if f.status is FrameStatus.COMPLETE]
     others = [f.status for _, f in frames if f.status is not FrameStatus.COMPLETE]
     assert others.count(FrameStatus.INCOMPLETE) == 1, "half a frame"
     assert others.count(FrameStatus.CORRUPT) == 1, "a frame of another size"
-    pulses = [pulse for pulse, _ in whole]
+    pulses = [pulse for pulse, _ in complete]
     assert sorted(pulses) == sorted([*(set(range(1, 20)) - {3, 5, 7, 9}), 4, 11])
-    older = [f for pulse, f in whole if pulse == 4]
+    older = [f for pulse, f in complete if pulse == 4]
     assert older[0].device_ns == older[1].device_ns and older[0].counter == older[1].counter
-    by_pulse = dict(whole)
+    by_pulse = dict(complete)
     assert by_pulse[12].counter == 12 and by_pulse[14].counter == 2
     before, after = by_pulse[14].device_ns, by_pulse[16].device_ns
     assert before is not None and after is not None
@@ -154,7 +154,7 @@ def test_each_fault_of_a_frame_is_seen_as_what_it_is_and_touches_no_other() -> N
 
 @pytest.mark.parametrize(("name", "lasts_s"), [("cable-pulled", 4.0), ("power-cycle", 4.0)])
 def test_a_head_that_goes_away_is_lost_and_back_by_itself(name: str, lasts_s: float) -> None:
-    with flying(Planned(name, "SU00", 0.5, None, lasts_s, 0.0)) as (head, host):
+    with flying(PlannedFault(name, "SU00", 0.5, None, lasts_s, 0.0)) as (head, host):
         assert host.wait(lambda: host.named("lost") >= 1)
         assert host.wait(lambda: host.named("opened") >= 2)
         deadline = time.monotonic() + WITHIN_S

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tests.faults.hostile import PARSERS, Mutator, Parser, kept_nbytes
+from tests.faults.hostile_parsers import PARSERS, Mutator, Parser, retained_nbytes
 
 MESSAGES = 1_000_000
 SOAK_MESSAGES = 10_000_000
@@ -28,19 +28,19 @@ GROWTH_NBYTES = 60_000
 pytestmark = pytest.mark.timeout(1200)
 
 
-def pieces(data: bytes, chance: random.Random) -> Iterator[bytes]:
+def pieces(data: bytes, rng: random.Random) -> Iterator[bytes]:
     """As it may arrive: cut anywhere."""
     at = 0
     while at < len(data):
-        size = chance.randint(*PIECE_NBYTES)
+        size = rng.randint(*PIECE_NBYTES)
         yield data[at : at + size]
         at += size
 
 
 def survive(parser: Parser, seed: int, count: int) -> None:
     """Feed a batch of spoilt messages with genuine ones between, which are to be understood."""
-    chance = random.Random(seed)
-    spoilt = Mutator(parser.genuine, parser.reseal, chance).messages(count)
+    rng = random.Random(seed)
+    spoilt = Mutator(parser.genuine, parser.reseal, rng).messages(count)
     if parser.answers_only:
         for message in spoilt:
             parser.feed(message)
@@ -51,10 +51,10 @@ def survive(parser: Parser, seed: int, count: int) -> None:
     genuine = parser.genuine
     for _ in range(count // GROUP):
         data = b"".join(next(spoilt) for _ in range(GROUP))
-        for piece in pieces(data, chance):
+        for piece in pieces(data, rng):
             parser.feed(piece)
         # The first may fall victim to what the last damaged message promised; no other may.
-        first = chance.randrange(len(genuine))
+        first = rng.randrange(len(genuine))
         parser.feed(genuine[first])
         before = parser.understood()
         for number in range(1, FOLLOWING + 1):
@@ -72,7 +72,7 @@ def run(name: str, total: int) -> None:
         pytest.importorskip("pymavlink", reason="pymavlink is absent; pip install it")
     parser = PARSERS[name]()
     survive(parser, 0, BATCH)
-    kept = kept_nbytes(parser.state)
+    retained = retained_nbytes(parser.state)
     seeds = iter(range(1, 1 << 60))
 
     @settings(
@@ -87,7 +87,9 @@ def run(name: str, total: int) -> None:
         survive(parser, seed ^ next(seeds), BATCH)
 
     batches()
-    assert kept_nbytes(parser.state) < kept + GROWTH_NBYTES, "what a parser keeps is bounded"
+    assert retained_nbytes(parser.state) < retained + GROWTH_NBYTES, (
+        "what a parser keeps is bounded"
+    )
 
 
 def test_the_shares_of_all_parsers_are_the_whole() -> None:

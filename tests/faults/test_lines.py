@@ -11,30 +11,30 @@ import pytest
 import serial
 from pyubx2 import UBX_PROTOCOL, UBXReader
 
+from sim_hw.devices.device_loop import LineDevice
 from sim_hw.devices.modbus_probe import ModbusProbe
 from sim_hw.devices.pseudo_terminal import PseudoTerminal
-from sim_hw.devices.serving import LineDevice
 from sim_hw.faults.channel import BytesDamage, Channel
-from sim_hw.faults.plan import Planned
-from sim_hw.faults.wire import FaultyWire, FaultyWorldClock
-from sim_hw.receivers.receiver import ReceiverState
+from sim_hw.faults.faulty_line import FaultyWire, FaultyWorldClock
+from sim_hw.faults.plan import PlannedFault
+from sim_hw.receivers.emulated_receiver import ReceiverState
 from sim_hw.receivers.ublox_receiver import UbloxReceiver
 from sim_hw.world.world_clock import NS_PER_WEEK, WorldClock
 
 WITHIN_S = 20.0
 STATE = ReceiverState(48.0, 11.0, 500.0, (60.0, 0.0, 0.0), 0.0, 0.0, 0.0)
-ASKED = bytes.fromhex("01 04 00 00 00 01 31 ca")
+POLL_REQUEST = bytes.fromhex("01 04 00 00 00 01 31 ca")
 
 
-def planned(name: str, at_s: float, lasts_s: float | None = None, **more: object) -> Planned:
+def planned(name: str, at_s: float, lasts_s: float | None = None, **more: object) -> PlannedFault:
     amount = more.get("amount", 0.0)
     assert isinstance(amount, float)
-    return Planned(name, "d", at_s, None, lasts_s, amount, str(more.get("topic", "")))
+    return PlannedFault(name, "d", at_s, None, lasts_s, amount, str(more.get("topic", "")))
 
 
 @contextmanager
 def started(device: LineDevice, channel: Channel[bytes], line: PseudoTerminal) -> Iterator[None]:
-    device.wire = FaultyWire(device, channel, line)
+    device.byte_filter = FaultyWire(device, channel, line)
     channel.begin(time.monotonic_ns())
     device.start()
     try:
@@ -45,17 +45,17 @@ def started(device: LineDevice, channel: Channel[bytes], line: PseudoTerminal) -
 
 @contextmanager
 def receiver(
-    link: Path, *faults: Planned, rate_hz: float = 20.0
+    link: Path, *faults: PlannedFault, rate_hz: float = 20.0
 ) -> Iterator[tuple[UbloxReceiver, Channel[bytes]]]:
     channel = Channel(faults, BytesDamage(), seed=1)
-    clock = FaultyWorldClock(WorldClock.starting_now(), channel)
+    clock = FaultyWorldClock(WorldClock.from_wall_clock(), channel)
     line = PseudoTerminal(link)
-    made = UbloxReceiver(clock, lambda _: STATE, rate_hz=rate_hz, chatter=False, line=line)
-    with started(made, channel, line):
-        yield made, channel
+    emulated = UbloxReceiver(clock, lambda _: STATE, rate_hz=rate_hz, chatter=False, line=line)
+    with started(emulated, channel, line):
+        yield emulated, channel
 
 
-def heard(port: str, enough: Callable[[bytes], bool]) -> bytes:
+def read_until(port: str, enough: Callable[[bytes], bool]) -> bytes:
     """Read until there is enough."""
     data = b""
     deadline = time.monotonic() + WITHIN_S
@@ -88,32 +88,35 @@ def test_a_pulled_cable_takes_the_port_away_and_brings_it_back(tmp_path: Path) -
         while not link.exists():
             assert time.monotonic() < deadline
             time.sleep(0.02)
-        assert b"\xb5\x62" in heard(str(link), lambda data: len(data) > 500)
+        assert b"\xb5\x62" in read_until(str(link), lambda data: len(data) > 500)
 
 
 def test_a_mark_is_lost_alone(tmp_path: Path) -> None:
     link = tmp_path / "gnss"
-    with receiver(link, planned("lost", 0.0, topic="mark")) as (made, _):
+    with receiver(link, planned("lost", 0.0, topic="mark")) as (emulated, _):
 
         def three(data: bytes) -> bool:
-            if not made.counts["marks"] or data.count(b"\xb5\x62\x01\x07") > made.counts["marks"]:
-                made.mark(made.clock.gps_ns(time.monotonic_ns()))
+            if (
+                not emulated.counts["marks"]
+                or data.count(b"\xb5\x62\x01\x07") > emulated.counts["marks"]
+            ):
+                emulated.mark(emulated.clock.gps_ns(time.monotonic_ns()))
             return data.count(b"\xb5\x62\x0d\x03") >= 3
 
-        data = heard(str(link), three)
+        data = read_until(str(link), three)
     counts = [message.count for message in messages(data, "TIM-TM2")]
     assert counts == list(range(counts[0], counts[0] + len(counts))) and counts[0] >= 2
 
 
-def test_a_wrong_week_is_said_and_then_right_again(tmp_path: Path) -> None:
+def test_a_wrong_week_is_sent_and_then_the_right_one_again(tmp_path: Path) -> None:
     link = tmp_path / "gnss"
-    with receiver(link, planned("wrong-week", 0.5, 1.0, amount=-1024.0)) as (made, _):
-        week = made.clock.gps_ns(time.monotonic_ns()) // NS_PER_WEEK
+    with receiver(link, planned("wrong-week", 0.5, 1.0, amount=-1024.0)) as (emulated, _):
+        week = emulated.clock.gps_ns(time.monotonic_ns()) // NS_PER_WEEK
 
         def weeks(data: bytes) -> list[int]:
             return [m.week for m in messages(data, "NAV-TIMEGPS")]
 
-        data = heard(
+        data = read_until(
             str(link),
             lambda data: (
                 len(data) > 2000
@@ -128,17 +131,17 @@ def test_power_off_and_on_starts_the_count_again(tmp_path: Path) -> None:
     link = tmp_path / "gnss"
     channel = Channel([planned("power-cycle", 0.3, 0.3)], BytesDamage(), seed=1)
     line = PseudoTerminal(link)
-    made = UbloxReceiver(
-        WorldClock.starting_now(),
+    emulated = UbloxReceiver(
+        WorldClock.from_wall_clock(),
         lambda _: STATE,
         rate_hz=20.0,
         chatter=False,
         first_edge_count=700,
         line=line,
     )
-    with started(made, channel, line):
+    with started(emulated, channel, line):
         deadline = time.monotonic() + WITHIN_S
-        while not channel.hits:
+        while not channel.occurrences:
             assert time.monotonic() < deadline
             time.sleep(0.02)
         while not link.exists():
@@ -146,11 +149,11 @@ def test_power_off_and_on_starts_the_count_again(tmp_path: Path) -> None:
             time.sleep(0.02)
 
         def marked(data: bytes) -> bool:
-            if data and not made.counts["marks"]:
-                made.mark(made.clock.gps_ns(time.monotonic_ns()))
+            if data and not emulated.counts["marks"]:
+                emulated.mark(emulated.clock.gps_ns(time.monotonic_ns()))
             return b"\xb5\x62\x0d\x03" in data and data.count(b"\xb5\x62\x01\x07") > 3
 
-        data = heard(str(link), marked)
+        data = read_until(str(link), marked)
     assert [m.count for m in messages(data, "TIM-TM2")] == [1]
 
 
@@ -159,10 +162,10 @@ def test_a_late_answer_of_a_probe_comes_all_the_same(tmp_path: Path) -> None:
     line = PseudoTerminal(tmp_path / "probes")
     probe = ModbusProbe([lambda: 21.5], line=line)
     with started(probe, channel, line), serial.Serial(probe.port, timeout=WITHIN_S) as host:
-        asked_s = time.monotonic()
-        host.write(ASKED)
+        polled_s = time.monotonic()
+        host.write(POLL_REQUEST)
         assert len(host.read(7)) == 7
-        assert time.monotonic() - asked_s > 0.5
+        assert time.monotonic() - polled_s > 0.5
 
 
 @pytest.mark.parametrize("name", ["corrupt", "truncated", "lost"])
@@ -170,12 +173,12 @@ def test_a_damaged_answer_is_followed_by_a_good_one(tmp_path: Path, name: str) -
     channel = Channel([planned(name, 0.0)], BytesDamage(), seed=2)
     line = PseudoTerminal(tmp_path / "probes")
     probe = ModbusProbe([lambda: 21.5], line=line)
-    good = probe.answer(ASKED)
+    good = probe.answer(POLL_REQUEST)
     with started(probe, channel, line), serial.Serial(probe.port, timeout=0.5) as host:
-        host.write(ASKED)
+        host.write(POLL_REQUEST)
         assert host.read(7) != good
         host.reset_input_buffer()
-        host.write(ASKED)
+        host.write(POLL_REQUEST)
         assert host.read(7) == good
 
 
@@ -184,4 +187,4 @@ def test_a_flood_is_noise_between_answers(tmp_path: Path) -> None:
     line = PseudoTerminal(tmp_path / "probes")
     probe = ModbusProbe([lambda: 21.5], line=line)
     with started(probe, channel, line):
-        assert len(heard(probe.port, lambda data: len(data) > 10_000)) > 10_000
+        assert len(read_until(probe.port, lambda data: len(data) > 10_000)) > 10_000

@@ -18,15 +18,15 @@ SINGLE = [
 def test_without_a_fault_everything_is_matched() -> None:
     score = fly(Case("none", "", ()), 300, seed=1)
     assert not shortcomings(score)
-    assert score.frames_right == score.frames_came == 300 * 13
-    assert score.marks_right == score.marks_came == score.untouched_matched == 300
+    assert score.frames_right == score.frames_received == 300 * 13
+    assert score.marks_right == score.marks_received == score.untouched_matched == 300
 
 
 @pytest.mark.parametrize("case", SINGLE)
 def test_under_a_single_fault_what_it_does_not_touch_is_matched(case: Case) -> None:
     score = fly(case, EACH, seed=1, rig_name=SMALL_RIG)
     assert not shortcomings(score), score.examples
-    assert score.hits and score.untouched > EACH // 2
+    assert score.occurrences and score.untouched > EACH // 2
 
 
 def test_under_many_faults_nothing_is_paired_wrongly_and_what_can_be_is_paired() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from sim_hw.faults.catalogue import CATALOGUE, HEAD, RECEIVER, THERMOMETER, TRIGGER, DeviceKind
-from sim_hw.faults.plan import FaultPlanError, Planned, read_plan
+from sim_hw.faults.plan import FaultPlanError, PlannedFault, read_plan
 
 DEVICES: dict[str, DeviceKind] = {
     "SU00": HEAD,
@@ -28,12 +28,12 @@ def test_every_fault_has_its_name() -> None:
 
 def test_a_fault_is_written_as_name_time_device_and_duration() -> None:
     (fault,) = read_plan(["silent@12.5:SU01,4"], None, DEVICES)
-    assert fault == Planned("silent", "SU01", 12.5, None, 4.0, 0.0)
+    assert fault == PlannedFault("silent", "SU01", 12.5, None, 4.0, 0.0)
 
 
 def test_a_fault_may_begin_with_a_pulse_and_hit_one_kind_of_message() -> None:
     (fault,) = read_plan(["lost@#3:receiver/mark"], None, DEVICES)
-    assert fault == Planned("lost", "receiver", None, 3, None, 0.0, "mark")
+    assert fault == PlannedFault("lost", "receiver", None, 3, None, 0.0, "mark")
 
 
 def test_without_a_device_all_that_can_have_it_do() -> None:
@@ -42,18 +42,18 @@ def test_without_a_device_all_that_can_have_it_do() -> None:
     assert [f.device for f in read_plan(["open-sensor@1"], None, DEVICES)] == ["probes"]
 
 
-def test_a_scenario_says_more(tmp_path: Path) -> None:
+def test_a_scenario_adds_to_the_plan(tmp_path: Path) -> None:
     scenario = tmp_path / "night.toml"
     scenario.write_text(
         '[[fault]]\nfault = "late"\nat_s = 3\nby_s = 0.7\ndevice = "receiver/mark"\n'
         '[[fault]]\nfault = "wrong-week"\nat_pulse = 9\nduration_s = 30.0\nweeks = 1\n'
     )
     late, week = read_plan([], scenario, DEVICES)
-    assert late == Planned("late", "receiver", 3, None, None, 0.7, "mark")
-    assert week == Planned("wrong-week", "receiver", None, 9, 30.0, 1.0)
+    assert late == PlannedFault("late", "receiver", 3, None, None, 0.7, "mark")
+    assert week == PlannedFault("wrong-week", "receiver", None, 9, 30.0, 1.0)
 
 
-def test_all_mistakes_are_told_at_once_each_with_its_cure(tmp_path: Path) -> None:
+def test_all_mistakes_are_reported_together_each_with_its_cure(tmp_path: Path) -> None:
     scenario = tmp_path / "wrong.toml"
     scenario.write_text(
         "colour = 1\n"
@@ -96,14 +96,14 @@ def test_all_mistakes_are_told_at_once_each_with_its_cure(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "expected"),
     [("", "there is no [[fault]]"), ("fault = 3", "there is no [[fault]]"), ("[[", "not valid")],
 )
-def test_a_file_that_is_no_scenario_is_refused(tmp_path: Path, content: str, told: str) -> None:
+def test_a_file_that_is_no_scenario_is_refused(tmp_path: Path, content: str, expected: str) -> None:
     scenario = tmp_path / "s.toml"
     scenario.write_text(content)
     with pytest.raises(FaultPlanError, match=r"s\.toml") as caught:
         read_plan([], scenario, DEVICES)
-    assert told in str(caught.value)
+    assert expected in str(caught.value)
     with pytest.raises(FaultPlanError, match="cannot be read"):
         read_plan([], tmp_path / "none.toml", DEVICES)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.faults.restarts import (
-    NURSERY,
+    SPAWNER,
     descriptors,
     figures,
     kill_at_random,
@@ -26,37 +26,39 @@ MARGIN_S = 6.0
 
 
 def fly(folder: Path, lasts_s: float, seed: int) -> None:
-    NURSERY.submit(int).result()
+    SPAWNER.submit(int).result()
     threads_before = threading.active_count()
-    with running(folder) as made:
-        wait_until_all_speak(made, 120.0)
-        settled = (threading.active_count(), descriptors())
-        kills = kill_at_random(made, lasts_s, seed)
-        back_s = wait_until_all_speak(made, 120.0)
-        found = {device.name: figures(device) for device in made}
-        for device in made:
+    with running(folder) as started_devices:
+        wait_until_all_speak(started_devices, 120.0)
+        baseline = (threading.active_count(), descriptors())
+        kills = kill_at_random(started_devices, lasts_s, seed)
+        back_s = wait_until_all_speak(started_devices, 120.0)
+        found = {device.name: figures(device) for device in started_devices}
+        for device in started_devices:
             print(found[device.name].row(device), f"unnoticed {found[device.name].unnoticed}")
             for sentence in found[device.name].disturbances:
                 print("   ", sentence)
         deadline = time.monotonic() + 30
-        while (threading.active_count(), descriptors()) != settled:
+        while (threading.active_count(), descriptors()) != baseline:
             assert time.monotonic() < deadline, (
                 f"threads and descriptors {(threading.active_count(), descriptors())}, "
-                f"at first {settled}"
+                f"at first {baseline}"
             )
             time.sleep(0.2)
-        print(f"{kills} kills, all back after {back_s:.1f} s, {settled} threads and descriptors")
-        assert kills >= len(made), "every device was killed"
-        for device in made:
+        print(f"{kills} kills, all back after {back_s:.1f} s, {baseline} threads and descriptors")
+        assert kills >= len(started_devices), "every device was killed"
+        for device in started_devices:
             seen = found[device.name]
             assert not seen.disturbances, device.name
-            assert max(seen.noticed_s, default=0.0) < device.stated.noticed_s + MARGIN_S
+            assert max(seen.detected_s, default=0.0) < device.stated.detected_s + MARGIN_S
             assert max(seen.back_s) < device.stated.back_s + MARGIN_S, device.name
             for down, up in device.down:
                 # A death that lasts longer than what is stated does not pass unnoticed.
-                is_long = up - down > device.stated.noticed_s + MARGIN_S
-                told = [s for s, e in device.events if e.is_fault and down <= s <= up + MARGIN_S]
-                assert told or not is_long
+                is_long = up - down > device.stated.detected_s + MARGIN_S
+                reported = [
+                    s for s, e in device.events if e.is_fault and down <= s <= up + MARGIN_S
+                ]
+                assert reported or not is_long
     deadline = time.monotonic() + 30
     while threading.active_count() > threads_before:
         assert time.monotonic() < deadline, threading.enumerate()

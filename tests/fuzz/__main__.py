@@ -2,7 +2,7 @@
 
 With atheris (requirements-fuzz.lock, Apache-2.0) it is guided by coverage, without it inputs
 are mutated blindly. A crash is printed with the input as hexadecimal, and the exit status is 1.
-`--keep` adds what reached new code to the committed corpus, minimised. `--quiet-minutes 30` goes
+`--save` adds what reached new code to the committed corpus, minimised. `--quiet-minutes 30` goes
 round the parsers in pieces of `--seconds`, until each has run so many CPU minutes without a new
 edge; it can be ended at any time and goes on where it was, by the record in the folder `--work`.
 """
@@ -34,7 +34,7 @@ def main() -> int:
     arguments = argparse.ArgumentParser(description=__doc__)
     arguments.add_argument("parser", choices=[*TARGETS, "all"])
     arguments.add_argument("--seconds", type=float, default=60.0)
-    arguments.add_argument("--keep", action="store_true")
+    arguments.add_argument("--save", action="store_true")
     arguments.add_argument("--work", type=Path, help="Where inputs are kept between runs.")
     arguments.add_argument(
         "--quiet-minutes", type=float,
@@ -61,7 +61,7 @@ def _fuzz(name: str, given: argparse.Namespace) -> bool:
     piece = guided_piece(name, work, given.seconds)
     if not piece.is_well:
         return False
-    if given.keep:
+    if given.save:
         merged = work / f"{name}.merged"
         shutil.rmtree(merged, ignore_errors=True)
         merged.mkdir()
@@ -106,13 +106,15 @@ def guided_piece(name: str, work: Path, seconds: float) -> Piece:
         )  # fmt: skip
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     crashes = [path for kind in ("crash", "timeout", "oom") for path in inputs.glob(f"{kind}-*")]
-    said = done.stderr.splitlines()
-    print(name, *[line for line in said if "DONE" in line or "Done " in line][-2:], sep="  ")
+    stderr_lines = done.stderr.splitlines()
+    print(
+        name, *[line for line in stderr_lines if "DONE" in line or "Done " in line][-2:], sep="  "
+    )
     is_well = not crashes and not done.returncode
     if not is_well:
         print(
             f"{name}: status {done.returncode}\n"
-            + "\n".join((done.stdout.splitlines() + said)[-25:])
+            + "\n".join((done.stdout.splitlines() + stderr_lines)[-25:])
         )
         for path in crashes:
             print(f"{name}: {path}: {path.read_bytes()[:2000].hex()}")
@@ -163,25 +165,25 @@ def blind(name: str, seconds: float) -> bool:
     return True
 
 
-def mutations(seeds: tuple[bytes, ...], chance: random.Random) -> Iterator[bytes]:
+def mutations(seeds: tuple[bytes, ...], rng: random.Random) -> Iterator[bytes]:
     """Spoilt seeds, without end."""
-    words = [b"\xff" * 4, b"\0" * 4, b"\xff" * 8, b"\x7f", *b'1e999 -1 NaN " [ {'.split()]
+    tokens = [b"\xff" * 4, b"\0" * 4, b"\xff" * 8, b"\x7f", *b'1e999 -1 NaN " [ {'.split()]
     while True:
-        data = bytearray(chance.choice(seeds))
-        for _ in range(chance.randint(1, 4)):
-            at = chance.randrange(len(data) + 1)
-            kind = chance.randrange(5)
+        data = bytearray(rng.choice(seeds))
+        for _ in range(rng.randint(1, 4)):
+            at = rng.randrange(len(data) + 1)
+            kind = rng.randrange(5)
             if kind == 0:
-                del data[at : at + chance.randint(1, 16)]
+                del data[at : at + rng.randint(1, 16)]
             elif kind == 1:
-                data[at:at] = chance.choice(words)
+                data[at:at] = rng.choice(tokens)
             elif kind == 2:
-                data[at : at + 4] = chance.choice(words)
+                data[at : at + 4] = rng.choice(tokens)
             elif kind == 3:
-                other = chance.choice(seeds)
-                data[at:] = other[chance.randrange(len(other) + 1) :]
+                other = rng.choice(seeds)
+                data[at:] = other[rng.randrange(len(other) + 1) :]
             else:
-                data[at : at + 1] = bytes([chance.randrange(256)])
+                data[at : at + 1] = bytes([rng.randrange(256)])
         yield bytes(data[:INPUT_MAX_SIZE])
 
 

@@ -65,10 +65,10 @@ def begun(cpu_s: float) -> str:
     return f"begun after {cpu_s:.3f} s of CPU"
 
 
-def piece_of(said: str, cpu_s: float, *, is_well: bool) -> Piece:
+def piece_of(output: str, cpu_s: float, *, is_well: bool) -> Piece:
     """What the fuzzer said of a run that took `cpu_s` in all."""
-    counted = [(int(number), int(edges)) for number, edges in _LINE.findall(said)]
-    start = _BEGUN.search(said)
+    counted = [(int(number), int(edges)) for number, edges in _LINE.findall(output)]
+    start = _BEGUN.search(output)
     return Piece(
         cpu_s=max(0.0, cpu_s - float(start[1])) if start else 0.0,
         executions=max((number for number, _ in counted), default=0),
@@ -114,8 +114,8 @@ def until_quiet(
             if not piece.is_well or not piece.cpu_s:
                 failed.add(name)
             write(work, known)
-            told = known[name]
-            print(f"{name}: {told.edges} edges, quiet for {told.quiet_cpu_s:.0f} s", flush=True)
+            state = known[name]
+            print(f"{name}: {state.edges} edges, quiet for {state.quiet_cpu_s:.0f} s", flush=True)
     print(f"{len(names) - len(failed)} of {len(names)} without a crash", *sorted(failed))
     return 1 if failed else 0
 

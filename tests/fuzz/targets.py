@@ -69,7 +69,7 @@ def _line(name: str, start: tuple[float, float]) -> dict[str, object]:
 
 
 def plan_geojson() -> Target:
-    from daemon.planning.reading import PlanError, plan_from_bytes
+    from daemon.planning.plan_readers import PlanError, plan_from_bytes
 
     place = {"type": "Point", "coordinates": [15.001, 47.0]}
     content = {
@@ -85,7 +85,7 @@ def plan_geojson() -> Target:
 
 
 def plan_kml() -> Target:
-    from daemon.planning.reading import PlanError, plan_from_bytes
+    from daemon.planning.plan_readers import PlanError, plan_from_bytes
 
     text = (
         '<?xml version="1.0"?><kml xmlns="http://www.opengis.net/kml/2.2"><Document><Placemark>'
@@ -97,7 +97,7 @@ def plan_kml() -> Target:
 
 
 def plan_qgroundcontrol() -> Target:
-    from daemon.planning.reading import PlanError, plan_from_bytes
+    from daemon.planning.plan_readers import PlanError, plan_from_bytes
 
     items = [
         {"command": 16, "params": [0, 0, 0, None, 47.0, 15.4, 100]},
@@ -159,8 +159,8 @@ def tokens() -> Target:
 
 
 def exposure_record() -> Target:
+    from daemon.mission.canonical_json import RecordError, parse_record
     from daemon.mission.exposure import capture_bytes, capture_from_json, exposure_bytes, from_json
-    from daemon.mission.records import RecordError, parse_record
     from tests.daemon.small_camera import capture_of, final_record
 
     def parse(data: bytes) -> object:
@@ -175,7 +175,7 @@ def exposure_record() -> Target:
 
 
 def quality_report() -> Target:
-    from daemon.mission.records import RecordError
+    from daemon.mission.canonical_json import RecordError
     from daemon.mission.store.level2 import read_report
     from processing.quality import valid_area
 
@@ -193,7 +193,7 @@ def quality_report() -> Target:
 
 
 def stitch_record() -> Target:
-    from daemon.mission.records import RecordError, parse_record
+    from daemon.mission.canonical_json import RecordError, parse_record
     from processing.mosaic.stitch_record import StitchRecordError, stitch_record_from_json
 
     return Target(
@@ -289,7 +289,7 @@ def folder_frame() -> Target:
     from drivers.cameras.folder.frames import FrameFileError, read_frame
 
     return Target(
-        lambda data: read_frame(_file("a.tif", data), room_nbytes=1_000_000),
+        lambda data: read_frame(_file("a.tif", data), max_nbytes=1_000_000),
         (FrameFileError,),
         _tiffs(),
     )
@@ -401,7 +401,7 @@ def xmp() -> Target:
 
 
 def dbat_script() -> Target:
-    from daemon.postflight.adjustment.tables import ProjectError
+    from daemon.postflight.adjustment.csv_tables import ProjectError
     from daemon.postflight.importers.dbat import import_dbat
 
     seed = (
@@ -418,15 +418,15 @@ def dbat_script() -> Target:
 
 
 def adjustment_project() -> Target:
+    from daemon.postflight.adjustment.csv_tables import ProjectError
     from daemon.postflight.adjustment.project_file import read_project_file
-    from daemon.postflight.adjustment.tables import ProjectError
 
     seed = b'format = 1\nname = "n"\n[[camera]]\nname = "c"\nf_mm = 50\nfree = ["k1"]\n'
     return Target(lambda data: read_project_file(_file("p.toml", data)), (ProjectError,), (seed,))
 
 
 def adjustment_table() -> Target:
-    from daemon.postflight.adjustment.tables import ProjectError, read_table
+    from daemon.postflight.adjustment.csv_tables import ProjectError, read_table
 
     def parse(data: bytes) -> object:
         return read_table(_file("t.csv", data), ("point",), ("x_m",)).numbers("x_m")
@@ -435,7 +435,7 @@ def adjustment_table() -> Target:
 
 
 def laboratory_series() -> Target:
-    from daemon.postflight.calibration.laboratory.series import SeriesError, read_series
+    from daemon.postflight.calibration.laboratory.laboratory_series import SeriesError, read_series
     from processing.rig import RigError, shipped_rigs
 
     def parse(data: bytes) -> object:
@@ -477,12 +477,12 @@ def catalog() -> Target:
 def telemetry() -> Target:
     import msgpack
 
-    from daemon.onboard.monitoring.mavlink.datagrams import VERSION, Received
+    from daemon.onboard.monitoring.mavlink.datagrams import VERSION, DatagramReceiver
 
     def parse(data: bytes) -> object:
-        received = Received()
-        received.take(data)
-        received.take(data[::-1])
+        received = DatagramReceiver()
+        received.receive(data)
+        received.receive(data[::-1])
         return [received.thumbnail(number) for number in list(received._pieces)]
 
     def seed(kind: str, **content: object) -> bytes:
@@ -502,14 +502,14 @@ def monitor() -> Target:
     import msgpack
     from rich.console import Console
 
-    from daemon.cli.monitor import MonitorError, _Seen
-    from daemon.onboard.monitoring.client.client import _record
+    from daemon.cli.monitor import MonitorError, _MonitorState
+    from daemon.onboard.monitoring.client.telemetry_client import _record
 
     console = Console(file=io.StringIO(), width=100)
 
     def parse(data: bytes) -> object:
-        seen = _Seen()
-        seen.take(_record(data))
+        seen = _MonitorState()
+        seen.receive(_record(data))
         console.print(seen.drawn("127.0.0.1:8000"))
         console.file.seek(0)
         console.file.truncate()
@@ -525,17 +525,17 @@ def monitor() -> Target:
 
 
 def control_line() -> Target:
-    from daemon.onboard.monitoring.access.control_socket import _asks_for_state, _request
+    from daemon.onboard.monitoring.access.control_socket import _is_state_query, _request
 
     def parse(data: bytes) -> object:
-        return _asks_for_state(data), _request(data)
+        return _is_state_query(data), _request(data)
 
     seed = b'{"command": "interval", "arguments": {"interval_s": 2.0, "count": 3}}'
     return Target(parse, (), (seed, b'{"command": "state"}'))
 
 
 def page_link() -> Target:
-    from daemon.onboard.service.messages import Command, CommandRefused, Pong, Told
+    from daemon.onboard.service.messages import CommandRefused, Pong, ServiceCommand, ServiceEvent
     from daemon.onboard.service.page_messages import (
         InvalidMessageError,
         pack_from_page,
@@ -552,18 +552,18 @@ def page_link() -> Target:
     arguments = {"interval_s": 2.0, "count": 3, "override": False, "reason": "x"}
     seeds = (
         Pong({}),
-        Command(1, "interval", arguments, "anna", "operator", "10.0.0.9"),
+        ServiceCommand(1, "interval", arguments, "anna", "operator", "10.0.0.9"),
         CommandRefused("land", "unknown", "none", "10.0.0.66", "no"),
-        Told({"event": "watching", "host": "::", "port": 8080, "tls": True}),
+        ServiceEvent({"event": "watching", "host": "::", "port": 8080, "tls": True}),
     )
     return Target(parse, (InvalidMessageError,), tuple(map(pack_from_page, seeds)))
 
 
 def command_body() -> Target:
-    from daemon.onboard.monitoring.web.bodies import parsed
+    from daemon.onboard.monitoring.web.request_body import parse_command_body
 
     seed = b'{"interval_s": 2.0, "count": 3, "reason": "x"}'
-    return Target(parsed, (ValueError,), (seed,))
+    return Target(parse_command_body, (ValueError,), (seed,))
 
 
 def signed_mavlink() -> Target:
@@ -579,7 +579,7 @@ def device(name: str) -> Callable[[], Target]:
     """A driver's parser; it keeps its state from input to input, as in flight."""
 
     def make() -> Target:
-        from tests.faults.hostile import PARSERS
+        from tests.faults.hostile_parsers import PARSERS
 
         parser = PARSERS[name]()
         return Target(parser.feed, (), parser.genuine[:8])

@@ -9,7 +9,7 @@ import pytest
 from tests.fuzz import progress
 from tests.fuzz.progress import Piece, Progress, begun, piece_of, read, until_quiet
 
-SAID = f"""{begun(4.5)}
+OUTPUT = f"""{begun(4.5)}
 INFO: seed corpus: files: 12
 #13	INITED cov: 210 ft: 300 corp: 9/1Kb exec/s: 0 rss: 60Mb
 #900	NEW    cov: 214 ft: 310 corp: 10/1Kb lim: 100 exec/s: 450 rss: 61Mb
@@ -17,12 +17,12 @@ INFO: seed corpus: files: 12
 """
 
 
-def test_what_the_fuzzer_says_is_read_and_its_start_is_not_counted() -> None:
-    assert piece_of(SAID, 34.5, is_well=True) == Piece(30.0, 4096, 214)
+def test_the_output_of_the_fuzzer_is_read_and_its_start_is_not_counted() -> None:
+    assert piece_of(OUTPUT, 34.5, is_well=True) == Piece(30.0, 4096, 214)
     assert piece_of("killed at once", 3.0, is_well=False) == Piece(0.0, 0, 0, is_well=False)
 
 
-def test_a_new_edge_a_crash_and_other_code_begin_the_quiet_time_anew() -> None:
+def test_a_new_edge_a_crash_and_other_code_restart_the_quiet_time() -> None:
     first = Progress().after(Piece(60.0, 10, 200), "a")
     assert (first.quiet_cpu_s, first.edges) == (0.0, 200)
     quiet = first.after(Piece(60.0, 10, 200), "a").after(Piece(50.0, 10, 190), "a")

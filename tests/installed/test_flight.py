@@ -52,7 +52,7 @@ def needed() -> str | None:
 
 def boot(place: Path) -> dict[str, str]:
     """Boot, fly, power off; the facts that flight.sh said."""
-    words = {
+    variables = {
         "PATH": "/usr/sbin:/usr/bin:/sbin:/bin",
         "PLACE": str(place),
         "REPOSITORY": str(ROOT),
@@ -66,7 +66,7 @@ def boot(place: Path) -> dict[str, str]:
                 *("unshare", "--pid", "--fork", "--kill-child", "--mount", "--uts", "--ipc"),
                 *("--cgroup", "bash", str(ROOT / "tests/installed/boot.sh")),
             ],
-            env=words,
+            env=variables,
             stdin=subprocess.DEVNULL,
             stdout=out,
             stderr=out,
@@ -97,19 +97,19 @@ def test_a_flight_passes_inside_the_hardened_unit(tmp_path: Path) -> None:
     if missing is not None:
         pytest.skip(missing)
     with NamedTemporaryFile(prefix="not-of-this-machine-") as of_the_host:
-        said = boot(tmp_path)
+        results = boot(tmp_path)
         assert Path(of_the_host.name).exists()
-    told = (tmp_path / "service.err").read_text("utf-8")[-2000:]
-    assert said["kernels"] == "0"
-    assert (said["health_started"], said["health_result"]) == ("0", "success")
-    assert (said["health_file"], said["health_folder"]) == ("root 644", "root 755")
-    assert (said["health_read"], said["health_planted"]) == ("1", "1")
-    assert said["health_by_timer"] == "1"
-    assert said["started"] == "0", told
-    assert said["user"] == "syntopic"
-    assert (said["NoNewPrivs"], said["Seccomp"], int(said["CapEff"], 16)) == ("1", "2", 0)
-    assert said["oom_policy"] == "continue"
-    assert (said["page_user"], said["page_killed"]) == ("syntopic", "0")
-    assert (said["result"], said["status"]) == ("success", "0"), told
-    assert (said["sealed"], said["processed"]) == ("4", "4")
-    assert said["verified"] == "0"
+    stderr_tail = (tmp_path / "service.err").read_text("utf-8")[-2000:]
+    assert results["kernels"] == "0"
+    assert (results["health_started"], results["health_result"]) == ("0", "success")
+    assert (results["health_file"], results["health_folder"]) == ("root 644", "root 755")
+    assert (results["health_read"], results["health_planted"]) == ("1", "1")
+    assert results["health_by_timer"] == "1"
+    assert results["started"] == "0", stderr_tail
+    assert results["user"] == "syntopic"
+    assert (results["NoNewPrivs"], results["Seccomp"], int(results["CapEff"], 16)) == ("1", "2", 0)
+    assert results["oom_policy"] == "continue"
+    assert (results["page_user"], results["page_killed"]) == ("syntopic", "0")
+    assert (results["result"], results["status"]) == ("success", "0"), stderr_tail
+    assert (results["sealed"], results["processed"]) == ("4", "4")
+    assert results["verified"] == "0"

@@ -45,7 +45,7 @@ DOWNLOAD_LIMIT_S: Final = 900
 XZ_MAGIC: Final = b"\xfd7zXZ\x00"
 ELF_MAGIC: Final = b"\x7fELF"
 NO_STATUS: Final = 125
-KERNEL_WORDS: Final = (
+KERNEL_ARGUMENTS: Final = (
     "console=ttyS0 quiet loglevel=4 panic=-1 tsc=reliable no_timer_check mitigations=off "
     "random.trust_cpu=on nokaslr audit=0 security=none cryptomgr.notests"
 )
@@ -97,7 +97,7 @@ def run(image: Path, command: str, *, with_kvm: bool = False) -> int:
             *(("-accel", "kvm") if has_kvm else ()),
             *("-accel", "tcg", "-smp", "2", "-m", str(MEMORY_MIB)),
             *("-kernel", str(image / "kernel"), "-initrd", str(image / "initrd.cpio")),
-            *("-append", KERNEL_WORDS),
+            *("-append", KERNEL_ARGUMENTS),
             *("-virtfs", _share("/", "host") + ",readonly=on,multidevs=remap"),
             *("-virtfs", _share(name, "out")),
             *("-chardev", "null,id=nobody", "-device", "isa-parallel,chardev=nobody"),
@@ -117,7 +117,7 @@ def _share(path: str, tag: str) -> str:
 
 
 def _script(command: str) -> str:
-    words = {
+    parameters = {
         "HOME": "/dev/kernel-guest/tmp",
         "TMPDIR": "/dev/kernel-guest/tmp",
         "PATH": "/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin",
@@ -126,7 +126,7 @@ def _script(command: str) -> str:
         "KERNEL_GUEST": "/dev/kernel-guest",
         "COLUMNS": "100",
     }
-    exports = "".join(f"export {name}={value}\n" for name, value in words.items())
+    exports = "".join(f"export {name}={value}\n" for name, value in parameters.items())
     return f"{exports}cd {shlex.quote(str(REPOSITORY))}\n{command}\n"
 
 
@@ -149,18 +149,18 @@ def prepare() -> Path:
     if missing:
         raise CannotRunError(f"install Debian's {' '.join(missing)}")
     kernel = _kernel_package()
-    said = hashlib.sha256(Path(__file__).read_bytes() + (HERE / "guest.sh").read_bytes())
+    digest = hashlib.sha256(Path(__file__).read_bytes() + (HERE / "guest.sh").read_bytes())
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    image = cache / "syntopic" / "kernel-machine" / f"{kernel}-{said.hexdigest()[:12]}"
+    image = cache / "syntopic" / "kernel-machine" / f"{kernel}-{digest.hexdigest()[:12]}"
     if (image / "initrd.cpio").exists():
         return image
     image.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="making-", dir=image.parent) as name:
         place = Path(name)
         _build(place, kernel)
-        made = place / "image"
+        image_part = place / "image"
         try:
-            made.rename(image)
+            image_part.rename(image)
         except OSError:
             # Another run was faster; what it made is the same.
             if not (image / "initrd.cpio").exists():
@@ -179,17 +179,17 @@ def _which(program: str) -> str | None:
 def _kernel_package() -> str:
     """The package of Debian's current kernel; its name moves with security updates."""
     for _ in range(2):
-        told = subprocess.run(
+        output = subprocess.run(
             ["apt-cache", "depends", METAPACKAGE],
             capture_output=True,
             text=True,
             timeout=60,
             check=False,
         ).stdout
-        for line in told.splitlines():
-            words = line.split()
-            if words[:1] == ["Depends:"] and words[1].startswith("linux-image-"):
-                return words[1]
+        for line in output.splitlines():
+            parameters = line.split()
+            if parameters[:1] == ["Depends:"] and parameters[1].startswith("linux-image-"):
+                return parameters[1]
         if os.geteuid() != 0:
             break
         subprocess.run(["apt-get", "update", "-qq"], timeout=DOWNLOAD_LIMIT_S, check=False)
@@ -226,14 +226,16 @@ def _build(place: Path, kernel: str) -> None:
     def needed(names: Iterable[str]) -> list[Path]:
         found: dict[Path, None] = {}
         for name in names:
-            told = subprocess.run(
+            output = subprocess.run(
                 [modprobe, "-d", unpacked, "-S", modules.name, "--show-depends", name],
                 capture_output=True,
                 text=True,
                 timeout=60,
                 check=True,
             ).stdout
-            found |= {Path(line.split()[1]): None for line in told.splitlines() if "insmod" in line}
+            found |= {
+                Path(line.split()[1]): None for line in output.splitlines() if "insmod" in line
+            }
         return list(found)
 
     boot, tested = needed(BOOT_MODULES), needed(TESTED_MODULES)

@@ -24,7 +24,7 @@ GUEST = Path(os.environ.get("KERNEL_GUEST", "/dev/kernel-guest"))
 PORT, CONTROL, IRQ = 0x378, 0x37A, 7
 IDLE, STROBE = 0x1C, 0x01
 """Interrupt enabled, selected, not in reset."""
-PATIENCE_S = 20.0
+TIMEOUT_S = 20.0
 
 
 def load() -> None:
@@ -55,7 +55,7 @@ def pulse() -> tuple[int, int]:
         return before, time.monotonic_ns()
 
 
-class Seen:
+class EdgeLog:
     """What the driver told, kept in order."""
 
     def __init__(self) -> None:
@@ -76,12 +76,12 @@ class Seen:
             return self._changed.wait_for(lambda: len(self.edges) >= count, limit_s)
 
     def wait_edges(self, count: int) -> None:
-        assert self.has_edges(count, PATIENCE_S), self.events
+        assert self.has_edges(count, TIMEOUT_S), self.events
 
     def wait_event(self, name: str, count: int = 1) -> None:
         with self._changed:
             assert self._changed.wait_for(
-                lambda: [event.name for event in self.events].count(name) >= count, PATIENCE_S
+                lambda: [event.name for event in self.events].count(name) >= count, TIMEOUT_S
             ), self.events
 
 
@@ -90,13 +90,13 @@ def counted(device: PpsDevice) -> dict[str, int]:
 
 
 @contextmanager
-def running() -> Iterator[tuple[PpsDevice, Seen]]:
-    device, seen = PpsDevice("pps", {"device": "/dev/pps0", "silence_s": 1.5}), Seen()
+def running() -> Iterator[tuple[PpsDevice, EdgeLog]]:
+    device, seen = PpsDevice("pps", {"device": "/dev/pps0", "silence_s": 1.5}), EdgeLog()
     thread = threading.Thread(target=device.run, args=(seen,), daemon=True)
     thread.start()
     try:
         # An edge before the source is open is nobody's.
-        first = time.monotonic() + PATIENCE_S
+        first = time.monotonic() + TIMEOUT_S
         pulse()
         while not seen.has_edges(1, 2.0):
             assert time.monotonic() < first, seen.events
@@ -104,17 +104,17 @@ def running() -> Iterator[tuple[PpsDevice, Seen]]:
         yield device, seen
     finally:
         device.close()
-        thread.join(PATIENCE_S)
+        thread.join(TIMEOUT_S)
     assert not thread.is_alive()
 
 
-def test_the_kernel_says_what_the_source_can_and_waits_no_longer_than_asked() -> None:
+def test_the_kernel_reports_the_capabilities_and_waits_no_longer_than_requested() -> None:
     pps = KernelPps("/dev/pps0")
     assert pps.capabilities() & CAPTURE_ASSERT
     assert pps.capabilities() & CAN_WAIT
     begin = time.monotonic()
     assert pps.fetch(0.5) is None
-    assert time.monotonic() - begin < PATIENCE_S
+    assert time.monotonic() - begin < TIMEOUT_S
     pps.close()
 
 
@@ -145,7 +145,7 @@ def test_every_edge_of_a_burst_is_delivered_or_counted_as_missed() -> None:
         already = kernel_count() - sum(counted(device).values())
         for _ in range(5):
             pulse()
-        deadline = time.monotonic() + PATIENCE_S
+        deadline = time.monotonic() + TIMEOUT_S
         while kernel_count() - sum(counted(device).values()) > already:
             assert time.monotonic() < deadline, (kernel_count(), already, device.statistics())
             time.sleep(0.1)

@@ -25,7 +25,7 @@ def webcam() -> Iterator[None]:
 
 
 def flight(**more: object) -> vivid.Flight:
-    return vivid.Flight(**{**SIZE, "keep": 0, **more})
+    return vivid.Flight(**{**SIZE, "keep_frames": 0, **more})
 
 
 def test_dropped_frames_are_gaps_that_are_counted_one_by_one() -> None:
@@ -44,15 +44,15 @@ def test_dropped_frames_are_gaps_that_are_counted_one_by_one() -> None:
     assert statistics["opened"] == 1
 
 
-def test_a_head_that_falls_silent_is_told_and_opened_until_it_speaks_again() -> None:
+def test_a_silent_head_is_reported_and_reopened_until_it_sends_again() -> None:
     with flight(silence_s=1.0) as head:
         head.wait_frames(2)
         vivid.set_control(0, "percentage_of_dropped_buffers", 100)
         head.wait_event("lost")
         vivid.set_control(0, "percentage_of_dropped_buffers", 0)
         head.wait_frames(3)
-    told = next(event for event in head.events if event.name == "lost")
-    assert "no frame came for 1 s" in told.sentence
+    reported = next(event for event in head.events if event.name == "lost")
+    assert "no frame came for 1 s" in reported.sentence
     assert head.head.statistics()["silences"] >= 1
 
 
@@ -65,7 +65,7 @@ def test_a_frame_with_the_kernels_error_flag_is_incomplete_though_it_is_whole_in
     statuses = [frame.status for frame in head.frames]
     assert statuses.count(FrameStatus.INCOMPLETE) == 1
     assert statuses[-1] is FrameStatus.COMPLETE
-    assert head.told == ["opened"], "the stream goes on as it was"
+    assert head.reported == ["opened"], "the stream goes on as it was"
 
 
 def test_a_buffer_the_kernel_refuses_once_is_given_again() -> None:
@@ -75,7 +75,7 @@ def test_a_buffer_the_kernel_refuses_once_is_given_again() -> None:
         head.wait_count("queue_failures", 1)
         head.wait_frames(10)
     assert head.head.statistics()["queue_failures"] == 1
-    assert head.told == ["opened"]
+    assert head.reported == ["opened"]
 
 
 @pytest.mark.parametrize("name", ["inject_vidioc_reqbufs_error", "inject_vidioc_streamon_error"])
@@ -83,17 +83,17 @@ def test_a_start_that_fails_once_is_tried_again(name: str) -> None:
     vivid.set_control(0, name, 1)
     with flight() as head:
         head.wait_frames(3)
-    assert head.told == ["opened", "lost", "opened"]
-    assert [e.is_fault for e in head.events if e.name in head.told] == [False, True, False]
+    assert head.reported == ["opened", "lost", "opened"]
+    assert [e.is_fault for e in head.events if e.name in head.reported] == [False, True, False]
 
 
-def test_a_stream_that_breaks_off_for_good_is_opened_anew() -> None:
+def test_a_stream_that_ends_for_good_is_reopened() -> None:
     with flight() as head:
         head.wait_frames(3)
         vivid.set_control(0, "inject_fatal_streaming_error", 1)
         head.wait_event("opened", 2)
         head.wait_frames(3)
-    assert head.told == ["opened", "lost", "opened"]
+    assert head.reported == ["opened", "lost", "opened"]
     lost = next(event for event in head.events if event.name == "lost")
     assert "its stream broke off" in lost.sentence
     ids = [frame.frame_id for frame in head.frames]
@@ -108,7 +108,7 @@ def test_an_unplugged_head_is_noticed_let_go_of_and_found_again() -> None:
         # vivid is there again once the last handle and mapping of it are gone.
         head.wait_event("opened", 2)
         head.wait_frames(3)
-    assert head.told[:2] == ["opened", "lost"]
+    assert head.reported[:2] == ["opened", "lost"]
     assert head.head.statistics()["opened"] == 2
 
 
@@ -142,7 +142,7 @@ def test_a_time_of_no_possible_world_is_no_time(choice: int) -> None:
         head.wait_frames(4)
     assert [frame.device_ns for frame in head.frames[:4]] == [None] * 4
     assert head.head.statistics()["stamps_implausible"] >= 4
-    assert head.told == ["opened"]
+    assert head.reported == ["opened"]
 
 
 def test_all_slots_taken_is_a_frame_lost_and_the_stream_goes_on() -> None:
@@ -158,7 +158,7 @@ def test_all_slots_taken_is_a_frame_lost_and_the_stream_goes_on() -> None:
         with pytest.raises(ValueError, match="was not handed out"):
             head.head.recycle(7)
         head.wait_frames(5)
-    assert head.told == ["opened", "underrun"]
+    assert head.reported == ["opened", "underrun"]
 
 
 def test_a_head_that_another_program_streams_from_is_waited_for() -> None:
@@ -172,7 +172,7 @@ def test_a_head_that_another_program_streams_from_is_waited_for() -> None:
     assert "busy" in lost.sentence.lower()
 
 
-def test_an_absent_head_is_told_with_its_cure() -> None:
+def test_an_absent_head_is_reported_with_its_cure() -> None:
     vivid.unload()
     with pytest.raises(DeviceError, match="there is no such node; check cable and power"):
         flight().head.bind()
@@ -180,4 +180,4 @@ def test_an_absent_head_is_told_with_its_cure() -> None:
         head.wait_event("lost")
         vivid.load(node_types="0x1", input_types="0x0", num_inputs=1, multiplanar=1)
         head.wait_frames(2)
-    assert head.told == ["lost", "opened"]
+    assert head.reported == ["lost", "opened"]

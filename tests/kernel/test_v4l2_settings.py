@@ -22,7 +22,7 @@ def webcam() -> Iterator[None]:
 
 
 def flight(**more: object) -> vivid.Flight:
-    return vivid.Flight(**{**SIZE, "keep": 0, **more})
+    return vivid.Flight(**{**SIZE, "keep_frames": 0, **more})
 
 
 def test_controls_are_written_and_recorded_with_each_frame() -> None:
@@ -76,8 +76,8 @@ def test_both_sources_of_time_give_the_start_of_exposure() -> None:
     end = sorted(lateness[END_OF_FRAME])[6]
     assert 0 <= start < 1_000_000_000
     assert end < start + 5_000_000
-    told = vivid.ctl(0, "--get-parm")
-    assert "Frames per second" in told
+    reported = vivid.ctl(0, "--get-parm")
+    assert "Frames per second" in reported
 
 
 def test_the_same_pixels_come_from_the_bus_name_as_from_the_path() -> None:
@@ -88,10 +88,10 @@ def test_the_same_pixels_come_from_the_bus_name_as_from_the_path() -> None:
     )
     with flight(device=node.bus) as head:
         head.wait_frames(2)
-    assert head.told == ["opened"]
+    assert head.reported == ["opened"]
 
 
-def test_check_finds_the_head_and_says_what_to_write() -> None:
+def test_check_finds_the_head_and_states_what_to_write() -> None:
     from daemon.cli.find_heads import v4l2_heads
 
     (head,), problems = v4l2_heads()
@@ -115,7 +115,7 @@ def test_settings_that_the_head_refuses_come_all_at_once() -> None:
         ).head.bind()
     lines = str(refused.value).splitlines()
     assert len(lines) == 6
-    for said in (
+    for expected in (
         "width_px x height_px is 641 x 361; the head gives",
         "gain would set gain to 256; the head takes 0 to 255",
         "exposure_time_us is 100; the head has no control of it",
@@ -123,7 +123,7 @@ def test_settings_that_the_head_refuses_come_all_at_once() -> None:
         "controls would set contrast to 1000; the head takes 0 to 255",
         "temperature_control names 'thermometer'",
     ):
-        assert any(said in line for line in lines), f"{said!r} is not in {lines}"
+        assert any(expected in line for line in lines), f"{expected!r} is not in {lines}"
     assert vivid.descriptors() == set()
 
 

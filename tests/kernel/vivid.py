@@ -17,35 +17,35 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.cameras.v4l2.head import V4l2Head
+from drivers.cameras.v4l2.v4l2_head import V4l2Head
 from drivers.contract import DeviceEvent, Frame, LifeCycle, Record
 
 GUEST = Path(os.environ.get("KERNEL_GUEST", "/dev/kernel-guest"))
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 UNTOUCHED = 0xA5A5
 
 
 def load(**parameters: object) -> None:
     """Load vivid anew."""
     unload()
-    words = [f"{name}={value}" for name, value in parameters.items()]
-    subprocess.run(["insmod", GUEST / "modules/vivid.ko", *words], timeout=60, check=True)
+    arguments = [f"{name}={value}" for name, value in parameters.items()]
+    subprocess.run(["insmod", GUEST / "modules/vivid.ko", *arguments], timeout=60, check=True)
 
 
 def unload() -> None:
     subprocess.run(["rmmod", "vivid"], capture_output=True, timeout=60, check=False)
 
 
-def ctl(node: int, *words: str) -> str:
+def ctl(node: int, *arguments: str) -> str:
     """Run v4l2-ctl on a node; what it said."""
     done = subprocess.run(
-        ["v4l2-ctl", "-d", f"/dev/video{node}", *words],
+        ["v4l2-ctl", "-d", f"/dev/video{node}", *arguments],
         capture_output=True,
         text=True,
         timeout=60,
         check=False,
     )
-    assert done.returncode == 0, f"v4l2-ctl {words}: {done.stdout}{done.stderr}"
+    assert done.returncode == 0, f"v4l2-ctl {arguments}: {done.stdout}{done.stderr}"
     return done.stdout
 
 
@@ -75,7 +75,7 @@ class Flight:
         *,
         nbytes: int = 1280 * 720 * 2,
         slot_count: int = 4,
-        keep: int = 400,
+        keep_frames: int = 400,
         **section: object,
     ) -> None:
         self.memory = Memory(nbytes, slot_count)
@@ -84,7 +84,7 @@ class Flight:
             {"device": "/dev/video0", "check_interval_s": 0.5, **section},
             memory=self.memory,
         )
-        self.keep = keep
+        self.keep_frames = keep_frames
         self.recycle = True
         self.frames: list[Frame] = []
         self.pictures: list[NDArray[np.uint16]] = []
@@ -98,7 +98,7 @@ class Flight:
             if isinstance(record, Frame):
                 count = record.width_px * record.height_px
                 slot = self.memory.slots[record.slot]
-                if len(self.pictures) < self.keep:
+                if len(self.pictures) < self.keep_frames:
                     self.pictures.append(slot[:count].reshape(record.height_px, -1).copy())
                     self.behind.append(bool((slot[count:] == UNTOUCHED).all()))
                 self.frames.append(record)
@@ -120,7 +120,7 @@ class Flight:
 
     def wait(self, true: Callable[[], bool], what: str) -> None:
         with self.changed:
-            assert self.changed.wait_for(true, PATIENCE_S), (
+            assert self.changed.wait_for(true, TIMEOUT_S), (
                 f"{what} did not come: {self.names}, {dict(self.head.statistics())}"
             )
 
@@ -132,10 +132,10 @@ class Flight:
     def wait_event(self, name: str, times: int = 1) -> None:
         self.wait(lambda: self.names.count(name) >= times, f"event {name}")
 
-    def wait_count(self, counter: str, at_least: int) -> None:
-        deadline = time.monotonic() + PATIENCE_S
+    def wait_count(self, counter: str, min_count: int) -> None:
+        deadline = time.monotonic() + TIMEOUT_S
         pause = threading.Event()
-        while self.head.statistics().get(counter, 0) < at_least:
+        while self.head.statistics().get(counter, 0) < min_count:
             assert time.monotonic() < deadline, f"{counter}: {dict(self.head.statistics())}"
             pause.wait(0.05)
 
@@ -144,7 +144,7 @@ class Flight:
         return [event.name for event in self.events]
 
     @property
-    def told(self) -> list[str]:
+    def reported(self) -> list[str]:
         """What was told besides frames missing: a slow host loses some of its own."""
         return [name for name in self.names if name != "frames-missing"]
 

@@ -45,7 +45,7 @@ def vip_px_of_raw(
     """Virtual pixels of raw pixels at a temperature common to all probes, step by step."""
     dc = temperature_c - sensor.calibration_c
     pitch = sensor.pitch_um / 1000.0
-    turn = sensor.rotation_rad + sensor.drift.rotation_urad_per_k * dc / 1e6
+    angle_rad = sensor.rotation_rad + sensor.drift.rotation_urad_per_k * dc / 1e6
     scale = sensor.scale * (1.0 + sensor.drift.scale_ppm_per_k * dc / 1e6)
     centre = (
         sensor.x_mm + sensor.drift.x_um_per_k * dc / 1000.0,
@@ -56,9 +56,9 @@ def vip_px_of_raw(
         true_row = row - sensor.tdi_row_sign * tdi_shifts / 2.0
         right = (column - (sensor.width_px - 1) / 2.0) * pitch * scale
         up = ((sensor.height_px - 1) / 2.0 - true_row) * pitch * scale
-        turned = complex(right, up) * np.exp(1j * turn)
-        skew = sensor.skew_x_ppm_per_mm * turned.real + sensor.skew_y_ppm_per_mm * turned.imag
-        place = complex(*centre) + turned * (1.0 + skew / 1e6)
+        rotated = complex(right, up) * np.exp(1j * angle_rad)
+        skew = sensor.skew_x_ppm_per_mm * rotated.real + sensor.skew_y_ppm_per_mm * rotated.imag
+        place = complex(*centre) + rotated * (1.0 + skew / 1e6)
         points.append((place.real, place.imag))
     ideal = ideal_from_measured(cone.lens, np.array(points))
     # Rays at f(T), turned into the master camera and seen by a pinhole that looks down -z.
@@ -88,8 +88,8 @@ def placed(layer: Array, similarity: tuple[float, float, float, float], xy_mm: A
 
     Source: Ladstädter et al. (2010), eq. 1.
     """
-    x, y, turn, scale = similarity
-    c, s = scale * np.cos(turn), scale * np.sin(turn)
+    x, y, angle_rad, scale = similarity
+    c, s = scale * np.cos(angle_rad), scale * np.sin(angle_rad)
     affine = np.array([[c, -s, x], [s, c, y]])
     in_layer = cv2.transform(xy_mm[:, None, :], affine)
     return np.asarray(cv2.perspectiveTransform(in_layer, layer)[:, 0, :])

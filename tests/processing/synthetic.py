@@ -21,7 +21,7 @@ from processing.geometry.topology import (
     overlaps,
 )
 from processing.matching.tie_points import PAN_TO_COLOUR, PAN_TO_PAN, TiePoints
-from processing.mosaic.free import free_mosaic
+from processing.mosaic.free_mosaic import free_mosaic
 from processing.mosaic.model import MosaicModel, placement_at
 from processing.rig import Rig
 
@@ -66,8 +66,8 @@ def make_truth(
         spread[first + np.array([2, 5])] = layer_px
     values = rng.normal(0.0, 1.0, len(spread)) * spread * model.units
     for axis in range(3):
-        turns = [first + axis for first in model.mountings.values()]
-        values[turns] -= values[turns].mean() if turns else 0.0
+        rotation_rows = [first + axis for first in model.mountings.values()]
+        values[rotation_rows] -= values[rotation_rows].mean() if rotation_rows else 0.0
     for name, (x, y) in (displaced or {}).items():
         values[model.sensors[name]] += x * model.pitch_mm
         values[model.sensors[name] + 1] += y * model.pitch_mm
@@ -82,7 +82,7 @@ def no_tie_points(rig: Rig) -> TiePoints:
     return TiePoints(
         names=tuple(s.name for s in rig.sensors),
         pairs=_pairs(rig),
-        sought=(0,) * len(_pairs(rig)),
+        attempted=(0,) * len(_pairs(rig)),
         sensor_a=index,
         sensor_b=index,
         raw_a=pair,
@@ -145,7 +145,7 @@ def tie_points_of(
     return TiePoints(
         names=names,
         pairs=tuple((a, b) for a, b, _, _ in areas),
-        sought=tuple(per_overlap if k == PAN_TO_PAN else per_sensor for _, _, _, k in areas),
+        attempted=tuple(per_overlap if k == PAN_TO_PAN else per_sensor for _, _, _, k in areas),
         sensor_a=table[:, 0].astype(np.int64),
         sensor_b=table[:, 1].astype(np.int64),
         raw_a=table[:, 2:4].copy(),

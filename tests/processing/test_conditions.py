@@ -98,7 +98,7 @@ def test_temperatures_are_sorted_into_usable_missing_and_impossible(rig: Rig) ->
     assert found.missing == ("1", "2", "B", "N") and found.out_of_range == ("3",)
 
 
-def test_dc_is_told_per_cone_and_as_the_mean_of_the_pan_cones(rig: Rig) -> None:
+def test_dc_is_reported_per_cone_and_as_the_mean_of_the_pan_cones(rig: Rig) -> None:
     readings = {"0": 32.0, "1": 31.0, "2": 33.0, "3": 32.0, "G": 50.0}
     found = figures(rig, Conditions(temperatures_c=readings, temperature_age_s={"0": 2, "G": 5}))
     assert found["dc_k_1"] == pytest.approx(11.0) and found["dc_k_R"] is None

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from processing.bundle.bent_rays import Rays, bent, refraction_coefficient
+from processing.bundle.curvature_refraction import RayModel, bent, refraction_coefficient
 from processing.bundle.rotations import exponential
 from processing.geometry.drift import lag_step, physical_similarity
 from processing.geometry.lens import ideal_from_measured
@@ -26,7 +26,7 @@ from processing.geometry.virtual_camera import GroundPlane, offset_mm, vip_from_
 from processing.image.kernels import cubic_weights, phase_corrected_weights
 from processing.mosaic.datum import datum_constraints
 from processing.mosaic.estimated_dc import expansion_rate
-from processing.mosaic.model import build_model, further_turn, placement_at, vip_and_design
+from processing.mosaic.model import build_model, placement_at, small_rotation_design, vip_and_design
 from processing.mosaic.validity import ValiditySettings
 from processing.rig import Lens, find_rig
 
@@ -52,7 +52,7 @@ def test_the_elements_of_the_rotation_matrix(omega: float, phi: float, kappa: fl
 def test_a_small_rotation_moves_an_image_point_as_the_matrix_of_the_page_says() -> None:
     x, y, f = 12.0, -7.0, 100.0
     page = np.array([[x * y / f, -f - x * x / f, -y], [f + y * y / f, -x * y / f, x]])
-    assert further_turn(np.array([[x, y]]), f)[:, :, 0] == pytest.approx(page)
+    assert small_rotation_design(np.array([[x, y]]), f)[:, :, 0] == pytest.approx(page)
     w = np.array([2e-6, -3e-6, 1e-6])
     ray = exponential(w[None])[0] @ np.array([x, y, -f])
     moved = -f * ray[:2] / ray[2] - np.array([x, y])
@@ -199,7 +199,7 @@ def test_curvature_and_refraction() -> None:
     k = 2410e-6 * (hk / (hk**2 - 6 * hk + 250) - gk / (gk**2 - 6 * gk + 250) * gk / hk)
     assert float(refraction_coefficient(np.array(height), 200.0)) == pytest.approx(k)
     out = 1 + k * (1 + (e * e + n * n) / z**2)
-    found = bent(ray, np.array([height]), Rays(radius, refraction=True, ground_m=200.0))[0][0]
+    found = bent(ray, np.array([height]), RayModel(radius, refraction=True, ground_m=200.0))[0][0]
     assert found == pytest.approx([e * out, n * out, z], abs=1e-9)
 
 
@@ -221,5 +221,7 @@ def test_the_phase_error_of_the_kernel_is_below_what_its_page_states(phase: floa
 
 def test_the_limits_of_the_pages_are_those_of_the_code() -> None:
     settings = ValiditySettings()
-    assert settings.family_alpha == 0.001 and settings.odds == 19.0
-    assert settings.knowledge.probe_sigma_k == 0.1 and settings.knowledge.unknown_sigma_k == 10.0
+    assert settings.family_alpha == 0.001 and settings.odds_limit == 19.0
+    assert (
+        settings.prior_sigmas.probe_sigma_k == 0.1 and settings.prior_sigmas.unknown_sigma_k == 10.0
+    )

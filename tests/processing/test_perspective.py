@@ -10,13 +10,13 @@ import pytest
 from processing.geometry.conditions import Conditions
 from processing.pipelines.perspective import (
     HeadPipeline,
-    looks_apart,
+    has_diverging_axes,
     perspective_of,
     raw_of_perspective,
 )
 from processing.quality.report import QualityReport
 from processing.rig import Cone, Rig, find_rig
-from sim_hw.world.camera import true_camera, undistorted
+from sim_hw.world.true_camera import true_camera, undistorted
 
 
 def distorting(name: str, size_mm: float) -> Rig:
@@ -61,8 +61,8 @@ def test_what_lies_on_a_straight_line_in_the_perspective_does_so_after_resamplin
         bands=("pan",),
         sensors=(replace(rig.cone("7").sensors[0], colour_filter_array="none", black_dn=0.0),),
     )
-    lone = replace(rig, cones=(cone,), master_cone="7", reference_cone="7")
-    expected, found = _waves(cone, lone)
+    single_cone_rig = replace(rig, cones=(cone,), master_cone="7", reference_cone="7")
+    expected, found = _waves(cone, single_cone_rig)
     seen = found > 0
     assert seen.mean() > 0.95
     off = found[seen].astype(float) / 8.0 - expected[seen]
@@ -91,15 +91,15 @@ def _waves(cone: Cone, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
     return wave(x, y), found
 
 
-def test_only_rigs_whose_heads_look_apart_are_images_of_their_own() -> None:
-    assert looks_apart(find_rig("midas"))
-    assert not looks_apart(find_rig("rededge"))
-    assert not looks_apart(find_rig("ultracam-x"))
+def test_only_rigs_whose_heads_have_diverging_axes_are_images_of_their_own() -> None:
+    assert has_diverging_axes(find_rig("midas"))
+    assert not has_diverging_axes(find_rig("rededge"))
+    assert not has_diverging_axes(find_rig("ultracam-x"))
     with pytest.raises(ValueError, match="there is no"):
         HeadPipeline(find_rig("ultracam-x"))
 
 
-def test_a_missing_frame_leaves_the_other_heads_and_says_so() -> None:
+def test_a_missing_frame_leaves_the_other_heads_and_reports_it() -> None:
     rig = find_rig("midas-mini")
     frames = {
         s.name: np.full((s.height_px, s.width_px), 1000, np.uint16)
@@ -124,7 +124,7 @@ def _lit_heads(rig: Rig) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.trust
-def test_wrong_words_steps_and_unread_lines_of_a_head_are_named() -> None:
+def test_wrong_values_steps_and_unread_lines_of_a_head_are_named() -> None:
     rig = find_rig("midas-mini")
     pipeline, healthy = HeadPipeline(rig, threads=1), _lit_heads(rig)
     assert pipeline.process(healthy, Conditions()).report.verdict.value == "good"

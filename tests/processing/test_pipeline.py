@@ -15,10 +15,10 @@ from scipy import ndimage
 from processing.geometry.conditions import usable_temperatures
 from processing.geometry.placement import nominal_placements, vip_mm_from_raw, vip_px_from_mm
 from processing.image.lattice import colour_raster
-from processing.mosaic.drawing import residuals_svg
+from processing.mosaic.mosaic_plots import residuals_svg
 from processing.mosaic.residual_vectors import residual_vectors
-from processing.pipelines.compiled import kernels, variants
-from processing.pipelines.stitched import Conditions, Pipeline, Product, Settings
+from processing.pipelines.kernel_compilation import kernels, variants
+from processing.pipelines.stitched import Conditions, Pipeline, PipelineSettings, Product
 from processing.quality.report import FIGURES, Flag, Verdict, as_json
 from processing.radiometry.level1 import exposed_rows, level1_counts_per_dn
 from processing.rig import Rig, find_rig
@@ -34,7 +34,7 @@ def rig() -> Rig:
 
 @pytest.fixture(scope="module")
 def pipeline(rig: Rig) -> Pipeline:
-    pipeline = Pipeline(rig, {}, Settings(baselines=True))
+    pipeline = Pipeline(rig, {}, PipelineSettings(baselines=True))
     pipeline.warm_up()
     return pipeline
 
@@ -92,12 +92,12 @@ def rms(lengths: NDArray[np.float64]) -> float:
 @pytest.fixture(scope="module")
 def product(rig: Rig, pipeline: Pipeline, exposure: Exposure) -> Product:
     """One product with pixel arrays of its own, for the pipeline goes on to others."""
-    made = pipeline.process(exposure.frames, conditions(rig, exposure))
+    processed = pipeline.process(exposure.frames, conditions(rig, exposure))
     return replace(
-        made,
-        pan=made.pan.copy(),
-        valid=made.valid.copy(),
-        colour={band: raster.copy() for band, raster in made.colour.items()},
+        processed,
+        pan=processed.pan.copy(),
+        valid=processed.valid.copy(),
+        colour={band: raster.copy() for band, raster in processed.colour.items()},
     )
 
 
@@ -132,12 +132,12 @@ def test_the_darker_head_is_balanced_and_no_step_is_left_at_its_seams(product: P
     assert np.ptp(others) < 3e-3
 
 
-def test_the_pixels_show_the_scene_where_the_geometry_says(
+def test_the_pixels_show_the_scene_where_the_geometry_states(
     rig: Rig, exposure: Exposure, product: Product
 ) -> None:
     """The image-based check: grey values against an undisturbed exposure's, at the same places."""
     clean = expose(rig, seed=5)
-    found = Pipeline(rig, {}, Settings()).process(
+    found = Pipeline(rig, {}, PipelineSettings()).process(
         clean.frames, replace(conditions(rig, clean), temperatures_c=clean.temperatures_c)
     )
     seen = (product.valid > 0) & (found.valid > 0)
@@ -160,7 +160,7 @@ def test_the_pixels_show_the_scene_where_the_geometry_says(
         assert abs(shift) < 0.02
 
 
-def test_validity_tells_the_sensor_of_every_pixel(product: Product) -> None:
+def test_validity_gives_the_sensor_of_every_pixel(product: Product) -> None:
     names = product.sensors
     assert set(np.unique(product.valid)) <= set(range(len(names) + 1))
     assert names[product.valid[200, 300] - 1] == "SU00"
@@ -206,20 +206,20 @@ def test_residuals_can_be_drawn(rig: Rig, product: Product) -> None:
     assert len(svg) < 400_000
 
 
-def test_residuals_are_told_as_numbers(rig: Rig, product: Product) -> None:
-    told = residual_vectors(rig, product.tie_points, product.mosaic)
+def test_residuals_are_reported_as_numbers(rig: Rig, product: Product) -> None:
+    vector_data = residual_vectors(rig, product.tie_points, product.mosaic)
     figures = product.report.figures
     pan = {sensor.name for cone in rig.pan_cones for sensor in cone.sensors}
-    used = sum(one["used"] for one in told["overlaps"] if set(one["sensors"]) <= pan)
+    used = sum(one["used"] for one in vector_data["overlaps"] if set(one["sensors"]) <= pan)
     assert used == figures["tie_points_pp"]
-    vectors = np.array(told["vectors"])
+    vectors = np.array(vector_data["vectors"])
     assert 300 <= len(vectors) <= 600
     assert (vectors[:, :2] > -20).all()
-    assert (vectors[:, 0] < told["width_px"] + 20).all()
-    assert (vectors[:, 1] < told["height_px"] + 20).all()
+    assert (vectors[:, 0] < vector_data["width_px"] + 20).all()
+    assert (vectors[:, 1] < vector_data["height_px"] + 20).all()
     # A residual is small; of what is left out, some are not.
     assert np.median(np.hypot(*vectors[vectors[:, 4] == 0, 2:4].T)) < 0.2
-    assert len(json.dumps(told)) < 40_000
+    assert len(json.dumps(vector_data)) < 40_000
 
 
 def test_nothing_compiles_after_the_warm_up(
@@ -264,34 +264,34 @@ def test_a_missing_frame_leaves_a_hole_and_a_usable_image(
     rig: Rig, pipeline: Pipeline, exposure: Exposure, missing: tuple[str, ...]
 ) -> None:
     frames = {name: frame for name, frame in exposure.frames.items() if name not in missing}
-    made = pipeline.process(frames, conditions(rig, exposure))
-    assert made.report.verdict is Verdict.USABLE
-    assert made.report.flags & Flag.FRAME_MISSING
-    assert made.report.figures["missing_sensors"] == ", ".join(missing)
-    absent = [made.sensors.index(name) + 1 for name in missing if name in made.sensors]
-    assert not np.isin(made.valid & 0x7F, absent).any()
-    assert not any(f"{name}.raw" in made.geometry["free"] for name in missing)
-    _, inner = errors_px(rig, exposure, made.geometry["free"])
+    processed = pipeline.process(frames, conditions(rig, exposure))
+    assert processed.report.verdict is Verdict.USABLE
+    assert processed.report.flags & Flag.FRAME_MISSING
+    assert processed.report.figures["missing_sensors"] == ", ".join(missing)
+    absent = [processed.sensors.index(name) + 1 for name in missing if name in processed.sensors]
+    assert not np.isin(processed.valid & 0x7F, absent).any()
+    assert not any(f"{name}.raw" in processed.geometry["free"] for name in missing)
+    _, inner = errors_px(rig, exposure, processed.geometry["free"])
     assert rms(inner) < 0.05
     for band, name in (("red", "R"), ("green", "G"), ("nir", "N")):
-        assert bool(made.colour[band].any()) == (name not in missing)
+        assert bool(processed.colour[band].any()) == (name not in missing)
 
 
 def test_without_any_frame_there_is_a_verdict_and_no_exception(
     rig: Rig, pipeline: Pipeline
 ) -> None:
-    made = pipeline.process({}, Conditions())
-    assert made.report.verdict is Verdict.REFLY
-    assert not made.valid.any() and not made.pan.any()
-    json.dumps(as_json(made.report), allow_nan=False)
+    processed = pipeline.process({}, Conditions())
+    assert processed.report.verdict is Verdict.REFLY
+    assert not processed.valid.any() and not processed.pan.any()
+    json.dumps(as_json(processed.report), allow_nan=False)
 
 
-def test_open_water_is_placed_by_calibration_and_says_so(rig: Rig, pipeline: Pipeline) -> None:
+def test_open_water_is_placed_by_calibration_and_reports_it(rig: Rig, pipeline: Pipeline) -> None:
     water = expose(rig, dc_k=12.0, contrast=0.0)
-    made = pipeline.process(water.frames, conditions(rig, water))
-    assert made.report.flags & Flag.TIE_POINTS
-    assert made.report.verdict is not Verdict.GOOD
-    absolute, _ = errors_px(rig, water, made.geometry["free"])
+    processed = pipeline.process(water.frames, conditions(rig, water))
+    assert processed.report.flags & Flag.TIE_POINTS
+    assert processed.report.verdict is not Verdict.GOOD
+    absolute, _ = errors_px(rig, water, processed.geometry["free"])
     assert absolute.max() < 0.01
 
 
@@ -299,20 +299,20 @@ def test_a_probe_that_is_open_or_impossible_is_flagged(
     rig: Rig, pipeline: Pipeline, exposure: Exposure
 ) -> None:
     readings = dict(exposure.temperatures_c) | {"1": None, "2": 300.0}
-    made = pipeline.process(
+    processed = pipeline.process(
         exposure.frames, replace(conditions(rig, exposure), temperatures_c=readings)
     )
-    assert made.report.flags & Flag.TEMPERATURE_MISSING
-    assert made.report.flags & Flag.TEMPERATURE_RANGE
-    assert made.report.figures["dc_k_1"] is None
+    assert processed.report.flags & Flag.TEMPERATURE_MISSING
+    assert processed.report.flags & Flag.TEMPERATURE_RANGE
+    assert processed.report.figures["dc_k_1"] is None
 
 
 def test_the_fixed_method_can_be_chosen(rig: Rig, exposure: Exposure) -> None:
-    made = Pipeline(rig, {}, Settings(method="fixed")).process(
+    processed = Pipeline(rig, {}, PipelineSettings(method="fixed")).process(
         exposure.frames, conditions(rig, exposure)
     )
-    assert made.report.figures["method"] == "fixed"
-    assert set(made.geometry) == {"fixed"} and made.validity is None
+    assert processed.report.figures["method"] == "fixed"
+    assert set(processed.geometry) == {"fixed"} and processed.validity is None
 
 
 def test_a_frame_of_another_size_is_refused(
@@ -335,7 +335,7 @@ def test_each_frame_is_corrected_with_its_own_exposure_time_and_tdi(
     usual = conditions(rig, exposure)
     temperatures = usable_temperatures(rig, usual, pipeline.settings.thresholds)
     before, _ = pipeline._correct(exposure.frames, usual, temperatures)
-    before = {name: words.copy() for name, words in before.items()}
+    before = {name: level1_frame.copy() for name, level1_frame in before.items()}
     short = exposure.frames["SU01"].astype(np.float64)
     black = rig.sensor("SU01").black_dn
     frames = {**exposure.frames, "SU01": np.rint((short - black) / 2 + black).astype(np.uint16)}
@@ -345,13 +345,13 @@ def test_each_frame_is_corrected_with_its_own_exposure_time_and_tdi(
         tdi_shifts={**usual.tdi_shifts, "SU01": 9},
     )
     after, _ = pipeline._correct(frames, deviating, temperatures)
-    for name, words in after.items():
+    for name, level1_frame in after.items():
         if name != "SU01":
-            assert np.array_equal(words, before[name]), name
+            assert np.array_equal(level1_frame, before[name]), name
     rows = exposed_rows(rig.sensor("SU01"), 9)
     assert not after["SU01"][: rows[0]].any()  # entering rows of nine shifts, not of six
     seen = np.s_[rows[0] : rows[1] + 1]
     half_a_dn = level1_counts_per_dn(rig.sensor("SU01").bits) * 1.01
-    apart = after["SU01"][seen].astype(int) - before["SU01"][seen].astype(int)
-    assert np.abs(apart).max() <= half_a_dn + 2
-    assert abs(apart.mean()) < 1.0
+    change = after["SU01"][seen].astype(int) - before["SU01"][seen].astype(int)
+    assert np.abs(change).max() <= half_a_dn + 2
+    assert abs(change.mean()) < 1.0

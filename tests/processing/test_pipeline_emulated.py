@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from processing.pipelines.stitched import Pipeline, Product, Settings
+from processing.pipelines.stitched import Pipeline, PipelineSettings, Product
 from processing.quality.report import Flag, Verdict
 from processing.radiometry.calibration import load_radiometry
-from sim_hw.world import laboratory
-from tests.processing.emulated import SEED, Array, Emulated, expose, rms
+from sim_hw.world import sensor_calibration
+from tests.processing.emulated_exposure import SEED, Array, EmulatedExposure, expose, rms
 
 DISPLACED = (1.0, -0.6)
 
@@ -20,7 +20,7 @@ DISPLACED = (1.0, -0.6)
 class Flown:
     """An emulated exposure, and what the pipeline made of it."""
 
-    emulated: Emulated
+    emulated: EmulatedExposure
     product: Product
 
     def errors_px(self, method: str) -> tuple[Array, Array]:
@@ -33,14 +33,14 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
     emulated = expose("ultracam-x-mini", folder, height_px=3200, displaced_px={"SU02": DISPLACED})
     rig, radiometry = emulated.world.rig, {}
     for sensor in rig.sensors:
-        measured = laboratory.measure(sensor, emulated.sensors[sensor.name], SEED)
-        laboratory.write_radiometry(folder, sensor, measured)
+        measured = sensor_calibration.measure(sensor, emulated.sensors[sensor.name], SEED)
+        sensor_calibration.write_radiometry(folder, sensor, measured)
         radiometry[sensor.name] = load_radiometry(folder / "radiometry" / f"{sensor.name}.npz")
-    pipeline = Pipeline(rig, radiometry, Settings(baselines=True))
+    pipeline = Pipeline(rig, radiometry, PipelineSettings(baselines=True))
     return Flown(emulated, pipeline.process(emulated.frames, emulated.conditions))
 
 
-def test_the_stitched_geometry_is_within_the_bars_of_the_house(flown: Flown) -> None:
+def test_the_stitched_geometry_is_within_the_accuracy_limits(flown: Flown) -> None:
     absolute, inner = flown.errors_px("free")
     assert rms(inner) < 0.05 and np.hypot(*inner.T).max() < 0.15
     assert rms(absolute) < 0.05 and np.hypot(*absolute.T).max() < 0.15

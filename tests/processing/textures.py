@@ -26,8 +26,8 @@ class Texture:
 
     def moved(self, dx: float, dy: float) -> Array:
         """The texture with its content moved by (dx, dy) px to the right and down."""
-        turn = np.exp(-2j * np.pi * (self.fx * dx + self.fy * dy))
-        return np.asarray(np.fft.ifft2(self.spectrum * turn).real + LEVEL)
+        phase_factor = np.exp(-2j * np.pi * (self.fx * dx + self.fy * dy))
+        return np.asarray(np.fft.ifft2(self.spectrum * phase_factor).real + LEVEL)
 
 
 def box_means(image: Array, ratio: int) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sim_hw.receivers.receiver import ReceiverState
+from sim_hw.receivers.emulated_receiver import ReceiverState
 
 NS = 1_000_000_000
 WEEK_NS = 7 * 86_400 * NS

@@ -27,11 +27,11 @@ from sim_hw.gige import features as at
 from sim_hw.processes.head_process import FirstLine
 from sim_hw.processes.simulator import SimulatorError, head_addresses
 from sim_hw.world.electronics import Electronics, true_sensor
-from sim_hw.world.rendering import Look, light_on_sensor
+from sim_hw.world.rendering import ExposureParameters, light_on_sensor
 from sim_hw.world.scene import open_scene
 from sim_hw.world.truth import world_of
 from sim_hw.world.world import World, WorldSettings
-from tests.sim_hw.gige.test_head import Controller
+from tests.sim_hw.gige.test_gige_head import Controller
 
 READY_WITHIN_S = 90.0
 ENDS_WITHIN_S = 60.0
@@ -104,7 +104,7 @@ def wait_for(condition: Any, what: str, within_s: float = 10.0) -> None:
         time.sleep(0.05)
 
 
-def test_it_says_once_where_everything_is(emulator: Emulator) -> None:
+def test_it_states_once_where_everything_is(emulator: Emulator) -> None:
     ready = emulator.ready
     assert ready["event"] == "ready"
     assert list(ready["heads"]) == [
@@ -173,7 +173,7 @@ def test_frames_marks_and_truth_of_a_pulse_belong_together(emulator: Emulator) -
         flight = world.flight.beginning_first_line_at(float(truth["first_line_at_m"]))
         for name in names:
             cone, sensor = world.rig.cone_of(name), world.rig.sensor(name)
-            look = Look(
+            look = ExposureParameters(
                 int(truth[f"{name}.mid_gps_ns"]),
                 float(truth[f"{name}.exposure_time_us"]),
                 int(truth[f"{name}.tdi_shifts"]),
@@ -224,7 +224,7 @@ def marks(port: serial.Serial, *, count: int) -> list[int]:
     return found
 
 
-def test_told_to_end_it_ends_with_everything(emulator: Emulator) -> None:
+def test_it_ends_with_everything_on_request(emulator: Emulator) -> None:
     assert emulator.end() == 0
     assert emulator.process.stdout is not None
     assert emulator.process.stdout.read() == ""

@@ -26,7 +26,7 @@ import tifffile
 
 from daemon.cli.sim import Emulator, free_first_address, service_toml, simulator_arguments
 from daemon.onboard.monitoring.access.tokens import add_token
-from tests.system.flown import ROOT, syntopic
+from tests.system.demo_mission import ROOT, syntopic
 from tests.system.test_operators_page import Running
 
 WITHIN_S = 180.0
@@ -104,7 +104,7 @@ def fly(out: Path, emulator: Emulator, count: int, block: int) -> dict[str, Any]
                 at_camera = is_attacked(number, block)
                 aim_at(attackers, "camera" if at_camera else "elsewhere")
         ended = service.wait_for(lambda e: e["event"] == "ended", WITHIN_S)
-        said, _ = attackers.communicate(timeout=30)
+        output, _ = attackers.communicate(timeout=30)
         mission = service.wait_for(lambda e: e["event"] == "mission", 1)["path"]
     finally:
         if attackers is not None and attackers.poll() is None:
@@ -117,7 +117,7 @@ def fly(out: Path, emulator: Emulator, count: int, block: int) -> dict[str, Any]
         "failure": ended["failure"],
         "ledger": ended["ledger"],
         "udp_sockets": len(aim["udp_ports"]) + len(aim["control_ports"]),
-        "attackers": json.loads(said),
+        "attackers": json.loads(output),
         "verdict_s": verdict_times(service.events, count, block),
         "reported": sorted({e["name"] for e in service.events if e["event"] == "device"}),
         "faults": [e["sentence"] for e in service.events if e["event"] == "device" and e["fault"]],

@@ -24,11 +24,11 @@ from typing import Any
 
 Address = tuple[str, int]
 
-SHARE = 0.25
+CPU_SHARE = 0.25
 """Of one core, at most."""
 CPU_MAX_S = 120
 ROUND_S = 0.02
-STRANGER = "127.66.6.6"
+OTHER_HOST = "127.66.6.6"
 SLOW_MAX = 100
 FLOOD_NBYTES = 1 << 18
 MDNS = ("224.0.0.251", 5353)
@@ -91,7 +91,7 @@ def forged_announcement(round_: int) -> bytes:
         record(service, 12, instance),
         record(instance, 33, struct.pack(">HHH", 0, 0, 9) + host),
         record(instance, 16, b"\x09tls=false"),
-        record(host, 1, socket.inet_aton(STRANGER)),
+        record(host, 1, socket.inet_aton(OTHER_HOST)),
     ]
     return struct.pack(">HHHHHH", 0, 0x8400, 0, len(answers), 0, 0) + b"".join(answers)
 
@@ -103,7 +103,7 @@ class Attackers:
         self._aim, self._sink = aim, sink
         self._is_at_camera = False
         self._udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._udp.bind((STRANGER, 0))
+        self._udp.bind((OTHER_HOST, 0))
         self._udp.setsockopt(
             socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton("127.0.0.1")
         )
@@ -164,15 +164,15 @@ class Attackers:
 
 
 def connected(page: Address) -> socket.socket:
-    made = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-    made.settimeout(0.1)
+    connection = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    connection.settimeout(0.1)
     try:
-        made.bind((STRANGER, 0))
-        made.connect(page)
+        connection.bind((OTHER_HOST, 0))
+        connection.connect(page)
     except OSError:
-        made.close()
+        connection.close()
         raise
-    return made
+    return connection
 
 
 def flood(page: Address) -> None:
@@ -237,11 +237,11 @@ def main() -> None:
             attackers.aim(done == "camera")
         attackers.round(number)
         number += 1
-        ahead_s = time.process_time() / SHARE - (time.monotonic() - began_s)
+        ahead_s = time.process_time() / CPU_SHARE - (time.monotonic() - began_s)
         over.wait(max(ahead_s, ROUND_S))
     os.kill(child, 9)
-    said = {"sent": attackers.sent, "rounds": number, "cpu_s": round(time.process_time(), 1)}
-    print(json.dumps(said))
+    summary = {"sent": attackers.sent, "rounds": number, "cpu_s": round(time.process_time(), 1)}
+    print(json.dumps(summary))
 
 
 if __name__ == "__main__":

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.flown import Flown, fly
+from tests.system.demo_mission import DemoMission, fly
 
 
 @pytest.fixture(scope="session")
-def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
+def flown(tmp_path_factory: pytest.TempPathFactory) -> DemoMission:
     return fly(tmp_path_factory.mktemp("first-flight"))
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from tests.system.flown import ROOT, Flown
+from tests.system.demo_mission import ROOT, DemoMission
 
 pytest.importorskip("gi", reason="needs PyGObject (extra aravis) and gir1.2-aravis-0.8")
 pytest.importorskip("pymavlink", reason="pip install 'syntopic[mavlink]'")
@@ -30,7 +30,7 @@ NAMESPACE = ["unshare", "--map-root-user", "--net"]
 
 
 def test_an_attacked_flight_loses_nothing_and_stores_what_its_heads_sent(
-    tmp_path: Path, flown: Flown, record_property: Callable[[str, Any], None]
+    tmp_path: Path, flown: DemoMission, record_property: Callable[[str, Any], None]
 ) -> None:
     has_unshare = shutil.which("unshare") is not None
     if not has_unshare or subprocess.run([*NAMESPACE, "true"], check=False).returncode:
@@ -47,26 +47,26 @@ def test_an_attacked_flight_loses_nothing_and_stores_what_its_heads_sent(
         check=False,
     )
     assert done.returncode == 0, done.stderr[-3000:]
-    said = json.loads(done.stdout)
+    output = json.loads(done.stdout)
     for name in ("verdict_s", "attackers"):
-        record_property(name, json.dumps(said[name]))
-        print(name, said[name])
+        record_property(name, json.dumps(output[name]))
+        print(name, output[name])
     # Everything was attacked: two sockets a head, and each kind of attacker got through.
-    assert said["udp_sockets"] > 2 * HEADS
-    assert set(said["attackers"]["sent"]) == {
+    assert output["udp_sockets"] > 2 * HEADS
+    assert set(output["attackers"]["sent"]) == {
         *("gvsp", "gvcp", "junk", "commands to heads", "mavlink junk", "mavlink replayed"),
         *("announcements", "slow connections", "floods", "wrong tokens"),
     }
-    assert all(count > 0 for count in said["attackers"]["sent"].values())
-    assert "other-sender" in said["reported"]
+    assert all(count > 0 for count in output["attackers"]["sent"].values())
+    assert "other-sender" in output["reported"]
 
-    assert said["failure"] is None
-    triggers = said["ledger"]["triggers"]
+    assert output["failure"] is None
+    triggers = output["ledger"]["triggers"]
     assert (triggers["triggers"], triggers["complete"]) == (EXPOSURES, EXPOSURES)
     assert (triggers["lost"], triggers["degraded"]) == (0, 0)
-    frames = said["ledger"]["frames"]
+    frames = output["ledger"]["frames"]
     assert (frames["received"], frames["used"]) == (HEADS * EXPOSURES, HEADS * EXPOSURES)
-    assert said["ledger"]["balanced"]
-    assert said["pixels"] == {"stored": HEADS * EXPOSURES, "same": HEADS * EXPOSURES}
-    assert said["verified"] == 0
-    assert not [name for name in said["reported"] if name in ("lost", "stream-restarted")]
+    assert output["ledger"]["balanced"]
+    assert output["pixels"] == {"stored": HEADS * EXPOSURES, "same": HEADS * EXPOSURES}
+    assert output["verified"] == 0
+    assert not [name for name in output["reported"] if name in ("lost", "stream-restarted")]

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.ring_heads import HEADER_PX, RING, build_ring, is_whole, number_of
+from benchmarks.ring_heads import HEADER_PX, RING, build_ring, is_intact, number_of
 from processing.rig import find_rig
 
 REPOSITORY = Path(__file__).parents[2]
@@ -27,20 +27,20 @@ def ring_of(folder: Path) -> np.ndarray[tuple[int, ...], np.dtype[np.uint16]]:
     )
 
 
-def test_frames_of_the_ring_are_told_apart_and_damage_is_seen(tmp_path: Path) -> None:
+def test_frames_of_the_ring_are_distinguished_and_damage_is_detected(tmp_path: Path) -> None:
     ring = ring_of(tmp_path)
-    assert [is_whole(frame) for frame in ring] == [True] * RING
+    assert [is_intact(frame) for frame in ring] == [True] * RING
     assert [number_of(frame) for frame in ring] == [0] * RING, "numbered when they are exposed"
     assert not np.array_equal(ring[0, 1], ring[1, 1])
     ring[1, 700, 3] ^= 1
-    assert not is_whole(ring[1])
+    assert not is_intact(ring[1])
     ring[2, 0, :HEADER_PX] = 0
     assert number_of(ring[2]) is None
 
 
 @pytest.mark.system
 @pytest.mark.timeout(300)
-def test_capture_alone_loses_nothing_and_says_what_it_took(tmp_path: Path) -> None:
+def test_capture_alone_loses_nothing_and_reports_its_cost(tmp_path: Path) -> None:
     pytest.importorskip("gi", reason="needs PyGObject (extra aravis) and gir1.2-aravis-0.8")
     command = [sys.executable, "-m", "benchmarks.capture", "--rig", RIG, "--noise", "--json"]
     done = subprocess.run(
@@ -53,13 +53,13 @@ def test_capture_alone_loses_nothing_and_says_what_it_took(tmp_path: Path) -> No
         check=False,
     )
     assert done.returncode == 0, f"{done.stdout}{done.stderr}"
-    told = json.loads(done.stdout)
-    assert told["nothing_lost"]
-    assert told["triggers"]["complete"] == 4
-    assert told["frames_exposed"] == told["frames_sent"] == 4 * 5
-    assert told["looked_at"] == 4
-    assert told["read_whole"] == 1
+    output = json.loads(done.stdout)
+    assert output["nothing_lost"]
+    assert output["triggers"]["complete"] == 4
+    assert output["frames_exposed"] == output["frames_sent"] == 4 * 5
+    assert output["checked"] == 4
+    assert output["fully_checked"] == 1
     processes = {"service", "writer", "capture", "worker", "heads 1", "heads 2"}
-    assert set(told["cpu_s"]) == processes
-    assert told["cpu_s"]["capture"] > 0
+    assert set(output["cpu_s"]) == processes
+    assert output["cpu_s"]["capture"] > 0
     assert list(tmp_path.glob("syntopic-capture-*")) == [], "nothing is left"

@@ -12,8 +12,8 @@ from daemon.cli.sim import Emulator, free_first_address, service_toml, simulator
 from daemon.mission.layout import Mission
 from daemon.mission.store.level0_folder import read_sealed
 from daemon.mission.verification.verification import verify
-from tests.crash.write_log import needs_strace, run_ill
-from tests.system.flown import ROOT
+from tests.crash.write_log import needs_strace, run_with_faults
+from tests.system.demo_mission import ROOT
 
 pytestmark = [
     pytest.mark.system,
@@ -23,7 +23,7 @@ pytestmark = [
 
 EXPOSURES = 7
 REFUSED = ("fsync", "pwrite64")
-TOLD = ("stored", "sealed", "lost")
+COUNTED_EVENTS = ("stored", "sealed", "lost")
 
 # Calls are counted in each thread for itself. The mission is made and opened with the first of
 # them; the last exposures find a disk that is well again.
@@ -48,16 +48,16 @@ def test_a_disk_that_refuses_and_stalls_costs_exposures_and_never_the_service(
         service_toml(emulator.ready, root="missions", count=EXPOSURES, end_when_done=True)
     )
     program = [sys.executable, "-m", "tests.crash.service", str(config)]
-    said, trace = tmp_path / "events", tmp_path / "trace"
+    stdout, trace = tmp_path / "events", tmp_path / "trace"
     try:
-        run_ill(program, FAULTS, trace, cwd=ROOT, said=said)
+        run_with_faults(program, FAULTS, trace, cwd=ROOT, stdout=stdout)
     finally:
         emulator.end()
     calls = trace.read_text().splitlines()
     refused = {name: sum(name in call and "INJECTED" in call for call in calls) for name in REFUSED}
     stalled = sum("DELAYED" in call for call in calls)
     assert min(refused.values()) >= 3 and stalled >= 3, "the disk was well"
-    events = [json.loads(line) for line in said.read_text().splitlines()]
+    events = [json.loads(line) for line in stdout.read_text().splitlines()]
     kinds = [event["event"] for event in events]
     last_refusal = max(i for i, kind in enumerate(kinds) if kind == "not-written")
     assert "stored" in kinds[last_refusal:], "storing does not go on when the disk is well again"
@@ -70,10 +70,19 @@ def test_a_disk_that_refuses_and_stalls_costs_exposures_and_never_the_service(
     # What was told is so, and each trigger has its record.
     mission = Mission.open(Path(next(e["path"] for e in events if e["event"] == "mission")))
     found = {number: read_sealed(mission.level0(number)) for number in mission.numbers()}
-    kept = {number for number, record in found.items() if record and record.exposure.frames}
-    told = {kind: {e["number"] for e in events if e["event"] == kind} for kind in TOLD}
-    assert told["stored"] == kept and len(kept) == counts["complete"] + counts["degraded"]
-    assert told["sealed"] == told["stored"]
-    assert told["sealed"] | told["lost"] == set(found) == set(range(1, EXPOSURES + 1))
+    present = {number for number, record in found.items() if record and record.exposure.frames}
+    numbers_by_event = {
+        kind: {e["number"] for e in events if e["event"] == kind} for kind in COUNTED_EVENTS
+    }
+    assert (
+        numbers_by_event["stored"] == present
+        and len(present) == counts["complete"] + counts["degraded"]
+    )
+    assert numbers_by_event["sealed"] == numbers_by_event["stored"]
+    assert (
+        numbers_by_event["sealed"] | numbers_by_event["lost"]
+        == set(found)
+        == set(range(1, EXPOSURES + 1))
+    )
     assert verify(mission).problems == ()
-    print(json.dumps({"refused": refused, "stalled": stalled, "kept": len(kept), **counts}))
+    print(json.dumps({"refused": refused, "stalled": stalled, "kept": len(present), **counts}))

@@ -15,13 +15,13 @@ from typing import Any
 import pytest
 
 from daemon.cli.sim import Emulator, free_first_address, service_toml, simulator_arguments
-from tests.system.flown import ROOT, syntopic
+from tests.system.demo_mission import ROOT, syntopic
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(400)]
 
 WAIT_S = 120.0
-CHILDREN_DIE_WITHIN_S = 3.0
-NOBODY = "127.99.99.99"
+CHILDREN_END_TIMEOUT_S = 3.0
+ABSENT_ADDRESS = "127.99.99.99"
 """An address at which no head answers."""
 
 
@@ -44,7 +44,7 @@ def start(config: Path) -> subprocess.Popen[str]:
     )
 
 
-def heard(service: subprocess.Popen[str]) -> Iterator[dict[str, Any]]:
+def read_events(service: subprocess.Popen[str]) -> Iterator[dict[str, Any]]:
     assert service.stdout is not None
     deadline = time.monotonic() + WAIT_S
     for line in service.stdout:
@@ -78,7 +78,7 @@ def test_a_killed_service_goes_on_in_the_same_flight(emulator: tuple[Emulator, P
     first = start(config)
     stored: set[int] = set()
     mission = ""
-    for event in heard(first):
+    for event in read_events(first):
         if event["event"] == "mission":
             mission = event["path"]
         if event["event"] == "stored":
@@ -91,7 +91,7 @@ def test_a_killed_service_goes_on_in_the_same_flight(emulator: tuple[Emulator, P
     assert len(family) >= 3
     first.send_signal(signal.SIGKILL)
     first.wait(10)
-    deadline = time.monotonic() + CHILDREN_DIE_WITHIN_S
+    deadline = time.monotonic() + CHILDREN_END_TIMEOUT_S
     while any(is_running(pid) for pid in family):
         assert time.monotonic() < deadline, "a process outlived the service"
         time.sleep(0.02)
@@ -104,13 +104,13 @@ def test_a_killed_service_goes_on_in_the_same_flight(emulator: tuple[Emulator, P
             unsealed.append(number)
 
     second = start(config)
-    events = list(heard(second))
+    events = list(read_events(second))
     assert second.wait(30) == 0
-    (told,) = [event for event in events if event["event"] == "mission"]
-    assert told["path"] == mission and told["resumed"]
+    (mission_event,) = [event for event in events if event["event"] == "mission"]
+    assert mission_event["path"] == mission and mission_event["resumed"]
     for number in unsealed:
         done = f"exposure {number}: was stored but not sealed; sealed from the log (event-mark)"
-        assert done in told["recovery"]
+        assert done in mission_event["recovery"]
     (ended,) = [event for event in events if event["event"] == "ended"]
     counts = ended["ledger"]["triggers"]
     assert counts["triggers"] == 6
@@ -133,10 +133,10 @@ def test_after_an_orderly_end_a_new_mission_begins(emulator: tuple[Emulator, Pat
     before = {path.name for path in (folder / "missions").iterdir()}
     config.write_text(service_toml(devices.ready, root="missions", count=1, end_when_done=True))
     service = start(config)
-    events = list(heard(service))
+    events = list(read_events(service))
     assert service.wait(30) == 0
-    (told,) = [event for event in events if event["event"] == "mission"]
-    assert not told["resumed"] and Path(told["path"]).name not in before
+    (mission_event,) = [event for event in events if event["event"] == "mission"]
+    assert not mission_event["resumed"] and Path(mission_event["path"]).name not in before
 
 
 def test_check_prints_a_tree_of_what_is_well_and_the_cure_of_what_is_not(
@@ -146,21 +146,25 @@ def test_check_prints_a_tree_of_what_is_well_and_the_cure_of_what_is_not(
     config = folder / "check.toml"
     text = service_toml(devices.ready, root="missions")
     config.write_text(text)
-    well = syntopic("check", str(config), "--json")
-    said = json.loads(well.stdout)
-    assert well.returncode == 0, said
-    assert said["outcome"] == "pass"
-    kinds = [finding["kind"] for finding in said["findings"]]
+    passing = syntopic("check", str(config), "--json")
+    findings_json = json.loads(passing.stdout)
+    assert passing.returncode == 0, findings_json
+    assert findings_json["outcome"] == "pass"
+    kinds = [finding["kind"] for finding in findings_json["findings"]]
     assert kinds.count("head") == 13 and {"disk", "memory", "pipeline", "trigger"} <= set(kinds)
-    tried = {f["name"]: f["outcome"] for f in said["findings"] if f["kind"] == "stream"}
+    tried = {f["name"]: f["outcome"] for f in findings_json["findings"] if f["kind"] == "stream"}
     assert tried["position of gnss"] == "pass" and tried["frame of SU03"] == "not tried"
     present = devices.ready["heads"]["SU03"]["address"]
-    config.write_text(text.replace(f'"{present}"', f'"{NOBODY}"'))
-    ill = syntopic("check", str(config), "--json")
-    said = json.loads(ill.stdout)
-    assert ill.returncode == 1
-    (head,) = [finding for finding in said["findings"] if finding["outcome"] == "fail"]
-    assert head["name"] == "SU03" and NOBODY in head["sentence"] and "check" in head["sentence"]
+    config.write_text(text.replace(f'"{present}"', f'"{ABSENT_ADDRESS}"'))
+    failing = syntopic("check", str(config), "--json")
+    findings_json = json.loads(failing.stdout)
+    assert failing.returncode == 1
+    (head,) = [finding for finding in findings_json["findings"] if finding["outcome"] == "fail"]
+    assert (
+        head["name"] == "SU03"
+        and ABSENT_ADDRESS in head["sentence"]
+        and "check" in head["sentence"]
+    )
 
 
 def test_check_fires_one_exposure_only_where_that_is_asked_for(
@@ -190,7 +194,7 @@ def test_a_process_that_dies_ends_the_service_with_a_sentence_and_the_flight_sta
     service = start(config)
     faults = []
     mission = ""
-    for event in heard(service):
+    for event in read_events(service):
         if event["event"] == "mission":
             mission = event["path"]
         elif event["event"] == "kernels":
@@ -210,12 +214,14 @@ def test_a_head_that_is_not_there_and_a_slow_pipeline_cost_flags_and_nothing_els
     config = folder / "service.toml"
     text = service_toml(devices.ready, root="degraded", count=3, end_when_done=True)
     address = devices.ready["heads"]["SU11"]["address"]
-    text = text.replace(f'"{address}"', f'"{NOBODY}"') + "\n[limits]\nready_timeout_s = 4.0\n"
+    text = (
+        text.replace(f'"{address}"', f'"{ABSENT_ADDRESS}"') + "\n[limits]\nready_timeout_s = 4.0\n"
+    )
     config.write_text(text)
     service = start(config)
     events = []
     worker = 0
-    for event in heard(service):
+    for event in read_events(service):
         events.append(event)
         if event["event"] == "kernels":
             worker = worker_of(service)
@@ -244,7 +250,7 @@ def test_sigterm_lands_in_good_order(emulator: tuple[Emulator, Path]) -> None:
     service = start(config)
     mission = ""
     ended: dict[str, Any] = {}
-    for event in heard(service):
+    for event in read_events(service):
         if event["event"] == "mission":
             mission = event["path"]
         elif event["event"] == "triggered" and event["number"] == 2:
@@ -270,7 +276,7 @@ def test_a_failing_supply_finds_everything_safe_within_the_stated_time(
     mission, stored, triggered = "", set(), set()
     status: dict[str, Any] = {}
     begun = safe_s = 0.0
-    for event in heard(service):
+    for event in read_events(service):
         if event["event"] == "mission":
             mission = event["path"]
         elif event["event"] == "triggered":

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from daemon.cli.sim import Emulator, free_first_address, service_toml, simulator_arguments
-from tests.system.test_faults_in_flight import heard, start
+from tests.system.test_faults_in_flight import read_events, start
 
 pytestmark = [pytest.mark.soak, pytest.mark.timeout(1200)]
 
@@ -53,7 +53,7 @@ def test_each_fault_costs_what_it_hits_and_no_other_exposure(tmp_path: Path) -> 
         text = service_toml(emulator.ready, root="missions", count=EXPOSURES, end_when_done=True)
         config.write_text(f"{text}\n[limits]\n{LIMITS}\n")
         service = start(config)
-        events: list[dict[str, Any]] = list(heard(service))
+        events: list[dict[str, Any]] = list(read_events(service))
         assert service.wait(30) == 0
     finally:
         emulator.end()

@@ -18,7 +18,7 @@ from pyubx2 import UBXReader
 from sim_hw.world.rendering import render_ideal
 from sim_hw.world.scene import open_scene
 from sim_hw.world.truth import world_of
-from tests.system.flown import Flown, syntopic
+from tests.system.demo_mission import DemoMission, syntopic
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(400)]
 
@@ -34,48 +34,55 @@ def shift_px(truth: NDArray[np.float32], image: NDArray[np.float32]) -> tuple[fl
     return float(warp[0, 2]), float(warp[1, 2])
 
 
-def test_twelve_of_twelve_exposures_are_complete_and_the_ledger_balances(flown: Flown) -> None:
-    said = flown.said
-    assert (said["exposures"], said["complete"], said["degraded"], said["lost"]) == (12, 12, 0, 0)
-    assert said["ledger_balanced"] is True
-    assert len(said["verdicts"]) == 12
-    assert set(said["verdicts"]) <= {"good", "usable"}
+def test_twelve_of_twelve_exposures_are_complete_and_the_ledger_balances(
+    flown: DemoMission,
+) -> None:
+    summary = flown.summary
+    assert (summary["exposures"], summary["complete"], summary["degraded"], summary["lost"]) == (
+        12,
+        12,
+        0,
+        0,
+    )
+    assert summary["ledger_balanced"] is True
+    assert len(summary["verdicts"]) == 12
+    assert set(summary["verdicts"]) <= {"good", "usable"}
 
 
-def test_the_stitched_images_are_where_the_truth_says(flown: Flown) -> None:
-    said = flown.said
-    assert said["rms_px"] < 0.1
-    assert said["rms_px_absolute"] < 0.15
-    assert said["rms_px_no_tdm"] > 3 * said["rms_px"]
-    assert said["rms_px_fixed"] > said["rms_px"]
+def test_the_stitched_images_are_where_the_truth_is(flown: DemoMission) -> None:
+    summary = flown.summary
+    assert summary["rms_px"] < 0.1
+    assert summary["rms_px_absolute"] < 0.15
+    assert summary["rms_px_no_tdm"] > 3 * summary["rms_px"]
+    assert summary["rms_px_fixed"] > summary["rms_px"]
 
 
-def test_the_mission_and_its_log_say_that_it_is_simulated(flown: Flown) -> None:
+def test_the_mission_and_its_log_say_that_it_is_simulated(flown: DemoMission) -> None:
     assert json.loads((flown.mission / "mission.json").read_text())["simulated"] is True
     for name in ("residuals.json", "mosaic.json"):
-        told = json.loads((flown.mission / "L2/000001" / name).read_text())
-        assert told["simulated"] is True, name
+        product_json = json.loads((flown.mission / "L2/000001" / name).read_text())
+        assert product_json["simulated"] is True, name
     (log,) = (flown.mission / "log").glob("*.mcap")
     with log.open("rb") as file:
         about = next(one for one in StreamReader(file).records if isinstance(one, Metadata))
     assert about.metadata["simulated"] == "true"
 
 
-def test_the_displaced_sensor_is_named_in_every_exposure(flown: Flown) -> None:
-    assert flown.said["displaced_sensor"] == "SU02"
-    assert flown.said["displaced_sensors"] == ["SU02"] * 12
+def test_the_displaced_sensor_is_named_in_every_exposure(flown: DemoMission) -> None:
+    assert flown.summary["displaced_sensor"] == "SU02"
+    assert flown.summary["displaced_sensors"] == ["SU02"] * 12
 
 
-def test_every_exposure_has_the_receivers_time_and_no_other(flown: Flown) -> None:
-    assert flown.said["time_error_ns"] == 0
-    assert flown.said["time_sigma_ns"] < 1000
+def test_every_exposure_has_the_receivers_time_and_no_other(flown: DemoMission) -> None:
+    assert flown.summary["time_error_ns"] == 0
+    assert flown.summary["time_sigma_ns"] < 1000
     for path in (flown.mission / "L0").glob("*/exposure.json"):
         record = json.loads(path.read_text())
         assert record["mark_source"] == "event-mark"
         assert all(frame["time_source"] == "event-mark" for frame in record["frames"])
 
 
-def test_every_frame_has_its_own_syntopic_instant_close_to_the_truth(flown: Flown) -> None:
+def test_every_frame_has_its_own_syntopic_instant_close_to_the_truth(flown: DemoMission) -> None:
     record = json.loads((flown.mission / "L0/000004/exposure.json").read_text())
     truth = np.load(flown.truth / "000004.npz")
     for frame in record["frames"]:
@@ -83,7 +90,7 @@ def test_every_frame_has_its_own_syntopic_instant_close_to_the_truth(flown: Flow
         assert abs(int(frame["mid_exposure_gps_ns"]) - true_ns) < 2_000, frame["sensor"]
 
 
-def test_the_virtual_image_shows_what_an_ideal_camera_would_see(flown: Flown) -> None:
+def test_the_virtual_image_shows_what_an_ideal_camera_would_see(flown: DemoMission) -> None:
     """Image against image: the truth is rendered, and both are correlated in windows."""
     number = 6
     pan = tifffile.imread(flown.mission / f"L2/{number:06d}/pan.tif").astype(np.float32)
@@ -104,10 +111,12 @@ def test_the_virtual_image_shows_what_an_ideal_camera_would_see(flown: Flown) ->
     assert np.abs(measured).max() < 0.25
 
 
-def test_the_mission_verifies_and_a_flipped_bit_is_found(flown: Flown, tmp_path: Path) -> None:
-    whole = syntopic("verify", str(flown.mission), "--json")
-    assert whole.returncode == 0, whole.stdout
-    assert json.loads(whole.stdout)["frames"] == 156
+def test_the_mission_verifies_and_a_flipped_bit_is_found(
+    flown: DemoMission, tmp_path: Path
+) -> None:
+    verified = syntopic("verify", str(flown.mission), "--json")
+    assert verified.returncode == 0, verified.stdout
+    assert json.loads(verified.stdout)["frames"] == 156
     copy = tmp_path / flown.mission.name
     shutil.copytree(flown.mission, copy, ignore=shutil.ignore_patterns("L2"))
     frame = copy / "L0/000003/SU11.tif"
@@ -122,7 +131,7 @@ def test_the_mission_verifies_and_a_flipped_bit_is_found(flown: Flown, tmp_path:
 
 
 def test_processing_again_gives_the_same_image_and_the_same_figures(
-    flown: Flown, tmp_path: Path
+    flown: DemoMission, tmp_path: Path
 ) -> None:
     copy = tmp_path / flown.mission.name
     # The exposure before it says how far they overlap.
@@ -140,7 +149,7 @@ def test_processing_again_gives_the_same_image_and_the_same_figures(
     )
 
 
-def test_an_exposure_written_by_hand_is_processed(flown: Flown, tmp_path: Path) -> None:
+def test_an_exposure_written_by_hand_is_processed(flown: DemoMission, tmp_path: Path) -> None:
     """Only TIFFs that tifffile wrote and a rig file: no record, no log, no index."""
     folder = tmp_path / "by-hand"
     (folder / "L0/000001").mkdir(parents=True)
@@ -157,19 +166,19 @@ def test_an_exposure_written_by_hand_is_processed(flown: Flown, tmp_path: Path) 
     assert tifffile.imread(folder / "L2/000001/pan.tif").shape == (2226, 3480)
 
 
-def test_the_receivers_bytes_come_out_whole_for_other_programs(flown: Flown) -> None:
+def test_the_receivers_bytes_come_out_whole_for_other_programs(flown: DemoMission) -> None:
     done = syntopic("export", "raw", str(flown.mission), "--json")
     assert done.returncode == 0, done.stderr
-    said = json.loads(done.stdout)
-    with (Path(said["folder"]) / "gnss.ubx").open("rb") as stream:
+    summary = json.loads(done.stdout)
+    with (Path(summary["folder"]) / "gnss.ubx").open("rb") as stream:
         kinds = [message.identity for _, message in UBXReader(stream, protfilter=2)]
     assert kinds.count("TIM-TM2") == 12
     assert kinds.count("NAV-PVT") > 100
-    assert said["events"] == 12
+    assert summary["events"] == 12
 
 
-def test_the_report_needs_nothing_beside_it_and_names_the_sensor(flown: Flown) -> None:
-    html = Path(flown.said["report"]).read_text()
+def test_the_report_is_self_contained_and_names_the_sensor(flown: DemoMission) -> None:
+    html = Path(flown.summary["report"]).read_text()
     assert "Simulated flight" in html
     assert "Displaced sensor: SU02" in html
     assert 'src="http' not in html and 'href="http' not in html

@@ -17,7 +17,7 @@ from mcap.reader import make_reader
 
 from tests.browser import Browser
 from tests.npm import npm_package
-from tests.system.flown import Flown, syntopic
+from tests.system.demo_mission import DemoMission, syntopic
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(400)]
 
@@ -53,7 +53,9 @@ def studio(tmp_path: Path) -> Iterator[str]:
         serving.join(10)
 
 
-def test_foxglove_opens_the_log_of_a_mission(flown: Flown, studio: str, tmp_path: Path) -> None:
+def test_foxglove_opens_the_log_of_a_mission(
+    flown: DemoMission, studio: str, tmp_path: Path
+) -> None:
     done = syntopic("export", "foxglove", str(flown.mission), "--json")
     assert done.returncode == 0, done.stderr
     exported = json.loads(done.stdout)
@@ -70,8 +72,8 @@ def test_foxglove_opens_the_log_of_a_mission(flown: Flown, studio: str, tmp_path
         assert "Waiting for" not in browser.text("#root"), "the map or the image is empty"
         browser.evaluate(f"{PROBLEMS}.click()")
         browser.wait_for(shows("No problems found"), WITHIN_S)
-        if keep := os.environ.get("SYNTOPIC_PICTURES"):
-            browser.picture(Path(keep) / "foxglove.png")
+        if pictures_folder := os.environ.get("SYNTOPIC_PICTURES"):
+            browser.picture(Path(pictures_folder) / "foxglove.png")
         assert [url for url in browser.requested if "//127.0.0.1" not in url and "://" in url] == []
 
 

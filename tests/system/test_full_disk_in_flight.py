@@ -11,7 +11,7 @@ import pytest
 
 from daemon.cli.sim import Emulator, free_first_address, service_toml, simulator_arguments
 from tests.crash.test_full_disk import NAMESPACE, needs_namespace
-from tests.system.flown import ROOT
+from tests.system.demo_mission import ROOT
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(400)]
 
@@ -38,12 +38,12 @@ def test_a_full_disk_costs_exposures_and_never_the_service(tmp_path: Path, scene
         emulator.end()
     assert done.returncode == 0, done.stderr[-3000:]
     print(done.stdout)
-    said = json.loads(done.stdout)
-    assert said["was_freed"] and said["status"] == 0 and said["failure"] is None
-    assert said["events"]["not-written"] >= 1 and said["events"]["disk"] >= 1
-    counts = said["triggers"]
-    assert said["balanced"] and counts["open"] == 0 and counts["lost"] >= 1
+    output = json.loads(done.stdout)
+    assert output["was_freed"] and output["status"] == 0 and output["failure"] is None
+    assert output["events"]["not-written"] >= 1 and output["events"]["disk"] >= 1
+    counts = output["triggers"]
+    assert output["balanced"] and counts["open"] == 0 and counts["lost"] >= 1
     # Each trigger has its record, each stored exposure its frames, and nothing is half there.
-    assert said["problems"] == []
-    assert said["exposures"] == counts["triggers"]
-    assert len(said["stored"]) == counts["complete"] + counts["degraded"] >= 4
+    assert output["problems"] == []
+    assert output["exposures"] == counts["triggers"]
+    assert len(output["stored"]) == counts["complete"] + counts["degraded"] >= 4

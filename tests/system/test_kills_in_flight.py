@@ -14,13 +14,13 @@ from pathlib import Path
 import pytest
 
 from daemon.cli.sim import Emulator, free_first_address, service_toml, simulator_arguments
-from tests.system.flown import ROOT, syntopic
-from tests.system.test_faults_in_flight import heard
+from tests.system.demo_mission import ROOT, syntopic
+from tests.system.test_faults_in_flight import read_events
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(400)]
 
-EXPOSURES_OF_A_LIFE = 1
-LIFE_LIMIT_S = 60.0
+EXPOSURES_PER_RUN = 1
+RUN_LIMIT_S = 60.0
 
 
 def kill_in_flight(
@@ -32,7 +32,7 @@ def kill_in_flight(
     `syntopic verify` as well, and what the logs hold of every life is replayed. `scene` is how many
     exposures of ground the emulator builds, `scenes` where it keeps them.
     """
-    dice = random.Random(seed)
+    rng = random.Random(seed)
     rig = "ultracam-l-mini"
     arguments = simulator_arguments(rig, folder / "sim", seed=4, dc=0, displace=[])
     address = free_first_address()
@@ -40,20 +40,20 @@ def kill_in_flight(
     emulator = Emulator([*arguments, "--scene-cache", str(scenes)])
     config = folder / "service.toml"
     config.write_text(service_toml(emulator.ready, root="missions"))
-    told: dict[str, set[int]] = {"triggered": set(), "stored": set(), "sealed": set()}
+    numbers_by_event: dict[str, set[int]] = {"triggered": set(), "stored": set(), "sealed": set()}
     missions: set[str] = set()
     in_flight = 0
     begun_s = time.monotonic()
     try:
-        for life in range(1, kills + 1):
-            is_long = life % every == 0
-            in_flight += _live(config, dice, told, missions, is_long=is_long)
+        for run_number in range(1, kills + 1):
+            is_long = run_number % every == 0
+            in_flight += _run_and_kill(config, rng, numbers_by_event, missions, is_long=is_long)
         (mission,) = missions
         seconds = round(time.monotonic() - begun_s, 1)
         # Landing at once: recovery has the last word.
         last = _start(config)
         ended = {}
-        for event in heard(last):
+        for event in read_events(last):
             if event["event"] == "mission":
                 last.send_signal(signal.SIGTERM)
             elif event["event"] == "ended":
@@ -67,9 +67,9 @@ def kill_in_flight(
         for path in Path(mission, "L0").glob("*/exposure.json")
         if (record := json.loads(path.read_text()))
     }
-    kept = {number for number, record in records.items() if record["frames"]}
-    assert told["stored"] and told["stored"] <= kept
-    assert told["sealed"] <= records.keys()
+    present = {number for number, record in records.items() if record["frames"]}
+    assert numbers_by_event["stored"] and numbers_by_event["stored"] <= present
+    assert numbers_by_event["sealed"] <= records.keys()
     assert ended["ledger"]["triggers"]["triggers"] == len(records)
     verified = syntopic("verify", mission, "--json")
     assert verified.returncode == 0, verified.stdout
@@ -78,20 +78,20 @@ def kill_in_flight(
     figures = {
         "kills": kills,
         "killed in flight": in_flight,
-        "triggered": len(told["triggered"]),
-        "stored": len(told["stored"]),
+        "triggered": len(numbers_by_event["triggered"]),
+        "stored": len(numbers_by_event["stored"]),
         "records": len(records),
-        "kept": len(kept),
+        "kept": len(present),
         "seconds": seconds,
     }
     print(json.dumps(figures))
     return figures
 
 
-def _live(
+def _run_and_kill(
     config: Path,
-    dice: random.Random,
-    told: dict[str, set[int]],
+    rng: random.Random,
+    numbers_by_event: dict[str, set[int]],
     missions: set[str],
     *,
     is_long: bool,
@@ -99,22 +99,22 @@ def _live(
     """One life; whether it had given a trigger when it was killed."""
     service = _start(config)
     killer = threading.Timer(
-        LIFE_LIMIT_S if is_long else dice.uniform(0.3, 2.0), service.send_signal, [signal.SIGKILL]
+        RUN_LIMIT_S if is_long else rng.uniform(0.3, 2.0), service.send_signal, [signal.SIGKILL]
     )
     killer.start()
     stored = 0
     was_in_flight = False
-    for event in heard(service):
+    for event in read_events(service):
         kind = event["event"]
         if kind == "mission":
             missions.add(event["path"])
-        elif kind in told:
-            told[kind].add(event["number"])
+        elif kind in numbers_by_event:
+            numbers_by_event[kind].add(event["number"])
             was_in_flight = True
             stored += kind == "stored"
-        if is_long and stored == EXPOSURES_OF_A_LIFE:
+        if is_long and stored == EXPOSURES_PER_RUN:
             killer.cancel()
-            threading.Timer(dice.uniform(0.0, 0.3), service.send_signal, [signal.SIGKILL]).start()
+            threading.Timer(rng.uniform(0.0, 0.3), service.send_signal, [signal.SIGKILL]).start()
             is_long = False
     killer.cancel()
     service.wait(10)

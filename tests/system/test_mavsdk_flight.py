@@ -10,7 +10,7 @@ import pytest
 
 from daemon.cli.sim import Emulator, free_first_address, service_toml, simulator_arguments
 from tests.daemon.onboard.monitoring.test_mavsdk_camera import free_port
-from tests.system.flown import Flown
+from tests.system.demo_mission import DemoMission
 from tests.system.test_operators_page import READY_WITHIN_S, Running
 
 PHOTOS = 2
@@ -20,7 +20,7 @@ PHOTOS = 2
 @pytest.mark.peer
 @pytest.mark.timeout(600)
 def test_photos_that_a_ground_station_asked_for_are_in_the_ledger(
-    tmp_path: Path, flown: Flown
+    tmp_path: Path, flown: DemoMission
 ) -> None:
     mavsdk = pytest.importorskip("mavsdk", reason="mavsdk is absent; pip install it")
     from mavsdk.plugins.camera import Camera
@@ -45,16 +45,16 @@ def test_photos_that_a_ground_station_asked_for_are_in_the_ledger(
         sdk.add_any_connection(f"udpin://127.0.0.1:{port}")
         camera = _camera(sdk, Camera)
         (listed,) = _wait(lambda: camera.camera_list().cameras)
-        heard: list[Any] = []
+        received: list[Any] = []
         camera.subscribe_capture_info(
-            lambda *told: heard.extend(one for one in told if hasattr(one, "index"))
+            lambda *telemetry: received.extend(one for one in telemetry if hasattr(one, "index"))
         )
         for number in range(1, PHOTOS + 1):
             camera.take_photo(listed.component_id)
             service.wait_for(
                 lambda e, n=number: e["event"] == "sealed" and e["number"] == n, READY_WITHIN_S
             )
-        _wait(lambda: {one.index for one in heard} >= set(range(PHOTOS)))
+        _wait(lambda: {one.index for one in received} >= set(range(PHOTOS)))
         service.process.terminate()
         ended = service.wait_for(lambda e: e["event"] == "ended", 90)
         assert ended["ledger"]["balanced"]
@@ -74,9 +74,9 @@ def _camera(sdk: Any, plugin: Any) -> Any:
     return plugin(_wait(sdk.get_systems)[0])
 
 
-def _wait(told: Any, within_s: float = 60.0) -> Any:
+def _wait(telemetry: Any, within_s: float = 60.0) -> Any:
     deadline = time.monotonic() + within_s
-    while not (found := told()):
+    while not (found := telemetry()):
         assert time.monotonic() < deadline
         time.sleep(0.1)
     return found

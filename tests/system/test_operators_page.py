@@ -26,12 +26,12 @@ import pytest
 
 from daemon.cli.sim import Emulator, free_first_address, service_toml, simulator_arguments
 from daemon.onboard.monitoring.access.tokens import add_token
-from daemon.planning.model import Plane, Point
-from daemon.planning.reading import read_plan
+from daemon.planning.model import LocalPlane, Point
+from daemon.planning.plan_readers import read_plan
 from sim_hw.world.flight import FlightPlan
 from tests.browser import Browser, chromium
 from tests.daemon.onboard.monitoring.test_mavsdk_camera import free_port
-from tests.system.flown import ROOT, Flown
+from tests.system.demo_mission import ROOT, DemoMission
 from tests.system.waypoints import darkened, fly_mission
 
 EXPOSURES = 4
@@ -48,7 +48,7 @@ GAIN_DB = 3.0
 STEPS = (0.95, 1.1, 1.2)
 """Ways between waypoints, of what the overlap asks for."""
 LINE_AHEAD_S, LINE_LENGTH_M = 25.0, 30_000.0
-AWAY_M = 6.0
+MAX_DISTANCE_M = 6.0
 """A tenth of a second's flight: the machine may be busy. What was reached is printed."""
 
 
@@ -64,13 +64,13 @@ class Running:
             text=True,
         )
         self.events: list[dict[str, Any]] = []
-        self._fresh: queue.Queue[dict[str, Any]] = queue.Queue()
-        threading.Thread(target=self._hear, daemon=True).start()
+        self._new_events: queue.Queue[dict[str, Any]] = queue.Queue()
+        threading.Thread(target=self._collect_events, daemon=True).start()
 
-    def _hear(self) -> None:
+    def _collect_events(self) -> None:
         assert self.process.stdout is not None
         for line in self.process.stdout:
-            self._fresh.put(json.loads(line))
+            self._new_events.put(json.loads(line))
 
     def wait_for(self, is_it: Callable[[dict[str, Any]], bool], within_s: float) -> dict[str, Any]:
         """The first event of a kind, whether it has come already or not."""
@@ -82,7 +82,7 @@ class Running:
                     return self.events[checked]
                 checked += 1
             try:
-                self.events.append(self._fresh.get(timeout=deadline - time.monotonic()))
+                self.events.append(self._new_events.get(timeout=deadline - time.monotonic()))
             except (queue.Empty, ValueError):
                 raise AssertionError(f"not within {within_s} s: {self.events[-3:]}") from None
 
@@ -95,7 +95,7 @@ def planned_line(ready: Mapping[str, Any]) -> dict[str, Any]:
     """
     passed_s = (time.monotonic_ns() - ready["mono_ns_at_line_start"]) * 1e-9
     begins_m = (passed_s + LINE_AHEAD_S) * ready["plan"]["ground_speed_mps"]
-    plane = Plane(Point(FlightPlan.latitude_deg, FlightPlan.longitude_deg))
+    plane = LocalPlane(Point(FlightPlan.latitude_deg, FlightPlan.longitude_deg))
     ends = [plane.place(0.0, begins_m), plane.place(0.0, begins_m + LINE_LENGTH_M)]
     line = {
         "type": "Feature",
@@ -127,7 +127,7 @@ def planned_line(ready: Mapping[str, Any]) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def camera(
-    tmp_path_factory: pytest.TempPathFactory, flown: Flown
+    tmp_path_factory: pytest.TempPathFactory, flown: DemoMission
 ) -> Iterator[tuple[Running, str, str]]:
     """A service that waits for the command to start; its page's address, and a token."""
     chromium()
@@ -149,8 +149,8 @@ def camera(
     token = add_token(folder / "tokens.toml", "operator", "administrator")
     service = Running(config)
     try:
-        told = service.wait_for(lambda e: e["event"] == "watching", READY_WITHIN_S)
-        yield service, f"http://{told['host']}:{told['port']}/", token
+        details = service.wait_for(lambda e: e["event"] == "watching", READY_WITHIN_S)
+        yield service, f"http://{details['host']}:{details['port']}/", token
     finally:
         if service.process.poll() is None:
             service.process.terminate()
@@ -201,35 +201,43 @@ def test_a_flight_is_flown_from_the_page(
         browser.wait_for(f"document.querySelector('.line-label')?.innerText === '{LINE}'", 10)
         assert browser.text("#rows tr td:nth-child(3)") == LINE
         browser.wait_for("document.querySelector('#quicklook').naturalWidth > 0", 20)
-        keep = os.environ.get("SYNTOPIC_PICTURES")
-        browser.picture(Path(keep) / "page.png" if keep else tmp_path / "page.png")
+        pictures_folder = os.environ.get("SYNTOPIC_PICTURES")
+        browser.picture(
+            Path(pictures_folder) / "page.png" if pictures_folder else tmp_path / "page.png"
+        )
 
         service.wait_for(lambda e: e["event"] == "processed" and e["number"] == EXPOSURES, 10)
         for number in range(1, EXPOSURES + 1):
             print(f"exposure {number}, s after the trigger: {steps_s(service, number)}")
         busy.append(busy_share())
-        can_judge = max(busy) < OTHERS_BUSY
-        told = "" if can_judge else ": too busy to judge by"
-        print(f"cores busy before and after the flight: {busy[0]:.0%}, {busy[1]:.0%}{told}")
-        if can_judge:
+        is_idle_enough = max(busy) < OTHERS_BUSY
+        details = "" if is_idle_enough else ": too busy to judge by"
+        print(f"cores busy before and after the flight: {busy[0]:.0%}, {busy[1]:.0%}{details}")
+        if is_idle_enough:
             assert statistics.median(latencies_s) < SLACK * VERDICT_WITHIN_S
         browser.click("#show-residuals")
         browser.wait_for("document.querySelectorAll('#vectors path')[0]?.getAttribute('d')", 20)
         browser.evaluate("document.querySelector('#exposure-room').open = false")
         browser.evaluate("document.querySelector('#overlaps-room').open = true")
-        browser.picture(Path(keep) / "residuals.png" if keep else tmp_path / "residuals.png")
+        browser.picture(
+            Path(pictures_folder) / "residuals.png"
+            if pictures_folder
+            else tmp_path / "residuals.png"
+        )
         tablet = {"width": 768, "height": 1024, "deviceScaleFactor": 1, "mobile": True}
         browser.call("Emulation.setDeviceMetricsOverride", **tablet)
         browser.click("#theme")
-        browser.picture(Path(keep) / "night.png" if keep else tmp_path / "night.png")
+        browser.picture(
+            Path(pictures_folder) / "night.png" if pictures_folder else tmp_path / "night.png"
+        )
         browser.evaluate("window.confirm = () => true")
         browser.click("[data-command=land]")
         ended = service.wait_for(lambda e: e["event"] == "ended", 60)
         assert ended["failure"] is None
         assert ended["ledger"]["triggers"]["lost"] == 0
-        away_m = exposed_where_planned(Path(event_of(service, "mission")["path"]))
-        record_property("away_from_place_m", [round(value, 2) for value in away_m])
-        print(f"exposed beside the planned places by {[round(v, 2) for v in away_m]} m")
+        deviation_m = exposed_where_planned(Path(event_of(service, "mission")["path"]))
+        record_property("away_from_place_m", [round(value, 2) for value in deviation_m])
+        print(f"exposed beside the planned places by {[round(v, 2) for v in deviation_m]} m")
         commands = [(e["name"], e["by"]) for e in service.events if e["event"] == "command"]
         assert commands == [("exposure", "operator"), ("start", "operator"), ("land", "operator")]
 
@@ -253,11 +261,11 @@ def event_of(service: Running, name: str) -> dict[str, Any]:
 
 def steps_s(service: Running, number: int) -> dict[str, float]:
     """When an exposure was stored, sealed, judged and processed, and how long the pipeline took."""
-    told = {e["event"]: e for e in service.events if e.get("number") == number}
-    fired_ns = int(told["triggered"]["mono_ns"])
+    details = {e["event"]: e for e in service.events if e.get("number") == number}
+    fired_ns = int(details["triggered"]["mono_ns"])
     steps = ("stored", "sealed", "judged", "processed")
-    found = {step: round((int(told[step]["mono_ns"]) - fired_ns) * 1e-9, 2) for step in steps}
-    return {**found, "pipeline": round(told["processed"]["duration_s"], 2)}
+    found = {step: round((int(details[step]["mono_ns"]) - fired_ns) * 1e-9, 2) for step in steps}
+    return {**found, "pipeline": round(details["processed"]["duration_s"], 2)}
 
 
 def exposed_where_planned(mission: Path) -> list[float]:
@@ -266,9 +274,9 @@ def exposed_where_planned(mission: Path) -> list[float]:
     Records, index and footprints must name line and strip, and the overlap be that of the plan.
     """
     plan = read_plan(next(mission.glob("plan.*")))
-    plane, at_m = Plane(plan.lines[0].start), plan.lines[0].at_m
+    plane, at_m = LocalPlane(plan.lines[0].start), plan.lines[0].at_m
     distance_m = tomllib.loads((mission / "service.toml").read_text())["trigger"]["distance_m"]
-    places, away_m, before_m = [], [], math.nan
+    places, deviation_m, before_m = [], [], math.nan
     for number in range(1, EXPOSURES + 1):
         record = json.loads((mission / f"L0/{number:06d}/exposure.json").read_text())
         assert (record["line_id"], record["strip_id"]) == (LINE, STRIP)
@@ -277,7 +285,7 @@ def exposed_where_planned(mission: Path) -> list[float]:
         where = record["navigation"]
         _, along_m = plane.flat(Point(where["latitude_deg"], where["longitude_deg"]))
         places.append(min(range(len(at_m)), key=lambda k, m=along_m: abs(at_m[k] - m)))
-        away_m.append(along_m - at_m[places[-1]])
+        deviation_m.append(along_m - at_m[places[-1]])
         quality = json.loads((mission / f"L2/{number:06d}/quality.json").read_text())
         if number > 1:
             step = (along_m - before_m) / distance_m
@@ -287,19 +295,19 @@ def exposed_where_planned(mission: Path) -> list[float]:
         before_m = along_m
     assert places == list(range(places[0], places[0] + EXPOSURES))
     # On a machine that is busy with other things the order itself comes late.
-    assert min(map(abs, away_m)) < AWAY_M
-    assert max(map(abs, away_m)) < 0.3 * distance_m
+    assert min(map(abs, deviation_m)) < MAX_DISTANCE_M
+    assert max(map(abs, deviation_m)) < 0.3 * distance_m
     with closing(sqlite3.connect(f"file:{mission}/mission.db?mode=ro", uri=True)) as index:
         assert index.execute("SELECT DISTINCT line_id, strip_id FROM exposures").fetchall() == [
             (LINE, STRIP)
         ]
-    return away_m
+    return deviation_m
 
 
 @pytest.mark.system
 @pytest.mark.timeout(600)
 def test_a_mission_of_waypoints_is_exposed_and_a_head_that_goes_is_seen_and_acknowledged(
-    tmp_path: Path, flown: Flown
+    tmp_path: Path, flown: DemoMission
 ) -> None:
     """An autopilot orders exposures at its waypoints, in a light that the heads follow.
 
@@ -318,9 +326,9 @@ def test_a_mission_of_waypoints_is_exposed_and_a_head_that_goes_is_seen_and_ackn
     token = add_token(tmp_path / "tokens.toml", "operator", "administrator")
     service = Running(config)
     try:
-        told = service.wait_for(lambda e: e["event"] == "watching", READY_WITHIN_S)
+        details = service.wait_for(lambda e: e["event"] == "watching", READY_WITHIN_S)
         with Browser(tmp_path / "profile") as browser:
-            browser.open(f"http://{told['host']}:{told['port']}/")
+            browser.open(f"http://{details['host']}:{details['port']}/")
             browser.wait_for("document.querySelector('#link')?.innerText === 'linked'", 60)
             service.wait_for(lambda e: e["event"] == "ready", READY_WITHIN_S)
             browser.wait_for("document.querySelector('#phase').innerText === 'ready'", 30)
@@ -338,8 +346,10 @@ def test_a_mission_of_waypoints_is_exposed_and_a_head_that_goes_is_seen_and_ackn
             # It stands still, so it stays; but somebody has seen it.
             browser.wait_for(f"document.querySelector('[data-fault={name}] button') === null", 30)
             assert "WARNING, acknowledged" in browser.text("#faults")
-            keep = os.environ.get("SYNTOPIC_PICTURES")
-            browser.picture(Path(keep) / "faults.png" if keep else tmp_path / "faults.png")
+            pictures_folder = os.environ.get("SYNTOPIC_PICTURES")
+            browser.picture(
+                Path(pictures_folder) / "faults.png" if pictures_folder else tmp_path / "faults.png"
+            )
     finally:
         if service.process.poll() is None:
             service.process.terminate()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from daemon.cli.sim import Emulator, free_first_address, service_toml, simulator_arguments
-from tests.system.flown import fly, syntopic
+from tests.system.demo_mission import fly, syntopic
 
 pytestmark = [pytest.mark.system, pytest.mark.soak, pytest.mark.timeout(600)]
 
@@ -25,17 +25,17 @@ def test_three_of_three_exposures_have_the_mark_of_their_own_strobe(
     receiver: str, tmp_path: Path
 ) -> None:
     flown = fly(tmp_path, "--rig", RIG, "--exposures", "3", "--receiver", receiver)
-    said = flown.said
-    assert (said["exposures"], said["complete"], said["lost"]) == (3, 3, 0)
-    assert said["ledger_balanced"] is True
+    summary = flown.summary
+    assert (summary["exposures"], summary["complete"], summary["lost"]) == (3, 3, 0)
+    assert summary["ledger_balanced"] is True
     records = sorted((flown.mission / "L0").glob("*/exposure.json"))
     assert len(records) == 3
     for path in records:
         record = json.loads(path.read_text())
         truth = np.load(flown.truth / f"{path.parent.name}.npz")
         assert record["mark_source"] == "event-mark"
-        away_ns = int(record["mark_gps_ns"]) - int(truth["mark_gps_ns"])
-        assert abs(away_ns) <= TIME_WITHIN_NS[receiver]
+        error_ns = int(record["mark_gps_ns"]) - int(truth["mark_gps_ns"])
+        assert abs(error_ns) <= TIME_WITHIN_NS[receiver]
         latitude, longitude, height = truth["latitude_longitude_height"]
         place = record["navigation"]
         north_m = (place["latitude_deg"] - latitude) * 111_320

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from daemon.cli.sim import Emulator, free_first_address, service_toml, simulator_arguments
-from tests.system.flown import ROOT, Flown, syntopic
+from tests.system.demo_mission import ROOT, DemoMission, syntopic
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(300)]
 
@@ -23,31 +23,29 @@ IMAGES = ("pan.tif", "rgbn.tif", "geometry.npz", "quality.json")
 LONG_RUN_S = 7000.0
 
 
-def compared(told: dict[str, Any]) -> dict[str, tuple[int, int]]:
-    return {row["what"]: (row["equal"], row["different"]) for row in told["compared"]}
+def compared(output: dict[str, Any]) -> dict[str, tuple[int, int]]:
+    return {row["what"]: (row["equal"], row["different"]) for row in output["compared"]}
 
 
 def test_a_replay_gives_the_same_hashes_with_one_exposure_in_work_and_with_two(
-    flown: Flown,
+    flown: DemoMission,
 ) -> None:
     done = syntopic("replay", str(flown.mission), "--only", "5", "--only", "6", "--json")
-    told = json.loads(done.stdout)
-    assert done.returncode == 0, told["sentences"][:5]
-    found = compared(told)
+    output = json.loads(done.stdout)
+    assert done.returncode == 0, output["sentences"][:5]
+    found = compared(output)
     assert found["exposure records"] == (12, 0)
     assert found["seals"] == (12, 0)
     assert found["ledger"] == (1, 0)
     assert found["records of gnss"][0] > 100
     assert found["records of probes"][0] > 100
-    for lanes in (1, 2):
+    for parallel in (1, 2):
         for file in ("pan.tif", "rgbn.tif", "geometry.npz", "quality.json"):
-            assert found[f"{file}, {lanes} in work"] == (2, 0)
+            assert found[f"{file}, {parallel} in work"] == (2, 0)
     assert sum(different for _, different in found.values()) == 0
 
 
-def test_a_replay_finds_one_flipped_bit_in_what_the_receiver_said(
-    flown: Flown, tmp_path: Path
-) -> None:
+def test_a_replay_finds_one_flipped_bit_of_the_receiver(flown: DemoMission, tmp_path: Path) -> None:
     mission = tmp_path / flown.mission.name
     mission.mkdir()
     shutil.copytree(flown.mission / "L0", mission / "L0", copy_function=os.link)
@@ -63,11 +61,11 @@ def test_a_replay_finds_one_flipped_bit_in_what_the_receiver_said(
     log.chmod(0o644)
     log.write_bytes(data)
     done = syntopic("replay", str(mission), "--records-only", "--json")
-    told = json.loads(done.stdout)
+    output = json.loads(done.stdout)
     assert done.returncode == 1
     # The message's checksum is wrong now, so what was told then is not in the bytes any more.
-    assert compared(told)["records of gnss"][1] > 0
-    assert told["sentences"]
+    assert compared(output)["records of gnss"][1] > 0
+    assert output["sentences"]
 
 
 def fly_long(folder: Path, count: int) -> Path:
@@ -104,14 +102,14 @@ def test_two_hundred_exposures_replayed_give_equal_hashes(tmp_path: Path) -> Non
     """About 13 GB; a busy machine may put images off or lose frames, and replays that as well."""
     count = 200
     mission = fly_long(tmp_path, count)
-    made = len(list((mission / "L2").glob("[0-9]*")))
+    image_count = len(list((mission / "L2").glob("[0-9]*")))
     done = syntopic("replay", str(mission), "--json", within_s=LONG_RUN_S)
-    told = json.loads(done.stdout)
-    print(json.dumps(told))
-    found = compared(told)
-    assert done.returncode == 0, told["sentences"][:5]
+    output = json.loads(done.stdout)
+    print(json.dumps(output))
+    found = compared(output)
+    assert done.returncode == 0, output["sentences"][:5]
     assert found["exposure records"] == (count, 0) and found["ledger"] == (1, 0)
-    for lanes in (1, 2):
+    for parallel in (1, 2):
         for file in IMAGES:
-            assert found[f"{file}, {lanes} in work"] == (made, 0)
-    assert made >= 0.9 * count
+            assert found[f"{file}, {parallel} in work"] == (image_count, 0)
+    assert image_count >= 0.9 * count

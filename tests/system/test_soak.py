@@ -11,13 +11,13 @@ from pathlib import Path
 import pytest
 
 from daemon.cli.sim import Emulator, free_first_address, service_toml, simulator_arguments
-from tests.system.flown import syntopic
-from tests.system.test_faults_in_flight import heard, start
+from tests.system.demo_mission import syntopic
+from tests.system.test_faults_in_flight import read_events, start
 
 pytestmark = [pytest.mark.soak, pytest.mark.timeout(7200)]
 
 KILLS = 20
-LONGEST_LIFE_S = 30.0
+LONGEST_RUN_S = 30.0
 
 
 def test_twenty_kills_at_random_instants_lose_nothing_that_was_reported_stored(
@@ -35,10 +35,10 @@ def test_twenty_kills_at_random_instants_lose_nothing_that_was_reported_stored(
         for _ in range(KILLS):
             service = start(config)
             killer = threading.Timer(
-                rng.uniform(1.0, LONGEST_LIFE_S), service.send_signal, [signal.SIGKILL]
+                rng.uniform(1.0, LONGEST_RUN_S), service.send_signal, [signal.SIGKILL]
             )
             killer.start()
-            for event in heard(service):
+            for event in read_events(service):
                 if event["event"] == "mission":
                     missions.add(event["path"])
                 elif event["event"] == "stored":
@@ -49,14 +49,14 @@ def test_twenty_kills_at_random_instants_lose_nothing_that_was_reported_stored(
             service_toml(emulator.ready, root="missions", count=1, end_when_done=True)
         )
         last = start(config)
-        events = list(heard(last))
+        events = list(read_events(last))
         assert last.wait(30) == 0
     finally:
         emulator.end()
     (ended,) = [event for event in events if event["event"] == "ended"]
     assert ended["ledger"]["balanced"], ended["ledger"]["imbalances"]
-    kept = {int(path.name) for path in Path(mission, "L0").glob("[0-9]*")}
-    assert stored and stored <= kept
+    present = {int(path.name) for path in Path(mission, "L0").glob("[0-9]*")}
+    assert stored and stored <= present
     verified = syntopic("verify", mission, "--json")
     assert verified.returncode == 0, verified.stdout
-    print(json.dumps({"kills": KILLS, "stored": len(stored), "kept": len(kept)}))
+    print(json.dumps({"kills": KILLS, "stored": len(stored), "kept": len(present)}))

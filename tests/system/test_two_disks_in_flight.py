@@ -17,7 +17,7 @@ from daemon.mission.log.flight_log import logs_of
 from daemon.mission.store.level0_folder import read_sealed
 from daemon.mission.verification.verification import verify
 from processing.quality.report import Flag
-from tests.system.flown import ROOT
+from tests.system.demo_mission import ROOT
 
 pytestmark = [pytest.mark.system, pytest.mark.trust, pytest.mark.timeout(400)]
 

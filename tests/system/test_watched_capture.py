@@ -13,17 +13,17 @@ import pytest
 
 from daemon.cli.sim import Emulator, free_first_address, service_toml, simulator_arguments
 from tests.daemon.onboard.monitoring.test_watchers import STALLED, WATCHERS, follow, stall
-from tests.system.flown import Flown
+from tests.system.demo_mission import DemoMission
 from tests.system.test_operators_page import READY_WITHIN_S, Running, busy_share
 
 pytestmark = [pytest.mark.soak, pytest.mark.timeout(900)]
 
-ALONE, WATCHED = 15, 15
-EXPOSURES = ALONE + WATCHED
+UNWATCHED, WATCHED = 15, 15
+EXPOSURES = UNWATCHED + WATCHED
 
 
 def test_capture_takes_no_longer_with_fifty_watchers(
-    tmp_path: Path, flown: Flown, record_property: Callable[[str, Any], None]
+    tmp_path: Path, flown: DemoMission, record_property: Callable[[str, Any], None]
 ) -> None:
     arguments = simulator_arguments("ultracam-x-mini", tmp_path / "sim", seed=1, dc=0, displace=[])
     arguments += ["--scene-cache", str(flown.scenes), "--exposures", str(EXPOSURES), "--still"]
@@ -35,7 +35,7 @@ def test_capture_takes_no_longer_with_fifty_watchers(
     try:
         port = service.wait_for(lambda e: e["event"] == "watching", READY_WITHIN_S)["port"]
         service.wait_for(lambda e: e["event"] == "ready", READY_WITHIN_S)
-        service.wait_for(lambda e: e["event"] == "stored" and e["number"] == ALONE, 300)
+        service.wait_for(lambda e: e["event"] == "stored" and e["number"] == UNWATCHED, 300)
         watching = threading.Thread(target=lambda: asyncio.run(watch(port)))
         watching.start()
         watching.join(300)
@@ -48,12 +48,12 @@ def test_capture_takes_no_longer_with_fifty_watchers(
         emulator.end()
     assert ended["failure"] is None and ended["ledger"]["triggers"]["lost"] == 0
     # The first exposure warms what it touches; that during which they join is neither nor.
-    alone = stored_s(service, range(2, ALONE + 1))
-    watched = stored_s(service, range(ALONE + 2, EXPOSURES + 1))
+    alone = stored_s(service, range(2, UNWATCHED + 1))
+    watched = stored_s(service, range(UNWATCHED + 2, EXPOSURES + 1))
     for name, values in (("alone", alone), ("watched", watched)):
-        told = f"{statistics.median(values):.3f} ({min(values):.3f} to {max(values):.3f}) s"
-        print(f"trigger to stored, {name}, {len(values)} exposures: {told}")
-        record_property(name, told)
+        latency_text = f"{statistics.median(values):.3f} ({min(values):.3f} to {max(values):.3f}) s"
+        print(f"trigger to stored, {name}, {len(values)} exposures: {latency_text}")
+        record_property(name, latency_text)
     assert statistics.median(watched) <= max(alone)
 
 

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import tifffile
 
-from daemon.planning.model import Plane, Point
-from sim_hw.receivers.mavlink_mission import HEADER, MissionAutopilot, Place, read_mission
+from daemon.planning.model import LocalPlane, Point
+from sim_hw.receivers.mavlink_mission import HEADER, LatLon, MissionAutopilot, read_mission
 from sim_hw.world.flight import FlightPlan
 
 WAYPOINTS = 4
@@ -48,7 +48,7 @@ class Mission:
     def __init__(self, ready: Mapping[str, Any], port: int) -> None:
         self._started_ns = ready["mono_ns_at_line_start"]
         self._speed_mps = ready["plan"]["ground_speed_mps"]
-        self._plane = Plane(Point(FlightPlan.latitude_deg, FlightPlan.longitude_deg))
+        self._plane = LocalPlane(Point(FlightPlan.latitude_deg, FlightPlan.longitude_deg))
         first_m = self._north_m(time.monotonic_ns()) + AHEAD_S * self._speed_mps
         step_m = STEP * ready["plan"]["distance_m"]
         self.waypoints_m = [first_m + k * step_m for k in range(WAYPOINTS)]
@@ -59,7 +59,7 @@ class Mission:
     def _north_m(self, mono_ns: int) -> float:
         return (mono_ns - self._started_ns) * 1e-9 * self._speed_mps
 
-    def _place(self, mono_ns: int) -> Place:
+    def _place(self, mono_ns: int) -> LatLon:
         point = self._plane.place(0.0, self._north_m(mono_ns))
         return point.latitude_deg, point.longitude_deg
 
@@ -75,7 +75,7 @@ class Mission:
         ]
         return "\n".join([HEADER, *lines])
 
-    def away_m(self, records: list[dict[str, Any]]) -> list[float]:
+    def distance_m(self, records: list[dict[str, Any]]) -> list[float]:
         """How far behind its waypoint each exposure was made."""
         found = []
         for record, north_m in zip(records, self.waypoints_m, strict=True):
@@ -98,18 +98,18 @@ def fly_mission(ready: Mapping[str, Any], port: int, service: Any) -> None:
         mission.autopilot.close()
     assert mission.autopilot.results == [ACCEPTED] * WAYPOINTS
     assert len(mission.autopilot.reached) == WAYPOINTS
-    asked = [e for e in service.events if e["event"] == "command"]
-    assert [(e["name"], e["by"]) for e in asked] == [("trigger", "mavlink 1/1")] * WAYPOINTS
+    commands = [e for e in service.events if e["event"] == "command"]
+    assert [(e["name"], e["by"]) for e in commands] == [("trigger", "mavlink 1/1")] * WAYPOINTS
     path = Path(next(e for e in service.events if e["event"] == "mission")["path"])
     folders = [path / f"L0/{number:06d}" for number in range(1, WAYPOINTS + 1)]
     records = [json.loads((folder / "exposure.json").read_text()) for folder in folders]
-    away_m = mission.away_m(records)
-    print(f"exposed behind the waypoints by {[round(m, 1) for m in away_m]} m")
-    assert min(away_m) > -2.0 and max(away_m) < OFF_PLACE_M
-    _the_light_came(folders, records, service.events)
+    distance_m = mission.distance_m(records)
+    print(f"exposed behind the waypoints by {[round(m, 1) for m in distance_m]} m")
+    assert min(distance_m) > -2.0 and max(distance_m) < OFF_PLACE_M
+    _check_brightness(folders, records, service.events)
 
 
-def _the_light_came(
+def _check_brightness(
     folders: list[Path], records: list[dict[str, Any]], events: list[dict[str, Any]]
 ) -> None:
     """Exposure time, gain and TDI went through the heads' registers, and the pixels followed."""
@@ -120,11 +120,15 @@ def _the_light_came(
     print(f"light {[round(v) for v in light]} us, TDI {shifts}, {[round(b, 2) for b in bright]}")
     assert light[-1] > 1.8 * light[0]
     for k in range(1, len(frames)):
-        apart = math.log(bright[k] / bright[0]) - math.log(light[k] / light[0])
-        assert abs(apart) < 0.15, "the pixels have the light that the record tells of"
+        log_ratio = math.log(bright[k] / bright[0]) - math.log(light[k] / light[0])
+        assert abs(log_ratio) < 0.15, "the pixels have the light that the record tells of"
     assert abs(math.log(bright[-1] / TARGET)) < abs(math.log(bright[0] / TARGET))
-    told = [e for e in events if e["event"] == "exposure-settings" and e["by"] == "automatic"]
-    assert told and all(e["control"] == "automatic" and e["lock"] == "line" for e in told)
+    settings_events = [
+        e for e in events if e["event"] == "exposure-settings" and e["by"] == "automatic"
+    ]
+    assert settings_events and all(
+        e["control"] == "automatic" and e["lock"] == "line" for e in settings_events
+    )
 
 
 def _brightness(path: Path) -> float:

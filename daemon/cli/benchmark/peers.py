@@ -24,7 +24,7 @@ from processing.matching.tie_points import PAN_TO_PAN, TiePoints
 from processing.rig import Rig
 
 CELL_PX = 32
-PEER_WITHIN_S = 1500.0
+PEER_TIMEOUT_S = 1500.0
 PACKAGES = {
     "nona": "hugin-tools",
     "pano_trafo": "hugin-tools",
@@ -144,9 +144,9 @@ def nona_geometry(
                 continue
             step = max(len(geometry[f"{name}.vip"]) // GEOMETRY_POINTS, 1)
             vip = geometry[f"{name}.vip"][::step]
-            asked = "".join(f"{column} {row}\n" for column, row in vip)
-            told = _run(["pano_trafo", "-r", str(project), str(number)], asked)
-            raw = np.array([line.split() for line in told.splitlines() if line.strip()], float)
+            stdin_text = "".join(f"{column} {row}\n" for column, row in vip)
+            output = _run(["pano_trafo", "-r", str(project), str(number)], stdin_text)
+            raw = np.array([line.split() for line in output.splitlines() if line.strip()], float)
             if raw.shape != vip.shape:
                 raise PeerError(f"pano_trafo gave {len(raw)} of {len(vip)} points of {name}")
             table |= {f"{name}.vip": vip, f"{name}.raw": raw}
@@ -199,20 +199,20 @@ def _found(program: str) -> bool:
     return shutil.which(program) is not None
 
 
-def _run(command: list[str], asked: str | None = None) -> str:
+def _run(command: list[str], stdin_text: str | None = None) -> str:
     try:
         done = subprocess.run(
             command,
-            input=asked,
+            input=stdin_text,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             check=True,
-            timeout=PEER_WITHIN_S,
+            timeout=PEER_TIMEOUT_S,
             text=True,
             errors="replace",
         )
     except subprocess.TimeoutExpired as error:
-        raise PeerError(f"{command[0]} took longer than {PEER_WITHIN_S:.0f} s") from error
+        raise PeerError(f"{command[0]} took longer than {PEER_TIMEOUT_S:.0f} s") from error
     except subprocess.CalledProcessError as error:
         last = error.stdout.strip().splitlines()[-1:]
         raise PeerError(f"{command[0]} failed: {last[0] if last else error.returncode}") from error

@@ -29,31 +29,31 @@ from daemon.cli.benchmark.measurement import interleaved, machine, spread
 from daemon.configuration.model import PlanSection
 from daemon.errors import DaemonError
 from daemon.mission.layout import Mission
-from daemon.mission.store import direct, store
+from daemon.mission.store import direct_io, store
 from daemon.mission.store.radiometry_folder import RadiometryFolder
-from daemon.onboard.pipeline.lanes import Lanes
-from daemon.onboard.pipeline.worker import process_exposure, settle_threads
-from daemon.orientation.exterior import mount_of
-from daemon.products.conditions import conditions_of
+from daemon.onboard.pipeline.pipeline_pool import PipelinePool
+from daemon.onboard.pipeline.worker import configure_threads, process_exposure
+from daemon.orientation.exterior_orientation import mount_of
+from daemon.products.exposure_conditions import conditions_of
 from daemon.products.processor import Processor, make_products
-from daemon.products.reports import Made
-from daemon.products.stitched import stitched_made
+from daemon.products.product_files import ProductFiles
+from daemon.products.stitched_image import build_stitched
 from processing.matching.tie_points import TiePoints
-from processing.pipelines.stitched import Pipeline, Product, Settings
+from processing.pipelines.stitched import Pipeline, PipelineSettings, Product
 from processing.quality.report import Flag
 from processing.rig import Rig, load_rig
 
 DC_K = 12.0
 DISPLACED_PX = (1.0, -0.6)
-RENDER_WITHIN_S = 1800.0
-JUDGE_WITHIN_S = 600.0
+RENDER_TIMEOUT_S = 1800.0
+EVALUATION_TIMEOUT_S = 600.0
 
 
 class BenchError(DaemonError):
     """What is to be timed cannot be had; the sentence says why."""
 
 
-def exposures_of(rig_name: str, rig: Rig, folder: Path) -> Path:
+def benchmark_exposure(rig_name: str, rig: Rig, folder: Path) -> Path:
     """The folder with one exposure of a rig, rendered first where it is not there.
 
     dC is 12 K, one sensor of the master cone is displaced, radiometry is as a laboratory measures.
@@ -65,23 +65,23 @@ def exposures_of(rig_name: str, rig: Rig, folder: Path) -> Path:
     master = rig.master_sensors
     if len(master) > 2:
         command += ["--displace", f"{master[2].name}={DISPLACED_PX[0]},{DISPLACED_PX[1]}"]
-    _json_of(command, RENDER_WITHIN_S, "rendering the exposure", needs_json=False)
+    _json_of(command, RENDER_TIMEOUT_S, "rendering the exposure", needs_json=False)
     return folder
 
 
 def measure(
-    folder: Path, *, runs: int, threads: int, peers: bool, lanes: int = 2
+    folder: Path, *, runs: int, threads: int, peers: bool, parallel: int = 2
 ) -> dict[str, Any]:
     """All figures of one rig as one JSON object; see docs of the command.
 
     Args:
-        folder: from `exposures_of`.
+        folder: from `benchmark_exposure`.
         runs: how often everything is timed.
         threads: cores the pipeline may use.
         peers: also cv2.remap and, where installed, nona + enblend.
-        lanes: exposures in work at a time, as the service's `exposures_in_work`.
+        lanes: exposures in work at a time, as the service's `parallel_exposures`.
     """
-    settle_threads()
+    configure_threads()
     mission = Mission.open(folder / "mission")
     rig = load_rig(mission.rig_path)
     radiometry = folder / "calibration" / "radiometry"
@@ -89,17 +89,17 @@ def measure(
     pipeline = Pipeline(
         rig,
         RadiometryFolder(radiometry, rig),
-        Settings(geometry=False, threads=threads),
+        PipelineSettings(geometry=False, threads=threads),
     )
     pipeline.warm_up()
     stored, exposure = store.load_level0(mission.level0(1), rig)
     frames = {name: np.array(frame) for name, frame in stored.items()}
     conditions = conditions_of(exposure, rig, plan, Flag(0))
     product = pipeline.process(frames, conditions)
-    processor, mount = Processor(pipeline, stitched_made), mount_of(mission)[0]
+    processor, mount = Processor(pipeline, build_stitched), mount_of(mission)[0]
 
-    def make(lane: Processor) -> Made:
-        return make_products(lane, mount, plan, exposure, frames, conditions)
+    def make(worker: Processor) -> ProductFiles:
+        return make_products(worker, mount, plan, exposure, frames, conditions)
 
     result = {
         "rig": rig.name,
@@ -108,7 +108,7 @@ def measure(
         "threads": threads,
         **_timed(pipeline, lambda: make(processor), frames, product, runs),
     }
-    result |= _side_by_side(processor, make, lanes=lanes, count=3 * runs)
+    result |= _side_by_side(processor, make, parallel=parallel, count=3 * runs)
     if peers:
         product = pipeline.process(frames, conditions)
         tie_points = product.tie_points
@@ -119,14 +119,14 @@ def measure(
     process_exposure(processor, mission, mount, plan, exposure, frames)
     result |= _geometry(mission, folder / "truth")
     if peers and "skipped" not in result["peers"]["nona_enblend"]:
-        told = _peer_geometry(rig, mission, folder / "truth", tie_points)
-        result["peers"]["nona_enblend"] |= told
+        geometry = _peer_geometry(rig, mission, folder / "truth", tie_points)
+        result["peers"]["nona_enblend"] |= geometry
     return result
 
 
 def _timed(
     pipeline: Pipeline,
-    make: Callable[[], Made],
+    make: Callable[[], ProductFiles],
     frames: Mapping[str, NDArray[np.uint16]],
     product: Product,
     runs: int,
@@ -179,30 +179,30 @@ def _timed(
 
 
 def _side_by_side(
-    processor: Processor, make: Callable[[Processor], Made], *, lanes: int, count: int
+    processor: Processor, make: Callable[[Processor], ProductFiles], *, parallel: int, count: int
 ) -> dict[str, Any]:
     """The pace with exposures in work side by side, as in the service, and each one's latency.
 
     Timed from the end of the first exposures to the end of the last, all lanes full all the while.
     Each file is written anew, and removed when as many others were written as there are lanes.
     """
-    work = Lanes[Processor](processor, lanes)
+    work = PipelinePool[Processor](processor, parallel)
     ends: list[float] = []
     latencies: list[float] = []
     used: list[float] = []
 
     with tempfile.TemporaryDirectory(prefix="syntopic-bench-") as scratch:
 
-        def one(number: int, lane: Processor) -> None:
+        def one(number: int, worker: Processor) -> None:
             started = time.perf_counter()
             folder = Path(scratch) / str(number)
             folder.mkdir()
-            _to_disk(make(lane)[1], folder)
+            _to_disk(make(worker)[1], folder)
             ended = time.perf_counter()
             ends.append(ended)
             used.append(time.process_time())
             latencies.append(ended - started)
-            shutil.rmtree(Path(scratch) / str(number - lanes), ignore_errors=True)
+            shutil.rmtree(Path(scratch) / str(number - parallel), ignore_errors=True)
 
         # As many before, to fill the buffers of the others, and as many after, to keep lanes full.
         tasks = [work.submit(partial(one, k)) for k in range(count + 2 * work.count)]
@@ -214,7 +214,7 @@ def _side_by_side(
     return {
         "realtime_factor": processor.rig.frame_interval_s / seconds,
         "side_by_side": {
-            "lanes": work.count,
+            "parallel": work.count,
             "exposures": count,
             "seconds_per_exposure": seconds,
             "cpu_s_per_exposure": (used[last] - used[first]) / count,
@@ -263,7 +263,7 @@ def _peer_geometry(
             (Path(scratch) / "L0").symlink_to(mission.level0(1).parent.resolve())
             table: Mapping[str, Any] = peers.nona_geometry(rig, mission.level0(1), ours, given)
             np.savez(stitched / "geometry.npz", **table)
-            figures = _judged(Path(scratch), truth)["free"]
+            figures = _evaluate_geometry(Path(scratch), truth)["free"]
         result |= {
             f"rms_px{suffix}": figures["inner_rms_px"],
             f"max_px{suffix}": figures["inner_max_px"],
@@ -271,15 +271,17 @@ def _peer_geometry(
     return result
 
 
-def _judged(mission: Path, truth: Path) -> dict[str, dict[str, float]]:
+def _evaluate_geometry(mission: Path, truth: Path) -> dict[str, dict[str, float]]:
     """Figures by method against the truth, which only the judge's own process reads."""
-    command = [sys.executable, "-m", "sim_hw.judge", "--mission", str(mission)]
-    judged = _json_of([*command, "--truth", str(truth)], JUDGE_WITHIN_S, "judging the geometry")
-    return dict(judged["methods"])
+    command = [sys.executable, "-m", "sim_hw.truth_comparison", "--mission", str(mission)]
+    evaluated = _json_of(
+        [*command, "--truth", str(truth)], EVALUATION_TIMEOUT_S, "judging the geometry"
+    )
+    return dict(evaluated["methods"])
 
 
 def _geometry(mission: Mission, truth: Path) -> dict[str, Any]:
-    methods = _judged(mission.path, truth)
+    methods = _evaluate_geometry(mission.path, truth)
     return {
         "rms_px": methods["free"]["inner_rms_px"],
         "max_px": methods["free"]["inner_max_px"],
@@ -294,7 +296,7 @@ def _to_disk(contents: Mapping[str, Sequence[bytes | memoryview]], folder: Path)
     """Write all files of an exposure as the service does, synced; earlier ones make way."""
     for name, parts in contents.items():
         (folder / name).unlink(missing_ok=True)
-        direct.create_file(folder / name, parts)
+        direct_io.create_file(folder / name, parts)
 
 
 def _plan_of(mission: Mission) -> PlanSection:
@@ -308,10 +310,10 @@ def _json_of(
     command: list[str], within_s: float, what: str, *, needs_json: bool = True
 ) -> dict[str, Any]:
     try:
-        said = subprocess.run(command, capture_output=True, check=True, timeout=within_s)
+        completed = subprocess.run(command, capture_output=True, check=True, timeout=within_s)
     except subprocess.TimeoutExpired as error:
         raise BenchError(f"{what} took longer than {within_s:.0f} s") from error
     except subprocess.CalledProcessError as error:
         last = error.stderr.decode(errors="replace").strip().splitlines()[-1:]
         raise BenchError(f"{what} failed: {last[0] if last else error.returncode}") from error
-    return dict(json.loads(said.stdout)) if needs_json else {}
+    return dict(json.loads(completed.stdout)) if needs_json else {}

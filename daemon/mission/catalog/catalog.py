@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from daemon.errors import DaemonError
-from daemon.mission.catalog.catalog_schema import SCHEMA_VERSION, create, is_plain, migrate
-from daemon.mission.exposure import Capture, Exposure, FrameRecord
+from daemon.mission.catalog.catalog_schema import SCHEMA_VERSION, create, has_only_tables, migrate
+from daemon.mission.exposure import CaptureRecord, Exposure, FrameRecord
 
 BUSY_TIMEOUT_S = 10.0
 """How long a writer waits while another process commits."""
@@ -102,14 +102,14 @@ class Catalog:
         return cls(connection)
 
     @classmethod
-    def read(cls, path: Path, *, is_settled: bool = False) -> Catalog:
+    def read(cls, path: Path, *, is_immutable: bool = False) -> Catalog:
         """Open for reading only, while another process writes or on a medium that is read-only.
 
         One of an older schema is read through a copy in memory, and left as it is.
 
         Args:
             path: the index.
-            is_settled: nobody writes it, so that no files are needed in its folder to share it.
+            is_immutable: nobody writes it, so that no files are needed in its folder to share it.
 
         Raises:
             CatalogError: not there, damaged, or of a newer schema version.
@@ -117,7 +117,7 @@ class Catalog:
         if not path.is_file():
             raise CatalogError(f"{path}: no such index; syntopic repair builds it again")
         address = path.resolve().as_uri()
-        is_one_file = is_settled and not path.with_name(f"{path.name}-wal").exists()
+        is_one_file = is_immutable and not path.with_name(f"{path.name}-wal").exists()
         try:
             connection = sqlite3.connect(
                 f"{address}?immutable=1" if is_one_file else f"{address}?mode=ro",
@@ -138,7 +138,7 @@ class Catalog:
             if 0 < version < SCHEMA_VERSION:
                 connection = _migrated_copy(connection)
                 version = SCHEMA_VERSION
-            is_ours = is_plain(connection)
+            is_ours = has_only_tables(connection)
         except sqlite3.Error as error:
             raise CatalogError(_damaged(path, error)) from error
         if version != SCHEMA_VERSION:
@@ -156,7 +156,7 @@ class Catalog:
                 self._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
             self._connection.close()
 
-    def add_stored(self, capture: Capture) -> None:
+    def add_stored(self, capture: CaptureRecord) -> None:
         """Commit that an exposure's pixels are durable."""
         with self._lock:
             self._begin()
@@ -292,7 +292,7 @@ class Catalog:
         )
         return str(rows[0][0]) if rows else ""
 
-    def _insert(self, record: Capture | Exposure, state: str) -> None:
+    def _insert(self, record: CaptureRecord | Exposure, state: str) -> None:
         self._connection.execute(
             "INSERT INTO exposures (number, state, is_sealed, trigger_sequence, trigger_mono_ns,"
             " boot_id, line_id, strip_id, flags, is_simulated)"
@@ -340,7 +340,7 @@ class Catalog:
 
 def _prepare(connection: sqlite3.Connection, path: Path) -> None:
     version = connection.execute("PRAGMA user_version").fetchone()[0]
-    if not is_plain(connection):
+    if not has_only_tables(connection):
         raise CatalogError(_damaged(path, "it holds views or triggers; ours has none"))
     if version == SCHEMA_VERSION:
         verdict = connection.execute("PRAGMA quick_check(1)").fetchone()[0]

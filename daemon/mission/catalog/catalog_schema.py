@@ -94,7 +94,7 @@ def migrate(connection: sqlite3.Connection) -> None:
         raise
 
 
-def is_plain(connection: sqlite3.Connection) -> bool:
+def has_only_tables(connection: sqlite3.Connection) -> bool:
     """Whether there are tables and indexes only: a view or a trigger of a stranger runs code."""
     kinds = connection.execute("SELECT DISTINCT type FROM sqlite_schema").fetchall()
     return {kind for (kind,) in kinds} <= {"table", "index"}

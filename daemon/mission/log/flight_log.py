@@ -27,8 +27,8 @@ from mcap.records import Message as McapMessage
 from mcap.stream_reader import breakup_chunk
 from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType, Writer
 
-from daemon.mission.log.log_records import Message, loose_bytes
-from daemon.mission.records import RecordError, canonical_bytes, parse_record
+from daemon.mission.canonical_json import RecordError, canonical_bytes, parse_record
+from daemon.mission.log.log_records import Message, lenient_json_bytes
 from daemon.mission.store import durable
 
 PROFILE = "syntopic"
@@ -38,7 +38,7 @@ CHECKPOINT_TOPIC = "log/checkpoint"
 RECORD_MAX_NBYTES = 16_000_000
 """Nothing larger is read: messages of ours have some kB, chunks of other tools a few MB."""
 
-_DAMAGE = (
+_DAMAGE_ERRORS = (
     McapError,
     zstandard.ZstdError,
     struct.error,
@@ -94,7 +94,7 @@ class FlightLog:
         self._channels: dict[str, int] = {}
         self._schema: int | None = None
         self._sequence = 0
-        self._stream: LogStream = stream or _StraightStream(path)
+        self._stream: LogStream = stream or _UnbufferedStream(path)
         self._synced_at = 0
         self._writer = Writer(
             self._stream,
@@ -145,7 +145,7 @@ class FlightLog:
                 hold exactly as text.
         """
         is_json = not topic.startswith("raw/")
-        data = payload if isinstance(payload, bytes) else loose_bytes(payload)
+        data = payload if isinstance(payload, bytes) else lenient_json_bytes(payload)
         self._sequence += 1
         try:
             if self.dropped > self._reported:
@@ -243,11 +243,11 @@ class LogReader:
                     break
                 try:
                     found = list(self._records(header[0], body, channels))
-                except _DAMAGE:
+                except _DAMAGE_ERRORS:
                     break
                 for message in found:
                     if message.topic == CHECKPOINT_TOPIC:
-                        self.bad_checkpoints += not _agrees(message, position, crc32)
+                        self.bad_checkpoints += not _checksum_matches(message, position, crc32)
                     else:
                         yield message
                 crc32 = zlib.crc32(body, zlib.crc32(header, crc32))
@@ -299,7 +299,7 @@ def host_boot_id() -> str:
     return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
 
 
-class _StraightStream:
+class _UnbufferedStream:
     """What the MCAP writer writes to: straight to the kernel, whole or not at all."""
 
     def __init__(self, path: Path) -> None:
@@ -369,7 +369,7 @@ def _unpacked(chunk: Chunk) -> Chunk:
     return replace(chunk, compression="", data=data)
 
 
-def _agrees(message: Message, position: int, crc32: int) -> bool:
+def _checksum_matches(message: Message, position: int, crc32: int) -> bool:
     try:
         content = parse_record(message.payload, message.topic)
     except RecordError:

@@ -12,7 +12,7 @@ from dataclasses import MISSING, dataclass, field, fields
 from enum import Enum
 from typing import Any, Final, get_type_hints
 
-from daemon.mission.records import (
+from daemon.mission.canonical_json import (
     EXACT_INTEGER_LIMIT,
     Fields,
     RecordError,
@@ -78,11 +78,11 @@ def message_of(record: Record | LoggedTrigger) -> Message:
     if isinstance(record, RawBytes):
         return Message(f"raw/{record.device}", record.mono_ns, record.data)
     if isinstance(record, LoggedTrigger):
-        return Message("trigger", record.pulse.mono_ns, loose_bytes(_trigger_json(record)))
+        return Message("trigger", record.pulse.mono_ns, lenient_json_bytes(_trigger_json(record)))
     content = {field.name: getattr(record, field.name) for field in fields(record)}
     name = next(iter(content.values()))
     content |= {key: _text(content[key]) for key in _INSTANTS & content.keys()}
-    return Message(f"{_TOPICS[type(record)]}/{name}", record.mono_ns, loose_bytes(content))
+    return Message(f"{_TOPICS[type(record)]}/{name}", record.mono_ns, lenient_json_bytes(content))
 
 
 def record_of(message: Message) -> LoggedRecord | None:
@@ -100,12 +100,12 @@ def record_of(message: Message) -> LoggedRecord | None:
     return None if problems else record
 
 
-def loose_bytes(content: Mapping[str, Any]) -> bytes:
+def lenient_json_bytes(content: Mapping[str, Any]) -> bytes:
     """Any content as canonical JSON: what JSON cannot hold becomes a text. Never raises."""
-    return canonical_bytes(_loose(content))
+    return canonical_bytes(_lenient(content))
 
 
-def _loose(value: Any) -> Any:
+def _lenient(value: Any) -> Any:
     if value is None or isinstance(value, bool):
         return value
     if isinstance(value, str):
@@ -117,9 +117,9 @@ def _loose(value: Any) -> Any:
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
     if isinstance(value, Mapping):
-        return {_unicode(str(key)): _loose(item) for key, item in value.items()}
+        return {_unicode(str(key)): _lenient(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_loose(item) for item in value]
+        return [_lenient(item) for item in value]
     return str(value)
 
 
@@ -154,7 +154,7 @@ def _trigger(fields: Fields) -> LoggedTrigger:
 def _needed(fields: Fields, key: str) -> int:
     value = fields.instant(key)
     if value is None:
-        fields.complain(key, "a decimal string is needed")
+        fields.add_problem(key, "a decimal string is needed")
         return 0
     return value
 
@@ -196,7 +196,7 @@ _INSTANTS: Final = frozenset(
 )
 """Written as texts: they may exceed what JSON's numbers hold."""
 
-_QUESTIONS: Final[Mapping[Any, Callable[[Fields, str], Any]]] = {
+_TYPE_READERS: Final[Mapping[Any, Callable[[Fields, str], Any]]] = {
     "leap_seconds": _leap_seconds,
     **{(name, int): _needed for name in _INSTANTS},
     **{(name, int | None): Fields.instant for name in _INSTANTS},
@@ -215,17 +215,17 @@ _QUESTIONS: Final[Mapping[Any, Callable[[Fields, str], Any]]] = {
 
 def _reader(kind: type[Any]) -> Callable[[Fields], LoggedRecord]:
     """A function that reads a record field by field, as the fields are declared."""
-    asked = {
-        name: next(_QUESTIONS[key] for key in (name, (name, hint), hint) if key in _QUESTIONS)
+    field_readers = {
+        name: next(_TYPE_READERS[key] for key in (name, (name, hint), hint) if key in _TYPE_READERS)
         for name, hint in get_type_hints(kind).items()
     }
     # A log of an earlier version lacks the fields that came later: those have defaults.
-    later = {one.name for one in fields(kind) if one.default is not MISSING}
+    optional = {one.name for one in fields(kind) if one.default is not MISSING}
     return lambda given: kind(
         **{
-            name: ask(given, name)
-            for name, ask in asked.items()
-            if name in given.content or name not in later
+            name: read_field(given, name)
+            for name, read_field in field_readers.items()
+            if name in given.content or name not in optional
         }
     )
 

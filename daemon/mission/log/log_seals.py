@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from contextlib import closing
 
+from daemon.mission.canonical_json import Fields, RecordError, parse_record, plain_name
 from daemon.mission.layout import Mission
 from daemon.mission.log.flight_log import logs_of
-from daemon.mission.records import Fields, RecordError, parse_record, plain_name
 from daemon.mission.store import durable
 from daemon.mission.store.level0_folder import hash_file
 from daemon.mission.verification.chain_file import ChainFile, LogSeal

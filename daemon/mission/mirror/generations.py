@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from daemon.mission.records import Fields, RecordError, canonical_bytes, parse_record
+from daemon.mission.canonical_json import Fields, RecordError, canonical_bytes, parse_record
 from daemon.mission.store import durable
 
 STATE_FILE = "disks.json"
@@ -44,7 +44,7 @@ def next_generation(history: Generations, disks: Sequence[str], first: int) -> G
     return (*history, Generation(number, secrets.token_hex(8), tuple(disks), first))
 
 
-def leads(history: Generations, other: Generations) -> bool:
+def is_up_to_date_with(history: Generations, other: Generations) -> bool:
     """Whether a copy knows all that another knows: the other's last generation is in its history.
 
     Both lead where they are in step; neither where each went on without the other.
@@ -52,9 +52,9 @@ def leads(history: Generations, other: Generations) -> bool:
     return not other or other[-1].token in {generation.token for generation in history}
 
 
-def first_difference(behind: Generations, leading: Generations) -> int:
+def first_difference(outdated: Generations, leading: Generations) -> int:
     """Number of the first exposure that a copy may lack of one that leads."""
-    since = leading[len(behind) :]
+    since = leading[len(outdated) :]
     return min((generation.first for generation in since), default=1)
 
 

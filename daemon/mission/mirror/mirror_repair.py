@@ -1,6 +1,6 @@
 """Bring two copies of a mission together on the ground: what `syntopic repair --mirror` does.
 
-In flight the same is done by `daemon.mission.mirror.returning`.
+In flight the same is done by `daemon.mission.mirror.disk_rejoin`.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ from collections.abc import Callable
 from daemon.mission.layout import CURRENT_FILE, Mission
 from daemon.mission.mirror.generations import (
     first_difference,
-    leads,
+    is_up_to_date_with,
     next_generation,
     read_generations,
     write_generations,
 )
-from daemon.mission.mirror.mirror_start import pull_tail
+from daemon.mission.mirror.mirror_startup import copy_missing_tail
 from daemon.mission.mirror.resync import MirrorError, Resync, refuse_split
 from daemon.mission.store import durable
 from daemon.mission.store.disk_identity import give_disk_id
@@ -33,26 +33,26 @@ def leading_first(one: Mission, other: Mission) -> tuple[Mission, Mission]:
     if one.path.resolve() == other.path.resolve():
         raise MirrorError(f"{one.path} and {other.path} are one folder; give the other copy")
     ours, theirs = read_generations(one.path), read_generations(other.path)
-    if leads(theirs, ours) and not leads(ours, theirs):
+    if is_up_to_date_with(theirs, ours) and not is_up_to_date_with(ours, theirs):
         one, other = other, one
     refuse_split(one, other)
     return one, other
 
 
-def before_recovery(leading: Mission, behind: Mission) -> list[str]:
+def before_recovery(leading: Mission, outdated: Mission) -> list[str]:
     """Take over what a flight that was interrupted wrote to the other copy only; both are held.
 
     Raises:
         OSError, DaemonError: a disk refused.
     """
-    ours, theirs = read_generations(leading.path), read_generations(behind.path)
+    ours, theirs = read_generations(leading.path), read_generations(outdated.path)
     if not ours or not theirs or ours[-1].token != theirs[-1].token:
         return []
-    return pull_tail(leading, behind)
+    return copy_missing_tail(leading, outdated)
 
 
 def after_recovery(
-    leading: Mission, behind: Mission, step: Callable[[], None] = lambda: None
+    leading: Mission, outdated: Mission, step: Callable[[], None] = lambda: None
 ) -> list[str]:
     """Bring the other copy up to date with one that recovery has put in order; both are held.
 
@@ -67,17 +67,17 @@ def after_recovery(
     Raises:
         OSError, DaemonError: a disk refused; doing it again goes on where it stopped.
     """
-    ours, theirs = read_generations(leading.path), read_generations(behind.path)
-    count = Resync(leading, behind, first_difference(theirs, ours), step)
+    ours, theirs = read_generations(leading.path), read_generations(outdated.path)
+    count = Resync(leading, outdated, first_difference(theirs, ours), step)
     done = count.run()
     count.copy_chain_and_index()
-    ids = [give_disk_id(leading.root), give_disk_id(behind.root)]
+    ids = [give_disk_id(leading.root), give_disk_id(outdated.root)]
     if not ours or set(ours[-1].disks) != set(ids) or ours != theirs:
         number = 1 + max(leading.numbers(), default=0)
         history = next_generation(ours, ids, number)
-        write_generations(behind.path, history)
+        write_generations(outdated.path, history)
         write_generations(leading.path, history)
-    if behind.is_current and not leading.is_current:
-        (behind.root / CURRENT_FILE).unlink()
-        durable.sync_directory(behind.root)
-    return [f"{behind.path}: brought up to date with {leading.path}; {done} items were copied"]
+    if outdated.is_current and not leading.is_current:
+        (outdated.root / CURRENT_FILE).unlink()
+        durable.sync_directory(outdated.root)
+    return [f"{outdated.path}: brought up to date with {leading.path}; {done} items were copied"]

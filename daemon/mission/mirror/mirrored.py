@@ -2,7 +2,7 @@
 
 Each disk works in a lane of its own. One that refuses, or makes no progress while another does, is
 dropped; that is durable on the others before anything more is acknowledged. A disk that returns is
-brought up to date by `daemon.mission.mirror.returning` and joins between two orders.
+brought up to date by `daemon.mission.mirror.disk_rejoin` and joins between two orders.
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.errors import DaemonError
-from daemon.mission.exposure import Capture, Exposure, FrameRecord
+from daemon.mission.exposure import CaptureRecord, Exposure, FrameRecord
 from daemon.mission.log.flight_log import FlightLog, host_boot_id, new_log_name
+from daemon.mission.mirror.disk_rejoin import RejoiningDisk, RejoinSettings
 from daemon.mission.mirror.generations import (
     first_difference,
     next_generation,
@@ -28,12 +29,11 @@ from daemon.mission.mirror.generations import (
     write_generations,
 )
 from daemon.mission.mirror.mirrored_log import SharedStream
-from daemon.mission.mirror.returning import ReturningDisk, ReturnSettings
+from daemon.mission.store.disk_executor import DroppedError
 from daemon.mission.store.disk_identity import Disk
-from daemon.mission.store.lane import DroppedError
 from daemon.mission.transfer.mission_copy import MissionCopy
 
-LOOK_S = 0.05
+POLL_S = 0.05
 END_TIMEOUT_S = 2.0
 
 EventName = Literal["disk-dropped", "disk-released", "disk-joined"]
@@ -68,17 +68,17 @@ class MirroredStorage:
         disks: Sequence[Disk],
         *,
         stall_s: float,
-        returns: ReturnSettings,
+        rejoin: RejoinSettings,
         emit: Callable[[DiskEvent], None],
         simulated: bool = False,
     ) -> None:
         self._mission_id = mission_id
         self._stall_s = stall_s
-        self._returns = returns
+        self._rejoin = rejoin
         self._emit = emit
-        self._looked_s = time.monotonic()
+        self._polled_s = time.monotonic()
         self._abandoned: list[MissionCopy] = []
-        self._away: dict[str, ReturningDisk] = {}
+        self._inactive: dict[str, RejoiningDisk] = {}
         self._changes = 0
         self._ends_mission = False
         self.is_storing = False
@@ -90,7 +90,7 @@ class MirroredStorage:
         numbers = leading.mission.numbers()
         self._first_missing = self._next_number = 1 + max(numbers, default=0)
         self._log_name = new_log_name()
-        leading.lane.submit(partial(leading.open, self._log_name)).result()
+        leading.executor.submit(partial(leading.open, self._log_name)).result()
         self._stream = SharedStream(self._append_log, self._sync_log)
         self._log = FlightLog(
             leading.mission.log_dir / self._log_name,
@@ -100,7 +100,7 @@ class MirroredStorage:
         )
         self._log.sync()
         for disk in disks[1:]:
-            self._await_return(disk, 0.0)
+            self._start_rejoin(disk, 0.0)
 
     @property
     def log(self) -> FlightLog:
@@ -131,16 +131,16 @@ class MirroredStorage:
             }
             for disk in self.in_use
         }
-        others = {label: away.status for label, away in self._away.items()}
+        others = {label: inactive.status for label, inactive in self._inactive.items()}
         return tuple((in_use | others)[label] for label in sorted(in_use | others, reverse=True))
 
     @property
-    def away(self) -> Mapping[str, ReturningDisk]:
+    def inactive(self) -> Mapping[str, RejoiningDisk]:
         """Disks that are not in use, by label."""
-        return self._away
+        return self._inactive
 
     def write(
-        self, capture: Capture, pixels: Mapping[str, NDArray[np.uint16]]
+        self, capture: CaptureRecord, pixels: Mapping[str, NDArray[np.uint16]]
     ) -> tuple[tuple[FrameRecord, ...], tuple[str, ...]]:
         """Make an exposure's frames durable on every disk in use.
 
@@ -153,14 +153,14 @@ class MirroredStorage:
         self._next_number = capture.number
         self.is_storing = True
         try:
-            frames = self._everywhere(lambda copy: copy.writer.write_frames(capture, pixels))
+            frames = self._on_all_disks(lambda copy: copy.writer.write_frames(capture, pixels))
             try:
                 self._record()
             except OSError:
                 self._withdraw(capture.number)
                 raise
             stored = replace(capture, frames=frames)
-            self._everywhere(lambda copy: copy.writer.note_stored(stored))
+            self._on_all_disks(lambda copy: copy.writer.note_stored(stored))
         finally:
             self._next_number = capture.number + 1
             self.is_storing = False
@@ -177,7 +177,7 @@ class MirroredStorage:
             OSError, StoreError: as `Level0Writer.seal`; sealing the same again is right.
         """
         try:
-            sha256 = self._everywhere(lambda copy: copy.writer.seal(exposure))
+            sha256 = self._on_all_disks(lambda copy: copy.writer.seal(exposure))
             self._record()
         finally:
             self._changes += 1
@@ -186,7 +186,7 @@ class MirroredStorage:
     def note_products(self, number: int, files: Mapping[str, int], verdict: str | None) -> None:
         """Note products in the index of the leading disk, where they are."""
         copy = self._copies[0]
-        copy.lane.submit(lambda: copy.writer.note_products(number, files, verdict))
+        copy.executor.submit(lambda: copy.writer.note_products(number, files, verdict))
 
     def write_note(self, name: str, data: bytes) -> None:
         """Put a small file under a name below the root of every disk in use; nobody waits for it.
@@ -196,7 +196,7 @@ class MirroredStorage:
             data: its content.
         """
         for copy in self._copies:
-            copy.lane.submit(partial(copy.write_note, name, data))
+            copy.executor.submit(partial(copy.write_note, name, data))
 
     def tick(self) -> None:
         """Drop disks that stall or refused meanwhile, and let a disk join that is up to date.
@@ -209,11 +209,11 @@ class MirroredStorage:
             # Refused, it is tried again before anything is acknowledged.
             with suppress(OSError):
                 self._record()
-        for away in list(self._away.values()):
-            if away.ready_at == self._changes:
-                self._join(away)
+        for inactive in list(self._inactive.values()):
+            if inactive.ready_at == self._changes:
+                self._join(inactive)
 
-    def release(self, label: str, why: str) -> None:
+    def release(self, label: str, reason: str) -> None:
         """Take a disk out of use in good order, so that it can be unmounted.
 
         Raises:
@@ -224,14 +224,14 @@ class MirroredStorage:
             raise DaemonError(f"disk {label} is not in use")
         if len(self._copies) == 1:
             raise DaemonError(f"disk {label} is the only one in use; it cannot be released")
-        self._wait({copy: copy.lane.submit(copy.close)})
-        self._drop(copy, why, is_fault=False)
+        self._wait({copy: copy.executor.submit(copy.close)})
+        self._drop(copy, reason, is_fault=False)
 
-    def drop(self, label: str, why: str) -> None:
+    def drop(self, label: str, reason: str) -> None:
         """Drop a disk of which others know that it is of no use any more; never the only one."""
         for copy in list(self._copies):
             if copy.disk.label == label:
-                self._drop(copy, why)
+                self._drop(copy, reason)
 
     def accept(self, label: str) -> None:
         """Take whatever disk is at the place of one that is not in use, and bring it up to date.
@@ -239,10 +239,10 @@ class MirroredStorage:
         Raises:
             DaemonError: the disk is in use.
         """
-        away = self._away.get(label)
-        if away is None:
+        inactive = self._inactive.get(label)
+        if inactive is None:
             raise DaemonError(f"disk {label} is in use; release it first")
-        away.accept()
+        inactive.accept()
 
     def end_mission(self) -> None:
         """Nobody is to go on with the mission once this is closed."""
@@ -250,32 +250,32 @@ class MirroredStorage:
 
     def close(self) -> None:
         """Close log and index on every disk in use."""
-        for away in self._away.values():
-            away.end()
+        for inactive in self._inactive.values():
+            inactive.end()
         self._log.close()
-        self._wait({copy: copy.lane.submit(copy.close) for copy in self._copies})
+        self._wait({copy: copy.executor.submit(copy.close) for copy in self._copies})
         if self._ends_mission:
-            self._wait({copy: copy.lane.submit(copy.mission.close) for copy in self._copies})
+            self._wait({copy: copy.executor.submit(copy.mission.close) for copy in self._copies})
         for copy in self._copies:
-            copy.lane.end(END_TIMEOUT_S)
+            copy.executor.end(END_TIMEOUT_S)
 
     @property
     def is_hanging(self) -> bool:
         """Whether a thread still hangs on a disk that was dropped."""
-        return any(copy.lane.is_alive for copy in (*self._abandoned, *self._copies))
+        return any(copy.executor.is_alive for copy in (*self._abandoned, *self._copies))
 
     def _hangs_on(self, label: str) -> bool:
-        return any(c.lane.is_alive for c in self._abandoned if c.disk.label == label)
+        return any(c.executor.is_alive for c in self._abandoned if c.disk.label == label)
 
     # Work on all disks
 
-    def _everywhere(self, work: Callable[[MissionCopy], T]) -> T:
+    def _on_all_disks(self, work: Callable[[MissionCopy], T]) -> T:
         """Do the same on every disk in use; a disk that refuses where another does not is dropped.
 
         Raises:
             OSError, StoreError: what the leading disk said, where none did it.
         """
-        futures = {copy: copy.lane.submit(partial(work, copy)) for copy in self._copies}
+        futures = {copy: copy.executor.submit(partial(work, copy)) for copy in self._copies}
         self._wait(futures)
         results: dict[MissionCopy, T] = {}
         refusals: dict[MissionCopy, OSError | DaemonError] = {}
@@ -302,11 +302,11 @@ class MirroredStorage:
             pending = [
                 future
                 for copy, future in futures.items()
-                if not future.done() and not copy.lane.is_abandoned
+                if not future.done() and not copy.executor.is_abandoned
             ]
             if not pending:
                 return
-            wait(pending, timeout=LOOK_S)
+            wait(pending, timeout=POLL_S)
             self._drop_stalled()
 
     # Disks in use
@@ -325,13 +325,13 @@ class MirroredStorage:
             if not self._history or set(self._history[-1].disks) != set(ids):
                 self._history = next_generation(self._history, ids, self._first_missing)
             history = self._history
-            self._everywhere(lambda copy, h=history: write_generations(copy.mission.path, h))  # type: ignore[misc]
+            self._on_all_disks(lambda copy, h=history: write_generations(copy.mission.path, h))  # type: ignore[misc]
             self._is_recorded, self._is_due = True, False
 
     def _drop_stalled(self) -> None:
         now_s = time.monotonic()
-        elapsed_s, self._looked_s = now_s - self._looked_s, now_s
-        waited_s = {copy: copy.lane.look(elapsed_s) for copy in self._copies}
+        elapsed_s, self._polled_s = now_s - self._polled_s, now_s
+        waited_s = {copy: copy.executor.update_waited(elapsed_s) for copy in self._copies}
         # Where all of them wait, the machine is busy or they share a cause: dropping helps nobody.
         if min(waited_s.values()) > self._stall_s / 2:
             return
@@ -348,66 +348,66 @@ class MirroredStorage:
         for copy in refusing:
             copy.refusal = None
 
-    def _drop(self, copy: MissionCopy, why: str, *, is_fault: bool = True) -> None:
+    def _drop(self, copy: MissionCopy, reason: str, *, is_fault: bool = True) -> None:
         if copy not in self._copies or len(self._copies) == 1:
             return
         self._first_missing = self._next_number
         self._copies.remove(copy)
-        copy.lane.abandon()
+        copy.executor.abandon()
         self._abandoned.append(copy)
         self._is_recorded, self._is_due = False, True
         self.dropped_count += is_fault
-        self._await_return(copy.disk, self._returns.look_s, is_held=not is_fault)
+        self._start_rejoin(copy.disk, self._rejoin.poll_s, is_held=not is_fault)
         left = ", ".join(map(str, self.in_use))
         if is_fault:
             sentence = (
-                f"disk {copy.disk} was dropped: {why}; storing goes on with {left}; check its "
+                f"disk {copy.disk} was dropped: {reason}; storing goes on with {left}; check its "
                 "cable and power; it is brought up to date when it answers again"
             )
-            self._tell("disk-dropped", copy.disk, sentence)
+            self._emit_event("disk-dropped", copy.disk, sentence)
         else:
             sentence = (
-                f"disk {copy.disk} is released ({why}) and may be unmounted; storing goes on with "
+                f"disk {copy.disk} is released ({reason}) and may be unmounted; storing goes on with "
                 f"{left}"
             )
-            self._tell("disk-released", copy.disk, sentence)
+            self._emit_event("disk-released", copy.disk, sentence)
 
-    def _join(self, away: ReturningDisk) -> None:
+    def _join(self, inactive: RejoiningDisk) -> None:
         """A disk that has everything is in use again."""
-        leading, resync = self._copies[0], away.resync
-        if resync is None or not away.end(LOOK_S):
+        leading, resync = self._copies[0], inactive.resync
+        if resync is None or not inactive.end(POLL_S):
             return
-        self._wait({leading: leading.lane.submit(lambda: None)})  # the log is on it up to here
-        copy = MissionCopy(away.disk, self._mission_id)
+        self._wait({leading: leading.executor.submit(lambda: None)})  # the log is on it up to here
+        copy = MissionCopy(inactive.disk, self._mission_id)
         work = partial(copy.join, leading, resync, self._log_name, self._stream.offset)
-        opening = copy.lane.submit(work)
+        opening = copy.executor.submit(work)
         wait([opening], timeout=self._stall_s)
         try:
             if not opening.done():
                 raise DaemonError(f"it was not opened within {self._stall_s:g} s")
             opening.result()
         except (OSError, DaemonError) as error:
-            copy.lane.abandon()
+            copy.executor.abandon()
             self._abandoned.append(copy)
-            self._await_return(away.disk, self._returns.look_s)
-            self._away[
-                away.disk.label
-            ].problem = f"disk {away.disk} is not in use: {_reason(error)}"
+            self._start_rejoin(inactive.disk, self._rejoin.poll_s)
+            self._inactive[
+                inactive.disk.label
+            ].problem = f"disk {inactive.disk} is not in use: {_reason(error)}"
             return
-        del self._away[away.disk.label]
+        del self._inactive[inactive.disk.label]
         self._copies.append(copy)
         self._first_missing = self._next_number
         self._is_recorded, self._is_due = False, True
         with suppress(OSError):
             self._record()
         if copy in self._copies:
-            self._tell("disk-joined", copy.disk, f"disk {copy.disk} is up to date and in use")
+            self._emit_event("disk-joined", copy.disk, f"disk {copy.disk} is up to date and in use")
 
-    def _tell(self, name: EventName, disk: Disk, sentence: str) -> None:
+    def _emit_event(self, name: EventName, disk: Disk, sentence: str) -> None:
         self._emit(DiskEvent(name, disk, sentence, self.in_use, self.dropped_count))
 
-    def _await_return(self, disk: Disk, delay_s: float, *, is_held: bool = False) -> None:
-        self._away[disk.label] = ReturningDisk(
+    def _start_rejoin(self, disk: Disk, delay_s: float, *, is_held: bool = False) -> None:
+        self._inactive[disk.label] = RejoiningDisk(
             disk,
             self._mission_id,
             source=lambda: self._copies[0].mission,
@@ -416,23 +416,25 @@ class MirroredStorage:
             is_free=lambda: not self._hangs_on(disk.label),
             open_log=lambda: self._log_name,
             first_missing=lambda history: first_difference(history, self._history),
-            settings=self._returns,
+            settings=self._rejoin,
             delay_s=delay_s,
             is_held=is_held,
         )
 
     def _withdraw(self, number: int) -> None:
         """No disk may keep what was not acknowledged; recovery keeps what cannot be taken back."""
-        taking = {c: c.lane.submit(partial(c.writer.withdraw, number)) for c in self._copies}
-        self._wait(taking)
+        withdrawals = {
+            c: c.executor.submit(partial(c.writer.withdraw, number)) for c in self._copies
+        }
+        self._wait(withdrawals)
 
     def _append_log(self, data: bytes) -> None:
         for copy in self._copies:
-            copy.lane.submit(partial(copy.append_log, data))
+            copy.executor.submit(partial(copy.append_log, data))
 
     def _sync_log(self) -> None:
         for copy in self._copies:
-            copy.lane.submit(copy.sync_log)
+            copy.executor.submit(copy.sync_log)
 
 
 def _reason(error: OSError | DaemonError) -> str:

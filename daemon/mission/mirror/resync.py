@@ -15,7 +15,7 @@ from pathlib import Path
 
 from daemon.errors import DaemonError
 from daemon.mission.layout import DISCARDED, Mission
-from daemon.mission.mirror.generations import STATE_FILE, leads, read_generations
+from daemon.mission.mirror.generations import STATE_FILE, is_up_to_date_with, read_generations
 from daemon.mission.store import durable
 from daemon.mission.store.level0_folder import CAPTURE_FILE, EXPOSURE_FILE, hash_file, read_capture
 from daemon.mission.verification.chain_file import CHAIN_FILE
@@ -73,7 +73,7 @@ class Resync:
         for folder in ("L0", "L2", "log", "export"):
             durable.make_directories(self._target.path / folder)
         done = sum(self._small_file(name) for name in self._small_files(self._source.path))
-        done += self._set_strangers_aside()
+        done += self._supersede_extra_exposures()
         todo = [n for n in self._source.numbers() if self._known.get(n) != self._is_sealed(n)]
         self.waiting = len(todo)
         for number in todo:
@@ -90,7 +90,7 @@ class Resync:
     def copy_log(self, path: Path) -> None:
         """Put a log of the source in place of the target's."""
         target = self._target.log_dir / path.name
-        self._set_file_aside(target)
+        self._supersede_file(target)
         self._copy(path, target)
         durable.sync_directory(target.parent)
 
@@ -99,7 +99,7 @@ class Resync:
         source, target = self._source.log_dir / name, self._target.log_dir / name
         known = self._logs.get(name)
         if known is None:
-            self._set_file_aside(target)
+            self._supersede_file(target)
             known = 0
         with source.open("rb", buffering=0) as reading, target.open("ab", buffering=0) as writing:
             os.ftruncate(writing.fileno(), known)
@@ -134,8 +134,8 @@ class Resync:
         except sqlite3.Error as error:
             raise MirrorError(f"the index cannot be copied to {final} ({error})") from error
         durable.sync_file(part)
-        for ending in ("-wal", "-shm"):
-            final.with_name(final.name + ending).unlink(missing_ok=True)
+        for suffix in ("-wal", "-shm"):
+            final.with_name(final.name + suffix).unlink(missing_ok=True)
         part.rename(final)
         durable.sync_directory(final.parent)
 
@@ -164,7 +164,7 @@ class Resync:
         if target.is_file() and target.read_bytes() == source.read_bytes():
             return False
         durable.make_directories(target.parent)
-        self._set_file_aside(target)
+        self._supersede_file(target)
         self._copy(source, target)
         durable.sync_directory(target.parent)
         return True
@@ -184,11 +184,11 @@ class Resync:
         self._logs[path.name] = nbytes
         return not is_same
 
-    def _set_strangers_aside(self) -> int:
-        strangers = sorted(set(self._target.numbers()) - set(self._source.numbers()))
-        for number in strangers:
-            self._set_aside(number)
-        return len(strangers)
+    def _supersede_extra_exposures(self) -> int:
+        extra = sorted(set(self._target.numbers()) - set(self._source.numbers()))
+        for number in extra:
+            self._supersede(number)
+        return len(extra)
 
     def _is_sealed(self, number: int) -> bool:
         return (self._source.level0(number) / EXPOSURE_FILE).exists()
@@ -206,7 +206,7 @@ class Resync:
         is_sealed = self._is_sealed(number)
         did = False
         if target.is_dir() and not self._is_same(number):
-            self._set_aside(number)
+            self._supersede(number)
         if not target.is_dir():
             self._copy_folder(source, target)
             did = True
@@ -276,18 +276,18 @@ class Resync:
     def _hash(self, path: Path) -> str:
         return hash_file(path, lambda _: self.step())
 
-    def _set_file_aside(self, path: Path) -> None:
+    def _supersede_file(self, path: Path) -> None:
         if path.exists():
-            aside = self._target.path / SUPERSEDED
-            durable.make_directories(aside)
-            path.rename(_free_name(aside / path.name))
+            superseded = self._target.path / SUPERSEDED
+            durable.make_directories(superseded)
+            path.rename(_free_name(superseded / path.name))
 
-    def _set_aside(self, number: int) -> None:
+    def _supersede(self, number: int) -> None:
         folder = self._target.level0(number)
-        aside = self._target.level0_root / DISCARDED
-        durable.make_directories(aside)
-        folder.rename(_free_name(aside / folder.name))
-        durable.sync_directory(aside)
+        superseded = self._target.level0_root / DISCARDED
+        durable.make_directories(superseded)
+        folder.rename(_free_name(superseded / folder.name))
+        durable.sync_directory(superseded)
         durable.sync_directory(folder.parent)
 
 
@@ -299,7 +299,7 @@ def refuse_split(source: Mission, target: Mission) -> None:
         RecordError: a history is damaged.
     """
     ours, theirs = read_generations(source.path), read_generations(target.path)
-    if not leads(ours, theirs):
+    if not is_up_to_date_with(ours, theirs):
         raise MirrorError(
             f"{source.path} and {target.path} each went on without the other since generation "
             f"{theirs[-1].number}; nothing is overwritten: move one of them away, keep both, and "

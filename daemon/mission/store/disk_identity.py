@@ -9,7 +9,7 @@ import uuid
 from dataclasses import dataclass
 from pathlib import Path
 
-from daemon.mission.records import RecordError, canonical_bytes, parse_record, plain_name
+from daemon.mission.canonical_json import RecordError, canonical_bytes, parse_record, plain_name
 from daemon.mission.store import durable
 
 ID_FILE = "syntopic-disk.json"

@@ -9,9 +9,9 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
+from daemon.mission.canonical_json import RecordError
 from daemon.mission.exposure import FrameRecord
-from daemon.mission.records import RecordError
-from daemon.mission.store.level0 import Frame
+from daemon.mission.store.level0 import DecodedFrame
 from processing.rig import Sensor
 
 EXPOSURE_TIME_MAX_US = 600e6
@@ -24,7 +24,9 @@ _BAYER = {"BayerRG": "RGGB", "BayerBG": "BGGR", "BayerGR": "GRBG", "BayerGB": "G
 _BAYER |= {f"S{pattern}": pattern for pattern in _BAYER.values()}  # as V4L2 calls them
 
 
-def mismatches(number: int, record: FrameRecord, sensor: Sensor, frame: Frame) -> Iterator[str]:
+def mismatches(
+    number: int, record: FrameRecord, sensor: Sensor, frame: DecodedFrame
+) -> Iterator[str]:
     """What of a frame does not fit its record or its rig, one sentence each.
 
     Args:
@@ -94,7 +96,7 @@ def _format_mismatches(pixel_format: str, sensor: Sensor) -> Iterator[str]:
         )
 
 
-def _description_mismatches(number: int, record: FrameRecord, frame: Frame) -> Iterator[str]:
+def _description_mismatches(number: int, record: FrameRecord, frame: DecodedFrame) -> Iterator[str]:
     """What the file itself says, against the record; only what both say."""
     recorded = {
         "exposure": number,
@@ -107,8 +109,8 @@ def _description_mismatches(number: int, record: FrameRecord, frame: Frame) -> I
         TDI_SETTING: record.settings.get(TDI_SETTING),
     }
     settings = frame.description.get("settings")
-    said = {**frame.description, **(settings if isinstance(settings, dict) else {})}
+    stored_values = {**frame.description, **(settings if isinstance(settings, dict) else {})}
     for key, wanted in recorded.items():
-        found = said.get(key)
+        found = stored_values.get(key)
         if found not in (None, "") and wanted is not None and found != wanted:
             yield f"its file says {key} {found!r}; the record says {wanted!r}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from daemon.mission.records import RecordError
+from daemon.mission.canonical_json import RecordError
 
 SUFFIX = ".tif"
 _SUFFIXES = (".tif", ".tiff")

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from daemon.errors import DaemonError
-from daemon.mission.records import RecordError, parse_record
+from daemon.mission.canonical_json import RecordError, parse_record
 from daemon.mission.store import durable
 
 REPORT = Path("/run/syntopic-health/disks.json")
@@ -29,7 +29,7 @@ TEMPERATURE_MAX_C = 70.0
 """NVMe drives begin to throttle at 70 to 85 degC, SATA drives are specified up to 70."""
 
 WEAR_MAX_PERCENT = 90.0
-ASK_TIMEOUT_S = 20.0
+SMARTCTL_TIMEOUT_S = 20.0
 _REALLOCATED, _PENDING, _UNCORRECTABLE = 5, 197, 198
 """Attributes of ATA drives, by their usual ids."""
 
@@ -66,7 +66,7 @@ def run_smartctl(arguments: Sequence[str]) -> str:
             capture_output=True,
             text=True,
             errors="replace",
-            timeout=ASK_TIMEOUT_S,
+            timeout=SMARTCTL_TIMEOUT_S,
             check=False,
         )
     except FileNotFoundError as error:
@@ -105,47 +105,49 @@ def write_report(path: Path, report: Mapping[str, Any]) -> None:
     durable.replace_file(path, json.dumps(report).encode())
 
 
-def health_of(stated: Mapping[str, Any]) -> DiskHealth:
+def health_of(smart_data: Mapping[str, Any]) -> DiskHealth:
     """The health of one disk, from what `smartctl --all --json` printed of it.
 
     Source: smartctl(8) 7.2 and later, option `-j`; NVM Express Base Specification, SMART / Health
     Information log page.
     """
-    if isinstance(error := stated.get("error"), str):
+    if isinstance(error := smart_data.get("error"), str):
         return DiskHealth(problems=(error,))
-    nvme = _object(stated.get("nvme_smart_health_information_log"))
-    status = _object(stated.get("smart_status")).get("passed")
-    temperature_c = _number(_object(stated.get("temperature")).get("current"))
+    nvme = _object(smart_data.get("nvme_smart_health_information_log"))
+    status = _object(smart_data.get("smart_status")).get("passed")
+    temperature_c = _number(_object(smart_data.get("temperature")).get("current"))
     wear = _number(nvme.get("percentage_used"))
     if wear is None:
-        wear = _number(_object(stated.get("endurance_used")).get("current_percent"))
-    problems = list(_problems(stated, nvme, status))
+        wear = _number(_object(smart_data.get("endurance_used")).get("current_percent"))
+    problems = list(_problems(smart_data, nvme, status))
     if temperature_c is not None and temperature_c > TEMPERATURE_MAX_C:
         problems.append(f"it is {temperature_c:g} degC hot; cool it, {TEMPERATURE_MAX_C:g} is much")
     if wear is not None and wear >= WEAR_MAX_PERCENT:
         problems.append(f"{wear:g} % of its endurance is used; change it")
     return DiskHealth(
-        str(stated.get("model_name", "")),
-        str(stated.get("serial_number", "")),
+        str(smart_data.get("model_name", "")),
+        str(smart_data.get("serial_number", "")),
         temperature_c,
         wear,
         tuple(problems),
     )
 
 
-def _problems(stated: Mapping[str, Any], nvme: Mapping[str, Any], status: object) -> Iterator[str]:
+def _problems(
+    smart_data: Mapping[str, Any], nvme: Mapping[str, Any], status: object
+) -> Iterator[str]:
     if status is False:
         yield "it states that it fails (SMART); copy what is on it and change it"
     if status is None and not nvme:
         yield "it states nothing of its health (SMART); enable SMART, or look at its controller"
     if _number(nvme.get("critical_warning")):
         yield f"it warns (NVMe critical warning {int(nvme['critical_warning']):#04x}); change it"
-    spare, least = _number(nvme.get("available_spare")), nvme.get("available_spare_threshold")
-    if spare is not None and spare < (_number(least) or 0.0):
+    spare, minimum = _number(nvme.get("available_spare")), nvme.get("available_spare_threshold")
+    if spare is not None and spare < (_number(minimum) or 0.0):
         yield f"{spare:g} % of its spare blocks are left; change it"
     if errors := _number(nvme.get("media_errors")):
         yield f"it has lost data {errors:g} times (media errors); change it"
-    table = _object(stated.get("ata_smart_attributes")).get("table")
+    table = _object(smart_data.get("ata_smart_attributes")).get("table")
     for one in table if isinstance(table, list) else []:
         attribute = _object(one)
         raw = _number(_object(attribute.get("raw")).get("value"))

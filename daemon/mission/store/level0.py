@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.errors import DaemonError
-from daemon.mission.records import canonical_bytes
+from daemon.mission.canonical_json import canonical_bytes
 from drivers.cameras.tiff_layout import layout_problem
 
 PIXEL_ALIGNMENT = 4096
@@ -35,7 +35,7 @@ TIFF_MAX_BYTES = 4_000_000_000
 PART_ALLOWANCE_BYTES = 1 << 20
 """Tiles at the edges of a small image reach beyond it."""
 
-DEFLATE_MOST = 1032
+DEFLATE_MAX_RATIO = 1032
 """How many times its size Deflate can unpack to (zlib, technical details)."""
 
 _DEFLATE = (8, 32946)
@@ -68,7 +68,7 @@ def tiff_parts(
 
 
 @dataclass(frozen=True)
-class Frame:
+class DecodedFrame:
     """A frame as it was read at once: pixels (height, width), hash of the file, ImageDescription.
 
     `pixels` may be read-only; `description` is empty for a file of others.
@@ -79,7 +79,7 @@ class Frame:
     description: Mapping[str, Any]
 
 
-def read_frame(path: Path, *, width_px: int, height_px: int) -> Frame:
+def read_frame(path: Path, *, width_px: int, height_px: int) -> DecodedFrame:
     """Read a frame's file once: what is hashed is what is decoded.
 
     Raises:
@@ -94,13 +94,13 @@ def read_frame(path: Path, *, width_px: int, height_px: int) -> Frame:
         text = page.description
         if page.compression == 1 and page.is_final:
             kind = np.dtype(np.uint16).newbyteorder(page.parent.byteorder)
-            words = np.frombuffer(data, kind, page.size, page.dataoffsets[0])
-            pixels = np.asarray(words, np.uint16).reshape(page.shape)
+            samples = np.frombuffer(data, kind, page.size, page.dataoffsets[0])
+            pixels = np.asarray(samples, np.uint16).reshape(page.shape)
         else:
             pixels = page.asarray()
     if pixels.shape != (height_px, width_px):
         raise RasterError(f"{path.name}: its pixels end early")
-    return Frame(pixels, hashlib.sha256(data).hexdigest(), _described(text))
+    return DecodedFrame(pixels, hashlib.sha256(data).hexdigest(), _described(text))
 
 
 def read_tiff(
@@ -150,14 +150,14 @@ def _first_page(path: Path, file: BytesIO | None = None) -> Iterator[Any]:
             if problem := layout_problem(tiff):
                 raise RasterError(f"{path.name}: {problem}")
             page = tiff.pages[0]
-            refuse_bomb(page, path)
+            refuse_decompression_bomb(page, path)
             yield page
     except OSError as error:
         reason = error.strerror or type(error).__name__
         raise RasterError(f"{path}: cannot be read ({reason})") from error
     except RasterError:
         raise
-    except tiff_faults() as error:
+    except tiff_errors() as error:
         raise RasterError(f"{path.name}: not a usable TIFF ({error})") from error
 
 
@@ -181,7 +181,7 @@ def _refuse_other_pixels(
         )
 
 
-def tiff_faults() -> tuple[type[Exception], ...]:
+def tiff_errors() -> tuple[type[Exception], ...]:
     """What tifffile raises on bytes that are no TIFF, or a hostile one."""
     from tifffile import TiffFileError
 
@@ -200,7 +200,7 @@ def tiff_faults() -> tuple[type[Exception], ...]:
     )
 
 
-def refuse_bomb(page: Any, path: Path) -> None:
+def refuse_decompression_bomb(page: Any, path: Path) -> None:
     """Refuse a page of tifffile's whose pixels need more memory than its file or size warrant.
 
     Raises:
@@ -209,10 +209,10 @@ def refuse_bomb(page: Any, path: Path) -> None:
     """
     file = page.parent.filehandle
     file_nbytes = file.size
-    ratio = 1 if page.compression == 1 else DEFLATE_MOST
-    most = min(TIFF_MAX_BYTES, ratio * file_nbytes)
-    if page.nbytes > most:
-        raise RasterError(f"{path.name}: says {page.nbytes} bytes of pixels; it holds {most}")
+    ratio = 1 if page.compression == 1 else DEFLATE_MAX_RATIO
+    max_ratio = min(TIFF_MAX_BYTES, ratio * file_nbytes)
+    if page.nbytes > max_ratio:
+        raise RasterError(f"{path.name}: says {page.nbytes} bytes of pixels; it holds {max_ratio}")
     part_nbytes = math.prod(page.chunks) * page.dtype.itemsize
     if part_nbytes > page.nbytes + PART_ALLOWANCE_BYTES:
         raise RasterError(f"{path.name}: one of its parts says {part_nbytes} bytes; that is more")
@@ -243,7 +243,7 @@ def read_description(path: Path) -> dict[str, Any]:
             return _described(tiff.pages[0].description)
     except OSError:
         return {}
-    except tiff_faults():
+    except tiff_errors():
         return {}
 
 

@@ -14,15 +14,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.mission.canonical_json import RECORD_MAX_BYTES, RecordError, parse_record, sha256_hex
 from daemon.mission.exposure import (
-    Capture,
+    CaptureRecord,
     Exposure,
     FrameRecord,
     RecordState,
     capture_from_json,
     from_json,
 )
-from daemon.mission.records import RECORD_MAX_BYTES, RecordError, parse_record, sha256_hex
 from daemon.mission.store.frame_checks import mismatches
 from daemon.mission.store.frame_files import frame_files, other_spelling
 from daemon.mission.store.level0 import RasterError, read_frame
@@ -57,7 +57,7 @@ def read_sealed(folder: Path) -> SealedRecord | None:
     return SealedRecord(exposure, sha256_hex(data))
 
 
-def read_capture(folder: Path) -> Capture | None:
+def read_capture(folder: Path) -> CaptureRecord | None:
     """What was known when the pixels became durable, or None for a folder of others.
 
     Raises:
@@ -70,9 +70,9 @@ def read_capture(folder: Path) -> Capture | None:
     return capture_from_json(parse_record(data, name), name)
 
 
-def exposure_of(capture: Capture) -> Exposure:
+def unsealed_exposure(capture: CaptureRecord) -> Exposure:
     """An exposure that is not sealed yet: no mark, no navigation, no temperatures."""
-    known = {field.name: getattr(capture, field.name) for field in fields(Capture)}
+    known = {field.name: getattr(capture, field.name) for field in fields(CaptureRecord)}
     state: RecordState = "degraded" if capture.missing else "complete"
     return Exposure(**known, state=state if capture.frames else "lost")
 
@@ -107,7 +107,7 @@ def load_level0(
         files = frame_files(folder, [sensor.name for sensor in rig.sensors])
         records = [_default_frame(rig.sensor(name), file) for name, file in files.items()]
     frames: dict[str, NDArray[np.uint16]] = {}
-    kept: list[FrameRecord] = []
+    loaded: list[FrameRecord] = []
     missing = dict(exposure.missing)
     problems: list[str] = []
     if calibration_sha256 and exposure.calibration_sha256 not in ("", calibration_sha256):
@@ -143,7 +143,7 @@ def load_level0(
         ]
         frames[record.sensor] = frame.pixels
         height_px, width_px = frames[record.sensor].shape
-        kept.append(replace(record, file=path.name, width_px=width_px, height_px=height_px))
+        loaded.append(replace(record, file=path.name, width_px=width_px, height_px=height_px))
     if problems:
         raise RecordError(problems)
     for sensor in rig.sensors:
@@ -151,7 +151,7 @@ def load_level0(
             missing.setdefault(sensor.name, "no frame in the folder")
     state: RecordState = "lost" if not frames else "degraded" if missing else exposure.state
     return frames, replace(
-        exposure, frames=tuple(kept), missing=tuple(missing.items()), state=state
+        exposure, frames=tuple(loaded), missing=tuple(missing.items()), state=state
     )
 
 
@@ -174,7 +174,7 @@ def _record_or_defaults(folder: Path) -> Exposure:
         return sealed.exposure
     capture = read_capture(folder)
     if capture is not None:
-        return exposure_of(capture)
+        return unsealed_exposure(capture)
     return Exposure(number=int(folder.name) if folder.name.isdigit() and int(folder.name) else 1)
 
 

@@ -16,9 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.errors import DaemonError
+from daemon.mission.canonical_json import (
+    Fields,
+    RecordError,
+    canonical_bytes,
+    parse_record,
+    plain_name,
+)
 from daemon.mission.layout import Mission
-from daemon.mission.records import Fields, RecordError, canonical_bytes, parse_record, plain_name
-from daemon.mission.store import direct
+from daemon.mission.store import direct_io
 from daemon.mission.store.level0 import tiff_parts
 from daemon.mission.store.publication import published, sweep
 
@@ -142,7 +148,7 @@ def write_folder(
     """
     with published(final) as part:
         return {
-            name: direct.create_file(part / name, parts, mode=0o644)
+            name: direct_io.create_file(part / name, parts, mode=0o644)
             for name, parts in contents.items()
         }
 
@@ -228,10 +234,10 @@ def pictures(
     quicklook: NDArray[np.uint8], report_json: Mapping[str, Any]
 ) -> dict[str, Sequence[bytes | memoryview]]:
     """The quick look and its thumbnail; those of emulated hardware say so in a comment."""
-    whole, small = jpeg_bytes(quicklook), thumbnail_bytes(quicklook)
+    full_size, small = jpeg_bytes(quicklook), thumbnail_bytes(quicklook)
     if simulated_mark(report_json):
-        whole, small = (jpeg[:2] + JPEG_COMMENT + jpeg[2:] for jpeg in (whole, small))
-    return {"quicklook.jpg": [whole], "thumbnail.jpg": [small]}
+        full_size, small = (jpeg[:2] + JPEG_COMMENT + jpeg[2:] for jpeg in (full_size, small))
+    return {"quicklook.jpg": [full_size], "thumbnail.jpg": [small]}
 
 
 def thumbnail_bytes(quicklook: NDArray[np.uint8]) -> bytes:

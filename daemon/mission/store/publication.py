@@ -91,7 +91,7 @@ def sweep(folder: Path, name: str = "") -> list[str]:
                 else:
                     entry.rename(final)
                     done.append(f"{folder.name}/{final.name}: earlier products put back")
-        elif _removed_from_the_dead(entry):
+        elif _remove_abandoned(entry):
             done.append(f"{folder.name}/{found}: removed, its writer did not finish")
     if done:
         durable.sync_directory(folder)
@@ -131,7 +131,7 @@ def _locked(folder: Path) -> int | None:
     return descriptor
 
 
-def _removed_from_the_dead(entry: Path) -> bool:
+def _remove_abandoned(entry: Path) -> bool:
     """Remove what no living writer holds; nobody can begin to hold it while it is removed."""
     try:
         lock = _locked(entry)

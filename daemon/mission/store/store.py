@@ -22,11 +22,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.errors import DaemonError
+from daemon.mission.canonical_json import plain_name, sha256_hex
 from daemon.mission.catalog.catalog import Catalog
-from daemon.mission.exposure import Capture, Exposure, FrameRecord, capture_bytes, exposure_bytes
+from daemon.mission.exposure import (
+    CaptureRecord,
+    Exposure,
+    FrameRecord,
+    capture_bytes,
+    exposure_bytes,
+)
 from daemon.mission.layout import Mission
-from daemon.mission.records import plain_name, sha256_hex
-from daemon.mission.store import direct, durable
+from daemon.mission.store import direct_io, durable
 from daemon.mission.store.level0 import tiff_parts
 from daemon.mission.store.level0_folder import (
     CAPTURE_FILE,
@@ -40,7 +46,7 @@ from daemon.mission.verification.chain_file import ChainFile
 from daemon.mission.verification.verification import VerifyReport, verify
 
 __all__ = [
-    "Capture",
+    "CaptureRecord",
     "Level0Writer",
     "StoreError",
     "VerifyReport",
@@ -99,7 +105,7 @@ class Level0Writer:
         return self._head_sha256
 
     def write(
-        self, capture: Capture, pixels: Mapping[str, NDArray[np.uint16]]
+        self, capture: CaptureRecord, pixels: Mapping[str, NDArray[np.uint16]]
     ) -> tuple[FrameRecord, ...]:
         """Make an exposure's frames durable and note it; on return the exposure is *stored*.
 
@@ -110,7 +116,7 @@ class Level0Writer:
         return frames
 
     def write_frames(
-        self, capture: Capture, pixels: Mapping[str, NDArray[np.uint16]]
+        self, capture: CaptureRecord, pixels: Mapping[str, NDArray[np.uint16]]
     ) -> tuple[FrameRecord, ...]:
         """Make an exposure's frames durable, without a word in chain file and index.
 
@@ -147,7 +153,7 @@ class Level0Writer:
             raise
         return frames
 
-    def note_stored(self, stored: Capture) -> None:
+    def note_stored(self, stored: CaptureRecord) -> None:
         """Note in chain file and index that an exposure's frames are durable."""
         sha256 = sha256_hex(capture_bytes(stored))
         self._commit(lambda: self._chain.stored(stored.number, sha256))
@@ -224,7 +230,7 @@ class Level0Writer:
             self._catalog.close()
 
     def _write_frames(
-        self, part: Path, capture: Capture, pixels: Mapping[str, NDArray[np.uint16]]
+        self, part: Path, capture: CaptureRecord, pixels: Mapping[str, NDArray[np.uint16]]
     ) -> tuple[FrameRecord, ...]:
         tasks: list[Future[FrameRecord]] = [
             self._pool.submit(self._write_frame, part, capture, frame, pixels[frame.sensor])
@@ -234,7 +240,7 @@ class Level0Writer:
         return tuple(task.result() for task in tasks)
 
     def _write_frame(
-        self, part: Path, capture: Capture, frame: FrameRecord, pixels: NDArray[np.uint16]
+        self, part: Path, capture: CaptureRecord, frame: FrameRecord, pixels: NDArray[np.uint16]
     ) -> FrameRecord:
         written = _write_frame(part, capture, frame, pixels)
         self._step()
@@ -281,18 +287,18 @@ def _withdraw(part: Path, final: Path) -> None:
 
 
 def _write_frame(
-    part: Path, capture: Capture, frame: FrameRecord, pixels: NDArray[np.uint16]
+    part: Path, capture: CaptureRecord, frame: FrameRecord, pixels: NDArray[np.uint16]
 ) -> FrameRecord:
     name = f"{frame.sensor}.tif"
     parts = tiff_parts([pixels], _description(capture, frame))
-    direct.create_file(part / name, parts)
+    direct_io.create_file(part / name, parts)
     digest = hashlib.sha256()
     for piece in parts:
         digest.update(piece)
     return replace(frame, file=name, sha256=digest.hexdigest())
 
 
-def _description(capture: Capture, frame: FrameRecord) -> dict[str, Any]:
+def _description(capture: CaptureRecord, frame: FrameRecord) -> dict[str, Any]:
     """What the head knew, and nothing that was found out later."""
     return {
         "syntopic": 1,
@@ -309,7 +315,7 @@ def _description(capture: Capture, frame: FrameRecord) -> dict[str, Any]:
     }
 
 
-def _check(capture: Capture, pixels: Mapping[str, NDArray[np.uint16]]) -> None:
+def _check(capture: CaptureRecord, pixels: Mapping[str, NDArray[np.uint16]]) -> None:
     named = [frame.sensor for frame in capture.frames]
     if sorted(named) != sorted(pixels):
         raise StoreError(
@@ -326,8 +332,8 @@ def _check(capture: Capture, pixels: Mapping[str, NDArray[np.uint16]]) -> None:
             )
 
 
-def _capture_of(exposure: Exposure) -> Capture:
-    return Capture(
+def _capture_of(exposure: Exposure) -> CaptureRecord:
+    return CaptureRecord(
         number=exposure.number,
         trigger_sequence=exposure.trigger_sequence,
         trigger_mono_ns=exposure.trigger_mono_ns,

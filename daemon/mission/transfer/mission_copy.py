@@ -13,8 +13,8 @@ from daemon.mission.log.log_seals import close_run, seal_logs
 from daemon.mission.mirror.mirrored_log import LogFile
 from daemon.mission.mirror.resync import MirrorError, Resync
 from daemon.mission.store import durable
+from daemon.mission.store.disk_executor import DiskExecutor
 from daemon.mission.store.disk_identity import Disk
-from daemon.mission.store.lane import DiskLane
 from daemon.mission.store.store import Level0Writer
 from daemon.mission.verification.chain_file import ChainFile
 
@@ -25,7 +25,7 @@ class MissionCopy:
     def __init__(self, disk: Disk, mission_id: str) -> None:
         self.disk = disk
         self.mission = Mission(disk.root / mission_id, mission_id)
-        self.lane = DiskLane(disk, self._let_go)
+        self.executor = DiskExecutor(disk, self._release)
         self.refusal: OSError | None = None
         self._holding = ExitStack()
         self._writer: Level0Writer | None = None
@@ -65,7 +65,7 @@ class MissionCopy:
             MirrorError: the chain of records here ends with another one.
         """
         self._holding.enter_context(self.mission.held())
-        resync.step = self.lane.step
+        resync.step = self.executor.step
         resync.copy_open_log(log_name, offset)
         resync.copy_chain_and_index()
         self._open_writer()
@@ -108,11 +108,11 @@ class MissionCopy:
         if not self.writer.unindexed:
             with suppress(OSError):  # `syntopic repair` closes it if the disk refuses
                 close_run(self.mission, self._chain, "landing")
-        self._let_go()
+        self._release()
 
     def _open_writer(self) -> ChainFile:
         self._chain = self.mission.open_chain()
-        self._writer = Level0Writer(self.mission, chain=self._chain, step=self.lane.step)
+        self._writer = Level0Writer(self.mission, chain=self._chain, step=self.executor.step)
         return self._chain
 
     def _close_log(self) -> None:
@@ -120,7 +120,7 @@ class MissionCopy:
             self._log.close()
             self._log = None
 
-    def _let_go(self) -> None:
+    def _release(self) -> None:
         # An index that is closed late would take files of its successor's away by their names.
         self._close_log()
         if self._writer is not None:

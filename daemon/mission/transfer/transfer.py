@@ -1,8 +1,8 @@
 """Copying a mission to another disk: resumable, verified, never at the cost of the last copy.
 
 Every file is hashed in the source and read back from the copy's disk in each run, whatever an
-earlier run noted. The states of a copy are in `daemon.mission.transfer.transfer_note`; removing the
-source is in `daemon.mission.transfer.transfer_removal`.
+earlier run noted. The states of a copy are in `daemon.mission.transfer.transfer_manifest`; removing
+the source is in `daemon.mission.transfer.transfer_removal`.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from pathlib import Path
 from daemon.mission.catalog.catalog import Catalog, CatalogError
 from daemon.mission.layout import Mission, MissionError
 from daemon.mission.store import durable
-from daemon.mission.store.tree import FileEntry, FileTree, Step
-from daemon.mission.transfer.transfer_note import (
-    LEFT_OUT,
-    NOTE_FILE,
+from daemon.mission.store.file_tree import ByteProgress, FileEntry, FileTree
+from daemon.mission.transfer.transfer_manifest import (
+    EXCLUDED_FILES,
+    MANIFEST_FILE,
     CopiedFile,
     TransferError,
-    TransferNote,
-    read_note,
+    TransferManifest,
+    read_manifest,
 )
 from daemon.mission.transfer.transfer_removal import (
     REMOVING_SUFFIX,
@@ -53,7 +53,7 @@ class TransferReport:
 
     target: Path
     copied: int
-    kept: int
+    already_present: int
     nbytes: int
     verified: VerifyReport
     source_removed: bool
@@ -97,12 +97,12 @@ def transfer(
         source = stack.enter_context(FileTree.open(source_path))
         durable.make_directories(target_path.parent)
         target = stack.enter_context(_locked_target(target_path, source))
-        note = read_note(target, mission)
-        _settle_index(mission)
-        if note is not None and note.state == "sealed":
-            copying = _Copying(source, target, note.files, progress)
-            return copying.confirm_sealed(note, remove=remove_source)
-        copying = _Copying(source, target, note.files if note else {}, progress)
+        manifest = read_manifest(target, mission)
+        _checkpoint_index(mission)
+        if manifest is not None and manifest.state == "sealed":
+            copying = _Copying(source, target, manifest.files, progress)
+            return copying.confirm_sealed(manifest, remove=remove_source)
+        copying = _Copying(source, target, manifest.files if manifest else {}, progress)
         return copying.run(mission, remove=remove_source)
 
 
@@ -134,8 +134,8 @@ def finish_transfer(
         return None
     with ExitStack() as stack:
         target = stack.enter_context(_locked_target(target_path, None))
-        note = read_note(target)
-        if note is None or note.state != "sealed" or note.mission != source_path.name:
+        manifest = read_manifest(target)
+        if manifest is None or manifest.state != "sealed" or manifest.mission != source_path.name:
             if is_left:
                 raise TransferError(
                     f"{target_path} is not the sealed copy; {source_path} was transferred to "
@@ -143,12 +143,12 @@ def finish_transfer(
                 )
             return None
         if is_left:
-            stack.enter_context(Mission(removing, note.mission).held())
-        step = _counter(note.nbytes, progress)
-        check_sealed(target, note, step)
+            stack.enter_context(Mission(removing, manifest.mission).held())
+        step = _counter(manifest.nbytes, progress)
+        check_sealed(target, manifest, step)
         if is_left:
-            finish_removal(removing, note)
-    return _sealed_report(target_path, note, source_removed=True)
+            finish_removal(removing, manifest)
+    return _sealed_report(target_path, manifest, source_removed=True)
 
 
 class _Copying:
@@ -164,83 +164,83 @@ class _Copying:
         self._source = source
         self._target = target
         self._noted = noted
-        self._folders, files = source.walk()
-        self._entries = [entry for entry in files if entry.name not in LEFT_OUT]
+        self._folders, files = source.list_entries()
+        self._entries = [entry for entry in files if entry.name not in EXCLUDED_FILES]
         self._nbytes = sum(entry.nbytes for entry in self._entries)
         self._step = _counter(2 * self._nbytes, progress)
 
     def run(self, mission: Mission, *, remove: bool) -> TransferReport:
         """Copy, verify, and seal and remove the source where that is wanted."""
-        gone = self._gone_from_source()
-        self._refuse_without_room()
-        note = TransferNote(mission.id, mission.genesis_sha256(), "copying")
+        removed = self._removed_from_source()
+        self._require_free_space()
+        manifest = TransferManifest(mission.id, mission.genesis_sha256(), "copying")
         expected = {e.name: CopiedFile(e.nbytes, self._verified(e.name)) for e in self._entries}
-        still_there = {name: self._noted[name] for name in gone}
-        replace(note, files={**still_there, **expected}).write(self._target)
+        retained = {name: self._noted[name] for name in removed}
+        replace(manifest, files={**retained, **expected}).write(self._target)
         for folder in self._folders:
             self._target.make_folder(folder)
         files: dict[str, CopiedFile] = {}
-        kept = 0
+        already_present = 0
         for entry in self._entries:
-            sha256, is_kept = self._copy(entry)
-            kept += is_kept
+            sha256, was_present = self._copy(entry)
+            already_present += was_present
             files[entry.name] = CopiedFile(entry.nbytes, sha256)
-        for name in gone:
+        for name in removed:
             self._target.unlink(name)
         self._target.sync_folders(self._folders)
         _sync_above(self._target.path)
         verified = verify(Mission.open(self._target.path))
-        if not verified.is_well:
+        if not verified.is_intact:
             raise TransferError(
                 f"the copy in {self._target.path} has an error: {verified.problems[0]} "
                 f"({len(verified.problems)} in all). If `syntopic verify {self._source.path}` "
                 "reports the same, the copy is faithful; the source is kept"
             )
-        note = replace(
-            note,
+        manifest = replace(
+            manifest,
             state="complete",
             files=files,
             exposures=verified.exposures,
             frames=verified.frames,
         )
-        note.write(self._target)
+        manifest.write(self._target)
         if remove:
-            note = replace(note, state="sealed", sealed_utc=f"{datetime.now(UTC):%FT%TZ}")
+            manifest = replace(manifest, state="sealed", sealed_utc=f"{datetime.now(UTC):%FT%TZ}")
             self._refuse_changed_source(self._entries)
-            note.write(self._target)
-            remove_sealed_source(self._source, note, self._target.path)
+            manifest.write(self._target)
+            remove_sealed_source(self._source, manifest, self._target.path)
         return TransferReport(
             self._target.path,
-            len(files) - kept,
-            kept,
+            len(files) - already_present,
+            already_present,
             self._nbytes,
             verified,
             remove,
-            note.sealed_utc,
+            manifest.sealed_utc,
         )
 
-    def confirm_sealed(self, note: TransferNote, *, remove: bool) -> TransferReport:
+    def confirm_sealed(self, manifest: TransferManifest, *, remove: bool) -> TransferReport:
         """The copy was sealed by an earlier run: it is read again and never written."""
         found = {entry.name: entry.nbytes for entry in self._entries}
         differing = sorted(
             name
-            for name in {*found, *note.files}
-            if name not in note.files or found.get(name) != note.files[name].nbytes
+            for name in {*found, *manifest.files}
+            if name not in manifest.files or found.get(name) != manifest.files[name].nbytes
         )
-        for name in note.files:
-            if not differing and self._hash_source(name) != note.files[name].sha256:
+        for name in manifest.files:
+            if not differing and self._hash_source(name) != manifest.files[name].sha256:
                 differing.append(name)
         if differing:
             raise TransferError(
                 f"{self._source.path / differing[0]} differs from the copy that was sealed on "
-                f"{note.sealed_utc} ({len(differing)} such files); source and copy are kept. "
+                f"{manifest.sealed_utc} ({len(differing)} such files); source and copy are kept. "
                 "Transfer the mission into another folder, or remove the one that is not wanted"
             )
-        check_sealed(self._target, note, self._step)
+        check_sealed(self._target, manifest, self._step)
         if remove:
             self._refuse_changed_source(self._entries)
-            remove_sealed_source(self._source, note, self._target.path)
-        return _sealed_report(self._target.path, note, source_removed=remove)
+            remove_sealed_source(self._source, manifest, self._target.path)
+        return _sealed_report(self._target.path, manifest, source_removed=remove)
 
     def _copy(self, entry: FileEntry) -> tuple[str, bool]:
         """Bring one file into the copy; its SHA-256, and whether the copy had it already."""
@@ -259,7 +259,7 @@ class _Copying:
                 )
         return self._target.copy_from(self._source, entry, self._step), False
 
-    def _gone_from_source(self) -> list[str]:
+    def _removed_from_source(self) -> list[str]:
         """Files of the copy, products and exports only, that the source does not have any more.
 
         Unfinished files of an interrupted run are removed.
@@ -269,13 +269,13 @@ class _Copying:
                 the source has lost.
         """
         ours = {entry.name for entry in self._entries}
-        gone = []
+        removed = []
         unfinished = []
-        for file in self._target.walk()[1]:
-            if file.name in ours or file.name in LEFT_OUT:
+        for file in self._target.list_entries()[1]:
+            if file.name in ours or file.name in EXCLUDED_FILES:
                 continue
-            whole = _name_of_part(file.name)
-            if whole in self._noted:
+            final_name = _name_of_part(file.name)
+            if final_name in self._noted:
                 unfinished.append(file.name)
             elif file.name not in self._noted:
                 raise TransferError(
@@ -289,12 +289,12 @@ class _Copying:
                     "into another folder if that file is not wanted"
                 )
             else:
-                gone.append(file.name)
+                removed.append(file.name)
         for name in unfinished:
             self._target.unlink(name)
-        return gone
+        return removed
 
-    def _refuse_without_room(self) -> None:
+    def _require_free_space(self) -> None:
         needed = sum(e.nbytes for e in self._entries if self._target.size(e.name) != e.nbytes)
         free = durable.free_bytes(self._target.path)
         if free < needed:
@@ -304,7 +304,9 @@ class _Copying:
             )
 
     def _refuse_changed_source(self, entries: list[FileEntry]) -> None:
-        found = [entry for entry in self._source.walk()[1] if entry.name not in LEFT_OUT]
+        found = [
+            entry for entry in self._source.list_entries()[1] if entry.name not in EXCLUDED_FILES
+        ]
         if found != entries:
             raise TransferError(
                 f"{self._source.path} changed while it was copied; it is kept. "
@@ -336,9 +338,9 @@ def _locked_target(path: Path, source: FileTree | None) -> Iterator[FileTree]:
             fcntl.flock(target.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise MissionError(f"another transfer writes to {path}; wait for its end") from error
-        folders, files = target.walk()
-        has_note = any(file.name == NOTE_FILE for file in files)
-        if not has_note and (folders or any(file.name not in LEFT_OUT for file in files)):
+        folders, files = target.list_entries()
+        has_manifest = any(file.name == MANIFEST_FILE for file in files)
+        if not has_manifest and (folders or any(file.name not in EXCLUDED_FILES for file in files)):
             raise TransferError(
                 f"{path} is not empty and was not made by a transfer; move it away or choose "
                 "another disk"
@@ -347,7 +349,7 @@ def _locked_target(path: Path, source: FileTree | None) -> Iterator[FileTree]:
             yield target
 
 
-def _settle_index(mission: Mission) -> None:
+def _checkpoint_index(mission: Mission) -> None:
     """Fold the write-ahead log into the index, so that one file holds it."""
     if not mission.catalog_path.exists():
         return
@@ -380,11 +382,11 @@ def _name_of_part(name: str) -> str | None:
     folder, _, last = name.rpartition("/")
     if not (last.startswith(".") and last.endswith(durable.PART_SUFFIX)):
         return None
-    whole = last[1 : -len(durable.PART_SUFFIX)]
-    return f"{folder}/{whole}" if folder else whole
+    final_name = last[1 : -len(durable.PART_SUFFIX)]
+    return f"{folder}/{final_name}" if folder else final_name
 
 
-def _counter(total: int, progress: Progress) -> Step:
+def _counter(total: int, progress: Progress) -> ByteProgress:
     done = 0
 
     def step(count: int) -> None:
@@ -396,8 +398,16 @@ def _counter(total: int, progress: Progress) -> Step:
     return step
 
 
-def _sealed_report(target: Path, note: TransferNote, *, source_removed: bool) -> TransferReport:
-    verified = VerifyReport(note.exposures, note.frames, note.nbytes, ())
+def _sealed_report(
+    target: Path, manifest: TransferManifest, *, source_removed: bool
+) -> TransferReport:
+    verified = VerifyReport(manifest.exposures, manifest.frames, manifest.nbytes, ())
     return TransferReport(
-        target, 0, len(note.files), note.nbytes, verified, source_removed, note.sealed_utc
+        target,
+        0,
+        len(manifest.files),
+        manifest.nbytes,
+        verified,
+        source_removed,
+        manifest.sealed_utc,
     )

@@ -13,13 +13,13 @@ import os
 from pathlib import Path
 
 from daemon.mission.store import durable
-from daemon.mission.store.tree import FileTree, Step, TreeError
-from daemon.mission.transfer.transfer_note import (
-    LEFT_OUT,
+from daemon.mission.store.file_tree import ByteProgress, FileTree, TreeError
+from daemon.mission.transfer.transfer_manifest import (
+    EXCLUDED_FILES,
     LOCK_FILE,
-    MARK_FILE,
+    MOVED_FILE,
     TransferError,
-    TransferNote,
+    TransferManifest,
 )
 
 REMOVING_SUFFIX = ".removing"
@@ -30,13 +30,13 @@ def removing_path(source: Path) -> Path:
     return source.with_name(f".{source.name}{REMOVING_SUFFIX}")
 
 
-def check_sealed(target: FileTree, note: TransferNote, step: Step) -> None:
+def check_sealed(target: FileTree, manifest: TransferManifest, step: ByteProgress) -> None:
     """Read a sealed copy from the disk and compare every file with the seal.
 
     Raises:
         TransferError: a file is missing or differs.
     """
-    for name, file in note.files.items():
+    for name, file in manifest.files.items():
         try:
             found = target.sha256(name, step, from_disk=True)
         except FileNotFoundError:
@@ -48,12 +48,12 @@ def check_sealed(target: FileTree, note: TransferNote, step: Step) -> None:
         if found != file.sha256:
             state = "is missing" if found == "nothing" else "was changed"
             raise TransferError(
-                f"{target.path / name} {state} since the copy was sealed on {note.sealed_utc}; "
+                f"{target.path / name} {state} since the copy was sealed on {manifest.sealed_utc}; "
                 "what the source still has is kept"
             )
 
 
-def remove_sealed_source(source: FileTree, note: TransferNote, target: Path) -> None:
+def remove_sealed_source(source: FileTree, manifest: TransferManifest, target: Path) -> None:
     """Remove a source that is as it was copied.
 
     Args:
@@ -65,16 +65,16 @@ def remove_sealed_source(source: FileTree, note: TransferNote, target: Path) -> 
         TransferError: the folder cannot be renamed, or holds what the copy does not.
     """
     mark = {
-        "mission": note.mission,
+        "mission": manifest.mission,
         "copy": str(target),
-        "sealed_utc": note.sealed_utc,
-        "seal_sha256": note.sha256,
+        "sealed_utc": manifest.sealed_utc,
+        "seal_sha256": manifest.sha256,
         "meaning": "The copy is complete and verified; this folder is being removed.",
     }
-    source.replace(MARK_FILE, json.dumps(mark, indent=1).encode("utf-8", "replace") + b"\n")
+    source.replace(MOVED_FILE, json.dumps(mark, indent=1).encode("utf-8", "replace") + b"\n")
     removing = removing_path(source.path)
     if removing.exists():
-        finish_removal(removing, note)
+        finish_removal(removing, manifest)
     try:
         source.path.rename(removing)
     except OSError as error:
@@ -84,33 +84,33 @@ def remove_sealed_source(source: FileTree, note: TransferNote, target: Path) -> 
             "sealed"
         ) from error
     durable.sync_directory(removing.parent)
-    finish_removal(removing, note)
+    finish_removal(removing, manifest)
 
 
-def finish_removal(removing: Path, note: TransferNote) -> None:
+def finish_removal(removing: Path, manifest: TransferManifest) -> None:
     """Remove what is left of a source; the mark goes last.
 
     Raises:
         TransferError: the folder was not moved to this copy, or holds files that the copy does not.
     """
     with FileTree.open(removing) as tree:
-        folders, files = tree.walk()
-        _check_mark(tree, note, is_empty=not [f for f in files if f.name not in LEFT_OUT])
+        folders, files = tree.list_entries()
+        _check_mark(tree, manifest, is_empty=not [f for f in files if f.name not in EXCLUDED_FILES])
         for file in files:
-            if file.name not in LEFT_OUT and file.name not in note.files:
+            if file.name not in EXCLUDED_FILES and file.name not in manifest.files:
                 raise TransferError(
                     f"{removing / file.name} is not in the sealed copy; nothing more is removed. "
                     "Move that file away and run the transfer again"
                 )
         for file in files:
-            if file.name not in (LOCK_FILE, MARK_FILE):
+            if file.name not in (LOCK_FILE, MOVED_FILE):
                 tree.unlink(file.name)
         for folder in reversed(folders):
             tree.remove_folder(folder)
         # After a power cut, too, nothing may be left here without its mark.
         os.fsync(tree.descriptor)
         tree.unlink(LOCK_FILE)
-        tree.unlink(MARK_FILE)
+        tree.unlink(MOVED_FILE)
     removing.rmdir()
     durable.sync_directory(removing.parent)
 
@@ -119,22 +119,22 @@ def copy_named_by(removing: Path) -> str:
     """The folder that the mark in a half removed source names; "another disk" if unreadable."""
     try:
         with FileTree.open(removing) as tree:
-            return str(json.loads(tree.read_small(MARK_FILE))["copy"])
+            return str(json.loads(tree.read_small(MOVED_FILE))["copy"])
     except (OSError, ValueError, KeyError, TypeError, TreeError):
         return "another disk"
 
 
-def _check_mark(tree: FileTree, note: TransferNote, *, is_empty: bool) -> None:
+def _check_mark(tree: FileTree, manifest: TransferManifest, *, is_empty: bool) -> None:
     try:
-        found = json.loads(tree.read_small(MARK_FILE))["seal_sha256"]
+        found = json.loads(tree.read_small(MOVED_FILE))["seal_sha256"]
     except FileNotFoundError:
         if is_empty:
             return  # the mark is the last to go
         found = None
     except (ValueError, KeyError, TypeError):
         found = None
-    if found != note.sha256:
+    if found != manifest.sha256:
         raise TransferError(
-            f"{tree.path / MARK_FILE} does not name this copy; nothing more is removed. Name the "
+            f"{tree.path / MOVED_FILE} does not name this copy; nothing more is removed. Name the "
             f"disk that holds the copy in {copy_named_by(tree.path)}"
         )

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Link:
+class ChainLink:
     """A sealed record: the hash of its bytes, and the hash it quotes."""
 
     number: int
@@ -27,12 +27,12 @@ class ChainReport:
     genesis where there is none.
     """
 
-    order: tuple[Link, ...]
+    order: tuple[ChainLink, ...]
     head_sha256: str
     problems: tuple[str, ...]
 
 
-def follow_chain(links: Iterable[Link], genesis_sha256: str) -> ChainReport:
+def follow_chain(links: Iterable[ChainLink], genesis_sha256: str) -> ChainReport:
     """Follow the chain from its beginning.
 
     Args:
@@ -40,7 +40,7 @@ def follow_chain(links: Iterable[Link], genesis_sha256: str) -> ChainReport:
         genesis_sha256: what the first record quotes.
     """
     records = sorted(links, key=lambda link: link.number)
-    following: dict[str, list[Link]] = {}
+    following: dict[str, list[ChainLink]] = {}
     for link in records:
         following.setdefault(link.previous_sha256, []).append(link)
     problems = [
@@ -62,16 +62,16 @@ def follow_chain(links: Iterable[Link], genesis_sha256: str) -> ChainReport:
     seen = {link.number for link in order}
     for link in records:
         if link.number not in seen and link.previous_sha256 not in known:
-            behind = [link, *_reachable(link.sha256, following)]
-            order += [b for b in behind if b.number not in seen]
-            seen.update(b.number for b in behind)
+            unreachable = [link, *_reachable(link.sha256, following)]
+            order += [b for b in unreachable if b.number not in seen]
+            seen.update(b.number for b in unreachable)
     order += [link for link in records if link.number not in seen]
     head = order[-1].sha256 if order else genesis_sha256
     return ChainReport(tuple(order), head, tuple(problems))
 
 
-def _reachable(start_sha256: str, following: dict[str, list[Link]]) -> list[Link]:
-    order: list[Link] = []
+def _reachable(start_sha256: str, following: dict[str, list[ChainLink]]) -> list[ChainLink]:
+    order: list[ChainLink] = []
     waiting = [start_sha256]
     visited: set[str] = set()
     while waiting:

@@ -17,7 +17,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from daemon.mission.records import Fields, RecordError, canonical_bytes, parse_record, sha256_hex
+from daemon.mission.canonical_json import (
+    Fields,
+    RecordError,
+    canonical_bytes,
+    parse_record,
+    sha256_hex,
+)
 from daemon.mission.store import durable
 
 CHAIN_FILE = "chain.jsonl"
@@ -89,7 +95,7 @@ def read_history(path: Path) -> History:
                 if not line.endswith(b"\n") and len(line) < LINE_MAX_BYTES:
                     reader.torn_nbytes = len(line)
                     break
-                reader.take(line)
+                reader.read_line(line)
     except FileNotFoundError:
         return History()
     return reader.history()
@@ -141,7 +147,7 @@ class ChainFile:
         self.history = read_history(path)
         self.is_new = not self.history.exists or not self.history.nbytes
         if self.is_new:
-            rebuilt_utc = utc_text() if is_expected else ""
+            rebuilt_utc = utc_now_text() if is_expected else ""
             durable.replace_file(path, first_line(genesis_sha256, rebuilt_utc=rebuilt_utc))
             self.history = read_history(path)
         self._descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
@@ -185,7 +191,7 @@ class ChainFile:
         self.history = self._reread()
         if self._descriptor is None or self.history.closing is not None:
             return False
-        content = {"by": by, "utc": utc_text(), "files": dict(files)}
+        content = {"by": by, "utc": utc_now_text(), "files": dict(files)}
         self._append({"kind": "closed", "sealed": len(self.history.sealed), **content})
         return True
 
@@ -220,7 +226,7 @@ class ChainFile:
         self._known.add(key)
 
 
-def utc_text() -> str:
+def utc_now_text() -> str:
     """The present UTC, to the second."""
     return f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}"
 
@@ -261,7 +267,7 @@ class _Reader:
         self._count = 0
         self._nbytes = 0
 
-    def take(self, line: bytes) -> None:
+    def read_line(self, line: bytes) -> None:
         self._count += 1
         self._nbytes += len(line)
         name = f"{CHAIN_FILE}, line {self._count}"
@@ -279,8 +285,8 @@ class _Reader:
             return
         expected, sha256 = _expected(entry, self._head_sha256)
         if line != expected:
-            said = "was altered, or lines before it were removed"
-            self._problems.append(f"{name}: {said}; its hash does not fit")
+            damage = "was altered, or lines before it were removed"
+            self._problems.append(f"{name}: {damage}; its hash does not fit")
         self._head_sha256 = str(claimed) if line != expected else sha256
         self._closing = None
         self._note(entry, name)
@@ -312,7 +318,7 @@ class _Reader:
         nbytes = fields.integer("nbytes") if kind == "log-sealed" else 0
         genesis_sha256 = fields.sha256("mission_sha256")
         if fields.integer("format", CHAIN_FORMAT) != CHAIN_FORMAT:
-            fields.complain("format", f"this version reads format {CHAIN_FORMAT}")
+            fields.add_problem("format", f"this version reads format {CHAIN_FORMAT}")
         if problems:
             self._problems += problems
         elif kind == "begun":

@@ -15,7 +15,7 @@ from daemon.mission.layout import DISCARDED
 from daemon.mission.store import durable
 
 UNFINISHED = "being written, or left unfinished by a service that was killed (syntopic repair)"
-_NOT_OURS = "not written by Syntopic"
+_FOREIGN_FILE = "not written by Syntopic"
 
 _REASONS: tuple[tuple[str, str], ...] = (
     ("mission.db", "index, built again from the records; its rows are compared with them"),
@@ -32,7 +32,7 @@ _REASONS: tuple[tuple[str, str], ...] = (
 
 
 @dataclass(frozen=True)
-class NotCovered:
+class UncoveredFiles:
     """Files whose content no hash covers, by their paths in the mission, and why."""
 
     reason: str
@@ -48,7 +48,7 @@ class Inventory:
 
     files: dict[str, int] = field(default_factory=dict)
     folders: list[str] = field(default_factory=list)
-    odd: list[str] = field(default_factory=list)
+    special_files: list[str] = field(default_factory=list)
     unreadable: dict[str, str] = field(default_factory=dict)
     _names: dict[str, list[str]] = field(default_factory=dict)
 
@@ -83,7 +83,7 @@ def take_inventory(root: Path) -> Inventory:
                 elif entry.is_file(follow_symlinks=False):
                     found.files[path] = entry.stat(follow_symlinks=False).st_size
                 else:
-                    found.odd.append(path)
+                    found.special_files.append(path)
                     continue
             except OSError:
                 continue
@@ -96,12 +96,12 @@ def is_unfinished(path: str) -> bool:
     return any(part.endswith((durable.PART_SUFFIX, ".replaced")) for part in path.split("/"))
 
 
-def group(reasons: Mapping[str, str]) -> tuple[NotCovered, ...]:
+def group(reasons: Mapping[str, str]) -> tuple[UncoveredFiles, ...]:
     """Files by the reason why they are not covered, in the order of their paths."""
     by_reason: dict[str, list[str]] = {}
     for path in sorted(reasons):
         by_reason.setdefault(reasons[path], []).append(path)
-    return tuple(NotCovered(reason, tuple(files)) for reason, files in by_reason.items())
+    return tuple(UncoveredFiles(reason, tuple(files)) for reason, files in by_reason.items())
 
 
 def reasons_for(paths: Iterable[str]) -> dict[str, str]:
@@ -112,4 +112,4 @@ def reasons_for(paths: Iterable[str]) -> dict[str, str]:
 def _reason(path: str) -> str:
     if is_unfinished(path):
         return UNFINISHED
-    return next((reason for start, reason in _REASONS if path.startswith(start)), _NOT_OURS)
+    return next((reason for start, reason in _REASONS if path.startswith(start)), _FOREIGN_FILE)

@@ -13,12 +13,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from daemon.mission.canonical_json import RecordError, parse_record
 from daemon.mission.catalog.catalog import Catalog, CatalogError
-from daemon.mission.exposure import Capture, Exposure
+from daemon.mission.exposure import CaptureRecord, Exposure
 from daemon.mission.layout import DISCARDED, Mission, exposure_name
 from daemon.mission.log.flight_log import logs_of, read
 from daemon.mission.log.log_records import LoggedRecord, LoggedTrigger, record_of
-from daemon.mission.records import RecordError, parse_record
 from daemon.mission.store import durable, level2
 from daemon.mission.store.level0_folder import (
     CAPTURE_FILE,
@@ -29,7 +29,7 @@ from daemon.mission.store.level0_folder import (
     read_sealed,
 )
 from daemon.mission.store.store import Level0Writer
-from daemon.mission.verification.chain import ChainReport, Link, follow_chain
+from daemon.mission.verification.chain import ChainLink, ChainReport, follow_chain
 from daemon.mission.verification.chain_file import CHAIN_FILE, ChainFile
 from processing.rig import RigError, load_rig
 
@@ -38,7 +38,7 @@ CONTEXT_NS = 60_000_000_000
 
 LEDGER_TOPIC = "ledger"
 
-Complete = Callable[[Capture, Sequence[LoggedRecord]], Exposure]
+Complete = Callable[[CaptureRecord, Sequence[LoggedRecord]], Exposure]
 """Makes the final record of a stored exposure from what was logged around it."""
 
 
@@ -54,18 +54,18 @@ class RecoveryReport:
 
     done: tuple[str, ...]
     problems: tuple[str, ...]
-    noticed: tuple[str, ...]
+    notices: tuple[str, ...]
     sealed: tuple[int, ...]
     lost: tuple[int, ...]
     next_number: int
-    settled: tuple[Exposure, ...]
+    finalized: tuple[Exposure, ...]
     ledger_sheet: Mapping[str, Any] | None
     log_bytes_cut: int
 
     @property
     def sentences(self) -> tuple[str, ...]:
         """All there is to tell the crew, what went wrong first."""
-        return (*self.problems, *self.done, *self.noticed)
+        return (*self.problems, *self.done, *self.notices)
 
 
 def recover(mission: Mission, complete: Complete, *, software: str = "") -> RecoveryReport:
@@ -98,7 +98,7 @@ class _Recovery:
         self.software = software
         self.done: list[str] = []
         self.problems: list[str] = []
-        self.noticed: list[str] = []
+        self.notices: list[str] = []
         self.removed: set[int] = set()
         self.unsealed: set[int] = set()
         self._altered: set[int] = set()
@@ -125,11 +125,11 @@ class _Recovery:
         return RecoveryReport(
             done=tuple(self.done),
             problems=tuple(self.problems),
-            noticed=tuple(self.noticed),
+            notices=tuple(self.notices),
             sealed=tuple(newly),
             lost=tuple(lost),
             next_number=next_number,
-            settled=tuple(sealed[number].exposure for number in sorted(sealed)),
+            finalized=tuple(sealed[number].exposure for number in sorted(sealed)),
             ledger_sheet=log.sheet,
             log_bytes_cut=log.cut_nbytes,
         )
@@ -139,7 +139,7 @@ class _Recovery:
         known = {sentence for source, _, sentence in catalog.events() if source == "recovery"}
         new = [("done", sentence) for sentence in self.done]
         new += [("problem", sentence) for sentence in self.problems if sentence not in known]
-        new += [("noticed", sentence) for sentence in self.noticed if sentence not in known]
+        new += [("noticed", sentence) for sentence in self.notices if sentence not in known]
         for name, sentence in new:
             is_fault = name == "problem"
             catalog.add_event("recovery", name, sentence, is_fault=is_fault, mono_ns=0, boot_id="")
@@ -148,34 +148,34 @@ class _Recovery:
         """Folders without their final name: whole ones get it, the rest is set aside."""
         for part in sorted(self.mission.level0_root.glob(f"*{durable.PART_SUFFIX}")):
             final = part.with_name(part.name.removesuffix(durable.PART_SUFFIX))
-            if not final.exists() and _is_whole(part):
+            if not final.exists() and _is_complete(part):
                 durable.rename_directory(part, final)
                 self.done.append(f"exposure {final.name}: was whole but unnamed; kept as stored")
             else:
-                self._set_aside(part, final.name)
+                self._discard(part, final.name)
         for number in self.mission.numbers():
             folder = self.mission.level0(number)
             if durable.remove_parts(folder / EXPOSURE_FILE):
                 durable.sync_directory(folder)
                 self.done.append(f"exposure {number}: a record written half was removed")
 
-    def _set_aside(self, part: Path, name: str) -> None:
-        aside = self.mission.level0_root / DISCARDED
-        durable.make_directories(aside)
+    def _discard(self, part: Path, name: str) -> None:
+        discarded = self.mission.level0_root / DISCARDED
+        durable.make_directories(discarded)
         repetition = 1
-        while (target := aside / f"{name}-{repetition}").exists():
+        while (target := discarded / f"{name}-{repetition}").exists():
             repetition += 1
         part.rename(target)
-        durable.sync_directory(aside)
+        durable.sync_directory(discarded)
         durable.sync_directory(part.parent)
         self.done.append(
             f"exposure {name}: was being written and never called stored; "
             f"what there is lies in L0/{DISCARDED}/{target.name}"
         )
 
-    def _read_folders(self) -> tuple[dict[int, SealedRecord], dict[int, Capture]]:
+    def _read_folders(self) -> tuple[dict[int, SealedRecord], dict[int, CaptureRecord]]:
         sealed: dict[int, SealedRecord] = {}
-        captures: dict[int, Capture] = {}
+        captures: dict[int, CaptureRecord] = {}
         for number in self.mission.numbers():
             folder = self.mission.level0(number)
             try:
@@ -195,7 +195,7 @@ class _Recovery:
         return sealed, captures
 
     def _chain(self, sealed: Mapping[int, SealedRecord]) -> ChainReport:
-        links = [Link(n, r.sha256, r.exposure.previous_sha256) for n, r in sealed.items()]
+        links = [ChainLink(n, r.sha256, r.exposure.previous_sha256) for n, r in sealed.items()]
         chain = follow_chain(links, self.mission.genesis_sha256())
         self.problems += chain.problems
         return chain
@@ -203,7 +203,7 @@ class _Recovery:
     def _index(
         self,
         sealed: Mapping[int, SealedRecord],
-        captures: Mapping[int, Capture],
+        captures: Mapping[int, CaptureRecord],
         chain: ChainReport,
     ) -> Catalog:
         """The index, made to say what the folders say."""
@@ -233,7 +233,7 @@ class _Recovery:
         self,
         chain_file: ChainFile,
         sealed: Mapping[int, SealedRecord],
-        captures: Mapping[int, Capture],
+        captures: Mapping[int, CaptureRecord],
         chain: ChainReport,
     ) -> None:
         """The chain file, completed by what became durable and was not noted in it."""
@@ -288,16 +288,18 @@ class _Recovery:
         try:
             return Catalog.open(path)
         except CatalogError as error:
-            aside = path.with_name(f"{path.name}.damaged")
+            discarded = path.with_name(f"{path.name}.damaged")
             repetition = 1
-            while aside.exists():
+            while discarded.exists():
                 repetition += 1
-                aside = path.with_name(f"{path.name}.damaged-{repetition}")
-            path.rename(aside)
-            for ending in ("-wal", "-shm"):
-                path.with_name(path.name + ending).unlink(missing_ok=True)
+                discarded = path.with_name(f"{path.name}.damaged-{repetition}")
+            path.rename(discarded)
+            for suffix in ("-wal", "-shm"):
+                path.with_name(path.name + suffix).unlink(missing_ok=True)
             durable.sync_directory(path.parent)
-            self.done.append(f"the index was unusable ({error}); kept as {aside.name}, built again")
+            self.done.append(
+                f"the index was unusable ({error}); kept as {discarded.name}, built again"
+            )
             return Catalog.open(path)
 
     def _triggers(self) -> _Log:
@@ -314,7 +316,7 @@ class _Recovery:
                         log.sheet = parse_record(message.payload, message.topic)
             if reader.cut_nbytes:
                 log.cut_nbytes += reader.cut_nbytes
-                self.noticed.append(
+                self.notices.append(
                     f"log/{path.name}: ends in the middle of a message; "
                     f"{reader.cut_nbytes} bytes cannot be read"
                 )
@@ -326,7 +328,7 @@ class _Recovery:
         self,
         catalog: Catalog,
         chain_file: ChainFile,
-        captures: Mapping[int, Capture],
+        captures: Mapping[int, CaptureRecord],
         sealed: dict[int, SealedRecord],
         log: _Log,
         known: AbstractSet[int],
@@ -337,8 +339,8 @@ class _Recovery:
         was removed.
         """
         waiting = {n: c for n, c in captures.items() if n not in sealed}
-        there_or_removed = known | set(self.mission.numbers())
-        lost = [number for number in sorted(log.triggers) if number not in there_or_removed]
+        present_or_removed = known | set(self.mission.numbers())
+        lost = [number for number in sorted(log.triggers) if number not in present_or_removed]
         for number in lost:
             waiting[number] = self._capture_of_lost(*log.triggers[number])
         if not waiting:
@@ -370,13 +372,13 @@ class _Recovery:
             writer.close()
         return newly, [number for number in lost if number in newly]
 
-    def _capture_of_lost(self, boot_id: str, trigger: LoggedTrigger) -> Capture:
+    def _capture_of_lost(self, boot_id: str, trigger: LoggedTrigger) -> CaptureRecord:
         cause = "the service ended before its frame was stored"
         try:
             sensors = [sensor.name for sensor in load_rig(self.mission.rig_path).sensors]
         except RigError:
             sensors = []
-        return Capture(
+        return CaptureRecord(
             number=trigger.number,
             trigger_sequence=trigger.pulse.sequence,
             trigger_mono_ns=trigger.pulse.mono_ns,
@@ -387,7 +389,7 @@ class _Recovery:
         )
 
 
-def _is_whole(part: Path) -> bool:
+def _is_complete(part: Path) -> bool:
     """Whether every frame named in a part folder's record is there and hashes to what it says."""
     try:
         capture = read_capture(part)
@@ -404,7 +406,9 @@ def _is_whole(part: Path) -> bool:
     return True
 
 
-def _logged_around(log_dir: Path, waiting: Mapping[int, Capture]) -> dict[int, list[LoggedRecord]]:
+def _logged_around(
+    log_dir: Path, waiting: Mapping[int, CaptureRecord]
+) -> dict[int, list[LoggedRecord]]:
     """By exposure, what was logged around its trigger on the same boot, in order."""
     found: dict[int, list[LoggedRecord]] = {number: [] for number in waiting}
     for path in logs_of(log_dir):

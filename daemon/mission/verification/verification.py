@@ -16,23 +16,23 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
+from daemon.mission.canonical_json import RecordError
 from daemon.mission.catalog.catalog import Catalog, CatalogError, IndexedExposure
 from daemon.mission.layout import DISCARDED, Mission, is_exposure_name
 from daemon.mission.log.log_seals import CHANGING_FILES, SEALS_FILE, read_seals
-from daemon.mission.records import RecordError
 from daemon.mission.store.level0_folder import hash_file
-from daemon.mission.verification.chain import Link, follow_chain
+from daemon.mission.verification.chain import ChainLink, follow_chain
 from daemon.mission.verification.chain_file import CHAIN_FILE, History, LogSeal, read_history
 from daemon.mission.verification.inventory import (
     UNFINISHED,
-    NotCovered,
+    UncoveredFiles,
     group,
     is_unfinished,
     reasons_for,
     take_inventory,
 )
 from daemon.mission.verification.verified_exposure import (
-    Expected,
+    ExpectedExposure,
     FoundExposure,
     check_exposure,
 )
@@ -47,7 +47,7 @@ STATES = {
 
 
 @dataclass(frozen=True)
-class Covered:
+class CoveredFiles:
     """Files of one kind that were compared with a hash, and where that hash is written."""
 
     what: str
@@ -67,12 +67,12 @@ class VerifyReport:
     nbytes: int
     problems: tuple[str, ...]
     state: str = "ended"
-    covered: tuple[Covered, ...] = ()
-    not_covered: tuple[NotCovered, ...] = ()
+    covered: tuple[CoveredFiles, ...] = ()
+    not_covered: tuple[UncoveredFiles, ...] = ()
     remarks: tuple[str, ...] = ()
 
     @property
-    def is_well(self) -> bool:
+    def is_intact(self) -> bool:
         return not self.problems
 
 
@@ -127,7 +127,7 @@ class _Verification:
             nbytes=self._done,
             problems=tuple(self.problems),
             state="by hand" if not genesis else "flown" if self.is_flown else "ended",
-            covered=tuple(Covered(what, n, by) for (what, by), n in self.covered.items()),
+            covered=tuple(CoveredFiles(what, n, by) for (what, by), n in self.covered.items()),
             not_covered=group(self.not_covered),
             remarks=tuple(self.remarks),
         )
@@ -226,17 +226,17 @@ class _Verification:
 
     def _exposures(self, numbers: list[int], *, is_chained: bool) -> dict[int, FoundExposure]:
         folders = set(self.inventory.folders)
-        odd: dict[str, list[str]] = {}
-        for path in self.inventory.odd:
+        special_files: dict[str, list[str]] = {}
+        for path in self.inventory.special_files:
             folder, _, name = path.rpartition("/")
-            odd.setdefault(folder, []).append(name)
+            special_files.setdefault(folder, []).append(name)
         expected = [
-            Expected(
+            ExpectedExposure(
                 number=number,
                 folder=self.mission.level0(number),
                 names=self.inventory.below(f"L0/{self.mission.level0(number).name}"),
                 is_there=f"L0/{self.mission.level0(number).name}" in folders,
-                odd=odd.get(f"L0/{self.mission.level0(number).name}", []),
+                special_files=special_files.get(f"L0/{self.mission.level0(number).name}", []),
                 capture_sha256=self.history.stored.get(number, ""),
                 record_sha256=self.history.sealed.get(number, ()),
                 indexed=self.index.get(number),
@@ -265,7 +265,7 @@ class _Verification:
         it was read are left to the next verification.
         """
         links = [
-            Link(found.number, found.record_sha256, found.previous_sha256)
+            ChainLink(found.number, found.record_sha256, found.previous_sha256)
             for found in exposures.values()
             if found.record_sha256
             and (found.number in self.history.sealed or not (self.is_flown and self.history.exists))
@@ -365,7 +365,7 @@ class _Verification:
 
     def _entries(self) -> None:
         """What has no place in a mission."""
-        for path in self.inventory.odd:
+        for path in self.inventory.special_files:
             self.problems.append(
                 f"{path}: is a link, a pipe or a device; it was not followed. A mission holds "
                 "plain files and folders"
@@ -392,14 +392,14 @@ def _read_index(mission: Mission, *, is_flown: bool) -> tuple[dict[int, IndexedE
     Without its shared memory SQLite reads the file as it lies, which another process may be
     writing: such a finding counts when it is the same in every attempt.
     """
-    said = ""
+    error_text = ""
     for _ in range(3 if is_flown else 1):
         try:
-            catalog = Catalog.read(mission.catalog_path, is_settled=not is_flown)
+            catalog = Catalog.read(mission.catalog_path, is_immutable=not is_flown)
             try:
                 return catalog.snapshot(), ""
             finally:
                 catalog.close()
         except (CatalogError, sqlite3.Error) as error:
-            said = str(error)
-    return {}, said
+            error_text = str(error)
+    return {}, error_text

@@ -9,9 +9,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from daemon.mission.canonical_json import RecordError
 from daemon.mission.catalog.catalog import IndexedExposure
 from daemon.mission.exposure import FrameRecord
-from daemon.mission.records import RecordError
 from daemon.mission.store import durable
 from daemon.mission.store.level0_folder import (
     CAPTURE_FILE,
@@ -23,11 +23,11 @@ from daemon.mission.store.level0_folder import (
 from daemon.mission.verification.chain_file import CHAIN_FILE
 from daemon.mission.verification.inventory import UNFINISHED
 
-Step = Callable[[int], None]
+ByteProgress = Callable[[int], None]
 
 
 @dataclass(frozen=True)
-class Expected:
+class ExpectedExposure:
     """What is known of an exposure before its folder is looked into.
 
     `names` are the plain files and folders in it, `odd` links and pipes, which are not opened;
@@ -39,7 +39,7 @@ class Expected:
     folder: Path
     names: Sequence[str]
     is_there: bool
-    odd: Sequence[str]
+    special_files: Sequence[str]
     capture_sha256: str
     record_sha256: tuple[str, ...]
     indexed: IndexedExposure | None
@@ -63,15 +63,15 @@ class FoundExposure:
     covered: dict[tuple[str, str], list[str]] = field(default_factory=dict)
     not_covered: dict[str, str] = field(default_factory=dict)
 
-    def complain(self, sentence: str) -> None:
+    def add_problem(self, sentence: str) -> None:
         self.problems.append(f"exposure {self.number}: {sentence}")
 
 
-def check_exposure(expected: Expected, step: Step) -> FoundExposure:
+def check_exposure(expected: ExpectedExposure, step: ByteProgress) -> FoundExposure:
     """Compare a folder; `step` is called with the number of bytes read."""
     found = FoundExposure(expected.number, expected.folder.name)
     if not expected.is_there:
-        return _gone(expected, found)
+        return _check_missing_folder(expected, found)
     frames = _read_records(expected, found)
     _check_record(expected, found)
     _check_capture(expected, found)
@@ -80,19 +80,19 @@ def check_exposure(expected: Expected, step: Step) -> FoundExposure:
     return found
 
 
-def _gone(expected: Expected, found: FoundExposure) -> FoundExposure:
+def _check_missing_folder(expected: ExpectedExposure, found: FoundExposure) -> FoundExposure:
     found.is_there = False
     in_chain = expected.capture_sha256 or expected.record_sha256
-    witnesses = [CHAIN_FILE] * bool(in_chain) + ["the index"] * (expected.indexed is not None)
-    if witnesses:
-        found.complain(f"is in {' and '.join(witnesses)} but its folder is gone")
+    evidence = [CHAIN_FILE] * bool(in_chain) + ["the index"] * (expected.indexed is not None)
+    if evidence:
+        found.add_problem(f"is in {' and '.join(evidence)} but its folder is gone")
     return found
 
 
-def _read_records(expected: Expected, found: FoundExposure) -> tuple[FrameRecord, ...]:
+def _read_records(expected: ExpectedExposure, found: FoundExposure) -> tuple[FrameRecord, ...]:
     """The frames that the record names or, where it is not there or unusable, the capture."""
     frames: tuple[FrameRecord, ...] = ()
-    if {EXPOSURE_FILE, CAPTURE_FILE}.intersection(expected.odd):
+    if {EXPOSURE_FILE, CAPTURE_FILE}.intersection(expected.special_files):
         found.is_readable = False
         return frames
     try:
@@ -116,15 +116,17 @@ def _read_records(expected: Expected, found: FoundExposure) -> tuple[FrameRecord
     return frames
 
 
-def _check_record(expected: Expected, found: FoundExposure) -> None:
+def _check_record(expected: ExpectedExposure, found: FoundExposure) -> None:
     is_there = EXPOSURE_FILE in expected.names
     sealed = list(expected.record_sha256)
     if not sealed and expected.indexed is not None and expected.indexed.record_sha256:
         sealed = [expected.indexed.record_sha256]
     if len(set(sealed)) > 1:
-        found.complain("was sealed more than once; the record sealed first was removed or altered")
+        found.add_problem(
+            "was sealed more than once; the record sealed first was removed or altered"
+        )
     if sealed and not is_there:
-        found.complain("was sealed but its record is gone")
+        found.add_problem("was sealed but its record is gone")
     if not is_there:
         return
     by = CHAIN_FILE if expected.record_sha256 else "the next record, the last one: the index"
@@ -133,35 +135,40 @@ def _check_record(expected: Expected, found: FoundExposure) -> None:
     elif not expected.record_sha256 and expected.has_chain_file:
         found.not_covered[EXPOSURE_FILE] = UNFINISHED
         if not expected.is_flown:
-            found.complain(f"its record is not in {CHAIN_FILE}; one of them was altered by others")
+            found.add_problem(
+                f"its record is not in {CHAIN_FILE}; one of them was altered by others"
+            )
     else:
         found.covered["exposure records", by] = [EXPOSURE_FILE]
     if sealed and found.record_sha256 and found.record_sha256 not in sealed:
-        found.complain("its record differs from what was sealed")
+        found.add_problem("its record differs from what was sealed")
 
 
-def _check_capture(expected: Expected, found: FoundExposure) -> None:
+def _check_capture(expected: ExpectedExposure, found: FoundExposure) -> None:
     is_there = CAPTURE_FILE in expected.names
     if expected.capture_sha256:
         if not is_there:
-            found.complain(f"{CAPTURE_FILE} is missing")
+            found.add_problem(f"{CAPTURE_FILE} is missing")
             return
         found.covered["capture records", CHAIN_FILE] = [CAPTURE_FILE]
         try:
             if hash_file(expected.folder / CAPTURE_FILE) != expected.capture_sha256:
-                found.complain(f"{CAPTURE_FILE} differs from what was stored")
+                found.add_problem(f"{CAPTURE_FILE} differs from what was stored")
         except OSError as error:
-            found.complain(f"{CAPTURE_FILE} cannot be read ({error.strerror})")
+            found.add_problem(f"{CAPTURE_FILE} cannot be read ({error.strerror})")
     elif is_there and expected.has_chain_file:
         found.not_covered[CAPTURE_FILE] = UNFINISHED
         if not expected.is_flown:
-            found.complain(f"is not in {CHAIN_FILE}; one of them was altered by others")
+            found.add_problem(f"is not in {CHAIN_FILE}; one of them was altered by others")
     elif is_there:
         found.not_covered[CAPTURE_FILE] = "capture record of format 1, without a hash"
 
 
 def _check_frames(
-    expected: Expected, found: FoundExposure, frames: Sequence[FrameRecord], step: Step
+    expected: ExpectedExposure,
+    found: FoundExposure,
+    frames: Sequence[FrameRecord],
+    step: ByteProgress,
 ) -> None:
     by = EXPOSURE_FILE if found.record_sha256 else CAPTURE_FILE
     for frame in frames:
@@ -183,7 +190,9 @@ def _check_frames(
             found.problems.append(f"{where}: was altered; its hash differs from the record's")
 
 
-def _check_names(expected: Expected, found: FoundExposure, frames: Sequence[FrameRecord]) -> None:
+def _check_names(
+    expected: ExpectedExposure, found: FoundExposure, frames: Sequence[FrameRecord]
+) -> None:
     """Level-0 is immutable: what no record names was added later."""
     named = {EXPOSURE_FILE, CAPTURE_FILE}
     named |= {frame.file or f"{frame.sensor}.tif" for frame in frames}

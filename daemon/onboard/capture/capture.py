@@ -12,21 +12,21 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from daemon.onboard.capture.memory import FrameRing
+from daemon.onboard.capture.frame_ring import FrameRing
 from daemon.onboard.service.messages import (
-    Adjust,
+    ApplyExposureSettings,
+    BindFailed,
     Bound,
     DeviceSpec,
     Fire,
     Fired,
-    NotBound,
     Ping,
     Pong,
     Recycle,
     Stop,
 )
-from daemon.onboard.service.processes import Link
-from daemon.onboard.timing.timesync import TimesyncAsker, can_be_asked
+from daemon.onboard.service.processes import ServiceConnection
+from daemon.onboard.timing.timesync import TimesyncRequester, supports_timesync
 from drivers.base import registry
 from drivers.contract import (
     Device,
@@ -40,20 +40,22 @@ from drivers.contract import (
 CLOSE_TIMEOUT_S = 3.0
 
 
-def main(link: Link, specs: tuple[DeviceSpec, ...], rings: tuple[FrameRing, ...]) -> None:
+def main(
+    link: ServiceConnection, specs: tuple[DeviceSpec, ...], rings: tuple[FrameRing, ...]
+) -> None:
     """Open the devices, deliver until told to stop."""
     _Capture(link, specs, {ring.head: ring for ring in rings}).run()
 
 
 class _Capture:
     def __init__(
-        self, link: Link, specs: tuple[DeviceSpec, ...], rings: Mapping[str, FrameRing]
+        self, link: ServiceConnection, specs: tuple[DeviceSpec, ...], rings: Mapping[str, FrameRing]
     ) -> None:
         self.link = link
         self.devices: dict[str, tuple[DeviceSpec, Device]] = {}
         self.heads: dict[str, Head] = {}
         self.heads_of_output: dict[str, list[Head]] = {}
-        self.orders: queue.SimpleQueue[Fire | Adjust | None] = queue.SimpleQueue()
+        self.requests: queue.SimpleQueue[Fire | ApplyExposureSettings | None] = queue.SimpleQueue()
         trigger_spec: DeviceSpec | None = None
         for spec in specs:
             if spec.kind == "trigger":
@@ -65,10 +67,10 @@ class _Capture:
                 self.heads[spec.name] = device
                 self.heads_of_output.setdefault(spec.output, []).append(device)
         self.trigger_spec = trigger_spec
-        self.askers = [
-            TimesyncAsker(device, self._sink)
+        self.requesters = [
+            TimesyncRequester(device, self._sink)
             for _, device in self.devices.values()
-            if can_be_asked(device)
+            if supports_timesync(device)
         ]
 
     def run(self) -> None:
@@ -76,25 +78,25 @@ class _Capture:
             threading.Thread(target=self._deliver, args=pair, name=pair[0].name, daemon=True)
             for pair in self.devices.values()
         ]
-        threads.append(threading.Thread(target=self._fire_orders, name="trigger", daemon=True))
+        threads.append(threading.Thread(target=self._run_trigger, name="trigger", daemon=True))
         threads += [
-            threading.Thread(target=asker.run, name="timesync", daemon=True)
-            for asker in self.askers
+            threading.Thread(target=requester.run, name="timesync", daemon=True)
+            for requester in self.requesters
         ]
         for thread in threads:
             thread.start()
-        while not isinstance(order := self.link.receive(timeout_s=1.0), Stop):
-            if isinstance(order, Recycle):
-                for head, slot in order.slots.items():
+        while not isinstance(request := self.link.receive(timeout_s=1.0), Stop):
+            if isinstance(request, Recycle):
+                for head, slot in request.slots.items():
                     self.heads[head].recycle(slot)
-            elif isinstance(order, Fire | Adjust):
-                self.orders.put(order)
-            elif isinstance(order, Ping):
+            elif isinstance(request, Fire | ApplyExposureSettings):
+                self.requests.put(request)
+            elif isinstance(request, Ping):
                 counted = {name: dict(d.statistics()) for name, (_, d) in self.devices.items()}
                 self.link.send(Pong(counted))
-        self.orders.put(None)
-        for asker in self.askers:
-            asker.stop()
+        self.requests.put(None)
+        for requester in self.requesters:
+            requester.stop()
         closers = [
             threading.Thread(target=device.close, daemon=True)
             for _, device in self.devices.values()
@@ -111,13 +113,13 @@ class _Capture:
             found = self.heads[spec.name].bind(self._sink) if spec.kind == "head" else device.bind()
             self.link.send(Bound(spec.kind, spec.name, dict(found)))
         except DeviceError as error:
-            self.link.send(NotBound(spec.kind, spec.name, str(error)))
+            self.link.send(BindFailed(spec.kind, spec.name, str(error)))
         device.run(self._sink)
 
     def _sink(self, record: Record) -> None:
         self.link.send(record)
 
-    def _fire_orders(self) -> None:
+    def _run_trigger(self) -> None:
         """The trigger in a thread of its own: a slow unit holds up no frame."""
         if self.trigger_spec is None:
             return
@@ -127,30 +129,32 @@ class _Capture:
         try:
             self.link.send(Bound("trigger", spec.name, dict(trigger.bind())))
         except DeviceError as error:
-            self.link.send(NotBound("trigger", spec.name, str(error)))
-        while (order := self.orders.get()) is not None:
-            if isinstance(order, Adjust):
-                self._adjust(order)
+            self.link.send(BindFailed("trigger", spec.name, str(error)))
+        while (request := self.requests.get()) is not None:
+            if isinstance(request, ApplyExposureSettings):
+                self._adjust(request)
                 continue
             try:
-                if order.delays_ns != programmed:
-                    trigger.program(order.delays_ns)
-                    programmed = order.delays_ns
-                pulse = trigger.fire(order.sequence)
+                if request.delays_ns != programmed:
+                    trigger.program(request.delays_ns)
+                    programmed = request.delays_ns
+                pulse = trigger.fire(request.sequence)
             except DeviceError as error:
                 programmed = {}
-                self.link.send(Fired(order.sequence, None, str(error)))
+                self.link.send(Fired(request.sequence, None, str(error)))
                 event = DeviceEvent(spec.name, "not-fired", True, str(error), time.monotonic_ns())
                 self.link.send(event)
             else:
-                self.link.send(Fired(order.sequence, pulse, ""))
+                self.link.send(Fired(request.sequence, pulse, ""))
         trigger.close()
 
-    def _adjust(self, order: Adjust) -> None:
+    def _adjust(self, request: ApplyExposureSettings) -> None:
         """In the thread of the trigger, so that no pulse comes in between."""
-        for head, wanted in order.settings.items():
+        for head, setting in request.settings.items():
             try:
-                self.heads[head].adjust(wanted.exposure_time_us, wanted.gain_db, wanted.tdi_shifts)
+                self.heads[head].adjust(
+                    setting.exposure_time_us, setting.gain_db, setting.tdi_shifts
+                )
             except DeviceError as error:
                 event = DeviceEvent(head, "not-adjusted", False, str(error), time.monotonic_ns())
                 self.link.send(event)

@@ -69,11 +69,11 @@ def bound_problem(rig: Rig, kind: str, name: str, found: Mapping[str, str]) -> s
 
 def frame_problem(rig: Rig, head: str, found: Mapping[str, str]) -> str | None:
     """A sentence where a head's frames do not have the size or depth of the rig's sensor."""
-    told = _FRAME.match(found.get("frame", ""))
-    if told is None:
+    frame_format = _FRAME.match(found.get("frame", ""))
+    if frame_format is None:
         return None
     sensor = rig.sensor(head)
-    width, height, pixel_format = int(told[1]), int(told[2]), told[3]
+    width, height, pixel_format = int(frame_format[1]), int(frame_format[2]), frame_format[3]
     if (width, height) != (sensor.width_px, sensor.height_px):
         return (
             f"head {head} sends frames of {width} x {height} px, the rig has {sensor.width_px} x "

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from daemon.configuration.model import Configuration
-from daemon.onboard.preflight.findings import Finding, passed
+from daemon.onboard.preflight.check_results import CheckResult, passed
 from processing.rig import Rig
 
 ROUTES: Final = Path("/proc/net/route")
@@ -30,7 +30,7 @@ class Route:
     is_gateway: bool
 
 
-def head_network(configuration: Configuration, _rig: Rig) -> Iterator[Finding]:
+def head_network(configuration: Configuration, _rig: Rig) -> Iterator[CheckResult]:
     """A caution for each network that heads share with others; it keeps nobody from flying."""
     heads = {
         head.sensor: address

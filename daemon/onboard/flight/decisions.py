@@ -10,10 +10,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, cast
 
+from daemon.mission.canonical_json import RecordError, parse_record
 from daemon.mission.exposure import Exposure
-from daemon.mission.log.log_records import Message, loose_bytes
-from daemon.mission.records import RecordError, parse_record
-from daemon.onboard.flight.flight import Flight, ToStore
+from daemon.mission.log.log_records import Message, lenient_json_bytes
+from daemon.onboard.flight.flight import Flight, PendingStore
 
 TOPIC = "decision"
 Kind = Literal[
@@ -33,7 +33,7 @@ class Decision:
     def message(self) -> Message:
         """It, for the flight log."""
         content = {"kind": self.kind, "number": self.number, **self.detail}
-        return Message(TOPIC, self.mono_ns, loose_bytes(content))
+        return Message(TOPIC, self.mono_ns, lenient_json_bytes(content))
 
 
 def decision_of(message: Message) -> Decision | None:
@@ -58,30 +58,32 @@ class Tick:
     `foreseen` is the record of one that is only not sealed yet because its mark is the first.
     """
 
-    to_store: tuple[ToStore, ...]
+    to_store: tuple[PendingStore, ...]
     given_up: tuple[tuple[int, str], ...]
     to_seal: Exposure | None
-    foreseen: Exposure | None
+    provisional: Exposure | None
     asked_to_seal: bool
     resolved: int
 
     @property
     def detail(self) -> dict[str, Any] | None:
         """What the log has to say of it; None where nothing fell due."""
-        told = {
+        content = {
             "store": [due.capture.number for due in self.to_store],
             "given_up": [number for number, _ in self.given_up],
             "seal": None if self.to_seal is None else self.to_seal.number,
-            "foreseen": None if self.foreseen is None else self.foreseen.number,
+            "foreseen": None if self.provisional is None else self.provisional.number,
             "resolved": self.resolved,
         }
-        return {**told, "asked_to_seal": self.asked_to_seal} if any(told.values()) else None
+        return {**content, "asked_to_seal": self.asked_to_seal} if any(content.values()) else None
 
 
-def tick(flight: Flight, mono_ns: int, *, may_seal: bool, may_foresee: bool = True) -> Tick:
+def tick(flight: Flight, mono_ns: int, *, may_seal: bool, allow_provisional: bool = True) -> Tick:
     """What falls due now; `may_seal`: no record is on its way to the disk."""
     to_store = tuple(flight.due_to_store(mono_ns))
     given_up = tuple(flight.due_to_give_up(mono_ns))
     to_seal = flight.due_to_seal(mono_ns) if may_seal else None
-    foreseen = flight.due_to_foresee() if may_seal and may_foresee and to_seal is None else None
-    return Tick(to_store, given_up, to_seal, foreseen, may_seal, len(flight.resolved_marks))
+    provisional = (
+        flight.due_provisionally() if may_seal and allow_provisional and to_seal is None else None
+    )
+    return Tick(to_store, given_up, to_seal, provisional, may_seal, len(flight.resolved_marks))

@@ -17,7 +17,7 @@ Severity = Literal["note", "caution", "warning"]
 
 
 @dataclass(frozen=True)
-class Entry:
+class EventDefinition:
     """An event. Names of device events begin with "device/", arming's with "arming-"."""
 
     name: str
@@ -27,10 +27,12 @@ class Entry:
 
 
 _LISTED = tomllib.loads(Path(__file__).with_name("events.toml").read_text("utf-8"))
-TABLE: Final[Sequence[Entry]] = tuple(Entry(name, **told) for name, told in _LISTED.items())
+TABLE: Final[Sequence[EventDefinition]] = tuple(
+    EventDefinition(name, **fields) for name, fields in _LISTED.items()
+)
 
 
-def entry_of(name: str) -> Entry | None:
+def entry_of(name: str) -> EventDefinition | None:
     """The entry of an event, by its name; a device event also without "device/"."""
     return _BY_NAME.get(name) or _BY_NAME.get(f"device/{name}")
 

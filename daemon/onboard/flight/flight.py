@@ -13,17 +13,17 @@ from typing import Any
 
 from daemon.configuration.model import LimitsSection
 from daemon.mission.exposure import (
-    Capture,
+    CaptureRecord,
     Exposure,
     FrameRecord,
     RecordState,
 )
-from daemon.onboard.flight.composing import compose, instant_of
 from daemon.onboard.flight.ledger import Ledger
-from daemon.onboard.flight.temperatures import Temperatures
-from daemon.onboard.timing.clock import ClockEvent, HostClock
+from daemon.onboard.flight.record_builder import build_record, instant_of
+from daemon.onboard.flight.temperatures import TemperatureHistory
 from daemon.onboard.timing.device_clocks import DeviceClocks
-from daemon.onboard.timing.matching import Cause, Matcher, Pulse
+from daemon.onboard.timing.gps_clock import ClockEvent, GpsClock
+from daemon.onboard.timing.matching import Cause, FiredPulse, Matcher
 from daemon.orientation.navigation import Track
 from drivers.contract import (
     ClockReading,
@@ -42,7 +42,7 @@ NO_FLAG = Flag(0)
 
 
 @dataclass(frozen=True)
-class Identity:
+class FlightIdentity:
     """What every record of a flight repeats."""
 
     boot_id: str
@@ -55,40 +55,40 @@ class Identity:
 
 
 @dataclass(frozen=True)
-class ToStore:
+class PendingStore:
     """An exposure whose frames are all here, or will not come: to be made durable."""
 
-    capture: Capture
+    capture: CaptureRecord
     slots: Mapping[str, int]
 
 
 @dataclass
-class _Open:
+class _OpenExposure:
     number: int
     ordered_mono_ns: int
-    pulse: Pulse | None = None
+    pulse: FiredPulse | None = None
     frames: dict[str, Frame] = field(default_factory=dict)
     flags: Flag = NO_FLAG
     causes: dict[str, str] = field(default_factory=dict)
-    doubted: dict[str, str] = field(default_factory=dict)
+    ambiguous: dict[str, str] = field(default_factory=dict)
     """Heads of which a frame came that may be this exposure's, and what is to be said of it."""
     line_id: str = ""
     strip_id: str = ""
-    handed_to_disk: Capture | None = None
-    stored: Capture | None = None
+    being_stored: CaptureRecord | None = None
+    stored: CaptureRecord | None = None
     disks: tuple[str, ...] = ()
-    foreseen: tuple[EventMark, Flag, Exposure] | None = None
+    provisional: tuple[EventMark, Flag, Exposure] | None = None
     lost: str = ""
 
     @property
-    def told_flags(self) -> Flag:
+    def reported_flags(self) -> Flag:
         """The flags, and whether a missing frame may have come all the same."""
-        in_doubt = self.doubted.keys() - self.frames.keys() - self.causes.keys()
-        return self.flags | (Flag.FRAME_AMBIGUOUS if in_doubt else NO_FLAG)
+        has_ambiguous_frame = self.ambiguous.keys() - self.frames.keys() - self.causes.keys()
+        return self.flags | (Flag.FRAME_AMBIGUOUS if has_ambiguous_frame else NO_FLAG)
 
-    def why_missing(self, head: str) -> str:
+    def missing_cause(self, head: str) -> str:
         """What is to be said of a frame that is not there."""
-        return self.causes.get(head) or self.doubted.get(head, "no frame came")
+        return self.causes.get(head) or self.ambiguous.get(head, "no frame came")
 
 
 class Flight:
@@ -104,7 +104,7 @@ class Flight:
         self,
         rig: Rig,
         serial_of_head: Mapping[str, str],
-        identity: Identity,
+        identity: FlightIdentity,
         limits: LimitsSection,
         ledger: Ledger,
         first_number: int,
@@ -113,11 +113,11 @@ class Flight:
         self.identity = identity
         self.limits = limits
         self.ledger = ledger
-        self.clock = HostClock()
+        self.clock = GpsClock()
         self.device_clocks = DeviceClocks()
-        self._steps_told: dict[str, int] = {}
+        self._steps_reported: dict[str, int] = {}
         self.track = Track()
-        self.temperatures = Temperatures(lagged_sensors(rig))
+        self.temperatures = TemperatureHistory(lagged_sensors(rig))
         self.idle_slots: list[tuple[str, int]] = []
         self.resolved_marks: list[tuple[EventMark, Cause]] = []
         self.absent_heads: set[str] = set()
@@ -125,7 +125,7 @@ class Flight:
         self.serial_of_head = serial_of_head
         self._cone_of_head = {head: rig.cone_of(head) for head in serial_of_head}
         self._matcher = Matcher({h: c.name for h, c in self._cone_of_head.items()}, self.clock)
-        self._open: dict[int, _Open] = {}
+        self._open: dict[int, _OpenExposure] = {}
         self._next_number = first_number
 
     @property
@@ -136,7 +136,7 @@ class Flight:
     @property
     def awaits_frames(self) -> bool:
         """Whether heads are still exposing or sending."""
-        return any(not e.lost and e.handed_to_disk is None for e in self._open.values())
+        return any(not e.lost and e.being_stored is None for e in self._open.values())
 
     def order(self, mono_ns: int, line_id: str | None = None, strip_id: str = "") -> int:
         """A trigger is being ordered: its exposure is open from now on. Returns its number.
@@ -147,12 +147,14 @@ class Flight:
         self._next_number += 1
         line = self.identity.line_id if line_id is None else line_id
         flags = Flag.DISK_LOW if self.disk_is_low else NO_FLAG
-        self._open[number] = _Open(number, mono_ns, line_id=line, strip_id=strip_id, flags=flags)
+        self._open[number] = _OpenExposure(
+            number, mono_ns, line_id=line, strip_id=strip_id, flags=flags
+        )
         self.ledger.trigger(number)
         self._matcher.forget_before(number - 64)
         return number
 
-    def about(self, number: int) -> dict[str, Any]:
+    def order_details(self, number: int) -> dict[str, Any]:
         """What an open exposure was ordered with."""
         exposure = self._open[number]
         return {
@@ -161,7 +163,7 @@ class Flight:
             "flags": int(exposure.flags),
         }
 
-    def fired(self, pulse: Pulse) -> None:
+    def fired(self, pulse: FiredPulse) -> None:
         """The pulse was given."""
         self._open[pulse.number].pulse = pulse
         self._matcher.pulse(pulse)
@@ -172,7 +174,7 @@ class Flight:
         match = self._matcher.frame(frame)
         cause = match.cause
         exposure = None if match.number is None else self._open.get(match.number)
-        if cause is Cause.USED and (exposure is None or exposure.handed_to_disk is not None):
+        if cause is Cause.USED and (exposure is None or exposure.being_stored is not None):
             cause = Cause.LATE
         self.ledger.frame(frame.head, cause.value)
         if exposure is not None:
@@ -183,7 +185,7 @@ class Flight:
             exposure.causes[frame.head] = cause.value
         for number in match.possible:
             if number in self._open:
-                self._open[number].doubted[frame.head] = _DOUBTS[cause]
+                self._open[number].ambiguous[frame.head] = _AMBIGUITIES[cause]
         self.idle_slots.append((frame.head, frame.slot))
         return cause
 
@@ -215,11 +217,11 @@ class Flight:
 
     def clock_events(self, mono_ns: int) -> list[ClockEvent]:
         """What is to be told of the clocks since the last time of asking."""
-        told = self.clock.events(mono_ns)
+        events = self.clock.events(mono_ns)
         for device, steps in self.device_clocks.steps().items():
-            if steps > self._steps_told.get(device, 0):
-                self._steps_told[device] = steps
-                told.append(
+            if steps > self._steps_reported.get(device, 0):
+                self._steps_reported[device] = steps
+                events.append(
                     ClockEvent(
                         "device-clock-stepped",
                         True,
@@ -227,7 +229,7 @@ class Flight:
                         "check its power if it happens again",
                     )
                 )
-        return told
+        return events
 
     def land(self) -> None:
         """No more marks will come: what is still held belongs nowhere."""
@@ -244,25 +246,25 @@ class Flight:
         """A probe was read."""
         self.temperatures.add(sample)
 
-    def due_to_store(self, mono_ns: int) -> list[ToStore]:
+    def due_to_store(self, mono_ns: int) -> list[PendingStore]:
         """Exposures whose frames are complete, or whose time is up; each is returned once."""
         due = []
         for exposure in self._open.values():
-            if exposure.handed_to_disk is not None or exposure.lost or not exposure.frames:
+            if exposure.being_stored is not None or exposure.lost or not exposure.frames:
                 continue
             waited_ns = mono_ns - exposure.ordered_mono_ns
-            is_late = waited_ns > self.limits.frame_timeout_s * NS
-            if is_late or self._is_complete(exposure) or self._is_overtaken(exposure):
-                exposure.handed_to_disk = self._capture(exposure)
+            is_timed_out = waited_ns > self.limits.frame_timeout_s * NS
+            if is_timed_out or self._is_complete(exposure) or self._must_release_slots(exposure):
+                exposure.being_stored = self._capture(exposure)
                 slots = {head: frame.slot for head, frame in exposure.frames.items()}
-                due.append(ToStore(exposure.handed_to_disk, slots))
+                due.append(PendingStore(exposure.being_stored, slots))
         return due
 
-    def _is_complete(self, exposure: _Open) -> bool:
+    def _is_complete(self, exposure: _OpenExposure) -> bool:
         """Whether every head that can send its frame has done so."""
         return exposure.frames.keys() >= self.serial_of_head.keys() - self.absent_heads
 
-    def _is_overtaken(self, exposure: _Open) -> bool:
+    def _must_release_slots(self, exposure: _OpenExposure) -> bool:
         """Whether an exposure so much newer has as many frames that its slots are needed now.
 
         A silent head must not starve the others of memory: heads deliver in order, and one that is
@@ -283,22 +285,22 @@ class Flight:
                 continue
             cause = "no pulse was given" if exposure.pulse is None else "no head sent a frame"
             lost.append((exposure.number, cause))
-            self._lose(exposure, cause)
+            self._mark_lost(exposure, cause)
         return lost
 
     def not_fired(self, number: int, sentence: str) -> None:
         """The trigger unit gave no pulse, or nobody knows: the exposure is lost."""
         exposure = self._open.get(number)
         if exposure is not None and not exposure.frames:
-            self._lose(exposure, sentence)
+            self._mark_lost(exposure, sentence)
 
     def stored(
         self, number: int, frames: tuple[FrameRecord, ...], disks: tuple[str, ...] = ()
     ) -> None:
         """The pixels are durable; `disks` are the ids of the mirrored disks that have them."""
         exposure = self._open[number]
-        assert exposure.handed_to_disk is not None
-        exposure.stored = replace(exposure.handed_to_disk, frames=frames)
+        assert exposure.being_stored is not None
+        exposure.stored = replace(exposure.being_stored, frames=frames)
         exposure.disks = disks
         if len(disks) == 1:
             exposure.flags |= Flag.NOT_MIRRORED
@@ -308,12 +310,12 @@ class Flight:
         """The disk refused the pixels: the exposure is lost."""
         exposure = self._open[number]
         if exposure.stored is None:
-            self._lose(exposure, sentence)
+            self._mark_lost(exposure, sentence)
 
     def due_to_seal(self, mono_ns: int) -> Exposure | None:
         """The oldest open exposure, once it is stored or lost and its mark and navigation final."""
-        patience_ns = round((self.limits.mark_timeout_s + self.limits.frame_timeout_s) * NS)
-        self._give_up_marks(mono_ns - patience_ns)
+        mark_wait_ns = round((self.limits.mark_timeout_s + self.limits.frame_timeout_s) * NS)
+        self._give_up_marks(mono_ns - mark_wait_ns)
         if not self._open:
             return None
         exposure = next(iter(self._open.values()))
@@ -322,44 +324,44 @@ class Flight:
         if exposure.stored is None:
             return None
         waited_ns = mono_ns - exposure.ordered_mono_ns
-        is_patient = waited_ns <= self.limits.mark_timeout_s * NS
-        is_sure = self._matcher.marks.is_corroborated(exposure.number)
-        if is_patient and not (is_sure and self._has_navigation(exposure)):
+        is_waiting = waited_ns <= self.limits.mark_timeout_s * NS
+        is_corroborated = self._matcher.marks.is_corroborated(exposure.number)
+        if is_waiting and not (is_corroborated and self._has_navigation(exposure)):
             return None
         return self._seal(exposure, exposure.stored)
 
-    def due_to_foresee(self) -> Exposure | None:
+    def due_provisionally(self) -> Exposure | None:
         """The oldest open exposure where nothing but a second mark is awaited; returned once.
 
         It is sealed with this very record unless that mark makes its own another's.
         """
         exposure = next(iter(self._open.values()), None)
-        if exposure is None or exposure.stored is None or exposure.lost or exposure.foreseen:
+        if exposure is None or exposure.stored is None or exposure.lost or exposure.provisional:
             return None
         mark = self._matcher.mark_of(exposure.number)
         if mark is None or not self._has_navigation(exposure):
             return None
         record = self._compose(exposure, exposure.stored, mark)
-        exposure.foreseen = mark, exposure.told_flags, record
+        exposure.provisional = mark, exposure.reported_flags, record
         return record
 
-    def _has_navigation(self, exposure: _Open) -> bool:
+    def _has_navigation(self, exposure: _OpenExposure) -> bool:
         mark = self._matcher.mark_of(exposure.number)
-        return mark is not None and self.track.reaches(mark.gps_ns)
+        return mark is not None and self.track.covers(mark.gps_ns)
 
     def sealed(self, number: int, state: RecordState) -> None:
         """The record is on disk: the exposure is closed."""
-        self._settle(number, state)
+        self._close(number, state)
         self.ledger.sealed(number)
 
     def not_sealed(self, number: int, state: RecordState) -> None:
         """The disk will not have the record: closed here, and sealed by recovery one day."""
-        self._settle(number, state)
+        self._close(number, state)
 
-    def _settle(self, number: int, state: RecordState) -> None:
+    def _close(self, number: int, state: RecordState) -> None:
         exposure = self._open.pop(number)
         causes = {
-            head: exposure.why_missing(head)
+            head: exposure.missing_cause(head)
             for head in self.serial_of_head
             if head not in exposure.frames
         }
@@ -367,26 +369,26 @@ class Flight:
             causes["exposure"] = exposure.lost
         if self._matcher.mark_of(number) is not None:
             self.ledger.mark(Cause.USED.value)
-        self.ledger.settle(number, state, causes)
+        self.ledger.set_state(number, state, causes)
 
     def _give_up_marks(self, before_mono_ns: int) -> None:
         for mark in self._matcher.marks.give_up(before_mono_ns):
             self.ledger.mark(Cause.SPURIOUS.value)
             self.resolved_marks.append((mark, Cause.SPURIOUS))
 
-    def _lose(self, exposure: _Open, cause: str) -> None:
+    def _mark_lost(self, exposure: _OpenExposure, cause: str) -> None:
         exposure.lost = cause
         self.idle_slots += [(head, frame.slot) for head, frame in exposure.frames.items()]
 
-    def _capture(self, exposure: _Open) -> Capture:
+    def _capture(self, exposure: _OpenExposure) -> CaptureRecord:
         usable = {} if exposure.lost else _in_order(exposure.frames, self.serial_of_head)
         missing = [
-            (head, exposure.lost or exposure.why_missing(head))
+            (head, exposure.lost or exposure.missing_cause(head))
             for head in self.serial_of_head
             if head not in usable
         ]
-        flags = exposure.told_flags | (Flag.FRAME_MISSING if missing else NO_FLAG)
-        return Capture(
+        flags = exposure.reported_flags | (Flag.FRAME_MISSING if missing else NO_FLAG)
+        return CaptureRecord(
             number=exposure.number,
             trigger_sequence=exposure.number,
             trigger_mono_ns=exposure.pulse.mono_ns if exposure.pulse else exposure.ordered_mono_ns,
@@ -422,27 +424,29 @@ class Flight:
         )
 
     def _seal(
-        self, exposure: _Open, stored: Capture, *, state: RecordState | None = None
+        self, exposure: _OpenExposure, stored: CaptureRecord, *, state: RecordState | None = None
     ) -> Exposure:
         mark = self._matcher.mark_of(exposure.number)
         if mark is None and self._matcher.marks.has_ambiguous(exposure.number):
             exposure.flags |= Flag.MARK_AMBIGUOUS
         self._matcher.marks.seal(exposure.number)
-        foreseen = exposure.foreseen
-        if foreseen is not None and foreseen[:2] == (mark, exposure.told_flags):
-            return foreseen[2]
+        provisional = exposure.provisional
+        if provisional is not None and provisional[:2] == (mark, exposure.reported_flags):
+            return provisional[2]
         record = self._compose(exposure, stored, mark)
         return record if state is None else replace(record, state=state)
 
-    def _compose(self, exposure: _Open, stored: Capture, mark: EventMark | None) -> Exposure:
-        record = compose(
+    def _compose(
+        self, exposure: _OpenExposure, stored: CaptureRecord, mark: EventMark | None
+    ) -> Exposure:
+        record = build_record(
             self.rig,
             stored,
             exposure.pulse,
             instant_of(mark, exposure.pulse, self.clock),
             self.track,
             self.temperatures,
-            exposure.told_flags,
+            exposure.reported_flags,
         )
         return replace(record, disks=exposure.disks)
 
@@ -457,7 +461,7 @@ _FRAME_FLAGS = {
     Cause.CORRUPT: Flag.FRAME_CORRUPT,
     Cause.SPURIOUS: NO_FLAG,
 }
-_DOUBTS = {
+_AMBIGUITIES = {
     Cause.CORRUPT: "may be a corrupt frame that came, which may be of another exposure",
     Cause.SPURIOUS: "may be a frame that came and could not be told from others",
 }

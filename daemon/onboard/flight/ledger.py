@@ -22,7 +22,14 @@ from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
 from daemon.mission.exposure import Exposure
-from daemon.onboard.flight.transitions import LedgerError, Standing, State, Step, Storage, after
+from daemon.onboard.flight.transitions import (
+    ExposureState,
+    ExposureStatus,
+    LedgerError,
+    StorageState,
+    Transition,
+    next_status,
+)
 
 __all__ = ["CAUSES", "MARK", "Ledger", "LedgerError", "LedgerSheet", "Receipts"]
 
@@ -33,10 +40,10 @@ MARK = "mark"
 
 Causes = Mapping[str, str] | Iterable[tuple[str, str]]
 
-_SETTLING = {
-    State.COMPLETE: Step.SETTLE_COMPLETE,
-    State.DEGRADED: Step.SETTLE_DEGRADED,
-    State.LOST: Step.SETTLE_LOST,
+_TRANSITION_TO = {
+    ExposureState.COMPLETE: Transition.SET_COMPLETE,
+    ExposureState.DEGRADED: Transition.SET_DEGRADED,
+    ExposureState.LOST: Transition.SET_LOST,
 }
 
 
@@ -99,8 +106,8 @@ class LedgerSheet:
 
 
 @dataclass
-class _Entry:
-    standing: Standing = field(default_factory=Standing)
+class _LedgerEntry:
+    status: ExposureStatus = field(default_factory=ExposureStatus)
     missing: frozenset[str] = frozenset()
 
 
@@ -111,27 +118,27 @@ class _Account:
         self.name = name
         self.received = 0
         self.pending = 0
-        self.became = dict.fromkeys(CAUSES, 0)
+        self.by_cause = dict.fromkeys(CAUSES, 0)
 
     def enter(self, cause: str) -> None:
         if cause == PENDING:
             self.received += 1
             self.pending += 1
-        elif cause not in self.became:
+        elif cause not in self.by_cause:
             known = ", ".join((PENDING, *CAUSES))
             raise LedgerError(f"{self.name}: cause {cause!r}; it is one of {known}")
         elif self.pending:
             self.pending -= 1
-            self.became[cause] += 1
+            self.by_cause[cause] += 1
         else:
             self.received += 1
-            self.became[cause] += 1
+            self.by_cause[cause] += 1
 
     def receipts(self, missing: int) -> Receipts:
         return Receipts(
             self.name,
             received=self.received,
-            **self.became,
+            **self.by_cause,
             pending=self.pending,
             missing=missing,
         )
@@ -145,12 +152,12 @@ class Ledger:
     """
 
     def __init__(self, heads: Sequence[str] = ()) -> None:
-        self._entries: dict[int, _Entry] = {}
+        self._entries: dict[int, _LedgerEntry] = {}
         self._heads = {head: _Account(head) for head in heads}
         self._marks = _Account("marks")
         self._triggers = 0
-        self._in_state = dict.fromkeys(State, 0)
-        self._in_storage = dict.fromkeys(Storage, 0)
+        self._in_state = dict.fromkeys(ExposureState, 0)
+        self._in_storage = dict.fromkeys(StorageState, 0)
         self._missing: Counter[str] = Counter()
 
     @classmethod
@@ -179,22 +186,22 @@ class Ledger:
             if exposure.state != "complete" and not causes:
                 causes = {"exposure": f"recorded as {exposure.state}"}
             state = "degraded" if exposure.state == "complete" and causes else exposure.state
-            ledger.settle(exposure.number, state, causes)
+            ledger.set_state(exposure.number, state, causes)
             if state != "lost":
                 ledger.stored(exposure.number)
             ledger.sealed(exposure.number)
         if sheet is not None:
-            ledger._carry_on(sheet)
+            ledger._restore_counts(sheet)
         return ledger
 
     def trigger(self, number: int) -> None:
         """A pulse was given for exposure `number`."""
         if number in self._entries:
             raise LedgerError(f"exposure {number} was triggered already; numbers are used once")
-        self._entries[number] = _Entry()
+        self._entries[number] = _LedgerEntry()
         self._triggers += 1
-        self._in_state[State.OPEN] += 1
-        self._in_storage[Storage.VOLATILE] += 1
+        self._in_state[ExposureState.OPEN] += 1
+        self._in_storage[StorageState.VOLATILE] += 1
 
     def frame(self, head: str, cause: str) -> None:
         """A frame arrived ("pending"), or it is known what became of one.
@@ -207,7 +214,7 @@ class Ledger:
         """An event mark arrived ("pending"), or it is known what became of one."""
         self._marks.enter(cause)
 
-    def settle(self, number: int, state: str | State, causes: Causes = ()) -> None:
+    def set_state(self, number: int, state: str | ExposureState, causes: Causes = ()) -> None:
         """Judge an exposure; until it is sealed, a later judgement may only be worse.
 
         Args:
@@ -218,42 +225,42 @@ class Ledger:
                 sent a duplicate beside its good frame lacks nothing and is not named.
         """
         try:
-            wanted = State(state)
+            new_state = ExposureState(state)
         except ValueError:
-            wanted = State.OPEN
+            new_state = ExposureState.OPEN
         named = dict(causes)
-        if wanted not in _SETTLING:
+        if new_state not in _TRANSITION_TO:
             raise LedgerError(f"exposure {number}: settled means complete, degraded or lost")
-        if wanted is State.COMPLETE and named:
+        if new_state is ExposureState.COMPLETE and named:
             raise LedgerError(f"exposure {number}: is complete but lacks {', '.join(named)}")
-        if wanted is not State.COMPLETE and not named:
-            raise LedgerError(f"exposure {number}: is {wanted.value}; say what it lacks and why")
+        if new_state is not ExposureState.COMPLETE and not named:
+            raise LedgerError(f"exposure {number}: is {new_state.value}; say what it lacks and why")
         entry = self._entry(number)
-        self._step(number, _SETTLING[wanted])
+        self._step(number, _TRANSITION_TO[new_state])
         self._missing.subtract(entry.missing)
-        entry.missing = frozenset() if wanted is State.LOST else frozenset(named)
+        entry.missing = frozenset() if new_state is ExposureState.LOST else frozenset(named)
         self._missing.update(entry.missing)
 
     def stored(self, number: int) -> None:
         """Its pixels are durable."""
-        self._step(number, Step.STORE)
+        self._step(number, Transition.STORE)
 
     def sealed(self, number: int) -> None:
         """Its record is final and durable."""
-        self._step(number, Step.SEAL)
+        self._step(number, Transition.SEAL)
 
-    def standing(self, number: int) -> Standing:
+    def status(self, number: int) -> ExposureStatus:
         """How an exposure stands."""
-        return self._entry(number).standing
+        return self._entry(number).status
 
     def open_numbers(self) -> list[int]:
         """Exposures that are not judged yet, ascending."""
-        return sorted(n for n, e in self._entries.items() if e.standing.state is State.OPEN)
+        return sorted(n for n, e in self._entries.items() if e.status.state is ExposureState.OPEN)
 
     def unsealed_numbers(self) -> list[int]:
         """Exposures whose record is not final, ascending."""
         return sorted(
-            n for n, e in self._entries.items() if e.standing.storage is not Storage.SEALED
+            n for n, e in self._entries.items() if e.status.storage is not StorageState.SEALED
         )
 
     def imbalances(
@@ -272,22 +279,26 @@ class Ledger:
                 for account in (*self._heads.values(), self._marks)
                 if account.pending
             ]
-            if self._in_state[State.OPEN]:
-                found.append(f"{self._in_state[State.OPEN]} exposures are open after landing")
+            if self._in_state[ExposureState.OPEN]:
+                found.append(
+                    f"{self._in_state[ExposureState.OPEN]} exposures are open after landing"
+                )
         for account in (*self._heads.values(), self._marks):
-            total = account.pending + sum(account.became.values())
+            total = account.pending + sum(account.by_cause.values())
             if account.received != total:
                 found.append(f"{account.name}: {account.received} received, {total} accounted for")
-        whole = self._in_state[State.COMPLETE] + self._in_state[State.DEGRADED]
-        undecided = self._in_state[State.OPEN] + self._in_state[State.LOST]
+        with_frames = (
+            self._in_state[ExposureState.COMPLETE] + self._in_state[ExposureState.DEGRADED]
+        )
+        undecided = self._in_state[ExposureState.OPEN] + self._in_state[ExposureState.LOST]
         for head, account in self._heads.items():
-            with_it, used = whole - self._missing[head], account.became["used"]
-            if not with_it <= used <= with_it + undecided:
+            expected, used = with_frames - self._missing[head], account.by_cause["used"]
+            if not expected <= used <= expected + undecided:
                 found.append(
-                    f"{head}: {used} frames used, but {with_it} exposures have one "
+                    f"{head}: {used} frames used, but {expected} exposures have one "
                     f"and {undecided} are open or lost"
                 )
-        used = self._marks.became["used"]
+        used = self._marks.by_cause["used"]
         if used > self._triggers:
             found.append(f"marks: {used} used for {self._triggers} triggers")
         for head, count in (delivered or {}).items():
@@ -306,12 +317,12 @@ class Ledger:
         }
         return LedgerSheet(
             triggers=self._triggers,
-            open=self._in_state[State.OPEN],
-            complete=self._in_state[State.COMPLETE],
-            degraded=self._in_state[State.DEGRADED],
-            lost=self._in_state[State.LOST],
-            stored=self._in_storage[Storage.STORED] + self._sealed_with_pixels(),
-            sealed=self._in_storage[Storage.SEALED],
+            open=self._in_state[ExposureState.OPEN],
+            complete=self._in_state[ExposureState.COMPLETE],
+            degraded=self._in_state[ExposureState.DEGRADED],
+            lost=self._in_state[ExposureState.LOST],
+            stored=self._in_storage[StorageState.STORED] + self._sealed_with_pixels(),
+            sealed=self._in_storage[StorageState.SEALED],
             heads=heads,
             frames=Receipts("frames", **sums),
             marks=self._marks.receipts(self._missing[MARK]),
@@ -320,33 +331,33 @@ class Ledger:
 
     def _trigger_imbalances(self) -> list[str]:
         found = []
-        counted = dict.fromkeys(State, 0)
+        counted = dict.fromkeys(ExposureState, 0)
         for entry in self._entries.values():
-            counted[entry.standing.state] += 1
+            counted[entry.status.state] += 1
         if sum(self._in_state.values()) != self._triggers or counted != self._in_state:
             states = ", ".join(f"{count} {state.value}" for state, count in counted.items())
             found.append(f"{self._triggers} triggers, but {states}")
         return found
 
     def _sealed_with_pixels(self) -> int:
-        return self._in_storage[Storage.SEALED] - sum(
-            entry.standing == Standing(State.LOST, Storage.SEALED)
+        return self._in_storage[StorageState.SEALED] - sum(
+            entry.status == ExposureStatus(ExposureState.LOST, StorageState.SEALED)
             for entry in self._entries.values()
         )
 
-    def _step(self, number: int, step: Step) -> None:
+    def _step(self, number: int, step: Transition) -> None:
         entry = self._entry(number)
-        before = entry.standing
+        before = entry.status
         try:
-            entry.standing = after(before, step)
+            entry.status = next_status(before, step)
         except LedgerError as error:
             raise LedgerError(f"exposure {number}: {error}") from error
         self._in_state[before.state] -= 1
-        self._in_state[entry.standing.state] += 1
+        self._in_state[entry.status.state] += 1
         self._in_storage[before.storage] -= 1
-        self._in_storage[entry.standing.storage] += 1
+        self._in_storage[entry.status.storage] += 1
 
-    def _carry_on(self, sheet: Mapping[str, Any]) -> None:
+    def _restore_counts(self, sheet: Mapping[str, Any]) -> None:
         lines = sheet.get("heads")
         by_name = {
             line["name"]: line
@@ -360,12 +371,12 @@ class Ledger:
                 count = line.get(cause) if isinstance(line, Mapping) else None
                 if isinstance(count, int) and not isinstance(count, bool) and count > 0:
                     account.received += count
-                    account.became[cause] += count
+                    account.by_cause[cause] += count
 
     def _account(self, head: str) -> _Account:
         return self._heads.setdefault(head, _Account(head))
 
-    def _entry(self, number: int) -> _Entry:
+    def _entry(self, number: int) -> _LedgerEntry:
         entry = self._entries.get(number)
         if entry is None:
             raise LedgerError(f"exposure {number} was never triggered")

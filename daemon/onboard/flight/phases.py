@@ -28,17 +28,17 @@ class Phase(enum.StrEnum):
 
 
 @dataclass(frozen=True)
-class Facts:
+class PhaseInputs:
     """What the phase depends on."""
 
     is_prepared: bool = False
     is_armed: bool = False
-    runs: bool = False
+    is_running: bool = False
     has_landed: bool = False
     has_failed: bool = False
 
 
-NEXT: Final[Mapping[Phase, tuple[Phase, ...]]] = {
+ALLOWED_NEXT: Final[Mapping[Phase, tuple[Phase, ...]]] = {
     Phase.IDLE: (Phase.READY, Phase.LANDED, Phase.FAULT),
     Phase.READY: (Phase.ARMED, Phase.LANDED, Phase.FAULT),
     Phase.ARMED: (Phase.FLYING, Phase.READY, Phase.LANDED, Phase.FAULT),
@@ -50,23 +50,23 @@ NEXT: Final[Mapping[Phase, tuple[Phase, ...]]] = {
 the line goes on without it until it is stopped."""
 
 
-class StateMachine:
+class PhaseMachine:
     """The phase, and the way there."""
 
     def __init__(self) -> None:
         self.phase = Phase.IDLE
 
-    def follow(self, facts: Facts) -> list[Phase]:
+    def advance(self, facts: PhaseInputs) -> list[Phase]:
         """Go where the facts lead; the phases entered on the way, in their order."""
         entered: list[Phase] = []
         while (phase := _next(self.phase, facts)) is not None:
-            assert phase in NEXT[self.phase]
+            assert phase in ALLOWED_NEXT[self.phase]
             self.phase = phase
             entered.append(phase)
         return entered
 
 
-def _next(phase: Phase, facts: Facts) -> Phase | None:
+def _next(phase: Phase, facts: PhaseInputs) -> Phase | None:
     if phase is Phase.FAULT:
         return None
     if facts.has_failed:
@@ -80,7 +80,7 @@ def _next(phase: Phase, facts: Facts) -> Phase | None:
     if phase is Phase.READY:
         return Phase.ARMED if facts.is_armed else None
     if phase is Phase.FLYING:
-        return None if facts.runs else Phase.ARMED
-    if facts.runs:
+        return None if facts.is_running else Phase.ARMED
+    if facts.is_running:
         return Phase.FLYING
     return None if facts.is_armed else Phase.READY

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from daemon.mission.exposure import Capture, Exposure
+from daemon.mission.exposure import CaptureRecord, Exposure
 from daemon.mission.log.log_records import LoggedRecord, LoggedTrigger
 from daemon.mission.verification.recovery import Complete
-from daemon.onboard.flight.composing import compose, instant_of
-from daemon.onboard.flight.temperatures import Temperatures
-from daemon.onboard.timing.clock import HostClock
-from daemon.onboard.timing.matching import Matcher, Pulse
+from daemon.onboard.flight.record_builder import build_record, instant_of
+from daemon.onboard.flight.temperatures import TemperatureHistory
+from daemon.onboard.timing.gps_clock import GpsClock
+from daemon.onboard.timing.matching import FiredPulse, Matcher
 from daemon.orientation.navigation import Track
 from drivers.contract import EventMark, NavSample, PpsEdge, TemperatureSample
 from processing.geometry.drift import lagged_sensors
@@ -25,12 +25,12 @@ def seal_from_log(rig: Rig) -> Complete:
     """What `daemon.mission.verification.recovery.recover` needs to seal exposures of this rig."""
     cone_of_head = {sensor.name: cone.name for cone in rig.cones for sensor in cone.sensors}
 
-    def complete(capture: Capture, records: Sequence[LoggedRecord]) -> Exposure:
-        clock = HostClock()
+    def complete(capture: CaptureRecord, records: Sequence[LoggedRecord]) -> Exposure:
+        clock = GpsClock()
         matcher = Matcher(cone_of_head, clock)
         track = Track()
-        temperatures = Temperatures(lagged_sensors(rig))
-        pulse: Pulse | None = None
+        temperatures = TemperatureHistory(lagged_sensors(rig))
+        pulse: FiredPulse | None = None
         for record in records:
             if isinstance(record, NavSample) and record.time_valid:
                 track.add(record)
@@ -46,14 +46,14 @@ def seal_from_log(rig: Rig) -> Complete:
             elif isinstance(record, TemperatureSample):
                 temperatures.add(record)
         instant = instant_of(matcher.mark_of(capture.number), pulse, clock)
-        return compose(rig, capture, pulse, instant, track, temperatures, Flag(0))
+        return build_record(rig, capture, pulse, instant, track, temperatures, Flag(0))
 
     return complete
 
 
-def pulse_of(logged: LoggedTrigger) -> Pulse:
+def pulse_of(logged: LoggedTrigger) -> FiredPulse:
     """The pulse as the matching needs it."""
-    return Pulse(
+    return FiredPulse(
         number=logged.number,
         mono_ns=logged.pulse.mono_ns,
         sigma_ns=logged.pulse.sigma_ns,

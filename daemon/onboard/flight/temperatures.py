@@ -15,11 +15,11 @@ from drivers.contract import TemperatureSample
 from processing.geometry.drift import lag_step, lagged_probe
 from processing.rig import Sensor
 
-MEMORY = 128
+SAMPLES_PER_PROBE = 128
 """Samples kept of each probe; two minutes of a probe read every second."""
 
 
-class Temperatures:
+class TemperatureHistory:
     """The recent samples of every probe, and the lagged ones of sensors that ask for them.
 
     A lag begins in balance with the first reading: what happened before it is forgotten with the
@@ -35,7 +35,7 @@ class Temperatures:
 
     def add(self, sample: TemperatureSample) -> None:
         """Note a reading."""
-        self._keep(sample.probe, sample)
+        self._append(sample.probe, sample)
         if sample.value_c is None:
             return
         before = self._last_read.get(sample.probe)
@@ -43,7 +43,7 @@ class Temperatures:
             return
         for sensor in self._lagged:
             if sensor.probe == sample.probe:
-                self._follow(sensor, before, sample)
+                self._update_lagged(sensor, before, sample)
         self._last_read[sample.probe] = sample
 
     def __contains__(self, probe: str) -> bool:
@@ -59,7 +59,7 @@ class Temperatures:
             records.append(TemperatureRecord(probe, sample.value_c, mono_ns - sample.mono_ns))
         return tuple(records)
 
-    def _follow(
+    def _update_lagged(
         self, sensor: Sensor, before: TemperatureSample | None, now: TemperatureSample
     ) -> None:
         name = lagged_probe(sensor)
@@ -70,7 +70,7 @@ class Temperatures:
             assert lagged_c is not None
             step_s = (now.mono_ns - before.mono_ns) * 1e-9
             value_c = lag_step(lagged_c, before.value_c, value_c, step_s, sensor.drift.lag_s)
-        self._keep(name, replace(now, probe=name, value_c=value_c))
+        self._append(name, replace(now, probe=name, value_c=value_c))
 
-    def _keep(self, name: str, sample: TemperatureSample) -> None:
-        self._samples.setdefault(name, deque(maxlen=MEMORY)).append(sample)
+    def _append(self, name: str, sample: TemperatureSample) -> None:
+        self._samples.setdefault(name, deque(maxlen=SAMPLES_PER_PROBE)).append(sample)

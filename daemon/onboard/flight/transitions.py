@@ -16,7 +16,7 @@ class LedgerError(DaemonError):
     """A step that an exposure cannot take, or a count that cannot be."""
 
 
-class State(enum.Enum):
+class ExposureState(enum.Enum):
     """How an exposure stands. OPEN: triggered, not judged yet; the others say how it ended."""
 
     OPEN = "open"
@@ -25,7 +25,7 @@ class State(enum.Enum):
     LOST = "lost"
 
 
-class Storage(enum.Enum):
+class StorageState(enum.Enum):
     """How safe it is. STORED: pixels durable. SEALED: the record is final and durable."""
 
     VOLATILE = "volatile"
@@ -33,62 +33,71 @@ class Storage(enum.Enum):
     SEALED = "sealed"
 
 
-class Step(enum.Enum):
+class Transition(enum.Enum):
     """What happens to an exposure."""
 
-    SETTLE_COMPLETE = "settled complete"
-    SETTLE_DEGRADED = "settled degraded"
-    SETTLE_LOST = "settled lost"
+    SET_COMPLETE = "settled complete"
+    SET_DEGRADED = "settled degraded"
+    SET_LOST = "settled lost"
     STORE = "stored"
     SEAL = "sealed"
 
 
 @dataclass(frozen=True)
-class Standing:
+class ExposureStatus:
     """State and storage of one exposure."""
 
-    state: State = State.OPEN
-    storage: Storage = Storage.VOLATILE
+    state: ExposureState = ExposureState.OPEN
+    storage: StorageState = StorageState.VOLATILE
 
 
-def _table() -> dict[tuple[Standing, Step], Standing]:
-    open_, complete, degraded, lost = State.OPEN, State.COMPLETE, State.DEGRADED, State.LOST
-    volatile, stored, sealed = Storage.VOLATILE, Storage.STORED, Storage.SEALED
-    table: dict[tuple[Standing, Step], Standing] = {}
+def _table() -> dict[tuple[ExposureStatus, Transition], ExposureStatus]:
+    open_, complete, degraded, lost = (
+        ExposureState.OPEN,
+        ExposureState.COMPLETE,
+        ExposureState.DEGRADED,
+        ExposureState.LOST,
+    )
+    volatile, stored, sealed = StorageState.VOLATILE, StorageState.STORED, StorageState.SEALED
+    table: dict[tuple[ExposureStatus, Transition], ExposureStatus] = {}
 
     def allow(
-        state: State, storage: Storage, step: Step, new_state: State, new_storage: Storage
+        state: ExposureState,
+        storage: StorageState,
+        step: Transition,
+        new_state: ExposureState,
+        new_storage: StorageState,
     ) -> None:
-        table[Standing(state, storage), step] = Standing(new_state, new_storage)
+        table[ExposureStatus(state, storage), step] = ExposureStatus(new_state, new_storage)
 
     # Judged once; later it may only turn out worse, until it is sealed.
     for storage in (volatile, stored):
-        allow(open_, storage, Step.SETTLE_COMPLETE, complete, storage)
+        allow(open_, storage, Transition.SET_COMPLETE, complete, storage)
         for state in (open_, complete, degraded):
-            allow(state, storage, Step.SETTLE_DEGRADED, degraded, storage)
+            allow(state, storage, Transition.SET_DEGRADED, degraded, storage)
     # What is stored cannot be lost any more.
     for state in (open_, complete, degraded):
-        allow(state, volatile, Step.SETTLE_LOST, lost, volatile)
-        allow(state, volatile, Step.STORE, state, stored)
+        allow(state, volatile, Transition.SET_LOST, lost, volatile)
+        allow(state, volatile, Transition.STORE, state, stored)
     for state in (complete, degraded):
-        allow(state, stored, Step.SEAL, state, sealed)
-    allow(lost, volatile, Step.SEAL, lost, sealed)
+        allow(state, stored, Transition.SEAL, state, sealed)
+    allow(lost, volatile, Transition.SEAL, lost, sealed)
     return table
 
 
 TRANSITIONS = _table()
 
 
-def after(standing: Standing, step: Step) -> Standing:
+def next_status(status: ExposureStatus, step: Transition) -> ExposureStatus:
     """How an exposure stands after a step.
 
     Raises:
         LedgerError: the step is not allowed from there.
     """
-    following = TRANSITIONS.get((standing, step))
+    following = TRANSITIONS.get((status, step))
     if following is None:
         raise LedgerError(
-            f"an exposure that is {standing.state.value} and {standing.storage.value} "
+            f"an exposure that is {status.state.value} and {status.storage.value} "
             f"cannot be {step.value}"
         )
     return following

@@ -1,7 +1,7 @@
 """The plan of the mission being flown, and what of it is not seen by enough images yet.
 
 Exposures are gathered from the state as they come, so that those it no longer keeps still count.
-What has to be flown again is computed by `daemon.planning.advisor`.
+What has to be flown again is computed by `daemon.planning.reflight_planning`.
 """
 
 from __future__ import annotations
@@ -16,22 +16,22 @@ from typing import Any
 from daemon.configuration.model import ConfigurationError, PlanSection
 from daemon.errors import DaemonError
 from daemon.mission.layout import Mission
-from daemon.onboard.monitoring.state import FlightState
-from daemon.orientation.exterior import mount_of
-from daemon.planning.advisor import Advice, LineAdvice, advise
-from daemon.planning.flown import NO_FOOTPRINT, area_and_cause
-from daemon.planning.image_counts import Taken
+from daemon.onboard.monitoring.flight_state import FlightState
+from daemon.orientation.exterior_orientation import mount_of
+from daemon.planning.exposure_footprints import NO_FOOTPRINT, area_and_cause
+from daemon.planning.image_counts import ExposureFootprint
 from daemon.planning.image_size import image_on_ground_m
-from daemon.planning.model import Plan, Plane, PlannedLine, Point
-from daemon.planning.reading import read_plan
+from daemon.planning.model import LocalPlane, Plan, PlannedLine, Point
+from daemon.planning.plan_readers import read_plan
+from daemon.planning.reflight_files import hole_json
+from daemon.planning.reflight_planning import LineReflights, ReflightPlan, reflights
 from daemon.planning.relief import TerrainRelief, relief_or_reason
 from daemon.planning.steering import places_m
-from daemon.planning.writing import hole_json
 from processing.rig import Rig, RigError, load_rig
 
 
 @dataclass(frozen=True)
-class _Known:
+class _PlanContext:
     rig: Rig
     plan: Plan
     along_m: float
@@ -39,8 +39,8 @@ class _Known:
     height_m: float
     ground_height_m: float
     relief: TerrainRelief | None
-    level_because: str
-    lines: dict[str, LineAdvice] = field(default_factory=dict)
+    flat_ground_reason: str
+    lines: dict[str, LineReflights] = field(default_factory=dict)
 
     @property
     def base_m(self) -> float:
@@ -60,71 +60,77 @@ class Coverage:
         self._state = state
         self._configured = configured
         self._mission: str | None = None
-        self._known: _Known | None = None
-        self._taken: dict[int, tuple[str, Taken]] = {}
+        self._context: _PlanContext | None = None
+        self._taken: dict[int, tuple[str, ExposureFootprint]] = {}
         self._cursor = 0
 
-    def gather(self) -> None:
+    def update(self) -> None:
         """Take in what is new; often enough, since the state forgets."""
         if self._state.mission_path != self._mission:
             self._mission = self._state.mission_path
-            self._known = (
-                None if self._mission is None else _known_of(Path(self._mission), self._configured)
+            self._context = (
+                None
+                if self._mission is None
+                else _load_context(Path(self._mission), self._configured)
             )
             self._taken.clear()
             self._cursor = 0
-        if self._known is None:
+        if self._context is None:
             return
         for one in self._state.changed("exposures", self._cursor):
             self._cursor = one["sequence"]
             if one.get("step") not in ("triggered", "stored"):
-                taken = _taken(one, self._known)
+                taken = _taken(one, self._context)
                 self._taken[one["number"]] = (str(one.get("line") or ""), taken)
 
     def plan_json(self) -> dict[str, Any] | None:
         """Lines with their places, as the page draws them."""
-        self.gather()
-        if self._known is None:
+        self.update()
+        if self._context is None:
             return None
-        plan = self._known.plan
+        plan = self._context.plan
         return {
             "name": plan.name,
-            "lines": [_line_json(line, self._known) for line in plan.lines],
+            "lines": [_line_json(line, self._context) for line in plan.lines],
             "specification": vars(plan.specification),
         }
 
-    def question(self) -> Callable[[], Advice] | None:
+    def advice_task(self) -> Callable[[], ReflightPlan] | None:
         """What must be flown yet or again: the answer takes a while, and may in any thread."""
-        self.gather()
-        known = self._known
-        if known is None:
+        self.update()
+        context = self._context
+        if context is None:
             return None
         taken = [one for _, one in self._taken.values()]
         return partial(
-            advise,
-            known.plan,
+            reflights,
+            context.plan,
             taken,
-            image_along_m=known.along_m,
-            image_across_m=known.across_m,
-            relief=known.relief,
-            rest=self._rest(known),
-            known=known.lines,
+            image_along_m=context.along_m,
+            image_across_m=context.across_m,
+            relief=context.relief,
+            unflown=self._remaining(context),
+            known=context.lines,
         )
 
     def notes(self) -> list[str]:
         """What the advice assumes."""
-        known = self._known
-        return [known.level_because] if known is not None and known.level_because else []
+        context = self._context
+        return (
+            [context.flat_ground_reason]
+            if context is not None and context.flat_ground_reason
+            else []
+        )
 
-    def _rest(self, known: _Known) -> dict[str, tuple[float, float]]:
+    def _remaining(self, context: _PlanContext) -> dict[str, tuple[float, float]]:
         """By line, what is still to be flown: all of it, or what lies ahead on the line in work."""
-        flown: dict[str, list[Taken]] = {}
+        flown: dict[str, list[ExposureFootprint]] = {}
         latest = ""
         for latest, taken in (self._taken[number] for number in sorted(self._taken)):
             flown.setdefault(latest, []).append(taken)
-        rest: dict[str, tuple[float, float]] = {}
-        for line in known.plan.lines:
-            plane = Plane(line.start)
+        unflown: dict[str, tuple[float, float]] = {}
+        for line in context.plan.lines:
+            plane = LocalPlane(line.start)
             east, north = plane.flat(line.end)
             length_m = math.hypot(east, north)
             if not length_m:
@@ -132,16 +138,16 @@ class Coverage:
             placed = [one for one in flown.get(line.id, ()) if one.corners]
             at_m = []
             for one in placed:
-                x, y = plane.flat(_middle(one.corners))
+                x, y = plane.flat(_centroid(one.corners))
                 at_m.append((x * east + y * north) / length_m)
-            margin_m = known.base_m / 2
+            margin_m = context.base_m / 2
             if line.id not in flown:
-                rest[line.id] = (0.0, length_m)
+                unflown[line.id] = (0.0, length_m)
             elif line.id == latest and at_m:
                 ahead = (at_m[-1] + margin_m, length_m)
                 back = (0.0, at_m[-1] - margin_m)
-                rest[line.id] = ahead if at_m[-1] >= at_m[0] else back
-        return {line: (a, b) for line, (a, b) in rest.items() if a < b}
+                unflown[line.id] = ahead if at_m[-1] >= at_m[0] else back
+        return {line: (a, b) for line, (a, b) in unflown.items() if a < b}
 
     @property
     def is_simulated(self) -> bool:
@@ -150,19 +156,19 @@ class Coverage:
     @property
     def height_m(self) -> float:
         """Height above ground as planned, for missions that are written out."""
-        return self._known.height_m if self._known else 0.0
+        return self._context.height_m if self._context else 0.0
 
     @property
     def distance_m(self) -> float:
         """Between two exposures, by the overlap asked for."""
-        return self._known.base_m if self._known else 0.0
+        return self._context.base_m if self._context else 0.0
 
 
-def advice_json(advice: Advice, coverage: Coverage) -> dict[str, Any]:
+def advice_json(advice: ReflightPlan, coverage: Coverage) -> dict[str, Any]:
     """Segments as the page lists and draws them."""
     return {
         "planned_m": round(advice.planned_m, 1),
-        "well_m": round(advice.well_m, 1),
+        "covered_m": round(advice.covered_m, 1),
         "hole_m2": round(advice.hole_m2, 1),
         "notes": coverage.notes(),
         "segments": [
@@ -181,7 +187,7 @@ def advice_json(advice: Advice, coverage: Coverage) -> dict[str, Any]:
     }
 
 
-def _known_of(path: Path, configured: PlanSection | None) -> _Known | None:
+def _load_context(path: Path, configured: PlanSection | None) -> _PlanContext | None:
     try:
         mission = Mission.open(path)
         if mission.plan_path is None:
@@ -191,8 +197,8 @@ def _known_of(path: Path, configured: PlanSection | None) -> _Known | None:
     except (OSError, DaemonError, ConfigurationError, RigError):
         return None
     along_m, across_m = image_on_ground_m(rig, section.height_above_ground_m)
-    relief, level_because = relief_or_reason(configured or section)
-    return _Known(
+    relief, flat_ground_reason = relief_or_reason(configured or section)
+    return _PlanContext(
         rig=rig,
         plan=plan,
         along_m=along_m,
@@ -200,32 +206,39 @@ def _known_of(path: Path, configured: PlanSection | None) -> _Known | None:
         height_m=section.height_above_ground_m,
         ground_height_m=section.ground_height_m,
         relief=relief,
-        level_because=level_because,
+        flat_ground_reason=flat_ground_reason,
     )
 
 
-def _taken(one: Mapping[str, Any], known: _Known) -> Taken:
+def _taken(one: Mapping[str, Any], context: _PlanContext) -> ExposureFootprint:
     """An exposure as the advisor counts it; until it is judged, its missing heads alone decide."""
     corners, place = one.get("footprint"), one.get("place") or {}
     if not corners:
-        return Taken(one["number"], (), _objection(one) or NO_FOOTPRINT)
+        return ExposureFootprint(one["number"], (), _exclusion_reason(one) or NO_FOOTPRINT)
     missing = [str(sensor) for sensor in one.get("missing") or ()]
-    area, cause = area_and_cause(known.rig, one.get("valid_area"), missing)
-    eye = None
+    area, cause = area_and_cause(context.rig, one.get("valid_area"), missing)
+    projection_centre = None
     if place.get("height_m") is not None:
-        eye = (
+        projection_centre = (
             Point(place["latitude_deg"], place["longitude_deg"]),
-            place["height_m"] - known.ground_height_m,
+            place["height_m"] - context.ground_height_m,
         )
     places = tuple(Point(*corner) for corner in corners)
-    return Taken(one["number"], places, _objection(one), area=area, partly=cause, eye=eye)
+    return ExposureFootprint(
+        one["number"],
+        places,
+        _exclusion_reason(one),
+        area=area,
+        gap_cause=cause,
+        projection_centre=projection_centre,
+    )
 
 
-def _line_json(line: PlannedLine, known: _Known) -> dict[str, Any]:
-    plane = Plane(line.start)
+def _line_json(line: PlannedLine, context: _PlanContext) -> dict[str, Any]:
+    plane = LocalPlane(line.start)
     east, north = plane.flat(line.end)
     length_m = math.hypot(east, north)
-    places: Sequence[float] = places_m(line, length_m, known.base_m) if length_m else (0.0,)
+    places: Sequence[float] = places_m(line, length_m, context.base_m) if length_m else (0.0,)
     return {
         "id": line.id,
         "strip": line.strip or line.id,
@@ -234,7 +247,7 @@ def _line_json(line: PlannedLine, known: _Known) -> dict[str, Any]:
     }
 
 
-def _objection(one: Mapping[str, Any]) -> str:
+def _exclusion_reason(one: Mapping[str, Any]) -> str:
     """Why an exposure does not count; coverage itself is counted by the advisor."""
     if one.get("state") == "lost":
         return "lost"
@@ -245,6 +258,6 @@ def _objection(one: Mapping[str, Any]) -> str:
     return f"refly ({', '.join(why) or 'quality'})" if why or not grave else ""
 
 
-def _middle(corners: Iterable[Point]) -> Point:
+def _centroid(corners: Iterable[Point]) -> Point:
     latitudes, longitudes = zip(*corners, strict=True)
     return Point(sum(latitudes) / len(latitudes), sum(longitudes) / len(longitudes))

@@ -14,7 +14,7 @@ from prometheus_client.registry import Collector
 
 from daemon.onboard.flight.ledger import CAUSES, PENDING
 from daemon.onboard.flight.phases import Phase
-from daemon.onboard.monitoring.state import FlightState
+from daemon.onboard.monitoring.flight_state import FlightState
 
 PHASES = tuple(phase.value for phase in Phase)
 
@@ -22,11 +22,11 @@ PHASES = tuple(phase.value for phase in Phase)
 def exposition(state: FlightState) -> bytes:
     """The text that `/metrics` answers."""
     registry = CollectorRegistry()
-    registry.register(_Flight(state))
+    registry.register(_FlightCollector(state))
     return generate_latest(registry)
 
 
-class _Flight(Collector):
+class _FlightCollector(Collector):
     def __init__(self, state: FlightState) -> None:
         self._brief = state.brief()
         self._devices = state.changed("devices", 0)
@@ -133,7 +133,9 @@ class _Flight(Collector):
             if value is not None:
                 temperatures.add_metric([probe], value)
         yield temperatures
-        processing = [told for told in self._exposures if told.get("duration_s") is not None]
+        processing = [
+            exposure for exposure in self._exposures if exposure.get("duration_s") is not None
+        ]
         if processing:
             yield GaugeMetricFamily(
                 "syntopic_processing_last_seconds",

@@ -13,10 +13,10 @@ from typing import Any
 
 import msgpack
 
-from daemon.onboard.monitoring.state import PARTS, FlightState
+from daemon.onboard.monitoring.flight_state import PARTS, FlightState
 
 VERSION = 1
-LEAST_BYTES_PER_S = 1000
+MIN_BYTES_PER_S = 1000
 """Below this not even what is brief gets through once in a few seconds."""
 
 BRIEF_SHARE = 0.5
@@ -34,11 +34,11 @@ class Subscription:
     bytes_per_s: float = math.inf
     parts: tuple[str, ...] = PARTS
     _cursors: dict[str, int] = field(default_factory=dict)
-    _told_sequence: int = -1
-    _told_s: float = -math.inf
-    _told_faults: list[Any] = field(default_factory=list)
+    _sent_sequence: int = -1
+    _sent_s: float = -math.inf
+    _sent_faults: list[Any] = field(default_factory=list)
     _credit: float = 0.0
-    _earned_s: float | None = None
+    _refilled_s: float | None = None
 
     def record(self, state: FlightState, now_s: float, *, repeat_s: float = 1.0) -> Any:
         """The next record, as msgpack or JSON types; None when nothing is to be said yet.
@@ -47,50 +47,52 @@ class Subscription:
             now_s: any clock that goes evenly.
             repeat_s: what is brief is said again this often even if nothing changed.
         """
-        self._earn(now_s)
-        if state.sequence == self._told_sequence and now_s - self._told_s < repeat_s:
+        self._refill(now_s)
+        if state.sequence == self._sent_sequence and now_s - self._sent_s < repeat_s:
             return None
         record: dict[str, Any] = {"version": VERSION, **state.brief()}
         nbytes = packed_nbytes(record)
         left = self._credit - nbytes
         # What is brief may have half of the budget; a new fault waits for nothing but credit.
         pause_s = nbytes / (BRIEF_SHARE * self.bytes_per_s)
-        is_too_soon = now_s - self._told_s < pause_s and record["faults"] == self._told_faults
+        is_too_soon = now_s - self._sent_s < pause_s and record["faults"] == self._sent_faults
         if left < 0 or is_too_soon:
             return None
         complete = True
         for part in self.parts:
-            items, left, all_told = self._some_of(state, part, left)
+            items, left, is_complete = self._take_items(state, part, left)
             if items:
                 record[part] = items
-            complete = complete and all_told
+            complete = complete and is_complete
         self._credit = left
-        self._told_sequence = state.sequence if complete else -1
-        self._told_s, self._told_faults = now_s, record["faults"]
+        self._sent_sequence = state.sequence if complete else -1
+        self._sent_s, self._sent_faults = now_s, record["faults"]
         return record
 
-    def _earn(self, now_s: float) -> None:
-        most = self.bytes_per_s * BURST_S
-        if math.isinf(most):
-            self._credit = most
+    def _refill(self, now_s: float) -> None:
+        limit = self.bytes_per_s * BURST_S
+        if math.isinf(limit):
+            self._credit = limit
             return
-        passed_s = BURST_S if self._earned_s is None else now_s - self._earned_s
-        self._credit = min(self._credit + passed_s * self.bytes_per_s, most)
-        self._earned_s = now_s
+        passed_s = BURST_S if self._refilled_s is None else now_s - self._refilled_s
+        self._credit = min(self._credit + passed_s * self.bytes_per_s, limit)
+        self._refilled_s = now_s
 
-    def _some_of(self, state: FlightState, part: str, left: float) -> tuple[list[Any], float, bool]:
+    def _take_items(
+        self, state: FlightState, part: str, left: float
+    ) -> tuple[list[Any], float, bool]:
         """Items of a part that fit, what is left of the budget, and whether all were told."""
-        told: list[Any] = []
+        selected: list[Any] = []
         for item in state.changed(part, self._cursors.get(part, 0)):
             nbytes = packed_nbytes(item)
-            if not told:
+            if not selected:
                 nbytes += packed_nbytes(part) + ARRAY_HEAD_BYTES
             if nbytes > left:
-                return told, left, False
+                return selected, left, False
             left -= nbytes
-            told.append(item)
+            selected.append(item)
             self._cursors[part] = item["sequence"]
-        return told, left, True
+        return selected, left, True
 
 
 def packed(record: Any) -> bytes:

@@ -13,23 +13,23 @@ from typing import ClassVar
 
 from daemon.mission.exposure import Exposure
 from daemon.onboard.flight.decisions import Decision
-from daemon.onboard.service.desk import Desk
-from daemon.onboard.service.hearing import Tell
+from daemon.onboard.service.message_dispatcher import MessageDispatcher
 from daemon.onboard.service.messages import (
     FramesRead,
-    Judged,
-    NoteProducts,
+    IndexProducts,
     Process,
     Processed,
     ProcessFailed,
+    RecordFinalized,
     Recycle,
-    Settled,
+    VerdictReady,
     WorkerReady,
 )
+from daemon.onboard.service.record_ingest import EmitEvent
 
 
 @dataclass(frozen=True)
-class _Waiting:
+class _QueuedExposure:
     """An exposure waiting for the worker; `slots` while its frames are still in memory."""
 
     exposure: Exposure
@@ -37,7 +37,7 @@ class _Waiting:
     is_sealed: bool = True
 
 
-class PipelineQueue(Desk):
+class PipelineQueue(MessageDispatcher):
     """Hands exposures to the worker, so many at a time.
 
     Args:
@@ -50,27 +50,29 @@ class PipelineQueue(Desk):
 
     def __init__(
         self,
-        lanes: int,
+        parallel_exposures: int,
         send: Callable[[str, object], None],
-        tell: Tell,
-        decided: Callable[[Decision], None] = lambda _: None,
-        seen: Callable[[int, Mapping[str, Sequence[int]]], None] = lambda _number, _counts: None,
+        emit: EmitEvent,
+        on_decision: Callable[[Decision], None] = lambda _: None,
+        on_histograms: Callable[
+            [int, Mapping[str, Sequence[int]]], None
+        ] = lambda _number, _counts: None,
     ) -> None:
-        self._lanes = lanes
+        self._max_in_progress = parallel_exposures
         self._send = send
-        self._tell = tell
-        self._decided = decided
-        self._seen = seen
+        self._emit = emit
+        self._on_decision = on_decision
+        self._on_histograms = on_histograms
         self.is_ready = False
-        self._in_work: set[int] = set()
+        self._in_progress: set[int] = set()
         self._unsealed: set[int] = set()
-        self._waiting: deque[_Waiting] = deque()
+        self._waiting: deque[_QueuedExposure] = deque()
         self._in_memory: dict[int, Mapping[str, int]] = {}
 
     def __len__(self) -> int:
-        return len(self._waiting) + len(self._in_work)
+        return len(self._waiting) + len(self._in_progress)
 
-    def keep(self, number: int, slots: Mapping[str, int]) -> None:
+    def retain(self, number: int, slots: Mapping[str, int]) -> None:
         """The frames of an exposure lie in these slots; they are not filled again yet."""
         self._in_memory[number] = slots
 
@@ -84,30 +86,30 @@ class PipelineQueue(Desk):
         """The disk refused the frames; the flight hands back their slots."""
         self._in_memory.pop(number, None)
 
-    def foreseen(self, exposure: Exposure) -> None:
+    def provisional(self, exposure: Exposure) -> None:
         """An exposure may be begun; its record is as good as certain, and `sealed` will follow."""
         self._unsealed.add(exposure.number)
-        self._wait(exposure, is_sealed=False)
+        self._enqueue(exposure, is_sealed=False)
 
     def sealed(self, exposure: Exposure) -> None:
         """An exposure may be processed, and its products written."""
-        if exposure.number in self._unsealed and not self._forget(exposure.number):
-            self._send("worker", Settled(exposure.number, exposure))
+        if exposure.number in self._unsealed and not self._remove_waiting(exposure.number):
+            self._send("worker", RecordFinalized(exposure.number, exposure))
         else:
-            self._wait(exposure, is_sealed=True)
+            self._enqueue(exposure, is_sealed=True)
 
     def not_sealed(self, number: int) -> None:
         """The disk has no record of it: what was begun comes to nothing."""
-        if number in self._unsealed and not self._forget(number):
-            self._send("worker", Settled(number, None))
-        self._is_done(number)
+        if number in self._unsealed and not self._remove_waiting(number):
+            self._send("worker", RecordFinalized(number, None))
+        self._finish(number)
 
-    def _wait(self, exposure: Exposure, *, is_sealed: bool) -> None:
+    def _enqueue(self, exposure: Exposure, *, is_sealed: bool) -> None:
         slots = self._in_memory.get(exposure.number)
-        self._waiting.append(_Waiting(exposure, slots, is_sealed))
-        self._feed()
+        self._waiting.append(_QueuedExposure(exposure, slots, is_sealed))
+        self._dispatch_waiting()
 
-    def _forget(self, number: int) -> bool:
+    def _remove_waiting(self, number: int) -> bool:
         """An unsealed exposure is one no longer; whether it was still waiting, and does not now."""
         self._unsealed.discard(number)
         waiting = [task for task in self._waiting if task.exposure.number != number]
@@ -120,53 +122,52 @@ class PipelineQueue(Desk):
         self._send("capture", Recycle(slots))
 
     def _on_worker_ready(self, ready: WorkerReady) -> None:
-        self._tell("kernels", warm_up_s=round(ready.warm_up_s, 2))
+        self._emit("kernels", warm_up_s=round(ready.warm_up_s, 2))
         self.is_ready = True
-        self._feed()
+        self._dispatch_waiting()
 
     def _on_frames_read(self, read: FramesRead) -> None:
         if read.number in self._in_memory:
             self.recycle(self._in_memory.pop(read.number))
 
-    def _on_judged(self, judged: Judged) -> None:
-        self._tell("judged", number=judged.number, report=dict(judged.report))
+    def _on_verdict_ready(self, verdict: VerdictReady) -> None:
+        self._emit("judged", number=verdict.number, report=dict(verdict.report))
 
     def _on_processed(self, done: Processed) -> None:
         seconds = round(done.duration_s, 3)
-        self._tell("processed", number=done.number, report=dict(done.report), duration_s=seconds)
-        self._seen(done.number, done.histograms)
-        verdict = done.report.get("verdict")
-        self._send("writer", NoteProducts(done.number, done.files, verdict))
-        self._is_done(done.number)
+        self._emit("processed", number=done.number, report=dict(done.report), duration_s=seconds)
+        self._on_histograms(done.number, done.histograms)
+        self._send("writer", IndexProducts(done.number, done.files, done.report.get("verdict")))
+        self._finish(done.number)
 
     def _on_failed(self, failed: ProcessFailed) -> None:
-        self._tell(
+        self._emit(
             "not-processed",
             number=failed.number,
             sentence=failed.sentence,
             report=dict(failed.report),
         )
-        self._is_done(failed.number)
+        self._finish(failed.number)
 
-    def _is_done(self, number: int) -> None:
-        self._in_work.discard(number)
+    def _finish(self, number: int) -> None:
+        self._in_progress.discard(number)
         if number in self._in_memory:
             self.recycle(self._in_memory.pop(number))
-        self._feed()
+        self._dispatch_waiting()
 
-    def _feed(self) -> None:
-        while self.is_ready and self._waiting and len(self._in_work) < self._lanes:
+    def _dispatch_waiting(self) -> None:
+        while self.is_ready and self._waiting and len(self._in_progress) < self._max_in_progress:
             task = self._waiting.popleft()
             number, deferred = task.exposure.number, task.slots is None
-            self._in_work.add(number)
+            self._in_progress.add(number)
             now_ns = time.monotonic_ns()
-            self._decided(Decision("process", now_ns, number, {"deferred": deferred}))
+            self._on_decision(Decision("process", now_ns, number, {"deferred": deferred}))
             self._send("worker", Process(task.exposure, task.slots, task.is_sealed))
 
     handlers: ClassVar = {
         WorkerReady: _on_worker_ready,
         FramesRead: _on_frames_read,
-        Judged: _on_judged,
+        VerdictReady: _on_verdict_ready,
         Processed: _on_processed,
         ProcessFailed: _on_failed,
     }

@@ -1,7 +1,7 @@
 """The pipeline worker: Level-0 in, Level-2 products and a verdict out.
 
 It reads an exposure from shared memory while it is still there, else from disk; it never makes the
-capture wait. A few exposures are in work at a time (`daemon.onboard.pipeline.lanes`).
+capture wait. A few exposures are in work at a time (`daemon.onboard.pipeline.pipeline_pool`).
 """
 
 from __future__ import annotations
@@ -24,46 +24,46 @@ from daemon.errors import DaemonError
 from daemon.mission.exposure import Exposure
 from daemon.mission.layout import Mission
 from daemon.mission.store import level2, store
-from daemon.onboard.capture.memory import FrameRing
-from daemon.onboard.pipeline.lanes import Lanes
+from daemon.onboard.capture.frame_ring import FrameRing
+from daemon.onboard.pipeline.pipeline_pool import PipelinePool
 from daemon.onboard.service.messages import (
-    Begin,
+    BeginProcessing,
     FramesRead,
-    Judged,
     Ping,
     Pong,
     Process,
     Processed,
     ProcessFailed,
-    Settled,
+    RecordFinalized,
     Stop,
     UseMission,
+    VerdictReady,
     WorkerBuilt,
     WorkerReady,
     WorkerRefused,
     WorkerSettings,
 )
-from daemon.onboard.service.processes import Link
-from daemon.orientation.exterior import exposures_of, mount_of
-from daemon.orientation.ground import Ground, ground_of
-from daemon.planning.overlaps import Overlaps, Surroundings
-from daemon.products.conditions import capture_flags, conditions_of
+from daemon.onboard.service.processes import ServiceConnection
+from daemon.orientation.exterior_orientation import mount_of, sealed_exposures
+from daemon.orientation.ground_model import GroundModel, ground_of
+from daemon.planning.overlaps import Overlaps, OverlapShares
+from daemon.products.exposure_conditions import capture_flags, conditions_of
 from daemon.products.processor import Processor, build_processor, histograms_of, make_products
-from daemon.products.reports import Made
-from processing.quality.judgement import judge
+from daemon.products.product_files import ProductFiles
+from processing.quality.evaluation import evaluate
 from processing.quality.report import Flag, as_json
 from processing.rig import Rig, find_rig
 
 SWITCH_INTERVAL_S = 0.001
 """How long one thread may hold the interpreter while another waits to enter a kernel."""
-SETTLED_WITHIN_S = 3600.0
+FINALIZE_TIMEOUT_S = 3600.0
 """A disk that refuses a record is asked again and again; its products wait as long as that."""
 
 
-def main(link: Link, settings: WorkerSettings, rings: tuple[FrameRing, ...]) -> None:
+def main(link: ServiceConnection, settings: WorkerSettings, rings: tuple[FrameRing, ...]) -> None:
     """Process until told to stop."""
     started = time.monotonic()
-    settle_threads()
+    configure_threads()
     try:
         processor = build(settings)
     except (OSError, ValueError, ArithmeticError, MemoryError, DaemonError) as error:
@@ -79,31 +79,31 @@ def main(link: Link, settings: WorkerSettings, rings: tuple[FrameRing, ...]) -> 
         _wait_for_begin(link)
         return
     rig, mission = processor.rig, Mission.open(begin.mission)
-    lanes = Lanes[Processor](processor, settings.processing.exposures_in_work)
+    pool = PipelinePool[Processor](processor, settings.processing.parallel_exposures)
     mount, _ = mount_of(mission)
     plan = settings.plan
     overlaps, ground = overlaps_of(mission, rig), ground_of(rig, mount, plan)
-    desk = _Desk(link, rig, mission, mount, plan, rings, overlaps, ground)
+    context = WorkerContext(link, rig, mission, mount, plan, rings, overlaps, ground)
     link.send(WorkerReady(time.monotonic() - started))
-    in_work: set[Future[None]] = set()
-    while not isinstance(order := link.receive(timeout_s=1.0), Stop):
-        if isinstance(order, Ping):
+    in_progress: set[Future[None]] = set()
+    while not isinstance(message := link.receive(timeout_s=1.0), Stop):
+        if isinstance(message, Ping):
             link.send(Pong({}))
-        elif isinstance(order, Process):
+        elif isinstance(message, Process):
             # Here and not in a lane: the overlaps of one exposure follow from those before it.
-            surroundings = desk.surroundings_of(order.exposure)
-            desk.begin(order)
-            in_work.add(lanes.submit(partial(desk.process, order, surroundings)))
-        elif isinstance(order, Settled):
-            desk.settle(order)
-        elif isinstance(order, UseMission):
-            desk.mission = Mission(order.mission, order.mission.name)
-        done = {future for future in in_work if future.done()}
-        in_work -= done
+            overlap_shares = context.overlap_shares_of(message.exposure)
+            context.begin(message)
+            in_progress.add(pool.submit(partial(context.process, message, overlap_shares)))
+        elif isinstance(message, RecordFinalized):
+            context.finalize(message)
+        elif isinstance(message, UseMission):
+            context.mission = Mission(message.mission, message.mission.name)
+        done = {future for future in in_progress if future.done()}
+        in_progress -= done
         for future in done:
             future.result()  # a fault of our own ends the process, and the service says so
-    desk.settle_all()
-    lanes.end()
+    context.abandon_pending()
+    pool.end()
 
 
 def build(settings: WorkerSettings) -> Processor:
@@ -116,17 +116,17 @@ def build(settings: WorkerSettings) -> Processor:
     return build_processor(rig, settings.processing, settings.radiometry, settings.plan_file)
 
 
-def _wait_for_begin(link: Link) -> Begin | None:
+def _wait_for_begin(link: ServiceConnection) -> BeginProcessing | None:
     """The order to begin; None where the service ends before."""
-    while not isinstance(order := link.receive(timeout_s=1.0), Stop):
-        if isinstance(order, Begin):
-            return order
-        if isinstance(order, Ping):
+    while not isinstance(message := link.receive(timeout_s=1.0), Stop):
+        if isinstance(message, BeginProcessing):
+            return message
+        if isinstance(message, Ping):
             link.send(Pong({}))
     return None
 
 
-def settle_threads() -> None:
+def configure_threads() -> None:
     """Let threads take turns, and sleep where they wait; call it before the first kernel runs.
 
     OpenMP's threads spin by default, which takes the core from the exposure beside them.
@@ -140,7 +140,7 @@ def overlaps_of(mission: Mission, rig: Rig) -> Overlaps:
     mount, plan = mount_of(mission)
     overlaps = Overlaps(rig, mount, plan.ground_height_m)
     # Verification names what cannot be read; no flight is given up for an overlap.
-    for exposure in exposures_of(mission).results.values():
+    for exposure in sealed_exposures(mission).results.values():
         overlaps.add(exposure)
     return overlaps
 
@@ -154,8 +154,8 @@ def process_exposure(
     frames: Mapping[str, NDArray[np.uint16]],
     flags: Flag = Flag(0),  # noqa: B008 - an immutable value
     *,
-    surroundings: Surroundings | None = None,
-    ground: Ground | None = None,
+    overlap_shares: OverlapShares | None = None,
+    ground: GroundModel | None = None,
     frames_read: Callable[[], None] | None = None,
 ) -> tuple[dict[str, Any], Mapping[str, int]]:
     """Make the images of one exposure and write its Level-2 folder.
@@ -163,7 +163,7 @@ def process_exposure(
     Returns:
         The content of quality.json, and the files written with their sizes in bytes.
     """
-    conditions = conditions_of(exposure, processor.rig, plan, flags, surroundings, ground=ground)
+    conditions = conditions_of(exposure, processor.rig, plan, flags, overlap_shares, ground=ground)
     report, contents = make_products(
         processor, mount, plan, exposure, frames, conditions, frames_read=frames_read
     )
@@ -172,80 +172,88 @@ def process_exposure(
 
 def report_unprocessed(rig: Rig, exposure: Exposure, flags: Flag) -> dict[str, Any]:
     """The quality report of an exposure that has no image: what capture knows of it."""
-    known = capture_flags(exposure, rig) | flags | Flag.NOT_PROCESSED
+    known_flags = capture_flags(exposure, rig) | flags | Flag.NOT_PROCESSED
     if exposure.simulated:
-        known |= Flag.SIMULATED
+        known_flags |= Flag.SIMULATED
     missing = [sensor for sensor, _ in exposure.missing]
-    report = as_json(judge({}, capture_flags=known, missing_sensors=missing))
+    report = as_json(evaluate({}, capture_flags=known_flags, missing_sensors=missing))
     return {**report, "exposure": exposure.number}
 
 
 @dataclass
-class _Desk:
+class WorkerContext:
     """What every exposure needs on its way through a lane.
 
     `mission` changes where another disk leads; each exposure asks for it when it reads or writes.
     """
 
-    link: Link
+    link: ServiceConnection
     rig: Rig
     mission: Mission
     mount: MountSection
     plan: PlanSection
     rings: tuple[FrameRing, ...]
     overlaps: Overlaps
-    ground: Ground | None
-    unsettled: dict[int, SimpleQueue[tuple[Exposure, Surroundings] | None]] = field(
+    ground: GroundModel | None
+    provisional_records: dict[int, SimpleQueue[tuple[Exposure, OverlapShares] | None]] = field(
         default_factory=dict
     )
 
-    def begin(self, order: Process) -> None:
+    def begin(self, message: Process) -> None:
         """An exposure goes into a lane; one that is not sealed yet will be heard of again."""
-        if not order.is_sealed:
-            self.unsettled[order.exposure.number] = SimpleQueue()
+        if not message.is_sealed:
+            self.provisional_records[message.exposure.number] = SimpleQueue()
 
-    def settle(self, settled: Settled) -> None:
+    def finalize(self, finalized: RecordFinalized) -> None:
         """The record of an exposure in work is final, or will never be."""
-        if (outcome := self.unsettled.get(settled.number)) is None:
+        if (outcome := self.provisional_records.get(finalized.number)) is None:
             return  # it could not be processed, and said so
-        record = settled.exposure
-        outcome.put(None if record is None else (record, self.surroundings_of(record)))
+        record = finalized.exposure
+        outcome.put(None if record is None else (record, self.overlap_shares_of(record)))
 
-    def settle_all(self) -> None:
+    def abandon_pending(self) -> None:
         """The end: what is not sealed by now is not waited for."""
-        for outcome in list(self.unsettled.values()):
+        for outcome in list(self.provisional_records.values()):
             outcome.put(None)
 
-    def surroundings_of(self, exposure: Exposure) -> Surroundings:
+    def overlap_shares_of(self, exposure: Exposure) -> OverlapShares:
         """The overlaps of an exposure; call it in the order they were made."""
         self.overlaps.add(exposure)
         return self.overlaps.of(exposure.number)
 
-    def process(self, order: Process, surroundings: Surroundings, lane: Processor) -> None:
+    def process(
+        self, message: Process, overlap_shares: OverlapShares, processor: Processor
+    ) -> None:
         """Process one exposure and say what became of it."""
         started = time.monotonic()
-        exposure = order.exposure
+        exposure = message.exposure
         flags = Flag(0)
         try:
-            if order.slots is None:
+            if message.slots is None:
                 flags |= Flag.PROCESSING_BEHIND
                 frames = store.load_level0(self.mission.level0(exposure.number), self.rig)[0]
             else:
-                frames = self._frames_in_memory(exposure, order.slots)
+                frames = self._frames_in_memory(exposure, message.slots)
             histograms = histograms_of(self.rig, frames)
-            made = self._make(order.exposure, frames, flags, surroundings, lane)
-            if not order.is_sealed:
-                waits_since = time.monotonic()
-                settled = self.unsettled[exposure.number].get(timeout=SETTLED_WITHIN_S)
-                started += time.monotonic() - waits_since
-                if settled is None:
+            products = self._compute_products(
+                message.exposure, frames, flags, overlap_shares, processor
+            )
+            if not message.is_sealed:
+                wait_started = time.monotonic()
+                finalized = self.provisional_records[exposure.number].get(
+                    timeout=FINALIZE_TIMEOUT_S
+                )
+                started += time.monotonic() - wait_started
+                if finalized is None:
                     return
-                if settled[0] != exposure:
+                if finalized[0] != exposure:
                     # Its mark was another's: what was told is told anew.
-                    exposure = settled[0]
+                    exposure = finalized[0]
                     frames = store.load_level0(self.mission.level0(exposure.number), self.rig)[0]
-                    made = self._make(exposure, frames, flags, settled[1], lane)
-            report, contents = made
+                    products = self._compute_products(
+                        exposure, frames, flags, finalized[1], processor
+                    )
+            report, contents = products
             files = level2.write_folder(self.mission.level2(exposure.number), contents)
         except (OSError, ValueError, ArithmeticError, np.linalg.LinAlgError, Empty) as error:
             sentence = (
@@ -256,24 +264,24 @@ class _Desk:
             self.link.send(ProcessFailed(exposure.number, sentence, report))
             return
         finally:
-            self.unsettled.pop(exposure.number, None)
+            self.provisional_records.pop(exposure.number, None)
         seconds = time.monotonic() - started
         self.link.send(Processed(exposure.number, report, files, seconds, histograms))
 
-    def _make(
+    def _compute_products(
         self,
         exposure: Exposure,
         frames: Mapping[str, NDArray[np.uint16]],
         flags: Flag,
-        surroundings: Surroundings,
-        lane: Processor,
-    ) -> Made:
+        overlap_shares: OverlapShares,
+        processor: Processor,
+    ) -> ProductFiles:
         """The products of an exposure; its verdict is told before they are written."""
         conditions = conditions_of(
-            exposure, self.rig, self.plan, flags, surroundings, ground=self.ground
+            exposure, self.rig, self.plan, flags, overlap_shares, ground=self.ground
         )
-        made = make_products(
-            lane,
+        products = make_products(
+            processor,
             self.mount,
             self.plan,
             exposure,
@@ -281,8 +289,8 @@ class _Desk:
             conditions,
             frames_read=partial(self.link.send, FramesRead(exposure.number)),
         )
-        self.link.send(Judged(exposure.number, made[0]))
-        return made
+        self.link.send(VerdictReady(exposure.number, products[0]))
+        return products
 
     def _frames_in_memory(
         self, exposure: Exposure, slots: Mapping[str, int]

@@ -11,15 +11,15 @@ from collections.abc import Callable, Sequence
 
 from daemon.configuration.model import Configuration
 from daemon.onboard.capture.devices import stated_serial_problems
-from daemon.onboard.flight.arming import Lack, Readiness, lacks
+from daemon.onboard.flight.arming import MissingPrerequisite, Readiness, missing_prerequisites
 from daemon.onboard.flight.flight import Flight
-from daemon.onboard.flight.phases import Facts, Phase, StateMachine
+from daemon.onboard.flight.phases import Phase, PhaseInputs, PhaseMachine
 from daemon.onboard.pipeline.pipeline_queue import PipelineQueue
-from daemon.onboard.service.hearing import Hearing
-from daemon.onboard.service.line import Line
+from daemon.onboard.service.flight_line import FlightLine
+from daemon.onboard.service.record_ingest import RecordIngest
 from processing.rig import Rig
 
-AT_ONCE = 'the configuration (trigger.start = "at once")'
+IMMEDIATE_START = 'the configuration (trigger.start = "at once")'
 """Who takes upon them what is missing where nobody is asked."""
 
 
@@ -34,42 +34,44 @@ class Preflight:
         configuration: Configuration,
         rig: Rig,
         flight: Flight,
-        line: Line,
-        hearing: Hearing,
+        line: FlightLine,
+        ingest: RecordIngest,
         pipeline: PipelineQueue,
     ) -> None:
         self._configuration = configuration
         self._rig = rig
         self._flight = flight
         self._line = line
-        self._hearing = hearing
+        self._ingest = ingest
         self._pipeline = pipeline
-        self._machine = StateMachine()
+        self._machine = PhaseMachine()
         self.accepted: frozenset[str] = frozenset()
         self._is_armed = False
-        self.overridden: Callable[[str, Sequence[Lack], str], None] = lambda *_: None
+        self.on_override: Callable[[str, Sequence[MissingPrerequisite], str], None] = lambda *_: (
+            None
+        )
         """Told of who flies without what."""
 
     @property
     def phase(self) -> Phase:
         return self._machine.phase
 
-    def lacks(self) -> tuple[Lack, ...]:
+    def missing_prerequisites(self) -> tuple[MissingPrerequisite, ...]:
         """What is missing that nobody has accepted yet."""
-        there = self._look(time.monotonic_ns())
-        missing = lacks(there, self._configuration.limits)
-        return tuple(lack for lack in missing if lack.name not in self.accepted)
+        readiness = self._readiness(time.monotonic_ns())
+        missing = missing_prerequisites(readiness, self._configuration.limits)
+        return tuple(item for item in missing if item.name not in self.accepted)
 
     def arm(self) -> None:
         """Somebody armed, by a command; it holds while nothing is missing."""
         self._is_armed = True
 
-    def override(self, by: str, missing: Sequence[Lack], reason: str = "") -> None:
+    def override(self, by: str, missing: Sequence[MissingPrerequisite], reason: str = "") -> None:
         """Somebody flies without."""
-        self.accepted |= {lack.name for lack in missing if lack.may_be_overridden}
-        self.overridden(by, missing, reason)
+        self.accepted |= {item.name for item in missing if item.may_be_overridden}
+        self.on_override(by, missing, reason)
 
-    def follow(
+    def advance(
         self,
         *,
         is_prepared: bool,
@@ -77,22 +79,22 @@ class Preflight:
         has_failed: bool,
     ) -> list[Phase]:
         """The phases entered since the last time of asking."""
-        if self._line.runs:
+        if self._line.is_running:
             self._is_armed = True  # by the configuration, or by the command that started it
-        facts = Facts(
+        facts = PhaseInputs(
             is_prepared=is_prepared,
-            is_armed=self._is_armed and is_prepared and not self.lacks(),
-            runs=self._line.runs and not self._line.is_flown,
+            is_armed=self._is_armed and is_prepared and not self.missing_prerequisites(),
+            is_running=self._line.is_running and not self._line.is_flown,
             has_landed=has_landed,
             has_failed=has_failed,
         )
-        return self._machine.follow(facts)
+        return self._machine.advance(facts)
 
-    def _look(self, mono_ns: int) -> Readiness:
+    def _readiness(self, mono_ns: int) -> Readiness:
         configuration, flight = self._configuration, self._flight
-        active = self._hearing.active
+        active = self._ingest.active
         absent = [f"head {h.sensor}" for h in configuration.head if h.sensor not in active]
-        if not self._hearing.has_trigger:
+        if not self._ingest.has_trigger:
             absent.append("trigger")
         last = flight.track.last
         read = {t.probe: (t.value_c, t.age_ns * 1e-9) for t in flight.temperatures.at(mono_ns)}
@@ -100,17 +102,17 @@ class Preflight:
         return Readiness(
             has_kernels=self._pipeline.is_ready,
             absent=absent,
-            exposures_left=self._line.guard.look().exposures,
-            exposures_wanted=self._line.wanted or 1,
-            wants_time=bool(configuration.navigator),
-            has_time=flight.clock.gps_at(mono_ns) is not None and not flight.clock.is_doubtful,
+            exposures_left=self._line.guard.check().exposures,
+            exposures_planned=self._line.remaining or 1,
+            needs_time=bool(configuration.navigator),
+            has_time=flight.clock.gps_at(mono_ns) is not None and not flight.clock.is_suspect,
             position_age_s=None if last is None else (mono_ns - last.mono_ns) * 1e-9,
             has_fix=last is not None and last.fix != "none",
             probes_c={probe: read.get(probe) for probe in probes},
-            serials_untold=[
+            serials_unreported=[
                 head
-                for head, serial in self._hearing.serials.items()
+                for head, serial in self._ingest.serials.items()
                 if not serial and self._rig.sensor(head).serial
             ],
-            serials_differing=stated_serial_problems(configuration, self._rig),
+            serials_mismatched=stated_serial_problems(configuration, self._rig),
         )

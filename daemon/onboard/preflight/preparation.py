@@ -1,7 +1,7 @@
 """From the start of the service to its mission: prerequisites, the worker, and the mission itself.
 
 What is refused here is refused before a new mission exists. `syntopic check` looks at the same
-prerequisites and builds the same worker (`daemon.onboard.preflight.trial`).
+prerequisites and builds the same worker (`daemon.onboard.preflight.system_check`).
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from typing import ClassVar
 
 from daemon.configuration.model import Configuration
 from daemon.mission.layout import Mission
-from daemon.mission.mirror.mirror_start import FoundDisks, begin_mirrored, resume_mirrored
-from daemon.onboard.preflight.findings import Outcome
-from daemon.onboard.preflight.prerequisites import AFTER_RESTART, LOOKS, prerequisites
+from daemon.mission.mirror.mirror_startup import FoundDisks, begin_mirrored, resume_mirrored
+from daemon.onboard.preflight.check_results import CheckOutcome
+from daemon.onboard.preflight.prerequisites import CHECKS, CHECKS_AFTER_RESTART, prerequisites
 from daemon.onboard.preflight.resumption import resume
-from daemon.onboard.service.departure import create_mission, disks_of, interrupted_mission
-from daemon.onboard.service.desk import Desk
-from daemon.onboard.service.hearing import Tell
+from daemon.onboard.service.message_dispatcher import MessageDispatcher
 from daemon.onboard.service.messages import WorkerBuilt, WorkerRefused
+from daemon.onboard.service.record_ingest import EmitEvent
+from daemon.onboard.service.startup import create_mission, disks_of, interrupted_mission
 from processing.rig import Rig
 
 
-class Preparation(Desk):
+class Preparation(MessageDispatcher):
     """What happens before there is a mission.
 
     `rig` is the one that flies: the mission's own where one is resumed. `interrupted` is the
@@ -45,19 +45,19 @@ class Preparation(Desk):
         configuration: Configuration,
         rig: Rig,
         config_path: Path,
-        tell: Tell,
+        emit: EmitEvent,
         fail: Callable[[str], None],
     ) -> None:
         self._configuration = configuration
         self._config_path = config_path
-        self._tell = tell
+        self._emit = emit
         self._fail = fail
         self.rig = rig
         self.interrupted: Mission | None = None
         self.disks: FoundDisks | None = None
         self.is_built = False
 
-    async def look(self) -> bool:
+    async def check(self) -> bool:
         """Look at what a flight needs, and for a mission to be resumed; False where it fails.
 
         Raises:
@@ -69,13 +69,13 @@ class Preparation(Desk):
             self.interrupted = interrupted_mission(self._configuration)
         else:
             self.interrupted = self.disks.mission
-        looks = LOOKS if self.interrupted is None else AFTER_RESTART
-        findings = await asyncio.to_thread(prerequisites, self._configuration, self.rig, looks)
-        for finding in findings:
-            if finding.outcome is Outcome.FAIL and not finding.prevents:
-                item, sentence = f"{finding.kind} {finding.name}", finding.sentence
-                self._tell("prerequisite", fault=True, item=item, sentence=sentence)
-        refusals = [finding.sentence for finding in findings if finding.prevents]
+        checks = CHECKS if self.interrupted is None else CHECKS_AFTER_RESTART
+        results = await asyncio.to_thread(prerequisites, self._configuration, self.rig, checks)
+        for result in results:
+            if result.outcome is CheckOutcome.FAIL and not result.is_blocking:
+                item, sentence = f"{result.kind} {result.name}", result.sentence
+                self._emit("prerequisite", fault=True, item=item, sentence=sentence)
+        refusals = [result.sentence for result in results if result.is_blocking]
         for refusal in refusals:
             self._fail(refusal)
         return not refusals and (self.interrupted is None or self._resume(self.interrupted))
@@ -103,7 +103,7 @@ class Preparation(Desk):
             return False
         self.rig = resumption.rig
         differences = list(resumption.differences)
-        self._tell("resumed", sentence=resumption.sentence, differences=differences)
+        self._emit("resumed", sentence=resumption.sentence, differences=differences)
         return True
 
     def _on_built(self, _built: WorkerBuilt) -> None:

@@ -17,16 +17,16 @@ from typing import Final, TypeAlias
 from daemon.configuration.model import Configuration
 from daemon.mission.store import durable
 from daemon.mission.store.disk_identity import same_file_system
-from daemon.mission.store.guard import LEVEL2_SHARE
+from daemon.mission.store.disk_space import LEVEL2_SHARE
 from daemon.mission.store.health import read_health
 from daemon.onboard.capture.devices import frame_nbytes
 from daemon.onboard.capture.head_network import head_network
-from daemon.onboard.preflight.findings import Finding, Outcome, failed, passed
+from daemon.onboard.preflight.check_results import CheckOutcome, CheckResult, failed, passed
 from drivers.base import registry
 from drivers.base.extras import MissingExtraError, require
 from processing.rig import Rig
 
-Look: TypeAlias = Callable[[Configuration, Rig], Iterator[Finding]]
+Check: TypeAlias = Callable[[Configuration, Rig], Iterator[CheckResult]]
 
 PACE_NBYTES_MIN: Final = 16_000_000
 PACE_NBYTES_MAX: Final = 512_000_000
@@ -36,21 +36,21 @@ _BLOCK_NBYTES: Final = 4_000_000
 
 
 def prerequisites(
-    configuration: Configuration, rig: Rig, looks: Sequence[Look] | None = None
-) -> list[Finding]:
+    configuration: Configuration, rig: Rig, checks: Sequence[Check] | None = None
+) -> list[CheckResult]:
     """Every item that can be looked at without a device, in the order of `LOOKS`.
 
     An item that prevents the flight ends the looking: what follows may need it.
     """
-    findings: list[Finding] = []
-    for look in LOOKS if looks is None else looks:
-        findings += look(configuration, rig)
-        if any(finding.prevents for finding in findings):
+    results: list[CheckResult] = []
+    for check in CHECKS if checks is None else checks:
+        results += check(configuration, rig)
+        if any(result.is_blocking for result in results):
             break
-    return findings
+    return results
 
 
-def libraries(configuration: Configuration, rig: Rig) -> Iterator[Finding]:
+def libraries(configuration: Configuration, rig: Rig) -> Iterator[CheckResult]:
     """Optional packages that the configuration needs."""
     needed = {
         extra
@@ -67,12 +67,12 @@ def libraries(configuration: Configuration, rig: Rig) -> Iterator[Finding]:
         try:
             require(extra)
         except MissingExtraError as error:
-            yield failed("library", extra, str(error), prevents=True)
+            yield failed("library", extra, str(error), is_blocking=True)
         else:
             yield passed("library", extra)
 
 
-def calibration(configuration: Configuration, rig: Rig) -> Iterator[Finding]:
+def calibration(configuration: Configuration, rig: Rig) -> Iterator[CheckResult]:
     """The age of the calibration, and its files of every sensor that flies."""
     name = rig.calibration_id
     age_days = (_today() - datetime.date.fromisoformat(rig.calibration_date)).days
@@ -102,19 +102,19 @@ def calibration(configuration: Configuration, rig: Rig) -> Iterator[Finding]:
         yield passed("calibration", name, date=rig.calibration_date)
 
 
-def storage(configuration: Configuration, _rig: Rig) -> Iterator[Finding]:
+def storage(configuration: Configuration, _rig: Rig) -> Iterator[CheckResult]:
     """The root of missions and its mirror: there or creatable, and writable.
 
     Of two disks one is enough for a flight.
     """
     root, mirror = configuration.mission.root, configuration.mission.mirror
     if mirror is None:
-        yield _writable("root", root, prevents=True)
+        yield _writable("root", root, is_blocking=True)
         return
-    findings = [_writable("root", root), _writable("mirror", mirror)]
-    if all(finding.outcome is Outcome.FAIL for finding in findings):
-        findings = [_writable("root", root, prevents=True)]
-    yield from findings
+    results = [_writable("root", root), _writable("mirror", mirror)]
+    if all(result.outcome is CheckOutcome.FAIL for result in results):
+        results = [_writable("root", root, is_blocking=True)]
+    yield from results
     if same_file_system(root, mirror):
         yield passed(
             "disk",
@@ -124,7 +124,7 @@ def storage(configuration: Configuration, _rig: Rig) -> Iterator[Finding]:
         )
 
 
-def _writable(key: str, root: Path, *, prevents: bool = False) -> Finding:
+def _writable(key: str, root: Path, *, is_blocking: bool = False) -> CheckResult:
     try:
         if key == "mirror" and not root.is_dir():
             # A folder made here would lie below a mount point, on the wrong disk.
@@ -142,12 +142,12 @@ def _writable(key: str, root: Path, *, prevents: bool = False) -> Finding:
             str(root),
             f"mission.{key} {root} cannot be written ({error.strerror or error}); mount the disk, "
             "free it, or give the user of the service the right to write there",
-            prevents=prevents,
+            is_blocking=is_blocking,
         )
     return passed("disk", str(root), free_gb=f"{durable.free_bytes(root) / 1e9:.1f}")
 
 
-def disk_health(configuration: Configuration, _rig: Rig) -> Iterator[Finding]:
+def disk_health(configuration: Configuration, _rig: Rig) -> Iterator[CheckResult]:
     """What the disks state of themselves, where the helper reads it."""
     mission = configuration.mission
     for key, root in (("root", mission.root), ("mirror", mission.mirror)):
@@ -160,7 +160,7 @@ def disk_health(configuration: Configuration, _rig: Rig) -> Iterator[Finding]:
             continue  # `storage` says what is wrong with it
         if found is None:
             sentence = "not read; run: sudo systemctl enable --now syntopic-disk-health.timer"
-            yield Finding("disk", name, Outcome.NOT_TRIED, sentence)
+            yield CheckResult("disk", name, CheckOutcome.NOT_TRIED, sentence)
         elif found.problems:
             yield failed("disk", name, f"disk of {root}: {'; '.join(found.problems)}")
         else:
@@ -169,7 +169,7 @@ def disk_health(configuration: Configuration, _rig: Rig) -> Iterator[Finding]:
             yield passed("disk", name, model=found.model, serial=found.serial, **numbers)
 
 
-def memory(configuration: Configuration, rig: Rig) -> Iterator[Finding]:
+def memory(configuration: Configuration, rig: Rig) -> Iterator[CheckResult]:
     """Memory for the frames of the exposures that are held at a time."""
     depth = configuration.limits.exposures_in_memory
     needed = depth * exposure_nbytes(configuration, rig)
@@ -181,13 +181,13 @@ def memory(configuration: Configuration, rig: Rig) -> Iterator[Finding]:
             f"frames of {depth} exposures need {needed / 1e9:.1f} GB of memory and "
             f"{available / 1e9:.1f} GB are available; end other programs, add memory, or lower "
             "limits.exposures_in_memory",
-            prevents=True,
+            is_blocking=True,
         )
     else:
         yield passed("memory", "frames", needed_gb=f"{needed / 1e9:.2f}")
 
 
-def pace(configuration: Configuration, rig: Rig) -> Iterator[Finding]:
+def pace(configuration: Configuration, rig: Rig) -> Iterator[CheckResult]:
     """Whether the disk writes as fast as exposures may come."""
     root = configuration.mission.root
     nbytes = exposure_nbytes(configuration, rig)
@@ -200,26 +200,26 @@ def pace(configuration: Configuration, rig: Rig) -> Iterator[Finding]:
     measured = 0.0
     try:
         for _ in range(PACE_TRIES):
-            measured = max(measured, size / write_s(root, size))
+            measured = max(measured, size / measure_write_s(root, size))
             if measured >= needed:
                 break
     except OSError as error:
         sentence = f"the disk of {root} refused to write {size} bytes ({error.strerror or error})"
         yield failed("disk", "pace", f"{sentence}; check the disk")
         return
-    told = f"{measured / 1e6:.0f} MB/s measured, {needed / 1e6:.0f} MB/s needed"
+    rates = f"{measured / 1e6:.0f} MB/s measured, {needed / 1e6:.0f} MB/s needed"
     if measured < needed:
         yield failed(
             "disk",
             "pace",
-            f"the disk of {root} is too slow: {told} for an exposure every {interval_s:g} s; use "
+            f"the disk of {root} is too slow: {rates} for an exposure every {interval_s:g} s; use "
             "a faster disk, or expose less often. Frames that find no free memory are lost",
         )
     else:
-        yield passed("disk", "pace", told)
+        yield passed("disk", "pace", rates)
 
 
-LOOKS: Final[Sequence[Look]] = (
+CHECKS: Final[Sequence[Check]] = (
     libraries,
     calibration,
     storage,
@@ -229,7 +229,13 @@ LOOKS: Final[Sequence[Look]] = (
     pace,
 )
 """Every prerequisite, in the order they are looked at."""
-AFTER_RESTART: Final[Sequence[Look]] = (libraries, calibration, storage, memory, head_network)
+CHECKS_AFTER_RESTART: Final[Sequence[Check]] = (
+    libraries,
+    calibration,
+    storage,
+    memory,
+    head_network,
+)
 """Those of a flight that is resumed: nothing is measured while exposures are waited for."""
 
 
@@ -257,7 +263,7 @@ def available_memory_nbytes() -> int | None:
     return found[0] if found else None
 
 
-def write_s(root: Path, nbytes: int) -> float:
+def measure_write_s(root: Path, nbytes: int) -> float:
     """Seconds that a file of so many bytes takes to be durable in a folder; it is removed again.
 
     Raises:

@@ -15,11 +15,11 @@ from daemon.configuration.model import Configuration
 from daemon.mission.layout import Mission
 from daemon.mission.verification import recovery
 from daemon.onboard.flight.recovery_match import seal_from_log
-from daemon.onboard.preflight.findings import Finding, failed, passed
+from daemon.onboard.preflight.check_results import CheckResult, failed, passed
 from processing.rig import Rig, RigError, load_rig, shipped_rigs
 from processing.rig.toml_text import parse_toml
 
-NAMED_MOST: Final = 6
+DIFFERENCES_NAMED_MAX: Final = 6
 """Differences that the sentence names; the event lists all."""
 
 
@@ -47,45 +47,45 @@ def resume(
         configured: the rig that it names.
         config_path: where it lies, for the command that begins a new mission.
     """
-    anew = f"syntopic run {config_path} --new-mission"
+    new_mission_command = f"syntopic run {config_path} --new-mission"
     try:
         rig = load_rig(mission.rig_path)
     except RigError as error:
-        told = "; ".join(error.problems)
+        problems = "; ".join(error.problems)
         return Resumption(
             configured,
-            refusal=f"mission {mission.id} cannot be resumed, its rig.toml is damaged: {told}. "
-            f"Close it and begin a new one: {anew}",
+            refusal=f"mission {mission.id} cannot be resumed, its rig.toml is damaged: {problems}. "
+            f"Close it and begin a new one: {new_mission_command}",
         )
     known = {sensor.name for sensor in rig.sensors}
     unknown = [head.sensor for head in configuration.head if head.sensor not in known]
     differences = rig_differences(mission.rig_path, rig_file(configuration))
-    sentence = f"resuming mission {mission.id} with the rig of {_named(rig)}"
+    sentence = f"resuming mission {mission.id} with the rig of {_calibration_label(rig)}"
     if differences:
-        named = ", ".join(differences[:NAMED_MOST])
-        more = len(differences) - NAMED_MOST
+        named = ", ".join(differences[:DIFFERENCES_NAMED_MAX])
+        more = len(differences) - DIFFERENCES_NAMED_MAX
         named += f" and {more} more" if more > 0 else ""
         sentence += (
             f"; the configured rig differs in {named}. To fly with the configured rig, close this "
-            f"mission and begin a new one: {anew}"
+            f"mission and begin a new one: {new_mission_command}"
         )
     if unknown:
         return Resumption(
             rig,
             refusal=f"mission {mission.id} cannot be resumed: its rig has no sensor "
             f"{', '.join(unknown)}, which the configuration has heads for. Close it and begin a "
-            f"new one: {anew}",
+            f"new one: {new_mission_command}",
         )
     return Resumption(rig, sentence, tuple(differences))
 
 
-def resumption_finding(
+def resumption_result(
     mission: Mission, configuration: Configuration, configured: Rig, config_path: Path
-) -> tuple[Finding, Rig]:
+) -> tuple[CheckResult, Rig]:
     """What `check` says of a mission that `run` would resume, and the rig it would fly with."""
     resumption = resume(mission, configuration, configured, config_path)
     if resumption.refusal:
-        return failed("mission", mission.id, resumption.refusal, prevents=True), configured
+        return failed("mission", mission.id, resumption.refusal, is_blocking=True), configured
     if resumption.differences:
         return failed("mission", mission.id, resumption.sentence), resumption.rig
     return passed("mission", mission.id, resumption.sentence), resumption.rig
@@ -128,10 +128,13 @@ def rig_differences(flown: Path, configured: Path) -> list[str]:
     except (OSError, ValueError) as error:
         return [f"the whole file ({error})"]
     keys = sorted(key for key in old.keys() | new.keys() if old.get(key) != new.get(key))
-    return [f"{key} ({_shown(old, key)} in the mission, {_shown(new, key)} now)" for key in keys]
+    return [
+        f"{key} ({_value_text(old, key)} in the mission, {_value_text(new, key)} now)"
+        for key in keys
+    ]
 
 
-def _named(rig: Rig) -> str:
+def _calibration_label(rig: Rig) -> str:
     return f"calibration {rig.calibration_id} ({rig.calibration_date})"
 
 
@@ -150,7 +153,7 @@ def _leaves(value: Any, key: str = "") -> dict[str, Any]:
     return {key: value}
 
 
-def _shown(leaves: Mapping[str, Any], key: str) -> str:
+def _value_text(leaves: Mapping[str, Any], key: str) -> str:
     if key not in leaves:
         return "absent"
     text = repr(leaves[key])

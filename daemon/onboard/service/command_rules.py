@@ -10,7 +10,7 @@ from typing import Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from daemon.onboard.service.messages import Command
+from daemon.onboard.service.messages import ServiceCommand
 
 Role = Literal["observer", "operator", "administrator"]
 ROLES: Final[tuple[Role, ...]] = ("observer", "operator", "administrator")
@@ -63,7 +63,7 @@ def permits(role: str | None, command: str) -> bool:
     return role in known and known.index(role) >= known.index(needed)
 
 
-def violation(command: Command) -> str | None:
+def violation(command: ServiceCommand) -> str | None:
     """Why a command breaks the rules, in a sentence; None where it does not."""
     if command.name not in COMMAND_ROLES:
         return f"there is no command {command.name}"

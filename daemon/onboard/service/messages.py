@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from daemon.configuration.model import PlanSection, ProcessingSection
-from daemon.mission.exposure import Capture, Exposure, FrameRecord
+from daemon.mission.exposure import CaptureRecord, Exposure, FrameRecord
 from daemon.mission.log.log_records import Message
 from daemon.mission.store.disk_identity import Disk
 from drivers.contract import TriggerPulse
@@ -45,14 +45,14 @@ class Pong:
 
 
 @dataclass(frozen=True)
-class Told:
+class ServiceEvent:
     """Something happened: plain JSON types with a key "event"."""
 
     event: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class Command:
+class ServiceCommand:
     """Somebody wants something of the service; `by` is who, as the token says."""
 
     number: int
@@ -121,7 +121,7 @@ class Fire:
 
 
 @dataclass(frozen=True)
-class Adjust:
+class ApplyExposureSettings:
     """Expose with this from the next pulse on, by head."""
 
     settings: Mapping[str, ExposureSettings]
@@ -147,7 +147,7 @@ class Bound:
 
 
 @dataclass(frozen=True)
-class NotBound:
+class BindFailed:
     """A device did not answer at first; it goes on being looked for."""
 
     kind: str
@@ -171,7 +171,7 @@ class Fired:
 class Store:
     """Make an exposure's frames durable; by head, the slots they lie in."""
 
-    capture: Capture
+    capture: CaptureRecord
     slots: Mapping[str, int]
 
 
@@ -183,7 +183,7 @@ class Seal:
 
 
 @dataclass(frozen=True)
-class Log:
+class AppendToLog:
     """Append a message to the flight log; with `is_durable` it is on the disk at once."""
 
     message: Message
@@ -191,7 +191,7 @@ class Log:
 
 
 @dataclass(frozen=True)
-class NoteProducts:
+class IndexProducts:
     """Note in the index that an exposure has products: file name to size in bytes."""
 
     number: int
@@ -200,7 +200,7 @@ class NoteProducts:
 
 
 @dataclass(frozen=True)
-class WriteNote:
+class WriteSmallFile:
     """Put a small file under a name below the root of every disk in use."""
 
     name: str
@@ -283,12 +283,12 @@ class Sealed:
 class WriteFailed:
     """The disk refused; the exposure is not stored or not sealed.
 
-    `may_pass`: the demand was right and may be made again when the disk has come to itself.
+    `is_transient`: the demand was right and may be made again when the disk has come to itself.
     """
 
     number: int
     sentence: str
-    may_pass: bool = False
+    is_transient: bool = False
 
 
 # To the worker
@@ -309,7 +309,7 @@ class WorkerSettings:
 
 
 @dataclass(frozen=True)
-class Begin:
+class BeginProcessing:
     """Load the kernels, then process for this mission; for none where only that is tried."""
 
     mission: Path | None
@@ -335,7 +335,7 @@ class Process:
 
 
 @dataclass(frozen=True)
-class Settled:
+class RecordFinalized:
     """What became of an exposure that was begun unsealed: its record, or None for none."""
 
     number: int
@@ -372,7 +372,7 @@ class FramesRead:
 
 
 @dataclass(frozen=True)
-class Judged:
+class VerdictReady:
     """The verdict is known, its products are not written yet; `report` as in `Processed`."""
 
     number: int

@@ -13,7 +13,15 @@ from typing import Any, Final
 
 import msgpack
 
-from daemon.onboard.service.messages import Answer, Command, CommandRefused, Ping, Pong, Stop, Told
+from daemon.onboard.service.messages import (
+    Answer,
+    CommandRefused,
+    Ping,
+    Pong,
+    ServiceCommand,
+    ServiceEvent,
+    Stop,
+)
 
 FROM_PAGE_MAX_BYTES: Final = 32_768
 TO_PAGE_MAX_BYTES: Final = 100_000
@@ -42,18 +50,18 @@ def pack_from_page(message: object) -> bytes:
     match message:
         case Pong():
             return _packed("pong", {})
-        case Told(event):
-            return _packed("told", _cut(event))
-        case Command(arguments=arguments):
+        case ServiceEvent(event):
+            return _packed("told", _truncated(event))
+        case ServiceCommand(arguments=arguments):
             fields = {key: getattr(message, key) for key in _FROM_PAGE["command"]}
-            return _packed("command", _cut(fields) | {"arguments": _cut(arguments)})
+            return _packed("command", _truncated(fields) | {"arguments": _truncated(arguments)})
         case CommandRefused():
             fields = {key: getattr(message, key) for key in _FROM_PAGE["refused"]}
-            return _packed("refused", _cut(fields))
+            return _packed("refused", _truncated(fields))
     raise TypeError(f"the page's process has no message {type(message).__name__}")
 
 
-def unpack_from_page(data: bytes) -> Pong | Told | Command | CommandRefused:
+def unpack_from_page(data: bytes) -> Pong | ServiceEvent | ServiceCommand | CommandRefused:
     """A message of the page's process, every field checked.
 
     Raises:
@@ -65,13 +73,13 @@ def unpack_from_page(data: bytes) -> Pong | Told | Command | CommandRefused:
         schema = _PAGE_EVENTS.get(name) if isinstance(name, str) else None
         if schema is None:
             raise InvalidMessageError("an event that the page's process does not have")
-        return Told(_checked(fields, {"event": _text(NAME_MAX), **schema}))
+        return ServiceEvent(_checked(fields, {"event": _text(NAME_MAX), **schema}))
     if kind not in _FROM_PAGE:
         raise InvalidMessageError("a kind of message that the page's process does not have")
     checked = _checked(fields, _FROM_PAGE[kind])
     if kind == "pong":
         return Pong({})
-    return Command(**checked) if kind == "command" else CommandRefused(**checked)
+    return ServiceCommand(**checked) if kind == "command" else CommandRefused(**checked)
 
 
 def pack_to_page(message: object) -> bytes:
@@ -87,8 +95,8 @@ def pack_to_page(message: object) -> bytes:
             data = _packed("stop", {})
         case Answer(number, done, sentence):
             fields = {"number": number, "done": done, "sentence": sentence}
-            data = _packed("answer", _cut(fields))
-        case Told(event):
+            data = _packed("answer", _truncated(fields))
+        case ServiceEvent(event):
             data = _packed("told", {"event": event})
         case _:
             raise TypeError(f"no message for the page's process: {type(message).__name__}")
@@ -97,7 +105,7 @@ def pack_to_page(message: object) -> bytes:
     return data
 
 
-def unpack_to_page(data: bytes) -> Ping | Stop | Answer | Told:
+def unpack_to_page(data: bytes) -> Ping | Stop | Answer | ServiceEvent:
     """A message of the service.
 
     Raises:
@@ -108,7 +116,7 @@ def unpack_to_page(data: bytes) -> Ping | Stop | Answer | Told:
         raise InvalidMessageError("a kind of message that the service does not have")
     checked = _checked(fields, _TO_PAGE[kind])
     if kind == "told":
-        return Told(checked["event"])
+        return ServiceEvent(checked["event"])
     if kind == "answer":
         return Answer(**checked)
     return Ping() if kind == "ping" else Stop()
@@ -117,20 +125,20 @@ def unpack_to_page(data: bytes) -> Ping | Stop | Answer | Told:
 Check = Callable[[object], bool]
 
 
-def _text(most: int) -> Check:
-    return lambda value: type(value) is str and len(value) <= most
+def _text(maximum: int) -> Check:
+    return lambda value: type(value) is str and len(value) <= maximum
 
 
-def _whole(least: int, most: int) -> Check:
-    return lambda value: type(value) is int and least <= value <= most
+def _integer(minimum: int, maximum: int) -> Check:
+    return lambda value: type(value) is int and minimum <= value <= maximum
 
 
 def _flag(value: object) -> bool:
     return type(value) is bool
 
 
-def _is(wanted: object) -> Check:
-    return lambda value: type(value) is type(wanted) and value == wanted
+def _is(expected: object) -> Check:
+    return lambda value: type(value) is type(expected) and value == expected
 
 
 def _one_of(names: frozenset[str]) -> Check:
@@ -149,7 +157,7 @@ def _arguments(value: object) -> bool:
 def _is_plain(value: object) -> bool:
     if type(value) is float:
         return math.isfinite(value)
-    return _flag(value) or _text(NAME_MAX)(value) or _whole(-NUMBER_MAX, NUMBER_MAX)(value)
+    return _flag(value) or _text(NAME_MAX)(value) or _integer(-NUMBER_MAX, NUMBER_MAX)(value)
 
 
 def _event(value: object) -> bool:
@@ -159,7 +167,7 @@ def _event(value: object) -> bool:
 _FROM_PAGE: Mapping[str, Mapping[str, Check]] = {
     "pong": {},
     "command": {
-        "number": _whole(1, NUMBER_MAX),
+        "number": _integer(1, NUMBER_MAX),
         "name": _text(NAME_MAX),
         "arguments": _arguments,
         "by": _text(NAME_MAX),
@@ -172,7 +180,7 @@ _FROM_PAGE: Mapping[str, Mapping[str, Check]] = {
         "role": _text(NAME_MAX),
         "address": _text(NAME_MAX),
         "sentence": _text(TEXT_MAX),
-        "count": _whole(1, NUMBER_MAX),
+        "count": _integer(1, NUMBER_MAX),
     },
 }
 _PAGE_EVENTS: Mapping[str, Mapping[str, Check]] = {
@@ -182,7 +190,7 @@ _PAGE_EVENTS: Mapping[str, Mapping[str, Check]] = {
         "fault": _is(True),
         "sentence": _text(TEXT_MAX),
     },
-    "watching": {"host": _text(NAME_MAX), "port": _whole(0, 65_535), "tls": _flag},
+    "watching": {"host": _text(NAME_MAX), "port": _integer(0, 65_535), "tls": _flag},
     "tls-certificate": {"fault": _flag, "sentence": _text(TEXT_MAX)},
     "signing-state": {"sentence": _text(TEXT_MAX)},
     "page-link": {"fault": _is(True), "sentence": _text(TEXT_MAX)},
@@ -191,7 +199,7 @@ _TO_PAGE: Mapping[str, Mapping[str, Check]] = {
     "ping": {},
     "stop": {},
     "answer": {
-        "number": _whole(1, NUMBER_MAX),
+        "number": _integer(1, NUMBER_MAX),
         "done": _flag,
         "sentence": _text(TEXT_MAX),
     },
@@ -225,16 +233,16 @@ def _as_plain(value: object) -> object:
 
 
 def _unpacked(
-    data: bytes, most: int, *, array_max: int, text_max: int
+    data: bytes, maximum: int, *, array_max: int, text_max: int
 ) -> tuple[str, dict[str, Any]]:
     """Kind and fields; what a message announces is allocated only within the limits."""
-    if len(data) > most:
-        raise InvalidMessageError(f"more than {most} bytes")
+    if len(data) > maximum:
+        raise InvalidMessageError(f"more than {maximum} bytes")
     try:
         found = msgpack.unpackb(
             data,
-            unicode_errors="strict" if most == FROM_PAGE_MAX_BYTES else "surrogatepass",
-            object_pairs_hook=_once,
+            unicode_errors="strict" if maximum == FROM_PAGE_MAX_BYTES else "surrogatepass",
+            object_pairs_hook=_unique_keys,
             max_array_len=array_max,
             max_map_len=max(ARGUMENTS_MAX, array_max),
             max_str_len=text_max,
@@ -253,14 +261,14 @@ def _unpacked(
     return kind, fields
 
 
-def _once(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+def _unique_keys(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) != len(pairs):
         raise InvalidMessageError("a field is given twice")
     return found
 
 
-def _cut(fields: Mapping[str, Any]) -> dict[str, Any]:
+def _truncated(fields: Mapping[str, Any]) -> dict[str, Any]:
     """Texts within their limits, and such that they can be packed; anything else as it is."""
     return {
         key: value.encode("utf-8", "backslashreplace").decode()[

@@ -19,20 +19,20 @@ from multiprocessing.reduction import ForkingPickler
 from typing import Any, ClassVar
 
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
-TELL_MAX_BYTES = 100_000
+TRY_SEND_MAX_BYTES = 100_000
 """A local socket counts as writable while three quarters of its buffer (208 kB) are free."""
 
 _SPAWN = multiprocessing.get_context("spawn")
 
 
-class ServiceGoneError(Exception):
+class ServiceDisconnectedError(Exception):
     """The other end of a child's line is closed: nothing is left to be told."""
 
 
-class Link:
+class ServiceConnection:
     """The child's end of the line to the service; `send` may be called from any thread.
 
-    Both ways raise ServiceGoneError once the service is gone.
+    Both ways raise ServiceDisconnectedError once the service is gone.
     """
 
     def __init__(self, connection: Connection) -> None:
@@ -44,7 +44,7 @@ class Link:
             with self._lock:
                 self._connection.send(message)
         except OSError as error:
-            raise ServiceGoneError(str(error)) from error
+            raise ServiceDisconnectedError(str(error)) from error
 
     def fileno(self) -> int:
         """What an event loop waits on."""
@@ -55,13 +55,13 @@ class Link:
         try:
             return self._connection.recv() if self._connection.poll(timeout_s) else None
         except (EOFError, OSError) as error:
-            raise ServiceGoneError(str(error)) from error
+            raise ServiceDisconnectedError(str(error)) from error
 
 
-class Child:
+class ChildProcess:
     """The service's end: the process, and the connection to it."""
 
-    link: ClassVar[type] = Link
+    link: ClassVar[type] = ServiceConnection
     pause_s = 0.0
     """For so long nothing more is to be received from it; more than 0 after too many messages."""
 
@@ -73,10 +73,10 @@ class Child:
         environment: Mapping[str, str],
     ) -> None:
         self.name = name
-        self.connection, theirs = self._ends()
+        self.connection, child_end = self._ends()
         self.process = _SPAWN.Process(
             target=_child_main,
-            args=(type(self).link, theirs, os.getpid(), target, arguments),
+            args=(type(self).link, child_end, os.getpid(), target, arguments),
             name=f"syntopic-{name}",
             daemon=True,
         )
@@ -92,7 +92,7 @@ class Child:
                     del os.environ[key]
                 else:
                     os.environ[key] = value
-        theirs.close()
+        child_end.close()
 
     def _ends(self) -> tuple[Any, Any]:
         """Both ends of a new connection; a class that is not `Child` may use another kind."""
@@ -111,7 +111,7 @@ class Child:
         """BrokenPipeError where the child is gone; the service notices by its sentinel."""
         self.connection.send(message)
 
-    def tell(self, message: object) -> bool:
+    def try_send(self, message: object) -> bool:
         """Send only if that is certain not to wait; False where it was not sent.
 
         Raises:
@@ -121,8 +121,8 @@ class Child:
         if not writable:
             return False
         data = ForkingPickler.dumps(message)
-        if len(data) > TELL_MAX_BYTES:
-            raise ValueError(f"a message of {len(data)} bytes; {TELL_MAX_BYTES} may be told")
+        if len(data) > TRY_SEND_MAX_BYTES:
+            raise ValueError(f"a message of {len(data)} bytes; {TRY_SEND_MAX_BYTES} may be told")
         self.connection.send_bytes(data)
         return True
 
@@ -162,12 +162,12 @@ def _child_main(
     module, _, function = target.partition(":")
     try:
         getattr(importlib.import_module(module), function)(link(connection), *arguments)
-    except ServiceGoneError:
+    except ServiceDisconnectedError:
         os._exit(1)
 
 
 def _end_without_service(failed: threading.ExceptHookArgs) -> None:
     """A thread that finds the service gone ends the process without a word."""
-    if isinstance(failed.exc_value, ServiceGoneError):
+    if isinstance(failed.exc_value, ServiceDisconnectedError):
         os._exit(1)
     threading.__excepthook__(failed)

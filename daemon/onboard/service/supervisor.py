@@ -11,7 +11,7 @@ from contextlib import suppress
 from typing import Any
 
 from daemon.onboard.service.messages import InvalidMessages, Ping, Stop
-from daemon.onboard.service.processes import Child
+from daemon.onboard.service.processes import ChildProcess
 
 ANSWER_LIMIT_S: Mapping[str, float] = {"capture": 10.0, "writer": 60.0, "worker": 120.0}
 """How long a process may be silent before the watchdog is no longer fed: a writer waits for its
@@ -32,11 +32,13 @@ class Supervisor:
         died: called with the name of a child that ended without being told to.
     """
 
-    def __init__(self, hear: Callable[[object], None], died: Callable[[str], None]) -> None:
-        self._hear = hear
-        self._died = died
-        self._children: dict[str, Child] = {}
-        self._answered: dict[str, float] = {}
+    def __init__(
+        self, on_message: Callable[[object], None], on_death: Callable[[str], None]
+    ) -> None:
+        self._on_message = on_message
+        self._on_death = on_death
+        self._children: dict[str, ChildProcess] = {}
+        self._last_answer_s: dict[str, float] = {}
 
     def spawn(
         self, name: str, target: str, arguments: tuple[Any, ...], environment: Mapping[str, str]
@@ -47,7 +49,7 @@ class Supervisor:
             dead.end(0.0)
         child = _made(name, target, arguments, environment)
         self._children[name] = child
-        self._answered[name] = time.monotonic()
+        self._last_answer_s[name] = time.monotonic()
         asyncio.get_running_loop().add_reader(child.connection.fileno(), self._receive, child)
 
     def send(self, name: str, message: object) -> None:
@@ -63,11 +65,11 @@ class Supervisor:
         except OSError:
             self._receive(child)  # what it said before it ended, and then that it did
 
-    def tell(self, name: str, message: object) -> bool:
+    def try_send(self, name: str, message: object) -> bool:
         """Tell a child something unless that would take time; False where it was dropped."""
         child = self._children.get(name)
         try:
-            return child is not None and child.tell(message)
+            return child is not None and child.try_send(message)
         except OSError:
             return False  # its end is noticed by the loop
 
@@ -82,10 +84,10 @@ class Supervisor:
             self.send(name, Ping())
         now = time.monotonic()
         for name in self._children.keys() & RESTART_LIMIT_S.keys():
-            self.tell(name, Ping())
-            if now - self._answered[name] > RESTART_LIMIT_S[name]:
+            self.try_send(name, Ping())
+            if now - self._last_answer_s[name] > RESTART_LIMIT_S[name]:
                 self._children[name].process.kill()
-        return [name for name in watched if now - self._answered[name] > ANSWER_LIMIT_S[name]]
+        return [name for name in watched if now - self._last_answer_s[name] > ANSWER_LIMIT_S[name]]
 
     async def end(self, names: tuple[str, ...]) -> None:
         """Tell children to stop, in this order, and see them off."""
@@ -99,38 +101,40 @@ class Supervisor:
                 child.send(Stop())
             await asyncio.to_thread(child.end, END_TIMEOUT_S)
 
-    def _receive(self, child: Child) -> None:
+    def _receive(self, child: ChildProcess) -> None:
         """Everything a child has to say right now."""
         try:
             for message in child.receive():
                 if not isinstance(message, InvalidMessages):
-                    self._answered[child.name] = time.monotonic()
-                self._hear(message)
+                    self._last_answer_s[child.name] = time.monotonic()
+                self._on_message(message)
         except (EOFError, ConnectionError):
-            self._lost(child)
+            self._on_disconnect(child)
             return
         if child.pause_s:
             loop = asyncio.get_running_loop()
             loop.remove_reader(child.connection.fileno())
             loop.call_later(child.pause_s, self._go_on, child)
 
-    def _go_on(self, child: Child) -> None:
+    def _go_on(self, child: ChildProcess) -> None:
         """Receive again from a child that had sent too much."""
         if self._children.get(child.name) is child:
             loop = asyncio.get_running_loop()
             loop.add_reader(child.connection.fileno(), self._receive, child)
 
-    def _lost(self, child: Child) -> None:
+    def _on_disconnect(self, child: ChildProcess) -> None:
         asyncio.get_running_loop().remove_reader(child.connection.fileno())
-        self._died(child.name)
+        self._on_death(child.name)
 
 
 def _made(
     name: str, target: str, arguments: tuple[Any, ...], environment: Mapping[str, str]
-) -> Child:
+) -> ChildProcess:
     """The page's process speaks another language than the others: strangers can reach it."""
     if name != PAGE:
-        return Child(name, target, arguments, environment)
-    from daemon.onboard.service.page_link import PageChild  # needs msgpack, of the extra `watch`
+        return ChildProcess(name, target, arguments, environment)
+    from daemon.onboard.service.page_connection import (
+        PageProcess,  # needs msgpack, of the extra `watch`
+    )
 
-    return PageChild(name, target, arguments, environment)
+    return PageProcess(name, target, arguments, environment)

@@ -14,18 +14,17 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from daemon.configuration.model import Configuration
-from daemon.mission.exposure import Capture, Exposure
+from daemon.mission.exposure import CaptureRecord, Exposure
 from daemon.mission.layout import Mission
 from daemon.mission.log.log_records import LoggedRecord
-from daemon.mission.mirror.mirror_start import FoundDisks
+from daemon.mission.mirror.mirror_startup import FoundDisks
 from daemon.mission.store import durable
 from daemon.mission.store.disk_identity import Disk, same_file_system
-from daemon.mission.store.guard import needed_nbytes
+from daemon.mission.store.disk_space import needed_nbytes
 from daemon.mission.store.health import DiskHealth, read_health
 from daemon.mission.verification.recovery import Complete
 from daemon.onboard.preflight.prerequisites import exposure_nbytes
-from daemon.onboard.service.desk import Desk
-from daemon.onboard.service.hearing import Tell
+from daemon.onboard.service.message_dispatcher import MessageDispatcher
 from daemon.onboard.service.messages import (
     AcceptDisk,
     DiskChanged,
@@ -33,18 +32,19 @@ from daemon.onboard.service.messages import (
     DropDisk,
     EndMission,
     ReleaseDisk,
-    WriteNote,
+    WriteSmallFile,
 )
+from daemon.onboard.service.record_ingest import EmitEvent
 from daemon.onboard.storage.storage import MirrorPlan
 from processing.quality.report import Flag
 from processing.rig import Rig
 
 HEALTH_EVERY_S = 10.0
-ROOM_EXPOSURES = 10
+SPARE_EXPOSURES = 10
 """A disk that returns has room for so many more."""
 
 
-class Mirror(Desk):
+class Mirror(MessageDispatcher):
     """Follows the disks of a mission.
 
     Args:
@@ -64,23 +64,23 @@ class Mirror(Desk):
         configuration: Configuration,
         rig: Rig,
         send: Callable[[str, object], None],
-        tell: Tell,
-        moved: Callable[[Mission], None],
+        emit: EmitEvent,
+        on_leading_changed: Callable[[Mission], None],
     ) -> None:
         self._found = found
         self._disks = () if found is None else found.disks
         self._limits = configuration.limits
         self._needed_nbytes = needed_nbytes(exposure_nbytes(configuration, rig))
         self._send = send
-        self._tell = tell
-        self._moved = moved
+        self._emit = emit
+        self._on_leading_changed = on_leading_changed
         self._mission = mission
         self._in_use: tuple[Disk, ...] = self._disks[:1]
         self._status: Sequence[Mapping[str, Any]] = ()
         self._full: set[str] = set()
         self._has_landed = False
         self._health: dict[str, DiskHealth] = {}
-        self._look_after_s = 0.0
+        self._next_health_check_s = 0.0
 
     @property
     def is_on(self) -> bool:
@@ -92,43 +92,43 @@ class Mirror(Desk):
         """What the writer needs to know; None where the mission has one disk."""
         if not self._disks:
             return None
-        room_nbytes = self._limits.disk_reserve_bytes + ROOM_EXPOSURES * self._needed_nbytes
-        return MirrorPlan(self._disks, self._limits.mirror_timeout_s, room_nbytes)
+        required_nbytes = self._limits.disk_reserve_bytes + SPARE_EXPOSURES * self._needed_nbytes
+        return MirrorPlan(self._disks, self._limits.mirror_timeout_s, required_nbytes)
 
     @property
     def status(self) -> Sequence[Mapping[str, Any]]:
         """The disks as the page shows them, plain JSON types; none where there is one disk."""
         # A disk that was dropped is not asked: it may hang.
         left = {disk.label: self._left(_free_nbytes(disk.root)) for disk in self._in_use}
-        shown = self._status
+        listed = self._status
         if not self._disks and "root" in self._health:
-            shown = [{"disk": "root", "path": str(self._mission.root), "state": "in use"}]
+            listed = [{"disk": "root", "path": str(self._mission.root), "state": "in use"}]
         return [
             {
                 **one,
                 **({"exposures_left": left[one["disk"]]} if one["disk"] in left else {}),
                 **_health_json(self._health.get(one["disk"])),
             }
-            for one in shown
+            for one in listed
         ]
 
     def free_bytes(self, path: Path) -> int:
-        """What may still be put on every disk in use, for `daemon.mission.store.guard`."""
+        """What may still be put on every disk in use, for `daemon.mission.store.disk_space`."""
         if not self._disks:
             return durable.free_bytes(path)
         free = [_free_nbytes(disk.root) for disk in self._in_use]
         return min((nbytes for nbytes in free if nbytes is not None), default=0)
 
-    def look(self) -> None:
+    def check(self) -> None:
         """See whether a disk is full, and how the disks are."""
-        self._look_at_health()
+        self._check_health()
         self._drop_full()
 
-    def _look_at_health(self) -> None:
+    def _check_health(self) -> None:
         """Say of each disk in use when it is no longer well, or well again."""
-        if time.monotonic() < self._look_after_s:
+        if time.monotonic() < self._next_health_check_s:
             return
-        self._look_after_s = time.monotonic() + HEALTH_EVERY_S
+        self._next_health_check_s = time.monotonic() + HEALTH_EVERY_S
         roots = {disk.label: disk.root for disk in self._in_use} or {"root": self._mission.root}
         for label, root in roots.items():
             try:
@@ -140,12 +140,12 @@ class Mirror(Desk):
                 self._health[label] = found
             problems = () if found is None else found.problems
             if problems and problems != before.problems:
-                told = "; ".join(problems)
-                sentence = f"disk {label} ({root}): {told}"
-                self._tell("disk-health", fault=True, disk=label, sentence=sentence)
+                problem_text = "; ".join(problems)
+                sentence = f"disk {label} ({root}): {problem_text}"
+                self._emit("disk-health", fault=True, disk=label, sentence=sentence)
             elif before.problems and not problems:
                 sentence = f"disk {label} ({root}) is well again"
-                self._tell("disk-health", fault=False, disk=label, sentence=sentence)
+                self._emit("disk-health", fault=False, disk=label, sentence=sentence)
 
     def _drop_full(self) -> None:
         """Drop a disk that has no room for the next exposure where another has."""
@@ -161,7 +161,7 @@ class Mirror(Desk):
         """What was brought together before recovery, in sentences."""
         return () if self._found is None else self._found.done
 
-    def tell_findings(self) -> None:
+    def emit_disk_problems(self) -> None:
         """Say which disks cannot be used, or protect nothing."""
         findings = [] if self._found is None else list(self._found.findings)
         for disk in self._disks[1:]:
@@ -171,7 +171,7 @@ class Mirror(Desk):
                     "takes both; mount another disk there"
                 )
         for finding in findings:
-            self._tell("mirror", fault=True, sentence=finding)
+            self._emit("mirror", fault=True, sentence=finding)
 
     def naming_disks(self, complete: Complete) -> Complete:
         """What recovery seals says which disks hold the frames."""
@@ -179,29 +179,29 @@ class Mirror(Desk):
         if found is None:
             return complete
 
-        def named(capture: Capture, records: Sequence[LoggedRecord]) -> Exposure:
+        def named(capture: CaptureRecord, records: Sequence[LoggedRecord]) -> Exposure:
             exposure = complete(capture, records)
             disks = found.holding(capture.number) if exposure.frames else ()
-            lone = Flag.NOT_MIRRORED if len(disks) == 1 else Flag(0)
-            return replace(exposure, disks=disks, flags=exposure.flags | int(lone))
+            flag = Flag.NOT_MIRRORED if len(disks) == 1 else Flag(0)
+            return replace(exposure, disks=disks, flags=exposure.flags | int(flag))
 
         return named
 
-    async def keep(self, name: str, data: bytes) -> None:
-        """As `keep_now`, and nobody waits for the disk."""
+    async def save(self, name: str, data: bytes) -> None:
+        """As `save_now`, and nobody waits for the disk."""
         if self._is_with_writer:
-            self.keep_now(name, data)
+            self.save_now(name, data)
         else:
-            await asyncio.to_thread(self.keep_now, name, data)
+            await asyncio.to_thread(self.save_now, name, data)
 
-    def keep_now(self, name: str, data: bytes) -> None:
+    def save_now(self, name: str, data: bytes) -> None:
         """Keep a small file below the root of every disk in use.
 
         Raises:
             OSError: the only disk refused.
         """
         if self._is_with_writer:
-            self._send("writer", WriteNote(name, data))
+            self._send("writer", WriteSmallFile(name, data))
             return
         for root in [disk.root for disk in self._in_use] or [self._mission.root]:
             durable.replace_file(root / name, data)
@@ -250,7 +250,7 @@ class Mirror(Desk):
 
     def _on_changed(self, changed: DiskChanged) -> None:
         self._in_use = changed.in_use
-        self._tell(
+        self._emit(
             changed.name,
             fault=changed.name == "disk-dropped",
             disk=changed.disk.label,
@@ -262,7 +262,7 @@ class Mirror(Desk):
         leading = Mission(changed.in_use[0].root / self._mission.id, self._mission.id)
         if leading != self._mission:
             self._mission = leading
-            self._moved(leading)
+            self._on_leading_changed(leading)
 
     def _on_status(self, status: DiskStatus) -> None:
         self._status = status.disks

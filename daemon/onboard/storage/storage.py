@@ -14,12 +14,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.mission.exposure import Capture, Exposure, FrameRecord
+from daemon.mission.exposure import CaptureRecord, Exposure, FrameRecord
 from daemon.mission.layout import Mission
 from daemon.mission.log.flight_log import FlightLog
 from daemon.mission.log.log_seals import close_run, seal_logs
+from daemon.mission.mirror.disk_rejoin import RejoinSettings
 from daemon.mission.mirror.mirrored import DiskEvent, MirroredStorage
-from daemon.mission.mirror.returning import ReturnSettings
 from daemon.mission.store.disk_identity import Disk
 from daemon.mission.store.store import Level0Writer
 
@@ -28,14 +28,14 @@ from daemon.mission.store.store import Level0Writer
 class MirrorPlan:
     """The disks of a mirrored mission, the leading one first.
 
-    `stall_s` is how long a disk may make no progress before it is dropped, `room_nbytes` what a
+    `stall_s` is how long a disk may make no progress before it is dropped, `required_nbytes` what a
     disk needs free to be taken into use.
     """
 
     disks: tuple[Disk, ...]
     stall_s: float
-    room_nbytes: int = 0
-    look_s: float = 5.0
+    required_nbytes: int = 0
+    poll_s: float = 5.0
 
 
 class Storage(Protocol):
@@ -46,7 +46,7 @@ class Storage(Protocol):
     @property
     def unindexed(self) -> int: ...
     def write(
-        self, capture: Capture, pixels: Mapping[str, NDArray[np.uint16]]
+        self, capture: CaptureRecord, pixels: Mapping[str, NDArray[np.uint16]]
     ) -> tuple[tuple[FrameRecord, ...], tuple[str, ...]]: ...
     def seal(self, exposure: Exposure) -> str: ...
     def note_products(self, number: int, files: Mapping[str, int], verdict: str | None) -> None: ...
@@ -71,7 +71,7 @@ class OneDisk:
         return self._writer.unindexed
 
     def write(
-        self, capture: Capture, pixels: Mapping[str, NDArray[np.uint16]]
+        self, capture: CaptureRecord, pixels: Mapping[str, NDArray[np.uint16]]
     ) -> tuple[tuple[FrameRecord, ...], tuple[str, ...]]:
         return self._writer.write(capture, pixels), ()
 
@@ -107,7 +107,7 @@ def mirrored(
         mission.id,
         plan.disks,
         stall_s=plan.stall_s,
-        returns=ReturnSettings(look_s=plan.look_s, room_nbytes=plan.room_nbytes),
+        rejoin=RejoinSettings(poll_s=plan.poll_s, required_nbytes=plan.required_nbytes),
         emit=emit,
         simulated=mission.is_simulated,
     )

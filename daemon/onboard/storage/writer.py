@@ -15,31 +15,31 @@ from daemon.errors import DaemonError
 from daemon.mission.exposure import Exposure
 from daemon.mission.layout import Mission
 from daemon.mission.mirror.mirrored import DiskEvent, MirroredStorage
-from daemon.onboard.capture.memory import FrameRing
+from daemon.onboard.capture.frame_ring import FrameRing
 from daemon.onboard.service.messages import (
     AcceptDisk,
+    AppendToLog,
     DiskChanged,
     DiskStatus,
     DropDisk,
     EndMission,
-    Log,
-    NoteProducts,
+    IndexProducts,
     Ping,
     Pong,
     ReleaseDisk,
     Seal,
     Sealed,
+    ServiceEvent,
     Stop,
     Store,
     Stored,
-    Told,
     WriteFailed,
-    WriteNote,
+    WriteSmallFile,
 )
-from daemon.onboard.service.processes import Link
+from daemon.onboard.service.processes import ServiceConnection
 from daemon.onboard.storage.storage import MirrorPlan, OneDisk, Storage, mirrored
 
-LOOKS_PER_STALL = 8
+CHECKS_PER_STALL = 8
 """How often a disk is looked at within the time after which it is dropped."""
 
 LOG_SYNC_INTERVAL_S = 1.0
@@ -48,7 +48,7 @@ current frame, which may take as long as the disk does)."""
 
 
 def main(
-    link: Link,
+    link: ServiceConnection,
     mission_path: Path,
     rings: tuple[FrameRing, ...],
     mirror: MirrorPlan | None = None,
@@ -57,76 +57,78 @@ def main(
     mission = Mission.open(mission_path)
     memory = {ring.head: ring for ring in rings}
     if mirror is None:
-        _Writing(link, OneDisk(mission), memory).run(LOG_SYNC_INTERVAL_S)
+        _Writer(link, OneDisk(mission), memory).run(LOG_SYNC_INTERVAL_S)
         return
     storage = mirrored(mission, mirror, lambda event: link.send(_changed(event)))
-    _MirroredWriting(link, storage, memory).run(mirror.stall_s / LOOKS_PER_STALL)
+    _MirroredWriter(link, storage, memory).run(mirror.stall_s / CHECKS_PER_STALL)
     if storage.is_hanging:
         os._exit(0)  # the interpreter would wait for a thread that hangs in the kernel
 
 
-class _Writing:
+class _Writer:
     """Does what the service orders, one order after another."""
 
-    def __init__(self, link: Link, storage: Storage, memory: Mapping[str, FrameRing]) -> None:
+    def __init__(
+        self, link: ServiceConnection, storage: Storage, memory: Mapping[str, FrameRing]
+    ) -> None:
         self.link = link
         self.storage = storage
         self._memory = memory
-        self._refused = 0
+        self._backlog = 0
 
     def run(self, wait_s: float) -> None:
         """Work until told to stop, waiting so long for an order at a time."""
         synced = time.monotonic()
-        while not isinstance(order := self.link.receive(wait_s), Stop):
-            self.obey(order)
+        while not isinstance(request := self.link.receive(wait_s), Stop):
+            self.handle(request)
             self.storage.tick()
-            if (behind := self.storage.unindexed) != self._refused:
-                self._refused = behind
-                self.link.send(_told_of_index(behind))
+            if (backlog := self.storage.unindexed) != self._backlog:
+                self._backlog = backlog
+                self.link.send(_index_event(backlog))
             if time.monotonic() - synced >= LOG_SYNC_INTERVAL_S:
                 self.storage.log.sync()
                 synced = time.monotonic()
         self.storage.close()
 
-    def obey(self, order: object) -> None:
+    def handle(self, request: object) -> None:
         """Do what one order says, and answer it."""
-        if isinstance(order, Store):
-            self.link.send(_store(self.storage, self._memory, order))
-        elif isinstance(order, Seal):
-            self.link.send(_seal(self.storage, order.exposure))
-        elif isinstance(order, NoteProducts):
+        if isinstance(request, Store):
+            self.link.send(_store(self.storage, self._memory, request))
+        elif isinstance(request, Seal):
+            self.link.send(_seal(self.storage, request.exposure))
+        elif isinstance(request, IndexProducts):
             # A refusal costs nothing: recovery finds the products when the service starts next.
             with suppress(OSError, DaemonError):
-                self.storage.note_products(order.number, order.files, order.verdict)
-        elif isinstance(order, Log):
-            self.storage.log.write(order.message)
-            if order.is_durable:
+                self.storage.note_products(request.number, request.files, request.verdict)
+        elif isinstance(request, AppendToLog):
+            self.storage.log.write(request.message)
+            if request.is_durable:
                 self.storage.log.sync()
-        elif isinstance(order, Ping):
+        elif isinstance(request, Ping):
             self.link.send(Pong({}))
 
 
-class _MirroredWriting(_Writing):
+class _MirroredWriter(_Writer):
     """The same on two disks, and what concerns the disks themselves."""
 
     storage: MirroredStorage
 
-    def obey(self, order: object) -> None:
-        if isinstance(order, WriteNote):
-            self.storage.write_note(order.name, order.data)
-        elif isinstance(order, EndMission):
+    def handle(self, request: object) -> None:
+        if isinstance(request, WriteSmallFile):
+            self.storage.write_note(request.name, request.data)
+        elif isinstance(request, EndMission):
             self.storage.end_mission()
-        elif isinstance(order, DropDisk):
-            self.storage.drop(order.disk, order.why)
-        elif isinstance(order, ReleaseDisk):
+        elif isinstance(request, DropDisk):
+            self.storage.drop(request.disk, request.why)
+        elif isinstance(request, ReleaseDisk):
             with suppress(DaemonError):  # it was dropped meanwhile
-                self.storage.release(order.disk, "as commanded")
-        elif isinstance(order, AcceptDisk):
+                self.storage.release(request.disk, "as commanded")
+        elif isinstance(request, AcceptDisk):
             with suppress(DaemonError):  # it has joined meanwhile
-                self.storage.accept(order.disk)
+                self.storage.accept(request.disk)
         else:
-            super().obey(order)
-            if isinstance(order, Ping):
+            super().handle(request)
+            if isinstance(request, Ping):
                 self.link.send(DiskStatus(self.storage.status))
 
 
@@ -134,30 +136,34 @@ def _changed(event: DiskEvent) -> DiskChanged:
     return DiskChanged(event.name, event.disk, event.sentence, event.in_use, event.dropped_count)
 
 
-def _told_of_index(behind: int) -> Told:
+def _index_event(backlog: int) -> ServiceEvent:
     sentence = (
-        f"index or chain.jsonl refused {behind} changes; what they tell of is safe, and they are "
+        f"index or chain.jsonl refused {backlog} changes; what they tell of is safe, and they are "
         "tried again; look at the disk"
-        if behind
+        if backlog
         else "index and chain.jsonl have taken what they had refused"
     )
-    return Told({"event": "index", "fault": behind > 0, "behind": behind, "sentence": sentence})
+    return ServiceEvent(
+        {"event": "index", "fault": backlog > 0, "behind": backlog, "sentence": sentence}
+    )
 
 
-def _store(storage: Storage, memory: Mapping[str, FrameRing], order: Store) -> Stored | WriteFailed:
+def _store(
+    storage: Storage, memory: Mapping[str, FrameRing], request: Store
+) -> Stored | WriteFailed:
     started = time.monotonic()
     pixels = {
         frame.sensor: memory[frame.sensor].frame(
-            order.slots[frame.sensor], frame.height_px, frame.width_px
+            request.slots[frame.sensor], frame.height_px, frame.width_px
         )
-        for frame in order.capture.frames
+        for frame in request.capture.frames
     }
     try:
-        frames, disks = storage.write(order.capture, pixels)
+        frames, disks = storage.write(request.capture, pixels)
     except (OSError, DaemonError) as error:
-        sentence = f"exposure {order.capture.number} is not stored: {error}; look at the disk"
-        return WriteFailed(order.capture.number, sentence)
-    return Stored(order.capture.number, frames, time.monotonic() - started, disks)
+        sentence = f"exposure {request.capture.number} is not stored: {error}; look at the disk"
+        return WriteFailed(request.capture.number, sentence)
+    return Stored(request.capture.number, frames, time.monotonic() - started, disks)
 
 
 def _seal(storage: Storage, exposure: Exposure) -> Sealed | WriteFailed:
@@ -165,4 +171,4 @@ def _seal(storage: Storage, exposure: Exposure) -> Sealed | WriteFailed:
         return Sealed(exposure.number, storage.seal(exposure))
     except (OSError, DaemonError) as error:
         sentence = f"exposure {exposure.number} is not sealed: {error}; look at the disk"
-        return WriteFailed(exposure.number, sentence, may_pass=isinstance(error, OSError))
+        return WriteFailed(exposure.number, sentence, is_transient=isinstance(error, OSError))

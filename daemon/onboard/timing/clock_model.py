@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-MEMORY: Final = 40
+PAIRS_MAX: Final = 40
 """Pairs kept: the newest all, older ones ever thinner."""
-MEMORY_NS: Final = 1_800_000_000_000
+HISTORY_NS: Final = 1_800_000_000_000
 RATE_SIGMA: Final = 20_000.0
 """Standard deviation of a crystal's rate before anything is known of it, ns per s (20 ppm)."""
 RATE_LIMIT: Final = 500_000.0
@@ -37,8 +37,8 @@ SCALES: Final[Array] = np.logspace(math.log10(0.35), math.log10(8.0), 7)
 GRID_WANDER: Final[Array] = np.repeat(WANDER, len(SCALES))
 GRID_SCALE: Final[Array] = np.tile(SCALES, len(WANDER))
 NEGLIGIBLE: Final = 1e-3
-WANDER_USUAL: Final = 0.7
-WANDER_DECADES: Final = 1.5
+WANDER_PRIOR_MEAN: Final = 0.7
+WANDER_PRIOR_SIGMA: Final = 1.5
 """Crystals in a case that warms and cools wander by about 2 ppb after a second (log10 of its square
 here), one in three by six times more or less."""
 SCALE_SPREAD: Final = math.log(2.0)
@@ -49,16 +49,16 @@ GATE_SHARE: Final = 4
 """The fit that new pairs are held against is made anew after so large a share of new ones."""
 STEP_PAIRS: Final = 3
 """So many pairs held back that agree with each other are no outliers: the clock has stepped."""
-ROUNDS: Final = 3
-RECENT: Final = 24
-SCATTER_FROM: Final = 8
+ITERATIONS_MAX: Final = 3
+RECENT_PAIRS: Final = 24
+SCATTER_PAIRS_MIN: Final = 8
 SCATTER_LARGE: Final = 4.0
 """Where neighbours scatter by so many times their stated sigmas, these are multiplied: the grid of
 scales ends at eight, and pairs would be held back as outliers of each other for ever."""
 WANDER_ALLOWED: Final = 200.0
 """What the rate may have wandered between neighbours, ns per s^1.5."""
 GRID_PRIOR: Final[Array] = (
-    -0.5 * ((np.log10(GRID_WANDER) - WANDER_USUAL) / WANDER_DECADES) ** 2
+    -0.5 * ((np.log10(GRID_WANDER) - WANDER_PRIOR_MEAN) / WANDER_PRIOR_SIGMA) ** 2
     - 0.5 * (np.log(GRID_SCALE) / SCALE_SPREAD) ** 2
 )
 
@@ -80,22 +80,22 @@ class Pair:
 class Estimate:
     """An instant on the other clock.
 
-    `away_ns` is how far the nearest pair lies: beyond the last one the clock coasts.
+    `gap_ns` is how far the nearest pair lies: beyond the last one the clock coasts.
     """
 
     to_ns: int
     sigma_ns: float
-    away_ns: int
+    gap_ns: int
 
 
 class ClockModel:
     """An oscillator against a reference, over the last half hour at most."""
 
-    def __init__(self, *, memory: int = MEMORY) -> None:
+    def __init__(self, *, memory: int = PAIRS_MAX) -> None:
         self._memory = memory
         self._pairs: list[Pair] = []
-        self._held: list[Pair] = []
-        self._recent: deque[Pair] = deque(maxlen=RECENT)
+        self._rejected: list[Pair] = []
+        self._recent: deque[Pair] = deque(maxlen=RECENT_PAIRS)
         self._factor = 1.0
         self._fit: _Fit | None = None
         self._gate: _Fit | None = None
@@ -119,35 +119,37 @@ class ClockModel:
         is dropped, and they are the new beginning.
         """
         self._recent.append(pair)
-        self._look_at_scatter()
+        self._check_scatter()
         if pair in self._pairs:
             return True
         if len(self._pairs) >= 2 and not self._fits(pair):
-            self._held.append(pair)
+            self._rejected.append(pair)
             self.outliers += 1
-            if len(self._held) >= STEP_PAIRS and _agree(self._held[-STEP_PAIRS:], self._factor):
+            if len(self._rejected) >= STEP_PAIRS and _are_consistent(
+                self._rejected[-STEP_PAIRS:], self._factor
+            ):
                 self._step()
                 return True
-            del self._held[:-STEP_PAIRS]
+            del self._rejected[:-STEP_PAIRS]
             return False
-        self._held.clear()
+        self._rejected.clear()
         self._insert(pair)
         self._since_gate += 1
         return True
 
-    def take_back(self, key: Hashable) -> None:
+    def withdraw(self, key: Hashable) -> None:
         """Forget the pair of that key, if it is still there."""
-        kept = [pair for pair in self._pairs if pair.key != key]
-        if len(kept) < len(self._pairs):
-            self._pairs = kept
+        retained = [pair for pair in self._pairs if pair.key != key]
+        if len(retained) < len(self._pairs):
+            self._pairs = retained
             self._fit = self._gate = None
-        self._held = [pair for pair in self._held if pair.key != key]
-        self._recent = deque((pair for pair in self._recent if pair.key != key), RECENT)
+        self._rejected = [pair for pair in self._rejected if pair.key != key]
+        self._recent = deque((pair for pair in self._recent if pair.key != key), RECENT_PAIRS)
 
     def clear(self) -> None:
         """Forget everything."""
         self._pairs.clear()
-        self._held.clear()
+        self._rejected.clear()
         self._recent.clear()
         self._factor = 1.0
         self._fit = self._gate = None
@@ -163,11 +165,11 @@ class ClockModel:
             return None
         fit = self._fitted()
         to_ns, sigma_ns = fit.at(from_ns, self._factor * reading_sigma_ns)
-        if self._held and from_ns >= self._held[0].from_ns:
-            last = self._held[-1]
+        if self._rejected and from_ns >= self._rejected[0].from_ns:
+            last = self._rejected[-1]
             sigma_ns = math.hypot(sigma_ns, last.to_ns - fit.at(last.from_ns, 0.0)[0])
-        away_ns = min(abs(pair.from_ns - from_ns) for pair in self._pairs)
-        return Estimate(to_ns, sigma_ns, away_ns)
+        gap_ns = min(abs(pair.from_ns - from_ns) for pair in self._pairs)
+        return Estimate(to_ns, sigma_ns, gap_ns)
 
     def reading_scale(self) -> float:
         """By which factor sigmas of readings were found too small."""
@@ -180,7 +182,7 @@ class ClockModel:
             self._fit = _Fit(self._pairs, self._factor)
         return self._fit
 
-    def _look_at_scatter(self) -> None:
+    def _check_scatter(self) -> None:
         """Whether sigmas are stated far too small; then all recent pairs are used, with larger."""
         factor = _scatter_of(sorted(self._recent, key=lambda pair: pair.from_ns))
         factor = factor if factor > SCATTER_LARGE else 1.0
@@ -189,7 +191,7 @@ class ClockModel:
         self._factor = factor
         self._fit = self._gate = None
         if factor > 1.0:
-            self._held.clear()
+            self._rejected.clear()
             for pair in self._recent:
                 if pair not in self._pairs:
                     self._insert(pair)
@@ -204,13 +206,13 @@ class ClockModel:
         return abs(pair.to_ns - to_ns) <= OUTLIER * 1.5 * max(sigma_ns, stated_ns)
 
     def _step(self) -> None:
-        expected = self.at(self._held[-1].from_ns)
+        expected = self.at(self._rejected[-1].from_ns)
         assert expected is not None
         self.steps += 1
-        self.last_step_ns = self._held[-1].to_ns - expected.to_ns
-        self._pairs = sorted(self._held[-STEP_PAIRS:], key=lambda pair: pair.from_ns)
-        self._held.clear()
-        self._recent = deque(self._pairs, RECENT)
+        self.last_step_ns = self._rejected[-1].to_ns - expected.to_ns
+        self._pairs = sorted(self._rejected[-STEP_PAIRS:], key=lambda pair: pair.from_ns)
+        self._rejected.clear()
+        self._recent = deque(self._pairs, RECENT_PAIRS)
         self._fit = self._gate = None
 
     def _insert(self, pair: Pair) -> None:
@@ -220,22 +222,22 @@ class ClockModel:
             position -= 1
         pairs.insert(position, pair)
         newest_ns = pairs[-1].from_ns
-        while newest_ns - pairs[0].from_ns > MEMORY_NS:
+        while newest_ns - pairs[0].from_ns > HISTORY_NS:
             del pairs[0]
         if len(pairs) > self._memory:
-            del pairs[_most_dispensable(pairs)]
+            del pairs[_least_informative(pairs)]
         self._fit = None
 
 
-def _most_dispensable(pairs: list[Pair]) -> int:
+def _least_informative(pairs: list[Pair]) -> int:
     """The inner pair whose gap, were it gone, would be smallest for its age."""
     newest_ns = pairs[-1].from_ns
-    best, least = 1, math.inf
+    best, minimum = 1, math.inf
     for index in range(1, len(pairs) - 1):
         gap = pairs[index + 1].from_ns - pairs[index - 1].from_ns
         ratio = gap / (newest_ns - pairs[index].from_ns + 1)
-        if ratio < least:
-            best, least = index, ratio
+        if ratio < minimum:
+            best, minimum = index, ratio
     return best
 
 
@@ -260,15 +262,15 @@ def _scatter_of(pairs: list[Pair]) -> float:
         )
         ratios.append(abs(off - share * end) / sigma)
     # The median of a normal variable's size is 0.6745 sigma.
-    return statistics.median(ratios) / 0.6745 if len(ratios) >= SCATTER_FROM else 1.0
+    return statistics.median(ratios) / 0.6745 if len(ratios) >= SCATTER_PAIRS_MIN else 1.0
 
 
-def _agree(pairs: list[Pair], factor: float) -> bool:
+def _are_consistent(pairs: list[Pair], factor: float) -> bool:
     """Whether pairs lie on one line of a rate a clock can have."""
     for before, after in pairwise(sorted(pairs, key=lambda pair: pair.from_ns)):
-        apart_s = (after.from_ns - before.from_ns) * 1e-9
+        span_s = (after.from_ns - before.from_ns) * 1e-9
         moved = (after.to_ns - before.to_ns) - (after.from_ns - before.from_ns)
-        tolerance = 8.0 * factor * (before.sigma_ns + after.sigma_ns) + RATE_SIGMA * 5 * apart_s
+        tolerance = 8.0 * factor * (before.sigma_ns + after.sigma_ns) + RATE_SIGMA * 5 * span_s
         if abs(moved) > min(tolerance, 1e8):
             return False
     return True
@@ -295,7 +297,7 @@ class _Fit:
         self._sigma = stated
         self._start = float(self._u[0])
         self._solve()
-        for _ in range(ROUNDS):
+        for _ in range(ITERATIONS_MAX):
             sigma = stated * self._growth()
             if bool(np.all(np.abs(sigma - self._sigma) <= 0.05 * self._sigma)):
                 break
@@ -320,7 +322,7 @@ class _Fit:
         normal = (inverse @ products)[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
         normal[:, 1, 1] += RATE_SIGMA**-2
         right = inverse @ (h * z[:, None])
-        cofactor, determinant = _inverse_of_twos(normal)
+        cofactor, determinant = _inverse_2x2(normal)
         line = np.einsum("gij,gj->gi", cofactor, right)
         residual = z - line @ h.T
         square = (inverse * residual) @ z
@@ -328,11 +330,11 @@ class _Fit:
         log_weight = log_likelihood + GRID_PRIOR
         weight = np.exp(log_weight - log_weight.max())
         # What explains the pairs a thousand times worse than the best is left out.
-        kept = weight > NEGLIGIBLE
-        self._weight = weight[kept] / weight[kept].sum()
-        self._wander, self._scale = GRID_WANDER[kept], GRID_SCALE[kept]
-        self._inverse, self._cofactor = inverse[kept], cofactor[kept]
-        self._line, self._residual, self._h = line[kept], residual[kept], h
+        retained = weight > NEGLIGIBLE
+        self._weight = weight[retained] / weight[retained].sum()
+        self._wander, self._scale = GRID_WANDER[retained], GRID_SCALE[retained]
+        self._inverse, self._cofactor = inverse[retained], cofactor[retained]
+        self._line, self._residual, self._h = line[retained], residual[retained], h
         self._weighted_residual = self._inverse * self._residual
 
     def _growth(self) -> Array:
@@ -342,12 +344,12 @@ class _Fit:
         best = int(np.argmax(self._weight))
         inverse, scale = self._inverse[best], self._scale[best]
         # What each pair is off from what the others say of it, and the variance of that.
-        whole = self._vectors @ (inverse * self._residual[best])
+        weighted_residual = self._vectors @ (inverse * self._residual[best])
         hat = self._vectors @ (inverse[:, None] * self._h)
         precision = np.einsum("ij,j,ij->i", self._vectors, inverse, self._vectors)
         precision -= np.einsum("ni,ij,nj->n", hat, self._cofactor[best], hat)
         precision = np.maximum(precision, 1e-12)
-        off = np.abs(whole) / precision * self._sigma
+        off = np.abs(weighted_residual) / precision * self._sigma
         variance = self._sigma**2 * (1.0 / precision - scale**2)
         variance = np.maximum(variance, 0.0) + (scale * self._stated) ** 2
         growth: Array = np.clip(off / (OUTLIER * 0.75 * np.sqrt(variance)), 1.0, 1e6)
@@ -358,15 +360,15 @@ class _Fit:
         # The kernel counts from the oldest pair; before it, everything is mirrored (the line is
         # free, so that the origin does not matter).
         at = np.array([u - self._start])
-        across = _wander_covariance(at, self._u - self._start)[0] / self._sigma
-        itself = float(_wander_covariance(at, at)[0, 0])
-        k = self._vectors.T @ across
+        cross_covariance = _wander_covariance(at, self._u - self._start)[0] / self._sigma
+        own_covariance = float(_wander_covariance(at, at)[0, 0])
+        k = self._vectors.T @ cross_covariance
         covariance = self._wander[:, None] * k
         weighted = covariance * self._inverse
         g = np.array([1.0, u]) - weighted @ self._h
         mean = self._line @ np.array([1.0, u]) + (covariance * self._weighted_residual).sum(axis=1)
         variance = (
-            self._wander * itself
+            self._wander * own_covariance
             - (weighted * covariance).sum(axis=1)
             + np.einsum("gi,gij,gj->g", g, self._cofactor, g)
         )
@@ -380,7 +382,7 @@ class _Fit:
         return float(math.sqrt(self._weight @ self._scale**2))
 
 
-def _inverse_of_twos(matrices: Array) -> tuple[Array, Array]:
+def _inverse_2x2(matrices: Array) -> tuple[Array, Array]:
     """Inverse and determinant of symmetric 2 x 2 matrices, shape (..., 2, 2)."""
     a, b, d = matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 1]
     determinant: Array = a * d - b * b

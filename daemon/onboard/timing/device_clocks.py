@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from daemon.onboard.timing.clock import RoundTrips
 from daemon.onboard.timing.clock_model import ClockModel, Pair
+from daemon.onboard.timing.gps_clock import RoundTrips
 from drivers.contract import ClockReading
 
 GROUP: Final = 4
@@ -29,7 +29,7 @@ class HostInstant:
     sigma_ns: int
 
 
-class DeviceClock:
+class DeviceClockEstimator:
     """One device's clock. Readings in, instants out; nothing here looks at a clock."""
 
     def __init__(self) -> None:
@@ -52,9 +52,9 @@ class DeviceClock:
             if reading.device_ns == newest_ns or reading.mono_ns <= self._newest_mono_ns:
                 return
             if reading.device_ns < newest_ns - BACKWARDS_NS:
-                self._begin_anew()
+                self._restart()
         self._newest_ns, self._newest_mono_ns = reading.device_ns, reading.mono_ns
-        self._round_trips.seen(reading.half_width_ns)
+        self._round_trips.add(reading.half_width_ns)
         self._group.append(reading)
         if len(self._group) < GROUP and len(self._model) >= GROUP:
             return
@@ -71,10 +71,10 @@ class DeviceClock:
         estimate = self._model.at(device_ns)
         if estimate is None:
             return None
-        hidden_ns = self._round_trips.hidden_ns
-        return HostInstant(estimate.to_ns, round((estimate.sigma_ns**2 + hidden_ns**2) ** 0.5))
+        systematic_ns = self._round_trips.systematic_ns
+        return HostInstant(estimate.to_ns, round((estimate.sigma_ns**2 + systematic_ns**2) ** 0.5))
 
-    def _begin_anew(self) -> None:
+    def _restart(self) -> None:
         self.restarts += 1
         self._model.clear()
         self._group.clear()
@@ -84,11 +84,11 @@ class DeviceClocks:
     """The clocks of all devices that were ever read, by name."""
 
     def __init__(self) -> None:
-        self._clocks: dict[str, DeviceClock] = {}
+        self._clocks: dict[str, DeviceClockEstimator] = {}
 
     def read(self, reading: ClockReading) -> None:
         """Note a reading of a device."""
-        self._clocks.setdefault(reading.device, DeviceClock()).read(reading)
+        self._clocks.setdefault(reading.device, DeviceClockEstimator()).read(reading)
 
     def at(self, device: str, device_ns: int) -> HostInstant | None:
         """Host time of a device's instant; None for a device that was never read."""

@@ -13,75 +13,78 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
-from daemon.onboard.timing.clock import HostClock
+from daemon.onboard.timing.gps_clock import GpsClock
 from daemon.onboard.timing.mark_matching import MarkMatcher
-from daemon.onboard.timing.pulses import Cause, Match, Pulse
+from daemon.onboard.timing.pulses import Cause, FiredPulse, MatchResult
 from drivers.contract import EventMark, Frame, FrameStatus
 
-__all__ = ["Cause", "Match", "Matcher", "Pulse", "start_of_exposure_mono_ns"]
+__all__ = ["Cause", "FiredPulse", "MatchResult", "Matcher", "start_of_exposure_mono_ns"]
 
 FRAME_WINDOW_NS: Final = 20_000_000
 """How far a frame's start may lie from its pulse: trigger latency of a head, clock drift between
 two latches (100 ppm over a minute is 6 ms)."""
 ARRIVAL_LIMIT_NS: Final = 20_000_000_000
 """A frame belongs to a pulse at most this much earlier."""
-USUAL_SLACK_NS: Final = 400_000_000
+ARRIVAL_TOLERANCE_NS: Final = 400_000_000
 """A frame that arrives so much off the usual is no witness of when it was exposed."""
-ARRIVALS_KEPT: Final = 16
-STARTS_TO_KNOW: Final = 5
+ARRIVALS_MAX: Final = 16
+STARTS_MIN: Final = 5
 """So many frames tell how far a head's starts usually lie from their pulses."""
-STARTS_KEPT: Final = 16
-USUAL_START_NS: Final = 500_000
+STARTS_MAX: Final = 16
+START_TOLERANCE_NS: Final = 500_000
 LATCH_DRIFT: Final = 1e-4
 """How far from there a start may lie, beside what pulse, latch and time since the latch leave
 open."""
-STARTS_TO_RETHINK: Final = 3
+STARTS_TO_RELEARN: Final = 3
 """So many unusual starts in succession that agree are the new usual."""
-SPURIOUS_TO_DOUBT: Final = 3
-DOUBT_NS: Final = 1_500_000_000
+SPURIOUS_MAX: Final = 3
+SPURIOUS_WINDOW_NS: Final = 1_500_000_000
 """A head that sent so many frames nobody asked for within this time is not believed."""
 
 
 @dataclass
-class _HeadRecord:
+class _HeadHistory:
     """What is known of one head. `offset`: its counter less the pulses' count."""
 
     offset: int | None = None
-    arrivals_ns: deque[int] = field(default_factory=lambda: deque(maxlen=ARRIVALS_KEPT))
-    starts_ns: deque[int] = field(default_factory=lambda: deque(maxlen=STARTS_KEPT))
+    arrivals_ns: deque[int] = field(default_factory=lambda: deque(maxlen=ARRIVALS_MAX))
+    starts_ns: deque[int] = field(default_factory=lambda: deque(maxlen=STARTS_MAX))
     """How much later than by their pulses exposures began, by the head's clock."""
-    odd_starts_ns: deque[int] = field(default_factory=lambda: deque(maxlen=STARTS_TO_RETHINK))
-    spurious_ns: deque[int] = field(default_factory=lambda: deque(maxlen=SPURIOUS_TO_DOUBT))
+    unusual_starts_ns: deque[int] = field(default_factory=lambda: deque(maxlen=STARTS_TO_RELEARN))
+    spurious_ns: deque[int] = field(default_factory=lambda: deque(maxlen=SPURIOUS_MAX))
     """When exposures began that nobody asked for."""
 
-    def is_in_doubt(self, start_ns: int) -> bool:
+    def is_suspect(self, start_ns: int) -> bool:
         """Whether so many frames came unasked for that one among them may be near by chance."""
-        full = len(self.spurious_ns) == SPURIOUS_TO_DOUBT
-        return full and abs(start_ns - self.spurious_ns[0]) < DOUBT_NS
+        full = len(self.spurious_ns) == SPURIOUS_MAX
+        return full and abs(start_ns - self.spurious_ns[0]) < SPURIOUS_WINDOW_NS
 
-    def starts_as_usual(self, away_ns: int, unsure_ns: int) -> bool:
+    def is_usual_start(self, offset_ns: int, tolerance_ns: int) -> bool:
         """Whether an exposure that began so much later than by its pulse is like those before.
 
         What is usual is learned anew where unusual ones agree: a head that was given another delay
         must not be disbelieved for ever.
         """
-        if len(self.starts_ns) >= STARTS_TO_KNOW:
-            usual_ns = statistics.median(self.starts_ns)
+        if len(self.starts_ns) >= STARTS_MIN:
+            median_ns = statistics.median(self.starts_ns)
             # 1.4826: from the median absolute deviation to a standard deviation.
-            spread_ns = 6 * 1.4826 * statistics.median(abs(s - usual_ns) for s in self.starts_ns)
-            window_ns = max(USUAL_START_NS, spread_ns) + unsure_ns
-            if abs(away_ns - usual_ns) > window_ns:
-                self.odd_starts_ns.append(away_ns)
-                odd_ns = self.odd_starts_ns
-                if len(odd_ns) < STARTS_TO_RETHINK or max(odd_ns) - min(odd_ns) > window_ns:
+            spread_ns = 6 * 1.4826 * statistics.median(abs(s - median_ns) for s in self.starts_ns)
+            window_ns = max(START_TOLERANCE_NS, spread_ns) + tolerance_ns
+            if abs(offset_ns - median_ns) > window_ns:
+                self.unusual_starts_ns.append(offset_ns)
+                unusual_ns = self.unusual_starts_ns
+                if (
+                    len(unusual_ns) < STARTS_TO_RELEARN
+                    or max(unusual_ns) - min(unusual_ns) > window_ns
+                ):
                     return False
                 self.starts_ns.clear()
-        self.odd_starts_ns.clear()
-        self.starts_ns.append(away_ns)
+        self.unusual_starts_ns.clear()
+        self.starts_ns.append(offset_ns)
         return True
 
     @property
-    def usual_ns(self) -> int | None:
+    def median_ns(self) -> int | None:
         """From the start of exposure to the arrival of the frame, as a rule."""
         return round(statistics.median(self.arrivals_ns)) if self.arrivals_ns else None
 
@@ -93,14 +96,14 @@ class Matcher:
     frame's is final, since its pixels are stored under the exposure's number.
     """
 
-    def __init__(self, cone_of_head: Mapping[str, str], clock: HostClock) -> None:
+    def __init__(self, cone_of_head: Mapping[str, str], clock: GpsClock) -> None:
         self._cone_of_head = cone_of_head
-        self._pulses: dict[int, Pulse] = {}
+        self._pulses: dict[int, FiredPulse] = {}
         self._frames: set[tuple[str, int]] = set()
-        self._heads = {head: _HeadRecord() for head in cone_of_head}
+        self._heads = {head: _HeadHistory() for head in cone_of_head}
         self.marks = MarkMatcher(clock)
 
-    def pulse(self, pulse: Pulse) -> None:
+    def pulse(self, pulse: FiredPulse) -> None:
         """Note a pulse that was given."""
         self._pulses[pulse.number] = pulse
         self.marks.pulse(pulse)
@@ -112,7 +115,7 @@ class Matcher:
         self._frames = {key for key in self._frames if key[1] >= number}
         self.marks.forget_before(number)
 
-    def mark(self, mark: EventMark) -> Match:
+    def mark(self, mark: EventMark) -> MatchResult:
         """The exposure an event mark belongs to, by what is known now."""
         return self.marks.mark(mark)
 
@@ -120,26 +123,26 @@ class Matcher:
         """The mark an exposure has, by what is known now."""
         return self.marks.mark_of(number)
 
-    def frame(self, frame: Frame) -> Match:
+    def frame(self, frame: Frame) -> MatchResult:
         """The exposure a frame belongs to."""
         number, possible = self._pulse_of(frame)
         if frame.status is not FrameStatus.COMPLETE:
-            return Match(number, Cause.CORRUPT, bool(possible), possible)
-        if number is not None and not self._is_like_the_others(frame, self._pulses[number]):
+            return MatchResult(number, Cause.CORRUPT, bool(possible), possible)
+        if number is not None and not self._is_typical_start(frame, self._pulses[number]):
             possible, number = (number,), None
         if number is None:
             start_ns = start_of_exposure_mono_ns(frame)
             if start_ns is not None:
                 self._heads[frame.head].spurious_ns.append(start_ns)
-            return Match(None, Cause.SPURIOUS, bool(possible), possible)
+            return MatchResult(None, Cause.SPURIOUS, bool(possible), possible)
         if (frame.head, number) in self._frames:
-            return Match(number, Cause.DUPLICATE)
+            return MatchResult(number, Cause.DUPLICATE)
         self._frames.add((frame.head, number))
         pulse, head = self._pulses[number], self._heads[frame.head]
         if frame.counter is not None:
             head.offset = frame.counter - pulse.count
         head.arrivals_ns.append(frame.mono_ns - self._start_ns(frame, pulse))
-        return Match(number, Cause.USED)
+        return MatchResult(number, Cause.USED)
 
     def has_pulse_of(self, frame: Frame) -> bool:
         """Whether the frame's own time says which pulse it is of."""
@@ -150,71 +153,71 @@ class Matcher:
     def _pulse_of(self, frame: Frame) -> tuple[int | None, tuple[int, ...]]:
         """The pulse of a frame, or None and those it may be of."""
         possible = [pulse for pulse in self._pulses.values() if self._arrives(frame, pulse)]
-        counted = self._counted(frame, possible)
+        by_count = self._pulse_by_count(frame, possible)
         start_ns = start_of_exposure_mono_ns(frame)
         if start_ns is not None:
             near = [p for p in possible if self._is_near(frame, p, start_ns)]
             if len(near) != 1:
                 return None, _numbers(near)
             pulse = near[0]
-            is_other = counted is not None and counted is not pulse
-            if is_other and counted is not None and self._speaks_for(frame, counted):
+            differs = by_count is not None and by_count is not pulse
+            if differs and by_count is not None and self._supports(frame, by_count):
                 # The head's clock says one pulse, its count and perhaps the arrival another.
-                is_sure = self._speaks_for(frame, pulse)
-                return (pulse.number, ()) if is_sure else (None, _numbers([pulse, counted]))
+                is_supported = self._supports(frame, pulse)
+                return (pulse.number, ()) if is_supported else (None, _numbers([pulse, by_count]))
             return pulse.number, ()
         waiting = [p for p in possible if (frame.head, p.number) not in self._frames]
-        if counted is not None:
+        if by_count is not None:
             # Without a time of its own, a count alone may be that of before a restart.
             head = self._heads[frame.head]
-            if head.usual_ns is None or self._speaks_for(frame, counted):
-                return counted.number, ()
+            if head.median_ns is None or self._supports(frame, by_count):
+                return by_count.number, ()
             return None, _numbers(waiting)
         return (waiting[0].number, ()) if len(waiting) == 1 else (None, _numbers(waiting))
 
-    def _is_like_the_others(self, frame: Frame, pulse: Pulse) -> bool:
+    def _is_typical_start(self, frame: Frame, pulse: FiredPulse) -> bool:
         """Whether a frame near a pulse began as its head's frames do, and not there by chance."""
         start_ns = start_of_exposure_mono_ns(frame)
         if start_ns is None or (frame.head, pulse.number) in self._frames:
             return True
         head = self._heads[frame.head]
-        if head.is_in_doubt(start_ns):
+        if head.is_suspect(start_ns):
             return False
         since_latch_ns = abs((frame.device_ns or 0) - (frame.device_clock_ns or 0))
-        unsure_ns = (
+        tolerance_ns = (
             pulse.sigma_ns + 3 * (frame.latch_sigma_ns or 0) + round(LATCH_DRIFT * since_latch_ns)
         )
-        return head.starts_as_usual(start_ns - self._start_ns(frame, pulse), unsure_ns)
+        return head.is_usual_start(start_ns - self._start_ns(frame, pulse), tolerance_ns)
 
-    def _start_ns(self, frame: Frame, pulse: Pulse) -> int:
+    def _start_ns(self, frame: Frame, pulse: FiredPulse) -> int:
         return pulse.mono_ns + pulse.delays_ns[self._cone_of_head[frame.head]]
 
-    def _arrives(self, frame: Frame, pulse: Pulse) -> bool:
+    def _arrives(self, frame: Frame, pulse: FiredPulse) -> bool:
         """Whether the frame came after its exposure began, and not ages after."""
         age_ns = frame.mono_ns - self._start_ns(frame, pulse)
         return -FRAME_WINDOW_NS - pulse.sigma_ns <= age_ns <= ARRIVAL_LIMIT_NS
 
-    def _is_near(self, frame: Frame, pulse: Pulse, start_ns: int) -> bool:
+    def _is_near(self, frame: Frame, pulse: FiredPulse, start_ns: int) -> bool:
         window_ns = FRAME_WINDOW_NS + pulse.sigma_ns + (frame.latch_sigma_ns or 0)
         return abs(self._start_ns(frame, pulse) - start_ns) <= window_ns
 
-    def _counted(self, frame: Frame, possible: list[Pulse]) -> Pulse | None:
+    def _pulse_by_count(self, frame: Frame, possible: list[FiredPulse]) -> FiredPulse | None:
         """The pulse a frame is of by its count; None where that tells nothing."""
         offset = self._heads[frame.head].offset
         if offset is None or frame.counter is None:
             return None
-        counted = [p for p in possible if frame.counter - p.count == offset]
-        return counted[0] if len(counted) == 1 else None
+        by_count = [p for p in possible if frame.counter - p.count == offset]
+        return by_count[0] if len(by_count) == 1 else None
 
-    def _speaks_for(self, frame: Frame, pulse: Pulse) -> bool:
+    def _supports(self, frame: Frame, pulse: FiredPulse) -> bool:
         """Whether the frame's arrival is what is usual for that pulse, and it waits for one."""
-        usual_ns = self._heads[frame.head].usual_ns
-        if usual_ns is None or (frame.head, pulse.number) in self._frames:
+        median_ns = self._heads[frame.head].median_ns
+        if median_ns is None or (frame.head, pulse.number) in self._frames:
             return False
-        return abs(frame.mono_ns - self._start_ns(frame, pulse) - usual_ns) <= USUAL_SLACK_NS
+        return abs(frame.mono_ns - self._start_ns(frame, pulse) - median_ns) <= ARRIVAL_TOLERANCE_NS
 
 
-def _numbers(pulses: Iterable[Pulse]) -> tuple[int, ...]:
+def _numbers(pulses: Iterable[FiredPulse]) -> tuple[int, ...]:
     return tuple(pulse.number for pulse in pulses)
 
 

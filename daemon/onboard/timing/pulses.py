@@ -19,7 +19,7 @@ class Cause(enum.Enum):
 
 
 @dataclass(frozen=True)
-class Pulse:
+class FiredPulse:
     """A pulse that was given, as the matching needs it.
 
     `mono_ns` is the moment the delays count from, the middle of the round trip in which the unit
@@ -38,7 +38,7 @@ class Pulse:
 
 
 @dataclass(frozen=True)
-class Match:
+class MatchResult:
     """Where a frame or mark belongs: `number` is None where it belongs nowhere.
 
     `possible` are the exposures a frame may be of, where that is for doubt.

@@ -13,7 +13,7 @@ from typing import Any, Final, Protocol, TypeGuard
 from drivers.contract import ClockReading, Sink
 
 INTERVAL_S: Final = 1.0
-LATE_NS: Final = 1_000_000_000
+ANSWER_MAX_NS: Final = 1_000_000_000
 """An answer that took longer is of no use."""
 
 
@@ -23,17 +23,17 @@ class TimesyncPort(Protocol):
     @property
     def name(self) -> str: ...
 
-    def listen_for_timesync(self, heard: Callable[[Any], None] | None) -> None: ...
+    def subscribe_timesync(self, on_answer: Callable[[Any], None] | None) -> None: ...
 
     def send_timesync(self, *, tc1_ns: int, ts1_ns: int) -> bool: ...
 
 
-def can_be_asked(device: object) -> TypeGuard[TimesyncPort]:
+def supports_timesync(device: object) -> TypeGuard[TimesyncPort]:
     """Whether a device has the port."""
-    return hasattr(device, "listen_for_timesync") and hasattr(device, "send_timesync")
+    return hasattr(device, "subscribe_timesync") and hasattr(device, "send_timesync")
 
 
-class TimesyncAsker:
+class TimesyncRequester:
     """Asks one autopilot and hands its answers on as readings."""
 
     def __init__(
@@ -41,32 +41,38 @@ class TimesyncAsker:
     ) -> None:
         self._port, self._sink, self._mono_ns = port, sink, mono_ns
         self._stop = threading.Event()
-        self._asked: set[int] = set()
-        port.listen_for_timesync(self.heard)
+        self._outstanding: set[int] = set()
+        port.subscribe_timesync(self.on_answer)
 
     def run(self) -> None:
         """Ask until told to stop, from a thread of the caller's."""
         while not self._stop.wait(INTERVAL_S):
-            self.ask()
+            self.request()
 
-    def ask(self) -> bool:
+    def request(self) -> bool:
         """Send one request; False where the line is not open."""
         ts1_ns = self._mono_ns()
         # Before it is sent: the answer may be heard before this goes on.
-        self._asked = {asked for asked in self._asked if ts1_ns - asked <= LATE_NS} | {ts1_ns}
+        self._outstanding = {
+            sent_ns for sent_ns in self._outstanding if ts1_ns - sent_ns <= ANSWER_MAX_NS
+        } | {ts1_ns}
         return self._port.send_timesync(tc1_ns=0, ts1_ns=ts1_ns)
 
-    def heard(self, timesync: Any) -> None:
+    def on_answer(self, timesync: Any) -> None:
         """An answer to a question of ours becomes a reading; others, and requests, do not."""
-        took_ns = timesync.mono_ns - timesync.ts1_ns
-        if timesync.tc1_ns <= 0 or timesync.ts1_ns not in self._asked or took_ns > LATE_NS:
+        round_trip_ns = timesync.mono_ns - timesync.ts1_ns
+        if (
+            timesync.tc1_ns <= 0
+            or timesync.ts1_ns not in self._outstanding
+            or round_trip_ns > ANSWER_MAX_NS
+        ):
             return
-        self._asked.discard(timesync.ts1_ns)
-        half_ns = (took_ns + 1) // 2
+        self._outstanding.discard(timesync.ts1_ns)
+        half_ns = (round_trip_ns + 1) // 2
         middle_ns = timesync.ts1_ns + half_ns
         self._sink(ClockReading(self._port.name, timesync.tc1_ns, middle_ns, half_ns))
 
     def stop(self) -> None:
         """End `run`, and listen no more."""
         self._stop.set()
-        self._port.listen_for_timesync(None)
+        self._port.subscribe_timesync(None)

@@ -1,7 +1,7 @@
 """Reading an adjustment project: `project.toml` and its tables become a network.
 
 The format is told in docs/formats.md. Coordinates without a value are NaN in the network and found
-by `processing.bundle.start`.
+by `processing.bundle.initial_values`.
 """
 
 from __future__ import annotations
@@ -15,34 +15,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.mission.foreign_files import ForeignFileError, within
+from daemon.postflight.adjustment.csv_tables import CsvTable, ProjectError, read_table
 from daemon.postflight.adjustment.project_file import (
+    AdjustmentHeadSection,
     CameraSection,
-    HeadSection,
     ProjectFile,
     read_project_file,
 )
-from daemon.postflight.adjustment.tables import ProjectError, Table, read_table
-from processing.bundle.adjust import Settings
-from processing.bundle.bent_rays import Rays
+from processing.bundle.adjust import AdjustmentSettings
+from processing.bundle.curvature_refraction import RayModel
 from processing.bundle.network import (
     INTERIOR,
     Attitudes,
-    Bearings,
-    Camera,
-    Constraint,
+    CameraModel,
     Distances,
     Gnss,
-    Head,
+    HeadMounting,
     ImagePoints,
     Images,
+    LinearConstraint,
+    MeasuredAttitudes,
     Network,
     Points,
     Stations,
-    no_bearings,
     no_distances,
     no_gnss,
+    no_measured_attitudes,
 )
-from processing.bundle.self_calibration import parts_of, self_calibrating
+from processing.bundle.self_calibration import parts_of, with_self_calibration
 from processing.geometry.rotation import rotation_matrix
 from processing.rig import RigError, find_rig, shipped_rigs
 
@@ -54,7 +54,7 @@ ANGLES = ("omega_deg", "phi_deg", "kappa_deg")
 
 
 @dataclass(frozen=True)
-class Checks:
+class CheckPoints:
     """Independent coordinates of object points: names, (n, 3) m, sigmas (n, 3) m."""
 
     names: tuple[str, ...]
@@ -69,8 +69,8 @@ class Project:
     name: str
     file: ProjectFile
     network: Network
-    settings: Settings
-    checks: Checks
+    settings: AdjustmentSettings
+    checks: CheckPoints
 
 
 def read_project(path: Path) -> Project:
@@ -95,11 +95,11 @@ def read_project(path: Path) -> Project:
         ("image", "point"),
         ("x_mm", "y_mm", "column_px", "row_px", "sx_um", "sy_um"),
     )
-    build = _Names(images, exposures, seen, points, problems)
-    told = [problem for t in build.tables for problem in t.problems]
-    if told:
+    build = _TableIndex(images, exposures, seen, points, problems)
+    reported = [problem for t in build.tables for problem in t.problems]
+    if reported:
         # Names that are not unique fit no index: what else is wrong cannot be told yet.
-        raise ProjectError(told)
+        raise ProjectError(reported)
     network = Network(
         cameras=cameras,
         heads=heads,
@@ -110,16 +110,16 @@ def read_project(path: Path) -> Project:
         image_points=build.image_points(file, cameras),
         distances=_distances(folder, file, build),
         gnss=_gnss(folder, file, build),
-        bearings=_bearings(folder, file, build),
-        constraints=tuple(Constraint(dict(c.coefficients)) for c in file.constraint),
-        rays=Rays(file.adjust.earth_radius_m, file.adjust.refraction, file.adjust.ground_m),
+        measured_attitudes=_bearings(folder, file, build),
+        constraints=tuple(LinearConstraint(dict(c.coefficients)) for c in file.constraint),
+        rays=RayModel(file.adjust.earth_radius_m, file.adjust.refraction, file.adjust.ground_m),
     )
     problems += [p for table in build.tables for p in table.problems]
     if problems:
         raise ProjectError(problems)
     a = file.adjust
-    settings = Settings(
-        most_iterations=a.most_iterations,
+    settings = AdjustmentSettings(
+        max_iterations=a.max_iterations,
         robust=a.robust,
         reject_beyond=a.reject_beyond,
         variance_components=a.variance_components,
@@ -128,11 +128,11 @@ def read_project(path: Path) -> Project:
     return Project(file.name, file, network, settings, build.checks())
 
 
-class _Names:
+class _TableIndex:
     """Tables by name, and the indices of what they name."""
 
     def __init__(
-        self, images: Table, exposures: Table | None, seen: Table, points: Table | None,
+        self, images: CsvTable, exposures: CsvTable | None, seen: CsvTable, points: CsvTable | None,
         problems: list[str],
     ) -> None:  # fmt: skip
         self.tables = [t for t in (images, exposures, seen, points) if t is not None]
@@ -162,11 +162,13 @@ class _Names:
         self.image_at = {name: k for k, name in enumerate(self.image_names)}
         self.point_at = {name: k for k, name in enumerate(self.point_names)}
 
-    def index(self, table: Table, column: str, at: dict[str, int], what: str) -> NDArray[np.int64]:
+    def index(
+        self, table: CsvTable, column: str, at: dict[str, int], what: str
+    ) -> NDArray[np.int64]:
         found = []
         for name, line in zip(table.text(column), table.lines, strict=True):
             if name not in at:
-                table.wrong(line, f"{what} {name!r} is not there")
+                table.add_problem(line, f"{what} {name!r} is not there")
             found.append(at.get(name, 0))
         return np.array(found, dtype=np.int64)
 
@@ -220,38 +222,40 @@ class _Names:
     def points(self) -> Points:
         n = len(self.point_names)
         xyz, sigma = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
-        far = np.zeros(n, dtype=bool)
+        with_coordinates = np.zeros(n, dtype=bool)
         table = self._points
         if table is not None:
             given = np.array([table.numbers(c) for c in XYZ]).T.reshape(-1, 3)
             own = np.array([table.numbers(c) for c in SIGMAS]).T.reshape(-1, 3)
             for k, role in enumerate(self._roles):
                 if role not in ("tie", "control", "check", "direction"):
-                    table.wrong(
+                    table.add_problem(
                         table.lines[k],
                         f"role is {role!r}; one of tie, control, check, direction is right",
                     )
                 xyz[k] = given[k] if role != "check" else np.nan
                 sigma[k] = own[k] if role in ("control", "direction") else np.nan
-                far[k] = role == "direction"
+                with_coordinates[k] = role == "direction"
                 if role in ("control", "direction") and not np.isfinite(given[k]).any():
-                    table.wrong(table.lines[k], f"a {role} point needs coordinates")
+                    table.add_problem(table.lines[k], f"a {role} point needs coordinates")
                 if (own[k] < 0.0).any():
-                    table.wrong(table.lines[k], "a sigma is negative; 0 holds, empty leaves free")
+                    table.add_problem(
+                        table.lines[k], "a sigma is negative; 0 holds, empty leaves free"
+                    )
             # A coordinate that is not known is no control, whatever sigma stands there.
             sigma[: len(given)] = np.where(np.isfinite(given), sigma[: len(given)], np.nan)
-        return Points(tuple(self.point_names), xyz, sigma, far)
+        return Points(tuple(self.point_names), xyz, sigma, with_coordinates)
 
-    def checks(self) -> Checks:
+    def checks(self) -> CheckPoints:
         table = self._points
         if table is None:
-            return Checks((), np.zeros((0, 3)), np.zeros((0, 3)))
+            return CheckPoints((), np.zeros((0, 3)), np.zeros((0, 3)))
         rows = [k for k, role in enumerate(self._roles) if role == "check"]
         given = np.array([table.numbers(c) for c in XYZ]).T.reshape(-1, 3)
         own = np.array([table.numbers(c, 0.0) for c in SIGMAS]).T.reshape(-1, 3)
-        return Checks(tuple(self.point_names[k] for k in rows), given[rows], own[rows])
+        return CheckPoints(tuple(self.point_names[k] for k in rows), given[rows], own[rows])
 
-    def image_points(self, file: ProjectFile, cameras: Sequence[Camera]) -> ImagePoints:
+    def image_points(self, file: ProjectFile, cameras: Sequence[CameraModel]) -> ImagePoints:
         table = self._seen
         image = self.index(table, "image", self.image_at, "image")
         point = self.index(table, "point", self.point_at, "point")
@@ -269,21 +273,21 @@ class _Names:
             )
             xy = np.zeros((len(table.rows), 2))
         for row in np.flatnonzero(~np.isfinite(xy).all(axis=1)):
-            table.wrong(table.lines[row], "an image point needs both coordinates")
+            table.add_problem(table.lines[row], "an image point needs both coordinates")
         return ImagePoints(image, point, np.nan_to_num(xy), sigma * 1e-3)
 
     def _from_pixels(self, file: ProjectFile, image: NDArray[np.int64], px: Array) -> Array:
         camera_at = {c.name: c for c in file.camera}
         names = self._images.text("camera")
         xy = np.zeros_like(px)
-        told: set[str] = set()
+        reported: set[str] = set()
         for k in np.unique(image):
             camera = camera_at.get(names[k])
             if camera is None:
                 continue
             if camera.pixel_um is None or camera.width_px is None or camera.height_px is None:
-                if camera.name not in told:
-                    told.add(camera.name)
+                if camera.name not in reported:
+                    reported.add(camera.name)
                     self.problems.append(
                         f"camera {camera.name}: pixel coordinates need pixel_um, width_px and "
                         "height_px"
@@ -294,17 +298,17 @@ class _Names:
             xy[rows, 1] = ((camera.height_px - 1) / 2.0 - px[rows, 1]) * pitch
         return xy
 
-    def _held(self, table: Table, column: str) -> NDArray[np.bool_]:
+    def _held(self, table: CsvTable, column: str) -> NDArray[np.bool_]:
         found = []
         for value, line in zip(table.text(column, "free"), table.lines, strict=True):
             if value not in ("free", "held"):
-                table.wrong(line, f"{column} is {value!r}; free or held is right")
+                table.add_problem(line, f"{column} is {value!r}; free or held is right")
             found.append(value == "held")
         return np.array(found, dtype=bool)
 
 
-def _camera(section: CameraSection, folder: Path, problems: list[str]) -> Camera:
-    camera = Camera(
+def _camera(section: CameraSection, folder: Path, problems: list[str]) -> CameraModel:
+    camera = CameraModel(
         section.name,
         section.f_mm,
         section.xp_mm,
@@ -321,7 +325,7 @@ def _camera(section: CameraSection, folder: Path, problems: list[str]) -> Camera
             shipped = section.rig in shipped_rigs()
             named = section.rig if shipped else str(within(folder, section.rig, "camera.rig"))
             rig = find_rig(named)
-        camera = self_calibrating(
+        camera = with_self_calibration(
             camera,
             section.parameters,
             () if rig is None else parts_of(rig),
@@ -332,10 +336,12 @@ def _camera(section: CameraSection, folder: Path, problems: list[str]) -> Camera
         problems += list(error.problems)
     except ValueError as error:
         problems.append(str(error))
-    return _shortened(camera, section, problems)
+    return _with_selected_parameters(camera, section, problems)
 
 
-def _shortened(camera: Camera, section: CameraSection, problems: list[str]) -> Camera:
+def _with_selected_parameters(
+    camera: CameraModel, section: CameraSection, problems: list[str]
+) -> CameraModel:
     """Without the parameters that were dropped, and with the values of terms that are known."""
     names = {t.name for t in camera.terms}
     foreign = [n for n in section.without if n not in names and n not in camera.free]
@@ -354,10 +360,10 @@ def _shortened(camera: Camera, section: CameraSection, problems: list[str]) -> C
     )
 
 
-def _head(section: HeadSection) -> Head:
+def _head(section: AdjustmentHeadSection) -> HeadMounting:
     angles = np.array([section.omega_deg, section.phi_deg, section.kappa_deg])
     sigma = section.rotation_sigma_deg
-    return Head(
+    return HeadMounting(
         section.name,
         _rotation(angles),
         np.array([section.x_m, section.y_m, section.z_m]),
@@ -376,18 +382,18 @@ def _rotation(angles_deg: Array) -> Array:
 
 def _optional(
     folder: Path, name: str | None, needed: Sequence[str], known: Sequence[str]
-) -> Table | None:
+) -> CsvTable | None:
     return None if name is None else _read(folder, name, needed, known)
 
 
-def _read(folder: Path, name: str, needed: Sequence[str], known: Sequence[str]) -> Table:
+def _read(folder: Path, name: str, needed: Sequence[str], known: Sequence[str]) -> CsvTable:
     try:
         return read_table(within(folder, name, "project.toml: files"), needed, known)
     except ForeignFileError as error:
         raise ProjectError([str(error)]) from error
 
 
-def _distances(folder: Path, file: ProjectFile, build: _Names) -> Distances:
+def _distances(folder: Path, file: ProjectFile, build: _TableIndex) -> Distances:
     table = _optional(
         folder, file.files.distances, ("point_a", "point_b", "distance_m", "sigma_m"), ()
     )
@@ -402,7 +408,7 @@ def _distances(folder: Path, file: ProjectFile, build: _Names) -> Distances:
     )
 
 
-def _gnss(folder: Path, file: ProjectFile, build: _Names) -> Gnss:
+def _gnss(folder: Path, file: ProjectFile, build: _TableIndex) -> Gnss:
     lever = ("lever_x_m", "lever_y_m", "lever_z_m")
     table = _optional(
         folder, file.files.gnss, ("exposure", *XYZ, *SIGMAS), ("line", "time_s", *lever)
@@ -414,7 +420,7 @@ def _gnss(folder: Path, file: ProjectFile, build: _Names) -> Gnss:
     levers = np.array([table.numbers(c, 0.0) for c in lever]).T.reshape(-1, 3)
     attitude = np.array([build.attitude_at.get(n, -1) for n in table.text("exposure")])
     for row in np.flatnonzero((attitude < 0) & (levers != 0.0).any(axis=1)):
-        table.wrong(
+        table.add_problem(
             table.lines[row],
             "a lever arm needs an attitude of the exposure; here every image has its own",
         )
@@ -433,14 +439,14 @@ def _gnss(folder: Path, file: ProjectFile, build: _Names) -> Gnss:
     )
 
 
-def _bearings(folder: Path, file: ProjectFile, build: _Names) -> Bearings:
+def _bearings(folder: Path, file: ProjectFile, build: _TableIndex) -> MeasuredAttitudes:
     table = _optional(folder, file.files.attitudes, ("exposure", *ANGLES, "sigma_deg"), ())
     if table is None:
-        return no_bearings()
+        return no_measured_attitudes()
     build.tables.append(table)
     angles = np.array([table.numbers(c) for c in ANGLES]).T.reshape(-1, 3)
     sigma = np.radians(np.array(table.numbers("sigma_deg")))
-    return Bearings(
+    return MeasuredAttitudes(
         build.index(table, "exposure", build.attitude_at, "attitude of exposure"),
         np.array([_rotation(a) for a in angles]).reshape(-1, 3, 3),
         np.tile(sigma[:, None], (1, 3)),

@@ -7,26 +7,26 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from daemon.mission.foreign_files import ForeignFileError, read_plain
-from daemon.postflight.adjustment.tables import ProjectError
+from daemon.mission.foreign_files import ForeignFileError, read_regular_file
+from daemon.postflight.adjustment.csv_tables import ProjectError
 from processing.bundle.self_calibration import SetName
 from processing.rig.toml_text import TomlError, parse_toml
 
 PROJECT_FILE_MAX_BYTES = 4_000_000
 
 
-class _Section(BaseModel):
+class _ProjectSection(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class AdjustSection(_Section):
+class AdjustSection(_ProjectSection):
     """How to adjust."""
 
     robust: bool = False
     reject_beyond: float | None = Field(default=None, gt=1.0)
     variance_components: bool = False
     minimum_norm: bool = False
-    most_iterations: int = Field(default=30, ge=1, le=1000)
+    max_iterations: int = Field(default=30, ge=1, le=1000)
     image_sigma_um: float = Field(default=1.0, gt=0.0)
     gnss: Literal["none", "shift", "linear"] = "none"
     earth_radius_m: float | None = Field(default=None, gt=1e6)
@@ -34,7 +34,7 @@ class AdjustSection(_Section):
     ground_m: float = 0.0
 
 
-class FilesSection(_Section):
+class FilesSection(_ProjectSection):
     """Where the tables are, relative to the project file."""
 
     images: str = "images.csv"
@@ -46,7 +46,7 @@ class FilesSection(_Section):
     attitudes: str | None = None
 
 
-class CameraSection(_Section):
+class CameraSection(_ProjectSection):
     """A camera."""
 
     name: str
@@ -76,7 +76,7 @@ class CameraSection(_Section):
     terms: dict[str, float] = {}
 
 
-class HeadSection(_Section):
+class AdjustmentHeadSection(_ProjectSection):
     """Where a camera sits against the others of an exposure."""
 
     name: str
@@ -92,13 +92,13 @@ class HeadSection(_Section):
     offset_sigma_m: float | None = Field(default=None, gt=0.0)
 
 
-class ConstraintSection(_Section):
+class ConstraintSection(_ProjectSection):
     """Corrections of named unknowns whose weighted sum is zero."""
 
     coefficients: dict[str, float] = Field(min_length=1)
 
 
-class ProjectFile(_Section):
+class ProjectFile(_ProjectSection):
     """project.toml."""
 
     format: Literal[1]
@@ -106,7 +106,7 @@ class ProjectFile(_Section):
     adjust: AdjustSection = AdjustSection()
     files: FilesSection = FilesSection()
     camera: tuple[CameraSection, ...] = Field(min_length=1)
-    head: tuple[HeadSection, ...] = ()
+    head: tuple[AdjustmentHeadSection, ...] = ()
     constraint: tuple[ConstraintSection, ...] = ()
 
 
@@ -117,7 +117,7 @@ def read_project_file(path: Path) -> ProjectFile:
         ProjectError: with a sentence per mistake.
     """
     try:
-        content = parse_toml(read_plain(path, PROJECT_FILE_MAX_BYTES))
+        content = parse_toml(read_regular_file(path, PROJECT_FILE_MAX_BYTES))
     except ForeignFileError as error:
         raise ProjectError([f"{error}; give the path of a project.toml"]) from error
     except TomlError as error:

@@ -24,7 +24,7 @@ _FAINT: Final = "#8a97a5"
 _WIDE, _HIGH = 760.0, 420.0
 _LEFT, _RIGHT, _TOP, _BOTTOM = 84.0, 740.0, 56.0, 360.0
 _MAP_PX: Final = 720
-_MOST_DOTS: Final = 4000
+_MAX_DOTS: Final = 4000
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def chart_svg(
                 f'<path d="M {way}" fill="none" stroke="{colour}" stroke-width="1.6"{dash}/>'
             )
         elif places:
-            step = max(1, math.ceil(len(places) / _MOST_DOTS))
+            step = max(1, math.ceil(len(places) / _MAX_DOTS))
             body += [
                 f'<circle cx="{a:.1f}" cy="{b:.1f}" r="2.6" fill="{colour}"/>'
                 for a, b in places[::step]
@@ -163,7 +163,7 @@ def vectors_svg(
         f'<rect x="20" y="44" width="{wide}" height="{high:.1f}" fill="#f6f8fa" '
         f'stroke="{_FAINT}"/>',
     ]
-    step = max(1, math.ceil(len(xy) / _MOST_DOTS))
+    step = max(1, math.ceil(len(xy) / _MAX_DOTS))
     parts = []
     for (x, y), (dx, dy) in zip(xy[::step], vector[::step], strict=True):
         px, py = 20 + (float(x) + half[0]) * scale, 44 + (half[1] - float(y)) * scale
@@ -175,17 +175,17 @@ def vectors_svg(
     bar = 10.0 ** math.floor(math.log10(longest * unit[1])) / unit[1]
     foot = 44 + high + 24
     body.append(_line(20, foot, 20 + bar * enlarge, foot, _INK))
-    told = f"{bar * unit[1]:g} {unit[0]}"
-    body.append(_text(28 + bar * enlarge, foot + 4, f"{told}   {note}", 12))
+    scale_text = f"{bar * unit[1]:g} {unit[0]}"
+    body.append(_text(28 + bar * enlarge, foot + 4, f"{scale_text}   {note}", 12))
     return _svg(740.0, foot + 22.0, body)
 
 
 def _finite(curve: Curve, *, log: bool) -> tuple[Array, Array]:
     x, y = np.asarray(curve.x, float), np.asarray(curve.y, float)
-    kept = np.isfinite(x) & np.isfinite(y)
+    valid = np.isfinite(x) & np.isfinite(y)
     if log:
-        kept &= (x > 0.0) & (y > 0.0)
-    return x[kept], y[kept]
+        valid &= (x > 0.0) & (y > 0.0)
+    return x[valid], y[valid]
 
 
 def _span(values: Array, *, log: bool) -> tuple[float, float]:

@@ -20,14 +20,14 @@ CAMERA_NAMESPACE = "http://pix4d.com/camera/1.0/"
 _GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
 _ASCII, _SHORT, _LONG, _RATIONAL, _BYTE, _UNDEFINED = 2, 3, 4, 5, 1, 7
 _SIZE = {_ASCII: 1, _SHORT: 2, _LONG: 4, _RATIONAL: 8, _BYTE: 1, _UNDEFINED: 1}
-_MOST_SEGMENT = 65_533
+_MAX_SEGMENT_NBYTES = 65_533
 _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
 
 Value = bytes | int | tuple[Fraction, ...]
 
 
 @dataclass(frozen=True)
-class Shot:
+class PictureMetadata:
     """What is told of a picture.
 
     `height_m` is above the ellipsoid (EXIF 2.32 knows no such reference: `remark` says it);
@@ -57,14 +57,14 @@ def utc_of(gps_ns: int) -> tuple[datetime, int]:
     """UTC of a GPS instant, whole seconds, and the nanoseconds beyond."""
     leap_s = leap_seconds_at(gps_ns)
     leap_s = leap_seconds_at(gps_ns - leap_s * 1_000_000_000)
-    seconds, rest = divmod(gps_ns, 1_000_000_000)
-    return _GPS_EPOCH + timedelta(seconds=seconds - leap_s), rest
+    seconds, remainder = divmod(gps_ns, 1_000_000_000)
+    return _GPS_EPOCH + timedelta(seconds=seconds - leap_s), remainder
 
 
-def exif_bytes(shot: Shot) -> bytes:
+def exif_bytes(shot: PictureMetadata) -> bytes:
     """The TIFF structure of an Exif segment, little-endian."""
-    when, beyond_ns = utc_of(shot.gps_ns)
-    stamp = _text(when.strftime("%Y:%m:%d %H:%M:%S"))
+    instant, beyond_ns = utc_of(shot.gps_ns)
+    stamp = _text(instant.strftime("%Y:%m:%d %H:%M:%S"))
     decimals = _text(f"{beyond_ns // 1000:06d}")
     per_cm = _rational(10.0 / (shot.pixel_um * 1e-3))
     main: list[tuple[int, int, Value]] = [
@@ -87,10 +87,12 @@ def exif_bytes(shot: Shot) -> bytes:
         (0xA420, _ASCII, _text(shot.name)),
     ]
     if shot.exposure_time_s:
-        detail.append((0x829A, _RATIONAL, (_rational(shot.exposure_time_s, most=1_000_000),)))
+        detail.append(
+            (0x829A, _RATIONAL, (_rational(shot.exposure_time_s, max_denominator=1_000_000),))
+        )
     if shot.serial:
         detail.append((0xA431, _ASCII, _text(shot.serial)))
-    second = Fraction(when.second * 1_000_000 + beyond_ns // 1000, 1_000_000)
+    second = Fraction(instant.second * 1_000_000 + beyond_ns // 1000, 1_000_000)
     gps: list[tuple[int, int, Value]] = [
         (0x0000, _BYTE, bytes([2, 3, 0, 0])),
         (0x0001, _ASCII, _text("N" if shot.latitude_deg >= 0 else "S")),
@@ -99,18 +101,18 @@ def exif_bytes(shot: Shot) -> bytes:
         (0x0004, _RATIONAL, _sexagesimal(shot.longitude_deg)),
         (0x0005, _BYTE, bytes([0 if shot.height_m >= 0 else 1])),
         (0x0006, _RATIONAL, (_rational(abs(shot.height_m)),)),
-        (0x0007, _RATIONAL, (Fraction(when.hour), Fraction(when.minute), second)),
+        (0x0007, _RATIONAL, (Fraction(instant.hour), Fraction(instant.minute), second)),
         (0x0010, _ASCII, _text("T")),
         (0x0011, _RATIONAL, (_rational(shot.yaw_pitch_roll_deg[0] % 360.0),)),
         (0x0012, _ASCII, _text("WGS-84")),
-        (0x001D, _ASCII, _text(when.strftime("%Y:%m:%d"))),
+        (0x001D, _ASCII, _text(instant.strftime("%Y:%m:%d"))),
     ]
     if shot.position_sigma_m is not None:
         gps.append((0x001F, _RATIONAL, (_rational(shot.position_sigma_m),)))
     return _tiff(main, detail, gps)
 
 
-def xmp_bytes(shot: Shot) -> bytes:
+def xmp_bytes(shot: PictureMetadata) -> bytes:
     """The XMP packet: attitude in Pix4D's `Camera` properties, orientation in our own."""
     yaw, pitch, roll = shot.yaw_pitch_roll_deg
     omega, phi, kappa = shot.omega_phi_kappa_deg
@@ -150,7 +152,7 @@ def xmp_bytes(shot: Shot) -> bytes:
     ).encode()
 
 
-def with_metadata(jpeg: bytes, shot: Shot) -> bytes:
+def with_metadata(jpeg: bytes, shot: PictureMetadata) -> bytes:
     """A JPEG with Exif and XMP behind its first marker.
 
     Raises:
@@ -163,7 +165,7 @@ def with_metadata(jpeg: bytes, shot: Shot) -> bytes:
         (b"Exif\0\0", exif_bytes(shot)),
         (b"http://ns.adobe.com/xap/1.0/\0", xmp_bytes(shot)),
     ):
-        if len(head) + len(body) > _MOST_SEGMENT:
+        if len(head) + len(body) > _MAX_SEGMENT_NBYTES:
             raise ValueError(f"{len(body)} bytes of metadata; a JPEG segment holds 64 KiB")
         segments += b"\xff\xe1" + struct.pack(">H", len(head) + len(body) + 2) + head + body
     return jpeg[:2] + segments + jpeg[2:]
@@ -219,26 +221,26 @@ def _text(value: str) -> bytes:
     return value.encode("ascii", "replace") + b"\0"
 
 
-def _rational(value: float, *, most: int = 100_000) -> Fraction:
-    return Fraction(value).limit_denominator(most)
+def _rational(value: float, *, max_denominator: int = 100_000) -> Fraction:
+    return Fraction(value).limit_denominator(max_denominator)
 
 
 def _sexagesimal(degrees: float) -> tuple[Fraction, ...]:
     """Degrees, minutes, seconds to 1e-6 of a second (30 um)."""
     total = round(abs(degrees) * 3600 * 1_000_000)
-    whole, rest = divmod(total, 3600 * 1_000_000)
-    minutes, seconds = divmod(rest, 60 * 1_000_000)
-    return Fraction(whole), Fraction(minutes), Fraction(seconds, 1_000_000)
+    whole_degrees, remainder = divmod(total, 3600 * 1_000_000)
+    minutes, seconds = divmod(remainder, 60 * 1_000_000)
+    return Fraction(whole_degrees), Fraction(minutes), Fraction(seconds, 1_000_000)
 
 
-def told(shot: Shot) -> Mapping[str, str]:
+def metadata_texts(shot: PictureMetadata) -> Mapping[str, str]:
     """The same as plain texts, for formats that have neither."""
-    when, beyond_ns = utc_of(shot.gps_ns)
+    instant, beyond_ns = utc_of(shot.gps_ns)
     omega, phi, kappa = shot.omega_phi_kappa_deg
     return {
         "CAMERA": shot.camera,
         "IMAGE": shot.name,
-        "UTC": f"{when:%Y-%m-%dT%H:%M:%S}.{beyond_ns // 1000:06d}Z",
+        "UTC": f"{instant:%Y-%m-%dT%H:%M:%S}.{beyond_ns // 1000:06d}Z",
         "GPS_NS": str(shot.gps_ns),
         "CRS": shot.crs,
         "PROJECTION_CENTRE_M": " ".join(f"{v:.4f}" for v in shot.centre_m),

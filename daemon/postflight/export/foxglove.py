@@ -16,16 +16,16 @@ from typing import Any
 
 from mcap.writer import Writer
 
+from daemon.mission.canonical_json import RecordError
 from daemon.mission.exposure import Exposure
+from daemon.mission.exposure_batch import ExposureFailure, for_each_exposure
 from daemon.mission.layout import Mission
 from daemon.mission.log.flight_log import logs_of, read
 from daemon.mission.log.log_records import record_of
-from daemon.mission.records import RecordError
 from daemon.mission.store import durable
 from daemon.mission.store.level2 import read_report
-from daemon.mission.walk import ExposureFailure, walk
-from daemon.onboard.service.commanding import AUDIT_TOPIC
-from daemon.orientation.exterior import exposure_of
+from daemon.onboard.service.command_execution import AUDIT_TOPIC
+from daemon.orientation.exterior_orientation import sealed_exposure
 from drivers.contract import DeviceEvent, NavSample
 from drivers.timescales.leap_seconds import leap_seconds_at
 
@@ -83,7 +83,7 @@ SCHEMAS: Mapping[str, Mapping[str, Any]] = {
 }
 """Properties by schema name, as Foxglove publishes them."""
 
-_Told = tuple[int, str, str, dict[str, Any]]
+_TopicMessage = tuple[int, str, str, dict[str, Any]]
 """UTC in ns since 1970, topic, schema, content without its timestamp."""
 
 
@@ -105,14 +105,14 @@ def export_foxglove(mission: Mission) -> FoxgloveExport:
     durable.make_directories(mission.export_dir)
     final = mission.export_dir / FILE_NAME
     counts: dict[str, int] = {}
-    read = walk(mission.numbers(), lambda number: _from_exposure(mission, number))
+    read = for_each_exposure(mission.numbers(), lambda number: _from_exposure(mission, number))
     of_exposures = (message for messages in read.results.values() for message in messages)
-    told = sorted([*_from_logs(mission), *of_exposures], key=itemgetter(0))
+    entries = sorted([*_from_logs(mission), *of_exposures], key=itemgetter(0))
     with durable.new_file(final) as part, part.open("wb") as file:
         writer = Writer(file)
         writer.start(profile="", library="syntopic")
         channels: dict[str, int] = {}
-        for utc_ns, topic, schema, content in told:
+        for utc_ns, topic, schema, content in entries:
             if topic not in channels:
                 channels[topic] = _register(writer, topic, schema)
             message = {"timestamp": {"sec": utc_ns // NS, "nsec": utc_ns % NS}, **content}
@@ -136,14 +136,14 @@ def _register(writer: Writer, topic: str, schema: str) -> int:
     return int(writer.register_channel(topic, "json", number))
 
 
-def _from_logs(mission: Mission) -> Iterator[_Told]:
+def _from_logs(mission: Mission) -> Iterator[_TopicMessage]:
     """Positions, and what devices and people said, from every log of the mission."""
     for path in logs_of(mission.log_dir):
-        said: list[tuple[int, int, str, str]] = []
+        log_messages: list[tuple[int, int, str, str]] = []
         mono_less_gps_ns: int | None = None
         for message in read(path):
             if message.topic == AUDIT_TOPIC:
-                said.append((message.mono_ns, INFO, *_of_command(message.payload)))
+                log_messages.append((message.mono_ns, INFO, *_of_command(message.payload)))
                 continue
             try:
                 record = record_of(message)
@@ -157,21 +157,21 @@ def _from_logs(mission: Mission) -> Iterator[_Told]:
                 yield (utc_ns(record.gps_ns), "/fix", "foxglove.LocationFix", _fix(record))
             elif isinstance(record, DeviceEvent):
                 level = ERROR if record.is_fault else INFO
-                said.append((record.mono_ns, level, record.device, record.sentence))
+                log_messages.append((record.mono_ns, level, record.device, record.sentence))
         if mono_less_gps_ns is None:
             continue  # nobody knows when this was said
-        for mono_ns, level, name, sentence in said:
-            yield (utc_ns(mono_ns - mono_less_gps_ns), *_said(level, name, sentence))
+        for mono_ns, level, name, sentence in log_messages:
+            yield (utc_ns(mono_ns - mono_less_gps_ns), *_log_message(level, name, sentence))
 
 
-def _from_exposure(mission: Mission, number: int) -> list[_Told]:
+def _from_exposure(mission: Mission, number: int) -> list[_TopicMessage]:
     """Thumbnail and findings of an exposure whose time is known."""
-    exposure = exposure_of(mission, number)
+    exposure = sealed_exposure(mission, number)
     if exposure is None or exposure.mark_gps_ns is None:
         return []
     at_ns = utc_ns(exposure.mark_gps_ns)
     folder = mission.level2(number)
-    messages: list[_Told] = [(at_ns, *_of_exposure(exposure, folder))]
+    messages: list[_TopicMessage] = [(at_ns, *_of_exposure(exposure, folder))]
     thumbnail = folder / "thumbnail.jpg"
     if thumbnail.exists():
         data = base64.b64encode(thumbnail.read_bytes()).decode("ascii")
@@ -185,19 +185,21 @@ def _of_exposure(exposure: Exposure, folder: Path) -> tuple[str, str, dict[str, 
     verdict = quality.get("verdict", "not processed")
     sentences = [finding["sentence"] for finding in quality.get("findings", [])]
     where = f", line {exposure.line_id}" if exposure.line_id else ""
-    told = f"exposure {exposure.number}{where}: {exposure.state}, {verdict}"
-    return _said(LEVELS.get(verdict, WARNING), "exposures", " ".join([f"{told}.", *sentences]))
+    entries = f"exposure {exposure.number}{where}: {exposure.state}, {verdict}"
+    return _log_message(
+        LEVELS.get(verdict, WARNING), "exposures", " ".join([f"{entries}.", *sentences])
+    )
 
 
 def _of_command(payload: bytes) -> tuple[str, str]:
     try:
-        told = json.loads(payload)
-        return str(told["by"]), f"{told['command']}: {told['sentence']}"
+        entries = json.loads(payload)
+        return str(entries["by"]), f"{entries['command']}: {entries['sentence']}"
     except (ValueError, KeyError, TypeError):
         return "audit", "a command that cannot be read"
 
 
-def _said(level: int, name: str, sentence: str) -> tuple[str, str, dict[str, Any]]:
+def _log_message(level: int, name: str, sentence: str) -> tuple[str, str, dict[str, Any]]:
     content = {"level": level, "message": sentence, "name": name, "file": "", "line": 0}
     return "/log", "foxglove.Log", content
 

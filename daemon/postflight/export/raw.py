@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from daemon.mission.exposure import to_json
+from daemon.mission.exposure_batch import ExposureFailure
 from daemon.mission.layout import Mission
 from daemon.mission.log.flight_log import logs_of, read
 from daemon.mission.store.durable import new_file
-from daemon.mission.walk import ExposureFailure
-from daemon.orientation.exterior import exposures_of
+from daemon.orientation.exterior_orientation import sealed_exposures
 
-NATIVE_ENDINGS = {
+NATIVE_SUFFIXES = {
     "ublox": "ubx",
     "novatel": "gps",
     "septentrio": "sbf",
@@ -75,20 +75,20 @@ def export_raw(mission: Mission) -> RawExport:
     """
     folder = mission.export_dir / "raw"
     folder.mkdir(parents=True, exist_ok=True)
-    endings = _receivers(mission)
-    nbytes = dict.fromkeys((f"{name}.{ending}" for name, ending in endings.items()), 0)
+    suffixes = _receivers(mission)
+    nbytes = dict.fromkeys((f"{name}.{suffix}" for name, suffix in suffixes.items()), 0)
     with ExitStack() as stack:
         files: dict[str, BinaryIO] = {
-            name: stack.enter_context(_new_binary(folder / f"{name}.{ending}"))
-            for name, ending in endings.items()
+            name: stack.enter_context(_new_binary(folder / f"{name}.{suffix}"))
+            for name, suffix in suffixes.items()
         }
         for path in logs_of(mission.log_dir):
             for message in read(path):
                 kind, _, device = message.topic.partition("/")
                 if kind == "raw" and device in files:
                     files[device].write(message.payload)
-                    nbytes[f"{device}.{endings[device]}"] += len(message.payload)
-    sealed = exposures_of(mission)
+                    nbytes[f"{device}.{suffixes[device]}"] += len(message.payload)
+    sealed = sealed_exposures(mission)
     records = [to_json(exposure) for exposure in sealed.results.values()]
     rows = [row for record in records for row in _event(record)]
     _write(folder / "events.csv", EVENT_COLUMNS, rows)
@@ -113,7 +113,7 @@ def _receivers(mission: Mission) -> dict[str, str]:
     """Ending by name of every navigator the flight was configured with."""
     flown = mission.flown_configuration()
     return {
-        section["name"]: NATIVE_ENDINGS.get(section["driver"], "bin")
+        section["name"]: NATIVE_SUFFIXES.get(section["driver"], "bin")
         for section in flown.get("navigator", [])
     }
 

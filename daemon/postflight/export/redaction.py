@@ -10,21 +10,23 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-LEFT_OUT = "left out"
-_WORDS = r"token|secret|passw|passphrase|pwd|key|credential|auth|cookie|bearer|psk"
-_SECRET_KEY = re.compile(_WORDS, re.IGNORECASE)
+REDACTED = "left out"
+_SECRET_WORDS = r"token|secret|passw|passphrase|pwd|key|credential|auth|cookie|bearer|psk"
+_SECRET_KEY = re.compile(_SECRET_WORDS, re.IGNORECASE)
 _SECRET_TEXTS = (
     # A name and perhaps a password before the host of an address.
-    (re.compile(r"([A-Za-z][A-Za-z0-9+.\-]*://)[^/?#\s\"']*@"), rf"\1{LEFT_OUT}@"),
-    (re.compile(r"(?i)(authorization\s*[:=]\s*)[^\r\n]+"), rf"\1{LEFT_OUT}"),
-    (re.compile(r"(?i)\b(bearer|basic)\s+[A-Za-z0-9._~+/=\-]+"), rf"\1 {LEFT_OUT}"),
+    (re.compile(r"([A-Za-z][A-Za-z0-9+.\-]*://)[^/?#\s\"']*@"), rf"\1{REDACTED}@"),
+    (re.compile(r"(?i)(authorization\s*[:=]\s*)[^\r\n]+"), rf"\1{REDACTED}"),
+    (re.compile(r"(?i)\b(bearer|basic)\s+[A-Za-z0-9._~+/=\-]+"), rf"\1 {REDACTED}"),
     # A parameter of an address, or an assignment within a text.
     (
-        re.compile(rf"([\w.\-]*(?:{_WORDS})[\w.\-]*\s*[=:]\s*)[^&;,\s\"'}}\]]+", re.IGNORECASE),
-        rf"\1{LEFT_OUT}",
+        re.compile(
+            rf"([\w.\-]*(?:{_SECRET_WORDS})[\w.\-]*\s*[=:]\s*)[^&;,\s\"'}}\]]+", re.IGNORECASE
+        ),
+        rf"\1{REDACTED}",
     ),
-    (re.compile(r"\bsyn_[A-Za-z0-9_\-]{16,}"), LEFT_OUT),
-    (re.compile(r"-----BEGIN[\s\S]*?(-----END[^-]*-----|\Z)"), LEFT_OUT),
+    (re.compile(r"\bsyn_[A-Za-z0-9_\-]{16,}"), REDACTED),
+    (re.compile(r"-----BEGIN[\s\S]*?(-----END[^-]*-----|\Z)"), REDACTED),
 )
 
 
@@ -36,7 +38,7 @@ def without_secrets(content: Any) -> Any:
     """
     if isinstance(content, Mapping):
         return {
-            text_without_secrets(str(key)): LEFT_OUT
+            text_without_secrets(str(key)): REDACTED
             if _SECRET_KEY.search(str(key))
             else without_secrets(value)
             for key, value in content.items()

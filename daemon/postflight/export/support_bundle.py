@@ -15,15 +15,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from daemon.mission.canonical_json import RECORD_MAX_BYTES, RecordError, parse_record
 from daemon.mission.catalog.catalog import Catalog, CatalogError
-from daemon.mission.foreign_files import ForeignFileError, read_plain
+from daemon.mission.foreign_files import ForeignFileError, read_regular_file
 from daemon.mission.layout import Mission, MissionError
 from daemon.mission.log.flight_log import logs_of, read
-from daemon.mission.records import RECORD_MAX_BYTES, RecordError, parse_record
 from daemon.mission.store import durable
 from daemon.mission.verification.verification import VerifyReport
-from daemon.postflight.export.redaction import LEFT_OUT, text_without_secrets, without_secrets
-from processing.rig.file import RIG_FILE_MAX_BYTES
+from daemon.postflight.export.redaction import REDACTED, text_without_secrets, without_secrets
+from processing.rig.rig_file import RIG_FILE_MAX_BYTES
 
 TOPICS = ("event/", "ledger", "audit", "trigger", "mark/", "log/")
 """Topics of the flight log that are told; navigation and raw bytes say where somebody flew."""
@@ -69,11 +69,13 @@ def write_bundle(
         put("versions.json", json.dumps(_versions(), indent=1))
         put("mission.json", json.dumps(without_secrets(mission.about()), indent=1))
         if mission.rig_path.exists():
-            text = read_plain(mission.rig_path, RIG_FILE_MAX_BYTES).decode("utf-8", "replace")
+            text = read_regular_file(mission.rig_path, RIG_FILE_MAX_BYTES).decode(
+                "utf-8", "replace"
+            )
             put("rig.toml", text_without_secrets(text))
         put("service.json", _configuration(mission))
         put("exposures.jsonl", "".join(_records(mission)))
-        put("log.jsonl", "".join(_told(mission)))
+        put("log.jsonl", "".join(_log_lines(mission)))
         put("events.json", json.dumps(_events(mission), indent=1))
         if verified is not None:
             put(
@@ -88,7 +90,7 @@ def _configuration(mission: Mission) -> str:
     try:
         flown = mission.flown_configuration()
     except MissionError:
-        return json.dumps({LEFT_OUT: "service.toml cannot be read as TOML"})
+        return json.dumps({REDACTED: "service.toml cannot be read as TOML"})
     return json.dumps(without_secrets(flown), indent=1, default=str)
 
 
@@ -107,22 +109,22 @@ def _versions() -> dict[str, object]:
 def _records(mission: Mission) -> Iterator[str]:
     """Record and quality report of each exposure, without where it was."""
     for number in mission.numbers():
-        told: dict[str, object] = {"number": number}
+        entry: dict[str, object] = {"number": number}
         for key, file in (
             ("record", mission.level0(number) / "exposure.json"),
             ("quality", mission.level2(number) / "quality.json"),
         ):
             try:
-                content = parse_record(read_plain(file, RECORD_MAX_BYTES), file.name)
+                content = parse_record(read_regular_file(file, RECORD_MAX_BYTES), file.name)
             except (ForeignFileError, RecordError) as error:
-                told[key] = f"not to be had: {type(error).__name__}"
+                entry[key] = f"not to be had: {type(error).__name__}"
                 continue
             content.pop("navigation", None)
-            told[key] = without_secrets(content)
-        yield json.dumps(told) + "\n"
+            entry[key] = without_secrets(content)
+        yield json.dumps(entry) + "\n"
 
 
-def _told(mission: Mission) -> Iterator[str]:
+def _log_lines(mission: Mission) -> Iterator[str]:
     """Messages of the flight log that hold neither bytes of devices nor places."""
     nbytes = 0
     for path in logs_of(mission.log_dir):

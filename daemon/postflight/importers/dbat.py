@@ -17,14 +17,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.mission.foreign_files import ForeignFileError, read_plain, within
+from daemon.mission.foreign_files import ForeignFileError, read_regular_file, within
 from daemon.mission.foreign_xml import XmlError, parse_xml
-from daemon.postflight.adjustment.project import Checks
+from daemon.postflight.adjustment.csv_tables import ProjectError
+from daemon.postflight.adjustment.project import CheckPoints
 from daemon.postflight.adjustment.project_file import AdjustSection, CameraSection, ProjectFile
-from daemon.postflight.adjustment.tables import ProjectError
 from processing.bundle.network import (
     Attitudes,
-    Camera,
+    CameraModel,
     ImagePoints,
     Images,
     Network,
@@ -34,22 +34,22 @@ from processing.bundle.network import (
 
 Array = NDArray[np.float64]
 
-_MOST_BYTES = 100_000_000
+_MAX_BYTES = 100_000_000
 ELEMENTS_MAX = 10_000
 _FREE = ("dx0", "dy0", "df", "k1", "k2", "k3", "p1", "p2", "b1")
 """Everything but skew, as its calibration scripts estimate."""
 
 
 @dataclass(frozen=True)
-class Imported:
+class ImportedProject:
     """A project file and its network; orientations and points without starting values are NaN."""
 
     file: ProjectFile
     network: Network
-    checks: Checks
+    checks: CheckPoints
 
 
-def import_dbat(script: Path) -> Imported:
+def import_dbat(script: Path) -> ImportedProject:
     """Read a script and the files it names.
 
     Raises:
@@ -66,7 +66,7 @@ def import_dbat(script: Path) -> Imported:
         ) from error
 
 
-def _imported(script: Path, root: ElementTree.Element) -> Imported:
+def _imported(script: Path, root: ElementTree.Element) -> ImportedProject:
     given = root.find("input")
     if given is None:
         raise ProjectError([f"{script.name}: no input section; a DBAT script has one"])
@@ -99,12 +99,12 @@ def _imported(script: Path, root: ElementTree.Element) -> Imported:
         adjust=AdjustSection(image_sigma_um=0.1 * pixel_mm * 1e3),
     )  # fmt: skip
     network, checks = _network(script, given, section, pixel_mm)
-    return Imported(file, network, checks)
+    return ImportedProject(file, network, checks)
 
 
 def _network(
     script: Path, given: ElementTree.Element, section: CameraSection, pixel_mm: float
-) -> tuple[Network, Checks]:
+) -> tuple[Network, CheckPoints]:
     images = _rows(script, given, "images", "id,path")
     seen = _rows(script, given, "image_pts", "im,id,x,y,sxy")
     control = _control(script, given)
@@ -124,7 +124,7 @@ def _network(
     index = np.arange(n)
     network = Network(
         cameras=(
-            Camera(
+            CameraModel(
                 section.name, section.f_mm, section.xp_mm, section.yp_mm, "centred",
                 free=frozenset(section.free), pixel_mm=pixel_mm,
             ),
@@ -140,7 +140,7 @@ def _network(
             np.stack([sigma, sigma], axis=1),
         ),
     )  # fmt: skip
-    return network, Checks((), np.zeros((0, 3)), np.zeros((0, 3)))
+    return network, CheckPoints((), np.zeros((0, 3)), np.zeros((0, 3)))
 
 
 def _control(script: Path, given: ElementTree.Element) -> dict[str, tuple[list[float], float]]:
@@ -187,7 +187,7 @@ def _within(script: Path, name: str) -> Path:
 
 def _bytes_of(path: Path) -> bytes:
     try:
-        return read_plain(path, _MOST_BYTES)
+        return read_regular_file(path, _MAX_BYTES)
     except ForeignFileError as error:
         raise ProjectError([str(error)]) from error
 

@@ -20,12 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.errors import DaemonError
+from daemon.mission.canonical_json import canonical_bytes, sha256_hex
 from daemon.mission.exposure import Exposure, FrameRecord, exposure_bytes
 from daemon.mission.layout import Mission, exposure_name
-from daemon.mission.records import canonical_bytes, sha256_hex
 from daemon.mission.store import durable
-from daemon.mission.store.level0 import tiff_faults, tiff_parts
-from daemon.postflight.calibration.rig_text import rig_toml
+from daemon.mission.store.level0 import tiff_errors, tiff_parts
+from daemon.postflight.calibration.rig_writer import rig_toml
 from daemon.postflight.importers.xmp import Xmp, XmpError, read_xmp
 from drivers.cameras.tiff_layout import layout_problem
 from processing.geometry.brown import Brown, lens_from_brown
@@ -82,7 +82,7 @@ class RedEdgeImage:
 
 
 @dataclass(frozen=True)
-class Imported:
+class ImportedMission:
     """What was written: the mission, its exposures, and how well each lens was carried over."""
 
     mission: Mission
@@ -94,7 +94,7 @@ class Imported:
 
 def import_rededge(
     folder: Path, out: Path, *, progress: Callable[[int, int], None] | None = None
-) -> Imported:
+) -> ImportedMission:
     """Write the mission folder `out` from all images below `folder`.
 
     Images of one capture become one exposure, in the order of their paths. `progress` is told
@@ -129,7 +129,7 @@ def import_rededge(
             frames += _write_exposure(part, number, capture, rig, sha256_hex(rig_bytes))
             if progress is not None:
                 progress(number, len(captures))
-    return Imported(Mission.open(out), len(captures), frames, fit, tuple(missing))
+    return ImportedMission(Mission.open(out), len(captures), frames, fit, tuple(missing))
 
 
 def rig_of(images: Mapping[str, RedEdgeImage]) -> tuple[Rig, dict[str, float]]:
@@ -178,17 +178,17 @@ def read_image(path: Path) -> tuple[RedEdgeImage, NDArray[np.uint16]]:
             if page.compression != 1 or 2 * shape[0] * shape[1] > path.stat().st_size:
                 raise ImagesError([f"{path.name}: is compressed or ends early; give the original"])
             image = _image(path, tags, shape)
-            words: NDArray[np.uint16] = np.ascontiguousarray(page.asarray())
+            pixels: NDArray[np.uint16] = np.ascontiguousarray(page.asarray())
     except (ImagesError, OSError):
         raise
     except XmpError as error:
         raise ImagesError([str(error)]) from error
-    except tiff_faults() as error:
+    except tiff_errors() as error:
         sentence = f"{path.name}: not a usable RedEdge image ({type(error).__name__}: {error})"
         raise ImagesError([sentence]) from error
-    if words.shape != shape:
+    if pixels.shape != shape:
         raise ImagesError([f"{path.name}: its pixels end early"])
-    return image, words
+    return image, pixels
 
 
 def _image(path: Path, tags: Mapping[int, Any], shape: tuple[int, int]) -> RedEdgeImage:
@@ -321,7 +321,7 @@ def _cone_of(cone: Cone, image: RedEdgeImage | None, fit: dict[str, float]) -> C
         pitch_um=round(image.pitch_mm * 1e3, 6),
         x_mm=((image.width_px - 1) / 2.0 - column) * image.pitch_mm,
         y_mm=(row - (image.height_px - 1) / 2.0) * image.pitch_mm,
-        black_dn=image.black / cone.sensors[0].words_per_dn,
+        black_dn=image.black / cone.sensors[0].raw_units_per_dn,
     )
     return replace(cone, lens=lens, sensors=(sensor,))
 
@@ -333,9 +333,9 @@ def _write_exposure(
     folder.mkdir()
     frames = []
     for image in sorted(capture, key=lambda image: image.sensor):
-        again, words = read_image(image.path)
-        told = {"sensor": image.sensor, "exposure": number, "source": image.path.name}
-        parts = tiff_parts([words], {"syntopic": 1, "head_serial": image.serial, **told})
+        again, pixels = read_image(image.path)
+        description = {"sensor": image.sensor, "exposure": number, "source": image.path.name}
+        parts = tiff_parts([pixels], {"syntopic": 1, "head_serial": image.serial, **description})
         name = f"{image.sensor}.tif"
         durable.create_file(folder / name, parts)
         frames.append(_frame(again, name, sha256_hex(b"".join(parts))))
@@ -394,14 +394,16 @@ def gps_ns_from_utc(utc: datetime) -> int:
 
 def _utc(exif: Mapping[str, Any]) -> datetime | None:
     try:
-        whole = datetime.strptime(str(exif["DateTimeOriginal"]).strip("\0 "), "%Y:%m:%d %H:%M:%S")
+        seconds_utc = datetime.strptime(
+            str(exif["DateTimeOriginal"]).strip("\0 "), "%Y:%m:%d %H:%M:%S"
+        )
         part = str(exif.get("SubsecTime", "0")).strip("\0 ")
         # The camera writes a sign where its clock ran before the second.
         microseconds = int(part.lstrip("-")[:6].ljust(6, "0"))
     except (KeyError, ValueError):
         return None
     sign = -1 if part.startswith("-") else 1
-    return whole.replace(tzinfo=UTC) + timedelta(microseconds=sign * microseconds)
+    return seconds_utc.replace(tzinfo=UTC) + timedelta(microseconds=sign * microseconds)
 
 
 def _place(gps: Any) -> dict[str, float]:

@@ -1,7 +1,7 @@
 """Recorded bytes of a device through its driver again, on a clock that goes as they came.
 
 The driver is the one that flew; only its port and its clock are stand-ins. What comes out is held
-against the records of the flight log by `daemon.postflight.replay.flight`.
+against the records of the flight log by `daemon.postflight.replay.flight_replay`.
 """
 
 from __future__ import annotations
@@ -49,21 +49,21 @@ class _Port:
         self.timeout: Any = 0.0
         self.chunks: deque[RawBytes] = deque()
         self._clock = clock
-        self._rest = b""
+        self._remainder = b""
 
     @property
     def in_waiting(self) -> int:
-        return len(self._rest)
+        return len(self._remainder)
 
     def read(self, size: int = 1) -> bytes:
-        if not self._rest and self.timeout and self.chunks:
+        if not self._remainder and self.timeout and self.chunks:
             chunk = self.chunks.popleft()
-            self._rest = chunk.data
+            self._remainder = chunk.data
             self._clock.now_ns = max(self._clock.now_ns, chunk.mono_ns)
-        elif not self._rest:
+        elif not self._remainder:
             # What was drained in flight is logged apart: a driver finds its line empty.
             self._clock.now_ns += round((self.timeout or 0.0) * 1e9)
-        data, self._rest = self._rest[:size], self._rest[size:]
+        data, self._remainder = self._remainder[:size], self._remainder[size:]
         return data
 
     def write(self, data: bytes, /) -> int | None:
@@ -100,26 +100,26 @@ class Codec:
 def codec_for(kind: str, driver: str, name: str, settings: Mapping[str, object]) -> Codec | None:
     """The codec of a device as configured; None where its records are not made of logged bytes."""
     try:
-        made = registry.driver_for(kind, driver)
+        driver_class = registry.driver_for(kind, driver)
     except (DeviceError, ImportError):
         return None
-    if not issubclass(made, SerialDevice):
+    if not issubclass(driver_class, SerialDevice):
         return None
     clock = _Clock()
     port = _Port(clock)
-    return Codec(made(name, settings, clock=clock, open_port=lambda *_: port), port, clock)
+    return Codec(driver_class(name, settings, clock=clock, open_port=lambda *_: port), port, clock)
 
 
-def has_first_bytes(heard: Iterable[RawBytes | DeviceEvent]) -> bool:
+def has_first_bytes(recorded: Iterable[RawBytes | DeviceEvent]) -> bool:
     """Whether the log holds what a device said before it was open, or there was nothing.
 
     That was told to nobody, but the decoder learned from it, such as whether attitudes come.
     """
-    first = next(iter(heard), None)
+    first = next(iter(recorded), None)
     return not isinstance(first, DeviceEvent) or first.name != "opened"
 
 
-def decode_all(codec: Codec, heard: Iterable[RawBytes | DeviceEvent]) -> list[Decoded]:
+def decode_all(codec: Codec, recorded: Iterable[RawBytes | DeviceEvent]) -> list[Decoded]:
     """Everything a device said in one run of the service.
 
     Args:
@@ -129,7 +129,7 @@ def decode_all(codec: Codec, heard: Iterable[RawBytes | DeviceEvent]) -> list[De
     found: list[Decoded] = []
     chunks: list[RawBytes] = []
     was_opened = False
-    for record in heard:
+    for record in recorded:
         if isinstance(record, RawBytes):
             chunks.append(record)
         elif record.name == "opened" and not was_opened:

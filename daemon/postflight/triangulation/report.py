@@ -18,31 +18,31 @@ from numpy.typing import NDArray
 
 from daemon.orientation.georeference import Georeference
 from daemon.orientation.local_frame import FRAME_FILE
+from daemon.postflight.adjustment.csv_tables import ProjectError, write_table
 from daemon.postflight.adjustment.project import Project
-from daemon.postflight.adjustment.tables import ProjectError, write_table
-from daemon.postflight.adjustment.writing import fill_results, new_project
-from daemon.postflight.triangulation.triangulation import Block
+from daemon.postflight.adjustment.project_writer import fill_results, new_project
+from daemon.postflight.triangulation.triangulation import ImageBlock
 from daemon.terminal.console import Console
 from daemon.terminal.tables import light_table
 from processing.bundle.adjust import Adjustment
-from processing.bundle.findings import (
-    checked_against,
+from processing.bundle.adjustment_results import (
+    check_point_differences,
     control_residuals,
     exposures_of,
     image_residuals_mm,
     systematic_residuals,
 )
 from processing.geometry.orientation import grid_from_enu, omega_phi_kappa
-from processing.matching.blocks import TiedBlock, sides_of
+from processing.matching.block_matching import BlockTiePoints, match_counts_by_line
 
 Array = NDArray[np.float64]
 
 CELLS = (16, 11)
-_LEAST_IN_CELL = 10
+_MIN_IN_CELL = 10
 
 
 def triangulation_of(
-    block: Block, tied: TiedBlock, project: Project, result: Adjustment
+    block: ImageBlock, tied: BlockTiePoints, project: Project, result: Adjustment
 ) -> dict[str, Any]:
     """The section `triangulation` of the report; lengths in m, px and um as named."""
     network = result.network
@@ -52,13 +52,13 @@ def triangulation_of(
     rms_um = np.sqrt(np.mean(residual[tie] ** 2, axis=0)) * 1e3
     sigma_um = [float(v) * 1e3 for v in network.image_points.sigma_mm[tie].mean(axis=0)]
     pattern = systematic_residuals(result, 0, CELLS)
-    filled = pattern.count >= _LEAST_IN_CELL
+    filled = pattern.count >= _MIN_IN_CELL
     worst = np.hypot(*pattern.mean_mm[filled].T).max() * 1e3 if filled.any() else math.nan
     rays = np.bincount(network.image_points.point[tie], minlength=tied.points)[: tied.points]
-    along, across = sides_of(tied, block.lines)
+    along, across = match_counts_by_line(tied, block.lines)
     checks = project.checks
     control = control_residuals(result)
-    against = checked_against(result, checks.names, checks.xyz_m, checks.sigma_m)
+    against = check_point_differences(result, checks.names, checks.xyz_m, checks.sigma_m)
     px = block.image.pitch_um
     return {
         "exposures": len(block.names),
@@ -98,7 +98,7 @@ def _agreement(names: tuple[str, ...], difference_m: Array, gsd_m: float) -> dic
 
 
 def write_triangulation(
-    folder: Path, block: Block, project: Project, result: Adjustment, report: Mapping[str, Any]
+    folder: Path, block: ImageBlock, project: Project, result: Adjustment, report: Mapping[str, Any]
 ) -> None:
     """Write the adjusted project with its report, and orientations in the coordinate system.
 
@@ -114,7 +114,7 @@ def write_triangulation(
 
 
 def _fill(
-    folder: Path, block: Block, project: Project, result: Adjustment, report: Mapping[str, Any]
+    folder: Path, block: ImageBlock, project: Project, result: Adjustment, report: Mapping[str, Any]
 ) -> None:
     (folder / "rig.toml").write_bytes(block.mission.rig_path.read_bytes())
     fill_results(folder, _named(project), result, report)

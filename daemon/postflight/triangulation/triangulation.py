@@ -1,7 +1,8 @@
 """Aerial triangulation of a mission: matched, adjusted with direct georeferencing as start.
 
 The result is an adjustment project like any other (docs/formats.md), with all its tables, and the
-orientations in the coordinate system asked for. Matching is in `processing.matching.blocks`.
+orientations in the coordinate system asked for. Matching is in
+`processing.matching.block_matching`.
 """
 
 from __future__ import annotations
@@ -17,38 +18,38 @@ from numpy.typing import NDArray
 
 from daemon.errors import DaemonError
 from daemon.mission.exposure import Exposure
+from daemon.mission.exposure_batch import ExposureFailure, for_each_exposure
 from daemon.mission.layout import Mission
 from daemon.mission.store.level0 import check_tiff, read_description, read_tiff
-from daemon.mission.walk import ExposureFailure, walk
-from daemon.orientation.exterior import ExteriorOrientation, exposures_of
-from daemon.orientation.inputs import orienting
+from daemon.orientation.exterior_orientation import ExteriorOrientation, sealed_exposures
 from daemon.orientation.local_frame import LocalFrame
-from daemon.postflight.adjustment.project import Checks, Project
+from daemon.orientation.orientation_inputs import read_orientation_inputs
+from daemon.postflight.adjustment.csv_tables import CsvTable, read_table
+from daemon.postflight.adjustment.project import CheckPoints, Project
 from daemon.postflight.adjustment.project_file import ProjectFile
-from daemon.postflight.adjustment.tables import Table, read_table
-from processing.bundle.adjust import Settings, adjust
-from processing.bundle.iterations import Progress
+from processing.bundle.adjust import AdjustmentSettings, adjust
+from processing.bundle.gauss_newton import Progress
+from processing.bundle.initial_values import completed
 from processing.bundle.network import (
     Attitudes,
-    Bearings,
-    Camera,
+    CameraModel,
     Gnss,
     ImagePoints,
     Images,
+    MeasuredAttitudes,
     Network,
     Points,
     Stations,
 )
-from processing.bundle.self_calibration import SetName, parts_of, self_calibrating
-from processing.bundle.start import completed
-from processing.matching.blocks import BlockMatching, TiedBlock, image_mm, tied_block
+from processing.bundle.self_calibration import SetName, parts_of, with_self_calibration
+from processing.matching.block_matching import BlockMatching, BlockTiePoints, image_mm, match_block
 from processing.pipelines.perspective import perspective_of
 from processing.rig import Rig, VirtualImage, load_rig
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.float32]
 
-KEPT_IMAGES = 12
+CACHED_IMAGES = 12
 TIE_SIGMA_PX = 0.03
 MEASURED_SIGMA_PX = 0.3
 GEODETIC = ("latitude_deg", "longitude_deg", "height_m")
@@ -60,7 +61,7 @@ class TriangulationError(DaemonError, ValueError):
 
 
 @dataclass(frozen=True)
-class Asked:
+class TriangulationSettings:
     """How to triangulate.
 
     `parameters` is the set of additional parameters, `interior` whether it holds the interior
@@ -78,7 +79,7 @@ class Asked:
 
 
 @dataclass(frozen=True)
-class Block:
+class ImageBlock:
     """Images of one geometry, stitched or of heads, with a start orientation in a local frame.
 
     `failures` are exposures whose record or images cannot be read; they are not in the block.
@@ -123,7 +124,7 @@ def block_of(
     trajectory_file: Path | None = None,
     mount_file: Path | None = None,
     heads: Sequence[str] = (),
-) -> Block:
+) -> ImageBlock:
     """Orient the exposures that have a stitched PAN image, or the images of heads.
 
     Args:
@@ -137,7 +138,7 @@ def block_of(
     rig = load_rig(mission.rig_path)
     image = _common_image(rig, heads)
     files = [f"{name}.tif" for name in heads or ("pan",)]
-    read = exposures_of(mission)
+    read = sealed_exposures(mission)
     candidates = {
         number: exposure
         for number, exposure in read.results.items()
@@ -152,7 +153,7 @@ def block_of(
             )
         return candidates[number]
 
-    usable = walk(candidates, with_usable_images)
+    usable = for_each_exposure(candidates, with_usable_images)
     exposures = list(usable.results.values())
     failures = (*read.failures, *usable.failures)
     if len(exposures) < 2:
@@ -161,11 +162,11 @@ def block_of(
             "time; a block takes two or more. Run `syntopic process` first"
             + "".join(f"; exposure {one.exposure}: {one.cause}" for one in failures)
         )
-    means = orienting(
+    inputs = read_orientation_inputs(
         mission, exposures, crs=crs, trajectory_file=trajectory_file, mount_file=mount_file
     )
     oriented = [
-        eo for eo in means.oriented(exposures) if (eo.cone in heads if heads else eo.is_virtual)
+        eo for eo in inputs.oriented(exposures) if (eo.cone in heads if heads else eo.is_virtual)
     ]
     if len(oriented) < 2:
         raise TriangulationError(
@@ -182,9 +183,9 @@ def block_of(
             for eo in oriented
         ]
     )
-    return Block(
-        mission, rig, image, tuple(oriented), means.crs, frame, station, rotation,
-        means.ground_height_m, failures,
+    return ImageBlock(
+        mission, rig, image, tuple(oriented), inputs.crs, frame, station, rotation,
+        inputs.ground_height_m, failures,
     )  # fmt: skip
 
 
@@ -208,27 +209,29 @@ def _common_image(rig: Rig, heads: Sequence[str]) -> VirtualImage:
     return image
 
 
-def matched(block: Block, settings: BlockMatching, progress: Callable[[int], None]) -> TiedBlock:
+def match_mission_block(
+    block: ImageBlock, settings: BlockMatching, progress: Callable[[int], None]
+) -> BlockTiePoints:
     """Tie points of all overlapping images; a dozen of them are kept in memory."""
-    kept: OrderedDict[int, Picture] = OrderedDict()
+    cache: OrderedDict[int, Picture] = OrderedDict()
 
     def load(k: int) -> Picture:
-        if k in kept:
-            kept.move_to_end(k)
-            return kept[k]
-        words = _words(block, block.oriented[k])
-        kept[k] = np.where(words == 0, np.nan, words).astype(np.float32)
-        if len(kept) > KEPT_IMAGES:
-            kept.popitem(last=False)
-        return kept[k]
+        if k in cache:
+            cache.move_to_end(k)
+            return cache[k]
+        pixels = _image_pixels(block, block.oriented[k])
+        cache[k] = np.where(pixels == 0, np.nan, pixels).astype(np.float32)
+        if len(cache) > CACHED_IMAGES:
+            cache.popitem(last=False)
+        return cache[k]
 
-    return tied_block(
+    return match_block(
         load, block.image, block.station_m, block.rotation, block.ground_m, settings,
         progress=progress,
     )  # fmt: skip
 
 
-def _words(block: Block, eo: ExteriorOrientation) -> NDArray[np.uint16]:
+def _image_pixels(block: ImageBlock, eo: ExteriorOrientation) -> NDArray[np.uint16]:
     """Pixels of an image: PAN, or of a head the green band, else the first."""
     path = block.mission.level2(eo.exposure) / ("pan.tif" if eo.is_virtual else f"{eo.cone}.tif")
     bands = [] if eo.is_virtual else read_description(path).get("bands", [])
@@ -239,9 +242,9 @@ def _words(block: Block, eo: ExteriorOrientation) -> NDArray[np.uint16]:
 
 
 def project_of(
-    block: Block,
-    tied: TiedBlock,
-    asked: Asked,
+    block: ImageBlock,
+    tied: BlockTiePoints,
+    options: TriangulationSettings,
     *,
     points_file: Path | None = None,
     measured_file: Path | None = None,
@@ -250,7 +253,7 @@ def project_of(
 
     Raises:
         TriangulationError: no tie points, or a set that the rig cannot have.
-        daemon.postflight.adjustment.tables.ProjectError: control files with mistakes.
+        daemon.postflight.adjustment.csv_tables.ProjectError: control files with mistakes.
     """
     if not len(tied.image):
         raise TriangulationError(
@@ -271,14 +274,14 @@ def project_of(
     px = np.concatenate([tied.px, surveyed.px])
     spread = np.concatenate([np.full(len(tied.image), TIE_SIGMA_PX), surveyed.sigma_px]) * pitch
     lines = tuple(dict.fromkeys(block.lines))
-    file = _file(block, asked)
+    file = _file(block, options)
     try:
-        camera = self_calibrating(
-            Camera(block.camera, block.image.f_mm, pixel_mm=pitch),
-            asked.parameters,
-            parts_of(block.rig) if asked.parameters.startswith("sensors") else (),
+        camera = with_self_calibration(
+            CameraModel(block.camera, block.image.f_mm, pixel_mm=pitch),
+            options.parameters,
+            parts_of(block.rig) if options.parameters.startswith("sensors") else (),
             master_cone=block.rig.master_cone,
-            interior=asked.interior,
+            interior=options.interior,
         )
     except ValueError as error:
         raise TriangulationError(str(error)) from error
@@ -296,21 +299,25 @@ def project_of(
             station=every,
             attitude=every,
             position_m=block.station_m,
-            sigma_m=np.tile(asked.position_sigma_m, (n, 1)),
+            sigma_m=np.tile(options.position_sigma_m, (n, 1)),
             lever_m=np.zeros((n, 3)),
             line=np.array([lines.index(line) for line in block.lines], dtype=np.int64),
             time_s=np.array([eo.gps_ns - block.oriented[0].gps_ns for eo in block.oriented]) * 1e-9,
             lines=tuple(line or "line" for line in lines),
             drift="linear"
-            if asked.drift == "linear"
+            if options.drift == "linear"
             else "shift"
-            if asked.drift == "shift"
+            if options.drift == "shift"
             else "none",
         ),
-        bearings=Bearings(every, block.rotation, np.tile(asked.attitude_sigma_rad, (n, 1))),
+        measured_attitudes=MeasuredAttitudes(
+            every, block.rotation, np.tile(options.attitude_sigma_rad, (n, 1))
+        ),
     )
-    settings = Settings(robust=True, reject_beyond=asked.reject_beyond, variance_components=True)
-    checks = Checks(
+    settings = AdjustmentSettings(
+        robust=True, reject_beyond=options.reject_beyond, variance_components=True
+    )
+    checks = CheckPoints(
         tuple(name for name, c in zip(surveyed.names, control, strict=True) if not c),
         surveyed.xyz_m[~control],
         surveyed.sigma_m[~control],
@@ -318,19 +325,19 @@ def project_of(
     return Project(file.name, file, network, settings, checks)
 
 
-def weighted(project: Project, ties: int, progress: Progress | None = None) -> Project:
+def weight_by_residuals(project: Project, ties: int, progress: Progress | None = None) -> Project:
     """The project with the sigma of matched coordinates as matching shows it.
 
     Adjusted without measured points; these keep the sigma they were given, and would otherwise be
     scaled with coordinates many times better than theirs.
 
     Raises:
-        NetworkError, DefectError: as `processing.bundle.adjust.adjust`.
+        NetworkError, RankDefectError: as `processing.bundle.adjust.adjust`.
     """
     network = project.network
     table = network.image_points
     own = table.point < ties
-    alone = replace(
+    unweighted = replace(
         network,
         image_points=ImagePoints(
             table.image[own], table.point[own], table.xy_mm[own], table.sigma_mm[own]
@@ -338,7 +345,7 @@ def weighted(project: Project, ties: int, progress: Progress | None = None) -> P
         points=replace(network.points, sigma_m=np.full_like(network.points.sigma_m, np.nan)),
     )
     settings = replace(project.settings, reject_beyond=None, variance_components=True)
-    found = adjust(completed(alone), settings, progress=progress)
+    found = adjust(completed(unweighted), settings, progress=progress)
     factor = [found.factors.get(name, 1.0) for name in ("image x", "image y")]
     scale = np.where(own[:, None], np.sqrt(factor), 1.0)
     return replace(
@@ -360,7 +367,7 @@ class _Surveyed:
     sigma_px: Array
 
 
-def _surveyed(block: Block, points_file: Path | None, measured_file: Path | None) -> _Surveyed:
+def _surveyed(block: ImageBlock, points_file: Path | None, measured_file: Path | None) -> _Surveyed:
     none = np.zeros(0, np.int64)
     if points_file is None or measured_file is None:
         if points_file is not None or measured_file is not None:
@@ -375,7 +382,7 @@ def _surveyed(block: Block, points_file: Path | None, measured_file: Path | None
     roles = table.text("role")
     for role, line in zip(roles, table.lines, strict=True):
         if role not in ("control", "check"):
-            table.wrong(line, f"role is {role!r}; control or check is right")
+            table.add_problem(line, f"role is {role!r}; control or check is right")
     place = np.array([table.numbers(c) for c in GEODETIC])
     sigma = np.array([table.numbers(c, 0.02) for c in SIGMAS]).T.reshape(-1, 3)
     seen = read_table(measured_file, ("image", "point", "column_px", "row_px"), ("sigma_px",))
@@ -383,9 +390,9 @@ def _surveyed(block: Block, points_file: Path | None, measured_file: Path | None
     point = _index(seen, "point", names)
     px = np.array([seen.numbers("column_px"), seen.numbers("row_px")]).T.reshape(-1, 2)
     spread = np.array(seen.numbers("sigma_px", MEASURED_SIGMA_PX))
-    told = [*table.problems, *seen.problems]
-    if told or not np.isfinite(place).all() or not np.isfinite(px).all():
-        raise TriangulationError("; ".join(told) or "an empty cell where a number is needed")
+    problems = [*table.problems, *seen.problems]
+    if problems or not np.isfinite(place).all() or not np.isfinite(px).all():
+        raise TriangulationError("; ".join(problems) or "an empty cell where a number is needed")
     return _Surveyed(
         tuple(names),
         tuple(roles),
@@ -398,36 +405,36 @@ def _surveyed(block: Block, points_file: Path | None, measured_file: Path | None
     )
 
 
-def _index(table: Table, column: str, names: Sequence[str]) -> NDArray[np.int64]:
+def _index(table: CsvTable, column: str, names: Sequence[str]) -> NDArray[np.int64]:
     at = {name: k for k, name in enumerate(names)}
     found = []
     for name, line in zip(table.text(column), table.lines, strict=True):
         if name not in at:
-            table.wrong(line, f"{column} {name!r} is not there")
+            table.add_problem(line, f"{column} {name!r} is not there")
         found.append(at.get(name, 0))
     return np.array(found, dtype=np.int64)
 
 
-def _file(block: Block, asked: Asked) -> ProjectFile:
+def _file(block: ImageBlock, options: TriangulationSettings) -> ProjectFile:
     camera = {
         "name": block.camera,
         "f_mm": block.image.f_mm,
         "pixel_um": block.image.pitch_um,
         "width_px": block.image.width_px,
         "height_px": block.image.height_px,
-        "parameters": asked.parameters,
-        "interior": asked.interior,
+        "parameters": options.parameters,
+        "interior": options.interior,
     }
-    if asked.parameters.startswith("sensors"):
+    if options.parameters.startswith("sensors"):
         camera["rig"] = "rig.toml"
     return ProjectFile.model_validate(
         {
             "format": 1,
-            "name": f"{block.mission.id}, {asked.parameters}",
+            "name": f"{block.mission.id}, {options.parameters}",
             "adjust": {
                 "robust": True,
-                "reject_beyond": asked.reject_beyond,
-                "gnss": asked.drift,
+                "reject_beyond": options.reject_beyond,
+                "gnss": options.drift,
                 "image_sigma_um": TIE_SIGMA_PX * block.image.pitch_um,
             },
             "camera": [camera],

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 from drivers.base.settings import Setting
-from drivers.cameras.aravis.head import AravisHead
+from drivers.cameras.aravis.aravis_head import AravisHead
 from drivers.contract import DeviceError, Head
 from drivers.timescales.clock import Clock
 from drivers.triggers.software import SoftwareTrigger
@@ -25,8 +25,8 @@ class ActionTrigger(SoftwareTrigger):
     kind: ClassVar = "trigger"
     head_trigger_source: ClassVar = "action"
 
-    scheduled = Setting(True, says="say when on the head's clock, instead of at once")
-    lead_ms = Setting(50.0, minimum=1, maximum=1000, says="how long ahead commands are sent")
+    scheduled = Setting(True, help="say when on the head's clock, instead of at once")
+    lead_ms = Setting(50.0, minimum=1, maximum=1000, help="how long ahead commands are sent")
 
     def __init__(
         self,
@@ -56,12 +56,12 @@ class ActionTrigger(SoftwareTrigger):
             return super()._fire_one(head, delay_ns, start_ns)
         assert isinstance(head, AravisHead)
         moment_ns = start_ns + round(self.lead_ms * 1e6)
-        told = head.clock_at(moment_ns + delay_ns)
-        if told is None:
+        head_clock = head.clock_at(moment_ns + delay_ns)
+        if head_clock is None:
             raise DeviceError(
                 f"{head.name}: the head's clock is not known; set scheduled = false, or take a "
                 "head with a timestamp latch"
             )
-        device_ns, sigma_ns = told
-        head.act(device_ns)
+        device_ns, sigma_ns = head_clock
+        head.send_action_command(device_ns)
         return moment_ns - sigma_ns, moment_ns + sigma_ns

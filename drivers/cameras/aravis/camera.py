@@ -1,7 +1,7 @@
 """One opened GenICam head: its settings written, its clock, temperature and trigger.
 
 Frames are in `drivers.cameras.aravis.stream`; finding, losing and finding again in
-`drivers.cameras.aravis.head`.
+`drivers.cameras.aravis.aravis_head`.
 """
 
 from __future__ import annotations
@@ -15,25 +15,25 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from drivers.cameras.aravis.formats import packing_of, unsuitable
+from drivers.cameras.aravis.camera_access import local_interface, open_camera
+from drivers.cameras.aravis.formats import packing_of, packing_problem
 from drivers.cameras.aravis.gvcp import GVCP_PORT, is_ip_address
-from drivers.cameras.aravis.library import aravis, aravis_error, said
-from drivers.cameras.aravis.opening import interface_of, opened
-from drivers.cameras.aravis.senders import ControlSenders, NewSockets
+from drivers.cameras.aravis.library import aravis, aravis_error, message_of
+from drivers.cameras.aravis.packet_filter import ControlSocketFilter, SocketCapture
 from drivers.cameras.aravis.settings import AravisSettings
 from drivers.cameras.pixels import Packing
 from drivers.contract import DeviceError
 
-LATCH_TRIES: Final = 3
+LATCH_ATTEMPTS: Final = 3
 NS_PER_S: Final = 1_000_000_000
-EARLIER_SETTINGS: Final = 4
-SAME_TIME_SHARE: Final = 0.01
+SETTINGS_HISTORY_LENGTH: Final = 4
+EXPOSURE_TIME_TOLERANCE: Final = 0.01
 """How near the time a frame tells must be to that it was exposed with; heads round it."""
 CHUNKS: Final = ("Timestamp", "ExposureTime", "CounterValue", "Gain", "Temperature", "FrameID")
 
 
 @dataclass(frozen=True)
-class Latch:
+class ClockLatch:
     """The head's clock and the host time it belongs to."""
 
     device_clock_ns: int
@@ -42,7 +42,7 @@ class Latch:
 
 
 @dataclass(frozen=True)
-class Geometry:
+class FrameGeometry:
     """What a frame has to look like."""
 
     width_px: int
@@ -53,7 +53,7 @@ class Geometry:
     payload_nbytes: int
 
 
-class HeldByAnotherError(DeviceError):
+class ControlDeniedError(DeviceError):
     """Another program controls the head."""
 
 
@@ -64,14 +64,14 @@ class AravisCamera:
     `drivers.cameras.aravis.library.OPENING` while it is made and configured.
 
     Raises:
-        HeldByAnotherError: another program has control.
+        ControlDeniedError: another program has control.
         DeviceError: it does not answer or refuses settings; all refusals in one message.
     """
 
     def __init__(self, head: str, settings: AravisSettings) -> None:
         self._who = f"{head} at {settings.address}"
         self.chunk_parser: Any = None
-        self._control: ControlSenders | None = None
+        self._control: ControlSocketFilter | None = None
         try:
             self._open_and_configure(settings)
         except (DeviceError, aravis_error()):
@@ -82,7 +82,7 @@ class AravisCamera:
         address = settings.address
         self._camera: Any = None
         if not is_ip_address(address):
-            self._camera = opened(self._who, "", address)
+            self._camera = open_camera(self._who, "", address)
             if not self._camera.is_gv_device():
                 self._configure_all(settings)
                 return
@@ -90,15 +90,15 @@ class AravisCamera:
             address = self.ip_address
             self._camera = None
             gc.collect()
-        interface = interface_of(self._who, address)
-        with NewSockets(interface, address) as sockets:
-            self._camera = opened(self._who, interface, address)
-            self._control = ControlSenders(sockets.take(), address, GVCP_PORT)
+        interface = local_interface(self._who, address)
+        with SocketCapture(interface, address) as sockets:
+            self._camera = open_camera(self._who, interface, address)
+            self._control = ControlSocketFilter(sockets.take(), address, GVCP_PORT)
             self._configure_all(settings)
 
     def _configure_all(self, settings: AravisSettings) -> None:
         if self._camera.is_gv_device() and not self._camera.get_device().is_controller():
-            raise HeldByAnotherError(
+            raise ControlDeniedError(
                 f"{self._who}: another program controls the head; end that program"
             )
         self.identity = self._identity(settings)
@@ -110,7 +110,9 @@ class AravisCamera:
         self._has_temperature = self._has("DeviceTemperature")
         self.exposure_time_us = float(self._camera.get_exposure_time())
         self.frame_settings = self._frame_settings()
-        self._earlier: deque[Mapping[str, float | int | str]] = deque(maxlen=EARLIER_SETTINGS)
+        self._earlier: deque[Mapping[str, float | int | str]] = deque(
+            maxlen=SETTINGS_HISTORY_LENGTH
+        )
 
     @property
     def raw(self) -> Any:
@@ -163,7 +165,7 @@ class AravisCamera:
 
     def other_senders(self) -> int:
         """Datagrams of others that came to the control socket; they were dropped."""
-        return 0 if self._control is None else self._control.others()
+        return 0 if self._control is None else self._control.dropped_datagrams()
 
     def adjust(self, exposure_time_us: float, gain_db: float, tdi_shifts: int) -> None:
         """Write exposure settings while the head runs; those it has not are left out.
@@ -184,14 +186,17 @@ class AravisCamera:
         except aravis_error() as error:
             raise DeviceError(
                 f"{self._who}: {exposure_time_us:g} us, {gain_db:g} dB, {tdi_shifts} TDI shifts "
-                f"are refused ({said(error)}); choose settings within the head's bounds"
+                f"are refused ({message_of(error)}); choose settings within the head's bounds"
             ) from None
 
     def settings_of(self, exposure_us: float | None) -> Mapping[str, float | int | str]:
         """What a frame was exposed with, by the exposure time it tells: it may be from before."""
         for settings in (self.frame_settings, *reversed(self._earlier)):
             time_us = float(settings["ExposureTime"])
-            if exposure_us is None or abs(time_us - exposure_us) <= SAME_TIME_SHARE * time_us:
+            if (
+                exposure_us is None
+                or abs(time_us - exposure_us) <= EXPOSURE_TIME_TOLERANCE * time_us
+            ):
                 return settings
         return self.frame_settings
 
@@ -199,13 +204,13 @@ class AravisCamera:
         """Raises what Aravis raises."""
         self._camera.software_trigger()
 
-    def latch(self) -> Latch | None:
+    def latch(self) -> ClockLatch | None:
         """Read the head's clock; the best of three tries. None where the head cannot."""
         if self._latch_features is None:
             return None
         command, value, is_ns = self._latch_features
-        best: Latch | None = None
-        for _ in range(LATCH_TRIES):
+        best: ClockLatch | None = None
+        for _ in range(LATCH_ATTEMPTS):
             before_ns = time.monotonic_ns()
             self._camera.execute_command(command)
             after_ns = time.monotonic_ns()
@@ -213,14 +218,14 @@ class AravisCamera:
             sigma_ns = (after_ns - before_ns + 1) // 2
             if best is None or sigma_ns < best.sigma_ns:
                 clock_ns = ticks if is_ns else self.ns_from_ticks(ticks)
-                best = Latch(clock_ns, before_ns + sigma_ns, sigma_ns)
+                best = ClockLatch(clock_ns, before_ns + sigma_ns, sigma_ns)
         return best
 
     def temperature_c(self) -> float | None:
         """DeviceTemperature; None where the head has none."""
         return float(self._camera.get_float("DeviceTemperature")) if self._has_temperature else None
 
-    def sign_of_life(self) -> None:
+    def check_alive(self) -> None:
         """Read something that is not cached; raises what Aravis raises."""
         self._camera.get_exposure_time()
 
@@ -240,13 +245,13 @@ class AravisCamera:
     def _identity(self, settings: AravisSettings) -> dict[str, str]:
         camera, failed = self._camera, aravis_error()
         identity = {"address": settings.address}
-        questions: Mapping[str, Callable[[], object]] = {
+        identity_features: Mapping[str, Callable[[], object]] = {
             "vendor": camera.get_vendor_name,
             "model": camera.get_model_name,
             "serial": camera.get_device_serial_number,
             "version": lambda: camera.get_string("DeviceVersion"),
         }
-        for key, ask in questions.items():
+        for key, ask in identity_features.items():
             try:
                 identity[key] = str(ask() or "")
             except failed:
@@ -264,11 +269,11 @@ class AravisCamera:
         camera = self._camera
         refusals: list[str] = []
 
-        def write(key: str, value: object, action: Callable[[], object], cure: str) -> None:
+        def write(key: str, value: object, action: Callable[[], object], hint: str) -> None:
             try:
                 action()
             except failed as error:
-                refusals.append(f"{key} = {value!r} is refused ({said(error)}); {cure}")
+                refusals.append(f"{key} = {value!r} is refused ({message_of(error)}); {hint}")
 
         # A head that a killed controller left running would refuse the rest.
         write("acquisition", "stop", camera.stop_acquisition, "switch the head off and on")
@@ -306,7 +311,7 @@ class AravisCamera:
         _, _, width, height = (int(n) for n in _region(camera))
         packing = packing_of(str(camera.get_pixel_format_as_string()))
         assert packing is not None, "the settings allow no other format"
-        self.geometry = Geometry(
+        self.geometry = FrameGeometry(
             width_px=width,
             height_px=height,
             pixel_format=str(camera.get_pixel_format_as_string()),
@@ -314,7 +319,7 @@ class AravisCamera:
             packing=packing,
             payload_nbytes=int(camera.get_payload()),
         )
-        wrong = unsuitable(packing, width)
+        wrong = packing_problem(packing, width)
         return [wrong] if wrong else []
 
     def _write_action(

@@ -35,7 +35,7 @@ def packing_of(pixel_format: str) -> Packing | None:
     return _PACKINGS.get(found[1]) if found else None
 
 
-def unsuitable(packing: Packing, width_px: int) -> str | None:
+def packing_problem(packing: Packing, width_px: int) -> str | None:
     """Why a packing does not fit a width; None where it does."""
     group = pixels_in_a_group(packing)
     if width_px % group == 0:

@@ -95,11 +95,11 @@ def send_action(
     if device_ns is not None:
         flags |= SCHEDULED
         body += struct.pack(">Q", device_ns)
-    answer = _ask(address, ACTION_CMD, body, flags=flags, timeout_s=timeout_s)
+    answer = _request(address, ACTION_CMD, body, flags=flags, timeout_s=timeout_s)
     return None if answer is None else answer[0]
 
 
-def _ask(
+def _request(
     address: str, command: int, body: bytes, *, timeout_s: float, flags: int = ACK_REQUIRED
 ) -> tuple[int, bytes] | None:
     """Status and body of the answer to a command; None for silence or an unreachable head.
@@ -135,7 +135,7 @@ def _ask(
 
 def _read_register(address: str, register: int, timeout_s: float) -> tuple[int, int] | None:
     """Status and value of a register; None where no fitting answer came."""
-    answer = _ask(address, READREG_CMD, struct.pack(">I", register), timeout_s=timeout_s)
+    answer = _request(address, READREG_CMD, struct.pack(">I", register), timeout_s=timeout_s)
     if answer is None:
         return None
     status, body = answer

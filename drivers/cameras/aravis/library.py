@@ -49,6 +49,6 @@ def inet_address() -> Any:
     return Gio.InetAddress
 
 
-def said(error: Exception) -> str:
+def message_of(error: Exception) -> str:
     """The words of what Aravis raised."""
     return str(getattr(error, "message", error))

@@ -10,63 +10,63 @@ from drivers.cameras.aravis.formats import packing_of
 
 
 class AravisSettings(Configured):
-    """The settings of `drivers.cameras.aravis.head.AravisHead`."""
+    """The settings of `drivers.cameras.aravis.aravis_head.AravisHead`."""
 
     address = Setting(
-        "", required=True, says="IP address of the head, or its name as arv-tool says"
+        "", required=True, help="IP address of the head, or its name as arv-tool says"
     )
-    serial = Setting("", says="serial number the head must have; empty takes any")
-    width_px = Setting(0, minimum=0, says="columns; 0 takes what the head is set to")
-    height_px = Setting(0, minimum=0, says="rows; 0 takes what the head is set to")
-    pixel_format = Setting("Mono16", says="GenICam name of the pixel format")
-    exposure_time_us = Setting(1000.0, minimum=1, maximum=60e6, says="exposure time, us")
-    gain_db = Setting(0.0, minimum=-20, maximum=60, says="gain, dB")
-    tdi_shifts = Setting(0, minimum=0, maximum=1000, says="TDI shifts; 0 for a head without TDI")
+    serial = Setting("", help="serial number the head must have; empty takes any")
+    width_px = Setting(0, minimum=0, help="columns; 0 takes what the head is set to")
+    height_px = Setting(0, minimum=0, help="rows; 0 takes what the head is set to")
+    pixel_format = Setting("Mono16", help="GenICam name of the pixel format")
+    exposure_time_us = Setting(1000.0, minimum=1, maximum=60e6, help="exposure time, us")
+    gain_db = Setting(0.0, minimum=-20, maximum=60, help="gain, dB")
+    tdi_shifts = Setting(0, minimum=0, maximum=1000, help="TDI shifts; 0 for a head without TDI")
     trigger_source = Setting(
-        "line", choices=("line", "software", "action"), says="what starts an exposure"
+        "line", choices=("line", "software", "action"), help="what starts an exposure"
     )
-    trigger_line = Setting("Line1", says="GenICam name of the head's trigger input")
-    trigger_action = Setting("Action1", says="GenICam name of the head's action signal")
+    trigger_line = Setting("Line1", help="GenICam name of the head's trigger input")
+    trigger_action = Setting("Action1", help="GenICam name of the head's action signal")
     action_device_key = Setting(
-        0x5359_4E54, minimum=0, maximum=0xFFFF_FFFF, says="device key of action commands"
+        0x5359_4E54, minimum=0, maximum=0xFFFF_FFFF, help="device key of action commands"
     )
     action_group_key = Setting(
-        1, minimum=0, maximum=0xFFFF_FFFF, says="group key of action commands"
+        1, minimum=0, maximum=0xFFFF_FFFF, help="group key of action commands"
     )
     action_group_mask = Setting(
-        1, minimum=1, maximum=0xFFFF_FFFF, says="groups of action commands the head is in, bits"
+        1, minimum=1, maximum=0xFFFF_FFFF, help="groups of action commands the head is in, bits"
     )
     packet_size = Setting(
-        0, minimum=0, maximum=65535, says="bytes of a stream packet; 0 tries what passes"
+        0, minimum=0, maximum=65535, help="bytes of a stream packet; 0 tries what passes"
     )
     packet_size_limit = Setting(
-        8192, minimum=576, maximum=65535, says="the largest packet that is tried"
+        8192, minimum=576, maximum=65535, help="the largest packet that is tried"
     )
     socket_buffer_bytes = Setting(
         33_554_432,
         minimum=65536,
         maximum=1 << 30,
-        says="receive buffer; the kernel's rmem_max limits it",
+        help="receive buffer; the kernel's rmem_max limits it",
     )
     packet_socket = Setting(
-        False, says="read packets below the network stack (needs CAP_NET_RAW, fewer copies)"
+        False, help="read packets below the network stack (needs CAP_NET_RAW, fewer copies)"
     )
     packet_timeout_ms = Setting(
-        20.0, minimum=1, maximum=1000, says="a packet so late is asked for again"
+        20.0, minimum=1, maximum=1000, help="a packet so late is asked for again"
     )
     frame_retention_ms = Setting(
-        500.0, minimum=10, maximum=5000, says="without a packet for so long a frame is given up"
+        500.0, minimum=10, maximum=5000, help="without a packet for so long a frame is given up"
     )
-    chunks = Setting(True, says="let the head write time, exposure and counter behind the pixels")
+    chunks = Setting(True, help="let the head write time, exposure and counter behind the pixels")
     latch_interval_s = Setting(
-        2.0, minimum=0.5, maximum=2.5, says="time between readings of the head's clock and health"
+        2.0, minimum=0.5, maximum=2.5, help="time between readings of the head's clock and health"
     )
-    held_limit_s = Setting(
-        15.0, minimum=1, maximum=120, says="how long a dead controller's hold is waited out"
+    control_wait_limit_s = Setting(
+        15.0, minimum=1, maximum=120, help="how long a dead controller's hold is waited out"
     )
 
     @classmethod
-    def contradictions(cls, values: Mapping[str, Any]) -> list[str]:
+    def setting_conflicts(cls, values: Mapping[str, Any]) -> list[str]:
         found = []
         if (values["width_px"] == 0) != (values["height_px"] == 0):
             found.append(

@@ -1,7 +1,7 @@
 """Frames of one head, received into memory of our own.
 
 Slots and Aravis' buffers are paired here; when a stream is made and dropped is decided in
-`drivers.cameras.aravis.head`.
+`drivers.cameras.aravis.aravis_head`.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from typing import Any, Final
 
 from drivers.cameras.aravis.camera import AravisCamera
 from drivers.cameras.aravis.library import aravis, aravis_error
-from drivers.cameras.aravis.senders import (
-    StreamSenders,
-    hold_packet_sockets,
+from drivers.cameras.aravis.packet_filter import (
+    StreamSocketFilter,
+    filter_packet_sockets,
     interface_towards,
     socket_inodes,
 )
@@ -25,7 +25,7 @@ from drivers.cameras.aravis.settings import AravisSettings
 from drivers.cameras.pixels import Packing, bytes_at, packed_nbytes, unpack, words_at
 from drivers.contract import DeviceError, FrameMemory
 
-INFOS: Final = {
+STATISTIC_NAMES: Final = {
     "n_underruns": "underrun_packets",
     "n_resend_requests": "resend_requests",
     "n_resent_packets": "resent_packets",
@@ -116,16 +116,16 @@ class FrameStream:
                 f"{settings.name} at {settings.address}: the stream cannot be made; check that no "
                 "other program holds the head"
             )
-        self._senders: StreamSenders | None = None
+        self._senders: StreamSocketFilter | None = None
         self._ignored = 0
         self._restarts = 0
         if camera.raw.is_gv_device():
-            self._hold_to_the_head(camera, settings)
+            self._filter_to_head(camera, settings)
             self._tune(settings)
         for slot in free:
-            self.lend(slot)
+            self.queue_slot(slot)
 
-    def lend(self, slot: int) -> None:
+    def queue_slot(self, slot: int) -> None:
         """Let Aravis fill this slot next; from any thread."""
         self._stream.push_buffer(self._buffers[slot])
 
@@ -136,18 +136,18 @@ class FrameStream:
             return None
         reason = str(buffer.get_status().value_nick)
         # Aravis complains on stderr when asked for the size of a frame that it gave up.
-        whole = reason == "success"
-        if whole:
+        is_complete = reason == "success"
+        if is_complete:
             self._ignored = self._ignored_packets()
-        parser = self._parser if whole and buffer.has_chunks() else None
+        parser = self._parser if is_complete and buffer.has_chunks() else None
         return ReceivedFrame(
             slot=self._slots[hash(buffer)],
             reason=reason,
             frame_id=int(buffer.get_frame_id()),
             leader_ns=int(buffer.get_timestamp()),
-            width_px=int(buffer.get_image_width()) if whole else None,
-            height_px=int(buffer.get_image_height()) if whole else None,
-            pixel_format_code=int(buffer.get_image_pixel_format()) if whole else None,
+            width_px=int(buffer.get_image_width()) if is_complete else None,
+            height_px=int(buffer.get_image_height()) if is_complete else None,
+            pixel_format_code=int(buffer.get_image_pixel_format()) if is_complete else None,
             chunk_timestamp=_chunk(parser, "get_integer_value", buffer, "ChunkTimestamp"),
             chunk_exposure_us=_chunk(parser, "get_float_value", buffer, "ChunkExposureTime"),
             chunk_counter=_chunk(parser, "get_integer_value", buffer, "ChunkCounterValue"),
@@ -170,12 +170,12 @@ class FrameStream:
         `other_senders` are datagrams of others, which were dropped.
         """
         found: Counter[str] = Counter()
-        for theirs, ours in INFOS.items():
+        for theirs, ours in STATISTIC_NAMES.items():
             found[ours] = self._info(theirs)
         found["underruns"] = -(-found["underrun_packets"] // self._packets_per_frame)
         found["stream_restarts"] = self._restarts
         if self._senders is not None:
-            found["other_senders"] = self._senders.look(found["received_packets"])
+            found["other_senders"] = self._senders.poll(found["received_packets"])
         return found
 
     @property
@@ -199,7 +199,7 @@ class FrameStream:
         self._restarts += 1
         return True
 
-    def drop(self) -> None:
+    def close(self) -> None:
         """End the stream. When this returns Aravis writes into no slot any more."""
         weak = self._stream.weak_ref()
         self._stream = None
@@ -222,19 +222,19 @@ class FrameStream:
         """Packets that Aravis dropped although there was a buffer for them."""
         return self._info("n_ignored_packets") - self._info("n_underruns")
 
-    def _hold_to_the_head(self, camera: AravisCamera, settings: AravisSettings) -> None:
+    def _filter_to_head(self, camera: AravisCamera, settings: AravisSettings) -> None:
         """Let only the head's datagrams reach Aravis, and begin after those that came before."""
         stream, address = self._stream, camera.ip_address
         stream.stop_thread(False)
         port = int(stream.get_port())
-        self._senders = StreamSenders(
+        self._senders = StreamSocketFilter(
             port, address, camera.stream_source_port, camera.fire_test_packet
         )
         known = socket_inodes()
         stream.start_thread()
         if settings.packet_socket:
             source = address, self._senders.source_port
-            hold_packet_sockets(known, source, (interface_towards(address), port))
+            filter_packet_sockets(known, source, (interface_towards(address), port))
 
     def _tune(self, settings: AravisSettings) -> None:
         library, stream = aravis(), self._stream
@@ -243,7 +243,7 @@ class FrameStream:
         stream.set_property("socket-buffer-size", socket_nbytes)
         # Aravis widens its socket only once a first frame has begun, and loses that one.
         if self._senders is not None:
-            self._senders.widen(socket_nbytes)
+            self._senders.set_receive_buffer(socket_nbytes)
         stream.set_property("packet-resend", library.GvStreamPacketResend.ALWAYS)
         stream.set_property("packet-request-ratio", 1.0)
         stream.set_property("packet-timeout", round(settings.packet_timeout_ms * 1e3))

@@ -1,6 +1,6 @@
 """Reading frames of a folder: which files there are, and what one of them holds.
 
-When a frame is due, and into which slot it goes, is in `drivers.cameras.folder.head`.
+When a frame is due, and into which slot it goes, is in `drivers.cameras.folder.folder_head`.
 """
 
 from __future__ import annotations
@@ -62,12 +62,12 @@ def _order(name: str) -> list[tuple[int, str]]:
     return [(int(part[:18]), part) if at % 2 else (-1, part) for at, part in enumerate(parts)]
 
 
-def read_frame(path: Path, *, room_nbytes: int) -> FrameFile:
+def read_frame(path: Path, *, max_nbytes: int) -> FrameFile:
     """Read a TIFF of one plane and 16 bits.
 
     Args:
         path: the file.
-        room_nbytes: nothing larger than this is unpacked.
+        max_nbytes: nothing larger than this is unpacked.
 
     Raises:
         FrameFileError: it is none, is damaged, or does not fit.
@@ -83,9 +83,9 @@ def read_frame(path: Path, *, room_nbytes: int) -> FrameFile:
             if len(shape) != 2 or str(dtype) != "uint16":
                 raise FrameFileError(f"has shape {shape} of {dtype}; one plane of uint16 is needed")
             nbytes = shape[0] * shape[1] * 2
-            if not 0 < nbytes <= room_nbytes:
+            if not 0 < nbytes <= max_nbytes:
                 raise FrameFileError(
-                    f"has {shape[1]} x {shape[0]} px; the head's memory holds {room_nbytes // 2}"
+                    f"has {shape[1]} x {shape[0]} px; the head's memory holds {max_nbytes // 2}"
                 )
             pixels = page.asarray()
             description = str(page.description)[:MAX_DESCRIPTION]
@@ -107,15 +107,15 @@ def read_frame(path: Path, *, room_nbytes: int) -> FrameFile:
         raise FrameFileError(f"cannot be read as a TIFF ({error})") from error
     if pixels.shape != shape:
         raise FrameFileError(f"ends before its {shape[1]} x {shape[0]} px do")
-    known = _known(description)
+    known = _parse_description(description)
     settings = known.get("settings")
     return FrameFile(
         path=path,
         pixels=pixels,
         head_serial=str(known.get("head_serial") or "")[:80],
         pixel_format=str(known.get("pixel_format") or "Mono16")[:40],
-        device_ns=_whole(known.get("device_ns")),
-        counter=_whole(known.get("counter")),
+        device_ns=_integer_or_none(known.get("device_ns")),
+        counter=_integer_or_none(known.get("counter")),
         exposure_time_us=_finite(known.get("exposure_time_us")),
         temperature_c=_finite(known.get("temperature_c")),
         settings={
@@ -126,7 +126,7 @@ def read_frame(path: Path, *, room_nbytes: int) -> FrameFile:
     )
 
 
-def _known(description: str) -> Mapping[str, Any]:
+def _parse_description(description: str) -> Mapping[str, Any]:
     try:
         content = json.loads(description)
     except (ValueError, RecursionError):
@@ -135,7 +135,7 @@ def _known(description: str) -> Mapping[str, Any]:
     return content if ours else {}
 
 
-def _whole(value: object) -> int | None:
+def _integer_or_none(value: object) -> int | None:
     """A whole number below 2^63, or such a one in decimal digits as instants are written."""
     if isinstance(value, str) and re.fullmatch(r"\d{1,19}", value, re.ASCII):
         value = int(value)

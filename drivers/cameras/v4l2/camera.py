@@ -1,6 +1,6 @@
 """One opened V4L2 head: its settings written, its exposure, gain and temperature as they are.
 
-Frames are taken from the node in `drivers.cameras.v4l2.head`.
+Frames are taken from the node in `drivers.cameras.v4l2.v4l2_head`.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from typing import Final, TypeAlias
 
 from drivers.cameras.v4l2 import uapi
 from drivers.cameras.v4l2.discovery import path_of, serial_number
-from drivers.cameras.v4l2.formats import FORMATS, PixelFormat, known
-from drivers.cameras.v4l2.node import Control, Layout, VideoNode
+from drivers.cameras.v4l2.formats import FORMATS, PixelFormat, format_of_code
+from drivers.cameras.v4l2.node import Control, FrameLayout, VideoNode
 from drivers.cameras.v4l2.settings import V4l2Settings, assignments
 from drivers.contract import DeviceError
 
@@ -54,14 +54,14 @@ class V4l2Camera:
             ) from None
         except OSError as error:
             raise DeviceError(
-                f"{self._who}: {path} cannot be opened ({_said(error)}); check cable and power"
+                f"{self._who}: {path} cannot be opened ({_message_of(error)}); check cable and power"
             ) from None
         try:
             self._configure(settings)
         except OSError as error:
             self.node.close()
             raise DeviceError(
-                f"{self._who}: the head was lost while it was set ({_said(error)}); check cable "
+                f"{self._who}: the head was lost while it was set ({_message_of(error)}); check cable "
                 "and power"
             ) from None
         except DeviceError:
@@ -92,7 +92,7 @@ class V4l2Camera:
         value = self.node.read_all({name: self.controls[name]}).get(name)
         return None if value is None else value * self._settings.temperature_unit_c
 
-    def recorded(self) -> dict[str, float | int | str]:
+    def control_values(self) -> dict[str, float | int | str]:
         """Every control of picture and camera as it stands, and the pixel format."""
         chosen = {
             name: control
@@ -101,7 +101,7 @@ class V4l2Camera:
         }
         return {"PixelFormat": self.format.name, **self.node.read_all(chosen)}
 
-    def press(self, name: str) -> None:
+    def press_button(self, name: str) -> None:
         """Press a button; OSError where the head refuses."""
         self.node.write(self.controls[name], 1)
 
@@ -138,7 +138,7 @@ class V4l2Camera:
         if not settings.gain_unit_db or self._gain_control is None:
             raise DeviceError(
                 f"{self._who}: gain is asked to be {gain_db:g} dB; set gain_unit_db, what a step "
-                "of the head's gain is, or [exposure] gain_most_db = 0"
+                "of the head's gain is, or [exposure] gain_max_db = 0"
             )
         if (automatic := by_id.get(uapi.CID_AUTOGAIN)) is not None:
             writes.append(("gain_db", automatic, 0))
@@ -166,9 +166,9 @@ class V4l2Camera:
             try:
                 node.set_input(settings.video_input)
             except OSError as error:
-                _keep_unless_gone(error)
+                _record_refusal(error)
                 refusals.append(
-                    f"video_input = {settings.video_input} is refused ({_said(error)}); see "
+                    f"video_input = {settings.video_input} is refused ({_message_of(error)}); see "
                     "v4l2-ctl --list-inputs"
                 )
         self.layout = self._write_format(refusals)
@@ -185,25 +185,25 @@ class V4l2Camera:
         if refusals:
             raise DeviceError("\n".join(f"{self._who}: {refusal}" for refusal in refusals))
 
-    def _write_format(self, refusals: list[str]) -> Layout:
+    def _write_format(self, refusals: list[str]) -> FrameLayout:
         settings, node = self._settings, self.node
-        wanted = FORMATS[settings.pixel_format]
+        requested = FORMATS[settings.pixel_format]
         current = node.layout()
         width = settings.width_px or current.width_px
         height = settings.height_px or current.height_px
         try:
-            layout = node.set_layout(width, height, wanted.code)
+            layout = node.set_layout(width, height, requested.code)
         except OSError as error:
-            _keep_unless_gone(error)
+            _record_refusal(error)
             refusals.append(
-                f"{width} x {height} {wanted.name} is refused ({_said(error)}); if the node is "
+                f"{width} x {height} {requested.name} is refused ({_message_of(error)}); if the node is "
                 "busy, end the program that uses it"
             )
             return current
-        if layout.code != wanted.code:
-            offered = [ours.name for ours in map(known, node.formats()) if ours]
+        if layout.code != requested.code:
+            offered = [ours.name for ours in map(format_of_code, node.formats()) if ours]
             refusals.append(
-                f"pixel_format is {wanted.name!r}; the head has "
+                f"pixel_format is {requested.name!r}; the head has "
                 + (", ".join(offered) or "no format that is one of ours")
             )
         if (layout.width_px, layout.height_px) != (width, height):
@@ -214,15 +214,15 @@ class V4l2Camera:
         return layout
 
     def _write_interval(self, refusals: list[str]) -> None:
-        wanted_s = self._settings.frame_interval_s
+        requested_s = self._settings.frame_interval_s
         try:
-            given_s = self.node.set_interval(wanted_s)
+            granted_s = self.node.set_interval(requested_s)
         except OSError as error:
-            _keep_unless_gone(error)
-            refusals.append(f"frame_interval_s is {wanted_s:g}; the head has none, set 0")
+            _record_refusal(error)
+            refusals.append(f"frame_interval_s is {requested_s:g}; the head has none, set 0")
             return
-        if abs(given_s - wanted_s) > 0.01 * wanted_s:
-            refusals.append(f"frame_interval_s is {wanted_s:g}; the head gives {given_s:g}")
+        if abs(granted_s - requested_s) > 0.01 * requested_s:
+            refusals.append(f"frame_interval_s is {requested_s:g}; the head gives {granted_s:g}")
 
     def _find_exposure(self, refusals: list[str]) -> None:
         """The control of the exposure time and its unit."""
@@ -314,9 +314,9 @@ class V4l2Camera:
         try:
             self.node.write(control, value)
         except OSError as error:
-            _keep_unless_gone(error)
+            _record_refusal(error)
             refusals.append(
-                f"{key}: {control.name} = {value} is refused ({_said(error)}); see v4l2-ctl "
+                f"{key}: {control.name} = {value} is refused ({_message_of(error)}); see v4l2-ctl "
                 "--list-ctrls-menus"
             )
             return
@@ -327,10 +327,10 @@ class V4l2Camera:
         return f"{key} names {name!r}; the head has {', '.join(self.controls) or 'no controls'}"
 
 
-def _keep_unless_gone(error: OSError) -> None:
+def _record_refusal(error: OSError) -> None:
     if error.errno in NOT_FOUND:
         raise error
 
 
-def _said(error: OSError) -> str:
+def _message_of(error: OSError) -> str:
     return error.strerror or str(error)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from drivers.cameras.v4l2.formats import known
+from drivers.cameras.v4l2.formats import format_of_code
 from drivers.cameras.v4l2.node import VideoNode
 from drivers.cameras.v4l2.uapi import fourcc_name
 
@@ -74,5 +74,5 @@ def serial_number(path: str) -> str:
 
 
 def _name(code: int) -> str:
-    ours = known(code)
+    ours = format_of_code(code)
     return ours.name if ours else fourcc_name(code)

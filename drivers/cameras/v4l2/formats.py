@@ -62,6 +62,6 @@ FORMATS: Final = {
 }
 
 
-def known(code: int) -> PixelFormat | None:
+def format_of_code(code: int) -> PixelFormat | None:
     """The format of a code, where it is one of ours."""
     return next((found for found in FORMATS.values() if found.code == code), None)

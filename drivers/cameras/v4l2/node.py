@@ -1,7 +1,7 @@
 """An opened video node of the kernel: its ioctls, its buffers, its controls.
 
 Every call either returns or raises OSError; none waits but `wait`, which has a time-out. What is
-asked when, and what an error means for the head, is in `drivers.cameras.v4l2.head`.
+asked when, and what an error means for the head, is in `drivers.cameras.v4l2.v4l2_head`.
 
 Source: Documentation/userspace-api/media/v4l of the kernel.
 """
@@ -39,7 +39,7 @@ _NUMBERS: Final = (
 
 
 @dataclass(frozen=True)
-class Layout:
+class FrameLayout:
     """How a frame lies in a buffer."""
 
     width_px: int
@@ -70,7 +70,7 @@ class Control:
 
 
 @dataclass(frozen=True)
-class Filled:
+class FilledBuffer:
     """A buffer the kernel has filled.
 
     `stamp_ns` is CLOCK_MONOTONIC, None where the kernel says that its stamp is of another clock.
@@ -135,7 +135,7 @@ class VideoNode:
         found = poll.poll(timeout_s * 1e3)
         return found[0][1] if found else 0
 
-    def sign_of_life(self) -> None:
+    def check_alive(self) -> None:
         """Raises OSError (ENODEV) where the device is gone."""
         self._call(uapi.QUERYCAP, uapi.Capability())
 
@@ -155,12 +155,12 @@ class VideoNode:
             codes.append(int(description.pixelformat))
         return codes
 
-    def layout(self) -> Layout:
+    def layout(self) -> FrameLayout:
         """What the head is set to."""
         form = uapi.Format(type=self.buffer_type)
         return self._layout(self._call(uapi.G_FMT, form))
 
-    def set_layout(self, width_px: int, height_px: int, code: int) -> Layout:
+    def set_layout(self, width_px: int, height_px: int, code: int) -> FrameLayout:
         """Ask for a format; what the head made of it, which may be something else."""
         form = self._call(uapi.G_FMT, uapi.Format(type=self.buffer_type))
         pix = form.fmt.pix_mp if self.is_multi_planar else form.fmt.pix
@@ -184,17 +184,17 @@ class VideoNode:
         self._call(uapi.S_PARM, parm)
         return float(fraction.numerator / fraction.denominator if fraction.denominator else 0)
 
-    def _layout(self, form: uapi.Format) -> Layout:
+    def _layout(self, form: uapi.Format) -> FrameLayout:
         if not self.is_multi_planar:
             pix = form.fmt.pix
-            return Layout(
+            return FrameLayout(
                 pix.width, pix.height, int(pix.pixelformat), pix.bytesperline, pix.sizeimage
             )
         pix = form.fmt.pix_mp
         if pix.num_planes != 1:
             raise OSError(errno.EINVAL, f"the format has {pix.num_planes} planes, not one")
         plane = pix.plane_fmt[0]
-        return Layout(
+        return FrameLayout(
             pix.width, pix.height, int(pix.pixelformat), plane.bytesperline, plane.sizeimage
         )
 
@@ -229,7 +229,7 @@ class VideoNode:
             with contextlib.suppress(OSError):
                 self._call(uapi.REQBUFS, request)
 
-    def content(self, filled: Filled) -> NDArray[np.uint8]:
+    def content(self, filled: FilledBuffer) -> NDArray[np.uint8]:
         """What a filled buffer holds. Not to be kept: a view holds the mapping open."""
         import numpy as np
 
@@ -242,7 +242,7 @@ class VideoNode:
         buffer, _planes = self._buffer(index)
         self._call(uapi.QBUF, buffer)
 
-    def dequeue(self) -> Filled | None:
+    def dequeue(self) -> FilledBuffer | None:
         """The next filled buffer; None where there is none yet."""
         buffer, planes = self._buffer(0)
         try:
@@ -254,7 +254,7 @@ class VideoNode:
         flags = int(buffer.flags)
         stamp = buffer.timestamp
         clock = flags & uapi.BUF_FLAG_TIMESTAMP_MASK
-        return Filled(
+        return FilledBuffer(
             index=int(buffer.index),
             offset=int(planes[0].data_offset) if self.is_multi_planar else 0,
             nbytes=int(planes[0].bytesused if self.is_multi_planar else buffer.bytesused),
@@ -274,10 +274,10 @@ class VideoNode:
         self._call(uapi.STREAMOFF, ctypes.c_int(self.buffer_type))
 
     def _buffer(self, index: int) -> tuple[uapi.Buffer, Any]:
-        planes = (uapi.Plane * uapi.VIDEO_MAX_PLANES)()
+        planes = (uapi.BufferPlane * uapi.VIDEO_MAX_PLANES)()
         buffer = uapi.Buffer(index=index, type=self.buffer_type, memory=uapi.MEMORY_MMAP)
         if self.is_multi_planar:
-            buffer.m.planes = ctypes.cast(planes, ctypes.POINTER(uapi.Plane))
+            buffer.m.planes = ctypes.cast(planes, ctypes.POINTER(uapi.BufferPlane))
             buffer.length = 1
         return buffer, planes
 

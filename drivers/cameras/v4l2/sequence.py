@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from typing import Final
 
 MODULUS: Final = 1 << 32
-LEAP: Final = 1 << 31
+RESTART_THRESHOLD: Final = 1 << 31
 """A step of more than half of the range is a step back."""
 
 
 @dataclass(frozen=True)
-class Counted:
+class SequenceCount:
     """What a sequence number says: the frame's count from 1, and how many were lost before it."""
 
     counter: int
@@ -33,7 +33,7 @@ class SequenceCounter:
         self._last: int | None = None
         self._counter = 0
 
-    def take(self, sequence: int) -> Counted:
+    def advance(self, sequence: int) -> SequenceCount:
         """The next frame's number. A step back goes on counting by one, since nobody knows more."""
         if self._last is None:
             # A stream starts at 0; what is missing before the first frame was lost.
@@ -42,9 +42,9 @@ class SequenceCounter:
             step = (sequence - self._last) % MODULUS
         started, self._last = self._last is not None, sequence
         if step == 0 and started:
-            return Counted(self._counter, 0, is_repeated=True)
-        if step == 0 or step >= LEAP:
+            return SequenceCount(self._counter, 0, is_repeated=True)
+        if step == 0 or step >= RESTART_THRESHOLD:
             self._counter += 1
-            return Counted(self._counter, 0, is_restart=True)
+            return SequenceCount(self._counter, 0, is_restart=True)
         self._counter += step
-        return Counted(self._counter, step - 1)
+        return SequenceCount(self._counter, step - 1)

@@ -13,69 +13,69 @@ ASSIGNMENT: Final = re.compile(r"([a-z0-9_]+)=(-?\d+)")
 
 
 class V4l2Settings(Configured):
-    """The settings of `drivers.cameras.v4l2.head.V4l2Head`."""
+    """The settings of `drivers.cameras.v4l2.v4l2_head.V4l2Head`."""
 
     device = Setting(
         "",
         required=True,
-        says="path of the node, best below /dev/v4l, or its bus as v4l2-ctl says",
+        help="path of the node, best below /dev/v4l, or its bus as v4l2-ctl says",
     )
-    serial = Setting("", says="serial number the head must have (USB); empty takes any")
-    width_px = Setting(0, minimum=0, says="columns; 0 takes what the head is set to")
-    height_px = Setting(0, minimum=0, says="rows; 0 takes what the head is set to")
-    pixel_format = Setting("Y12", choices=tuple(FORMATS), says="V4L2 name of the pixel format")
-    video_input = Setting(-1, minimum=-1, maximum=255, says="number of the input; -1 leaves it")
+    serial = Setting("", help="serial number the head must have (USB); empty takes any")
+    width_px = Setting(0, minimum=0, help="columns; 0 takes what the head is set to")
+    height_px = Setting(0, minimum=0, help="rows; 0 takes what the head is set to")
+    pixel_format = Setting("Y12", choices=tuple(FORMATS), help="V4L2 name of the pixel format")
+    video_input = Setting(-1, minimum=-1, maximum=255, help="number of the input; -1 leaves it")
     frame_interval_s = Setting(
-        0.0, minimum=0, maximum=3600, says="from frame to frame of a free-running head; 0 leaves it"
+        0.0, minimum=0, maximum=3600, help="from frame to frame of a free-running head; 0 leaves it"
     )
     exposure_time_us = Setting(
-        0.0, minimum=0, maximum=60e6, says="exposure time, us; 0 leaves what the head is set to"
+        0.0, minimum=0, maximum=60e6, help="exposure time, us; 0 leaves what the head is set to"
     )
     exposure_control = Setting(
-        "", says="name of its control; empty finds it, none where it is set elsewhere"
+        "", help="name of its control; empty finds it, none where it is set elsewhere"
     )
     exposure_unit_us = Setting(
-        0.0, minimum=0, maximum=1e6, says="unit of that control, us; 0 finds it"
+        0.0, minimum=0, maximum=1e6, help="unit of that control, us; 0 finds it"
     )
     gain = Setting(
-        -1, minimum=-1, maximum=1 << 31, says="gain in the head's own unit; -1 leaves it"
+        -1, minimum=-1, maximum=1 << 31, help="gain in the head's own unit; -1 leaves it"
     )
-    gain_control = Setting("", says="name of its control; empty finds it")
+    gain_control = Setting("", help="name of its control; empty finds it")
     gain_unit_db = Setting(
         0.0,
         minimum=0,
         maximum=60,
-        says="a step of that control, dB; 0: not known, gain is not changed in flight",
+        help="a step of that control, dB; 0: not known, gain is not changed in flight",
     )
     controls = Setting(
-        tuple[str, ...](), says="further controls to be set, each name=number, in this order"
+        tuple[str, ...](), help="further controls to be set, each name=number, in this order"
     )
-    temperature_control = Setting("", says="control that tells the head's temperature")
-    temperature_unit_c = Setting(1.0, minimum=1e-6, maximum=1000, says="unit of that control, degC")
-    trigger_source = Setting("line", choices=("line", "software"), says="what starts an exposure")
-    trigger_control = Setting("", says="button control that is pressed for a software trigger")
+    temperature_control = Setting("", help="control that tells the head's temperature")
+    temperature_unit_c = Setting(1.0, minimum=1e-6, maximum=1000, help="unit of that control, degC")
+    trigger_source = Setting("line", choices=("line", "software"), help="what starts an exposure")
+    trigger_control = Setting("", help="button control that is pressed for a software trigger")
     readout_us = Setting(
         0.0,
         minimum=0,
         maximum=60e6,
-        says="end of exposure to end of frame, where frames are stamped at their end, us",
+        help="end of exposure to end of frame, where frames are stamped at their end, us",
     )
     stamp_sigma_us = Setting(
-        500.0, minimum=0, maximum=1e6, says="standard deviation of the kernel's time of a frame, us"
+        500.0, minimum=0, maximum=1e6, help="standard deviation of the kernel's time of a frame, us"
     )
-    buffers = Setting(4, minimum=2, maximum=32, says="buffers of the kernel")
+    buffers = Setting(4, minimum=2, maximum=32, help="buffers of the kernel")
     silence_s = Setting(
         0.0,
         minimum=0,
         maximum=3600,
-        says="a free-running head is opened anew without a frame for so long; 0 for triggered ones",
+        help="a free-running head is opened anew without a frame for so long; 0 for triggered ones",
     )
     check_interval_s = Setting(
-        2.0, minimum=0.2, maximum=60, says="time between looks at the head's controls and health"
+        2.0, minimum=0.2, maximum=60, help="time between looks at the head's controls and health"
     )
 
     @classmethod
-    def contradictions(cls, values: Mapping[str, Any]) -> list[str]:
+    def setting_conflicts(cls, values: Mapping[str, Any]) -> list[str]:
         found = []
         if (values["width_px"] == 0) != (values["height_px"] == 0):
             found.append(

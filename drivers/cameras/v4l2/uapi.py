@@ -191,7 +191,7 @@ class _PlaneMemory(ctypes.Union):
     ]
 
 
-class Plane(ctypes.Structure):
+class BufferPlane(ctypes.Structure):
     """struct v4l2_plane."""
 
     _fields_ = [
@@ -207,7 +207,7 @@ class _BufferMemory(ctypes.Union):
     _fields_ = [
         ("offset", ctypes.c_uint32),
         ("userptr", ctypes.c_ulong),
-        ("planes", ctypes.POINTER(Plane)),
+        ("planes", ctypes.POINTER(BufferPlane)),
         ("fd", ctypes.c_int32),
     ]
 

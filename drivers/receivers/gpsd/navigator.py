@@ -12,10 +12,10 @@ from typing import Any, ClassVar
 
 from drivers.base.settings import Setting
 from drivers.contract import DeviceError, NavSample
+from drivers.receivers.fix_monitor import FixMonitor, fix_description
 from drivers.receivers.gpsd.reports import GpsdReports
-from drivers.receivers.receiver_fix import FixWatch, fix_in_words
 from drivers.timescales.clock import Clock
-from drivers.transport.serial_device import READ_STEP_S, PortOpener, SerialDevice, SerialLine
+from drivers.transport.serial_device import READ_TIMEOUT_S, PortOpener, SerialDevice, SerialLine
 from drivers.transport.tcp_port import SCHEME, TcpPort, open_tcp_port
 
 
@@ -46,10 +46,10 @@ class GpsdNavigator(SerialDevice):
 
     kind: ClassVar = "navigator"
     what = "gpsd"
-    silence_cure = "Check that its receiver is switched on and that gpsd watches it"
+    silence_hint = "Check that its receiver is switched on and that gpsd watches it"
 
-    port = Setting("127.0.0.1:2947", says="address and TCP port of the gpsd")
-    device = Setting("", says="the receiver's path at the gpsd; empty: every one it has")
+    port = Setting("127.0.0.1:2947", help="address and TCP port of the gpsd")
+    device = Setting("", help="the receiver's path at the gpsd; empty: every one it has")
 
     def __init__(
         self,
@@ -62,10 +62,10 @@ class GpsdNavigator(SerialDevice):
         super().__init__(name, settings, clock=clock, open_port=open_port)
         self.reports = GpsdReports(name, self.device)
         self._is_watching = False
-        self._fix = FixWatch(self.teller, self.clock, name)
+        self._fix = FixMonitor(self.emitter, self.clock, name)
 
     @classmethod
-    def contradictions(cls, values: Mapping[str, Any]) -> list[str]:
+    def setting_conflicts(cls, values: Mapping[str, Any]) -> list[str]:
         host, _, port = values["port"].rpartition(":")
         if not host or not (port.isascii() and port.isdigit() and 0 < int(port[:6]) < 65536):
             return [f"port is {values['port']!r}; host:port, as 127.0.0.1:2947"]
@@ -88,7 +88,7 @@ class GpsdNavigator(SerialDevice):
                     "release": reports.release,
                     "devices": devices,
                     "leap_seconds": reports.leap_seconds,
-                    "fix": fix_in_words(reports.fix, reports.satellites),
+                    "fix": fix_description(reports.fix, reports.satellites),
                 }
         if not reports.release:
             raise DeviceError(
@@ -111,7 +111,7 @@ class GpsdNavigator(SerialDevice):
 
     def connected(self) -> None:
         self.reports.reset()
-        self._fix.reopened()
+        self._fix.reset()
         self._is_watching = False
 
     def step(self, line: SerialLine) -> Iterable[NavSample]:
@@ -122,20 +122,20 @@ class GpsdNavigator(SerialDevice):
             line.write(f"?WATCH={json.dumps(watch)};\n".encode())
             self._is_watching = True
         reports = self.reports
-        bad, told = reports.bad_messages, reports.seen["TPV"]
-        data = line.read(READ_STEP_S)
+        bad, fix_report = reports.bad_messages, reports.seen["TPV"]
+        data = line.read(READ_TIMEOUT_S)
         samples = reports.feed(data, self.clock.mono_ns())
         # A gpsd that lives while its receiver is silent is silent as a navigator.
-        self.heard(messages=reports.seen["TPV"] - told)
-        self._fix.follow(reports.fix, reports.satellites)
+        self.count_messages(messages=reports.seen["TPV"] - fix_report)
+        self._fix.update(reports.fix, reports.satellites)
         if reports.bad_messages > bad:
-            self.teller.complain(
+            self.emitter.emit_throttled(
                 "unreadable",
                 f"The gpsd {self.name} at {self.port} sent what is no report of a gpsd. Check "
                 "that the port is gpsd's own.",
             )
         if reports.error:
-            self.teller.complain(
+            self.emitter.emit_throttled(
                 "refused", f"The gpsd {self.name} at {self.port} says: {reports.error}."
             )
             reports.error = ""

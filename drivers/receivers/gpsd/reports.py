@@ -18,8 +18,8 @@ from drivers.timescales.leap_seconds import leap_seconds_at
 
 MAX_LINE: Final = 65_536
 """gpsd's own longest report, SKY of all constellations, stays below 20 kB."""
-SIGMA_MOST_M: Final = 10_000.0
-SIGMA_MOST_MPS: Final = 1_000.0
+SIGMA_MAX_M: Final = 10_000.0
+SIGMA_MAX_MPS: Final = 1_000.0
 """A larger one means that the receiver does not know."""
 ATTITUDE_SLACK_NS: Final = 1_000_000
 FIXES: Final = {2: "2d", 3: "3d"}
@@ -183,7 +183,7 @@ class GpsdReports:
                 longitude_deg=longitude if longitude <= 180 else longitude - 360,
                 height_m=height,
                 horizontal_sigma_m=horizontal_m,
-                vertical_sigma_m=None if height is None else _sigma(report, "epv", SIGMA_MOST_M),
+                vertical_sigma_m=None if height is None else _sigma(report, "epv", SIGMA_MAX_M),
                 velocity_ned_mps=velocity,
                 speed_sigma_mps=speed_sigma,
                 roll_rad=roll,
@@ -234,9 +234,9 @@ def _sigma(report: Mapping[str, Any], key: str, most: float) -> float | None:
 
 
 def _horizontal_sigma_m(report: Mapping[str, Any]) -> float | None:
-    east, north = _sigma(report, "epx", SIGMA_MOST_M), _sigma(report, "epy", SIGMA_MOST_M)
+    east, north = _sigma(report, "epx", SIGMA_MAX_M), _sigma(report, "epy", SIGMA_MAX_M)
     if _number(report, "eph") is not None or east is None or north is None:
-        return _sigma(report, "eph", SIGMA_MOST_M)
+        return _sigma(report, "eph", SIGMA_MAX_M)
     return math.hypot(east, north)
 
 
@@ -252,7 +252,7 @@ def _velocity(report: Mapping[str, Any]) -> tuple[Velocity | None, float | None]
         down = -climb
     if north is None or east is None:
         return None, None
-    return (north, east, down), _sigma(report, "eps", SIGMA_MOST_MPS)
+    return (north, east, down), _sigma(report, "eps", SIGMA_MAX_MPS)
 
 
 def _utc_ns(text: object) -> int | None:

@@ -23,25 +23,25 @@ GPS_EPOCH_UNIX_NS: Final = (GPS_EPOCH_DAY - UNIX_EPOCH_DAY) * 86_400 * SECOND_NS
 UNIX_FROM_US: Final = 1_000_000_000_000_000
 """A later microsecond is of UTC (September 2001), an earlier one counts from the start."""
 MS_NS: Final = 1_000_000
-CUT_SIGMA_NS: Final = MS_NS / math.sqrt(12)
+TRUNCATION_SIGMA_NS: Final = MS_NS / math.sqrt(12)
 """The time since start is cut to milliseconds, maybe at the same place every time."""
-KEPT: Final = 40
-KEPT_FOR_NS: Final = 120 * SECOND_NS
+HISTORY_LENGTH: Final = 40
+HISTORY_NS: Final = 120 * SECOND_NS
 RATE_SIGMA: Final = 30e-6
 """By which the autopilot's clock runs off UTC."""
 PRIOR_SIGMA_NS: Final = 6 * MS_NS
-BELIEF: Final = 3
+PRIOR_WEIGHT: Final = 3
 """How many messages the prior standard deviation of one message weighs."""
-BELIEF_AFTER_STEP: Final = 32
+PRIOR_WEIGHT_AFTER_STEP: Final = 32
 """Likewise of what the messages before a step showed."""
 STEP_FROM: Final = 16
 """So many messages say how far one of them may be off."""
-ALIKE_MOST: Final = 0.9
+CORRELATION_MAX: Final = 0.9
 ROUNDS: Final = 6
 RESTART_BACK_NS: Final = 1_000 * MS_NS
 """By so much less than before the time since start is that of another start; less is a message
 that was overtaken."""
-SURELY_STEPPED_NS: Final = SECOND_NS // 2
+CERTAIN_STEP_NS: Final = SECOND_NS // 2
 """Two messages in succession that are further off have another UTC."""
 STEPS: Final = ((3, 3, 0.95, 1.5), (8, 7, 0.75, 1.0), (12, 11, 0.6, 1.0))
 """UTC has stepped where of so many newest messages so many err to the same side by more than that
@@ -65,12 +65,12 @@ class BootClock:
         self.last_step_ns: int | None = None
         """By how much UTC stepped the last time; None for a restart."""
         self.leap_seconds: int | None = None
-        self._readings: deque[Reading] = deque(maxlen=KEPT)
-        self._prior = _Scatter(PRIOR_SIGMA_NS**2, PRIOR_SIGMA_NS, 1.0, BELIEF)
+        self._readings: deque[Reading] = deque(maxlen=HISTORY_LENGTH)
+        self._prior = _Scatter(PRIOR_SIGMA_NS**2, PRIOR_SIGMA_NS, 1.0, PRIOR_WEIGHT)
         self._line = _Line([(0, 0)], self._prior)
         self._doubt_ns = 0.0
 
-    def tell(self, unix_us: int, boot_ms: int) -> None:
+    def add_system_time(self, unix_us: int, boot_ms: int) -> None:
         """A SYSTEM_TIME came; without UTC (before the first fix) it says nothing."""
         if unix_us < UNIX_FROM_US:
             return
@@ -82,9 +82,9 @@ class BootClock:
             self._step([reading], None)
         else:
             readings.append(reading)
-            while boot_ns - readings[0][0] > KEPT_FOR_NS:
+            while boot_ns - readings[0][0] > HISTORY_NS:
                 readings.popleft()
-            self._look_for_a_step()
+            self._detect_step()
         self._line = _Line(list(readings), self._prior)
         self.leap_seconds = leap_seconds_at(unix_ns - GPS_EPOCH_UNIX_NS)
 
@@ -108,7 +108,7 @@ class BootClock:
 
     def sigma_ns(self, boot_ns: int) -> int:
         """Standard deviation of `gps_ns` against what the autopilot's UTC is on the average."""
-        return round(math.hypot(self._line.sigma_ns(boot_ns), CUT_SIGMA_NS, self._doubt_ns))
+        return round(math.hypot(self._line.sigma_ns(boot_ns), TRUNCATION_SIGMA_NS, self._doubt_ns))
 
     @property
     def last_boot_ns(self) -> int:
@@ -118,13 +118,13 @@ class BootClock:
     @property
     def utc_sigma_ns(self) -> int:
         """Standard deviation of a single stamp of the autopilot's UTC."""
-        return round(math.hypot(self._line.one_sigma_ns, CUT_SIGMA_NS))
+        return round(math.hypot(self._line.one_sigma_ns, TRUNCATION_SIGMA_NS))
 
-    def _look_for_a_step(self) -> None:
+    def _detect_step(self) -> None:
         readings = list(self._readings)
         self._doubt_ns = 0.0
         off = [offset_ns - self._line.at(boot_ns) for boot_ns, offset_ns in readings[-2:]]
-        if len(off) == 2 and (min(off) > SURELY_STEPPED_NS or max(off) < -SURELY_STEPPED_NS):
+        if len(off) == 2 and (min(off) > CERTAIN_STEP_NS or max(off) < -CERTAIN_STEP_NS):
             self._step(readings[-2:], round(off[-1]))
             return
         for count, needed, quantile, factor in STEPS:
@@ -140,7 +140,7 @@ class BootClock:
             above = sum(each > limit_ns for each in off)
             below = sum(each < -limit_ns for each in off)
             if max(above, below) >= needed:
-                self._prior = line.scatter(BELIEF_AFTER_STEP)
+                self._prior = line.scatter(PRIOR_WEIGHT_AFTER_STEP)
                 self._step(newest, round(statistics.median(off)))
                 return
         limit_ns = self._line.limit_ns(*STEPS[0][2:])
@@ -164,8 +164,8 @@ class _Scatter:
 
     variance: float
     one_sigma_ns: float
-    alike: float
-    belief: int
+    autocorrelation_factor: float
+    prior_weight: int
 
 
 class _Line:
@@ -199,8 +199,10 @@ class _Line:
         s0, s1 = float(n), sum(times)
         s2 = sum(t * t for t in times) + variance / slope_sigma**2
         determinant = s0 * s2 - s1 * s1
-        self._variance, self._alike = variance, self._alike_of(off)
-        self._covariance = [self._alike * variance * s / determinant for s in (s2, -s1, s0)]
+        self._variance, self._autocorrelation = variance, self._autocorrelation_factor(off)
+        self._covariance = [
+            self._autocorrelation * variance * s / determinant for s in (s2, -s1, s0)
+        ]
 
     def at(self, boot_ns: int) -> float:
         """UTC less the time since start."""
@@ -218,15 +220,17 @@ class _Line:
         """Standard deviation of one reading: 95 % lie within two of them."""
         n, prior = len(self._sizes), self._prior
         seen = self.quantile_ns(0.95) / 2
-        return math.sqrt((prior.belief * prior.one_sigma_ns**2 + n * seen**2) / (prior.belief + n))
+        return math.sqrt(
+            (prior.prior_weight * prior.one_sigma_ns**2 + n * seen**2) / (prior.prior_weight + n)
+        )
 
-    def scatter(self, belief: int) -> _Scatter:
+    def scatter(self, prior_weight: int) -> _Scatter:
         """What these readings show, for those after a step."""
-        return _Scatter(self._variance, self.one_sigma_ns, self._alike, belief)
+        return _Scatter(self._variance, self.one_sigma_ns, self._autocorrelation, prior_weight)
 
     def limit_ns(self, share: float, factor: float) -> float:
         """What more than that is off is not the scatter of these readings."""
-        return factor * math.sqrt(self._alike) * max(self.quantile_ns(share), MS_NS)
+        return factor * math.sqrt(self._autocorrelation) * max(self.quantile_ns(share), MS_NS)
 
     def quantile_ns(self, share: float) -> float:
         """What that share of the readings is off by at most."""
@@ -238,7 +242,7 @@ class _Line:
 
     def _scale(self, off: list[float]) -> float:
         """Robust standard deviation of the core of the readings."""
-        return max(1.4826 * statistics.median(abs(each) for each in off), CUT_SIGMA_NS)
+        return max(1.4826 * statistics.median(abs(each) for each in off), TRUNCATION_SIGMA_NS)
 
     def _variance_of_one(self, off: list[float]) -> float:
         """That of a reading, as far as it enters the line; few readings are not believed."""
@@ -246,10 +250,10 @@ class _Line:
         square = sum((3 * u / (2 + u * u)) ** 2 for u in (each / scale for each in off)) / n
         slope = sum(3 * (2 - u * u) / (2 + u * u) ** 2 for u in (r / scale for r in off)) / n
         seen = scale**2 * square / max(slope, 0.3) ** 2
-        belief = self._prior.belief
-        return (belief * self._prior.variance + n * seen) / (belief + max(n - 2, 0))
+        prior_weight = self._prior.prior_weight
+        return (prior_weight * self._prior.variance + n * seen) / (prior_weight + max(n - 2, 0))
 
-    def _alike_of(self, off: list[float]) -> float:
+    def _autocorrelation_factor(self, off: list[float]) -> float:
         """By how much the variance of the line is larger than were all readings independent, from
         how alike neighbours are (autocorrelation of first order)."""
         scale, n, prior = self._scale(off), len(off), self._prior
@@ -257,7 +261,11 @@ class _Line:
         products = sum(a * b for a, b in pairwise(scores))
         square = sum(score * score for score in scores)
         # The line takes out what would have been alike; few readings say little.
-        alike = min(max((products / square if square else 0.0) + 2 / n, 0.0), ALIKE_MOST)
-        alike *= n / (n + BELIEF)
-        factor = (1 + alike) / (1 - alike)
-        return (prior.belief * prior.alike + n * factor) / (prior.belief + n)
+        autocorrelation_factor = min(
+            max((products / square if square else 0.0) + 2 / n, 0.0), CORRELATION_MAX
+        )
+        autocorrelation_factor *= n / (n + PRIOR_WEIGHT)
+        factor = (1 + autocorrelation_factor) / (1 - autocorrelation_factor)
+        return (prior.prior_weight * prior.autocorrelation_factor + n * factor) / (
+            prior.prior_weight + n
+        )

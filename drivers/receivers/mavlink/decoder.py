@@ -22,9 +22,9 @@ AUTOPILOT_INVALID: Final = 8
 """MAV_AUTOPILOT of whatever is on the bus and is none: cameras, gimbals, ground stations."""
 FIXES: Final = {0: "none", 1: "none", 2: "2d"}
 """By GPS_FIX_TYPE; every other one is a fix of position and height."""
-GPS_OLD_MS: Final = 5_000
-ATTITUDES_KEPT: Final = 256
-QUATERNION_OLD_MS: Final = 1_000
+GPS_MAX_AGE_MS: Final = 5_000
+ATTITUDE_HISTORY_LENGTH: Final = 256
+QUATERNION_MAX_AGE_MS: Final = 1_000
 """After so long without ATTITUDE_QUATERNION, ATTITUDE is read."""
 ATTITUDE_GAP_MS: Final = 500
 """Between attitudes further apart nothing is interpolated."""
@@ -70,7 +70,7 @@ class MavlinkDecoder(MessageDecoder):
             ("samples", "samples_without_time", "marks", "marks_far", "marks_without_time",
              "messages_of_others", "messages_lost", "clock_steps"),
         )  # fmt: skip
-        self.unreadable = self._parser.errors
+        self.decode_errors = self._parser.errors
         self.clock = BootClock()
         self.system = system
         """The autopilot's number; 0 until its first heartbeat."""
@@ -86,7 +86,7 @@ class MavlinkDecoder(MessageDecoder):
         self._sequence: int | None = None
         self._gps: tuple[int, Any] | None = None
         self._boot_ms = 0
-        self._attitudes: deque[tuple[int, Quaternion]] = deque(maxlen=ATTITUDES_KEPT)
+        self._attitudes: deque[tuple[int, Quaternion]] = deque(maxlen=ATTITUDE_HISTORY_LENGTH)
         self._quaternion_ms: int | None = None
         self._held: tuple[Any, int] | None = None
         self._handlers: Mapping[str, Callable[[Any, int], list[Nav]]] = {
@@ -129,9 +129,9 @@ class MavlinkDecoder(MessageDecoder):
         handler = self._handlers.get(name)
         if handler is None:
             return []
-        made = handler(parsed, mono_ns)
+        decoded = handler(parsed, mono_ns)
         self.seen[name] += 1
-        return made
+        return decoded
 
     def _on_heartbeat(self, message: Any) -> None:
         if message.autopilot == AUTOPILOT_INVALID:
@@ -170,7 +170,7 @@ class MavlinkDecoder(MessageDecoder):
         if not all(math.isfinite(angle) and abs(angle) <= math.tau for angle in angles):
             raise ValueError("angles that are none")
         last_ms = self._quaternion_ms
-        if last_ms is not None and 0 <= message.time_boot_ms - last_ms < QUATERNION_OLD_MS:
+        if last_ms is not None and 0 <= message.time_boot_ms - last_ms < QUATERNION_MAX_AGE_MS:
             return []
         return self._on_attitude(message.time_boot_ms, quaternion_of(*angles))
 
@@ -183,13 +183,13 @@ class MavlinkDecoder(MessageDecoder):
 
     def _on_position(self, message: Any, mono_ns: int) -> list[Nav]:
         self._at(message.time_boot_ms)
-        made = self._release()
+        decoded = self._release()
         last_ms = self._attitudes[-1][0] if self._attitudes else None
         # Where attitudes come, the one after the position is waited for, and both interpolated.
         if last_ms is not None and 0 < message.time_boot_ms - last_ms < ATTITUDE_GAP_MS:
             self._held = (message, mono_ns)
-            return made
-        return [*made, *self._sample(message, mono_ns)]
+            return decoded
+        return [*decoded, *self._sample(message, mono_ns)]
 
     def _release(self) -> list[Nav]:
         if self._held is None:
@@ -257,12 +257,12 @@ class MavlinkDecoder(MessageDecoder):
         """Fix, satellites, sigmas of place, height and speed, and the geoid's height."""
         if self._gps is None:
             return "none", None, (None, None, None), self._undulation_m
-        heard_ms, gps = self._gps
+        received_ms, gps = self._gps
         # Extensions: zero where the autopilot does not send them.
         undulation_m = (
             (gps.alt_ellipsoid - gps.alt) * 1e-3 if gps.alt_ellipsoid else self._undulation_m
         )
-        if self._boot_ms - heard_ms > GPS_OLD_MS:
+        if self._boot_ms - received_ms > GPS_MAX_AGE_MS:
             # How well it is known by now nobody says.
             return "dead-reckoning", None, (None, None, None), undulation_m
         horizontal_m, vertical_m, speed_mps = (
@@ -280,14 +280,14 @@ class MavlinkDecoder(MessageDecoder):
             return None
         if after[0] - before[0] > ATTITUDE_GAP_MS:
             return None
-        share = (boot_ms - before[0]) / max(after[0] - before[0], 1)
-        return angles_of(between(before[1], after[1], share))
+        fraction = (boot_ms - before[0]) / max(after[0] - before[0], 1)
+        return angles_of(interpolated_quaternion(before[1], after[1], fraction))
 
     # Time and marks
 
     def _on_system_time(self, message: Any, _mono_ns: int) -> list[Nav]:
         self._at(message.time_boot_ms)
-        self.clock.tell(message.time_unix_usec, message.time_boot_ms)
+        self.clock.add_system_time(message.time_unix_usec, message.time_boot_ms)
         self.counters["clock_steps"] = self.clock.steps
         return []
 
@@ -315,7 +315,7 @@ class MavlinkDecoder(MessageDecoder):
             gps_ns, sigma_ns, valid = message.time_usec * 1000, self.clock.utc_sigma_ns, False
         else:
             gps_ns, sigma_ns = known
-            valid = self.near_navigation(gps_ns)
+            valid = self.is_near_navigation(gps_ns)
         self.counters["marks"] += 1
         return [
             EventMark(
@@ -331,15 +331,15 @@ class MavlinkDecoder(MessageDecoder):
         ]
 
 
-def between(first: Quaternion, second: Quaternion, share: float) -> Quaternion:
+def interpolated_quaternion(first: Quaternion, second: Quaternion, fraction: float) -> Quaternion:
     """The rotation that share of the way from the first to the second, along the shorter arc."""
     cosine = sum(a * b for a, b in zip(first, second, strict=True))
     sign = -1.0 if cosine < 0 else 1.0
     angle = math.acos(min(1.0, abs(cosine)))
     if angle < 1e-9:
         return first
-    one = math.sin((1 - share) * angle) / math.sin(angle)
-    other = sign * math.sin(share * angle) / math.sin(angle)
+    one = math.sin((1 - fraction) * angle) / math.sin(angle)
+    other = sign * math.sin(fraction * angle) / math.sin(angle)
     w, x, y, z = (one * a + other * b for a, b in zip(first, second, strict=True))
     return w, x, y, z
 

@@ -13,7 +13,7 @@ from drivers.base.settings import Setting
 from drivers.contract import ClockReading
 from drivers.receivers.mavlink.decoder import MavlinkDecoder, Timesync
 from drivers.receivers.mavlink.library import dialect
-from drivers.receivers.receiver import ListeningNavigator
+from drivers.receivers.streaming_navigator import StreamingNavigator
 from drivers.timescales.clock import Clock
 from drivers.transport.serial_device import (
     LineLostError,
@@ -26,8 +26,8 @@ from drivers.transport.serial_device import (
 SECOND_NS: Final = 1_000_000_000
 COMPANION: Final = 191
 """MAV_COMP_ID_ONBOARD_COMPUTER: who we are on the autopilot's bus."""
-ASK_AGAIN_NS: Final = 5 * SECOND_NS
-ANSWER_WITHIN_NS: Final = SECOND_NS
+REQUEST_INTERVAL_NS: Final = 5 * SECOND_NS
+ANSWER_TIMEOUT_NS: Final = SECOND_NS
 """A later answer to TIMESYNC says little, and may be of an autopilot that has restarted."""
 SET_MESSAGE_INTERVAL: Final = 511
 AUTOPILOTS: Final = {3: "ArduPilot", 12: "PX4"}
@@ -35,7 +35,7 @@ AUTOPILOTS: Final = {3: "ArduPilot", 12: "PX4"}
 TimesyncListener = Callable[[Timesync], None]
 
 
-class MavlinkNavigator(ListeningNavigator):
+class MavlinkNavigator(StreamingNavigator):
     """An autopilot that speaks MAVLink 1 or 2.
 
     Yields a NavSample for every GLOBAL_POSITION_INT, an EventMark for every CAMERA_TRIGGER, and a
@@ -50,33 +50,33 @@ class MavlinkNavigator(ListeningNavigator):
     what = "autopilot"
     protocol = "MAVLink"
     required = ("GLOBAL_POSITION_INT",)
-    switch_on = "switch it on for this port, or let this computer ask for it (request = true)"
+    enable_hint = "switch it on for this port, or let this computer ask for it (request = true)"
 
     port = Setting(
         "",
         required=True,
-        says="serial port, tcp://host:port, udpin://host:port (listens) or udpout://host:port",
+        help="serial port, tcp://host:port, udpin://host:port (listens) or udpout://host:port",
     )
     system = Setting(
-        0, minimum=0, maximum=255, says="number of the autopilot; 0: the first that is heard"
+        0, minimum=0, maximum=255, help="number of the autopilot; 0: the first that is heard"
     )
-    request = Setting(True, says="ask the autopilot for messages that do not come")
-    position_hz = Setting(10.0, minimum=0.1, maximum=400, says="rate of GLOBAL_POSITION_INT")
+    request = Setting(True, help="ask the autopilot for messages that do not come")
+    position_hz = Setting(10.0, minimum=0.1, maximum=400, help="rate of GLOBAL_POSITION_INT")
     attitude_hz = Setting(
-        50.0, minimum=0.1, maximum=1000, says="rate of ATTITUDE_QUATERNION or ATTITUDE"
+        50.0, minimum=0.1, maximum=1000, help="rate of ATTITUDE_QUATERNION or ATTITUDE"
     )
-    imu_hz = Setting(0.0, minimum=0, maximum=1000, says="rate of HIGHRES_IMU; 0: not asked for")
+    imu_hz = Setting(0.0, minimum=0, maximum=1000, help="rate of HIGHRES_IMU; 0: not asked for")
     timesync_hz = Setting(
-        1.0, minimum=0, maximum=20, says="how often its clock is asked for (TIMESYNC); 0: never"
+        1.0, minimum=0, maximum=20, help="how often its clock is asked for (TIMESYNC); 0: never"
     )
     mark_accuracy_ns = Setting(
-        1_000_000, minimum=1, maximum=1_000_000_000, says="accuracy of CAMERA_TRIGGER's time"
+        1_000_000, minimum=1, maximum=1_000_000_000, help="accuracy of CAMERA_TRIGGER's time"
     )
     undulation_m = Setting(
         0.0,
         minimum=-200,
         maximum=200,
-        says="geoid above ellipsoid, m, for autopilots that send no ellipsoidal height; "
+        help="geoid above ellipsoid, m, for autopilots that send no ellipsoidal height; "
         "if neither is known, heights are absent",
     )
 
@@ -96,10 +96,10 @@ class MavlinkNavigator(ListeningNavigator):
         self._sequence = 0
         self._heartbeat_ns = 0
         self._ask_ns = 0
-        self._seen_when_asked: dict[str, int] = {}
+        self._seen_at_request: dict[str, int] = {}
         self._steps_reported = 0
         self._timesync_ns = 0
-        self._asked_at_ns: set[int] = set()
+        self._requested_at_ns: set[int] = set()
         self._timesync_listener: TimesyncListener | None = None
         self.counters.update(requests=0, refusals=0, timesyncs=0)
 
@@ -113,12 +113,12 @@ class MavlinkNavigator(ListeningNavigator):
 
     # The port for TIMESYNC
 
-    def listen_for_timesync(self, heard: TimesyncListener | None) -> None:
+    def subscribe_timesync(self, callback: TimesyncListener | None) -> None:
         """Call `heard` with every TIMESYNC of the autopilot, from the thread that runs the device.
 
         `heard` returns quickly; None ends it.
         """
-        self._timesync_listener = heard
+        self._timesync_listener = callback
 
     def send_timesync(self, *, tc1_ns: int, ts1_ns: int) -> bool:
         """Send a TIMESYNC, from any thread; False where the line is not open or just lost.
@@ -131,7 +131,7 @@ class MavlinkNavigator(ListeningNavigator):
             return False
         message = dialect().MAVLink_timesync_message(tc1_ns, ts1_ns)
         try:
-            self._say(line, message)
+            self._send_message(line, message)
         except LineLostError:
             return False
         return True
@@ -150,12 +150,12 @@ class MavlinkNavigator(ListeningNavigator):
     def connected(self) -> None:
         super().connected()
         self._heartbeat_ns = self._ask_ns = self._timesync_ns = self.clock.mono_ns()
-        self._seen_when_asked = {}
-        self._asked_at_ns = set()
+        self._seen_at_request = {}
+        self._requested_at_ns = set()
 
     def step(self, line: SerialLine) -> Iterable[Sample]:
         self._talking = line
-        self._tend(line)
+        self._run_periodic_tasks(line)
         samples = [*super().step(line)]
         self._report_steps()
         while self.decoder.timesyncs:
@@ -177,7 +177,7 @@ class MavlinkNavigator(ListeningNavigator):
             if clock.last_step_ns is None
             else f"set its UTC by {clock.last_step_ns * 1e-9:+.3f} s against its own clock"
         )
-        self.teller.complain(
+        self.emitter.emit_throttled(
             "receiver-stepped",
             f"The autopilot {self.name} {what} ({clock.steps} so far). Its times are good to "
             f"{clock.sigma_ns(clock.last_boot_ns) * 1e-6:.1f} ms now, and better after some "
@@ -187,10 +187,10 @@ class MavlinkNavigator(ListeningNavigator):
     def _reading(self, timesync: Timesync) -> list[ClockReading]:
         """The autopilot's clock, where this is the answer to what we asked; it is used once."""
         round_trip_ns = timesync.mono_ns - timesync.ts1_ns
-        if timesync.tc1_ns <= 0 or timesync.ts1_ns not in self._asked_at_ns:
+        if timesync.tc1_ns <= 0 or timesync.ts1_ns not in self._requested_at_ns:
             return []
-        self._asked_at_ns.discard(timesync.ts1_ns)
-        if not 0 <= round_trip_ns <= ANSWER_WITHIN_NS:
+        self._requested_at_ns.discard(timesync.ts1_ns)
+        if not 0 <= round_trip_ns <= ANSWER_TIMEOUT_NS:
             return []
         self.counters["timesyncs"] += 1
         half_ns = round_trip_ns // 2
@@ -200,13 +200,13 @@ class MavlinkNavigator(ListeningNavigator):
         self._talking = None
         super().close()
 
-    def _tend(self, line: SerialLine) -> None:
+    def _run_periodic_tasks(self, line: SerialLine) -> None:
         """Heartbeat, TIMESYNC and requests, when they are due."""
         now_ns = self.clock.mono_ns()
         if now_ns >= self._heartbeat_ns:
             self._heartbeat_ns = now_ns + SECOND_NS
             here = dialect()
-            self._say(
+            self._send_message(
                 line,
                 here.MAVLink_heartbeat_message(
                     here.MAV_TYPE_ONBOARD_CONTROLLER,
@@ -219,15 +219,17 @@ class MavlinkNavigator(ListeningNavigator):
             )
         if self.timesync_hz and self.decoder.system and now_ns >= self._timesync_ns:
             self._timesync_ns = now_ns + round(SECOND_NS / self.timesync_hz)
-            self._asked_at_ns = {at for at in self._asked_at_ns if now_ns - at < ANSWER_WITHIN_NS}
-            asked_ns = self.clock.mono_ns()
-            self._asked_at_ns.add(asked_ns)
-            self._say(line, dialect().MAVLink_timesync_message(0, asked_ns))
+            self._requested_at_ns = {
+                at for at in self._requested_at_ns if now_ns - at < ANSWER_TIMEOUT_NS
+            }
+            requested_ns = self.clock.mono_ns()
+            self._requested_at_ns.add(requested_ns)
+            self._send_message(line, dialect().MAVLink_timesync_message(0, requested_ns))
         if self.request and self.decoder.system and now_ns >= self._ask_ns:
-            self._ask_ns = now_ns + ASK_AGAIN_NS
-            self._ask_for_what_does_not_come(line)
+            self._ask_ns = now_ns + REQUEST_INTERVAL_NS
+            self._request_missing_messages(line)
 
-    def _ask_for_what_does_not_come(self, line: SerialLine) -> None:
+    def _request_missing_messages(self, line: SerialLine) -> None:
         wanted = {
             "SYSTEM_TIME": 1.0,
             "GPS_RAW_INT": 1.0,
@@ -237,20 +239,20 @@ class MavlinkNavigator(ListeningNavigator):
         }
         here = dialect()
         quaternions = self.decoder.seen["ATTITUDE_QUATERNION"]
-        if self._seen_when_asked.get("ATTITUDE_QUATERNION") == quaternions:
+        if self._seen_at_request.get("ATTITUDE_QUATERNION") == quaternions:
             wanted["ATTITUDE"] = self.attitude_hz
-            if self.decoder.seen["ATTITUDE"] > self._seen_when_asked.get("ATTITUDE", 0):
+            if self.decoder.seen["ATTITUDE"] > self._seen_at_request.get("ATTITUDE", 0):
                 del wanted["ATTITUDE_QUATERNION"]
         for name, hertz in wanted.items():
             seen = self.decoder.seen[name]
             # Half of what is wanted is enough: a line that is full would not carry more.
-            enough = hertz * ASK_AGAIN_NS / SECOND_NS / 2
-            before = self._seen_when_asked.get(name)
-            self._seen_when_asked[name] = seen
+            enough = hertz * REQUEST_INTERVAL_NS / SECOND_NS / 2
+            before = self._seen_at_request.get(name)
+            self._seen_at_request[name] = seen
             if not hertz or (before is not None and seen - before >= enough):
                 continue
             self.counters["requests"] += 1
-            self._say(
+            self._send_message(
                 line,
                 here.MAVLink_command_long_message(
                     self.decoder.system,
@@ -271,14 +273,14 @@ class MavlinkNavigator(ListeningNavigator):
         if command != SET_MESSAGE_INTERVAL:
             return
         self.counters["refusals"] += 1
-        self.teller.complain(
+        self.emitter.emit_throttled(
             "refused",
             f"The autopilot {self.name} refuses to send a message it was asked for (result "
             f"{result}). Switch GLOBAL_POSITION_INT, ATTITUDE_QUATERNION, GPS_RAW_INT and "
             "SYSTEM_TIME on there for this port.",
         )
 
-    def _say(self, line: SerialLine, message: Any) -> None:
+    def _send_message(self, line: SerialLine, message: Any) -> None:
         """Pack and send as a companion of the autopilot's own system."""
         with self._writing:
             packer = dialect().MAVLink(None, self.decoder.system or self.system or 1, COMPANION)

@@ -52,7 +52,7 @@ class NmeaDecoder(MessageDecoder):
             a receiver whose count of weeks rolled over, and is corrected by 1024 weeks.
     """
 
-    unreadable = (ValueError, IndexError, OverflowError)
+    decode_errors = (ValueError, IndexError, OverflowError)
     bad_counter = "bad_sentences"
 
     def __init__(
@@ -105,15 +105,15 @@ class NmeaDecoder(MessageDecoder):
             return [mark]
         if kind not in SENTENCES:
             return []
-        made: list[Nav] = []
+        decoded: list[Nav] = []
         if kind in TIME_AT:
             text = fields[TIME_AT[kind]] if len(fields) > TIME_AT[kind] else ""
             if not text:
-                self._without_time(kind, fields, mono_ns)
+                self._on_sentence_without_time(kind, fields, mono_ns)
                 return []
             time = time_of_day_ns(text)
             if self._epoch is None or self._epoch.time != time:
-                made = self._close()
+                decoded = self._close()
                 self._epoch = Epoch(time, mono_ns)
         if self._epoch is None:
             self.seen[kind] += 1
@@ -122,10 +122,10 @@ class NmeaDecoder(MessageDecoder):
         self.seen[kind] += 1
         expected = frozenset[str]().union(*self._kinds)
         if expected and expected <= self._epoch.kinds:
-            made.extend(self._complete(self._epoch))
-        return made
+            decoded.extend(self._complete(self._epoch))
+        return decoded
 
-    def _without_time(self, kind: str, fields: list[str], mono_ns: int) -> None:
+    def _on_sentence_without_time(self, kind: str, fields: list[str], mono_ns: int) -> None:
         """A receiver that has never had a fix sends its sentences without a time."""
         epoch = Epoch((0, False), mono_ns)
         epoch.add(kind, fields)
@@ -236,7 +236,7 @@ class NmeaDecoder(MessageDecoder):
             # and week the sentence gives differs by receiver: navigation decides.
             near = self._gps_ns
             gps_ns = min((by_utc_day, by_gps_day), key=lambda at: abs(at - near))
-            valid = self.near_navigation(gps_ns)
+            valid = self.is_near_navigation(gps_ns)
         elif by_utc_day != by_gps_day:
             valid = False
         self.counters["marks"] += 1

@@ -39,8 +39,8 @@ PUBX_STATUS: Final = {
 DRMS_OF_CEP: Final = math.sqrt(2 / (2 * math.log(2)))
 """Garmin's horizontal error is a circle that holds one half; ours is the root of both variances."""
 SIGMA_OF_PROBABLE: Final = 1 / 0.674490
-SAME_PLACE_DIGITS: Final = 2.0
-SAME_PLACE_DEG: Final = 2e-5
+SAME_POSITION_DIGITS: Final = 2.0
+SAME_POSITION_DEG: Final = 2e-5
 """Two sentences of one time may give positions so many last digits, and so far, apart: 2 m."""
 
 Fields = list[str]
@@ -82,9 +82,9 @@ class Epoch:
     @property
     def fix(self) -> str:
         """The worst of what was said of the fix; "none" where nothing was."""
-        for word in ("none", "time", "dead-reckoning"):
-            if word in self.fixes:
-                return word
+        for fix_status in ("none", "time", "dead-reckoning"):
+            if fix_status in self.fixes:
+                return fix_status
         if not self.fixes or self.position is None or self.is_contradictory:
             return "none"
         return "2d" if "2d" in self.fixes else "3d"
@@ -111,7 +111,7 @@ class Epoch:
         SENTENCES[kind](self, fields)
         self.kinds.add(kind)
 
-    def _place(self, fields: Fields, rank: int) -> None:
+    def _set_position(self, fields: Fields, rank: int) -> None:
         """A position, in four fields; that of the highest rank counts.
 
         One that contradicts another of the same time by more than its digits makes both unusable:
@@ -122,7 +122,9 @@ class Epoch:
             return
         resolution = max(resolution_deg(fields[0]), resolution_deg(fields[2]))
         if self.position is not None:
-            allowed = SAME_PLACE_DEG + SAME_PLACE_DIGITS * max(resolution, self.resolution_deg)
+            allowed = SAME_POSITION_DEG + SAME_POSITION_DIGITS * max(
+                resolution, self.resolution_deg
+            )
             north = abs(position[0] - self.position[0])
             east = abs(math.remainder(position[1] - self.position[1], 360))
             east *= math.cos(math.radians(position[0]))
@@ -131,24 +133,24 @@ class Epoch:
             self.position, self.position_rank = position, rank
             self.resolution_deg = resolution
 
-    def _say(self, word: str) -> bool:
+    def _add_fix(self, fix_status: str) -> bool:
         """Note a word about the fix; whether it comes with a position.
 
         Without one the other fields mean nothing: receivers fill them with what they like.
         """
-        self.fixes.add(word)
-        return word not in ("none", "time")
+        self.fixes.add(fix_status)
+        return fix_status not in ("none", "time")
 
     def _mode(self, status: str, mode: str) -> bool:
         """Status A or V, and the mode indicator where the version has one. See `_say`."""
-        return self._say("none" if status != "A" else MODES.get(mode, "fix"))
+        return self._add_fix("none" if status != "A" else MODES.get(mode, "fix"))
 
     # Sentences
 
     def _rmc(self, fields: Fields) -> None:
         if not self._mode(fields[2], fields[12] if len(fields) > 12 else ""):
             return
-        self._place(fields[3:7], rank=2)
+        self._set_position(fields[3:7], rank=2)
         speed, course = number_or_none(fields[7]), number_or_none(fields[8])
         if fields[9]:
             self.day = day_of(fields[9])
@@ -160,27 +162,30 @@ class Epoch:
     def _gga(self, fields: Fields) -> None:
         quality = int(number(fields[6] or "0"))
         self._satellites(fields[7])
-        if not self._say(QUALITIES.get(quality, "fix")):
+        if not self._add_fix(QUALITIES.get(quality, "fix")):
             return
         self.hdop = dop_or_none(fields[8]) or self.hdop
-        self._place(fields[2:6], rank=4)
+        self._set_position(fields[2:6], rank=4)
         self._heights(fields[9:13:2], fields[10:13:2])
 
     def _gns(self, fields: Fields) -> None:
         modes = {MODES.get(mode, "fix") for mode in fields[6]}
         self._satellites(fields[7])
-        if not self._say(
-            next((word for word in ("fix", "dead-reckoning") if word in modes), "none")
+        if not self._add_fix(
+            next(
+                (fix_status for fix_status in ("fix", "dead-reckoning") if fix_status in modes),
+                "none",
+            )
         ):
             return
         self.hdop = dop_or_none(fields[8]) or self.hdop
-        self._place(fields[2:6], rank=5)
+        self._set_position(fields[2:6], rank=5)
         self._heights(fields[9:11])
 
     def _gll(self, fields: Fields) -> None:
         # Older than version 2.3: neither time nor status.
         if self._mode(fields[6], fields[7] if len(fields) > 7 else ""):
-            self._place(fields[1:5], rank=1)
+            self._set_position(fields[1:5], rank=1)
 
     def _gst(self, fields: Fields) -> None:
         self._sigmas(*(number_or_none(fields[n]) for n in (6, 7, 8)))
@@ -216,7 +221,7 @@ class Epoch:
     def _gsa(self, fields: Fields) -> None:
         # One for each constellation; only a 2d fix is new: that there is none, others say with it.
         if fields[2] == "2":
-            self._say("2d")
+            self._add_fix("2d")
         self.hdop = self.hdop or dop_or_none(fields[16])
         self.vdop = dop_or_none(fields[17])
 
@@ -235,11 +240,11 @@ class Epoch:
 
     def _pubx(self, fields: Fields) -> None:
         """PUBX,00: position and its accuracy."""
-        word = PUBX_STATUS.get(fields[8], "none")
-        if not self._say(word):
+        fix_status = PUBX_STATUS.get(fields[8], "none")
+        if not self._add_fix(fix_status):
             return
-        self._place(fields[3:7], rank=3)
-        if word == "3d":
+        self._set_position(fields[3:7], rank=3)
+        if fix_status == "3d":
             self.ellipsoidal_m = number_or_none(fields[7])
         if self.horizontal_sigma_m is None:
             self.horizontal_sigma_m = number_or_none(fields[9]) or None
@@ -261,9 +266,9 @@ class Epoch:
             month_day = fields[3]
             self.day = day_of(month_day[2:4] + month_day[:2] + month_day[4:])
         self._satellites(fields[9])
-        if not self._say(GGK_QUALITIES.get(int(number(fields[8] or "0")), "fix")):
+        if not self._add_fix(GGK_QUALITIES.get(int(number(fields[8] or "0")), "fix")):
             return
-        self._place(fields[4:8], rank=6)
+        self._set_position(fields[4:8], rank=6)
         if fields[11].startswith("EHT"):
             self.ellipsoidal_m = number_or_none(fields[11][3:])
 

@@ -11,18 +11,18 @@ from typing import ClassVar, Final
 
 from drivers.base.settings import Setting
 from drivers.receivers.nmea.decoder import NmeaDecoder
-from drivers.receivers.receiver import ListeningNavigator
+from drivers.receivers.streaming_navigator import StreamingNavigator
 from drivers.timescales.gps_time import GPS_EPOCH_DAY
 from drivers.transport.serial_device import Sample, SerialLine
 
 NOT_BEFORE_DAY: Final = datetime.date(2020, 1, 1).toordinal() - GPS_EPOCH_DAY
 """No flight was earlier: a receiver that says so lost count of the weeks (1024 of them)."""
 
-UNDATED_MOST: Final = 5
+UNDATED_MAX: Final = 5
 """So many positions before the first date are normal: it comes once a second."""
 
 
-class NmeaNavigator(ListeningNavigator):
+class NmeaNavigator(StreamingNavigator):
     """A receiver that sends NMEA 0183 sentences by itself.
 
     Yields a NavSample for every epoch with a fix and an EventMark for every $PTNL,EVT. What a
@@ -37,20 +37,20 @@ class NmeaNavigator(ListeningNavigator):
     required = ("RMC", "GGA", "GNS", "PTNL,GGK", "PUBX,00")
 
     range_error_m = Setting(
-        5.0, minimum=0.001, maximum=1000, says="without GST, sigma is this times the HDOP"
+        5.0, minimum=0.001, maximum=1000, help="without GST, sigma is this times the HDOP"
     )
     undulation_m = Setting(
         0.0,
         minimum=-200,
         maximum=200,
-        says="geoid above ellipsoid, m, for receivers that do not send it; if neither is known, "
+        help="geoid above ellipsoid, m, for receivers that do not send it; if neither is known, "
         "heights are absent",
     )
     speed_sigma_mps = Setting(
-        0.5, minimum=0.001, maximum=100, says="sigma of velocity, which NMEA does not tell"
+        0.5, minimum=0.001, maximum=100, help="sigma of velocity, which NMEA does not tell"
     )
     mark_accuracy_ns = Setting(
-        1000, minimum=1, maximum=1_000_000_000, says="accuracy of an event mark, by the data sheet"
+        1000, minimum=1, maximum=1_000_000_000, help="accuracy of an event mark, by the data sheet"
     )
 
     def new_decoder(self) -> NmeaDecoder:
@@ -66,14 +66,14 @@ class NmeaNavigator(ListeningNavigator):
     def step(self, line: SerialLine) -> Iterable[Sample]:
         records = super().step(line)
         counters = self.decoder.counters
-        if counters["samples_without_date"] >= UNDATED_MOST and not counters["samples"]:
-            self.teller.complain(
+        if counters["samples_without_date"] >= UNDATED_MAX and not counters["samples"]:
+            self.emitter.emit_throttled(
                 "no-date",
                 f"The receiver {self.name} at {self.port} sends positions and no date. Switch on "
                 "RMC or ZDA.",
             )
         if counters["dates_rolled_over"]:
-            self.teller.complain(
+            self.emitter.emit_throttled(
                 "rolled-over",
                 f"The receiver {self.name} at {self.port} sends dates of 1024 weeks ago; they are "
                 "corrected. Update its firmware.",

@@ -13,9 +13,9 @@ from collections import Counter
 from typing import Any, Final
 
 from drivers.contract import POSITION_FIXES, EventMark, NavSample, Velocity
-from drivers.receivers.ascii_numbers import decimal_number, whole_number
+from drivers.receivers.ascii_numbers import parse_decimal, parse_integer
 from drivers.receivers.message_decoder import MessageDecoder, Nav
-from drivers.receivers.novatel.framing import Log, log_of, novatel_framer
+from drivers.receivers.novatel.framing import NovatelLog, log_of, novatel_framer
 from drivers.timescales.gps_time import RECENT_NS, SECOND_NS, WEEK_NS
 
 NAMES: Final = {
@@ -48,9 +48,9 @@ INS_FIXES: Final = {
 }  # fmt: skip
 COMPUTED: Final = (0, "SOL_COMPUTED")
 VALID: Final = (0, 1, "VALID")
-TIME_IS_GOOD_FROM: Final = 120
+MIN_TIME_STATUS: Final = 120
 """Of the numbers of the time status: COARSESTEERING and all that are finer."""
-GOOD_WORDS: Final = frozenset(
+GOOD_TIME_STATES: Final = frozenset(
     ("COARSESTEERING", "FREEWHEELING", "FINEADJUSTING", "FINE", "FINEBACKUPSTEERING",
      "FINESTEERING", "EXACT", "SATTIME")
 )  # fmt: skip
@@ -72,7 +72,7 @@ class NovatelDecoder(MessageDecoder):
     raises.
     """
 
-    unreadable = (ValueError, TypeError, IndexError, OverflowError, struct.error)
+    decode_errors = (ValueError, TypeError, IndexError, OverflowError, struct.error)
     bad_counter = "bad_logs"
 
     def __init__(self, receiver: str, *, mark_accuracy_ns: int = 100) -> None:
@@ -92,21 +92,23 @@ class NovatelDecoder(MessageDecoder):
     def on_message(self, message: bytes, mono_ns: int) -> list[Nav]:
         return self._on_log(log_of(message), mono_ns)
 
-    def _on_log(self, log: Log, mono_ns: int) -> list[Nav]:
+    def _on_log(self, log: NovatelLog, mono_ns: int) -> list[Nav]:
         name = NAMES.get(log.identity, "") if isinstance(log.identity, int) else log.identity
         name = name.removesuffix("S") if name == "INSPVAS" else name
         if name not in NAMES.values():
             return []
         if isinstance(log.time_status, int):
-            self._time_good = log.time_status >= TIME_IS_GOOD_FROM
+            self._time_good = log.time_status >= MIN_TIME_STATUS
         elif log.time_status is not None:
-            self._time_good = log.time_status in GOOD_WORDS
+            self._time_good = log.time_status in GOOD_TIME_STATES
         values = _values(name, log.body)
         if any(isinstance(value, float) and not math.isfinite(value) for value in values):
             raise ValueError(f"{name} holds a number that is none")
-        made: list[Nav] = []
+        decoded: list[Nav] = []
         if name.startswith("MARK"):
-            made = self._on_mark(int(name[4]), values, is_pva=name.endswith("PVA"), mono_ns=mono_ns)
+            decoded = self._on_mark(
+                int(name[4]), values, is_pva=name.endswith("PVA"), mono_ns=mono_ns
+            )
         elif name == "TIME":
             if values[10] in VALID[1:]:
                 self._leap = round(-values[3])
@@ -117,16 +119,16 @@ class NovatelDecoder(MessageDecoder):
                 ned = (speed * math.cos(course), speed * math.sin(course), -up)
                 self._velocity = (_header_ns(log), ned)
         elif name == "BESTPOS":
-            made = self._on_bestpos(log, values, mono_ns)
+            decoded = self._on_bestpos(log, values, mono_ns)
         elif name == "INSPVAX":
             self._sigmas = (math.hypot(*values[12:14]), values[14], math.hypot(*values[15:18]))
             height = values[4] + values[5]
             inertial = (*values[2:4], height, *values[6:12], values[0])
-            made = self._on_inertial(_header_ns(log), inertial, mono_ns)
+            decoded = self._on_inertial(_header_ns(log), inertial, mono_ns)
         else:
-            made = self._on_inertial(_gps_ns(values[0], values[1]), values[2:], mono_ns)
+            decoded = self._on_inertial(_gps_ns(values[0], values[1]), values[2:], mono_ns)
         self.seen[name] += 1
-        return made
+        return decoded
 
     # Navigation
 
@@ -146,7 +148,7 @@ class NovatelDecoder(MessageDecoder):
             attitude=(math.radians(roll), math.radians(pitch), math.radians(azimuth) % math.tau),
         )
 
-    def _on_bestpos(self, log: Log, values: tuple[Any, ...], mono_ns: int) -> list[Nav]:
+    def _on_bestpos(self, log: NovatelLog, values: tuple[Any, ...], mono_ns: int) -> list[Nav]:
         gps_ns = _header_ns(log)
         self._satellites = int(values[12])
         if self._inertial_ns is not None and abs(gps_ns - self._inertial_ns) < RECENT_NS:
@@ -227,7 +229,7 @@ class NovatelDecoder(MessageDecoder):
             return []
         recent.append(gps_ns)
         del recent[:-16]
-        valid = valid and self.near_navigation(gps_ns)
+        valid = valid and self.is_near_navigation(gps_ns)
         self.counters["marks"] += 1
         count = self._counts[channel] = (self._counts[channel] + 1) % (1 << COUNT_BITS)
         return [
@@ -259,14 +261,14 @@ def _enumerated(text: str) -> int | str:
     return int(text) if text.isascii() and text.isdigit() else text
 
 
-_READ: Final = {"i": whole_number, "f": decimal_number, "w": _enumerated}
+_READ: Final = {"i": parse_integer, "f": parse_decimal, "w": _enumerated}
 
 
 def _gps_ns(week: int, seconds: float) -> int:
     return _gps_of(week, round(seconds * 1e9))
 
 
-def _header_ns(log: Log) -> int:
+def _header_ns(log: NovatelLog) -> int:
     return _gps_of(log.week, log.tow_ns)
 
 

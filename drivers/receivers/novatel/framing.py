@@ -13,7 +13,7 @@ import zlib
 from dataclasses import dataclass
 from typing import Final
 
-from drivers.receivers.ascii_numbers import decimal_number, whole_number
+from drivers.receivers.ascii_numbers import parse_decimal, parse_integer
 from drivers.receivers.message_framer import MessageFramer, line_size
 
 STARTS: Final = b"\xaa#%"
@@ -26,7 +26,7 @@ _ASCII: Final = re.compile(rb"[#%]([^*]*)\*([0-9a-fA-F]{8})\r?\n")
 
 
 @dataclass(frozen=True)
-class Log:
+class NovatelLog:
     """One log: its number (binary) or name (ASCII), header time, and body.
 
     `time_status` is the number of the manual or the ASCII word, None in short headers.
@@ -49,27 +49,29 @@ def novatel_framer() -> MessageFramer:
     return MessageFramer(STARTS, _size_of, _fits)
 
 
-def log_of(frame: bytes) -> Log:
+def log_of(frame: bytes) -> NovatelLog:
     """A whole checked frame taken apart; ValueError where its text is none."""
     if frame[0] == 0xAA:
         identity = struct.unpack_from("<H", frame, 4)[0]
         if frame[2] == 0x13:
             week, ms = struct.unpack_from("<Hi", frame, 6)
-            return Log(identity, week, ms * 1_000_000, None, frame[SHORT_HEADER:-CRC_NBYTES])
+            return NovatelLog(identity, week, ms * 1_000_000, None, frame[SHORT_HEADER:-CRC_NBYTES])
         week, ms = struct.unpack_from("<Hi", frame, 14)
-        return Log(identity, week, ms * 1_000_000, frame[13], frame[frame[3] : -CRC_NBYTES])
+        return NovatelLog(identity, week, ms * 1_000_000, frame[13], frame[frame[3] : -CRC_NBYTES])
     head, _, body = frame[1 : frame.rindex(b"*")].decode("ascii").partition(";")
-    words = head.split(",")
-    name = words[0].removesuffix("A")
+    fields = head.split(",")
+    name = fields[0].removesuffix("A")
     if frame[:1] == b"%":
-        return Log(name, whole_number(words[1]), _tow_ns(words[2]), None, body.split(","))
-    if len(words) < 10:
+        return NovatelLog(name, parse_integer(fields[1]), _tow_ns(fields[2]), None, body.split(","))
+    if len(fields) < 10:
         raise ValueError("a header of fewer than ten words")
-    return Log(name, whole_number(words[5]), _tow_ns(words[6]), words[4], body.split(","))
+    return NovatelLog(
+        name, parse_integer(fields[5]), _tow_ns(fields[6]), fields[4], body.split(",")
+    )
 
 
 def _tow_ns(text: str) -> int:
-    return round(decimal_number(text) * 1e9)
+    return round(parse_decimal(text) * 1e9)
 
 
 def _size_of(buffer: bytes, at: int) -> int | None:

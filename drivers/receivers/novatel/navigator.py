@@ -9,10 +9,10 @@ from typing import ClassVar
 
 from drivers.base.settings import Setting
 from drivers.receivers.novatel.decoder import NovatelDecoder
-from drivers.receivers.receiver import ListeningNavigator
+from drivers.receivers.streaming_navigator import StreamingNavigator
 
 
-class NovatelNavigator(ListeningNavigator):
+class NovatelNavigator(StreamingNavigator):
     """A NovAtel receiver that sends its logs by itself, binary or ASCII.
 
     Yields a NavSample for every inertial solution, or for every BESTPOS where there is none, and
@@ -26,7 +26,7 @@ class NovatelNavigator(ListeningNavigator):
     required = ("INSPVAX", "INSPVA", "BESTPOS")
 
     mark_accuracy_ns = Setting(
-        100, minimum=1, maximum=1_000_000_000, says="accuracy of an event mark, by the data sheet"
+        100, minimum=1, maximum=1_000_000_000, help="accuracy of an event mark, by the data sheet"
     )
 
     def new_decoder(self) -> NovatelDecoder:

@@ -51,7 +51,7 @@ INS_PART: Final = struct.Struct("<3f")
 
 
 @dataclass(frozen=True)
-class Block:
+class SbfBlock:
     """One block: time stamp on the receiver's clock (None where unknown) and values.
 
     `values` are those of LAYOUTS, floats None where the receiver says not to use them; `rest` is
@@ -80,7 +80,7 @@ def crc(data: bytes) -> int:
     return binascii.crc_hqx(data, 0)
 
 
-def block_of(frame: bytes) -> Block | None:
+def block_of(frame: bytes) -> SbfBlock | None:
     """A whole checked block taken apart; None for one of no use here.
 
     Raises:
@@ -101,7 +101,7 @@ def block_of(frame: bytes) -> Block | None:
         raise ValueError(f"time of week of {tow_ms} ms")
     else:
         rx_ns = week * WEEK_NS + tow_ms * 1_000_000
-    return Block(name, identity >> 13, rx_ns, values, frame[at + layout.size :])
+    return SbfBlock(name, identity >> 13, rx_ns, values, frame[at + layout.size :])
 
 
 def number(value: int | float) -> int | float | None:
@@ -118,7 +118,7 @@ def number(value: int | float) -> int | float | None:
     return value
 
 
-def accuracies_m(block: Block) -> tuple[float, float] | None:
+def accuracies_m(block: SbfBlock) -> tuple[float, float] | None:
     """Horizontal and vertical standard deviation of a PVTGeodetic of revision 2; None without.
 
     The block holds twice their value.

@@ -17,7 +17,7 @@ from drivers.contract import POSITION_FIXES, EventMark, NavSample, Velocity
 from drivers.receivers.message_decoder import MessageDecoder, Nav
 from drivers.receivers.septentrio.blocks import (
     INS_PART,
-    Block,
+    SbfBlock,
     accuracies_m,
     block_of,
     number,
@@ -54,13 +54,13 @@ class _Epoch:
     rx_ns: int
     mono_ns: int
     kinds: set[str] = field(default_factory=set)
-    pvt: Block | None = None
+    pvt: SbfBlock | None = None
     sigmas_m: tuple[float, float] | None = None
     speed_sigma_mps: float | None = None
     hdop: float | None = None
     vdop: float | None = None
     attitude: Triple = (None, None, None)
-    told: bool = False
+    is_emitted: bool = False
 
 
 class SbfDecoder(MessageDecoder):
@@ -72,7 +72,7 @@ class SbfDecoder(MessageDecoder):
     Nothing that is fed raises.
     """
 
-    unreadable = (ValueError, TypeError, struct.error, OverflowError)
+    decode_errors = (ValueError, TypeError, struct.error, OverflowError)
     bad_counter = "bad_blocks"
 
     def __init__(self, receiver: str, *, edge: str = "rising", mark_accuracy_ns: int = 100) -> None:
@@ -102,7 +102,7 @@ class SbfDecoder(MessageDecoder):
         block = block_of(message)
         if block is None:
             return []
-        made: list[Nav] = []
+        decoded: list[Nav] = []
         if block.name == "ReceiverTime":
             self._on_receiver_time(block)
         elif block.rx_ns is None:
@@ -112,22 +112,22 @@ class SbfDecoder(MessageDecoder):
                 self.fix, self.satellites = "none", 0
             self.counters["marks_without_time"] += block.name == "ExtEvent"
         elif block.name == "ExtEvent":
-            made = self._on_event(block, block.rx_ns, mono_ns)
+            decoded = self._on_event(block, block.rx_ns, mono_ns)
         elif block.name == "ExtEventPVTGeodetic":
             self._on_event_position(block.rx_ns)
         elif block.name == "INSNavGeod":
-            made = self._on_inertial(block, block.rx_ns, mono_ns)
+            decoded = self._on_inertial(block, block.rx_ns, mono_ns)
         elif block.name in EPOCH_KINDS:
-            made = self._on_part_of_epoch(block, block.rx_ns, mono_ns)
+            decoded = self._on_part_of_epoch(block, block.rx_ns, mono_ns)
         self.seen[block.name] += 1
-        return made
+        return decoded
 
     # Epochs
 
-    def _on_part_of_epoch(self, block: Block, rx_ns: int, mono_ns: int) -> list[Nav]:
-        made: list[Nav] = []
+    def _on_part_of_epoch(self, block: SbfBlock, rx_ns: int, mono_ns: int) -> list[Nav]:
+        decoded: list[Nav] = []
         if self._epoch is None or self._epoch.rx_ns != rx_ns:
-            made = self._close()
+            decoded = self._close()
             self._epoch = _Epoch(rx_ns, mono_ns)
         epoch = self._epoch
         values = block.values
@@ -147,20 +147,20 @@ class SbfDecoder(MessageDecoder):
                 epoch.speed_sigma_mps = math.sqrt(sum(values[2:5]))
         epoch.kinds.add(block.name)
         if self._expected and self._expected <= epoch.kinds:
-            made.extend(self._tell(epoch))
-        return made
+            decoded.extend(self._emit(epoch))
+        return decoded
 
     def _close(self) -> list[Nav]:
         if self._epoch is None:
             return []
         self._expected = frozenset(self._epoch.kinds)
-        return self._tell(self._epoch)
+        return self._emit(self._epoch)
 
-    def _tell(self, epoch: _Epoch) -> list[Nav]:
+    def _emit(self, epoch: _Epoch) -> list[Nav]:
         block = epoch.pvt
-        if epoch.told or block is None:
+        if epoch.is_emitted or block is None:
             return []
-        epoch.told = True
+        epoch.is_emitted = True
         mode, error, latitude, longitude, height, _, north, east, up = block.values[:9]
         bias_ms = block.values[10]
         gps_ns = epoch.rx_ns - round((bias_ms or 0.0) * 1e6)
@@ -185,7 +185,7 @@ class SbfDecoder(MessageDecoder):
             sigma_source=source,
         )
 
-    def _on_inertial(self, block: Block, rx_ns: int, mono_ns: int) -> list[Nav]:
+    def _on_inertial(self, block: SbfBlock, rx_ns: int, mono_ns: int) -> list[Nav]:
         mode, error = block.values[:2]
         latitude, longitude, height = block.values[4:7]
         parts = _ins_parts(block)
@@ -267,13 +267,13 @@ class SbfDecoder(MessageDecoder):
 
     # Time and marks
 
-    def _on_receiver_time(self, block: Block) -> None:
+    def _on_receiver_time(self, block: SbfBlock) -> None:
         leap, level = block.values[6:8]
         self._time_good = level & WEEK_AND_TOW_SET == WEEK_AND_TOW_SET
         if leap != LEAP_UNKNOWN and 0 <= leap <= MAX_LEAP_SECONDS and self._time_good:
             self._leap = leap
 
-    def _on_event(self, block: Block, rx_ns: int, mono_ns: int) -> list[Nav]:
+    def _on_event(self, block: SbfBlock, rx_ns: int, mono_ns: int) -> list[Nav]:
         channel, polarity, offset_s, bias_s = block.values
         self._marked_rx_ns = rx_ns
         if polarity != self._polarity:
@@ -284,7 +284,7 @@ class SbfDecoder(MessageDecoder):
         # t = TOW + Offset - RxClkBias; without a bias the receiver has had no PVT for ten minutes.
         gps_ns = rx_ns + round(offset_s * 1e9) - round((bias_s or 0.0) * 1e9)
         age_s = int.from_bytes(block.rest[:2], "little") if block.revision >= 1 else 0
-        valid = bias_s is not None and self._time_good and self.near_navigation(gps_ns)
+        valid = bias_s is not None and self._time_good and self.is_near_navigation(gps_ns)
         self.counters["marks"] += 1
         self._counts[channel] += 1
         return [
@@ -311,7 +311,7 @@ class SbfDecoder(MessageDecoder):
             self.counters["marks_lost"] += 1
 
 
-def _ins_parts(block: Block) -> dict[int, tuple[float, float, float]]:
+def _ins_parts(block: SbfBlock) -> dict[int, tuple[float, float, float]]:
     """The optional parts that are there and can be used, by number of their bit."""
     listed = block.values[11]
     parts: dict[int, tuple[float, float, float]] = {}

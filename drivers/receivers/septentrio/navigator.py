@@ -8,11 +8,11 @@ from __future__ import annotations
 from typing import ClassVar
 
 from drivers.base.settings import Setting
-from drivers.receivers.receiver import EDGE, ListeningNavigator
 from drivers.receivers.septentrio.decoder import SbfDecoder
+from drivers.receivers.streaming_navigator import EDGE, StreamingNavigator
 
 
-class SeptentrioNavigator(ListeningNavigator):
+class SeptentrioNavigator(StreamingNavigator):
     """A Septentrio receiver that sends SBF by itself.
 
     Yields a NavSample for every INSNavGeod, or for every PVTGeodetic where there is none, and an
@@ -24,11 +24,11 @@ class SeptentrioNavigator(ListeningNavigator):
     kind: ClassVar = "navigator"
     protocol = "SBF"
     required = ("PVTGeodetic", "INSNavGeod")
-    switch_on = "switch on PVTGeodetic and ExtEvent for this port (setSBFOutput)"
+    enable_hint = "switch on PVTGeodetic and ExtEvent for this port (setSBFOutput)"
 
     edge = EDGE
     mark_accuracy_ns = Setting(
-        100, minimum=1, maximum=1_000_000_000, says="accuracy of an event mark, by the data sheet"
+        100, minimum=1, maximum=1_000_000_000, help="accuracy of an event mark, by the data sheet"
     )
 
     def new_decoder(self) -> SbfDecoder:

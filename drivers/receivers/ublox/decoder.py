@@ -42,7 +42,7 @@ TIME_BASE_RECEIVER: Final = 0
 TIME_BASE_UTC: Final = 2
 LEAP_SOURCE_DEFAULT: Final = 0
 """Of NAV-TIMELS: the firmware's own guess. 255, "unknown", is what an M8T says of received ones."""
-ATTITUDES_KEPT: Final = 64
+ATTITUDE_HISTORY_LENGTH: Final = 64
 ACCURACY_UNKNOWN: Final = 0xFFFFFFFF
 """What hAcc, vAcc and sAcc hold before the receiver can estimate them."""
 
@@ -56,7 +56,7 @@ class UbxDecoder(MessageDecoder):
     raises.
     """
 
-    unreadable = (
+    decode_errors = (
         UBXMessageError,
         UBXParseError,
         UBXStreamError,
@@ -73,7 +73,7 @@ class UbxDecoder(MessageDecoder):
         self._leap_is_default = False
         self._timegps_ns: int | None = None
         self._attitudes: deque[tuple[int, tuple[float, float, float]]] = deque(
-            maxlen=ATTITUDES_KEPT
+            maxlen=ATTITUDE_HISTORY_LENGTH
         )
         self._attitude_follows = False
         self._without_attitude: int | None = None
@@ -103,9 +103,9 @@ class UbxDecoder(MessageDecoder):
             return []
         parsed = UBXReader.parse(message)
         identity = str(parsed.identity)
-        made = self._handlers[identity](parsed, mono_ns)
+        decoded = self._handlers[identity](parsed, mono_ns)
         self.seen[identity] += 1
-        return made
+        return decoded
 
     # Navigation
 
@@ -237,7 +237,7 @@ class UbxDecoder(MessageDecoder):
         if message.timeBase == TIME_BASE_UTC:
             valid = valid and self._leap is not None
             gps_ns += (self._leap or 0) * SECOND_NS
-        valid = valid and self.near_navigation(gps_ns)
+        valid = valid and self.is_near_navigation(gps_ns)
         self.counters["marks"] += 1
         return [
             EventMark(

@@ -67,7 +67,7 @@ class UbxFramer:
                 break
             self._skip(buffer[at:sync])
             at = sync
-            size = self._frame_size(buffer, at, whole_only=False)
+            size = self._frame_size(buffer, at, complete_only=False)
             if size is None:
                 break
             if size == 0:
@@ -81,7 +81,7 @@ class UbxFramer:
         self._buffer = buffer[at:]
         return found
 
-    def _frame_size(self, buffer: bytes, at: int, *, whole_only: bool) -> int | None:
+    def _frame_size(self, buffer: bytes, at: int, *, complete_only: bool) -> int | None:
         """Size of the frame at a sync; 0 if there is none, None if that cannot be said yet."""
         head = buffer[at : at + 6]
         if len(head) > 2 and head[2] not in CLASSES:
@@ -93,14 +93,14 @@ class UbxFramer:
             return 0
         end = at + OVERHEAD + payload
         if end <= len(buffer) and not _checksum_fits(buffer[at + 2 : end]):
-            self.bad_frames += not whole_only
+            self.bad_frames += not complete_only
             return 0
-        if whole_only:
+        if complete_only:
             return end - at if end <= len(buffer) else 0
         # A frame inside the payload means that this sync was not one, or its length is damaged.
         inner = buffer.find(SYNC, at + 2, end)
         while inner >= 0:
-            if self._frame_size(buffer[:end], inner, whole_only=True):
+            if self._frame_size(buffer[:end], inner, complete_only=True):
                 self.bad_frames += 1
                 return 0
             inner = buffer.find(SYNC, inner + 1, end)

@@ -8,11 +8,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import ClassVar
 
-from drivers.receivers.receiver import EDGE, ListeningNavigator
+from drivers.receivers.streaming_navigator import EDGE, StreamingNavigator
 from drivers.receivers.ublox.decoder import UbxDecoder
 
 
-class UbloxNavigator(ListeningNavigator):
+class UbloxNavigator(StreamingNavigator):
     """A u-blox receiver (M8 or later) that sends UBX by itself.
 
     Yields a NavSample for every NAV-PVT and an EventMark for every edge of TIM-TM2 of the kind
@@ -26,7 +26,7 @@ class UbloxNavigator(ListeningNavigator):
     kind: ClassVar = "navigator"
     protocol = "UBX"
     required = ("NAV-PVT",)
-    switch_on = "switch on UBX-NAV-PVT and UBX-TIM-TM2 for this port"
+    enable_hint = "switch on UBX-NAV-PVT and UBX-TIM-TM2 for this port"
 
     edge = EDGE
 
@@ -35,7 +35,7 @@ class UbloxNavigator(ListeningNavigator):
     def new_decoder(self) -> UbxDecoder:
         return UbxDecoder(self.name, edge=self.edge)
 
-    def not_understood(self) -> str:
+    def undecodable_sentence(self) -> str:
         if self.decoder.other_bytes > self.decoder.bad_bytes:
             return (
                 f"the receiver at {self.port} sends text only; switch its output to UBX "

@@ -69,8 +69,8 @@ class LinePattern:
         self._steps: list[_Step] = []
         self._built = 0
         try:
-            whole = self._alternatives()
-            self._start = whole(self._add(_Step("match")))
+            build_program = self._alternatives()
+            self._start = build_program(self._add(_Step("match")))
         except RecursionError as error:
             raise PatternError("its groups are nested too deeply") from error
 

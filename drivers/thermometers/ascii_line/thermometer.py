@@ -15,17 +15,17 @@ from drivers.contract import DeviceError, TemperatureSample
 from drivers.thermometers.ascii_line.pattern import MAX_LINE, LinePattern, PatternError
 from drivers.timescales.clock import Clock
 from drivers.transport.serial_device import (
-    READ_STEP_S,
+    READ_TIMEOUT_S,
     PortOpener,
     SerialDevice,
     SerialLine,
     open_serial_port,
 )
 
-ENDS: Final = {"cr": b"\r", "lf": b"\n", "crlf": b"\r\n"}
+TERMINATORS: Final = {"cr": b"\r", "lf": b"\n", "crlf": b"\r\n"}
 NUMBER: Final = re.compile(r"[-+]?(\d{1,9}([.,]\d{0,9})?|[.,]\d{1,9})([eE][-+]?\d{1,2})?")
 ABSOLUTE_ZERO_C: Final = -273.15
-HOTTEST_C: Final = 2000.0
+MAX_TEMPERATURE_C: Final = 2000.0
 
 
 class AsciiLineThermometer(SerialDevice):
@@ -33,29 +33,29 @@ class AsciiLineThermometer(SerialDevice):
 
     The named groups of `pattern` are, in their order, the readings of `channels`. A pattern with
     the groups `channel` and `value` is for instruments that send a line per channel: the text of
-    `channel` is looked up in `channel_words`. A reading that is one of `open_words` is an open
-    sensor and yields a sample with `value_c=None`; one that is no temperature yields nothing.
+    `channel` is looked up in `channel_labels`. A reading that is one of `open_sensor_labels` is an
+    open sensor and yields a sample with `value_c=None`; one that is no temperature yields nothing.
     """
 
     kind: ClassVar = "thermometer"
     what = "thermometer"
 
-    baudrate = Setting(9600, minimum=300, maximum=4_000_000, says="speed of the line, bit/s")
-    parity = Setting("N", choices=("N", "E", "O"), says="parity on the wire")
-    pattern = Setting("", required=True, says="what a line looks like, with named groups")
+    baudrate = Setting(9600, minimum=300, maximum=4_000_000, help="speed of the line, bit/s")
+    parity = Setting("N", choices=("N", "E", "O"), help="parity on the wire")
+    pattern = Setting("", required=True, help="what a line looks like, with named groups")
     channels: Setting[tuple[str, ...]] = Setting(
-        (), required=True, minimum=1, maximum=64, says="names of the probes, in the pattern's order"
+        (), required=True, minimum=1, maximum=64, help="names of the probes, in the pattern's order"
     )
-    channel_words: Setting[tuple[str, ...]] = Setting(
-        (), maximum=64, says="what the instrument calls the probes; empty: as they are named"
+    channel_labels: Setting[tuple[str, ...]] = Setting(
+        (), maximum=64, help="what the instrument calls the probes; empty: as they are named"
     )
-    open_words: Setting[tuple[str, ...]] = Setting(
-        ("OPEN",), maximum=16, says="readings that mean an open sensor"
+    open_sensor_labels: Setting[tuple[str, ...]] = Setting(
+        ("OPEN",), maximum=16, help="readings that mean an open sensor"
     )
-    unit = Setting("C", choices=("C", "F", "K"), says="unit of the readings")
-    command = Setting("", says="what asks for a reading; empty: the instrument speaks by itself")
-    command_end = Setting("cr", choices=tuple(ENDS), says="what ends the command")
-    interval_s = Setting(1.0, minimum=0.05, maximum=3600, says="time from command to command")
+    unit = Setting("C", choices=("C", "F", "K"), help="unit of the readings")
+    command = Setting("", help="what asks for a reading; empty: the instrument speaks by itself")
+    command_end = Setting("cr", choices=tuple(TERMINATORS), help="what ends the command")
+    interval_s = Setting(1.0, minimum=0.05, maximum=3600, help="time from command to command")
 
     def __init__(
         self,
@@ -67,20 +67,20 @@ class AsciiLineThermometer(SerialDevice):
     ) -> None:
         super().__init__(name, settings, clock=clock, open_port=open_port)
         self._pattern = LinePattern(self.pattern)
-        self._probes = dict(zip(self.channel_words or self.channels, self.channels, strict=True))
-        self._open_words = {word.casefold() for word in self.open_words}
+        self._probes = dict(zip(self.channel_labels or self.channels, self.channels, strict=True))
+        self._open_sensor_labels = {label.casefold() for label in self.open_sensor_labels}
         self._pending = b""
         self._overlong = False
         self._next_command_ns = 0
-        self._last_strange = ""
+        self._last_bad_line = ""
         self.counters.update(lines=0, readings=0, open_sensors=0)
 
     @classmethod
-    def contradictions(cls, values: Mapping[str, Any]) -> list[str]:
-        channels, words = values["channels"], values["channel_words"]
+    def setting_conflicts(cls, values: Mapping[str, Any]) -> list[str]:
+        channels, labels = values["channels"], values["channel_labels"]
         found = [
             f"{key} names {', '.join(twice)} twice; every probe has its own name"
-            for key in ("channels", "channel_words")
+            for key in ("channels", "channel_labels")
             if (twice := sorted({name for name in values[key] if values[key].count(name) > 1}))
         ]
         try:
@@ -88,10 +88,12 @@ class AsciiLineThermometer(SerialDevice):
         except PatternError as error:
             return [*found, f"pattern is {values['pattern']!r}; {error}"]
         if set(groups) == {"channel", "value"}:
-            if words and len(words) != len(channels):
-                found.append(f"channel_words has {len(words)} words; channels has {len(channels)}")
-        elif words:
-            found.append("channel_words is given; only a pattern with the group channel uses it")
+            if labels and len(labels) != len(channels):
+                found.append(
+                    f"channel_labels has {len(labels)} words; channels has {len(channels)}"
+                )
+        elif labels:
+            found.append("channel_labels is given; only a pattern with the group channel uses it")
         elif len(groups) != len(channels):
             found.append(
                 f"pattern has {len(groups)} named groups; {len(channels)} are needed, one (?P<name>"
@@ -112,24 +114,24 @@ class AsciiLineThermometer(SerialDevice):
     def identify(self, line: SerialLine) -> Mapping[str, str]:
         """Listen until every probe was read, `silence_s` at most; what they said."""
         deadline_ns = self.clock.mono_ns() + round(self.silence_s * 1e9)
-        said: dict[str, str] = {}
+        readings_text: dict[str, str] = {}
         before = self.counters["bytes"]
         while self.clock.mono_ns() < deadline_ns and not self._closing.is_set():
             for sample in self.step(line):
                 value_c = sample.value_c
-                said[sample.probe] = "open" if value_c is None else f"{value_c:.2f} degC"
-            if len(said) == len(self.channels):
-                return {f"probe {probe}": said[probe] for probe in self.channels}
-        if said:
-            missing = ", ".join(probe for probe in self.channels if probe not in said)
+                readings_text[sample.probe] = "open" if value_c is None else f"{value_c:.2f} degC"
+            if len(readings_text) == len(self.channels):
+                return {f"probe {probe}": readings_text[probe] for probe in self.channels}
+        if readings_text:
+            missing = ", ".join(probe for probe in self.channels if probe not in readings_text)
             raise DeviceError(
                 f"{self.name}: the instrument at {self.port} gave no reading of {missing} in "
-                f"{self.silence_s:g} s; check channels and channel_words"
+                f"{self.silence_s:g} s; check channels and channel_labels"
             )
-        if self._last_strange:
+        if self._last_bad_line:
             raise DeviceError(
                 f"{self.name}: no line at {self.port} fits the pattern, the last was "
-                f"{self._last_strange!r}; check pattern, baudrate ({self.baudrate}) and parity"
+                f"{self._last_bad_line!r}; check pattern, baudrate ({self.baudrate}) and parity"
             )
         came = self.counters["bytes"] - before
         raise DeviceError(
@@ -142,16 +144,16 @@ class AsciiLineThermometer(SerialDevice):
     def connected(self) -> None:
         self._pending = b""
         self._overlong = False
-        self._last_strange = ""
+        self._last_bad_line = ""
         self._next_command_ns = self.clock.mono_ns()
 
     def step(self, line: SerialLine) -> Iterable[TemperatureSample]:
-        wait_s = READ_STEP_S
+        wait_s = READ_TIMEOUT_S
         if self.command:
             now_ns = self.clock.mono_ns()
             if now_ns >= self._next_command_ns:
                 self._next_command_ns = now_ns + round(self.interval_s * 1e9)
-                line.write(self.command.encode("ascii") + ENDS[self.command_end])
+                line.write(self.command.encode("ascii") + TERMINATORS[self.command_end])
             wait_s = min(wait_s, (self._next_command_ns - now_ns) * 1e-9)
         data = line.read(max(wait_s, 0.001))
         now_ns = self.clock.mono_ns()
@@ -162,8 +164,8 @@ class AsciiLineThermometer(SerialDevice):
 
     def _lines(self, data: bytes) -> Iterable[str]:
         """Whole lines, without empty ones; one that is too long is dropped to its end."""
-        *whole, rest = re.split(rb"[\r\n\0]", self._pending + data)
-        for piece in whole:
+        *complete_lines, rest = re.split(rb"[\r\n\0]", self._pending + data)
+        for piece in complete_lines:
             overlong, self._overlong = self._overlong, False
             if overlong or len(piece) > MAX_LINE:
                 self._drop_line(len(piece))
@@ -177,7 +179,7 @@ class AsciiLineThermometer(SerialDevice):
     def _drop_line(self, nbytes: int) -> None:
         self.counters["bad_bytes"] += nbytes
         self.counters["bad_messages"] += 1
-        self._strange("a line that does not end")
+        self._report_bad_line("a line that does not end")
 
     def _read(self, text: str, now_ns: int) -> list[TemperatureSample]:
         self.counters["lines"] += 1
@@ -192,7 +194,7 @@ class AsciiLineThermometer(SerialDevice):
             probe = self._probes.get(groups["channel"].strip())
             if probe is None:
                 self.counters["other_channels"] += 1
-                self.heard()
+                self.count_messages()
                 return []
             readings = {probe: groups["value"]}
         else:
@@ -208,31 +210,31 @@ class AsciiLineThermometer(SerialDevice):
         if len(samples) < len(readings):
             self._bad_line(text)
         if samples:
-            self.heard()
+            self.count_messages()
         self.counters["readings"] += len(samples)
         return samples
 
     def _celsius(self, reading: str) -> float | None:
         """The reading in degC, None for an open sensor; ValueError where it is no temperature."""
-        if reading.casefold() in self._open_words:
+        if reading.casefold() in self._open_sensor_labels:
             self.counters["open_sensors"] += 1
             return None
         if NUMBER.fullmatch(reading) is None:
             raise ValueError(reading)
         value = float(reading.replace(",", "."))
         value_c = {"C": value, "F": (value - 32) / 1.8, "K": value + ABSOLUTE_ZERO_C}[self.unit]
-        if not ABSOLUTE_ZERO_C <= value_c <= HOTTEST_C:
+        if not ABSOLUTE_ZERO_C <= value_c <= MAX_TEMPERATURE_C:
             raise ValueError(reading)
         return value_c
 
     def _bad_line(self, text: str) -> None:
         self.counters["bad_messages"] += 1
-        self._last_strange = text[:80]
-        self._strange(f"{text[:80]!r}")
+        self._last_bad_line = text[:80]
+        self._report_bad_line(f"{text[:80]!r}")
 
-    def _strange(self, what: str) -> None:
-        self.teller.complain(
+    def _report_bad_line(self, what: str) -> None:
+        self.emitter.emit_throttled(
             "unreadable",
             f"The thermometer {self.name} at {self.port} sent {what}, which is no reading as the "
-            "pattern has it. Check pattern, open_words, baud rate and parity.",
+            "pattern has it. Check pattern, open_sensor_labels, baud rate and parity.",
         )

@@ -18,7 +18,7 @@ _IIO: Final = re.compile(r"in_(temp\w*?)_(input|raw)")
 _NUMBER: Final = re.compile(r"[-+]?\d{1,12}(\.\d{1,12})?")
 
 
-class SensorGoneError(Exception):
+class SensorLostError(Exception):
     """The sensor's files cannot be read, or hold no number; internal."""
 
 
@@ -38,7 +38,7 @@ class HostSensor:
     is_raw: bool
 
     @property
-    def words(self) -> tuple[str, ...]:
+    def aliases(self) -> tuple[str, ...]:
         """What the sensor may be called in a configuration, the plainest first."""
         channels = (self.channel, self.label) if self.label else (self.channel,)
         chips = (self.chip, f"{self.chip}@{self.device}") if self.device else (self.chip,)
@@ -48,7 +48,7 @@ class HostSensor:
         """The temperature in degC; None where the chip says that the sensor is open.
 
         Raises:
-            SensorGoneError: it is no longer there, or does not answer.
+            SensorLostError: it is no longer there, or does not answer.
         """
         if self.is_raw:
             stem = self.path.name.removesuffix("_raw")
@@ -124,9 +124,9 @@ def _number(path: Path) -> float:
     try:
         text = _text(path)
     except OSError as error:
-        raise SensorGoneError(f"{path}: {error.strerror or error}") from error
+        raise SensorLostError(f"{path}: {error.strerror or error}") from error
     if _NUMBER.fullmatch(text) is None:
-        raise SensorGoneError(f"{path} holds {text[:40]!r}, which is no number")
+        raise SensorLostError(f"{path} holds {text[:40]!r}, which is no number")
     return float(text)
 
 

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Final
 from drivers.base.device import DeviceDriver
 from drivers.base.settings import Setting
 from drivers.contract import DeviceError, LifeCycle, Sink, TemperatureSample
-from drivers.thermometers.host.sensors import HostSensor, SensorGoneError, find_sensors
+from drivers.thermometers.host.sensors import HostSensor, SensorLostError, find_sensors
 from drivers.timescales.clock import Clock
 
 SYSFS: Final = Path("/sys")
@@ -33,12 +33,12 @@ class HostThermometer(DeviceDriver):
     counted = ("readings", "failures", "open_sensors", "losses")
 
     sensors: Setting[tuple[str, ...]] = Setting(
-        (), required=True, minimum=1, maximum=64, says="sensors as chip/channel or chip/label"
+        (), required=True, minimum=1, maximum=64, help="sensors as chip/channel or chip/label"
     )
     channels: Setting[tuple[str, ...]] = Setting(
-        (), required=True, minimum=1, maximum=64, says="names of the probes, one for each sensor"
+        (), required=True, minimum=1, maximum=64, help="names of the probes, one for each sensor"
     )
-    interval_s = Setting(1.0, minimum=0.05, maximum=3600, says="time from reading to reading")
+    interval_s = Setting(1.0, minimum=0.05, maximum=3600, help="time from reading to reading")
 
     def __init__(
         self,
@@ -54,7 +54,7 @@ class HostThermometer(DeviceDriver):
         self._lost: set[str] = set()
 
     @classmethod
-    def contradictions(cls, values: Mapping[str, Any]) -> list[str]:
+    def setting_conflicts(cls, values: Mapping[str, Any]) -> list[str]:
         sensors, channels = values["sensors"], values["channels"]
         found = []
         if len(sensors) != len(channels):
@@ -77,7 +77,7 @@ class HostThermometer(DeviceDriver):
             try:
                 self._found[probe] = self._find(sensor, known)
                 value_c = self._found[probe].read_c()
-            except SensorGoneError as error:
+            except SensorLostError as error:
                 problems.append(f"{self.name}: {error}")
                 continue
             found[f"probe {probe}"] = "open" if value_c is None else f"{value_c:.1f} degC"
@@ -86,11 +86,11 @@ class HostThermometer(DeviceDriver):
         self._state = LifeCycle.BOUND
         return found
 
-    def _reach(self) -> None:
+    def _open_device(self) -> None:
         """Sysfs is always there; a sensor that is not is looked for at every reading."""
 
-    def _tell_opened(self) -> None:
-        self.teller.tell("opened", f"The host's sensors {self.name} are read; nothing to do.")
+    def _emit_opened(self) -> None:
+        self.emitter.emit("opened", f"The host's sensors {self.name} are read; nothing to do.")
 
     def _serve(self, sink: Sink) -> None:
         self._state = LifeCycle.ACTIVE
@@ -109,13 +109,13 @@ class HostThermometer(DeviceDriver):
                     known = find_sensors(self._root) if known is None else known
                     self._found[probe] = self._find(sensor, known)
                 value_c = self._found[probe].read_c()
-            except SensorGoneError as error:
+            except SensorLostError as error:
                 self._found.pop(probe, None)
                 self.counters["failures"] += 1
                 if probe not in self._lost:
                     self._lost.add(probe)
                     self.counters["losses"] += 1
-                    self.teller.tell(
+                    self.emitter.emit(
                         "lost",
                         f"The sensor {sensor} of probe {probe} cannot be read ({error}). Check "
                         "that its kernel module is loaded; it is looked for again by itself.",
@@ -124,7 +124,7 @@ class HostThermometer(DeviceDriver):
                 continue
             if probe in self._lost:
                 self._lost.discard(probe)
-                self.teller.tell(
+                self.emitter.emit(
                     "recovered", f"The sensor {sensor} of probe {probe} is back; nothing to do."
                 )
             self.counters["readings"] += 1
@@ -132,11 +132,11 @@ class HostThermometer(DeviceDriver):
             sink(TemperatureSample(probe, value_c, self.clock.mono_ns()))
 
     def _find(self, sensor: str, known: list[HostSensor]) -> HostSensor:
-        matches = [candidate for candidate in known if sensor in candidate.words]
+        matches = [candidate for candidate in known if sensor in candidate.aliases]
         if len(matches) == 1:
             return matches[0]
         if matches:
-            devices = ", ".join(candidate.words[-1] for candidate in matches)
-            raise SensorGoneError(f"sensor {sensor} is there {len(matches)} times: {devices}")
-        listed = ", ".join(candidate.words[0] for candidate in known[:20]) or "none at all"
-        raise SensorGoneError(f"sensor {sensor} is not there; the host has {listed}")
+            devices = ", ".join(candidate.aliases[-1] for candidate in matches)
+            raise SensorLostError(f"sensor {sensor} is there {len(matches)} times: {devices}")
+        listed = ", ".join(candidate.aliases[0] for candidate in known[:20]) or "none at all"
+        raise SensorLostError(f"sensor {sensor} is not there; the host has {listed}")

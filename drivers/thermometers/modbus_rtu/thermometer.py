@@ -18,7 +18,7 @@ from drivers.thermometers.modbus_rtu.frames import (
     find_reply,
     read_request,
 )
-from drivers.transport.serial_device import READ_STEP_S, SerialDevice, SerialLine
+from drivers.transport.serial_device import READ_TIMEOUT_S, SerialDevice, SerialLine
 
 OPEN_SENSOR: Final = 0x7FFF
 DRAIN_STEPS: Final = 50
@@ -37,24 +37,24 @@ class ModbusThermometer(SerialDevice):
     kind: ClassVar = "thermometer"
     what = "thermometer"
 
-    baudrate = Setting(19200, minimum=300, maximum=4_000_000, says="speed of the line, bit/s")
-    parity = Setting("E", choices=("N", "E", "O"), says="parity on the wire")
-    unit = Setting(1, minimum=1, maximum=247, says="the module's number on the line")
-    first_register = Setting(0, minimum=0, maximum=65535, says="address of the first channel")
+    baudrate = Setting(19200, minimum=300, maximum=4_000_000, help="speed of the line, bit/s")
+    parity = Setting("E", choices=("N", "E", "O"), help="parity on the wire")
+    unit = Setting(1, minimum=1, maximum=247, help="the module's number on the line")
+    first_register = Setting(0, minimum=0, maximum=65535, help="address of the first channel")
     channels: Setting[tuple[str, ...]] = Setting(
         (),
         required=True,
         minimum=1,
         maximum=MAX_REGISTERS,
-        says="names of the probes, in the order of the registers",
+        help="names of the probes, in the order of the registers",
     )
-    interval_s = Setting(1.0, minimum=0.05, maximum=3600, says="time from reading to reading")
-    answer_timeout_s = Setting(0.5, minimum=0.01, maximum=1, says="longest wait for an answer")
+    interval_s = Setting(1.0, minimum=0.05, maximum=3600, help="time from reading to reading")
+    answer_timeout_s = Setting(0.5, minimum=0.01, maximum=1, help="longest wait for an answer")
 
     _next_poll_ns = 0
 
     @classmethod
-    def contradictions(cls, values: Mapping[str, Any]) -> list[str]:
+    def setting_conflicts(cls, values: Mapping[str, Any]) -> list[str]:
         found = []
         channels = values["channels"]
         twice = sorted({name for name in channels if channels.count(name) > 1})
@@ -78,7 +78,7 @@ class ModbusThermometer(SerialDevice):
 
     def identify(self, line: SerialLine) -> Mapping[str, str]:
         """Read once; what every probe says."""
-        reply = self._ask(line)
+        reply = self._read_registers(line)
         if reply is None:
             raise DeviceError(
                 f"{self.name}: unit {self.unit} at {self.port} gave no answer within "
@@ -99,16 +99,16 @@ class ModbusThermometer(SerialDevice):
     def step(self, line: SerialLine) -> Iterable[TemperatureSample]:
         wait_ns = self._next_poll_ns - self.clock.mono_ns()
         if wait_ns > 0:
-            self.clock.wait(self._closing, min(wait_ns * 1e-9, READ_STEP_S))
+            self.clock.wait(self._closing, min(wait_ns * 1e-9, READ_TIMEOUT_S))
             return []
         interval_ns = round(self.interval_s * 1e9)
         self._next_poll_ns = max(self._next_poll_ns + interval_ns, self.clock.mono_ns())
-        reply = self._ask(line)
+        reply = self._read_registers(line)
         if reply is None:
             return []
         if reply.exception is not None:
             self.counters["exceptions"] += 1
-            self.teller.complain("exception", self._exception(reply.exception))
+            self.emitter.emit_throttled("exception", self._exception(reply.exception))
             return []
         now_ns = self.clock.mono_ns()
         return [
@@ -116,24 +116,24 @@ class ModbusThermometer(SerialDevice):
             for probe, register in zip(self.channels, reply.registers, strict=True)
         ]
 
-    def _ask(self, line: SerialLine) -> Reply | None:
+    def _read_registers(self, line: SerialLine) -> Reply | None:
         """One request; None where no valid answer came in time."""
         self.counters["bad_bytes"] += line.drain(DRAIN_STEPS)
         line.write(read_request(self.unit, self.first_register, len(self.channels)))
         received = b""
         deadline_ns = self.clock.mono_ns() + round(self.answer_timeout_s * 1e9)
         while (left_ns := deadline_ns - self.clock.mono_ns()) > 0 and not self._closing.is_set():
-            received += line.read(min(left_ns * 1e-9, READ_STEP_S))
+            received += line.read(min(left_ns * 1e-9, READ_TIMEOUT_S))
             reply = find_reply(received, self.unit, len(self.channels))
             if reply is not None:
                 self.counters["bad_bytes"] += reply.skipped
-                self.heard()
+                self.count_messages()
                 return reply
         self.counters["timeouts"] += 1
         if received:
             self.counters["bad_bytes"] += len(received)
             self.counters["bad_messages"] += 1
-            self.teller.complain(
+            self.emitter.emit_throttled(
                 "checksum",
                 f"The thermometer {self.name} at {self.port} answers with bytes that make no "
                 "sense. Check baud rate, parity and the line's termination.",

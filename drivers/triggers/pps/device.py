@@ -19,16 +19,16 @@ from drivers.timescales.clock import Clock
 from drivers.triggers.pps.binding import CAN_WAIT, CAPTURE_ASSERT, CAPTURE_CLEAR, Edges, KernelPps
 from drivers.triggers.pps.emulated import SCHEME, EmulatedPps
 
-WAIT_S: Final = 0.5
+WAIT_TIMEOUT_S: Final = 0.5
 """Longest wait in the kernel before the driver looks up again."""
-OFFSET_TRIES: Final = 5
-SLEW: Final = 1e-3
+OFFSET_ATTEMPTS: Final = 5
+MAX_SLEW_RATE: Final = 1e-3
 """No time daemon slews the wall clock faster than this, twice."""
 STEP_NS: Final = 50_000
-OLD_NS: Final = 2_000_000_000
+MAX_EDGE_AGE_NS: Final = 2_000_000_000
 
 
-class Source(Protocol):
+class PpsBackend(Protocol):
     """Where edges come from."""
 
     def capabilities(self) -> int: ...
@@ -46,7 +46,7 @@ class Source(Protocol):
     def close(self) -> None: ...
 
 
-def open_source(device: str) -> Source:
+def open_source(device: str) -> PpsBackend:
     """The kernel's device, or an emulated one where the name is tcp://host:port."""
     return EmulatedPps(device) if device.startswith(SCHEME) else KernelPps(device)
 
@@ -54,7 +54,7 @@ def open_source(device: str) -> Source:
 def wall_clock() -> tuple[int, int]:
     """CLOCK_MONOTONIC, and CLOCK_REALTIME less it, both at about the same moment."""
     best: tuple[int, int, int] | None = None
-    for _ in range(OFFSET_TRIES):
+    for _ in range(OFFSET_ATTEMPTS):
         before = time.monotonic_ns()
         real = time.time_ns()
         after = time.monotonic_ns()
@@ -84,23 +84,23 @@ class PpsDevice(DeviceDriver):
         "opened",
         "silences",
     )
-    delivered = "edges"
+    delivery_counter = "edges"
 
     device = Setting(
-        "", required=True, says="such as /dev/pps0; tcp://host:port is an emulated one"
+        "", required=True, help="such as /dev/pps0; tcp://host:port is an emulated one"
     )
-    edge = Setting("assert", choices=("assert", "clear"), says="which edge begins the second")
+    edge = Setting("assert", choices=("assert", "clear"), help="which edge begins the second")
     latency_ns = Setting(
         0,
         minimum=-1_000_000,
         maximum=1_000_000,
-        says="from the edge to the kernel's stamp, as known",
+        help="from the edge to the kernel's stamp, as known",
     )
     sigma_ns = Setting(
-        5_000, minimum=10, maximum=10_000_000, says="standard deviation of that, with its jitter"
+        5_000, minimum=10, maximum=10_000_000, help="standard deviation of that, with its jitter"
     )
     silence_s = Setting(
-        2.5, minimum=1.1, maximum=60, says="without an edge for so long the source is silent"
+        2.5, minimum=1.1, maximum=60, help="without an edge for so long the source is silent"
     )
 
     def __init__(
@@ -109,12 +109,12 @@ class PpsDevice(DeviceDriver):
         settings: Mapping[str, object],
         *,
         clock: Clock | None = None,
-        opener: Callable[[str], Source] = open_source,
+        source_opener: Callable[[str], PpsBackend] = open_source,
         wall: Callable[[], tuple[int, int]] = wall_clock,
     ) -> None:
         super().__init__(name, settings, clock=clock)
-        self._opener, self._wall = opener, wall
-        self._source: Source | None = None
+        self._opener, self._wall = source_opener, wall
+        self._source: PpsBackend | None = None
         self._last_sequence: int | None = None
         self._last_wall: tuple[int, int] | None = None
 
@@ -124,10 +124,10 @@ class PpsDevice(DeviceDriver):
         deadline_ns = self.clock.mono_ns() + round(self.silence_s * 1e9)
         while self.clock.mono_ns() < deadline_ns and not self._closing.is_set():
             try:
-                edges = source.fetch(WAIT_S)
+                edges = source.fetch(WAIT_TIMEOUT_S)
             except OSError as error:
-                self._let_go()
-                raise self._gone(error) from error
+                self._release_device()
+                raise self._source_lost(error) from error
             if edges is not None and self._of(edges)[1]:
                 self._state = LifeCycle.BOUND
                 found = {"device": self.device, "edge": self.edge, "count": str(self._of(edges)[0])}
@@ -135,7 +135,7 @@ class PpsDevice(DeviceDriver):
                 if label.is_file():
                     found["source"] = label.read_text(encoding="utf-8").strip()
                 return found
-        self._let_go()
+        self._release_device()
         raise DeviceError(
             f"{self.name}: no {self.edge} edge came at {self.device} in {self.silence_s:g} s: "
             "check the PPS cable, that the receiver has a fix and sends PPS, and the polarity"
@@ -146,7 +146,7 @@ class PpsDevice(DeviceDriver):
         mono_ns, offset_ns = wall = self._wall()
         last, self._last_wall = self._last_wall, wall
         if last is not None:
-            slewed_ns = STEP_NS + round((mono_ns - last[0]) * SLEW)
+            slewed_ns = STEP_NS + round((mono_ns - last[0]) * MAX_SLEW_RATE)
             if abs(offset_ns - last[1]) > slewed_ns:
                 self.counters["wall_clock_steps"] += 1
                 self._last_sequence = self._of(edges)[0]
@@ -159,46 +159,46 @@ class PpsDevice(DeviceDriver):
         if previous is not None and 1 < (jump := (sequence - previous) % 2**32) < 2**31:
             self.counters["edges_missed"] += jump - 1
         edge_ns = real_ns - offset_ns
-        if not 0 <= mono_ns - edge_ns + STEP_NS < OLD_NS:
+        if not 0 <= mono_ns - edge_ns + STEP_NS < MAX_EDGE_AGE_NS:
             self.counters["edges_repeated"] += 1
             return None
         self.counters["edges"] += 1
         return PpsEdge(self.name, sequence, edge_ns - self.latency_ns, self.sigma_ns)
 
-    def _reach(self) -> None:
+    def _open_device(self) -> None:
         self._source = self._source or self._open()
 
-    def _tell_opened(self) -> None:
-        self.teller.tell("opened", f"The pulse per second {self.name} is open.")
+    def _emit_opened(self) -> None:
+        self.emitter.emit("opened", f"The pulse per second {self.name} is open.")
 
     def _serve(self, sink: Sink) -> None:
         self._state = LifeCycle.ACTIVE
         try:
             self._listen(sink)
         except OSError as error:
-            self._tell_lost(f"{self._gone(error)}. It is tried again by itself.")
+            self._emit_lost(f"{self._source_lost(error)}. It is tried again by itself.")
 
     def _listen(self, sink: Sink) -> None:
         source = self._source
         assert source is not None
         silence_ns = round(self.silence_s * 1e9)
-        heard_ns, is_silent = self.clock.mono_ns(), False
+        last_edge_ns, is_silent = self.clock.mono_ns(), False
         self._last_wall = self._wall()
         if self._last_sequence is None and (before := source.latest()) is not None:
             self._last_sequence = self._of(before)[0]
         while not self._closing.is_set():
-            edges = source.fetch(WAIT_S) or self._unwaited(source)
+            edges = source.fetch(WAIT_TIMEOUT_S) or self._edge_between_waits(source)
             edge = None if edges is None else self.edge_of(edges)
             if edge is not None:
                 sink(edge)
-                heard_ns = self.clock.mono_ns()
+                last_edge_ns = self.clock.mono_ns()
                 if is_silent:
                     is_silent = False
-                    self.teller.tell("recovered", f"The pulse per second {self.name} is back.")
-            elif not is_silent and self.clock.mono_ns() - heard_ns >= silence_ns:
+                    self.emitter.emit("recovered", f"The pulse per second {self.name} is back.")
+            elif not is_silent and self.clock.mono_ns() - last_edge_ns >= silence_ns:
                 is_silent = True
                 self.counters["silences"] += 1
-                self.teller.tell(
+                self.emitter.emit(
                     "silent",
                     f"No edge of the pulse per second {self.name} for {self.silence_s:g} s; check "
                     "the PPS cable and the receiver's fix. The clock coasts.",
@@ -207,7 +207,7 @@ class PpsDevice(DeviceDriver):
             if is_silent and not source.is_there():
                 raise OSError(errno.ENODEV, os.strerror(errno.ENODEV))
 
-    def _unwaited(self, source: Source) -> Edges | None:
+    def _edge_between_waits(self, source: PpsBackend) -> Edges | None:
         """An edge that came between two waits; None where none did."""
         edges = source.latest()
         return None if edges is None or self._of(edges)[0] == self._last_sequence else edges
@@ -217,11 +217,11 @@ class PpsDevice(DeviceDriver):
             return edges.assert_sequence, edges.assert_ns
         return edges.clear_sequence, edges.clear_ns
 
-    def _open(self) -> Source:
+    def _open(self) -> PpsBackend:
         try:
             source = self._opener(self.device)
         except OSError as error:
-            raise self._gone(error) from error
+            raise self._source_lost(error) from error
         wanted = CAPTURE_ASSERT if self.edge == "assert" else CAPTURE_CLEAR
         try:
             can = source.capabilities()
@@ -236,12 +236,12 @@ class PpsDevice(DeviceDriver):
                 source.set_mode(mode | wanted)
         except (OSError, DeviceError) as error:
             source.close()
-            raise error if isinstance(error, DeviceError) else self._gone(error) from error
+            raise error if isinstance(error, DeviceError) else self._source_lost(error) from error
         self.counters["opened"] += 1
         self._last_sequence = None
         return source
 
-    def _gone(self, error: OSError) -> DeviceError:
+    def _source_lost(self, error: OSError) -> DeviceError:
         why = error.strerror or str(error)
         if isinstance(error, FileNotFoundError):
             why = "there is none; load pps-ldisc or pps-gpio and check its name in /sys/class/pps"
@@ -249,7 +249,7 @@ class PpsDevice(DeviceDriver):
             why = "permission denied; install the udev rules, which give it to the service's group"
         return DeviceError(f"{self.name}: pulse per second at {self.device}: {why}")
 
-    def _let_go(self) -> None:
+    def _release_device(self) -> None:
         source, self._source = self._source, None
         if source is not None:
             source.close()

@@ -42,9 +42,11 @@ class EmulatedPps:
             line, separator, rest = self._received.partition(b"\n")
             if separator:
                 self._received = rest
-                words = line.split()
-                if len(words) == 2 and all(word.isdigit() and len(word) < 20 for word in words):
-                    return Edges(int(words[0]), 0, int(words[1]), 0)
+                fields = line.split()
+                if len(fields) == 2 and all(
+                    field.isdigit() and len(field) < 20 for field in fields
+                ):
+                    return Edges(int(fields[0]), 0, int(fields[1]), 0)
                 continue
             self._socket.settimeout(left_s)
             try:

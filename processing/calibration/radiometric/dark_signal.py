@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from processing.calibration.radiometric.series import FrameSet, Map
+from processing.calibration.radiometric.frame_series import FrameSet, Map
 
 Array = NDArray[np.float64]
 

@@ -18,16 +18,16 @@ Flags = NDArray[np.bool_]
 
 PIXEL_SIGMAS: Final = 7.0
 """Beyond this a pixel is no member of its sensor: one of 4e11 good ones."""
-LEAST_RESPONSE_LOSS: Final = 0.05
+MIN_RESPONSE_LOSS: Final = 0.05
 DARK_SIGMAS: Final = 12.0
 """Dark signals are skewed: a logarithmic normal with a spread of 20 % stays within."""
 NOISE_FACTOR: Final = 3.0
 """A defect's temporal standard deviation against its surroundings'."""
 COLUMN_SIGMAS: Final = 6.0
 COLUMN_RUN_PX: Final = 32
-_LEAST_COLUMN_LOSS: Final = 0.01
-_LEAST_RUN_PX: Final = 24
-_CALM_SIGMAS: Final = 4.0
+_MIN_COLUMN_LOSS: Final = 0.01
+_MIN_RUN_PX: Final = 24
+_QUIET_SIGMAS: Final = 4.0
 _BLOCK_PX: Final = 16
 _DEGREE: Final = 6
 
@@ -43,18 +43,18 @@ class DefectColumn:
 
 
 @dataclass(frozen=True)
-class Defects:
+class DefectMap:
     """What was found. `mask` (height, width) uint8; `single` pixels, `clusters` of two or more
     that are no column, and `columns`. `by_cause` counts pixels by the map that gave them away."""
 
     mask: NDArray[np.uint8]
-    single: int
+    single_pixels: int
     clusters: tuple[int, ...]
     columns: tuple[DefectColumn, ...]
     by_cause: dict[str, int]
 
 
-def find_defects(flat: Array, dark: Array, noise: Array) -> Defects:
+def find_defects(flat: Array, dark: Array, noise: Array) -> DefectMap:
     """Find them.
 
     Args:
@@ -64,26 +64,26 @@ def find_defects(flat: Array, dark: Array, noise: Array) -> Defects:
             width), about one. It holds few frames, so only what is far off counts.
     """
     relative = relative_response(flat)
-    glow = dark - np.float32(np.median(dark))
-    limit = max(PIXEL_SIGMAS * robust_sigma(relative), LEAST_RESPONSE_LOSS)
+    dark_excess = dark - np.float32(np.median(dark))
+    limit = max(PIXEL_SIGMAS * robust_sigma(relative), MIN_RESPONSE_LOSS)
     causes = {
         "response": np.abs(relative) > limit,
-        "dark signal": np.abs(glow) > DARK_SIGMAS * robust_sigma(glow),
+        "dark signal": np.abs(dark_excess) > DARK_SIGMAS * robust_sigma(dark_excess),
         "noise": noise > NOISE_FACTOR**2,
     }
     found = np.logical_or.reduce(list(causes.values()))
     columns: list[DefectColumn] = []
-    for cause, values in (("response", relative), ("dark signal", glow)):
+    for cause, values in (("response", relative), ("dark signal", dark_excess)):
         for column in _columns(np.asarray(values), cause, floor=cause == "response"):
             found[column.first_row : column.last_row + 1, column.column] = True
             columns.append(column)
     in_column = np.zeros_like(found)
     for c in columns:
         in_column[c.first_row : c.last_row + 1, c.column] = True
-    single, clusters, found = _grouped(found, in_column)
-    return Defects(
+    single_pixels, clusters, found = _grouped(found, in_column)
+    return DefectMap(
         mask=found.astype(np.uint8),
-        single=single,
+        single_pixels=single_pixels,
         clusters=clusters,
         columns=tuple(columns),
         by_cause={name: int(flags.sum()) for name, flags in causes.items()},
@@ -148,17 +148,17 @@ def _columns(values: Array, cause: str, *, floor: bool) -> list[DefectColumn]:
     size = min(COLUMN_RUN_PX, max(values.shape[0] // 4, 4))
     # Single outliers are not a column: they are held at what a good pixel may have.
     sigma = robust_sigma(difference)
-    calm = np.clip(difference, -_CALM_SIGMAS * sigma, _CALM_SIGMAS * sigma)
+    calm = np.clip(difference, -_QUIET_SIGMAS * sigma, _QUIET_SIGMAS * sigma)
     running = ndimage.uniform_filter1d(calm, size, axis=0, mode="reflect")
     limit = COLUMN_SIGMAS * max(robust_sigma(running), sigma / np.sqrt(size))
-    limit = max(limit, _LEAST_COLUMN_LOSS if floor else 0.0)
+    limit = max(limit, _MIN_COLUMN_LOSS if floor else 0.0)
     found = []
     for column in np.flatnonzero((np.abs(running) > limit).any(axis=0)):
         labels, count = ndimage.label(np.abs(running[:, column]) > limit)
         for label in range(1, count + 1):
             rows = np.flatnonzero(labels == label)
-            run = _ends(calm[:, column], rows, size)
-            if run is None or run[1] - run[0] + 1 < _LEAST_RUN_PX:
+            run = _run_limits(calm[:, column], rows, size)
+            if run is None or run[1] - run[0] + 1 < _MIN_RUN_PX:
                 continue
             # Two or three outliers move a mean; a column moves the median.
             if abs(float(np.median(calm[run[0] : run[1] + 1, column]))) > limit:
@@ -166,7 +166,7 @@ def _columns(values: Array, cause: str, *, floor: bool) -> list[DefectColumn]:
     return _merged(found)
 
 
-def _ends(values: Array, rows: Array, size: int) -> tuple[int, int] | None:
+def _run_limits(values: Array, rows: Array, size: int) -> tuple[int, int] | None:
     """First and last row of a run: where the sum of (value - half of its depth) is largest."""
     first, last = max(int(rows[0]) - size, 0), min(int(rows[-1]) + size, len(values) - 1)
     part = values[first : last + 1]

@@ -23,7 +23,7 @@ _CLIPPED_SHARE: Final = 1e-3
 
 
 @dataclass(frozen=True)
-class Ladder:
+class ExposureSeries:
     """A series of growing exposure, over the same good pixels.
 
     `exposure` (n,) is light times time, any unit; `signal_dn` (n,) above the offset; `variance_dn2`
@@ -46,24 +46,24 @@ class PhotonTransfer:
 
     Attributes:
         gain_dn_per_e: overall system gain K, with its sigma.
-        dark_noise_e: temporal dark noise, quantisation taken off.
+        temporal_dark_noise_e: temporal dark noise, quantisation taken off.
         saturation_dn, saturation_e: signal where the variance is largest.
-        threshold_e: least detectable signal (signal to noise 1).
+        absolute_threshold_e: least detectable signal (signal to noise 1).
         dynamic_range: saturation over threshold.
-        best_ratio: signal to noise at saturation.
+        snr_max: signal to noise at saturation.
         linearity_percent: mean |deviation| from the line between 5 and 95 % of saturation.
         responsivity: DN per unit of exposure, of that line; deviations (n,) in %, NaN outside.
     """
 
     gain_dn_per_e: float
     gain_sigma: float
-    dark_noise_e: float
+    temporal_dark_noise_e: float
     dark_noise_sigma_e: float
     saturation_dn: float
     saturation_e: float
-    threshold_e: float
+    absolute_threshold_e: float
     dynamic_range: float
-    best_ratio: float
+    snr_max: float
     linearity_percent: float
     responsivity: float
     deviation_percent: Array
@@ -73,46 +73,57 @@ class PhotonTransfer:
         return np.asarray(dark_dn2 + self.gain_dn_per_e * signal_dn)
 
 
-def photon_transfer(ladder: Ladder) -> PhotonTransfer:
+def photon_transfer(exposure_series: ExposureSeries) -> PhotonTransfer:
     """Evaluate a ladder.
 
     Raises:
         ValueError: too few steps between 5 and 70 % of saturation.
     """
-    top = int(np.argmax(np.where(ladder.clipped < 0.5, ladder.variance_dn2, -np.inf)))
-    saturation = float(ladder.signal_dn[top])
-    used = (ladder.signal_dn < _FIT_SHARE * saturation) & (ladder.clipped <= _CLIPPED_SHARE)
+    top = int(
+        np.argmax(np.where(exposure_series.clipped < 0.5, exposure_series.variance_dn2, -np.inf))
+    )
+    saturation = float(exposure_series.signal_dn[top])
+    used = (exposure_series.signal_dn < _FIT_SHARE * saturation) & (
+        exposure_series.clipped <= _CLIPPED_SHARE
+    )
     if used.sum() < 4:
         raise ValueError(
             f"{int(used.sum())} flat sets lie below {_FIT_SHARE:.0%} of saturation "
             f"({saturation:.0f} DN); four or more are needed for photon transfer"
         )
-    mu, var = ladder.signal_dn[used], ladder.variance_dn2[used] - ladder.dark_dn2
-    weight = 1.0 / ladder.sigma_dn2[used] ** 2
+    mu, var = (
+        exposure_series.signal_dn[used],
+        exposure_series.variance_dn2[used] - exposure_series.dark_dn2,
+    )
+    weight = 1.0 / exposure_series.sigma_dn2[used] ** 2
     normal = float(np.sum(weight * mu * mu))
     gain = float(np.sum(weight * mu * var)) / normal
-    by_dark = float(np.sum(weight * mu)) / normal * ladder.dark_sigma_dn2
+    by_dark = float(np.sum(weight * mu)) / normal * exposure_series.dark_sigma_dn2
     gain_sigma = math.hypot(normal**-0.5, by_dark)
-    dark_e2 = max(ladder.dark_dn2 - QUANTISATION_DN2, 0.0) / gain**2
+    dark_e2 = max(exposure_series.dark_dn2 - QUANTISATION_DN2, 0.0) / gain**2
     dark_noise = math.sqrt(dark_e2)
-    dark_sigma = ladder.dark_sigma_dn2 / gain**2 / (2.0 * dark_noise) if dark_noise else 0.0
-    threshold = math.sqrt(ladder.dark_dn2 / gain**2 + 0.25) + 0.5
+    dark_sigma = (
+        exposure_series.dark_sigma_dn2 / gain**2 / (2.0 * dark_noise) if dark_noise else 0.0
+    )
+    threshold = math.sqrt(exposure_series.dark_dn2 / gain**2 + 0.25) + 0.5
     saturation_e = saturation / gain
     low, high = (share * saturation for share in _LINEAR_SHARES)
-    inside = (ladder.signal_dn >= low) & (ladder.signal_dn <= high)
-    slope, offset = _relative_line(ladder.exposure[inside], ladder.signal_dn[inside])
-    line = offset + slope * ladder.exposure
-    deviation = np.where(inside, 100.0 * (ladder.signal_dn - line) / line, np.nan)
+    inside = (exposure_series.signal_dn >= low) & (exposure_series.signal_dn <= high)
+    slope, offset = _relative_line(
+        exposure_series.exposure[inside], exposure_series.signal_dn[inside]
+    )
+    line = offset + slope * exposure_series.exposure
+    deviation = np.where(inside, 100.0 * (exposure_series.signal_dn - line) / line, np.nan)
     return PhotonTransfer(
         gain_dn_per_e=gain,
         gain_sigma=gain_sigma,
-        dark_noise_e=dark_noise,
+        temporal_dark_noise_e=dark_noise,
         dark_noise_sigma_e=math.hypot(dark_sigma, dark_noise * gain_sigma / gain),
         saturation_dn=saturation,
         saturation_e=saturation_e,
-        threshold_e=threshold,
+        absolute_threshold_e=threshold,
         dynamic_range=saturation_e / threshold,
-        best_ratio=math.sqrt(saturation_e),
+        snr_max=math.sqrt(saturation_e),
         linearity_percent=float(np.mean(np.abs(deviation[inside]))),
         responsivity=slope,
         deviation_percent=np.asarray(deviation),
@@ -126,10 +137,10 @@ def _relative_line(exposure: Array, signal: Array) -> tuple[float, float]:
     return float(solved[0]), float(solved[1])
 
 
-def ladder_of(
+def exposure_series_of(
     steps: Sequence[tuple[float, float, float, float, float]], dark: tuple[float, float]
-) -> Ladder:
+) -> ExposureSeries:
     """Put steps (exposure, signal, variance, its sigma, clipped share) in order."""
     table = np.array(sorted(steps), float).reshape(-1, 5).T
     exposure, signal, variance, sigma, clipped = table
-    return Ladder(exposure, signal, variance, sigma, clipped, dark[0], dark[1])
+    return ExposureSeries(exposure, signal, variance, sigma, clipped, dark[0], dark[1])

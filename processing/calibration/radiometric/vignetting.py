@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.calibration.radiometric.series import Map
+from processing.calibration.radiometric.frame_series import Map
 
 Array = NDArray[Any]
 
@@ -35,14 +35,16 @@ class ApertureModel:
     reach_mm: float
     coefficients: Array
     covariance: Array
-    light: dict[float, float]
+    illumination: dict[float, float]
     misfit_percent: dict[float, float]
 
     def ratio(self, r2_mm2: Array, f_number: float) -> Map:
         """Field of light at an aperture over that at the base aperture, one on the axis."""
         rho2 = r2_mm2 / self.reach_mm**2
         shape = sum(c * rho2**p for c, p in zip(self.coefficients, _POWERS, strict=True))
-        return np.asarray(1.0 + _q(f_number, self.base_f_number) * shape, dtype=np.float32)
+        return np.asarray(
+            1.0 + _relative_aperture_area(f_number, self.base_f_number) * shape, dtype=np.float32
+        )
 
 
 def fit_aperture(
@@ -69,7 +71,7 @@ def fit_aperture(
         # The aperture's light multiplies the whole field: ratio = e (1 + q S), e unknown.
         own = np.zeros((len(ratio), len(others)))
         own[:, k] = 1.0
-        rows.append(np.hstack([_q(f_number, base[0]) * shape, own]))
+        rows.append(np.hstack([_relative_aperture_area(f_number, base[0]) * shape, own]))
         values.append(ratio)
         ratios.append(ratio)
     if not others:
@@ -77,32 +79,33 @@ def fit_aperture(
         return ApertureModel(
             base[0], reach2**0.5, np.zeros(len(_POWERS)), empty, {base[0]: 1.0}, {}
         )
-    light = np.ones(len(others))
+    illumination = np.ones(len(others))
     for _ in range(4):
         design = np.vstack(rows).copy()
         for k in range(len(others)):
             part = slice(k * len(rho2), (k + 1) * len(rho2))
-            design[part, : len(_POWERS)] *= light[k]
+            design[part, : len(_POWERS)] *= illumination[k]
         solved, *_ = np.linalg.lstsq(design, np.concatenate(values), rcond=None)
-        light = solved[len(_POWERS) :]
+        illumination = solved[len(_POWERS) :]
     residual = np.concatenate(values) - design @ solved
     freedom = len(residual) - len(solved)
     cofactor = np.linalg.inv(design.T @ design)[: len(_POWERS), : len(_POWERS)]
-    apart = residual.reshape(len(others), -1)
+    residuals_by_aperture = residual.reshape(len(others), -1)
     return ApertureModel(
         base_f_number=base[0],
         reach_mm=reach2**0.5,
         coefficients=solved[: len(_POWERS)],
         covariance=cofactor * float(residual @ residual) / freedom,
-        light={base[0]: 1.0} | {f: float(e) for (f, _), e in zip(others, light, strict=True)},
+        illumination={base[0]: 1.0}
+        | {f: float(e) for (f, _), e in zip(others, illumination, strict=True)},
         misfit_percent={
             f: float(100.0 * np.sqrt(np.mean(r**2)))
-            for (f, _), r in zip(others, apart, strict=True)
+            for (f, _), r in zip(others, residuals_by_aperture, strict=True)
         },
     )
 
 
-def _q(f_number: float, base: float) -> float:
+def _relative_aperture_area(f_number: float, base: float) -> float:
     return (base / f_number) ** 2 - 1.0
 
 
@@ -117,5 +120,5 @@ def _blocks(values: Array, good: Array) -> Array:
         return np.asarray(shaped.sum(axis=(1, 3)).ravel())
 
     count = summed(good)
-    kept = count > _BLOCK_PX**2 / 2
-    return np.asarray(summed(np.where(good, values, 0.0))[kept] / count[kept])
+    valid = count > _BLOCK_PX**2 / 2
+    return np.asarray(summed(np.where(good, values, 0.0))[valid] / count[valid])

@@ -18,52 +18,60 @@ from processing.rig import find_rig
 
 
 @pytest.fixture(scope="module")
-def told(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+def figures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     folder = tmp_path_factory.mktemp("bench")
     command = [sys.executable, "-m", "daemon", "bench", "ultracam-x-mini", "--json", "--runs", "2"]
-    said = subprocess.run(
+    sentence = subprocess.run(
         [*command, "--no-peers", "--folder", str(folder)],
         stdout=subprocess.PIPE,
         check=True,
         timeout=240,
     )
-    return dict(json.loads(said.stdout))
+    return dict(json.loads(sentence.stdout))
 
 
-def test_figures_of_all_stages_are_told_with_their_spread(told: dict[str, Any]) -> None:
+def test_figures_of_all_stages_are_reported_with_their_spread(figures: dict[str, Any]) -> None:
     stages = {"radiometry", "tie_points", "mosaic", "composition", "colour", "writing"}
-    assert stages <= set(told["stages"])
-    for times in (*told["stages"].values(), told["pipeline"], told["fixed_method"], told["copy"]):
+    assert stages <= set(figures["stages"])
+    for times in (
+        *figures["stages"].values(),
+        figures["pipeline"],
+        figures["fixed_method"],
+        figures["copy"],
+    ):
         # A stage of a small rig may take less than the tenth of a millisecond that is told.
         assert 0.0 <= times["min_s"] <= times["median_s"] <= times["max_s"]
-    assert told["pipeline"]["min_s"] > 0.0
-    assert told["realtime_factor_alone"] == told["frame_interval_s"] / told["pipeline"]["median_s"]
-    assert "peers" not in told
+    assert figures["pipeline"]["min_s"] > 0.0
+    assert (
+        figures["realtime_factor_alone"]
+        == figures["frame_interval_s"] / figures["pipeline"]["median_s"]
+    )
+    assert "peers" not in figures
 
 
-def test_the_pace_is_that_of_exposures_side_by_side_and_says_how_long_each_takes(
-    told: dict[str, Any],
+def test_the_pace_is_that_of_parallel_exposures_with_the_latency_of_each(
+    figures: dict[str, Any],
 ) -> None:
-    side = told["side_by_side"]
-    assert side["lanes"] == 2 and side["exposures"] == 6
-    pace = told["frame_interval_s"] / side["seconds_per_exposure"]
-    assert told["realtime_factor"] == pytest.approx(pace)
+    side = figures["side_by_side"]
+    assert side["parallel"] == 2 and side["exposures"] == 6
+    pace = figures["frame_interval_s"] / side["seconds_per_exposure"]
+    assert figures["realtime_factor"] == pytest.approx(pace)
     # What is overlapped takes longer than its share of the time, never less.
     assert side["latency"]["median_s"] > side["seconds_per_exposure"]
     assert side["cpu_s_per_exposure"] > 0.0
 
 
-def test_what_is_timed_is_right_against_the_truth(told: dict[str, Any]) -> None:
-    assert told["rms_px"] < 0.05 and told["max_px"] < 0.15
-    assert told["rms_px_fixed"] > 3 * told["rms_px"]
+def test_what_is_timed_is_right_against_the_truth(figures: dict[str, Any]) -> None:
+    assert figures["rms_px"] < 0.05 and figures["max_px"] < 0.15
+    assert figures["rms_px_fixed"] > 3 * figures["rms_px"]
 
 
 def test_a_peer_that_is_not_installed_is_named_with_its_package(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
-    said = peers.missing_programs()
-    assert said is not None and "hugin-tools" in said and "enblend" in said
+    sentence = peers.missing_programs()
+    assert sentence is not None and "hugin-tools" in sentence and "enblend" in sentence
 
 
 @pytest.mark.skipif(shutil.which("pano_trafo") is None, reason="Debian package hugin-tools")

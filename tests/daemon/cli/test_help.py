@@ -27,7 +27,7 @@ ALL = dict(commands(get_command(app), "syntopic"))
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_every_command_has_an_example_and_says_what_each_option_is(name: str) -> None:
+def test_every_command_has_an_example_and_describes_each_option(name: str) -> None:
     command = ALL[name]
     assert "`syntopic " in command.help
     assert "Example" in command.help
@@ -56,7 +56,7 @@ def test_the_help_page_imports_no_command_and_no_heavy_library() -> None:
     assert ast.literal_eval(ours) == [
         "daemon.cli",
         "daemon.cli.command_table",
-        "daemon.cli.interruption",
+        "daemon.cli.interrupt_messages",
     ]
     assert all(f" {name} " in done.stdout for name in TABLE)
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from daemon import cli
-from daemon.cli import interruption
+from daemon.cli import interrupt_messages
 from daemon.mission.log.flight_log import read
 from daemon.mission.store import durable
 from tests.crash.kill_at_call import run_to_call
@@ -40,8 +40,8 @@ class Case:
     """What is run first, to its end."""
 
 
-def _mission(*words: str, options: tuple[str, ...] = ()) -> Callable[[Path], list[str]]:
-    return lambda folder: [*words, str(folder / "flown" / MISSION), *options]
+def _mission(*command: str, options: tuple[str, ...] = ()) -> Callable[[Path], list[str]]:
+    return lambda folder: [*command, str(folder / "flown" / MISSION), *options]
 
 
 def _install(folder: Path) -> list[str]:
@@ -88,14 +88,14 @@ CASES = (
 
 
 @pytest.fixture(scope="module")
-def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("pristine")
     three_exposures(folder / "flown")
     (folder / "tokens.toml").touch(mode=0o640)
     return folder
 
 
-def run(arguments: list[str], said: Path) -> Callable[[], None]:
+def run(arguments: list[str], output_file: Path) -> Callable[[], None]:
     """The command as the shell starts it; its status and what it prints go into a file."""
 
     def action() -> None:
@@ -107,13 +107,13 @@ def run(arguments: list[str], said: Path) -> Callable[[], None]:
                 cli.main()
             except SystemExit as ended:
                 status = ended.code
-        with said.open("w") as file:
+        with output_file.open("w") as file:
             json.dump({"status": status, "errors": errors.getvalue()}, file)
 
     return action
 
 
-def check_whole(folder: Path) -> None:
+def check_complete(folder: Path) -> None:
     """Every file with its final name is complete.
 
     Raises:
@@ -142,48 +142,48 @@ def check_whole(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_an_interrupted_command_leaves_whole_files_and_says_how_to_continue(
-    case: Case, pristine: Path, tmp_path: Path
+def test_an_interrupted_command_leaves_complete_files_and_states_how_to_continue(
+    case: Case, original: Path, tmp_path: Path
 ) -> None:
-    folder, said, begun = tmp_path / "trial", tmp_path / "said.json", tmp_path / "begun"
-    shutil.copytree(pristine, begun)
+    folder, output_file, begun = tmp_path / "trial", tmp_path / "said.json", tmp_path / "begun"
+    shutil.copytree(original, begun)
     if case.before is not None:
-        run_to_call(run(case.before(begun), said), None)
-        assert json.loads(said.read_text())["status"] == 0, said.read_text()
+        run_to_call(run(case.before(begun), output_file), None)
+        assert json.loads(output_file.read_text())["status"] == 0, output_file.read_text()
 
-    def trial(last: int | None, by: signal.Signals = signal.SIGKILL) -> list[str]:
+    def run_case(last: int | None, by: signal.Signals = signal.SIGKILL) -> list[str]:
         shutil.rmtree(folder, ignore_errors=True)
         shutil.copytree(begun, folder)
-        said.unlink(missing_ok=True)
-        return run_to_call(run(case.arguments(folder), said), last, torn=True, by=by)
+        output_file.unlink(missing_ok=True)
+        return run_to_call(run(case.arguments(folder), output_file), last, torn=True, by=by)
 
     shutil.copytree(begun, folder)
-    run(case.arguments(folder), said)()  # what it imports is there for the trials
-    count = len(trial(None))
-    assert json.loads(said.read_text())["status"] == 0, said.read_text()
+    run(case.arguments(folder), output_file)()  # what it imports is there for the trials
+    count = len(run_case(None))
+    assert json.loads(output_file.read_text())["status"] == 0, output_file.read_text()
     assert count > 3
-    whole = sorted(str(p.relative_to(folder)) for p in folder.rglob("*"))
+    expected_names = sorted(str(p.relative_to(folder)) for p in folder.rglob("*"))
     interrupted = 0
     # Neighbours differ little where a command changes the disk in many small steps.
     for last in range(1, count, max(1, count // case.positions)):
-        trial(last, signal.SIGINT)
-        answer = json.loads(said.read_text())
-        assert answer["status"] == interruption.STATUS, (last, answer)
+        run_case(last, signal.SIGINT)
+        answer = json.loads(output_file.read_text())
+        assert answer["status"] == interrupt_messages.STATUS, (last, answer)
         lines = [line for line in answer["errors"].splitlines() if line.strip()]
-        assert lines[-1] == interruption.sentence_of(case.name), (last, answer)
+        assert lines[-1] == interrupt_messages.sentence_of(case.name), (last, answer)
         assert "Traceback" not in answer["errors"]
         assert not list(folder.rglob("*.part")), last
-        check_whole(folder)
+        check_complete(folder)
         interrupted += 1
         if interrupted % 2:
-            trial(last)
-            check_whole(folder)
+            run_case(last)
+            check_complete(folder)
         if interrupted % 3 == 1 or not case.reruns:
             continue
         # Once more, as the sentence says.
-        run_to_call(run(case.arguments(folder), said), None)
-        assert json.loads(said.read_text())["status"] == 0, (last, said.read_text())
-        assert whole == sorted(str(p.relative_to(folder)) for p in folder.rglob("*")), last
+        run_to_call(run(case.arguments(folder), output_file), None)
+        assert json.loads(output_file.read_text())["status"] == 0, (last, output_file.read_text())
+        assert expected_names == sorted(str(p.relative_to(folder)) for p in folder.rglob("*")), last
     assert interrupted >= 3
 
 
@@ -191,25 +191,25 @@ def test_every_command_has_a_sentence_of_its_own() -> None:
     import typer.main
 
     commands = typer.main.get_command(cli.app).commands  # type: ignore[attr-defined]
-    missing = [name for name in commands if name not in interruption.SENTENCES]
+    missing = [name for name in commands if name not in interrupt_messages.SENTENCES]
     assert missing == []
     for name in commands:
-        sentence = interruption.sentence_of(name)
+        sentence = interrupt_messages.sentence_of(name)
         assert sentence.count(".") == 1 and sentence.endswith(".") and ";" in sentence
 
 
 def test_a_disk_that_refuses_ends_in_a_sentence(
-    pristine: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    original: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder, said = tmp_path / "trial", tmp_path / "said.json"
-    shutil.copytree(pristine, folder)
+    folder, output_file = tmp_path / "trial", tmp_path / "said.json"
+    shutil.copytree(original, folder)
 
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(durable, "write_all", full)
-    run(_mission("report")(folder), said)()
-    answer = json.loads(said.read_text())
+    run(_mission("report")(folder), output_file)()
+    answer = json.loads(output_file.read_text())
     assert answer["status"] == 1
     assert "No space left on device" in answer["errors"] and "Traceback" not in answer["errors"]
     assert not list(folder.rglob("*.part"))

@@ -21,8 +21,8 @@ def test_beneath_the_table_stands_why_an_exposure_is_not_good() -> None:
         "verdict": "usable",
         "duration_s": 1.0,
     }
-    told = io.StringIO()
-    print_reports(Console(file=told, width=100), "Level-2", [report])
-    assert "Exposure 7: Head SU10 sent no image." in told.getvalue()
-    assert "Simulated" not in told.getvalue()
-    assert "0.000" not in told.getvalue(), "an unknown sigma0 is not a perfect one"
+    output = io.StringIO()
+    print_reports(Console(file=output, width=100), "Level-2", [report])
+    assert "Exposure 7: Head SU10 sent no image." in output.getvalue()
+    assert "Simulated" not in output.getvalue()
+    assert "0.000" not in output.getvalue(), "an unknown sigma0 is not a perfect one"

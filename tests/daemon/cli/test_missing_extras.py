@@ -74,7 +74,7 @@ def configured(folder: Path, **parts: str) -> str:
     return str(path)
 
 
-def said_without(
+def output_without(
     modules: tuple[str, ...], folder: Path, *arguments: str
 ) -> tuple[subprocess.CompletedProcess[str], float]:
     """What the command prints where these modules cannot be imported, and its CPU seconds."""
@@ -136,10 +136,10 @@ def test_a_missing_library_is_one_sentence_with_the_command_that_installs_it(
     if "MISSION" in arguments:
         real["MISSION"] = str(_mission(folder).path)
     given = [real.get(argument, argument) for argument in arguments]
-    done, spent_s = said_without(EXTRAS[extra].modules, folder, *given)
-    told = done.stdout + done.stderr
-    assert f"Run: pip install 'syntopic[{extra}]'" in told, told
-    assert told.count("pip install") == 1 and "Traceback" not in told
+    done, spent_s = output_without(EXTRAS[extra].modules, folder, *given)
+    output = done.stdout + done.stderr
+    assert f"Run: pip install 'syntopic[{extra}]'" in output, output
+    assert output.count("pip install") == 1 and "Traceback" not in output
     assert done.returncode in (1, 2)
     assert spent_s < CPU_WITHIN_S
     assert not (folder / "missions").is_dir() or not any((folder / "missions").glob("2*"))
@@ -149,7 +149,7 @@ def test_a_missing_library_is_one_sentence_with_the_command_that_installs_it(
 def test_the_system_library_has_its_own_command(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    done, _ = said_without(("gi",), folder, "run", configured(folder, **ARAVIS))
+    done, _ = output_without(("gi",), folder, "run", configured(folder, **ARAVIS))
     assert "sudo apt install gir1.2-aravis-0.8" in done.stdout + done.stderr
 
     class _NoTypelib:

@@ -17,14 +17,14 @@ def test_nothing_is_written_unless_a_drawing_is_asked_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    said = CliRunner().invoke(app, [*SHOW, "--json"])
-    assert said.exit_code == 0 and json.loads(said.stdout)["drawing"] is None
+    result = CliRunner().invoke(app, [*SHOW, "--json"])
+    assert result.exit_code == 0 and json.loads(result.stdout)["drawing"] is None
     assert CliRunner().invoke(app, SHOW).exit_code == 0
     assert not list(tmp_path.iterdir())
 
 
 def test_a_drawing_lies_where_it_was_asked_for(tmp_path: Path) -> None:
     drawing = tmp_path / "rig.svg"
-    said = CliRunner().invoke(app, [*SHOW, "--drawing", str(drawing), "--json"])
-    assert json.loads(said.stdout)["drawing"] == str(drawing)
+    result = CliRunner().invoke(app, [*SHOW, "--drawing", str(drawing), "--json"])
+    assert json.loads(result.stdout)["drawing"] == str(drawing)
     assert drawing.read_text().startswith("<svg")

@@ -29,7 +29,7 @@ def problems_of(content: dict[str, Any]) -> tuple[str, ...]:
     return refused.value.problems
 
 
-def test_a_good_configuration_is_taken_with_paths_beside_the_file(tmp_path: Path) -> None:
+def test_a_valid_configuration_resolves_paths_relative_to_the_file(tmp_path: Path) -> None:
     configuration, rig = from_mapping(copy.deepcopy(GOOD), tmp_path / "service.toml")
     assert rig.name == "ultracam-x-mini"
     assert configuration.mission.root == tmp_path / "missions"
@@ -131,13 +131,17 @@ def test_a_plan_to_follow_has_to_be_there_and_readable(tmp_path: Path) -> None:
             from_mapping(content, tmp_path / "service.toml")
 
 
-def test_parts_that_no_bus_tells_are_stated_and_only_those_the_rig_has() -> None:
+def test_parts_that_no_bus_reports_are_listed_and_only_those_of_the_rig() -> None:
     content = copy.deepcopy(GOOD)
     content["serials"] = {"lens": {"0": "L-1"}, "probe": {"0": "PT-17"}}
     configuration, _ = from_mapping(content, FILE)
     assert configuration.serials.parts == {"lens 0": "L-1", "probe 0": "PT-17"}
     content["serials"] = {"lens": {"9": "L-1"}, "probe": {"boiler": "PT-17"}}
-    said = problems_of(content)
-    assert len(said) == 2 and "serials.lens.9" in said[0] and "serials.probe.boiler" in said[1]
+    problems = problems_of(content)
+    assert (
+        len(problems) == 2
+        and "serials.lens.9" in problems[0]
+        and "serials.probe.boiler" in problems[1]
+    )
     content["serials"] = {"lens": "L-1"}
     assert "serials.lens" in problems_of(content)[0]

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from daemon.configuration.model import Configuration, ConfigurationError, load
-from daemon.onboard.preflight.findings import Outcome
+from daemon.onboard.preflight.check_results import CheckOutcome
 from daemon.onboard.preflight.prerequisites import storage
 from processing.rig import Rig
 
@@ -34,8 +34,8 @@ def refusal(tmp_path: Path, mission: str, limits: str = "") -> str:
 def test_a_timeout_that_memory_does_not_bridge_is_refused_with_the_depth_that_does(
     tmp_path: Path,
 ) -> None:
-    told = refusal(tmp_path, 'mirror = "b"', "mirror_timeout_s = 1.5\nexposures_in_memory = 3")
-    assert "bridges 1.5 s" in told and "limits.exposures_in_memory to 4" in told
+    output = refusal(tmp_path, 'mirror = "b"', "mirror_timeout_s = 1.5\nexposures_in_memory = 3")
+    assert "bridges 1.5 s" in output and "limits.exposures_in_memory to 4" in output
     # Without a mirror nothing is waited for.
     assert refusal_free(tmp_path, "", "mirror_timeout_s = 1.5\nexposures_in_memory = 3")
     deep = "mirror_timeout_s = 1.5\nexposures_in_memory = 4"
@@ -52,8 +52,8 @@ def refusal_free(tmp_path: Path, mission: str, limits: str) -> bool:
 
 @pytest.mark.parametrize("mirror", ["a", "a/b", "."])
 def test_a_mirror_in_or_around_the_root_is_refused(tmp_path: Path, mirror: str) -> None:
-    told = refusal(tmp_path, f'mirror = "{mirror}"', "exposures_in_memory = 8")
-    assert "give a folder on another disk" in told
+    output = refusal(tmp_path, f'mirror = "{mirror}"', "exposures_in_memory = 8")
+    assert "give a folder on another disk" in output
 
 
 def mission_of(tmp_path: Path, mirror: Path | None) -> Configuration:
@@ -66,16 +66,16 @@ def mission_of(tmp_path: Path, mirror: Path | None) -> Configuration:
 def test_check_cautions_where_both_lie_on_one_file_system(tmp_path: Path) -> None:
     (tmp_path / "b").mkdir()
     found = list(storage(mission_of(tmp_path, tmp_path / "b"), None))  # type: ignore[arg-type]
-    assert [finding.outcome for finding in found] == [Outcome.PASS] * 3
+    assert [result.outcome for result in found] == [CheckOutcome.PASS] * 3
     assert found[2].sentence.startswith("caution:") and "same file system" in found[2].sentence
     assert len(list(storage(mission_of(tmp_path, None), None))) == 1  # type: ignore[arg-type]
 
 
 def test_one_disk_of_two_is_enough_for_a_flight_and_the_other_is_named(tmp_path: Path) -> None:
     found = list(storage(mission_of(tmp_path, tmp_path / "b"), None))  # type: ignore[arg-type]
-    assert found[1].outcome is Outcome.FAIL and not found[1].prevents
+    assert found[1].outcome is CheckOutcome.FAIL and not found[1].is_blocking
     assert "mission.mirror" in found[1].sentence and not (tmp_path / "b").exists()
     (tmp_path / "a").rmdir()
     (tmp_path / "a").write_text("no folder")
     found = list(storage(mission_of(tmp_path, tmp_path / "b"), None))  # type: ignore[arg-type]
-    assert found[0].prevents and "mission.root" in found[0].sentence
+    assert found[0].is_blocking and "mission.root" in found[0].sentence

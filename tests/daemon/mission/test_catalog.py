@@ -133,7 +133,7 @@ def test_a_connection_serves_every_thread_and_waits_10_s_for_another_process(pat
         catalog.close()
 
 
-def test_a_reader_follows_later_commits_where_nobody_says_that_it_is_settled(path):
+def test_a_reader_follows_later_commits_unless_the_index_is_immutable(path):
     one_exposure(path)
     reader = Catalog.read(path)
     writer = Catalog.open(path)
@@ -143,18 +143,18 @@ def test_a_reader_follows_later_commits_where_nobody_says_that_it_is_settled(pat
     writer.close()
 
 
-def test_a_settled_index_is_read_without_files_beside_it(path):
+def test_an_immutable_index_is_read_without_further_files(path):
     one_exposure(path)
-    reader = Catalog.read(path, is_settled=True)
+    reader = Catalog.read(path, is_immutable=True)
     assert [row.number for row in reader.exposures()] == [1]
     assert [entry.name for entry in path.parent.iterdir()] == [path.name]
     reader.close()
 
 
-def test_a_settled_index_with_a_log_is_read_with_what_the_log_holds(path):
+def test_an_immutable_index_with_a_log_is_read_with_the_content_of_the_log(path):
     writer = Catalog.open(path)
     writer.add_stored(capture_of(1))
-    reader = Catalog.read(path, is_settled=True)
+    reader = Catalog.read(path, is_immutable=True)
     assert [row.number for row in reader.exposures()] == [1]
     reader.close()
     writer.close()

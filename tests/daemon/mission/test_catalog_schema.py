@@ -57,11 +57,11 @@ def mission(tmp_path):
 def test_an_index_of_the_first_schema_becomes_one_of_the_present(mission):
     fly(mission, [1, 2])
     rows = Catalog.read(mission.catalog_path).exposures()
-    fresh = columns(mission.catalog_path)
+    current = columns(mission.catalog_path)
     make_old(mission.catalog_path)
-    assert columns(mission.catalog_path) != fresh
+    assert columns(mission.catalog_path) != current
     Catalog.open(mission.catalog_path).close()
-    assert columns(mission.catalog_path) == fresh
+    assert columns(mission.catalog_path) == current
     assert Catalog.read(mission.catalog_path).exposures() == rows
 
 

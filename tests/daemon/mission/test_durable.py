@@ -121,21 +121,21 @@ def test_a_set_of_files_is_complete_where_its_last_file_is(tmp_path: Path, is_th
             for name in ("images.csv", "project.toml", "report.json"):
                 (part / name).write_bytes(NEW)
 
-    def made(folder: Path) -> Path:
+    def write_project_folder(folder: Path) -> Path:
         if is_there:
             folder.mkdir()
             (folder / "mine.txt").write_bytes(OLD)
         return folder
 
-    first = made(tmp_path / "0")
+    first = write_project_folder(tmp_path / "0")
     count = len(run_to_call(lambda: write(first), None))
-    whole = names_in(first)
-    assert ("mine.txt" in whole) == is_there and "project.toml" in whole
+    names = names_in(first)
+    assert ("mine.txt" in names) == is_there and "project.toml" in names
     for last in range(1, count + 1):
-        folder = made(tmp_path / str(last))
+        folder = write_project_folder(tmp_path / str(last))
         run_to_call(lambda f=folder: write(f), last)
         if (folder / "project.toml").exists():
-            assert names_in(folder) == whole
+            assert names_in(folder) == names
         for path in folder.glob("*"):
             assert path.read_bytes() == (OLD if path.name == "mine.txt" else NEW)
     # The next writer of the same folder removes what a killed one left.

@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from daemon.mission.canonical_json import RecordError, parse_record
 from daemon.mission.exposure import (
-    Capture,
+    CaptureRecord,
     Exposure,
     FrameRecord,
     NavigationRecord,
@@ -20,7 +21,6 @@ from daemon.mission.exposure import (
     from_json,
     to_json,
 )
-from daemon.mission.records import RecordError, parse_record
 from tests.daemon.small_camera import capture_of, final_record
 
 instants = st.none() | st.integers(-(2**63) + 1, 2**63 - 1)
@@ -185,6 +185,6 @@ def test_no_value_under_any_key_raises_anything_but_a_record_error(data):
 
 
 def test_the_capture_of_an_exposure_is_no_exposure():
-    content = json.loads(capture_bytes(Capture(number=1)))
+    content = json.loads(capture_bytes(CaptureRecord(number=1)))
     with pytest.raises(RecordError, match="kind is 'capture'"):
         from_json(content)

@@ -60,9 +60,9 @@ def test_a_record_reads_back_as_it_was(record):
 
 
 def test_bytes_of_a_device_are_kept_as_they_came(log):
-    everything = bytes(range(256))
-    log.write(message_of(RawBytes("gnss", 77, everything)))
-    assert list(read(log.path)) == [Message("raw/gnss", 77, everything)]
+    all_bytes = bytes(range(256))
+    log.write(message_of(RawBytes("gnss", 77, all_bytes)))
+    assert list(read(log.path)) == [Message("raw/gnss", 77, all_bytes)]
 
 
 @given(st.text(), st.binary(max_size=60))
@@ -174,7 +174,7 @@ def test_a_checkpoint_that_cannot_be_read_is_counted_as_bad(log):
     assert reader.bad_checkpoints == 1
 
 
-def test_a_disk_that_refuses_costs_messages_and_the_log_says_how_many(log, monkeypatch):
+def test_a_refusing_disk_costs_messages_and_the_log_counts_them(log, monkeypatch):
     log.append("service/a", 1, {"n": 1})
     with monkeypatch.context() as patch:
         half_done = os.write
@@ -191,8 +191,8 @@ def test_a_disk_that_refuses_costs_messages_and_the_log_says_how_many(log, monke
     log.append("service/b", 4, {"n": 4})
     log.close()
     reader = read(log.path)
-    told = [(m.topic, m.payload) for m in reader]
-    assert told == [
+    messages = [(m.topic, m.payload) for m in reader]
+    assert messages == [
         ("service/a", b'{"n":1}\n'),
         ("log/dropped", b'{"dropped":2}\n'),
         ("service/b", b'{"n":4}\n'),
@@ -217,9 +217,9 @@ while True:
         for _ in range(500):
             acknowledged = int(process.stdout.readline())
         process.send_signal(signal.SIGKILL)
-        rest = process.stdout.read().split(b"\n")
+        last_lines = process.stdout.read().split(b"\n")
         process.wait(timeout=30)
-    acknowledged = max([acknowledged, *(int(line) for line in rest[:-1])])
+    acknowledged = max([acknowledged, *(int(line) for line in last_lines[:-1])])
     reader = read(tmp_path / "k.mcap")
     numbers = [message.mono_ns for message in reader]
     assert numbers[:acknowledged] == list(range(1, acknowledged + 1))

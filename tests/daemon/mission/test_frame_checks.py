@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
+from daemon.mission.canonical_json import RecordError, sha256_hex
 from daemon.mission.layout import Mission
-from daemon.mission.records import RecordError, sha256_hex
 from daemon.mission.store.frame_checks import tdi_shifts
 from daemon.mission.store.level0 import tiff_parts
 from daemon.mission.store.store import load_level0

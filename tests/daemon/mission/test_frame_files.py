@@ -2,7 +2,7 @@
 
 import pytest
 
-from daemon.mission.records import RecordError
+from daemon.mission.canonical_json import RecordError
 from daemon.mission.store.frame_files import frame_files, other_spelling
 
 pytestmark = pytest.mark.trust
@@ -21,13 +21,13 @@ def test_every_spelling_of_a_suffix_is_found(tmp_path, name):
     assert frame_files(laid_out(tmp_path, name), SENSORS) == {"SU30": name}
 
 
-def test_case_tells_sensors_apart_where_the_rig_does(tmp_path):
+def test_case_distinguishes_sensors_where_the_rig_does(tmp_path):
     folder = laid_out(tmp_path, "b.tif", "B.tif")
     assert frame_files(folder, SENSORS) == {"B": "B.tif", "b": "b.tif"}
 
 
 @pytest.mark.parametrize(
-    ("names", "says"),
+    ("names", "expected"),
     [
         (("SU30.tif", "SU30.TIF"), "SU30.TIF and SU30.tif are both frames of SU30; keep one"),
         (("SU30.tif", "SU3O.tif"), "SU3O.tif: no sensor of the rig has this name"),
@@ -35,8 +35,8 @@ def test_case_tells_sensors_apart_where_the_rig_does(tmp_path):
         (("SU30.tif", "su30.tif"), "su30.tif: no sensor of the rig has this name"),
     ],
 )
-def test_what_cannot_be_told_is_refused(tmp_path, names, says):
-    with pytest.raises(RecordError, match=says):
+def test_an_ambiguous_file_is_refused(tmp_path, names, expected):
+    with pytest.raises(RecordError, match=expected):
         frame_files(laid_out(tmp_path, *names), SENSORS)
 
 

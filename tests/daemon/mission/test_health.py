@@ -74,7 +74,7 @@ def test_healthy_disks_state_temperature_and_wear_and_no_problem() -> None:
 
 
 @pytest.mark.parametrize(
-    ("stated", "told"),
+    ("smart_data", "expected"),
     [
         (NVME | {"smart_status": {"passed": False}}, "states that it fails"),
         (nvme(critical_warning=4), "critical warning 0x04"),
@@ -88,9 +88,9 @@ def test_healthy_disks_state_temperature_and_wear_and_no_problem() -> None:
         ({"error": "smartctl printed no JSON"}, "no JSON"),
     ],
 )
-def test_what_a_bad_disk_states_is_a_sentence(stated: dict[str, Any], told: str) -> None:
-    (problem,) = health_of(stated).problems
-    assert told in problem
+def test_what_a_bad_disk_states_is_a_sentence(smart_data: dict[str, Any], expected: str) -> None:
+    (problem,) = health_of(smart_data).problems
+    assert expected in problem
 
 
 def test_the_limits_themselves_are_healthy() -> None:
@@ -100,15 +100,15 @@ def test_the_limits_themselves_are_healthy() -> None:
 
 
 @pytest.mark.parametrize(
-    "stated",
+    "smart_data",
     [
         {}, {"smart_status": None}, {"temperature": 5, "smart_status": {"passed": "yes"}},
         {"nvme_smart_health_information_log": {"critical_warning": "x", "percentage_used": None}},
         {"ata_smart_attributes": {"table": [None, 5, {"id": 197, "raw": {"value": "many"}}]}},
     ],
 )  # fmt: skip
-def test_malformed_output_never_raises_and_claims_nothing(stated: dict[str, Any]) -> None:
-    found = health_of(stated)
+def test_malformed_output_never_raises_and_claims_nothing(smart_data: dict[str, Any]) -> None:
+    found = health_of(smart_data)
     assert found.temperature_c is None and found.wear_percent is None
 
 

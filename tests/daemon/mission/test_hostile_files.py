@@ -26,7 +26,7 @@ from daemon.mission.log.log_records import record_of
 from daemon.mission.store.level0 import RasterError, read_description, read_tiff, tiff_parts
 from daemon.mission.store.store import verify
 from daemon.mission.verification.recovery import recover
-from daemon.planning.reading import PlanError, read_plan
+from daemon.planning.plan_readers import PlanError, read_plan
 from tests.daemon.small_camera import complete_from_log, fly, new_mission
 
 MEMORY_BYTES = 40_000_000
@@ -85,12 +85,12 @@ def held(act) -> None:
 # TIFFs
 
 
-def ours() -> bytes:
+def own_tiff() -> bytes:
     pixels = np.arange(64 * 48, dtype=np.uint16).reshape(48, 64)
     return b"".join(tiff_parts([pixels], {"sensor": "SU00"}))
 
 
-def theirs(**options) -> bytes:
+def foreign_tiff(**options) -> bytes:
     buffer = BytesIO()
     pixels = np.arange(64 * 48, dtype=np.uint16).reshape(48, 64)
     tifffile.imwrite(buffer, pixels, **options)
@@ -108,11 +108,11 @@ def try_tiff(path: Path) -> None:
 HEAD = 4096
 """Of our TIFF: everything before its pixels."""
 TIFFS = st.one_of(
-    mutated(ours()[:HEAD]).map(lambda head: head + ours()[HEAD:]),
-    mutated(ours()[:400]).map(lambda head: head.ljust(HEAD, b"\0") + ours()[HEAD:]),
-    mutated(theirs(compression="zlib", predictor=True)),
-    mutated(theirs(bigtiff=True)),
-    mutated(theirs(tile=(16, 16), compression="zlib")),
+    mutated(own_tiff()[:HEAD]).map(lambda head: head + own_tiff()[HEAD:]),
+    mutated(own_tiff()[:400]).map(lambda head: head.ljust(HEAD, b"\0") + own_tiff()[HEAD:]),
+    mutated(foreign_tiff(compression="zlib", predictor=True)),
+    mutated(foreign_tiff(bigtiff=True)),
+    mutated(foreign_tiff(tile=(16, 16), compression="zlib")),
 )
 
 
@@ -126,7 +126,7 @@ def test_a_mutated_tiff_is_read_or_refused_in_bounds(tmp_path, data):
 
 def test_a_tiff_that_unpacks_to_more_than_its_size_is_refused(tmp_path):
     """A few hundred kB that would unpack to 300 MB in the place of one small strip."""
-    seed = theirs(compression="zlib", rowsperstrip=48)
+    seed = foreign_tiff(compression="zlib", rowsperstrip=48)
     with tifffile.TiffFile(BytesIO(seed)) as tiff:
         page = tiff.pages[0]
         places = [page.tags[code].valueoffset for code in (273, 279)]
@@ -146,9 +146,9 @@ def test_a_tiff_that_unpacks_to_more_than_its_size_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("side", [40_000, 2**31])
-def test_a_tiff_that_says_more_pixels_than_it_holds_is_refused(tmp_path, side):
-    data = bytearray(ours())
-    with tifffile.TiffFile(BytesIO(ours())) as tiff:
+def test_a_tiff_that_declares_more_pixels_than_it_holds_is_refused(tmp_path, side):
+    data = bytearray(own_tiff())
+    with tifffile.TiffFile(BytesIO(own_tiff())) as tiff:
         places = [tiff.pages[0].tags[code].valueoffset for code in (256, 257, 278)]
     for place in places:
         data[place : place + 4] = struct.pack("<I", side)
@@ -209,7 +209,7 @@ def test_a_mutated_log_is_read_as_far_as_it_goes(tmp_path, data):
 
 
 @pytest.mark.parametrize("compression", [CompressionType.LZ4, CompressionType.ZSTD])
-def test_a_chunk_that_unpacks_to_more_than_it_says_ends_the_log_there(tmp_path, compression):
+def test_a_chunk_that_unpacks_to_more_than_it_declares_ends_the_log_there(tmp_path, compression):
     buffer = BytesIO()
     writer = Writer(buffer, compression=compression, chunk_size=400_000_000)
     writer.start()
@@ -232,9 +232,9 @@ def test_a_chunk_that_unpacks_to_more_than_it_says_ends_the_log_there(tmp_path, 
 
 @pytest.fixture
 def mission(tmp_path):
-    made = new_mission(tmp_path / "missions")
-    fly(made, [1, 2])
-    return made
+    new = new_mission(tmp_path / "missions")
+    fly(new, [1, 2])
+    return new
 
 
 @pytest.mark.parametrize(

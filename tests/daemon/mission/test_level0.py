@@ -77,16 +77,16 @@ def test_a_tiff_of_another_writer_is_taken(tmp_path, options):
 
 
 @pytest.mark.parametrize(
-    ("pixels", "says"),
+    ("pixels", "expected"),
     [
         (PIXELS.astype(np.uint8), "holds uint8"),
         (PIXELS[:, :32], "32 x 48 px; the sensor has 64 x 48 px"),
         (np.stack([PIXELS] * 3, axis=-1), "one plane"),
     ],
 )
-def test_a_tiff_that_does_not_fit_is_refused_with_what_was_found(tmp_path, pixels, says):
+def test_a_tiff_that_does_not_fit_is_refused_with_what_was_found(tmp_path, pixels, expected):
     tifffile.imwrite(tmp_path / "c.tif", np.ascontiguousarray(pixels))
-    with pytest.raises(RasterError, match=says):
+    with pytest.raises(RasterError, match=expected):
         read_tiff(tmp_path / "c.tif", width_px=64, height_px=48)
 
 
@@ -99,9 +99,9 @@ def test_a_plane_that_the_file_does_not_have_is_refused(tmp_path, plane):
 
 
 def test_a_torn_or_foreign_file_is_refused_at_every_length(tmp_path):
-    whole = b"".join(tiff_parts([PIXELS], {"sensor": "SU00"}))
-    for length in [*range(0, 400, 7), PIXEL_ALIGNMENT, len(whole) - 1]:
-        (tmp_path / "d.tif").write_bytes(whole[:length])
+    intact = b"".join(tiff_parts([PIXELS], {"sensor": "SU00"}))
+    for length in [*range(0, 400, 7), PIXEL_ALIGNMENT, len(intact) - 1]:
+        (tmp_path / "d.tif").write_bytes(intact[:length])
         with pytest.raises(RasterError):
             read_tiff(tmp_path / "d.tif")
 

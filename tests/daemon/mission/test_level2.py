@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from daemon.mission.records import RecordError
+from daemon.mission.canonical_json import RecordError
 from daemon.mission.store import publication
 from daemon.mission.store.level2 import ProductError, recover_level2, write_level2
 from tests.daemon.small_camera import new_mission
@@ -73,13 +73,13 @@ def test_images_of_emulated_hardware_say_so_themselves(mission):
     real = {path.name: path.read_bytes() for path in folder.iterdir()}
     _write(mission, report_json=REPORT | {"flags": ["SIGMA0", "SIMULATED"]})
     for name in ("pan.tif", "rgbn.tif"):
-        with tifffile.TiffFile(folder / name) as told:
-            assert json.loads(told.pages[0].description)["simulated"] is True
+        with tifffile.TiffFile(folder / name) as written:
+            assert json.loads(written.pages[0].description)["simulated"] is True
         assert b"simulated" not in real[name]
     for name in ("quicklook.jpg", "thumbnail.jpg"):
-        told = (folder / name).read_bytes()
-        assert b"SIMULATED: emulated hardware" in told and b"SIMULATED" not in real[name]
-        pixels = [cv2.imdecode(np.frombuffer(data, np.uint8), 1) for data in (told, real[name])]
+        written = (folder / name).read_bytes()
+        assert b"SIMULATED: emulated hardware" in written and b"SIMULATED" not in real[name]
+        pixels = [cv2.imdecode(np.frombuffer(data, np.uint8), 1) for data in (written, real[name])]
         assert np.array_equal(*pixels)
 
 

@@ -14,10 +14,10 @@ import pytest
 from daemon.mission.layout import Mission
 from daemon.mission.log.flight_log import logs_of, read
 from daemon.mission.log.log_records import Message
+from daemon.mission.mirror.disk_rejoin import RejoinSettings
 from daemon.mission.mirror.generations import read_generations
-from daemon.mission.mirror.mirror_start import begin_mirrored, find_disks, resume_mirrored
+from daemon.mission.mirror.mirror_startup import begin_mirrored, find_disks, resume_mirrored
 from daemon.mission.mirror.mirrored import DiskEvent, MirroredStorage
-from daemon.mission.mirror.returning import ReturnSettings
 from daemon.mission.store.disk_identity import Disk, give_disk_id
 from daemon.mission.store.level0_folder import read_sealed
 from daemon.mission.store.store import verify
@@ -34,11 +34,11 @@ from tests.daemon.small_camera import (
 pytestmark = pytest.mark.trust
 
 STALL_S = 0.6
-LOOK_S = 0.05
-PATIENCE_S = 60.0
+POLL_S = 0.05
+TIMEOUT_S = 60.0
 
 
-class Flown:
+class MirroredFlight:
     """A mirrored mission on two folders, and what it said."""
 
     def __init__(self, roots: dict[str, Path]) -> None:
@@ -59,7 +59,7 @@ class Flown:
             self.mission.id,
             self.found.disks,
             stall_s=STALL_S,
-            returns=ReturnSettings(LOOK_S, LOOK_S),
+            rejoin=RejoinSettings(POLL_S, POLL_S),
             emit=self.events.append,
             simulated=True,
         )
@@ -77,7 +77,7 @@ class Flown:
         return disks
 
     def until(self, is_so: Callable[[], bool], what: str) -> None:
-        end_s = time.monotonic() + PATIENCE_S
+        end_s = time.monotonic() + TIMEOUT_S
         while not is_so():
             assert time.monotonic() < end_s, f"not {what}: {self.problems()}"
             self.storage.tick()
@@ -88,21 +88,21 @@ class Flown:
         self.until(lambda: len(self.storage.in_use) == 2, "joined")
 
     def problems(self) -> list[str]:
-        return [away.problem for away in self.storage.away.values()]
+        return [inactive.problem for inactive in self.storage.inactive.values()]
 
 
 @pytest.fixture
-def flown(tmp_path: Path) -> Iterator[Flown]:
+def flown(tmp_path: Path) -> Iterator[MirroredFlight]:
     roots = {"root": tmp_path / "a", "mirror": tmp_path / "b"}
     for root in roots.values():
         root.mkdir()
-    made = Flown(roots)
-    made.joined()
-    yield made
-    made.storage.close()
+    flight = MirroredFlight(roots)
+    flight.joined()
+    yield flight
+    flight.storage.close()
 
 
-def test_what_is_stored_is_on_both_disks_and_the_record_names_them(flown: Flown) -> None:
+def test_what_is_stored_is_on_both_disks_and_the_record_names_them(flown: MirroredFlight) -> None:
     ids = {give_disk_id(root) for root in flown.roots.values()}
     assert len(ids) == 2
     assert set(flown.expose(1)) == ids and set(flown.expose(2)) == ids
@@ -126,7 +126,7 @@ def test_what_is_stored_is_on_both_disks_and_the_record_names_them(flown: Flown)
 @pytest.mark.parametrize("failing", ["root", "mirror"])
 @pytest.mark.parametrize("code", [errno.EIO, errno.ENOSPC, errno.ENODEV, errno.EROFS])
 def test_a_disk_that_refuses_a_frame_is_dropped_and_the_exposure_is_stored_on_the_other(
-    flown: Flown, failing: str, code: int
+    flown: MirroredFlight, failing: str, code: int
 ) -> None:
     flown.expose(1)
     (left,) = set(flown.roots) - {failing}
@@ -145,7 +145,7 @@ def test_a_disk_that_refuses_a_frame_is_dropped_and_the_exposure_is_stored_on_th
 
 @pytest.mark.parametrize("stalled", ["root", "mirror"])
 def test_a_disk_that_makes_no_progress_is_dropped_in_time_and_does_not_block_the_other(
-    flown: Flown, stalled: str
+    flown: MirroredFlight, stalled: str
 ) -> None:
     flown.expose(1)
     (left,) = set(flown.roots) - {stalled}
@@ -166,13 +166,13 @@ def test_a_disk_that_makes_no_progress_is_dropped_in_time_and_does_not_block_the
         assert one is not None and one == other
 
 
-def test_where_both_disks_wait_none_is_accused(flown: Flown) -> None:
+def test_where_both_disks_wait_none_is_accused(flown: MirroredFlight) -> None:
     with ExitStack() as stack:
         for root in flown.roots.values():
             stack.enter_context(stalling(root))
         flown.storage.note_products(1, {}, None)
         for copy in flown.storage._copies:
-            copy.lane.submit(lambda root=copy.disk.root: list(root.iterdir()))  # type: ignore[misc]
+            copy.executor.submit(lambda root=copy.disk.root: list(root.iterdir()))  # type: ignore[misc]
         end_s = time.monotonic() + 3 * STALL_S
         while time.monotonic() < end_s:
             flown.storage.tick()
@@ -182,7 +182,7 @@ def test_where_both_disks_wait_none_is_accused(flown: Flown) -> None:
 
 
 def test_where_no_disk_takes_an_exposure_it_is_not_stored_and_both_stay_in_use(
-    flown: Flown,
+    flown: MirroredFlight,
 ) -> None:
     with refusing(flown.roots["root"]), refusing(flown.roots["mirror"]):
         with pytest.raises(OSError, match="Input/output"):
@@ -191,7 +191,7 @@ def test_where_no_disk_takes_an_exposure_it_is_not_stored_and_both_stay_in_use(
     assert len(flown.expose(1)) == 2
 
 
-def test_what_the_last_disk_cannot_say_of_itself_is_not_acknowledged(flown: Flown) -> None:
+def test_what_the_last_disk_cannot_say_of_itself_is_not_acknowledged(flown: MirroredFlight) -> None:
     """The survivor takes the frames and refuses the new generation: nothing is called stored."""
     flown.expose(1)
     state = flown.copy("root").path / ".disks.json"
@@ -204,7 +204,7 @@ def test_what_the_last_disk_cannot_say_of_itself_is_not_acknowledged(flown: Flow
     assert len(read_generations(flown.copy("root").path)[-1].disks) == 1
 
 
-def test_a_disk_that_returns_is_brought_up_to_date_and_joins(flown: Flown) -> None:
+def test_a_disk_that_returns_is_brought_up_to_date_and_joins(flown: MirroredFlight) -> None:
     flown.expose(1)
     with refusing(flown.roots["root"]):
         for number in (2, 3, 4):
@@ -225,7 +225,7 @@ def test_a_disk_that_returns_is_brought_up_to_date_and_joins(flown: Flown) -> No
     assert histories[0] == histories[1] and len(histories[0]) == 4
 
 
-def test_a_record_written_differently_on_one_disk_drops_it(flown: Flown) -> None:
+def test_a_record_written_differently_on_one_disk_drops_it(flown: MirroredFlight) -> None:
     flown.expose(1)
     flown.storage._copies[1].writer._head_sha256 = "0" * 64
     flown.expose(2)
@@ -234,11 +234,11 @@ def test_a_record_written_differently_on_one_disk_drops_it(flown: Flown) -> None
     assert verify(flown.copy("root")).problems == ()
 
 
-def test_a_released_disk_is_left_alone_until_it_is_accepted(flown: Flown) -> None:
+def test_a_released_disk_is_left_alone_until_it_is_accepted(flown: MirroredFlight) -> None:
     flown.expose(1)
     flown.storage.release("mirror", "commanded by a test")
     flown.expose(2)
-    end_s = time.monotonic() + 10 * LOOK_S
+    end_s = time.monotonic() + 10 * POLL_S
     while time.monotonic() < end_s:
         flown.storage.tick()
         time.sleep(0.01)
@@ -250,7 +250,7 @@ def test_a_released_disk_is_left_alone_until_it_is_accepted(flown: Flown) -> Non
 
 
 def test_an_empty_mount_point_is_not_taken_for_the_disk_and_a_new_disk_when_it_is_accepted(
-    flown: Flown, tmp_path: Path
+    flown: MirroredFlight, tmp_path: Path
 ) -> None:
     flown.expose(1)
     root = flown.roots["mirror"]
@@ -277,8 +277,8 @@ def give_disk_id_of(tmp_path: Path, root: Path) -> str:
     return give_disk_id(pulled)
 
 
-def test_a_disk_without_room_does_not_return(flown: Flown) -> None:
-    flown.storage._returns = ReturnSettings(LOOK_S, LOOK_S, room_nbytes=1 << 62)
+def test_a_disk_without_room_does_not_return(flown: MirroredFlight) -> None:
+    flown.storage._rejoin = RejoinSettings(POLL_S, POLL_S, required_nbytes=1 << 62)
     with refusing(flown.roots["mirror"]):
         flown.expose(1)
     flown.until(lambda: any("GB are needed" in p for p in flown.problems()), "said")

@@ -39,7 +39,7 @@ def test_a_closed_mission_is_not_continued_and_the_next_gets_its_own_id(tmp_path
     assert Mission.current(tmp_path) == second
 
 
-def test_the_id_is_in_utc_whatever_zone_the_start_is_told_in(tmp_path):
+def test_the_id_is_in_utc_whatever_zone_the_start_is_given_in(tmp_path):
     mission = Mission.create(
         tmp_path,
         "small",
@@ -68,7 +68,7 @@ def test_a_folder_that_is_no_mission_is_refused_with_a_sentence(tmp_path):
 
 
 @pytest.mark.parametrize("content", [b'{"mission":"../x"}', b'{"mission":"gone"}', b"{}"])
-def test_a_damaged_marker_is_told_with_its_cure(tmp_path, content):
+def test_a_damaged_marker_is_reported_with_its_cure(tmp_path, content):
     (tmp_path / "current-mission.json").write_bytes(content)
     with pytest.raises(MissionError, match="remove"):
         Mission.current(tmp_path)

@@ -76,8 +76,8 @@ def test_a_mission_in_order_is_left_as_it_is(mission):
     report = recover(mission, complete_from_log)
     assert report.sentences == ()
     assert report.next_number == 4
-    assert [e.number for e in report.settled] == [1, 2, 3]
-    assert Ledger.resume(report.settled).sheet().is_balanced
+    assert [e.number for e in report.finalized] == [1, 2, 3]
+    assert Ledger.resume(report.finalized).sheet().is_balanced
     assert_in_order(mission)
 
 
@@ -112,7 +112,7 @@ def test_a_torn_log_seals_with_what_it_still_has(mission):
     os.truncate(log.path, size - 20)
     report = recover(mission, complete_from_log)
     assert report.log_bytes_cut > 0
-    assert any("ends in the middle of a message" in sentence for sentence in report.noticed)
+    assert any("ends in the middle of a message" in sentence for sentence in report.notices)
     assert read_sealed(mission.level0(2)).exposure.mark_gps_ns == mark_of(2).gps_ns
     log.close()
 
@@ -161,7 +161,7 @@ def test_a_folder_without_a_row_gets_one(mission):
     assert_in_order(mission)
 
 
-def test_a_row_without_a_folder_is_told_as_a_problem(mission):
+def test_a_row_without_a_folder_is_reported_as_a_problem(mission):
     fly(mission, [1, 2])
     shutil.rmtree(mission.level0(2))
     report = recover(mission, complete_from_log)
@@ -223,7 +223,7 @@ def test_a_trigger_that_left_nothing_is_recorded_as_lost(mission):
     lost = read_sealed(mission.level0(2)).exposure
     assert lost.state == "lost" and [sensor for sensor, _ in lost.missing] == list(SENSORS)
     assert lost.mark_gps_ns == mark_of(2).gps_ns
-    sheet = Ledger.resume(report.settled).sheet()
+    sheet = Ledger.resume(report.finalized).sheet()
     assert (sheet.triggers, sheet.complete, sheet.lost) == (2, 1, 1)
     assert sheet.is_balanced
     assert_in_order(mission)
@@ -235,11 +235,11 @@ def test_the_last_sheet_of_the_ledger_is_handed_on(mission):
         log.append("ledger", 5, {"heads": [{"name": "SU00", "late": late}]})
     log.close()
     report = recover(mission, complete_from_log)
-    ledger = Ledger.resume(report.settled, sheet=report.ledger_sheet)
+    ledger = Ledger.resume(report.finalized, sheet=report.ledger_sheet)
     assert ledger.sheet().frames.late == 2
 
 
-def test_an_altered_record_and_a_break_in_the_chain_are_told(mission):
+def test_an_altered_record_and_a_break_in_the_chain_are_reported(mission):
     fly(mission, [1, 2, 3])
     path = mission.level0(2) / "exposure.json"
     path.chmod(0o644)
@@ -253,7 +253,7 @@ def test_an_altered_record_and_a_break_in_the_chain_are_told(mission):
     )
 
 
-def test_a_damaged_record_stops_nobody_and_is_told(mission):
+def test_a_damaged_record_is_reported_and_stops_nothing(mission):
     fly(mission, [1, 2])
     path = mission.level0(1) / "exposure.json"
     path.chmod(0o644)
@@ -299,31 +299,31 @@ def test_a_stop_at_every_single_step_of_store_and_seal_is_recovered(tmp_path, mo
         mission = new_mission(folder)
         fly(mission, [1])
         writer = Level0Writer(mission, threads=1)
-        said = []
+        acknowledged = []
         steps = 0
         with monkeypatch.context() as patch:
             for (owner, name), function in real.items():
                 patch.setattr(owner, name, stopping(function))
             try:
                 stored = store_one(writer, 2)
-                said.append("stored")
+                acknowledged.append("stored")
                 writer.seal(final_record(stored))
-                said.append("sealed")
+                acknowledged.append("sealed")
             except PowerCut:
                 pass
         writer.close()
         report = recover(mission, complete_from_log)
         assert report.problems == ()
         present = 2 in mission.numbers()
-        assert present or "stored" not in said
+        assert present or "stored" not in acknowledged
         if present:
             assert read_capture(mission.level0(2)) is not None
-        outcomes.add((tuple(said), present))
+        outcomes.add((tuple(acknowledged), present))
         writer = Level0Writer(mission)
         writer.seal(final_record(store_one(writer, report.next_number)))
         writer.close()
         assert_in_order(mission)
-        if said == ["stored", "sealed"]:
+        if acknowledged == ["stored", "sealed"]:
             break
     assert stop_at > 15
     assert outcomes == {((), False), ((), True), (("stored",), True), (("stored", "sealed"), True)}

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from daemon.mission.canonical_json import RecordError
 from daemon.mission.catalog.catalog import Catalog
 from daemon.mission.exposure import Exposure
-from daemon.mission.records import RecordError
 from daemon.mission.store import durable
 from daemon.mission.store.level0 import read_description
 from daemon.mission.store.store import Level0Writer, StoreError, load_level0, verify
@@ -60,11 +60,11 @@ def test_a_stored_exposure_reads_back_pixel_by_pixel(mission, writer):
 
 def test_the_tags_hold_what_the_head_knew_and_no_gps_time(mission, writer):
     store_one(writer, 5)
-    told = read_description(mission.level0(5) / "SU01.tif")
-    assert told["exposure"] == 5
-    assert told["device_ns"] == "5000000000000000005"
-    assert told["settings"] == {"gain_db": 0.0, "tdi_shifts": 12}
-    assert not any("gps" in key for key in told)
+    description = read_description(mission.level0(5) / "SU01.tif")
+    assert description["exposure"] == 5
+    assert description["device_ns"] == "5000000000000000005"
+    assert description["settings"] == {"gain_db": 0.0, "tdi_shifts": 12}
+    assert not any("gps" in key for key in description)
 
 
 def test_the_record_is_written_once_and_quotes_the_one_before(mission, writer):
@@ -121,7 +121,9 @@ def test_frames_and_pixels_that_do_not_fit_are_refused_before_anything_is_writte
     assert list(mission.level0_root.iterdir()) == []
 
 
-def test_before_stored_is_said_every_byte_and_name_is_synced_in_order(mission, writer, monkeypatch):
+def test_every_byte_and_name_is_synced_in_order_before_stored_is_reported(
+    mission, writer, monkeypatch
+):
     """The order is: files, folder, rename, parent, commit (docs/durability.md)."""
     trace = []
     real = {"fsync": os.fsync, "rename": Path.rename, "add": Catalog.add_stored}
@@ -213,7 +215,7 @@ def test_a_full_disk_at_any_step_leaves_the_exposure_whole_or_not_at_all(
         assert verify(mission).problems == ()
 
 
-def test_the_kernel_refusing_in_the_middle_of_a_frame_is_told_and_cleared(tmp_path):
+def test_a_kernel_refusal_within_a_frame_is_reported_and_cleared(tmp_path):
     """A real limit of the kernel (RLIMIT_FSIZE), so that a write ends short."""
     mission = new_mission(tmp_path)
     program = f"""
@@ -273,14 +275,17 @@ def test_verification_finds_an_altered_bit_a_missing_frame_and_an_extra_file(mis
 
 def test_verification_finds_an_altered_record_even_when_it_is_the_last(mission):
     fly(mission, [1, 2, 3])
-    for number, says in ((2, "chain is broken before exposure 3"), (3, "exposure 3: its record")):
+    for number, expected in (
+        (2, "chain is broken before exposure 3"),
+        (3, "exposure 3: its record"),
+    ):
         path = mission.level0(number) / "exposure.json"
-        whole = path.read_bytes()
+        intact = path.read_bytes()
         path.chmod(0o644)
-        path.write_bytes(whole.replace(b'"flags":0', b'"flags":1'))
+        path.write_bytes(intact.replace(b'"flags":0', b'"flags":1'))
         problems = verify(mission).problems
-        assert any(says in problem for problem in problems)
-        path.write_bytes(whole)
+        assert any(expected in problem for problem in problems)
+        path.write_bytes(intact)
     assert verify(mission).problems == ()
 
 
@@ -296,9 +301,9 @@ def test_verification_finds_a_removed_exposure(mission):
 
 def test_progress_ends_at_its_total(mission):
     fly(mission, [1, 2])
-    told = []
-    report = verify(mission, lambda done, total: told.append((done, total)))
-    assert told[-1] == (report.nbytes, report.nbytes)
+    description = []
+    report = verify(mission, lambda done, total: description.append((done, total)))
+    assert description[-1] == (report.nbytes, report.nbytes)
     assert report.nbytes == 6 * (4096 + WIDTH_PX * HEIGHT_PX * 2)
 
 

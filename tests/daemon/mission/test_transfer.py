@@ -13,7 +13,7 @@ from daemon.mission.layout import Mission, MissionError
 from daemon.mission.log.flight_log import FlightLog
 from daemon.mission.log.log_seals import seal_logs
 from daemon.mission.store import durable
-from daemon.mission.store.tree import FileTree, TreeError
+from daemon.mission.store.file_tree import FileTree, TreeError
 from daemon.mission.transfer import transfer
 from daemon.mission.verification.verification import verify
 from tests.daemon.small_camera import fly, new_mission
@@ -34,19 +34,19 @@ def files_below(folder: Path) -> dict[str, bytes]:
     return {
         str(path.relative_to(folder)): path.read_bytes()
         for path in sorted(folder.rglob("*"))
-        if path.is_file() and path.name not in transfer.LEFT_OUT
+        if path.is_file() and path.name not in transfer.EXCLUDED_FILES
     }
 
 
 def test_every_byte_arrives_and_the_copy_verifies(mission: Mission, tmp_path: Path) -> None:
-    told: list[tuple[int, int]] = []
-    report = transfer.transfer(mission, tmp_path / "disk", progress=lambda *at: told.append(at))
+    reported: list[tuple[int, int]] = []
+    report = transfer.transfer(mission, tmp_path / "disk", progress=lambda *at: reported.append(at))
     assert report.target == tmp_path / "disk" / mission.id
     assert files_below(report.target) == files_below(mission.path)
-    assert report.kept == 0
+    assert report.already_present == 0
     assert (report.verified.exposures, report.verified.frames) == (3, 9)
-    assert told[0] == (0, 2 * report.nbytes)
-    assert told[-1] == (2 * report.nbytes, 2 * report.nbytes)
+    assert reported[0] == (0, 2 * report.nbytes)
+    assert reported[-1] == (2 * report.nbytes, 2 * report.nbytes)
     frame = report.target / "L0/000001/SU00.tif"
     assert frame.stat().st_mode & 0o777 == 0o444
     assert mission.path.exists()
@@ -76,7 +76,7 @@ def test_interrupted_at_any_file_it_goes_on_where_it_stopped(
             assert attempts < 20
     assert attempts > 3
     assert report.copied <= 3
-    assert report.kept >= 9
+    assert report.already_present >= 9
     assert files_below(report.target) == files_below(mission.path)
 
 
@@ -100,7 +100,7 @@ def test_the_source_goes_only_after_all_of_it_is_verified(
         patch.setattr(FileTree, "sha256", lambda *a, **k: "0" * 64)
         with pytest.raises(TreeError, match="do not use this disk"):
             transfer.transfer(mission, tmp_path / "disk", remove_source=True)
-    assert verify(mission).is_well
+    assert verify(mission).is_intact
     assert not list((tmp_path / "disk").rglob("*.part"))
     frame = mission.level0(2) / "SU00.tif"
     frame.chmod(0o644)
@@ -115,7 +115,7 @@ def test_the_source_goes_only_after_all_of_it_is_verified(
     report = transfer.transfer(mission, tmp_path / "disk", remove_source=True)
     assert report.source_removed
     assert not mission.path.exists()
-    assert verify(Mission.open(report.target)).is_well
+    assert verify(Mission.open(report.target)).is_intact
 
 
 def test_a_mission_that_is_being_flown_is_not_copied(mission: Mission, tmp_path: Path) -> None:
@@ -123,7 +123,7 @@ def test_a_mission_that_is_being_flown_is_not_copied(mission: Mission, tmp_path:
         transfer.transfer(mission, tmp_path / "disk")
 
 
-def test_links_and_strangers_are_refused(mission: Mission, tmp_path: Path) -> None:
+def test_links_and_unknown_files_are_refused(mission: Mission, tmp_path: Path) -> None:
     (mission.export_dir / "link").symlink_to("/etc/passwd")
     with pytest.raises(TreeError, match="not a plain file"):
         transfer.transfer(mission, tmp_path / "disk")
@@ -148,12 +148,12 @@ def test_a_disk_without_room_is_refused_before_anything_is_copied(
 
 
 def test_a_truncated_or_altered_log_is_found(mission: Mission) -> None:
-    assert verify(mission).is_well
+    assert verify(mission).is_intact
     log = next(mission.log_dir.glob("*.mcap"))
-    whole = log.read_bytes()
-    os.truncate(log, len(whole) - 10)
+    intact = log.read_bytes()
+    os.truncate(log, len(intact) - 10)
     assert verify(mission).problems == (f"log {log.name}: was truncated; 10 bytes are missing",)
-    log.write_bytes(whole[:-20] + bytes(20))
+    log.write_bytes(intact[:-20] + bytes(20))
     assert verify(mission).problems == (f"log {log.name}: was altered after it was sealed",)
     log.unlink()
     assert verify(mission).problems == (f"log {log.name}: is missing",)
@@ -161,10 +161,10 @@ def test_a_truncated_or_altered_log_is_found(mission: Mission) -> None:
 
 def test_swapped_frames_are_found(mission: Mission) -> None:
     a, b = mission.level0(1) / "SU00.tif", mission.level0(2) / "SU00.tif"
-    keep = a.with_name("keep")
-    a.rename(keep)
+    parked = a.with_name("keep")
+    a.rename(parked)
     b.rename(a)
-    keep.rename(b)
+    parked.rename(b)
     assert [p.split(":")[0] for p in verify(mission).problems] == [
         "exposure 000001, SU00.tif",
         "exposure 000002, SU00.tif",
@@ -177,11 +177,11 @@ def test_the_index_is_built_again_by_repair(mission: Mission) -> None:
     from daemon.cli import app
 
     mission.catalog_path.unlink()
-    assert not verify(mission).is_well
-    said = CliRunner().invoke(app, ["repair", str(mission.path), "--json"])
-    assert said.exit_code == 0, said.output
-    assert json.loads(said.stdout)["exposures"] == 3
-    assert verify(mission).is_well
-    said = CliRunner().invoke(app, ["repair", str(mission.path), "--rebuild"])
-    assert said.exit_code == 0, said.output
-    assert verify(mission).is_well
+    assert not verify(mission).is_intact
+    result = CliRunner().invoke(app, ["repair", str(mission.path), "--json"])
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["exposures"] == 3
+    assert verify(mission).is_intact
+    result = CliRunner().invoke(app, ["repair", str(mission.path), "--rebuild"])
+    assert result.exit_code == 0, result.output
+    assert verify(mission).is_intact

@@ -13,10 +13,10 @@ from typer.testing import CliRunner
 
 from daemon.cli import app
 from daemon.mission.layout import Mission, MissionError
-from daemon.mission.store import tree as trees
-from daemon.mission.store.tree import FileTree, TreeError
+from daemon.mission.store import file_tree as trees
+from daemon.mission.store.file_tree import FileTree, TreeError
 from daemon.mission.transfer.transfer import TransferError, transfer
-from daemon.mission.transfer.transfer_note import LEFT_OUT, MARK_FILE, NOTE_FILE
+from daemon.mission.transfer.transfer_manifest import EXCLUDED_FILES, MANIFEST_FILE, MOVED_FILE
 from daemon.mission.transfer.transfer_removal import removing_path
 from daemon.mission.verification.verification import verify
 from tests.crash.kill_at_call import run_to_call
@@ -59,7 +59,7 @@ def flip(path: Path, offset: int = -2) -> None:
     os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
 
 
-def everything(folder: Path) -> dict[str, bytes]:
+def contents_of(folder: Path) -> dict[str, bytes]:
     return {str(p): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
@@ -69,12 +69,12 @@ def removal_killed_at(mission: Mission, disk: Path, files_removed: int) -> None:
     def action() -> None:
         run(mission.path, disk, "--remove-source")
 
-    kept = mission.path.with_name("kept")
-    shutil.copytree(mission.path, kept)
+    parked = mission.path.with_name("kept")
+    shutil.copytree(mission.path, parked)
     calls = run_to_call(action, None)
     last = len(calls) - calls[::-1].index("rename")
     shutil.rmtree(disk)
-    kept.rename(mission.path)
+    parked.rename(mission.path)
     unlinks = [n for n, call in enumerate(calls, 1) if call == "unlink" and n > last]
     assert run_to_call(action, unlinks[files_removed]) == []
 
@@ -88,15 +88,15 @@ def test_a_second_run_after_a_killed_removal_keeps_the_whole_copy(
     assert not mission.path.exists()
     left = content_of(removing_path(mission.path))
     assert 0 < len(left) < len(original)
-    sealed = everything(disk)
+    sealed = contents_of(disk)
     answer = run(mission.path, disk, "--remove-source")
     assert answer["source_removed"] is True and answer["copied"] == 0
     assert content_of(disk / mission.id) == original
-    assert {n: b for n, b in everything(disk).items() if Path(n).name not in LEFT_OUT} == {
-        n: b for n, b in sealed.items() if Path(n).name not in LEFT_OUT
+    assert {n: b for n, b in contents_of(disk).items() if Path(n).name not in EXCLUDED_FILES} == {
+        n: b for n, b in sealed.items() if Path(n).name not in EXCLUDED_FILES
     }
     assert not removing_path(mission.path).exists()
-    assert verify(Mission.open(disk / mission.id)).is_well
+    assert verify(Mission.open(disk / mission.id)).is_intact
     # Once more, as after a kill in the very last call: still a success.
     assert run(mission.path, disk)["source_removed"] is True
 
@@ -105,7 +105,7 @@ def test_the_removal_is_not_resumed_with_a_damaged_or_another_copy(
     mission: Mission, disk: Path, tmp_path: Path
 ) -> None:
     removal_killed_at(mission, disk, 3)
-    left = everything(mission.root)
+    left = contents_of(mission.root)
     copy = disk / mission.id
     flip(copy / "L0/000002/SU00.tif")
     with pytest.raises(TransferError, match=r"L0/000002/SU00\.tif was changed since"):
@@ -121,13 +121,13 @@ def test_the_removal_is_not_resumed_with_a_damaged_or_another_copy(
             run(mission.path, elsewhere)
     other = tmp_path / "other"
     shutil.copytree(disk, other)
-    note = other / mission.id / NOTE_FILE
+    note = other / mission.id / MANIFEST_FILE
     note.write_text(note.read_text().replace('"sealed_utc": "2', '"sealed_utc": "1'))
     with pytest.raises(TransferError, match="does not name this copy"):
         run(mission.path, other)
     with pytest.raises((TransferError, MissionError)):
         run(removing_path(mission.path), tmp_path / "third")
-    assert {n: b for n, b in everything(mission.root).items() if not n.endswith(".held")} == {
+    assert {n: b for n, b in contents_of(mission.root).items() if not n.endswith(".held")} == {
         n: b for n, b in left.items() if not n.endswith(".held")
     }
     assert run(mission.path, disk)["source_removed"] is True
@@ -152,14 +152,14 @@ def test_a_sealed_copy_is_never_changed_by_a_later_run(mission: Mission, disk: P
     saved = mission.root.parent / "saved"
     shutil.copytree(mission.path, saved)
     run(mission.path, disk, "--remove-source")
-    sealed = everything(disk)
+    sealed = contents_of(disk)
     shutil.copytree(saved, mission.path)
     (mission.export_dir / "report.html").write_text("later")
     shutil.rmtree(mission.level0(2))
     for arguments in ([], ["--remove-source"]):
         with pytest.raises(TransferError, match="differs from the copy that was sealed"):
             run(mission.path, disk, *arguments)
-        assert everything(disk) == sealed
+        assert contents_of(disk) == sealed
     shutil.rmtree(mission.path)
     shutil.copytree(saved, mission.path)
     flip(mission.level0(1) / "SU00.tif")
@@ -173,7 +173,7 @@ def test_a_sealed_copy_is_never_changed_by_a_later_run(mission: Mission, disk: P
     assert mission.path.exists()
     assert run(mission.path, disk, "--remove-source")["source_removed"] is True
     assert not mission.path.exists()
-    assert everything(disk) == sealed
+    assert contents_of(disk) == sealed
 
 
 @pytest.mark.parametrize(
@@ -218,11 +218,11 @@ def test_a_folder_that_is_not_ours_is_refused_and_left_alone(
     target.mkdir(parents=True)
     (target / "thesis.doc").write_text("mine")
     if content is not None:
-        (target / NOTE_FILE).write_text(content)
-    before = everything(disk)
+        (target / MANIFEST_FILE).write_text(content)
+    before = contents_of(disk)
     with pytest.raises(TransferError, match=r"not made by a transfer|is damaged"):
         run(mission.path, disk, "--remove-source")
-    assert everything(disk).items() - {(str(target / ".held"), b"")} == before.items()
+    assert contents_of(disk).items() - {(str(target / ".held"), b"")} == before.items()
 
 
 def test_an_unrelated_file_in_a_copy_is_not_deleted(mission: Mission, disk: Path) -> None:
@@ -271,7 +271,9 @@ def test_a_folder_that_becomes_a_link_while_it_is_copied_is_not_followed(
     real = FileTree.copy_from
     exchanged = mission.path
 
-    def exchange(tree: FileTree, source: FileTree, entry: trees.FileEntry, step: trees.Step) -> str:
+    def exchange(
+        tree: FileTree, source: FileTree, entry: trees.FileEntry, step: trees.ByteProgress
+    ) -> str:
         if entry.name == "L0/000002/SU00.tif":
             place = exchanged / "L0/000002"
             place.rename(tmp_path / "moved")
@@ -289,7 +291,7 @@ def test_a_folder_that_becomes_a_link_while_it_is_copied_is_not_followed(
         transfer(mission, disk, remove_source=True)
     assert [p.name for p in elsewhere.iterdir()] == ["SU00.tif"]
     assert (elsewhere / "SU00.tif").read_bytes() == b"secret"
-    assert verify(mission).is_well
+    assert verify(mission).is_intact
 
 
 def test_the_source_itself_by_another_path_is_not_a_target(
@@ -326,7 +328,7 @@ def test_a_source_changed_during_the_copy_is_kept(
         run(mission.path, disk, "--remove-source")
     monkeypatch.undo()
     assert (mission.export_dir / "late.csv").exists()
-    assert not (mission.path / MARK_FILE).exists()
+    assert not (mission.path / MOVED_FILE).exists()
     run(mission.path, disk, "--remove-source")
     assert (disk / mission.id / "export/late.csv").read_text() == "late"
 

@@ -22,13 +22,13 @@ from tempfile import mkdtemp
 import numpy as np
 import pytest
 
-from daemon.mission.exposure import Capture
+from daemon.mission.exposure import CaptureRecord
 from daemon.mission.store import durable
 from daemon.mission.store.level0_folder import hash_file, read_sealed
 from processing.rig import find_rig
 from tests.daemon.mission.faulty_disk import refusing, stalling
 from tests.daemon.mission.loop_disk import LoopDisk, why_not
-from tests.daemon.mission.test_mirrored import STALL_S, Flown
+from tests.daemon.mission.test_mirrored import STALL_S, MirroredFlight
 from tests.daemon.small_camera import capture_of, final_record, frame_record, pixels_of
 
 pytestmark = pytest.mark.trust
@@ -38,7 +38,7 @@ EXPOSURES = int(os.environ.get("SYNTOPIC_TWO_DISKS_EXPOSURES", "500"))
 BEFORE, WITHOUT = 2, 4
 """Exposures before each fault, and with one disk."""
 DISK_NBYTES = 2_000_000_000
-KEPT = 10
+RETAINED = 10
 
 
 class FolderDisk:
@@ -71,12 +71,15 @@ class Flight:
     """Exposures on two disks, what was called stored, and where it was found afterwards."""
 
     def __init__(
-        self, disks: dict[str, LoopDisk | FolderDisk], camera: Callable[[int], Capture], seed: int
+        self,
+        disks: dict[str, LoopDisk | FolderDisk],
+        camera: Callable[[int], CaptureRecord],
+        seed: int,
     ) -> None:
         self.disks = disks
         self.random = random.Random(seed)
         self._camera = camera
-        self.flown = Flown({label: disk.root for label, disk in disks.items()})
+        self.flown = MirroredFlight({label: disk.root for label, disk in disks.items()})
         self.flown.joined()
         self.number = 0
         self.stored: dict[int, dict[str, str]] = {}
@@ -116,7 +119,7 @@ class Flight:
 
     def forget(self) -> None:
         """Delete what both disks were seen to have; a test's doing, never the product's."""
-        for number in [n for n in self.stored if n <= self.number - KEPT]:
+        for number in [n for n in self.stored if n <= self.number - RETAINED]:
             for label in self.disks:
                 durable.remove_tree(self.flown.copy(label).level0(number))
             del self.stored[number]
@@ -156,18 +159,18 @@ class Flight:
 def fly(flight: Flight, exposures: int) -> dict[str, object]:
     faults: Counter[str] = Counter()
     begun_s = time.monotonic()
-    turns = 0
+    fault_count = 0
     while flight.number < exposures:
         for _ in range(BEFORE):
             flight.expose()
-        kind, label = KINDS[turns // 2 % len(KINDS)], list(flight.disks)[turns % 2]
+        kind, label = KINDS[fault_count // 2 % len(KINDS)], list(flight.disks)[fault_count % 2]
         flight.suffer(kind, label)
         faults[f"{kind} {label}"] += 1
-        turns += 1
+        fault_count += 1
     flight.flown.storage.end_mission()
     flight.flown.storage.close()
     dropped = [event for event in flight.flown.events if event.name == "disk-dropped"]
-    assert len(dropped) == turns, "a disk was dropped without a fault, or not dropped at one"
+    assert len(dropped) == fault_count, "a disk was dropped without a fault, or not dropped at one"
     return {
         "exposures": flight.number,
         "not stored": flight.lost,
@@ -179,17 +182,17 @@ def fly(flight: Flight, exposures: int) -> dict[str, object]:
 
 @pytest.fixture
 def folder() -> Iterator[Path]:
-    made = Path(mkdtemp(prefix="syntopic-"))
-    yield made
-    durable.remove_tree(made)
+    folder_made = Path(mkdtemp(prefix="syntopic-"))
+    yield folder_made
+    durable.remove_tree(folder_made)
 
 
-def small(number: int) -> Capture:
+def small(number: int) -> CaptureRecord:
     assert pixels_of(number)
     return capture_of(number)
 
 
-def mini(number: int) -> Capture:
+def mini(number: int) -> CaptureRecord:
     """Frames of the sizes of `ultracam-x-mini`."""
     frames = tuple(
         replace(frame_record("SU00", number), sensor=s.name, width_px=s.width_px,

@@ -16,15 +16,15 @@ import pytest
 from typer.testing import CliRunner
 
 from daemon.cli import app
+from daemon.mission.canonical_json import canonical_bytes
 from daemon.mission.layout import Mission
 from daemon.mission.log.flight_log import FlightLog
 from daemon.mission.log.log_seals import close_run, seal_logs
-from daemon.mission.records import canonical_bytes
 from daemon.mission.store import durable
+from daemon.mission.store.file_tree import BLOCK_BYTES, _sha256
 from daemon.mission.store.level0_folder import hash_file
 from daemon.mission.store.level2 import write_level2
 from daemon.mission.store.store import Level0Writer
-from daemon.mission.store.tree import BLOCK_BYTES, _sha256
 from daemon.mission.verification.verification import VerifyReport, verify
 from tests.daemon.small_camera import RIG_TOML, SENSORS, final_record, fly, store_one
 
@@ -150,8 +150,8 @@ def test_the_removal_of_the_newest_record_is_noticed(
         repair(mission)
     problems = verify(mission).problems
     if what == "folder":
-        witnesses = "chain.jsonl" if rebuilt else "chain.jsonl and the index"
-        assert f"exposure 3: is in {witnesses} but its folder is gone" in problems
+        evidence = "chain.jsonl" if rebuilt else "chain.jsonl and the index"
+        assert f"exposure 3: is in {evidence} but its folder is gone" in problems
     elif rebuilt:
         assert any("exposure 3: was sealed more than once" in p for p in problems)
     else:
@@ -167,8 +167,8 @@ def test_repair_does_not_record_a_removed_exposure_as_lost(mission: Mission) -> 
 
 @pytest.mark.parametrize("lines", range(1, 11))
 def test_a_chain_file_cut_at_any_line_is_noticed(mission: Mission, lines: int) -> None:
-    whole = mission.chain_path.read_bytes().splitlines(keepends=True)
-    mission.chain_path.write_bytes(b"".join(whole[: len(whole) - lines]))
+    intact = mission.chain_path.read_bytes().splitlines(keepends=True)
+    mission.chain_path.write_bytes(b"".join(intact[: len(intact) - lines]))
     report = verify(mission)
     if lines <= 2:  # the same as after a kill: what these lines cover is listed as not covered
         assert any("chain.jsonl is open" in remark for remark in report.remarks)
@@ -177,7 +177,7 @@ def test_a_chain_file_cut_at_any_line_is_noticed(mission: Mission, lines: int) -
         assert any("chain.jsonl" in problem for problem in report.problems)
 
 
-def test_a_chain_file_that_repair_wrote_again_says_so_for_ever(mission: Mission) -> None:
+def test_a_chain_file_rewritten_by_repair_states_so_permanently(mission: Mission) -> None:
     mission.chain_path.unlink()
     repair(mission)
     repair(mission)
@@ -186,9 +186,9 @@ def test_a_chain_file_that_repair_wrote_again_says_so_for_ever(mission: Mission)
 
 
 def test_a_removed_line_of_the_chain_file_is_noticed(mission: Mission) -> None:
-    whole = mission.chain_path.read_bytes().splitlines(keepends=True)
-    for line in range(len(whole)):
-        mission.chain_path.write_bytes(b"".join(whole[:line] + whole[line + 1 :]))
+    intact = mission.chain_path.read_bytes().splitlines(keepends=True)
+    for line in range(len(intact)):
+        mission.chain_path.write_bytes(b"".join(intact[:line] + intact[line + 1 :]))
         report = verify(mission)
         assert report.problems or any("is open" in remark for remark in report.remarks), line
 
@@ -218,8 +218,8 @@ def test_odd_names_in_level0_are_named_and_stop_nothing(
         f"{name}: is no exposure; recovery on start sees to what is unfinished" in report.problems
     )
     assert names_it(report, "L0/000002/SU01.tif")
-    said = CliRunner().invoke(app, ["verify", str(mission.path)])
-    assert said.exit_code == 1 and "2 problems" in said.output, said.output
+    result = CliRunner().invoke(app, ["verify", str(mission.path)])
+    assert result.exit_code == 1 and "2 problems" in result.output, result.output
 
 
 @pytest.mark.parametrize("name", ["log/x.mcap", "L0/000002/SU99.tif", "L0/000002/sub"])
@@ -302,14 +302,14 @@ def test_a_damaged_log_of_format_1_is_not_sealed_again_as_it_is(mission: Mission
 
 
 def test_the_command_lists_what_is_covered_and_what_is_not(mission: Mission) -> None:
-    said = CliRunner().invoke(app, ["verify", str(mission.path)], env={"COLUMNS": "160"})
-    assert said.exit_code == 0, said.output
-    assert "exposure records" in said.output and "Not covered" in said.output
-    assert "3 exposures, 9 frames: nothing is wrong" in said.output
-    said = CliRunner().invoke(app, ["verify", str(mission.path), "--json"])
-    told = json.loads(said.stdout)
-    assert {"problems", "covered", "not_covered", "remarks", "state"} < told.keys()
-    assert {"reason", "files"} == told["not_covered"][0].keys()
+    result = CliRunner().invoke(app, ["verify", str(mission.path)], env={"COLUMNS": "160"})
+    assert result.exit_code == 0, result.output
+    assert "exposure records" in result.output and "Not covered" in result.output
+    assert "3 exposures, 9 frames: nothing is wrong" in result.output
+    result = CliRunner().invoke(app, ["verify", str(mission.path), "--json"])
+    output = json.loads(result.stdout)
+    assert {"problems", "covered", "not_covered", "remarks", "state"} < output.keys()
+    assert {"reason", "files"} == output["not_covered"][0].keys()
     assert CliRunner().invoke(app, ["verify"]).exit_code == 2
 
 
@@ -338,10 +338,10 @@ def test_what_is_unfinished_is_wrong_only_after_the_flight(mission: Mission) -> 
 
 
 def exchange(a: Path, b: Path) -> None:
-    keep = a.with_name("keep")
-    a.rename(keep)
+    parked = a.with_name("keep")
+    a.rename(parked)
     b.rename(a)
-    keep.rename(b)
+    parked.rename(b)
 
 
 def make_old(mission: Mission) -> None:

@@ -27,12 +27,12 @@ UNIT = str(TARGETS["syntopic.service"])
 EXPOSURE_MAX = 1.5
 
 
-def quiet(_line: str) -> None: ...
+def ignore(_line: str) -> None: ...
 
 
 def lay_out(root: Path, *, replace: bool = False, missions: Path | None = None) -> list[str]:
     texts = contents(COMMAND, CONFIGURATION, missions)
-    return install(texts, steps(COMMAND, None), root=root, tell=quiet, replace=replace).files
+    return install(texts, steps(COMMAND, None), root=root, log=ignore, replace=replace).files
 
 
 def systemd_analyze() -> str:
@@ -69,8 +69,8 @@ def test_a_mirror_is_let_through_the_hardening_and_may_be_missing_at_the_start()
     assert texts[str(DROP_IN)] == (
         "[Service]\nReadWritePaths=-/a/flights\nReadWritePaths=-/b/flights\n"
     )
-    at_home = contents(COMMAND, CONFIGURATION, Path("/var/lib/syntopic/flights"), Path("/b"))
-    assert at_home[str(DROP_IN)] == "[Service]\nReadWritePaths=-/b\n"
+    with_home = contents(COMMAND, CONFIGURATION, Path("/var/lib/syntopic/flights"), Path("/b"))
+    assert with_home[str(DROP_IN)] == "[Service]\nReadWritePaths=-/b\n"
 
 
 def test_the_helper_that_asks_the_disks_is_valid_and_closed_to_all_else(tmp_path: Path) -> None:
@@ -80,15 +80,15 @@ def test_the_helper_that_asks_the_disks_is_valid_and_closed_to_all_else(tmp_path
     text = contents(COMMAND, CONFIGURATION, None)[str(TARGETS[name])]
     assert f"ExecStart={COMMAND} disk-health" in text
     unit.write_text(text)
-    judged = subprocess.run(
+    completed = subprocess.run(
         [program, "security", "--offline=true", str(unit)],
         capture_output=True,
         text=True,
         timeout=60,
         check=False,
     )
-    found = re.search(rf"Overall exposure level for {re.escape(name)}: ([0-9.]+)", judged.stdout)
-    assert found, judged.stdout + judged.stderr
+    found = re.search(rf"Overall exposure level for {re.escape(name)}: ([0-9.]+)", completed.stdout)
+    assert found, completed.stdout + completed.stderr
     assert float(found.group(1)) <= EXPOSURE_MAX
 
 
@@ -119,12 +119,12 @@ def test_uninstalling_removes_what_was_brought_and_nothing_else(tmp_path: Path) 
     for path in (mission, kernel):
         path.parent.mkdir(parents=True)
         path.write_text("x")
-    done = uninstall(root=tmp_path, tell=quiet)
-    assert done.kept == [str(TARGETS["udev.rules"])]
+    done = uninstall(root=tmp_path, log=ignore)
+    assert done.retained == [str(TARGETS["udev.rules"])]
     left = sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file())
     assert left == [str(rules.relative_to(tmp_path)), str(mission.relative_to(tmp_path))]
     with pytest.raises(InstallationError, match="nothing was installed"):
-        uninstall(root=tmp_path, tell=quiet)
+        uninstall(root=tmp_path, log=ignore)
 
 
 def test_a_forged_note_does_not_make_uninstall_remove_other_files(tmp_path: Path) -> None:
@@ -132,7 +132,7 @@ def test_a_forged_note_does_not_make_uninstall_remove_other_files(tmp_path: Path
     noted = tmp_path / str(MANIFEST).lstrip("/")
     noted.write_text(json.dumps({"/etc/passwd": "0" * 64}))
     with pytest.raises(InstallationError, match="not ours"):
-        uninstall(root=tmp_path, tell=quiet)
+        uninstall(root=tmp_path, log=ignore)
 
 
 def test_the_unit_and_its_companions_are_valid(tmp_path: Path) -> None:
@@ -174,13 +174,13 @@ def test_the_unit_is_hardened(tmp_path: Path) -> None:
     program = systemd_analyze()
     unit = tmp_path / "syntopic.service"
     unit.write_text(contents(COMMAND, CONFIGURATION, None)[UNIT])
-    judged = subprocess.run(
+    completed = subprocess.run(
         [program, "security", "--offline=true", str(unit)],
         capture_output=True,
         text=True,
         timeout=60,
         check=False,
     )
-    found = re.search(r"Overall exposure level for syntopic\.service: ([0-9.]+)", judged.stdout)
-    assert found, judged.stdout + judged.stderr
+    found = re.search(r"Overall exposure level for syntopic\.service: ([0-9.]+)", completed.stdout)
+    assert found, completed.stdout + completed.stderr
     assert float(found.group(1)) <= EXPOSURE_MAX

@@ -19,7 +19,7 @@ rasterio = pytest.importorskip("rasterio", reason="needs the extra geotiff")
 from daemon.mission.foreign_files import is_on_local_disk  # noqa: E402
 from daemon.mission.layout import Mission  # noqa: E402
 from daemon.orientation.elevation import ElevationError, read_elevation  # noqa: E402
-from daemon.orientation.exterior import mount_of  # noqa: E402
+from daemon.orientation.exterior_orientation import mount_of  # noqa: E402
 from daemon.orientation.georeference import Georeference, GeoreferenceError  # noqa: E402
 
 CRS = "EPSG:32633"
@@ -60,10 +60,10 @@ HEADER = "ncols 2\nnrows 2\nxllcorner 500000\nyllcorner 5200000\ncellsize 10\n"
 class Contacts(http.server.BaseHTTPRequestHandler):
     """Notes every request."""
 
-    made: list[str] = []  # noqa: RUF012 - one list for all requests
+    requests: list[str] = []  # noqa: RUF012 - one list for all requests
 
     def do_GET(self) -> None:
-        Contacts.made.append(self.path)
+        Contacts.requests.append(self.path)
         self.send_error(404)
 
     do_HEAD = do_GET  # noqa: N815 - the name that http.server calls
@@ -74,7 +74,7 @@ class Contacts(http.server.BaseHTTPRequestHandler):
 
 @pytest.fixture
 def server() -> Iterator[str]:
-    Contacts.made.clear()
+    Contacts.requests.clear()
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Contacts) as serving:
         thread = threading.Thread(target=serving.serve_forever, daemon=True)
         thread.start()
@@ -102,23 +102,23 @@ def test_a_height_model_that_names_a_network_file_opens_no_connection(
     planted.write_text(vrt(f"/vsicurl/{server}/dem.tif"))
     with rasterio.Env(), pytest.raises(rasterio.errors.RasterioError):
         rasterio.open(planted).read(1)
-    assert Contacts.made, "without a bound on drivers GDAL does connect"
-    Contacts.made.clear()
+    assert Contacts.requests, "without a bound on drivers GDAL does connect"
+    Contacts.requests.clear()
     with pytest.raises(ElevationError, match="no GeoTIFF that can be read"):
         read_elevation(planted, system)
-    assert Contacts.made == []
+    assert Contacts.requests == []
 
 
 def test_what_lies_next_to_a_height_model_is_not_read(
     tmp_path: Path, server: str, system: Georeference
 ) -> None:
     good = geotiff(tmp_path / "dem.tif")
-    for ending in (".ovr", ".msk", ".aux.xml"):
-        Path(f"{good}{ending}").write_text(vrt(f"/vsicurl/{server}/dem.tif"))
+    for suffix in (".ovr", ".msk", ".aux.xml"):
+        Path(f"{good}{suffix}").write_text(vrt(f"/vsicurl/{server}/dem.tif"))
     (tmp_path / "dem.tfw").write_text("1\n0\n0\n-1\n0\n0\n")
     model = read_elevation(good, system)
     assert model.step_x_m == 10.0 and model.height_m[0, 0] == 300.0
-    assert Contacts.made == []
+    assert Contacts.requests == []
 
 
 NAMES = [

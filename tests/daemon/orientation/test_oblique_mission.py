@@ -22,27 +22,31 @@ from daemon.mission.exposure import NavigationRecord, exposure_bytes
 from daemon.mission.layout import Mission
 from daemon.mission.store import store
 from daemon.mission.store.level0 import read_description
-from daemon.onboard.capture.memory import FrameRing
+from daemon.onboard.capture.frame_ring import FrameRing
 from daemon.onboard.pipeline import worker
 from daemon.onboard.service.messages import (
-    Begin,
+    BeginProcessing,
     FramesRead,
-    Judged,
     Process,
     Processed,
     Stop,
+    VerdictReady,
     WorkerBuilt,
     WorkerReady,
     WorkerSettings,
 )
 from daemon.orientation.local_frame import LocalFrame
-from daemon.postflight.export.certificate import CertificateError, certificate_of
-from daemon.postflight.replay.flight import Replayed
-from daemon.postflight.triangulation.triangulation import TriangulationError, block_of, matched
-from processing.matching.blocks import BlockMatching
+from daemon.postflight.export.camera_certificate import CameraCertificateError, certificate_of
+from daemon.postflight.replay.flight_replay import ReplayResult
+from daemon.postflight.triangulation.triangulation import (
+    TriangulationError,
+    block_of,
+    match_mission_block,
+)
+from processing.matching.block_matching import BlockMatching
 from processing.rig import load_rig, shipped_rigs
 from sim_hw.processes.exposures import EPOCH_GPS_NS, FIRST_AFTER_S, write_exposures
-from sim_hw.world import camera
+from sim_hw.world import true_camera
 from sim_hw.world.world import World, WorldSettings
 
 pyproj = pytest.importorskip("pyproj", reason="pip install 'syntopic[geodesy]'")
@@ -73,10 +77,10 @@ def flown(tmp_path_factory) -> tuple[World, Path]:
     write_exposures(world, folder, count=EXPOSURES, scenes=folder / "scenes", lines=LINES)
     done = RUN.invoke(app, ["process", str(folder / "mission"), "--json"])
     assert done.exit_code == 0, done.output
-    told = json.loads(done.stdout)["exposures"]
-    assert [e["heads"] for e in told] == [["nadir", "5", "7", "8", "19"]] * 4
+    output = json.loads(done.stdout)["exposures"]
+    assert [e["heads"] for e in output] == [["nadir", "5", "7", "8", "19"]] * 4
     # The calibration of the paper is of 2008; the emulated rig's is not.
-    assert not any("CALIBRATION_EXPIRED" in e["flags"] for e in told)
+    assert not any("CALIBRATION_EXPIRED" in e["flags"] for e in output)
     return world, folder
 
 
@@ -95,13 +99,13 @@ class _Link:
     """The worker's end of a link: one exposure from memory, then the end."""
 
     def __init__(self, *orders: object) -> None:
-        self.orders, self.said = [*orders, Stop()], []
+        self.orders, self.received = [*orders, Stop()], []
 
     def receive(self, *, timeout_s: float) -> object:
         return self.orders.pop(0)
 
     def send(self, message: object) -> None:
-        self.said.append(message)
+        self.received.append(message)
 
 
 def test_the_onboard_worker_makes_every_head_and_its_orientation_as_exposures_come(
@@ -130,10 +134,10 @@ def test_the_onboard_worker_makes_every_head_and_its_orientation_as_exposures_co
     settings = WorkerSettings(
         str(mission.rig_path), as_flown(mission, None)[1], None, plan, ProcessingSection()
     )
-    link = _Link(Begin(mission.path), Process(exposure, dict.fromkeys(frames, 1)))
+    link = _Link(BeginProcessing(mission.path), Process(exposure, dict.fromkeys(frames, 1)))
     worker.main(link, settings, rings)
-    said = [type(message) for message in link.said]
-    assert said == [WorkerBuilt, WorkerReady, FramesRead, Judged, Processed]
+    received = [type(message) for message in link.received]
+    assert received == [WorkerBuilt, WorkerReady, FramesRead, VerdictReady, Processed]
     flown_folder, again = mission.level2(2), folder / "mission/L2/000002"
     for name in ("nadir.tif", "5.tif", "7.tif", "8.tif", "19.tif", "quicklook.jpg"):
         assert (flown_folder / name).read_bytes() == (again / name).read_bytes()
@@ -142,17 +146,19 @@ def test_the_onboard_worker_makes_every_head_and_its_orientation_as_exposures_co
     assert report["verdict"] in ("good", "usable") and report["figures"]["tilt_deg"] < 3.0
     # An exposure time of the plan leaves a third of a pixel or so under the nadir head.
     assert 0.05 < report["figures"]["smear_along_px"] < 1.0
-    told = json.loads((flown_folder / "orientation.json").read_text())
-    assert [head["cone"] for head in told["heads"]] == report["heads"]
-    for head in told["heads"]:
+    output = json.loads((flown_folder / "orientation.json").read_text())
+    assert [head["cone"] for head in output["heads"]] == report["heads"]
+    for head in output["heads"]:
         cone = rig.cone(head["cone"])
-        there = flight.geodetic(camera.projection_centre_m(cone, pose))
+        there = flight.geodetic(true_camera.projection_centre_m(cone, pose))
         place = (head["latitude_deg"], head["longitude_deg"], head["height_m"])
         assert np.abs(np.subtract(there, place) * [111_000, 111_000, 1]).max() < 0.002
-        truth = pose.enu_from_body @ camera.BODY_FROM_CAMERA @ world.camera.master_from_cone(cone)
-        turn = camera.rotation_opk(np.radians(head["omega_phi_kappa_deg"])).T @ truth
+        truth = (
+            pose.enu_from_body @ true_camera.BODY_FROM_CAMERA @ world.camera.master_from_cone(cone)
+        )
+        rotation = true_camera.rotation_opk(np.radians(head["omega_phi_kappa_deg"])).T @ truth
         # The emulated mounting is off by 20 urad about each axis.
-        assert np.abs(turn - np.eye(3)).max() < 2e-4, cone.name
+        assert np.abs(rotation - np.eye(3)).max() < 2e-4, cone.name
         ground = np.array(head["footprint"]) - [longitude, latitude]
         assert (ground[:, 1].min() > 0.02) == (cone.name == "5"), "the head that looks ahead"
 
@@ -179,19 +185,22 @@ def test_a_flight_over_a_height_model_is_replayed_with_the_model_from_elsewhere(
     (mission.path / "log").mkdir()
     (mission.path / "log" / "1.mcap").touch()
     again = {"records": [exposure], "is_complete": True}
-    monkeypatch.setattr("daemon.postflight.replay.flight.replay_log", lambda *_: Replayed(**again))
+    monkeypatch.setattr(
+        "daemon.postflight.replay.flight_replay.replay_log", lambda *_: ReplayResult(**again)
+    )
     models = [hill(tmp_path / f"{top}.asc", here, top) for top in (150.0, 300.0)]
     shutil.rmtree(mission.level2_root)
     flown_with = ["process", str(mission.path), "--only", "2", "--elevation", str(models[0])]
     assert RUN.invoke(app, flown_with).exit_code == 0
-    asked = ["replay", str(mission.path), "--lanes", "1", "--json"]
-    without = RUN.invoke(app, asked)
+    arguments = ["replay", str(mission.path), "--parallel", "1", "--json"]
+    without = RUN.invoke(app, arguments)
     assert without.exit_code != 0 and "give --elevation FILE" in str(without.exception)
-    told = [
-        json.loads(RUN.invoke(app, [*asked, "--elevation", str(model)]).stdout) for model in models
+    output = [
+        json.loads(RUN.invoke(app, [*arguments, "--elevation", str(model)]).stdout)
+        for model in models
     ]
-    assert told[0]["agrees"], told[0]["sentences"]
-    assert told[1]["sentences"] == ["L2/000002/quality.json: differs with 1 in work"]
+    assert output[0]["agrees"], output[0]["sentences"]
+    assert output[1]["sentences"] == ["L2/000002/quality.json: differs with 1 in work"]
 
 
 def test_like_looking_obliques_are_tied_where_both_see_the_same_ground(flown) -> None:
@@ -199,26 +208,26 @@ def test_like_looking_obliques_are_tied_where_both_see_the_same_ground(flown) ->
     mission = Mission.open(folder / "mission")
     trajectory = folder / "trajectory.csv"
     block = block_of(mission, crs=CRS, trajectory_file=trajectory, heads=("5", "8"))
-    tied = matched(block, BlockMatching(cells=(14, 10)), lambda _done: None)
+    tied = match_mission_block(block, BlockMatching(cells=(14, 10)), lambda _done: None)
     assert len(block.names) == EXPOSURES * LINES * 2 and tied.points > 100
     first = EPOCH_GPS_NS + FIRST_AFTER_S * 1_000_000_000
     flight = world.flight.beginning_first_line_at(world.flight.distance_flown_m(first))
-    places, turns = [], []
+    places, rotations = [], []
     for eo in block.oriented:
         pose, cone = flight.pose(eo.gps_ns), world.rig.cone(eo.cone)
-        places.append(camera.projection_centre_m(cone, pose))
+        places.append(true_camera.projection_centre_m(cone, pose))
         own = world.camera.master_from_cone(cone)
-        turns.append(pose.enu_from_body @ camera.BODY_FROM_CAMERA @ own)
+        rotations.append(pose.enu_from_body @ true_camera.BODY_FROM_CAMERA @ own)
     ground: dict[int, np.ndarray] = {}
     errors = []
     middle = np.array([block.image.width_px - 1, block.image.height_px - 1]) / 2
     for k, point, px in zip(tied.image, tied.point, tied.px, strict=True):
         if point not in ground:
             x, y = (px - middle) * block.image.pitch_mm
-            ray = turns[k] @ np.array([x, -y, -block.image.f_mm])
+            ray = rotations[k] @ np.array([x, -y, -block.image.f_mm])
             ground[point] = world.terrain.intersect(places[k], ray[None])[0]
             continue
-        seen = turns[k].T @ (ground[point] - places[k])
+        seen = rotations[k].T @ (ground[point] - places[k])
         at = -block.image.f_mm / seen[2] / block.image.pitch_mm * seen[:2]
         errors.append(px - middle - at * [1, -1])
     size = np.array(errors)
@@ -241,38 +250,40 @@ def hill(path: Path, here: tuple[float, float, float], top_m: float) -> Path:
 
 
 def _oriented(folder: Path) -> dict[str, dict]:
-    asked = ["orient", str(folder / "mission"), "--trajectory", str(folder / "trajectory.csv")]
-    done = RUN.invoke(app, [*asked, "--crs", CRS, "--json"])
+    arguments = ["orient", str(folder / "mission"), "--trajectory", str(folder / "trajectory.csv")]
+    done = RUN.invoke(app, [*arguments, "--crs", CRS, "--json"])
     assert done.exit_code == 0, done.output
     return {eo["image"]: eo for eo in json.loads(done.stdout)["oriented"]}
 
 
 def test_every_head_is_oriented_where_it_truly_looked(flown) -> None:
     world, folder = flown
-    told = _oriented(folder)
-    assert len(told) == EXPOSURES * LINES * 5
+    output = _oriented(folder)
+    assert len(output) == EXPOSURES * LINES * 5
     rig = load_rig(Mission.open(folder / "mission").rig_path)
     first = EPOCH_GPS_NS + FIRST_AFTER_S * 1_000_000_000
     flight = world.flight.beginning_first_line_at(world.flight.distance_flown_m(first))
     to_grid = pyproj.Transformer.from_crs("EPSG:4979", CRS, always_xy=True)
-    for name, eo in told.items():
+    for name, eo in output.items():
         cone = rig.cone(name.split("_")[1])
         pose = flight.pose(int(eo["gps_ns"]))
-        latitude, longitude, height = flight.geodetic(camera.projection_centre_m(cone, pose))
+        latitude, longitude, height = flight.geodetic(true_camera.projection_centre_m(cone, pose))
         east, north, up = to_grid.transform(longitude, latitude, height)
         off = np.array([east - eo["east_m"], north - eo["north_m"], up - eo["height_m"]])
         assert np.abs(off).max() < 0.3, "five standard deviations of the trajectory"
         # Where the middle of the head's image meets the ground.
-        truth = pose.enu_from_body @ camera.BODY_FROM_CAMERA @ world.camera.master_from_cone(cone)
+        truth = (
+            pose.enu_from_body @ true_camera.BODY_FROM_CAMERA @ world.camera.master_from_cone(cone)
+        )
         omega, phi, kappa = np.radians(eo["omega_phi_kappa_deg"])
-        found = camera.rotation_opk((omega, phi, kappa))
+        found = true_camera.rotation_opk((omega, phi, kappa))
         axis = found[:, 2] @ truth[:, 2]
         # The grid turns by its convergence; the angle off the vertical stays but for the curvature.
         assert np.degrees(np.arccos(min(1.0, axis))) < 1.0
         assert abs(np.degrees(np.arccos(found[2, 2]) - np.arccos(truth[2, 2]))) < 0.05
 
 
-def test_the_second_line_is_flown_back_beside_the_first(flown) -> None:
+def test_the_second_line_is_flown_back_next_to_the_first(flown) -> None:
     world, folder = flown
     records = [
         json.loads((folder / f"mission/L0/{k:06d}/exposure.json").read_text()) for k in (1, 2, 3, 4)
@@ -281,21 +292,21 @@ def test_the_second_line_is_flown_back_beside_the_first(flown) -> None:
     first = EPOCH_GPS_NS + FIRST_AFTER_S * 1_000_000_000
     flight = world.flight.beginning_first_line_at(world.flight.distance_flown_m(first))
     places = [flight.pose(int(r["mark_gps_ns"])).position_enu_m for r in records]
-    apart = np.linalg.norm((places[3] - places[0])[:2])
-    assert apart == pytest.approx(world.flight.plan.line_spacing_m, rel=0.1)
+    distance_m = np.linalg.norm((places[3] - places[0])[:2])
+    assert distance_m == pytest.approx(world.flight.plan.line_spacing_m, rel=0.1)
     headings = [flight.pose(int(r["mark_gps_ns"])).heading_rad for r in records]
     assert abs(abs(headings[2] - headings[0]) - np.pi) < 0.1
 
 
 def _exported(folder: Path, kind: str) -> Path:
-    asked = ["export", "pictures", str(folder / "mission"), "--as", kind, "--only", "2"]
+    arguments = ["export", "pictures", str(folder / "mission"), "--as", kind, "--only", "2"]
     done = RUN.invoke(
-        app, [*asked, "--trajectory", str(folder / "trajectory.csv"), "--crs", CRS, "--json"]
+        app, [*arguments, "--trajectory", str(folder / "trajectory.csv"), "--crs", CRS, "--json"]
     )
     assert done.exit_code == 0, done.output + str(done.exception)
-    told = json.loads(done.stdout)
-    assert len(told["files"]) == 5
-    return Path(told["folder"])
+    output = json.loads(done.stdout)
+    assert len(output["files"]) == 5
+    return Path(output["folder"])
 
 
 def test_exiftool_reads_time_place_and_attitude_of_a_picture(flown) -> None:
@@ -303,32 +314,32 @@ def test_exiftool_reads_time_place_and_attitude_of_a_picture(flown) -> None:
     pictures = _exported(folder, "jpeg")
     if shutil.which("exiftool") is None:
         pytest.skip("exiftool is not here; apt-get install libimage-exiftool-perl")
-    told = json.loads(
+    output = json.loads(
         subprocess.run(
             ["exiftool", "-json", "-n", str(pictures / "000002_7.jpg")],
             capture_output=True, check=True, timeout=60,
         ).stdout
     )[0]  # fmt: skip
     eo = _oriented(folder)["000002_7"]
-    assert "Warning" not in told
+    assert "Warning" not in output
     to_wgs = pyproj.Transformer.from_crs(CRS, "EPSG:4979", always_xy=True)
     longitude, latitude, height = to_wgs.transform(eo["east_m"], eo["north_m"], eo["height_m"])
-    assert told["GPSLatitude"] == pytest.approx(latitude, abs=1e-8)
-    assert told["GPSLongitude"] == pytest.approx(longitude, abs=1e-8)
-    assert told["GPSAltitude"] == pytest.approx(height, abs=1e-3)
-    assert told["FocalLength"] == 51.0
-    assert 10.0 / told["FocalPlaneXResolution"] == pytest.approx(7.2e-3)
-    assert [told["Omega"], told["Phi"], told["Kappa"]] == pytest.approx(
+    assert output["GPSLatitude"] == pytest.approx(latitude, abs=1e-8)
+    assert output["GPSLongitude"] == pytest.approx(longitude, abs=1e-8)
+    assert output["GPSAltitude"] == pytest.approx(height, abs=1e-3)
+    assert output["FocalLength"] == 51.0
+    assert 10.0 / output["FocalPlaneXResolution"] == pytest.approx(7.2e-3)
+    assert [output["Omega"], output["Phi"], output["Kappa"]] == pytest.approx(
         eo["omega_phi_kappa_deg"], abs=1e-6
     )
     # The head looks right, 44.2 deg off the vertical: that is roll, seen from its own camera.
-    assert abs(abs(told["Roll"]) - 44.2) < 3.0 or abs(abs(told["Pitch"]) - 44.2) < 3.0
+    assert abs(abs(output["Roll"]) - 44.2) < 3.0 or abs(abs(output["Pitch"]) - 44.2) < 3.0
     instant = datetime(1980, 1, 6, tzinfo=UTC) + timedelta(
         microseconds=int(eo["gps_ns"]) // 1000, seconds=-18
     )
-    assert told["DateTimeOriginal"] == instant.strftime("%Y:%m:%d %H:%M:%S")
-    assert told["Model"].startswith("Track'Air MIDAS") and told["ImageUniqueID"] == "000002_7"
-    assert "SIMULATED" in told["ImageDescription"]
+    assert output["DateTimeOriginal"] == instant.strftime("%Y:%m:%d %H:%M:%S")
+    assert output["Model"].startswith("Track'Air MIDAS") and output["ImageUniqueID"] == "000002_7"
+    assert "SIMULATED" in output["ImageDescription"]
 
 
 def test_a_cog_has_tiles_overviews_tags_and_lies_where_the_head_looked(flown) -> None:
@@ -357,22 +368,22 @@ def test_every_head_is_certified_with_axes_and_signs(flown) -> None:
     _, folder = flown
     done = RUN.invoke(app, ["export", "certificate", str(folder / "mission"), "--json"])
     assert done.exit_code == 0, done.output
-    told = json.loads(done.stdout)
-    assert [c["name"] for c in told["cameras"]] == ["nadir", "5", "7", "8", "19"]
-    assert told["cameras"][1]["principal_distance_mm"] == 51.0
-    assert told["cameras"][1]["pixel_size_um"] == 7.2
-    assert told["simulated"] and "the camera looks along -z" in told["axes"]
+    output = json.loads(done.stdout)
+    assert [c["name"] for c in output["cameras"]] == ["nadir", "5", "7", "8", "19"]
+    assert output["cameras"][1]["principal_distance_mm"] == 51.0
+    assert output["cameras"][1]["pixel_size_um"] == 7.2
+    assert output["simulated"] and "the camera looks along -z" in output["axes"]
     page = (folder / "mission/export/certificate.html").read_text()
     assert "SIMULATED" in page and "Axes and signs" in page
 
 
 def test_the_certificate_of_a_stitched_rig_is_that_of_its_virtual_camera() -> None:
-    told = certificate_of(load_rig(shipped_rigs()["ultracam-x"]))
-    pan, colour = told["cameras"]
+    output = certificate_of(load_rig(shipped_rigs()["ultracam-x"]))
+    pan, colour = output["cameras"]
     assert (pan["width_px"], pan["height_px"], pan["pixel_size_um"]) == (14430, 9420, 7.2)
     assert pan["principal_distance_mm"] == 100.5
     assert colour["pixel_size_um"] == pytest.approx(21.6) and colour["width_px"] == 4810
-    with pytest.raises(CertificateError, match="no camera to certify"):
+    with pytest.raises(CameraCertificateError, match="no camera to certify"):
         certificate_of(load_rig(shipped_rigs()["rededge"]))
 
 
@@ -387,8 +398,8 @@ def test_footprints_follow_a_height_model(flown, tmp_path: Path) -> None:
     dem = tmp_path / "slope.asc"
     head = f"ncols {rows}\nnrows {rows}\nxllcorner {x0}\nyllcorner {y0}\ncellsize {cell}\n"
     dem.write_text(head + "\n".join(" ".join(f"{v:.3f}" for v in row) for row in heights))
-    asked = ["orient", str(folder / "mission"), "--trajectory", str(folder / "trajectory.csv")]
-    done = RUN.invoke(app, [*asked, "--crs", CRS, "--dem", str(dem), "--json"])
+    arguments = ["orient", str(folder / "mission"), "--trajectory", str(folder / "trajectory.csv")]
+    done = RUN.invoke(app, [*arguments, "--crs", CRS, "--dem", str(dem), "--json"])
     assert done.exit_code == 0, done.output + str(done.exception)
     written = Path(json.loads(done.stdout)["folder"]) / "footprints.geojson"
     features = {f["properties"]["image"]: f for f in json.loads(written.read_text())["features"]}
@@ -399,11 +410,11 @@ def test_footprints_follow_a_height_model(flown, tmp_path: Path) -> None:
     _, n = to_grid.transform(ring[:, 0], ring[:, 1])
     # The upper middle of the forward head's image, 46 deg off the vertical, meets the slope.
     omega, phi, kappa = np.radians(eo["omega_phi_kappa_deg"])
-    ray = camera.rotation_opk((omega, phi, kappa)) @ np.array([0.0, 278 * 7.2e-3 / 2, -51.0])
+    ray = true_camera.rotation_opk((omega, phi, kappa)) @ np.array([0.0, 278 * 7.2e-3 / 2, -51.0])
     fall = eo["height_m"] - 395.0
     reach = fall / (-ray[2] + 0.1 * ray[1])
     assert n.max() == pytest.approx(eo["north_m"] + reach * ray[1], abs=8.0)
-    wrong = RUN.invoke(app, [*asked, "--crs", CRS, "--dem", str(folder / "trajectory.csv")])
+    wrong = RUN.invoke(app, [*arguments, "--crs", CRS, "--dem", str(folder / "trajectory.csv")])
     assert wrong.exit_code != 0
 
 
@@ -422,11 +433,13 @@ def test_intersected_points_err_as_their_sigmas_say(flown, tmp_path: Path) -> No
         cone = rig.cone(name.split("_")[1])
         for k in range(6):
             xy = random.uniform(-0.4, 0.4, 2) * [416 * 7.2e-3, 278 * 7.2e-3]
-            turn = (
-                pose.enu_from_body @ camera.BODY_FROM_CAMERA @ world.camera.master_from_cone(cone)
+            rotation = (
+                pose.enu_from_body
+                @ true_camera.BODY_FROM_CAMERA
+                @ world.camera.master_from_cone(cone)
             )
-            ray = turn @ np.array([*xy, -cone.lens.f_mm])
-            ground = world.terrain.intersect(camera.projection_centre_m(cone, pose), ray)
+            ray = rotation @ np.array([*xy, -cone.lens.f_mm])
+            ground = world.terrain.intersect(true_camera.projection_centre_m(cone, pose), ray)
             seen = [
                 row for row in (_seen(world, rig, n, p, ground) for n, p in poses.items()) if row
             ]
@@ -439,15 +452,15 @@ def test_intersected_points_err_as_their_sigmas_say(flown, tmp_path: Path) -> No
                 lines.append(f"{image},{point},{column + noise[0]:.4f},{row + noise[1]:.4f},0.3")
     lines.append("000001_5,alone,100,100,0.3")
     (tmp_path / "measured.csv").write_text("\n".join(lines) + "\n")
-    asked = ["intersect", str(folder / "mission"), str(tmp_path / "measured.csv"), "--json"]
+    arguments = ["intersect", str(folder / "mission"), str(tmp_path / "measured.csv"), "--json"]
     sigmas = ["--attitude-sigma", "5", "5", "5", "--position-sigma", "0.05", "0.05", "0.05"]
-    done = RUN.invoke(app, [*asked, *sigmas, "--trajectory", str(folder / "trajectory.csv")])
+    done = RUN.invoke(app, [*arguments, *sigmas, "--trajectory", str(folder / "trajectory.csv")])
     assert done.exit_code == 0, done.output + str(done.exception)
-    told = json.loads(done.stdout)
-    assert told["left_out"] == ["alone"] and len(told["points"]) == len(truth) >= 8
+    output = json.loads(done.stdout)
+    assert output["left_out"] == ["alone"] and len(output["points"]) == len(truth) >= 8
     frame = LocalFrame(flight.plan.latitude_deg, flight.plan.longitude_deg)
     ratios = []
-    for p in told["points"]:
+    for p in output["points"]:
         place = [np.array(p[k]) for k in ("latitude_deg", "longitude_deg", "height_m")]
         latitude, longitude, height = flight.geodetic(truth[p["name"]])
         expected = frame.from_geodetic(np.array(latitude), np.array(longitude), np.array(height))
@@ -460,8 +473,10 @@ def test_intersected_points_err_as_their_sigmas_say(flown, tmp_path: Path) -> No
 def _seen(world, rig, name, pose, ground):
     """Image, column and row in strict perspective where the true head sees a ground point."""
     cone = rig.cone(name.split("_")[1])
-    turn = pose.enu_from_body @ camera.BODY_FROM_CAMERA @ world.camera.master_from_cone(cone)
-    seen = (ground - camera.projection_centre_m(cone, pose)) @ turn
+    rotation = (
+        pose.enu_from_body @ true_camera.BODY_FROM_CAMERA @ world.camera.master_from_cone(cone)
+    )
+    seen = (ground - true_camera.projection_centre_m(cone, pose)) @ rotation
     x, y = -cone.lens.f_mm * seen[:2] / seen[2] / 7.2e-3
     column, row = x + (416 - 1) / 2, (278 - 1) / 2 - y
     inside = seen[2] < 0 and 3 < column < 412 and 3 < row < 274

@@ -19,16 +19,21 @@ from daemon.configuration.model import MountSection
 from daemon.mission.layout import Mission
 from daemon.mission.log.flight_log import FlightLog
 from daemon.mission.log.log_records import message_of
-from daemon.orientation.exterior import ExteriorOrientation, exposures_of, mount_of, orient
+from daemon.orientation.exterior_orientation import (
+    ExteriorOrientation,
+    mount_of,
+    orient,
+    sealed_exposures,
+)
 from daemon.orientation.georeference import Georeference, GeoreferenceError, utm_of
-from daemon.orientation.inputs import OrientationError
-from daemon.orientation.trajectory import TrajectoryError, flown, read_trajectory
-from daemon.postflight.export.orientation import export_orientation
+from daemon.orientation.orientation_inputs import OrientationError
+from daemon.orientation.trajectory import TrajectoryError, flown_trajectory, read_trajectory
+from daemon.postflight.export.orientation_set import export_orientation
 from drivers.contract import NavSample
 from processing.geometry.rotation import rotation_matrix as r
 from processing.rig import load_rig, shipped_rigs
-from sim_hw.world.camera import BODY_FROM_CAMERA, projection_centre_m
-from sim_hw.world.flight import Flight, FlightPlan, enu_from_body
+from sim_hw.world.flight import FlightPlan, SimulatedFlight, enu_from_body
+from sim_hw.world.true_camera import BODY_FROM_CAMERA, projection_centre_m
 
 pyproj = pytest.importorskip("pyproj", reason="pip install 'syntopic[geodesy]'")
 
@@ -45,7 +50,7 @@ PLAN = FlightPlan(
     longitude_deg=17.37,
     attitude_rms_deg=2.0,
 )
-FLIGHT = Flight(PLAN, seed=3, epoch_gps_ns=EPOCH_NS)
+FLIGHT = SimulatedFlight(PLAN, seed=3, epoch_gps_ns=EPOCH_NS)
 MID_NS = EPOCH_NS + 5_034_567_890
 ANTENNA_M = (0.4, -0.2, -1.3)
 BORESIGHT_DEG = (0.21, -0.13, 0.35)
@@ -102,10 +107,10 @@ def mission_at(path: Path, *, mount: str = "", samples: list[NavSample] = SAMPLE
 
 
 def master_of(mission: Mission, mount: MountSection | None = None) -> ExteriorOrientation:
-    exposure = exposures_of(mission).results[1]
+    exposure = sealed_exposures(mission).results[1]
     rig = load_rig(mission.rig_path)
     crs = Georeference(utm_of(PLAN.latitude_deg, PLAN.longitude_deg))
-    found = orient(exposure, rig, mount or mount_of(mission)[0], flown(mission), crs)
+    found = orient(exposure, rig, mount or mount_of(mission)[0], flown_trajectory(mission), crs)
     master = next(found)
     assert isinstance(master, ExteriorOrientation)
     return master
@@ -262,7 +267,7 @@ def sbet(samples: list[NavSample], wander_rad: float = 0.0) -> bytes:
     return rows.astype("<f8").tobytes()
 
 
-def test_a_post_processed_trajectory_stands_beside_the_one_flown(tmp_path: Path) -> None:
+def test_a_post_processed_trajectory_is_stored_next_to_the_one_flown(tmp_path: Path) -> None:
     mission = mission_at(tmp_path / "mission")
     fine = [sample_at(EPOCH_NS + i * 5_000_000) for i in range(2000)]
     (tmp_path / "best.out").write_bytes(sbet(fine, wander_rad=0.7))
@@ -275,7 +280,7 @@ def test_a_post_processed_trajectory_stands_beside_the_one_flown(tmp_path: Path)
     assert again.oriented[0].centre_m == pytest.approx(in_flight.oriented[0].centre_m, abs=2e-3)
 
 
-def test_a_csv_trajectory_says_the_same_as_the_sbet(tmp_path: Path) -> None:
+def test_a_csv_trajectory_equals_the_sbet(tmp_path: Path) -> None:
     fine = [sample_at(EPOCH_NS + i * 5_000_000) for i in range(2000)]
     (tmp_path / "t.out").write_bytes(sbet(fine))
     lines = ["gps_ns,latitude_deg,longitude_deg,height_m,roll_deg,pitch_deg,heading_deg"]

@@ -17,12 +17,12 @@ from daemon.orientation.local_frame import LocalFrame
 from daemon.postflight.adjustment.project import read_project
 from processing.rig import shipped_rigs
 from sim_hw.processes.exposures import EPOCH_GPS_NS, FIRST_AFTER_S
-from sim_hw.world import camera
-from sim_hw.world.flight import Flight
-from sim_hw.world.post_processed import marks_of_lines, write_trajectory
+from sim_hw.world import true_camera
+from sim_hw.world.flight import SimulatedFlight
+from sim_hw.world.post_processed_trajectory import marks_of_lines, write_trajectory
 from sim_hw.world.rendering import render_ideal
 from sim_hw.world.scene import open_scene
-from sim_hw.world.surveyed import write_surveyed
+from sim_hw.world.surveyed_points import write_surveyed
 from sim_hw.world.world import World, WorldSettings
 
 pyproj = pytest.importorskip("pyproj", reason="pip install 'syntopic[geodesy]'")
@@ -31,7 +31,7 @@ EACH, LINES = 4, 2
 
 
 @pytest.fixture(scope="module")
-def flown(tmp_path_factory) -> tuple[Path, World, Flight, list[int]]:
+def flown(tmp_path_factory) -> tuple[Path, World, SimulatedFlight, list[int]]:
     """Eight ideal images with shot noise over true terrain, a trajectory, surveyed points."""
     folder = tmp_path_factory.mktemp("block")
     text = shipped_rigs()["ultracam-l-mini"].read_text()
@@ -53,11 +53,11 @@ def flown(tmp_path_factory) -> tuple[Path, World, Flight, list[int]]:
     mission, noise = folder / "mission", np.random.default_rng(5)
     for number, mark in enumerate(marks, 1):
         light = render_ideal(world, scene, flight, mark)
-        words = np.clip(light / light.mean() * 8000.0, 2, 60000)
-        words = (words + noise.normal(0.0, 40.0, words.shape)).clip(2, 65534).astype(np.uint16)
+        pixels = np.clip(light / light.mean() * 8000.0, 2, 60000)
+        pixels = (pixels + noise.normal(0.0, 40.0, pixels.shape)).clip(2, 65534).astype(np.uint16)
         (mission / f"L2/{number:06d}").mkdir(parents=True)
         (mission / f"L0/{number:06d}").mkdir(parents=True)
-        parts = tiff_parts([np.ascontiguousarray(words & 0xFFFE)], {"bands": ["pan"]})
+        parts = tiff_parts([np.ascontiguousarray(pixels & 0xFFFE)], {"bands": ["pan"]})
         (mission / f"L2/{number:06d}/pan.tif").write_bytes(b"".join(bytes(p) for p in parts))
         record = {
             "number": number,
@@ -78,7 +78,7 @@ def _pan(world: World):
     return [s for cone in world.rig.pan_cones for s in cone.sensors]
 
 
-def _asked(folder: Path, out: str, *more: str) -> list[str]:
+def _settings(folder: Path, out: str, *more: str) -> list[str]:
     return [
         "triangulate", str(folder / "mission"), "--trajectory", str(folder / "trajectory.csv"),
         "--out", str(folder / out), "--json", *more,
@@ -86,24 +86,24 @@ def _asked(folder: Path, out: str, *more: str) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def told(flown) -> dict:
+def report(flown) -> dict:
     folder = flown[0]
     points = ["--points", str(folder / "surveyed/points.csv")]
     measured = ["--measured", str(folder / "surveyed/measured.csv")]
-    done = RUN.invoke(app, _asked(folder, "none", *points, *measured))
+    done = RUN.invoke(app, _settings(folder, "none", *points, *measured))
     assert done.exit_code == 0, done.output
     return json.loads(done.stdout)
 
 
-def test_lines_flown_there_and_back_are_tied_to_each_other(told) -> None:
-    t = told["triangulation"]
+def test_lines_flown_there_and_back_are_tied_to_each_other(report) -> None:
+    t = report["triangulation"]
     assert (t["exposures"], t["lines"]) == (EACH * LINES, LINES)
     assert t["matches_across"] > 100 and t["matches_along"] > 500
     assert t["rays"]["3"] > 50
 
 
-def test_check_points_err_as_predicted_and_matching_by_hundredths_of_a_pixel(told) -> None:
-    t = told["triangulation"]
+def test_check_points_err_as_predicted_and_matching_by_hundredths_of_a_pixel(report) -> None:
+    t = report["triangulation"]
     assert max(t["image_rms_px"]) < 0.05
     assert t["checks"]["count"] == 12 and t["control"]["count"] == 6
     assert max(t["checks"]["rms_px"][:2]) < 0.3
@@ -112,7 +112,7 @@ def test_check_points_err_as_predicted_and_matching_by_hundredths_of_a_pixel(tol
     assert t["systematic_most_um"] < 1.0
 
 
-def test_adjusted_orientations_are_those_of_the_true_camera(flown, told) -> None:
+def test_adjusted_orientations_are_those_of_the_true_camera(flown, report) -> None:
     folder, world, flight, marks = flown
     rows = [
         line.split(",")
@@ -123,26 +123,28 @@ def test_adjusted_orientations_are_those_of_the_true_camera(flown, told) -> None
     frame = LocalFrame(world.flight.plan.latitude_deg, world.flight.plan.longitude_deg)
     for row, mark in zip(rows, marks, strict=True):
         pose = flight.pose(mark)
-        truth = flight.geodetic(camera.image_centre_m(world.rig, pose))
+        truth = flight.geodetic(true_camera.image_centre_m(world.rig, pose))
         found = frame.from_geodetic(float(row[7]), float(row[8]), np.array(float(row[3])))
         expected = frame.from_geodetic(*(np.array(v) for v in truth))
         sigma = np.array([float(v) for v in row[9:12]])
         assert (np.abs(found - expected) < 5.0 * sigma + 0.02).all(), row[0]
 
 
-def test_the_result_is_a_project_that_adjusts_again(flown, told) -> None:
+def test_the_result_is_a_project_that_adjusts_again(flown, report) -> None:
     folder = flown[0]
     again = read_project(folder / "none/project.toml")
     assert len(again.network.images.names) == EACH * LINES
     page = (folder / "none/report.html").read_text()
     assert "RMSE" in page and "Mean image residuals" in page and "checks, RMS" in page
-    twice = RUN.invoke(app, _asked(folder, "none"))
+    twice = RUN.invoke(app, _settings(folder, "none"))
     assert twice.exit_code != 0
 
 
 def test_control_without_its_places_in_the_images_is_refused_with_the_cure(flown) -> None:
     folder = flown[0]
-    done = RUN.invoke(app, _asked(folder, "half", "--points", str(folder / "surveyed/points.csv")))
+    done = RUN.invoke(
+        app, _settings(folder, "half", "--points", str(folder / "surveyed/points.csv"))
+    )
     assert done.exit_code != 0 and "--measured go together" in str(done.exception)
 
 
@@ -156,15 +158,15 @@ def test_a_local_frame_is_true_to_length_and_comes_back() -> None:
     assert length == pytest.approx(np.hypot(3000, 2000) * (1 - 500 / 6.378e6), abs=0.01)
 
 
-def test_a_triangulated_block_tells_the_boresight(flown, told, tmp_path: Path) -> None:
+def test_a_triangulated_block_yields_the_boresight(flown, report, tmp_path: Path) -> None:
     folder = flown[0]
-    asked = [
+    arguments = [
         "calibrate", "boresight", str(folder / "none"), "--mission", str(folder / "mission"),
         "--trajectory", str(folder / "trajectory.csv"), "--out", str(tmp_path / "b"), "--json",
         "--hold", "lever", "--position-sigma", "0.05", "0.05", "0.05",
         "--attitude-sigma", "5", "5", "5",
     ]  # fmt: skip
-    done = RUN.invoke(app, asked)
+    done = RUN.invoke(app, arguments)
     assert done.exit_code == 0, done.output + str(done.exception)
     found = {(q["where"], q["what"]): q for q in json.loads(done.stdout)["quantities"]}
     # The emulated unit is aligned with the camera, its clock is right, both heights agree.

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from daemon.planning.reading import PlanError, read_plan
-from tests.daemon.planning.test_reading import A, B, C, collection, feature, plan_of
+from daemon.planning.plan_readers import PlanError, read_plan
+from tests.daemon.planning.test_plan_readers import A, B, C, collection, feature, plan_of
 
 LINES = 20_000
 
@@ -70,9 +70,9 @@ WRONG_TYPES: dict[str, tuple[str, bytes]] = {
 def test_a_value_of_the_wrong_type_is_refused_in_a_short_sentence(
     tmp_path: Path, kind: str
 ) -> None:
-    ending, data = WRONG_TYPES[kind]
+    suffix, data = WRONG_TYPES[kind]
     with pytest.raises(PlanError) as refused:
-        plan_of(tmp_path, f"p{ending}", data)
+        plan_of(tmp_path, f"p{suffix}", data)
     assert len(str(refused.value)) < 500
 
 
@@ -103,9 +103,9 @@ def test_json_of_millions_of_lists_is_refused_before_it_takes_memory(tmp_path: P
 
 
 @pytest.mark.trust
-@pytest.mark.parametrize("ending", [".geojson", ".kml"])
-def test_a_plan_of_20000_lines_is_read_in_seconds(tmp_path: Path, ending: str) -> None:
-    if ending == ".geojson":
+@pytest.mark.parametrize("suffix", [".geojson", ".kml"])
+def test_a_plan_of_20000_lines_is_read_in_seconds(tmp_path: Path, suffix: str) -> None:
+    if suffix == ".geojson":
         places = [[15 + i % 100 * 1e-2, 47 + i // 100 * 1e-3] for i in range(LINES)]
         data = collection(*(feature([[x, y], [x + 9e-3, y]], id=f"L{x}/{y}") for x, y in places))
     else:
@@ -115,9 +115,9 @@ def test_a_plan_of_20000_lines_is_read_in_seconds(tmp_path: Path, ending: str) -
             for i in range(LINES)
         )
         data = b"<kml>" + data + b"</kml>"
-    (tmp_path / f"p{ending}").write_bytes(data)
+    (tmp_path / f"p{suffix}").write_bytes(data)
     begun_s = time.process_time()
-    assert len(read_plan(tmp_path / f"p{ending}").lines) == LINES
+    assert len(read_plan(tmp_path / f"p{suffix}").lines) == LINES
     assert time.process_time() - begun_s < 6.0
 
 

@@ -8,31 +8,31 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from daemon.planning.advisor import _exposures, _images_at, _runs
 from daemon.planning.image_counts import (
     Array,
-    Seen,
-    Strip,
-    Taken,
+    ExposureFootprint,
+    LineStrip,
+    StripCoverage,
     count_images,
-    flown_over,
     gaps_of,
     image_shares,
     is_inside,
+    project_footprints,
     strip_of,
 )
-from daemon.planning.model import Plane, PlannedLine, Point
+from daemon.planning.model import LocalPlane, PlannedLine, Point
+from daemon.planning.reflight_planning import _exposures, _images_at, _runs
 from processing.quality.valid_area import ValidArea
 
-PLANE = Plane(Point(47.0, 15.0))
+PLANE = LocalPlane(Point(47.0, 15.0))
 LINE = PlannedLine("1", PLANE.place(0.0, 0.0), PLANE.place(0.0, 100.0))
 
 
-def strip(half_width_m: float = 20.0, image_along_m: float = 40.0) -> Strip:
+def strip(half_width_m: float = 20.0, image_along_m: float = 40.0) -> LineStrip:
     """Northwards: `along` is north, left is west."""
-    made = strip_of(LINE, PLANE, half_width_m=half_width_m, image_along_m=image_along_m)
-    assert made is not None
-    return made
+    strip_made = strip_of(LINE, PLANE, half_width_m=half_width_m, image_along_m=image_along_m)
+    assert strip_made is not None
+    return strip_made
 
 
 def box(west: float, south: float, east: float, north: float) -> tuple[Point, ...]:
@@ -41,11 +41,11 @@ def box(west: float, south: float, east: float, north: float) -> tuple[Point, ..
     return tuple(PLANE.place(*corner) for corner in corners)
 
 
-def seen_of(one: Taken, over: Strip) -> list[Seen]:
-    return list(flown_over(PLANE, [one]).seen(over))
+def seen_of(one: ExposureFootprint, over: LineStrip) -> list[StripCoverage]:
+    return list(project_footprints(PLANE, [one]).seen(over))
 
 
-def points_of(one: Taken, over: Strip) -> set[tuple[int, int]]:
+def points_of(one: ExposureFootprint, over: LineStrip) -> set[tuple[int, int]]:
     """North and east of the points seen, whole metres."""
     found = set()
     for seen in seen_of(one, over):
@@ -69,37 +69,45 @@ def points_of(one: Taken, over: Strip) -> set[tuple[int, int]]:
 def test_a_strip_has_points_every_2_m_or_256_to_an_image(
     half_width_m: float, image_along_m: float, step_m: float, rows: int, columns: int
 ) -> None:
-    made = strip(half_width_m, image_along_m)
-    assert (len(made.along), len(made.across)) == (rows, columns)
-    assert (made.along[0], made.along[1], made.along[-1]) == (0.0, step_m, step_m * (rows - 1))
-    assert (made.across[0], made.across[-1]) == (-half_width_m, half_width_m)
-    assert made.cell_m == (step_m, pytest.approx(2 * half_width_m / (columns - 1)))
-    assert made.length_m == pytest.approx(100.0)
+    strip_made = strip(half_width_m, image_along_m)
+    assert (len(strip_made.along), len(strip_made.across)) == (rows, columns)
+    assert (strip_made.along[0], strip_made.along[1], strip_made.along[-1]) == (
+        0.0,
+        step_m,
+        step_m * (rows - 1),
+    )
+    assert (strip_made.across[0], strip_made.across[-1]) == (-half_width_m, half_width_m)
+    assert strip_made.cell_m == (step_m, pytest.approx(2 * half_width_m / (columns - 1)))
+    assert strip_made.length_m == pytest.approx(100.0)
 
 
 def test_the_points_of_a_strip_lie_ahead_and_to_the_left() -> None:
-    made = strip()
-    assert made.points.shape == (51, 21, 2)
-    assert made.points[0, 0] == pytest.approx((20.0, 0.0), abs=1e-6)
-    assert made.points[50, 20] == pytest.approx((-20.0, 100.0), abs=1e-6)
-    assert made.place(30.0, 5.0) == pytest.approx((-5.0, 30.0), abs=1e-6)
-    assert made.left == pytest.approx((-1.0, 0.0), abs=1e-9)
+    strip_made = strip()
+    assert strip_made.points.shape == (51, 21, 2)
+    assert strip_made.points[0, 0] == pytest.approx((20.0, 0.0), abs=1e-6)
+    assert strip_made.points[50, 20] == pytest.approx((-20.0, 100.0), abs=1e-6)
+    assert strip_made.place(30.0, 5.0) == pytest.approx((-5.0, 30.0), abs=1e-6)
+    assert strip_made.left == pytest.approx((-1.0, 0.0), abs=1e-9)
     still = PlannedLine("1", PLANE.place(0.0, 0.0), PLANE.place(0.0, 0.0))
     assert strip_of(still, PLANE, half_width_m=1.0, image_along_m=1.0) is None
 
 
 def test_relief_is_asked_for_at_the_places_of_the_points() -> None:
-    asked: list[Array] = []
+    requested: list[Array] = []
 
     def relief(places: Array) -> Array:
-        asked.append(places)
+        requested.append(places)
         return np.zeros(places.shape[:2])
 
-    made = strip_of(LINE, PLANE, half_width_m=20.0, image_along_m=40.0, relief=relief)
-    assert made is not None and made.relief_m is not None and made.relief_m.shape == (51, 21)
+    strip_made = strip_of(LINE, PLANE, half_width_m=20.0, image_along_m=40.0, relief=relief)
+    assert (
+        strip_made is not None
+        and strip_made.relief_m is not None
+        and strip_made.relief_m.shape == (51, 21)
+    )
     for row, column in ((0, 0), (50, 20), (13, 7)):
-        expected = PLANE.place(*made.points[row, column])
-        assert asked[0][row, column] == pytest.approx(tuple(expected), abs=1e-9)
+        expected = PLANE.place(*strip_made.points[row, column])
+        assert requested[0][row, column] == pytest.approx(tuple(expected), abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -122,7 +130,7 @@ def test_an_image_sees_the_points_within_its_footprint(
         for e in range(-20, 21, 2)
         if south <= n <= north and west <= e <= east
     }
-    assert points_of(Taken(1, box(west, south, east, north)), strip()) == expected
+    assert points_of(ExposureFootprint(1, box(west, south, east, north)), strip()) == expected
 
 
 @pytest.mark.parametrize(
@@ -138,18 +146,20 @@ def test_an_image_sees_the_points_within_its_footprint(
         ((-40, 10, -19.5, 30), True),
     ],
 )
-def test_an_image_beside_a_strip_is_not_looked_at(
+def test_an_image_next_to_a_strip_is_not_evaluated(
     footprint: tuple[float, float, float, float], is_near: bool
 ) -> None:
-    one = Taken(1, box(*footprint))
-    assert (flown_over(PLANE, [Taken(7, ()), one]).near(strip()) == (one,)) is is_near
+    one = ExposureFootprint(1, box(*footprint))
+    assert (
+        project_footprints(PLANE, [ExposureFootprint(7, ()), one]).near(strip()) == (one,)
+    ) is is_near
 
 
 def test_relief_carries_ground_out_of_an_image_and_another_into_it() -> None:
     """Ground 50 m high under a camera at 100 m is seen where level ground twice as far out is."""
     high = replace(strip(), relief_m=np.full((51, 21), 50.0))
-    eye = (PLANE.place(0.0, 50.0), 100.0)
-    one = Taken(1, box(-21, 29, 21, 71), eye=eye)
+    projection_centre = (PLANE.place(0.0, 50.0), 100.0)
+    one = ExposureFootprint(1, box(-21, 29, 21, 71), projection_centre=projection_centre)
     expected = {
         (n, e)
         for n in range(0, 101, 2)
@@ -160,15 +170,15 @@ def test_relief_carries_ground_out_of_an_image_and_another_into_it() -> None:
     deep = replace(strip(), relief_m=np.full((51, 21), -100.0))
     beyond = {(n, e) for n in range(8, 93, 2) for e in range(-20, 21, 2)}
     assert points_of(one, deep) == beyond, "half as far out"
-    assert points_of(replace(one, eye=None), high) == points_of(one, strip())
+    assert points_of(replace(one, projection_centre=None), high) == points_of(one, strip())
 
 
 def test_images_and_their_gaps_are_counted_by_band() -> None:
     over = strip()
     halves = ValidArea(4, 2, {"pan": ((0, 0, 4, 1),), "red": ((0, 0, 1, 2),)})
-    whole = Taken(1, box(-50, -50, 50, 150))
-    part = Taken(2, box(-19, 21, 19, 61), area=halves)
-    seen = list(flown_over(PLANE, [whole, part]).seen(over))
+    full = ExposureFootprint(1, box(-50, -50, 50, 150))
+    part = ExposureFootprint(2, box(-19, 21, 19, 61), area=halves)
+    seen = list(project_footprints(PLANE, [full, part]).seen(over))
     inside, gaps = count_images(over, seen)
     rows, columns = over.along, -over.across
     within = (rows[:, None] > 21) & (rows[:, None] < 61) & (np.abs(columns) < 19)

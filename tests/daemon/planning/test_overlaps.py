@@ -12,8 +12,8 @@ from daemon.configuration.model import MountSection
 from daemon.mission.exposure import Exposure, NavigationRecord
 from daemon.mission.layout import Mission
 from daemon.onboard.pipeline import worker
-from daemon.planning.model import Plane, Point
-from daemon.planning.overlaps import Overlaps, Surroundings, _samples, _sees
+from daemon.planning.model import LocalPlane, Point
+from daemon.planning.overlaps import Overlaps, OverlapShares, _samples, _visible
 from processing.quality.nominal_area import nominal_area
 from processing.rig import find_rig
 
@@ -22,7 +22,7 @@ HEIGHT_M, GROUND_M = 3000.0, 400.0
 assert RIG.virtual_image is not None
 SCALE = HEIGHT_M / RIG.virtual_image.f_mm * RIG.virtual_image.pitch_mm
 ALONG_M, ACROSS_M = RIG.virtual_image.height_px * SCALE, RIG.virtual_image.width_px * SCALE
-PLANE = Plane(Point(47.0, 15.0))
+PLANE = LocalPlane(Point(47.0, 15.0))
 
 
 def exposure(number: int, line: str, east_m: float, north_m: float, heading: float) -> Exposure:
@@ -92,7 +92,7 @@ def test_figures_do_not_depend_on_what_came_later() -> None:
         assert in_order.of(one.number) == at_once.of(one.number)
 
 
-def test_without_a_line_or_an_attitude_nothing_is_said() -> None:
+def test_without_a_line_or_an_attitude_nothing_is_stated() -> None:
     navigation = exposure(1, "a", 0, 0, 0).navigation
     assert navigation is not None
     blind = Exposure(number=1, line_id="a", navigation=replace(navigation, roll_rad=None))
@@ -105,7 +105,7 @@ def test_a_record_that_cannot_be_read_costs_its_own_overlap_only(tmp_path: Path)
         (tmp_path / f"L0/{number:06d}").mkdir(parents=True)
     (tmp_path / "L0/000001/exposure.json").write_bytes(b'{"number": 1, ')
     (tmp_path / "service.toml").write_text("[plan]\nground_height_m = 400.0\n")
-    assert worker.overlaps_of(Mission(tmp_path, tmp_path.name), RIG).of(1) == Surroundings()
+    assert worker.overlaps_of(Mission(tmp_path, tmp_path.name), RIG).of(1) == OverlapShares()
 
 
 def test_an_image_sees_nothing_in_its_gaps_and_nothing_beyond_its_border() -> None:
@@ -115,7 +115,7 @@ def test_an_image_sees_nothing_in_its_gaps_and_nothing_beyond_its_border() -> No
     )
     (band, *_) = image.area.gaps
     there = _samples(image.corners)
-    seen = _sees(image, there, band)
+    seen = _visible(image, there, band)
     assert float(seen.mean()) == pytest.approx(image.area.share(band), abs=0.05)
     assert 0.0 < float(seen.mean()) < 1.0
-    assert not _sees(image, there + 3.0 * ACROSS_M, band).any()
+    assert not _visible(image, there + 3.0 * ACROSS_M, band).any()

@@ -45,6 +45,6 @@ def test_between_nodes_values_are_interpolated_along_one_axis() -> None:
     assert between[:, 0].tolist() == pytest.approx(
         np.array([[0, 1], [3, 2], [6, 3], [9, 4], [7, 2], [5, 0]])
     )
-    turned = _between(values.transpose(1, 0, 2), nodes, 6, 1)
-    assert turned[0] == pytest.approx(between[:, 0])
+    transposed = _between(values.transpose(1, 0, 2), nodes, 6, 1)
+    assert transposed[0] == pytest.approx(between[:, 0])
     assert _between(values[:1], np.array([0]), 1, 0) == pytest.approx(values[:1])

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daemon.planning.model import Plan, Plane, PlannedLine, Point
+from daemon.planning.model import LocalPlane, Plan, PlannedLine, Point
 from daemon.planning.steering import PlanTrigger
 from drivers.contract import NavSample
 from tests.daemon.onboard.flight.test_flight import nav as any_sample
 
 NS = 1_000_000_000
 ORIGIN = Point(48.0, 11.0)
-PLANE = Plane(ORIGIN)
+PLANE = LocalPlane(ORIGIN)
 SPEED_MPS = 60.0
 Leg = tuple[tuple[float, float], tuple[float, float]]
 
@@ -32,7 +32,7 @@ def trigger(*lines: PlannedLine, interval_s: float = 1.0) -> PlanTrigger:
         Plan("test", lines),
         distance_m=100.0,
         corridor_m=80.0,
-        least_interval_ns=round(interval_s * NS),
+        min_interval_ns=round(interval_s * NS),
     )
 
 
@@ -95,7 +95,7 @@ def test_a_distance_of_the_line_goes_before_that_of_the_trigger() -> None:
     assert norths(taken) == [0.0, 250.0, 500.0, 750.0, 1000.0]
 
 
-def test_two_lines_are_told_apart_and_the_turn_is_not_exposed() -> None:
+def test_two_lines_are_distinguished_and_the_turn_is_not_exposed() -> None:
     legs = [
         ((0.0, -300.0), (0.0, 1500.0)),
         ((0.0, 1500.0), (300.0, 1500.0)),
@@ -116,7 +116,7 @@ def test_who_joins_in_the_middle_exposes_the_rest() -> None:
 
 
 @pytest.mark.parametrize("leg", [((90, -300), (90, 1500)), ((-800, 300), (800, 700))])
-def test_beside_or_across_a_line_nothing_is_exposed(leg: Leg) -> None:
+def test_next_to_or_across_a_line_nothing_is_exposed(leg: Leg) -> None:
     assert flown(trigger(line("7", 0.0)), [leg]) == []
 
 
@@ -192,9 +192,11 @@ def test_a_place_is_counted_along_and_across_an_oblique_line() -> None:
     oblique = PlannedLine("8", PLANE.place(300.0, 100.0), PLANE.place(900.0, 900.0))
     steering = trigger(line("7", -2000.0), oblique)
     course_deg = math.degrees(math.atan2(0.6, 0.8))
-    for turn_deg, along_m, across_m in ((0.0, 400.0, 30.0), (180.0, 600.0, -30.0)):
+    for heading_change_deg, along_m, across_m in ((0.0, 400.0, 30.0), (180.0, 600.0, -30.0)):
         # 400 m from the start, and 30 m to the right of it.
-        sample = at(300.0 + 240.0 + 24.0, 100.0 + 320.0 - 18.0, course_deg=course_deg + turn_deg)
+        sample = at(
+            300.0 + 240.0 + 24.0, 100.0 + 320.0 - 18.0, course_deg=course_deg + heading_change_deg
+        )
         here = steering.on_line(sample)
         assert here is not None
         assert (here.along_m, here.across_m) == pytest.approx((along_m, across_m), abs=0.1)

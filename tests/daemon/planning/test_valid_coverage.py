@@ -22,15 +22,15 @@ from typer.testing import CliRunner
 from daemon.cli import app
 from daemon.mission.exposure import Exposure, NavigationRecord, exposure_bytes
 from daemon.onboard.monitoring.coverage import Coverage, advice_json
-from daemon.onboard.monitoring.process import _Ground
-from daemon.onboard.monitoring.state import FlightState
-from daemon.onboard.service.watching import summary
-from daemon.planning.model import Plane, Point
-from daemon.postflight.report import write_report
+from daemon.onboard.monitoring.flight_state import FlightState
+from daemon.onboard.monitoring.monitoring_process import _MissionGeometry
+from daemon.onboard.service.monitoring_link import summary
+from daemon.planning.model import LocalPlane, Point
+from daemon.postflight.mission_report import write_report
 from processing.geometry.placement import nominal_placements
 from processing.geometry.topology import footprint
 from processing.rig import find_rig, shipped_rigs
-from tests.daemon.onboard.monitoring import flown as events
+from tests.daemon.onboard.monitoring import flight_events as events
 
 pytestmark = pytest.mark.trust
 
@@ -48,7 +48,7 @@ ALONG_M, ACROSS_M = (2 * half * HEIGHT_M / F_MM for half in reversed(HALF_MM))
 BASE_M = 0.4 * ALONG_M
 STATIONS = 13
 LINE_M = BASE_M * (STATIONS - 1)
-ORIGIN = PLANE = Plane(Point(47.07, 15.43))
+ORIGIN = PLANE = LocalPlane(Point(47.07, 15.43))
 CELL_M = 4.0
 EDGE_M = 0.5 * 0.004 * ACROSS_M
 """How well the edge of a hole is known: half a cell of an image's valid area, 1.5 m here."""
@@ -204,15 +204,15 @@ def mission_of(folder: Path, shots: list[Shot], *, has_area: bool = True, plan: 
 def advised(mission: Path, *options: str) -> dict[str, Any]:
     """What `syntopic reflights` prints."""
     done = CliRunner().invoke(app, ["reflights", str(mission), "--json", *options])
-    told = json.loads(done.stdout)
-    assert done.exit_code == (1 if told["segments"] else 0), done.output
-    return dict(told)
+    output = json.loads(done.stdout)
+    assert done.exit_code == (1 if output["segments"] else 0), done.output
+    return dict(output)
 
 
-def assert_the_hole(told: dict[str, Any], expected: Short) -> None:
+def assert_the_hole(output: dict[str, Any], expected: Short) -> None:
     """Area, and stations just before and behind the hole."""
-    assert told["hole_m2"] == pytest.approx(expected.area_m2, abs=expected.within_m2)
-    (segment,) = told["segments"]
+    assert output["hole_m2"] == pytest.approx(expected.area_m2, abs=expected.within_m2)
+    (segment,) = output["segments"]
     margin = (expected.from_m - segment["from_m"], segment["to_m"] - expected.to_m)
     assert min(margin) > -2 * CELL_M
     assert max(margin) <= BASE_M + 2 * CELL_M
@@ -226,12 +226,12 @@ def test_a_head_unplugged_over_five_exposures_leaves_its_hole(
     shots = line(dict.fromkeys(range(5, 10), (head,)))
     expected = short_of(shots)
     assert expected.area_m2 > 1e4
-    told = advised(mission_of(tmp_path, shots, has_area=has_area))
-    assert_the_hole(told, expected)
-    (segment,) = told["segments"]
+    output = advised(mission_of(tmp_path, shots, has_area=has_area))
+    assert_the_hole(output, expected)
+    (segment,) = output["segments"]
     assert segment["reasons"] == [f"exposures 5 to 9: no image of {head}"]
     assert {band for hole in segment["holes"] for band in hole["bands"]} == {"pan"}
-    assert len(told["notes"]) == (0 if has_area else 1)
+    assert len(output["notes"]) == (0 if has_area else 1)
 
 
 def test_what_is_advised_closes_the_hole_and_less_does_not(tmp_path: Path) -> None:
@@ -240,8 +240,8 @@ def test_what_is_advised_closes_the_hole_and_less_does_not(tmp_path: Path) -> No
     first, last = round(segment["from_m"] / BASE_M), round(segment["to_m"] / BASE_M)
     again = [Shot(100 + k, "A", 0.0, k * BASE_M) for k in range(first, last + 1)]
     assert short_of(shots + again).area_m2 == 0.0
-    told = advised(mission_of(tmp_path / "b", shots + again))
-    assert (told["segments"], told["hole_m2"]) == ([], 0)
+    output = advised(mission_of(tmp_path / "b", shots + again))
+    assert (output["segments"], output["hole_m2"]) == ([], 0)
     assert short_of(shots + again[2:]).area_m2 > 0.0
     assert short_of(shots + again[:-2]).area_m2 > 0.0
 
@@ -249,9 +249,9 @@ def test_what_is_advised_closes_the_hole_and_less_does_not(tmp_path: Path) -> No
 def test_a_colour_head_unplugged_is_a_hole_of_its_bands_alone(tmp_path: Path) -> None:
     shots = line(dict.fromkeys(range(4, 8), ("R",)))
     assert short_of(shots, "pan").area_m2 == 0.0
-    told = advised(mission_of(tmp_path, shots))
-    assert_the_hole(told, short_of(shots, "red"))
-    (hole,) = told["segments"][0]["holes"]
+    output = advised(mission_of(tmp_path, shots))
+    assert_the_hole(output, short_of(shots, "red"))
+    (hole,) = output["segments"][0]["holes"]
     assert (hole["bands"], hole["images"], hole["needed"]) == (["red"], 0, 2)
 
 
@@ -261,9 +261,9 @@ def test_a_head_missing_once_or_in_two_images_far_apart_is_covered_by_the_others
     """At 60 % every point is seen twice at least, by half of the images three times."""
     shots = line({3: ("SU30",), 9: ("SU30",)})
     expected = short_of(shots)
-    told = advised(mission_of(tmp_path, shots))
-    assert told["hole_m2"] == pytest.approx(expected.area_m2, abs=expected.within_m2)
-    assert bool(told["segments"]) == (expected.area_m2 > 0)
+    output = advised(mission_of(tmp_path, shots))
+    assert output["hole_m2"] == pytest.approx(expected.area_m2, abs=expected.within_m2)
+    assert bool(output["segments"]) == (expected.area_m2 > 0)
 
 
 def test_frames_half_read_leave_half_a_hole(tmp_path: Path) -> None:
@@ -272,9 +272,9 @@ def test_frames_half_read_leave_half_a_hole(tmp_path: Path) -> None:
     ]
     expected = short_of(shots)
     assert expected.area_m2 > 1e4
-    told = advised(mission_of(tmp_path, shots))
-    assert_the_hole(told, expected)
-    (reason,) = told["segments"][0]["reasons"]
+    output = advised(mission_of(tmp_path, shots))
+    assert_the_hole(output, expected)
+    (reason,) = output["segments"][0]["reasons"]
     match = re.fullmatch(r"exposures 5 to 8: no valid pixels in (\d+)% of pan", reason)
     assert match is not None
     # Half of two of the heads that make the image.
@@ -283,10 +283,10 @@ def test_frames_half_read_leave_half_a_hole(tmp_path: Path) -> None:
 
 def test_a_lost_exposure_is_named_and_its_hole_found(tmp_path: Path) -> None:
     shots = [replace(one, is_lost=one.number == 6) for one in line({})]
-    told = advised(mission_of(tmp_path, shots))
-    assert_the_hole(told, short_of(shots))
-    assert told["segments"][0]["reasons"] == ["exposure 6: lost"]
-    assert told["segments"][0]["holes"][0]["bands"] == []
+    output = advised(mission_of(tmp_path, shots))
+    assert_the_hole(output, short_of(shots))
+    assert output["segments"][0]["reasons"] == ["exposure 6: lost"]
+    assert output["segments"][0]["holes"][0]["bands"] == []
 
 
 def test_crab_and_tilt_move_the_hole_as_the_image_does(tmp_path: Path) -> None:
@@ -298,8 +298,8 @@ def test_crab_and_tilt_move_the_hole_as_the_image_does(tmp_path: Path) -> None:
     expected = short_of(shots)
     straight = short_of([replace(one, attitude_deg=(0.0, 0.0, 0.0)) for one in shots])
     assert abs(expected.area_m2 - straight.area_m2) > 2 * straight.within_m2
-    told = advised(mission_of(tmp_path, shots))
-    assert told["hole_m2"] == pytest.approx(expected.area_m2, abs=expected.within_m2)
+    output = advised(mission_of(tmp_path, shots))
+    assert output["hole_m2"] == pytest.approx(expected.area_m2, abs=expected.within_m2)
 
 
 def test_relief_is_followed_where_a_height_model_is_configured(tmp_path: Path) -> None:
@@ -332,19 +332,19 @@ def test_relief_is_followed_where_a_height_model_is_configured(tmp_path: Path) -
     mission = mission_of(tmp_path / "r", shots, plan=relative)
     (note,) = advised(mission)["notes"]  # a mission's name leads out of its folder by no ".."
     assert note.startswith("Level ground is assumed: ")
-    told = advised(mission, "--elevation", str(model))
-    assert told["hole_m2"] == pytest.approx(expected.area_m2, abs=expected.within_m2)
+    output = advised(mission, "--elevation", str(model))
+    assert output["hole_m2"] == pytest.approx(expected.area_m2, abs=expected.within_m2)
     shutil.copy(model, mission)
-    told = advised(mission)
-    assert told["hole_m2"] == pytest.approx(expected.area_m2, abs=expected.within_m2)
+    output = advised(mission)
+    assert output["hole_m2"] == pytest.approx(expected.area_m2, abs=expected.within_m2)
     settings = f'elevation = "{tmp_path}/dem.asc"\nelevation_crs = "{crs}"\n'
-    told = advised(mission_of(tmp_path / "a", shots, plan=settings))
-    assert told["hole_m2"] == pytest.approx(expected.area_m2, abs=expected.within_m2)
-    assert told["notes"] == []
+    output = advised(mission_of(tmp_path / "a", shots, plan=settings))
+    assert output["hole_m2"] == pytest.approx(expected.area_m2, abs=expected.within_m2)
+    assert output["notes"] == []
     gone = settings.replace("dem.asc", "gone.asc")
-    told = advised(mission_of(tmp_path / "b", shots, plan=gone))
-    assert told["hole_m2"] == pytest.approx(level.area_m2, abs=level.within_m2)
-    (note,) = told["notes"]
+    output = advised(mission_of(tmp_path / "b", shots, plan=gone))
+    assert output["hole_m2"] == pytest.approx(level.area_m2, abs=level.within_m2)
+    (note,) = output["notes"]
     assert note.startswith("Level ground is assumed: ") and "gone.asc" in note
 
 
@@ -354,8 +354,8 @@ def test_in_flight_the_hole_is_known_while_it_is_flown_and_only_what_is_behind(
     """Before the exposures are judged their missing heads count, then their valid areas."""
     shots = line(dict.fromkeys(range(4, 9), ("SU00",)))
     mission = mission_of(tmp_path, [])
-    ground = _Ground()
-    state = FlightState("syntopic", ground.seen_from)
+    ground = _MissionGeometry()
+    state = FlightState("syntopic", ground.footprint_corners)
     ground.state = state
     state.apply(events.mission(str(mission)))
     coverage = Coverage(state)
@@ -363,11 +363,11 @@ def test_in_flight_the_hole_is_known_while_it_is_flown_and_only_what_is_behind(
         state.apply({"event": "sealed", **summary(record(shot))})
         if shot.number % 2:
             report = {"verdict": "usable", "valid_area": valid_area_json(shot)}
-            told = {"event": "processed", "number": shot.number, "report": report}
-            state.apply({**told, "duration_s": 0.5})
-        question = coverage.question()
-        assert question is not None
-        advice = advice_json(question(), coverage)
+            output = {"event": "processed", "number": shot.number, "report": report}
+            state.apply({**output, "duration_s": 0.5})
+        advice_task = coverage.advice_task()
+        assert advice_task is not None
+        advice = advice_json(advice_task(), coverage)
         holes = [one for one in advice["segments"] if one["kind"] == "hole"]
         # What the planned images to come will see is no hole yet.
         to_come = [Shot(99, "A", 0.0, k * BASE_M) for k in range(shot.number, STATIONS)]
@@ -383,8 +383,8 @@ def test_in_flight_the_hole_is_known_while_it_is_flown_and_only_what_is_behind(
 def test_the_report_lists_and_draws_the_hole(tmp_path: Path) -> None:
     mission = mission_of(tmp_path, line(dict.fromkeys(range(5, 10), ("SU00",))))
     page = write_report(mission).path.read_text()
-    told = advised(mission)
-    assert f"too few images see {told['hole_m2'] / 1e4:.2f} ha" in page
+    output = advised(mission)
+    assert f"too few images see {output['hole_m2'] / 1e4:.2f} ha" in page
     assert "exposures 5 to 9: no image of SU00" in page
-    drawn = sum(len(hole["rings"]) for hole in told["segments"][0]["holes"])
+    drawn = sum(len(hole["rings"]) for hole in output["segments"][0]["holes"])
     assert page.count('fill="#b3261e"') == drawn > 0

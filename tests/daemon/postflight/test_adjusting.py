@@ -14,22 +14,22 @@ import pytest
 from typer.testing import CliRunner
 
 from daemon.cli import app
-from daemon.postflight.adjustment.project import Checks, read_project
+from daemon.postflight.adjustment.csv_tables import ProjectError
+from daemon.postflight.adjustment.project import CheckPoints, read_project
 from daemon.postflight.adjustment.project_file import (
+    AdjustmentHeadSection,
     AdjustSection,
     CameraSection,
-    HeadSection,
     ProjectFile,
 )
-from daemon.postflight.adjustment.tables import ProjectError
-from daemon.postflight.adjustment.writing import write_project
+from daemon.postflight.adjustment.project_writer import write_project
 from daemon.postflight.importers.dbat import import_dbat
 from processing.bundle.adjust import Adjustment, adjust
-from processing.bundle.bent_rays import Rays
-from processing.bundle.findings import exposures_of, parameters_of
-from processing.bundle.network import Bearings, Distances, Head
-from processing.bundle.start import completed
-from tests.processing.bundle.networks import aerial, turned
+from processing.bundle.adjustment_results import exposures_of, parameters_of
+from processing.bundle.curvature_refraction import RayModel
+from processing.bundle.initial_values import completed
+from processing.bundle.network import Distances, HeadMounting, MeasuredAttitudes
+from tests.processing.bundle.simulated_networks import aerial, rotation_of
 
 HERE = Path(__file__).parents[2] / "processing" / "bundle" / "data" / "dbat-camcal"
 SHARED = Path(__file__).parents[4] / "shared" / "data" / "dbat-camcal"
@@ -85,16 +85,16 @@ def test_the_published_calibration_is_repeated_to_the_printed_digits(calibrated)
     assert calibrated.redundancy == 3725
     assert calibrated.observations == 4148
     assert calibrated.unknowns == 423
-    ours = published_terms(calibrated)
-    assert set(ours) == set(PUBLISHED)
+    adjusted = published_terms(calibrated)
+    assert set(adjusted) == set(PUBLISHED)
     for name, (value, sigma) in PUBLISHED.items():
-        assert float(digits(ours[name][1], sigma)) == float(sigma), name
+        assert float(digits(adjusted[name][1], sigma)) == float(sigma), name
         if name == "p2":
             continue
-        assert float(digits(ours[name][0], value)) == float(value), name
+        assert float(digits(adjusted[name][0], value)) == float(value), name
     # The published run ended at a tolerance of 1e-6: the sixth digit of P2 is one off.
-    assert ours["p2"][0] == pytest.approx(-4.41171e-05, abs=1.01e-10)
-    assert float(digits(ours["p2"][0], "-4.412e-05")) == -4.412e-05
+    assert adjusted["p2"][0] == pytest.approx(-4.41171e-05, abs=1.01e-10)
+    assert float(digits(adjusted["p2"][0], "-4.412e-05")) == -4.412e-05
 
 
 def test_the_published_calibration_is_repeated_far_below_its_standard_deviations(
@@ -121,9 +121,9 @@ def test_the_published_calibration_is_repeated_far_below_its_standard_deviations
 def test_every_station_is_that_of_the_published_result(calibrated, folder) -> None:
     lines = (folder / "result" / "camera_stations.txt").read_text().splitlines()
     rows = [re.split(r",\s*", line) for line in lines if not line.startswith("#")]
-    ours = exposures_of(calibrated)
-    assert len(rows) == len(ours) == 21
-    for row, own in zip(rows, ours, strict=True):
+    adjusted = exposures_of(calibrated)
+    assert len(rows) == len(adjusted) == 21
+    for row, own in zip(rows, adjusted, strict=True):
         numbers = np.array([float(v) for v in row[2:14]])
         assert np.abs(own.position_m - numbers[:3]).max() < 1e-7
         turn = own.angles_rad - numbers[3:6]
@@ -154,9 +154,9 @@ def test_the_command_imports_and_adjusts(tmp_path) -> None:
         app, ["import", "dbat", str(HERE / "camcaldemo.xml"), "--out", str(project)]
     )
     assert imported.exit_code == 0, imported.output
-    said = runner.invoke(app, ["adjust", str(project), "--out", str(out), "--json"])
-    assert said.exit_code == 0, said.output
-    report = json.loads(said.stdout[said.stdout.index("{") :])
+    run_result = runner.invoke(app, ["adjust", str(project), "--out", str(out), "--json"])
+    assert run_result.exit_code == 0, run_result.output
+    report = json.loads(run_result.stdout[run_result.stdout.index("{") :])
     assert report["sigma0"] == pytest.approx(1.614804, abs=1e-6)
     assert report["redundancy"] == 3725
     assert report["cameras"][0]["principal_distance_mm"] == pytest.approx(7.456995, abs=1e-6)
@@ -174,9 +174,12 @@ def test_the_command_imports_and_adjusts(tmp_path) -> None:
 
 
 def test_a_project_survives_writing_and_reading(tmp_path) -> None:
-    heads = (HeadSection(name="n"), HeadSection(name="o", omega_deg=30.0, rotation="free"))
-    made = aerial(
-        heads=(_head(), replace(_head("o", turned(np.pi / 6, 0, 0)), rotation_free=True)),
+    heads = (
+        AdjustmentHeadSection(name="n"),
+        AdjustmentHeadSection(name="o", omega_deg=30.0, rotation="free"),
+    )
+    block = aerial(
+        heads=(_head(), replace(_head("o", rotation_of(np.pi / 6, 0, 0)), rotation_free=True)),
         gnss_sigma_m=0.05,
         sigma_mm=1e-3,
     )
@@ -185,15 +188,15 @@ def test_a_project_survives_writing_and_reading(tmp_path) -> None:
         format=1, name="block", camera=(camera,), head=heads, adjust=AdjustSection(gnss="shift")
     )
     network = replace(
-        made.network,
-        cameras=(replace(made.network.cameras[0], free=frozenset({"k1"}), sigma={"k1": 1e-7}),),
-        gnss=replace(made.network.gnss, drift="shift"),
+        block.network,
+        cameras=(replace(block.network.cameras[0], free=frozenset({"k1"}), sigma={"k1": 1e-7}),),
+        gnss=replace(block.network.gnss, drift="shift"),
     )
-    checks = Checks(("p50",), made.points[50:51], np.full((1, 3), 0.02))
+    checks = CheckPoints(("p50",), block.points[50:51], np.full((1, 3), 0.02))
     write_project(tmp_path / "p", file, network, checks)
     back = read_project(tmp_path / "p" / "project.toml")
     assert back.checks.names == ("p50",)
-    assert np.array_equal(back.checks.xyz_m, made.points[50:51])
+    assert np.array_equal(back.checks.xyz_m, block.points[50:51])
     plain, read = adjust(network), adjust(completed(back.network), back.settings)
     assert read.sigma0 == pytest.approx(plain.sigma0, rel=1e-9)
     assert read.redundancy == plain.redundancy
@@ -201,14 +204,16 @@ def test_a_project_survives_writing_and_reading(tmp_path) -> None:
 
 
 def test_distances_attitudes_and_map_coordinates_survive_too(tmp_path) -> None:
-    made = aerial(sigma_mm=1e-3)
-    n = len(made.network.stations.names)
-    apart = float(np.linalg.norm(made.points[20] - made.points[30]))
+    block = aerial(sigma_mm=1e-3)
+    n = len(block.network.stations.names)
+    distance_m = float(np.linalg.norm(block.points[20] - block.points[30]))
     network = replace(
-        made.network,
-        distances=Distances(np.array([20]), np.array([30]), np.array([apart]), np.array([0.01])),
-        bearings=Bearings(np.arange(n), made.attitude, np.full((n, 3), 2e-4)),
-        rays=Rays(6_371_000.0, refraction=True, ground_m=100.0),
+        block.network,
+        distances=Distances(
+            np.array([20]), np.array([30]), np.array([distance_m]), np.array([0.01])
+        ),
+        measured_attitudes=MeasuredAttitudes(np.arange(n), block.attitude, np.full((n, 3), 2e-4)),
+        rays=RayModel(6_371_000.0, refraction=True, ground_m=100.0),
     )
     file = ProjectFile(
         format=1,
@@ -216,7 +221,9 @@ def test_distances_attitudes_and_map_coordinates_survive_too(tmp_path) -> None:
         camera=(CameraSection(name="c", f_mm=70.0),),
         adjust=AdjustSection(earth_radius_m=6_371_000.0, refraction=True, ground_m=100.0),
     )
-    write_project(tmp_path / "p", file, network, Checks((), np.zeros((0, 3)), np.zeros((0, 3))))
+    write_project(
+        tmp_path / "p", file, network, CheckPoints((), np.zeros((0, 3)), np.zeros((0, 3)))
+    )
     back = read_project(tmp_path / "p" / "project.toml")
     assert back.network.rays == network.rays
     plain, read = adjust(network), adjust(completed(back.network), back.settings)
@@ -226,19 +233,19 @@ def test_distances_attitudes_and_map_coordinates_survive_too(tmp_path) -> None:
 
 
 def test_names_from_files_do_no_harm_in_the_report(tmp_path) -> None:
-    made = aerial(sigma_mm=1e-3, points=120)
+    block = aerial(sigma_mm=1e-3, points=120)
     evil = "<script>alert(1)</script>"
-    network = replace(made.network, cameras=(replace(made.network.cameras[0], name=evil),))
+    network = replace(block.network, cameras=(replace(block.network.cameras[0], name=evil),))
     file = ProjectFile(format=1, name=evil, camera=(CameraSection(name=evil, f_mm=70.0),))
-    checks = Checks(("p50",), made.points[50:51], np.full((1, 3), 0.02))
+    checks = CheckPoints(("p50",), block.points[50:51], np.full((1, 3), 0.02))
     write_project(tmp_path / "p", file, network, checks)
     out = tmp_path / "out"
-    said = CliRunner().invoke(app, ["adjust", str(tmp_path / "p"), "--out", str(out)])
-    assert said.exit_code == 0, said.output
+    run_result = CliRunner().invoke(app, ["adjust", str(tmp_path / "p"), "--out", str(out)])
+    assert run_result.exit_code == 0, run_result.output
     page = (out / "report.html").read_text()
     assert "<script" not in page
     assert "&lt;script&gt;" in page
-    assert "Check points: 1" in said.output
+    assert "Check points: 1" in run_result.output
 
 
 def test_images_with_angles_of_their_own_share_a_projection_centre(tmp_path) -> None:
@@ -257,7 +264,7 @@ def test_images_with_angles_of_their_own_share_a_projection_centre(tmp_path) -> 
     assert list(network.images.attitude) == [0, 1]
 
 
-def test_all_mistakes_are_told_at_once_with_file_and_line(tmp_path) -> None:
+def test_all_mistakes_are_reported_together_with_file_and_line(tmp_path) -> None:
     (tmp_path / "project.toml").write_text(
         'format = 1\nname = "bad"\n[files]\npoints = "points.csv"\n'
         '[[camera]]\nname = "c"\nf_mm = 50.0\n'
@@ -284,17 +291,17 @@ def test_all_mistakes_are_told_at_once_with_file_and_line(tmp_path) -> None:
 
 
 def test_what_cannot_be_determined_ends_the_command_with_its_name(tmp_path) -> None:
-    made = aerial(control=0)
+    block = aerial(control=0)
     camera = CameraSection(name="c", f_mm=70.0)
     file = ProjectFile(format=1, name="free", camera=(camera,))
-    none = Checks((), np.zeros((0, 3)), np.zeros((0, 3)))
-    write_project(tmp_path / "p", file, made.network, none)
-    said = CliRunner().invoke(app, ["adjust", str(tmp_path / "p"), "--json"])
-    assert said.exit_code == 1
-    assert any("scale of the whole block" in p for p in json.loads(said.stdout)["problems"])
+    none = CheckPoints((), np.zeros((0, 3)), np.zeros((0, 3)))
+    write_project(tmp_path / "p", file, block.network, none)
+    run_result = CliRunner().invoke(app, ["adjust", str(tmp_path / "p"), "--json"])
+    assert run_result.exit_code == 1
+    assert any("scale of the whole block" in p for p in json.loads(run_result.stdout)["problems"])
     freed = CliRunner().invoke(app, ["adjust", str(tmp_path / "p"), "--free-network", "--json"])
     assert freed.exit_code == 0, freed.output
 
 
 def _head(name="n", rotation=None):
-    return Head(name, np.eye(3) if rotation is None else rotation, np.zeros(3))
+    return HeadMounting(name, np.eye(3) if rotation is None else rotation, np.zeros(3))

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from daemon.postflight.adjustment.csv_tables import ProjectError, read_table, write_table
 from daemon.postflight.adjustment.project import read_project
-from daemon.postflight.adjustment.tables import ProjectError, read_table, write_table
 from daemon.postflight.importers.dbat import import_dbat
 
 PROJECT = (

@@ -23,8 +23,8 @@ from daemon.postflight.importers.rededge import (
     import_rededge,
     read_image,
 )
-from daemon.products.bands import radiance_of
-from daemon.products.conditions import conditions_of
+from daemon.products.band_images import radiance_of
+from daemon.products.exposure_conditions import conditions_of
 from processing.geometry.placement import vip_mm_from_raw, vip_px_from_mm
 from processing.geometry.projective import apply_projective
 from processing.image.band_registration import band_placements, reference_image
@@ -44,15 +44,15 @@ PUBLISHED = {
 def processed(tmp_path_factory):
     """The recorded camera, imported and processed: mission, rig, reports by exposure."""
     path = tmp_path_factory.mktemp("rededge") / "field"
-    told = _said(["import", "rededge", str(RECORDED), "--out", str(path), "--json"])
-    assert told["exposures"] == 2 and told["frames"] == 10 and told["missing"] == []
-    assert max(told["lens_fit_px"].values()) < 0.03
+    output = _run_json(["import", "rededge", str(RECORDED), "--out", str(path), "--json"])
+    assert output["exposures"] == 2 and output["frames"] == 10 and output["missing"] == []
+    assert max(output["lens_fit_px"].values()) < 0.03
     mission = Mission.open(path)
-    reports = _said(["process", str(path), "--json"])["exposures"]
+    reports = _run_json(["process", str(path), "--json"])["exposures"]
     return mission, load_rig(mission.rig_path), {r["exposure"]: r for r in reports}
 
 
-def _said(arguments):
+def _run_json(arguments):
     """What the command says as JSON."""
     done = CliRunner().invoke(app, arguments)
     assert done.exit_code == 0, done.output
@@ -66,9 +66,9 @@ def test_the_mission_holds_the_camera_s_words_and_its_calibration(processed):
     for number, image in ((1, "IMG_0000"), (2, "IMG_0001")):
         load_level0(mission.level0(number), rig)
         for sensor, head in (("B", 1), ("G", 2), ("R", 3), ("N", 4), ("E", 5)):
-            theirs = tifffile.imread(RECORDED / "0000SET" / "000" / f"{image}_{head}.tif")
-            ours = tifffile.imread(mission.level0(number) / f"{sensor}.tif")
-            assert np.array_equal(ours, theirs)
+            reference = tifffile.imread(RECORDED / "0000SET" / "000" / f"{image}_{head}.tif")
+            undistorted = tifffile.imread(mission.level0(number) / f"{sensor}.tif")
+            assert np.array_equal(undistorted, reference)
     blue = rig.cone("B")
     assert blue.sensors[0].justified == "left" and blue.sensors[0].black_dn == 300.0
     assert blue.lens.f_mm == pytest.approx(1449.3582467 * 0.00375, rel=1e-6)
@@ -79,15 +79,15 @@ def test_the_lens_of_the_rig_undoes_the_distortion_as_opencv_does(processed):
     _, rig, _ = processed
     blue = rig.cone("B")
     matrix = np.array([[1449.3582467, 0, 627.6347], [0, 1449.3582467, 479.8587], [0, 0, 1.0]])
-    told = np.array([-0.0967965553, 0.1404189347, 0.000275838377, 0.000660072954, -0.0229808426])
+    output = np.array([-0.0967965553, 0.1404189347, 0.000275838377, 0.000660072954, -0.0229808426])
     raw = np.stack(np.meshgrid(np.linspace(0, 1279, 17), np.linspace(0, 959, 13)), -1).reshape(
         -1, 2
     )
-    theirs = cv2.undistortPoints(
-        raw[:, None], matrix, told, criteria=(cv2.TERM_CRITERIA_COUNT, 100, 0.0)
+    reference = cv2.undistortPoints(
+        raw[:, None], matrix, output, criteria=(cv2.TERM_CRITERIA_COUNT, 100, 0.0)
     )[:, 0]
-    ours = vip_mm_from_raw(band_placements(rig, {})["B"], raw) / rig.cone("G").lens.f_mm
-    error_px = np.abs(ours * [1, -1] - theirs).max() * 1449.36
+    undistorted = vip_mm_from_raw(band_placements(rig, {})["B"], raw) / rig.cone("G").lens.f_mm
+    error_px = np.abs(undistorted * [1, -1] - reference).max() * 1449.36
     assert error_px < 0.03
     assert blue.lens.serial == "1777777"
 
@@ -151,14 +151,14 @@ def test_the_saturation_flag_is_raised_on_the_flight_frame_and_not_on_the_panel(
 
 
 @needs_recording
-def test_a_missing_reference_band_leaves_the_others_as_calibrated_and_says_so(processed):
+def test_a_missing_reference_band_is_reported_and_leaves_the_others_as_calibrated(processed):
     mission, rig, _ = processed
     radiance = radiance_of(rig, mission.path / "radiometry")
     pipeline = BandPipeline(rig, radiance)
     frames, exposure = load_level0(mission.level0(2), rig)
     del frames["G"]
-    told = conditions_of(exposure, rig, PlanSection.model_validate({}), Flag(0))
-    product = pipeline.process(frames, told)
+    output = conditions_of(exposure, rig, PlanSection.model_validate({}), Flag(0))
+    product = pipeline.process(frames, output)
     assert set(product.bands) == set(PUBLISHED) - {"green"} and radiance
     assert not any(band.registered for band in product.registrations)
     assert Flag.FRAME_MISSING in product.report.flags and Flag.TIE_POINTS in product.report.flags
@@ -181,12 +181,12 @@ def test_images_of_two_cameras_and_doubled_images_are_refused_and_leave_nothing(
 
 
 @needs_recording
-def test_a_damaged_image_is_told_by_name(tmp_path):
+def test_a_damaged_image_is_reported_by_name(tmp_path):
     folder = tmp_path / "set"
     folder.mkdir()
-    whole = (RECORDED / "0000SET" / "000" / "IMG_0000_1.tif").read_bytes()
-    (folder / "short.tif").write_bytes(whole[:300_000])
-    (folder / "torn.tif").write_bytes(whole[: len(whole) - 5000])
+    file_bytes = (RECORDED / "0000SET" / "000" / "IMG_0000_1.tif").read_bytes()
+    (folder / "short.tif").write_bytes(file_bytes[:300_000])
+    (folder / "torn.tif").write_bytes(file_bytes[: len(file_bytes) - 5000])
     with pytest.raises(ImagesError) as refused:
         import_rededge(folder, tmp_path / "out")
     assert len(refused.value.problems) == 2
@@ -196,13 +196,13 @@ def test_a_damaged_image_is_told_by_name(tmp_path):
 @needs_recording
 def test_damaged_tags_end_in_a_sentence_or_in_an_image_and_never_otherwise(tmp_path):
     """Single bytes of header and tags are changed, everything else stays."""
-    whole = (RECORDED / "0000SET" / "000" / "IMG_0000_1.tif").read_bytes()
-    (first,) = struct.unpack_from("<I", whole, 4)
+    file_bytes = (RECORDED / "0000SET" / "000" / "IMG_0000_1.tif").read_bytes()
+    (first,) = struct.unpack_from("<I", file_bytes, 4)
     rng = np.random.default_rng(11)
     refused = 0
     for _ in range(250):
-        damaged = bytearray(whole)
-        for at in rng.integers(first, len(whole), 3):
+        damaged = bytearray(file_bytes)
+        for at in rng.integers(first, len(file_bytes), 3):
             damaged[at] = rng.integers(0, 256)
         damaged[rng.integers(first, first + 300)] ^= 1 << rng.integers(0, 8)
         path = tmp_path / "a.tif"

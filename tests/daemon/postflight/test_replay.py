@@ -24,8 +24,8 @@ from daemon.mission.log.flight_log import FlightLog
 from daemon.mission.log.log_records import Message, message_of
 from daemon.onboard.flight.decisions import Decision, decision_of
 from daemon.postflight.replay.codecs import Decoded, codec_for, decode_all
-from daemon.postflight.replay.flight import Replayed, replay_log
-from daemon.postflight.replay.products import _hashes_on_disk, content_hash
+from daemon.postflight.replay.flight_replay import ReplayResult, replay_log
+from daemon.postflight.replay.product_comparison import _hashes_on_disk, content_hash
 from drivers.contract import (
     ClockReading,
     DeviceEvent,
@@ -35,11 +35,11 @@ from drivers.contract import (
     TemperatureSample,
 )
 from drivers.thermometers.modbus_rtu.thermometer import ModbusThermometer
+from sim_hw.receivers.emulated_receiver import ReceiverAccuracy, ReceiverState
 from sim_hw.receivers.nmea_sentences import nmea
-from sim_hw.receivers.receiver import ReceiverAccuracy, ReceiverState
 from sim_hw.receivers.ublox_messages import nav_att, nav_pvt
 from tests.daemon.configuration.test_configuration import GOOD
-from tests.drivers.stand_ins import FakeClock, FakePort, Notebook
+from tests.drivers.fakes import FakeClock, FakePort, RecordingSink
 from tests.drivers.test_modbus_rtu import reply
 
 SECOND_NS = 1_000_000_000
@@ -54,7 +54,7 @@ def sentences(second: int) -> bytes:
     return b"".join(nmea(text) for text in (gga, rmc))
 
 
-def heard(cuts: Iterable[int]) -> list[RawBytes | DeviceEvent]:
+def recorded(cuts: Iterable[int]) -> list[RawBytes | DeviceEvent]:
     """The line of a receiver, opened before its third epoch, in pieces of some sizes."""
     records: list[RawBytes | DeviceEvent] = []
     sizes = list(cuts)
@@ -80,24 +80,24 @@ def flown_log() -> list[Record]:
     """What is logged of a u-blox receiver whose attitudes come behind its positions, opened before
     its third epoch; and readings of a clock, as of a receiver that can be asked."""
     state = ReceiverState(47.0, 15.0, 1000.0, (55.0, 0.0, 0.0), 1.0, 2.0, 0.0)
-    heard: list[RawBytes | DeviceEvent] = []
+    recorded: list[RawBytes | DeviceEvent] = []
     for epoch in range(EPOCHS):
         mono_ns, gps_ns = (epoch + 1) * SECOND_NS, GPS_NS + epoch * SECOND_NS
         if epoch == 2:
-            heard.append(DeviceEvent("gnss", "opened", False, "", mono_ns))
+            recorded.append(DeviceEvent("gnss", "opened", False, "", mono_ns))
         position = nav_pvt(gps_ns, state, ReceiverAccuracy(), 14, 18)
         attitude = nav_att(gps_ns, state, ReceiverAccuracy())
-        heard.append(RawBytes("gnss", mono_ns, position + attitude))
+        recorded.append(RawBytes("gnss", mono_ns, position + attitude))
     codec = codec_for("navigator", "ublox", "gnss", {"port": "/dev/null"})
     assert codec is not None
-    told = decode_all(codec, heard)
-    assert len(told) == EPOCHS - 2
-    readings = [ClockReading("gnss", 7, record.mono_ns, 3) for record in told]
-    both = [record for pair in zip(readings, told, strict=True) for record in pair]
-    return [*heard, *both]
+    decoded = decode_all(codec, recorded)
+    assert len(decoded) == EPOCHS - 2
+    readings = [ClockReading("gnss", 7, record.mono_ns, 3) for record in decoded]
+    both = [record for pair in zip(readings, decoded, strict=True) for record in pair]
+    return [*recorded, *both]
 
 
-def replay_of(log: Iterable[Record], folder: Path) -> Replayed:
+def replay_of(log: Iterable[Record], folder: Path) -> ReplayResult:
     written = FlightLog.create(folder, boot_id="a boot")
     for record in log:
         written.write(message_of(record))
@@ -135,15 +135,15 @@ def test_a_later_record_that_differs_is_a_difference(
 
 @given(st.lists(st.integers(min_value=1, max_value=60), max_size=5))
 def test_bytes_mean_the_same_however_they_came_in_pieces(cuts: list[int]) -> None:
-    whole, pieces = decode(heard([])), decode(heard(cuts))
-    positions = [s for s in whole if isinstance(s, NavSample)]
+    in_one_piece, pieces = decode(recorded([])), decode(recorded(cuts))
+    positions = [s for s in in_one_piece if isinstance(s, NavSample)]
     assert len(positions) >= EPOCHS - 3
-    assert [s.gps_ns for s in whole] == [s.gps_ns for s in pieces]
+    assert [s.gps_ns for s in in_one_piece] == [s.gps_ns for s in pieces]
 
 
-def test_what_came_before_the_device_was_open_was_told_to_nobody() -> None:
-    everything = decode([r for r in heard([]) if isinstance(r, RawBytes)])
-    assert len(decode(heard([]))) < len(everything) == EPOCHS
+def test_bytes_before_the_device_was_open_are_not_decoded() -> None:
+    all_decoded = decode([r for r in recorded([]) if isinstance(r, RawBytes)])
+    assert len(decode(recorded([]))) < len(all_decoded) == EPOCHS
 
 
 def test_an_answer_that_came_too_late_in_flight_is_none_in_the_replay() -> None:
@@ -160,21 +160,21 @@ def test_an_answer_that_came_too_late_in_flight_is_none_in_the_replay() -> None:
     flown = ModbusThermometer(
         "probes", section, clock=clock, open_port=lambda *_: FakePort(clock, answer)
     )
-    notebook = Notebook()
+    notebook = RecordingSink()
     notebook.stop = lambda _: flown._closing.set() if len(notebook.records) > 8 else None
     flown.run(notebook)
     records = notebook.records
-    said = [r for r in records if isinstance(r, TemperatureSample)]
-    assert len(said) >= 2 and said[0].value_c == 0.7
+    samples = [r for r in records if isinstance(r, TemperatureSample)]
+    assert len(samples) >= 2 and samples[0].value_c == 0.7
     (stale,) = [r for r in records if isinstance(r, RawBytes) and r.device == "probes.stale"]
     assert stale.data == reply(1, [999])
     # A replay takes only what has the device's name.
     of_device = (RawBytes, DeviceEvent)
-    heard = [r for r in records if isinstance(r, of_device) and r.device == "probes"]
+    recorded = [r for r in records if isinstance(r, of_device) and r.device == "probes"]
     codec = codec_for("thermometer", "modbus-rtu", "probes", section)
     assert codec is not None
-    found = [r.value_c for r in decode_all(codec, heard) if isinstance(r, TemperatureSample)]
-    assert found == [r.value_c for r in said]
+    found = [r.value_c for r in decode_all(codec, recorded) if isinstance(r, TemperatureSample)]
+    assert found == [r.value_c for r in samples]
 
 
 def test_a_device_whose_bytes_are_not_logged_has_no_codec() -> None:
@@ -213,7 +213,7 @@ def test_durations_are_left_out_of_the_report_and_nothing_else() -> None:
 
 
 def test_nothing_compared_is_not_agreement() -> None:
-    replayed = Replayed()
+    replayed = ReplayResult()
     assert not replayed.agrees
     replayed.compare("ledger", agrees=True)
     assert replayed.agrees

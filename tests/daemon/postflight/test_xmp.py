@@ -19,7 +19,7 @@ def test_values_and_sequences_are_read_by_their_names():
     assert "ModelType" in xmp and "Irradiance" not in xmp
 
 
-def test_a_missing_value_and_a_wrong_number_are_told_with_file_and_key():
+def test_a_missing_value_and_a_wrong_number_are_reported_with_file_and_key():
     xmp = read_xmp(packet(CentralWavelength="blue"), "a.tif")
     with pytest.raises(XmpError, match=r"a\.tif: XMP Irradiance has 0 values"):
         xmp.text("Irradiance")
@@ -51,9 +51,9 @@ def test_a_hostile_packet_is_refused_with_a_sentence(hostile, sentence):
 @settings(max_examples=150, deadline=None)
 @given(st.integers(0, len(packet()) - 1), st.binary(max_size=6))
 def test_a_damaged_packet_is_read_or_refused_but_never_more(at, noise):
-    whole = packet()
+    intact = packet()
     try:
-        xmp = read_xmp(whole[:at] + noise + whole[at + len(noise) :], "a.tif")
+        xmp = read_xmp(intact[:at] + noise + intact[at + len(noise) :], "a.tif")
         xmp.numbers("VignettingPolynomial", 6)
     except XmpError:
         pass

@@ -14,7 +14,7 @@ from daemon.cli import app
 from daemon.configuration.model import ConfigurationError
 from daemon.mission.layout import Mission, MissionError
 from daemon.mission.store.level0 import read_description, tiff_parts
-from daemon.postflight.calibration.rig_text import rig_toml
+from daemon.postflight.calibration.rig_writer import rig_toml
 from daemon.products import level3
 from processing.rig import find_rig, load_rig, rig_from_mapping
 from tests.processing.image.test_pansharpening import box_means, scene
@@ -47,21 +47,21 @@ def mission(tmp_path):
     content = tomllib.loads(rig_toml(find_rig("ultracam-x-mini")).decode())
     content["virtual_image"] |= {"width_px": 360, "height_px": 300}
     (path / "rig.toml").write_bytes(rig_toml(rig_from_mapping(content, "rig.toml")))
-    made = Mission.open(path)
+    created = Mission.open(path)
     _, pan, colour = scene(RATIO)
     pan, colour = pan[:300], {name: band[:100] for name, band in colour.items()}
     halved = {name: (band // 2).astype(np.uint16) for name, band in colour.items()}
-    write_level2(made, 1, pan, colour, exposure_us=4000.0)
-    write_level2(made, 2, (pan // 2).astype(np.uint16), halved, exposure_us=2000.0)
-    write_level2(made, 3, pan, colour, exposure_us=4000.0)
-    return made
+    write_level2(created, 1, pan, colour, exposure_us=4000.0)
+    write_level2(created, 2, (pan // 2).astype(np.uint16), halved, exposure_us=2000.0)
+    write_level2(created, 3, pan, colour, exposure_us=4000.0)
+    return created
 
 
-def developed(mission, numbers=(1, 2, 3), **wishes):
+def developed(mission, numbers=(1, 2, 3), **options):
     rig = load_rig(mission.rig_path)
     tones, unreadable = level3.mission_tones(mission, rig)
     assert unreadable == ()
-    return tones, [level3.develop(mission, rig, n, tones, **wishes) for n in numbers]
+    return tones, [level3.pansharpen(mission, rig, n, tones, **options) for n in numbers]
 
 
 def test_the_images_are_tiled_and_read_by_others(mission):
@@ -108,7 +108,7 @@ def test_one_curve_serves_all_exposures_and_neighbours_match(mission):
     assert again.sha256 == tones.sha256
 
 
-def test_wishes_are_followed_and_an_earlier_result_is_replaced(mission):
+def test_options_are_applied_and_an_earlier_result_is_replaced(mission):
     developed(mission, numbers=(1,))
     stale = mission.path / "L3" / "000001.0123abcd.part"
     stale.mkdir()
@@ -118,18 +118,18 @@ def test_wishes_are_followed_and_an_earlier_result_is_replaced(mission):
     assert sorted(p.name for p in (mission.path / "L3").iterdir()) == ["000001", "tone-curve.json"]
 
 
-def test_the_command_develops_the_whole_mission_and_refuses_unknown_wishes(mission):
+def test_the_command_pansharpens_the_entire_mission_and_refuses_unknown_options(mission):
     done = CliRunner().invoke(app, ["pansharpen", str(mission.path), "--bits", "8", "--json"])
     assert done.exit_code == 0, done.output
-    told = json.loads(done.stdout)
-    assert [row["exposure"] for row in told["exposures"]] == [1, 2, 3]
-    assert all(set(row["files"]) == {"rgb-8.tif", "cir-8.tif"} for row in told["exposures"])
+    output = json.loads(done.stdout)
+    assert [row["exposure"] for row in output["exposures"]] == [1, 2, 3]
+    assert all(set(row["files"]) == {"rgb-8.tif", "cir-8.tif"} for row in output["exposures"])
     with pytest.raises(ConfigurationError, match="--image is rgb or cir"):
         CliRunner().invoke(app, ["pansharpen", str(mission.path), "--image", "x"],
                            catch_exceptions=False)  # fmt: skip
 
 
-def test_a_missing_band_leaves_out_its_images_and_says_so(mission):
+def test_a_missing_band_is_reported_and_leaves_out_its_images(mission):
     _, pan, colour = scene(RATIO)
     colour = {name: band[:100].copy() for name, band in colour.items()}
     colour["nir"][:] = 0
@@ -139,7 +139,7 @@ def test_a_missing_band_leaves_out_its_images_and_says_so(mission):
     assert done.left_out == ("cir: no nir at Level-2",)
 
 
-def test_level_2_that_is_missing_or_damaged_is_told_with_its_cure(mission):
+def test_missing_or_damaged_level_2_is_reported_with_its_cure(mission):
     (mission.level2(3) / "pan.tif").unlink()
     with pytest.raises(level3.Level3Error, match=r"exposure 3: has no pan\.tif.*syntopic process"):
         developed(mission, numbers=(3,))
@@ -171,9 +171,9 @@ def test_the_command_goes_on_after_an_exposure_it_cannot_develop(mission, damage
     damage(mission)
     done = CliRunner().invoke(app, ["pansharpen", str(mission.path), "--bits", "8", "--json"])
     assert done.exit_code == 1
-    told = json.loads(done.stdout)
-    assert [row["exposure"] for row in told["exposures"]] == [2, 3]
-    (failure,) = told["failures"]
+    output = json.loads(done.stdout)
+    assert [row["exposure"] for row in output["exposures"]] == [2, 3]
+    (failure,) = output["failures"]
     assert failure["exposure"] == 1 and cause in failure["cause"]
     assert "1 exposure failed" in done.stderr and "1 " in done.stderr
     assert sorted(p.name for p in (mission.path / "L3").iterdir()) == [

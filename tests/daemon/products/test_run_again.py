@@ -20,10 +20,10 @@ class FakeService:
 
     def __init__(self, configuration: Any, _rig: Any, _path: Path, _show: Callable[..., None]):
         self.flown.append(configuration)
-        self.goes_on = False
+        self.continues = False
 
     async def run(self) -> int:
-        status, self.goes_on = self.endings.pop(0)
+        status, self.continues = self.endings.pop(0)
         return status
 
 

@@ -65,9 +65,9 @@ def test_a_mission_and_a_plan_with_markup_in_their_names_are_advised_on(tmp_path
     plan = tmp_path / "[b].geojson"
     text = (mission / "plan.geojson").read_text()
     plan.write_text(text.replace('"id": "A"', '"id": "[/x] [blink]A"'))
-    asked = ["reflights", str(mission), "--plan", str(plan)]
-    done = CliRunner().invoke(app, asked)
+    arguments = ["reflights", str(mission), "--plan", str(plan)]
+    done = CliRunner().invoke(app, arguments)
     assert done.exit_code == 1 and isinstance(done.exception, SystemExit), done.output
     assert "[/x]" in done.output and "[red]" in done.output
-    told = json.loads(CliRunner().invoke(app, [*asked, "--json"]).stdout)
-    assert told["segments"][0]["line"] == "[/x] [blink]A"
+    output = json.loads(CliRunner().invoke(app, [*arguments, "--json"]).stdout)
+    assert output["segments"][0]["line"] == "[/x] [blink]A"

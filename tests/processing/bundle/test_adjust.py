@@ -8,10 +8,21 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from processing.bundle.adjust import Adjustment, Settings, adjust
-from processing.bundle.network import Bearings, Camera, Constraint, Network, NetworkError
-from processing.bundle.rotations import logarithm
-from tests.processing.bundle.networks import Made, aerial, turned, with_everything
+from processing.bundle.adjust import Adjustment, AdjustmentSettings, adjust
+from processing.bundle.network import (
+    CameraModel,
+    LinearConstraint,
+    MeasuredAttitudes,
+    Network,
+    NetworkError,
+)
+from processing.bundle.rotations import vectors_from_rotations
+from tests.processing.bundle.simulated_networks import (
+    SimulatedNetwork,
+    aerial,
+    rotation_of,
+    with_everything,
+)
 
 
 def _dense(result: Adjustment) -> tuple[np.ndarray, np.ndarray]:
@@ -26,18 +37,21 @@ def _dense(result: Adjustment) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_without_noise_the_truth_comes_back() -> None:
-    made = with_everything()
-    result = adjust(made.network)
-    assert np.abs(result.state.station - made.station).max() < 1e-5
-    assert np.abs(result.state.interior[0][:3] - made.interior[0][:3]).max() < 1e-6
+    simulated = with_everything()
+    result = adjust(simulated.network)
+    assert np.abs(result.state.station - simulated.station).max() < 1e-5
+    assert np.abs(result.state.interior[0][:3] - simulated.interior[0][:3]).max() < 1e-6
     assert result.state.terms[0][0] == pytest.approx(3e-5, abs=1e-9)
-    oblique = turned(0.5, 0.01, 0.02)
-    assert np.abs(logarithm((result.state.head_rotation[1].T @ oblique)[None])).max() < 1e-7
+    oblique = rotation_of(0.5, 0.01, 0.02)
+    assert (
+        np.abs(vectors_from_rotations((result.state.head_rotation[1].T @ oblique)[None])).max()
+        < 1e-7
+    )
 
 
-def test_covariances_and_redundancy_numbers_are_those_of_the_whole_inverse() -> None:
-    made = with_everything()
-    result = adjust(made.network)
+def test_covariances_and_redundancy_numbers_are_those_of_the_full_inverse() -> None:
+    simulated = with_everything()
+    result = adjust(simulated.network)
     design, free = _dense(result)
     scale = np.linalg.norm(design, axis=0)
     inverse = np.linalg.inv((design / scale).T @ (design / scale)) / scale[:, None] / scale
@@ -45,10 +59,10 @@ def test_covariances_and_redundancy_numbers_are_those_of_the_whole_inverse() -> 
     size = np.sqrt(np.diag(inverse))
     off = (result.cofactor - inverse[:c, :c]) / size[:c, None] / size[:c]
     assert np.abs(off).max() < 1e-6
-    whole = np.zeros((len(free), len(free)))
-    whole[np.ix_(free, free)] = inverse[c:, c:]
+    full_inverse = np.zeros((len(free), len(free)))
+    full_inverse[np.ix_(free, free)] = inverse[c:, c:]
     for k, point in enumerate(result.layout.eliminated_points):
-        own = whole[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
+        own = full_inverse[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
         assert np.abs(result.point_cofactor[point] - own).max() < 1e-6 * np.abs(own).max()
     leverage = np.einsum("ij,jk,ik->i", design, inverse, design)
     assert np.abs(result.redundancy_number - (1.0 - leverage)).max() < 1e-7
@@ -56,10 +70,10 @@ def test_covariances_and_redundancy_numbers_are_those_of_the_whole_inverse() -> 
     assert result.redundancy_number.sum() == pytest.approx(result.redundancy, abs=1e-6)
 
 
-def test_constraints_are_kept_and_their_cofactors_are_those_of_the_bordered_inverse() -> None:
-    made = aerial(sigma_mm=1e-3, seed=5, control_sigma_m=0.5)
-    names = [f"station {name} X" for name in made.network.stations.names]
-    network = replace(made.network, constraints=(Constraint(dict.fromkeys(names, 1.0)),))
+def test_constraints_are_fulfilled_and_their_cofactors_are_those_of_the_bordered_inverse() -> None:
+    simulated = aerial(sigma_mm=1e-3, seed=5, control_sigma_m=0.5)
+    names = [f"station {name} X" for name in simulated.network.stations.names]
+    network = replace(simulated.network, constraints=(LinearConstraint(dict.fromkeys(names, 1.0)),))
     result = adjust(network)
     moved = result.state.station[:, 0] - network.stations.position_m[:, 0]
     assert abs(moved.sum()) < 1e-9
@@ -74,23 +88,23 @@ def test_constraints_are_kept_and_their_cofactors_are_those_of_the_bordered_inve
     assert result.redundancy == len(design) - size + 1
 
 
-def _adjusted(seed: int) -> tuple[Made, Adjustment]:
-    made = aerial(seed=seed, sigma_mm=1e-3, gnss_sigma_m=0.05, points=40, lines=2, along=4)
-    return made, adjust(made.network)
+def _adjusted(seed: int) -> tuple[SimulatedNetwork, Adjustment]:
+    simulated = aerial(seed=seed, sigma_mm=1e-3, gnss_sigma_m=0.05, points=40, lines=2, along=4)
+    return simulated, adjust(simulated.network)
 
 
-def test_uncertainty_is_honest() -> None:
+def test_uncertainty_is_realistic() -> None:
     squares, dimensions, errors = 0.0, 0, []
     for seed in range(24):
-        made, result = _adjusted(seed)
+        simulated, result = _adjusted(seed)
         columns = result.layout.station.ravel()
-        error = (result.state.station - made.station).ravel()
+        error = (result.state.station - simulated.station).ravel()
         covariance = result.cofactor[np.ix_(columns, columns)]
         squares += float(error @ np.linalg.solve(covariance, error))
         dimensions += len(error)
         for point in result.layout.eliminated_points:
             own = result.point_cofactor[point]
-            off = result.state.points[point] - made.points[point]
+            off = result.state.points[point] - simulated.points[point]
             errors.append(off / np.sqrt(np.diag(own)))
     low, high = stats.chi2.ppf([0.0005, 0.9995], dimensions)
     assert low < squares < high
@@ -100,14 +114,14 @@ def test_uncertainty_is_honest() -> None:
 
 
 def test_sigma0_and_components_find_wrong_sigmas() -> None:
-    made = aerial(seed=7, sigma_mm=2e-3, gnss_sigma_m=0.05, points=250, lines=3, along=8)
-    table, gnss = made.network.image_points, made.network.gnss
+    simulated = aerial(seed=7, sigma_mm=2e-3, gnss_sigma_m=0.05, points=250, lines=3, along=8)
+    table, gnss = simulated.network.image_points, simulated.network.gnss
     network = replace(
-        made.network,
+        simulated.network,
         image_points=replace(table, sigma_mm=table.sigma_mm / 2.0),
         gnss=replace(gnss, sigma_m=gnss.sigma_m * 3.0),
     )
-    result = adjust(network, Settings(variance_components=True))
+    result = adjust(network, AdjustmentSettings(variance_components=True))
     assert result.factors["image x"] == pytest.approx(4.0, rel=0.15)
     assert result.factors["image y"] == pytest.approx(4.0, rel=0.15)
     assert result.factors["GNSS height"] == pytest.approx(1.0 / 9.0, rel=0.6)
@@ -116,31 +130,31 @@ def test_sigma0_and_components_find_wrong_sigmas() -> None:
 
 
 def test_blunders_are_found_and_nothing_else() -> None:
-    made = aerial(seed=8, sigma_mm=1e-3, points=200, lines=3, along=6)
-    table = made.network.image_points
+    simulated = aerial(seed=8, sigma_mm=1e-3, points=200, lines=3, along=6)
+    table = simulated.network.image_points
     rays = np.bincount(table.point, minlength=200)
     several = np.flatnonzero(rays[table.point] >= 5)
     wrong = np.random.default_rng(1).choice(several, 25, replace=False)
     xy = table.xy_mm.copy()
     xy[wrong] += np.random.default_rng(2).normal(0, 1, (25, 2)) * 0.3 + 0.1
-    network = replace(made.network, image_points=replace(table, xy_mm=xy))
+    network = replace(simulated.network, image_points=replace(table, xy_mm=xy))
     plain = adjust(network)
     assert plain.sigma0 > 10.0
-    result = adjust(network, Settings(robust=True, reject_beyond=4.0))
+    result = adjust(network, AdjustmentSettings(robust=True, reject_beyond=4.0))
     assert set(wrong) <= set(np.flatnonzero(result.rejected))
     assert int(result.rejected.sum()) <= 28
     assert result.sigma0 == pytest.approx(1.0, abs=0.08)
 
 
 def test_a_point_seen_once_is_left_out_and_changes_nothing() -> None:
-    made = aerial(seed=9, sigma_mm=1e-3)
-    table = made.network.image_points
+    simulated = aerial(seed=9, sigma_mm=1e-3)
+    table = simulated.network.image_points
     rays = np.bincount(table.point, minlength=60)
     lonely = int(np.flatnonzero(rays[8:] >= 3)[0]) + 8
     first = int(np.flatnonzero(table.point == lonely)[0])
     keep = (table.point != lonely) | (np.arange(len(table.point)) == first)
-    network = replace(made.network, image_points=_only(table, keep))
-    without = replace(made.network, image_points=_only(table, table.point != lonely))
+    network = replace(simulated.network, image_points=_only(table, keep))
+    without = replace(simulated.network, image_points=_only(table, table.point != lonely))
     result, reference = adjust(network), adjust(without)
     assert result.left_out[lonely]
     assert np.isnan(result.point_cofactor[lonely]).all()
@@ -159,23 +173,23 @@ def _only(table, keep):
 
 
 def test_shared_projection_centres_share_three_unknowns() -> None:
-    made = with_everything()
-    images = made.network.images
+    simulated = with_everything()
+    images = simulated.network.images
     # Every image an attitude of its own, the projection centres of an exposure in one.
     n = len(images.names)
-    heads = made.network.heads
+    heads = simulated.network.heads
     own = np.array(
-        [made.attitude[images.attitude[k]] @ heads[images.head[k]].rotation for k in range(n)]
+        [simulated.attitude[images.attitude[k]] @ heads[images.head[k]].rotation for k in range(n)]
     )
     network = replace(
-        made.network,
+        simulated.network,
         attitudes=replace(
-            made.network.attitudes, names=images.names, rotation=own, fixed=np.zeros(n, bool)
+            simulated.network.attitudes, names=images.names, rotation=own, fixed=np.zeros(n, bool)
         ),
         images=replace(images, attitude=np.arange(n), head=np.full(n, -1)),
         heads=(),
-        gnss=replace(made.network.gnss, attitude=np.arange(0, n, 2)),
-        bearings=Bearings(np.arange(n), own, np.full((n, 3), 1e-3)),
+        gnss=replace(simulated.network.gnss, attitude=np.arange(0, n, 2)),
+        measured_attitudes=MeasuredAttitudes(np.arange(n), own, np.full((n, 3), 1e-3)),
     )
     result = adjust(network)
     kinds = [u.kind for u in result.layout.unknowns]
@@ -187,7 +201,7 @@ def test_tables_that_do_not_fit_are_refused_with_all_their_mistakes() -> None:
     network = aerial().network
     broken = replace(
         network,
-        cameras=(Camera("c", -70.0),),
+        cameras=(CameraModel("c", -70.0),),
         images=replace(network.images, station=network.images.station + 1),
         image_points=replace(network.image_points, sigma_mm=network.image_points.sigma_mm * 0.0),
     )
@@ -206,26 +220,26 @@ def test_starting_values_far_off_end_in_a_sentence() -> None:
         adjust(replace(network, stations=replace(network.stations, position_m=below)))
 
 
-def test_sigmas_are_scaled_only_where_that_is_asked_for() -> None:
-    made = aerial(seed=7, sigma_mm=2e-3, points=120)
-    table = made.network.image_points
-    network = replace(made.network, image_points=replace(table, sigma_mm=table.sigma_mm / 2.0))
+def test_sigmas_are_scaled_only_where_that_is_requested() -> None:
+    simulated = aerial(seed=7, sigma_mm=2e-3, points=120)
+    table = simulated.network.image_points
+    network = replace(simulated.network, image_points=replace(table, sigma_mm=table.sigma_mm / 2.0))
     result = adjust(network)
     assert result.factors == {}
     assert result.sigma0 == pytest.approx(2.0, rel=0.15)
 
 
 def test_each_round_of_data_snooping_is_announced_with_its_number() -> None:
-    made = aerial(seed=8, sigma_mm=1e-3, points=60)
-    table = made.network.image_points
+    simulated = aerial(seed=8, sigma_mm=1e-3, points=60)
+    table = simulated.network.image_points
     rays = np.bincount(table.point, minlength=60)
     wrong = np.flatnonzero(table.point == int(np.flatnonzero(rays >= 6)[-1]))[:2]
     xy = table.xy_mm.copy()
     xy[wrong] += [[0.1, 0.05], [-0.02, 0.03]]
-    network = replace(made.network, image_points=replace(table, xy_mm=xy))
+    network = replace(simulated.network, image_points=replace(table, xy_mm=xy))
     rounds, objectives = [], []
 
-    def tell(what: str, number: int, value: float) -> None:
+    def report_progress(what: str, number: int, value: float) -> None:
         if what == "iteration":
             objectives.append(value)
         elif what.endswith("left out"):
@@ -233,7 +247,7 @@ def test_each_round_of_data_snooping_is_announced_with_its_number() -> None:
             # What the iterations before it ended with.
             assert value == objectives[-1]
 
-    result = adjust(network, Settings(reject_beyond=5.0), progress=tell)
+    result = adjust(network, AdjustmentSettings(reject_beyond=5.0), progress=report_progress)
     assert [number for _, number in rounds] == list(range(1, len(rounds) + 1))
     assert rounds[-1][0] == f"{int(result.rejected.sum())} image points left out"
     assert set(wrong) <= set(np.flatnonzero(result.rejected))

@@ -7,34 +7,39 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.aerial_block import Judged, judged, network_of
+from benchmarks.aerial_block import AdjustedBlock, evaluate, network_of
 from processing.bundle.adjust import adjust
-from processing.bundle.findings import parameters_of
-from processing.bundle.network import Camera
-from processing.bundle.self_calibration import SETS, parameter_count, parts_of, self_calibrating
+from processing.bundle.adjustment_results import parameters_of
+from processing.bundle.network import CameraModel
+from processing.bundle.self_calibration import (
+    SETS,
+    parameter_count,
+    parts_of,
+    with_self_calibration,
+)
 from processing.bundle.terms import part_of
 from processing.rig import find_rig
 from sim_hw.blocks.aerial import (
-    Block,
-    Errors,
+    AerialBlock,
+    MeasurementErrors,
     ccd_pattern,
-    flown,
     frame_of,
     image_grid,
-    left_after_orientation,
+    residuals_after_orientation,
+    simulate_block,
     small_plan,
 )
-from tests.processing.bundle.networks import aerial
+from tests.processing.bundle.simulated_networks import aerial
 
 
 @pytest.fixture(scope="module")
-def block() -> Block:
-    return flown(small_plan(), seed=1)
+def block() -> AerialBlock:
+    return simulate_block(small_plan(), seed=1)
 
 
 @pytest.fixture(scope="module")
-def full(block) -> Judged:
-    return judged(block, "sensors-full")
+def full(block) -> AdjustedBlock:
+    return evaluate(block, "sensors-full")
 
 
 @pytest.mark.parametrize(
@@ -45,10 +50,10 @@ def test_the_sets_have_the_parameters_of_the_topology(rig_name, counts) -> None:
     rig = find_rig(rig_name)
     sensors = sum(len(cone.sensors) for cone in rig.pan_cones)
     cones = len(rig.pan_cones)
-    camera = Camera("stitched", rig.virtual_image.f_mm)
+    camera = CameraModel("stitched", rig.virtual_image.f_mm)
     found = tuple(
         parameter_count(
-            self_calibrating(
+            with_self_calibration(
                 camera, name, parts_of(rig), master_cone=rig.master_cone, interior=True
             )
         )
@@ -59,7 +64,7 @@ def test_the_sets_have_the_parameters_of_the_topology(rig_name, counts) -> None:
     assert found[3] == 7 + 6 * (sensors - 1) + 2 * (cones - 1)
 
 
-def test_every_image_point_belongs_to_the_ccd_that_made_it() -> None:
+def test_every_image_point_belongs_to_the_ccd_that_recorded_it() -> None:
     rig = find_rig("ultracam-x")
     parts = parts_of(rig)
     for index, part in enumerate(parts):
@@ -72,8 +77,8 @@ def test_every_image_point_belongs_to_the_ccd_that_made_it() -> None:
 
 
 def test_without_a_pattern_sigma0_is_the_noise_and_no_parameter_is_needed() -> None:
-    plan = replace(small_plan(), errors=Errors(pattern_mm=0.0))
-    found = judged(flown(plan, seed=2), "none")
+    plan = replace(small_plan(), errors=MeasurementErrors(pattern_mm=0.0))
+    found = evaluate(simulate_block(plan, seed=2), "none")
     assert found.figures["sigma0"] == pytest.approx(1.0, abs=0.03)
     low, high = found.figures["check_squares_bounds"]
     assert low < found.figures["check_squares"] < high
@@ -88,7 +93,7 @@ def test_the_set_that_can_model_the_pattern_leaves_none_of_it(full) -> None:
 
 
 def test_the_pattern_shows_without_that_set(block, full) -> None:
-    radial = judged(block, "radial")
+    radial = evaluate(block, "radial")
     assert radial.figures["sigma0"] > 1.05
     assert radial.figures["left_max_um"] > 1.5
     assert radial.figures["residual_pattern_max_um"] > 2.0 * full.figures["residual_pattern_max_um"]
@@ -117,18 +122,18 @@ def test_gnss_shifts_and_drifts_of_every_strip_are_found(block, full) -> None:
         assert (np.abs(result.state.shift[line] - mean) < 4.0 * own).all()
 
 
-def test_the_planted_pattern_has_the_size_it_is_said_to_have(block) -> None:
+def test_the_planted_pattern_has_the_size_it_is_stated_to_have(block) -> None:
     frame = block.plan.frame
     places = image_grid(frame, 24, 25)
-    left = left_after_orientation(frame, places, block.pattern.at(places))
+    left = residuals_after_orientation(frame, places, block.pattern.at(places))
     assert np.hypot(*left.T).max() == pytest.approx(2e-3, rel=0.01)
 
 
 def test_nine_ccds_off_on_their_own_are_found_by_58_parameters_and_not_by_two() -> None:
     rig = find_rig("ultracam-x")
     plan = small_plan(frame_of(rig), "ultracam-x")
-    block = flown(plan, 3, ccd_pattern(rig, 3, 2e-3))
-    full, radial = judged(block, "sensors-full"), judged(block, "radial")
+    block = simulate_block(plan, 3, ccd_pattern(rig, 3, 2e-3))
+    full, radial = evaluate(block, "sensors-full"), evaluate(block, "radial")
     assert full.figures["parameters"] == 58, "61 less the interior orientation"
     assert full.figures["sigma0"] == pytest.approx(1.0, abs=0.05)
     assert radial.figures["sigma0"] > 1.5
@@ -143,12 +148,12 @@ def test_nine_ccds_off_on_their_own_are_found_by_58_parameters_and_not_by_two() 
 
 def _sigma_of_f(heights: tuple[float, ...], gnss_sigma_m: float | None) -> float:
     """Of the principal distance, with one shift of all GNSS positions unknown."""
-    camera = Camera("c", 70.0, free=frozenset({"dx0", "dy0", "df"}))
-    made = aerial(
+    camera = CameraModel("c", 70.0, free=frozenset({"dx0", "dy0", "df"}))
+    simulated = aerial(
         cameras=(camera,), sigma_mm=1e-3, heights=heights, gnss_sigma_m=gnss_sigma_m, lines=3,
         along=5, points=90, relief_m=20.0,
     )  # fmt: skip
-    network = made.network
+    network = simulated.network
     if gnss_sigma_m is not None:
         gnss = network.gnss
         gnss = replace(gnss, line=np.zeros_like(gnss.line), lines=("all",), drift="shift")

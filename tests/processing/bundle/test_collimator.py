@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from processing.bundle.adjust import Adjustment, adjust
-from processing.bundle.findings import parameters_of
+from processing.bundle.adjustment_results import parameters_of
 from processing.bundle.network import (
     Attitudes,
-    Camera,
+    CameraModel,
     ImagePoints,
     Images,
     Network,
     Points,
     Stations,
 )
-from processing.bundle.rank import DefectError
-from tests.processing.bundle.networks import measured_from_ideal, turned
+from processing.bundle.rank_diagnosis import RankDefectError
+from tests.processing.bundle.simulated_networks import measured_from_ideal, rotation_of
 
 TRUE = np.array([0.02, -0.015, 0.03, 4e-7, -3e-11, 0.0, 3e-7, -2e-7, 2e-6, -1e-6])
 FREE = frozenset({"dx0", "dy0", "df", "k1", "k2", "p1", "p2", "b1", "b2"})
@@ -29,15 +29,15 @@ PITCH_MM = 0.012
 def series(seed: int, *, count: int = 4, sigma_mm: float = PITCH_MM / 20.0) -> Network:
     """Targets over the field of a 7168 x 4096 head of 120 mm, seen in `count` orientations."""
     random = np.random.default_rng(seed)
-    camera = Camera("head", 120.0, interior=TRUE, free=FREE)
+    camera = CameraModel("head", 120.0, interior=TRUE, free=FREE)
     x, y = np.meshgrid(np.linspace(-0.33, 0.33, 13), np.linspace(-0.19, 0.19, 9))
     directions = np.column_stack([x.ravel(), y.ravel(), -np.ones(x.size)])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     image, point, xy, rotations, starts = [], [], [], [], []
     for k in range(count):
-        rotation = turned(*random.normal(0.0, 0.01, 2), k * np.pi / 2.0)
+        rotation = rotation_of(*random.normal(0.0, 0.01, 2), k * np.pi / 2.0)
         rotations.append(rotation)
-        starts.append(rotation @ turned(*random.normal(0.0, 2e-3, 3)))
+        starts.append(rotation @ rotation_of(*random.normal(0.0, 2e-3, 3)))
         seen = directions @ rotation
         for p, s in enumerate(seen):
             ideal = -120.0 * s[:2] / s[2]
@@ -103,8 +103,8 @@ def test_more_series_make_the_principal_point_surer() -> None:
 def test_directions_say_nothing_of_where_the_head_stands() -> None:
     network = series(2, count=1)
     free = replace(network, stations=replace(network.stations, fixed=np.zeros(1, bool)))
-    with pytest.raises(DefectError) as caught:
+    with pytest.raises(RankDefectError) as caught:
         adjust(free)
-    said = [d.sentence for d in caught.value.defects]
-    assert len(said) == 3
-    assert [s.split(" of ")[0] for s in said] == ["position in X", "position in Y", "height"]
+    sentences = [d.sentence for d in caught.value.rank_defects]
+    assert len(sentences) == 3
+    assert [s.split(" of ")[0] for s in sentences] == ["position in X", "position in Y", "height"]

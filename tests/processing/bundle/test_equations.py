@@ -9,24 +9,24 @@ import pytest
 
 from processing.bundle.camera_model import ideal_mm
 from processing.bundle.equations import GROUPS, BehindCameraError, equations
-from processing.bundle.network import Camera
+from processing.bundle.network import CameraModel
 from processing.bundle.rotations import (
     angles_by_rotation_vector,
-    exponential,
-    logarithm,
     omega_phi_kappa,
+    rotations_from_vectors,
+    vectors_from_rotations,
 )
-from processing.bundle.unknowns import improved, layout_of, starting_state
+from processing.bundle.unknowns import apply_corrections, initial_values, layout_of
 from processing.geometry.lens import ideal_from_measured
 from processing.geometry.rotation import rotation_matrix
 from processing.rig import find_rig
-from tests.processing.bundle.networks import aerial, turned, with_everything
+from tests.processing.bundle.simulated_networks import aerial, rotation_of, with_everything
 
 
 def test_derivatives_of_every_unknown_agree_with_differences() -> None:
     network = with_everything().network
     layout = layout_of(network, np.zeros(len(network.points.names), dtype=bool))
-    state = starting_state(network)
+    state = initial_values(network)
     random = np.random.default_rng(4)
     state = replace(
         state,
@@ -48,8 +48,8 @@ def test_derivatives_of_every_unknown_agree_with_differences() -> None:
         assert size > 0.0, layout.unknowns[column].name
         dx = np.zeros(layout.columns)
         dx[column] = 1.0 / size
-        up = equations(network, layout, improved(state, layout, dx, none), weight)
-        down = equations(network, layout, improved(state, layout, -dx, none), weight)
+        up = equations(network, layout, apply_corrections(state, layout, dx, none), weight)
+        down = equations(network, layout, apply_corrections(state, layout, -dx, none), weight)
         numeric = -(up.misclosure - down.misclosure) / (2.0 * dx[column])
         error = np.abs(numeric - design[:, column]).max() / size
         assert error < 1e-6, (layout.unknowns[column].name, error)
@@ -57,8 +57,8 @@ def test_derivatives_of_every_unknown_agree_with_differences() -> None:
     for axis in range(3):
         dp = np.zeros((points, 3))
         dp[:, axis] = 1e-3
-        up = equations(network, layout, improved(state, layout, nothing, dp), weight)
-        down = equations(network, layout, improved(state, layout, nothing, -dp), weight)
+        up = equations(network, layout, apply_corrections(state, layout, nothing, dp), weight)
+        down = equations(network, layout, apply_corrections(state, layout, nothing, -dp), weight)
         own = rows.point >= 0
         numeric = -(up.misclosure - down.misclosure)[own] / 2e-3
         assert (
@@ -68,14 +68,14 @@ def test_derivatives_of_every_unknown_agree_with_differences() -> None:
 
 
 def test_the_truth_leaves_no_misclosure() -> None:
-    made = with_everything()
-    network = made.network
+    simulated = with_everything()
+    network = simulated.network
     state = replace(
-        starting_state(network),
-        station=made.station,
-        attitude=made.attitude,
-        points=made.points,
-        interior=made.interior,
+        initial_values(network),
+        station=simulated.station,
+        attitude=simulated.attitude,
+        points=simulated.points,
+        interior=simulated.interior,
         terms=(np.array([3e-5]), np.zeros(0)),
     )
     layout = layout_of(network, np.zeros(len(network.points.names), dtype=bool))
@@ -98,7 +98,7 @@ def test_the_australis_model_is_the_lens_correction_of_the_pipeline() -> None:
          lens.b1, lens.b2]
     )  # fmt: skip
     xy = np.random.default_rng(1).uniform(-30, 30, (50, 2))
-    ours = ideal_mm(Camera("c", lens.f_mm), interior, np.zeros(0), xy)
+    ours = ideal_mm(CameraModel("c", lens.f_mm), interior, np.zeros(0), xy)
     assert np.abs(ours - ideal_from_measured(lens, xy)).max() < 1e-12
 
 
@@ -107,33 +107,33 @@ def test_angles_of_many_rotations_are_those_of_one() -> None:
     rotations = np.array([rotation_matrix(*a) for a in angles])
     assert np.abs(omega_phi_kappa(rotations) - angles).max() < 1e-12
     vectors = np.random.default_rng(3).uniform(-1.5, 1.5, (20, 3))
-    assert np.abs(logarithm(exponential(vectors)) - vectors).max() < 1e-12
+    assert np.abs(vectors_from_rotations(rotations_from_vectors(vectors)) - vectors).max() < 1e-12
     step = 1e-6
     for axis in range(3):
-        small = exponential(np.tile(np.eye(3)[axis] * step, (20, 1)))
+        small = rotations_from_vectors(np.tile(np.eye(3)[axis] * step, (20, 1)))
         there, back = rotations @ small, rotations @ np.swapaxes(small, 1, 2)
         numeric = (omega_phi_kappa(there) - omega_phi_kappa(back)) / (2 * step)
         assert np.abs(numeric - angles_by_rotation_vector(rotations)[:, :, axis]).max() < 1e-8
 
 
-def test_points_behind_a_camera_are_told_of() -> None:
+def test_points_behind_a_camera_are_reported() -> None:
     network = aerial().network
     upside_down = replace(
         network.attitudes,
-        rotation=network.attitudes.rotation @ turned(np.pi, 0.0, 0.0),
+        rotation=network.attitudes.rotation @ rotation_of(np.pi, 0.0, 0.0),
     )
     network = replace(network, attitudes=upside_down)
     layout = layout_of(network, np.zeros(len(network.points.names), dtype=bool))
     with pytest.raises(BehindCameraError):
         equations(
-            network, layout, starting_state(network), np.ones(len(network.image_points.image))
+            network, layout, initial_values(network), np.ones(len(network.image_points.image))
         )
 
 
 def test_misclosures_of_every_kind_are_in_sigmas() -> None:
     network = with_everything().network
     layout = layout_of(network, np.zeros(len(network.points.names), dtype=bool))
-    state = starting_state(network)
+    state = initial_values(network)
     state = replace(state, points=state.points + np.array([0.06, -0.04, 0.03]))
     weight = np.ones(len(network.image_points.image))
     rows = equations(network, layout, state, weight)
@@ -153,13 +153,15 @@ def test_misclosures_of_every_kind_are_in_sigmas() -> None:
     np.testing.assert_allclose(of("GNSS plan"), expected(off[:, :2], gnss.sigma_m[:, :2]))
     np.testing.assert_allclose(of("GNSS height"), expected(off[:, 2], gnss.sigma_m[:, 2]))
     distances = network.distances
-    apart = np.linalg.norm(state.points[[20, 40]] - state.points[[30, 1]], axis=1)
+    distance = np.linalg.norm(state.points[[20, 40]] - state.points[[30, 1]], axis=1)
     np.testing.assert_allclose(
-        of("distance"), expected(apart - distances.distance_m, distances.sigma_m)
+        of("distance"), expected(distance - distances.distance_m, distances.sigma_m)
     )
-    turns = logarithm(np.einsum("nji,njk->nik", network.bearings.rotation, state.attitude))
+    rotation_vectors = vectors_from_rotations(
+        np.einsum("nji,njk->nik", network.measured_attitudes.rotation, state.attitude)
+    )
     np.testing.assert_allclose(
-        of("attitude"), expected(turns, network.bearings.sigma_rad), rtol=1e-3
+        of("attitude"), expected(rotation_vectors, network.measured_attitudes.sigma_rad), rtol=1e-3
     )
     quarter = equations(network, layout, state, weight * 0.25)
     image = rows.group < 2

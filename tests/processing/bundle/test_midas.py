@@ -7,15 +7,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.midas_block import Repeated, network_of, repeated
+from benchmarks.midas_block import BlockResult, network_of, run_block
 from processing.bundle.adjust import adjust
-from processing.bundle.intersection import carried_covariance, intersection, orientation_layout
-from sim_hw.blocks.oblique import HEADS, TABLE_2_GRAD, Noise, flown_obliquely, table_2_rotation
+from processing.bundle.point_intersection import (
+    intersect_points,
+    orientation_layout,
+    propagated_covariance,
+)
+from sim_hw.blocks.oblique import (
+    HEADS,
+    TABLE_2_GRAD,
+    MeasurementNoise,
+    simulate_oblique_block,
+    table_2_rotation,
+)
 
 
 @pytest.fixture(scope="module")
-def blocks() -> list[Repeated]:
-    return [repeated(seed) for seed in (1, 2)]
+def blocks() -> list[BlockResult]:
+    return [run_block(seed) for seed in (1, 2)]
 
 
 def test_table_2_is_read_with_phi_primary() -> None:
@@ -40,11 +50,11 @@ def test_relative_orientations_are_those_of_table_2_within_their_sigmas(blocks) 
 def test_averaging_over_the_block_gives_what_the_common_adjustment_gives(blocks) -> None:
     for block in blocks:
         for name, head in block.figures["heads"].items():
-            apart = np.abs(head["averaged_less_adjusted_mgrad"])
+            difference = np.abs(head["averaged_less_adjusted_mgrad"])
             # A mean of a dozen exposures, and principal points that are determined anew.
             bound = 3.0 * np.array(head["averaged_spread_mgrad"]) / np.sqrt(8.0)
             bound += 1.5 * np.array(head["sigma_mgrad"])
-            assert (apart < bound).all(), name
+            assert (difference < bound).all(), name
 
 
 def test_sigma0_is_the_noise_and_the_control_its_sigma(blocks) -> None:
@@ -67,7 +77,9 @@ def test_intersections_err_as_predicted_with_the_control_of_the_paper(blocks) ->
 
 
 def test_with_exact_orientations_an_intersection_is_as_good_as_its_image_coordinates() -> None:
-    block = flown_obliquely(4, noise=Noise(image_mm=(0.002, 0.002), principal_mm=0.0))
+    block = simulate_oblique_block(
+        4, noise=MeasurementNoise(image_mm=(0.002, 0.002), principal_mm=0.0)
+    )
     network = network_of(block, (0, 1, 2, 3, 4), own=False)
     interior = np.zeros((5, 10))
     interior[:, 3:5] = block.radial
@@ -84,8 +96,8 @@ def test_with_exact_orientations_an_intersection_is_as_good_as_its_image_coordin
     )
     layout = orientation_layout(network)
     assert layout.columns == 0
-    exact = carried_covariance(layout, None, position_m=np.zeros(3), attitude_rad=np.zeros(3))
-    found = intersection(network, layout, exact)
+    exact = propagated_covariance(layout, None, position_m=np.zeros(3), attitude_rad=np.zeros(3))
+    found = intersect_points(network, layout, exact)
     good = np.isfinite(found.xyz_m).all(axis=1)
     error = (found.xyz_m - block.points)[good]
     squares = np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariance_m2[good]), error)
@@ -94,7 +106,7 @@ def test_with_exact_orientations_an_intersection_is_as_good_as_its_image_coordin
 
 
 def test_one_attitude_with_heads_takes_fewer_unknowns_than_attitudes_of_their_own() -> None:
-    block = flown_obliquely(5)
+    block = simulate_oblique_block(5)
     heads = adjust(network_of(block, (0, 1, 2, 3, 4), own=False))
     own = adjust(network_of(block, (0, 1, 2, 3, 4), own=True))
     kinds = [u.kind for u in heads.layout.unknowns]

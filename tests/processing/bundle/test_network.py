@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from processing.bundle.network import NetworkError, checked
-from tests.processing.bundle.networks import with_everything
+from processing.bundle.network import NetworkError, validate
+from tests.processing.bundle.simulated_networks import with_everything
 
 
 def refusal(change) -> str:
@@ -21,7 +21,7 @@ def refusal(change) -> str:
 def test_a_name_that_is_given_twice_is_the_one_named() -> None:
     def twice(n) -> None:
         names = (*n.points.names[:-1], n.points.names[1])
-        checked(replace(n, points=replace(n.points, names=names)))
+        validate(replace(n, points=replace(n.points, names=names)))
 
     name = with_everything().network.points.names[1]
     assert f"object point {name} is given twice" in refusal(twice)
@@ -34,7 +34,7 @@ def test_a_sigma_of_zero_is_refused(table: str) -> None:
         field = "sigma_mm" if table == "image_points" else "sigma_m"
         sigma = np.array(getattr(own, field))
         sigma.flat[0] = 0.0
-        checked(replace(n, **{table: replace(own, **{field: sigma})}))
+        validate(replace(n, **{table: replace(own, **{field: sigma})}))
 
     assert "sigma" in refusal(zero)
 
@@ -43,6 +43,6 @@ def test_a_place_that_is_not_finite_is_refused() -> None:
     def lost(n) -> None:
         xyz = n.stations.position_m.copy()
         xyz[0, 1] = np.nan
-        checked(replace(n, stations=replace(n.stations, position_m=xyz)))
+        validate(replace(n, stations=replace(n.stations, position_m=xyz)))
 
     assert "stations hold a value that is not a finite number" in refusal(lost)

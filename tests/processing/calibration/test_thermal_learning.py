@@ -10,17 +10,17 @@ import pytest
 from numpy.typing import NDArray
 
 from processing.calibration.thermal_learning import (
-    Learned,
+    LearnedDrift,
     ThermalState,
     add_exposure,
     empty_state,
-    learned,
     observability,
+    solve_drift,
     state_from_json,
     state_json,
 )
 from processing.geometry.placement import nominal_placements
-from processing.mosaic.free import free_mosaic
+from processing.mosaic.free_mosaic import free_mosaic
 from processing.mosaic.stitch_record import (
     StitchRecord,
     StitchRecordError,
@@ -102,8 +102,8 @@ def records(rig: Rig, true_rig: Rig) -> list[StitchRecord]:
 
 
 @pytest.fixture(scope="module")
-def result(rig: Rig, records: list[StitchRecord]) -> Learned:
-    return learned(rig, gathered(rig, records))
+def result(rig: Rig, records: list[StitchRecord]) -> LearnedDrift:
+    return solve_drift(rig, gathered(rig, records))
 
 
 def true_inner(rig: Rig, true_rig: Rig, cone: str) -> NDArray[np.float64]:
@@ -120,15 +120,15 @@ def true_inner(rig: Rig, true_rig: Rig, cone: str) -> NDArray[np.float64]:
             for a, b in pairs
         ]
     )
-    turn, grow = off[:, 2].mean(), off[:, 3].mean()
+    rotation, grow = off[:, 2].mean(), off[:, 3].mean()
     for row, s in zip(off, rig.cone(cone).sensors, strict=True):
-        row[0] -= (-turn * s.y_mm + grow * s.x_mm) * 1e-3
-        row[1] -= (turn * s.x_mm + grow * s.y_mm) * 1e-3
+        row[0] -= (-rotation * s.y_mm + grow * s.x_mm) * 1e-3
+        row[1] -= (rotation * s.x_mm + grow * s.y_mm) * 1e-3
     return np.asarray(off - off.mean(axis=0))
 
 
 def test_the_rates_are_found_within_their_standard_deviations(
-    rig: Rig, true_rig: Rig, result: Learned
+    rig: Rig, true_rig: Rig, result: LearnedDrift
 ) -> None:
     errors, sizes = [], []
     for cone in ("0", "1", "2"):
@@ -144,7 +144,7 @@ def test_the_rates_are_found_within_their_standard_deviations(
 
 
 def test_the_intercept_takes_the_displacement_not_the_rate(
-    rig: Rig, true_rig: Rig, result: Learned
+    rig: Rig, true_rig: Rig, result: LearnedDrift
 ) -> None:
     master = [s for s in result.sensors if s.cone == "0"]
     moved = {
@@ -161,7 +161,7 @@ def test_the_intercept_takes_the_displacement_not_the_rate(
 
 
 def test_principal_distances_are_found_against_the_master_cone(
-    rig: Rig, true_rig: Rig, result: Learned
+    rig: Rig, true_rig: Rig, result: LearnedDrift
 ) -> None:
     def off(cone: str) -> float:
         return true_rig.cone(cone).lens.f_ppm_per_k - rig.cone(cone).lens.f_ppm_per_k
@@ -177,7 +177,7 @@ def test_below_five_kelvin_of_spread_nothing_is_learned(
     rig: Rig, records: list[StitchRecord]
 ) -> None:
     close = [r for r in records if -3.0 < r.dc_k["SU00"] < 3.0]
-    few = learned(rig, gathered(rig, close))
+    few = solve_drift(rig, gathered(rig, close))
     assert not few.sensors and not few.scales
     assert set(few.reasons) == {
         "0 places", "1 places", "2 places", "1 scale", "2 scale", "3 scale", "G scale",
@@ -186,14 +186,14 @@ def test_below_five_kelvin_of_spread_nothing_is_learned(
 
 
 def test_the_order_of_exposures_does_not_matter_and_the_state_survives_a_file(
-    rig: Rig, records: list[StitchRecord], result: Learned
+    rig: Rig, records: list[StitchRecord], result: LearnedDrift
 ) -> None:
     half = gathered(rig, records[4:][::-1])
-    kept = state_from_json(json.loads(json.dumps(state_json(half))))
-    assert state_json(kept) == state_json(half)
+    restored = state_from_json(json.loads(json.dumps(state_json(half))))
+    assert state_json(restored) == state_json(half)
     for record in records[:4]:
-        kept = add_exposure(rig, kept, record)
-    for a, b in zip(learned(rig, kept).sensors, result.sensors, strict=True):
+        restored = add_exposure(rig, restored, record)
+    for a, b in zip(solve_drift(rig, restored).sensors, result.sensors, strict=True):
         assert a.rates["x_um"] == pytest.approx(b.rates["x_um"], rel=1e-6, abs=1e-9)
     empty = empty_state(rig)
     assert state_json(state_from_json(json.loads(json.dumps(state_json(empty))))) == state_json(
@@ -229,12 +229,12 @@ def test_another_calibrations_record_is_refused(rig: Rig, records: list[StitchRe
         add_exposure(rig, empty_state(rig), other)
 
 
-def test_what_cannot_be_seen_is_said(rig: Rig) -> None:
-    told = {o.what: o for o in observability(rig)}
-    assert sum(not o.observable for o in told.values()) == 5
-    assert not told["cone 0: common shift, rotation and scale of its sensors"].observable
-    assert not told["a change of the principal distance common to all cones"].observable
-    assert any("12 rates" in what for what, o in told.items() if o.observable)
+def test_what_cannot_be_seen_is_stated(rig: Rig) -> None:
+    by_quantity = {o.what: o for o in observability(rig)}
+    assert sum(not o.observable for o in by_quantity.values()) == 5
+    assert not by_quantity["cone 0: common shift, rotation and scale of its sensors"].observable
+    assert not by_quantity["a change of the principal distance common to all cones"].observable
+    assert any("12 rates" in what for what, o in by_quantity.items() if o.observable)
 
 
 def test_a_record_survives_its_file_and_a_broken_one_is_refused(
@@ -253,7 +253,7 @@ def test_a_record_survives_its_file_and_a_broken_one_is_refused(
 def test_a_rig_of_single_sensors_teaches_its_principal_distances_and_no_places() -> None:
     rig = find_rig("ultracam-l-mini")
     true_rig = aged(rig)
-    result = learned(rig, gathered(rig, flight(rig, true_rig, (-12.0, -4.0, 4.0, 12.0))))
+    result = solve_drift(rig, gathered(rig, flight(rig, true_rig, (-12.0, -4.0, 4.0, 12.0))))
     assert not result.sensors and len(result.scales) >= 1
     master = rig.master_cone
     for scale in result.scales:

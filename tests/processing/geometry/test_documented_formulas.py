@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from processing.geometry.placement import nominal_placements, vip_mm_from_raw, vip_px_from_mm
-from processing.rig import Drift, VirtualImage, load_rig, shipped_rigs
+from processing.rig import ThermalDrift, VirtualImage, load_rig, shipped_rigs
 
 PAGE = Path(__file__).parents[3] / "docs/formats.md"
 DC_K, CONE_DC_K = 8.0, 10.0
@@ -57,9 +57,9 @@ def from_the_page(example, pixel, shifts):
     for axis, angle in reversed(list(enumerate(example["cone"]["rotation_rad"]))):
         s, t = math.sin(angle), math.cos(angle)
         one, two = [(1, 2), (2, 0), (0, 1)][axis]
-        turned = ray.copy()
-        turned[one], turned[two] = t * ray[one] - s * ray[two], s * ray[one] + t * ray[two]
-        ray = turned
+        rotated = ray.copy()
+        rotated[one], rotated[two] = t * ray[one] - s * ray[two], s * ray[one] + t * ray[two]
+        ray = rotated
     o = (100.0 * ray[0] / -ray[2], 100.0 * ray[1] / -ray[2])
     pixels = (o[0] / p + (big_w - 1) / 2, (big_h - 1) / 2 - o[1] / p)
     return [u, v, (x, y), delta, i, g, o, pixels]
@@ -76,7 +76,7 @@ def test_the_example_of_the_page_follows_from_its_formulas(section, example):
 @pytest.mark.parametrize("shifts", [0, 12, 13])
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("pixel", [PIXEL, (0.0, 0.0), (1247.0, 831.0)])
-def test_the_pipeline_places_pixels_as_the_page_says(example, shifts, sign, pixel):
+def test_the_pipeline_places_pixels_as_the_page_states(example, shifts, sign, pixel):
     rig = load_rig(shipped_rigs()["ultracam-x-mini"])
     example = {**example, "sensor": {**example["sensor"], "tdi_row_sign": sign}}
     cone = next(c for c in rig.cones if c.role == "pan" and c.name != rig.master_cone)
@@ -87,7 +87,7 @@ def test_the_pipeline_places_pixels_as_the_page_says(example, shifts, sign, pixe
         width_px=1248,
         height_px=832,
         pitch_um=36.0,
-        drift=Drift(**example["drift"]),
+        drift=ThermalDrift(**example["drift"]),
         probe="own",
         calibration_c=20.0,
     )

@@ -47,7 +47,7 @@ AT = np.array([[3.0, 4.0]])
         ("b2", 1e-3, (0.004, 0.0)),
     ],
 )
-def test_each_parameter_of_the_ten_moves_a_point_as_equation_5_1_says(
+def test_each_parameter_of_the_ten_moves_a_point_as_equation_5_1_states(
     parameter: str, value: float, expected: tuple[float, float]
 ) -> None:
     changed = dataclasses.replace(PLAIN, **{parameter: value})

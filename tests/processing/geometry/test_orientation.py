@@ -19,7 +19,7 @@ from processing.geometry.orientation import (
     phi_omega_kappa,
 )
 from processing.geometry.rotation import rotation_matrix
-from sim_hw.world import camera, flight
+from sim_hw.world import flight, true_camera
 
 ANGLE = st.floats(-math.pi, math.pi)
 HALF_ANGLE = st.floats(-1.5, 1.5)
@@ -62,7 +62,7 @@ def test_the_emulated_aircraft_agrees(roll: float, pitch: float, heading: float)
         body_from_camera=BODY_FROM_CAMERA,
         azimuth_of_north_rad=0.0,
     )
-    theirs = flight.enu_from_body(roll, pitch, heading) @ camera.BODY_FROM_CAMERA
+    theirs = flight.enu_from_body(roll, pitch, heading) @ true_camera.BODY_FROM_CAMERA
     assert ours == pytest.approx(theirs, abs=1e-12)
 
 
@@ -70,7 +70,7 @@ def test_level_and_northbound_all_angles_are_zero() -> None:
     assert omega_phi_kappa(looking(0, 0, 0)) == pytest.approx((0, 0, 0), abs=1e-15)
 
 
-def test_eastbound_the_image_is_turned_clockwise() -> None:
+def test_eastbound_the_image_is_rotated_clockwise() -> None:
     assert np.degrees(omega_phi_kappa(looking(0, 0, 90))) == pytest.approx([0, 0, -90])
 
 
@@ -81,13 +81,13 @@ def test_right_wing_down_northbound_is_seen_to_the_left() -> None:
     assert np.degrees(omega_phi_kappa(looking(10, 0, 0))) == pytest.approx([0, 10, 0])
 
 
-def test_nose_up_looks_ahead() -> None:
+def test_nose_up_points_ahead() -> None:
     axis = looking(0, 5, 0) @ np.array([0.0, 0.0, -1.0])
     assert axis[1] == pytest.approx(math.sin(math.radians(5)))
     assert np.degrees(omega_phi_kappa(looking(0, 5, 0))) == pytest.approx([5, 0, 0])
 
 
-def test_a_grid_whose_north_lies_west_of_true_north_turns_kappa() -> None:
+def test_a_grid_whose_north_lies_west_of_true_north_rotates_kappa() -> None:
     # True north at azimuth +1.5 deg of the grid: flying true north is flying 1.5 deg in the grid.
     assert np.degrees(omega_phi_kappa(looking(0, 0, 0, 1.5))) == pytest.approx([0, 0, -1.5])
     assert grid_from_enu(0.1) @ np.array([0, 1, 0]) == pytest.approx(
@@ -131,7 +131,7 @@ def test_rounding_beyond_one_gives_a_right_angle(beyond: float) -> None:
     assert phi_omega_kappa(about_x) == pytest.approx((0.0, quarter, 0.0))
 
 
-def test_east_turns_to_the_south_of_a_grid_whose_north_is_turned() -> None:
+def test_east_points_to_the_south_of_a_grid_whose_north_is_rotated() -> None:
     assert grid_from_enu(0.3) @ grid_from_enu(0.3).T == pytest.approx(np.eye(3))
     east = grid_from_enu(0.1) @ np.array([1.0, 0.0, 0.0])
     assert east == pytest.approx([math.cos(0.1), -math.sin(0.1), 0.0])

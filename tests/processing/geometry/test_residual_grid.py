@@ -8,18 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from daemon.postflight.calibration.rig_text import rig_toml
+from daemon.postflight.calibration.rig_writer import rig_toml
 from processing.geometry.lens import ideal_from_measured, measured_from_ideal
 from processing.geometry.placement import vip_mm_from_px
 from processing.geometry.residual_grid import (
     ResidualGrid,
+    cross_validation_residuals,
     fit_residual_grid,
     grid_of_lens,
-    left_by_halves,
 )
 from processing.pipelines.perspective import perspective_of, raw_of_perspective
 from processing.rig import Cone, LensGrid, Rig, RigError, find_rig, rig_from_mapping
-from sim_hw.world.camera import true_camera, undistorted
+from sim_hw.world.true_camera import true_camera, undistorted
 
 NOISE_UM = 0.1
 HALF_MM = (4.6, 3.1)
@@ -36,7 +36,7 @@ def ripple_mm(xy_mm: np.ndarray) -> np.ndarray:
 def planted() -> LensGrid:
     """The ripple in so many nodes that between them it is true to a nanometre or so."""
     x, y = np.linspace(-4.7, 4.7, 95), np.linspace(-3.2, 3.2, 65)
-    return ResidualGrid(x, y, ripple_mm(np.stack(np.meshgrid(x, y), axis=-1))).for_lens()
+    return ResidualGrid(x, y, ripple_mm(np.stack(np.meshgrid(x, y), axis=-1))).as_lens_grid()
 
 
 def calibrated() -> LensGrid:
@@ -44,7 +44,7 @@ def calibrated() -> LensGrid:
     random = np.random.default_rng(4)
     at = random.uniform(-1.0, 1.0, (400, 2)) * HALF_MM
     seen = ripple_mm(at) + random.normal(0.0, NOISE_UM * 1e-3, (400, 2))
-    return fit_residual_grid(at, seen, half_mm=HALF_MM, nodes=(17, 13)).for_lens()
+    return fit_residual_grid(at, seen, half_mm=HALF_MM, nodes=(17, 13)).as_lens_grid()
 
 
 def with_grid(rig: Rig, grid: LensGrid | None) -> Cone:
@@ -97,10 +97,10 @@ def test_a_rig_file_holds_the_grid_and_names_what_is_wrong_in_one() -> None:
     grid = content["cone"][0]["lens"]["residual_grid"]
     grid["dy_um"][2] = grid["dy_um"][2][:-1]
     grid["x_mm"][3] += 0.01
-    with pytest.raises(RigError) as told:
+    with pytest.raises(RigError) as refusal:
         rig_from_mapping(content, "rig.toml")
-    assert "lens.residual_grid.x_mm" in str(told.value) and "equal steps" in str(told.value)
-    assert "lens.residual_grid.dy_um" in str(told.value) and "13 lists" in str(told.value)
+    assert "lens.residual_grid.x_mm" in str(refusal.value) and "equal steps" in str(refusal.value)
+    assert "lens.residual_grid.dy_um" in str(refusal.value) and "13 lists" in str(refusal.value)
 
 
 def test_halves_that_differ_leave_their_difference() -> None:
@@ -108,5 +108,5 @@ def test_halves_that_differ_leave_their_difference() -> None:
     at = np.random.default_rng(1).uniform(-1.0, 1.0, (200, 2)) * HALF_MM
     sign = np.where(np.arange(200) % 2, -1.0, 1.0)
     residual = sign[:, None] * [1e-3, -5e-4]
-    left = left_by_halves(at, residual, half_mm=HALF_MM, nodes=(5, 4))
+    left = cross_validation_residuals(at, residual, half_mm=HALF_MM, nodes=(5, 4))
     np.testing.assert_allclose(left, 2.0 * residual, atol=1e-7)

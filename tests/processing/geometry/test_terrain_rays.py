@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from processing.bundle.bent_rays import MEAN_EARTH_RADIUS_M
+from processing.bundle.curvature_refraction import MEAN_EARTH_RADIUS_M
 from processing.geometry.terrain_rays import HeightModel, on_terrain
 from sim_hw.world.terrain import mild_relief
 
@@ -21,9 +21,10 @@ def test_oblique_rays_meet_the_ground_of_the_emulator() -> None:
     model = model_of(terrain.height_m)
     centre = np.array([120.0, -80.0, 1000.0])
     angles = np.radians(np.linspace(0.0, 58.0, 30))
-    turn = np.radians(np.linspace(0.0, 350.0, 30))
+    azimuth = np.radians(np.linspace(0.0, 350.0, 30))
     rays = np.stack(
-        [np.sin(angles) * np.sin(turn), np.sin(angles) * np.cos(turn), -np.cos(angles)], axis=1
+        [np.sin(angles) * np.sin(azimuth), np.sin(angles) * np.cos(azimuth), -np.cos(angles)],
+        axis=1,
     )
     found = on_terrain(centre, rays, model, earth_radius_m=None)
     truth = terrain.intersect(centre, rays)
@@ -96,7 +97,7 @@ def test_heights_are_bilinear_within_the_model_and_unknown_outside(
 
 
 @pytest.mark.parametrize("earth_radius_m", [None, MEAN_EARTH_RADIUS_M])
-def test_rays_meet_a_tilted_plane_where_algebra_says(earth_radius_m: float | None) -> None:
+def test_rays_meet_a_tilted_plane_where_algebra_states(earth_radius_m: float | None) -> None:
     plane = model_of(lambda x, y: 40.0 + 0.1 * x - 0.2 * y, half_m=600.0)
     centre = np.array([20.0, -30.0, 500.3])
     rays = np.array([[0.0, 0.0, -1.0], [0.6, 0.2, -1.0], [-0.3, 0.5, -2.0], [0.0, 0.9, -1.0]])

@@ -16,20 +16,20 @@ from processing.geometry.placement import (
 )
 from processing.geometry.topology import (
     Rectangle,
+    _contains_point,
     _is_strip,
     _is_upright,
-    _sees,
     colour_coverage,
     colour_ratio,
+    common_view,
     corners,
     counts,
     footprint,
     intersection,
     outline,
     overlaps,
-    seen_by_both,
 )
-from processing.mosaic.free import free_mosaic
+from processing.mosaic.free_mosaic import free_mosaic
 from processing.rig import Rig, Sensor, find_rig, load_rig, shipped_rigs
 from tests.processing.synthetic import make_truth, tie_points_of
 
@@ -238,7 +238,7 @@ def test_a_rig_without_colour_master_has_neither_coverage_nor_ratio() -> None:
     assert counts(rig).parameters == 56
 
 
-def test_a_ratio_that_is_not_whole_is_not_rounded() -> None:
+def test_a_ratio_that_is_not_an_integer_is_not_rounded() -> None:
     rig = find_rig("ultracam-x-mini")
     cones = tuple(
         dataclasses.replace(c, lens=dataclasses.replace(c.lens, f_mm=21.0)) if c.name == "G" else c
@@ -282,7 +282,7 @@ def test_footprints_and_outlines_reach_half_a_pixel_beyond_the_outer_pixels() ->
         assert found[2:, 1] == pytest.approx([-0.5, h - 0.5], abs=0.05)
 
 
-def turned(placement: SensorPlacement, angle_deg: float, x_mm: float) -> SensorPlacement:
+def rotated_placement(placement: SensorPlacement, angle_deg: float, x_mm: float) -> SensorPlacement:
     c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
     layer = np.array([[c, -s, x_mm], [s, c, 0.0], [0.0, 0.0, 1.0]])
     return dataclasses.replace(placement, layer=layer)
@@ -290,23 +290,25 @@ def turned(placement: SensorPlacement, angle_deg: float, x_mm: float) -> SensorP
 
 def test_a_tilted_sensor_shares_the_box_around_what_both_see() -> None:
     plain = nominal_placements(find_rig("ultracam-x-mini"), {}, {})["SU30"]
-    upright, quarter = turned(plain, 0.0, 0.0), turned(plain, 90.0, 0.0)
+    upright, quarter = rotated_placement(plain, 0.0, 0.0), rotated_placement(plain, 90.0, 0.0)
     box = footprint(upright)
-    common = seen_by_both(upright, quarter)
+    common = common_view(upright, quarter)
     # A sensor turned by 90 degrees about the middle: a square of its height, to its own offset.
     side = min(box.width_mm, box.height_mm)
     assert common.width_mm == pytest.approx(side, abs=0.05)
     assert common.height_mm == pytest.approx(side, abs=0.05)
-    tilted = seen_by_both(upright, turned(plain, 45.0, 0.0))
+    tilted = common_view(upright, rotated_placement(plain, 45.0, 0.0))
     # The diamond's corners along y are cut by the sensor's upper and lower sides.
     assert tilted.height_mm == pytest.approx(box.height_mm, rel=0.02)
     reach = (box.width_mm + box.height_mm) / 2.0**0.5
     assert tilted.width_mm == pytest.approx(min(reach, box.width_mm), rel=0.02)
-    assert seen_by_both(upright, turned(plain, 45.0, 100.0)) == Rectangle(0.0, 0.0, 0.0, 0.0)
+    assert common_view(upright, rotated_placement(plain, 45.0, 100.0)) == Rectangle(
+        0.0, 0.0, 0.0, 0.0
+    )
     # Askew by 1 % of the smaller side still counts as upright.
     for share, is_upright in ((0.9, True), (1.1, False)):
         angle = np.degrees(share * 0.01 * min(box.width_mm, box.height_mm) / box.width_mm)
-        assert _is_upright(turned(plain, angle, 0.0)) is is_upright
+        assert _is_upright(rotated_placement(plain, angle, 0.0)) is is_upright
 
 
 def test_a_sensor_sees_from_its_first_pixel_centre_to_its_last() -> None:
@@ -315,7 +317,7 @@ def test_a_sensor_sees_from_its_first_pixel_centre_to_its_last() -> None:
     inside, outside = [[0.1, 0.1], last - 0.1], [[-0.1, 5.0], [5.0, -0.1]]
     outside += [[last[0] + 0.1, 5.0], [5.0, last[1] + 0.1]]
     for at, seen in [*((p, True) for p in inside), *((p, False) for p in outside)]:
-        assert _sees(placement, vip_mm_from_raw(placement, np.array([at]))) is seen, at
+        assert _contains_point(placement, vip_mm_from_raw(placement, np.array([at]))) is seen, at
 
 
 def test_a_strip_is_longer_than_half_of_the_smaller_sensor() -> None:

@@ -15,12 +15,12 @@ from processing.geometry.rotation import rotation_matrix
 from processing.geometry.topology import corners, counts, overlaps
 from processing.geometry.virtual_camera import GroundPlane, ground_plane, head_parallax_px
 from processing.matching.tie_points import PAN_TO_COLOUR
-from processing.mosaic.fixed import fixed_mosaic
-from processing.mosaic.free import Mosaic, free_mosaic
+from processing.mosaic.fixed_mosaic import fixed_mosaic
+from processing.mosaic.free_mosaic import Mosaic, free_mosaic
 from processing.mosaic.model import placement_at
 from processing.mosaic.mounting import check_platform, platform_figures, verified_mosaic
 from processing.mosaic.pan_only import pan_only_mosaic
-from processing.quality.judgement import judge
+from processing.quality.evaluation import evaluate
 from processing.quality.report import Flag
 from processing.rig import Rig, find_rig
 from tests.processing.synthetic import Truth, make_truth, tie_points_of
@@ -33,9 +33,9 @@ def rig() -> Rig:
     return find_rig("dmc-mini")
 
 
-def drawn(rig: Rig, seed: int, *, turned_px: float = 1.0) -> tuple[Truth, Mosaic, Mosaic]:
+def drawn(rig: Rig, seed: int, *, rotation_px: float = 1.0) -> tuple[Truth, Mosaic, Mosaic]:
     rng = np.random.default_rng(seed)
-    truth = make_truth(rig, rng, layer_px=turned_px)
+    truth = make_truth(rig, rng, layer_px=rotation_px)
     points = tie_points_of(truth, rng, without_kind=PAN_TO_COLOUR)
     return truth, pan_only_mosaic(rig, truth.start, points), free_mosaic(rig, truth.start, points)
 
@@ -76,7 +76,7 @@ def test_green_adds_its_layer_to_the_angles(rig: Rig) -> None:
     assert mosaic.constrained_rank == 20 and not mosaic.undetermined
 
 
-def test_a_ray_meets_the_plane_where_a_drawing_says_it_does() -> None:
+def test_a_ray_meets_the_plane_where_a_drawing_states_it_does() -> None:
     """Ray by ray with points in space, against the homography the pixels are fetched by."""
     rig = find_rig("dmc")
     up = np.array([0.03, -0.05, 1.0])
@@ -141,43 +141,43 @@ def test_errors_of_the_nine_angles_are_as_large_as_stated(rig: Rig) -> None:
     assert np.mean(inside) > 0.98 and worst < 5.0
 
 
-def turned(rig: Rig, turns_rad: Array) -> Truth:
+def with_rotated_heads(rig: Rig, rotations_rad: Array) -> Truth:
     """A platform whose heads are turned about x, y, z of the virtual image, (4, 3), and no more."""
     truth = make_truth(rig, np.random.default_rng(1), layer_px=0.0)
     values = truth.values.copy()
-    for name, turn in zip("1234", turns_rad, strict=True):
+    for name, rotation in zip("1234", rotations_rad, strict=True):
         first = truth.model.mountings[name]
-        values[first : first + 3] = turn
+        values[first : first + 3] = rotation
     placements = {n: placement_at(truth.model, p, values) for n, p in truth.start.items()}
     return dataclasses.replace(truth, values=values, placements=placements)
 
 
-def test_a_platform_as_calibrated_has_not_expired_and_a_turned_head_has(rig: Rig) -> None:
+def test_a_platform_as_calibrated_has_not_expired_and_a_rotated_head_has(rig: Rig) -> None:
     rng = np.random.default_rng(9)
     for _ in range(20):
-        healthy = turned(rig, rng.normal(0.0, 20e-6, (4, 3)))
+        healthy = with_rotated_heads(rig, rng.normal(0.0, 20e-6, (4, 3)))
         points = tie_points_of(healthy, rng, without_kind=PAN_TO_COLOUR)
         check = check_platform(rig, free_mosaic(rig, healthy.start, points), points, {})
-        assert check is not None and check.freedom == 9 and not check.expired
-        assert not judge(platform_figures(check)).flags
-    turns = np.zeros((4, 3))
-    turns[1, 1] = 200e-6
-    moved = turned(rig, turns)
+        assert check is not None and check.degrees_of_freedom == 9 and not check.is_expired
+        assert not evaluate(platform_figures(check)).flags
+    rotations = np.zeros((4, 3))
+    rotations[1, 1] = 200e-6
+    moved = with_rotated_heads(rig, rotations)
     points = tie_points_of(moved, rng, without_kind=PAN_TO_COLOUR)
     check = check_platform(rig, free_mosaic(rig, moved.start, points), points, {})
-    assert check is not None and check.expired and check.farthest.cone == "2"
+    assert check is not None and check.is_expired and check.farthest.cone == "2"
     # 200 urad at 120 mm are 2 px; a quarter of it goes into the mean of the four.
     assert platform_figures(check)["platform_shift_px"] == pytest.approx(1.5, abs=0.08)
-    report = judge(platform_figures(check))
+    report = evaluate(platform_figures(check))
     assert report.flags == Flag.CALIBRATION_EXPIRED and "Head 2" in report.findings[0].sentence
 
 
 def test_shifts_that_are_left_become_increments_of_the_angles(rig: Rig) -> None:
     """From angles that were never adjusted, verification alone comes most of the way."""
     rng = np.random.default_rng(4)
-    turns = rng.normal(0.0, 50e-6, (4, 3))
-    turns[:, 2] = 0.0
-    truth = turned(rig, turns)
+    rotations = rng.normal(0.0, 50e-6, (4, 3))
+    rotations[:, 2] = 0.0
+    truth = with_rotated_heads(rig, rotations)
     points = tie_points_of(truth, rng, sigma_pp_px=0.02, without_kind=PAN_TO_COLOUR)
     held = fixed_mosaic(rig, truth.start, points)
     loose = dataclasses.replace(held, outliers=np.zeros_like(held.outliers))

@@ -48,7 +48,7 @@ def test_gains_come_back_from_the_overlaps_to_a_thousandth() -> None:
     assert len(balance.pairs) == 20  # 12 strips and the diagonals of four corners
 
 
-def test_cars_and_burnt_roofs_do_not_pull_the_balance() -> None:
+def test_cars_and_saturated_roofs_do_not_pull_the_balance() -> None:
     means = node_means(np.ones(9))
     means[1, 5:20, 40:44] *= 3.0
     means[4, 27:36, 40:60] = UNUSABLE
@@ -56,7 +56,7 @@ def test_cars_and_burnt_roofs_do_not_pull_the_balance() -> None:
     assert all(abs(gain - 1) < 2e-3 for gain in balance.gains.values())
 
 
-def test_where_light_and_dark_lie_far_apart_gain_and_offset_are_told_from_each_other() -> None:
+def test_where_light_and_dark_differ_strongly_gain_and_offset_are_separated() -> None:
     """Black has drifted by up to 2 DN (16 counts), and gains by a few per cent."""
     gains = np.array([1.0, 1.03, 0.98, 1.01, 0.97, 1.02, 1.0, 0.99, 1.01])
     black = np.array([0.0, 16.0, -12.0, 8.0, -16.0, 4.0, 10.0, -6.0, -4.0])
@@ -74,15 +74,15 @@ def test_where_light_and_dark_lie_far_apart_gain_and_offset_are_told_from_each_o
     assert min(pair.span for pair in balance.pairs if pair.samples > 100) > 4.0
     for level in (1500.0, 6000.0, 20000.0):
         # What the heads make of the same light, against each other.
-        said = [
+        balanced = [
             balance.gains[name] * (level / gains[k] + black[k]) + balance.offsets[name]
             for k, name in enumerate(NAMES)
         ]
-        assert max(said) / min(said) - 1 < 2e-3
+        assert max(balanced) / min(balanced) - 1 < 2e-3
     assert np.mean(list(balance.offsets.values())) == pytest.approx(0.0, abs=1e-6)
 
 
-def test_an_even_scene_tells_no_offset_from_a_gain() -> None:
+def test_an_even_scene_does_not_separate_offset_from_gain() -> None:
     balance = balance_gains(NAMES, node_means(np.linspace(0.9, 1.1, 9)))
     assert max(pair.span for pair in balance.pairs) < 4.0
     assert set(balance.offsets.values()) == {0.0}

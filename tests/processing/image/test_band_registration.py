@@ -32,7 +32,7 @@ from processing.rig import find_rig
 from tests.processing.textures import Texture
 
 WIDTH, HEIGHT = 512, 384
-TURNED = rotation_matrix(0.012, -0.021, 0.009)
+ROTATION = rotation_matrix(0.012, -0.021, 0.009)
 
 
 def small_rig():
@@ -47,7 +47,7 @@ def small_rig():
 
 
 RIG = small_rig()
-TRUE = rotation_homography(TURNED, 2.2, 2.2)
+TRUE = rotation_homography(ROTATION, 2.2, 2.2)
 """How a band is really turned against its calibration; the rig file says nothing of it."""
 
 
@@ -68,7 +68,7 @@ def scene():
     return Texture(640, np.random.default_rng(5), cutoff=0.12).moved(0.0, 0.0)
 
 
-def test_a_turned_band_is_found_to_a_twentieth_of_a_pixel_over_many_pixels(scene):
+def test_a_rotated_band_is_found_to_a_twentieth_of_a_pixel_over_many_pixels(scene):
     placements = band_placements(RIG, {})
     green = rendered(RIG, "G", np.eye(3), scene)
     other = rendered(RIG, "R", TRUE, scene, contrast=0.5)
@@ -101,7 +101,7 @@ def test_bands_of_different_scenes_are_not_forced_onto_each_other(scene):
     assert not found.registered and np.array_equal(found.band_from_reference, np.eye(3))
 
 
-def test_the_lattice_tells_raw_pixels_to_a_hundredth_of_a_pixel():
+def test_the_lattice_gives_raw_pixels_to_a_hundredth_of_a_pixel():
     image, placement = reference_image(RIG), band_placements(RIG, {})["E"]
     dense = raw_of_reference_pixels(image, placement, TRUE)
     grid = np.stack(np.meshgrid(np.arange(3, WIDTH, 37), np.arange(5, HEIGHT, 31)), -1)

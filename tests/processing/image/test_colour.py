@@ -85,7 +85,7 @@ def test_a_displaced_colour_head_is_brought_back_onto_green(
     assert np.sqrt(np.mean(np.sum(off**2, axis=1))) < bar
 
 
-def test_a_band_without_texture_lies_as_calibrated_and_says_so() -> None:
+def test_a_band_without_texture_lies_as_calibrated_and_reports_it() -> None:
     rig = find_rig("ultracam-x-mini")
     start = nominal_placements(rig, {}, {})
     rng = np.random.default_rng(1)

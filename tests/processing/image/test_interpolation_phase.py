@@ -131,7 +131,7 @@ def test_runs_whose_phase_drifts_hold_it_too(matrix: Matrix, wave: tuple[float, 
     assert shift < 0.005
 
 
-def test_a_level_surface_and_whole_pixels_come_out_as_they_are() -> None:
+def test_a_level_surface_and_integer_pixels_come_out_as_they_are() -> None:
     rng = np.random.default_rng(3)
     frame = (2 * rng.integers(1000, 30_000, (1, 130, 170))).astype(np.uint16)
     out, _ = fetch(frame, [(7.0, 1.0, 0.0, 9.0, 0.0, 1.0)], interpolation=DEFAULT_INTERPOLATION)

@@ -96,13 +96,13 @@ def test_data_never_become_no_data_and_never_wrap():
 
 def test_strips_make_no_difference(monkeypatch):
     _, pan, colour = scene(3)
-    whole = pansharpened(pan, colour, 3)
+    full_image = pansharpened(pan, colour, 3)
     monkeypatch.setattr(pansharpening, "STRIP_ROWS", 17)
     for name, sharp in pansharpened(pan, colour, 3).items():
-        assert np.abs(sharp.astype(int) - whole[name]).max() <= 1
+        assert np.abs(sharp.astype(int) - full_image[name]).max() <= 1
 
 
-def test_rows_and_columns_beyond_the_last_whole_colour_pixel_are_filled():
+def test_rows_and_columns_beyond_the_last_complete_colour_pixel_are_filled():
     _, pan, colour = scene(3)
     pan = np.pad(pan, ((0, 2), (0, 1)), mode="edge")
     sharp = pansharpened(pan, colour, 3)["green"]

@@ -18,7 +18,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Measured:
     return measure(folder, levels=(0.2,), changes=(False,), own_contrast=False)
 
 
-def test_heads_agree_along_the_whole_seam_to_two_parts_in_a_thousand(measured: Measured) -> None:
+def test_heads_agree_along_the_entire_seam_to_two_parts_in_a_thousand(measured: Measured) -> None:
     for seams in measured[0]:
         assert seams.strips > 300, seams.scene
         assert seams.largest <= 0.2, seams.scene

@@ -24,13 +24,13 @@ def test_no_phase_draws_matches_and_the_sigma_is_the_true_one(case: Case) -> Non
     assert found.largest_mean < chance + 0.004
     assert found.predicted_sigma / found.true_sigma == pytest.approx(1.0, abs=0.2)
     assert found.inside_3 > 0.985
-    assert found.kept > 0.9
+    assert found.accepted > 0.9
 
 
 def test_sharpness_costs_next_to_nothing_where_nothing_of_it_is_lost() -> None:
     """Green that is softer by half of its pixel tells places half as well, not a tenth."""
-    alike, soft = (
+    equal_sharpness, soft = (
         run(Case(RATIO, 0.5, 0.15, 0.3, blur), phases=2, size=800) for blur in (0.0, 0.6)
     )
-    assert soft.true_sigma < 2.0 * alike.true_sigma
+    assert soft.true_sigma < 2.0 * equal_sharpness.true_sigma
     assert np.abs(soft.means).max() < 0.005

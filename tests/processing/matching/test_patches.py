@@ -147,13 +147,13 @@ def test_a_flat_patch_and_one_off_the_search_are_not_matched() -> None:
 
 def test_saturated_or_missing_pixels_keep_a_patch_from_being_used() -> None:
     texture = Texture(300, np.random.default_rng(16)).moved(0.0, 0.0)
-    words = (8.0 * texture).astype(np.uint16) & 0xFFFE
+    raw = (8.0 * texture).astype(np.uint16) & 0xFFFE
     at = np.array([[100, 100], [200, 200], [100, 200]], dtype=np.int64)
-    spoilt = words.copy()
-    spoilt[100, 104] |= 1
-    spoilt[203, 200] = 0
+    damaged = raw.copy()
+    damaged[100, 104] |= 1
+    damaged[203, 200] = 0
     limits = np.array([0, 299, 0, 299], dtype=np.int64)
-    found = match_patches(words, spoilt, at, at, limits, 1, 9, 6, True, INTERPOLATION)
+    found = match_patches(raw, damaged, at, at, limits, 1, 9, 6, True, INTERPOLATION)
     assert found[:, 7].tolist() == [0.0, 0.0, 1.0]
     assert found[2, 0:2] == pytest.approx(found[2, 2:4], abs=1e-3)
     broken = texture.astype(np.float32)

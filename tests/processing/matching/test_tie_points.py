@@ -49,10 +49,12 @@ def scene() -> tuple[
     frames = {}
     for name, raw in exposure.frames.items():
         black = rig.sensor(name).black_dn
-        words = np.clip((raw.astype(np.float64) - black) * 8.0, 2, 65534).astype(np.uint16)
-        words &= 0xFFFE
-        words[: exposure.tdi_shifts[name]] = 0
-        frames[name] = words
+        raw_words_masked = np.clip((raw.astype(np.float64) - black) * 8.0, 2, 65534).astype(
+            np.uint16
+        )
+        raw_words_masked &= 0xFFFE
+        raw_words_masked[: exposure.tdi_shifts[name]] = 0
+        frames[name] = raw_words_masked
     start = nominal_placements(rig, exposure.temperatures_c, exposure.tdi_shifts)
     truth = nominal_placements(exposure.true_rig, exposure.temperatures_c, exposure.tdi_shifts)
     return rig, start, truth, frames
@@ -84,12 +86,12 @@ def test_points_of_every_pair_meet_in_the_true_geometry_without_bias() -> None:
         assert np.abs(own.mean(axis=0)).max() < bar, pair
     assert np.abs(error[points.kind == PAN_TO_PAN]).max() < 0.05
     assert np.abs(error[points.kind == PAN_TO_COLOUR]).max() < 0.3
-    assert len(points) > 0.95 * sum(points.sought)
+    assert len(points) > 0.95 * sum(points.attempted)
     # And in the geometry as calibrated they do not meet: the test would notice.
     assert np.abs(gaps_px(points, start)).max() > 2.0
 
 
-def test_points_are_spread_over_the_whole_strip_and_the_whole_sensor() -> None:
+def test_points_are_spread_over_the_entire_strip_and_the_entire_sensor() -> None:
     rig, start, _, frames = scene()
     points = match_tie_points(rig, start, frames)
     for number, (a, b) in enumerate(points.pairs):
@@ -137,7 +139,7 @@ def test_a_missing_frame_has_no_points_and_leaves_the_others_theirs() -> None:
     assert len(match_tie_points(rig, start, {})) == 0
 
 
-def test_water_has_few_points_and_says_how_many_were_sought() -> None:
+def test_water_has_few_points_and_states_how_many_were_sought() -> None:
     rig, start, _, frames = scene()
     rng = np.random.default_rng(3)
     water = {
@@ -145,8 +147,8 @@ def test_water_has_few_points_and_says_how_many_were_sought() -> None:
         for name, frame in frames.items()
     }
     points = match_tie_points(rig, start, water)
-    assert sum(points.sought) > 1000
-    assert len(points) < 0.01 * sum(points.sought)
+    assert sum(points.attempted) > 1000
+    assert len(points) < 0.01 * sum(points.attempted)
 
 
 def test_frames_of_the_wrong_shape_or_type_are_refused() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from processing.matching.tie_points import TiePointSettings
-from processing.pipelines.stitched import Pipeline, Product, Settings
+from processing.pipelines.stitched import Pipeline, PipelineSettings, Product
 from processing.quality.nominal_area import nominal_area
 from processing.quality.report import Flag, Verdict, as_json
 from processing.rig import Rig, find_rig
@@ -32,13 +32,13 @@ def exposure() -> Exposure:
 @pytest.fixture(scope="module")
 def pipeline() -> Pipeline:
     few = TiePointSettings(points_per_overlap=200, points_per_sensor=400)
-    return Pipeline(RIG, {}, Settings(interpolation="bilinear", tie_points=few))
+    return Pipeline(RIG, {}, PipelineSettings(interpolation="bilinear", tie_points=few))
 
 
 @pytest.fixture(scope="module")
-def whole(pipeline: Pipeline, exposure: Exposure) -> Product:
-    made = pipeline.process(exposure.frames, conditions(RIG, exposure))
-    return replace(made, pan=made.pan.copy(), valid=made.valid.copy())
+def complete_product(pipeline: Pipeline, exposure: Exposure) -> Product:
+    product_copy = pipeline.process(exposure.frames, conditions(RIG, exposure))
+    return replace(product_copy, pan=product_copy.pan.copy(), valid=product_copy.valid.copy())
 
 
 def number(product: Product, figure: str) -> float:
@@ -55,41 +55,53 @@ def test_every_sensor_and_every_cone_has_its_case() -> None:
     assert len(SINGLE) == 13 and len(CONES) == 8 and len(CASES) == 16
 
 
-def test_the_whole_camera_states_its_accuracy(whole: Product, exposure: Exposure) -> None:
-    absolute, _ = errors_px(RIG, exposure, whole.geometry["free"])
-    stated = number(whole, "stitched_sigma_px")
+def test_the_complete_camera_states_its_accuracy(
+    complete_product: Product, exposure: Exposure
+) -> None:
+    absolute, _ = errors_px(RIG, exposure, complete_product.geometry["free"])
+    stated = number(complete_product, "stitched_sigma_px")
     assert 0.01 < stated < 0.04
     # Errors are lengths of two coordinates; the calibration of this exposure is without error.
     assert rms(absolute) < np.sqrt(2.0) * stated
-    assert whole.report.flags == Flag.SIMULATED and whole.report.verdict is Verdict.GOOD
+    assert (
+        complete_product.report.flags == Flag.SIMULATED
+        and complete_product.report.verdict is Verdict.GOOD
+    )
 
 
 @pytest.mark.parametrize("missing", CASES, ids="+".join)
-def test_what_is_missing_leaves_an_image_that_says_so(
-    pipeline: Pipeline, exposure: Exposure, whole: Product, missing: tuple[str, ...]
+def test_what_is_missing_leaves_an_image_that_reports_it(
+    pipeline: Pipeline, exposure: Exposure, complete_product: Product, missing: tuple[str, ...]
 ) -> None:
     frames = {name: frame for name, frame in exposure.frames.items() if name not in missing}
-    made = pipeline.process(frames, conditions(RIG, exposure))
-    figures = made.report.figures
-    json.dumps(as_json(made.report), allow_nan=False)
+    product_copy = pipeline.process(frames, conditions(RIG, exposure))
+    figures = product_copy.report.figures
+    json.dumps(as_json(product_copy.report), allow_nan=False)
 
-    assert made.report.flags & Flag.FRAME_MISSING
+    assert product_copy.report.flags & Flag.FRAME_MISSING
     assert figures["missing_sensors"] == ", ".join(missing)
     expected = Verdict.REFLY if missing == MASTER else Verdict.USABLE
-    assert made.report.verdict is expected
-    assert not made.report.flags & (Flag.DC_DISAGREEMENT | Flag.DISPLACED_SENSOR | Flag.SIGMA0)
+    assert product_copy.report.verdict is expected
+    assert not product_copy.report.flags & (
+        Flag.DC_DISAGREEMENT | Flag.DISPLACED_SENSOR | Flag.SIGMA0
+    )
 
-    absent = [made.sensors.index(name) + 1 for name in missing if name in made.sensors]
-    contributing = made.valid & 0x7F
+    absent = [
+        product_copy.sensors.index(name) + 1 for name in missing if name in product_copy.sensors
+    ]
+    contributing = product_copy.valid & 0x7F
     assert not np.isin(contributing, absent).any()
-    assert np.array_equal(made.valid == 0, made.pan == 0)
-    lost = np.isin(whole.valid & 0x7F, absent)
-    assert (made.valid[~lost] > 0).sum() >= (whole.valid[~lost] > 0).sum() - 200
+    assert np.array_equal(product_copy.valid == 0, product_copy.pan == 0)
+    lost = np.isin(complete_product.valid & 0x7F, absent)
+    assert (product_copy.valid[~lost] > 0).sum() >= (complete_product.valid[~lost] > 0).sum() - 200
     for band, name in (("red", "R"), ("green", "G"), ("blue", "B"), ("nir", "N")):
-        assert bool(made.colour[band].any()) == (name not in missing)
+        assert bool(product_copy.colour[band].any()) == (name not in missing)
 
-    absolute, inner = errors_px(RIG, exposure, made.geometry["free"])
-    stated, before = number(made, "stitched_sigma_px"), number(whole, "stitched_sigma_px")
+    absolute, inner = errors_px(RIG, exposure, product_copy.geometry["free"])
+    stated, before = (
+        number(product_copy, "stitched_sigma_px"),
+        number(complete_product, "stitched_sigma_px"),
+    )
     assert rms(inner) < 0.02 and inner.max() < 0.05
     assert rms(absolute) < np.sqrt(2.0) * stated
     # It grows where what is missing carried the datum, and never shrinks.
@@ -99,50 +111,55 @@ def test_what_is_missing_leaves_an_image_that_says_so(
     if missing == MASTER:
         # Nothing but the platform calibration says where the image lies.
         assert stated > 0.5
-    assert set(missing) & pan_sensors(RIG) <= set(_held(made)) or missing == ("SU30",)
+    assert set(missing) & pan_sensors(RIG) <= set(_held(product_copy)) or missing == ("SU30",)
 
 
 def test_without_any_probe_the_image_is_as_unsure_as_temperatures_are(
     pipeline: Pipeline, exposure: Exposure
 ) -> None:
     unread = dict.fromkeys(exposure.temperatures_c)
-    made = pipeline.process(
+    product_copy = pipeline.process(
         exposure.frames, replace(conditions(RIG, exposure), temperatures_c=unread)
     )
-    assert made.report.flags == Flag.TEMPERATURE_MISSING | Flag.SIMULATED
-    absolute, inner = errors_px(RIG, exposure, made.geometry["free"])
+    assert product_copy.report.flags == Flag.TEMPERATURE_MISSING | Flag.SIMULATED
+    absolute, inner = errors_px(RIG, exposure, product_copy.geometry["free"])
     # It is 12 K warmer than is taken for granted.
     assert rms(inner) < 0.02 < 0.3 < rms(absolute)
-    assert rms(absolute) < np.sqrt(2.0) * number(made, "stitched_sigma_px")
+    assert rms(absolute) < np.sqrt(2.0) * number(product_copy, "stitched_sigma_px")
 
 
 @pytest.mark.parametrize(("name", "lost"), [("SU02", 0.5), ("N", 1.0)])
-def test_a_frame_that_was_read_out_in_part_is_told(
+def test_a_frame_that_was_read_out_in_part_is_reported(
     pipeline: Pipeline, exposure: Exposure, name: str, lost: float
 ) -> None:
     frame = exposure.frames[name].copy()
     frame[round((1.0 - lost) * len(frame)) :] = 0
-    made = pipeline.process(dict(exposure.frames) | {name: frame}, conditions(RIG, exposure))
-    assert made.report.flags & Flag.FRAME_CORRUPT and made.report.verdict is Verdict.USABLE
-    assert number(made, "unread_worst_fraction") == pytest.approx(lost, abs=0.03)
-    assert any(f"of {name} was not read out" in f.sentence for f in made.report.findings)
+    product_copy = pipeline.process(
+        dict(exposure.frames) | {name: frame}, conditions(RIG, exposure)
+    )
+    assert (
+        product_copy.report.flags & Flag.FRAME_CORRUPT
+        and product_copy.report.verdict is Verdict.USABLE
+    )
+    assert number(product_copy, "unread_worst_fraction") == pytest.approx(lost, abs=0.03)
+    assert any(f"of {name} was not read out" in f.sentence for f in product_copy.report.findings)
 
 
 @pytest.mark.trust
 @pytest.mark.parametrize("missing", [("SU02",), ("SU10", "SU30"), ("N",), ("G", "SU11")])
-def test_the_valid_area_is_that_of_the_pixels_and_what_calibration_says(
+def test_the_valid_area_is_that_of_the_pixels_and_what_calibration_states(
     pipeline: Pipeline, exposure: Exposure, missing: tuple[str, ...]
 ) -> None:
     frames = {name: frame for name, frame in exposure.frames.items() if name not in missing}
-    made = pipeline.process(frames, conditions(RIG, exposure))
-    assert valid_shares(made) == pytest.approx(pixel_shares(made), abs=0.005)
+    product_copy = pipeline.process(frames, conditions(RIG, exposure))
+    assert valid_shares(product_copy) == pytest.approx(pixel_shares(product_copy), abs=0.005)
     nominal = nominal_area(RIG, missing)
     for band in ("pan", "red", "green", "blue", "nir"):
-        differs = nominal.mask(band) != made.valid_area.mask(band)
+        differs = nominal.mask(band) != product_copy.valid_area.mask(band)
         assert differs.mean() < 0.02, band
-    worst = min(valid_shares(made).items(), key=lambda one: one[1])
-    assert number(made, "valid_worst_fraction") == pytest.approx(worst[1], abs=1e-9)
-    (finding,) = (f for f in made.report.findings if f.flag is Flag.FRAME_MISSING)
+    worst = min(valid_shares(product_copy).items(), key=lambda one: one[1])
+    assert number(product_copy, "valid_worst_fraction") == pytest.approx(worst[1], abs=1e-9)
+    (finding,) = (f for f in product_copy.report.findings if f.flag is Flag.FRAME_MISSING)
     assert f"{1 - worst[1]:.0%} of {worst[0]} has no valid pixels" in finding.sentence
 
 
@@ -155,46 +172,57 @@ def test_lines_that_were_not_read_out_are_no_data(
     frame[len(frame) // 2 :] = 0
     without = {key: one for key, one in exposure.frames.items() if key != name}
     gone = 1.0 - valid_shares(pipeline.process(without, conditions(RIG, exposure)))[band]
-    made = pipeline.process(without | {name: frame}, conditions(RIG, exposure))
-    half = 1.0 - valid_shares(made)[band]
+    product_copy = pipeline.process(without | {name: frame}, conditions(RIG, exposure))
+    half = 1.0 - valid_shares(product_copy)[band]
     # A seam stays in the middle of the overlap, so a PAN head takes a little more than its half.
     assert 0.45 * gone < half < 0.7 * gone
-    assert valid_shares(made) == pytest.approx(pixel_shares(made), abs=0.005)
+    assert valid_shares(product_copy) == pytest.approx(pixel_shares(product_copy), abs=0.005)
 
 
-def valid_shares(made: Product) -> dict[str, float]:
-    return {band: made.valid_area.share(band) for band in ("pan", "red", "green", "blue", "nir")}
-
-
-def pixel_shares(made: Product) -> dict[str, float]:
+def valid_shares(product_copy: Product) -> dict[str, float]:
     return {
-        name: float((band > 0).mean()) for name, band in {"pan": made.pan, **made.colour}.items()
+        band: product_copy.valid_area.share(band) for band in ("pan", "red", "green", "blue", "nir")
     }
 
 
-def _held(made: Product) -> list[str]:
-    return str(made.report.figures["undetermined"]).split(", ")
+def pixel_shares(product_copy: Product) -> dict[str, float]:
+    return {
+        name: float((band > 0).mean())
+        for name, band in {"pan": product_copy.pan, **product_copy.colour}.items()
+    }
 
 
-def test_a_stuck_probe_is_told_by_the_stitching(pipeline: Pipeline, exposure: Exposure) -> None:
+def _held(product_copy: Product) -> list[str]:
+    return str(product_copy.report.figures["undetermined"]).split(", ")
+
+
+def test_a_stuck_probe_is_reported_by_the_stitching(pipeline: Pipeline, exposure: Exposure) -> None:
     stuck = dict(exposure.temperatures_c) | {"1": 20.0}
-    made = pipeline.process(
+    product_copy = pipeline.process(
         exposure.frames, replace(conditions(RIG, exposure), temperatures_c=stuck)
     )
-    assert made.report.flags & Flag.DC_DISAGREEMENT and made.report.verdict is Verdict.USABLE
-    assert made.report.figures["dc_disagreement"] == "1"
-    estimated, sigma = number(made, "dc_estimated_k"), number(made, "dc_estimated_sigma_k")
+    assert (
+        product_copy.report.flags & Flag.DC_DISAGREEMENT
+        and product_copy.report.verdict is Verdict.USABLE
+    )
+    assert product_copy.report.figures["dc_disagreement"] == "1"
+    estimated, sigma = (
+        number(product_copy, "dc_estimated_k"),
+        number(product_copy, "dc_estimated_sigma_k"),
+    )
     assert abs(estimated - 12.0) < 4.0 * sigma and sigma < 0.5
 
 
 def test_without_a_probe_the_others_stand_in_and_the_image_is_as_good(
-    pipeline: Pipeline, exposure: Exposure, whole: Product
+    pipeline: Pipeline, exposure: Exposure, complete_product: Product
 ) -> None:
     open_probe = dict(exposure.temperatures_c) | {"0": None}
-    made = pipeline.process(
+    product_copy = pipeline.process(
         exposure.frames, replace(conditions(RIG, exposure), temperatures_c=open_probe)
     )
-    assert made.report.flags == Flag.TEMPERATURE_MISSING | Flag.SIMULATED
-    absolute, _ = errors_px(RIG, exposure, made.geometry["free"])
+    assert product_copy.report.flags == Flag.TEMPERATURE_MISSING | Flag.SIMULATED
+    absolute, _ = errors_px(RIG, exposure, product_copy.geometry["free"])
     assert rms(absolute) < 0.02
-    assert number(made, "stitched_sigma_px") > 3.0 * number(whole, "stitched_sigma_px")
+    assert number(product_copy, "stitched_sigma_px") > 3.0 * number(
+        complete_product, "stitched_sigma_px"
+    )

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from benchmarks.displacement_power import Outcomes, ideal
-from benchmarks.stitching_trials import MatchingErrors
+from benchmarks.stitching_samples import MatchingErrors
 from processing.rig import find_rig
-from tests.processing.mosaic.test_honest_uncertainty import ERRORS
+from tests.processing.mosaic.test_stated_uncertainty import ERRORS
 
 pytestmark = pytest.mark.timeout(600)
 
@@ -17,7 +17,9 @@ def outcomes() -> Outcomes:
     return Outcomes(MatchingErrors.load(ERRORS))
 
 
-def test_healthy_exposures_name_a_sensor_in_two_of_a_thousand_at_most(outcomes: Outcomes) -> None:
+def test_error_free_exposures_name_a_sensor_in_two_of_a_thousand_at_most(
+    outcomes: Outcomes,
+) -> None:
     assert outcomes.false_alarms(3000) <= 6
 
 
@@ -37,9 +39,9 @@ def test_at_twice_that_the_right_sensor_is_named(outcomes: Outcomes, dc_k: float
 
 
 @pytest.mark.parametrize("off_k", [4.0, 16.0])
-def test_no_sensor_is_accused_of_what_a_probe_misreads(outcomes: Outcomes, off_k: float) -> None:
-    told = outcomes.misread(0.0, off_k, exposures=300, flights=2)
-    assert told.accused + told.either <= 0.01 and told.flights_accused == 0.0
+def test_no_sensor_is_named_for_the_bias_of_a_probe(outcomes: Outcomes, off_k: float) -> None:
+    told = outcomes.probe_bias(0.0, off_k, exposures=300, flights=2)
+    assert told.misattributed + told.either <= 0.01 and told.flights_misattributed == 0.0
     assert told.named > (0.1 if off_k < 10.0 else 0.95)
 
 

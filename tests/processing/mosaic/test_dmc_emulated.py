@@ -11,7 +11,7 @@ from benchmarks import rendered
 from processing.pipelines.stitched import Conditions, Pipeline
 from processing.quality.report import Flag, Verdict
 from processing.rig import Rig
-from sim_hw.world.snapshots import Heads
+from sim_hw.world.snapshots import RigElectronics
 from sim_hw.world.world import World
 
 SEED = 5
@@ -19,8 +19,8 @@ SEED = 5
 
 @dataclass
 class Flown:
-    exposure: rendered.Exposure
-    heads: Heads
+    exposure: rendered.RenderedExposure
+    heads: RigElectronics
     pipeline: Pipeline
     conditions: Conditions
 
@@ -33,12 +33,12 @@ class Flown:
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
     world = World(rendered.world_settings("dmc-mini", SEED, dc_k=12.0))
     exposure = rendered.take(world, tmp_path_factory.mktemp("scenes"))
-    heads = Heads(world, seed=SEED)
+    heads = RigElectronics(world, seed=SEED)
     pipeline = Pipeline(world.rig, rendered.radiometry_of(heads))
     return Flown(exposure, heads, pipeline, rendered.conditions_of(exposure, seed=SEED))
 
 
-def test_the_virtual_image_is_within_the_bars_of_the_house(flown: Flown) -> None:
+def test_the_virtual_image_is_within_the_accuracy_limits(flown: Flown) -> None:
     product = flown.pipeline.process(flown.frames, flown.conditions)
     figures = product.report.figures
     inner = rendered.errors_of(product.geometry["free"], flown.exposure.snapshot)
@@ -46,7 +46,7 @@ def test_the_virtual_image_is_within_the_bars_of_the_house(flown: Flown) -> None
     assert product.report.verdict is Verdict.GOOD and not product.report.flags
     assert figures["valid_fraction"] == 1.0
     assert figures["projection_height_m"] == 3000.0 and product.ground is not None
-    assert product.platform is not None and not product.platform.expired
+    assert product.platform is not None and not product.platform.is_expired
     assert isinstance(figures["tie_points_pp"], int) and figures["tie_points_pp"] > 800
     assert all(band.registered for band in product.bands)
     assert isinstance(figures["green_rms_px"], float) and figures["green_rms_px"] < 0.2
@@ -55,9 +55,9 @@ def test_the_virtual_image_is_within_the_bars_of_the_house(flown: Flown) -> None
     assert product.balance.spread < 0.01
 
 
-def test_a_platform_that_has_turned_is_said_to_have_expired_and_made_good(flown: Flown) -> None:
+def test_a_platform_that_has_rotated_is_reported_as_expired_and_corrected(flown: Flown) -> None:
     pipeline = Pipeline(
-        _turned(flown.pipeline.rig, "3", 250e-6), rendered.radiometry_of(flown.heads)
+        _with_rotated_head(flown.pipeline.rig, "3", 250e-6), rendered.radiometry_of(flown.heads)
     )
     product = pipeline.process(flown.frames, flown.conditions)
     assert product.report.flags == Flag.CALIBRATION_EXPIRED
@@ -78,7 +78,7 @@ def test_without_one_head_three_quarters_of_the_image_remain(flown: Flown) -> No
     assert inner["inner_rms_px"] < 0.05 and inner["inner_max_px"] < 0.15
 
 
-def _turned(rig: Rig, name: str, phi_rad: float) -> Rig:
+def _with_rotated_head(rig: Rig, name: str, phi_rad: float) -> Rig:
     cones = []
     for cone in rig.cones:
         if cone.name == name:

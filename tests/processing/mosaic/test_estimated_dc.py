@@ -10,8 +10,8 @@ import pytest
 
 from processing.geometry.placement import nominal_placements
 from processing.mosaic.estimated_dc import EstimatedDc, combined_dc, estimate_dc, expansion_rate
-from processing.mosaic.free import free_mosaic
-from processing.rig import Cone, Drift, Rig, Sensor, find_rig
+from processing.mosaic.free_mosaic import free_mosaic
+from processing.rig import Cone, Rig, Sensor, ThermalDrift, find_rig
 from tests.processing.synthetic import make_truth, tie_points_of
 
 CALIBRATION_PX = 0.02
@@ -27,10 +27,10 @@ def estimates(
 ) -> tuple[EstimatedDc, ...]:
     """One exposure at `dc_k`; the probes say `measured_dc_k`."""
     rng = np.random.default_rng(seed)
-    made = make_truth(rig, rng, temperature_c=20.0 + dc_k, sensor_px=CALIBRATION_PX, layer_px=3.0)
-    told = dc_k if measured_dc_k is None else measured_dc_k
-    temperatures = dict.fromkeys(rig.probes, 20.0 + told)
-    mosaic = free_mosaic(rig, nominal_placements(rig, temperatures, {}), tie_points_of(made, rng))
+    truth = make_truth(rig, rng, temperature_c=20.0 + dc_k, sensor_px=CALIBRATION_PX, layer_px=3.0)
+    probe_dc_k = dc_k if measured_dc_k is None else measured_dc_k
+    temperatures = dict.fromkeys(rig.probes, 20.0 + probe_dc_k)
+    mosaic = free_mosaic(rig, nominal_placements(rig, temperatures, {}), tie_points_of(truth, rng))
     return estimate_dc(rig, mosaic, temperatures)
 
 
@@ -41,7 +41,7 @@ def with_sensors(rig: Rig, change: Callable[[Sensor], Sensor]) -> Rig:
     return dataclasses.replace(rig, cones=tuple(changed(cone) for cone in rig.cones))
 
 
-def test_the_error_of_an_estimate_is_what_its_sigma_says(rig: Rig) -> None:
+def test_the_error_of_an_estimate_is_what_its_sigma_states(rig: Rig) -> None:
     errors = []
     for seed in range(16):
         dc = -20.0 + 40.0 * seed / 15.0
@@ -54,7 +54,7 @@ def test_the_error_of_an_estimate_is_what_its_sigma_says(rig: Rig) -> None:
     assert np.abs(errors).max() < 4.0
 
 
-def test_only_cones_of_two_or_more_sensors_tell(rig: Rig) -> None:
+def test_only_cones_of_two_or_more_sensors_give_an_estimate(rig: Rig) -> None:
     found = estimates(rig, 10.0, 1)
     assert [e.cone for e in found] == ["0", "1", "2"]
     combined = combined_dc(found)
@@ -82,15 +82,15 @@ def test_an_expired_model_disagrees_with_its_probes(rig: Rig) -> None:
         return dataclasses.replace(sensor, drift=drift)
 
     rng = np.random.default_rng(4)
-    made = make_truth(rig, rng, temperature_c=35.0, sensor_px=0.02, layer_px=1.0)
-    points = tie_points_of(made, rng)
+    truth = make_truth(rig, rng, temperature_c=35.0, sensor_px=0.02, layer_px=1.0)
+    points = tie_points_of(truth, rng)
     expired = with_sensors(rig, softer)
-    told = dict.fromkeys(rig.probes, 35.0)
-    mosaic = free_mosaic(expired, nominal_placements(expired, told, {}), points)
-    assert all(e.disagrees for e in estimate_dc(expired, mosaic, told))
+    probe_dc_k = dict.fromkeys(rig.probes, 35.0)
+    mosaic = free_mosaic(expired, nominal_placements(expired, probe_dc_k, {}), points)
+    assert all(e.disagrees for e in estimate_dc(expired, mosaic, probe_dc_k))
 
 
-def test_a_mount_that_expands_like_silicon_tells_nothing(rig: Rig) -> None:
+def test_a_mount_that_expands_like_silicon_yields_nothing(rig: Rig) -> None:
     silicon_ppm = rig.sensor("SU00").drift.scale_ppm_per_k
 
     def like_silicon(sensor: Sensor) -> Sensor:
@@ -100,16 +100,16 @@ def test_a_mount_that_expands_like_silicon_tells_nothing(rig: Rig) -> None:
         )
         return dataclasses.replace(sensor, drift=drift)
 
-    alike = with_sensors(rig, like_silicon)
-    assert abs(expansion_rate(alike.cone("0").sensors)[0]) < 1e-6
-    for e in estimates(alike, 15.0, 5, measured_dc_k=0.0):
+    silicon_rig = with_sensors(rig, like_silicon)
+    assert abs(expansion_rate(silicon_rig.cone("0").sensors)[0]) < 1e-6
+    for e in estimates(silicon_rig, 15.0, 5, measured_dc_k=0.0):
         assert e.estimated_k is None and e.sigma_k is None and not e.disagrees
 
 
 def test_close_to_silicon_the_sigma_grows(rig: Rig) -> None:
     def invar_like(sensor: Sensor) -> Sensor:
         d = sensor.drift
-        drift = Drift(0.3 * d.x_um_per_k, 0.3 * d.y_um_per_k, 0.0, d.scale_ppm_per_k, 0.001)
+        drift = ThermalDrift(0.3 * d.x_um_per_k, 0.3 * d.y_um_per_k, 0.0, d.scale_ppm_per_k, 0.001)
         return dataclasses.replace(sensor, drift=drift)
 
     softer = with_sensors(rig, invar_like)
@@ -121,27 +121,31 @@ def test_close_to_silicon_the_sigma_grows(rig: Rig) -> None:
 
 def test_a_displaced_sensor_of_the_master_cone_can_be_left_out(rig: Rig) -> None:
     rng = np.random.default_rng(7)
-    made = make_truth(
+    truth = make_truth(
         rig, rng, temperature_c=30.0, sensor_px=0.02, displaced={"SU02": (-3.0, -2.0)}
     )
-    told = dict.fromkeys(rig.probes, 30.0)
-    mosaic = free_mosaic(rig, nominal_placements(rig, told, {}), tie_points_of(made, rng))
-    fooled, robust = (estimate_dc(rig, mosaic, told, displaced=out)[0] for out in ((), ("SU02",)))
+    probe_dc_k = dict.fromkeys(rig.probes, 30.0)
+    mosaic = free_mosaic(rig, nominal_placements(rig, probe_dc_k, {}), tie_points_of(truth, rng))
+    fooled, robust = (
+        estimate_dc(rig, mosaic, probe_dc_k, displaced=out)[0] for out in ((), ("SU02",))
+    )
     assert fooled.disagrees and not robust.disagrees
     assert robust.estimated_k == pytest.approx(10.0, abs=4.0 * (robust.sigma_k or 0.0))
 
 
 def test_without_tie_points_there_is_no_estimate(rig: Rig) -> None:
     rng = np.random.default_rng(8)
-    made = make_truth(rig, rng)
-    points = tie_points_of(made, rng, without=tuple(s.name for s in rig.sensors))
-    mosaic = free_mosaic(rig, made.start, points)
+    truth = make_truth(rig, rng)
+    points = tie_points_of(truth, rng, without=tuple(s.name for s in rig.sensors))
+    mosaic = free_mosaic(rig, truth.start, points)
     assert all(e.estimated_k is None for e in estimate_dc(rig, mosaic, {}))
 
 
 @pytest.mark.soak
 @pytest.mark.timeout(1800)
-def test_a_thousand_healthy_exposures_raise_no_flag_and_no_stuck_probe_is_missed(rig: Rig) -> None:
+def test_a_thousand_error_free_exposures_raise_no_flag_and_no_stuck_probe_is_missed(
+    rig: Rig,
+) -> None:
     """Calibration, coefficients and probes off by their sigmas; probe 1 then off by two limits."""
     false, missed, errors = 0, 0, []
     for k in range(1000):
@@ -154,10 +158,10 @@ def test_a_thousand_healthy_exposures_raise_no_flag_and_no_stuck_probe_is_missed
             return dataclasses.replace(sensor, drift=drift)
 
         true_rig, dc = with_sensors(rig, off), rng.uniform(-20.0, 20.0)
-        made = make_truth(
+        truth = make_truth(
             true_rig, rng, temperature_c=20.0 + dc, sensor_px=CALIBRATION_PX, layer_px=1.0
         )
-        points = tie_points_of(made, rng, per_overlap=60, per_sensor=120)
+        points = tie_points_of(truth, rng, per_overlap=60, per_sensor=120)
         read = {probe: 20.0 + dc + rng.normal(0.0, 0.1) for probe in rig.probes}
         mosaic = free_mosaic(rig, nominal_placements(rig, read, {}), points)
         found = estimate_dc(rig, mosaic, read)

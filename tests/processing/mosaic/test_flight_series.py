@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from processing.mosaic.flight_series import Series, variance_factor
+from processing.mosaic.flight_series import ContrastSeries, variance_factor
 
 
-def series(count: int, scale: float = 1.0) -> Series:
+def series(count: int, scale: float = 1.0) -> ContrastSeries:
     """Steps of 3, 4, 5, ... between exposures of variances 1, 2, 3, ..."""
     y = scale * np.cumsum([0.0, *np.arange(3.0, 2.0 + count)])[:, None]
     variances = np.arange(1.0, count + 1.0)[:, None, None]
-    return Series(tuple(range(count)), y, variances, np.zeros(count))
+    return ContrastSeries(tuple(range(count)), y, variances, np.zeros(count))
 
 
 def test_the_factor_is_the_median_square_of_steps_over_the_variances_of_both_exposures() -> None:

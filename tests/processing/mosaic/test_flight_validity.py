@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from processing.geometry.placement import nominal_placements
-from processing.mosaic.flight_validity import FlightValidity, judge_flight
-from processing.mosaic.free import free_mosaic
-from processing.mosaic.stitch_record import TURNS, StitchRecord, stitch_record
+from processing.mosaic.flight_validity import FlightValidity, evaluate_flight
+from processing.mosaic.free_mosaic import free_mosaic
+from processing.mosaic.stitch_record import ROTATIONS, StitchRecord, stitch_record
 from processing.rig import Rig, find_rig
 from tests.processing.synthetic import make_truth, tie_points_of
 
@@ -43,12 +43,12 @@ def template(rig: Rig) -> StitchRecord:
     mosaic = free_mosaic(rig, nominal_placements(rig, read, {}), points)
     record = stitch_record(rig, mosaic, read, read)
     # Turns of cones follow from the layers and say nothing of places.
-    kept = [i for i, name in enumerate(record.names) if not name.endswith(TURNS)]
+    place_rows = [i for i, name in enumerate(record.names) if not name.endswith(ROTATIONS)]
     return dataclasses.replace(
         record,
-        names=tuple(record.names[i] for i in kept),
-        values=record.values[kept],
-        covariance=record.covariance[np.ix_(kept, kept)],
+        names=tuple(record.names[i] for i in place_rows),
+        values=record.values[place_rows],
+        covariance=record.covariance[np.ix_(place_rows, place_rows)],
     )
 
 
@@ -65,7 +65,7 @@ def records_of(moves: Moves, *, seed: int, count: int = EXPOSURES) -> dict[int, 
     for number in range(1, count + 1):
         rng = np.random.default_rng([seed, number])
         dc = 8.0 - 12.0 * number / count
-        misread = {probe: float(rng.normal(0.0, 0.1)) for probe in MINI.probes}
+        probe_bias = {probe: float(rng.normal(0.0, 0.1)) for probe in MINI.probes}
         noise = AXES @ (np.sqrt(np.maximum(SPREAD, 0.0)) * rng.standard_normal(len(SPREAD)))
         values = noise.copy()
         for name, error in errors.items():
@@ -74,20 +74,20 @@ def records_of(moves: Moves, *, seed: int, count: int = EXPOSURES) -> dict[int, 
             per_kelvin = (sensor.drift.x_um_per_k, sensor.drift.y_um_per_k)
             for axis in (0, 1):
                 place = (error[axis] + (number >= since) * far[axis]) * sensor.pitch_um
-                place += drift[name][axis] * dc - per_kelvin[axis] * misread[sensor.probe]
+                place += drift[name][axis] * dc - per_kelvin[axis] * probe_bias[sensor.probe]
                 values[RECORD.names.index(f"{name}.{'xy'[axis]}_um")] += place
-        dc_k = {s.name: dc + misread[s.probe] for s in MINI.sensors if s.name in RECORD.dc_k}
+        dc_k = {s.name: dc + probe_bias[s.probe] for s in MINI.sensors if s.name in RECORD.dc_k}
         records[number] = dataclasses.replace(RECORD, values=values, dc_k=dc_k)
     return records
 
 
 def fly(moves: Moves, *, seed: int, count: int = EXPOSURES) -> FlightValidity:
-    return judge_flight(MINI, records_of(moves, seed=seed, count=count))
+    return evaluate_flight(MINI, records_of(moves, seed=seed, count=count))
 
 
 def test_a_sensor_that_moves_by_eight_hundredths_is_named_with_the_exposure_it_began() -> None:
-    told = fly({"SU02": (31, (0.064, -0.048))}, seed=8)
-    (step,) = told.steps
+    validity = fly({"SU02": (31, (0.064, -0.048))}, seed=8)
+    (step,) = validity.steps
     assert (step.kind, step.sensor, step.alternatives) == ("named", "SU02", ())
     assert abs(step.since - 31) <= 1 and step.earliest <= 31 <= step.latest
     assert math.hypot(step.dx_px - 0.064, step.dy_px + 0.048) < 4.0 * step.sigma_px
@@ -96,15 +96,15 @@ def test_a_sensor_that_moves_by_eight_hundredths_is_named_with_the_exposure_it_b
     assert f"px since exposure {step.since}" in step.sentence
 
 
-def test_a_hundred_healthy_flights_tell_of_nothing() -> None:
+def test_a_hundred_error_free_flights_report_nothing() -> None:
     for seed in range(100):
-        told = fly({}, seed=1000 + seed)
-        assert told.steps == (), seed
-        assert set(told.exposures) == {"0", "1", "2"}
-        assert min(told.exposures.values()) > EXPOSURES - 3
+        validity = fly({}, seed=1000 + seed)
+        assert validity.steps == (), seed
+        assert set(validity.exposures) == {"0", "1", "2"}
+        assert min(validity.exposures.values()) > EXPOSURES - 3
 
 
-def test_what_is_said_of_a_displacement_is_as_sure_as_its_sigma() -> None:
+def test_what_is_stated_of_a_displacement_is_as_sure_as_its_sigma() -> None:
     normalised, spans, sure = [], 0, 0
     for seed in range(60):
         since, angle = 10 + seed % 30, 0.1 * seed
@@ -118,7 +118,7 @@ def test_what_is_said_of_a_displacement_is_as_sure_as_its_sigma() -> None:
     assert 0.7 < float(np.std(normalised)) < 1.3 and abs(float(np.mean(normalised))) < 0.5
 
 
-def test_what_was_displaced_before_the_flight_is_told_from_its_beginning() -> None:
+def test_what_was_displaced_before_the_flight_is_reported_from_its_beginning() -> None:
     (step,) = fly({"SU01": (0, (0.3, 0.2))}, seed=2, count=24).steps
     assert step.from_start and step.sensor == "SU01" and step.kind == "named"
     # What calibration does not know stays in the sum, however many exposures there are.
@@ -127,21 +127,21 @@ def test_what_was_displaced_before_the_flight_is_told_from_its_beginning() -> No
     assert "since before exposure 1" in step.sentence
 
 
-def test_two_sensors_that_move_at_once_are_said_to_be_ambiguous() -> None:
-    told = fly({"SU00": (20, (0.3, 0.1)), "SU03": (20, (-0.1, 0.3))}, seed=3, count=36)
-    (step,) = told.steps
+def test_two_sensors_that_move_at_once_are_reported_as_ambiguous() -> None:
+    validity = fly({"SU00": (20, (0.3, 0.1)), "SU03": (20, (-0.1, 0.3))}, seed=3, count=36)
+    (step,) = validity.steps
     assert step.kind == "several" and abs(step.since - 20) <= 1
     assert "More than one sensor of cone 0" in step.sentence
     assert "cannot be told" in step.sentence
 
 
 def test_two_sensors_that_move_one_after_the_other_are_both_named() -> None:
-    told = fly({"SU00": (12, (0.3, 0.1)), "SU03": (26, (-0.1, 0.25))}, seed=4, count=36)
-    assert [(s.sensor, s.kind) for s in told.steps] == [("SU00", "named"), ("SU03", "named")]
-    assert [s.since for s in told.steps] == pytest.approx([12, 26], abs=1)
+    validity = fly({"SU00": (12, (0.3, 0.1)), "SU03": (26, (-0.1, 0.25))}, seed=4, count=36)
+    assert [(s.sensor, s.kind) for s in validity.steps] == [("SU00", "named"), ("SU03", "named")]
+    assert [s.since for s in validity.steps] == pytest.approx([12, 26], abs=1)
 
 
-def test_in_a_cone_of_two_the_culprit_cannot_be_told() -> None:
+def test_in_a_cone_of_two_the_displaced_sensor_cannot_be_determined() -> None:
     (step,) = fly({"SU11": (15, (0.15, -0.1))}, seed=5, count=30).steps
     assert step.cone == "1" and step.kind == "relative"
     assert {step.sensor, *step.alternatives} == {"SU10", "SU11"}
@@ -152,11 +152,11 @@ def test_in_a_cone_of_two_the_culprit_cannot_be_told() -> None:
 def test_one_wrong_exposure_is_no_displacement() -> None:
     records = records_of({}, seed=6, count=20)
     wrong = records_of({"SU02": (1, (0.5, 0.0))}, seed=6, count=20)[10]
-    told = judge_flight(MINI, records | {10: wrong})
-    assert told.steps == () and told.left_out["0"] == (10,)
+    validity = evaluate_flight(MINI, records | {10: wrong})
+    assert validity.steps == () and validity.left_out["0"] == (10,)
 
 
-def test_real_adjustments_of_a_flight_tell_the_same() -> None:
+def test_real_adjustments_of_a_flight_give_the_same() -> None:
     errors = camera_errors(MINI, 7)
     records = {}
     for number in range(1, 13):
@@ -169,12 +169,12 @@ def test_real_adjustments_of_a_flight_tell_the_same() -> None:
         read = dict.fromkeys(MINI.probes, 25.0)
         mosaic = free_mosaic(MINI, nominal_placements(MINI, read, {}), points)
         records[number] = stitch_record(MINI, mosaic, read, read)
-    (step,) = judge_flight(MINI, records).steps
+    (step,) = evaluate_flight(MINI, records).steps
     assert step.sensor == "SU02" and step.since == 6
     assert math.hypot(step.dx_px - 0.1, step.dy_px + 0.1) < 4.0 * step.sigma_px
 
 
-def test_probes_that_misread_since_an_exposure_are_told_and_no_sensor_of_the_master() -> None:
+def test_probes_that_misread_since_an_exposure_are_reported_and_no_sensor_of_the_master() -> None:
     errors = camera_errors(MINI, 9)
     records = {}
     for number in range(1, 13):
@@ -186,16 +186,16 @@ def test_probes_that_misread_since_an_exposure_are_told_and_no_sensor_of_the_mas
             read |= {"0": 29.0, "1": 22.0}
         mosaic = free_mosaic(MINI, nominal_placements(MINI, read, {}), points)
         records[number] = stitch_record(MINI, mosaic, read, read)
-    master, other = sorted(judge_flight(MINI, records).steps, key=lambda step: step.cone)
+    master, other = sorted(evaluate_flight(MINI, records).steps, key=lambda step: step.cone)
     assert (master.kind, master.since, master.sensor) == ("misread", 7, "")
-    assert master.misread is not None and master.misread.probe == "0"
-    assert abs(master.misread.off_k - 4.0) < 4.0 * master.misread.sigma_k < 2.0
+    assert master.probe_bias is not None and master.probe_bias.probe == "0"
+    assert abs(master.probe_bias.bias_k - 4.0) < 4.0 * master.probe_bias.sigma_k < 2.0
     assert master.sentence.startswith("Probe 0 has read ")
     assert master.sentence.endswith("K too high on average since exposure 7 or earlier; check it.")
     # Of two sensors only the way between them is seen: a probe explains it as well as a slip.
     assert (other.kind, other.cone, other.since) == ("relative", "1", 7)
-    assert other.misread is not None and other.misread.probe == "1"
-    assert abs(other.misread.off_k + 3.0) < 4.0 * other.misread.sigma_k < 2.0
+    assert other.probe_bias is not None and other.probe_bias.probe == "1"
+    assert abs(other.probe_bias.bias_k + 3.0) < 4.0 * other.probe_bias.sigma_k < 2.0
     assert "or probe 1 has read " in other.sentence and "too low" in other.sentence
 
 
@@ -205,7 +205,7 @@ def test_a_stuck_probe_is_no_row_of_steps_and_hides_no_sensor() -> None:
         stuck = {}
         for number, record in records.items():
             # The mount cools by 0.375 K from one exposure to the next; the probe does not tell.
-            off_k = 0.375 * max(0, number - 8)
+            bias_k = 0.375 * max(0, number - 8)
             values, dc_k = record.values.copy(), dict(record.dc_k)
             for sensor in MINI.master_sensors:
                 drift = sensor.drift
@@ -214,13 +214,13 @@ def test_a_stuck_probe_is_no_row_of_steps_and_hides_no_sensor() -> None:
                     ("y_um", drift.y_um_per_k),
                     ("scale_ppm", drift.scale_ppm_per_k),
                 ):
-                    values[record.names.index(f"{sensor.name}.{what}")] -= rate * off_k
-                dc_k[sensor.name] += off_k
+                    values[record.names.index(f"{sensor.name}.{what}")] -= rate * bias_k
+                dc_k[sensor.name] += bias_k
             stuck[number] = dataclasses.replace(record, values=values, dc_k=dc_k)
-        steps = [s for s in judge_flight(MINI, stuck).steps if s.cone == "0"]
-        assert [s.misread.probe for s in steps if s.misread and s.kind == "misread"] == ["0"]
+        steps = [s for s in evaluate_flight(MINI, stuck).steps if s.cone == "0"]
+        assert [s.probe_bias.probe for s in steps if s.probe_bias and s.kind == "misread"] == ["0"]
         assert tuple(s.sensor for s in steps if s.kind != "misread") == moved
 
 
-def test_too_few_exposures_tell_nothing() -> None:
-    assert judge_flight(MINI, {}).steps == ()
+def test_too_few_exposures_yield_nothing() -> None:
+    assert evaluate_flight(MINI, {}).steps == ()

@@ -11,10 +11,14 @@ from numpy.typing import NDArray
 
 from processing.geometry.placement import nominal_placements, vip_mm_from_raw
 from processing.matching.tie_points import TiePoints
-from processing.mosaic.free import Mosaic, free_mosaic
+from processing.mosaic.free_mosaic import Mosaic, free_mosaic
 from processing.mosaic.held import calibrated_parts, held_quantities, scale_figures, scaled_part
 from processing.mosaic.mounting import verified_mosaic
-from processing.mosaic.precision import Disturbance, disturbance_covariance_px, placed_sigma_px
+from processing.mosaic.precision import (
+    UncertaintyContribution,
+    disturbance_covariance_px,
+    placed_sigma_px,
+)
 from processing.rig import Cone, Sensor, find_rig
 from tests.processing.synthetic import make_truth, tie_points_of
 
@@ -134,7 +138,7 @@ def test_places_drift_and_probes_widen_the_sigma_of_a_healthy_platform() -> None
     ppm = sensor.drift.scale_ppm_per_k - DMC.cone("2").lens.f_ppm_per_k
     warmed = sum(part.layers["2"][2] for part in of_head[2:])
     assert warmed == pytest.approx(ppm * 0.1e-6)
-    disturbance = Disturbance(parts=parts)
+    disturbance = UncertaintyContribution(parts=parts)
     variance = np.diag(disturbance_covariance_px(DMC, mosaic, {"P2": AT}, disturbance))
     expected = sum(part.at(mosaic, "P2", AT) ** 2 for part in parts)
     np.testing.assert_allclose(variance.reshape(-1, 2), expected, rtol=1e-9)

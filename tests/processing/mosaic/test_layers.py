@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from processing.geometry.projective import rotation_homography
 from processing.geometry.rotation import rotation_matrix
 from processing.geometry.similarity import fit_similarity
-from processing.mosaic.free import Mosaic
+from processing.mosaic.free_mosaic import Mosaic
 from processing.mosaic.layers import LayerChange, LayerCheck, check_layers, layer_figures
 from processing.rig import Cone, Rig
 from tests.processing.mosaic.test_precision import mosaic_of
@@ -29,10 +29,10 @@ def planted(name: str, changes: dict[str, Array]) -> tuple[Rig, Mosaic]:
     f, half = model.f_mm, model.half_size_mm
     values = np.zeros(len(model.names))
     for cone, (scale, *angles) in changes.items():
-        turned = rotation_homography(rotation_matrix(*np.array(angles) * 1e-6), f, f)
-        turned = turned @ np.diag([1.0 + scale * 1e-6, 1.0 + scale * 1e-6, 1.0])
+        homography = rotation_homography(rotation_matrix(*np.array(angles) * 1e-6), f, f)
+        homography = homography @ np.diag([1.0 + scale * 1e-6, 1.0 + scale * 1e-6, 1.0])
         norm = np.diag([1.0 / half, 1.0 / half, 1.0])
-        p = norm @ turned @ np.linalg.inv(norm)
+        p = norm @ homography @ np.linalg.inv(norm)
         values[model.layers[cone] : model.layers[cone] + 8] = (p / p[2, 2] - np.eye(3)).ravel()[:8]
     covariance = np.zeros((len(values), len(values)))
     return rig, dataclasses.replace(mosaic, values=values, covariance=covariance, undetermined=())

@@ -13,7 +13,7 @@ from processing.geometry.placement import vip_mm_from_raw
 from processing.geometry.rotation import rotation_matrix
 from processing.matching.tie_points import PAN_TO_PAN, TiePoints
 from processing.mosaic.estimated_dc import EstimatedDc, combined_dc
-from processing.mosaic.free import Mosaic, free_mosaic
+from processing.mosaic.free_mosaic import Mosaic, free_mosaic
 from processing.mosaic.mounting import (
     _affine_shift,
     _middle_mm,
@@ -40,7 +40,7 @@ def adjusted() -> tuple[Mosaic, TiePoints]:
 
 
 @pytest.mark.parametrize("dc_k", [0.0, 7.0])
-def test_a_head_with_one_sensor_seems_turned_by_its_place(dc_k: float) -> None:
+def test_a_head_with_one_sensor_seems_rotated_by_its_place(dc_k: float) -> None:
     cone = DMC.cone("2")
     (sensor,) = cone.sensors
     found = place_covariance(cone, {sensor.name: dc_k})
@@ -52,7 +52,7 @@ def test_a_head_with_one_sensor_seems_turned_by_its_place(dc_k: float) -> None:
 
 
 @pytest.mark.parametrize(("sensors", "is_datum"), [(2, True), (3, True), (4, True), (4, False)])
-def test_a_cone_of_several_seems_turned_by_the_mean_of_their_places(
+def test_a_cone_of_several_seems_rotated_by_the_mean_of_their_places(
     sensors: int, is_datum: bool
 ) -> None:
     cone = X_MINI.cone("0")
@@ -65,8 +65,8 @@ def test_a_cone_of_several_seems_turned_by_the_mean_of_their_places(
     rows = [np.column_stack([-y, np.ones(sensors), np.zeros(sensors)])]
     rows += [np.column_stack([x, np.zeros(sensors), np.ones(sensors)])]
     fit = np.linalg.pinv(np.stack(rows, axis=1).reshape(-1, 3))
-    turn, across, _ = np.sum((fit * sigma_mm) ** 2, axis=1)
-    about_z = turn if is_datum and sensors > 2 else 0.0
+    rotation_variance, across, _ = np.sum((fit * sigma_mm) ** 2, axis=1)
+    about_z = rotation_variance if is_datum and sensors > 2 else 0.0
     across /= cone.lens.f_mm**2
     np.testing.assert_allclose(found, np.diag([across, across, about_z]), rtol=1e-9, atol=1e-20)
 
@@ -83,8 +83,8 @@ def test_the_shift_of_a_head_is_that_of_its_residuals_at_its_middle() -> None:
     arm = at - _middle_mm(DMC, mosaic, name)[0] / mosaic.model.pitch_mm
     linear = np.array([[2e-4, -1e-4], [3e-4, 5e-5]])
     moved = [0.7, -0.4] + arm @ linear.T + 0.05 * rng.standard_normal((len(points), 2))
-    turned = dataclasses.replace(mosaic, residuals_px=sign[:, None] * moved)
-    shift, sigma, affine, count = _affine_shift(DMC, turned, points, name)
+    with_shift = dataclasses.replace(mosaic, residuals_px=sign[:, None] * moved)
+    shift, sigma, affine, count = _affine_shift(DMC, with_shift, points, name)
     rows = (sign != 0.0) & (points.kind == PAN_TO_PAN) & ~mosaic.outliers
     assert count == int(rows.sum())
     weight = 1.0 / points.sigma_px[rows] ** 2
@@ -107,11 +107,11 @@ def test_heads_that_tie_points_leave_open_are_not_compared() -> None:
     mosaic, points = adjusted()
     every = check_platform(DMC, mosaic, points, {})
     assert every is not None and [head.cone for head in every.heads] == ["1", "2", "3", "4"]
-    assert every.freedom == 9
+    assert every.degrees_of_freedom == 9
     some = dataclasses.replace(mosaic, undetermined=("2.omega", "3.kappa"))
     check = check_platform(DMC, some, points, {})
     assert check is not None and [head.cone for head in check.heads] == ["1", "4"]
-    assert check.freedom == 3
+    assert check.degrees_of_freedom == 3
     one = dataclasses.replace(mosaic, undetermined=("1.phi", "2.omega", "3.kappa"))
     assert check_platform(DMC, one, points, {}) is None
     assert check_platform(DMC, dataclasses.replace(mosaic, redundancy=0.0), points, {}) is None

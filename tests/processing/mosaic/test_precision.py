@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from processing.geometry.placement import nominal_placements, vip_mm_from_raw
 from processing.geometry.similarity import fit_similarity
 from processing.mosaic.datum import datum_candidates
-from processing.mosaic.free import Mosaic, free_mosaic, vip_precision_px
+from processing.mosaic.free_mosaic import Mosaic, free_mosaic, vip_precision_px
 from processing.mosaic.precision import (
-    Disturbance,
+    UncertaintyContribution,
     datum_covariance,
     datum_design,
     datum_per_kelvin_px,
@@ -185,12 +185,12 @@ def test_one_sensor_alone_knows_scale_and_rotation_by_its_half_height() -> None:
     half_mm = sensor.height_px / 2.0 * sensor.pitch_mm
     # Scale and rotation from two places half the height apart.
     warm = (0.1 * sensor.drift.scale_ppm_per_k * 1e-3) ** 2
-    turned = (0.1 * sensor.drift.rotation_urad_per_k * 1e-3) ** 2
+    rotated = (0.1 * sensor.drift.rotation_urad_per_k * 1e-3) ** 2
     own = 2.0 * (sensor.position_sigma_um / half_mm) ** 2
     assert found[2, 2] * sensor.pitch_um**2 == pytest.approx(own + warm, rel=1e-6)
-    assert found[3, 3] * sensor.pitch_um**2 == pytest.approx(own + turned, rel=1e-6)
+    assert found[3, 3] * sensor.pitch_um**2 == pytest.approx(own + rotated, rel=1e-6)
     # Either place is as sure as the sensor's, the upper one but for 0.1 K over half its height.
-    for up, added in ((0.0, 0.0), (half_mm, (warm + turned) / 2.0 * half_mm**2)):
+    for up, added in ((0.0, 0.0), (half_mm, (warm + rotated) / 2.0 * half_mm**2)):
         design = datum_design(np.array([[sensor.x_mm, sensor.y_mm + up]]))
         variance_um2 = np.trace(design @ found @ design.T) / 2.0 * sensor.pitch_um**2
         assert variance_um2 == pytest.approx(sensor.position_sigma_um**2 + added, rel=1e-6)
@@ -219,10 +219,10 @@ def test_of_converging_heads_the_mean_rotation_places_the_image() -> None:
 def test_the_datum_design_is_the_derivative_of_a_similarity() -> None:
     xy = np.array([[3.0, -2.0], [-7.0, 5.0]])
     shift = np.array([1e-3, -2e-3])
-    scale, turn = 3e-6, -4e-6
-    turned = xy + shift + scale * xy + turn * np.column_stack([-xy[:, 1], xy[:, 0]])
-    moved = datum_design(xy) @ np.array([*shift, scale, turn])
-    np.testing.assert_allclose(moved, (turned - xy).ravel(), rtol=1e-9)
+    scale, rotation = 3e-6, -4e-6
+    rotated = xy + shift + scale * xy + rotation * np.column_stack([-xy[:, 1], xy[:, 0]])
+    moved = datum_design(xy) @ np.array([*shift, scale, rotation])
+    np.testing.assert_allclose(moved, (rotated - xy).ravel(), rtol=1e-9)
 
 
 def test_of_converging_heads_the_datum_is_a_rotation_of_the_virtual_camera() -> None:
@@ -232,8 +232,8 @@ def test_of_converging_heads_the_datum_is_a_rotation_of_the_virtual_camera() -> 
     xy = np.array([[19.0, -10.0], [-15.0, 8.0]])
     by_x, by_y, by_z = 3e-5, -2e-5, 1e-5
     rays = np.column_stack([xy, [-f, -f]])
-    turned = rays + np.cross([by_x, by_y, by_z], rays)
-    expected = turned[:, :2] * (-f / turned[:, 2:]) - xy
+    rotated = rays + np.cross([by_x, by_y, by_z], rays)
+    expected = rotated[:, :2] * (-f / rotated[:, 2:]) - xy
     datum = np.array([-f * by_y, f * by_x, 0.0, by_z])
     moved = moved_datum_design(rig, mosaic, xy) @ datum
     np.testing.assert_allclose(moved, expected.ravel(), rtol=1e-3)
@@ -247,7 +247,9 @@ def test_findings_add_their_variance_to_the_placed_pixels() -> None:
     x, y = vip_mm_from_raw(mosaic.placements["SU10"], at).T
     plain = placed_sigma_px(rig, mosaic, "SU10", at, NO_READING) ** 2
     datum = np.diag([0.3**2, 0.7**2, 0.02**2, 0.05**2])
-    found = Disturbance(datum, {"SU10": np.array([4.0, 9.0]), "SU11": np.array([100.0, 100.0])})
+    found = UncertaintyContribution(
+        datum, {"SU10": np.array([4.0, 9.0]), "SU11": np.array([100.0, 100.0])}
+    )
     more = placed_sigma_px(rig, mosaic, "SU10", at, NO_READING, found) ** 2 - plain
     expected_x = 0.3**2 + (0.02 * x) ** 2 + (0.05 * y) ** 2 + 4.0
     expected_y = 0.7**2 + (0.02 * y) ** 2 + (0.05 * x) ** 2 + 9.0
@@ -298,7 +300,9 @@ def test_the_covariance_of_places_holds_their_variances_and_what_they_share() ->
 
 def test_figures_are_root_mean_squares_over_middle_and_corners_of_present_sensors() -> None:
     rig, mosaic = mosaic_of("ultracam-x-mini")
-    found = Disturbance(frames={"SU10": np.array([0.09, 0.04]), "SU20": np.array([400.0, 400.0])})
+    found = UncertaintyContribution(
+        frames={"SU10": np.array([0.09, 0.04]), "SU20": np.array([400.0, 400.0])}
+    )
     present = ("SU00", "SU10", rig.cone(rig.colour_master_cone or "").sensors[0].name)
     figures = precision_figures(rig, mosaic, present, NO_READING, found)
     w, h = 1248, 832

@@ -10,9 +10,9 @@ from scipy.stats import chi2
 
 from processing.geometry.placement import nominal_placements
 from processing.mosaic import validity
-from processing.mosaic.free import free_mosaic
+from processing.mosaic.free_mosaic import free_mosaic
 from processing.mosaic.misfit import Misfit
-from processing.mosaic.validity import Displacement, judge_master
+from processing.mosaic.validity import Displacement, evaluate_master
 from processing.rig import find_rig
 from tests.processing.mosaic.test_precision import mosaic_of
 from tests.processing.mosaic.test_validity import exposure
@@ -47,19 +47,27 @@ def test_sums_are_those_of_the_points_in_use() -> None:
 
 def test_a_sensor_is_named_beyond_the_limit_of_two_coordinates_of_one_of_four() -> None:
     rig, mosaic = mosaic_of("ultracam-x-mini")
-    judged = judge_master(rig, mosaic, {})
-    assert judged.limit == pytest.approx(chi2.isf(0.001 / 4, 2))
-    assert judged.global_freedom == 4
-    assert judged.global_limit == pytest.approx(chi2.isf(0.001, 4))
+    master_validity = evaluate_master(rig, mosaic, {})
+    assert master_validity.limit == pytest.approx(chi2.isf(0.001 / 4, 2))
+    assert master_validity.global_degrees_of_freedom == 4
+    assert master_validity.global_limit == pytest.approx(chi2.isf(0.001, 4))
 
 
 def test_a_camera_without_a_master_of_three_has_nothing_to_test() -> None:
     rig = find_rig("dmc-mini")
     mosaic = free_mosaic(rig, nominal_placements(rig, {}, {}), no_tie_points(rig))
-    judged = judge_master(rig, mosaic, {})
-    assert (judged.global_statistic, judged.global_freedom, judged.global_limit) == (0.0, 0, 0.0)
-    assert judged.consistent and judged.limit == float("inf")
-    assert judged.hypotheses == () and judged.displaced is None and not judged.several
+    master_validity = evaluate_master(rig, mosaic, {})
+    assert (
+        master_validity.global_statistic,
+        master_validity.global_degrees_of_freedom,
+        master_validity.global_limit,
+    ) == (0.0, 0, 0.0)
+    assert master_validity.consistent and master_validity.limit == float("inf")
+    assert (
+        master_validity.hypotheses == ()
+        and master_validity.displaced is None
+        and not master_validity.several_displaced
+    )
 
 
 @pytest.mark.parametrize(("beyond", "displaced"), [(1.0, True), (-1.0, False)])
@@ -81,7 +89,7 @@ def test_of_what_a_wrong_probe_leaves_the_likeliest_sensor_decides(
         return found[-1]
 
     monkeypatch.setattr(validity, "_hypotheses", hypotheses)
-    judged = judge_master(MINI, mosaic, read)
+    master_validity = evaluate_master(MINI, mosaic, read)
     assert len(found) == 3
-    assert judged.displaced == (found[2][0] if displaced else None)
-    assert (judged.misread is None) == displaced
+    assert master_validity.displaced == (found[2][0] if displaced else None)
+    assert (master_validity.probe_bias is None) == displaced

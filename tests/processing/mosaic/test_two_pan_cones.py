@@ -19,12 +19,12 @@ from processing.geometry.placement import (
     vip_px_from_mm,
 )
 from processing.geometry.projective import apply_projective
-from processing.mosaic.free import free_mosaic
+from processing.mosaic.free_mosaic import free_mosaic
 from processing.mosaic.pan_only import pan_only_mosaic
-from processing.pipelines.stitched import Pipeline, Product, Settings
+from processing.pipelines.stitched import Pipeline, PipelineSettings, Product
 from processing.quality.report import Flag, Verdict
 from processing.rig import Rig, find_rig
-from tests.processing.emulated import Emulated, after_similarity, expose, rms
+from tests.processing.emulated_exposure import EmulatedExposure, after_similarity, expose, rms
 from tests.processing.synthetic import make_truth, tie_points_of
 
 
@@ -32,7 +32,7 @@ from tests.processing.synthetic import make_truth, tie_points_of
 class Flown:
     """An emulated exposure, and what the pipeline made of it."""
 
-    emulated: Emulated
+    emulated: EmulatedExposure
     pipeline: Pipeline
     product: Product
 
@@ -40,11 +40,13 @@ class Flown:
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
     emulated = expose("ultracam-l-mini", tmp_path_factory.mktemp("emulated"), height_px=2300)
-    pipeline = Pipeline(emulated.world.rig, None, Settings())
+    pipeline = Pipeline(emulated.world.rig, None, PipelineSettings())
     product = pipeline.process(emulated.frames, emulated.conditions)
     colour = {name: band.copy() for name, band in product.colour.items()}
-    kept = replace(product, pan=product.pan.copy(), valid=product.valid.copy(), colour=colour)
-    return Flown(emulated, pipeline, kept)
+    product_copy = replace(
+        product, pan=product.pan.copy(), valid=product.valid.copy(), colour=colour
+    )
+    return Flown(emulated, pipeline, product_copy)
 
 
 def test_the_stitched_geometry_is_within_its_bars(flown: Flown) -> None:
@@ -63,7 +65,7 @@ def test_sixteen_unknowns_and_none_of_them_undetermined(flown: Flown) -> None:
     assert flown.product.report.verdict is Verdict.GOOD
 
 
-def test_nothing_is_said_of_a_displacement_that_cannot_be_seen(flown: Flown) -> None:
+def test_nothing_is_stated_of_a_displacement_that_cannot_be_seen(flown: Flown) -> None:
     validity = flown.product.validity
     assert validity is not None and validity.displaced is None and not validity.relative
     assert set(validity.observability.values()) == {"unobservable"}

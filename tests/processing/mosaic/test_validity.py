@@ -12,8 +12,8 @@ from scipy.stats import chi2
 
 from processing.geometry.placement import nominal_placements, vip_mm_from_raw
 from processing.matching.tie_points import TiePoints
-from processing.mosaic.free import Mosaic, free_mosaic
-from processing.mosaic.validity import judge_master, robust_datum
+from processing.mosaic.free_mosaic import Mosaic, free_mosaic
+from processing.mosaic.validity import evaluate_master, robust_datum
 from processing.rig import Rig, find_rig
 from tests.processing.geometry.test_topology import side_by_side_rig
 from tests.processing.synthetic import Truth, make_truth, tie_points_of
@@ -24,7 +24,7 @@ PITCH_MM = 7.2e-3
 MASTER = ("SU00", "SU01", "SU02", "SU03")
 
 
-def healthy_offsets(rng: np.random.Generator, dc_k: float) -> dict[str, tuple[float, float]]:
+def calibration_offsets(rng: np.random.Generator, dc_k: float) -> dict[str, tuple[float, float]]:
     """What calibration and TDM coefficients may be off by, drawn from their sigmas, px."""
     result = {}
     for cone in MINI.pan_cones:
@@ -51,7 +51,7 @@ def exposure(
 ) -> tuple[Truth, TiePoints, Mosaic, dict[str, float]]:
     """An exposure whose probe 0 reads `misread_k` too much."""
     rng = np.random.default_rng(seed)
-    offsets = healthy_offsets(rng, dc_k)
+    offsets = calibration_offsets(rng, dc_k)
     for name, (x, y) in displaced.items():
         offsets[name] = (offsets[name][0] + x, offsets[name][1] + y)
     truth = make_truth(rig, rng, temperature_c=20.0 + dc_k, sensor_px=0.0, displaced=offsets)
@@ -72,16 +72,16 @@ def absolute_error_px(truth: Truth, mosaic: Mosaic) -> float:
     return float(np.sqrt(np.mean(np.concatenate(errors))))
 
 
-def test_fifty_healthy_exposures_raise_no_alarm_and_follow_the_chi_square() -> None:
+def test_fifty_error_free_exposures_raise_no_alarm_and_follow_the_chi_square() -> None:
     statistics = []
     for seed in range(50):
         _, _, mosaic, temperatures = exposure(seed, {})
-        judged = judge_master(MINI, mosaic, temperatures)
-        assert judged.displaced is None, seed
-        assert not judged.several
-        assert not any(relative.significant for relative in judged.relative), seed
-        assert judged.global_freedom == 4
-        statistics.append(judged.global_statistic)
+        validity = evaluate_master(MINI, mosaic, temperatures)
+        assert validity.displaced is None, seed
+        assert not validity.several_displaced
+        assert not any(relative.significant for relative in validity.relative), seed
+        assert validity.global_degrees_of_freedom == 4
+        statistics.append(validity.global_statistic)
     low, high = chi2.ppf([0.0005, 0.9995], 4 * 50)
     assert low < sum(statistics) < high
 
@@ -94,16 +94,16 @@ def test_a_displaced_master_sensor_is_named_with_its_displacement(
     angle = 2.0 * MASTER.index(sensor) + length
     moved = (length * math.cos(angle), length * math.sin(angle))
     _, _, mosaic, temperatures = exposure(7, {sensor: moved})
-    judged = judge_master(MINI, mosaic, temperatures)
-    assert judged.displaced is not None
-    assert judged.displaced.sensor == sensor
-    assert not judged.several
-    error = (judged.displaced.dx_px - moved[0], judged.displaced.dy_px - moved[1])
-    assert abs(error[0]) < 4.0 * judged.displaced.sigma_x_px
-    assert abs(error[1]) < 4.0 * judged.displaced.sigma_y_px
-    assert judged.displaced.sigma_x_px < 0.08
+    validity = evaluate_master(MINI, mosaic, temperatures)
+    assert validity.displaced is not None
+    assert validity.displaced.sensor == sensor
+    assert not validity.several_displaced
+    error = (validity.displaced.dx_px - moved[0], validity.displaced.dy_px - moved[1])
+    assert abs(error[0]) < 4.0 * validity.displaced.sigma_x_px
+    assert abs(error[1]) < 4.0 * validity.displaced.sigma_y_px
+    assert validity.displaced.sigma_x_px < 0.08
     # Half of it shows as a residual in the datum of all four.
-    residual = next(r for r in judged.residuals if r.sensor == sensor)
+    residual = next(r for r in validity.residuals if r.sensor == sensor)
     assert math.hypot(residual.dx_px, residual.dy_px) == pytest.approx(length / 2.0, abs=0.1)
 
 
@@ -111,7 +111,7 @@ def test_the_estimated_displacement_is_as_good_as_its_sigma() -> None:
     normalised = []
     for seed in range(30):
         _, _, mosaic, temperatures = exposure(200 + seed, {"SU02": (0.9, -0.6)})
-        d = judge_master(MINI, mosaic, temperatures).displaced
+        d = evaluate_master(MINI, mosaic, temperatures).displaced
         assert d is not None
         assert d.sensor == "SU02"
         normalised += [(d.dx_px - 0.9) / d.sigma_x_px, (d.dy_px + 0.6) / d.sigma_y_px]
@@ -121,8 +121,8 @@ def test_the_estimated_displacement_is_as_good_as_its_sigma() -> None:
 
 def test_the_robust_datum_corrects_the_absolute_position_and_nothing_else() -> None:
     truth, points, mosaic, temperatures = exposure(11, {"SU01": (1.6, -1.2)})
-    judged = judge_master(MINI, mosaic, temperatures)
-    repaired = robust_datum(MINI, truth.start, points, mosaic, judged)
+    validity = evaluate_master(MINI, mosaic, temperatures)
+    repaired = robust_datum(MINI, truth.start, points, mosaic, validity)
     assert repaired.datum_sensors == ("SU00", "SU02", "SU03")
     assert absolute_error_px(truth, mosaic) > 0.5
     assert absolute_error_px(truth, repaired) < 0.08
@@ -131,14 +131,14 @@ def test_the_robust_datum_corrects_the_absolute_position_and_nothing_else() -> N
 
 def test_without_a_displaced_sensor_the_robust_datum_is_the_same_mosaic() -> None:
     truth, points, mosaic, temperatures = exposure(12, {})
-    judged = judge_master(MINI, mosaic, temperatures)
-    assert robust_datum(MINI, truth.start, points, mosaic, judged) is mosaic
+    validity = evaluate_master(MINI, mosaic, temperatures)
+    assert robust_datum(MINI, truth.start, points, mosaic, validity) is mosaic
 
 
-def test_the_judgement_does_not_depend_on_the_datum() -> None:
+def test_the_evaluation_does_not_depend_on_the_datum() -> None:
     truth, points, mosaic, temperatures = exposure(13, {"SU03": (0.5, 0.5)})
-    first = judge_master(MINI, mosaic, temperatures)
-    second = judge_master(
+    first = evaluate_master(MINI, mosaic, temperatures)
+    second = evaluate_master(
         MINI, robust_datum(MINI, truth.start, points, mosaic, first), temperatures
     )
     assert first.displaced is not None
@@ -148,45 +148,45 @@ def test_the_judgement_does_not_depend_on_the_datum() -> None:
     assert second.global_statistic == pytest.approx(first.global_statistic, rel=5e-3)
 
 
-def test_a_small_displacement_that_two_sensors_explain_alike_is_said_to_be_ambiguous() -> None:
+def test_a_small_displacement_that_two_sensors_explain_alike_is_reported_as_ambiguous() -> None:
     truth, points, mosaic, temperatures = exposure(17, {"SU00": (0.2, 0.0)}, sigma_pp_px=0.05)
-    judged = judge_master(MINI, mosaic, temperatures)
-    assert judged.displaced is not None
-    assert judged.alternatives
-    assert judged.displaced.sensor not in judged.alternatives
-    assert len(judged.hypotheses) == 4
+    validity = evaluate_master(MINI, mosaic, temperatures)
+    assert validity.displaced is not None
+    assert validity.alternatives
+    assert validity.displaced.sensor not in validity.alternatives
+    assert len(validity.hypotheses) == 4
     # Wrongly blamed it would spoil the datum, so the datum rests on neither.
-    doubted = {judged.displaced.sensor, *judged.alternatives}
-    repaired = robust_datum(MINI, truth.start, points, mosaic, judged)
-    assert len(doubted) == 2 and set(repaired.datum_sensors) == set(MASTER) - doubted
+    ambiguous = {validity.displaced.sensor, *validity.alternatives}
+    repaired = robust_datum(MINI, truth.start, points, mosaic, validity)
+    assert len(ambiguous) == 2 and set(repaired.datum_sensors) == set(MASTER) - ambiguous
     _, _, clear, temperatures = exposure(14, {"SU00": (3.0, 0.0)})
-    assert judge_master(MINI, clear, temperatures).alternatives == ()
+    assert evaluate_master(MINI, clear, temperatures).alternatives == ()
 
 
 def test_two_displaced_sensors_are_not_passed_off_as_one() -> None:
     _, _, mosaic, temperatures = exposure(15, {"SU00": (2.0, 0.0), "SU03": (0.0, 2.0)})
-    assert judge_master(MINI, mosaic, temperatures).several
+    assert evaluate_master(MINI, mosaic, temperatures).several_displaced
 
 
-def test_a_probe_that_misreads_is_named_and_no_sensor_accused() -> None:
+def test_a_biased_probe_is_named_and_no_sensor_is() -> None:
     off = []
     for seed in range(40, 46):
         _, _, mosaic, temperatures = exposure(seed, {}, dc_k=0.0, misread_k=9.0)
-        judged = judge_master(MINI, mosaic, temperatures)
-        assert judged.hypotheses[0].statistic > judged.limit, "a sensor would have been accused"
-        assert judged.displaced is None and not judged.several
-        assert judged.misread is not None and judged.misread.probe == "0"
-        assert judged.misread.sigma_k < 0.5
-        off.append((judged.misread.off_k - 9.0) / judged.misread.sigma_k)
+        validity = evaluate_master(MINI, mosaic, temperatures)
+        assert validity.hypotheses[0].statistic > validity.limit, "a sensor would have been accused"
+        assert validity.displaced is None and not validity.several_displaced
+        assert validity.probe_bias is not None and validity.probe_bias.probe == "0"
+        assert validity.probe_bias.sigma_k < 0.5
+        off.append((validity.probe_bias.bias_k - 9.0) / validity.probe_bias.sigma_k)
     assert max(np.abs(off)) < 4.0
 
 
 def test_a_sensor_that_moved_is_named_whatever_the_probe_reads() -> None:
     for misread_k in (-4.0, 0.0, 4.0):
         _, _, mosaic, temperatures = exposure(47, {"SU03": (0.5, 0.3)}, misread_k=misread_k)
-        judged = judge_master(MINI, mosaic, temperatures)
-        assert judged.displaced is not None and judged.displaced.sensor == "SU03", misread_k
-        assert judged.misread is None and not judged.several
+        validity = evaluate_master(MINI, mosaic, temperatures)
+        assert validity.displaced is not None and validity.displaced.sensor == "SU03", misread_k
+        assert validity.probe_bias is None and not validity.several_displaced
 
 
 def test_a_sensor_with_a_probe_of_its_own_may_be_warm_or_displaced() -> None:
@@ -203,27 +203,27 @@ def test_a_sensor_with_a_probe_of_its_own_may_be_warm_or_displaced() -> None:
     drift = rig.sensor("SU02").drift
     two_kelvin = (2.0 * drift.x_um_per_k / 7.2, 2.0 * drift.y_um_per_k / 7.2)
     _, _, mosaic, temperatures = exposure(48, {"SU02": two_kelvin}, dc_k=0.0, rig=rig)
-    judged = judge_master(rig, mosaic, temperatures)
-    assert judged.displaced is not None and judged.displaced.sensor == "SU02"
-    assert judged.misread is not None and judged.misread.probe == "9"
-    assert judged.misread.off_k == pytest.approx(-2.0, abs=4.0 * judged.misread.sigma_k)
+    validity = evaluate_master(rig, mosaic, temperatures)
+    assert validity.displaced is not None and validity.displaced.sensor == "SU02"
+    assert validity.probe_bias is not None and validity.probe_bias.probe == "9"
+    assert validity.probe_bias.bias_k == pytest.approx(-2.0, abs=4.0 * validity.probe_bias.sigma_k)
     across = (-two_kelvin[1], two_kelvin[0])
     _, _, mosaic, temperatures = exposure(49, {"SU02": across}, dc_k=0.0, rig=rig)
-    judged = judge_master(rig, mosaic, temperatures)
-    assert judged.displaced is not None and judged.misread is None
+    validity = evaluate_master(rig, mosaic, temperatures)
+    assert validity.displaced is not None and validity.probe_bias is None
 
 
 def test_in_a_two_sensor_cone_only_the_relative_displacement_is_known() -> None:
     _, _, mosaic, temperatures = exposure(16, {"SU11": (0.6, -0.4)})
-    judged = judge_master(MINI, mosaic, temperatures)
-    assert judged.displaced is None
-    assert judged.observability == {
+    validity = evaluate_master(MINI, mosaic, temperatures)
+    assert validity.displaced is None
+    assert validity.observability == {
         "0": "named",
         "1": "relative",
         "2": "relative",
         "3": "unobservable",
     }
-    one, two = judged.relative
+    one, two = validity.relative
     assert (one.cone, one.sensor_a, one.sensor_b) == ("1", "SU10", "SU11")
     assert one.significant
     assert one.dx_px == pytest.approx(-0.6, abs=4 * one.sigma_x_px)
@@ -241,9 +241,9 @@ def test_a_sensor_alone_in_its_cone_moves_unseen() -> None:
     )
     shifted = dataclasses.replace(truth, placements={**truth.placements, "SU30": moved})
     mosaic = free_mosaic(MINI, truth.start, tie_points_of(shifted, rng))
-    judged = judge_master(MINI, mosaic, dict.fromkeys(MINI.probes, 20.0))
-    assert judged.displaced is None
-    assert judged.consistent
+    validity = evaluate_master(MINI, mosaic, dict.fromkeys(MINI.probes, 20.0))
+    assert validity.displaced is None
+    assert validity.consistent
     assert mosaic.sigma0 == pytest.approx(1.0, abs=0.05)
 
 
@@ -251,29 +251,29 @@ def test_with_three_master_sensors_a_displacement_is_seen_but_nobody_is_cleared(
     rng = np.random.default_rng(18)
     truth = make_truth(MINI, rng, sensor_px=0.0, temperature_c=20.0, displaced={"SU00": (3.0, 0)})
     points = tie_points_of(truth, rng, without=("SU03",))
-    judged = judge_master(
+    validity = evaluate_master(
         MINI, free_mosaic(MINI, truth.start, points), dict.fromkeys(MINI.probes, 20.0)
     )
-    assert judged.observability["0"] == "relative"
-    assert judged.displaced is not None
-    assert set(judged.alternatives) | {judged.displaced.sensor} == {"SU00", "SU01", "SU02"}
+    assert validity.observability["0"] == "relative"
+    assert validity.displaced is not None
+    assert set(validity.alternatives) | {validity.displaced.sensor} == {"SU00", "SU01", "SU02"}
 
 
-def test_a_rig_of_single_sensors_has_nothing_to_judge() -> None:
+def test_a_rig_of_single_sensors_has_nothing_to_evaluate() -> None:
     rig = side_by_side_rig()
     rng = np.random.default_rng(19)
     truth = make_truth(rig, rng)
     mosaic = free_mosaic(rig, truth.start, tie_points_of(truth, rng))
-    judged = judge_master(rig, mosaic, {})
-    assert judged.observability == {"0": "unobservable", "1": "unobservable"}
-    assert judged.displaced is None
-    assert judged.consistent
-    assert judged.residuals == ()
+    validity = evaluate_master(rig, mosaic, {})
+    assert validity.observability == {"0": "unobservable", "1": "unobservable"}
+    assert validity.displaced is None
+    assert validity.consistent
+    assert validity.residuals == ()
 
 
-def test_an_unknown_temperature_widens_what_counts_as_healthy() -> None:
+def test_an_unknown_temperature_widens_what_counts_as_error_free() -> None:
     _, _, mosaic, temperatures = exposure(20, {"SU00": (0.5, 0.0)})
-    known = judge_master(MINI, mosaic, temperatures)
-    unknown = judge_master(MINI, mosaic, {})
+    known = evaluate_master(MINI, mosaic, temperatures)
+    unknown = evaluate_master(MINI, mosaic, {})
     assert known.displaced is not None
     assert unknown.global_statistic < known.global_statistic

@@ -14,14 +14,14 @@ from processing.geometry.topology import corners, overlaps
 from processing.matching.tie_points import PAN_TO_COLOUR, PAN_TO_PAN, TiePoints
 from processing.mosaic.weights import (
     CLASSES,
-    Group,
     MosaicSettings,
+    TiePointGroup,
+    block_after_step,
     block_of,
     class_scales,
-    first_look,
     full_weight,
     groups_of,
-    moved_on,
+    initial_weights,
     weight_factors,
 )
 from processing.rig import find_rig
@@ -40,10 +40,10 @@ def exposure() -> tuple[Truth, TiePoints]:
     return truth, points
 
 
-def group_of(difference: Array, *, kind: int = PAN_TO_PAN, sigma: float = 1.0) -> Group:
+def group_of(difference: Array, *, kind: int = PAN_TO_PAN, sigma: float = 1.0) -> TiePointGroup:
     n = len(difference)
     none = np.empty((n, 2))
-    return Group(
+    return TiePointGroup(
         a="SU00",
         b="SU10",
         kind=kind,
@@ -72,9 +72,11 @@ def test_sigmas_are_those_of_the_class_times_how_sharp_the_match_is() -> None:
             np.testing.assert_allclose(group.sigma, expected, rtol=1e-12)
             continue
         xy = vip_mm_from_raw(truth.start[group.a], points.raw_a[group.rows])
-        alone = ~np.any([c.rectangle.contains(xy) for c in shared], axis=0)
-        np.testing.assert_allclose(group.sigma[alone], 0.2 * relative[alone], rtol=1e-12)
-        assert 0.5 < alone.mean() < 1.0
+        outside_shared = ~np.any([c.rectangle.contains(xy) for c in shared], axis=0)
+        np.testing.assert_allclose(
+            group.sigma[outside_shared], 0.2 * relative[outside_shared], rtol=1e-12
+        )
+        assert 0.5 < outside_shared.mean() < 1.0
     only = groups_of(MINI, truth.start, points, settings, (PAN_TO_PAN,))
     assert {g.kind for g in only} == {PAN_TO_PAN} and len(only) == 12
 
@@ -121,7 +123,7 @@ def test_the_first_look_leaves_out_what_is_far_from_the_median_of_its_pair() -> 
     px = truth.model.pitch_mm
     difference = vip_mm_from_raw(truth.start[group.a], a) / px
     difference -= vip_mm_from_raw(truth.start[group.b], b) / px
-    factors = first_look(truth.model, truth.start, group)
+    factors = initial_weights(truth.model, truth.start, group)
     np.testing.assert_allclose(group.difference, difference, atol=1e-6)
     off = np.abs(difference - np.median(difference, axis=0))
     spread = 1.4826 * np.median(off, axis=0)
@@ -130,11 +132,11 @@ def test_the_first_look_leaves_out_what_is_far_from_the_median_of_its_pair() -> 
     assert group.redundancy.tolist() == np.ones((len(a), 2)).tolist()
     # Planted: one point just within six spreads in x, one just beyond in y.
     width = truth.start[group.a].sensor.pitch_mm
-    turned = np.array([[1.0, 0.0], [0.0, 1.0]]) * limit * (0.99, 1.01) * width
+    offsets = np.array([[1.0, 0.0], [0.0, 1.0]]) * limit * (0.99, 1.01) * width
     moved = dataclasses.replace(group, corrected_a=group.corrected_a.copy())
     middle = np.argsort(off.sum(axis=1))[:2]
-    moved.corrected_a[middle] += turned - (difference[middle] - np.median(difference, axis=0)) * px
-    assert first_look(truth.model, truth.start, moved)[middle].tolist() == [1.0, 0.0]
+    moved.corrected_a[middle] += offsets - (difference[middle] - np.median(difference, axis=0)) * px
+    assert initial_weights(truth.model, truth.start, moved)[middle].tolist() == [1.0, 0.0]
 
 
 def test_small_spreads_count_as_a_fifth_of_a_pixel() -> None:
@@ -145,8 +147,8 @@ def test_small_spreads_count_as_a_fifth_of_a_pixel() -> None:
     group = dataclasses.replace(group_of(np.zeros((n, 2))), corrected_a=at.copy(), corrected_b=at)
     group.corrected_a[0, 0] = 1.19 * truth.model.pitch_mm
     group.corrected_a[1, 1] = -1.21 * truth.model.pitch_mm
-    kept = first_look(truth.model, placements, group)
-    assert kept.tolist() == [1.0, 0.0, *[1.0] * 7]
+    initial_weights_found = initial_weights(truth.model, placements, group)
+    assert initial_weights_found.tolist() == [1.0, 0.0, *[1.0] * 7]
 
 
 def test_the_equations_are_derivatives_of_their_misclosure() -> None:
@@ -166,7 +168,7 @@ def test_the_equations_are_derivatives_of_their_misclosure() -> None:
         # x of all, then y of all; the noise of matching is all that is left at the truth.
         assert np.abs(block.misclosure).max() < 2.0
         group.difference = np.column_stack([group.sigma, -2.0 * group.sigma])
-        later = moved_on(block, group, 0.5)
+        later = block_after_step(block, group, 0.5)
         np.testing.assert_allclose(later.misclosure, [*-group.sigma, *2.0 * group.sigma])
         np.testing.assert_allclose(later.weight, 4.0 * 1.7**2 * block.weight, rtol=1e-12)
         assert later.design is block.design
@@ -179,7 +181,7 @@ def test_full_weight_is_one_over_the_variance_of_either_coordinate() -> None:
     assert weights.tolist() == [1.0, 0.0625, 1.0, 0.0625]
 
 
-def components(pan: float, colour: float, n: int = 40) -> list[Group]:
+def components(pan: float, colour: float, n: int = 40) -> list[TiePointGroup]:
     alternating = np.array([1.0, -1.0] * (n // 2))[:, None] * np.ones((1, 2))
     return [
         group_of(alternating * pan * 0.1, sigma=0.1),
@@ -210,9 +212,12 @@ def test_a_ratio_moved_by_two_per_mille_has_moved(ratio: float, expected: bool) 
 
 def test_a_class_of_too_little_redundancy_keeps_its_scale() -> None:
     before = {PAN_TO_PAN: 1.0, PAN_TO_COLOUR: 3.0}
-    for n, kept in ((14, True), (16, False)):
+    for n, initial_weights_found in ((14, True), (16, False)):
         after, moved = class_scales(components(1.0, 2.0, n), before, MosaicSettings())
-        assert after[PAN_TO_COLOUR] == pytest.approx(3.0 if kept else 2.0) and moved is not kept
+        assert (
+            after[PAN_TO_COLOUR] == pytest.approx(3.0 if initial_weights_found else 2.0)
+            and moved is not initial_weights_found
+        )
     thirty = components(1.0, 2.0, 40)
     thirty[0].redundancy[:] = 30.0 / 80.0
     assert class_scales(thirty, before, MosaicSettings())[0][PAN_TO_COLOUR] != 3.0

@@ -12,7 +12,7 @@ from processing.quality.probe_health import (
     ProbeState,
     bridge_by_others,
     calibration_temperatures,
-    judge_probes,
+    evaluate_probes,
 )
 from processing.quality.report import NO_FLAGS, Flag
 from processing.rig import find_rig
@@ -42,7 +42,7 @@ def test_a_climb_raises_no_alarm() -> None:
     for seed in range(20):
         histories = climb(seed=seed)
         for at_s in (0.0, 300.0, 900.0, 1800.0):
-            for probe, reading in judge_probes(histories, at_s, CALIBRATION).items():
+            for probe, reading in evaluate_probes(histories, at_s, CALIBRATION).items():
                 assert reading.state is ProbeState.GOOD and reading.flag == NO_FLAGS
                 assert reading.value_c is not None
                 assert abs(reading.value_c - truth_c(probe, at_s)) < 0.4
@@ -50,7 +50,7 @@ def test_a_climb_raises_no_alarm() -> None:
 
 def test_a_camera_at_rest_has_no_stuck_probe() -> None:
     still = {p: [ProbeSample(float(t), 20.0) for t in range(0, 1800, 10)] for p in CALIBRATION}
-    readings = judge_probes(still, 1790.0, CALIBRATION)
+    readings = evaluate_probes(still, 1790.0, CALIBRATION)
     assert {r.state for r in readings.values()} == {ProbeState.GOOD}
 
 
@@ -78,7 +78,7 @@ def test_a_fault_is_named_flagged_and_bridged_by_the_others(state: ProbeState, f
     }[state]
     histories["1"] = before + faulty
     for at_s in (1300.0, 1800.0):
-        readings = judge_probes(histories, at_s, CALIBRATION)
+        readings = evaluate_probes(histories, at_s, CALIBRATION)
         assert readings["1"].state is state and readings["1"].flag == flag
         assert readings["1"].sources == ("0", "2", "3")
         assert {readings[p].state for p in "023"} == {ProbeState.GOOD}
@@ -94,12 +94,12 @@ def test_a_probe_that_comes_back_is_believed_again() -> None:
         ProbeSample(s.time_s, 60.0 if 500.0 <= s.time_s < 560.0 else s.value_c)
         for s in histories["2"]
     ]
-    assert judge_probes(histories, 520.0, CALIBRATION)["2"].state is ProbeState.JUMP
-    assert judge_probes(histories, 600.0, CALIBRATION)["2"].state is ProbeState.GOOD
+    assert evaluate_probes(histories, 520.0, CALIBRATION)["2"].state is ProbeState.JUMP
+    assert evaluate_probes(histories, 600.0, CALIBRATION)["2"].state is ProbeState.GOOD
 
 
 def test_stitching_bridges_where_no_other_probe_is_left() -> None:
-    readings = judge_probes({}, 100.0, CALIBRATION, estimates={"0": (8.0, 0.3)})
+    readings = evaluate_probes({}, 100.0, CALIBRATION, estimates={"0": (8.0, 0.3)})
     assert readings["0"].value_c == 8.0 and readings["0"].sigma_k == pytest.approx(0.3)
     assert readings["0"].sources == ("stitching",)
     assert readings["1"].value_c is None and math.isinf(readings["1"].sigma_k)
@@ -108,12 +108,12 @@ def test_stitching_bridges_where_no_other_probe_is_left() -> None:
 def test_stitching_and_the_others_are_weighed_with_each_other() -> None:
     histories = climb()
     histories["1"] = []
-    alone = judge_probes(histories, 900.0, CALIBRATION)["1"]
+    own_reading = evaluate_probes(histories, 900.0, CALIBRATION)["1"]
     true_c = truth_c("1", 900.0)
-    both = judge_probes(histories, 900.0, CALIBRATION, estimates={"1": (true_c, 0.3)})["1"]
-    assert alone.value_c is not None and both.value_c is not None
-    assert alone.sigma_k == 2.0 and both.sigma_k < 0.3
-    assert abs(both.value_c - true_c) < abs(alone.value_c - true_c)
+    both = evaluate_probes(histories, 900.0, CALIBRATION, estimates={"1": (true_c, 0.3)})["1"]
+    assert own_reading.value_c is not None and both.value_c is not None
+    assert own_reading.sigma_k == 2.0 and both.sigma_k < 0.3
+    assert abs(both.value_c - true_c) < abs(own_reading.value_c - true_c)
     assert both.sources == ("0", "2", "3", "stitching")
 
 
@@ -140,7 +140,7 @@ def warming(rate_k: float, until_s: int = 700) -> list[ProbeSample]:
 
 @pytest.mark.parametrize(("age_s", "state"), [(30.0, "good"), (30.5, "missing")])
 def test_a_reading_older_than_half_a_minute_is_missing(age_s: float, state: str) -> None:
-    found = judge_probes({"0": [ProbeSample(5.0, 20.0)]}, 5.0 + age_s, {"0": 20.0})
+    found = evaluate_probes({"0": [ProbeSample(5.0, 20.0)]}, 5.0 + age_s, {"0": 20.0})
     assert found["0"].state.value == state
 
 
@@ -155,7 +155,7 @@ def test_a_reading_older_than_half_a_minute_is_missing(age_s: float, state: str)
     ],
 )
 def test_a_camera_is_between_minus_40_and_70_degrees(value_c: float, state: ProbeState) -> None:
-    assert judge_probes({"0": [ProbeSample(0.0, value_c)]}, 0.0, {"0": 20.0})["0"].state is state
+    assert evaluate_probes({"0": [ProbeSample(0.0, value_c)]}, 0.0, {"0": 20.0})["0"].state is state
 
 
 @pytest.mark.parametrize(
@@ -172,14 +172,14 @@ def test_a_step_is_possible_by_2_k_or_a_tenth_of_a_kelvin_a_second(
     step_k: float, after_s: float, state: ProbeState
 ) -> None:
     history = [ProbeSample(0.0, 20.0), ProbeSample(after_s, 20.0 + step_k)]
-    assert judge_probes({"0": history}, after_s, {"0": 20.0})["0"].state is state
+    assert evaluate_probes({"0": history}, after_s, {"0": 20.0})["0"].state is state
 
 
 def test_what_is_possible_counts_from_the_last_reading_not_the_last_believed_one() -> None:
     history = [ProbeSample(0.0, 20.0)] + [ProbeSample(float(t), 25.0) for t in range(10, 101, 10)]
-    assert judge_probes({"0": history}, 100.0, {"0": 20.0})["0"].state is ProbeState.JUMP
+    assert evaluate_probes({"0": history}, 100.0, {"0": 20.0})["0"].state is ProbeState.JUMP
     open_between = [ProbeSample(0.0, 20.0), ProbeSample(40.0, None), ProbeSample(60.0, 25.9)]
-    assert judge_probes({"0": open_between}, 60.0, {"0": 20.0})["0"].state is ProbeState.GOOD
+    assert evaluate_probes({"0": open_between}, 60.0, {"0": 20.0})["0"].state is ProbeState.GOOD
 
 
 @pytest.mark.parametrize(
@@ -198,7 +198,7 @@ def test_a_probe_within_a_twentieth_of_a_kelvin_while_others_move_by_2_k_is_stuc
     own = steady(20.0)
     own[-3] = ProbeSample(own[-3].time_s, 20.0 + own_k)
     histories = {"0": own, "1": warming(moved_k), "2": warming(moved_k)}
-    found = judge_probes(histories, 700.0, dict.fromkeys("012", 20.0))
+    found = evaluate_probes(histories, 700.0, dict.fromkeys("012", 20.0))
     assert found["0"].state is state
     assert found["1"].state is found["2"].state is ProbeState.GOOD
 
@@ -207,17 +207,17 @@ def test_a_probe_within_a_twentieth_of_a_kelvin_while_others_move_by_2_k_is_stuc
 def test_ten_minutes_of_history_are_needed_to_be_stuck(began_s: int, state: ProbeState) -> None:
     own = [s for s in steady(20.0, every_s=1) if s.time_s >= began_s]
     histories = {"0": own, "1": warming(3.0), "2": warming(3.0)}
-    assert judge_probes(histories, 700.0, dict.fromkeys("012", 20.0))["0"].state is state
+    assert evaluate_probes(histories, 700.0, dict.fromkeys("012", 20.0))["0"].state is state
 
 
 def test_one_other_probe_and_two_readings_are_too_few_to_be_stuck() -> None:
     calibration = dict.fromkeys("012", 20.0)
     one_other = {"0": steady(20.0), "1": warming(3.0)}
-    assert judge_probes(one_other, 700.0, calibration)["0"].state is ProbeState.GOOD
+    assert evaluate_probes(one_other, 700.0, calibration)["0"].state is ProbeState.GOOD
     for count, state in ((2, ProbeState.GOOD), (3, ProbeState.STUCK)):
         own = [ProbeSample(0.0, 20.0), *[ProbeSample(700.0 - k, 20.0) for k in range(count)][::-1]]
         histories = {"0": own, "1": warming(3.0), "2": warming(3.0)}
-        assert judge_probes(histories, 700.0, calibration)["0"].state is state
+        assert evaluate_probes(histories, 700.0, calibration)["0"].state is state
 
 
 def test_a_bridge_keeps_the_distance_and_ages_by_a_twentieth_of_a_kelvin_a_minute() -> None:
@@ -225,7 +225,7 @@ def test_a_bridge_keeps_the_distance_and_ages_by_a_twentieth_of_a_kelvin_a_minut
     calibration = {"0": 21.0, "1": 20.0, "2": 19.0}
     silent = [ProbeSample(float(t), 26.5 if t % 20 else 26.7) for t in range(10, 601, 10)]
     others = {"1": steady(25.0, 720), "2": steady(24.0, 720)}
-    found = judge_probes({"0": silent} | others, 720.0, calibration)["0"]
+    found = evaluate_probes({"0": silent} | others, 720.0, calibration)["0"]
     assert found.state is ProbeState.MISSING and found.sources == ("1", "2")
     # 5 K above calibration as the others, and its own 0.6 K.
     assert found.value_c == pytest.approx(21.0 + 5.0 + 0.6)
@@ -236,11 +236,11 @@ def test_a_bridge_keeps_the_distance_and_ages_by_a_twentieth_of_a_kelvin_a_minut
 def test_an_old_bridge_is_worth_no_less_than_one_without_history() -> None:
     calibration = dict.fromkeys("012", 20.0)
     others = {"1": steady(25.0, 6000), "2": steady(25.0, 6000)}
-    found = judge_probes({"0": [ProbeSample(0.0, 23.0)]} | others, 6000.0, calibration)["0"]
+    found = evaluate_probes({"0": [ProbeSample(0.0, 23.0)]} | others, 6000.0, calibration)["0"]
     assert found.sigma_k == 2.0 and found.value_c == pytest.approx(23.0)
-    without = judge_probes(others, 6000.0, calibration)["0"]
+    without = evaluate_probes(others, 6000.0, calibration)["0"]
     assert without.sigma_k == 2.0 and without.value_c == pytest.approx(25.0)
-    assert judge_probes(others, 6000.0, calibration)["1"].sigma_k == 0.1
+    assert evaluate_probes(others, 6000.0, calibration)["1"].sigma_k == 0.1
 
 
 def test_a_stuck_probe_is_bridged_by_its_distance_before_it_stood_still() -> None:
@@ -251,13 +251,13 @@ def test_a_stuck_probe_is_bridged_by_its_distance_before_it_stood_still() -> Non
         for s in moving
         if s.value_c is not None
     ]
-    found = judge_probes({"0": own, "1": moving, "2": moving}, 1400.0, calibration)["0"]
+    found = evaluate_probes({"0": own, "1": moving, "2": moving}, 1400.0, calibration)["0"]
     assert found.state is ProbeState.STUCK
     assert found.value_c == pytest.approx(27.0 + 0.8, abs=1e-6)
 
 
 def test_estimates_are_weighted_by_their_variances() -> None:
-    found = judge_probes(
+    found = evaluate_probes(
         {"1": steady(24.0), "2": steady(24.0)},
         700.0,
         dict.fromkeys("012", 20.0),

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from processing.geometry.placement import nominal_placements
 from processing.geometry.topology import overlaps
-from processing.matching.tie_places import overlap_pixels
+from processing.matching.tie_point_search import overlap_pixels
 from processing.quality import relative_sharpness
 from processing.quality.relative_sharpness import _typical, relative_sharpness_figures
 from processing.rig import Sensor, find_rig
@@ -46,7 +46,7 @@ def test_a_head_with_three_fifths_of_the_detail_is_in_order(
 
 
 def test_a_head_at_the_limit_is_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(relative_sharpness, "LEAST_RATIO", 0.5)
+    monkeypatch.setattr(relative_sharpness, "MIN_RATIO", 0.5)
     monkeypatch.setattr(relative_sharpness, "_typical", lambda found: 0.5)
     assert figures(monkeypatch, {})["blurred_sensor"] is None
 
@@ -63,8 +63,11 @@ def test_ground_without_detail_is_not_compared(
 ) -> None:
     shares: Shares = {s.name: (sharper, sharper) for s in PAN}
     shares["SU10"] = (0.26, 0.26)
-    made = figures(monkeypatch, shares)
-    assert made.get("blurred_sensor") == ("SU10" if found else None) and bool(made) == found
+    report_figures = figures(monkeypatch, shares)
+    assert (
+        report_figures.get("blurred_sensor") == ("SU10" if found else None)
+        and bool(report_figures) == found
+    )
 
 
 def test_directions_and_heads_without_a_share_are_not_compared(

@@ -7,7 +7,7 @@ import math
 
 import pytest
 
-from processing.quality.judgement import judge
+from processing.quality.evaluation import evaluate
 from processing.quality.report import NO_FLAGS, Flag, Thresholds, Verdict, as_json
 
 GOOD = {
@@ -29,15 +29,15 @@ GOOD = {
 
 
 def test_good_figures_make_a_good_exposure() -> None:
-    report = judge(GOOD)
+    report = evaluate(GOOD)
     assert report.verdict is Verdict.GOOD
     assert report.flags == NO_FLAGS and report.findings == ()
 
 
-def test_what_is_not_known_is_not_judged() -> None:
-    assert judge({}).verdict is Verdict.GOOD
-    assert judge(dict.fromkeys(GOOD)).verdict is Verdict.GOOD
-    assert judge(dict.fromkeys(GOOD, math.nan)).verdict is Verdict.GOOD
+def test_what_is_not_known_is_not_evaluated() -> None:
+    assert evaluate({}).verdict is Verdict.GOOD
+    assert evaluate(dict.fromkeys(GOOD)).verdict is Verdict.GOOD
+    assert evaluate(dict.fromkeys(GOOD, math.nan)).verdict is Verdict.GOOD
 
 
 @pytest.mark.parametrize(
@@ -66,7 +66,7 @@ def test_what_is_not_known_is_not_judged() -> None:
 def test_each_figure_beyond_its_threshold_raises_its_flag(
     name: str, value: float, flag: Flag, verdict: Verdict
 ) -> None:
-    report = judge(GOOD | {name: value})
+    report = evaluate(GOOD | {name: value})
     assert report.flags == flag
     assert report.verdict is verdict
     (finding,) = report.findings
@@ -75,31 +75,31 @@ def test_each_figure_beyond_its_threshold_raises_its_flag(
 
 
 def test_an_exposure_without_tie_points_is_flown_again() -> None:
-    report = judge(GOOD | {"tie_points_pp": 3, "tie_points_min_overlap": 0})
+    report = evaluate(GOOD | {"tie_points_pp": 3, "tie_points_min_overlap": 0})
     assert report.verdict is Verdict.REFLY
 
 
 def test_a_missing_frame_makes_the_exposure_usable_at_most() -> None:
-    report = judge(GOOD, missing_sensors=["SU10"])
+    report = evaluate(GOOD, missing_sensors=["SU10"])
     assert report.verdict is Verdict.USABLE and report.flags == Flag.FRAME_MISSING
     assert "SU10" in report.findings[0].sentence
 
 
 def test_a_displaced_sensor_that_was_handled_is_no_reason_to_fly_again() -> None:
-    report = judge(
+    report = evaluate(
         GOOD | {"displaced_sensor": "SU01", "displacement_x_px": 0.6, "displacement_y_px": -0.8}
     )
     assert report.verdict is Verdict.USABLE and report.flags == Flag.DISPLACED_SENSOR
     assert "Sensor SU01 sits 1.00 px off" in report.findings[0].sentence
 
 
-def test_probes_are_named_and_their_flags_told_apart() -> None:
-    report = judge(GOOD, missing_probes=["1", "G"], probes_out_of_range=["2"])
+def test_probes_are_named_and_their_flags_distinguished() -> None:
+    report = evaluate(GOOD, missing_probes=["1", "G"], probes_out_of_range=["2"])
     assert report.flags == Flag.TEMPERATURE_MISSING | Flag.TEMPERATURE_RANGE
     assert "probe 1, G" in report.findings[0].sentence
 
 
-def test_every_flag_capture_may_raise_says_what_to_do() -> None:
+def test_every_flag_capture_may_raise_states_what_to_do() -> None:
     figures_only = (
         Flag.TIME_SIGMA
         | Flag.TEMPERATURE_MISSING
@@ -117,26 +117,26 @@ def test_every_flag_capture_may_raise_says_what_to_do() -> None:
     for flag in Flag:
         if flag & figures_only:
             continue
-        report = judge(GOOD, capture_flags=flag)
+        report = evaluate(GOOD, capture_flags=flag)
         assert report.flags == flag
         assert [finding.flag for finding in report.findings] == [flag]
 
 
-def test_a_capture_flag_without_figures_is_kept() -> None:
-    assert judge(GOOD, capture_flags=Flag.TIME_SIGMA).flags == Flag.TIME_SIGMA
+def test_a_capture_flag_without_figures_is_retained() -> None:
+    assert evaluate(GOOD, capture_flags=Flag.TIME_SIGMA).flags == Flag.TIME_SIGMA
 
 
-def test_simulation_is_told_and_does_not_spoil_the_verdict() -> None:
-    report = judge(GOOD, capture_flags=Flag.SIMULATED)
+def test_simulation_is_reported_and_does_not_spoil_the_verdict() -> None:
+    report = evaluate(GOOD, capture_flags=Flag.SIMULATED)
     assert report.verdict is Verdict.GOOD and report.flags == Flag.SIMULATED
 
 
 def test_thresholds_are_the_configurations_to_change() -> None:
-    assert judge(GOOD, thresholds=Thresholds(sigma0_px=0.01)).flags == Flag.SIGMA0
+    assert evaluate(GOOD, thresholds=Thresholds(sigma0_px=0.01)).flags == Flag.SIGMA0
 
 
 def test_json_has_no_nan_and_names_its_flags() -> None:
-    report = judge(
+    report = evaluate(
         GOOD | {"sigma0_px": math.nan, "sharpness": math.inf, "sigma0_um": -math.inf},
         capture_flags=Flag.MARK_MISSING,
         missing_sensors=["G"],
@@ -164,42 +164,49 @@ def test_bits_keep_their_places_for_ever() -> None:
     }
 
 
-def test_two_displaced_sensors_are_said_to_be_ambiguous() -> None:
+def test_two_displaced_sensors_are_reported_as_ambiguous() -> None:
     moved = {"displaced_sensor": "SU01", "displacement_x_px": 0.6, "displacement_y_px": -0.8}
-    report = judge(GOOD | moved | {"displaced_several": 1})
+    report = evaluate(GOOD | moved | {"displaced_several": 1})
     assert report.flags == Flag.DISPLACED_SENSOR
     assert "More than one sensor" in report.findings[0].sentence
     assert "cannot be told" in report.findings[0].sentence
-    unsure = judge(GOOD | moved | {"displaced_alternatives": "SU00, SU03"})
+    unsure = evaluate(GOOD | moved | {"displaced_alternatives": "SU00, SU03"})
     assert "unless it is SU00, SU03" in unsure.findings[0].sentence
 
 
-def test_a_probe_that_explains_it_is_named_instead_of_a_sensor_or_beside_it() -> None:
+def test_a_probe_that_explains_it_is_named_instead_of_a_sensor_or_in_addition_to_it() -> None:
     misread = {"misread_probe": "0", "misread_k": 3.96, "misread_sigma_k": 0.2}
-    report = judge(GOOD | misread | {"dc_disagreement": "0"})
+    report = evaluate(GOOD | misread | {"dc_disagreement": "0"})
     assert report.flags == Flag.DC_DISAGREEMENT and report.verdict is Verdict.USABLE
     (finding,) = report.findings
     assert "probe 0 reads 4.0 K too high" in finding.sentence
     moved = {"displaced_sensor": "SU01", "displacement_x_px": 0.6, "displacement_y_px": -0.8}
-    report = judge(GOOD | misread | moved | {"misread_k": -2.0})
+    report = evaluate(GOOD | misread | moved | {"misread_k": -2.0})
     assert report.flags == Flag.DC_DISAGREEMENT | Flag.DISPLACED_SENSOR
     for finding in report.findings:
         assert "probe 0 reads 2.0 K too low" in finding.sentence and "SU01" in finding.sentence
     assert "the stitching cannot tell" in report.findings[1].sentence
 
 
-def test_an_overlap_without_tie_points_because_it_is_burnt_says_so() -> None:
+def test_an_overlap_without_tie_points_because_it_is_saturated_reports_it() -> None:
     few = {"tie_points_min_overlap": 3, "tie_points_min_overlap_name": "SU03-SU11"}
-    burnt = judge(GOOD | few | {"tie_points_min_overlap_burnt": 0.83, "saturated_fraction": 0.06})
-    assert burnt.flags == Flag.TIE_POINTS | Flag.OVEREXPOSED
-    told = next(f.sentence for f in burnt.findings if f.flag == Flag.TIE_POINTS)
-    assert "SU03-SU11 because it is burnt out: 83%" in told and "water" not in told
-    lake = judge(GOOD | few | {"tie_points_min_overlap_burnt": 0.1, "saturated_fraction": 0.06})
-    told = next(f.sentence for f in lake.findings if f.flag == Flag.TIE_POINTS)
-    assert "water" in told
+    saturated_report = evaluate(
+        GOOD | few | {"tie_points_min_overlap_burnt": 0.83, "saturated_fraction": 0.06}
+    )
+    assert saturated_report.flags == Flag.TIE_POINTS | Flag.OVEREXPOSED
+    sentence_of_overlap = next(
+        f.sentence for f in saturated_report.findings if f.flag == Flag.TIE_POINTS
+    )
+    assert (
+        "SU03-SU11 because it is burnt out: 83%" in sentence_of_overlap
+        and "water" not in sentence_of_overlap
+    )
+    lake = evaluate(GOOD | few | {"tie_points_min_overlap_burnt": 0.1, "saturated_fraction": 0.06})
+    sentence_of_overlap = next(f.sentence for f in lake.findings if f.flag == Flag.TIE_POINTS)
+    assert "water" in sentence_of_overlap
 
 
-def test_sensors_that_rest_on_calibration_are_told() -> None:
-    report = judge(GOOD | {"resting_on_calibration": "SU00, SU10"})
+def test_sensors_that_rest_on_calibration_are_reported() -> None:
+    report = evaluate(GOOD | {"resting_on_calibration": "SU00, SU10"})
     assert report.flags == Flag.TIE_POINTS and report.verdict is Verdict.USABLE
     assert "Too little detail to place SU00, SU10" in report.findings[0].sentence

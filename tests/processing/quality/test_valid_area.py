@@ -27,9 +27,9 @@ def area_from(mask: np.ndarray, saturated_bit: int = 0) -> ValidArea:
     return area_of({"pan": gap_cells(mask, *grid, saturated_bit=saturated_bit)})
 
 
-def test_a_whole_image_takes_no_box_and_an_empty_one_takes_one() -> None:
-    whole = area_from(np.ones((300, 400), np.uint8))
-    assert (whole.gaps, whole.share("pan")) == ({}, 1.0)
+def test_a_complete_image_takes_no_box_and_an_empty_one_takes_one() -> None:
+    full_area = area_from(np.ones((300, 400), np.uint8))
+    assert (full_area.gaps, full_area.share("pan")) == ({}, 1.0)
     empty = area_from(np.zeros((300, 400), np.uint8))
     assert empty.gaps == {"pan": ((0, 0, CELLS, CELLS * 3 // 4),)}
     assert empty.share("pan") == 0.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from processing.quality.judgement import judge
+from processing.quality.evaluation import evaluate
 from processing.quality.report import Flag
 from processing.quality.valid_area import _coarser, _smoothed, boxes_of, from_json
 
@@ -78,5 +78,5 @@ def test_a_layer_that_a_slip_explains_is_no_expired_calibration(
         "platform_shift_head": "2",
         "slip_cone": slipped,
     }
-    report = judge(figures)
+    report = evaluate(figures)
     assert (Flag.CALIBRATION_EXPIRED in report.flags) == raised

@@ -29,8 +29,8 @@ def test_the_bound_is_what_eliminating_all_other_pixels_leaves(kind: str) -> Non
     missing = np.array([places.index(place) for place in MISSING[kind]])
     rest = np.setdiff1d(np.arange(len(places)), missing)
     across = covariance[np.ix_(missing, rest)]
-    told = across @ np.linalg.solve(covariance[np.ix_(rest, rest)], across.T)
-    left = np.mean(np.diag(covariance[np.ix_(missing, missing)] - told)) - 1.0
+    predicted = across @ np.linalg.solve(covariance[np.ix_(rest, rest)], across.T)
+    left = np.mean(np.diag(covariance[np.ix_(missing, missing)] - predicted)) - 1.0
     assert bounds(spectrum)[kind] == pytest.approx(math.sqrt(left), rel=1e-9)
 
 

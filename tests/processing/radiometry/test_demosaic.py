@@ -33,10 +33,10 @@ def waves(rng: np.random.Generator, *, sigma_px: float, count: int = 400) -> tup
     """A random texture as a sum of waves, blurred by a Gaussian: known at any place, not only at
     whole pixels. Its amplitudes fall with frequency, as those of ground do."""
     radius = rng.uniform(0.01, 0.7, count)
-    turn = rng.uniform(0, 2 * np.pi, count)
+    direction = rng.uniform(0, 2 * np.pi, count)
     amplitude = np.exp(-2 * (np.pi * sigma_px * radius) ** 2) / np.sqrt(radius + 0.03)
     phase = rng.uniform(0, 2 * np.pi, count)
-    return radius * np.cos(turn), radius * np.sin(turn), amplitude, phase
+    return radius * np.cos(direction), radius * np.sin(direction), amplitude, phase
 
 
 def seen(texture: tuple[Array, ...], size: int, dx: float, dy: float) -> Array:
@@ -59,7 +59,7 @@ def test_grey_stays_what_it_is(array: str) -> None:
 
 
 @pytest.mark.parametrize("array", ARRAYS)
-def test_colours_are_kept_apart_and_measured_pixels_as_they_are(array: str) -> None:
+def test_colours_are_separated_and_measured_pixels_as_they_are(array: str) -> None:
     flat = np.stack([np.full((40, 50), v, np.float64) for v in (9000, 20000, 4000)])
     mosaic = behind_filters(flat, array)
     out = np.empty((3, 40, 50), np.uint16)
@@ -85,8 +85,8 @@ def test_a_long_wave_is_not_shifted_in_any_colour(array: str, band: str) -> None
         demosaic(behind_filters(colours, array), array, out=out)
         inner = (slice(16, -16), slice(16, -16))
         carrier = np.exp(-1j * phase[inner])
-        turned = np.angle(np.sum((out[k][inner] - 16000.0) * carrier))
-        assert abs(turned) / (2 * np.pi * np.hypot(fx, fy)) < 1e-3
+        phase_shift = np.angle(np.sum((out[k][inner] - 16000.0) * carrier))
+        assert abs(phase_shift) / (2 * np.pi * np.hypot(fx, fy)) < 1e-3
 
 
 def match_bias(
@@ -127,9 +127,9 @@ def match_bias(
         errors.append(good[:, 2:4] - good[:, 0:2] - (dx, dy))
     every = np.concatenate(errors)
     off = np.hypot(*(every - np.median(every, axis=0)).T)
-    kept = every[off < 5 * np.median(off)]
-    mean = kept.mean(axis=0)
-    return float(mean[0]), float(mean[1]), float(np.sqrt(np.mean(kept**2)))
+    inliers = every[off < 5 * np.median(off)]
+    mean = inliers.mean(axis=0)
+    return float(mean[0]), float(mean[1]), float(np.sqrt(np.mean(inliers**2)))
 
 
 @pytest.mark.parametrize("array", ["RGGB", "GRBG"])

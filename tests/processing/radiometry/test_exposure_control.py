@@ -24,10 +24,10 @@ from sim_hw.world.electronics import Electronics, true_sensor
 
 ROWS_PER_S = 55.0 / 0.215
 LIMITS = ExposureLimits(
-    time_least_us=200.0,
-    time_most_us=20_000.0,
-    gain_most_db=12.0,
-    tdi_most=4,
+    exposure_time_min_us=200.0,
+    exposure_time_max_us=20_000.0,
+    gain_max_db=12.0,
+    tdi_shifts_max=4,
     rows_per_s=ROWS_PER_S,
 )
 
@@ -64,10 +64,10 @@ def test_time_comes_first_then_tdi_and_gain_only_when_motion_forbids_more() -> N
     assert much.exposure_time_us == pytest.approx(4.5 * row_us, rel=1e-3)
     assert much.gain_db == pytest.approx(6.02, abs=0.02)
     most = settings_for(900.0 * row_us, now, LIMITS)
-    assert most.gain_db == LIMITS.gain_most_db
+    assert most.gain_db == LIMITS.gain_max_db
 
 
-def test_a_head_without_tdi_is_kept_short() -> None:
+def test_a_head_without_tdi_is_limited_to_short_exposures() -> None:
     limits = ExposureLimits(50.0, 20_000.0, 12.0, 0, ROWS_PER_S, smear_px=0.3)
     found = settings_for(4000.0, ExposureSettings(500.0), limits)
     assert found.tdi_shifts == 0
@@ -91,17 +91,17 @@ def test_without_height_or_speed_the_time_never_grows() -> None:
     rows_per_s=st.floats(10.0, 20_000.0),
     allowed_px=st.floats(0.1, 1.0),
     crab=st.floats(-0.3, 0.3),
-    tdi_most=st.integers(0, 64),
+    tdi_shifts_max=st.integers(0, 64),
 )
 def test_no_settings_break_a_limit(
-    light: float, rows_per_s: float, allowed_px: float, crab: float, tdi_most: int
+    light: float, rows_per_s: float, allowed_px: float, crab: float, tdi_shifts_max: int
 ) -> None:
     limits = ExposureLimits(
-        *(1.0, 30_000.0, 12.0, tdi_most, rows_per_s), smear_px=allowed_px, crab_rad=crab
+        *(1.0, 30_000.0, 12.0, tdi_shifts_max, rows_per_s), smear_px=allowed_px, crab_rad=crab
     )
     found = settings_for(light, ExposureSettings(1000.0), limits)
     assert 0.0 <= found.gain_db <= 12.0
-    assert 0 <= found.tdi_shifts <= tdi_most
+    assert 0 <= found.tdi_shifts <= tdi_shifts_max
     assert 1.0 <= found.exposure_time_us <= 30_000.1
     assert smear_px(found, limits) <= allowed_px + rows_per_s * 1e-7 + 1e-6
 

@@ -71,7 +71,7 @@ def signal_of(level1: NDArray[np.uint16]) -> NDArray[np.float64]:
     return (level1 & 0xFFFE) / COUNTS
 
 
-def words(dn: NDArray[np.float64]) -> NDArray[np.uint16]:
+def as_words(dn: NDArray[np.float64]) -> NDArray[np.uint16]:
     return np.clip(np.rint(dn), 0, 4095).astype(np.uint16)
 
 
@@ -84,7 +84,7 @@ def test_a_response_that_grows_with_temperature_is_taken_off(
     warming = replace(calibration, response_per_k=1e-3)
     warmth = 35.0 - calibration.reference_c
     light = np.full(SHAPE, 1000.0)
-    raw = words(expose(calibration, light * (1.0 + 1e-3 * warmth), temperature_c=35.0))
+    raw = as_words(expose(calibration, light * (1.0 + 1e-3 * warmth), temperature_c=35.0))
     out = np.empty(SHAPE, np.uint16)
     level1_from_level0(
         corrector_for(sensor, warming),
@@ -102,7 +102,7 @@ def test_signal_comes_back_through_bias_dark_and_gain(
     sensor: Sensor, calibration: RadiometricCalibration, temperature_c: float
 ) -> None:
     signal = np.random.default_rng(1).uniform(200, 3000, SHAPE)
-    raw = words(expose(calibration, signal, temperature_c=temperature_c, exposure_time_s=0.02))
+    raw = as_words(expose(calibration, signal, temperature_c=temperature_c, exposure_time_s=0.02))
     out = np.zeros(SHAPE, np.uint16)
     level1_from_level0(
         corrector_for(sensor, calibration),
@@ -124,7 +124,7 @@ def test_tdi_takes_the_means_over_the_pixels_the_charge_visited(
     shifts = 7
     sensor = replace(sensor, tdi_row_sign=sign)
     signal = np.random.default_rng(1).uniform(200, 3000, SHAPE)
-    raw = words(expose(calibration, signal, temperature_c=31.0, tdi_shifts=shifts, sign=sign))
+    raw = as_words(expose(calibration, signal, temperature_c=31.0, tdi_shifts=shifts, sign=sign))
     out = np.zeros(SHAPE, np.uint16)
     level1_from_level0(
         corrector_for(sensor, calibration),
@@ -202,7 +202,7 @@ def test_signal_below_black_is_held_above_no_data(sensor: Sensor) -> None:
     assert np.all(out == LEVEL1_FLOOR)
 
 
-def test_full_scale_of_any_depth_fills_half_of_the_word() -> None:
+def test_full_scale_of_any_depth_fills_half_of_the_range() -> None:
     for bits in (8, 10, 12, 14, 16):
         assert level1_counts_per_dn(bits) * 2**bits == 32768
 
@@ -211,7 +211,7 @@ def defective(
     sensor: Sensor, image: NDArray[np.float64], defect: NDArray[np.uint8], tdi_shifts: int = 0
 ) -> NDArray[np.float64]:
     """Correct an image whose defect pixels hold nonsense; returns signal, DN."""
-    raw = words(image + 64)
+    raw = as_words(image + 64)
     raw[defect != 0] = 4095
     out = np.zeros(SHAPE, np.uint16)
     level1_from_level0(
@@ -256,7 +256,7 @@ def test_a_defect_spoils_as_many_rows_more_as_there_were_tdi_shifts(sensor: Sens
     image = 900.0 + 4.0 * columns + 2.0 * rows
     defect = np.zeros(SHAPE, np.uint8)
     defect[40, 60] = 1
-    raw = words(image + 64)
+    raw = as_words(image + 64)
     raw[40 : 40 + shifts + 1, 60] = 300
     out = np.zeros(SHAPE, np.uint16)
     level1_from_level0(
@@ -299,10 +299,12 @@ def test_maps_of_a_narrow_range_take_eight_bits_and_wide_ones_keep_sixteen(
     defect[3, 5] = 1
     narrow = replace(calibration, bias_dn=60.0 + spread, dark_dn_per_s=spread, defect=defect)
     wide = replace(narrow, defect=np.zeros_like(defect))
-    kept, kept_wide = corrector_for(sensor, narrow), corrector_for(sensor, wide)
-    assert kept.bias is not None and kept.bias.dtype == np.uint8
-    assert kept.dark is not None and kept.dark.dtype == np.uint8
-    assert kept_wide.bias is not None and kept_wide.bias.dtype == np.uint16
+    narrow_corrector, wide_corrector = corrector_for(sensor, narrow), corrector_for(sensor, wide)
+    assert narrow_corrector.bias is not None and narrow_corrector.bias.dtype == np.uint8
+    assert narrow_corrector.dark is not None and narrow_corrector.dark.dtype == np.uint8
+    assert wide_corrector.bias is not None and wide_corrector.bias.dtype == np.uint16
     good = defect == 0
-    told = kept.least_bias_dn + kept.bias * kept.bias_unit_dn
-    assert np.abs(told - narrow.bias_dn)[good].max() < 1.0 / 64.0
+    bias_dn_of = (
+        narrow_corrector.min_bias_dn + narrow_corrector.bias * narrow_corrector.bias_unit_dn
+    )
+    assert np.abs(bias_dn_of - narrow.bias_dn)[good].max() < 1.0 / 64.0

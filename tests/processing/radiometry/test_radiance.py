@@ -13,8 +13,8 @@ from processing.radiometry.radiance import (
     RadianceCalibration,
     load_radiance,
     radiance_as_json,
-    radiance_from_words,
-    saturated_words,
+    radiance_from_raw,
+    saturated_pixels,
 )
 from processing.rig import find_rig
 
@@ -31,36 +31,36 @@ CALIBRATION = RadianceCalibration(
 
 
 def test_radiance_follows_the_maker_s_formula_pixel_by_pixel():
-    words = np.arange(48, dtype=np.uint16).reshape(6, 8) * 640 + 6000
-    found = radiance_from_words(
-        SENSOR, CALIBRATION, words, exposure_time_s=0.002, gain=2.0, black=4700.0
+    raw = np.arange(48, dtype=np.uint16).reshape(6, 8) * 640 + 6000
+    found = radiance_from_raw(
+        SENSOR, CALIBRATION, raw, exposure_time_s=0.002, gain=2.0, black=4700.0
     )
     column, row = 7, 5
     r = np.hypot(column - 3.0, row - 2.0)
     v = 1.0 / (1.0 - 1e-3 * r + 2e-4 * r**2)
     rows = 1.0 / (1.0 + 1e-7 * row / 0.002 - 3e-6 * row)
-    word = float(words[row, column])
-    expected = v * rows * (word - 4700.0) * 2e-4 / (2.0 * 0.002 * 65536.0)
+    raw_value = float(raw[row, column])
+    expected = v * rows * (raw_value - 4700.0) * 2e-4 / (2.0 * 0.002 * 65536.0)
     assert found[row, column] == pytest.approx(expected, rel=1e-6)
     assert found.dtype == np.float32
 
 
-def test_right_justified_words_of_the_same_light_have_the_same_radiance():
+def test_right_justified_values_of_the_same_light_have_the_same_radiance():
     left = np.full((6, 8), 16 * 1234, np.uint16)
     right = np.full((6, 8), 1234, np.uint16)
     plain = replace(SENSOR, justified="right")
-    a = radiance_from_words(SENSOR, CALIBRATION, left, exposure_time_s=0.001)
-    b = radiance_from_words(plain, CALIBRATION, right, exposure_time_s=0.001)
+    a = radiance_from_raw(SENSOR, CALIBRATION, left, exposure_time_s=0.001)
+    b = radiance_from_raw(plain, CALIBRATION, right, exposure_time_s=0.001)
     assert np.allclose(a, b, rtol=1e-6)
-    assert saturated_words(SENSOR, np.array([65519, 65520], np.uint16)).tolist() == [False, True]
-    assert saturated_words(plain, np.array([4094, 4095], np.uint16)).tolist() == [False, True]
+    assert saturated_pixels(SENSOR, np.array([65519, 65520], np.uint16)).tolist() == [False, True]
+    assert saturated_pixels(plain, np.array([4094, 4095], np.uint16)).tolist() == [False, True]
 
 
 def test_a_frame_that_does_not_fit_and_a_missing_exposure_time_are_refused():
     with pytest.raises(ValueError, match="uint16 of"):
-        radiance_from_words(SENSOR, CALIBRATION, np.zeros((6, 7), np.uint16), exposure_time_s=1.0)
+        radiance_from_raw(SENSOR, CALIBRATION, np.zeros((6, 7), np.uint16), exposure_time_s=1.0)
     with pytest.raises(ValueError, match="exposure time 0 s"):
-        radiance_from_words(SENSOR, CALIBRATION, np.zeros((6, 8), np.uint16), exposure_time_s=0.0)
+        radiance_from_raw(SENSOR, CALIBRATION, np.zeros((6, 8), np.uint16), exposure_time_s=0.0)
 
 
 def test_a_calibration_survives_its_file_and_a_wrong_one_is_refused(tmp_path):

@@ -10,7 +10,7 @@ from processing.radiometry.tone_curve import (
     histogram,
     lookup_table,
     mission_curve,
-    scaled_words,
+    scaled_value_table,
 )
 
 RNG = np.random.default_rng(8)
@@ -47,13 +47,13 @@ def test_no_data_stay_no_data_and_data_never_become_it():
     assert table[65535] == 255
 
 
-def test_half_the_exposure_time_is_made_up_for():
+def test_half_the_exposure_time_is_compensated():
     bright = bands(3000.0)
     dark = {name: np.maximum(band // 2, 1).astype(np.uint16) for name, band in bright.items()}
     summed = {n: histogram(bright[n]) + histogram(dark[n], 2.0) for n in bright}
     curve = mission_curve(summed)
-    alone = mission_curve({name: histogram(band) for name, band in bright.items()})
-    assert curve.high["red"] == pytest.approx(alone.high["red"], rel=0.01)
+    single_curve = mission_curve({name: histogram(band) for name, band in bright.items()})
+    assert curve.high["red"] == pytest.approx(single_curve.high["red"], rel=0.01)
     for name, band in bright.items():
         difference = lookup_table(curve, name)[band].astype(int) - lookup_table(curve, name, 2.0)[
             dark[name]
@@ -61,12 +61,12 @@ def test_half_the_exposure_time_is_made_up_for():
         assert np.abs(difference).max() <= 2, name
 
 
-def test_scaled_words_keep_data_apart_from_no_data_and_do_not_wrap():
-    words = scaled_words(0.1)
-    assert words[0] == 0 and words[1] == 1 and words[1000] == 100
-    assert scaled_words(3.0)[65535] == 65535
+def test_scaled_values_separate_data_from_no_data_and_do_not_wrap():
+    value_table = scaled_value_table(0.1)
+    assert value_table[0] == 0 and value_table[1] == 1 and value_table[1000] == 100
+    assert scaled_value_table(3.0)[65535] == 65535
     with pytest.raises(ValueError, match="positive"):
-        scaled_words(0.0)
+        scaled_value_table(0.0)
 
 
 def test_a_band_without_data_has_no_curve_and_a_mission_without_colour_is_refused():

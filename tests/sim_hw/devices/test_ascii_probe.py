@@ -15,8 +15,8 @@ from drivers.thermometers.ascii_line.thermometer import AsciiLineThermometer
 from sim_hw.devices.ascii_probe import AsciiProbe
 from sim_hw.devices.network_line import TcpLine
 from sim_hw.devices.pseudo_terminal import PseudoTerminal
-from sim_hw.receivers.kinds import PROBES, probes
-from tests.drivers.stand_ins import Notebook
+from sim_hw.receivers.device_kinds import PROBES, probes
+from tests.drivers.fakes import RecordingSink
 
 WITHIN_S = 20.0
 CHANNELS = [lambda: 21.34, lambda: -5.2, lambda: None, lambda: float("nan")]
@@ -35,7 +35,7 @@ def test_pyserial_reads_its_lines_by_their_pattern() -> None:
     assert found.groups() == (b"+21.34", b"-5.20", b"OPEN", b"OPEN")
 
 
-def test_asked_by_command_it_answers_that_and_nothing_else() -> None:
+def test_queried_by_command_it_answers_that_and_nothing_else() -> None:
     probe = AsciiProbe(
         CHANNELS[:2], ["CH1: {0}", "CH2: {1}"], command="READ?", value_format="{:.1f}", end="\r"
     )
@@ -44,12 +44,12 @@ def test_asked_by_command_it_answers_that_and_nothing_else() -> None:
         try:
             port.write(b"WHO?\r\nREAD")
             port.write(b"?\r")
-            said = port.read_until(b"CH2: -5.2\r")
+            received = port.read_until(b"CH2: -5.2\r")
             port.timeout = 0.2
             assert port.read(1) == b""
         finally:
             probe.close()
-    assert said == b"CH1: 21.3\rCH2: -5.2\r"
+    assert received == b"CH1: 21.3\rCH2: -5.2\r"
     assert (probe.counts["commands"], probe.counts["unknown_commands"]) == (1, 1)
 
 
@@ -66,7 +66,7 @@ def test_the_driver_reads_what_the_instrument_measures(command: str, network: bo
         "port": probe.port, "pattern": r"^T1=(?P<a>\S+) T2=(?P<b>\S+) T3=(?P<c>\S+)$",
         "channels": ["0", "1", "G"], "command": command, "interval_s": 0.1,
     })  # fmt: skip
-    notebook, enough = Notebook(), threading.Event()
+    notebook, enough = RecordingSink(), threading.Event()
 
     def watch(_: object) -> None:
         if sum(isinstance(r, TemperatureSample) for r in notebook.records) >= 9:
@@ -88,7 +88,7 @@ def test_the_driver_reads_what_the_instrument_measures(command: str, network: bo
 
 
 @pytest.mark.parametrize("kind", PROBES)
-def test_the_settings_that_are_told_fit_the_device(kind: str, tmp_path: Path) -> None:
+def test_the_settings_that_are_reported_fit_the_device(kind: str, tmp_path: Path) -> None:
     names = {str(n): (lambda n=n: 20.0 + n) for n in range(8)}
     emulated = probes(kind, names, tmp_path / "probes")
     driver = {"modbus": "modbus-rtu", "ascii": "ascii-line"}[kind]

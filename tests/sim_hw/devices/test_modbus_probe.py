@@ -138,9 +138,9 @@ def test_it_finds_the_next_request_after_noise_and_a_silence(line: Line) -> None
 
 
 def test_a_request_may_come_in_pieces(line: Line) -> None:
-    whole = request(FIRST_REGISTER, 1)
-    line.send(whole[:3])
-    line.send(whole[3:])
+    full_request = request(FIRST_REGISTER, 1)
+    line.send(full_request[:3])
+    line.send(full_request[3:])
     assert line.receive(7) == framed(3, 4, 2, 0, 213)
 
 

@@ -10,8 +10,8 @@ from sim_hw.devices.pps_source import PpsSource
 from sim_hw.world.world_clock import NS_PER_S, WorldClock
 
 
-def test_edges_are_whole_seconds_of_gps_time_and_a_pulled_cable_is_told() -> None:
-    clock = WorldClock.starting_now()
+def test_edges_are_full_seconds_of_gps_time_and_a_pulled_cable_is_reported() -> None:
+    clock = WorldClock.from_wall_clock()
     source = PpsSource(clock, seed=3)
     source.start()
     pps = PpsDevice("pps", {"device": source.device, "silence_s": 1.5})
@@ -36,9 +36,9 @@ def test_edges_are_whole_seconds_of_gps_time_and_a_pulled_cable_is_told() -> Non
     thread.start()
     try:
         assert enough.wait(30)
-        source.silence()
+        source.suspend()
         assert silent.wait(30)
-        source.speak()
+        source.resume()
         assert back.wait(30)
     finally:
         pps.close()

@@ -99,7 +99,7 @@ def test_the_count_is_the_units_own_and_outlives_a_connection(unit: Unit) -> Non
     second.close()
 
 
-def test_a_second_connection_is_told_who_owns_the_unit_and_is_closed(unit: Unit) -> None:
+def test_a_second_connection_receives_the_name_of_the_owner_and_is_closed(unit: Unit) -> None:
     owner = unit.connect()
     host, port = owner._socket.getsockname()
     second = unit.connect()

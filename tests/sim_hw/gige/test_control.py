@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim_hw.gige import features as at
-from sim_hw.gige.control import Actions, ControlChannel
+from sim_hw.gige.control import ControlChannel, HeadActions
 from sim_hw.gige.gvcp import ResendRequest, Status
 from sim_hw.gige.registers import FrameSize, HeadIdentity, RegisterMemory
 
@@ -36,10 +36,10 @@ class Bench:
         )
         self.channel = ControlChannel(
             self.registers,
-            Actions(
+            HeadActions(
                 written=self.written.append,
                 resend=self.resends.append,
-                act=self._act,
+                execute_action=self._act,
                 control_lost=self._lost,
                 is_acquiring=lambda: self.acquiring,
             ),
@@ -88,7 +88,7 @@ def bench() -> Bench:
     return Bench()
 
 
-def test_discovery_says_who_the_head_is(bench: Bench) -> None:
+def test_discovery_identifies_the_head(bench: Bench) -> None:
     status, body = bench.ask(DISCOVERY)
     assert status == Status.SUCCESS
     assert len(body) == 0xF8
@@ -333,7 +333,7 @@ def bench_with_keys() -> Bench:
     return bench
 
 
-def test_a_head_says_that_it_takes_actions_scheduled_ones_too() -> None:
+def test_a_head_states_that_it_takes_actions_scheduled_ones_too() -> None:
     capability = Bench().read(0x0934)
     assert capability & ACTION_CAPABILITY
     assert capability & SCHEDULED_CAPABILITY
@@ -361,7 +361,7 @@ def test_a_head_without_a_controller_takes_no_action() -> None:
     assert bench.channel.answer(packet, OTHER_HOST, 0) is None
 
 
-def test_a_scheduled_action_says_when() -> None:
+def test_a_scheduled_action_states_its_time() -> None:
     bench = bench_with_keys()
     body = struct.pack(">IIIQ", 7, 8, 0xFFFF_FFFF, 123_456_789_012_345)
     assert bench.channel.answer(bench.packet(ACTION, body, flags=0x81), HOST, 0) is not None

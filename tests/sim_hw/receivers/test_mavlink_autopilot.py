@@ -15,7 +15,13 @@ from hypothesis import strategies as st
 
 from sim_hw.devices.network_line import UdpLine
 from sim_hw.receivers.mavlink_autopilot import DEFAULT_HZ, MavlinkAutopilot
-from sim_hw.receivers.mavlink_messages import Listener, Received, definitions, message, x25
+from sim_hw.receivers.mavlink_messages import (
+    MavlinkStreamParser,
+    ReceivedMessage,
+    definitions,
+    message,
+    x25,
+)
 from sim_hw.world.world_clock import WorldClock
 from tests.sim_hw.receiver_state import NS, START_GPS_NS, STATE, state_at
 
@@ -41,15 +47,15 @@ def parsed(data: bytes) -> list[Any]:
     return list(messages)
 
 
-def heard(data: bytes) -> Received:
-    (received,) = Listener().feed(data)
+def parsed_values(data: bytes) -> ReceivedMessage:
+    (received,) = MavlinkStreamParser().feed(data)
     return received
 
 
-def asked(autopilot: MavlinkAutopilot, request: Any, mono_ns: int = NS) -> list[Any]:
+def answers_to(autopilot: MavlinkAutopilot, request: Any, mono_ns: int = NS) -> list[Any]:
     """What it answers to a message that pymavlink packed."""
     packed = bytes(request.pack(dialect.MAVLink(None, 255, 190)))
-    return parsed(autopilot.answer(heard(packed), mono_ns))
+    return parsed(autopilot.answer(parsed_values(packed), mono_ns))
 
 
 def command(number: int, *parameters: float) -> Any:
@@ -76,7 +82,7 @@ def test_trailing_zeros_are_cut_but_a_message_is_never_empty() -> None:
 
 def test_pymavlink_reads_the_numbers_that_were_put_in(autopilot: MavlinkAutopilot) -> None:
     autopilot._set_period("HIGHRES_IMU", NS, 0)
-    found = {m.get_type(): m for m in parsed(autopilot.said_until(1_234_567))}
+    found = {m.get_type(): m for m in parsed(autopilot.messages_until(1_234_567))}
     assert list(found) == list(DEFAULT_HZ)
     assert {(m.get_srcSystem(), m.get_srcComponent()) for m in found.values()} == {(1, 1)}
     assert (found["HEARTBEAT"].autopilot, found["HEARTBEAT"].type) == (12, 1)
@@ -109,76 +115,78 @@ def angles(w: float, x: float, y: float, z: float) -> tuple[float, float, float]
     )
 
 
-def test_a_strobe_is_told_with_its_own_time_and_number(autopilot: MavlinkAutopilot) -> None:
-    autopilot.said_until(0)
+def test_a_strobe_is_reported_with_its_own_time_and_number(autopilot: MavlinkAutopilot) -> None:
+    autopilot.messages_until(0)
     for at_ms in (40, 20):
         autopilot.mark(START_GPS_NS + at_ms * 1_000_000 + 789)
-    said = parsed(autopilot.said_until(50_000_000))
-    triggers = [m for m in said if m.get_type() == "CAMERA_TRIGGER"]
+    parsed_messages = parsed(autopilot.messages_until(50_000_000))
+    triggers = [m for m in parsed_messages if m.get_type() == "CAMERA_TRIGGER"]
     assert [(m.time_usec, m.seq) for m in triggers] == [(754_020_000, 1), (754_040_000, 0)]
     utc = MavlinkAutopilot(WorldClock(START_GPS_NS, 0), state_at, triggers_in_utc=True)
     utc.mark(START_GPS_NS + 123_456)
-    (trigger,) = [m for m in parsed(utc.said_until(NS)) if m.get_type() == "CAMERA_TRIGGER"]
+    (trigger,) = [m for m in parsed(utc.messages_until(NS)) if m.get_type() == "CAMERA_TRIGGER"]
     utc.close()
     assert trigger.time_usec == UNIX_S * 1_000_000 + 123
 
 
 def test_a_request_for_time_is_answered_with_its_own_stamp(autopilot: MavlinkAutopilot) -> None:
-    (answer,) = asked(autopilot, dialect.MAVLink_timesync_message(0, 77), 2 * NS + 5)
+    (answer,) = answers_to(autopilot, dialect.MAVLink_timesync_message(0, 77), 2 * NS + 5)
     assert (answer.tc1, answer.ts1) == (BOOT_NS + 2 * NS + 5, 77)
-    assert asked(autopilot, dialect.MAVLink_timesync_message(9, 77)) == []
+    assert answers_to(autopilot, dialect.MAVLink_timesync_message(9, 77)) == []
 
 
 def test_rates_are_set_by_command_and_by_stream(autopilot: MavlinkAutopilot) -> None:
-    (done,) = asked(autopilot, command(511, 33, 20_000.0))
+    (done,) = answers_to(autopilot, command(511, 33, 20_000.0))
     assert (done.command, done.result, done.target_system) == (511, 0, 255)
     assert count(autopilot, NS, "GLOBAL_POSITION_INT") == 50
-    asked(autopilot, command(511, 33, -1.0), 2 * NS)
+    answers_to(autopilot, command(511, 33, -1.0), 2 * NS)
     assert count(autopilot, 3 * NS, "GLOBAL_POSITION_INT") == 0
-    asked(autopilot, dialect.MAVLink_request_data_stream_message(1, 1, 10, 25, 1), 4 * NS)
+    answers_to(autopilot, dialect.MAVLink_request_data_stream_message(1, 1, 10, 25, 1), 4 * NS)
     assert count(autopilot, 4 * NS, "ATTITUDE_QUATERNION") == 25
-    (refused,) = asked(autopilot, command(511, 999, 20_000.0))
+    (refused,) = answers_to(autopilot, command(511, 999, 20_000.0))
     assert refused.result == 2
-    (strange,) = asked(autopilot, command(511, math.nan, math.nan))
+    (strange,) = answers_to(autopilot, command(511, math.nan, math.nan))
     assert strange.result == 2
 
 
 def count(autopilot: MavlinkAutopilot, from_ns: int, name: str) -> int:
     """How often it says that within a second."""
-    said = b"".join(autopilot.said_until(from_ns + n * 1_000_000) for n in range(1000))
-    return sum(m.get_type() == name for m in parsed(said))
+    parsed_messages = b"".join(
+        autopilot.messages_until(from_ns + n * 1_000_000) for n in range(1000)
+    )
+    return sum(m.get_type() == name for m in parsed(parsed_messages))
 
 
-def test_messages_intervals_and_parameters_are_told_when_asked(
+def test_messages_intervals_and_parameters_are_reported_on_request(
     autopilot: MavlinkAutopilot,
 ) -> None:
-    done, version = asked(autopilot, command(512, 148))
+    done, version = answers_to(autopilot, command(512, 148))
     assert (done.result, version.get_type()) == (0, "AUTOPILOT_VERSION")
-    _, interval = asked(autopilot, command(510, 33))
+    _, interval = answers_to(autopilot, command(510, 33))
     assert (interval.message_id, interval.interval_us) == (33, 200_000)
-    (unknown,) = asked(autopilot, command(176, 1))
+    (unknown,) = answers_to(autopilot, command(176, 1))
     assert unknown.result == 3
-    listed = asked(autopilot, dialect.MAVLink_param_request_list_message(1, 1))
+    listed = answers_to(autopilot, dialect.MAVLink_param_request_list_message(1, 1))
     assert [p.param_index for p in listed] == list(range(listed[0].param_count))
     read = dialect.MAVLink_param_request_read_message(1, 1, b"TRIG_MODE", -1)
-    assert asked(autopilot, read)[0].param_value == 4.0
+    assert answers_to(autopilot, read)[0].param_value == 4.0
     change = dialect.MAVLink_param_set_message(1, 1, b"TRIG_MODE", 2.0, 9)
-    assert asked(autopilot, change)[0].param_value == 2.0
-    assert asked(autopilot, read)[0].param_value == 2.0
-    assert asked(autopilot, dialect.MAVLink_param_request_list_message(2, 1)) == []
+    assert answers_to(autopilot, change)[0].param_value == 2.0
+    assert answers_to(autopilot, read)[0].param_value == 2.0
+    assert answers_to(autopilot, dialect.MAVLink_param_request_list_message(2, 1)) == []
 
 
-def test_faults_can_tell_what_is_a_mark_and_what_is_navigation(autopilot: MavlinkAutopilot) -> None:
+def test_faults_distinguish_marks_from_navigation(autopilot: MavlinkAutopilot) -> None:
     autopilot.mark(START_GPS_NS)
-    said = autopilot.said_until(NS)
-    parts = autopilot.parts(said)
-    assert b"".join(data for _, data in parts) == said
+    parsed_messages = autopilot.messages_until(NS)
+    parts = autopilot.parts(parsed_messages)
+    assert b"".join(data for _, data in parts) == parsed_messages
     assert [topic for topic, _ in parts].count("mark") == 1
     assert parts[0][0] == "mark"
     autopilot.restart_count()
     autopilot.mark(START_GPS_NS + 2 * NS)
     (trigger,) = [
-        m for m in parsed(autopilot.said_until(3 * NS)) if m.get_type() == "CAMERA_TRIGGER"
+        m for m in parsed(autopilot.messages_until(3 * NS)) if m.get_type() == "CAMERA_TRIGGER"
     ]
     assert trigger.seq == 0
 
@@ -186,17 +194,17 @@ def test_faults_can_tell_what_is_a_mark_and_what_is_navigation(autopilot: Mavlin
 @settings(max_examples=200, deadline=None)
 @given(noise=st.binary(max_size=120), piece=st.integers(1, 40))
 def test_what_a_host_writes_may_be_anything(noise: bytes, piece: int) -> None:
-    listener = Listener()
+    listener = MavlinkStreamParser()
     # Noise that looks like a header may hold back what follows until it is whole; then it is over.
     data = noise + message("TIMESYNC", 1, 255, 1, ts1=5) + bytes(300)
     found = [m for at in range(0, len(data), piece) for m in listener.feed(data[at : at + piece])]
     assert [m.values["ts1"] for m in found if m.name == "TIMESYNC"][-1:] == [5]
 
 
-def test_a_damaged_message_is_not_heard() -> None:
+def test_a_damaged_message_is_not_received() -> None:
     data = bytearray(message("TIMESYNC", 1, 255, 1, ts1=5))
     data[-1] ^= 1
-    assert Listener().feed(bytes(data)) == []
+    assert MavlinkStreamParser().feed(bytes(data)) == []
     assert struct.calcsize(definitions()["TIMESYNC"].layout.format) == 16
 
 
@@ -213,7 +221,7 @@ def test_mavsdk_finds_the_vehicle_and_reads_its_place_and_attitude() -> None:
 
     port = free_udp_port()
     autopilot = MavlinkAutopilot(
-        WorldClock.starting_now(), state_at, line=UdpLine(("127.0.0.1", port))
+        WorldClock.from_wall_clock(), state_at, line=UdpLine(("127.0.0.1", port))
     )
     autopilot.start()
     sdk = mavsdk.Mavsdk(mavsdk.Configuration.create_with_component_type(

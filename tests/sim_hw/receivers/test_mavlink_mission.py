@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from daemon.planning.advisor import Segment
 from daemon.planning.model import PlannedLine, Point
-from daemon.planning.writing import mavlink_mission
+from daemon.planning.reflight_files import mavlink_mission
+from daemon.planning.reflight_planning import Segment
 from sim_hw.receivers.mavlink_mission import MissionAutopilot, read_mission
 
 LATITUDE, LONGITUDE = 47.0, 15.0
@@ -29,12 +29,12 @@ def test_cameras_are_commanded_when_a_waypoint_lies_behind_and_not_before() -> N
             for k, north in enumerate((0.0025, 0.0055))
         ]
     )
-    looks = 0
+    position_count = 0
 
     def place(_mono_ns: int) -> tuple[float, float]:
-        nonlocal looks
-        looks += 1
-        return LATITUDE + (looks - 1) * SPEED_DEG, LONGITUDE
+        nonlocal position_count
+        position_count += 1
+        return LATITUDE + (position_count - 1) * SPEED_DEG, LONGITUDE
 
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as camera:
         camera.bind(("127.0.0.1", 0))
@@ -42,20 +42,21 @@ def test_cameras_are_commanded_when_a_waypoint_lies_behind_and_not_before() -> N
         autopilot = MissionAutopilot(read_mission(text), place, camera.getsockname())
         autopilot.start()
         try:
-            heard: list[Any] = []
+            received: list[Any] = []
             mav = common.MAVLink(None)
-            while len(heard) < 4:
+            while len(received) < 4:
                 data, address = camera.recvfrom(2048)
-                heard += mav.parse_buffer(bytearray(data)) or []
+                received += mav.parse_buffer(bytearray(data)) or []
         finally:
             autopilot.close()
     assert address[0] == "127.0.0.1"
-    said = [
-        (one.get_type(), getattr(one, "seq", None) or getattr(one, "command", 0)) for one in heard
+    commands = [
+        (one.get_type(), getattr(one, "seq", None) or getattr(one, "command", 0))
+        for one in received
     ]
     waypoint, order = "MISSION_ITEM_REACHED", ("COMMAND_LONG", 2000)
-    assert said == [(waypoint, 0), order, (waypoint, 2), order]
-    assert (heard[1].param3, heard[1].target_component) == (1.0, 100)
+    assert commands == [(waypoint, 0), order, (waypoint, 2), order]
+    assert (received[1].param3, received[1].target_component) == (1.0, 100)
     assert [index for index, _ in autopilot.reached] == [0, 2]
 
 

@@ -16,9 +16,9 @@ import pytest
 from drivers.contract import EventMark
 from drivers.receivers.novatel.decoder import NovatelDecoder
 from sim_hw.faults.catalogue import MARK, NAVIGATION
+from sim_hw.receivers.emulated_receiver import Edge, EmulatedReceiver
 from sim_hw.receivers.nmea_receiver import NmeaReceiver
 from sim_hw.receivers.novatel_receiver import CLOCK_OFFSET_MAX_NS, NovatelReceiver
-from sim_hw.receivers.receiver import Edge, EmulatedReceiver
 from sim_hw.receivers.septentrio_messages import FALLING, RISING
 from sim_hw.receivers.septentrio_receiver import SeptentrioReceiver
 from sim_hw.world.world_clock import WorldClock
@@ -35,7 +35,7 @@ def make(kind: Kind, *, seed: int = 5) -> Any:
     return kind(WorldClock(START_GPS_NS, 0), state_at, seed=seed)
 
 
-def said(kind: Kind, *, seed: int = 5) -> tuple[bytes, int]:
+def first_epoch(kind: Kind, *, seed: int = 5) -> tuple[bytes, int]:
     """What it says for its first epoch, and when that was."""
     receiver = make(kind, seed=seed)
     epoch_ns = receiver.epoch_after(START_GPS_NS - 1_000_000)
@@ -44,7 +44,7 @@ def said(kind: Kind, *, seed: int = 5) -> tuple[bytes, int]:
     return data, epoch_ns
 
 
-def said_of_edges(kind: Kind) -> bytes:
+def edge_messages(kind: Kind) -> bytes:
     receiver = make(kind)
     data = b"".join(
         receiver.event_bytes(Edge(at, is_rising, number))
@@ -72,7 +72,7 @@ def oem(data: bytes) -> list[tuple[str, Any]]:
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_pysbf2_reads_the_septentrios_numbers(seed: int) -> None:
-    data, epoch_ns = said(SeptentrioReceiver, seed=seed)
+    data, epoch_ns = first_epoch(SeptentrioReceiver, seed=seed)
     blocks = sbf(data)
     assert list(blocks) == [
         "PVTGeodetic",
@@ -103,7 +103,7 @@ def test_pysbf2_reads_the_septentrios_numbers(seed: int) -> None:
 
 def test_pysbf2_reads_the_septentrios_events_to_the_nanosecond() -> None:
     reader = pytest.importorskip("pysbf2", reason="pysbf2 is absent; pip install it").SBFReader
-    events = [m for _, m in reader(io.BytesIO(said_of_edges(SeptentrioReceiver)), quitonerror=2)]
+    events = [m for _, m in reader(io.BytesIO(edge_messages(SeptentrioReceiver)), quitonerror=2)]
     assert [m.identity for m in events] == ["ExtEvent", "ExtEventPVTGeodetic"] * 3
     for at_ns, event in zip(EDGES_NS, events[::2], strict=True):
         # pysbf2 shows TOW as a clock; its bytes are the number.
@@ -115,7 +115,7 @@ def test_pysbf2_reads_the_septentrios_events_to_the_nanosecond() -> None:
 
 
 def test_novatels_own_decoder_reads_the_novatels_numbers() -> None:
-    data, epoch_ns = said(NovatelReceiver)
+    data, epoch_ns = first_epoch(NovatelReceiver)
     logs = oem(data)
     assert [name for name, _ in logs] == [
         "TIME",
@@ -143,7 +143,7 @@ def test_novatels_own_decoder_reads_the_novatels_numbers() -> None:
 
 
 def test_novatels_own_decoder_reads_every_mark_twice_and_to_the_nanosecond() -> None:
-    marks = oem(said_of_edges(NovatelReceiver))
+    marks = oem(edge_messages(NovatelReceiver))
     assert [name for name, _ in marks] == ["MARK1TIME", "MARK1PVA"] * 3
     for at_ns, (_, time), (_, pva) in zip(EDGES_NS, marks[::2], marks[1::2], strict=True):
         offset_ns = time.offset * 1e9
@@ -166,7 +166,7 @@ def test_every_mark_input_of_the_novatel_has_logs_of_its_own(mark_input: int) ->
     assert (mark.channel, abs(mark.gps_ns - EDGES_NS[0]) <= 1) == (mark_input, True)
 
 
-def test_asked_for_both_edges_the_septentrio_tells_each_with_its_polarity() -> None:
+def test_with_both_edges_requested_the_septentrio_reports_each_with_its_polarity() -> None:
     receiver = make(SeptentrioReceiver)
     receiver.reported_edges = frozenset((RISING, FALLING))
     edges = [Edge(EDGES_NS[0], True, 1), Edge(EDGES_NS[0] + 50_000, False, 1)]
@@ -180,7 +180,7 @@ def test_asked_for_both_edges_the_septentrio_tells_each_with_its_polarity() -> N
 
 def test_pynmeagps_reads_the_nmea_receivers_numbers_and_every_checksum() -> None:
     pynmeagps = pytest.importorskip("pynmeagps", reason="pynmeagps is absent; pip install it")
-    data, _ = said(NmeaReceiver)
+    data, _ = first_epoch(NmeaReceiver)
     reader = pynmeagps.NMEAReader(io.BytesIO(data), quitonerror=2, validate=1)
     found = {message.msgID: message for _, message in reader}
     assert list(found) == ["RMC", "GGA", "GST", "VTG", "HDT", "ASHR", "ZDA"]
@@ -220,7 +220,7 @@ def test_marks_come_at_once_and_epochs_in_their_order(kind: Kind) -> None:
     for _ in range(10):
         dues.append(receiver.due_mono_ns())
         marks_before = receiver.statistics()["marks"]
-        receiver.speak()
+        receiver.emit_due()
         rising += receiver.statistics()["marks"] - marks_before
     receiver.close()
     assert dues == sorted(dues)
@@ -229,7 +229,7 @@ def test_marks_come_at_once_and_epochs_in_their_order(kind: Kind) -> None:
 
 
 @pytest.mark.parametrize("kind", [SeptentrioReceiver, NovatelReceiver, NmeaReceiver])
-def test_faults_can_tell_what_is_a_mark_and_what_is_navigation(kind: Kind) -> None:
+def test_faults_distinguish_marks_from_navigation(kind: Kind) -> None:
     receiver = make(kind)
     receiver.due_mono_ns()
     receiver._plan_epoch(START_GPS_NS)
@@ -237,8 +237,8 @@ def test_faults_can_tell_what_is_a_mark_and_what_is_navigation(kind: Kind) -> No
     topics = []
     for _ in range(3):
         receiver.due_mono_ns()
-        ((topic, said),) = receiver.parts(receiver.speak())
-        topics.append((topic, bool(said)))
+        ((topic, first_epoch),) = receiver.parts(receiver.emit_due())
+        topics.append((topic, bool(first_epoch)))
     receiver.close()
     assert topics[0] == (MARK, True)
     assert (NAVIGATION, True) in topics[1:]
@@ -249,7 +249,7 @@ def test_gpsd_reports_the_position_of_the_nmea_receiver() -> None:
     program = shutil.which("gpsd", path=f"{os.environ.get('PATH', '')}:/usr/sbin")
     if program is None:
         pytest.skip("gpsd is absent; install Debian's gpsd")
-    receiver = NmeaReceiver(WorldClock.starting_now(), state_at)
+    receiver = NmeaReceiver(WorldClock.from_wall_clock(), state_at)
     receiver.start()
     # gpsd gives up root before it opens the port.
     Path(receiver.port).chmod(0o666)

@@ -20,7 +20,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_hw.receivers.nmea_sentences import nmea, utc_fields
+from sim_hw.receivers.nmea_sentences import broken_down_utc, nmea
 from sim_hw.receivers.ublox_messages import nav_pvt
 from sim_hw.receivers.ublox_receiver import (
     LATENCY_NS,
@@ -77,8 +77,8 @@ def gps_ns_of(message: Any) -> int:
     utc = datetime(
         message.year, message.month, message.day, message.hour, message.min, message.second
     )
-    whole = utc.replace(tzinfo=UTC) - GPS_EPOCH
-    return round(whole / timedelta(seconds=1)) * NS + message.nano + 18 * NS
+    since_epoch = utc.replace(tzinfo=UTC) - GPS_EPOCH
+    return round(since_epoch / timedelta(seconds=1)) * NS + message.nano + 18 * NS
 
 
 def test_epochs_come_every_200_ms_and_miss_it_by_less_than_half_a_millisecond(
@@ -175,7 +175,7 @@ def test_without_chatter_only_what_is_needed_is_sent() -> None:
 
 @given(gps_ns=st.integers(START_GPS_NS, START_GPS_NS + 40 * 365 * 86_400 * NS))
 def test_utc_is_split_as_ublox_does_it(gps_ns: int) -> None:
-    utc = utc_fields(gps_ns)
+    utc = broken_down_utc(gps_ns)
     assert -5_000_000 <= utc.nano <= 994_999_999
     split = datetime(utc.year, utc.month, utc.day, utc.hour, utc.minute, utc.second, tzinfo=UTC)
     since = split - GPS_EPOCH
@@ -204,7 +204,7 @@ def marks_of(messages: list[Any]) -> list[Any]:
     return [message for message in messages if message.identity == "TIM-TM2"]
 
 
-def test_a_mark_is_told_with_the_epoch_after_it_to_the_nanosecond() -> None:
+def test_a_mark_is_reported_with_the_epoch_after_it_to_the_nanosecond() -> None:
     receiver = make_receiver(chatter=False)
     first_ns = receiver.epoch_after(START_GPS_NS)
     second_ns = receiver.epoch_after(first_ns)
@@ -222,7 +222,7 @@ def test_a_mark_is_told_with_the_epoch_after_it_to_the_nanosecond() -> None:
     assert mark.accEst == 25
 
 
-def test_of_several_marks_in_one_epoch_only_the_last_is_told_but_all_are_counted() -> None:
+def test_of_several_marks_in_one_epoch_only_the_last_is_reported_but_all_are_counted() -> None:
     receiver = make_receiver(chatter=False)
     epoch_ns = receiver.epoch_after(START_GPS_NS)
     marks_ns = [epoch_ns - 90_000_000, epoch_ns - 60_000_000, epoch_ns - 30_000_000]
@@ -235,7 +235,7 @@ def test_of_several_marks_in_one_epoch_only_the_last_is_told_but_all_are_counted
     receiver.close()
 
 
-def test_a_strobe_across_an_epoch_tells_its_falling_edge_with_the_next() -> None:
+def test_a_strobe_across_an_epoch_reports_its_falling_edge_with_the_next() -> None:
     receiver = make_receiver(chatter=False)
     epoch_ns = receiver.epoch_after(START_GPS_NS)
     receiver.mark(epoch_ns - STROBE_WIDTH_NS // 2)
@@ -279,7 +279,7 @@ class HostPort:
 
 
 def test_live_bytes_arrive_30_to_80_ms_after_their_epoch_and_marks_with_them() -> None:
-    clock = WorldClock.starting_now()
+    clock = WorldClock.from_wall_clock()
     receiver = UbloxReceiver(clock, state_at, chatter=False, seed=2)
     host = HostPort(receiver.port)
     receiver.start()
@@ -303,7 +303,7 @@ def test_live_bytes_arrive_30_to_80_ms_after_their_epoch_and_marks_with_them() -
 
 
 def test_a_host_that_never_reads_costs_bytes_not_time() -> None:
-    clock = WorldClock.starting_now()
+    clock = WorldClock.from_wall_clock()
     receiver = UbloxReceiver(clock, state_at, rate_hz=100.0, seed=2)
     host = HostPort(receiver.port)
     receiver.start()
@@ -322,7 +322,7 @@ def test_a_host_that_never_reads_costs_bytes_not_time() -> None:
 
 
 def test_what_the_host_writes_is_swallowed_and_not_echoed() -> None:
-    receiver = UbloxReceiver(WorldClock.starting_now(), state_at, chatter=False)
+    receiver = UbloxReceiver(WorldClock.from_wall_clock(), state_at, chatter=False)
     host = HostPort(receiver.port)
     receiver.start()
     try:
@@ -341,7 +341,7 @@ def test_what_the_host_writes_is_swallowed_and_not_echoed() -> None:
 
 
 def test_a_port_nobody_has_open_keeps_nothing_stale() -> None:
-    receiver = UbloxReceiver(WorldClock.starting_now(), state_at, chatter=False)
+    receiver = UbloxReceiver(WorldClock.from_wall_clock(), state_at, chatter=False)
     receiver.start()
     try:
         deadline = time.monotonic() + 5.0
@@ -365,7 +365,7 @@ def test_gpsd_reports_the_position_and_the_time() -> None:
     program = shutil.which("gpsd", path=f"{os.environ.get('PATH', '')}:/usr/sbin")
     if program is None:
         pytest.skip("gpsd is absent; install Debian's gpsd")
-    clock = WorldClock.starting_now()
+    clock = WorldClock.from_wall_clock()
     receiver = UbloxReceiver(clock, state_at)
     receiver.start()
     # gpsd gives up root before it opens the port.

@@ -10,7 +10,7 @@ import pytest
 
 from processing.rig import shipped_rigs
 from sim_hw.world import rendering
-from sim_hw.world.rendering import Look, filter_of
+from sim_hw.world.rendering import ExposureParameters, filter_of
 from sim_hw.world.scene import open_scene
 from sim_hw.world.world import World, WorldSettings
 
@@ -43,7 +43,9 @@ def test_each_pixel_has_the_light_a_head_of_its_band_alone_would_have(tmp_path: 
     assert scene.step("green") == 1
     flight = world.flight.beginning_first_line_at(1100.0)
     cone, sensor = world.rig.cone("RGB"), world.rig.sensor("RGB")
-    look = Look(EPOCH + 20_000_000_000, world.plan.exposure_time_us["RGB"], tdi_shifts=0)
+    look = ExposureParameters(
+        EPOCH + 20_000_000_000, world.plan.exposure_time_us["RGB"], tdi_shifts=0
+    )
     mosaic = rendering.light_on_sensor(world, scene, flight, cone, sensor, look)
     plain = replace(sensor, colour_filter_array="none")
     for band, rows, columns in (
@@ -51,8 +53,8 @@ def test_each_pixel_has_the_light_a_head_of_its_band_alone_would_have(tmp_path: 
         ("green", slice(1, None, 2), slice(0, None, 2)),
         ("blue", slice(1, None, 2), slice(1, None, 2)),
     ):
-        alone = replace(cone, bands=(band,))
-        light = rendering.light_on_sensor(world, scene, flight, alone, plain, look)
+        single_band = replace(cone, bands=(band,))
+        light = rendering.light_on_sensor(world, scene, flight, single_band, plain, look)
         assert np.array_equal(mosaic[rows, columns], light[rows, columns])
 
 

@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 from sim_hw.world.ellipsoid import ecef_from_geodetic, geodetic_from_ecef, geodetic_from_enu
-from sim_hw.world.flight import Flight, FlightPlan, attitude_tremor, enu_from_body, path_point
+from sim_hw.world.flight import (
+    FlightPlan,
+    SimulatedFlight,
+    enu_from_body,
+    path_point,
+    random_attitude_motion,
+)
 from sim_hw.world.seeding import random_stream
 from sim_hw.world.terrain import mild_relief
 
@@ -20,14 +26,14 @@ PLAN = FlightPlan(
 
 
 def test_the_same_seed_flies_the_same_flight_and_another_does_not() -> None:
-    one, same, other = (Flight(PLAN, seed, EPOCH) for seed in (3, 3, 4))
+    one, same, other = (SimulatedFlight(PLAN, seed, EPOCH) for seed in (3, 3, 4))
     at = EPOCH + 12_345_678_901
     assert np.array_equal(one.pose(at).enu_from_body, same.pose(at).enu_from_body)
     assert not np.allclose(one.pose(at).enu_from_body, other.pose(at).enu_from_body, atol=1e-5)
 
 
 def test_velocity_is_the_derivative_of_position_on_lines_and_in_turns() -> None:
-    flight = Flight(PLAN, 1, EPOCH)
+    flight = SimulatedFlight(PLAN, 1, EPOCH)
     for second in np.arange(-30, 400, 1.7):
         at = EPOCH + round(second * SECOND)
         step = 1_000_000
@@ -48,7 +54,7 @@ def test_the_aircraft_comes_back_on_the_next_line() -> None:
 
 
 def test_a_line_may_begin_anywhere_without_a_jump() -> None:
-    flight = Flight(PLAN, 1, EPOCH)
+    flight = SimulatedFlight(PLAN, 1, EPOCH)
     at = EPOCH + 200 * SECOND
     begun = flight.beginning_first_line_at(flight.distance_flown_m(at))
     straight = begun.pose(at - SECOND).position_enu_m
@@ -59,8 +65,8 @@ def test_a_line_may_begin_anywhere_without_a_jump() -> None:
     ) or begun.pose(at + 45 * SECOND).heading_rad == pytest.approx(2 * math.pi, abs=math.radians(3))
 
 
-def test_attitude_trembles_with_the_angle_and_the_rate_that_were_asked_for() -> None:
-    tremor = attitude_tremor(random_stream(5, "roll"), rms=0.0035, rate_rms=0.0052)
+def test_attitude_trembles_with_the_angle_and_the_rate_that_were_requested() -> None:
+    tremor = random_attitude_motion(random_stream(5, "roll"), rms=0.0035, rate_rms=0.0052)
     t = np.arange(0, 4000, 0.05)
     angle = np.array([tremor.value(x) for x in t])
     assert angle.std() == pytest.approx(0.0035, rel=0.05)
@@ -69,7 +75,7 @@ def test_attitude_trembles_with_the_angle_and_the_rate_that_were_asked_for() -> 
     assert tremor.rate_rms == pytest.approx(0.0052, rel=0.03)
 
 
-def test_body_axes_turn_with_heading_pitch_and_roll() -> None:
+def test_body_axes_rotate_with_heading_pitch_and_roll() -> None:
     east_bound = enu_from_body(0.0, 0.0, math.pi / 2)
     assert east_bound @ [1, 0, 0] == pytest.approx([1, 0, 0], abs=1e-12)
     assert east_bound @ [0, 1, 0] == pytest.approx([0, -1, 0], abs=1e-12)
@@ -79,11 +85,11 @@ def test_body_axes_turn_with_heading_pitch_and_roll() -> None:
 
 
 def test_wind_from_the_left_leaves_the_camera_crabbed_to_the_left() -> None:
-    calm = {"attitude_rms_deg": 0.0, "rate_rms_dps": 0.0, "wander_rms_m": 0.0}
+    calm = {"attitude_rms_deg": 0.0, "rate_rms_dps": 0.0, "track_deviation_rms_m": 0.0}
     plan = FlightPlan(
         3000.0, 50.0, 1000.0, 500.0, wind_across_mps=5.0, drift_correction=0.0, **calm
     )
-    pose = Flight(plan, 1, EPOCH).pose(EPOCH)
+    pose = SimulatedFlight(plan, 1, EPOCH).pose(EPOCH)
     assert pose.heading_rad == pytest.approx(2 * math.pi - math.atan2(5, 50))
     assert pose.velocity_enu_mps == pytest.approx([0, 50, 0], abs=1e-9)
 
@@ -121,9 +127,9 @@ def test_an_inertial_unit_is_level_where_it_is_and_not_where_the_flight_began() 
         line_spacing_m=500.0,
         attitude_rms_deg=0.0,
         rate_rms_dps=0.0,
-        wander_rms_m=0.0,
+        track_deviation_rms_m=0.0,
     )
-    flown = Flight(still, seed=1, epoch_gps_ns=0)
+    flown = SimulatedFlight(still, seed=1, epoch_gps_ns=0)
     pose = flown.pose(150 * 10**9)  # 9 km north of the origin
     roll, pitch, heading = flown.attitude_rad(pose)
     # The mount is level in the plane of the origin, so the nose is up against the level there.

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from processing.rig import shipped_rigs
-from sim_hw.world import camera, laboratory, rendering, spline
+from sim_hw.world import rendering, sensor_calibration, spline, true_camera
 from sim_hw.world.electronics import Electronics, SensorTruth, over_tdi_path, true_sensor
-from sim_hw.world.rendering import GRID_PX, Look
+from sim_hw.world.rendering import GRID_PX, ExposureParameters
 from sim_hw.world.scene import Scene, SceneSettings, open_scene
 from sim_hw.world.truth import true_vip
 from sim_hw.world.world import World, WorldSettings
@@ -22,7 +22,7 @@ RIG = shipped_rigs()["ultracam-x-mini"]
 SETTINGS = WorldSettings(
     rig_file=str(RIG), seed=3, epoch_gps_ns=EPOCH, dc_k=12.0, displaced_px={"SU02": (1.0, -0.6)}
 )
-LOOK = Look(EPOCH + 20_000_000_000, 3907.7, tdi_shifts=1)
+LOOK = ExposureParameters(EPOCH + 20_000_000_000, 3907.7, tdi_shifts=1)
 
 
 @pytest.fixture(scope="module")
@@ -69,13 +69,15 @@ def test_a_ray_cast_by_hand_meets_the_same_ground_and_the_same_virtual_pixel(wor
     sensor_c, f_c = (world.temperature_c(p, LOOK.mid_gps_ns) for p in (sensor.probe, cone.probe))
     dc = sensor_c - 20.0
     u = np.array([(column - 623.5) * 0.0072, (415.5 - (row - 0.5)) * 0.0072])
-    turn = sensor.rotation_rad + sensor.drift.rotation_urad_per_k * 1e-6 * dc
+    rotation = sensor.rotation_rad + sensor.drift.rotation_urad_per_k * 1e-6 * dc
     grow = 1 + sensor.drift.scale_ppm_per_k * 1e-6 * dc
-    turned = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    rotation_2d = np.array(
+        [[np.cos(rotation), -np.sin(rotation)], [np.sin(rotation), np.cos(rotation)]]
+    )
     error = np.array(world.camera.place_error_mm[name])
     drift = np.array([sensor.drift.x_um_per_k, sensor.drift.y_um_per_k]) * 1e-3 * dc
-    p = np.array([sensor.x_mm, sensor.y_mm]) + error + drift + grow * turned @ u
-    ideal = camera.undistorted(cone.lens, p[None])[0]
+    p = np.array([sensor.x_mm, sensor.y_mm]) + error + drift + grow * rotation_2d @ u
+    ideal = true_camera.undistorted(cone.lens, p[None])[0]
     f = cone.lens.f_mm * (1 + cone.lens.f_ppm_per_k * 1e-6 * (f_c - 20.0))
     ray = world.camera.master_from_cone(cone) @ np.array([ideal[0], ideal[1], -f])
     forward_right_down = np.array([ray[1], ray[0], -ray[2]])
@@ -171,7 +173,9 @@ def _interpolated(picture: np.ndarray, at: tuple[np.ndarray, np.ndarray]) -> np.
 
 
 def test_tdi_that_fits_the_flight_leaves_only_the_crab_and_the_tremor(world: World) -> None:
-    calm = replace(world.flight.plan, attitude_rms_deg=0.0, rate_rms_dps=0.0, wander_rms_m=0.0)
+    calm = replace(
+        world.flight.plan, attitude_rms_deg=0.0, rate_rms_dps=0.0, track_deviation_rms_m=0.0
+    )
     flight = replace(world.flight, plan=calm)
     cone, sensor = world.rig.cone_of("SU30"), world.rig.sensor("SU30")
     crab = np.arctan2(4.0, 55.0) * 0.2
@@ -254,7 +258,7 @@ def test_the_laboratory_finds_the_sensor_within_the_noise_of_its_series(
 ) -> None:
     cone, sensor = world.rig.cone_of("SU00"), world.rig.sensor("SU00")
     truth = true_sensor(cone, sensor, 3, field_radius_mm=world.field_radius_mm(cone))
-    found = laboratory.measure(sensor, truth, 3)
+    found = sensor_calibration.measure(sensor, truth, 3)
     good = truth.defect == 0
     residual = found.gain[good] * truth.response[good] - 1
     light_e = 0.5 * 4095 * 20
@@ -266,7 +270,7 @@ def test_the_laboratory_finds_the_sensor_within_the_noise_of_its_series(
     assert np.isfinite(found.gain).all()
     assert found.gain.max() < 2.5
     assert 1000 * 0.5 < found.defect.sum() < 5000
-    laboratory.write_radiometry(tmp_path, sensor, found)
+    sensor_calibration.write_radiometry(tmp_path, sensor, found)
     with np.load(tmp_path / "radiometry" / "SU00.npz") as stored:
         assert set(stored.files) == {
             "bias_dn",
@@ -283,7 +287,7 @@ def test_calibrated_frames_give_the_light_back(world: World, scene: Scene) -> No
     flight = world.flight.beginning_first_line_at(1100.0)
     cone, sensor = world.rig.cone_of("SU00"), world.rig.sensor("SU00")
     truth = true_sensor(cone, sensor, 3, field_radius_mm=world.field_radius_mm(cone))
-    found = laboratory.measure(sensor, truth, 3)
+    found = sensor_calibration.measure(sensor, truth, 3)
     electronics = Electronics(sensor, truth, world.electrons_per_radiance_s(cone))
     look = replace(LOOK, tdi_shifts=0)
     light = rendering.light_on_sensor(world, scene, flight, cone, sensor, look)

@@ -54,7 +54,7 @@ def test_every_sample_is_one_of_a_source_and_none_is_a_blend() -> None:
     low = random.integers(0, 1000, (800, 800, 4), dtype=np.uint16)
     high = random.integers(60000, 61000, (800, 800, 4), dtype=np.uint16)
     quilt = quilting.plan_quilt([low, high], height_px=1400, width_px=1400, random=random)
-    picture = quilting.sew([low, high], quilt, height_px=1400, width_px=1400)
+    picture = quilting.assemble([low, high], quilt, height_px=1400, width_px=1400)
     assert picture.shape == (1400, 1400, 4)
     assert np.all((picture < 1000) | (picture >= 60000))
     assert 0.02 < np.mean(picture < 1000) < 0.98
@@ -70,7 +70,7 @@ def test_the_cut_follows_the_least_difference() -> None:
 def test_patches_meet_better_at_a_seam_than_by_chance(sources: list[quilting.Picture]) -> None:
     size = {"height_px": 1648, "width_px": 1648}
     quilt = quilting.plan_quilt(sources, **size, random=random_stream(1, "quilt"))
-    picture = np.sqrt(quilting.sew(sources, quilt, **size)[..., 1].astype(np.float64))
+    picture = np.sqrt(quilting.assemble(sources, quilt, **size)[..., 1].astype(np.float64))
     step = quilting.PATCH_PX - quilting.OVERLAP_PX
     across = np.abs(np.diff(picture, axis=1))
     seam = np.mean(

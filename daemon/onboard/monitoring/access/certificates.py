@@ -1,6 +1,6 @@
 """The service's TLS certificate: read, checked, and used by a server context.
 
-Making certificates is in `daemon.onboard.monitoring.access.authority`.
+Making certificates is in `daemon.onboard.monitoring.access.certificate_authority`.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from daemon.errors import DaemonError
 EXPIRES_SOON_S: Final = 30 * 86_400
 NO_CHECK_TIME: Final = ssl.VerifyFlags(0x200000)
 """X509_V_FLAG_NO_CHECK_TIME of OpenSSL's <openssl/x509_vfy.h>; Python has no name for it."""
-STAMP_OF_NONE: Final = (0, 0, 0)
+MISSING_FILE_STAMP: Final = (0, 0, 0)
 
 
-class CertificateError(DaemonError):
+class TlsCertificateError(DaemonError):
     """A certificate or key that cannot be used; the sentence says why, and the cure."""
 
 
@@ -45,19 +45,20 @@ def server_context(certificate: Path, key: Path) -> ssl.SSLContext:
     """A context for TLS 1.2 and newer with this certificate.
 
     Raises:
-        CertificateError: a file is missing or damaged, the key belongs to another certificate, is
+        TlsCertificateError: a file is missing or damaged, the key belongs to another certificate,
+        is
             encrypted, or can be read by everybody.
     """
     for path, setting in ((certificate, "tls_certificate"), (key, "tls_key")):
         mode = _mode_of_file(path, setting)
     if mode & 0o007:
-        raise CertificateError(
+        raise TlsCertificateError(
             f"{key} can be read or changed by everybody on this machine, and so is no secret; make "
             f"a new one, or if nobody has read it: chmod 640 {key}"
         )
 
     def refuse_to_decrypt() -> str:
-        raise CertificateError(
+        raise TlsCertificateError(
             f"{key} is encrypted, and a service has nobody to ask for its passphrase; store it "
             f"without one: openssl pkey -in {key} -out PLAIN"
         )
@@ -69,10 +70,10 @@ def server_context(certificate: Path, key: Path) -> ssl.SSLContext:
         context.load_cert_chain(certificate, key, refuse_to_decrypt)
     except (OSError, ValueError) as error:
         if isinstance(error, ssl.SSLError) and error.reason == "KEY_VALUES_MISMATCH":
-            raise CertificateError(
+            raise TlsCertificateError(
                 f"{key} is not the key of {certificate}; give the two that belong together"
             ) from error
-        raise CertificateError(
+        raise TlsCertificateError(
             f"{certificate} and {key} cannot be loaded ({error}); give a PEM certificate and its "
             "key (syntopic certificate makes both)"
         ) from error
@@ -90,7 +91,7 @@ def read_certificate(path: Path, context: ssl.SSLContext) -> Certificate:
         context: of `server_context`.
 
     Raises:
-        CertificateError: a client would not accept it for a server, whomever it trusts.
+        TlsCertificateError: a client would not accept it for a server, whomever it trusts.
     """
     client = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     client.check_hostname = False
@@ -98,16 +99,16 @@ def read_certificate(path: Path, context: ssl.SSLContext) -> Certificate:
     to_client, to_server = ssl.MemoryBIO(), ssl.MemoryBIO()
     try:
         client.load_verify_locations(path)
-        asking = client.wrap_bio(to_client, to_server)
-        answering = context.wrap_bio(to_server, to_client, server_side=True)
-        for end in (asking, answering, asking, answering):
+        client_side = client.wrap_bio(to_client, to_server)
+        server_side = context.wrap_bio(to_server, to_client, server_side=True)
+        for end in (client_side, server_side, client_side, server_side):
             try:
                 end.do_handshake()
             except ssl.SSLWantReadError:
                 continue
-        stated: dict[str, Any] = asking.getpeercert() or {}
+        stated: dict[str, Any] = client_side.getpeercert() or {}
     except (OSError, ValueError) as error:
-        raise CertificateError(
+        raise TlsCertificateError(
             f"{path} is no certificate for a server ({error}); make one: syntopic certificate"
         ) from error
     alternatives = stated.get("subjectAltName", ())
@@ -188,29 +189,30 @@ class CertificateFiles:
     def __init__(self, certificate: Path, key: Path, context: ssl.SSLContext) -> None:
         self._certificate, self._key = certificate, key
         self.context = context
-        self._stamps = self._look()
+        self._stamps = self._read_stamps()
         self._refused = self._stamps
 
     def renewed(self) -> bool:
         """Whether the files were changed and are used now.
 
         Raises:
-            CertificateError: they were changed and cannot be used, raised once; `context` remains
+            TlsCertificateError: they were changed and cannot be used, raised once; `context`
+            remains
                 the previous one.
         """
-        stamps = self._look()
+        stamps = self._read_stamps()
         if stamps in (self._stamps, self._refused):
             return False
         try:
             context = server_context(self._certificate, self._key)
             read_certificate(self._certificate, context)
-        except CertificateError:
+        except TlsCertificateError:
             self._refused = stamps
             raise
         self.context, self._stamps = context, stamps
         return True
 
-    def _look(self) -> tuple[tuple[int, int, int], ...]:
+    def _read_stamps(self) -> tuple[tuple[int, int, int], ...]:
         return tuple(_stamp(path) for path in (self._certificate, self._key))
 
 
@@ -218,7 +220,7 @@ def _stamp(path: Path) -> tuple[int, int, int]:
     try:
         status = path.stat()
     except OSError:
-        return STAMP_OF_NONE
+        return MISSING_FILE_STAMP
     return status.st_ino, status.st_mtime_ns, status.st_mode
 
 
@@ -226,11 +228,11 @@ def _mode_of_file(path: Path, setting: str) -> int:
     try:
         mode = path.stat().st_mode
     except OSError as error:
-        raise CertificateError(
+        raise TlsCertificateError(
             f"{path} cannot be read ({error.strerror}); [watch] {setting} names a PEM file"
         ) from error
     if not stat.S_ISREG(mode):
-        raise CertificateError(f"{path} is no regular file; [watch] {setting} names a PEM file")
+        raise TlsCertificateError(f"{path} is no regular file; [watch] {setting} names a PEM file")
     return mode
 
 

@@ -27,9 +27,13 @@ from typing import Any, Final, get_args
 from pydantic import ValidationError
 
 from daemon.errors import DaemonError
-from daemon.onboard.monitoring.access.gate import Gate, NoAnswerError, NotPermittedError
+from daemon.onboard.monitoring.access.command_gateway import (
+    AnswerTimeoutError,
+    CommandGateway,
+    NotPermittedError,
+)
 from daemon.onboard.monitoring.access.roles import Principal, Role
-from daemon.onboard.monitoring.state import FlightState
+from daemon.onboard.monitoring.flight_state import FlightState
 from daemon.onboard.monitoring.web.api import CommandName
 from daemon.onboard.service.command_rules import CommandBody
 
@@ -43,7 +47,7 @@ STATE: Final = "state"
 """Asks for what the service knows of itself; nothing is done, and nothing goes to the log."""
 IDLE_TIMEOUT_S: Final = 30.0
 ANSWER_TIMEOUT_S: Final = 10.0
-STRANGER_TIMEOUT_S: Final = 1.0
+UNAUTHORIZED_TIMEOUT_S: Final = 1.0
 CALLERS_MAX: Final = 8
 
 
@@ -52,7 +56,7 @@ class ControlError(DaemonError):
 
 
 @dataclass(frozen=True)
-class Caller:
+class PeerProcess:
     """Who is at the other end, by the kernel."""
 
     pid: int
@@ -68,7 +72,7 @@ class Caller:
             return f"uid {self.uid}"
 
 
-def caller_of(connection: socket.socket) -> Caller:
+def peer_process(connection: socket.socket) -> PeerProcess:
     """Who connected, at the time of connecting."""
     layout = struct.Struct("3i")
     found = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, layout.size)
@@ -78,7 +82,7 @@ def caller_of(connection: socket.socket) -> Caller:
     with suppress(OSError):
         listed = connection.getsockopt(socket.SOL_SOCKET, SO_PEERGROUPS, GROUPS_MAX * size)
     groups = struct.unpack(f"{len(listed) // size}I", listed)
-    return Caller(pid, uid, frozenset((gid, *groups)))
+    return PeerProcess(pid, uid, frozenset((gid, *groups)))
 
 
 class ControlSocket:
@@ -97,11 +101,11 @@ class ControlSocket:
         path: Path,
         group: str | None,
         administrators: str | None,
-        gate: Gate,
+        gateway: CommandGateway,
         state: FlightState,
     ) -> None:
         self.path = path
-        self._gate = gate
+        self._gateway = gateway
         self._state = state
         self._gid = _gid_of(group)
         self._administrators = None if administrators is None else _gid_of(administrators)
@@ -126,24 +130,24 @@ class ControlSocket:
             with suppress(OSError):
                 self.path.unlink()
 
-    def role_of(self, caller: Caller) -> Role | None:
+    def role_of(self, caller: PeerProcess) -> Role | None:
         """The role of a process, by its user and groups; None for one that may not command."""
         if caller.uid in (0, os.geteuid()) or self._administrators in caller.groups:
             return "administrator"
         return "operator" if self._gid in caller.groups else None
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        caller = caller_of(writer.get_extra_info("socket"))
+        caller = peer_process(writer.get_extra_info("socket"))
         by = Principal(caller.name, self.role_of(caller), f"control socket, pid {caller.pid}")
         try:
             if by.role is None:
-                await self._turn_away(reader, writer, by)
+                await self._refuse(reader, writer, by)
             elif self._callers >= CALLERS_MAX:
                 await _answer(writer, done=False, sentence="too many callers; try again")
             else:
                 self._callers += 1
                 try:
-                    await self._hear(reader, writer, by)
+                    await self._serve_requests(reader, writer, by)
                 finally:
                     self._callers -= 1
         except (TimeoutError, ConnectionError, ValueError):
@@ -151,37 +155,37 @@ class ControlSocket:
         finally:
             writer.close()
 
-    async def _turn_away(
+    async def _refuse(
         self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, by: Principal
     ) -> None:
         """Refuse a process that may not command, and record what it asked for."""
         sentence = f"{by.name} may not command; the group {self._group} may"
-        wanted: tuple[str, Any] | str = ""
+        attempted: tuple[str, Any] | str = ""
         # Unread bytes would take the answer with them when the socket closes.
         with suppress(TimeoutError, ValueError):
-            wanted = _request(await asyncio.wait_for(reader.readline(), STRANGER_TIMEOUT_S))
-        self._gate.refuse("" if isinstance(wanted, str) else wanted[0], by, sentence)
+            attempted = _request(await asyncio.wait_for(reader.readline(), UNAUTHORIZED_TIMEOUT_S))
+        self._gateway.refuse("" if isinstance(attempted, str) else attempted[0], by, sentence)
         await _answer(writer, done=False, sentence=sentence)
 
-    async def _hear(
+    async def _serve_requests(
         self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, by: Principal
     ) -> None:
         while line := await asyncio.wait_for(reader.readline(), IDLE_TIMEOUT_S):
-            if _asks_for_state(line):
+            if _is_state_query(line):
                 await _answer(writer, done=True, sentence="", **self._state_now())
                 continue
-            done, sentence = await self._obey(line, by)
+            done, sentence = await self._execute(line, by)
             await _answer(writer, done=done, sentence=sentence)
 
-    async def _obey(self, line: bytes, by: Principal) -> tuple[bool, str]:
-        asked = _request(line)
-        if isinstance(asked, str):
-            self._gate.refuse("", by, asked)
-            return False, asked
-        name, arguments = asked
+    async def _execute(self, line: bytes, by: Principal) -> tuple[bool, str]:
+        query = _request(line)
+        if isinstance(query, str):
+            self._gateway.refuse("", by, query)
+            return False, query
+        name, arguments = query
         try:
-            answer = await self._gate.command(name, arguments, by)
-        except (NoAnswerError, NotPermittedError) as error:
+            answer = await self._gateway.command(name, arguments, by)
+        except (AnswerTimeoutError, NotPermittedError) as error:
             return False, str(error)
         if answer.done and name == "acknowledge":
             self._state.acknowledge(str(arguments.get("fault")))
@@ -209,7 +213,7 @@ class ControlSocket:
             return str(self._gid)
 
 
-def give(path: Path, name: str, arguments: Mapping[str, Any]) -> tuple[bool, str]:
+def send_command(path: Path, name: str, arguments: Mapping[str, Any]) -> tuple[bool, str]:
     """Give one command over a socket; whether it was done, and the service's sentence.
 
     Raises:
@@ -219,7 +223,7 @@ def give(path: Path, name: str, arguments: Mapping[str, Any]) -> tuple[bool, str
     return bool(answer.get("done")), str(answer.get("sentence", ""))
 
 
-def ask(path: Path) -> Mapping[str, Any]:
+def query_state(path: Path) -> Mapping[str, Any]:
     """The state of the service: phase, devices, what is missing for arming, and faults.
 
     Raises:
@@ -231,9 +235,9 @@ def ask(path: Path) -> Mapping[str, Any]:
     return answer
 
 
-def _exchange(path: Path, asked: Mapping[str, Any]) -> Mapping[str, Any]:
+def _exchange(path: Path, query: Mapping[str, Any]) -> Mapping[str, Any]:
     """Send a line and read the line that answers it."""
-    request = json.dumps(asked).encode() + b"\n"
+    request = json.dumps(query).encode() + b"\n"
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
             connection.settimeout(ANSWER_TIMEOUT_S)
@@ -253,25 +257,27 @@ def _exchange(path: Path, asked: Mapping[str, Any]) -> Mapping[str, Any]:
 def _request(line: bytes) -> tuple[str, dict[str, Any]] | str:
     """The command of a line and its arguments, or what is wrong with it."""
     try:
-        asked = json.loads(line)
-        name, arguments = asked["command"], asked.get("arguments", {})
+        query = json.loads(line)
+        name, arguments = query["command"], query.get("arguments", {})
         body = CommandBody.model_validate(arguments)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         if isinstance(error, ValidationError):
-            told = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
-            return f"arguments: {told}"
+            details = "; ".join(
+                f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()
+            )
+            return f"arguments: {details}"
         return 'not understood; a line is {"command": NAME, "arguments": {...}}'
     if name not in get_args(CommandName):
         return f"there is no command {str(name)[:40]!r}; one of {', '.join(get_args(CommandName))}"
     return str(name), body.model_dump(exclude_none=True)
 
 
-def _asks_for_state(line: bytes) -> bool:
+def _is_state_query(line: bytes) -> bool:
     try:
-        asked = json.loads(line)
+        query = json.loads(line)
     except (ValueError, RecursionError):
         return False
-    return isinstance(asked, dict) and asked.get("command") == STATE
+    return isinstance(query, dict) and query.get("command") == STATE
 
 
 async def _answer(
@@ -295,7 +301,7 @@ def _gid_of(group: str | None) -> int:
 def _listen(path: Path, gid: int) -> socket.socket:
     listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
     try:
-        _clear(path)
+        _remove_stale_socket(path)
         listening.bind(str(path))
         path.chmod(0o660)
         if gid != os.getegid():
@@ -315,7 +321,7 @@ def _listen(path: Path, gid: int) -> socket.socket:
     return listening
 
 
-def _clear(path: Path) -> None:
+def _remove_stale_socket(path: Path) -> None:
     """Take away a socket that nobody listens at any more, and nothing else."""
     try:
         if not stat.S_ISSOCK(path.lstat().st_mode):

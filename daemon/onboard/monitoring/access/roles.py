@@ -1,7 +1,7 @@
 """Who gives a command, and whether their role permits it.
 
-A command reaches the service only through `daemon.onboard.monitoring.access.gate`, which asks here,
-whatever way it came: page, API, MAVLink or control socket.
+A command reaches the service only through `daemon.onboard.monitoring.access.command_gateway`, which
+asks here, whatever way it came: page, API, MAVLink or control socket.
 """
 
 from __future__ import annotations

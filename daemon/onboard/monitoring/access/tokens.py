@@ -24,7 +24,7 @@ TOKEN_BYTES = 32
 PREFIX = "syn_"
 FAILURES_ALLOWED = 5
 FAILURE_WINDOW_S = 60.0
-ADDRESSES_REMEMBERED = 4096
+ADDRESSES_MAX = 4096
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@\-]{0,63}")
 _HASH = re.compile(r"[0-9a-f]{64}")
 
@@ -34,7 +34,7 @@ class TokenError(DaemonError):
 
 
 @dataclass(frozen=True)
-class Holder:
+class TokenHolder:
     """Whom a token belongs to, and what they may do."""
 
     name: str
@@ -45,9 +45,9 @@ class Holder:
 class Tokens:
     """Holders by the hash of their token, hexadecimal."""
 
-    holders: Mapping[str, Holder]
+    holders: Mapping[str, TokenHolder]
 
-    def holder_of(self, token: str) -> Holder | None:
+    def holder_of(self, token: str) -> TokenHolder | None:
         """Who holds a token; every hash is looked at, whatever the token."""
         given = _hash_of(token)
         found = None
@@ -57,7 +57,7 @@ class Tokens:
         return found
 
 
-class Attempts:
+class FailedAttempts:
     """Counts wrong tokens by address; more than a few a minute are not even looked at."""
 
     def __init__(self) -> None:
@@ -72,7 +72,7 @@ class Attempts:
         return len(failures) >= FAILURES_ALLOWED
 
     def failed(self, address: str, now_s: float) -> None:
-        if len(self._failures) >= ADDRESSES_REMEMBERED:
+        if len(self._failures) >= ADDRESSES_MAX:
             del self._failures[next(iter(self._failures))]
         self._failures.setdefault(address, deque(maxlen=FAILURES_ALLOWED)).append(now_s)
 
@@ -91,7 +91,7 @@ def read_tokens(path: Path | None) -> Tokens:
         content = parse_toml(path.read_bytes())
     except (OSError, ValueError) as error:
         raise TokenError(f"{path}: cannot be read ({error})") from error
-    holders: dict[str, Holder] = {}
+    holders: dict[str, TokenHolder] = {}
     for name, entry in content.items():
         role = entry.get("role") if isinstance(entry, dict) else None
         hashed = entry.get("sha256") if isinstance(entry, dict) else None
@@ -101,7 +101,7 @@ def read_tokens(path: Path | None) -> Tokens:
                 f"({', '.join(ROLES)}) and its sha256. Remove the entry and make the token again "
                 "(syntopic token add)"
             )
-        holders[hashed] = Holder(name, role)
+        holders[hashed] = TokenHolder(name, role)
     return Tokens(holders)
 
 
@@ -117,7 +117,7 @@ def add_token(path: Path, name: str, role: Role) -> str:
     if any(holder.name == name for holder in holders.values()):
         raise TokenError(f"{name} has a token; remove it first (syntopic token remove {name})")
     token = PREFIX + secrets.token_urlsafe(TOKEN_BYTES)
-    holders[_hash_of(token)] = Holder(name, role)
+    holders[_hash_of(token)] = TokenHolder(name, role)
     _write(path, holders)
     return token
 
@@ -129,13 +129,13 @@ def remove_token(path: Path, name: str) -> None:
         TokenError: nobody of that name has one.
     """
     holders = dict(read_tokens(path).holders)
-    left = {hashed: holder for hashed, holder in holders.items() if holder.name != name}
-    if len(left) == len(holders):
+    remaining = {hashed: holder for hashed, holder in holders.items() if holder.name != name}
+    if len(remaining) == len(holders):
         raise TokenError(f"{path}: nobody called {name} has a token")
-    _write(path, left)
+    _write(path, remaining)
 
 
-def _write(path: Path, holders: Mapping[str, Holder]) -> None:
+def _write(path: Path, holders: Mapping[str, TokenHolder]) -> None:
     durable.make_directories(path.absolute().parent)
     lines = ["# Hashes of tokens; written by `syntopic token`."]
     for hashed, holder in sorted(holders.items(), key=lambda item: item[1].name):

@@ -17,12 +17,22 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, cast
 
 from daemon.configuration.model import MavlinkCameraSection
-from daemon.onboard.monitoring.access.gate import Gate, NoAnswerError, NotPermittedError
+from daemon.onboard.monitoring.access.command_gateway import (
+    AnswerTimeoutError,
+    CommandGateway,
+    NotPermittedError,
+)
 from daemon.onboard.monitoring.access.roles import Principal, Role
-from daemon.onboard.monitoring.mavlink.requests import ACTIONS, BY_IDENTITY, REQUESTS, whole, wish
+from daemon.onboard.monitoring.flight_state import FlightState
+from daemon.onboard.monitoring.mavlink.requests import (
+    ACTIONS,
+    BY_IDENTITY,
+    REQUESTS,
+    as_integer,
+    service_command,
+)
 from daemon.onboard.monitoring.mavlink.senders import Address, Senders
 from daemon.onboard.monitoring.mavlink.signatures import Signatures, read_key
-from daemon.onboard.monitoring.state import FlightState
 from drivers.base.extras import require
 from drivers.receivers.mavlink.library import MavlinkParser
 from drivers.timescales.leap_seconds import leap_seconds_at
@@ -56,7 +66,7 @@ class MavlinkCamera(asyncio.DatagramProtocol):
         self,
         settings: MavlinkCameraSection,
         state: FlightState,
-        gate: Gate,
+        gateway: CommandGateway,
         rig: Callable[[], Rig | None],
         ground_height_m: Callable[[], float | None] = lambda: None,
         report: Callable[[str], None] = _log.error,
@@ -67,7 +77,7 @@ class MavlinkCamera(asyncio.DatagramProtocol):
         """
         self._settings = settings
         self._state = state
-        self._gate = gate
+        self._gateway = gateway
         self._rig = rig
         self._ground_height_m = ground_height_m
         self._report = report
@@ -77,12 +87,12 @@ class MavlinkCamera(asyncio.DatagramProtocol):
         )
         self._parser = MavlinkParser()
         self._senders = Senders(self._parser)
-        self._signatures = self._sign()
+        self._signatures = self._load_signatures()
         self._saver = ThreadPoolExecutor(1, "mavlink-timestamps")
         self._boot_s = time.monotonic()
         self._fixed: tuple[Address, ...] = ()
-        self._told: set[int] = set()
-        self._told_mission: str | None = None
+        self._sent: set[int] = set()
+        self._sent_mission: str | None = None
         self._interval_s = 0.0
         self._task: asyncio.Task[None] | None = None
         self._commands: set[asyncio.Task[None]] = set()
@@ -101,7 +111,7 @@ class MavlinkCamera(asyncio.DatagramProtocol):
             self._fixed = (address,)
             local = "127.0.0.1" if host.startswith("127.") else "0.0.0.0"
             await loop.create_datagram_endpoint(lambda: self, local_addr=(local, 0))
-        self._task = asyncio.create_task(self._live())
+        self._task = asyncio.create_task(self._run())
 
     def end(self) -> None:
         for task in (self._task, *self._commands):
@@ -134,7 +144,7 @@ class MavlinkCamera(asyncio.DatagramProtocol):
                 self._count("bad_bytes", len(frame))
                 continue
             self._count("messages")
-            is_peer = self._senders.met(addr, now_s, is_signed=is_signed)
+            is_peer = self._senders.register(addr, now_s, is_signed=is_signed)
             if message.get_type() == "HEARTBEAT" and not is_peer:
                 # One for one: however many others there are, nobody misses that the camera is here.
                 self._send(self._heartbeat(), addr)
@@ -153,74 +163,76 @@ class MavlinkCamera(asyncio.DatagramProtocol):
         if number in REQUESTS:
             self._request(message, address, REQUESTS[number])
         elif number in ACTIONS:
-            self._act(message, address, ACTIONS[number], is_signed=is_signed)
+            self._execute(message, address, ACTIONS[number], is_signed=is_signed)
         else:
             self._acknowledge(message, address, self._dialect.MAV_RESULT_UNSUPPORTED)
 
-    def _request(self, message: Any, address: Address, wanted: str | None) -> None:
+    def _request(self, message: Any, address: Address, requested: str | None) -> None:
         """512 and its older siblings: tell one message again."""
-        if wanted is None:
-            wanted = BY_IDENTITY.get(whole(message.param1))
-        if wanted == "CAMERA_IMAGE_CAPTURED":
+        if requested is None:
+            requested = BY_IDENTITY.get(as_integer(message.param1))
+        if requested == "CAMERA_IMAGE_CAPTURED":
             given = message.param1 if message.command == 2002 else message.param2
-            index = whole(given)
+            index = as_integer(given)
             one = None if index is None else self._state.exposure(index + 1)
-            if one is None or not self._is_taken(one):
+            if one is None or not self._is_final(one):
                 self._acknowledge(message, address, self._dialect.MAV_RESULT_DENIED)
                 return
             self._acknowledge(message, address, self._dialect.MAV_RESULT_ACCEPTED)
             self._send(self._captured(one), address)
             return
-        tell = {
+        encode = {
             "CAMERA_INFORMATION": self._information,
             "CAMERA_SETTINGS": self._camera_settings,
             "STORAGE_INFORMATION": self._storage,
             "CAMERA_CAPTURE_STATUS": self._capture_status,
-        }.get(wanted or "")
-        if tell is None:
+        }.get(requested or "")
+        if encode is None:
             self._acknowledge(message, address, self._dialect.MAV_RESULT_UNSUPPORTED)
             return
         self._acknowledge(message, address, self._dialect.MAV_RESULT_ACCEPTED)
-        self._send(tell(), address)
+        self._send(encode(), address)
 
-    def _act(self, message: Any, address: Address, action: str, *, is_signed: bool) -> None:
+    def _execute(self, message: Any, address: Address, action: str, *, is_signed: bool) -> None:
         """What changes something: only from those the configuration lets."""
         if self._settings.commands != "any" and not (
             self._settings.commands == "signed" and is_signed
         ):
             self._count("commands_refused")
             self._acknowledge(message, address, self._dialect.MAV_RESULT_DENIED)
-            wanted = None if action == "mode" else wish(action, message)
-            self._gate.refuse(
-                action if wanted is None else wanted[0],
+            requested = None if action == "mode" else service_command(action, message)
+            self._gateway.refuse(
+                action if requested is None else requested[0],
                 _principal(message, address, None),
                 f"[watch.mavlink] commands is {self._settings.commands!r}"
                 + ("" if self._settings.commands == "none" else ", and the signature is not valid"),
             )
             return
         if action == "mode":
-            is_image = whole(message.param2) == MODE_IMAGE
+            is_image = as_integer(message.param2) == MODE_IMAGE
             result = "ACCEPTED" if is_image else "UNSUPPORTED"
             self._acknowledge(message, address, getattr(self._dialect, f"MAV_RESULT_{result}"))
             if is_image:
                 self._send(self._camera_settings(), address)
             return
-        wanted = wish(action, message)
-        if wanted is None:
+        requested = service_command(action, message)
+        if requested is None:
             self._acknowledge(message, address, self._dialect.MAV_RESULT_DENIED)
             return
-        task = asyncio.create_task(self._ask_service(message, address, *wanted))
+        task = asyncio.create_task(self._forward(message, address, *requested))
         self._commands.add(task)
         task.add_done_callback(self._commands.discard)
 
-    async def _ask_service(
+    async def _forward(
         self, message: Any, address: Address, name: str, arguments: Mapping[str, Any]
     ) -> None:
         await self._save_timestamps()
         try:
-            answer = await self._gate.command(name, arguments, _principal(message, address, ROLE))
+            answer = await self._gateway.command(
+                name, arguments, _principal(message, address, ROLE)
+            )
             done = answer.done
-        except (NoAnswerError, NotPermittedError):
+        except (AnswerTimeoutError, NotPermittedError):
             done = False
         result = "ACCEPTED" if done else "TEMPORARILY_REJECTED"
         self._acknowledge(message, address, getattr(self._dialect, f"MAV_RESULT_{result}"))
@@ -241,39 +253,39 @@ class MavlinkCamera(asyncio.DatagramProtocol):
 
     # What goes out by itself
 
-    async def _live(self) -> None:
+    async def _run(self) -> None:
         beat_s, saved_s = -math.inf, time.monotonic()
         while True:
             now_s = time.monotonic()
             if now_s - beat_s >= HEARTBEAT_S:
                 beat_s = now_s
-                self._tell_all(self._heartbeat())
+                self._broadcast(self._heartbeat())
             if now_s - saved_s >= SAVE_EVERY_S:
                 saved_s = now_s
                 await self._save_timestamps()
             self._advance_clock()
-            self._tell_captures()
+            self._send_captures()
             await asyncio.sleep(TICK_S)
 
-    def _tell_captures(self) -> None:
+    def _send_captures(self) -> None:
         mission = self._state.mission_path
-        if mission != self._told_mission:
-            self._told_mission = mission
-            self._told.clear()
+        if mission != self._sent_mission:
+            self._sent_mission = mission
+            self._sent.clear()
         for one in self._state.exposures():
-            if one["number"] in self._told or not self._is_taken(one):
+            if one["number"] in self._sent or not self._is_final(one):
                 continue
-            self._told.add(one["number"])
-            self._tell_all(self._captured(one))
+            self._sent.add(one["number"])
+            self._broadcast(self._captured(one))
             if self._settings.feedback and one.get("state") != "lost":
-                self._tell_all(self._feedback(one))
-            self._tell_all(self._capture_status())
+                self._broadcast(self._feedback(one))
+            self._broadcast(self._capture_status())
 
-    def _is_taken(self, one: Mapping[str, Any]) -> bool:
+    def _is_final(self, one: Mapping[str, Any]) -> bool:
         """Whether it is final when and where it was taken, or that it is lost."""
         return one.get("state") == "lost" or "mark_gps_ns" in one
 
-    def _tell_all(self, message: Any) -> None:
+    def _broadcast(self, message: Any) -> None:
         for address in {*self._fixed, *self._senders.peers}:
             self._send(message, address)
 
@@ -396,7 +408,7 @@ class MavlinkCamera(asyncio.DatagramProtocol):
             one["number"] & 0xFFFF,
         )
 
-    def _sign(self) -> Signatures | None:
+    def _load_signatures(self) -> Signatures | None:
         if self._settings.signing_key is None:
             return None
         signatures = Signatures(read_key(self._settings.signing_key), self._settings.signing_state)

@@ -18,7 +18,7 @@ from typing import Any
 
 import msgpack
 
-from daemon.onboard.monitoring.state import FlightState
+from daemon.onboard.monitoring.flight_state import FlightState
 from daemon.onboard.monitoring.telemetry import VERSION, packed
 
 DATAGRAM_MAX_BYTES = 1200
@@ -29,20 +29,20 @@ FAULT_EVERY_S = 2.0
 NEW_FAULT_TIMES, NEW_FAULT_EVERY_S = 6, 0.6
 """A new fault is said densely at first: a link that loses a third loses all six once in 700."""
 
-REPEATED = 200
+REPEATED_EXPOSURES = 200
 """How many of the newest exposures are said again."""
 
 PICTURE_EVERY = 4
 """One picture, or piece of one, to so many exposures that are said again."""
 
-PICTURES_KEPT = 8
+PREVIEWS_MAX = 8
 PIECES_MAX = 1000
 TICK_S = 0.1
 BURST_S = 1.0
 
 
 @dataclass
-class Sender:
+class DatagramScheduler:
     """What is said when; one for each link. Times are those of any clock that goes evenly."""
 
     bytes_per_s: float
@@ -50,16 +50,16 @@ class Sender:
     _at_s: float | None = None
     _brief_s: float = -math.inf
     _faults: dict[tuple[str, bool, bool], tuple[float, int]] = field(default_factory=dict)
-    _told: int = 0
-    _turn: int = 0
-    _shown: int = 0
-    _shown_turn: int = -1
+    _last_sequence: int = 0
+    _repeat_index: int = 0
+    _preview_index: int = 0
+    _preview_at: int = -1
 
     def due(self, state: FlightState, now_s: float) -> Iterator[bytes]:
         """The datagrams that are due now, as far as the budget goes."""
         passed_s = BURST_S if self._at_s is None else now_s - self._at_s
-        most = max(self.bytes_per_s * BURST_S, DATAGRAM_MAX_BYTES)
-        self._credit, self._at_s = min(self._credit + passed_s * self.bytes_per_s, most), now_s
+        limit = max(self.bytes_per_s * BURST_S, DATAGRAM_MAX_BYTES)
+        self._credit, self._at_s = min(self._credit + passed_s * self.bytes_per_s, limit), now_s
         for datagram in self._candidates(state, now_s):
             if len(datagram) > self._credit:
                 return
@@ -69,33 +69,37 @@ class Sender:
     def _candidates(self, state: FlightState, now_s: float) -> Iterator[bytes]:
         for fault in state.faults():
             key = (fault["id"], fault["stands"], fault["acknowledged"])
-            told_s, times = self._faults.get(key, (-math.inf, 0))
+            sent_s, times = self._faults.get(key, (-math.inf, 0))
             pause_s = NEW_FAULT_EVERY_S if times < NEW_FAULT_TIMES else FAULT_EVERY_S
-            if now_s - told_s >= pause_s:
+            if now_s - sent_s >= pause_s:
                 yield _datagram("fault", fault)
                 self._faults[key] = now_s, times + 1
         if now_s - self._brief_s >= BRIEF_EVERY_S:
             yield _datagram("brief", _brief_of(state))
             self._brief_s = now_s
-        for one in state.changed("exposures", self._told):
+        for one in state.changed("exposures", self._last_sequence):
             yield _datagram("exposure", one)
-            self._told = one["sequence"]
-        newest = state.exposures()[-REPEATED:]
-        shown = [*state.changed("residuals", 0), *state.changed("thumbnails", 0)]
+            self._last_sequence = one["sequence"]
+        newest = state.exposures()[-REPEATED_EXPOSURES:]
+        previews = [*state.changed("residuals", 0), *state.changed("thumbnails", 0)]
         for _ in newest:
-            self._turn %= len(newest)
-            if shown and self._turn % PICTURE_EVERY == 0 and self._shown_turn != self._turn:
-                self._shown %= len(shown)
-                picture = shown[-1 - self._shown]
+            self._repeat_index %= len(newest)
+            if (
+                previews
+                and self._repeat_index % PICTURE_EVERY == 0
+                and self._preview_at != self._repeat_index
+            ):
+                self._preview_index %= len(previews)
+                picture = previews[-1 - self._preview_index]
                 yield _datagram("thumbnail" if "data" in picture else "residuals", picture)
-                self._shown += 1
-                self._shown_turn = self._turn
-            yield _datagram("exposure", newest[self._turn])
-            self._turn += 1  # one that did not fit is the next one's first
-            self._shown_turn = -1
+                self._preview_index += 1
+                self._preview_at = self._repeat_index
+            yield _datagram("exposure", newest[self._repeat_index])
+            self._repeat_index += 1  # one that did not fit is the next one's first
+            self._preview_at = -1
 
 
-class Received:
+class DatagramReceiver:
     """A watcher's end: datagrams in any order, with any of them missing, made a state again."""
 
     def __init__(self) -> None:
@@ -104,7 +108,7 @@ class Received:
         self.exposures: dict[int, dict[str, Any]] = {}
         self.residuals: dict[int, dict[str, Any]] = {}
         self._pieces: dict[int, dict[int, dict[str, Any]]] = {}
-        self.bad = 0
+        self.rejected_count = 0
 
     def thumbnail(self, number: int) -> bytes | None:
         """An exposure's JPEG, once all of its pieces are here."""
@@ -113,17 +117,17 @@ class Received:
             return None
         return b"".join(pieces[k]["data"] for k in sorted(pieces))
 
-    def take(self, datagram: bytes) -> None:
+    def receive(self, datagram: bytes) -> None:
         """Take one in; what is no datagram of ours is counted."""
         try:
-            told = msgpack.unpackb(datagram)
-            kind, content = told["kind"], told["content"]
-            if told["version"] != VERSION or not isinstance(content, dict):
+            message = msgpack.unpackb(datagram)
+            kind, content = message["kind"], message["content"]
+            if message["version"] != VERSION or not isinstance(content, dict):
                 raise ValueError("of another version")
             if kind in ("exposure", "residuals", "thumbnail"):
                 _check_number(content["number"])
             if kind == "brief":
-                self._take_brief(content)
+                self._receive_brief(content)
             elif kind == "fault":
                 self._newer(self.faults, content["id"], content)
             elif kind == "exposure":
@@ -138,13 +142,13 @@ class Received:
                     raise TypeError("a piece of a picture is bytes")
                 pieces = self._pieces.setdefault(content["number"], {})
                 self._newer(pieces, content["piece"], content)
-            for shown in (self.residuals, self._pieces):
-                while len(shown) > PICTURES_KEPT:
-                    del shown[min(shown)]
+            for previews in (self.residuals, self._pieces):
+                while len(previews) > PREVIEWS_MAX:
+                    del previews[min(previews)]
         except (ValueError, KeyError, TypeError, msgpack.UnpackException):
-            self.bad += 1
+            self.rejected_count += 1
 
-    def _take_brief(self, content: dict[str, Any]) -> None:
+    def _receive_brief(self, content: dict[str, Any]) -> None:
         if content["sequence"] < self.brief.get("sequence", -1):
             if content["mission"] == self.brief.get("mission"):
                 return  # it was overtaken
@@ -152,14 +156,14 @@ class Received:
             self.residuals.clear()
             self._pieces.clear()
         self.brief = content
-        standing = set(content["faults"])
-        for gone in [known for known in self.faults if known not in standing]:
-            del self.faults[gone]
+        reported = set(content["faults"])
+        for removed in [stored for stored in self.faults if stored not in reported]:
+            del self.faults[removed]
 
     @staticmethod
-    def _newer(known: dict[Any, dict[str, Any]], key: Any, content: dict[str, Any]) -> None:
-        if content["sequence"] >= known.get(key, {}).get("sequence", -1):
-            known[key] = content
+    def _newer(stored: dict[Any, dict[str, Any]], key: Any, content: dict[str, Any]) -> None:
+        if content["sequence"] >= stored.get(key, {}).get("sequence", -1):
+            stored[key] = content
 
 
 def _check_number(value: object) -> int:
@@ -170,7 +174,7 @@ def _check_number(value: object) -> int:
 
 async def send(state: FlightState, addresses: Mapping[str, tuple[str, int]], budget: float) -> None:
     """Say it to each address, for ever; a link that refuses costs only its datagrams."""
-    senders = {name: Sender(budget) for name in addresses}
+    senders = {name: DatagramScheduler(budget) for name in addresses}
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
         link.setblocking(False)
         link.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
@@ -198,16 +202,16 @@ def _brief_of(state: FlightState) -> dict[str, Any]:
     }
 
 
-_LEFT_OUT_FIRST = ("findings", "found", "valid_area", "footprint", "place", "figures", "recovery")
+_DROP_ORDER = ("findings", "found", "valid_area", "footprint", "place", "figures", "recovery")
 
 
 def _datagram(kind: str, content: Mapping[str, Any]) -> bytes:
     """One datagram; what does not fit loses its least important parts."""
-    kept = dict(content)
-    data = packed({"version": VERSION, "kind": kind, "content": kept})
-    for name in _LEFT_OUT_FIRST:
+    remaining = dict(content)
+    data = packed({"version": VERSION, "kind": kind, "content": remaining})
+    for name in _DROP_ORDER:
         if len(data) <= DATAGRAM_MAX_BYTES:
             break
-        if kept.pop(name, None) is not None:
-            data = packed({"version": VERSION, "kind": kind, "content": kept})
+        if remaining.pop(name, None) is not None:
+            data = packed({"version": VERSION, "kind": kind, "content": remaining})
     return data

@@ -36,15 +36,15 @@ ACTIONS: Mapping[int, str] = {
 }
 
 
-def wish(action: str, message: Any) -> tuple[str, dict[str, Any]] | None:
+def service_command(action: str, message: Any) -> tuple[str, dict[str, Any]] | None:
     """The service's command for a MAVLink one; None where its parameters make no sense."""
     if action == "stop":
         return "stop", {}
     if action == "once":
         return "trigger", {}
     if action == "capture":
-        count = whole(message.param3)
-        interval_s = finite(message.param2)
+        count = as_integer(message.param3)
+        interval_s = as_finite(message.param2)
         if count is None or count < 0:
             return None
         if count == 1:
@@ -53,28 +53,28 @@ def wish(action: str, message: Any) -> tuple[str, dict[str, Any]] | None:
             return None
         return "interval", {"interval_s": interval_s, "count": count}
     if action == "distance":
-        distance_m = finite(message.param1)
+        distance_m = as_finite(message.param1)
         if distance_m is None or distance_m < 0:
             return None
         return ("distance", {"distance_m": distance_m}) if distance_m > 0 else ("stop", {})
     if action == "interval":
-        interval_ms = finite(message.param1)
+        interval_ms = as_finite(message.param1)
         if interval_ms is None or interval_ms == 0:
             return None
         if interval_ms < 0:
             return "stop", {}
         return "interval", {"interval_s": interval_ms / 1000, "count": 0}
-    enabled = whole(message.param1)  # 2003 DO_TRIGGER_CONTROL
+    enabled = as_integer(message.param1)  # 2003 DO_TRIGGER_CONTROL
     if enabled not in (0, 1):
         return None
     return ("start", {}) if enabled else ("stop", {})
 
 
-def whole(value: float) -> int | None:
+def as_integer(value: float) -> int | None:
     """A parameter as a whole number; None for what is none, such as NaN."""
     return int(value) if math.isfinite(value) and abs(value) < 2**31 else None
 
 
-def finite(value: float) -> float | None:
+def as_finite(value: float) -> float | None:
     """A parameter as a number; None for NaN and infinity."""
     return float(value) if math.isfinite(value) else None

@@ -17,7 +17,7 @@ STREAMS_MAX: Final = 16
 STREAM_BYTES_PER_S: Final = 8000
 """For all unsigned ones of these together; searching damaged bytes for messages costs time."""
 PEERS_MAX: Final = 16
-PEER_FORGOTTEN_S: Final = 60.0
+PEER_TIMEOUT_S: Final = 60.0
 
 Address = tuple[str, int]
 
@@ -53,11 +53,11 @@ class Senders:
         """
         if len(data) > DATAGRAM_MAX_BYTES:
             return [], len(data)
-        whole = self._parser.messages_of(data)
-        if whole is not None:
+        complete = self._parser.messages_of(data)
+        if complete is not None:
             self._streams.pop(address, None)
-            return whole, 0
-        if not self._is_signed(address) and not self._pay(len(data), now_s):
+            return complete, 0
+        if not self._is_signed(address) and not self._spend(len(data), now_s):
             return [], len(data)
         # Taken out and put back: the last one is the one that was used last.
         stream = self._streams.pop(address, None) or self._parser.framer()
@@ -68,19 +68,19 @@ class Senders:
         before = stream.bad_bytes
         return stream.feed(data), stream.bad_bytes - before
 
-    def met(self, address: Address, now_s: float, *, is_signed: bool) -> bool:
+    def register(self, address: Address, now_s: float, *, is_signed: bool) -> bool:
         """A message of a sender came; whether it is a peer now."""
-        for old in [a for a, p in self._peers.items() if now_s - p.last_s > PEER_FORGOTTEN_S]:
+        for old in [a for a, p in self._peers.items() if now_s - p.last_s > PEER_TIMEOUT_S]:
             del self._peers[old]
         peer = self._peers.get(address)
         if peer is not None:
             peer.last_s, peer.is_signed = now_s, peer.is_signed or is_signed
             return True
         if len(self._peers) >= PEERS_MAX:
-            leaving = [a for a, p in self._peers.items() if is_signed and not p.is_signed]
-            if not leaving:
+            evictable = [a for a, p in self._peers.items() if is_signed and not p.is_signed]
+            if not evictable:
                 return False
-            del self._peers[min(leaving, key=lambda each: self._peers[each].last_s)]
+            del self._peers[min(evictable, key=lambda each: self._peers[each].last_s)]
         self._peers[address] = _Peer(now_s, is_signed)
         return True
 
@@ -88,7 +88,7 @@ class Senders:
         peer = self._peers.get(address)
         return peer is not None and peer.is_signed
 
-    def _pay(self, nbytes: int, now_s: float) -> bool:
+    def _spend(self, nbytes: int, now_s: float) -> bool:
         passed_s, self._credit_s = now_s - self._credit_s, now_s
         gained = passed_s * STREAM_BYTES_PER_S
         self._credit_bytes = min(self._credit_bytes + gained, STREAM_BYTES_PER_S)

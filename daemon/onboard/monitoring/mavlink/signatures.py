@@ -21,7 +21,7 @@ from daemon.mission.store import durable
 
 KEY_BYTES: Final = 32
 KEY_TEXT_MAX: Final = 4096
-OPEN_TO_EVERYBODY: Final = 0o007
+OTHERS_PERMISSION_BITS: Final = 0o007
 SIGNATURE_BYTES: Final = 6
 TRAILER_BYTES: Final = 13
 """Link id, timestamp and signature."""
@@ -159,7 +159,7 @@ def read_key(path: Path) -> bytes:
     """
     try:
         with path.open("rb") as file:
-            is_open = os.fstat(file.fileno()).st_mode & OPEN_TO_EVERYBODY
+            is_open = os.fstat(file.fileno()).st_mode & OTHERS_PERMISSION_BITS
             key = bytes.fromhex(file.read(KEY_TEXT_MAX).decode("ascii").strip())
     except (OSError, ValueError) as error:
         raise ValueError(f"{path}: no signing key ({error}); 64 hexadecimal digits") from error

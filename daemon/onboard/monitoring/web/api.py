@@ -26,23 +26,27 @@ from starlette.requests import HTTPConnection
 from starlette.websockets import WebSocketDisconnect
 
 from daemon.mission.layout import exposure_name
-from daemon.onboard.monitoring.access.gate import Gate, NoAnswerError, NotPermittedError
+from daemon.onboard.monitoring.access.command_gateway import (
+    AnswerTimeoutError,
+    CommandGateway,
+    NotPermittedError,
+)
 from daemon.onboard.monitoring.access.roles import COMMAND_ROLES, Principal, missing_role
-from daemon.onboard.monitoring.access.tokens import Attempts, Holder, Tokens
+from daemon.onboard.monitoring.access.tokens import FailedAttempts, TokenHolder, Tokens
 from daemon.onboard.monitoring.coverage import Coverage
+from daemon.onboard.monitoring.flight_state import EXPOSURES_MAX, PARTS, PREVIEW_PARTS, FlightState
 from daemon.onboard.monitoring.metrics import exposition
-from daemon.onboard.monitoring.planned import add_plan
-from daemon.onboard.monitoring.state import EXPOSURES_KEPT, PARTS, PICTURE_PARTS, FlightState
-from daemon.onboard.monitoring.telemetry import LEAST_BYTES_PER_S, Subscription, packed
-from daemon.onboard.monitoring.web.bodies import DOCUMENTED, command_body
+from daemon.onboard.monitoring.plan_routes import add_plan
+from daemon.onboard.monitoring.telemetry import MIN_BYTES_PER_S, Subscription, packed
 from daemon.onboard.monitoring.web.connections import (
     WATCHERS_MAX,
-    Connection,
+    ClientConnection,
     Connections,
-    Use,
+    ConnectionUse,
     source_of,
 )
-from daemon.onboard.monitoring.web.guard import CONNECTION, bearer
+from daemon.onboard.monitoring.web.request_body import COMMAND_OPENAPI, command_body
+from daemon.onboard.monitoring.web.request_filter import CONNECTION, bearer_token
 
 PAGE = Path(__file__).parent / "page"
 PROBLEM_JSON = "application/problem+json"
@@ -82,7 +86,7 @@ class Problem(BaseModel):
     detail: str = ""
 
 
-class Outcome(BaseModel):
+class CommandResponse(BaseModel):
     """What became of a command."""
 
     done: bool
@@ -115,20 +119,20 @@ CommandName = Literal[
 
 
 @dataclass(frozen=True)
-class WatchSettings:
+class AccessSettings:
     """Who may look and who may command.
 
-    `is_open`: looking needs no token.
+    `anonymous_read`: looking needs no token.
     """
 
     tokens: Tokens
-    is_open: bool = True
+    anonymous_read: bool = True
 
 
 def create_app(
     state: FlightState,
-    gate: Gate,
-    settings: WatchSettings,
+    gateway: CommandGateway,
+    settings: AccessSettings,
     coverage: Coverage | None = None,
     connections: Connections | None = None,
 ) -> FastAPI:
@@ -141,30 +145,32 @@ def create_app(
         docs_url=None,
         redoc_url=None,
     )
-    app.middleware("http")(_harden)
+    app.middleware("http")(_add_security_headers)
     app.add_exception_handler(StarletteHTTPException, _http_problem)
     app.add_exception_handler(RequestValidationError, _validation_problem)
-    doors = _Doors(settings, gate, connections or Connections())
-    _add_state(app, state, doors)
-    _add_products(app, state, doors)
-    _add_commands(app, state, gate, doors)
-    _add_telemetry(app, state, doors)
-    add_plan(app, coverage or Coverage(state), Depends(doors.watch))
+    access = _AccessControl(settings, gateway, connections or Connections())
+    _add_state(app, state, access)
+    _add_products(app, state, access)
+    _add_commands(app, state, gateway, access)
+    _add_telemetry(app, state, access)
+    add_plan(app, coverage or Coverage(state), Depends(access.watch))
     _add_page(app)
     return app
 
 
-class _Doors:
+class _AccessControl:
     """Checks tokens; a door is a dependency of a route."""
 
-    def __init__(self, settings: WatchSettings, gate: Gate, connections: Connections) -> None:
+    def __init__(
+        self, settings: AccessSettings, gateway: CommandGateway, connections: Connections
+    ) -> None:
         self._settings = settings
-        self._gate = gate
-        self._attempts = Attempts()
+        self._gateway = gateway
+        self._attempts = FailedAttempts()
         self.connections = connections
 
     async def watch(self, request: Request) -> None:
-        if not self._settings.is_open:
+        if not self._settings.anonymous_read:
             self.admit(request)
 
     async def command(self, request: Request) -> Principal:
@@ -173,28 +179,28 @@ class _Doors:
         try:
             holder = self.admit(request)
         except HTTPException as error:
-            stranger = Principal("unknown", None, address)
-            self._gate.refuse(name, stranger, error.detail)
+            unauthenticated = Principal("unknown", None, address)
+            self._gateway.refuse(name, unauthenticated, error.detail)
             raise
         by = Principal(holder.name, holder.role, address)
         if name in COMMAND_ROLES:
             try:
-                self._gate.admit(name, by)
+                self._gateway.admit(name, by)
             except NotPermittedError as error:
                 raise HTTPException(403, str(error)) from error
             return by
-        self._gate.refuse(name, by, "there is no such command")
+        self._gateway.refuse(name, by, "there is no such command")
         if missing_role(by, LEAST_COMMAND) is not None:
             raise HTTPException(403, f"{by.name} has the role {by.role}, which gives no commands")
         return by  # whoever commands at all learns which commands there are
 
-    def admit(self, asking: HTTPConnection) -> Holder:
+    def admit(self, http: HTTPConnection) -> TokenHolder:
         """Who comes with this token. A valid one is admitted, however many wrong ones came before.
 
         Raises:
             HTTPException: 401, or 429 after too many wrong tokens.
         """
-        token = bearer(asking.scope["headers"])
+        token = bearer_token(http.scope["headers"])
         if token is None:
             raise HTTPException(
                 401,
@@ -203,28 +209,28 @@ class _Doors:
             )
         holder = self._settings.tokens.holder_of(token)
         if holder is None:
-            source, now_s = source_of(_address(asking)), time.monotonic()
+            source, now_s = source_of(_address(http)), time.monotonic()
             if self._attempts.is_blocked(source, now_s):
                 raise HTTPException(429, "too many wrong tokens from this address; wait a minute")
             self._attempts.failed(source, now_s)
             raise HTTPException(401, "token rejected", {"WWW-Authenticate": "Bearer"})
-        connection = _connection(asking)
+        connection = _connection(http)
         if connection is not None:
-            connection.is_known = True
+            connection.is_authenticated = True
         return holder
 
-    def may_watch(self, asking: HTTPConnection) -> bool:
-        if self._settings.is_open and bearer(asking.scope["headers"]) is None:
+    def may_watch(self, http: HTTPConnection) -> bool:
+        if self._settings.anonymous_read and bearer_token(http.scope["headers"]) is None:
             return True
         try:
-            self.admit(asking)
+            self.admit(http)
         except HTTPException:
-            return self._settings.is_open
+            return self._settings.anonymous_read
         return True
 
 
-def _add_state(app: FastAPI, state: FlightState, doors: _Doors) -> None:
-    watcher = Depends(doors.watch)
+def _add_state(app: FastAPI, state: FlightState, access: _AccessControl) -> None:
+    watcher = Depends(access.watch)
 
     @app.get("/api/v1/state", dependencies=[watcher], tags=["state"])
     async def whole_state() -> dict[str, Any]:
@@ -279,13 +285,13 @@ def _add_state(app: FastAPI, state: FlightState, doors: _Doors) -> None:
         return Response(exposition(state), media_type="text/plain; version=0.0.4")
 
 
-def _add_products(app: FastAPI, state: FlightState, doors: _Doors) -> None:
-    watcher = Depends(doors.watch)
+def _add_products(app: FastAPI, state: FlightState, access: _AccessControl) -> None:
+    watcher = Depends(access.watch)
 
     @app.get("/api/v1/exposures", dependencies=[watcher], tags=["exposures"])
     async def exposures(
         after: Annotated[int, Query(ge=0, lt=10**9, description="number")] = 0,
-        limit: Annotated[int, Query(ge=1, le=EXPOSURES_KEPT)] = 100,
+        limit: Annotated[int, Query(ge=1, le=EXPOSURES_MAX)] = 100,
     ) -> list[dict[str, Any]]:
         """Exposures by number."""
         return state.exposures(after, limit)
@@ -316,11 +322,15 @@ def _add_products(app: FastAPI, state: FlightState, doors: _Doors) -> None:
         return FileResponse(path, media_type=IMAGES[product], headers=policy)
 
 
-def _add_commands(app: FastAPI, state: FlightState, gate: Gate, doors: _Doors) -> None:
-    principal = Depends(doors.command)
+def _add_commands(
+    app: FastAPI, state: FlightState, gateway: CommandGateway, access: _AccessControl
+) -> None:
+    principal = Depends(access.command)
 
-    @app.post("/api/v1/commands/{name}", tags=["commands"], openapi_extra=DOCUMENTED)
-    async def command(name: CommandName, request: Request, by: Principal = principal) -> Outcome:
+    @app.post("/api/v1/commands/{name}", tags=["commands"], openapi_extra=COMMAND_OPENAPI)
+    async def command(
+        name: CommandName, request: Request, by: Principal = principal
+    ) -> CommandResponse:
         """arm, start or stop the line, trigger, land, acknowledge, expose otherwise.
 
         Needs a token of the role operator; new-mission, release-disk and accept-disk need the
@@ -334,22 +344,22 @@ def _add_commands(app: FastAPI, state: FlightState, gate: Gate, doors: _Doors) -
                 if not any(fault["id"] == given.fault for fault in state.faults()):
                     raise HTTPException(404, f"no fault {given.fault!r} is listed")
         except HTTPException as error:
-            gate.refuse(name, by, error.detail)
+            gateway.refuse(name, by, error.detail)
             raise
         try:
-            answer = await gate.command(name, given.model_dump(exclude_none=True), by)
+            answer = await gateway.command(name, given.model_dump(exclude_none=True), by)
         except NotPermittedError as error:
             raise HTTPException(403, str(error)) from error
-        except NoAnswerError as error:
+        except AnswerTimeoutError as error:
             raise HTTPException(504, str(error)) from error
         if answer.done and name == "acknowledge" and given.fault is not None:
             state.acknowledge(given.fault)
         if not answer.done:
             raise HTTPException(409, answer.sentence)
-        return Outcome(done=True, sentence=answer.sentence)
+        return CommandResponse(done=True, sentence=answer.sentence)
 
 
-def _add_telemetry(app: FastAPI, state: FlightState, doors: _Doors) -> None:
+def _add_telemetry(app: FastAPI, state: FlightState, access: _AccessControl) -> None:
     @app.websocket("/api/v1/telemetry")
     async def telemetry(
         socket: WebSocket,
@@ -360,31 +370,31 @@ def _add_telemetry(app: FastAPI, state: FlightState, doors: _Doors) -> None:
         if "token" in socket.query_params:
             await socket.close(1008, "a token belongs into a header, not into the address")
             return
-        if not doors.may_watch(socket):
+        if not access.may_watch(socket):
             await socket.close(1008, "a token is needed")
             return
         connection = _connection(socket)
-        if not doors.connections.may_watch(connection):
+        if not access.connections.may_watch(connection):
             await socket.close(1013, f"too many watchers: {WATCHERS_MAX}")
             return
         if connection is not None:
-            connection.enter(Use.WATCHER)
+            connection.enter(ConnectionUse.WATCHER)
         offered = socket.scope.get("subprotocols", [])
         await socket.accept(SUBPROTOCOL if SUBPROTOCOL in offered else None)
         # Over JSON pictures are fetched, not told.
-        parts = PARTS if form == "json" else (*PARTS, *PICTURE_PARTS)
-        told = Subscription(max(bytes_per_s, LEAST_BYTES_PER_S), parts)
-        gone = asyncio.ensure_future(_until_gone(socket))
+        parts = PARTS if form == "json" else (*PARTS, *PREVIEW_PARTS)
+        subscription = Subscription(max(bytes_per_s, MIN_BYTES_PER_S), parts)
+        disconnected = asyncio.ensure_future(_wait_for_disconnect(socket))
         try:
-            while not gone.done():
-                record = told.record(state, time.monotonic())
+            while not disconnected.done():
+                record = subscription.record(state, time.monotonic())
                 if record is not None:
                     await asyncio.wait_for(_send(socket, record, form), SEND_TIMEOUT_S)
-                await asyncio.wait([gone], timeout=TELEMETRY_TICK_S)
+                await asyncio.wait([disconnected], timeout=TELEMETRY_TICK_S)
         except (TimeoutError, WebSocketDisconnect, RuntimeError):
             pass  # it stalled or went; nothing is kept for it
         finally:
-            gone.cancel()
+            disconnected.cancel()
             with suppress(RuntimeError, WebSocketDisconnect):
                 await socket.close()
 
@@ -396,7 +406,7 @@ async def _send(socket: WebSocket, record: Any, form: str) -> None:
         await socket.send_json(record)
 
 
-async def _until_gone(socket: WebSocket) -> None:
+async def _wait_for_disconnect(socket: WebSocket) -> None:
     """Hear what the watcher says, which is nothing, until it goes."""
     with suppress(WebSocketDisconnect, RuntimeError):
         while True:
@@ -416,7 +426,7 @@ def _documented_problem() -> dict[str, Any]:
     return {"description": "what is wrong", "content": {PROBLEM_JSON: {"schema": schema}}}
 
 
-async def _harden(
+async def _add_security_headers(
     request: Request, call_next: Callable[[Request], Awaitable[Response]]
 ) -> Response:
     response = await call_next(request)
@@ -462,11 +472,11 @@ def _title(status: int) -> str:
     return titles.get(status, "Not done")
 
 
-def _address(asking: HTTPConnection) -> str:
-    return asking.client.host if asking.client else ""
+def _address(http: HTTPConnection) -> str:
+    return http.client.host if http.client else ""
 
 
-def _connection(asking: HTTPConnection) -> Connection | None:
+def _connection(http: HTTPConnection) -> ClientConnection | None:
     """The TCP connection it came on; None in tests without a server."""
-    found = asking.scope.get("state", {}).get(CONNECTION)
-    return found if isinstance(found, Connection) else None
+    found = http.scope.get("state", {}).get(CONNECTION)
+    return found if isinstance(found, ClientConnection) else None

@@ -32,10 +32,10 @@ REQUEST_MAX_S = 120.0
 SWEEP_S = 1.0
 REQUESTS_PER_S, REQUESTS_BURST = 50.0, 400
 """Anonymous requests of one source."""
-SOURCES_REMEMBERED = 4096
+SOURCES_MAX = 4096
 
 
-class Use(IntEnum):
+class ConnectionUse(IntEnum):
     """What a connection is used for; the less useful is closed first."""
 
     IDLE = 0
@@ -44,25 +44,25 @@ class Use(IntEnum):
 
 
 @dataclass(eq=False)
-class Connection:
+class ClientConnection:
     """One TCP connection.
 
     Attributes:
         source: address, or /64 network for IPv6.
-        is_known: a valid token was presented on it.
+        is_authenticated: a valid token was presented on it.
     """
 
     link: socket.socket
     source: str
     since_s: float
-    use: Use = Use.IDLE
+    use: ConnectionUse = ConnectionUse.IDLE
     requests: int = 0
-    is_known: bool = False
+    is_authenticated: bool = False
 
     def is_open(self) -> bool:
         return self.link.fileno() >= 0
 
-    def enter(self, use: Use) -> None:
+    def enter(self, use: ConnectionUse) -> None:
         self.use = use
         self.since_s = time.monotonic()
 
@@ -81,14 +81,14 @@ class Connections:
 
     def __init__(self, proxies: Collection[str] = ()) -> None:
         self._proxies = frozenset(proxies)
-        self._by_peer: dict[tuple[str, int], Connection] = {}
+        self._by_peer: dict[tuple[str, int], ClientConnection] = {}
         self._rates: dict[str, tuple[float, float]] = {}
         self.closed = 0
         """Connections that were closed to make space."""
 
     def admit(self, link: socket.socket, host: str, port: int) -> bool:
         """Add a new connection; False where it has to be refused."""
-        self._forget_closed()
+        self._remove_closed()
         source = source_of(host)
         if host not in self._proxies:
             same = [one for one in self._by_peer.values() if one.source == source]
@@ -97,10 +97,10 @@ class Connections:
         all_open = self._by_peer.values()
         if len(all_open) >= CONNECTIONS_MAX and not self._close_one(all_open):
             return False
-        self._by_peer[host, port] = Connection(link, source, time.monotonic())
+        self._by_peer[host, port] = ClientConnection(link, source, time.monotonic())
         return True
 
-    def of(self, peer: Any) -> Connection | None:
+    def of(self, peer: Any) -> ClientConnection | None:
         """The connection of a peer's (host, port)."""
         return self._by_peer.get(tuple(peer)) if peer else None
 
@@ -109,10 +109,14 @@ class Connections:
         now_s = time.monotonic()
         left, then_s = self._rates.pop(source, (float(REQUESTS_BURST), now_s))
         left = min(REQUESTS_BURST, left + (now_s - then_s) * REQUESTS_PER_S)
-        if len(self._rates) >= SOURCES_REMEMBERED:
+        if len(self._rates) >= SOURCES_MAX:
             del self._rates[next(iter(self._rates))]
         self._rates[source] = (max(0.0, left - 1.0), now_s)
-        busy = [c for c in self._by_peer.values() if c.use is Use.REQUEST and not c.is_known]
+        busy = [
+            c
+            for c in self._by_peer.values()
+            if c.use is ConnectionUse.REQUEST and not c.is_authenticated
+        ]
         of_source = sum(1 for one in busy if one.source == source)
         return (
             left >= 1.0
@@ -120,47 +124,49 @@ class Connections:
             and of_source < REQUESTS_AT_ONCE_PER_SOURCE
         )
 
-    def may_watch(self, newcomer: Connection | None) -> bool:
+    def may_watch(self, new_connection: ClientConnection | None) -> bool:
         """Whether one more watcher is served; where all places are taken, somebody else may go."""
-        self._forget_closed()
-        watchers = [one for one in self._by_peer.values() if one.use is Use.WATCHER]
-        others = [one for one in watchers if one is not newcomer]
+        self._remove_closed()
+        watchers = [one for one in self._by_peer.values() if one.use is ConnectionUse.WATCHER]
+        others = [one for one in watchers if one is not new_connection]
         if len(others) < WATCHERS_MAX:
             return True
-        if newcomer is None:
+        if new_connection is None:
             return False
-        if not newcomer.is_known:
+        if not new_connection.is_authenticated:
             count = Counter(one.source for one in others)
-            others = [one for one in others if count[one.source] > count[newcomer.source] + 1]
+            others = [one for one in others if count[one.source] > count[new_connection.source] + 1]
         return self._close_one(others)
 
     def sweep(self) -> None:
         """End what takes too long."""
-        self._forget_closed()
+        self._remove_closed()
         now_s = time.monotonic()
-        allowed_s = {Use.IDLE: IDLE_MAX_S, Use.REQUEST: REQUEST_MAX_S}
+        allowed_s = {ConnectionUse.IDLE: IDLE_MAX_S, ConnectionUse.REQUEST: REQUEST_MAX_S}
         for one in self._by_peer.values():
             if now_s - one.since_s > allowed_s.get(one.use, float("inf")):
                 one.abort()
 
-    async def keep_sweeping(self) -> None:
+    async def run_sweeps(self) -> None:
         while True:
             await asyncio.sleep(SWEEP_S)
             self.sweep()
 
-    def _close_one(self, among: Iterable[Connection]) -> bool:
+    def _close_one(self, among: Iterable[ClientConnection]) -> bool:
         """Close the least useful anonymous connection: of the source that has most, the oldest."""
-        anonymous = [one for one in among if not one.is_known]
+        anonymous = [one for one in among if not one.is_authenticated]
         if not anonymous:
             return False
         count = Counter(one.source for one in self._by_peer.values())
-        worst = min(anonymous, key=lambda one: (-count[one.source], one.use, one.since_s))
-        worst.abort()
-        self._by_peer = {peer: one for peer, one in self._by_peer.items() if one is not worst}
+        least_useful = min(anonymous, key=lambda one: (-count[one.source], one.use, one.since_s))
+        least_useful.abort()
+        self._by_peer = {
+            peer: one for peer, one in self._by_peer.items() if one is not least_useful
+        }
         self.closed += 1
         return True
 
-    def _forget_closed(self) -> None:
+    def _remove_closed(self) -> None:
         closed = [peer for peer, one in self._by_peer.items() if not one.is_open()]
         for peer in closed:
             del self._by_peer[peer]

@@ -24,23 +24,23 @@ TLS_RECORD_HANDSHAKE: Final = 0x16
 PLAIN_READ_BYTES: Final = 16_384
 
 
-class Listener:
+class ConnectionListener:
     """Accepts connections and gives each to a protocol of its own.
 
     Args:
         listening: a listening socket.
-        make_protocol: makes the protocol of a connection.
+        protocol_factory: makes the protocol of a connection.
         context: the TLS context of the next connection; None where TLS is not used at all.
     """
 
     def __init__(
         self,
         listening: socket.socket,
-        make_protocol: Callable[[], asyncio.Protocol],
+        protocol_factory: Callable[[], asyncio.Protocol],
         context: Callable[[], ssl.SSLContext] | None,
     ) -> None:
         self._listening = listening
-        self._make_protocol = make_protocol
+        self._protocol_factory = protocol_factory
         self._context = context
         self._handshakes: dict[asyncio.Task[None], str] = {}
         listening.setblocking(False)
@@ -63,15 +63,15 @@ class Listener:
                 await asyncio.sleep(PAUSE_S)
                 continue
             if len(self._handshakes) >= HANDSHAKES_MAX:
-                self._end_one()
+                self._cancel_one_handshake()
             task = asyncio.create_task(self._admit(connection))
             self._handshakes[task] = str(address[0])
             task.add_done_callback(self._handshakes.pop)
 
-    def _end_one(self) -> None:
+    def _cancel_one_handshake(self) -> None:
         count = Counter(self._handshakes.values())
-        _, most = max((count[address], address) for address in count)
-        oldest = next(task for task, address in self._handshakes.items() if address == most)
+        _, busiest = max((count[address], address) for address in count)
+        oldest = next(task for task, address in self._handshakes.items() if address == busiest)
         oldest.cancel()
         self._handshakes.pop(oldest)
         oldest.remove_done_callback(self._handshakes.pop)
@@ -93,11 +93,11 @@ class Listener:
             await _readable(connection)
             first = connection.recv(1, socket.MSG_PEEK)
             if first != bytes([TLS_RECORD_HANDSHAKE]):
-                await _answer_plain(connection)
+                await _reject_plain_http(connection)
                 return
             context = self._context()
         await loop.connect_accepted_socket(
-            self._make_protocol,
+            self._protocol_factory,
             connection,
             ssl=context,
             ssl_handshake_timeout=HANDSHAKE_TIMEOUT_S if context else None,
@@ -120,7 +120,7 @@ async def _readable(connection: socket.socket) -> None:
         loop.remove_reader(connection)
 
 
-async def _answer_plain(connection: socket.socket) -> None:
+async def _reject_plain_http(connection: socket.socket) -> None:
     """Say where TLS is spoken to somebody who does not speak it, and close.
 
     Nothing of the request is repeated in the answer.

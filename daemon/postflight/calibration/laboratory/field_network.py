@@ -10,19 +10,19 @@ from typing import Final
 
 import numpy as np
 
-from daemon.postflight.calibration.laboratory.field_measuring import (
-    Exposure,
-    Field,
-    Looks,
+from daemon.postflight.calibration.laboratory.field_measurement import (
+    FieldExposure,
+    TargetField,
+    TargetObservations,
     master_of,
     offset_m,
 )
-from daemon.postflight.calibration.laboratory.head import LENS_KEYS, layer_mm
+from daemon.postflight.calibration.laboratory.head_geometry import LENS_KEYS, layer_mm
 from processing.bundle.network import (
     INTERIOR,
     Attitudes,
-    Camera,
-    Head,
+    CameraModel,
+    HeadMounting,
     ImagePoints,
     Images,
     Network,
@@ -38,9 +38,9 @@ LENS_FREE: Final = ("k1", "k2", "p1", "p2")
 
 def lab_network(
     rig: Rig,
-    exposures: Sequence[Exposure],
-    field: Field,
-    looks: Looks,
+    exposures: Sequence[FieldExposure],
+    field: TargetField,
+    observations: TargetObservations,
     *,
     offset_sigma_mm: float,
     skew_sigma_per_mm: float,
@@ -54,18 +54,20 @@ def lab_network(
     master = master_of(rig)
     cone_index = {cone.name: k for k, cone in enumerate(rig.cones)}
     of_sensor = np.array([cone_index[rig.cone_of(s.name).name] for s in rig.sensors])
-    cone_of_look = of_sensor[looks.sensor]
-    looked = set(cone_of_look.tolist())
-    pairs = sorted(set(zip(looks.exposure.tolist(), cone_of_look.tolist(), strict=True)))
+    cone_of_observation = of_sensor[observations.sensor]
+    observed = set(cone_of_observation.tolist())
+    pairs = sorted(
+        set(zip(observations.exposure.tolist(), cone_of_observation.tolist(), strict=True))
+    )
     image_of = {pair: k for k, pair in enumerate(pairs)}
-    xy = np.empty_like(looks.px)
-    sigma = np.empty_like(looks.px)
+    xy = np.empty_like(observations.px)
+    sigma = np.empty_like(observations.px)
     for j, sensor in enumerate(rig.sensors):
-        own = looks.sensor == j
-        xy[own] = layer_mm(sensor, looks.px[own])
+        own = observations.sensor == j
+        xy[own] = layer_mm(sensor, observations.px[own])
         sigma[own] = sigma_px * sensor.pitch_mm
     heads = tuple(
-        Head(
+        HeadMounting(
             cone.name,
             rotation_matrix(*cone.rotation_rad),
             offset_m(drawn, cone),
@@ -74,9 +76,9 @@ def lab_network(
             offset_sigma_m=offset_sigma_mm * 1e-3 if free else None,
         )
         for k, cone in enumerate(rig.cones)
-        for free in [cone.name != master.name and k in looked]
+        for free in [cone.name != master.name and k in observed]
     )
-    used = np.unique(looks.target)
+    used = np.unique(observations.target)
     point_of = np.full(len(field.names), -1)
     point_of[used] = np.arange(len(used))
     names = tuple(e.name for e in exposures)
@@ -84,9 +86,9 @@ def lab_network(
     return Network(
         cameras=tuple(
             _camera(cone, skew_sigma_per_mm)
-            if k in looked
+            if k in observed
             # A cone that took no part stays as it is.
-            else Camera(cone.name, cone.lens.f_mm)
+            else CameraModel(cone.name, cone.lens.f_mm)
             for k, cone in enumerate(rig.cones)
         ),
         stations=Stations(names, np.stack([e.position_m for e in exposures]), held),
@@ -108,10 +110,12 @@ def lab_network(
             image=np.array(
                 [
                     image_of[pair]
-                    for pair in zip(looks.exposure.tolist(), cone_of_look.tolist(), strict=True)
+                    for pair in zip(
+                        observations.exposure.tolist(), cone_of_observation.tolist(), strict=True
+                    )
                 ]
             ),
-            point=point_of[looks.target],
+            point=point_of[observations.target],
             xy_mm=xy,
             sigma_mm=sigma,
         ),
@@ -123,7 +127,7 @@ def term_name(sensor: Sensor, kind: Kind) -> str:
     return f"{sensor.name} {kind}"
 
 
-def _camera(cone: Cone, skew_sigma_per_mm: float) -> Camera:
+def _camera(cone: Cone, skew_sigma_per_mm: float) -> CameraModel:
     parts = tuple(_part(cone, sensor) for sensor in cone.sensors)
     terms, sigma = [], {}
     for k, sensor in enumerate(cone.sensors):
@@ -135,7 +139,7 @@ def _camera(cone: Cone, skew_sigma_per_mm: float) -> Camera:
             if kind in ("perspective-x", "perspective-y"):
                 sigma[term_name(sensor, kind)] = skew_sigma_per_mm
     interior = np.array([float(getattr(cone.lens, LENS_KEYS[name])) for name in INTERIOR])
-    return Camera(
+    return CameraModel(
         cone.name,
         cone.lens.f_mm,
         interior=interior,

@@ -11,14 +11,20 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.postflight.calibration.laboratory.field import RigCalibration
+from daemon.postflight.calibration.calibration_report import (
+    CalibrationReport,
+    Plot,
+    Previous,
+    Quantity,
+    ReportTable,
+)
+from daemon.postflight.calibration.laboratory.calibration_field import RigCalibration
 from daemon.postflight.calibration.laboratory.field_network import LENS_FREE
-from daemon.postflight.calibration.laboratory.head import LENS_KEYS
-from daemon.postflight.calibration.laboratory.report import of_series
-from daemon.postflight.calibration.laboratory.series import Series
+from daemon.postflight.calibration.laboratory.head_geometry import LENS_KEYS
+from daemon.postflight.calibration.laboratory.laboratory_report import of_series
+from daemon.postflight.calibration.laboratory.laboratory_series import LaboratorySeries
 from daemon.postflight.calibration.plots import histogram_svg, map_svg, vectors_svg
-from daemon.postflight.calibration.report import CalibrationReport, Plot, Previous, Quantity, Sheet
-from processing.bundle.findings import image_residuals_mm, systematic_residuals
+from processing.bundle.adjustment_results import image_residuals_mm, systematic_residuals
 from processing.bundle.network import INTERIOR
 from processing.rig import Rig
 
@@ -26,7 +32,7 @@ Array = NDArray[np.float64]
 
 HIGH_CORRELATION: Final = 0.9
 _CELLS: Final = (16, 12)
-_MOST_PAIRS: Final = 30
+_MAX_PAIRS: Final = 30
 
 _KINDS: Final = {
     "shift-x": ("x", "um", 1e3),
@@ -39,7 +45,7 @@ _KINDS: Final = {
 
 
 @dataclass(frozen=True)
-class Estimated:
+class EstimatedParameter:
     """One estimated number with its column in the adjustment. `value` and `before` in the
     adjustment's units (mm, rad, 1, m), `factor` of `unit` to one of these."""
 
@@ -52,7 +58,7 @@ class Estimated:
     column: int
 
 
-def estimated(found: RigCalibration) -> list[Estimated]:
+def estimated_parameters(found: RigCalibration) -> list[EstimatedParameter]:
     """All parameters of the rig, as the rig file has them."""
     result, rows = found.adjustment, []
     new, old = found.rig, found.before
@@ -65,7 +71,9 @@ def estimated(found: RigCalibration) -> list[Estimated]:
             unit = "mm^-2" if name == "k1" else "mm^-4" if name == "k2" else "mm^-1"
             value = float(getattr(cone.lens, LENS_KEYS[name]))
             was = float(getattr(before.lens, LENS_KEYS[name]))
-            rows.append(Estimated(f"cone {cone.name}", name, unit, 1.0, value, was, column))
+            rows.append(
+                EstimatedParameter(f"cone {cone.name}", name, unit, 1.0, value, was, column)
+            )
         names = [t.name for t in result.network.cameras[k].terms]
         for name, column in zip(names, result.layout.terms[k].tolist(), strict=True):
             sensor, kind = name.rsplit(" ", 1)
@@ -79,12 +87,12 @@ def estimated(found: RigCalibration) -> list[Estimated]:
                 "perspective-x": (a.skew_per_mm[0], b.skew_per_mm[0]),
                 "perspective-y": (a.skew_per_mm[1], b.skew_per_mm[1]),
             }[kind]
-            rows.append(Estimated(sensor, what, unit, factor, value, was, int(column)))
+            rows.append(EstimatedParameter(sensor, what, unit, factor, value, was, int(column)))
         for axis, what in enumerate(("omega", "phi", "kappa")):
             column = int(result.layout.head_rotation[k, axis])
             if column >= 0:
                 rows.append(
-                    Estimated(
+                    EstimatedParameter(
                         f"cone {cone.name}",
                         what,
                         "urad",
@@ -97,7 +105,7 @@ def estimated(found: RigCalibration) -> list[Estimated]:
     return rows
 
 
-def covariance_of(found: RigCalibration, rows: Sequence[Estimated]) -> Array:
+def covariance_of(found: RigCalibration, rows: Sequence[EstimatedParameter]) -> Array:
     """Covariance (n, n) in the adjustment's units. A cone's angles are small about its own axes:
     their rotation vector and omega, phi, kappa are taken as one."""
     columns = np.array([r.column for r in rows])
@@ -105,7 +113,7 @@ def covariance_of(found: RigCalibration, rows: Sequence[Estimated]) -> Array:
     return np.asarray(result.sigma0**2 * result.cofactor[np.ix_(columns, columns)])
 
 
-def covariance_bytes(rows: Sequence[Estimated], covariance: Array) -> bytes:
+def covariance_bytes(rows: Sequence[EstimatedParameter], covariance: Array) -> bytes:
     """`covariance.npz`: names, values and covariance in mm, rad and ones."""
     stream = io.BytesIO()
     np.savez(
@@ -118,7 +126,7 @@ def covariance_bytes(rows: Sequence[Estimated], covariance: Array) -> bytes:
 
 
 def field_report(
-    series: Series,
+    series: LaboratorySeries,
     found: RigCalibration,
     *,
     calibration_id: str,
@@ -126,7 +134,7 @@ def field_report(
     previous: tuple[Path, Previous] | None,
 ) -> CalibrationReport:
     """Tell it all."""
-    rows = estimated(found)
+    rows = estimated_parameters(found)
     covariance = covariance_of(found, rows)
     sigma = np.sqrt(np.diag(covariance))
     quantities = [
@@ -151,7 +159,7 @@ def field_report(
             f"no temperature of {', '.join(sorted(missing))}: the new places are taken to hold at "
             "the old calibration's temperature"
         )
-    looks = int(good.sum())
+    point_count = int(good.sum())
     report = CalibrationReport(
         kind="lab",
         title=f"Laboratory calibration of {rig.name}",
@@ -160,7 +168,7 @@ def field_report(
         facts=[
             ("exposures", str(len(result.network.stations.names))),
             ("targets", str(len(result.network.points.names))),
-            ("image points", f"{looks}, {found.rejected} left out"),
+            ("image points", f"{point_count}, {found.rejected} left out"),
             *((f"probe {n}", f"{v:.2f} degC") for n, v in found.temperatures_c.items()),
         ],
         serials={},
@@ -171,17 +179,17 @@ def field_report(
             "redundancy": result.redundancy,
             "unknowns": result.unknowns,
             "observations": result.observations,
-            "image_points": looks,
+            "image_points": point_count,
             "rejected": found.rejected,
         },
         verdicts=[
-            f"{looks} image points, redundancy {result.redundancy}; sigma of an image coordinate "
+            f"{point_count} image points, redundancy {result.redundancy}; sigma of an image coordinate "
             f"{found.sigma_px:.4f} px, sigma0 {result.sigma0:.3f}.",
             "Datum: principal distance and point of every cone as they were, the first CCD of "
             "each cone not turned, the master cone not rotated.",
         ],
         warnings=warnings,
-        sheets=[_parameters(rows, sigma), _correlated(rows, covariance), _cones(found)],
+        tables=[_parameters(rows, sigma), _correlated(rows, covariance), _cones(found)],
         plots=_plots(found, rows, covariance),
     )
     return of_series(
@@ -193,8 +201,8 @@ def field_report(
     )
 
 
-def _parameters(rows: Sequence[Estimated], sigma: Array) -> Sheet:
-    return Sheet(
+def _parameters(rows: Sequence[EstimatedParameter], sigma: Array) -> ReportTable:
+    return ReportTable(
         "Parameters",
         ("where", "what", "value", "before", "change", "sigma", "unit", "change / sigma"),
         [
@@ -215,13 +223,13 @@ def _parameters(rows: Sequence[Estimated], sigma: Array) -> Sheet:
     )
 
 
-def _correlated(rows: Sequence[Estimated], covariance: Array) -> Sheet:
+def _correlated(rows: Sequence[EstimatedParameter], covariance: Array) -> ReportTable:
     spread = np.sqrt(np.diag(covariance))
     correlation = covariance / spread[:, None] / spread
     i, j = np.triu_indices(len(rows), 1)
     order = np.argsort(-np.abs(correlation[i, j]))
     high = [k for k in order.tolist() if abs(correlation[i[k], j[k]]) > HIGH_CORRELATION]
-    return Sheet(
+    return ReportTable(
         f"Correlations beyond {HIGH_CORRELATION:g}",
         ("one", "other", "correlation"),
         [
@@ -230,13 +238,13 @@ def _correlated(rows: Sequence[Estimated], covariance: Array) -> Sheet:
                 f"{rows[j[k]].where} {rows[j[k]].what}",
                 f"{correlation[i[k], j[k]]:+.3f}",
             )
-            for k in high[:_MOST_PAIRS]
+            for k in high[:_MAX_PAIRS]
         ],
         f"{len(high)} of {len(i)} pairs; all of them are in covariance.npz.",
     )
 
 
-def _cones(found: RigCalibration) -> Sheet:
+def _cones(found: RigCalibration) -> ReportTable:
     result = found.adjustment
     residual = image_residuals_mm(result)
     table, rows = result.network.image_points, []
@@ -254,18 +262,20 @@ def _cones(found: RigCalibration) -> Sheet:
                 float(np.hypot(*own.T).max()) / pitch if len(own) else None,
             )
         )
-    return Sheet(
+    return ReportTable(
         "What is left", ("cone", "image points", "RMS x px", "RMS y px", "largest px"), rows
     )
 
 
-def _plots(found: RigCalibration, rows: Sequence[Estimated], covariance: Array) -> list[Plot]:
+def _plots(
+    found: RigCalibration, rows: Sequence[EstimatedParameter], covariance: Array
+) -> list[Plot]:
     result, plots = found.adjustment, []
     for k, cone in enumerate(found.rig.cones):
         if not result.network.cameras[k].terms:
             continue
         pattern = systematic_residuals(result, k, _CELLS)
-        half = _half(found.rig, k)
+        half = _half_extent(found.rig, k)
         plots.append(
             Plot(
                 f"Cone {cone.name}: mean residuals",
@@ -298,7 +308,7 @@ def _plots(found: RigCalibration, rows: Sequence[Estimated], covariance: Array) 
     return plots
 
 
-def _half(rig: Rig, cone: int) -> tuple[float, float]:
+def _half_extent(rig: Rig, cone: int) -> tuple[float, float]:
     sensors = rig.cones[cone].sensors
     return (
         max(abs(s.x_mm) + s.width_px * s.pitch_mm / 2.0 for s in sensors) * 1.02,

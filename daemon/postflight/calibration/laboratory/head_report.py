@@ -10,12 +10,18 @@ from typing import Any, Final
 
 import numpy as np
 
-from daemon.postflight.calibration.laboratory.head import LENS_KEYS, HeadGeometry
-from daemon.postflight.calibration.laboratory.report import of_series
-from daemon.postflight.calibration.laboratory.series import Series
+from daemon.postflight.calibration.calibration_report import (
+    CalibrationReport,
+    Plot,
+    Previous,
+    Quantity,
+    ReportTable,
+)
+from daemon.postflight.calibration.laboratory.head_geometry import LENS_KEYS, HeadGeometry
+from daemon.postflight.calibration.laboratory.laboratory_report import of_series
+from daemon.postflight.calibration.laboratory.laboratory_series import LaboratorySeries
 from daemon.postflight.calibration.plots import Curve, chart_svg, histogram_svg, vectors_svg
-from daemon.postflight.calibration.report import CalibrationReport, Plot, Previous, Quantity, Sheet
-from processing.bundle.findings import Parameter, exposures_of, parameters_of
+from processing.bundle.adjustment_results import EstimatedParameter, exposures_of, parameters_of
 from processing.bundle.network import INTERIOR
 from processing.rig import Rig
 
@@ -53,7 +59,7 @@ def calibrated_rig(
 
 
 def head_report(
-    series: Series,
+    series: LaboratorySeries,
     heads: Sequence[HeadGeometry],
     *,
     calibration_id: str,
@@ -64,16 +70,16 @@ def head_report(
     quantities = [q for head in heads for q in quantities_of(head)]
     verdicts, warnings = [], []
     for head in heads:
-        told = (
+        sentence = (
             f"{head.cone.name}: {len(head.measured_mm)} targets in {len(head.series)} series leave "
             f"{head.residual_px:.4f} px = {head.residual_px * head.sensor.pitch_um:.3f} um (root "
-            f"mean square of a coordinate) to the ten parameters, {head.left_px:.4f} px with "
+            f"mean square of a coordinate) to the ten parameters, {head.grid_residual_px:.4f} px with "
             "the grid"
         )
         if head.residual_px < RESIDUAL_BAR_PX:
-            verdicts.append(f"{told}; below 1/20 px.")
+            verdicts.append(f"{sentence}; below 1/20 px.")
         else:
-            warnings.append(f"{told}; 1/20 px is the bar.")
+            warnings.append(f"{sentence}; 1/20 px is the bar.")
         warnings += _warnings(head)
     report = CalibrationReport(
         kind="head",
@@ -89,7 +95,7 @@ def head_report(
         figures={h.cone.name: _figures(h) for h in heads},
         verdicts=verdicts,
         warnings=warnings,
-        sheets=[_parameters(heads), _correlations(heads), _series(heads), _fit(heads)],
+        tables=[_parameters(heads), _correlations(heads), _series(heads), _fit(heads)],
         plots=[plot for head in heads for plot in _plots(head)],
     )
     sensors = {h.sensor.name for h in heads}
@@ -113,7 +119,7 @@ def _warnings(head: HeadGeometry) -> list[str]:
     return found
 
 
-def _parameters(heads: Sequence[HeadGeometry]) -> Sheet:
+def _parameters(heads: Sequence[HeadGeometry]) -> ReportTable:
     rows: list[tuple[str | float | None, ...]] = []
     for head in heads:
         for p in parameters_of(head.adjustment):
@@ -128,10 +134,10 @@ def _parameters(heads: Sequence[HeadGeometry]) -> Sheet:
                     float(f"{p.t:.1f}"),
                     before,
                     _at_corner_um(head, p),
-                    ", ".join(f"{name} {r:+.3f}" for name, r in p.correlated) or None,
+                    ", ".join(f"{name} {r:+.3f}" for name, r in p.high_correlations) or None,
                 )
             )
-    return Sheet(
+    return ReportTable(
         "Parameters",
         (
             "head",
@@ -150,7 +156,7 @@ def _parameters(heads: Sequence[HeadGeometry]) -> Sheet:
     )
 
 
-def _at_corner_um(head: HeadGeometry, p: Parameter) -> float:
+def _at_corner_um(head: HeadGeometry, p: EstimatedParameter) -> float:
     """What one sigma of a parameter moves the corner of the field by."""
     half = np.array([head.sensor.width_px, head.sensor.height_px]) * head.sensor.pitch_mm / 2.0
     x, y = (float(v) for v in half)
@@ -170,7 +176,7 @@ def _at_corner_um(head: HeadGeometry, p: Parameter) -> float:
     return float(f"{1e3 * effect[p.name] * p.sigma:.3g}")
 
 
-def _correlations(heads: Sequence[HeadGeometry]) -> Sheet:
+def _correlations(heads: Sequence[HeadGeometry]) -> ReportTable:
     rows: list[tuple[str | float | None, ...]] = []
     names: tuple[str, ...] = ()
     for head in heads:
@@ -182,10 +188,10 @@ def _correlations(heads: Sequence[HeadGeometry]) -> Sheet:
         spread = np.sqrt(np.diag(own))
         for name, row in zip(names, own / spread[:, None] / spread, strict=True):
             rows.append((f"{head.cone.name} {name}", *(f"{v:+.2f}" for v in row)))
-    return Sheet("Correlations", ("", *names), rows)
+    return ReportTable("Correlations", ("", *names), rows)
 
 
-def _series(heads: Sequence[HeadGeometry]) -> Sheet:
+def _series(heads: Sequence[HeadGeometry]) -> ReportTable:
     rows: list[tuple[str | float | None, ...]] = [
         (
             o.name,
@@ -195,14 +201,14 @@ def _series(heads: Sequence[HeadGeometry]) -> Sheet:
         for head in heads
         for o in exposures_of(head.adjustment)
     ]
-    return Sheet(
+    return ReportTable(
         "Orientation of each series: three unknowns",
         ("series", "omega deg", "phi deg", "kappa deg", "sigma urad", "sigma urad", "sigma urad"),
         rows,
     )
 
 
-def _fit(heads: Sequence[HeadGeometry]) -> Sheet:
+def _fit(heads: Sequence[HeadGeometry]) -> ReportTable:
     rows = [
         (
             h.cone.name,
@@ -214,11 +220,11 @@ def _fit(heads: Sequence[HeadGeometry]) -> Sheet:
             1e3 * h.sigma_mm * _factor(h),
             h.residual_px,
             float(np.hypot(*h.residual_mm.T).max()) / h.sensor.pitch_mm,
-            h.left_px,
+            h.grid_residual_px,
         )
         for h in heads
     ]
-    return Sheet(
+    return ReportTable(
         "What is left",
         (
             "head",
@@ -253,7 +259,7 @@ def _figures(head: HeadGeometry) -> dict[str, Any]:
         "sigma_um": 1e3 * head.sigma_mm * _factor(head),
         "expected_sigma_um": 1e3 * head.sigma_mm,
         "residual_px": head.residual_px,
-        "residual_with_grid_px": head.left_px,
+        "residual_with_grid_px": head.grid_residual_px,
         "matching_sigma_px": float(np.nanmedian(head.matching.sigma_px)),
         "temperature_c": head.temperature_c,
         "rejected": int(head.adjustment.rejected.sum()),

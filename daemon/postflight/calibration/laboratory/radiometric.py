@@ -16,17 +16,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.mission.store.level0 import read_tiff
-from daemon.postflight.calibration.laboratory.series import Series, SeriesError
+from daemon.postflight.calibration.laboratory.laboratory_series import LaboratorySeries, SeriesError
 from processing.calibration.radiometric.dark_signal import DarkSignal, fit_dark_signal
-from processing.calibration.radiometric.defects import Defects, find_defects, smooth_field
+from processing.calibration.radiometric.defects import DefectMap, find_defects, smooth_field
+from processing.calibration.radiometric.flat_residual import FlatResidual, flat_residual
+from processing.calibration.radiometric.frame_series import (
+    FrameAccumulator,
+    FrameSet,
+    Map,
+    SeriesCondition,
+    select_light,
+)
 from processing.calibration.radiometric.photon_transfer import (
-    Ladder,
+    ExposureSeries,
     PhotonTransfer,
-    ladder_of,
+    exposure_series_of,
     photon_transfer,
 )
-from processing.calibration.radiometric.residual import FlatResidual, flat_residual
-from processing.calibration.radiometric.series import Condition, FrameSet, Gathering, Map, of_light
 from processing.calibration.radiometric.spatial_noise import SpatialNoise, spatial_noise
 from processing.calibration.radiometric.vignetting import ApertureModel, fit_aperture
 from processing.radiometry.calibration import GAIN_LIMITS, RadiometricCalibration
@@ -36,11 +42,11 @@ Progress = Callable[[str], None]
 
 _SET_SPREAD_K: Final = 3.0
 _SAME_TEMPERATURE_K: Final = 2.0
-_TOLD_SIGMAS: Final = 4.0
+_SIGNIFICANT_SIGMAS: Final = 4.0
 
 
 @dataclass(frozen=True)
-class Shot:
+class CalibrationShot:
     """One image of the series."""
 
     path: Path
@@ -67,10 +73,10 @@ class HeadCalibration:
     sensor: Sensor
     dark: DarkSignal
     transfer: PhotonTransfer
-    ladder: Ladder
+    ladder: ExposureSeries
     prnu: SpatialNoise
     dsnu_dn: SpatialNoise
-    defects: Defects
+    defects: DefectMap
     signal_per_light: Map
     gain: Map
     gain_c: float
@@ -103,10 +109,10 @@ class HeadCalibration:
         if self.response_per_k is None:
             return False
         value, sigma = self.response_per_k
-        return abs(value) > _TOLD_SIGMAS * sigma
+        return abs(value) > _SIGNIFICANT_SIGMAS * sigma
 
 
-def shots_of(series: Series) -> list[Shot]:
+def shots_of(series: LaboratorySeries) -> list[CalibrationShot]:
     """The images of the series, every one checked.
 
     Raises:
@@ -114,7 +120,7 @@ def shots_of(series: Series) -> list[Shot]:
     """
     known = [s.name for s in series.rig.sensors]
     shots = [
-        Shot(
+        CalibrationShot(
             path=series.file(image),
             sensor=image.choice("sensor", known),
             set_name=image.text("set"),
@@ -130,19 +136,19 @@ def shots_of(series: Series) -> list[Shot]:
     ]
     problems = series.table.problems
     for members in sets_of(shots).values():
-        problems += _unlike(members)
+        problems += _differing_conditions(members)
     return shots
 
 
-def sets_of(shots: Sequence[Shot]) -> dict[str, list[Shot]]:
+def sets_of(shots: Sequence[CalibrationShot]) -> dict[str, list[CalibrationShot]]:
     """Images by the name of their set, in the order of the series."""
-    sets: dict[str, list[Shot]] = {}
+    sets: dict[str, list[CalibrationShot]] = {}
     for shot in shots:
         sets.setdefault(shot.set_name, []).append(shot)
     return sets
 
 
-def _unlike(members: Sequence[Shot]) -> list[str]:
+def _differing_conditions(members: Sequence[CalibrationShot]) -> list[str]:
     first = members[0]
     keys = ("sensor", "light", "use", "exposure_time_s", "f_number", "tdi_shifts")
     found = [
@@ -166,7 +172,7 @@ def _unlike(members: Sequence[Shot]) -> list[str]:
 
 def calibrate_sensor(
     sensor: Sensor,
-    shots: Sequence[Shot],
+    shots: Sequence[CalibrationShot],
     *,
     temperature_sigma_c: float,
     monitor_sigma: float,
@@ -181,9 +187,9 @@ def calibrate_sensor(
     fit: list[FrameSet] = []
     for name, members in sets_of(shots).items():
         if members[0].use == "fit":
-            fit.append(_gathered(sensor, name, members))
+            fit.append(_averaged(sensor, name, members))
         progress(f"{sensor.name}: {name}")
-    dark_sets, flat_sets = of_light(fit, "dark"), of_light(fit, "flat")
+    dark_sets, flat_sets = select_light(fit, "dark"), select_light(fit, "flat")
     plain = [s for s in flat_sets if s.condition.tdi_shifts == 0]
     if not plain:
         raise SeriesError([f"{sensor.name}: no flat set without TDI; take some"])
@@ -196,7 +202,7 @@ def calibrate_sensor(
             temperature_sigma_c=temperature_sigma_c,
         )
         signal = _signal(main, dark)
-        base = [s for s in plain if _like(s, main)]
+        base = [s for s in plain if _same_conditions(s, main)]
         steps, transfer = _transferred(base, dark_sets, dark, ~main.clipped)
         predicted = transfer.variance_dn2(np.maximum(signal, 0.0), steps.dark_dn2)
         defects = find_defects(signal, dark.dark_dn_per_s, main.variance / predicted)
@@ -237,7 +243,9 @@ def calibrate_sensor(
     )
 
 
-def checks_of(head: HeadCalibration, shots: Sequence[Shot]) -> tuple[tuple[str, FlatResidual], ...]:
+def checks_of(
+    head: HeadCalibration, shots: Sequence[CalibrationShot]
+) -> tuple[tuple[str, FlatResidual], ...]:
     """Correct the frames set apart as the pipeline will, and hold what is left of even light
     against photon transfer. One entry a set, of its frames' mean."""
     found = []
@@ -281,9 +289,9 @@ def _peak(head: HeadCalibration) -> float:
     return float(smooth_field(head.signal_per_light).max())
 
 
-def _gathered(sensor: Sensor, name: str, members: Sequence[Shot]) -> FrameSet:
+def _averaged(sensor: Sensor, name: str, members: Sequence[CalibrationShot]) -> FrameSet:
     first = members[0]
-    condition = Condition(
+    condition = SeriesCondition(
         name=name,
         light=first.light,
         exposure_time_s=first.exposure_time_s,
@@ -292,16 +300,16 @@ def _gathered(sensor: Sensor, name: str, members: Sequence[Shot]) -> FrameSet:
         temperature_c=float(np.mean([m.temperature_c for m in members])),
         monitor=float(np.mean([m.monitor for m in members])) if first.light == "flat" else 0.0,
     )
-    gathering = Gathering(condition, sensor.black_dn, sensor.full_scale_dn)
+    averaging = FrameAccumulator(condition, sensor.black_dn, sensor.full_scale_dn)
     for member in members:
-        gathering.add(_frame(sensor, member), temperature_c=member.temperature_c)
+        averaging.add(_frame(sensor, member), temperature_c=member.temperature_c)
     try:
-        return gathering.finished()
+        return averaging.result()
     except ValueError as error:
         raise SeriesError([f"{sensor.name}: {error}"]) from error
 
 
-def _frame(sensor: Sensor, shot: Shot) -> NDArray[np.uint16]:
+def _frame(sensor: Sensor, shot: CalibrationShot) -> NDArray[np.uint16]:
     return read_tiff(shot.path, width_px=sensor.width_px, height_px=sensor.height_px)
 
 
@@ -310,7 +318,7 @@ def _signal(frames: FrameSet, dark: DarkSignal) -> Map:
     return np.asarray(frames.mean - dark.offset(c.exposure_time_s, c.temperature_c), np.float32)
 
 
-def _like(frames: FrameSet, main: FrameSet) -> bool:
+def _same_conditions(frames: FrameSet, main: FrameSet) -> bool:
     a, b = frames.condition, main.condition
     near = abs(a.temperature_c - b.temperature_c) < _SAME_TEMPERATURE_K
     return near and a.f_number == b.f_number
@@ -318,7 +326,7 @@ def _like(frames: FrameSet, main: FrameSet) -> bool:
 
 def _transferred(
     base: Sequence[FrameSet], dark_sets: Sequence[FrameSet], dark: DarkSignal, good: Any
-) -> tuple[Ladder, PhotonTransfer]:
+) -> tuple[ExposureSeries, PhotonTransfer]:
     steps = []
     for s in base:
         noise = float(np.mean(s.variance[good], dtype=np.float64))
@@ -335,7 +343,7 @@ def _transferred(
     short = [s for s in dark_sets if s.condition.exposure_time_s == shortest]
     noise = float(np.mean([np.mean(s.variance[good], dtype=np.float64) for s in short]))
     freedom = sum(s.count - 1 for s in short) * int(good.sum())
-    ladder = ladder_of(steps, (noise, noise * math.sqrt(2.0 / freedom)))
+    ladder = exposure_series_of(steps, (noise, noise * math.sqrt(2.0 / freedom)))
     return ladder, photon_transfer(ladder)
 
 

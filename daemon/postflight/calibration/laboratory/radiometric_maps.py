@@ -15,8 +15,8 @@ from typing import Final
 
 import numpy as np
 
+from daemon.postflight.calibration.calibration_report import ReportTable
 from daemon.postflight.calibration.laboratory.radiometric import HeadCalibration
-from daemon.postflight.calibration.report import Sheet
 from processing.radiometry.calibration import (
     GAIN_LIMITS,
     CalibrationError,
@@ -62,7 +62,9 @@ def calibration_bytes(calibration: RadiometricCalibration) -> bytes:
     return stream.getvalue()
 
 
-def maps_against(folder: Path, heads: Sequence[HeadCalibration], f_number: float) -> Sheet | None:
+def maps_against(
+    folder: Path, heads: Sequence[HeadCalibration], f_number: float
+) -> ReportTable | None:
     """Pixel by pixel against the maps of the previous calibration, where they are there."""
     rows: list[tuple[str | float | int | None, ...]] = []
     for head in heads:
@@ -81,7 +83,7 @@ def maps_against(folder: Path, heads: Sequence[HeadCalibration], f_number: float
         common = float(np.median(change))
         # Both maps are taken to hold the noise of this one.
         expected = head.gain_noise * math.sqrt(2.0)
-        apart = np.abs(change - common) > _CHANGED_SIGMAS * expected
+        changed = np.abs(change - common) > _CHANGED_SIGMAS * expected
         bias = head.dark.bias_sigma_dn * math.sqrt(2.0)
         rows.append(
             (
@@ -89,7 +91,7 @@ def maps_against(folder: Path, heads: Sequence[HeadCalibration], f_number: float
                 100.0 * common,
                 100.0 * float(np.std(change)),
                 100.0 * expected,
-                int(apart.sum()),
+                int(changed.sum()),
                 float(np.std((new.bias_dn - old.bias_dn)[good])),
                 bias,
                 int(((new.defect != 0) & (old.defect == 0)).sum()),
@@ -98,7 +100,7 @@ def maps_against(folder: Path, heads: Sequence[HeadCalibration], f_number: float
         )
     if not rows:
         return None
-    return Sheet(
+    return ReportTable(
         "Maps against the previous calibration",
         (
             "sensor",

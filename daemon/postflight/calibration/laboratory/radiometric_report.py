@@ -9,12 +9,18 @@ from typing import Any, Final
 
 import numpy as np
 
+from daemon.postflight.calibration.calibration_report import (
+    CalibrationReport,
+    Plot,
+    Previous,
+    Quantity,
+    ReportTable,
+)
+from daemon.postflight.calibration.laboratory.laboratory_report import of_series
+from daemon.postflight.calibration.laboratory.laboratory_series import LaboratorySeries
 from daemon.postflight.calibration.laboratory.radiometric import HeadCalibration
 from daemon.postflight.calibration.laboratory.radiometric_maps import maps_against
-from daemon.postflight.calibration.laboratory.report import of_series
-from daemon.postflight.calibration.laboratory.series import Series
 from daemon.postflight.calibration.plots import Curve, chart_svg, histogram_svg, map_svg
-from daemon.postflight.calibration.report import CalibrationReport, Plot, Previous, Quantity, Sheet
 from processing.calibration.radiometric.defects import relative_response
 
 RATIO_BAR: Final = 1.05
@@ -29,7 +35,7 @@ def quantities_of(head: HeadCalibration) -> list[Quantity]:
     level = float(np.median(head.dark.dark_dn_per_s))
     found = [
         Quantity(where, "system gain K", "DN/e", t.gain_dn_per_e, t.gain_sigma),
-        Quantity(where, "dark noise", "e", t.dark_noise_e, t.dark_noise_sigma_e),
+        Quantity(where, "dark noise", "e", t.temporal_dark_noise_e, t.dark_noise_sigma_e),
         Quantity(where, "saturation", "e", t.saturation_e, None),
         Quantity(where, "dynamic range", "dB", 20.0 * math.log10(t.dynamic_range), None),
         Quantity(where, "linearity error", "%", t.linearity_percent, None),
@@ -61,7 +67,7 @@ def quantities_of(head: HeadCalibration) -> list[Quantity]:
 
 
 def radiometric_report(
-    series: Series,
+    series: LaboratorySeries,
     heads: Sequence[HeadCalibration],
     *,
     calibration_id: str,
@@ -81,18 +87,20 @@ def radiometric_report(
     if worst is None:
         warnings.append('No image was set apart (`use` = "check"): nothing was verified.')
     else:
-        told = f"Corrected flat fields leave at most {worst:.3f} of what photon transfer predicts"
+        sentence = (
+            f"Corrected flat fields leave at most {worst:.3f} of what photon transfer predicts"
+        )
         if worst <= RATIO_BAR:
-            verdicts.append(f"{told}: limited by shot noise.")
+            verdicts.append(f"{sentence}: limited by shot noise.")
         else:
-            warnings.append(f"{told}; up to {RATIO_BAR:g} is limited by shot noise.")
+            warnings.append(f"{sentence}; up to {RATIO_BAR:g} is limited by shot noise.")
     for head in heads:
         warnings += _warnings(head)
-    sheets = [_emva(heads), _defects(heads), _functional(heads), _checks(heads)]
+    tables = [_emva(heads), _defects(heads), _functional(heads), _checks(heads)]
     if previous is not None:
         compared = maps_against(previous[0], heads, apertures[0])
         if compared is not None:
-            sheets.append(compared)
+            tables.append(compared)
     report = CalibrationReport(
         kind="radiometric",
         title=f"Radiometric calibration of {series.rig.name}",
@@ -107,7 +115,7 @@ def radiometric_report(
         figures={h.sensor.name: _figures(h) for h in heads},
         verdicts=verdicts,
         warnings=warnings,
-        sheets=sheets,
+        tables=tables,
         plots=[plot for head in heads for plot in _plots(head)],
     )
     sensors = {h.sensor.name for h in heads}
@@ -134,7 +142,7 @@ def _warnings(head: HeadCalibration) -> list[str]:
     return found
 
 
-def _emva(heads: Sequence[HeadCalibration]) -> Sheet:
+def _emva(heads: Sequence[HeadCalibration]) -> ReportTable:
     rows = []
     for h in heads:
         t = h.transfer
@@ -142,11 +150,11 @@ def _emva(heads: Sequence[HeadCalibration]) -> Sheet:
             (
                 h.sensor.name,
                 f"{t.gain_dn_per_e:.6f} ± {t.gain_sigma:.6f}",
-                f"{t.dark_noise_e:.2f} ± {t.dark_noise_sigma_e:.2f}",
+                f"{t.temporal_dark_noise_e:.2f} ± {t.dark_noise_sigma_e:.2f}",
                 f"{t.saturation_e:.0f}",
-                f"{t.threshold_e:.1f}",
+                f"{t.absolute_threshold_e:.1f}",
                 f"{t.dynamic_range:.0f} = {20 * math.log10(t.dynamic_range):.1f} dB",
-                f"{t.best_ratio:.0f} = {20 * math.log10(t.best_ratio):.1f} dB",
+                f"{t.snr_max:.0f} = {20 * math.log10(t.snr_max):.1f} dB",
                 f"{t.linearity_percent:.3f}",
                 f"{100 * h.prnu.total:.3f} ({100 * h.prnu.column:.3f} {100 * h.prnu.row:.3f} "
                 f"{100 * h.prnu.pixel:.3f})",
@@ -154,7 +162,7 @@ def _emva(heads: Sequence[HeadCalibration]) -> Sheet:
                 f" {h.dsnu_dn.row / t.gain_dn_per_e:.2f} {h.dsnu_dn.pixel / t.gain_dn_per_e:.2f})",
             )
         )
-    return Sheet(
+    return ReportTable(
         "In the manner of EMVA 1288",
         (
             "sensor",
@@ -176,7 +184,7 @@ def _emva(heads: Sequence[HeadCalibration]) -> Sheet:
     )
 
 
-def _defects(heads: Sequence[HeadCalibration]) -> Sheet:
+def _defects(heads: Sequence[HeadCalibration]) -> ReportTable:
     rows = []
     for h in heads:
         d = h.defects
@@ -188,20 +196,20 @@ def _defects(heads: Sequence[HeadCalibration]) -> Sheet:
             (
                 h.sensor.name,
                 int((d.mask != 0).sum()),
-                d.single,
+                d.single_pixels,
                 f"{len(d.clusters)} ({', '.join(str(c) for c in d.clusters[:6])})",
                 f"{len(d.columns)}: {columns}{more}" if d.columns else "0",
                 ", ".join(f"{cause} {n}" for cause, n in d.by_cause.items()),
             )
         )
-    return Sheet(
+    return ReportTable(
         "Defects",
         ("sensor", "pixels", "single", "clusters (px)", "columns: rows", "stand out by"),
         rows,
     )
 
 
-def _functional(heads: Sequence[HeadCalibration]) -> Sheet:
+def _functional(heads: Sequence[HeadCalibration]) -> ReportTable:
     rows = []
     for h in heads:
         a = h.aperture
@@ -218,10 +226,10 @@ def _functional(heads: Sequence[HeadCalibration]) -> Sheet:
                 per_k,
                 ", ".join(f"{c:+.4f}" for c in a.coefficients),
                 ", ".join(f"f/{f:g} {m:.3f}" for f, m in a.misfit_percent.items()) or "–",
-                ", ".join(f"f/{f:g} {v:.4f}" for f, v in a.light.items()),
+                ", ".join(f"f/{f:g} {v:.4f}" for f, v in a.illumination.items()),
             )
         )
-    return Sheet(
+    return ReportTable(
         "Functional model",
         (
             "sensor",
@@ -240,13 +248,13 @@ def _functional(heads: Sequence[HeadCalibration]) -> Sheet:
     )
 
 
-def _checks(heads: Sequence[HeadCalibration]) -> Sheet:
+def _checks(heads: Sequence[HeadCalibration]) -> ReportTable:
     rows = [
         (h.sensor.name, title, c.mean_dn, c.residual_dn, c.ratio)
         for h in heads
         for title, c in h.checks
     ]
-    return Sheet(
+    return ReportTable(
         "Frames set apart, corrected",
         ("sensor", "condition", "signal DN", "residual DN", "residual over photon transfer"),
         rows,
@@ -267,7 +275,7 @@ def _figures(head: HeadCalibration) -> dict[str, Any]:
         "dark_sigma_dn_per_s": head.dark.dark_sigma_dn_per_s,
         "dark_misfit": head.dark.misfit,
         "defects": {
-            "single": d.single,
+            "single": d.single_pixels,
             "clusters": list(d.clusters),
             "columns": [[c.column, c.first_row, c.last_row] for c in d.columns],
         },

@@ -11,8 +11,8 @@ from daemon.configuration.model import MountSection
 from daemon.mission.exposure import Exposure, from_json, to_json
 from daemon.mission.log.log_records import message_of, record_of
 from daemon.onboard.flight.flight import Flight
-from daemon.orientation.footprints import seen_from
-from daemon.orientation.in_flight import orientation_json
+from daemon.orientation.footprints import footprint_corners
+from daemon.orientation.in_flight_orientation import orientation_json
 from processing.quality.report import Flag
 from tests.daemon.onboard.flight.test_flight import (
     NS,
@@ -55,10 +55,10 @@ def test_an_exposure_among_positions_without_a_height_has_none() -> None:
     written = json.loads(json.dumps(to_json(exposure)))
     assert written["navigation"]["height_m"] is None
     assert from_json(written) == exposure
-    assert seen_from(RIG, MountSection(), exposure.navigation, 395.0) is None
-    told = orientation_json(exposure, RIG, MountSection(), 395.0)
-    assert told["heads"] == []
-    assert {one["why"] for one in told["unoriented"]} == {"no height"}
+    assert footprint_corners(RIG, MountSection(), exposure.navigation, 395.0) is None
+    reported = orientation_json(exposure, RIG, MountSection(), 395.0)
+    assert reported["heads"] == []
+    assert {one["why"] for one in reported["unoriented"]} == {"no height"}
 
 
 def test_an_exposure_among_positions_with_a_height_is_oriented() -> None:

@@ -12,21 +12,21 @@ import pytest
 from daemon.configuration.model import LimitsSection
 from daemon.onboard.flight.arming import (
     FILE,
-    Lack,
+    MissingPrerequisite,
     Readiness,
-    lacks,
+    missing_prerequisites,
     override_message,
-    override_note,
+    overrides_content,
     overrides_of,
 )
 from daemon.onboard.flight.event_table import entry_of
 
-ALL_THERE = Readiness(
+READY = Readiness(
     has_kernels=True,
     absent=(),
     exposures_left=500,
-    exposures_wanted=400,
-    wants_time=True,
+    exposures_planned=400,
+    needs_time=True,
     has_time=True,
     position_age_s=0.1,
     has_fix=True,
@@ -35,7 +35,7 @@ ALL_THERE = Readiness(
 
 
 def test_nothing_is_missing_where_all_is_there() -> None:
-    assert lacks(ALL_THERE, LimitsSection()) == ()
+    assert missing_prerequisites(READY, LimitsSection()) == ()
 
 
 @pytest.mark.parametrize(
@@ -51,23 +51,23 @@ def test_nothing_is_missing_where_all_is_there() -> None:
         ({"probes_c": {"1": None}}, "arming-temperature", "probe 1"),
         ({"probes_c": {"1": (None, 0.1)}}, "arming-temperature", "probe 1"),
         ({"probes_c": {"1": (20.0, 60.0)}}, "arming-temperature", "older than 10 s"),
-        ({"serials_untold": ["SU00"]}, "arming-serial", "SU00"),
-        ({"serials_differing": ["lens 0 is 'L-2'"]}, "arming-serial", "lens 0 is 'L-2'"),
+        ({"serials_unreported": ["SU00"]}, "arming-serial", "SU00"),
+        ({"serials_mismatched": ["lens 0 is 'L-2'"]}, "arming-serial", "lens 0 is 'L-2'"),
     ],
 )
 def test_each_thing_that_is_missing_is_named_with_its_cure(
-    change: dict[str, Any], name: str, says: str
+    change: dict[str, Any], name: str, sentences: str
 ) -> None:
-    (lack,) = lacks(replace(ALL_THERE, **change), LimitsSection())
-    assert (lack.name, says in str(lack)) == (name, True)
-    assert lack.cure and lack.cure in str(lack)
-    assert lack.may_be_overridden is (name != "arming-kernels")
-    assert entry_of(lack.name) is not None
+    (item,) = missing_prerequisites(replace(READY, **change), LimitsSection())
+    assert (item.name, sentences in str(item)) == (name, True)
+    assert item.cure and item.cure in str(item)
+    assert item.may_be_overridden is (name != "arming-kernels")
+    assert entry_of(item.name) is not None
 
 
 def test_a_rig_without_receiver_and_probes_needs_neither() -> None:
-    bare = replace(ALL_THERE, wants_time=False, has_time=False, position_age_s=None, probes_c={})
-    assert lacks(bare, LimitsSection()) == ()
+    bare = replace(READY, needs_time=False, has_time=False, position_age_s=None, probes_c={})
+    assert missing_prerequisites(bare, LimitsSection()) == ()
 
 
 @pytest.mark.parametrize(
@@ -77,12 +77,12 @@ def test_a_rig_without_receiver_and_probes_needs_neither() -> None:
 def test_the_disk_must_take_what_the_plan_asks_for_and_one_exposure_at_least(
     left: int, wanted: int, is_enough: bool
 ) -> None:
-    there = replace(ALL_THERE, exposures_left=left, exposures_wanted=wanted)
-    assert (lacks(there, LimitsSection()) == ()) is is_enough
+    readiness = replace(READY, exposures_left=left, exposures_planned=wanted)
+    assert (missing_prerequisites(readiness, LimitsSection()) == ()) is is_enough
 
 
 @pytest.mark.parametrize(
-    ("change", "is_stale"),
+    ("change", "is_outdated"),
     [
         ({"position_age_s": 4.0}, False),
         ({"position_age_s": 4.001}, True),
@@ -91,17 +91,17 @@ def test_the_disk_must_take_what_the_plan_asks_for_and_one_exposure_at_least(
         ({"probes_c": {"0": (0.0, 7.0)}}, False),
     ],
 )
-def test_what_is_as_old_as_its_limit_is_fresh(change: dict[str, Any], is_stale: bool) -> None:
+def test_what_is_as_old_as_its_limit_is_fresh(change: dict[str, Any], is_outdated: bool) -> None:
     limits = LimitsSection(navigation_stale_s=4.0, temperature_stale_s=7.0)
-    assert (lacks(replace(ALL_THERE, **change), limits) != ()) is is_stale
+    assert (missing_prerequisites(replace(READY, **change), limits) != ()) is is_outdated
 
 
 def test_an_override_is_in_the_flight_log_and_a_damaged_note_counts_as_none(tmp_path: Path) -> None:
-    lack = Lack("arming-device", "no head SU02", "check its cable")
-    assert lack.may_be_overridden
-    content = json.loads(override_message("operator", [lack], "training").payload)
+    item = MissingPrerequisite("arming-device", "no head SU02", "check its cable")
+    assert item.may_be_overridden
+    content = json.loads(override_message("operator", [item], "training").payload)
     assert (content["by"], content["reason"]) == ("operator", "training")
-    assert "reason" not in json.loads(override_message("operator", [lack]).payload)
+    assert "reason" not in json.loads(override_message("operator", [item]).payload)
     for note in (b"{", b"{}", b'{"overrides": null}', b'{"overrides": [7]}'):
         (tmp_path / FILE).write_bytes(note)
         assert overrides_of(tmp_path) == []
@@ -109,9 +109,9 @@ def test_an_override_is_in_the_flight_log_and_a_damaged_note_counts_as_none(tmp_
 
 def test_an_override_is_kept_with_who_when_what_and_why(tmp_path: Path) -> None:
     assert overrides_of(tmp_path) == []
-    missing = Lack("arming-device", "no head SU02", "check its cable")
-    (tmp_path / FILE).write_bytes(override_note(tmp_path, "operator", [missing]))
-    again = override_note(tmp_path, "uid 1000", [missing], reason="it is not needed")
+    missing = MissingPrerequisite("arming-device", "no head SU02", "check its cable")
+    (tmp_path / FILE).write_bytes(overrides_content(tmp_path, "operator", [missing]))
+    again = overrides_content(tmp_path, "uid 1000", [missing], reason="it is not needed")
     (tmp_path / FILE).write_bytes(again)
     first, second = overrides_of(tmp_path)
     assert first["by"] == "operator"

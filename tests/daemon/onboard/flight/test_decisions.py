@@ -18,13 +18,13 @@ def due(to_seal: object = None) -> Any:
         due_to_store=lambda _: [],
         due_to_give_up=lambda _: [],
         due_to_seal=lambda _: to_seal,
-        due_to_foresee=lambda: "foreseen",
+        due_provisionally=lambda: "foreseen",
         resolved_marks=[],
     )
 
 
 @pytest.mark.parametrize(
-    ("may_seal", "may_foresee", "to_seal", "foreseen"),
+    ("may_seal", "allow_provisional", "to_seal", "foreseen"),
     [
         (True, True, None, "foreseen"),
         (True, False, None, None),
@@ -34,10 +34,10 @@ def due(to_seal: object = None) -> Any:
     ],
 )
 def test_a_record_is_foreseen_only_while_none_is_sealed(
-    may_seal: bool, may_foresee: bool, to_seal: object, foreseen: object
+    may_seal: bool, allow_provisional: bool, to_seal: object, provisional: object
 ) -> None:
-    found = tick(due(to_seal), 7, may_seal=may_seal, may_foresee=may_foresee)
-    assert (found.to_seal, found.foreseen) == (to_seal, foreseen)
+    found = tick(due(to_seal), 7, may_seal=may_seal, allow_provisional=allow_provisional)
+    assert (found.to_seal, found.provisional) == (to_seal, provisional)
     assert found.asked_to_seal is may_seal
 
 

@@ -10,12 +10,18 @@ from typing import get_args
 from daemon.onboard.flight.event_table import TABLE, Severity, as_markdown, entry_of
 
 ROOT = Path(__file__).parents[4]
-TELLERS = {"_event": "", "_tell": "", "tell": "device/", "complain": "device/", "_alarm": "device/"}
+TELLERS = {
+    "_event": "",
+    "_tell": "",
+    "emit": "device/",
+    "emit_throttled": "device/",
+    "_alarm": "device/",
+}
 GENERIC = "device"
 """The event that carries those of devices, each by its name."""
 
 
-def told() -> Iterator[tuple[str, str]]:
+def emitted() -> Iterator[tuple[str, str]]:
     """Names of events in the sources of service and drivers, and where they are."""
     for folder in ("daemon", "drivers"):
         for path in sorted((ROOT / folder).rglob("*.py")):
@@ -41,13 +47,13 @@ def _event_of(node: ast.AST, *, is_driver: bool) -> str | None:
         return f"device/{node.args[1].value!s}"
     if called not in TELLERS or not isinstance(first, ast.Constant):
         return None
-    if called in ("tell", "complain") and not is_driver:
+    if called in ("emit", "emit_throttled") and not is_driver:
         return None
     return f"{TELLERS[called]}{first.value!s}"
 
 
 def test_every_event_in_the_sources_is_in_the_table() -> None:
-    found = dict(told())
+    found = dict(emitted())
     assert len(found) > 35
     found.pop(GENERIC)
     unknown = {name: where for name, where in found.items() if entry_of(name) is None}
@@ -55,7 +61,7 @@ def test_every_event_in_the_sources_is_in_the_table() -> None:
 
 
 def test_nothing_in_the_table_is_never_told() -> None:
-    found = dict(told()) | {"device/absent": "", "phase": ""}
+    found = dict(emitted()) | {"device/absent": "", "phase": ""}
     never = {e.name for e in TABLE if e.name not in found and not e.name.startswith("arming-")}
     assert never == set()
 

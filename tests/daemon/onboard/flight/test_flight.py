@@ -9,10 +9,10 @@ import pytest
 from daemon.configuration.model import LimitsSection
 from daemon.mission.exposure import Exposure, FrameRecord
 from daemon.mission.log.log_records import LoggedTrigger, message_of, record_of
-from daemon.onboard.flight.flight import Flight, Identity
+from daemon.onboard.flight.flight import Flight, FlightIdentity
 from daemon.onboard.flight.ledger import Ledger
 from daemon.onboard.flight.recovery_match import seal_from_log
-from daemon.onboard.timing.matching import Cause, Pulse
+from daemon.onboard.timing.matching import Cause, FiredPulse
 from drivers.contract import (
     ClockReading,
     EventMark,
@@ -33,7 +33,7 @@ HEADS = ("SU00", "SU10", "G")
 LIMITS = LimitsSection(frame_timeout_s=8.0, mark_timeout_s=3.0)
 DELAYS_NS = {cone.name: 1_000_000 * index for index, cone in enumerate(RIG.cones)}
 STROBE_NS = DELAYS_NS["0"] + 2_000_000
-IDENTITY = Identity("boot", "1", "calibration", "", "", "syntopic test", simulated=True)
+IDENTITY = FlightIdentity("boot", "1", "calibration", "", "", "syntopic test", simulated=True)
 
 
 def flight(*, has_pps: bool = True) -> Flight:
@@ -79,11 +79,11 @@ EARLIER = [
 ]
 
 
-def pulse(number: int, t_s: float) -> Pulse:
-    return Pulse(number, round(t_s * NS), 50_000, number, DELAYS_NS, STROBE_NS)
+def pulse(number: int, t_s: float) -> FiredPulse:
+    return FiredPulse(number, round(t_s * NS), 50_000, number, DELAYS_NS, STROBE_NS)
 
 
-def frame(head: str, given: Pulse, slot: int = 0) -> Frame:
+def frame(head: str, given: FiredPulse, slot: int = 0) -> Frame:
     start_ns = given.mono_ns + given.delays_ns[RIG.cone_of(head).name]
     return Frame(
         head=head,
@@ -104,7 +104,7 @@ def frame(head: str, given: Pulse, slot: int = 0) -> Frame:
     )
 
 
-def mark(given: Pulse) -> EventMark:
+def mark(given: FiredPulse) -> EventMark:
     gps_ns = GPS_NS + given.mono_ns + given.strobe_delay_ns
     return EventMark("gnss", 0, gps_ns, 25, given.count, 16, True, given.mono_ns + NS // 4)
 
@@ -118,7 +118,7 @@ def stored_frames(flying: Flight, number: int, mono_ns: int) -> tuple[FrameRecor
     )
 
 
-def fly_one(flying: Flight, number: int, t_s: float, heads: tuple[str, ...] = HEADS) -> Pulse:
+def fly_one(flying: Flight, number: int, t_s: float, heads: tuple[str, ...] = HEADS) -> FiredPulse:
     assert flying.order(round(t_s * NS)) == number
     given = pulse(number, t_s)
     flying.fired(given)
@@ -172,7 +172,7 @@ def test_a_missing_frame_is_waited_for_and_then_the_exposure_is_degraded() -> No
     assert (sheet.degraded, sheet.frames.late) == (1, 1) and sheet.is_balanced
 
 
-def in_two_that_wait(flying: Flight, status: FrameStatus) -> tuple[Pulse, Pulse]:
+def in_two_that_wait(flying: Flight, status: FrameStatus) -> tuple[FiredPulse, FiredPulse]:
     """Two exposures wait for G, of which a frame comes that says nothing of when it was made."""
     first, second = (fly_one(flying, number, 1.35 * number, HEADS[:2]) for number in (1, 2))
     unknown = {"device_ns": None, "counter": None, "status": status}
@@ -355,8 +355,8 @@ def test_recovery_makes_the_same_record_from_the_log_as_the_flight_did(*, has_ma
     frames = tuple(replace(r, file=f"{r.sensor}.tif", sha256="0" * 64) for r in due.capture.frames)
     flying.stored(1, frames)
     logged = [*EARLIER, *(TemperatureSample(p, 32.0, -NS // 2) for p in RIG.probes)]
-    told = TriggerPulse(1, given.mono_ns, given.sigma_ns, given.count)
-    records = [*logged, LoggedTrigger(1, told, DELAYS_NS, STROBE_NS)]
+    reported = TriggerPulse(1, given.mono_ns, given.sigma_ns, given.count)
+    records = [*logged, LoggedTrigger(1, reported, DELAYS_NS, STROBE_NS)]
     if has_mark:
         flying.mark(mark(given))
         records.append(mark(given))
@@ -383,17 +383,19 @@ def test_a_head_whose_clock_starts_again_is_told_of_once() -> None:
         mono_ns = 2 * NS * earlier
         flying.clock_reading(ClockReading("G", 900 * NS + mono_ns, mono_ns, 40_000))
     flying.frame(again)
-    (told,) = flying.clock_events(15 * NS)
-    assert told.name == "device-clock-stepped" and "G" in told.sentence and told.is_fault
+    (reported,) = flying.clock_events(15 * NS)
+    assert (
+        reported.name == "device-clock-stepped" and "G" in reported.sentence and reported.is_fault
+    )
     assert flying.clock_events(16 * NS) == []
 
 
 def test_holdover_is_told_with_cause_and_cure_and_flagged_and_ends() -> None:
     flying = flight()
     given = fly_one(flying, 1, 20.0)
-    (told,) = flying.clock_events(21 * NS)
-    assert told.name == "pps-holdover" and told.is_fault
-    assert "check the PPS cable" in told.sentence
+    (reported,) = flying.clock_events(21 * NS)
+    assert reported.name == "pps-holdover" and reported.is_fault
+    assert "check the PPS cable" in reported.sentence
     flying.stored(1, stored_frames(flying, 1, 21 * NS))
     exposure = seal(flying, 24 * NS)
     assert exposure.mark_source == "pps" and Flag(exposure.flags) & Flag.TIME_HOLDOVER
@@ -410,17 +412,17 @@ def test_an_exposure_that_only_waits_for_a_second_mark_is_foreseen_as_it_is_seal
     flying = flight(has_pps=False)
     first, second = fly_one(flying, 1, 0.0), fly_one(flying, 2, 2.0)
     flying.stored(1, flying.due_to_store(NS)[0].capture.frames)
-    assert flying.due_to_foresee() is None, "it has no mark yet"
+    assert flying.due_provisionally() is None, "it has no mark yet"
     flying.mark(mark(first))
-    assert flying.due_to_foresee() is None, "the position beyond the mark is awaited"
+    assert flying.due_provisionally() is None, "the position beyond the mark is awaited"
     flying.navigation(nav(0.2))
-    foreseen = flying.due_to_foresee()
-    assert foreseen is not None and foreseen.mark_source == "event-mark"
-    assert flying.due_to_foresee() is None, "it is told once"
+    provisional = flying.due_provisionally()
+    assert provisional is not None and provisional.mark_source == "event-mark"
+    assert flying.due_provisionally() is None, "it is told once"
     assert flying.due_to_seal(NS) is None, "and not sealed yet"
     flying.temperature(TemperatureSample("cone", 44.0, NS))
     flying.mark(mark(second))
-    assert seal(flying, 3 * NS) is foreseen, "what is learned later does not make it another"
+    assert seal(flying, 3 * NS) is provisional, "what is learned later does not make it another"
 
 
 def test_what_was_foreseen_with_a_mark_that_was_noise_is_sealed_without_it() -> None:
@@ -429,10 +431,10 @@ def test_what_was_foreseen_with_a_mark_that_was_noise_is_sealed_without_it() -> 
     flying.stored(1, flying.due_to_store(NS)[0].capture.frames)
     flying.mark(replace(mark(given[0]), gps_ns=mark(given[0]).gps_ns + 200_000_000, count=0))
     flying.navigation(nav(1.0))
-    foreseen = flying.due_to_foresee()
-    assert foreseen is not None
+    provisional = flying.due_provisionally()
+    assert provisional is not None
     flying.mark(mark(given[1]))
     flying.mark(mark(given[2]))
     flying.navigation(nav(4.5))
     exposure = seal(flying, 5 * NS)
-    assert exposure != foreseen and exposure.mark_source == "interpolated"
+    assert exposure != provisional and exposure.mark_source == "interpolated"

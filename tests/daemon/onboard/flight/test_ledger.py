@@ -12,39 +12,50 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 
 from daemon.mission.exposure import Exposure
 from daemon.onboard.flight.ledger import CAUSES, Ledger, LedgerError, Receipts
-from daemon.onboard.flight.transitions import TRANSITIONS, Standing, State, Step, Storage, after
+from daemon.onboard.flight.transitions import (
+    TRANSITIONS,
+    ExposureState,
+    ExposureStatus,
+    StorageState,
+    Transition,
+    next_status,
+)
 from tests.daemon.small_camera import SENSORS, capture_of, final_record
 
-STANDINGS = [Standing(s, k) for s, k in itertools.product(State, Storage)]
+STANDINGS = [ExposureStatus(s, k) for s, k in itertools.product(ExposureState, StorageState)]
 
 
 def test_every_step_that_is_not_listed_is_refused():
-    for standing, step in itertools.product(STANDINGS, Step):
-        if (standing, step) in TRANSITIONS:
-            after(standing, step)
+    for status, step in itertools.product(STANDINGS, Transition):
+        if (status, step) in TRANSITIONS:
+            next_status(status, step)
         else:
             with pytest.raises(LedgerError, match="cannot be"):
-                after(standing, step)
+                next_status(status, step)
 
 
 def test_nothing_happens_to_a_sealed_exposure_and_none_opens_again():
     for (before, _), result in TRANSITIONS.items():
-        assert before.storage is not Storage.SEALED
-        assert before.state is State.OPEN or result.state is not State.OPEN
+        assert before.storage is not StorageState.SEALED
+        assert before.state is ExposureState.OPEN or result.state is not ExposureState.OPEN
 
 
 def test_what_is_stored_is_never_lost():
     for (before, _), result in TRANSITIONS.items():
-        if before.storage is Storage.STORED:
-            assert result.state is not State.LOST
+        if before.storage is StorageState.STORED:
+            assert result.state is not ExposureState.LOST
 
 
 def test_only_judged_exposures_are_sealed_and_only_with_pixels_or_lost():
-    ends = {r for r in TRANSITIONS.values() if r.storage is Storage.SEALED}
-    assert {r.state for r in ends} == {State.COMPLETE, State.DEGRADED, State.LOST}
+    ends = {r for r in TRANSITIONS.values() if r.storage is StorageState.SEALED}
+    assert {r.state for r in ends} == {
+        ExposureState.COMPLETE,
+        ExposureState.DEGRADED,
+        ExposureState.LOST,
+    }
     for (before, step), result in TRANSITIONS.items():
-        if step is Step.SEAL:
-            assert before.storage is Storage.STORED or result.state is State.LOST
+        if step is Transition.SEAL:
+            assert before.storage is StorageState.STORED or result.state is ExposureState.LOST
 
 
 class AnyFlight(RuleBasedStateMachine):
@@ -94,9 +105,9 @@ class AnyFlight(RuleBasedStateMachine):
         causes = missing or {"store": "refused"}
         try:
             if step == "complete":
-                self.ledger.settle(number, "complete", missing)
+                self.ledger.set_state(number, "complete", missing)
             elif step in ("degraded", "lost"):
-                self.ledger.settle(number, step, causes)
+                self.ledger.set_state(number, step, causes)
             elif step == "stored":
                 self.ledger.stored(number)
             else:
@@ -130,7 +141,7 @@ def test_a_frame_used_twice_is_an_imbalance():
     ledger = Ledger(["SU00"])
     ledger.trigger(1)
     ledger.frame("SU00", "used")
-    ledger.settle(1, "complete")
+    ledger.set_state(1, "complete")
     assert ledger.imbalances() == []
     ledger.frame("SU00", "used")
     assert ledger.imbalances() == [
@@ -141,7 +152,7 @@ def test_a_frame_used_twice_is_an_imbalance():
 def test_a_frame_that_was_forgotten_is_an_imbalance():
     ledger = Ledger(["SU00"])
     ledger.trigger(1)
-    ledger.settle(1, "complete")
+    ledger.set_state(1, "complete")
     assert "SU00: 0 frames used, but 1 exposures have one" in ledger.imbalances()[0]
 
 
@@ -168,11 +179,11 @@ def test_a_flight_goes_on_with_its_records_and_its_last_sheet():
             flown.frame(head, "used")
         flown.mark("used")
         records.append(final_record(capture_of(number, sensors)))
-        flown.settle(number, records[-1].state, dict(records[-1].missing))
+        flown.set_state(number, records[-1].state, dict(records[-1].missing))
         flown.stored(number)
         flown.sealed(number)
     flown.trigger(4)
-    flown.settle(4, "lost", {"exposure": "no head sent a frame"})
+    flown.set_state(4, "lost", {"exposure": "no head sent a frame"})
     flown.sealed(4)
     records.append(replace(Exposure(number=4), state="lost", missing=(("SU00", "none"),)))
     flown.frame("SU01", "duplicate")
@@ -203,7 +214,7 @@ def test_after_landing_nothing_may_be_open_or_pending():
     ]
     ledger.frame("SU00", "used")
     ledger.mark("spurious")
-    ledger.settle(1, "complete")
+    ledger.set_state(1, "complete")
     assert ledger.imbalances(has_landed=True) == []
 
 
@@ -220,10 +231,10 @@ def test_every_count_of_a_sheet_is_exact():
             ledger.frame("SU00", cause)
             ledger.mark(cause)
     ledger.frame("SU00", "pending")
-    ledger.settle(1, "complete")
+    ledger.set_state(1, "complete")
     for number in (2, 3, 4):
-        ledger.settle(number, "degraded", {"SU01": "no frame", "mark": "none came"})
-    ledger.settle(5, "lost", {"exposure": "no pulse"})
+        ledger.set_state(number, "degraded", {"SU01": "no frame", "mark": "none came"})
+    ledger.set_state(5, "lost", {"exposure": "no pulse"})
     for number in (1, 2, 3):
         ledger.stored(number)
     for number in (1, 5):
@@ -254,8 +265,8 @@ def test_used_frames_lie_between_whole_exposures_and_those_with_the_undecided(us
     for _ in range(used):
         ledger.frame("SU00", "used")
     for number in (1, 2):
-        ledger.settle(number, "complete")
-    ledger.settle(3, "lost", {"exposure": "no pulse"})
+        ledger.set_state(number, "complete")
+    ledger.set_state(3, "lost", {"exposure": "no pulse"})
     assert (ledger.imbalances() == []) is balances
 
 
@@ -271,10 +282,10 @@ def test_marks_are_as_many_as_triggers_at_most():
 def test_an_exposure_judged_worse_names_its_last_causes_alone():
     ledger = Ledger(["SU00", "SU01"])
     ledger.trigger(1)
-    ledger.settle(1, "degraded", {"SU00": "late"})
-    ledger.settle(1, "degraded", {"SU01": "late", "SU00": "late"})
+    ledger.set_state(1, "degraded", {"SU00": "late"})
+    ledger.set_state(1, "degraded", {"SU01": "late", "SU00": "late"})
     assert [head.missing for head in ledger.sheet().heads] == [1, 1]
-    ledger.settle(1, "lost", {"exposure": "the disk refused"})
+    ledger.set_state(1, "lost", {"exposure": "the disk refused"})
     assert [head.missing for head in ledger.sheet().heads] == [0, 0]
 
 
@@ -292,7 +303,7 @@ def test_a_judgement_and_its_causes_fit_each_other(state, causes, message):
     ledger = Ledger(["SU00"])
     ledger.trigger(1)
     with pytest.raises(LedgerError, match=f"exposure 1: {message}"):
-        ledger.settle(1, state, causes)
+        ledger.set_state(1, state, causes)
     assert ledger.open_numbers() == [1]
 
 
@@ -302,7 +313,7 @@ def test_a_number_is_triggered_once_and_an_unknown_one_is_refused():
     with pytest.raises(LedgerError, match="exposure 1 was triggered already"):
         ledger.trigger(1)
     with pytest.raises(LedgerError, match="exposure 2 was never triggered"):
-        ledger.standing(2)
+        ledger.status(2)
     with pytest.raises(LedgerError, match="SU00: cause 'odd'; it is one of pending, used, late"):
         ledger.frame("SU00", "odd")
     assert ledger.sheet().triggers == 1

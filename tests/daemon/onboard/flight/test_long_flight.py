@@ -89,8 +89,8 @@ def fly(root: Path, exposures: int) -> dict[str, int | float]:
         expose(flown, log, number)
         now_ns = (number * INTERVAL_S + 1) * NS
         for due in flown.due_to_store(now_ns):
-            here = {record.sensor: pixels[record.sensor] for record in due.capture.frames}
-            flown.stored(due.capture.number, writer.write(due.capture, here))
+            position = {record.sensor: pixels[record.sensor] for record in due.capture.frames}
+            flown.stored(due.capture.number, writer.write(due.capture, position))
         while (record := flown.due_to_seal(now_ns)) is not None:
             writer.seal(record)
             flown.sealed(record.number, record.state)

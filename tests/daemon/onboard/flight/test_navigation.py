@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from daemon.orientation.navigation import Track, around, metres_per_degree
+from daemon.orientation.navigation import Track, metres_per_degree, navigation_at
 from drivers.contract import NavSample
 
 NS = 1_000_000_000
@@ -64,7 +64,7 @@ def test_heading_is_interpolated_across_north() -> None:
 def test_shortly_after_the_last_sample_it_is_extrapolated_and_says_so() -> None:
     track = Track()
     track.add(sample(0.0))
-    assert not track.reaches(GPS_NS + NS)
+    assert not track.covers(GPS_NS + NS)
     record = track.at(GPS_NS + NS)
     assert record is not None and record.method == "extrapolated" and record.gap_ns == NS
 
@@ -175,12 +175,12 @@ def test_a_record_is_never_better_than_its_worse_support(u: float) -> None:
         replace(sample(-0.2), fix="dead-reckoning", horizontal_sigma_m=9.0, vertical_sigma_m=20.0),
     ):
         before, after = sorted((good, bad), key=lambda s: s.gps_ns)
-        record = around((before, after), before.gps_ns + round(u * 200_000_000))
+        record = navigation_at((before, after), before.gps_ns + round(u * 200_000_000))
         assert record is not None
         assert record.horizontal_sigma_m is not None and record.horizontal_sigma_m >= 9.0
         assert record.vertical_sigma_m is not None and record.vertical_sigma_m >= 20.0
         assert (record.fix, record.satellites) == ("dead-reckoning", 12)
-    unknown = around((good, replace(sample(0.2), horizontal_sigma_m=None)), GPS_NS + 1000)
+    unknown = navigation_at((good, replace(sample(0.2), horizontal_sigma_m=None)), GPS_NS + 1000)
     assert unknown is not None and unknown.horizontal_sigma_m is None
 
 
@@ -191,7 +191,7 @@ def test_a_position_counts_by_its_sigma() -> None:
     moved = replace(sample(0.2), horizontal_sigma_m=10.0, vertical_sigma_m=10.0)
     assert moved.latitude_deg is not None
     moved = replace(moved, latitude_deg=moved.latitude_deg + 8.0 / north_m, height_m=HEIGHT + 7.0)
-    record = around((good, moved), GPS_NS + 190_000_000)
+    record = navigation_at((good, moved), GPS_NS + 190_000_000)
     assert record is not None and record.height_m is not None
     flown_m = (record.latitude_deg - LATITUDE) * north_m
     assert flown_m == pytest.approx(50.0 * 0.19 + 0.19**2, abs=0.02)
@@ -219,15 +219,15 @@ def test_a_sample_with_a_height_is_waited_for_two_seconds_at_most() -> None:
     track = Track()
     track.add(sample(0.0))
     track.add(flat(0.5))
-    assert not track.reaches(GPS_NS + 300_000_000)
+    assert not track.covers(GPS_NS + 300_000_000)
     track.add(flat(2.2))
-    assert not track.reaches(GPS_NS + 300_000_000)
+    assert not track.covers(GPS_NS + 300_000_000)
     track.add(flat(2.4))
-    assert track.reaches(GPS_NS + 300_000_000)
+    assert track.covers(GPS_NS + 300_000_000)
     bare = Track()
     bare.add(flat(0.0))
     bare.add(flat(0.5))
-    assert bare.reaches(GPS_NS + 300_000_000)
+    assert bare.covers(GPS_NS + 300_000_000)
 
 
 @pytest.mark.trust
@@ -262,16 +262,16 @@ def test_at_the_instant_of_a_sample_the_record_has_its_height() -> None:
     for tenth, height in ((0, HEIGHT), (2, HEIGHT + 3.0), (4, HEIGHT)):
         velocity = (50.0, 0.0, None)
         bare = [replace(s, velocity_ned_mps=velocity) for s in track._samples]
-        record = around(bare, GPS_NS + tenth * NS // 10)
+        record = navigation_at(bare, GPS_NS + tenth * NS // 10)
         assert record is not None
         assert (record.height_m, record.vertical_sigma_m) == (pytest.approx(height), 9.0)
 
 
 @pytest.mark.trust
 def test_samples_exactly_two_seconds_apart_are_still_bridged() -> None:
-    record = around((sample(0.0), sample(2.0)), GPS_NS + NS)
+    record = navigation_at((sample(0.0), sample(2.0)), GPS_NS + NS)
     assert record is not None and (record.method, record.gap_ns) == ("interpolated", 2 * NS)
-    late = around((sample(0.0), sample(2.001)), GPS_NS + NS)
+    late = navigation_at((sample(0.0), sample(2.001)), GPS_NS + NS)
     assert late is not None and late.method == "extrapolated"
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from daemon.orientation.navigation import Track, _Leg, around, metres_per_degree
+from daemon.orientation.navigation import Track, _Segment, metres_per_degree, navigation_at
 from drivers.contract import NavSample
 from tests.daemon.onboard.flight.test_navigation import GPS_NS, HEIGHT, LATITUDE, LONGITUDE, NS
 
@@ -55,23 +55,23 @@ def test_a_degree_is_as_long_as_on_the_ellipsoid(
     assert metres_per_degree(latitude_deg, height_m) == pytest.approx((north_m, east_m), abs=0.02)
 
 
-@pytest.mark.parametrize("away_s", [0.5, -0.5, 2.0])
-def test_a_sample_is_carried_on_by_its_velocity(away_s: float) -> None:
-    record = around([sample(0.0)], GPS_NS + round(away_s * NS))
+@pytest.mark.parametrize("elapsed_s", [0.5, -0.5, 2.0])
+def test_a_sample_is_carried_on_by_its_velocity(elapsed_s: float) -> None:
+    record = navigation_at([sample(0.0)], GPS_NS + round(elapsed_s * NS))
     assert record is not None
-    assert (record.latitude_deg - LATITUDE) * NORTH_M == pytest.approx(40.0 * away_s, abs=1e-6)
-    assert (record.longitude_deg - LONGITUDE) * EAST_M == pytest.approx(30.0 * away_s, abs=1e-6)
-    assert record.height_m == pytest.approx(HEIGHT + 2.0 * away_s)
-    bend_m = 2.0 * away_s**2 / 2
-    assert record.horizontal_sigma_m == pytest.approx(math.hypot(0.5, 0.2 * away_s, bend_m))
-    assert record.vertical_sigma_m == pytest.approx(math.hypot(0.9, 0.2 * away_s, bend_m))
-    assert (record.method, record.gap_ns) == ("extrapolated", round(abs(away_s) * NS))
+    assert (record.latitude_deg - LATITUDE) * NORTH_M == pytest.approx(40.0 * elapsed_s, abs=1e-6)
+    assert (record.longitude_deg - LONGITUDE) * EAST_M == pytest.approx(30.0 * elapsed_s, abs=1e-6)
+    assert record.height_m == pytest.approx(HEIGHT + 2.0 * elapsed_s)
+    manoeuvre_m = 2.0 * elapsed_s**2 / 2
+    assert record.horizontal_sigma_m == pytest.approx(math.hypot(0.5, 0.2 * elapsed_s, manoeuvre_m))
+    assert record.vertical_sigma_m == pytest.approx(math.hypot(0.9, 0.2 * elapsed_s, manoeuvre_m))
+    assert (record.method, record.gap_ns) == ("extrapolated", round(abs(elapsed_s) * NS))
     assert (record.roll_rad, record.pitch_rad, record.heading_rad) == (0.1, 0.2, 0.3)
 
 
 def test_what_the_receiver_does_not_send_is_not_made_up() -> None:
     at_ns = GPS_NS + NS
-    still = around([sample(0.0, velocity_ned_mps=None)], at_ns)
+    still = navigation_at([sample(0.0, velocity_ned_mps=None)], at_ns)
     assert still is not None
     assert (still.method, still.latitude_deg, still.horizontal_sigma_m) == (
         "nearest",
@@ -80,20 +80,20 @@ def test_what_the_receiver_does_not_send_is_not_made_up() -> None:
     )
     assert (still.height_m, still.sigma_source) == (HEIGHT, "none")
     assert still.vertical_sigma_m == pytest.approx(math.hypot(0.9, 3.0, 1.0))
-    level = around([sample(0.0, velocity_ned_mps=(40.0, 30.0, None))], at_ns)
+    level = navigation_at([sample(0.0, velocity_ned_mps=(40.0, 30.0, None))], at_ns)
     assert level is not None and level.height_m == HEIGHT
     assert level.vertical_sigma_m == pytest.approx(math.hypot(0.9, 3.0, 1.0))
     for unknown in ("speed_sigma_mps", "horizontal_sigma_m"):
-        record = around([sample(0.0, **{unknown: None})], at_ns)
+        record = navigation_at([sample(0.0, **{unknown: None})], at_ns)
         assert record is not None and record.horizontal_sigma_m is None
-    there = around([sample(0.0, speed_sigma_mps=None)], GPS_NS)
+    there = navigation_at([sample(0.0, speed_sigma_mps=None)], GPS_NS)
     assert there is not None
     assert (there.horizontal_sigma_m, there.vertical_sigma_m) == (0.5, 0.9)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.25, 0.5, 0.75])
 def test_between_two_samples_every_axis_is_on_the_way(share: float) -> None:
-    record = around([sample(0.0), sample(1.0)], GPS_NS + round(share * NS))
+    record = navigation_at([sample(0.0), sample(1.0)], GPS_NS + round(share * NS))
     assert record is not None
     assert (record.latitude_deg - LATITUDE) * NORTH_M == pytest.approx(40.0 * share, abs=1e-4)
     assert (record.longitude_deg - LONGITUDE) * EAST_M == pytest.approx(30.0 * share, abs=1e-4)
@@ -105,33 +105,33 @@ def test_between_two_samples_every_axis_is_on_the_way(share: float) -> None:
 
 def test_velocity_and_angles_are_shared_out_between_both_ends() -> None:
     turned = sample(1.0, velocity_ned_mps=(44.0, 26.0, 0.0), roll_rad=None, heading_rad=-0.1)
-    record = around([sample(0.0), turned], GPS_NS + NS // 4)
+    record = navigation_at([sample(0.0), turned], GPS_NS + NS // 4)
     assert record is not None
     assert record.velocity_ned_mps == pytest.approx((41.0, 29.0, -1.5))
     assert (record.roll_rad, record.pitch_rad) == (None, pytest.approx(0.2))
     assert record.heading_rad == pytest.approx(0.2)
     level = replace(turned, velocity_ned_mps=(44.0, 26.0, None))
-    record = around([sample(0.0), level], GPS_NS + NS // 4)
+    record = navigation_at([sample(0.0), level], GPS_NS + NS // 4)
     assert record is not None and record.velocity_ned_mps == pytest.approx((41.0, 29.0, None))
 
 
 def test_a_cubic_passes_both_ends_with_their_speeds() -> None:
     """From rest to 6 m/s over 2 s and 5 m: x(u) = (-2 u^3 + 3 u^2) 5 + (u^3 - u^2) 12."""
     for u in (0.0, 0.25, 0.5, 1.0):
-        moved_m, sigma_m = _Leg(2.0, u).carry(5.0, (0.0, 6.0), (None, None), (None, None))
-        assert moved_m == pytest.approx((-2 * u**3 + 3 * u**2) * 5.0 + (u**3 - u**2) * 12.0)
+        offset_m, sigma_m = _Segment(2.0, u).carry(5.0, (0.0, 6.0), (None, None), (None, None))
+        assert offset_m == pytest.approx((-2 * u**3 + 3 * u**2) * 5.0 + (u**3 - u**2) * 12.0)
         assert sigma_m is None
-    quarter = _Leg(2.0, 0.25).carry(5.0, (4.0, 0.0), (None, None), (None, None))[0]
+    quarter = _Segment(2.0, 0.25).carry(5.0, (4.0, 0.0), (None, None), (None, None))[0]
     # (2/64 - 3/16 + 1) * 0 + (1/64 - 2/16 + 1/4) * 8 + (-2/64 + 3/16) * 5
     assert quarter == pytest.approx(0.140625 * 8.0 + 0.15625 * 5.0)
 
 
 def test_without_speeds_the_way_is_straight_and_bends_by_an_acceleration() -> None:
-    moved_m, sigma_m = _Leg(2.0, 0.25).carry(8.0, None, (0.3, 0.4), (None, None))
+    offset_m, sigma_m = _Segment(2.0, 0.25).carry(8.0, None, (0.3, 0.4), (None, None))
     # The bend of 2 m/s^2 over 2 s at a quarter: 2 * 4 * 0.25 * 0.75 / 2 = 0.75 m.
-    assert (moved_m, sigma_m) == (2.0, pytest.approx(math.hypot(0.4, 0.75)))
-    assert _Leg(2.0, 0.25).carry(8.0, None, (0.3, None), (0.1, 0.1)) == (2.0, None)
-    with_speeds = _Leg(2.0, 0.25).carry(8.0, (4.0, 4.0), (0.3, 0.4), (None, 0.1))
+    assert (offset_m, sigma_m) == (2.0, pytest.approx(math.hypot(0.4, 0.75)))
+    assert _Segment(2.0, 0.25).carry(8.0, None, (0.3, None), (0.1, 0.1)) == (2.0, None)
+    with_speeds = _Segment(2.0, 0.25).carry(8.0, (4.0, 4.0), (0.3, 0.4), (None, 0.1))
     assert with_speeds == (pytest.approx(2.0), pytest.approx(math.hypot(0.4, 0.75)))
 
 
@@ -139,11 +139,11 @@ def test_ends_that_contradict_their_speeds_move_by_their_variances() -> None:
     """A way of 9 m at 4 m/s over 2 s: 1 m too far for sigmas of 0.3 and 0.4 m."""
     flown = (0.1 * 2.0) ** 2 / 2 + (2.0 * 4.0 / 8) ** 2
     gain = 1.0 / (0.3**2 + 0.4**2 + flown)
-    start, end = _Leg(2.0, 0.0), _Leg(2.0, 1.0)
+    start, end = _Segment(2.0, 0.0), _Segment(2.0, 1.0)
     settings = (9.0, (4.0, 4.0), (0.3, 0.4), (0.05, 0.1))
     assert start.carry(*settings)[0] == pytest.approx(gain * 0.3**2)
     assert end.carry(*settings)[0] == pytest.approx(9.0 - gain * 0.4**2)
-    _, sigma_m = _Leg(2.0, 0.25).carry(*settings)
+    _, sigma_m = _Segment(2.0, 0.25).carry(*settings)
     by_speeds_m = 0.1 * 2.0 * math.hypot(0.140625, -0.046875)
     assert sigma_m == pytest.approx(math.hypot(0.4, by_speeds_m, 0.75 * 0.1875))
 
@@ -153,23 +153,23 @@ def test_ends_that_contradict_their_speeds_move_by_their_variances() -> None:
 )
 def test_samples_are_bridged_over_2_s(gap_ns: int, method: str) -> None:
     later = replace(sample(2.0), gps_ns=GPS_NS + gap_ns)
-    record = around([sample(0.0), later], GPS_NS + NS)
+    record = navigation_at([sample(0.0), later], GPS_NS + NS)
     assert record is not None and record.method == method
 
 
 @pytest.mark.parametrize("side", [-1, 1])
 def test_a_sample_is_used_up_to_2_s_away(side: int) -> None:
-    assert around([sample(0.0)], GPS_NS + side * 2 * NS) is not None
-    assert around([sample(0.0)], GPS_NS + side * (2 * NS + 1)) is None
+    assert navigation_at([sample(0.0)], GPS_NS + side * 2 * NS) is not None
+    assert navigation_at([sample(0.0)], GPS_NS + side * (2 * NS + 1)) is None
 
 
 @pytest.mark.parametrize(
-    ("way_ms", "is_timely"), [(-100, True), (-101, False), (800, True), (801, False)]
+    ("latency_ms", "is_timely"), [(-100, True), (-101, False), (800, True), (801, False)]
 )
-def test_a_sample_came_when_one_of_its_time_may_come(way_ms: int, is_timely: bool) -> None:
+def test_a_sample_came_when_one_of_its_time_may_come(latency_ms: int, is_timely: bool) -> None:
     track = Track()
     track.add(sample(0.0))
-    record = track.at(GPS_NS + NS, NS - way_ms * MS)
+    record = track.at(GPS_NS + NS, NS - latency_ms * MS)
     assert (record is not None) is is_timely
 
 
@@ -184,11 +184,11 @@ def test_samples_of_the_last_two_minutes_are_known() -> None:
 
 
 @pytest.mark.parametrize(
-    ("beyond_m", "is_believed"), [(-0.01, True), (0.01, False)], ids=["within", "beyond"]
+    ("beyond_m", "is_used"), [(-0.01, True), (0.01, False)], ids=["within", "beyond"]
 )
 @pytest.mark.parametrize("axis", ["north", "east"])
 def test_a_way_may_differ_from_its_velocities_by_so_much(
-    axis: str, beyond_m: float, is_believed: bool
+    axis: str, beyond_m: float, is_used: bool
 ) -> None:
     """After 1 s: 1 m, 2 m of acceleration and five sigmas of both places and both speeds."""
     allowed_m = 1.0 + 2.0 + 5.0 * math.hypot(0.5, 0.5, 0.2, 0.2) + beyond_m
@@ -204,17 +204,19 @@ def test_a_way_may_differ_from_its_velocities_by_so_much(
     track.add(sample(0.0))
     track.add(off)
     record = track.at(GPS_NS + NS // 2)
-    assert (record is not None and record.method == "interpolated") is is_believed
+    assert (record is not None and record.method == "interpolated") is is_used
 
 
 def test_a_record_is_as_good_as_the_worse_of_its_supports() -> None:
     worse = sample(1.0, fix="dead-reckoning", satellites=5, sigma_source="dop",
                    leap_source="table", horizontal_sigma_m=0.7)  # fmt: skip
-    record = around([sample(0.0), worse], GPS_NS + NS // 4)
+    record = navigation_at([sample(0.0), worse], GPS_NS + NS // 4)
     assert record is not None
     assert (record.fix, record.satellites, record.sigma_source, record.leap_source) == (
         *("dead-reckoning", 5, "dop", "table"),
     )
     assert record.horizontal_sigma_m is not None and record.horizontal_sigma_m >= 0.7
-    unknown = around([sample(0.0, satellites=None), sample(1.0, satellites=None)], GPS_NS + 1)
+    unknown = navigation_at(
+        [sample(0.0, satellites=None), sample(1.0, satellites=None)], GPS_NS + 1
+    )
     assert unknown is not None and unknown.satellites is None

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from daemon.onboard.flight.temperatures import Temperatures
+from daemon.onboard.flight.temperatures import TemperatureHistory
 from drivers.contract import TemperatureSample
 from processing.geometry.drift import lag_step, lagged_probe, lagged_sensors, sensor_dc
 from processing.rig import Rig, find_rig
@@ -30,12 +30,12 @@ def reading(probe: str, time_s: float, value_c: float | None) -> TemperatureSamp
     return TemperatureSample(probe=probe, mono_ns=round(time_s * SECOND), value_c=value_c)
 
 
-def at(temperatures: Temperatures, time_s: float) -> dict[str, float | None]:
+def at(temperatures: TemperatureHistory, time_s: float) -> dict[str, float | None]:
     return {t.probe: t.value_c for t in temperatures.at(round(time_s * SECOND))}
 
 
 def test_a_lagged_sensor_follows_a_step_exponentially(rig: Rig) -> None:
-    slow = Temperatures(lagged_sensors(rig))
+    slow = TemperatureHistory(lagged_sensors(rig))
     slow.add(reading("0", 0.0, 20.0))
     for k in range(1, 601):
         slow.add(reading("0", k, 30.0))
@@ -66,7 +66,7 @@ def test_the_step_length_does_not_matter_on_a_straight_line() -> None:
 def test_an_open_probe_is_passed_over_and_an_old_reading_does_not_turn_the_lag_back(
     rig: Rig,
 ) -> None:
-    slow, plain = (Temperatures(lagged_sensors(rig)) for _ in range(2))
+    slow, plain = (TemperatureHistory(lagged_sensors(rig)) for _ in range(2))
     for temperatures, open_at in ((slow, 5.0), (plain, None)):
         temperatures.add(reading("0", 0.0, 20.0))
         if open_at is not None:
@@ -78,14 +78,14 @@ def test_an_open_probe_is_passed_over_and_an_old_reading_does_not_turn_the_lag_b
 
 
 def test_the_lagged_temperature_places_the_sensor_and_no_other(rig: Rig) -> None:
-    told = {"0": 30.0, lagged_probe(rig.sensor("SU00")): 26.0}
-    assert sensor_dc(rig.sensor("SU00"), told) == 6.0
-    assert sensor_dc(rig.sensor("SU01"), told) == 10.0
+    temperatures_c = {"0": 30.0, lagged_probe(rig.sensor("SU00")): 26.0}
+    assert sensor_dc(rig.sensor("SU00"), temperatures_c) == 6.0
+    assert sensor_dc(rig.sensor("SU01"), temperatures_c) == 10.0
     assert sensor_dc(rig.sensor("SU00"), {"0": 30.0}) == 10.0
 
 
 def test_a_rig_without_lags_records_its_probes_only() -> None:
     assert lagged_sensors(find_rig("ultracam-x-mini")) == ()
-    plain = Temperatures()
+    plain = TemperatureHistory()
     plain.add(reading("0", 0.0, 20.0))
     assert at(plain, 1.0) == {"0": 20.0}

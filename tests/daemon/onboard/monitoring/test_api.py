@@ -13,43 +13,45 @@ import pytest
 from fastapi.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
-from daemon.onboard.monitoring.access.gate import Gate
+from daemon.onboard.monitoring.access.command_gateway import CommandGateway
 from daemon.onboard.monitoring.access.roles import COMMAND_ROLES
 from daemon.onboard.monitoring.access.tokens import add_token, read_tokens
-from daemon.onboard.monitoring.state import FlightState
-from daemon.onboard.monitoring.web.api import CommandName, WatchSettings, create_app
-from daemon.onboard.service.messages import Answer, Command, CommandRefused
-from tests.daemon.onboard.monitoring import flown
+from daemon.onboard.monitoring.flight_state import FlightState
+from daemon.onboard.monitoring.web.api import AccessSettings, CommandName, create_app
+from daemon.onboard.service.messages import Answer, CommandRefused, ServiceCommand
+from tests.daemon.onboard.monitoring import flight_events
 
 
 class Camera:
     """A service that answers at once, as long as it `lives`."""
 
     def __init__(self, folder: Path) -> None:
-        self.commands: list[Command] = []
+        self.commands: list[ServiceCommand] = []
         self.refused: list[CommandRefused] = []
         self.lives = True
         self.refusal = ""
         self.state = FlightState("syntopic test")
-        self.state.apply(flown.mission(str(folder / "mission")))
-        self.gate = Gate(self.hear)
+        self.state.apply(flight_events.mission(str(folder / "mission")))
+        self.gateway = CommandGateway(self.receive)
         path = folder / "tokens.toml"
         self.operator = add_token(path, "operator", "operator")
         self.administrator = add_token(path, "chief", "administrator")
         self.pilot = add_token(path, "pilot", "observer")
         self.tokens = read_tokens(path)
 
-    def hear(self, command: Command | CommandRefused) -> None:
+    def receive(self, command: ServiceCommand | CommandRefused) -> None:
         if isinstance(command, CommandRefused):
             self.refused.append(command)
             return
         self.commands.append(command)
         if self.lives:
             answer = Answer(command.number, not self.refusal, self.refusal or "done as asked")
-            asyncio.get_running_loop().call_soon(self.gate.answered, answer)
+            asyncio.get_running_loop().call_soon(self.gateway.on_answer, answer)
 
-    def client(self, *, is_open: bool = True) -> TestClient:
-        return TestClient(create_app(self.state, self.gate, WatchSettings(self.tokens, is_open)))
+    def client(self, *, anonymous_read: bool = True) -> TestClient:
+        return TestClient(
+            create_app(self.state, self.gateway, AccessSettings(self.tokens, anonymous_read))
+        )
 
 
 @pytest.fixture
@@ -72,7 +74,11 @@ def bearer(token: str) -> dict[str, str]:
 
 
 def test_what_a_watcher_asks_for_is_told(camera: Camera, client: TestClient) -> None:
-    for event in (*flown.exposure(1), *flown.exposure(2, "refly"), flown.status(triggers=2)):
+    for event in (
+        *flight_events.exposure(1),
+        *flight_events.exposure(2, "refly"),
+        flight_events.status(triggers=2),
+    ):
         camera.state.apply(event)
     state = client.get("/api/v1/state").json()
     assert state["version"] == 1
@@ -128,7 +134,7 @@ def test_each_command_is_obeyed_from_its_role_on(
     camera: Camera, client: TestClient, name: str
 ) -> None:
     assert name in COMMAND_ROLES
-    camera.state.apply(flown.lost("SU02"))
+    camera.state.apply(flight_events.lost("SU02"))
     (fault,) = client.get("/api/v1/faults").json()
     body = {"fault": fault["id"]} if name == "acknowledge" else {}
     by_role = (camera.pilot, camera.operator, camera.administrator)
@@ -145,7 +151,7 @@ def test_each_command_is_obeyed_from_its_role_on(
 @pytest.mark.trust
 def test_a_token_travels_in_a_header_and_never_in_the_address(camera: Camera) -> None:
     telemetry = "/api/v1/telemetry?form=json"
-    with camera.client(is_open=False) as client:
+    with camera.client(anonymous_read=False) as client:
         for address, given in (
             (telemetry, {}),
             (f"{telemetry}&token={camera.pilot}", {}),
@@ -177,7 +183,7 @@ def test_guessing_is_stopped_and_keeps_no_valid_token_out(
 
 
 def test_a_closed_service_shows_nothing_without_a_token(camera: Camera) -> None:
-    with camera.client(is_open=False) as client:
+    with camera.client(anonymous_read=False) as client:
         assert client.get("/api/v1/state").status_code == 401
         assert client.get("/metrics").status_code == 401
         assert client.get("/api/v1/state", headers=bearer(camera.pilot)).status_code == 200
@@ -194,15 +200,15 @@ def test_the_services_refusal_comes_back_in_its_words(camera: Camera, client: Te
 def test_a_service_that_does_not_answer_is_not_waited_for_long(
     camera: Camera, client: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("daemon.onboard.monitoring.access.gate.ANSWER_TIMEOUT_S", 0.1)
+    monkeypatch.setattr("daemon.onboard.monitoring.access.command_gateway.ANSWER_TIMEOUT_S", 0.1)
     camera.lives = False
     answer = client.post("/api/v1/commands/stop", headers=bearer(camera.operator))
     assert answer.status_code == 504
 
 
 def test_a_fault_is_acknowledged(camera: Camera, client: TestClient) -> None:
-    camera.state.apply(flown.lost("SU02"))
-    camera.state.apply(flown.recovered("SU02"))
+    camera.state.apply(flight_events.lost("SU02"))
+    camera.state.apply(flight_events.recovered("SU02"))
     (fault,) = client.get("/api/v1/faults").json()
     send = {"headers": bearer(camera.operator)}
     assert client.post("/api/v1/commands/acknowledge", **send).status_code == 409
@@ -214,12 +220,12 @@ def test_a_fault_is_acknowledged(camera: Camera, client: TestClient) -> None:
 
 
 def test_telemetry_begins_with_everything_and_goes_on(camera: Camera, client: TestClient) -> None:
-    for event in flown.exposure(1):
+    for event in flight_events.exposure(1):
         camera.state.apply(event)
     with client.websocket_connect("/api/v1/telemetry?form=json") as socket:
         first = socket.receive_json()
         assert [one["number"] for one in first["exposures"]] == [1]
-        for event in flown.exposure(2):
+        for event in flight_events.exposure(2):
             camera.state.apply(event)
         while True:
             record = socket.receive_json()
@@ -233,7 +239,11 @@ def test_telemetry_begins_with_everything_and_goes_on(camera: Camera, client: Te
 def test_metrics_speak_prometheus(camera: Camera, client: TestClient) -> None:
     from prometheus_client.parser import text_string_to_metric_families
 
-    for event in (*flown.exposure(1), flown.status(triggers=1), flown.lost("SU02")):
+    for event in (
+        *flight_events.exposure(1),
+        flight_events.status(triggers=1),
+        flight_events.lost("SU02"),
+    ):
         camera.state.apply(event)
     text = client.get("/metrics").text
     samples = {
@@ -246,8 +256,8 @@ def test_metrics_speak_prometheus(camera: Camera, client: TestClient) -> None:
     assert samples["syntopic_frames_total", (("cause", "used"),)] == 13
     assert samples["syntopic_marks_pending", ()] == 0
     rules = (Path(__file__).parents[4] / "systemd/alerts.yml").read_text()
-    asked = set(re.findall(r"syntopic_\w+", rules))
-    assert asked and asked <= {name for name, _ in samples}
+    requests = set(re.findall(r"syntopic_\w+", rules))
+    assert requests and requests <= {name for name, _ in samples}
     assert samples["syntopic_clock_sigma_seconds", ()] == pytest.approx(25e-9)
     assert samples["syntopic_device_ready", (("device", "SU02"), ("kind", ""))] == 0
     assert samples["syntopic_phase", (("phase", "flying"),)] == 1

@@ -16,11 +16,11 @@ from typer.testing import CliRunner
 
 from daemon.cli import app
 from daemon.configuration.model import WatchSection
-from daemon.onboard.monitoring.access.authority import make_certificate
+from daemon.onboard.monitoring.access.certificate_authority import issue_certificate
 from daemon.onboard.monitoring.access.certificates import (
     Certificate,
-    CertificateError,
     CertificateFiles,
+    TlsCertificateError,
     expiry_warning,
     machine_names,
     name_problem,
@@ -28,8 +28,8 @@ from daemon.onboard.monitoring.access.certificates import (
     server_context,
     validity_problem,
 )
-from daemon.onboard.monitoring.prerequisites import watch_findings
-from daemon.onboard.preflight.findings import Finding, Outcome
+from daemon.onboard.monitoring.monitoring_prerequisites import check_monitoring
+from daemon.onboard.preflight.check_results import CheckOutcome, CheckResult
 
 pytestmark = pytest.mark.trust
 DAY_S = 86_400.0
@@ -38,7 +38,7 @@ DAY_S = 86_400.0
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("tls")
-    make_certificate(folder, names=["camera1.example.org"])
+    issue_certificate(folder, names=["camera1.example.org"])
     return folder
 
 
@@ -58,14 +58,14 @@ def openssl(*arguments: object) -> None:
 def greet(server: ssl.SSLContext, client: ssl.SSLContext, name: str) -> None:
     """A handshake in memory. Raises ssl.SSLError where the client does not trust the server."""
     to_client, to_server = ssl.MemoryBIO(), ssl.MemoryBIO()
-    asking = client.wrap_bio(to_client, to_server, server_hostname=name)
+    client_side = client.wrap_bio(to_client, to_server, server_hostname=name)
     answering = server.wrap_bio(to_server, to_client, server_side=True)
-    for end in (asking, answering, asking, answering):
+    for end in (client_side, answering, client_side, answering):
         try:
             end.do_handshake()
         except ssl.SSLWantReadError:
             continue
-    assert asking.getpeercert()
+    assert client_side.getpeercert()
 
 
 @pytest.mark.filterwarnings("ignore:ssl.TLSVersion")
@@ -91,29 +91,29 @@ def test_keys_are_private_and_the_authority_signs_for_nothing_else(tls: Path) ->
     modes = {path.name: path.stat().st_mode & 0o777 for path in tls.iterdir()}
     assert modes["authority.key"] == 0o600 and modes["server.key"] == 0o640
     before = (tls / "server.pem").read_bytes()
-    with pytest.raises(CertificateError, match=r"may not sign for all of .*bank\.example"):
-        make_certificate(tls, names=["bank.example"])
+    with pytest.raises(TlsCertificateError, match=r"may not sign for all of .*bank\.example"):
+        issue_certificate(tls, names=["bank.example"])
     assert (tls / "server.pem").read_bytes() == before
     (tls / "authority.pem").unlink()
-    again = make_certificate(tls, names=["bank.example"])
+    again = issue_certificate(tls, names=["bank.example"])
     assert again.is_new_authority and "bank.example" in again.names
 
 
 def test_a_renewal_keeps_authority_and_key_and_replaces_one_file(tls: Path) -> None:
     before = {path.name: path.read_bytes() for path in tls.iterdir()}
-    again = make_certificate(tls, names=["camera1.example.org"])
+    again = issue_certificate(tls, names=["camera1.example.org"])
     after = {path.name: path.read_bytes() for path in tls.iterdir()}
     assert not again.is_new_authority
     assert [name for name in before if before[name] != after[name]] == ["server.pem"]
     (tls / "authority.key").rename(tls.parent / "away.key")
-    with pytest.raises(CertificateError, match=r"authority\.key is missing.*--authority"):
-        make_certificate(tls)
+    with pytest.raises(TlsCertificateError, match=r"authority\.key is missing.*--authority"):
+        issue_certificate(tls)
 
 
 @pytest.mark.parametrize("name", ["a b", "x\nDNS.9 = evil", "-x.local", "..", "x" * 254, "*"])
 def test_a_name_that_is_none_is_refused(name: str, tmp_path: Path) -> None:
-    with pytest.raises(CertificateError, match="neither a DNS name nor an IP address"):
-        make_certificate(tmp_path, names=[name])
+    with pytest.raises(TlsCertificateError, match="neither a DNS name nor an IP address"):
+        issue_certificate(tmp_path, names=[name])
     assert not list(tmp_path.iterdir())
 
 
@@ -172,17 +172,17 @@ def test_what_cannot_be_used_is_refused_with_its_cure(
     damage: Callable[[Path], None], sentence: str, tls: Path
 ) -> None:
     damage(tls)
-    with pytest.raises(CertificateError, match=sentence):
+    with pytest.raises(TlsCertificateError, match=sentence):
         server_context(tls / "server.pem", tls / "server.key")
-    (finding,) = findings(tls)
-    assert finding.outcome is Outcome.FAIL and "Nobody can watch" in finding.sentence
+    (result,) = results(tls)
+    assert result.outcome is CheckOutcome.FAIL and "Nobody can watch" in result.sentence
 
 
-def findings(tls: Path, host: str = "127.0.0.1") -> list[Finding]:
+def results(tls: Path, host: str = "127.0.0.1") -> list[CheckResult]:
     settings = WatchSection(
         host=host, tls_certificate=tls / "server.pem", tls_key=tls / "server.key"
     )
-    return list(watch_findings(settings, port=False))
+    return list(check_monitoring(settings, port=False))
 
 
 def self_signed(tls: Path, *extensions: str, days: int = 365) -> None:
@@ -208,46 +208,46 @@ def expire(tls: Path) -> None:
 
 
 def test_a_good_certificate_passes(tls: Path) -> None:
-    assert [finding.outcome for finding in findings(tls)] == [Outcome.PASS, Outcome.PASS]
-    assert [finding.outcome for finding in findings(tls, "0.0.0.0")][1] is Outcome.PASS
-    lacking = findings(tls, "192.0.2.99")[1]
-    assert lacking.outcome is Outcome.FAIL and "lacks 192.0.2.99" in lacking.sentence
+    assert [result.outcome for result in results(tls)] == [CheckOutcome.PASS, CheckOutcome.PASS]
+    assert [result.outcome for result in results(tls, "0.0.0.0")][1] is CheckOutcome.PASS
+    incomplete = results(tls, "192.0.2.99")[1]
+    assert incomplete.outcome is CheckOutcome.FAIL and "lacks 192.0.2.99" in incomplete.sentence
 
 
 def test_a_certificate_for_another_machine_or_another_purpose_is_found(tls: Path) -> None:
     self_signed(tls, "subjectAltName=DNS:other.local,IP:127.0.0.1")
-    assert "none of this machine's names" in findings(tls)[1].sentence
+    assert "none of this machine's names" in results(tls)[1].sentence
     self_signed(tls, f"subjectAltName=DNS:{machine_names()[0]},IP:127.0.0.1")
-    assert [finding.outcome for finding in findings(tls)] == [Outcome.PASS, Outcome.PASS]
+    assert [result.outcome for result in results(tls)] == [CheckOutcome.PASS, CheckOutcome.PASS]
     self_signed(tls, "extendedKeyUsage=clientAuth")
-    (finding,) = findings(tls)
-    assert finding.outcome is Outcome.FAIL and "no certificate for a server" in finding.sentence
+    (result,) = results(tls)
+    assert result.outcome is CheckOutcome.FAIL and "no certificate for a server" in result.sentence
 
 
 def test_expired_and_soon_expiring_certificates_are_found(tls: Path) -> None:
-    make_certificate(tls, names=["camera1.example.org"], days=20)
-    late = findings(tls)[1]
-    assert late.outcome is Outcome.WAITING and "expires in 20 days" in late.sentence
+    issue_certificate(tls, names=["camera1.example.org"], days=20)
+    late = results(tls)[1]
+    assert late.outcome is CheckOutcome.WAITING and "expires in 20 days" in late.sentence
     expire(tls)
-    expired = findings(tls)
-    assert [finding.outcome for finding in expired] == [Outcome.PASS, Outcome.FAIL]
+    expired = results(tls)
+    assert [result.outcome for result in expired] == [CheckOutcome.PASS, CheckOutcome.FAIL]
     assert "expired on" in expired[1].sentence, "it is served, and clients refuse it"
 
 
 def test_dates_and_names_are_compared_as_clients_do() -> None:
-    known = Certificate(
+    available = Certificate(
         frozenset({"a.local", "*.example.org"}), frozenset({"10.0.0.5"}), 0.0, DAY_S
     )
-    assert "set the clock" in (validity_problem(known, -1.0) or "")
-    assert validity_problem(known, 0.0) is None and validity_problem(known, DAY_S) is None
-    assert "expired" in (validity_problem(known, DAY_S + 1) or "")
-    assert expiry_warning(known, DAY_S - 30 * DAY_S) is None
-    assert expiry_warning(known, DAY_S - 30 * DAY_S + 1) is not None
-    assert expiry_warning(known, DAY_S + 1) is None
-    assert name_problem(known, "0.0.0.0", ["b.local", "a.local"]) is None
-    assert name_problem(known, "10.0.0.5", ["c1.example.org"]) is None
-    assert name_problem(known, "10.0.0.6", ["a.local"]) is not None
-    assert name_problem(known, "0.0.0.0", ["c.d.example.org"]) is not None
+    assert "set the clock" in (validity_problem(available, -1.0) or "")
+    assert validity_problem(available, 0.0) is None and validity_problem(available, DAY_S) is None
+    assert "expired" in (validity_problem(available, DAY_S + 1) or "")
+    assert expiry_warning(available, DAY_S - 30 * DAY_S) is None
+    assert expiry_warning(available, DAY_S - 30 * DAY_S + 1) is not None
+    assert expiry_warning(available, DAY_S + 1) is None
+    assert name_problem(available, "0.0.0.0", ["b.local", "a.local"]) is None
+    assert name_problem(available, "10.0.0.5", ["c1.example.org"]) is None
+    assert name_problem(available, "10.0.0.6", ["a.local"]) is not None
+    assert name_problem(available, "0.0.0.0", ["c.d.example.org"]) is not None
 
 
 def test_a_renewed_certificate_is_used_and_a_damaged_one_reported_once(tls: Path) -> None:
@@ -255,11 +255,11 @@ def test_a_renewed_certificate_is_used_and_a_damaged_one_reported_once(tls: Path
     files = CertificateFiles(pem, key, server_context(pem, key))
     first = files.context
     assert not files.renewed()
-    make_certificate(tls, names=["camera1.example.org"])
+    issue_certificate(tls, names=["camera1.example.org"])
     assert files.renewed() and files.context is not first
     second, good = files.context, pem.read_bytes()
     pem.write_text("no certificate")
-    with pytest.raises(CertificateError):
+    with pytest.raises(TlsCertificateError):
         files.renewed()
     assert not files.renewed() and files.context is second
     pem.write_bytes(good)
@@ -270,8 +270,11 @@ def test_a_renewed_certificate_is_used_and_a_damaged_one_reported_once(tls: Path
 def test_the_command_makes_what_the_configuration_names(tmp_path: Path) -> None:
     made = CliRunner().invoke(app, ["certificate", "--folder", str(tmp_path / "tls"), "--json"])
     assert made.exit_code == 0, made.output
-    told = json.loads(made.stdout)
-    assert machine_names()[0] in told["names"] and "127.0.0.1" in told["names"]
-    assert [one.outcome for one in findings(tmp_path / "tls")] == [Outcome.PASS, Outcome.PASS]
+    reported = json.loads(made.stdout)
+    assert machine_names()[0] in reported["names"] and "127.0.0.1" in reported["names"]
+    assert [one.outcome for one in results(tmp_path / "tls")] == [
+        CheckOutcome.PASS,
+        CheckOutcome.PASS,
+    ]
     printed = CliRunner().invoke(app, ["certificate", "--folder", str(tmp_path / "tls")])
-    assert told["authority_sha256"] in printed.output and 'tls_key = "' in printed.output
+    assert reported["authority_sha256"] in printed.output and 'tls_key = "' in printed.output

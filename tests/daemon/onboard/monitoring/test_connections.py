@@ -16,9 +16,9 @@ from daemon.onboard.monitoring.web.connections import (
     REQUESTS_AT_ONCE_PER_SOURCE,
     REQUESTS_BURST,
     REQUESTS_PER_S,
-    Connection,
+    ClientConnection,
     Connections,
-    Use,
+    ConnectionUse,
     source_of,
 )
 
@@ -41,7 +41,7 @@ class Links:
         self.ends: list[socket.socket] = []
         self.port = 1024
 
-    def open(self, host: str) -> Connection | None:
+    def open(self, host: str) -> ClientConnection | None:
         ours, theirs = socket.socketpair()
         self.ends += [ours, theirs]
         self.port += 1
@@ -65,14 +65,16 @@ def links(clock: Clock) -> Iterator[Links]:
         end.close()
 
 
-def is_aborted(connection: Connection) -> bool:
+def is_aborted(connection: ClientConnection) -> bool:
     try:
         return connection.link.recv(1, socket.MSG_DONTWAIT | socket.MSG_PEEK) == b""
     except BlockingIOError:
         return False
 
 
-def opened(links: Links, host: str, clock: Clock, use: Use = Use.IDLE) -> Connection:
+def opened(
+    links: Links, host: str, clock: Clock, use: ConnectionUse = ConnectionUse.IDLE
+) -> ClientConnection:
     clock.now_s += 0.001
     connection = links.open(host)
     assert connection is not None
@@ -83,7 +85,7 @@ def opened(links: Links, host: str, clock: Clock, use: Use = Use.IDLE) -> Connec
 def test_an_address_with_too_many_connections_loses_its_oldest_idle_one(
     links: Links, clock: Clock
 ) -> None:
-    watcher = opened(links, "10.0.0.1", clock, Use.WATCHER)
+    watcher = opened(links, "10.0.0.1", clock, ConnectionUse.WATCHER)
     mine = [opened(links, "10.0.0.1", clock) for _ in range(CONNECTIONS_PER_SOURCE - 1)]
     other = opened(links, "10.0.0.2", clock)
     opened(links, "10.0.0.1", clock)
@@ -99,7 +101,7 @@ def test_an_address_with_too_many_connections_loses_its_oldest_idle_one(
 def test_a_full_table_closes_strangers_and_nobody_who_is_known(links: Links, clock: Clock) -> None:
     operator = [opened(links, "10.0.1.1", clock) for _ in range(10)]
     for one in operator:
-        one.is_known = True
+        one.is_authenticated = True
     strangers = [opened(links, f"10.1.{n // 250}.{n % 250}", clock) for n in range(CONNECTIONS_MAX)]
     assert not any(is_aborted(one) for one in operator)
     assert [is_aborted(one) for one in strangers[:12]] == [True] * 10 + [False] * 2
@@ -108,7 +110,7 @@ def test_a_full_table_closes_strangers_and_nobody_who_is_known(links: Links, clo
 
 def test_when_all_are_known_a_newcomer_is_refused(links: Links, clock: Clock) -> None:
     for _ in range(CONNECTIONS_PER_SOURCE):
-        opened(links, "10.0.0.1", clock).is_known = True
+        opened(links, "10.0.0.1", clock).is_authenticated = True
     assert links.open("10.0.0.1") is None
     assert links.open("10.0.0.2") is not None
 
@@ -121,8 +123,8 @@ def test_a_proxy_has_no_limit_of_its_own(links: Links, clock: Clock) -> None:
 
 def test_what_takes_too_long_is_ended(links: Links, clock: Clock) -> None:
     idle = opened(links, "10.0.0.1", clock)
-    request = opened(links, "10.0.0.1", clock, Use.REQUEST)
-    watcher = opened(links, "10.0.0.1", clock, Use.WATCHER)
+    request = opened(links, "10.0.0.1", clock, ConnectionUse.REQUEST)
+    watcher = opened(links, "10.0.0.1", clock, ConnectionUse.WATCHER)
     for passed_s, expected in (
         (IDLE_MAX_S - 0.1, [False, False, False]),
         (0.2, [True, False, False]),
@@ -136,34 +138,35 @@ def test_what_takes_too_long_is_ended(links: Links, clock: Clock) -> None:
 
 
 def test_requests_of_an_address_have_a_rate(links: Links, clock: Clock) -> None:
-    ask = links.connections.may_request
-    assert sum(ask("10.0.0.1") for _ in range(REQUESTS_BURST + 50)) == REQUESTS_BURST
-    assert ask("10.0.0.2")
+    request = links.connections.may_request
+    assert sum(request("10.0.0.1") for _ in range(REQUESTS_BURST + 50)) == REQUESTS_BURST
+    assert request("10.0.0.2")
     clock.now_s += 0.5
-    assert sum(ask("10.0.0.1") for _ in range(REQUESTS_BURST)) == REQUESTS_PER_S // 2
+    assert sum(request("10.0.0.1") for _ in range(REQUESTS_BURST)) == REQUESTS_PER_S // 2
 
 
 def test_few_requests_of_an_address_are_answered_at_once(links: Links, clock: Clock) -> None:
     busy = [
-        opened(links, "10.0.0.1", clock, Use.REQUEST) for _ in range(REQUESTS_AT_ONCE_PER_SOURCE)
+        opened(links, "10.0.0.1", clock, ConnectionUse.REQUEST)
+        for _ in range(REQUESTS_AT_ONCE_PER_SOURCE)
     ]
     assert not links.connections.may_request("10.0.0.1")
     assert links.connections.may_request("10.0.0.2")
-    busy[0].is_known = True
+    busy[0].is_authenticated = True
     assert links.connections.may_request("10.0.0.1")
 
 
 def test_places_of_watchers_are_shared_between_addresses(links: Links, clock: Clock) -> None:
     first = [
-        opened(links, f"10.0.0.{host}", clock, Use.WATCHER)
+        opened(links, f"10.0.0.{host}", clock, ConnectionUse.WATCHER)
         for host in (1, 3)
         for _ in range(table.WATCHERS_MAX // 2)
     ]
     same, other = opened(links, "10.0.0.1", clock), opened(links, "10.0.0.2", clock)
     assert not links.connections.may_watch(same)
     assert links.connections.may_watch(other)
-    other.enter(Use.WATCHER)
-    same.is_known = True
+    other.enter(ConnectionUse.WATCHER)
+    same.is_authenticated = True
     assert links.connections.may_watch(same)
     assert sum(map(is_aborted, first)) == 2
 

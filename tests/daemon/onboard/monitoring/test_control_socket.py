@@ -18,22 +18,22 @@ from typing import Any
 
 import pytest
 
+from daemon.onboard.monitoring.access.command_gateway import CommandGateway
 from daemon.onboard.monitoring.access.control_socket import (
-    Caller,
     ControlError,
     ControlSocket,
-    caller_of,
-    give,
+    PeerProcess,
+    peer_process,
+    send_command,
 )
-from daemon.onboard.monitoring.access.gate import Gate
 from daemon.onboard.monitoring.access.roles import Role
-from daemon.onboard.monitoring.state import FlightState
-from daemon.onboard.service.messages import Answer, Command, CommandRefused
-from tests.daemon.onboard.monitoring import flown
+from daemon.onboard.monitoring.flight_state import FlightState
+from daemon.onboard.service.messages import Answer, CommandRefused, ServiceCommand
+from tests.daemon.onboard.monitoring import flight_events
 
 RELEASE = "release-disk"
 ME = f"uid {os.geteuid()}"
-ASK = """
+STATE_QUERY = """
 import json, os, socket, sys
 os.setgroups([int(g) for g in sys.argv[2].split(",") if g])
 os.setgid(65534)
@@ -49,22 +49,22 @@ class Service:
     """Answers at once and remembers what it was asked."""
 
     def __init__(self) -> None:
-        self.commands: list[Command] = []
+        self.commands: list[ServiceCommand] = []
         self.refused: list[CommandRefused] = []
         self.state = FlightState("syntopic test")
-        self.gate = Gate(self.hear)
+        self.gateway = CommandGateway(self.receive)
 
-    def hear(self, command: Command | CommandRefused) -> None:
+    def receive(self, command: ServiceCommand | CommandRefused) -> None:
         if isinstance(command, CommandRefused):
             self.refused.append(command)
             return
         self.commands.append(command)
         answer = Answer(command.number, command.name != "stop", "as asked")
-        asyncio.get_running_loop().call_soon(self.gate.answered, answer)
+        asyncio.get_running_loop().call_soon(self.gateway.on_answer, answer)
 
     @asynccontextmanager
     async def listening(self, path: Path, group: str | None = None) -> AsyncIterator[ControlSocket]:
-        control = ControlSocket(path, group, None, self.gate, self.state)
+        control = ControlSocket(path, group, None, self.gateway, self.state)
         await control.begin()
         try:
             yield control
@@ -72,12 +72,12 @@ class Service:
             control.end()
 
 
-def with_socket(service: Service, path: Path, ask: Callable[[], Any]) -> Any:
+def with_socket(service: Service, path: Path, query: Callable[[], Any]) -> Any:
     """Ask from another thread while the socket listens."""
 
     async def run() -> Any:
         async with service.listening(path), asyncio.timeout(20):
-            return await asyncio.to_thread(ask)
+            return await asyncio.to_thread(query)
 
     return asyncio.run(run())
 
@@ -97,12 +97,12 @@ def lines(path: Path, *sent: bytes) -> list[dict[str, Any]]:
 
 def test_a_command_is_given_in_the_name_the_kernel_knows(tmp_path: Path) -> None:
     service, path = Service(), tmp_path / "control.sock"
-    done = with_socket(service, path, lambda: give(path, "start", {"override": True}))
+    done = with_socket(service, path, lambda: send_command(path, "start", {"override": True}))
     assert done == (True, "as asked")
     (command,) = service.commands
     assert (command.name, command.by.split(" (")[0]) == ("start", ME)
     assert command.arguments["override"] is True
-    refused = with_socket(service, path, lambda: give(path, "stop", {}))
+    refused = with_socket(service, path, lambda: send_command(path, "stop", {}))
     assert refused == (False, "as asked")
 
 
@@ -115,9 +115,11 @@ def test_the_socket_is_for_owner_and_group_and_goes_with_the_service(tmp_path: P
 
 def test_a_fault_that_is_acknowledged_leaves_the_list(tmp_path: Path) -> None:
     service, path = Service(), tmp_path / "control.sock"
-    service.state.apply(flown.lost("SU02"))
-    service.state.apply(flown.recovered("SU02"))
-    assert with_socket(service, path, lambda: give(path, "acknowledge", {"fault": "device SU02"}))
+    service.state.apply(flight_events.lost("SU02"))
+    service.state.apply(flight_events.recovered("SU02"))
+    assert with_socket(
+        service, path, lambda: send_command(path, "acknowledge", {"fault": "device SU02"})
+    )
     assert service.state.faults() == []
 
 
@@ -147,7 +149,7 @@ def test_a_line_without_end_is_cut_off_and_others_are_heard(tmp_path: Path) -> N
                 assert connection.recv(1) == b""
             except (BrokenPipeError, ConnectionResetError):
                 pass
-        return give(path, "start", {})
+        return send_command(path, "start", {})
 
     assert with_socket(service, path, flood)[0]
 
@@ -155,25 +157,25 @@ def test_a_line_without_end_is_cut_off_and_others_are_heard(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("caller", "role"),
     [
-        (Caller(1, 0, frozenset()), "administrator"),
-        (Caller(1, os.geteuid(), frozenset()), "administrator"),
-        (Caller(1, 4711, frozenset({grp.getgrnam("adm").gr_gid})), "administrator"),
-        (Caller(1, 4711, frozenset({grp.getgrnam("dialout").gr_gid})), "operator"),
-        (Caller(1, 4711, frozenset({4712})), None),
+        (PeerProcess(1, 0, frozenset()), "administrator"),
+        (PeerProcess(1, os.geteuid(), frozenset()), "administrator"),
+        (PeerProcess(1, 4711, frozenset({grp.getgrnam("adm").gr_gid})), "administrator"),
+        (PeerProcess(1, 4711, frozenset({grp.getgrnam("dialout").gr_gid})), "operator"),
+        (PeerProcess(1, 4711, frozenset({4712})), None),
     ],
 )
 def test_user_and_groups_of_a_process_are_its_role(
-    caller: Caller, role: Role | None, tmp_path: Path
+    caller: PeerProcess, role: Role | None, tmp_path: Path
 ) -> None:
     service = Service()
-    control = ControlSocket(tmp_path / "c", "dialout", "adm", service.gate, service.state)
+    control = ControlSocket(tmp_path / "c", "dialout", "adm", service.gateway, service.state)
     assert control.role_of(caller) == role
 
 
 def test_the_kernel_says_which_groups_somebody_is_of() -> None:
     here, there = socket.socketpair(socket.AF_UNIX)
     with here, there:
-        caller = caller_of(here)
+        caller = peer_process(here)
     assert (caller.pid, caller.uid) == (os.getpid(), os.geteuid())
     assert caller.groups == frozenset((os.getegid(), *os.getgroups()))
 
@@ -183,18 +185,18 @@ def test_a_stranger_is_refused_and_told_of_and_a_member_is_obeyed() -> None:
     with tempfile.TemporaryDirectory() as folder:
         # Everybody may enter it, as /run/syntopic.
         Path(folder).chmod(0o755)
-        _ask_as_others(Path(folder) / "control.sock")
+        _query_as_others(Path(folder) / "control.sock")
 
 
-def _ask_as_others(path: Path) -> None:
+def _query_as_others(path: Path) -> None:
     service = Service()
     group = grp.getgrnam("dialout")
 
-    def ask(groups: str, name: str) -> dict[str, Any]:
+    def query(groups: str, name: str) -> dict[str, Any]:
         # Knocking is open to all, as where the hardened unit may not give the socket away.
         path.chmod(0o666)
         done = subprocess.run(
-            [sys.executable, "-c", ASK, str(path), groups, name],
+            [sys.executable, "-c", STATE_QUERY, str(path), groups, name],
             capture_output=True,
             text=True,
             timeout=20,
@@ -204,18 +206,18 @@ def _ask_as_others(path: Path) -> None:
 
     async def run() -> list[dict[str, Any]]:
         async with service.listening(path, group.gr_name):
-            asked = (("", "start"), (str(group.gr_gid), "start"), (str(group.gr_gid), RELEASE))
-            return [await asyncio.to_thread(ask, *one) for one in asked]
+            query_line = (("", "start"), (str(group.gr_gid), "start"), (str(group.gr_gid), RELEASE))
+            return [await asyncio.to_thread(query, *one) for one in query_line]
 
-    stranger, member, too_much = asyncio.run(run())
-    assert (stranger["done"], "dialout may" in stranger["sentence"]) == (False, True)
+    unauthorized, member, too_much = asyncio.run(run())
+    assert (unauthorized["done"], "dialout may" in unauthorized["sentence"]) == (False, True)
     assert member["done"] is True
     assert (too_much["done"], "administrator" in too_much["sentence"]) == (False, True)
     (command,) = service.commands
     assert (command.by.split(" (")[0], command.role) == ("uid 65534", "operator")
     assert command.address.startswith("control socket, pid ")
     assert [(one.name, one.role, one.sentence) for one in service.refused] == [
-        ("start", "none", stranger["sentence"]),
+        ("start", "none", unauthorized["sentence"]),
         (RELEASE, "operator", too_much["sentence"]),
     ]
 
@@ -224,7 +226,7 @@ def test_a_socket_left_by_a_killed_service_is_taken_over_and_a_file_is_not(tmp_p
     path = tmp_path / "control.sock"
     with socket.socket(socket.AF_UNIX) as dead:
         dead.bind(str(path))
-    assert with_socket(Service(), path, lambda: give(path, "start", {}))[0]
+    assert with_socket(Service(), path, lambda: send_command(path, "start", {}))[0]
     path.write_text("precious")
     with pytest.raises(ControlError, match="no socket"):
         with_socket(Service(), path, lambda: None)
@@ -243,10 +245,10 @@ def test_a_second_service_does_not_take_the_socket_of_the_first(tmp_path: Path) 
 
 def test_nobody_listening_and_no_such_group_end_in_sentences(tmp_path: Path) -> None:
     with pytest.raises(ControlError, match="does the service run"):
-        give(tmp_path / "none.sock", "start", {})
+        send_command(tmp_path / "none.sock", "start", {})
     service = Service()
     with pytest.raises(ControlError, match="no group"):
-        ControlSocket(tmp_path / "c", "no-such-group", None, service.gate, service.state)
+        ControlSocket(tmp_path / "c", "no-such-group", None, service.gateway, service.state)
 
 
 def test_the_command_line_gives_what_it_is_told_and_its_status_says_what_became(
@@ -263,12 +265,12 @@ def test_the_command_line_gives_what_it_is_told_and_its_status_says_what_became(
             check=False,
         )
 
-    async def ask() -> tuple[subprocess.CompletedProcess[str], ...]:
+    async def query() -> tuple[subprocess.CompletedProcess[str], ...]:
         async with service.listening(path):
             given = ("interval", "--set", "interval_s=2.5", "--set", "count=4", "--json")
             return await asyncio.to_thread(run, *given), await asyncio.to_thread(run, "stop")
 
-    done, refused = asyncio.run(ask())
+    done, refused = asyncio.run(query())
     assert (done.returncode, json.loads(done.stdout)["done"]) == (0, True)
     assert (refused.returncode, refused.stdout.strip()) == (1, "as asked")
     interval = service.commands[0].arguments

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from daemon.onboard.monitoring.coverage import Coverage, advice_json
-from daemon.onboard.monitoring.process import _Ground
-from daemon.onboard.monitoring.state import FlightState
+from daemon.onboard.monitoring.flight_state import FlightState
+from daemon.onboard.monitoring.monitoring_process import _MissionGeometry
 from processing.rig import shipped_rigs
-from tests.daemon.onboard.monitoring import flown
+from tests.daemon.onboard.monitoring import flight_events
 
 
 @pytest.fixture
@@ -30,26 +30,26 @@ def state(tmp_path: Path) -> FlightState:
     (tmp_path / "service.toml").write_text("[plan]\nground_height_m = 395.0\n")
     plan = {"type": "FeatureCollection", "features": features}
     (tmp_path / "plan.geojson").write_text(json.dumps(plan))
-    ground = _Ground()
-    state = FlightState("syntopic", ground.seen_from)
+    ground = _MissionGeometry()
+    state = FlightState("syntopic", ground.footprint_corners)
     ground.state = state
-    state.apply(flown.mission(str(tmp_path)))
+    state.apply(flight_events.mission(str(tmp_path)))
     return state
 
 
 def fly(state: FlightState, first: int, places_m: list[int], *, line: str = "A") -> None:
     for number, north_m in enumerate(places_m, start=first):
-        for event in flown.exposure(number, "good", line=line, north_m=north_m):
+        for event in flight_events.exposure(number, "good", line=line, north_m=north_m):
             state.apply(event)
 
 
 def kinds(coverage: Coverage) -> list[tuple[str, str, int, int]]:
-    question = coverage.question()
-    assert question is not None
-    told = advice_json(question(), coverage)
+    advice_task = coverage.advice_task()
+    assert advice_task is not None
+    reported = advice_json(advice_task(), coverage)
     return [
         (one["line"], one["kind"], round(one["from_m"]), round(one["to_m"]))
-        for one in told["segments"]
+        for one in reported["segments"]
     ]
 
 
@@ -82,7 +82,7 @@ def test_a_line_flown_back_is_passed_from_its_end(state: FlightState) -> None:
 def test_a_line_that_was_left_has_no_rest_but_holes(state: FlightState) -> None:
     coverage = Coverage(state)
     fly(state, 1, [64 * k for k in range(10)])
-    coverage.gather()
+    coverage.update()
     fly(state, 20, [0], line="B")
     assert ("A", "hole") in [(line, kind) for line, kind, _, _ in kinds(coverage)]
 
@@ -93,9 +93,9 @@ def test_an_image_that_is_refly_leaves_a_hole_unless_only_its_overlap_is(
     fly(state, 1, [64 * k for k in range(19)])
     assert [one[0] for one in kinds(Coverage(state))] == ["B"]
     for flag, lines in (("OVERLAP", ["B"]), ("BLUR", ["A", "B"])):
-        told = flown.exposure(8, "refly", line="A", north_m=64 * 7)
-        told[-1]["report"]["findings"][0]["flag"] = flag
-        for event in told:
+        reported = flight_events.exposure(8, "refly", line="A", north_m=64 * 7)
+        reported[-1]["report"]["findings"][0]["flag"] = flag
+        for event in reported:
             state.apply(event)
         assert [one[0] for one in kinds(Coverage(state))] == lines
 
@@ -103,6 +103,6 @@ def test_an_image_that_is_refly_leaves_a_hole_unless_only_its_overlap_is(
 def test_without_a_plan_nothing_is_asked(tmp_path: Path) -> None:
     state = FlightState("syntopic")
     coverage = Coverage(state)
-    assert coverage.question() is None
-    state.apply(flown.mission(str(tmp_path / "gone")))
+    assert coverage.advice_task() is None
+    state.apply(flight_events.mission(str(tmp_path / "gone")))
     assert coverage.plan_json() is None

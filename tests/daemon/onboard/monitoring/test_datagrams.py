@@ -14,9 +14,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daemon.onboard.monitoring.mavlink.datagrams import DATAGRAM_MAX_BYTES, Received, Sender
-from daemon.onboard.monitoring.state import FlightState
-from tests.daemon.onboard.monitoring import flown
+from daemon.onboard.monitoring.flight_state import FlightState
+from daemon.onboard.monitoring.mavlink.datagrams import (
+    DATAGRAM_MAX_BYTES,
+    DatagramReceiver,
+    DatagramScheduler,
+)
+from tests.daemon.onboard.monitoring import flight_events
 
 
 @dataclass
@@ -46,7 +50,7 @@ class Relay:
             self._waiting, (self._free_s + self.delay_s + jitter_s, next(self._count), data)
         )
 
-    def take(self, now_s: float) -> list[bytes]:
+    def receive(self, now_s: float) -> list[bytes]:
         out = []
         while self._waiting and self._waiting[0][0] <= now_s:
             out.append(heapq.heappop(self._waiting)[2])
@@ -55,8 +59,12 @@ class Relay:
 
 def fly(relay: Relay, seconds: float, exposures: int, faults_s: dict[str, float]):
     """Fly and watch; returns state, watcher, and when each fault was seen."""
-    state, sender, watcher = FlightState("syntopic test"), Sender(4000 * 0.9), Received()
-    state.apply(flown.mission())
+    state, sender, watcher = (
+        FlightState("syntopic test"),
+        DatagramScheduler(4000 * 0.9),
+        DatagramReceiver(),
+    )
+    state.apply(flight_events.mission())
     seen: dict[str, float] = {}
     raised: set[str] = set()
     number = 0
@@ -64,19 +72,19 @@ def fly(relay: Relay, seconds: float, exposures: int, faults_s: dict[str, float]
         now_s = tick / 10
         if number < exposures and now_s >= 2.0 * (number + 1):
             number += 1
-            for event in flown.exposure(number, "usable" if number % 5 == 0 else "good"):
+            for event in flight_events.exposure(number, "usable" if number % 5 == 0 else "good"):
                 state.apply(event)
         if tick % 10 == 0:
-            state.apply(flown.status(triggers=number))
+            state.apply(flight_events.status(triggers=number))
         for device, at_s in faults_s.items():
             if now_s >= at_s and device not in raised:
                 raised.add(device)
-                state.apply(flown.lost(device))
+                state.apply(flight_events.lost(device))
         for datagram in sender.due(state, now_s):
             assert len(datagram) <= DATAGRAM_MAX_BYTES
             relay.put(datagram, now_s)
-        for datagram in relay.take(now_s):
-            watcher.take(datagram)
+        for datagram in relay.receive(now_s):
+            watcher.receive(datagram)
         for fault in watcher.faults.values():
             seen.setdefault(fault["device"], now_s)
     return state, watcher, seen
@@ -93,9 +101,9 @@ def test_a_thin_lossy_link_with_outages_ends_up_with_the_same_state() -> None:
     assert watcher.brief["status"]["ledger"] == state.brief()["status"]["ledger"]
     assert watcher.brief["verdicts"] == state.brief()["verdicts"]
     assert set(watcher.faults) == {fault["id"] for fault in state.faults()}
-    told = {one["number"]: one["verdict"] for one in watcher.exposures.values()}
-    assert told == {one["number"]: one["verdict"] for one in state.exposures()}
-    assert watcher.bad == 0
+    reported = {one["number"]: one["verdict"] for one in watcher.exposures.values()}
+    assert reported == {one["number"]: one["verdict"] for one in state.exposures()}
+    assert watcher.rejected_count == 0
 
 
 def test_a_fault_in_an_outage_is_seen_soon_after_it() -> None:
@@ -111,33 +119,33 @@ def test_one_who_comes_late_is_told_what_was() -> None:
 
 
 def test_a_fault_that_is_over_goes() -> None:
-    state, sender, watcher = FlightState("x"), Sender(1e6), Received()
-    state.apply(flown.mission())
-    state.apply(flown.lost("SU02"))
+    state, sender, watcher = FlightState("x"), DatagramScheduler(1e6), DatagramReceiver()
+    state.apply(flight_events.mission())
+    state.apply(flight_events.lost("SU02"))
     for datagram in sender.due(state, 0.0):
-        watcher.take(datagram)
+        watcher.receive(datagram)
     assert list(watcher.faults) == ["device SU02"]
-    state.apply(flown.recovered("SU02"))
+    state.apply(flight_events.recovered("SU02"))
     state.acknowledge("device SU02")
     for datagram in sender.due(state, 5.0):
-        watcher.take(datagram)
+        watcher.receive(datagram)
     assert watcher.faults == {}
 
 
 @given(st.lists(st.binary(max_size=100), max_size=5))
 def test_any_bytes_are_counted_and_harm_nothing(datagrams: list[bytes]) -> None:
-    watcher = Received()
+    watcher = DatagramReceiver()
     for datagram in datagrams:
-        watcher.take(datagram)
-    assert watcher.bad == len(datagrams)
+        watcher.receive(datagram)
+    assert watcher.rejected_count == len(datagrams)
 
 
 @pytest.mark.parametrize("bytes_per_s", [1000.0, 4000.0])
 def test_the_budget_is_kept(bytes_per_s: float) -> None:
-    state, sender = FlightState("x"), Sender(bytes_per_s)
-    state.apply(flown.mission())
+    state, sender = FlightState("x"), DatagramScheduler(bytes_per_s)
+    state.apply(flight_events.mission())
     for number in range(1, 100):
-        for event in flown.exposure(number):
+        for event in flight_events.exposure(number):
             state.apply(event)
     sent = sum(len(d) for tick in range(600) for d in sender.due(state, tick / 10))
     assert sent <= bytes_per_s * 61

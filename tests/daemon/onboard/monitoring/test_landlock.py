@@ -17,13 +17,13 @@ import pytest
 from daemon.configuration.model import PlanSection, WatchSection
 from daemon.onboard.monitoring import landlock
 from daemon.onboard.monitoring.access.tokens import add_token
-from daemon.onboard.monitoring.confinement import confine
-from daemon.onboard.service.messages import Answer, Command, Stop, Told
-from daemon.onboard.service.page_link import PageChild, PageLink
-from tests.daemon.onboard.monitoring import flown
+from daemon.onboard.monitoring.resource_limits import apply_resource_limits
+from daemon.onboard.service.messages import Answer, ServiceCommand, ServiceEvent, Stop
+from daemon.onboard.service.page_connection import PageConnection, PageProcess
+from tests.daemon.onboard.monitoring import flight_events
 
 
-def attacking(link: PageLink, folder: str) -> None:
+def attacking(link: PageConnection, folder: str) -> None:
     """A page's process that reaches for its parent, and says what it could do."""
     parent = os.getppid()
 
@@ -41,13 +41,13 @@ def attacking(link: PageLink, folder: str) -> None:
             return False
         return True
 
-    def tell() -> None:
+    def emit() -> None:
         done = " ".join(what for what in ("signal", "memory", "program", "file") if can(what))
-        link.send(Told({"event": "signing-state", "sentence": done}))
+        link.send(ServiceEvent({"event": "signing-state", "sentence": done}))
 
-    tell()
-    confine()
-    tell()
+    emit()
+    apply_resource_limits()
+    emit()
     link.receive(30.0)
 
 
@@ -61,49 +61,51 @@ def test_a_confined_page_process_starts_no_program_and_reaches_no_other_process(
     )
     if libc_abi < landlock.SIGNALS_SINCE_ABI:
         pytest.skip("needs Linux 6.12 or newer with Landlock")
-    child = PageChild("watch", f"{__name__}:attacking", (str(tmp_path),), {})
-    said: list[str] = []
+    child = PageProcess("watch", f"{__name__}:attacking", (str(tmp_path),), {})
+    sentences: list[str] = []
     deadline = time.monotonic() + 60.0
     try:
-        while len(said) < 2 and time.monotonic() < deadline:
-            said += [one.event["sentence"] for one in child.receive() if isinstance(one, Told)]
+        while len(sentences) < 2 and time.monotonic() < deadline:
+            sentences += [
+                one.event["sentence"] for one in child.receive() if isinstance(one, ServiceEvent)
+            ]
             time.sleep(0.02)
     finally:
         child.end(0.0)
-    assert said == ["signal memory program file", "file"]
+    assert sentences == ["signal memory program file", "file"]
 
 
 def test_a_confined_page_process_serves_state_and_passes_commands_on(tmp_path: Path) -> None:
     token = add_token(tmp_path / "tokens.toml", "anna", "operator")
     settings = WatchSection(host="127.0.0.1", port=0, tokens=tmp_path / "tokens.toml")
-    child = PageChild(
-        "watch", "daemon.onboard.monitoring.process:main", (settings, PlanSection()), {}
+    child = PageProcess(
+        "watch", "daemon.onboard.monitoring.monitoring_process:main", (settings, PlanSection()), {}
     )
     try:
-        watching = received(child, Told).event
+        watching = received(child, ServiceEvent).event
         assert watching["event"] == "watching"
-        assert child.tell(Told(flown.status(triggers=2)))
+        assert child.try_send(ServiceEvent(flight_events.status(triggers=2)))
         base = f"http://127.0.0.1:{watching['port']}/api/v1"
         deadline = time.monotonic() + 30.0
         while "ledger" not in (state := fetched(f"{base}/state")["status"]):
             assert time.monotonic() < deadline, "the status did not arrive"
             time.sleep(0.05)
-        assert state["ledger"] == flown.status(triggers=2)["ledger"]
+        assert state["ledger"] == flight_events.status(triggers=2)["ledger"]
         with ThreadPoolExecutor(1) as pool:
             posted = pool.submit(fetched, f"{base}/commands/arm", token)
-            command = received(child, Command)
+            command = received(child, ServiceCommand)
             assert (command.name, command.by, command.role) == ("arm", "anna", "operator")
-            assert child.tell(Answer(command.number, True, "armed"))
+            assert child.try_send(Answer(command.number, True, "armed"))
             assert posted.result(30)["sentence"] == "armed"
         assert child.invalid == 0
-        assert child.tell(Stop())
+        assert child.try_send(Stop())
         child.process.join(30)
         assert child.process.exitcode == 0
     finally:
         child.end(0.0)
 
 
-def received(child: PageChild, kind: type) -> Any:
+def received(child: PageProcess, kind: type) -> Any:
     """The next message of a kind; others are passed over."""
     deadline = time.monotonic() + 60.0
     while time.monotonic() < deadline:

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from daemon.onboard.monitoring.access.authority import make_certificate
+from daemon.onboard.monitoring.access.certificate_authority import issue_certificate
 from daemon.onboard.monitoring.access.certificates import server_context
 from daemon.onboard.monitoring.web import listener as listener_module
-from daemon.onboard.monitoring.web.listener import HANDSHAKES_MAX, Listener
+from daemon.onboard.monitoring.web.listener import HANDSHAKES_MAX, ConnectionListener
 
 pytestmark = pytest.mark.trust
 WITHIN_S = 30.0
@@ -38,16 +38,16 @@ class Echo(asyncio.Protocol):
 @pytest.fixture(scope="module")
 def tls(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("tls")
-    make_certificate(folder)
+    issue_certificate(folder)
     return folder
 
 
 @asynccontextmanager
-async def listening(tls: Path) -> AsyncIterator[tuple[Listener, int]]:
+async def listening(tls: Path) -> AsyncIterator[tuple[ConnectionListener, int]]:
     context = server_context(tls / "server.pem", tls / "server.key")
     plain = socket.create_server(("127.0.0.1", 0), backlog=256)
     port = plain.getsockname()[1]
-    listener = Listener(plain, Echo, lambda: context)
+    listener = ConnectionListener(plain, Echo, lambda: context)
     try:
         async with asyncio.timeout(WITHIN_S):
             yield listener, port
@@ -105,7 +105,7 @@ def test_a_handshake_has_its_time(tls: Path, sent: bytes, monkeypatch: pytest.Mo
 
 
 def test_plain_http_is_answered_with_where_to_go(tls: Path) -> None:
-    async def ask() -> bytes:
+    async def request() -> bytes:
         async with listening(tls) as (_, port):
             reader, writer = await asyncio.open_connection("127.0.0.1", port)
             writer.write(b"GET /<script>?token=syn_secret HTTP/1.1\r\nHost: evil.example\r\n\r\n")
@@ -115,7 +115,7 @@ def test_plain_http_is_answered_with_where_to_go(tls: Path) -> None:
             return answer
 
     made = Echo.made
-    answer = asyncio.run(ask())
+    answer = asyncio.run(request())
     assert answer.startswith(b"HTTP/1.1 400 ")
     assert b"evil" not in answer and b"script" not in answer and b"secret" not in answer
     assert Echo.made == made, "the application hears nothing of it"

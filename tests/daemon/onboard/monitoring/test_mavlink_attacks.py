@@ -26,7 +26,7 @@ from daemon.onboard.monitoring.mavlink.signatures import (
 )
 from drivers.receivers.mavlink.library import MavlinkParser
 from tests.daemon.configuration.test_configuration import GOOD
-from tests.daemon.onboard.monitoring import flown
+from tests.daemon.onboard.monitoring import flight_events
 from tests.daemon.onboard.monitoring.test_mavsdk_camera import Flying, wait_for
 
 dialect = pytest.importorskip(
@@ -53,7 +53,7 @@ class Station:
         self.mav = dialect.MAVLink(None, srcSystem=255, srcComponent=190)
         self.reader = dialect.MAVLink(None)
         self.reader.robust_parsing = True
-        self.heard: list[Any] = []
+        self.received: list[Any] = []
         if key is not None:
             self.mav.signing.secret_key = key
             self.mav.signing.sign_outgoing = True
@@ -69,16 +69,16 @@ class Station:
     def beat(self) -> None:
         self.send(bytes(self.mav.heartbeat_encode(6, 8, 0, 0, 4).pack(self.mav)))
 
-    def hear(self, kind: str) -> list[Any]:
+    def receive(self, kind: str) -> list[Any]:
         with suppress(TimeoutError):
-            self.heard += self.reader.parse_buffer(bytearray(self.socket.recv(2048))) or []
-        return [message for message in self.heard if message.get_type() == kind]
+            self.received += self.reader.parse_buffer(bytearray(self.socket.recv(2048))) or []
+        return [message for message in self.received if message.get_type() == kind]
 
     def order(self) -> int:
         """Send one capture and return what became of it."""
-        self.heard.clear()
+        self.received.clear()
         self.send(self.packed(*TRIGGER))
-        (ack, *_) = wait_for(lambda: self.hear("COMMAND_ACK"), "the answer")
+        (ack, *_) = wait_for(lambda: self.receive("COMMAND_ACK"), "the answer")
         return int(ack.result)
 
     def close(self) -> None:
@@ -99,7 +99,9 @@ def flight(tmp_path: Path, **settings: Any) -> Iterator[Flying]:
 
 
 @contextmanager
-def hammering(flying: Flying, *, hosts: list[str], said: bytes, every_s: float) -> Iterator[None]:
+def hammering(
+    flying: Flying, *, hosts: list[str], payload: bytes, every_s: float
+) -> Iterator[None]:
     """Strangers that say the same again and again until the block ends."""
     sockets = []
     for host in hosts:
@@ -110,7 +112,7 @@ def hammering(flying: Flying, *, hosts: list[str], said: bytes, every_s: float) 
     def hammer() -> None:
         while not stop.wait(every_s):
             for one in sockets:
-                one.sendto(said, ("127.0.0.1", flying.port))
+                one.sendto(payload, ("127.0.0.1", flying.port))
 
     thread = threading.Thread(target=hammer, daemon=True)
     thread.start()
@@ -135,12 +137,12 @@ def test_stray_bytes_of_others_before_each_command_jam_none_of_ten(
     tmp_path: Path, stray: bytes
 ) -> None:
     with flight(tmp_path) as flying:
-        operator, stranger = Station(flying, KEY), Station(flying, host="127.0.0.2")
+        operator, unknown_sender = Station(flying, KEY), Station(flying, host="127.0.0.2")
         for _ in range(10):
-            stranger.send(stray)
+            unknown_sender.send(stray)
             assert operator.order() == ACCEPTED
         assert len(flying.commands) == 10
-        operator.close(), stranger.close()
+        operator.close(), unknown_sender.close()
 
 
 def test_stray_bytes_from_the_operators_own_address_jam_nothing_either(tmp_path: Path) -> None:
@@ -159,34 +161,34 @@ def test_a_command_cut_in_two_datagrams_is_put_together_by_its_sender_only() -> 
     parser = MavlinkParser()
     senders = Senders(parser)
     mav = dialect.MAVLink(None, srcSystem=255, srcComponent=190)
-    whole = bytes(mav.heartbeat_encode(6, 8, 0, 0, 4).pack(mav))
-    assert senders.messages(whole[:9], ("a", 1), 0.0) == ([], 0)
-    assert senders.messages(whole[9:], ("b", 1), 0.0)[0] == []
-    assert senders.messages(whole, ("b", 1), 0.0) == ([whole], 0)
-    assert senders.messages(whole[9:], ("a", 1), 0.0) == ([whole], 0)
+    complete = bytes(mav.heartbeat_encode(6, 8, 0, 0, 4).pack(mav))
+    assert senders.messages(complete[:9], ("a", 1), 0.0) == ([], 0)
+    assert senders.messages(complete[9:], ("b", 1), 0.0)[0] == []
+    assert senders.messages(complete, ("b", 1), 0.0) == ([complete], 0)
+    assert senders.messages(complete[9:], ("a", 1), 0.0) == ([complete], 0)
 
 
 def test_senders_of_fragments_are_bounded_and_unsigned_ones_leave_first() -> None:
     senders = Senders(MavlinkParser())
     mav = dialect.MAVLink(None, srcSystem=255, srcComponent=190)
-    whole = bytes(mav.heartbeat_encode(6, 8, 0, 0, 4).pack(mav))
-    senders.met(("operator", 1), 0.0, is_signed=True)
-    assert senders.messages(whole[:9], ("operator", 1), 0.0) == ([], 0)
+    complete = bytes(mav.heartbeat_encode(6, 8, 0, 0, 4).pack(mav))
+    senders.register(("operator", 1), 0.0, is_signed=True)
+    assert senders.messages(complete[:9], ("operator", 1), 0.0) == ([], 0)
     for n in range(500):
-        senders.messages(whole[:9], (f"stranger {n}", 1), 0.0)
+        senders.messages(complete[:9], (f"stranger {n}", 1), 0.0)
     assert len(senders._streams) == STREAMS_MAX
-    assert senders.messages(whole[9:], ("operator", 1), 0.0) == ([whole], 0)
+    assert senders.messages(complete[9:], ("operator", 1), 0.0) == ([complete], 0)
 
 
 def test_damaged_bytes_cost_a_bounded_time_and_whole_messages_pass_all_the_same() -> None:
     senders = Senders(MavlinkParser())
     mav = dialect.MAVLink(None, srcSystem=255, srcComponent=190)
-    whole = bytes(mav.heartbeat_encode(6, 8, 0, 0, 4).pack(mav))
+    complete = bytes(mav.heartbeat_encode(6, 8, 0, 0, 4).pack(mav))
     costly = (b"\xfd\xff\x00\x00\x00\x00\x00\x00\x00\x00" * 204)[: senders.DATAGRAM_MAX_BYTES]
     begin = time.process_time()
     for n in range(2000):
         assert senders.messages(costly, (f"{n % 50}", 1), n * 1e-4)[0] == []
-        assert senders.messages(whole, ("operator", 1), n * 1e-4) == ([whole], 0)
+        assert senders.messages(complete, ("operator", 1), n * 1e-4) == ([complete], 0)
     assert time.process_time() - begin < 5.0, "4 MB in 0.2 s of them"
     assert senders.messages(bytes(65_000), ("x", 1), 1.0) == ([], 65_000)
 
@@ -212,7 +214,7 @@ def test_a_recorded_command_is_not_obeyed_after_a_restart_even_with_the_clock_pu
             attacker, operator = Station(flying, host="127.0.0.2"), Station(flying, KEY)
             operator.mav.signing.timestamp += 10 * TICKS_PER_S
             attacker.send(recorded)
-            (ack, *_) = wait_for(lambda s=attacker: s.hear("COMMAND_ACK"), "the answer")
+            (ack, *_) = wait_for(lambda s=attacker: s.receive("COMMAND_ACK"), "the answer")
             assert ack.result == DENIED
             assert flying.commands == []
             assert operator.order() == ACCEPTED, "the operator is not locked out"
@@ -222,8 +224,8 @@ def test_a_recorded_command_is_not_obeyed_after_a_restart_even_with_the_clock_pu
 def test_the_timestamp_is_durable_before_the_command_is_obeyed(tmp_path: Path) -> None:
     with flight(tmp_path) as flying:
         state, seen = tmp_path / "state" / "signing.json", []
-        obey = flying.gate._send
-        flying.gate._send = lambda command: (seen.append(state.exists()), obey(command))
+        obey = flying.gateway._send
+        flying.gateway._send = lambda command: (seen.append(state.exists()), obey(command))
         operator = Station(flying, KEY)
         assert operator.order() == ACCEPTED
         assert seen == [True]
@@ -394,11 +396,11 @@ def test_gps_time_of_a_flight_advances_the_clock_and_that_of_an_emulated_one_doe
         ahead_ns = time.time_ns() + 3600 * 1_000_000_000 - 315_964_800 * 1_000_000_000
         is_ahead = 3000 * TICKS_PER_S
         host = (time.time_ns() - SIGNING_EPOCH_UNIX_NS) // 10_000
-        flying.state.apply({**flown.mission(), "simulated": True})
-        flying.state.apply({**flown.status("flying"), "gps_ns": str(ahead_ns)})
+        flying.state.apply({**flight_events.mission(), "simulated": True})
+        flying.state.apply({**flight_events.status("flying"), "gps_ns": str(ahead_ns)})
         time.sleep(0.5)
         assert signatures.now() - host < is_ahead
-        flying.state.apply({**flown.mission(), "simulated": False})
+        flying.state.apply({**flight_events.mission(), "simulated": False})
         wait_for(lambda: signatures.now() - host > is_ahead, "the signing clock to follow")
 
 
@@ -411,9 +413,9 @@ CROWD = [f"127.0.1.{n}" for n in range(1, 21)]
 def heartbeats(station: Station, count: int) -> float:
     """Seconds until so many heartbeats of the camera were heard, with one of ours a second."""
     begin = beat_s = time.monotonic()
-    station.heard.clear()
+    station.received.clear()
     station.beat()
-    while len(station.hear("HEARTBEAT")) < count:
+    while len(station.receive("HEARTBEAT")) < count:
         assert time.monotonic() - begin < 30.0, "the operator hears no heartbeat"
         if time.monotonic() - beat_s >= 1.0:
             beat_s = time.monotonic()
@@ -426,8 +428,8 @@ def test_twenty_other_addresses_do_not_starve_an_operators_heartbeats(
     tmp_path: Path, key: bytes | None
 ) -> None:
     mav = dialect.MAVLink(None, srcSystem=255, srcComponent=190)
-    said = bytes(mav.heartbeat_encode(6, 8, 0, 0, 4).pack(mav))
-    with flight(tmp_path) as flying, hammering(flying, hosts=CROWD, said=said, every_s=0.02):
+    payload = bytes(mav.heartbeat_encode(6, 8, 0, 0, 4).pack(mav))
+    with flight(tmp_path) as flying, hammering(flying, hosts=CROWD, payload=payload, every_s=0.02):
         wait_for(lambda: len(flying.camera._senders.peers) == PEERS_MAX, "the crowd")
         operator = Station(flying, key)
         heartbeats(operator, 3)
@@ -438,23 +440,23 @@ def test_twenty_other_addresses_do_not_starve_an_operators_heartbeats(
 
 def test_who_was_there_first_stays_and_who_falls_silent_makes_room() -> None:
     senders = Senders(MavlinkParser())
-    assert senders.met(("operator", 1), 0.0, is_signed=False)
+    assert senders.register(("operator", 1), 0.0, is_signed=False)
     for n in range(100):
-        senders.met((f"stranger {n}", 1), 1.0, is_signed=False)
+        senders.register((f"stranger {n}", 1), 1.0, is_signed=False)
     assert len(senders.peers) == PEERS_MAX
     assert ("operator", 1) in senders.peers
-    senders.met(("operator", 1), 59.0, is_signed=False)
-    assert senders.met(("late", 1), 62.0, is_signed=False)
+    senders.register(("operator", 1), 59.0, is_signed=False)
+    assert senders.register(("late", 1), 62.0, is_signed=False)
     assert set(senders.peers) == {("operator", 1), ("late", 1)}
 
 
 def test_a_signed_sender_is_never_replaced_by_an_unsigned_one() -> None:
     senders = Senders(MavlinkParser())
     for n in range(PEERS_MAX):
-        assert senders.met((f"operator {n}", 1), float(n), is_signed=n % 2 == 0)
-    assert not senders.met(("stranger", 1), 20.0, is_signed=False)
-    assert senders.met(("signed", 1), 20.0, is_signed=True)
+        assert senders.register((f"operator {n}", 1), float(n), is_signed=n % 2 == 0)
+    assert not senders.register(("stranger", 1), 20.0, is_signed=False)
+    assert senders.register(("signed", 1), 20.0, is_signed=True)
     assert ("operator 1", 1) not in senders.peers, "the unsigned one that was silent for longest"
     for n in range(PEERS_MAX):
-        senders.met((f"signed {n}", 1), 21.0, is_signed=True)
+        senders.register((f"signed {n}", 1), 21.0, is_signed=True)
     assert {f"operator {n}" for n in range(0, PEERS_MAX, 2)} <= {a for a, _ in senders.peers}

@@ -17,13 +17,13 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from daemon.configuration.model import MavlinkCameraSection
-from daemon.onboard.monitoring.access.gate import Gate
+from daemon.onboard.monitoring.access.command_gateway import CommandGateway
+from daemon.onboard.monitoring.flight_state import FlightState
 from daemon.onboard.monitoring.mavlink.camera import MavlinkCamera
-from daemon.onboard.monitoring.mavlink.requests import wish
+from daemon.onboard.monitoring.mavlink.requests import service_command
 from daemon.onboard.monitoring.mavlink.signatures import read_key
-from daemon.onboard.monitoring.state import FlightState
 from processing.rig import load_rig, shipped_rigs
-from tests.daemon.onboard.monitoring import flown
+from tests.daemon.onboard.monitoring import flight_events
 from tests.daemon.onboard.monitoring.test_mavsdk_camera import Flying, wait_for
 
 dialect = pytest.importorskip(
@@ -47,24 +47,24 @@ class Station:
             self.mav.signing.secret_key = key
             self.mav.signing.sign_outgoing = True
             self.mav.signing.timestamp = round((time.time() - 1_420_070_400) * 1e5)
-        self.heard: list[Any] = []
-        wait_for(lambda: self.hear("HEARTBEAT"), "a heartbeat")
+        self.received: list[Any] = []
+        wait_for(lambda: self.receive("HEARTBEAT"), "a heartbeat")
 
-    def hear(self, kind: str) -> list[Any]:
+    def receive(self, kind: str) -> list[Any]:
         try:
             data, self.camera = self.socket.recvfrom(2048)
-            self.heard += self.reader.parse_buffer(bytearray(data)) or []
+            self.received += self.reader.parse_buffer(bytearray(data)) or []
         except TimeoutError:
             pass
-        return [message for message in self.heard if message.get_type() == kind]
+        return [message for message in self.received if message.get_type() == kind]
 
-    def ask(self, command: int, *parameters: float) -> Any:
+    def request(self, command: int, *parameters: float) -> Any:
         """Send a command and return its acknowledgement's result."""
-        self.heard.clear()
+        self.received.clear()
         given = [*parameters, *([0.0] * (7 - len(parameters)))]
         message = self.mav.command_long_encode(1, 100, command, 0, *given)
         self.socket.sendto(bytes(message.pack(self.mav)), self.camera)
-        (ack, *_) = wait_for(lambda: self.hear("COMMAND_ACK"), f"the answer to {command}")
+        (ack, *_) = wait_for(lambda: self.receive("COMMAND_ACK"), f"the answer to {command}")
         assert (ack.target_system, ack.target_component) == (255, 190)
         return ack.result
 
@@ -88,25 +88,25 @@ def signed(key_file: Path) -> Iterator[Flying]:
 
 
 def test_only_signed_commands_are_obeyed_but_everybody_may_look(signed: Flying) -> None:
-    stranger = Station(signed.port)
-    assert stranger.ask(512, 259) == dialect.MAV_RESULT_ACCEPTED
-    assert wait_for(lambda: stranger.hear("CAMERA_INFORMATION"), "what camera it is")
-    assert stranger.ask(2000, 0, 0, 1) == dialect.MAV_RESULT_DENIED
+    unknown_sender = Station(signed.port)
+    assert unknown_sender.request(512, 259) == dialect.MAV_RESULT_ACCEPTED
+    assert wait_for(lambda: unknown_sender.receive("CAMERA_INFORMATION"), "what camera it is")
+    assert unknown_sender.request(2000, 0, 0, 1) == dialect.MAV_RESULT_DENIED
     assert signed.commands == []
     wait_for(lambda: signed.refused, "the record of the refused command")
     (refused,) = signed.refused
     assert (refused.name, refused.role, refused.address) == ("trigger", "none", "udp 127.0.0.1")
     assert refused.by.startswith("mavlink ") and "signature" in refused.sentence
-    stranger.close()
+    unknown_sender.close()
     forger = Station(signed.port, secrets.token_bytes(32))
-    forger.heard.clear()
+    forger.received.clear()
     message = forger.mav.command_long_encode(1, 100, 2000, 0, 0, 0, 1, 0, 0, 0, 0)
     forger.socket.sendto(bytes(message.pack(forger.mav)), forger.camera)
     time.sleep(0.5)
     assert signed.commands == []
     forger.close()
     operator = Station(signed.port, KEY)
-    assert operator.ask(2000, 0, 0, 1) == dialect.MAV_RESULT_ACCEPTED
+    assert operator.request(2000, 0, 0, 1) == dialect.MAV_RESULT_ACCEPTED
     assert [(c.name, c.role) for c in signed.commands] == [("trigger", "operator")]
     operator.close()
 
@@ -135,14 +135,14 @@ def test_requests_of_every_kind_are_answered_or_refused() -> None:
             (261, "STORAGE_INFORMATION"),
             (262, "CAMERA_CAPTURE_STATUS"),
         ):
-            assert station.ask(512, identity) == accepted
-            assert wait_for(lambda k=kind: station.hear(k), kind)
-        assert station.ask(512, 269) == unsupported
-        assert station.ask(512, math.nan) == unsupported
-        assert station.ask(512, 263, math.nan) == dialect.MAV_RESULT_DENIED
-        assert station.ask(2002, 17) == dialect.MAV_RESULT_DENIED
-        assert station.ask(31337) == unsupported
-        assert station.ask(2000, 0, 1, 3) == dialect.MAV_RESULT_DENIED  # nobody may command
+            assert station.request(512, identity) == accepted
+            assert wait_for(lambda k=kind: station.receive(k), kind)
+        assert station.request(512, 269) == unsupported
+        assert station.request(512, math.nan) == unsupported
+        assert station.request(512, 263, math.nan) == dialect.MAV_RESULT_DENIED
+        assert station.request(2002, 17) == dialect.MAV_RESULT_DENIED
+        assert station.request(31337) == unsupported
+        assert station.request(2000, 0, 1, 3) == dialect.MAV_RESULT_DENIED  # nobody may command
         assert flying.camera.counts["commands_refused"] == 1
         wait_for(lambda: flying.refused, "the record of the refused command")
     finally:
@@ -156,8 +156,8 @@ def test_requests_of_every_kind_are_answered_or_refused() -> None:
 )
 def test_no_parameter_is_too_odd(action: str, parameters: list[float]) -> None:
     message = dialect.MAVLink(None).command_long_encode(1, 100, 2000, 0, *parameters)
-    wanted = wish(action, message)
-    assert wanted is None or wanted[0] in ("trigger", "interval", "distance", "start", "stop")
+    expected = service_command(action, message)
+    assert expected is None or expected[0] in ("trigger", "interval", "distance", "start", "stop")
 
 
 @settings(max_examples=300)
@@ -197,7 +197,7 @@ def test_a_key_that_is_none_is_refused(tmp_path: Path) -> None:
     (tmp_path / "key").write_text("abc")
     section = MavlinkCameraSection(commands="signed", signing_key=tmp_path / "key")
     with pytest.raises(ValueError, match="signing key"):
-        MavlinkCamera(section, FlightState("x"), Gate(lambda _: None), lambda: RIG)
+        MavlinkCamera(section, FlightState("x"), CommandGateway(lambda _: None), lambda: RIG)
 
 
 @pytest.mark.trust
@@ -210,7 +210,7 @@ def test_a_key_that_everybody_may_read_or_change_is_refused_with_the_command(
     path.chmod(mode)
     section = MavlinkCameraSection(commands="signed", signing_key=path)
     with pytest.raises(ValueError, match=f"chmod 600 '{path}'"):
-        MavlinkCamera(section, FlightState("x"), Gate(lambda _: None), lambda: RIG)
+        MavlinkCamera(section, FlightState("x"), CommandGateway(lambda _: None), lambda: RIG)
     for closed in (0o600, 0o640):
         path.chmod(closed)
         assert read_key(path) == KEY
@@ -218,6 +218,8 @@ def test_a_key_that_everybody_may_read_or_change_is_refused_with_the_command(
 
 def _camera() -> MavlinkCamera:
     state = FlightState("syntopic test")
-    state.apply(flown.mission())
+    state.apply(flight_events.mission())
     with asyncio.Runner():
-        return MavlinkCamera(MavlinkCameraSection(), state, Gate(lambda _: None), lambda: RIG)
+        return MavlinkCamera(
+            MavlinkCameraSection(), state, CommandGateway(lambda _: None), lambda: RIG
+        )

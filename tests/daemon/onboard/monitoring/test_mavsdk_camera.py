@@ -12,12 +12,12 @@ from typing import Any
 import pytest
 
 from daemon.configuration.model import MavlinkCameraSection
-from daemon.onboard.monitoring.access.gate import Gate
+from daemon.onboard.monitoring.access.command_gateway import CommandGateway
+from daemon.onboard.monitoring.flight_state import FlightState
 from daemon.onboard.monitoring.mavlink.camera import MavlinkCamera
-from daemon.onboard.monitoring.state import FlightState
-from daemon.onboard.service.messages import Answer, Command, CommandRefused
+from daemon.onboard.service.messages import Answer, CommandRefused, ServiceCommand
 from processing.rig import load_rig, shipped_rigs
-from tests.daemon.onboard.monitoring import flown
+from tests.daemon.onboard.monitoring import flight_events
 
 WITHIN_S = 40.0
 RIG = load_rig(shipped_rigs()["ultracam-x-mini"])
@@ -31,9 +31,9 @@ class Flying:
         connect = f"{settings.pop('scheme', 'udpout')}:127.0.0.1:{self.port}"
         self.settings = MavlinkCameraSection(connect=connect, **settings)
         self.state = FlightState("syntopic test")
-        self.state.apply(flown.mission())
-        self.state.apply(flown.status("ready"))
-        self.commands: list[Command] = []
+        self.state.apply(flight_events.mission())
+        self.state.apply(flight_events.status("ready"))
+        self.commands: list[ServiceCommand] = []
         self.refused: list[CommandRefused] = []
         self.lose: set[int] = set()
         self.number = 0
@@ -46,9 +46,9 @@ class Flying:
 
     def _run(self) -> None:
         asyncio.set_event_loop(self._loop)
-        self.gate = Gate(self._obey)
+        self.gateway = CommandGateway(self._execute)
         self.camera = MavlinkCamera(
-            self.settings, self.state, self.gate, lambda: RIG, lambda: 395.0
+            self.settings, self.state, self.gateway, lambda: RIG, lambda: 395.0
         )
         self._loop.run_until_complete(self.camera.begin())
         really_send = self.camera._send
@@ -65,12 +65,12 @@ class Flying:
         self._begun.set()
         self._loop.run_forever()
 
-    def _obey(self, command: Command | CommandRefused) -> None:
+    def _execute(self, command: ServiceCommand | CommandRefused) -> None:
         if isinstance(command, CommandRefused):
             self.refused.append(command)
             return
         self.commands.append(command)
-        self._loop.call_soon(self.gate.answered, Answer(command.number, True, "done"))
+        self._loop.call_soon(self.gateway.on_answer, Answer(command.number, True, "done"))
         if command.name == "trigger":
             self._loop.call_later(0.1, self._expose)
         elif command.name == "interval":
@@ -79,7 +79,7 @@ class Flying:
 
     def _expose(self) -> None:
         self.number += 1
-        for event in flown.exposure(self.number):
+        for event in flight_events.exposure(self.number):
             self.state.apply({**event, "mark_gps_ns": "1479300000000000000"})
 
     def close(self) -> None:
@@ -139,21 +139,21 @@ def test_mavsdk_lists_the_rig_as_one_camera(client: Any) -> None:
 @pytest.mark.peer
 def test_mavsdk_takes_photos_and_recovers_a_lost_record(client: Any, flying: Flying) -> None:
     (camera,) = wait_for(lambda: client.camera_list().cameras, "the list of cameras")
-    heard: list[Any] = []
+    received: list[Any] = []
     client.subscribe_capture_info(
-        lambda *told: heard.extend(t for t in told if hasattr(t, "index"))
+        lambda *messages: received.extend(t for t in messages if hasattr(t, "index"))
     )
     flying.lose = {1}
     for count in (1, 2, 3):
         client.take_photo(camera.component_id)
         wait_for(lambda n=count: flying.number >= n, f"exposure {count}")
         time.sleep(0.3)
-    wait_for(lambda: {one.index for one in heard} >= {0, 1, 2}, "records of all three")
+    wait_for(lambda: {one.index for one in received} >= {0, 1, 2}, "records of all three")
     assert [c.name for c in flying.commands] == ["trigger"] * 3
     assert all(c.by.startswith("mavlink ") for c in flying.commands)
     # The lost one was told twice: once into nothing, once when it was asked for.
     assert flying.sent_indices.count(1) >= 2
-    lost = next(one for one in heard if one.index == 1)
+    lost = next(one for one in received if one.index == 1)
     assert lost.position.latitude_deg == pytest.approx(47.07)
     assert lost.position.absolute_altitude_m == pytest.approx(1395.0)
     assert lost.position.relative_altitude_m == pytest.approx(1000.0)

@@ -11,29 +11,33 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from daemon.cli import app
-from daemon.cli.monitor import _Seen
-from tests.daemon.onboard.monitoring import flown
+from daemon.cli.monitor import _MonitorState
+from tests.daemon.onboard.monitoring import flight_events
 from tests.daemon.onboard.monitoring.test_page import Service
 
 
 @pytest.fixture
 def service(tmp_path: Path) -> Iterator[Service]:
     service = Service(tmp_path)
-    service.tell(flown.mission())
+    service.emit(flight_events.mission())
     yield service
     service.end()
 
 
 def test_the_state_is_told_once_as_json_and_drawn_with_what_is_wrong(service: Service) -> None:
-    for event in (*flown.exposure(1, "refly"), flown.lost("SU02"), flown.status(triggers=1)):
-        service.tell(event)
+    for event in (
+        *flight_events.exposure(1, "refly"),
+        flight_events.lost("SU02"),
+        flight_events.status(triggers=1),
+    ):
+        service.emit(event)
     address = service.address.removeprefix("http://").rstrip("/")
-    told = CliRunner().invoke(app, ["monitor", address, "--json"])
-    assert told.exit_code == 0, told.output
-    state = json.loads(told.stdout)
+    result = CliRunner().invoke(app, ["monitor", address, "--json"])
+    assert result.exit_code == 0, result.output
+    state = json.loads(result.stdout)
     assert [(one["number"], one["verdict"]) for one in state["exposures"]] == [(1, "refly")]
-    seen = _Seen()
-    seen.take(state)
+    seen = _MonitorState()
+    seen.receive(state)
     console = Console(record=True, width=100)
     console.print(seen.drawn(address))
     drawn = console.export_text()

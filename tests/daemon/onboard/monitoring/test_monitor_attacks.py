@@ -20,17 +20,17 @@ from websockets.http11 import Request, Response
 from websockets.sync.server import ServerConnection, serve
 
 from daemon.cli import app
-from daemon.cli.monitor import _Seen
+from daemon.cli.monitor import _MonitorState
 from daemon.errors import DaemonError
-from daemon.onboard.monitoring.client import finding
-from daemon.onboard.monitoring.client.client import (
-    Access,
+from daemon.onboard.monitoring.client import mdns_browser
+from daemon.onboard.monitoring.client.mdns_browser import AnnouncedService, parse_announcement
+from daemon.onboard.monitoring.client.telemetry_client import (
+    AccessOptions,
     ClientError,
-    Service,
-    require_safe,
-    service_at,
+    ServiceAddress,
+    check_token_transport,
+    parse_service_address,
 )
-from daemon.onboard.monitoring.client.finding import Announced, announced_by
 from daemon.terminal.printable import printable, printable_tree
 
 pytestmark = pytest.mark.trust
@@ -135,12 +135,12 @@ def test_control_sequences_of_a_service_never_reach_the_terminal() -> None:
         phase=ESCAPES, mission={"id": ESCAPES}, faults=[fault], exposures=[exposure], **{ESCAPES: 1}
     )
     with Impostor(data).listening() as address:
-        told = watched(address)
-    assert told.exit_code == 0, told.output
-    state = json.loads(told.stdout)
+        result = watched(address)
+    assert result.exit_code == 0, result.output
+    state = json.loads(result.stdout)
     assert printable_tree(state) == state
-    seen = _Seen()
-    seen.take(state)
+    seen = _MonitorState()
+    seen.receive(state)
     console = Console(record=True, width=100, force_terminal=False)
     console.print(seen.drawn(address))
     drawn = console.export_text().replace("\n", "")
@@ -182,31 +182,33 @@ def test_a_token_goes_into_a_header_and_follows_no_redirect_and_no_proxy(
 
 
 def test_a_token_goes_unencrypted_to_this_machine_only() -> None:
-    access = Access("syn_secret")
+    access = AccessOptions("syn_secret")
     for address in ("127.0.0.1:1", "127.9.9.9:1", "[::1]:1", "localhost:1", "https://10.0.0.5"):
-        require_safe(service_at(address), access)
+        check_token_transport(parse_service_address(address), access)
     for address in ("10.0.0.5:8470", "http://camera.local", "ws://[fd00::1]:1", "localhost.evil:1"):
         with pytest.raises(ClientError, match="--token-without-tls"):
-            require_safe(service_at(address), access)
-        require_safe(service_at(address), Access())
-        require_safe(service_at(address), Access("syn_secret", is_token_public=True))
-    require_safe(service_at("10.0.0.5:8470", tls=True), access)
+            check_token_transport(parse_service_address(address), access)
+        check_token_transport(parse_service_address(address), AccessOptions())
+        check_token_transport(
+            parse_service_address(address), AccessOptions("syn_secret", is_token_public=True)
+        )
+    check_token_transport(parse_service_address("10.0.0.5:8470", tls=True), access)
     for token in ("syn a", "syn\r\nX: y", "ä", "x" * 201):
         with pytest.raises(ClientError, match="no token"):
-            require_safe(service_at("https://a"), Access(token))
+            check_token_transport(parse_service_address("https://a"), AccessOptions(token))
 
 
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("camera.local", Service("camera.local", 8470, is_tls=False)),
-        ("https://camera.local:1/", Service("camera.local", 1, is_tls=True)),
-        ("wss://[fd00::1]", Service("fd00::1", 8470, is_tls=True)),
-        ("http://10.0.0.5:99", Service("10.0.0.5", 99, is_tls=False)),
+        ("camera.local", ServiceAddress("camera.local", 8470, is_tls=False)),
+        ("https://camera.local:1/", ServiceAddress("camera.local", 1, is_tls=True)),
+        ("wss://[fd00::1]", ServiceAddress("fd00::1", 8470, is_tls=True)),
+        ("http://10.0.0.5:99", ServiceAddress("10.0.0.5", 99, is_tls=False)),
     ],
 )
-def test_an_address_is_what_the_person_wrote(text: str, expected: Service) -> None:
-    assert service_at(text) == expected
+def test_an_address_is_what_the_person_wrote(text: str, expected: ServiceAddress) -> None:
+    assert parse_service_address(text) == expected
 
 
 @pytest.mark.parametrize(
@@ -218,14 +220,14 @@ def test_an_address_is_what_the_person_wrote(text: str, expected: Service) -> No
 )
 def test_an_address_that_is_none_is_refused(text: str) -> None:
     with pytest.raises(ClientError) as error:
-        service_at(text)
+        parse_service_address(text)
     assert printable(str(error.value), 2000) == str(error.value)
     assert "syn_x" not in str(error.value)
 
 
 def test_tls_and_http_contradict_each_other() -> None:
     with pytest.raises(ClientError, match="--tls asks for it"):
-        service_at("http://a", tls=True)
+        parse_service_address("http://a", tls=True)
 
 
 def test_an_announcement_neither_gets_a_token_nor_decides_about_tls(
@@ -234,8 +236,8 @@ def test_an_announcement_neither_gets_a_token_nor_decides_about_tls(
     forger = Impostor(record())
     with forger.listening() as address:
         for tls in ("true", "false"):
-            announced = Announced(address, {"tls": tls, "token": "command"})
-            monkeypatch.setattr(finding, "find_services", lambda one=announced: [one])
+            announced = AnnouncedService(address, {"tls": tls, "token": "command"})
+            monkeypatch.setattr(mdns_browser, "find_services", lambda one=announced: [one])
             sentence = refused(watched("--token", "syn_secret"))
             assert "anybody can announce" in sentence
             assert forger.requests == []
@@ -256,12 +258,12 @@ def test_announced_texts_are_printable_and_bounded() -> None:
         port=8470,
         properties=properties,
     )
-    announced = announced_by(info)
+    announced = parse_announcement(info)
     assert announced is not None and announced.address == "10.0.0.5:8470"
     for text in (*announced.text, *announced.text.values()):
-        assert printable(text) == text and len(text) <= finding.TEXT_MAX
+        assert printable(text) == text and len(text) <= mdns_browser.TEXT_MAX
     for port, addresses in ((0, [b"\x0a\x00\x00\x05"]), (8470, [])):
         odd = ServiceInfo(
             "_syntopic._tcp.local.", "a._syntopic._tcp.local.", addresses=addresses, port=port
         )
-        assert announced_by(odd) is None
+        assert parse_announcement(odd) is None

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, given, settings
 
-from daemon.onboard.monitoring.web.api import WatchSettings, create_app
-from tests.daemon.onboard.monitoring import flown
+from daemon.onboard.monitoring.web.api import AccessSettings, create_app
+from tests.daemon.onboard.monitoring import flight_events
 from tests.daemon.onboard.monitoring.test_api import Camera
 
 EXAMPLES = 30
@@ -24,13 +24,17 @@ def camera(tmp_path_factory: pytest.TempPathFactory) -> Camera:
     (product / "quicklook.jpg").write_bytes(b"\xff\xd8jpeg")
     (folder / "mission/service.toml").write_text("[mission]\n")
     camera = Camera(folder)
-    for event in (*flown.exposure(1), flown.status(triggers=1), flown.lost("SU02")):
+    for event in (
+        *flight_events.exposure(1),
+        flight_events.status(triggers=1),
+        flight_events.lost("SU02"),
+    ):
         camera.state.apply(event)
     return camera
 
 
 def test_whatever_is_asked_the_answer_keeps_to_the_document(camera: Camera) -> None:
-    app = create_app(camera.state, camera.gate, WatchSettings(camera.tokens))
+    app = create_app(camera.state, camera.gateway, AccessSettings(camera.tokens))
     operations = list(schemathesis.openapi.from_asgi("/openapi.json", app).get_all_operations())
     assert len(operations) >= 11
 
@@ -38,10 +42,10 @@ def test_whatever_is_asked_the_answer_keeps_to_the_document(camera: Camera) -> N
 
         @settings(max_examples=EXAMPLES, deadline=None, suppress_health_check=list(HealthCheck))
         @given(operation.ok().as_strategy())
-        def ask(case: Any) -> None:
+        def request(case: Any) -> None:
             token = {"Authorization": f"Bearer {camera.operator}"}
             answer = case.call(headers=token)
             assert answer.status_code < 500, (case.method, case.path, answer.text)
             case.validate_response(answer, headers=token)
 
-        ask()
+        request()

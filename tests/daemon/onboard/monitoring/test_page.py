@@ -14,10 +14,10 @@ import pytest
 
 from daemon.configuration.model import WatchSection
 from daemon.onboard.monitoring.access.tokens import add_token
-from daemon.onboard.service.messages import Answer, Command, Stop, Told
-from daemon.onboard.service.processes import Child
+from daemon.onboard.service.messages import Answer, ServiceCommand, ServiceEvent, Stop
+from daemon.onboard.service.processes import ChildProcess
 from tests.browser import Browser, chromium
-from tests.daemon.onboard.monitoring import flown
+from tests.daemon.onboard.monitoring import flight_events
 from tests.npm import npm_package
 
 WITHIN_S = 30.0
@@ -27,39 +27,43 @@ class Service:
     """The service's end of the watch process, in the hands of the test."""
 
     def __init__(
-        self, folder: Path, *, port: int = 0, is_open: bool = True, **further: Any
+        self, folder: Path, *, port: int = 0, anonymous_read: bool = True, **further: Any
     ) -> None:
         self.token = add_token(folder / "tokens.toml", "operator", "administrator")
         tokens = folder / "tokens.toml"
-        settings = WatchSection(port=port, tokens=tokens, announce=False, open=is_open, **further)
-        self.child = Child("watch", "daemon.onboard.monitoring.process:main", (settings,), {})
-        self.commands: list[Command] = []
+        settings = WatchSection(
+            port=port, tokens=tokens, announce=False, anonymous_read=anonymous_read, **further
+        )
+        self.child = ChildProcess(
+            "watch", "daemon.onboard.monitoring.monitoring_process:main", (settings,), {}
+        )
+        self.commands: list[ServiceCommand] = []
         self.events: list[Mapping[str, Any]] = []
         self.refusal = ""
         self.address = ""
         self.until(lambda: bool(self.address))
 
-    def tell(self, event: dict[str, Any]) -> None:
-        assert self.child.tell(Told(event))
+    def emit(self, event: dict[str, Any]) -> None:
+        assert self.child.try_send(ServiceEvent(event))
 
     def until(self, is_so: Any, within_s: float = 60.0) -> None:
         deadline = time.monotonic() + within_s
         while not is_so():
             assert time.monotonic() < deadline, "the watch process is silent"
             if self.child.connection.poll(0.05):
-                self.hear(self.child.connection.recv())
+                self.receive(self.child.connection.recv())
 
-    def hear(self, message: object) -> None:
-        if isinstance(message, Told):
+    def receive(self, message: object) -> None:
+        if isinstance(message, ServiceEvent):
             self.events.append(message.event)
-        if isinstance(message, Told) and message.event.get("event") == "watching":
+        if isinstance(message, ServiceEvent) and message.event.get("event") == "watching":
             scheme = "https" if message.event["tls"] else "http"
             self.address = f"{scheme}://{message.event['host']}:{message.event['port']}/"
-        elif isinstance(message, Command):
+        elif isinstance(message, ServiceCommand):
             self.commands.append(message)
             refuses = self.refusal and not message.arguments["override"]
-            said = self.refusal if refuses else "done as asked"
-            self.child.send(Answer(message.number, not refuses, said))
+            sentence = self.refusal if refuses else "done as asked"
+            self.child.send(Answer(message.number, not refuses, sentence))
 
     def end(self) -> None:
         self.child.send(Stop())
@@ -107,7 +111,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def service(folder: Path) -> Iterator[Service]:
     service = Service(folder)
-    service.tell(flown.mission(str(folder / "mission")))
+    service.emit(flight_events.mission(str(folder / "mission")))
     yield service
     service.end()
 
@@ -121,11 +125,11 @@ def browser(folder: Path, service: Service) -> Iterator[Browser]:
 
 
 def test_a_flight_is_seen_as_it_happens(service: Service, browser: Browser) -> None:
-    service.tell(flown.status(triggers=0))
+    service.emit(flight_events.status(triggers=0))
     for number, verdict in ((1, "good"), (2, "usable"), (3, "refly")):
-        for event in flown.exposure(number, verdict):
-            service.tell(event)
-        service.tell(flown.status(triggers=number))
+        for event in flight_events.exposure(number, verdict):
+            service.emit(event)
+        service.emit(flight_events.status(triggers=number))
         browser.wait_for(
             f"document.querySelector('#verdict').innerText.includes('exposure {number}')", WITHIN_S
         )
@@ -145,8 +149,8 @@ def test_the_planned_line_is_on_the_map_with_the_holes_in_what_was_flown(
     assert browser.evaluate("document.querySelectorAll('#segments tr').length") == 0
     # An image covers 169 m along the line; between 340 m and 640 m none was made.
     for number, north_m in enumerate((0, 68, 136, 204, 272, 340, 640, 708, 776), start=4):
-        for event in flown.exposure(number, "good", line="A1", north_m=north_m):
-            service.tell(event)
+        for event in flight_events.exposure(number, "good", line="A1", north_m=north_m):
+            service.emit(event)
     browser.wait_for("document.querySelectorAll('#segments tr').length === 1", WITHIN_S)
     line, from_m, to_m, hectares, why = browser.evaluate(
         "[...document.querySelectorAll('#segments td')].map((cell) => cell.innerText)"
@@ -159,11 +163,11 @@ def test_the_planned_line_is_on_the_map_with_the_holes_in_what_was_flown(
     assert "1 gap to re-fly" in browser.text("#well")
     assert browser.evaluate("document.querySelectorAll('#map .hole-area').length") >= 1
     assert "A1" in browser.text(".hole-label")
-    told = browser.evaluate(
+    reported = browser.evaluate(
         "fetch('/api/v1/advice/fly-again.geojson').then((answer) => answer.json())"
     )
-    assert {f["properties"]["strip"] for f in told["features"]} == {"S"}
-    assert all(f["properties"]["simulated"] for f in told["features"])
+    assert {f["properties"]["strip"] for f in reported["features"]} == {"S"}
+    assert all(f["properties"]["simulated"] for f in reported["features"])
 
 
 def test_residuals_are_laid_over_the_image_and_told_by_overlap_and_histogram_in_words(
@@ -204,12 +208,12 @@ def test_an_exposure_without_image_shows_none_not_that_of_another(browser: Brows
 def test_a_fault_is_seen_within_two_seconds_and_acknowledged_with_a_token(
     service: Service, browser: Browser
 ) -> None:
-    service.tell(flown.lost("SU02"))
+    service.emit(flight_events.lost("SU02"))
     seen_s = browser.wait_for("document.querySelector('#faults li.stands') !== null", WITHIN_S)
     assert seen_s < 2.0
     assert "WARNING" in browser.text("#faults")
     assert "SU02 does not answer; look at its cable." in browser.text("#faults")
-    service.tell(flown.recovered("SU02"))
+    service.emit(flight_events.recovered("SU02"))
     browser.wait_for("document.querySelector('#faults li.passed') !== null", WITHIN_S)
     # Nobody has shown a token yet: the page asks for one, and nothing is commanded.
     browser.click("#faults button")
@@ -237,29 +241,29 @@ def test_a_wrong_token_is_refused_in_words(service: Service, browser: Browser) -
 def test_what_forbids_arming_is_listed_with_its_cure_and_overridden_for_a_recorded_reason(
     service: Service, browser: Browser
 ) -> None:
-    lacking = ["no head SU02 (check its power and cable)", "no position (check the antenna)"]
-    service.tell(flown.status("ready", triggers=3) | {"missing": lacking})
+    missing_items = ["no head SU02 (check its power and cable)", "no position (check the antenna)"]
+    service.emit(flight_events.status("ready", triggers=3) | {"missing": missing_items})
     browser.wait_for("document.querySelectorAll('#missing li').length === 2", WITHIN_S)
-    service.refusal = f"not armed: {'; '.join(lacking)}; override to fly without"
-    is_open = "document.querySelector('#ask-override').open"
+    service.refusal = f"not armed: {'; '.join(missing_items)}; override to fly without"
+    anonymous_read = "document.querySelector('#ask-override').open"
     # Leaving it by the keyboard overrides nothing; neither does a reason of blanks.
     browser.evaluate("document.querySelector('[data-command=arm]').focus()")
     press(browser, "Enter")
     service.until(lambda: service.commands[-1].name == "arm")
-    browser.wait_for(is_open, WITHIN_S)
+    browser.wait_for(anonymous_read, WITHIN_S)
     listed = "[...document.querySelectorAll('#lacking li')].map((one) => one.innerText)"
-    assert browser.evaluate(listed) == lacking
+    assert browser.evaluate(listed) == missing_items
     assert browser.evaluate("document.activeElement.id") == "reason"
     browser.evaluate("document.querySelector('#reason').value = '  '")
     press(browser, "Enter")
-    assert browser.evaluate(is_open)
-    keep_picture(browser, "arming")
+    assert browser.evaluate(anonymous_read)
+    save_screenshot(browser, "arming")
     press(browser, "Escape")
-    browser.wait_for(f"!{is_open}", WITHIN_S)
+    browser.wait_for(f"!{anonymous_read}", WITHIN_S)
     assert [c.arguments["override"] for c in service.commands if c.name == "arm"] == [False]
     browser.click("[data-command=arm]")
     service.until(lambda: len([c for c in service.commands if c.name == "arm"]) == 2)
-    browser.wait_for(is_open, WITHIN_S)
+    browser.wait_for(anonymous_read, WITHIN_S)
     browser.evaluate("document.querySelector('#reason').value = 'SU02 is not needed here'")
     press(browser, "Enter")
     service.until(lambda: service.commands[-1].arguments["override"])
@@ -268,7 +272,7 @@ def test_what_forbids_arming_is_listed_with_its_cure_and_overridden_for_a_record
     assert given.arguments["reason"] == "SU02 is not needed here"
     browser.wait_for("document.querySelector('#answer').innerText === 'Done: done as asked'", 30)
     service.refusal = ""
-    service.tell(flown.status(triggers=3))
+    service.emit(flight_events.status(triggers=3))
 
 
 def test_exposure_settings_are_seen_and_set_from_the_page(
@@ -278,8 +282,8 @@ def test_exposure_settings_are_seen_and_set_from_the_page(
         "pan": {"exposure_time_us": 4000.0, "gain_db": 0.0, "tdi_shifts": 1},
         "G": {"exposure_time_us": 2000.0, "gain_db": 1.5, "tdi_shifts": 0},
     }
-    told = {"by": "automatic", "control": "automatic", "lock": "line", "settings": settings}
-    service.tell({"event": "exposure-settings", "mono_ns": "1", **told})
+    reported = {"by": "automatic", "control": "automatic", "lock": "line", "settings": settings}
+    service.emit({"event": "exposure-settings", "mono_ns": "1", **reported})
     browser.evaluate("document.querySelector('#exposure-room').open = true")
     browser.wait_for("document.querySelectorAll('#exposure-now li').length === 2", WITHIN_S)
     assert "G: 2000 µs, 1.5 dB, 0 TDI" in browser.text("#exposure-now")
@@ -334,14 +338,14 @@ def test_a_head_that_sends_no_image_draws_its_hole_on_the_map(
 ) -> None:
     pieces = browser.evaluate("document.querySelectorAll('#map .hole-area').length")
     for number, north_m in enumerate((816, 884, 952, 1020), start=20):
-        for event in flown.exposure(number, "usable", line="A1", north_m=north_m):
-            service.tell(event | ({"missing": ["SU00"]} if event["event"] == "sealed" else {}))
+        for event in flight_events.exposure(number, "usable", line="A1", north_m=north_m):
+            service.emit(event | ({"missing": ["SU00"]} if event["event"] == "sealed" else {}))
     browser.wait_for(f"document.querySelectorAll('#map .hole-area').length > {pieces}", WITHIN_S)
     browser.wait_for("document.querySelector('#segments').innerText.includes('SU00')", WITHIN_S)
     assert "pan: " in browser.text("#segments")
     assert "of 2 images" in browser.text("#segments")
     assert "exposures 20 to 23: no image of SU00" in browser.text("#segments")
-    keep_picture(browser, "hole")
+    save_screenshot(browser, "hole")
 
 
 @pytest.mark.trust
@@ -356,7 +360,7 @@ def test_the_lamp_of_the_phase_shows_what_holds(service: Service, browser: Brows
         ("armed", [], "armed, chip good"),
         ("flying", [], "flying, chip good"),
     ):
-        service.tell(flown.status(phase, triggers=3) | {"missing": missing})
+        service.emit(flight_events.status(phase, triggers=3) | {"missing": missing})
         browser.wait_for(f"{lamp} === '{shown}'", WITHIN_S)
 
 
@@ -367,7 +371,7 @@ def test_a_position_that_is_old_is_not_shown_as_the_present_one(
     here = {"latitude_deg": 47.07, "longitude_deg": 15.43, "satellites": 14}
     here |= {"velocity_ned_mps": [55.0, 0.0, 0.0]}
     for age_s, shown in ((0.2, ["14", "55.0 m/s"]), (6.0, ["–", "–"])):
-        service.tell(flown.status(triggers=3) | {"position": here | {"age_s": age_s}})
+        service.emit(flight_events.status(triggers=3) | {"position": here | {"age_s": age_s}})
         browser.wait_for(f"document.querySelector('#satellites').innerText === '{shown[0]}'", 30)
         assert browser.text("#speed") == shown[1]
 
@@ -376,15 +380,15 @@ def test_a_position_that_is_old_is_not_shown_as_the_present_one(
 def test_what_was_absent_at_the_start_and_came_stands_no_longer(
     service: Service, browser: Browser
 ) -> None:
-    service.tell({"event": "ready", "mono_ns": "1", "absent": ["trigger", "head SU02"]})
+    service.emit({"event": "ready", "mono_ns": "1", "absent": ["trigger", "head SU02"]})
     standing = (
         "[...document.querySelectorAll('#faults li.stands')].map((one) => one.dataset.fault)"
         ".filter((fault) => fault.startsWith('absent')).sort().join()"
     )
     browser.wait_for(f"{standing} === 'absent head SU02,absent trigger'", WITHIN_S)
-    service.tell(flown.status("flying", triggers=3) | {"absent": ["trigger"]})
+    service.emit(flight_events.status("flying", triggers=3) | {"absent": ["trigger"]})
     browser.wait_for(f"{standing} === 'absent trigger'", WITHIN_S)
-    service.tell(flown.status("flying", triggers=3) | {"absent": []})
+    service.emit(flight_events.status("flying", triggers=3) | {"absent": []})
     browser.wait_for(f"{standing} === ''", WITHIN_S)
 
 
@@ -392,11 +396,11 @@ def test_what_is_shown_without_a_link_is_marked_and_forgotten_when_another_fligh
     folder: Path, browser: Browser, tmp_path: Path
 ) -> None:
     """Looking needs a token here; the page asks for it, and shows images with it."""
-    closed = Service(tmp_path, is_open=False)
+    closed = Service(tmp_path, anonymous_read=False)
     try:
-        closed.tell(flown.mission(str(folder / "mission")))
-        for event in (*flown.exposure(1, "refly"), flown.status(triggers=1)):
-            closed.tell(event)
+        closed.emit(flight_events.mission(str(folder / "mission")))
+        for event in (*flight_events.exposure(1, "refly"), flight_events.status(triggers=1)):
+            closed.emit(event)
         browser.open(closed.address)
         browser.wait_for("document.querySelector('#ask-token')?.open", WITHIN_S)
         assert browser.text("#link") == "token needed"
@@ -412,7 +416,7 @@ def test_what_is_shown_without_a_link_is_marked_and_forgotten_when_another_fligh
     (tmp_path / "another").mkdir()
     another = Service(tmp_path / "another", port=int(closed.address.rstrip("/").split(":")[-1]))
     try:
-        another.tell(flown.mission() | {"id": "20261122T080000Z-other"})
+        another.emit(flight_events.mission() | {"id": "20261122T080000Z-other"})
         browser.wait_for("document.querySelector('#link').innerText === 'linked'", WITHIN_S)
         browser.wait_for("document.querySelector('#rows').childElementCount === 0", WITHIN_S)
         assert browser.evaluate("document.querySelector('#stale').hidden")
@@ -458,7 +462,7 @@ def press(browser: Browser, key: str) -> None:
     browser.call("Input.dispatchKeyEvent", type="keyUp", key=key, windowsVirtualKeyCode=code)
 
 
-def keep_picture(browser: Browser, name: str) -> None:
+def save_screenshot(browser: Browser, name: str) -> None:
     """What is seen, by day and by night, where somebody wants to look at it."""
     if keep := os.environ.get("SYNTOPIC_PICTURES"):
         for theme in ("dark", ""):
@@ -472,13 +476,13 @@ def test_a_landing_ends_in_no_alarm_and_a_lost_service_does(
     folder: Path, tmp_path: Path, has_landed: bool
 ) -> None:
     service = Service(tmp_path)
-    service.tell(flown.mission(str(folder / "mission")))
-    service.tell(flown.status("flying"))
+    service.emit(flight_events.mission(str(folder / "mission")))
+    service.emit(flight_events.status("flying"))
     with Browser(tmp_path / "profile") as browser:
         browser.open(service.address)
         browser.wait_for("document.querySelector('#phase')?.innerText === 'flying'", WITHIN_S)
         if has_landed:
-            service.tell({"event": "phase", "mono_ns": "1", "phase": "landed"})
+            service.emit({"event": "phase", "mono_ns": "1", "phase": "landed"})
             browser.wait_for("document.querySelector('#phase').innerText === 'landed'", WITHIN_S)
         service.end()
         browser.wait_for("document.body.classList.contains('stale')", WITHIN_S)
@@ -492,4 +496,4 @@ def test_a_landing_ends_in_no_alarm_and_a_lost_service_does(
             assert "Connection lost" in bar
         browser.evaluate("new Promise((resolve) => setTimeout(resolve, 1500))")
         assert (browser.text("#link"), browser.text("#stale")) == (lamp, bar)
-        keep_picture(browser, "landed" if has_landed else "lost-link")
+        save_screenshot(browser, "landed" if has_landed else "lost-link")

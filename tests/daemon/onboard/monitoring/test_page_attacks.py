@@ -16,21 +16,26 @@ import pytest
 
 from daemon.configuration.model import WatchSection
 from daemon.onboard.monitoring.access.tokens import FAILURES_ALLOWED, add_token
-from daemon.onboard.monitoring.confinement import FILES_MAX, MEMORY_MAX_BYTES, OOM_SCORE, confine
-from daemon.onboard.monitoring.protocols import (
+from daemon.onboard.monitoring.http_limits import (
     HEAD_MAX_BYTES,
     MESSAGE_MAX_BYTES,
     RECEIVED_BURST_BYTES,
 )
-from daemon.onboard.monitoring.web.bodies import BODY_MAX_BYTES, parsed
+from daemon.onboard.monitoring.resource_limits import (
+    FILES_MAX,
+    MEMORY_MAX_BYTES,
+    OOM_SCORE,
+    apply_resource_limits,
+)
 from daemon.onboard.monitoring.web.connections import (
     CONNECTIONS_PER_SOURCE,
     IDLE_MAX_S,
     REQUESTS_BURST,
 )
-from daemon.onboard.service.messages import Answer, Command, Stop, Told
-from daemon.onboard.service.processes import Child
-from tests.daemon.onboard.monitoring import flown
+from daemon.onboard.monitoring.web.request_body import BODY_MAX_BYTES, parse_command_body
+from daemon.onboard.service.messages import Answer, ServiceCommand, ServiceEvent, Stop
+from daemon.onboard.service.processes import ChildProcess
+from tests.daemon.onboard.monitoring import flight_events
 from tests.daemon.onboard.monitoring.test_watchers import resident_kb
 
 GROWTH_MAX_KB = 30_000
@@ -48,20 +53,22 @@ class Page:
         section = WatchSection(
             host="127.0.0.1", port=0, announce=False, tokens=folder / "tokens.toml", **settings
         )
-        self.child = Child("watch", "daemon.onboard.monitoring.process:main", (section,), {})
+        self.child = ChildProcess(
+            "watch", "daemon.onboard.monitoring.monitoring_process:main", (section,), {}
+        )
         assert self.child.connection.poll(60)
         self.port = int(self.child.connection.recv().event["port"])
-        self.child.tell(Told(flown.mission()))
+        self.child.try_send(ServiceEvent(flight_events.mission()))
         self.commands: list[str] = []
         self._ends = threading.Event()
-        self._obeying = threading.Thread(target=self._obey)
+        self._obeying = threading.Thread(target=self._execute)
         self._obeying.start()
 
-    def _obey(self) -> None:
+    def _execute(self) -> None:
         while not self._ends.is_set():
             if self.child.connection.poll(0.05):
                 message = self.child.connection.recv()
-                if isinstance(message, Command):
+                if isinstance(message, ServiceCommand):
                     self.commands.append(message.name)
                     self.child.send(Answer(message.number, True, "done as asked"))
 
@@ -74,7 +81,7 @@ class Page:
         link.settimeout(20.0)
         return link
 
-    def ask(self, request: bytes, source: str = ATTACKER) -> tuple[int, bytes]:
+    def request(self, request: bytes, source: str = ATTACKER) -> tuple[int, bytes]:
         """The status of the first answer, and everything until the server closes."""
         with self.connect(source) as link:
             with suppress(ConnectionError):  # refused before all of it was sent
@@ -84,7 +91,7 @@ class Page:
     def stop_command(self, source: str) -> tuple[int, float]:
         """An operator's command; its status and how long it took, in seconds."""
         begun = time.monotonic()
-        status, _ = self.ask(command(self.token), source)
+        status, _ = self.request(command(self.token), source)
         return status, time.monotonic() - begun
 
     def end(self) -> None:
@@ -165,7 +172,7 @@ def test_a_body_of_1200_megabytes_is_refused_before_it_is_read(
         taken = pour(link, bytes(65536), OFFERED_BYTES)
         assert taken < 20_000_000  # what the kernel's buffers hold
     assert page.resident_kb - before_kb < GROWTH_MAX_KB
-    status, answer = page.ask(head)
+    status, answer = page.request(head)
     assert status == (411 if "chunked" in length else 413), answer
     assert b"application/problem+json" in answer
 
@@ -180,7 +187,7 @@ def test_60_megabytes_of_brackets_do_not_hold_up_others(page: Page) -> None:
         pouring.start()
         for _ in range(5):
             begun = time.monotonic()
-            assert page.ask(get("/api/v1/brief", "Connection: close"), OPERATOR)[0] == 200
+            assert page.request(get("/api/v1/brief", "Connection: close"), OPERATOR)[0] == 200
             slowest_s = max(slowest_s, time.monotonic() - begun)
         pouring.join()
     assert slowest_s < ANSWERED_WITHIN_S
@@ -188,7 +195,7 @@ def test_60_megabytes_of_brackets_do_not_hold_up_others(page: Page) -> None:
 
 def test_a_stranger_learns_about_the_token_before_the_body_is_looked_at(page: Page) -> None:
     broken = b"{" * 1000
-    status, _ = page.ask(command("", body=broken))
+    status, _ = page.request(command("", body=broken))
     assert status == 401
     # The body may still be on its way: it is not waited for.
     with page.connect() as link:
@@ -216,7 +223,7 @@ def test_a_stranger_learns_about_the_token_before_the_body_is_looked_at(page: Pa
 )
 def test_hostile_json_is_refused_in_a_sentence(body: bytes, words: str) -> None:
     with pytest.raises(ValueError, match=words) as raised:
-        parsed(body)
+        parse_command_body(body)
     assert len(str(raised.value)) < 2000
 
 
@@ -237,7 +244,7 @@ def test_the_operators_own_bodies_are_held_to_the_limits_too(page: Page) -> None
         (b"\x16\x03\x01\x02\x00\x01" + bytes(500), 400),
     )
     for request, expected in cases:
-        status, answer = page.ask(request)
+        status, answer = page.request(request)
         assert status == expected, (request[:200], answer)
 
 
@@ -256,17 +263,17 @@ def test_a_body_that_does_not_come_is_waited_for_briefly(page: Page) -> None:
 @pytest.mark.trust
 def test_wrong_tokens_never_keep_a_valid_one_out(page: Page) -> None:
     """From the same address, over HTTP and WebSocket, whatever X-Forwarded-For says."""
-    statuses = [page.ask(command("guess"))[0] for _ in range(FAILURES_ALLOWED + 2)]
+    statuses = [page.request(command("guess"))[0] for _ in range(FAILURES_ALLOWED + 2)]
     assert statuses[:FAILURES_ALLOWED] == [401] * FAILURES_ALLOWED
     assert statuses[FAILURES_ALLOWED:] == [429, 429]
     for _ in range(FAILURES_ALLOWED + 1):
-        page.ask(
+        page.request(
             upgrade(
                 "", "Authorization: Bearer guess", "Origin: http://127.0.0.1", "Connection: close"
             )
         )
-    assert page.ask(command("guess", f"X-Forwarded-For: {OPERATOR}"))[0] == 429
-    assert page.ask(command("guess"), OPERATOR)[0] == 401
+    assert page.request(command("guess", f"X-Forwarded-For: {OPERATOR}"))[0] == 429
+    assert page.request(command("guess"), OPERATOR)[0] == 401
     assert page.stop_command(ATTACKER)[0] == 200
     assert page.stop_command(OPERATOR)[0] == 200
     assert page.commands[-1] == "stop"
@@ -301,9 +308,9 @@ def test_a_flood_of_requests_is_answered_429_and_the_operator_200(page: Page) ->
     refused = 0
     deadline = time.monotonic() + 20
     while not refused and time.monotonic() < deadline:
-        refused += page.ask(get("/api/v1/ledger", "Connection: close"))[0] == 429
+        refused += page.request(get("/api/v1/ledger", "Connection: close"))[0] == 429
     assert refused
-    assert page.ask(get("/api/v1/ledger", "Connection: close"), OPERATOR)[0] == 200
+    assert page.request(get("/api/v1/ledger", "Connection: close"), OPERATOR)[0] == 200
     assert page.stop_command(ATTACKER)[0] == 200
 
 
@@ -336,7 +343,7 @@ def test_a_talkative_or_malformed_watcher_is_let_go(page: Page, frames: bytes) -
         read_all(link)
         assert time.monotonic() - begun < 15, sent
     assert page.resident_kb - before_kb < GROWTH_MAX_KB
-    assert page.ask(get("/api/v1/brief", "Connection: close"), OPERATOR)[0] == 200
+    assert page.request(get("/api/v1/brief", "Connection: close"), OPERATOR)[0] == 200
 
 
 @pytest.mark.trust
@@ -417,12 +424,12 @@ def test_watchers_of_one_address_do_not_take_the_places_of_others(page: Page) ->
 )
 def test_only_own_names_are_served(page: Page, host: str, is_served: bool) -> None:
     """A page from elsewhere could read the state once its name resolves to this address."""
-    status, _ = page.ask(get("/api/v1/state", "Connection: close", host=host), "127.0.0.4")
+    status, _ = page.request(get("/api/v1/state", "Connection: close", host=host), "127.0.0.4")
     assert status == (200 if is_served else 421)
     with page.connect("127.0.0.4") as link:
         link.sendall(upgrade(host=host))
         assert link.recv(4096).startswith(b"HTTP/1.1 101") == is_served
-    status, _ = page.ask(get("/", "Connection: close", host=host), "127.0.0.4")
+    status, _ = page.request(get("/", "Connection: close", host=host), "127.0.0.4")
     assert status == (200 if is_served else 421)
 
 
@@ -447,7 +454,7 @@ def test_a_page_from_elsewhere_neither_commands_nor_watches(
 ) -> None:
     source = "127.0.0.5"
     given = len(page.commands)
-    status, _ = page.ask(command(page.token, f"Origin: {origin}"), source)
+    status, _ = page.request(command(page.token, f"Origin: {origin}"), source)
     assert status == (200 if is_allowed else 403)
     assert len(page.commands) - given == is_allowed
     with page.connect(source) as link:
@@ -457,24 +464,26 @@ def test_a_page_from_elsewhere_neither_commands_nor_watches(
 
 def test_two_host_headers_are_refused(page: Page) -> None:
     request = get("/api/v1/state", "Host: attacker.example", "Connection: close")
-    assert page.ask(request)[0] in (400, 421)
-    assert page.ask(b"GET /api/v1/state HTTP/1.0\r\n\r\n")[0] == 421
+    assert page.request(request)[0] in (400, 421)
+    assert page.request(b"GET /api/v1/state HTTP/1.0\r\n\r\n")[0] == 421
 
 
 def test_names_and_proxies_of_the_configuration_count(tmp_path: Path) -> None:
     page = Page(tmp_path, hosts=("camera.example",), proxies=("127.0.0.9",))
     try:
-        status, _ = page.ask(get("/", "Connection: close", host="camera.example:443"), "127.0.0.9")
+        status, _ = page.request(
+            get("/", "Connection: close", host="camera.example:443"), "127.0.0.9"
+        )
         assert status == 200
         for _ in range(FAILURES_ALLOWED):
             forwarded = f"X-Forwarded-For: {OPERATOR}, 198.51.100.1"
-            assert page.ask(command("guess", forwarded), "127.0.0.9")[0] == 401
-        assert page.ask(command("guess", forwarded), "127.0.0.9")[0] == 429
+            assert page.request(command("guess", forwarded), "127.0.0.9")[0] == 401
+        assert page.request(command("guess", forwarded), "127.0.0.9")[0] == 429
         # Counted for the client that the proxy names, not for the proxy or what the client claims.
         other = "X-Forwarded-For: 198.51.100.1, 198.51.100.2"
-        assert page.ask(command("guess", other), "127.0.0.9")[0] == 401
+        assert page.request(command("guess", other), "127.0.0.9")[0] == 401
         # Somebody who is no proxy names nobody.
-        assert page.ask(command("guess", forwarded), ATTACKER)[0] == 401
+        assert page.request(command("guess", forwarded), ATTACKER)[0] == 401
     finally:
         page.end()
 
@@ -503,6 +512,6 @@ def test_the_pages_process_is_bounded_by_itself(page: Page) -> None:
 
 def test_a_process_that_was_not_started_for_the_page_is_not_bounded() -> None:
     before = [resource.getrlimit(kind) for kind in (resource.RLIMIT_DATA, resource.RLIMIT_NOFILE)]
-    confine()
+    apply_resource_limits()
     after = [resource.getrlimit(kind) for kind in (resource.RLIMIT_DATA, resource.RLIMIT_NOFILE)]
     assert after == before

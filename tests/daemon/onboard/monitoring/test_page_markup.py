@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 import pytest
 
-from daemon.onboard.service.messages import Told
+from daemon.onboard.service.messages import ServiceEvent
 from processing.rig import shipped_rigs
 from tests.browser import Browser, chromium
-from tests.daemon.onboard.monitoring import flown
+from tests.daemon.onboard.monitoring import flight_events
 from tests.daemon.onboard.monitoring.test_page import WITHIN_S, Service
 
 pytestmark = pytest.mark.trust
@@ -55,26 +55,26 @@ def hostile(value: Any, key: str = "") -> Any:
 
 
 def events(folder: Path) -> Iterator[dict[str, Any]]:
-    yield flown.mission(str(folder / "mission")) | {"recovery": ["one frame was lost"]}
+    yield flight_events.mission(str(folder / "mission")) | {"recovery": ["one frame was lost"]}
     yield {"event": "bound", "device": "SU00", "kind": "head", "found": {"serial": "1"}}
-    yield flown.lost("SU02")
-    yield flown.lost("receiver")
-    yield flown.recovered("receiver")
-    yield flown.device_event("probe", "searching", "it is looked for", fault=False)
+    yield flight_events.lost("SU02")
+    yield flight_events.lost("receiver")
+    yield flight_events.recovered("receiver")
+    yield flight_events.device_event("probe", "searching", "it is looked for", fault=False)
     settings = {"pan": {"exposure_time_us": 4000.0, "gain_db": 0.0, "tdi_shifts": 1}}
     yield {
         **{"event": "exposure-settings", "mono_ns": "1", "by": "automatic"},
         **{"control": "automatic", "lock": "line", "locked_on": "A1", "settings": settings},
     }
     for number, north_m in enumerate((0, 68, 136, 640, 708), start=1):
-        yield from flown.exposure(number, "refly", line="A1", north_m=north_m)
+        yield from flight_events.exposure(number, "refly", line="A1", north_m=north_m)
     yield {"event": "triggered", "mono_ns": "1", "number": 6}
     yield {"event": "lost", "mono_ns": "1", "number": 6, "cause": "no frame came"}
     yield {"event": "triggered", "mono_ns": "1", "number": 7}
     yield {"event": "not-processed", "mono_ns": "1", "number": 7, "sentence": "no image"}
     yield {"event": "command", "mono_ns": "1", "name": "start", "by": "x", "sentence": "done"}
     disk = {"disk": "root", "path": "/a", "state": "in use", "healthy": False, "sentence": "hot"}
-    status = flown.status("ready", triggers=7)
+    status = flight_events.status("ready", triggers=7)
     yield status | {"missing": ["no head SU02"], "absent": ["trigger"], "disks": [disk]}
 
 
@@ -102,7 +102,7 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     (mission / "service.toml").write_text("[plan]\nground_height_m = 395.0\n")
     service = Service(folder)
     for event in events(folder):
-        while not service.child.tell(Told(hostile(event))):
+        while not service.child.try_send(ServiceEvent(hostile(event))):
             time.sleep(0.02)
     yield service
     service.end()

@@ -7,30 +7,30 @@ from pathlib import Path
 import msgpack
 import pytest
 
-from daemon.onboard.monitoring.state import FlightState
+from daemon.onboard.monitoring.flight_state import FlightState
 from daemon.onboard.monitoring.telemetry import Subscription, packed
-from tests.daemon.onboard.monitoring import flown
+from tests.daemon.onboard.monitoring import flight_events
 
 
 def fly(state: FlightState, numbers: range) -> None:
     for number in numbers:
-        for event in flown.exposure(number):
+        for event in flight_events.exposure(number):
             state.apply(event)
-        state.apply(flown.status(triggers=number))
+        state.apply(flight_events.status(triggers=number))
 
 
 @pytest.mark.parametrize("bytes_per_s", [1000, 4000, 1e9])
 def test_every_watcher_converges_within_its_budget(bytes_per_s: float) -> None:
     state = FlightState("syntopic test")
-    state.apply(flown.mission())
-    told = Subscription(bytes_per_s)
+    state.apply(flight_events.mission())
+    subscription = Subscription(bytes_per_s)
     seen: dict[int, object] = {}
     nbytes, now_s, brief = 0, 0.0, None
     for step in range(2000):
         now_s = step * 0.2
         if step < 200 and step % 10 == 0:
             fly(state, range(step // 10 + 1, step // 10 + 2))
-        record = told.record(state, now_s)
+        record = subscription.record(state, now_s)
         if record is None:
             continue
         nbytes += len(packed(record))
@@ -45,15 +45,15 @@ def test_every_watcher_converges_within_its_budget(bytes_per_s: float) -> None:
 
 def test_a_fault_overtakes_everything_else() -> None:
     state = FlightState("syntopic test")
-    state.apply(flown.mission())
+    state.apply(flight_events.mission())
     fly(state, range(1, 500))
-    told = Subscription(2000)
-    assert told.record(state, 0.0) is not None
-    state.apply(flown.lost("SU02"))
+    subscription = Subscription(2000)
+    assert subscription.record(state, 0.0) is not None
+    state.apply(flight_events.lost("SU02"))
     now_s = 0.0
     while True:
         now_s += 0.2
-        record = told.record(state, now_s)
+        record = subscription.record(state, now_s)
         if record is not None and record["faults"]:
             break
     assert now_s <= 2.0
@@ -61,7 +61,7 @@ def test_a_fault_overtakes_everything_else() -> None:
 
 def test_a_record_is_msgpack_that_any_reader_reads() -> None:
     state = FlightState("syntopic test")
-    state.apply(flown.mission())
+    state.apply(flight_events.mission())
     fly(state, range(1, 3))
     record = Subscription().record(state, 0.0)
     assert msgpack.unpackb(packed(record)) == record
@@ -70,9 +70,11 @@ def test_a_record_is_msgpack_that_any_reader_reads() -> None:
 
 def test_nothing_new_is_said_only_once_in_a_while() -> None:
     state = FlightState("syntopic test")
-    state.apply(flown.mission())
-    told = Subscription()
-    times = [step * 0.1 for step in range(100) if told.record(state, step * 0.1) is not None]
+    state.apply(flight_events.mission())
+    subscription = Subscription()
+    times = [
+        step * 0.1 for step in range(100) if subscription.record(state, step * 0.1) is not None
+    ]
     assert len(times) == pytest.approx(10, abs=1)
 
 
@@ -82,15 +84,22 @@ def test_the_schema_names_every_key_that_is_told() -> None:
     lost = {"event": "lost", "mono_ns": "1", "number": 2, "cause": "no frames"}
     bound = {"event": "bound", "device": "SU02", "kind": "head", "found": {}}
     for event in (
-        *(flown.mission(), bound, flown.lost("SU02"), *flown.exposure(1), lost, flown.status()),
+        *(
+            flight_events.mission(),
+            bound,
+            flight_events.lost("SU02"),
+            *flight_events.exposure(1),
+            lost,
+            flight_events.status(),
+        ),
         {"event": "exposure-settings", "settings": {}, **settings},
     ):
         state.apply(event)
     snapshot = state.snapshot()
     del snapshot["events"]  # each kind has its own keys, docs/events.md
-    told = set(snapshot)
+    subscription = set(snapshot)
     for part in snapshot.values():
         for item in part if isinstance(part, list) else [part]:
-            told |= set(item) if isinstance(item, dict) else set()
+            subscription |= set(item) if isinstance(item, dict) else set()
     schema = (Path(__file__).parents[4] / "docs/telemetry.md").read_text()
-    assert {key for key in told if f"`{key}`" not in schema} == set()
+    assert {key for key in subscription if f"`{key}`" not in schema} == set()

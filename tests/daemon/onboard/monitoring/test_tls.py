@@ -15,10 +15,10 @@ from typer.testing import CliRunner, Result
 
 from daemon.cli import app
 from daemon.configuration.model import WatchSection
-from daemon.onboard.monitoring.access.authority import make_certificate
+from daemon.onboard.monitoring.access.certificate_authority import issue_certificate
 from daemon.onboard.service.messages import Stop
-from daemon.onboard.service.processes import Child
-from tests.daemon.onboard.monitoring import flown
+from daemon.onboard.service.processes import ChildProcess
+from tests.daemon.onboard.monitoring import flight_events
 from tests.daemon.onboard.monitoring.test_certificates import expire, self_signed
 from tests.daemon.onboard.monitoring.test_page import Service
 
@@ -28,7 +28,7 @@ RENEWED_WITHIN_S = 30.0
 
 @pytest.fixture
 def service(tmp_path: Path) -> Iterator[Service]:
-    make_certificate(tmp_path / "tls")
+    issue_certificate(tmp_path / "tls")
     service = serving(tmp_path)
     yield service
     service.end()
@@ -37,8 +37,8 @@ def service(tmp_path: Path) -> Iterator[Service]:
 def serving(folder: Path, **further: Any) -> Service:
     files = {"tls_certificate": folder / "tls/server.pem", "tls_key": folder / "tls/server.key"}
     service = Service(folder, **files, **further)
-    service.tell(flown.mission())
-    service.tell(flown.status(triggers=3))
+    service.emit(flight_events.mission())
+    service.emit(flight_events.status(triggers=3))
     return service
 
 
@@ -53,8 +53,8 @@ def test_page_api_telemetry_and_commands_are_served_over_tls(
     trusting = ssl.create_default_context(cafile=str(tmp_path / "tls/authority.pem"))
 
     def get(path: str, **how: Any) -> bytes:
-        asked = urllib.request.Request(service.address + path, **how)
-        with urllib.request.urlopen(asked, timeout=30, context=trusting) as answer:
+        urls = urllib.request.Request(service.address + path, **how)
+        with urllib.request.urlopen(urls, timeout=30, context=trusting) as answer:
             return bytes(answer.read())
 
     assert b"<html" in get("")
@@ -70,8 +70,8 @@ def test_page_api_telemetry_and_commands_are_served_over_tls(
 
 
 def test_a_token_reaches_a_closed_service_over_tls_only(tmp_path: Path) -> None:
-    make_certificate(tmp_path / "tls")
-    service = serving(tmp_path, is_open=False)
+    issue_certificate(tmp_path / "tls")
+    service = serving(tmp_path, anonymous_read=False)
     try:
         authority = ("--authority", str(tmp_path / "tls/authority.pem"))
         nobody = watched(service.address, *authority)
@@ -89,13 +89,13 @@ def test_a_token_reaches_a_closed_service_over_tls_only(tmp_path: Path) -> None:
 def test_a_certificate_that_expired_or_is_for_another_machine_is_not_accepted(
     tmp_path: Path,
 ) -> None:
-    make_certificate(tmp_path / "tls")
+    issue_certificate(tmp_path / "tls")
     authority = ("--authority", str(tmp_path / "tls/authority.pem"))
     expire(tmp_path / "tls")
     service = serving(tmp_path)
     try:
-        told = [one for one in service.events if one.get("device") == "certificate for clients"]
-        assert "expired on" in told[0]["sentence"], "and it is served all the same"
+        reported = [one for one in service.events if one.get("device") == "certificate for clients"]
+        assert "expired on" in reported[0]["sentence"], "and it is served all the same"
         assert "certificate has expired" in str(watched(service.address, *authority).exception)
     finally:
         service.end()
@@ -118,22 +118,22 @@ def test_a_renewed_certificate_is_served_without_a_restart(
     authority = str(tmp_path / "tls/authority.pem")
     before = ssl.get_server_certificate(address, ca_certs=authority, timeout=30)
     (tmp_path / "tls/server.pem").write_text("half a certif")
-    service.until(lambda: told_of_certificate(service), RENEWED_WITHIN_S)
-    assert "The previous certificate is still used" in told_of_certificate(service)[0]["sentence"]
+    service.until(lambda: certificate_events(service), RENEWED_WITHIN_S)
+    assert "The previous certificate is still used" in certificate_events(service)[0]["sentence"]
     assert ssl.get_server_certificate(address, ca_certs=authority, timeout=30) == before
-    make_certificate(tmp_path / "tls")
-    service.until(lambda: len(told_of_certificate(service)) == 2, RENEWED_WITHIN_S)
-    assert told_of_certificate(service)[1]["fault"] is False
+    issue_certificate(tmp_path / "tls")
+    service.until(lambda: len(certificate_events(service)) == 2, RENEWED_WITHIN_S)
+    assert certificate_events(service)[1]["fault"] is False
     after = ssl.get_server_certificate(address, ca_certs=authority, timeout=30)
     assert after.strip() == (tmp_path / "tls/server.pem").read_text().strip() != before.strip()
 
 
-def told_of_certificate(service: Service) -> list[Any]:
+def certificate_events(service: Service) -> list[Any]:
     return [one for one in service.events if one.get("event") == "tls-certificate"]
 
 
 def test_a_key_that_everybody_may_read_is_not_served(tmp_path: Path) -> None:
-    make_certificate(tmp_path / "tls")
+    issue_certificate(tmp_path / "tls")
     (tmp_path / "tls/server.key").chmod(0o644)
     settings = WatchSection(
         port=0,
@@ -141,7 +141,9 @@ def test_a_key_that_everybody_may_read_is_not_served(tmp_path: Path) -> None:
         tls_certificate=tmp_path / "tls/server.pem",
         tls_key=tmp_path / "tls/server.key",
     )
-    child = Child("watch", "daemon.onboard.monitoring.process:main", (settings,), {})
+    child = ChildProcess(
+        "watch", "daemon.onboard.monitoring.monitoring_process:main", (settings,), {}
+    )
     try:
         assert child.connection.poll(60)
         event = child.connection.recv().event

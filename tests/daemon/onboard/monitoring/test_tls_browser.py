@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 
-from daemon.onboard.monitoring.access.authority import make_certificate
+from daemon.onboard.monitoring.access.certificate_authority import issue_certificate
 from tests.browser import Browser, chromium
-from tests.daemon.onboard.monitoring import flown
+from tests.daemon.onboard.monitoring import flight_events
 from tests.daemon.onboard.monitoring.test_page import WITHIN_S, Service
 from tests.namespaces import Host, two_hosts
 
@@ -32,11 +32,11 @@ ABILITIES = """(async () => ({
 """Any script of the page that does without a document serves as a service worker."""
 
 
-def trusting_home(home: Path, authority: Path) -> Path:
+def trusting_profile(home_folder: Path, authority: Path) -> Path:
     """A home folder whose certificate store trusts an authority, as a tablet that installed it."""
     if shutil.which("certutil") is None:
         pytest.skip("no certutil here; apt-get install libnss3-tools")
-    store = home / ".pki/nssdb"
+    store = home_folder / ".pki/nssdb"
     store.mkdir(parents=True)
     for arguments in (
         ("-N", "--empty-password"),
@@ -48,32 +48,32 @@ def trusting_home(home: Path, authority: Path) -> Path:
             capture_output=True,
             timeout=60,
         )
-    return home
+    return home_folder
 
 
 @contextmanager
 def camera_and_tablet(folder: Path) -> Iterator[tuple[Service, Host, Host]]:
     chromium()
     with two_hosts() as (camera, tablet):
-        make_certificate(folder / "tls", names=[camera.address])
+        issue_certificate(folder / "tls", names=[camera.address])
         files = {"tls_certificate": folder / "tls/server.pem", "tls_key": folder / "tls/server.key"}
         service = camera.run(lambda: Service(folder, host=camera.address, **files))
         try:
-            service.tell(flown.mission())
-            service.tell(flown.status(triggers=3))
+            service.emit(flight_events.mission())
+            service.emit(flight_events.status(triggers=3))
             yield service, camera, tablet
         finally:
             service.end()
 
 
-def visits(folder: Path, home: Path, camera: Host, *steps: tuple[str, bool]) -> list[Any]:
+def visits(folder: Path, home_folder: Path, camera: Host, *steps: tuple[str, bool]) -> list[Any]:
     """What pages can do, each an address and whether its certificate is clicked through.
 
     To be called in the thread of the host that the browser is on.
     """
-    home.mkdir(exist_ok=True)
+    home_folder.mkdir(exist_ok=True)
     mapped = f"--host-resolver-rules=MAP {NAME} {camera.address}"
-    with Browser(folder, flags=(mapped,), environment={"HOME": str(home)}) as browser:
+    with Browser(folder, flags=(mapped,), environment={"HOME": str(home_folder)}) as browser:
         return [_visit(browser, *step) for step in steps]
 
 
@@ -97,20 +97,22 @@ def test_a_trusted_certificate_gives_service_worker_and_wake_lock_on_another_hos
     tmp_path: Path,
 ) -> None:
     with camera_and_tablet(tmp_path) as (service, camera, tablet):
-        home = trusting_home(tmp_path / "home", tmp_path / "tls/authority.pem")
-        stranger = tmp_path / "stranger"
+        home_folder = trusting_profile(tmp_path / "home", tmp_path / "tls/authority.pem")
+        untrusting = tmp_path / "stranger"
         port = service.address.rstrip("/").rpartition(":")[2]
         plain = service.address.replace("https", "http")
 
-        def seen(home: Path, *steps: tuple[str, bool]) -> list[Any]:
-            profile = tmp_path / f"{home.name} profile"
-            return tablet.run(lambda: visits(profile, home, camera, *steps))
+        def seen(home_folder: Path, *steps: tuple[str, bool]) -> list[Any]:
+            profile = tmp_path / f"{home_folder.name} profile"
+            return tablet.run(lambda: visits(profile, home_folder, camera, *steps))
 
         by_name = f"https://{NAME}:{port}/"
-        trusted = seen(home, (service.address, False), (by_name, False), (plain, False))
+        trusted = seen(home_folder, (service.address, False), (by_name, False), (plain, False))
         everything = {"secure": True, "wakeLock": True, "serviceWorker": True}
         assert trusted[:2] == [everything, everything]
         assert trusted[2].strip() == f"This port speaks TLS: use {service.address}"
-        refused, clicked_through = seen(stranger, (service.address, False), (service.address, True))
+        refused, clicked_through = seen(
+            untrusting, (service.address, False), (service.address, True)
+        )
         assert "ERR_CERT_AUTHORITY_INVALID" in refused
         assert clicked_through["serviceWorker"] == "SecurityError", clicked_through

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from daemon.onboard.monitoring.access.tokens import (
-    Attempts,
+    FailedAttempts,
     TokenError,
     add_token,
     read_tokens,
@@ -58,7 +58,7 @@ def test_a_file_open_to_everybody_or_damaged_is_refused(tmp_path: Path) -> None:
 
 
 def test_after_five_wrong_tokens_an_address_waits_a_minute() -> None:
-    attempts = Attempts()
+    attempts = FailedAttempts()
     for i in range(5):
         assert not attempts.is_blocked("10.0.0.9", float(i))
         attempts.failed("10.0.0.9", float(i))
@@ -68,7 +68,7 @@ def test_after_five_wrong_tokens_an_address_waits_a_minute() -> None:
 
 
 def test_many_addresses_do_not_fill_the_memory() -> None:
-    attempts = Attempts()
+    attempts = FailedAttempts()
     for i in range(10_000):
         attempts.failed(f"fd00::{i:x}", 0.0)
     assert len(attempts._failures) <= 4096

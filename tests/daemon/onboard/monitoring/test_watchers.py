@@ -16,22 +16,22 @@ from pathlib import Path
 import pytest
 
 from daemon.configuration.model import WatchSection
-from daemon.onboard.monitoring.process import PING_S, PONG_WITHIN_S
-from daemon.onboard.service.messages import Stop, Told
-from daemon.onboard.service.processes import Child
-from tests.daemon.onboard.monitoring import flown
+from daemon.onboard.monitoring.monitoring_process import PING_S, PONG_TIMEOUT_S
+from daemon.onboard.service.messages import ServiceEvent, Stop
+from daemon.onboard.service.processes import ChildProcess
+from tests.daemon.onboard.monitoring import flight_events
 
 WATCHERS, STALLED, EXPOSURES = 50, 10, 60
 GROWTH_MAX_KB = 60_000
-LET_GO_WITHIN_S = PING_S + PONG_WITHIN_S + 2.0
+LET_GO_WITHIN_S = PING_S + PONG_TIMEOUT_S + 2.0
 
 
 @pytest.fixture
-def watch(tmp_path: Path) -> Iterator[tuple[Child, int]]:
+def watch(tmp_path: Path) -> Iterator[tuple[ChildProcess, int]]:
     (tmp_path / "L0").mkdir()
-    child = Child(
+    child = ChildProcess(
         "watch",
-        "daemon.onboard.monitoring.process:main",
+        "daemon.onboard.monitoring.monitoring_process:main",
         (WatchSection(port=0, announce=False),),
         {},
     )
@@ -83,17 +83,17 @@ async def stall(port: int, release: asyncio.Event) -> None:
     writer.close()
 
 
-def test_stalled_watchers_cost_the_others_nothing(watch: tuple[Child, int]) -> None:
+def test_stalled_watchers_cost_the_others_nothing(watch: tuple[ChildProcess, int]) -> None:
     child, port = watch
-    assert child.tell(Told(flown.mission()))
+    assert child.try_send(ServiceEvent(flight_events.mission()))
     before_kb = resident_kb(child.process.pid or 0)
     dropped = 0
 
     def fly() -> None:
         nonlocal dropped
         for number in range(1, EXPOSURES + 1):
-            for event in (*flown.exposure(number), flown.status(triggers=number)):
-                while not child.tell(Told(event)):
+            for event in (*flight_events.exposure(number), flight_events.status(triggers=number)):
+                while not child.try_send(ServiceEvent(event)):
                     dropped += 1
                     time.sleep(0.02)
             time.sleep(0.05)
@@ -116,7 +116,7 @@ def test_stalled_watchers_cost_the_others_nothing(watch: tuple[Child, int]) -> N
 
 
 def test_who_watches_is_served_until_the_service_says_so_whoever_is_signalled(
-    watch: tuple[Child, int],
+    watch: tuple[ChildProcess, int],
 ) -> None:
     """Ctrl-C and systemd signal the whole group; the service has exposures to seal."""
     child, port = watch
@@ -124,8 +124,8 @@ def test_who_watches_is_served_until_the_service_says_so_whoever_is_signalled(
     async def look() -> set[int]:
         following = asyncio.create_task(follow(port, 20))
         for number in range(1, 21):
-            for event in flown.exposure(number):
-                assert child.tell(Told(event))
+            for event in flight_events.exposure(number):
+                assert child.try_send(ServiceEvent(event))
             await asyncio.sleep(0.05)
             if number == 5:
                 os.kill(child.process.pid or 0, signal.SIGTERM)

@@ -17,21 +17,21 @@ import numba
 import numpy as np
 import pytest
 
-from daemon.cli.check import look
+from daemon.cli.check import collect_results
 from daemon.configuration.model import ConfigurationError, load
 from daemon.errors import DaemonError
 from daemon.mission.store.level0 import tiff_parts
 from daemon.onboard.pipeline import worker
-from daemon.onboard.preflight import prerequisites, trial
-from daemon.onboard.preflight.findings import Finding, Outcome, overall
+from daemon.onboard.preflight import prerequisites, system_check
+from daemon.onboard.preflight.check_results import CheckOutcome, CheckResult, worst_outcome
 from daemon.onboard.service import supervisor
-from daemon.onboard.service.processes import Link, ServiceGoneError
+from daemon.onboard.service.processes import ServiceConnection, ServiceDisconnectedError
 from daemon.onboard.service.service import Service
 from daemon.products.processor import Processor
 from sim_hw.devices.modbus_probe import ModbusProbe
 from sim_hw.devices.pseudo_terminal import PseudoTerminal
 from sim_hw.devices.pulse_bus import PulseBus
-from sim_hw.receivers.receiver import ReceiverState
+from sim_hw.receivers.emulated_receiver import ReceiverState
 from sim_hw.receivers.ublox_receiver import UbloxReceiver
 from sim_hw.world.world_clock import WorldClock
 
@@ -89,7 +89,7 @@ count = 3
 
 [processing]
 threads = 1
-exposures_in_work = 1
+parallel_exposures = 1
 
 [limits]
 ready_timeout_s = 1.0
@@ -142,11 +142,11 @@ class Planted:
 
     def frames(self, cone: str, **known: object) -> None:
         """The frames of a head."""
-        told = {"syntopic": 1, "head_serial": f"SN-{cone}", "pixel_format": "Mono12", **known}
+        reported = {"syntopic": 1, "head_serial": f"SN-{cone}", "pixel_format": "Mono12", **known}
         height, width = known.get("shape", (HEIGHT_PX, WIDTH_PX))  # type: ignore[misc]
         path = self.folder / "frames" / "000001" / f"SU{cone}.tif"
         path.parent.mkdir(parents=True, exist_ok=True)
-        about = {key: value for key, value in told.items() if key != "shape"}
+        about = {key: value for key, value in reported.items() if key != "shape"}
         pixels = np.full((height, width), 1000, np.uint16)
         path.write_bytes(b"".join(bytes(part) for part in tiff_parts([pixels], about)))
 
@@ -154,18 +154,18 @@ class Planted:
 
     def receiver(self) -> PseudoTerminal:
         line = PseudoTerminal()
-        receiver = UbloxReceiver(WorldClock.starting_now(), _state, line=line)
+        receiver = UbloxReceiver(WorldClock.from_wall_clock(), _state, line=line)
         self._start(receiver)
         self.add(f'[[navigator]]\nname = "gnss"\ndriver = "ublox"\nport = "{line.port}"')
         return line
 
     def line(self, data: Callable[[int], bytes], *, every_s: float = 0.1) -> str:
         """A serial line on which somebody repeats bytes; its port."""
-        line, ending = PseudoTerminal(), threading.Event()
+        line, event = PseudoTerminal(), threading.Event()
 
         def speak() -> None:
             count = 0
-            while not ending.wait(every_s):
+            while not event.wait(every_s):
                 line.write(data(count))
                 count += 1
 
@@ -173,7 +173,7 @@ class Planted:
         thread.start()
 
         def close() -> None:
-            ending.set()
+            event.set()
             thread.join()
             line.close()
 
@@ -233,8 +233,8 @@ class ThreadChild:
 
         def run() -> None:
             try:
-                with suppress(ServiceGoneError):
-                    main(Link(theirs), *arguments)
+                with suppress(ServiceDisconnectedError):
+                    main(ServiceConnection(theirs), *arguments)
             finally:
                 theirs.close()
 
@@ -258,7 +258,7 @@ class ThreadChild:
 
 
 @dataclass
-class Said:
+class Reported:
     """What one of the two commands said: its exit status and every sentence."""
 
     status: int
@@ -276,49 +276,53 @@ def in_threads(planted: Planted) -> None:
     patch(supervisor, "_made", ThreadChild)
     patch(Processor, "warm_up", lambda _processor: None)
     patch(numba, "threading_layer", lambda: "omp")
-    patch(worker, "settle_threads", lambda: None)
+    patch(worker, "configure_threads", lambda: None)
     patch(worker, "make_products", _no_products)
     patch(prerequisites, "PACE_NBYTES_MIN", 4_000_000)
-    patch(trial, "DATA_WITHIN_S", 2.5)
+    patch(system_check, "DATA_TIMEOUT_S", 2.5)
     patch(supervisor, "END_TIMEOUT_S", 1.0)
-    patch(trial, "BIND_WITHIN_S", 8.0)
-    patch(trial, "KERNELS_WITHIN_S", 8.0)
+    patch(system_check, "BIND_TIMEOUT_S", 8.0)
+    patch(system_check, "KERNELS_TIMEOUT_S", 8.0)
 
 
-def check(planted: Planted, *, fire: bool = False) -> Said:
+def check(planted: Planted, *, fire: bool = False) -> Reported:
     """What `syntopic check` finds."""
     try:
         configuration, rig = load(planted.config)
-        found = look(configuration, rig, planted.config, fire=fire)
+        found = collect_results(configuration, rig, planted.config, fire=fire)
     except ConfigurationError as error:
-        return Said(2, frozenset(error.problems))
+        return Reported(2, frozenset(error.problems))
     except DaemonError as error:
-        return Said(1, frozenset({str(error)}))
-    status = {Outcome.PASS: 0, Outcome.FAIL: 1, Outcome.WAITING: 3}[overall(found)]
-    failing = frozenset(one.name for one in found if one.outcome is Outcome.FAIL)
-    sentences = _of(found, Outcome.FAIL), _of(found, Outcome.WAITING)
-    return Said(status, *sentences, devices=failing)
+        return Reported(1, frozenset({str(error)}))
+    status = {CheckOutcome.PASS: 0, CheckOutcome.FAIL: 1, CheckOutcome.WAITING: 3}[
+        worst_outcome(found)
+    ]
+    failing = frozenset(one.name for one in found if one.outcome is CheckOutcome.FAIL)
+    sentences = _of(found, CheckOutcome.FAIL), _of(found, CheckOutcome.WAITING)
+    return Reported(status, *sentences, devices=failing)
 
 
-def run(planted: Planted, agreed: Callable[[Said], bool]) -> Said:
+def run(planted: Planted, agreed: Callable[[Reported], bool]) -> Reported:
     """What `syntopic run` says until it ends, or until it has said what is waited for."""
     try:
         configuration, rig = load(planted.config)
     except ConfigurationError as error:
-        return Said(2, frozenset(error.problems))
+        return Reported(2, frozenset(error.problems))
     events: list[Mapping[str, Any]] = []
     service = Service(configuration, rig, planted.config, events.append)
 
-    def so_far(status: int) -> Said:
+    def so_far(status: int) -> Reported:
         faults = [event for event in events if event.get("fault") or event["event"] == "fault"]
         faults += [event for event in events if event.get("differences")]
         names = {event["event"] for event in events}
-        lacks = service.preflight.lacks() if "mission" in names else ()
+        missing_prerequisites = (
+            service.preflight.missing_prerequisites() if "mission" in names else ()
+        )
         accepted = [event["sentence"] for event in events if event["event"] == "override"]
-        return Said(
+        return Reported(
             status,
             frozenset(str(event["sentence"]) for event in faults),
-            frozenset([*map(str, lacks), *accepted]),
+            frozenset([*map(str, missing_prerequisites), *accepted]),
             # A frame that is faster than the answer of its trigger belongs to nothing, and came.
             bool(names & {"stored", "frame"}),
             frozenset(str(event.get("device", "service")) for event in faults),
@@ -336,10 +340,10 @@ def run(planted: Planted, agreed: Callable[[Said], bool]) -> Said:
     try:
         return so_far(asyncio.run(fly()))
     except DaemonError as error:
-        return Said(1, frozenset({str(error)}))
+        return Reported(1, frozenset({str(error)}))
 
 
-def _of(found: list[Finding], outcome: Outcome) -> frozenset[str]:
+def _of(found: list[CheckResult], outcome: CheckOutcome) -> frozenset[str]:
     return frozenset(one.sentence for one in found if one.outcome is outcome)
 
 

@@ -11,10 +11,10 @@ import pytest
 
 from daemon.mission.log.flight_log import FlightLog, LogReader, read
 from daemon.mission.log.log_records import Message
-from daemon.onboard.service.messages import Answer, Command, CommandRefused, Log
+from daemon.onboard.service.messages import Answer, AppendToLog, CommandRefused, ServiceCommand
 from daemon.onboard.service.service import Service
-from daemon.onboard.storage.writer import _Writing
-from tests.daemon.onboard.service.test_commanding import FakeService
+from daemon.onboard.storage.writer import _Writer
+from tests.daemon.onboard.service.test_command_execution import FakeService
 
 pytestmark = pytest.mark.trust
 
@@ -28,7 +28,7 @@ class Flight(FakeService):
 
     def __init__(self) -> None:
         super().__init__()
-        self.sent: list[tuple[str, Log]] = []
+        self.sent: list[tuple[str, AppendToLog]] = []
         self.answers: list[Answer] = []
         self.events: list[dict[str, Any]] = []
         self.supervisor = SimpleNamespace(send=lambda *sent: self.sent.append(sent))
@@ -51,8 +51,10 @@ def test_a_command_and_a_refusal_are_in_the_flight_log_and_on_the_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     flight = Flight()
-    flight._on_command(Command(1, "trigger", {}, "anna", "operator", "10.0.0.9"))
-    flight._on_command(Command(2, "acknowledge", {"fault": "x"}, "eva", "administrator", "unix"))
+    flight._on_command(ServiceCommand(1, "trigger", {}, "anna", "operator", "10.0.0.9"))
+    flight._on_command(
+        ServiceCommand(2, "acknowledge", {"fault": "x"}, "eva", "administrator", "unix")
+    )
     flight._on_command_refused(CommandRefused("land", "unknown", "none", "10.0.0.66", "no", 7))
     assert [answer.done for answer in flight.answers] == [True, False]
     assert [(one["event"], one["name"]) for one in flight.events] == [
@@ -61,20 +63,20 @@ def test_a_command_and_a_refusal_are_in_the_flight_log_and_on_the_disk(
         ("command-refused", "land"),
     ]
     log = FlightLog.create(tmp_path)
-    writing = _Writing(None, SimpleNamespace(log=log), {})
+    writing = _Writer(None, SimpleNamespace(log=log), {})
     syncs = []
     really_sync = log.sync
     monkeypatch.setattr(log, "sync", lambda: (syncs.append(1), really_sync()))
-    writing.obey(Log(Message("raw/gnss", 1, b"x")))
+    writing.handle(AppendToLog(Message("raw/gnss", 1, b"x")))
     assert not syncs, "what devices send is synced once a second"
     for i, (process, order) in enumerate(flight.sent, start=1):
         assert process == "writer"
-        writing.obey(order)
+        writing.handle(order)
         assert len(syncs) == i
-    told = [json.loads(one.payload) for one in synced(tmp_path) if one.topic == "audit"]
-    assert [(one["by"], one["role"], one["address"], one["done"]) for one in told] == [
+    reported = [json.loads(one.payload) for one in synced(tmp_path) if one.topic == "audit"]
+    assert [(one["by"], one["role"], one["address"], one["done"]) for one in reported] == [
         ("anna", "operator", "10.0.0.9", True),
         ("eva", "administrator", "unix", False),
         ("unknown", "none", "10.0.0.66", False),
     ]
-    assert told[2]["refused"] is True and told[2]["count"] == 7
+    assert reported[2]["refused"] is True and reported[2]["count"] == 7

@@ -23,11 +23,11 @@ import serial
 
 from daemon.configuration.model import load
 from daemon.mission.layout import CURRENT_FILE
-from daemon.onboard.preflight import prerequisites, trial
-from daemon.onboard.service.departure import create_mission
+from daemon.onboard.preflight import prerequisites, system_check
+from daemon.onboard.service.startup import create_mission
 from daemon.products.processor import Processor
 from drivers.base.extras import missing
-from tests.daemon.onboard.service.flight_parts import Planted, Said, check, in_threads, run
+from tests.daemon.onboard.service.flight_parts import Planted, Reported, check, in_threads, run
 
 pytestmark = pytest.mark.trust
 
@@ -101,7 +101,7 @@ def port_in_use(planted: Planted) -> None:
     planted.add(WATCH.replace("port = 0", f"port = {taken.getsockname()[1]}"))
 
 
-def held_port(planted: Planted) -> None:
+def occupied_port(planted: Planted) -> None:
     port = planted.line(lambda _: b"")
     descriptor = os.open(port, os.O_RDWR | os.O_NOCTTY)
     planted.closing.append(lambda: os.close(descriptor))
@@ -157,13 +157,13 @@ def radiometry(*files: str) -> Callable[[Planted], object]:
     return plant
 
 
-def kernels_take_long(planted: Planted) -> None:
+def slow_kernels(planted: Planted) -> None:
     import threading
 
-    ending = threading.Event()
-    planted.closing.append(ending.set)
-    planted.monkeypatch.setattr(Processor, "warm_up", lambda _: ending.wait(60))
-    planted.monkeypatch.setattr(trial, "KERNELS_WITHIN_S", 0.3)
+    event = threading.Event()
+    planted.closing.append(event.set)
+    planted.monkeypatch.setattr(Processor, "warm_up", lambda _: event.wait(60))
+    planted.monkeypatch.setattr(system_check, "KERNELS_TIMEOUT_S", 0.3)
 
 
 FAULTS = (
@@ -219,8 +219,8 @@ FAULTS = (
     Fault("interrupted, its rig damaged", "prevented", "--new-mission", interrupted(damaged_copy)),
     Fault("interrupted, with other heads", "prevented", "has no sensor SUC", interrupted(changed('name = "SUB"', 'name = "SUC"'), changed('sensor = "SUB"', 'sensor = "SUC"'))),
     # What a flight goes on without
-    Fault("disk too slow", "degraded", "too slow", replaced(prerequisites, "write_s", lambda *_: 1e6)),
-    Fault("disk refuses to write", "degraded", "check the disk", replaced(prerequisites, "write_s", no_write)),
+    Fault("disk too slow", "degraded", "too slow", replaced(prerequisites, "measure_write_s", lambda *_: 1e6)),
+    Fault("disk refuses to write", "degraded", "check the disk", replaced(prerequisites, "measure_write_s", no_write)),
     Fault("disk full", "degraded", "room for 0 of 3", changed("disk_reserve_bytes = 0", f"disk_reserve_bytes = {1 << 60}")),
     Fault("calibration expired", "degraded", "was valid", changed('date = "2026-11-01"', 'date = "2001-01-01"')),
     Fault("calibration of no head", "degraded", "SUA, SUB", radiometry()),
@@ -234,7 +234,7 @@ FAULTS = (
     Fault("receiver silent", "degraded", "nothing came", spoken("novatel", lambda _: b"")),
     Fault("wrong baud rate", "degraded", "speed is", spoken("septentrio", lambda n: bytes(range(n % 200, n % 200 + 50)))),
     Fault("receiver of another kind", "degraded", "is no", spoken("novatel", lambda _: NMEA_VOID)),
-    Fault("port held by another", "degraded", "h", held_port),
+    Fault("port held by another", "degraded", "h", occupied_port),
     Fault("no permission on the port", "degraded", "permission denied", no_permission),
     Fault("thermometer absent", "degraded", "no such port", many(Planted.probes, added(PROBES + 'port = "/dev/absent"'))),
     Fault("thermometer silent", "degraded", "probes", many(Planted.probes, lambda p: p.add(PROBES + f'port = "{p.line(lambda _: b"")}"'))),
@@ -253,7 +253,7 @@ FAULTS = (
     Fault("interrupted, the rig changed", "degraded", "f_mm (100.0 in the mission, 101.5 now)", interrupted(changed("f_mm = 100.0", "f_mm = 101.5"))),
     # What comes by itself
     Fault("receiver that searches", "waiting", "no position", spoken("nmea", lambda _: NMEA_VOID)),
-    Fault("kernels not loaded yet", "waiting", "kernels", kernels_take_long),
+    Fault("kernels not loaded yet", "waiting", "kernels", slow_kernels),
     # Nothing wrong
     Fault("nothing", "passes", "", lambda _: None),
     Fault("mission root not there yet", "passes", "", changed('"missions"', '"some/where/missions"')),
@@ -282,17 +282,17 @@ def test_check_and_run_agree(planted: Planted, fault: Fault) -> None:
     fault.plant(planted)
     planted.write()
     if fault.outcome == "passes":
-        planted.monkeypatch.setattr(trial, "DATA_WITHIN_S", 30.0)
+        planted.monkeypatch.setattr(system_check, "DATA_TIMEOUT_S", 30.0)
     checked = check(planted)
     sentences = checked.waiting if fault.outcome == "waiting" else checked.failing
     assert any(fault.words in sentence for sentence in sentences) == bool(sentences), checked
     assert checked.status == {"refused": 2, "waiting": 3, "passes": 0}.get(fault.outcome, 1)
-    flown = run(planted, lambda said: AGREED[fault.outcome](checked, said))
+    flown = run(planted, lambda output: AGREED[fault.outcome](checked, output))
     assert AGREED[fault.outcome](checked, flown), (checked, flown)
     assert flown.devices - {"service"} <= checked.devices, (checked, flown)
-    said = {one for one in flown.failing if not one.startswith(CONSEQUENCES)}
+    output = {one for one in flown.failing if not one.startswith(CONSEQUENCES)}
     if flown.devices <= {"service"}:
-        assert _is_named(frozenset(said), by=checked.failing), (checked, flown)
+        assert _is_named(frozenset(output), by=checked.failing), (checked, flown)
 
 
 def test_there_are_at_least_sixty_faults() -> None:
@@ -306,7 +306,7 @@ def _is_named(sentences: frozenset[str], *, by: frozenset[str]) -> bool:
     return all(one and any(one in other or other in one for other in named) for one in sentences)
 
 
-AGREED: dict[str, Callable[[Said, Said], bool]] = {
+AGREED: dict[str, Callable[[Reported, Reported], bool]] = {
     "refused": lambda checked, flown: flown == checked,
     "prevented": lambda checked, flown: (
         flown.status == 1 and bool(flown.failing) and not flown.has_flown
@@ -315,7 +315,7 @@ AGREED: dict[str, Callable[[Said, Said], bool]] = {
         flown.status == 0 and _is_named(checked.failing, by=flown.failing | flown.waiting)
     ),
     "waiting": lambda checked, flown: any(
-        sentence in told for sentence in checked.waiting for told in flown.waiting
+        sentence in reported for sentence in checked.waiting for reported in flown.waiting
     ),
     "passes": lambda checked, flown: flown.has_flown and not flown.failing,
 }

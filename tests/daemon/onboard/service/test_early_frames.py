@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import pytest
 
-from daemon.onboard.service.hearing import EARLY_FRAME_LIMIT_NS, Hearing
-from daemon.onboard.service.line import Order
+from daemon.onboard.service.flight_line import Order
 from daemon.onboard.service.messages import Fired
+from daemon.onboard.service.record_ingest import EARLY_FRAME_LIMIT_NS, RecordIngest
 from drivers.contract import TriggerPulse
 from tests.daemon.onboard.flight.test_flight import HEADS, NS, STROBE_NS, flight, frame, pulse
 
@@ -24,7 +24,7 @@ class Flown:
         self.flight = flight()
         self.logged: list[object] = []
         self.reported: list[str] = []
-        self.hearing = Hearing(
+        self.ingest = RecordIngest(
             self.flight,
             self.logged.append,
             lambda event, **content: self.reported.append(f"{event} {content.get('cause')}"),
@@ -34,7 +34,7 @@ class Flown:
         given = pulse(number, INTERVAL_S * number)
         assert self.flight.order(given.mono_ns) == number
         order = Order(number, given.mono_ns, given.delays_ns, STROBE_NS)
-        self.hearing.orders[number] = order
+        self.ingest.orders[number] = order
 
     def frame(self, number: int, head: str, *, is_timed: bool) -> None:
         """A frame of a head; one of a folder has no clock of its own."""
@@ -42,12 +42,16 @@ class Flown:
         came = frame(head, given, slot=number % 3)
         if not is_timed:
             came = replace(came, device_clock_ns=None, device_clock_mono_ns=None)
-        self.hearing.hear(came)
+        self.ingest.dispatch(came)
 
     def answer(self, number: int, *, fired: bool = True) -> None:
         given = pulse(number, INTERVAL_S * number)
-        said = TriggerPulse(number, given.mono_ns, given.sigma_ns, given.count, given.spread_ns)
-        self.hearing.hear(Fired(number, said if fired else None, "" if fired else "no unit"))
+        trigger_pulse = TriggerPulse(
+            number, given.mono_ns, given.sigma_ns, given.count, given.spread_ns
+        )
+        self.ingest.dispatch(
+            Fired(number, trigger_pulse if fired else None, "" if fired else "no unit")
+        )
 
     @property
     def frames(self) -> dict[str, int]:
@@ -115,8 +119,8 @@ def test_a_trigger_that_never_answers_keeps_no_slot_for_ever() -> None:
     flown.order(1)
     flown.frame(1, HEADS[0], is_timed=False)
     came = pulse(1, INTERVAL_S).mono_ns + NS
-    flown.hearing.tell_of_time(came)
+    flown.ingest.emit_time_events(came)
     assert not flown.flight.idle_slots
-    flown.hearing.tell_of_time(came + EARLY_FRAME_LIMIT_NS + NS)
+    flown.ingest.emit_time_events(came + EARLY_FRAME_LIMIT_NS + NS)
     assert flown.flight.idle_slots == [(HEADS[0], 1)]
     assert flown.frames["spurious"] == 1

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from daemon.configuration.model import HeadSection, load
+from daemon.configuration.model import HeadDeviceSection, load
 from daemon.onboard.capture import head_network
 from daemon.onboard.capture.head_network import cautions_of
-from daemon.onboard.preflight.findings import Outcome
+from daemon.onboard.preflight.check_results import CheckOutcome
 from tests.daemon.onboard.service.flight_parts import Planted
 
 pytestmark = pytest.mark.trust
@@ -77,16 +77,16 @@ def test_check_says_so_and_the_flight_is_not_refused(
         monkeypatch.setattr(head_network, name, tmp_path / name)
     configuration, rig = load(planted.config)
     assert not list(head_network.head_network(configuration, rig)), "heads of a folder"
-    head = HeadSection.model_validate(
+    head = HeadDeviceSection.model_validate(
         {"sensor": "SUA", "driver": "aravis", "address": "192.168.1.11"}
     )
     changed = configuration.model_copy(update={"head": [head]})
-    (finding,) = head_network.head_network(changed, rig)
-    assert (finding.outcome, finding.prevents) == (Outcome.PASS, False)
-    emulated = HeadSection.model_validate(
+    (result,) = head_network.head_network(changed, rig)
+    assert (result.outcome, result.is_blocking) == (CheckOutcome.PASS, False)
+    emulated = HeadDeviceSection.model_validate(
         {"sensor": "SUA", "driver": "aravis", "address": "127.0.0.5"}
     )
     assert not list(
         head_network.head_network(configuration.model_copy(update={"head": [emulated]}), rig)
     )
-    assert finding.sentence.startswith("caution: head SUA is on a network shared with others")
+    assert result.sentence.startswith("caution: head SUA is on a network shared with others")

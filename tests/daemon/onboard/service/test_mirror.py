@@ -9,17 +9,17 @@ import pytest
 
 from daemon.configuration.model import Configuration, LimitsSection
 from daemon.mission.layout import Mission
-from daemon.mission.mirror.mirror_start import FoundDisks
+from daemon.mission.mirror.mirror_startup import FoundDisks
 from daemon.mission.store.disk_identity import Disk
 from daemon.mission.store.health import DiskHealth
-from daemon.onboard.flight.latches import Latches
+from daemon.onboard.flight.fault_latches import FaultLatches
 from daemon.onboard.service.messages import (
     AcceptDisk,
     DiskChanged,
     DropDisk,
     EndMission,
     ReleaseDisk,
-    WriteNote,
+    WriteSmallFile,
 )
 from daemon.onboard.storage import mirror as module
 from daemon.onboard.storage.mirror import Mirror
@@ -62,7 +62,7 @@ class Seen:
 
     def changed(self, name: str, disk: int, *in_use: int) -> None:
         disks = tuple(self.disks[i] for i in in_use)
-        self.mirror.hear(DiskChanged(name, self.disks[disk], "it is so", disks, 1))
+        self.mirror.dispatch(DiskChanged(name, self.disks[disk], "it is so", disks, 1))
 
 
 @pytest.fixture
@@ -74,14 +74,14 @@ def seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Seen:
 
 def test_a_full_disk_is_dropped_once_where_the_other_has_room(seen: Seen) -> None:
     seen.free["b"] = RESERVE + NEEDED
-    seen.mirror.look()
+    seen.mirror.check()
     assert seen.sent == [] and seen.mirror.free_bytes(Path()) == RESERVE + NEEDED
     seen.free["b"] = RESERVE + NEEDED - 1
     for _ in range(2):
-        seen.mirror.look()
+        seen.mirror.check()
     assert seen.sent == [DropDisk("mirror", "it has no room for another exposure")]
     seen.free["a"] = seen.free["b"] = 0
-    seen.mirror.look()
+    seen.mirror.check()
     assert len(seen.sent) == 1, "where both are full none is dropped"
 
 
@@ -90,7 +90,7 @@ def test_another_leading_disk_moves_the_mission_and_raises_a_fault_that_its_retu
 ) -> None:
     seen.changed("disk-dropped", 0, 1)
     assert seen.moved == [Mission(seen.roots[1] / "m", "m")]
-    latches = Latches()
+    latches = FaultLatches()
     for event in seen.events:
         latches.apply(event)
     assert [(f["id"], f["stands"]) for f in latches.listed()] == [("disk root", True)]
@@ -111,26 +111,26 @@ def test_disks_are_released_and_accepted_only_where_that_is_possible(seen: Seen)
 
 
 def test_small_files_go_through_the_writer_until_it_ends(seen: Seen) -> None:
-    seen.mirror.keep_now("note.json", b"1")
+    seen.mirror.save_now("note.json", b"1")
     seen.mirror.land(ends_mission=True)
-    seen.mirror.keep_now("note.json", b"2")
-    assert seen.sent == [WriteNote("note.json", b"1"), EndMission()]
+    seen.mirror.save_now("note.json", b"2")
+    assert seen.sent == [WriteSmallFile("note.json", b"1"), EndMission()]
     assert [(root / "note.json").read_bytes() for root in seen.roots] == [b"2", b"2"]
 
 
 def test_a_bad_disk_is_a_fault_until_it_is_well_and_a_figure_all_the_while(seen: Seen) -> None:
     seen.health["a"] = DiskHealth("M", "S", 80.0, 5.0, ("it is 80 degC hot",))
     for _ in range(2):
-        seen.mirror.look()
+        seen.mirror.check()
     seen.health["a"] = DiskHealth("M", "S", 60.0, 5.0)
-    seen.mirror.look()
-    said = [e for e in seen.events if e["event"] == "disk-health"]
-    assert [(e["fault"], e["disk"]) for e in said] == [(True, "root"), (False, "root")]
-    assert "80 degC" in said[0]["sentence"]
-    latches = Latches()
-    latches.apply(said[0])
+    seen.mirror.check()
+    health_events = [e for e in seen.events if e["event"] == "disk-health"]
+    assert [(e["fault"], e["disk"]) for e in health_events] == [(True, "root"), (False, "root")]
+    assert "80 degC" in health_events[0]["sentence"]
+    latches = FaultLatches()
+    latches.apply(health_events[0])
     assert latches.listed()[0]["stands"]
-    latches.apply(said[1])
+    latches.apply(health_events[1])
     assert not latches.listed()[0]["stands"]
 
 
@@ -138,13 +138,13 @@ def test_one_disk_is_as_ever_and_shown_only_where_its_health_is_known(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen = Seen(tmp_path, monkeypatch, mirrored=False)
-    seen.mirror.look()
+    seen.mirror.check()
     assert not seen.mirror.is_on and seen.mirror.plan is None and seen.mirror.status == []
     assert "one disk" in str(seen.mirror.release("root"))
-    seen.mirror.keep_now("note.json", b"1")
+    seen.mirror.save_now("note.json", b"1")
     seen.mirror.land(ends_mission=True)
     assert seen.sent == [] and (seen.roots[0] / "note.json").read_bytes() == b"1"
     seen.health["a"] = DiskHealth("M", "S", 41.0, 3.0)
-    seen.mirror.look()
+    seen.mirror.check()
     (disk,) = seen.mirror.status
     assert (disk["disk"], disk["temperature_c"], disk["healthy"]) == ("root", 41.0, True)

@@ -6,16 +6,22 @@ from types import SimpleNamespace
 from typing import Any
 
 from daemon.onboard.pipeline.pipeline_queue import PipelineQueue
-from daemon.onboard.service.messages import Process, Processed, Recycle, Settled, WorkerReady
+from daemon.onboard.service.messages import (
+    Process,
+    Processed,
+    RecordFinalized,
+    Recycle,
+    WorkerReady,
+)
 
 
 class Bench:
     """A queue and what it sent to the worker and to the heads."""
 
-    def __init__(self, lanes: int = 1) -> None:
+    def __init__(self, parallel_exposures: int = 1) -> None:
         self.worker: list[Any] = []
         self.recycled: list[Any] = []
-        self.queue = PipelineQueue(lanes, self._send, _untold)
+        self.queue = PipelineQueue(parallel_exposures, self._send, _untold)
 
     def _send(self, name: str, message: object) -> None:
         if name == "worker":
@@ -34,30 +40,30 @@ def exposure(number: int) -> Any:
 
 def test_an_exposure_that_is_foreseen_is_begun_once_and_settled_when_sealed() -> None:
     bench = Bench()
-    bench.queue.hear(WorkerReady(0.0))
-    bench.queue.keep(1, {"SU00": 2})
+    bench.queue.dispatch(WorkerReady(0.0))
+    bench.queue.retain(1, {"SU00": 2})
     first = exposure(1)
-    bench.queue.foreseen(first)
+    bench.queue.provisional(first)
     bench.queue.sealed(first)
-    assert bench.worker == [Process(first, {"SU00": 2}, is_sealed=False), Settled(1, first)]
-    bench.queue.hear(Processed(1, {}, {}, 0.1))
+    assert bench.worker == [Process(first, {"SU00": 2}, is_sealed=False), RecordFinalized(1, first)]
+    bench.queue.dispatch(Processed(1, {}, {}, 0.1))
     assert len(bench.queue) == 0 and bench.recycled == [{"SU00": 2}]
 
 
 def test_one_that_was_still_waiting_when_it_was_sealed_is_begun_as_sealed() -> None:
     bench = Bench()
     first = exposure(1)
-    bench.queue.foreseen(first)
+    bench.queue.provisional(first)
     bench.queue.sealed(first)
-    bench.queue.hear(WorkerReady(0.0))
+    bench.queue.dispatch(WorkerReady(0.0))
     assert bench.worker == [Process(first, None, is_sealed=True)]
 
 
 def test_one_that_is_never_sealed_leaves_its_lane_and_its_memory() -> None:
     bench = Bench()
-    bench.queue.hear(WorkerReady(0.0))
-    bench.queue.keep(1, {"SU00": 0})
-    bench.queue.foreseen(exposure(1))
+    bench.queue.dispatch(WorkerReady(0.0))
+    bench.queue.retain(1, {"SU00": 0})
+    bench.queue.provisional(exposure(1))
     bench.queue.not_sealed(1)
-    assert bench.worker[-1] == Settled(1, None)
+    assert bench.worker[-1] == RecordFinalized(1, None)
     assert len(bench.queue) == 0 and bench.recycled == [{"SU00": 0}]

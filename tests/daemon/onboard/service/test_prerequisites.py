@@ -11,8 +11,8 @@ import pytest
 
 from daemon.configuration.model import Configuration, load
 from daemon.onboard.preflight import prerequisites
-from daemon.onboard.preflight.findings import Finding, Outcome
-from daemon.onboard.preflight.prerequisites import AFTER_RESTART, LOOKS, exposure_interval_s
+from daemon.onboard.preflight.check_results import CheckOutcome, CheckResult
+from daemon.onboard.preflight.prerequisites import CHECKS, CHECKS_AFTER_RESTART, exposure_interval_s
 from processing.rig import Rig
 from tests.daemon.onboard.service.flight_parts import Planted
 
@@ -51,25 +51,27 @@ def test_the_shortest_interval_follows_from_trigger_speed_and_camera(
     assert exposure_interval_s(configuration, rig) == pytest.approx(interval_s)
 
 
-@pytest.mark.parametrize(("factor", "outcome"), [(1.01, Outcome.PASS), (0.99, Outcome.FAIL)])
+@pytest.mark.parametrize(
+    ("factor", "outcome"), [(1.01, CheckOutcome.PASS), (0.99, CheckOutcome.FAIL)]
+)
 def test_the_disk_has_to_write_frames_and_products_in_the_interval(
-    planted: Planted, factor: float, outcome: Outcome
+    planted: Planted, factor: float, outcome: CheckOutcome
 ) -> None:
     configuration, rig = loaded(planted, "interval_s = 2.0")
     needed = 3 * 2 * FRAME_NBYTES / 2.0
     planted.monkeypatch.setattr(
-        prerequisites, "write_s", lambda _root, nbytes: nbytes / (needed * factor)
+        prerequisites, "measure_write_s", lambda _root, nbytes: nbytes / (needed * factor)
     )
     (found,) = prerequisites.pace(configuration, rig)
-    assert (found.outcome, found.prevents) == (outcome, False)
+    assert (found.outcome, found.is_blocking) == (outcome, False)
 
 
 def test_the_best_of_three_tries_counts_and_a_good_one_ends_the_trying(planted: Planted) -> None:
     configuration, rig = loaded(planted)
     tries = iter((1e6, 1e-3, 1e6))
-    planted.monkeypatch.setattr(prerequisites, "write_s", lambda *_: next(tries))
+    planted.monkeypatch.setattr(prerequisites, "measure_write_s", lambda *_: next(tries))
     (found,) = prerequisites.pace(configuration, rig)
-    assert found.outcome is Outcome.PASS and next(tries) == 1e6
+    assert found.outcome is CheckOutcome.PASS and next(tries) == 1e6
 
 
 def test_what_is_written_to_measure_is_of_its_size_and_is_removed(planted: Planted) -> None:
@@ -82,24 +84,24 @@ def test_what_is_written_to_measure_is_of_its_size_and_is_removed(planted: Plant
         return sizes[-1]
 
     planted.monkeypatch.setattr(prerequisites.durable, "create_file", seen)
-    assert prerequisites.write_s(root, 5_000_001) > 0.0
+    assert prerequisites.measure_write_s(root, 5_000_001) > 0.0
     assert sizes == [5_000_001] and not list(root.iterdir())
 
 
-@pytest.mark.parametrize(("short", "outcome"), [(0, Outcome.PASS), (1, Outcome.FAIL)])
+@pytest.mark.parametrize(("short", "outcome"), [(0, CheckOutcome.PASS), (1, CheckOutcome.FAIL)])
 def test_memory_is_needed_for_every_frame_that_is_held(
-    planted: Planted, short: int, outcome: Outcome
+    planted: Planted, short: int, outcome: CheckOutcome
 ) -> None:
     configuration, rig = loaded(planted)
     needed = configuration.limits.exposures_in_memory * 2 * FRAME_NBYTES
     planted.monkeypatch.setattr(prerequisites, "available_memory_nbytes", lambda: needed - short)
     (found,) = prerequisites.memory(configuration, rig)
-    assert (found.outcome, found.prevents) == (outcome, outcome is Outcome.FAIL)
+    assert (found.outcome, found.is_blocking) == (outcome, outcome is CheckOutcome.FAIL)
 
 
-@pytest.mark.parametrize(("days", "outcome"), [(730, Outcome.PASS), (731, Outcome.FAIL)])
+@pytest.mark.parametrize(("days", "outcome"), [(730, CheckOutcome.PASS), (731, CheckOutcome.FAIL)])
 def test_a_calibration_is_trusted_to_its_last_day(
-    planted: Planted, days: int, outcome: Outcome
+    planted: Planted, days: int, outcome: CheckOutcome
 ) -> None:
     configuration, rig = loaded(planted)
     today = datetime.date.fromisoformat(rig.calibration_date) + datetime.timedelta(days)
@@ -111,13 +113,16 @@ def test_a_calibration_is_trusted_to_its_last_day(
 def test_what_prevents_ends_the_looking_and_a_restart_measures_nothing(planted: Planted) -> None:
     configuration, rig = loaded(planted)
 
-    def prevents(_configuration: Configuration, _rig: Rig) -> Iterator[Finding]:
-        yield Finding("a", "b", Outcome.FAIL, "no", prevents=True)
+    def is_blocking(_configuration: Configuration, _rig: Rig) -> Iterator[CheckResult]:
+        yield CheckResult("a", "b", CheckOutcome.FAIL, "no", is_blocking=True)
 
-    def never(_configuration: Configuration, _rig: Rig) -> Iterator[Finding]:
+    def never(_configuration: Configuration, _rig: Rig) -> Iterator[CheckResult]:
         raise AssertionError("looked at in vain")
 
-    found = prerequisites.prerequisites(configuration, rig, (prevents, never))
+    found = prerequisites.prerequisites(configuration, rig, (is_blocking, never))
     assert [one.name for one in found] == ["b"]
     # The health of disks is watched in flight anyway.
-    assert set(LOOKS) - set(AFTER_RESTART) == {prerequisites.pace, prerequisites.disk_health}
+    assert set(CHECKS) - set(CHECKS_AFTER_RESTART) == {
+        prerequisites.pace,
+        prerequisites.disk_health,
+    }

@@ -6,10 +6,10 @@ import threading
 
 import pytest
 
-from daemon.onboard.service.processes import Child, Link
+from daemon.onboard.service.processes import ChildProcess, ServiceConnection
 
 
-def chatter(link: Link, is_waiting: bool) -> None:
+def chatter(link: ServiceConnection, is_waiting: bool) -> None:
     """A child that sends without end, from a thread of its own or from its first one."""
 
     def send() -> None:
@@ -27,7 +27,7 @@ def chatter(link: Link, is_waiting: bool) -> None:
 def test_a_child_without_its_service_ends_silently(
     is_waiting: bool, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    child = Child("chatter", f"{__name__}:chatter", (is_waiting,), {})
+    child = ChildProcess("chatter", f"{__name__}:chatter", (is_waiting,), {})
     assert child.connection.poll(30), "the child never spoke"
     child.connection.close()
     child.process.join(30)

@@ -13,7 +13,7 @@ import pytest
 from daemon import cli
 from daemon.configuration.model import load
 from daemon.mission.layout import CURRENT_FILE, Mission
-from daemon.onboard.service.departure import create_mission, interrupted_mission
+from daemon.onboard.service.startup import create_mission, interrupted_mission
 from tests.daemon.onboard.service.flight_parts import Planted
 
 pytestmark = pytest.mark.trust
@@ -46,12 +46,12 @@ def test_a_removed_mission_folder_is_named_with_cures_that_work(
     with pytest.raises(SystemExit) as ended:
         cli.main()
     assert ended.value.code == 1
-    said = capsys.readouterr()
-    assert said.err.splitlines() == [
+    output = capsys.readouterr()
+    assert output.err.splitlines() == [
         f"{marker}: names mission {mission.id}, and {mission.path} is no folder; put the folder "
         f"back to continue the mission, or remove {marker} to start without it"
     ]
-    assert said.out == ""
+    assert output.out == ""
     assert json.loads(marker.read_text())["mission"] == mission.id, "nothing was changed"
     # The first cure.
     shutil.copytree(aside, mission.path)

@@ -13,8 +13,8 @@ from daemon.cli.run import run as run_command
 from daemon.configuration.model import load
 from daemon.mission.layout import Mission
 from daemon.onboard.preflight.resumption import resume, rig_differences
-from daemon.onboard.service.departure import create_mission, interrupted_mission
 from daemon.onboard.service.notify import Notifier
+from daemon.onboard.service.startup import create_mission, interrupted_mission
 from tests.daemon.onboard.service.flight_parts import RIG, Planted, in_threads
 
 pytestmark = pytest.mark.trust
@@ -52,14 +52,14 @@ def test_a_changed_rig_is_named_with_keys_and_values_and_the_old_one_is_flown(
     planted.change("h_um = 7.2", "h_um = 7.25")
     planted.write()
     events = fly(planted, capsys)
-    (told,) = [event for event in events if event["event"] == "resumed"]
-    assert told["sentence"].startswith(
+    (reported,) = [event for event in events if event["event"] == "resumed"]
+    assert reported["sentence"].startswith(
         f"resuming mission {mission.id} with the rig of calibration pair-1 (2026-11-01); the "
         "configured rig differs in calibration.id ('pair-1' in the mission, 'pair-2' now), "
         "cone[0].sensor[0].pitch_um (7.2 in the mission, 7.25 now)"
     )
-    assert told["sentence"].endswith(f"syntopic run {planted.config} --new-mission")
-    assert len(told["differences"]) == 3
+    assert reported["sentence"].endswith(f"syntopic run {planted.config} --new-mission")
+    assert len(reported["differences"]) == 3
     record = json.loads((mission.path / "L0/000001/exposure.json").read_text())
     assert record["calibration_id"] == "pair-1"
     assert interrupted_mission(load(planted.config)[0]) is None, "it is closed after its flight"

@@ -12,12 +12,12 @@ import pytest
 
 from daemon.onboard.service import supervisor
 from daemon.onboard.service.messages import Ping, Pong, Stop, WorkerBuilt, WorkerRefused
-from daemon.onboard.service.processes import Link
+from daemon.onboard.service.processes import ServiceConnection
 from daemon.onboard.service.supervisor import Supervisor
 from tests.daemon.onboard.service.flight_parts import ThreadChild
 
 
-def refusing(link: Link, *_: Any) -> None:
+def refusing(link: ServiceConnection, *_: Any) -> None:
     """A process that says two things and ends."""
     link.send(WorkerBuilt())
     link.send(WorkerRefused("no calibration"))
@@ -28,19 +28,19 @@ def test_a_refusal_is_taken_in_before_the_end_of_its_process(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(supervisor, "_made", ThreadChild)
-    said: list[object] = []
+    received: list[object] = []
 
     async def begin() -> None:
-        made = Supervisor(said.append, said.append)
+        made = Supervisor(received.append, received.append)
         made.spawn("worker", "tests.daemon.onboard.service.test_supervisor:refusing", (), {})
         made._children["worker"].thread.join(10)  # type: ignore[attr-defined]
         made.send("worker", Stop())  # the loop has not run: nothing was read yet
 
     asyncio.run(begin())
-    assert said == [WorkerBuilt(), WorkerRefused("no calibration"), "worker"]
+    assert received == [WorkerBuilt(), WorkerRefused("no calibration"), "worker"]
 
 
-def answering(link: Link) -> None:
+def answering(link: ServiceConnection) -> None:
     """A process that answers every ping."""
     while True:
         if isinstance(link.receive(1.0), Ping):
@@ -52,27 +52,27 @@ def test_a_page_process_that_hangs_is_ended_and_the_watchdog_fed_meanwhile(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(supervisor, "RESTART_LIMIT_S", {"watch": 4.0})
-    died: list[str] = []
+    on_death: list[str] = []
 
     async def watched() -> None:
-        made = Supervisor(lambda _: None, died.append)
+        made = Supervisor(lambda _: None, on_death.append)
         made.spawn("watch", "tests.daemon.onboard.service.test_supervisor:answering", (), {})
         pid = made._children["watch"].process.pid or 0
-        made._answered["watch"] += 30.0  # the process starts
+        made._last_answer_s["watch"] += 30.0  # the process starts
         deadline = time.monotonic() + 30.0
-        while made._answered["watch"] > time.monotonic() and time.monotonic() < deadline:
+        while made._last_answer_s["watch"] > time.monotonic() and time.monotonic() < deadline:
             assert made.ping() == []
             await asyncio.sleep(0.05)
         for _ in range(30):
             assert made.ping() == []
             await asyncio.sleep(0.05)
-        assert died == []
+        assert on_death == []
         os.kill(pid, signal.SIGSTOP)
-        while not died and time.monotonic() < deadline:
+        while not on_death and time.monotonic() < deadline:
             begun = time.monotonic()
             assert made.ping() == []
             assert time.monotonic() - begun < 1.0
             await asyncio.sleep(0.05)
 
     asyncio.run(watched())
-    assert died == ["watch"]
+    assert on_death == ["watch"]

@@ -17,7 +17,7 @@ from daemon.onboard.timing.clock_model import (
     RATE_SIGMA,
     ClockModel,
     Pair,
-    _agree,
+    _are_consistent,
     _Fit,
 )
 
@@ -140,4 +140,4 @@ def test_pairs_are_one_line_within_eight_of_their_sigmas_times_the_scatter(facto
     limit_ns = round(8.0 * factor * (50.0 + 30.0) + 5 * RATE_SIGMA * 2.0)
     for off_ns, agree in ((limit_ns, True), (-limit_ns, True), (limit_ns + 1, False)):
         pairs = [Pair(0, 0, 50.0), Pair(2 * NS, 2 * NS + off_ns, 30.0)]
-        assert _agree(pairs, factor) is agree
+        assert _are_consistent(pairs, factor) is agree

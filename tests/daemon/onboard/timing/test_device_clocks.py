@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from benchmarks.time_truth import Oscillator, inside
-from daemon.onboard.timing.device_clocks import DeviceClock, DeviceClocks
-from daemon.onboard.timing.timesync import TimesyncAsker
+from daemon.onboard.timing.device_clocks import DeviceClockEstimator, DeviceClocks
+from daemon.onboard.timing.timesync import TimesyncRequester
 from drivers.contract import ClockReading
 from drivers.receivers.mavlink.decoder import Timesync
 
@@ -23,10 +23,10 @@ def exchange(
     back_ns = 90_000 + chance.exponential(150_000)
     if chance.random() < 0.1:
         back_ns += chance.exponential(5_000_000)
-    said_ns = oscillator.reads(true_s + there_ns * 1e-9)
+    reported_ns = oscillator.reads(true_s + there_ns * 1e-9)
     half_ns = round((there_ns + back_ns) / 2)
     return ClockReading(
-        "autopilot", int(said_ns // grid_ns * grid_ns), round(true_s * NS) + half_ns, half_ns
+        "autopilot", int(reported_ns // grid_ns * grid_ns), round(true_s * NS) + half_ns, half_ns
     )
 
 
@@ -36,7 +36,7 @@ def test_errors_of_a_hundred_device_clocks_lie_inside_their_sigmas(grid_ns: int)
     for run in range(100):
         chance = np.random.default_rng([77, grid_ns, run])
         oscillator = Oscillator(chance, SPAN_S + 5.0)
-        clock = DeviceClock()
+        clock = DeviceClockEstimator()
         for second in range(SPAN_S):
             clock.read(exchange(chance, float(second), oscillator, grid_ns))
         at_s = SPAN_S + 1.5
@@ -63,7 +63,7 @@ def test_a_device_that_starts_again_is_learned_anew() -> None:
 
 @pytest.mark.parametrize(("back_ns", "steps"), [(NS, 0), (NS + 1, 1)])
 def test_a_reading_more_than_a_second_back_is_a_restart(back_ns: int, steps: int) -> None:
-    clock = DeviceClock()
+    clock = DeviceClockEstimator()
     clock.read(ClockReading("SU00", 500 * NS, NS, 50_000))
     clock.read(ClockReading("SU00", 500 * NS - back_ns, 2 * NS, 50_000))
     assert clock.restarts == steps
@@ -76,29 +76,29 @@ class Port:
 
     def __init__(self) -> None:
         self.now_ns = 100 * NS
-        self.heard = None
-        self.asked: list[int] = []
+        self.on_answer = None
+        self.requested_ns: list[int] = []
 
-    def listen_for_timesync(self, heard):
-        self.heard = heard
+    def subscribe_timesync(self, on_answer):
+        self.on_answer = on_answer
 
     def send_timesync(self, *, tc1_ns: int, ts1_ns: int) -> bool:
         assert tc1_ns == 0
-        self.asked.append(ts1_ns)
+        self.requested_ns.append(ts1_ns)
         return True
 
 
 def test_timesync_answers_become_readings_and_what_was_not_asked_does_not() -> None:
     port = Port()
     readings: list[ClockReading] = []
-    asker = TimesyncAsker(port, readings.append, mono_ns=lambda: port.now_ns)
-    assert asker.ask()
-    ts1 = port.asked[0]
+    requester = TimesyncRequester(port, readings.append, mono_ns=lambda: port.now_ns)
+    assert requester.request()
+    ts1 = port.requested_ns[0]
     answer = Timesync(ts1 + 7 * NS + 100_000, ts1, ts1 + 300_000, 1, 1)
-    asker.heard(Timesync(0, 55, ts1 + 1, 1, 1))
-    asker.heard(Timesync(9, 55, ts1 + 1, 1, 1))
-    asker.heard(answer)
-    asker.heard(answer)
+    requester.on_answer(Timesync(0, 55, ts1 + 1, 1, 1))
+    requester.on_answer(Timesync(9, 55, ts1 + 1, 1, 1))
+    requester.on_answer(answer)
+    requester.on_answer(answer)
     assert readings == [ClockReading("autopilot", ts1 + 7 * NS + 100_000, ts1 + 150_000, 150_000)]
-    asker.stop()
-    assert port.heard is None
+    requester.stop()
+    assert port.on_answer is None

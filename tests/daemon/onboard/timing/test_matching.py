@@ -7,8 +7,8 @@ from dataclasses import replace
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daemon.onboard.timing.clock import HostClock
-from daemon.onboard.timing.matching import Cause, Matcher, Pulse
+from daemon.onboard.timing.gps_clock import GpsClock
+from daemon.onboard.timing.matching import Cause, FiredPulse, Matcher
 from drivers.contract import EventMark, Frame, FrameStatus
 
 NS = 1_000_000_000
@@ -16,9 +16,9 @@ GPS_NS = 1_400_000_000 * NS
 CONES = {"SU00": "0", "G": "G"}
 
 
-def pulse(number: int, *, interval_ns: int = 2 * NS) -> Pulse:
+def pulse(number: int, *, interval_ns: int = 2 * NS) -> FiredPulse:
     delays_ns = {"0": 1_000_000, "G": 0}
-    return Pulse(number, number * interval_ns, 100_000, number, delays_ns, 3_000_000)
+    return FiredPulse(number, number * interval_ns, 100_000, number, delays_ns, 3_000_000)
 
 
 def frame(number: int, head: str = "SU00", **changes: object) -> Frame:
@@ -59,7 +59,7 @@ def mark(number: int, count: int | None = None, **changes: object) -> EventMark:
 
 
 def matcher(pulses: range) -> Matcher:
-    clock = HostClock()
+    clock = GpsClock()
     clock.message_arrived(GPS_NS, 60_000_000)
     made = Matcher(CONES, clock)
     for number in pulses:
@@ -166,7 +166,7 @@ def test_a_mark_that_neither_time_nor_count_explains_stays_unmatched() -> None:
 
 
 def test_a_first_mark_that_fits_two_pulses_stays_unmatched() -> None:
-    clock = HostClock()
+    clock = GpsClock()
     clock.message_arrived(GPS_NS, 60_000_000)
     matching = Matcher(CONES, clock)
     for number in (1, 2):

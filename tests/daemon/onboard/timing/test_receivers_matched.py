@@ -12,16 +12,16 @@ import threading
 import time
 from dataclasses import dataclass, field
 
-from daemon.onboard.timing.clock import HostClock
+from daemon.onboard.timing.gps_clock import GpsClock
 from daemon.onboard.timing.mark_matching import MarkMatcher
-from daemon.onboard.timing.pulses import Cause, Match, Pulse
+from daemon.onboard.timing.pulses import Cause, FiredPulse, MatchResult
 from drivers.base import registry
 from drivers.contract import EventMark, NavSample, Record
 from sim_hw.devices.network_line import UdpLine
+from sim_hw.receivers.emulated_receiver import EmulatedReceiver
 from sim_hw.receivers.mavlink_autopilot import MavlinkAutopilot
 from sim_hw.receivers.nmea_receiver import NmeaReceiver
 from sim_hw.receivers.novatel_receiver import NovatelReceiver
-from sim_hw.receivers.receiver import EmulatedReceiver
 from sim_hw.receivers.septentrio_receiver import SeptentrioReceiver
 from sim_hw.receivers.ublox_receiver import UbloxReceiver
 from sim_hw.world.world_clock import WorldClock
@@ -32,7 +32,7 @@ LOST = 2
 """The strobe of this pulse never reaches the receiver."""
 INTERVAL_NS = 1_100_000_000
 STROBE_DELAY_NS = 4_000_000
-TOLD_WITHIN_S = 20.0
+RECORD_TIMEOUT_S = 20.0
 SIGMA_NS = 100_000
 KINDS: dict[str, type[EmulatedReceiver]] = {
     "ublox": UbloxReceiver,
@@ -49,22 +49,22 @@ class Chain:
 
     kind: str
     receiver: EmulatedReceiver | MavlinkAutopilot
-    heard: queue.Queue[Record] = field(default_factory=queue.Queue)
-    clock: HostClock = field(default_factory=HostClock)
-    matches: list[tuple[EventMark, Match]] = field(default_factory=list)
+    records: queue.Queue[Record] = field(default_factory=queue.Queue)
+    clock: GpsClock = field(default_factory=GpsClock)
+    matches: list[tuple[EventMark, MatchResult]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.matcher = MarkMatcher(self.clock)
         driver = registry.driver_for("navigator", self.kind)
         self.navigator = driver("gnss", {"port": self.receiver.port})
         run = self.navigator.run
-        self.thread = threading.Thread(target=run, args=(self.heard.put,), daemon=True)
+        self.thread = threading.Thread(target=run, args=(self.records.put,), daemon=True)
 
     def listen_until(self, mono_ns: int) -> None:
         """Hand on what is heard, as the service does."""
         while (left_s := (mono_ns - time.monotonic_ns()) * 1e-9) > 0:
             try:
-                record = self.heard.get(timeout=left_s)
+                record = self.records.get(timeout=left_s)
             except queue.Empty:
                 return
             if isinstance(record, NavSample) and record.time_valid:
@@ -80,8 +80,10 @@ class Chain:
             self.listen_until(fired_ns)
             if number != LOST:
                 self.receiver.mark(world.gps_ns(strobe_ns))
-            self.matcher.pulse(Pulse(number, fired_ns, SIGMA_NS, number, {"0": 0}, STROBE_DELAY_NS))
-        deadline = time.monotonic() + TOLD_WITHIN_S
+            self.matcher.pulse(
+                FiredPulse(number, fired_ns, SIGMA_NS, number, {"0": 0}, STROBE_DELAY_NS)
+            )
+        deadline = time.monotonic() + RECORD_TIMEOUT_S
         while len(self.matches) < PULSES - 1 and time.monotonic() < deadline:
             self.listen_until(time.monotonic_ns() + 50_000_000)
 
@@ -98,7 +100,7 @@ def free_udp_port() -> int:
 
 
 def test_every_kind_of_receiver_has_its_marks_matched_to_their_own_pulses() -> None:
-    world = WorldClock.starting_now()
+    world = WorldClock.from_wall_clock()
     autopilot = MavlinkAutopilot(world, state_at, line=UdpLine(("127.0.0.1", free_udp_port())))
     chains = [Chain(kind, made(world, state_at)) for kind, made in KINDS.items()]
     chains.append(Chain("mavlink", autopilot))

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from benchmarks.time_truth import Oscillator
-from daemon.onboard.timing.clock import HostClock
 from daemon.onboard.timing.clock_model import ClockModel, Pair
-from daemon.onboard.timing.device_clocks import DeviceClock
+from daemon.onboard.timing.device_clocks import DeviceClockEstimator
+from daemon.onboard.timing.gps_clock import GpsClock
 from drivers.contract import ClockReading
 
 NS = 1_000_000_000
@@ -85,7 +85,7 @@ def test_a_device_whose_clock_jitters_behind_short_round_trips_is_not_called_exa
     errors, sigmas = [], []
     for run in range(RUNS):
         chance = np.random.default_rng([3, run])
-        oscillator, clock = Oscillator(chance, 130.0), DeviceClock()
+        oscillator, clock = Oscillator(chance, 130.0), DeviceClockEstimator()
         for second in range(1, 120):
             device_ns = round(oscillator.reads(second) + jitter(chance))
             clock.read(ClockReading("fc", device_ns, second * NS, 100_000))
@@ -120,7 +120,7 @@ def test_edges_that_scatter_may_all_be_late_by_as_much() -> None:
     late = heavy(20 * US, 240 * US)
     for run in range(RUNS):
         chance = np.random.default_rng([2, run])
-        oscillator, clock = Oscillator(chance, SPAN_S + 5.0), HostClock()
+        oscillator, clock = Oscillator(chance, SPAN_S + 5.0), GpsClock()
         for second in range(1, SPAN_S):
             clock.pps_edge(round(oscillator.reads(second) + abs(late(chance))), 5_000)
             for part in range(3):

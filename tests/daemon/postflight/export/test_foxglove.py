@@ -17,8 +17,8 @@ from daemon.mission.exposure import Exposure, exposure_bytes
 from daemon.mission.layout import Mission
 from daemon.mission.log.flight_log import FlightLog
 from daemon.mission.log.log_records import message_of
-from daemon.onboard.service.commanding import audit_message
-from daemon.onboard.service.messages import Answer, Command
+from daemon.onboard.service.command_execution import audit_message
+from daemon.onboard.service.messages import Answer, ServiceCommand
 from daemon.postflight.export.foxglove import export_foxglove, utc_ns
 from drivers.contract import DeviceEvent
 from tests.daemon.onboard.flight.test_flight import GPS_NS, nav
@@ -44,7 +44,7 @@ def mission(tmp_path: Path) -> Mission:
     log = FlightLog.create(mission.log_dir, boot_id="b")
     sample = nav(0.0)
     lost = DeviceEvent("SU02", "lost", True, "SU02 is gone; look.", sample.mono_ns + 1_000_000_000)
-    command = Command(1, "start", {}, "operator")
+    command = ServiceCommand(1, "start", {}, "operator")
     audit = audit_message(command, Answer(1, True, "the line runs"))
     for record in (sample, nav(0.2), lost, replace(sample, gps_ns=0, time_valid=False)):
         message = message_of(record)
@@ -63,7 +63,7 @@ def mission(tmp_path: Path) -> Mission:
     return mission
 
 
-def told(path: Path) -> list[tuple[str, str, int, dict[str, Any]]]:
+def messages_of(path: Path) -> list[tuple[str, str, int, dict[str, Any]]]:
     """Schema, topic, time and content of every message; each is valid under its own schema."""
     found = []
     with path.open("rb") as file:
@@ -83,10 +83,10 @@ def told(path: Path) -> list[tuple[str, str, int, dict[str, Any]]]:
     return found
 
 
-def test_track_thumbnails_and_messages_are_told_in_utc_in_order(mission: Mission) -> None:
+def test_track_thumbnails_and_messages_are_written_in_utc_in_order(mission: Mission) -> None:
     done = export_foxglove(mission)
     assert done.messages == {"/fix": 2, "/log": 3, "/thumbnail": 1}
-    found = told(done.file)
+    found = messages_of(done.file)
     assert [time_ns for *_, time_ns, _ in found] == sorted(time_ns for *_, time_ns, _ in found)
     fixes = [content for name, _, _, content in found if name == "foxglove.LocationFix"]
     assert (fixes[0]["latitude"], fixes[0]["longitude"]) == (48.0, 11.0)
@@ -115,4 +115,4 @@ def test_a_mission_without_anything_is_an_empty_file_that_opens(tmp_path: Path) 
     )
     done = export_foxglove(empty)
     assert done.messages == {}
-    assert told(done.file) == []
+    assert messages_of(done.file) == []

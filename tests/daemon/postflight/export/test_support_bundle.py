@@ -16,7 +16,7 @@ from daemon.postflight.export.support_bundle import write_bundle
 from tests.daemon.small_camera import fly, new_mission
 
 
-def test_a_bundle_tells_what_happened_and_nothing_secret(tmp_path: Path) -> None:
+def test_a_bundle_contains_what_happened_and_no_secret(tmp_path: Path) -> None:
     mission = new_mission(tmp_path)
     fly(mission, [1, 2])
     mission.service_path.chmod(0o640)
@@ -30,11 +30,11 @@ def test_a_bundle_tells_what_happened_and_nothing_secret(tmp_path: Path) -> None
     with zipfile.ZipFile(bundle.path) as opened:
         texts = {name: opened.read(name).decode() for name in opened.namelist()}
     assert sorted(texts) == sorted(bundle.contents)
-    everything = "\n".join(texts.values())
+    all_text = "\n".join(texts.values())
     assert "Look at its cable." in texts["log.jsonl"]
-    assert "hunter2" not in everything
-    assert "secret bytes" not in everything
-    assert "47.123456" not in everything
+    assert "hunter2" not in all_text
+    assert "secret bytes" not in all_text
+    assert "47.123456" not in all_text
     records = [json.loads(line) for line in texts["exposures.jsonl"].splitlines()]
     assert [one["number"] for one in records] == [1, 2]
     assert "navigation" not in records[0]["record"]
@@ -91,9 +91,9 @@ def test_secrets_in_events_and_records_are_left_out_too(tmp_path: Path) -> None:
     log.append("audit", 6, {"login": {"api-token": "hunter2"}, "password": ["hunter2"]})
     log.close()
     with zipfile.ZipFile(write_bundle(mission).path) as opened:
-        told = opened.read("log.jsonl").decode()
-    assert HIDDEN not in told and "caster refused" in told
-    for line in told.splitlines():
+        output = opened.read("log.jsonl").decode()
+    assert HIDDEN not in output and "caster refused" in output
+    for line in output.splitlines():
         json.loads(line)
 
 
@@ -105,8 +105,8 @@ def test_what_is_no_secret_stays() -> None:
 def test_the_command_writes_report_and_bundle(tmp_path: Path) -> None:
     mission = new_mission(tmp_path)
     fly(mission, [1])
-    said = CliRunner().invoke(app, ["report", str(mission.path), "--bundle", "--json"])
-    assert said.exit_code == 0, said.output
-    told = json.loads(said.stdout)
-    assert Path(told["report"]).exists()
-    assert "verify.json" in told["contents"]
+    result = CliRunner().invoke(app, ["report", str(mission.path), "--bundle", "--json"])
+    assert result.exit_code == 0, result.output
+    output = json.loads(result.stdout)
+    assert Path(output["report"]).exists()
+    assert "verify.json" in output["contents"]

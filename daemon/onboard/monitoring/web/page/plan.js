@@ -38,7 +38,7 @@ async function advise() {
   const advice = await askedJson("/api/v1/advice");
   if (!advice?.segments) return;
   const holes = advice.segments.filter((one) => one.kind === "hole");
-  const share = advice.planned_m ? 100 * advice.well_m / advice.planned_m : 0;
+  const share = advice.planned_m ? 100 * advice.covered_m / advice.planned_m : 0;
   well.textContent = [
     `${share.toFixed(0)} % of ${(advice.planned_m / 1000).toFixed(1)} km covered`,
     holes.length ? `${holes.length} ${holes.length === 1 ? "gap" : "gaps"} to re-fly, ${(advice.hole_m2 / 1e4).toFixed(2)} ha`

@@ -75,9 +75,9 @@ def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path,
 
 
 def _figures(root: Path) -> dict[str, dict[str, float]]:
-    told = json.loads((root / "a.json").read_text())
+    output = json.loads((root / "a.json").read_text())
     found: dict[str, dict[str, float]] = {}
-    for q in told["quantities"]:
+    for q in output["quantities"]:
         found.setdefault(q["where"], {})[q["what"]] = q["value"]
         if q["sigma"] is not None:
             found[q["where"]][f"sigma {q['what']}"] = q["sigma"]
@@ -105,8 +105,8 @@ def test_what_the_correction_leaves_is_shot_noise_at_every_level_aperture_and_td
     laboratory: tuple[Path, Rig],
 ) -> None:
     root, _ = laboratory
-    told = json.loads((root / "a.json").read_text())
-    checks = [c for name in ("S0", "SG") for c in told["figures"][name]["checks"]]
+    output = json.loads((root / "a.json").read_text())
+    checks = [c for name in ("S0", "SG") for c in output["figures"][name]["checks"]]
     assert len(checks) == 14
     assert sum("TDI" in c["condition"] for c in checks) == 6
     assert all(0.95 < c["ratio"] < 1.05 for c in checks), checks
@@ -119,14 +119,14 @@ def test_the_maps_and_the_model_come_back(laboratory: tuple[Path, Rig]) -> None:
         truth = np.load(root / "1" / "truth" / f"{name}.npz")
         good = truth["kind"] == 0
         found = RadiometryFolder(root / "a" / "f4", rig)[name]
-        told = json.loads((root / "a.json").read_text())["figures"][name]
+        output = json.loads((root / "a.json").read_text())["figures"][name]
         bias = (found.bias_dn - truth["bias_dn"])[good]
         dark = (found.dark_dn_per_s - truth["dark_e_per_s"] / 20.0)[good]
-        assert float(np.std(bias)) == pytest.approx(told["bias_sigma_dn"], rel=0.05)
+        assert float(np.std(bias)) == pytest.approx(output["bias_sigma_dn"], rel=0.05)
         # The dark signal itself makes noise in the warm frames, which the common sigma averages.
-        assert float(np.std(dark)) == pytest.approx(told["dark_sigma_dn_per_s"], rel=0.15)
+        assert float(np.std(dark)) == pytest.approx(output["dark_sigma_dn_per_s"], rel=0.15)
         product = (found.gain * truth["lit"])[good]
-        assert float(np.std(np.log(product))) == pytest.approx(told["gain_noise"], rel=0.25)
+        assert float(np.std(np.log(product))) == pytest.approx(output["gain_noise"], rel=0.25)
         own = figures[name]
         assert own["system gain K"] == pytest.approx(0.05, abs=4 * own["sigma system gain K"])
         assert own["dark noise"] == pytest.approx(30.0, abs=4 * own["sigma dark noise"])
@@ -151,10 +151,10 @@ def test_calibrated_again_nothing_has_changed_and_other_apertures_follow_from_th
         ],
     )
     assert run.exit_code == 0, run.output
-    told = json.loads(run.stdout)
-    assert told["previous"] == json.loads((root / "a.json").read_text())["calibration_id"]
-    assert len(told["changes"]) == 11
-    significant = [c for c in told["changes"] if c["significant"]]
+    output = json.loads(run.stdout)
+    assert output["previous"] == json.loads((root / "a.json").read_text())["calibration_id"]
+    assert len(output["changes"]) == 11
+    significant = [c for c in output["changes"] if c["significant"]]
     assert not significant, significant
     page = (out / "report.html").read_text()
     assert "Maps against the previous calibration" in page
@@ -164,7 +164,7 @@ def test_calibrated_again_nothing_has_changed_and_other_apertures_follow_from_th
     light = truth.lit(5.0 / 4.0)
     by_model = np.log((RadiometryFolder(out / "f5", rig)["S0"].gain * light)[good])
     by_neighbour = np.log((RadiometryFolder(out / "f4", rig)["S0"].gain * light)[good])
-    noise = told["figures"]["S0"]["gain_noise"]
+    noise = output["figures"]["S0"]["gain_noise"]
     assert float(np.std(by_model)) < 1.1 * noise
     assert float(np.std(by_neighbour)) > 5.0 * noise
 
@@ -192,10 +192,10 @@ def test_no_overwriting_and_a_bent_converter_and_a_warming_response_are_seen(
         app, ["radiometric", str(tmp_path / "series"), "--out", str(tmp_path / "c"), "--json"]
     )
     assert run.exit_code == 0, run.output
-    told = json.loads(run.stdout)
-    error = next(q["value"] for q in told["quantities"] if q["what"] == "linearity error")
+    output = json.loads(run.stdout)
+    error = next(q["value"] for q in output["quantities"] if q["what"] == "linearity error")
     assert 0.2 < error < 1.0
-    assert any("photon transfer" in w for w in told["warnings"])
+    assert any("photon transfer" in w for w in output["warnings"])
     # The pass in flight follows it: the bent converter takes a thirtieth of it.
     found = RadiometryFolder(tmp_path / "c" / "f4", rig)["S0"]
     assert found.response_per_k == pytest.approx(5e-4, rel=0.06)
@@ -215,6 +215,6 @@ def test_a_list_with_mistakes_is_refused_with_all_of_them(
     (tmp_path / "series.json").write_text(json.dumps(content))
     (tmp_path / "rig.toml").write_text(RIG)
     run = CliRunner().invoke(app, ["radiometric", str(tmp_path), "--out", str(tmp_path / "x")])
-    told = str(run.exception)
-    for words in ("'S9'", "'../out.tif'", "f_number is 0", "mood", "within 3 K"):
-        assert words in told
+    output = str(run.exception)
+    for expected in ("'S9'", "'../out.tif'", "f_number is 0", "mood", "within 3 K"):
+        assert expected in output

@@ -1,0 +1,98 @@
+"""What Ctrl-C leaves behind, in one sentence for each command.
+
+Files appear whole or not at all (`daemon.mission.store.durable`), so that what each sentence says
+holds at any instant. A command that handles Ctrl-C itself (`run`, `sim`) ends in its own way.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import typer
+
+STATUS = 130
+"""Exit status after SIGINT, as shells give it: 128 + 2."""
+
+RETRY_HINT = "run the same command again"
+_NOTHING_WRITTEN = f"nothing was changed; {RETRY_HINT}"
+_COMPLETE_FILES = f"every file that has its name is complete, new or as it was before; {RETRY_HINT}"
+
+SENTENCES = {
+    "demo": f"the exposures stored so far are complete; {RETRY_HINT} for a new flight",
+    "run": f"stored exposures are complete; {RETRY_HINT} to continue the flight",
+    "monitor": f"the flight is not affected; {RETRY_HINT} to watch it",
+    "send": "the service may have received the command; run `syntopic monitor` to see its state",
+    "process": (
+        "the products of exposures processed so far are complete and all others are as before; "
+        f"{RETRY_HINT}, or name the remaining exposures with --only"
+    ),
+    "pansharpen": (
+        f"the images computed so far are complete and all others are as before; {RETRY_HINT} to "
+        "compute the others"
+    ),
+    "repair": f"every step done so far is complete; {RETRY_HINT} to finish",
+    "transfer": (
+        "every file copied so far is complete, and nothing is removed before the copy is sealed; "
+        f"{RETRY_HINT} to continue"
+    ),
+    "kernels": f"the kernels compiled so far are kept; {RETRY_HINT} to compile the others",
+    "install": f"every file written so far is complete; {RETRY_HINT} to finish",
+    "uninstall": f"every file left is complete; {RETRY_HINT} to finish",
+    **dict.fromkeys(
+        ("explain", "check", "verify", "replay", "reflights", "disk-health"), _NOTHING_WRITTEN
+    ),
+    **dict.fromkeys(("bench", "rigs", "token list"), _NOTHING_WRITTEN),
+    "certificate": (
+        f"every file is complete, and the service uses the certificate it had; {RETRY_HINT} to finish"
+    ),
+    "token": (
+        "the token file is complete; run `syntopic token list` to see whether it was changed"
+    ),
+    **dict.fromkeys(("report", "adjust", "triangulate", "orient", "intersect"), _COMPLETE_FILES),
+    **dict.fromkeys(("calibrate", "import", "export", "sim", "rigs show"), _COMPLETE_FILES),
+}
+"""By the name of a command, or of a group whose commands have none of their own."""
+
+
+def sentence_of(name: str) -> str:
+    """What is complete after Ctrl-C, and how to continue.
+
+    Args:
+        name: of the command, such as "transfer" or "export raw".
+    """
+    known = SENTENCES.get(name) or SENTENCES.get(name.partition(" ")[0]) or _COMPLETE_FILES
+    return f"Interrupted: {known}."
+
+
+def make_interruptible(app: typer.Typer, group: str = "") -> None:
+    """Let every command of an application end with its sentence on Ctrl-C."""
+    for command in app.registered_commands:
+        callback = command.callback
+        if callback is not None:
+            name = command.name or callback.__name__.replace("_", "-")
+            command.callback = _interruptible(callback, f"{group} {name}".strip())
+    for below in app.registered_groups:
+        if below.typer_instance is not None and isinstance(below.name, str):
+            make_interruptible(below.typer_instance, f"{group} {below.name}".strip())
+
+
+def print_notice(sentence: str) -> None:
+    """Print where errors are printed."""
+    from daemon.terminal.console import Console
+
+    console = Console(stderr=True, soft_wrap=True)
+    console.print(sentence, style="yellow", markup=False, highlight=False)
+
+
+def _interruptible(callback: Callable[..., Any], name: str) -> Callable[..., Any]:
+    @functools.wraps(callback)
+    def run(*arguments: Any, **keywords: Any) -> Any:
+        try:
+            return callback(*arguments, **keywords)
+        except KeyboardInterrupt:
+            print_notice(sentence_of(name))
+            raise typer.Exit(STATUS) from None
+
+    return run

@@ -1,0 +1,101 @@
+"""How many exposures the disk still holds, for how long that is, and when it is too few.
+
+It only looks; the line stops by it (`daemon.onboard.service.flight_line`), and the service tells of
+it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from daemon.configuration.model import LimitsSection
+from daemon.mission.store import durable
+
+LEVEL2_SHARE = 2
+"""Products take about as much room as frames; one more share for the log and the index."""
+
+RATE_EXPOSURES = 9
+"""Exposures over which the current rate is taken, their intervals one fewer."""
+
+
+@dataclass(frozen=True)
+class DiskCapacity:
+    """What the disk still takes above the reserve.
+
+    `seconds` at the current rate; None where there is none yet. `is_low` is the warning, `is_full`
+    the stop: no exposure is begun that might not fit.
+    """
+
+    exposures: int
+    seconds: float | None
+    is_low: bool
+
+    @property
+    def is_full(self) -> bool:
+        return self.exposures == 0
+
+
+def needed_nbytes(exposure_nbytes: int) -> int:
+    """What an exposure takes on the disk, its products included."""
+    return max(1, (1 + LEVEL2_SHARE) * exposure_nbytes)
+
+
+class DiskSpaceMonitor:
+    """Looks after the disk of a mission.
+
+    Args:
+        limits: the reserve, and from how many exposures on it warns.
+        exposure_nbytes: the frames of one exposure.
+        path: on the disk.
+        free_bytes: asks the disk; for tests.
+    """
+
+    def __init__(
+        self,
+        limits: LimitsSection,
+        exposure_nbytes: int,
+        path: Path,
+        free_bytes: Callable[[Path], int] = durable.free_bytes,
+    ) -> None:
+        self._limits = limits
+        self._needed_nbytes = needed_nbytes(exposure_nbytes)
+        self._path = path
+        self._free_bytes = free_bytes
+        self._exposed_ns: deque[int] = deque(maxlen=RATE_EXPOSURES)
+        self._was_low = False
+
+    def add_exposure(self, mono_ns: int) -> None:
+        """An exposure was ordered: the rate follows the last few."""
+        self._exposed_ns.append(mono_ns)
+
+    def check(self) -> DiskCapacity:
+        """Ask the disk."""
+        free_nbytes = self._free_bytes(self._path) - self._limits.disk_reserve_bytes
+        exposures = max(0, free_nbytes // self._needed_nbytes)
+        interval_s = self._interval_s()
+        seconds = None if interval_s is None else exposures * interval_s
+        return DiskCapacity(exposures, seconds, exposures < self._limits.disk_warn_exposures)
+
+    def warning(self) -> str | None:
+        """What to tell the crew when the room has just become low; None at any other time."""
+        capacity = self.check()
+        is_first_warning = capacity.is_low and not self._was_low
+        self._was_low = capacity.is_low
+        if not is_first_warning:
+            return None
+        time_left = (
+            "" if capacity.seconds is None else f", {capacity.seconds / 60:.0f} min at this rate"
+        )
+        return (
+            f"the disk is low: room for {capacity.exposures} exposures{time_left}; finish this line and "
+            f"change the disk, or free {self._path}"
+        )
+
+    def _interval_s(self) -> float | None:
+        if len(self._exposed_ns) < 2:
+            return None
+        span_ns = self._exposed_ns[-1] - self._exposed_ns[0]
+        return span_ns / (len(self._exposed_ns) - 1) * 1e-9

@@ -1,0 +1,224 @@
+"""Faults that stand, or stood and nobody has acknowledged: kept until a person has seen them.
+
+Pure, but for the file that carries them over to the next start of the service.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from daemon.mission.canonical_json import Fields, RecordError, canonical_bytes, parse_record
+
+FILE = "unhandled-faults.json"
+"""In the root of missions: what nobody had acknowledged when the service was last heard."""
+FAULTS_MAX = 200
+DELIVERING = frozenset({"opened", "recovered"})
+UNAVAILABLE = frozenset({"absent", "lost", "silent", "held-by-another"})
+"""Names of device events after which a device delivers, or does not; others are complaints of one
+that does."""
+SEARCHING, FIXED = "searching", "fixed"
+"""Likewise, of a receiver that is open and has no fix yet, and that has one."""
+FILE_MAX_BYTES = 1_000_000
+
+
+@dataclass(frozen=True)
+class LatchedFault:
+    """A fault. `id` names it, `previous` says that it is of an earlier start of the service."""
+
+    id: str
+    device: str
+    sentence: str
+    stands: bool = True
+    acknowledged: bool = False
+    count: int = 1
+    sequence: int = 0
+    previous: bool = False
+
+
+class FaultLatches:
+    """Faults by their id; the oldest is forgotten beyond `KEPT`."""
+
+    def __init__(self) -> None:
+        self._latches: dict[str, LatchedFault] = {}
+
+    def raise_fault(
+        self, fault: str, sentence: str, device: str = "", *, sequence: int = 0
+    ) -> None:
+        """A fault has come, or come again."""
+        known = self._latches.pop(fault, None)
+        count = known.count + 1 if known else 1
+        self._latches[fault] = LatchedFault(fault, device, sentence, count=count, sequence=sequence)
+        while len(self._latches) > FAULTS_MAX:
+            del self._latches[next(iter(self._latches))]
+
+    def clear_fault(self, fault: str) -> None:
+        """A fault is over; it stays listed until a person has acknowledged it."""
+        found = self._latches.get(fault)
+        if found is None:
+            return
+        if found.acknowledged:
+            del self._latches[fault]
+        else:
+            self._latches[fault] = replace(found, stands=False)
+
+    def acknowledge(self, fault: str) -> bool:
+        """A person has seen a fault. One that has passed leaves the list; one that stands stays."""
+        found = self._latches.get(fault)
+        if found is None:
+            return False
+        if found.stands:
+            self._latches[fault] = replace(found, acknowledged=True)
+        else:
+            del self._latches[fault]
+        return True
+
+    def apply(self, event: Mapping[str, Any], *, sequence: int = 0) -> None:
+        """What an event of the service raises or puts an end to."""
+        kind, sentence = event.get("event"), str(event.get("sentence", ""))
+        if kind == "device":
+            self._apply_device(event, sentence, sequence)
+        elif kind == "disk-dropped":
+            label = str(event.get("disk"))
+            self.raise_fault(f"disk {label}", sentence, f"disk {label}", sequence=sequence)
+        elif kind == "disk-health":
+            fault = f"health of disk {event.get('disk')}"
+            if event.get("fault"):
+                self.raise_fault(fault, sentence, fault, sequence=sequence)
+            else:
+                self.clear_fault(fault)
+        elif kind in ("disk-joined", "disk-released"):
+            self.clear_fault(f"disk {event.get('disk')}")
+        elif kind in _FAULT_OF_EVENT:
+            fault, device = _FAULT_OF_EVENT[kind]
+            self.raise_fault(fault, sentence, device, sequence=sequence)
+        elif kind == "page-link":
+            self.raise_fault("page link", sentence, "service", sequence=sequence)
+            self.clear_fault("page link")  # it happened; nothing stands
+        elif kind == "prerequisite":
+            fault = f"prerequisite {event.get('item')}"
+            self.raise_fault(fault, sentence, "service", sequence=sequence)
+        elif kind == "lost":
+            number, cause = event.get("number"), event.get("cause")
+            description = f"Exposure {number}: {cause}"
+            fault = f"exposure {number}"
+            self.raise_fault(fault, description, "exposures", sequence=sequence)
+            self.clear_fault(fault)  # it happened; nothing stands
+        elif kind == "ready":
+            for absent in event.get("absent", []):
+                description = f"Flying without {absent}; look at it."
+                self.raise_fault(f"absent {absent}", description, str(absent), sequence=sequence)
+        elif kind == "status":
+            if event.get("exposures_left"):
+                self.clear_fault("disk")
+            self._clear_present(event)
+        elif kind == "previous-fault":
+            latch = _latch(event)
+            self.add_previous([latch] if latch else [], sequence=sequence)
+
+    def _clear_present(self, event: Mapping[str, Any]) -> None:
+        """What was absent when the service became ready, and is there now."""
+        if isinstance(absent := event.get("absent"), list):
+            still = {f"absent {one}" for one in absent}
+            for fault in [f for f in self._latches if f.startswith("absent ")]:
+                if fault not in still and self._latches[fault].stands:
+                    self.clear_fault(fault)
+
+    def _apply_device(self, event: Mapping[str, Any], sentence: str, sequence: int) -> None:
+        device, name = str(event.get("device")), event.get("name")
+        if device == "clock":
+            # One device, several things that come and go by themselves.
+            fault = f"clock {name}"
+            if event.get("fault"):
+                self.raise_fault(fault, sentence, device, sequence=sequence)
+            if not event.get("fault") or str(name).endswith("stepped"):
+                self.clear_fault(fault)
+        elif name in DELIVERING:
+            self.clear_fault(f"device {device}")
+        elif event.get("fault"):
+            is_unavailable = name in UNAVAILABLE
+            fault = f"device {device}" if is_unavailable else f"{name} {device}"
+            self.raise_fault(fault, sentence, device, sequence=sequence)
+            if not is_unavailable:
+                self.clear_fault(fault)
+
+    def add_previous(self, latches: Iterable[LatchedFault], *, sequence: int = 0) -> None:
+        """Faults of an earlier start: they no longer stand, and nobody has acknowledged them."""
+        for latch in latches:
+            if latch.id not in self._latches:
+                self._latches[latch.id] = replace(
+                    latch, stands=False, acknowledged=False, sequence=sequence, previous=True
+                )
+
+    def listed(self) -> list[dict[str, Any]]:
+        """All of them as plain JSON types, the newest first."""
+        return [asdict(latch) for latch in sorted(self._latches.values(), key=_newest_first)]
+
+    def unhandled(self) -> tuple[LatchedFault, ...]:
+        """Those that nobody has acknowledged, in the order they came."""
+        return tuple(latch for latch in self._latches.values() if not latch.acknowledged)
+
+    def __contains__(self, fault: str) -> bool:
+        return fault in self._latches
+
+
+def unhandled_content(latches: Iterable[LatchedFault]) -> bytes:
+    """The content of `FILE`: the faults nobody has acknowledged, for the next start."""
+    entries = [{key: getattr(latch, key) for key in _KEYS} for latch in latches]
+    return canonical_bytes({"faults": entries})
+
+
+def read_unhandled(root: Path) -> tuple[LatchedFault, ...]:
+    """The faults nobody had acknowledged; none where the file is missing or damaged."""
+    path = root / FILE
+    try:
+        if path.stat().st_size > FILE_MAX_BYTES:
+            return ()
+        content = parse_record(path.read_bytes(), FILE)
+    except (OSError, RecordError):
+        return ()
+    listed = content.get("faults")
+    return tuple(
+        latch
+        for one in (listed if isinstance(listed, list) else [])[:FAULTS_MAX]
+        if isinstance(one, Mapping) and (latch := _latch(one)) is not None
+    )
+
+
+def previous_faults(latches: Iterable[LatchedFault]) -> list[dict[str, Any]]:
+    """Events that tell of faults of an earlier start."""
+    return [
+        {"event": "previous-fault", **{key: getattr(latch, key) for key in _KEYS}}
+        for latch in latches
+    ]
+
+
+_FAULT_OF_EVENT: Mapping[object, tuple[str, str]] = {
+    "fault": ("service", "service"),
+    "ledger": ("ledger", "service"),
+    "disk": ("disk", "disk"),
+    "mirror": ("mirror", "disk"),
+    "not-written": ("disk", "disk"),
+    "power": ("power", "power"),
+    "override": ("override", "service"),
+}
+"""Faults and their device, by the event that raises them."""
+_KEYS = ("id", "device", "sentence", "count")
+
+
+def _latch(content: Mapping[str, Any]) -> LatchedFault | None:
+    problems: list[str] = []
+    fields = Fields(dict(content), "", FILE, problems)
+    latch = LatchedFault(
+        fields.text("id"),
+        fields.text("device"),
+        fields.text("sentence"),
+        count=fields.integer("count", 1, minimum=1),
+    )
+    return None if problems else latch
+
+
+def _newest_first(latch: LatchedFault) -> int:
+    return -latch.sequence

@@ -1,0 +1,359 @@
+"""What a watcher sees: the service's events, gathered into one state that is told whole or in part.
+
+Pure: events in, JSON types out. Events may be missing, since the line from the service drops what
+does not fit; the `status` event, once a second, says everything that must not stay wrong.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+from daemon.onboard.flight.fault_latches import (
+    DELIVERING,
+    FIXED,
+    SEARCHING,
+    UNAVAILABLE,
+    FaultLatches,
+)
+from daemon.onboard.flight.phases import Phase
+from daemon.onboard.monitoring.previews import Preview
+
+PHASES = frozenset(phase.value for phase in Phase)
+EXPOSURES_MAX = 2000
+"""In the snapshot; earlier ones are on disk, and `/exposures` tells them."""
+EVENTS_MAX = 500
+HISTORY_MAX = 7200
+FIGURES_REPORTED = (
+    *("sigma0_px", "sigma0_um", "tie_points_pp", "tie_points_pc", "outliers", "dc_k"),
+    *("dc_estimated_k", "dc_estimated_sigma_k", "displaced_sensor", "gsd_m", "tilt_deg"),
+    *("crab_deg", "sharpness", "saturated_fraction", "mean_dn", "valid_fraction", "method"),
+    *("forward_overlap", "sidelap", "sun_deg", "time_sigma_ns", "bright_fraction"),
+    *("stitched_sigma_px", "missing_sensors", "smear_along_px", "smear_across_px"),
+)
+PARTS = ("exposures", "devices", "settings", "track", "history", "events")
+"""Parts of the state besides what is brief, in the order of their worth on a thin link."""
+
+PREVIEW_PARTS = ("residuals", "thumbnails")
+"""Behind all of these, for those who have no page: not part of the snapshot."""
+
+RESIDUALS_MAX, PIECES_MAX = 5, 40
+
+PLACE_KEYS = (
+    *("latitude_deg", "longitude_deg", "height_m"),
+    *("roll_rad", "pitch_rad", "heading_rad", "leap_seconds"),
+)
+VERDICT_RANK = {"good": 0, "usable": 1, "refly": 2}
+
+Json = dict[str, Any]
+
+
+class FlightState:
+    """The state of one flight, for watchers.
+
+    `sequence` grows with every event, so that a watcher knows whether it missed one.
+    """
+
+    def __init__(
+        self,
+        software: str,
+        footprint: Callable[[Mapping[str, Any]], Any] = lambda _: None,
+        pictures: Callable[[str | None, int], Preview] = lambda _mission, _number: Preview(),
+    ) -> None:
+        """`footprint` gives the corners of what an exposure's navigation saw, where it can.
+
+        `pictures` reads what is there of a mission's exposure.
+        """
+        self.sequence = 0
+        self._footprint = footprint
+        self._pictures = pictures
+        self._residuals: deque[Json] = deque(maxlen=RESIDUALS_MAX)
+        self._pieces: deque[Json] = deque(maxlen=PIECES_MAX)
+        self._software = software
+        self._settings: list[Json] = []
+        self._phase = "idle"
+        self._mission: Json = {}
+        self._status: Json = {}
+        self._devices: dict[str, Json] = {}
+        self._latches = FaultLatches()
+        self._exposures: dict[int, Json] = {}
+        self._dropped_verdicts = dict.fromkeys(VERDICT_RANK, 0)
+        """Verdicts of exposures that are no longer kept: who counts must not see fewer."""
+        self._temperatures: dict[int, Any] = {}
+        self._events: deque[Json] = deque(maxlen=EVENTS_MAX)
+        self._history: deque[Json] = deque(maxlen=HISTORY_MAX)
+        self._track: deque[Json] = deque(maxlen=HISTORY_MAX)
+
+    def apply(self, event: Mapping[str, Any]) -> None:
+        """Take in one event of the service; one of an unknown kind is only listed."""
+        self.sequence += 1
+        kind = str(event.get("event", ""))
+        self._latches.apply(event, sequence=self.sequence)
+        handler = _HANDLERS.get(kind)
+        if handler is not None:
+            handler(self, event)
+        if kind not in ("status", "judged", "processed"):
+            self._events.append({"sequence": self.sequence, **event})
+
+    def brief(self) -> Json:
+        """What everybody must know at all times; a few hundred bytes."""
+        return {
+            "sequence": self.sequence,
+            "software": self._software,
+            "phase": self._phase,
+            "mission": self._mission,
+            "simulated": bool(self._mission.get("simulated")),
+            "status": self._status,
+            "faults": self.faults(),
+            "last_number": max(self._exposures, default=None),
+            "verdicts": self._verdict_counts(),
+        }
+
+    def changed(self, part: str, after: int) -> list[Json]:
+        """What of one of PARTS or PREVIEW_PARTS is newer than a sequence.
+
+        Ordered by sequence, so that a watcher may be given the beginning now and the rest later.
+        """
+        items: Iterable[Json] = {
+            "exposures": self._exposures.values(),
+            "devices": self._devices.values(),
+            "settings": self._settings,
+            "track": self._track,
+            "history": self._history,
+            "events": self._events,
+            "residuals": self._residuals,
+            "thumbnails": self._pieces,
+        }[part]
+        newer = [item for item in items if item["sequence"] > after]
+        return sorted(newer, key=lambda item: item["sequence"])
+
+    def snapshot(self) -> Json:
+        """Everything, for somebody who has just come."""
+        return {"version": 1, **self.brief(), **{part: self.changed(part, 0) for part in PARTS}}
+
+    @property
+    def phase(self) -> str:
+        return self._phase
+
+    @property
+    def mission_path(self) -> str | None:
+        path = self._mission.get("path")
+        return path if isinstance(path, str) else None
+
+    def faults(self) -> list[Json]:
+        """Faults that stand, or stood and nobody has acknowledged; the newest first."""
+        return self._latches.listed()
+
+    def exposures(self, after: int = 0, limit: int = EXPOSURES_MAX) -> list[Json]:
+        found = [record for number, record in sorted(self._exposures.items()) if number > after]
+        return found[:limit]
+
+    def exposure(self, number: int) -> Json | None:
+        return self._exposures.get(number)
+
+    def acknowledge(self, fault: str) -> bool:
+        """A person has seen a fault. One that has passed leaves the list; one that stands stays."""
+        self.sequence += 1
+        return self._latches.acknowledge(fault)
+
+    def add_sealed(self, sealed: Mapping[str, Any], report: Mapping[str, Any] | None) -> None:
+        """An exposure made before this state began, as its files tell; what was heard holds."""
+        number = sealed["number"]
+        if number in self._exposures:
+            return
+        self.sequence += 1
+        self._on_sealed(sealed)
+        if sealed["state"] == "lost":
+            self._exposure(sealed)["step"] = "lost"
+        elif report is not None:
+            self._apply_products({"number": number, "report": report})
+
+    # What each event means
+
+    def _on_mission(self, event: Mapping[str, Any]) -> None:
+        self._mission = {
+            key: event.get(key) for key in ("id", "path", "resumed", "rig", "simulated", "recovery")
+        }
+        self._phase = "idle"
+
+    def _on_bound(self, event: Mapping[str, Any]) -> None:
+        device = self._device(str(event.get("device")))
+        device |= {"kind": event.get("kind"), "found": event.get("found", {})}
+        if device["state"] == "unknown":
+            # A trigger unit has nothing to open; other devices say when they deliver.
+            device["state"] = "ready" if event.get("kind") == "trigger" else "found"
+
+    def _on_device(self, event: Mapping[str, Any]) -> None:
+        name = str(event.get("device"))
+        device = self._device(name)
+        device["sentence"] = event.get("sentence", "")
+        device["since_mono_ns"] = event.get("mono_ns")
+        if event.get("name") in UNAVAILABLE:
+            device["state"] = "absent" if event.get("name") == "absent" else "lost"
+        elif event.get("name") == SEARCHING:
+            device["state"] = "searching"
+        elif event.get("name") in DELIVERING or event.get("name") == FIXED:
+            device["state"] = "ready"
+
+    def _on_fault(self, event: Mapping[str, Any]) -> None:
+        self._phase = "fault"
+
+    def _on_phase(self, event: Mapping[str, Any]) -> None:
+        phase = event.get("phase")
+        if phase in PHASES:
+            self._phase = str(phase)
+
+    def _on_status(self, event: Mapping[str, Any]) -> None:
+        status = {key: value for key, value in event.items() if key != "event"}
+        self._status = status
+        phase = status.get("phase")
+        if phase in PHASES and self._phase != "fault":
+            self._phase = str(phase)
+        position = status.get("position")
+        if isinstance(position, Mapping):
+            at = [float(position["latitude_deg"]), float(position["longitude_deg"])]
+            if not self._track or self._track[-1]["at"] != at:
+                self._track.append({"sequence": self.sequence, "at": at})
+
+    def _on_triggered(self, event: Mapping[str, Any]) -> None:
+        self._exposure(event)["step"] = "triggered"
+
+    def _on_exposure_settings(self, event: Mapping[str, Any]) -> None:
+        record = {key: value for key, value in event.items() if key not in ("event", "mono_ns")}
+        self._settings = [{"sequence": self.sequence, **record}]
+
+    def _on_stored(self, event: Mapping[str, Any]) -> None:
+        self._exposure(event)["step"] = "stored"
+
+    def _on_sealed(self, event: Mapping[str, Any]) -> None:
+        record = self._exposure(event)
+        left_out = ("event", "mono_ns", "navigation", "temperatures_c")
+        record |= {key: value for key, value in event.items() if key not in left_out}
+        record["step"] = "sealed"
+        self._temperatures[record["number"]] = event.get("temperatures_c", {})
+        if event.get("navigation"):
+            record["footprint"] = self._footprint(event["navigation"])
+            record["place"] = {key: event["navigation"].get(key) for key in PLACE_KEYS}
+
+    def _on_verdict(self, event: Mapping[str, Any]) -> None:
+        """The verdict, before there are pictures to it."""
+        record = self._exposure(event)
+        report = event.get("report", {})
+        _apply_report(record, report)
+        figures = report.get("figures", {})
+        record["figures"] = {key: figures[key] for key in FIGURES_REPORTED if key in figures}
+        if report.get("valid_area"):
+            record["valid_area"] = report["valid_area"]
+
+    def _on_processed(self, event: Mapping[str, Any]) -> None:
+        self._apply_products(event)
+        self._add_preview(int(event["number"]))
+
+    def _apply_products(self, event: Mapping[str, Any]) -> None:
+        self._on_verdict(event)
+        record = self._exposure(event)
+        figures = event.get("report", {}).get("figures", {})
+        record["step"] = "processed"
+        record["duration_s"] = event.get("duration_s")
+        self._history.append(
+            {
+                "sequence": self.sequence,
+                "number": record["number"],
+                "sigma0_px": figures.get("sigma0_px"),
+                "dc_k": figures.get("dc_k"),
+                "dc_estimated_k": figures.get("dc_estimated_k"),
+                "time_sigma_ns": record.get("mark_sigma_ns"),
+                "temperatures_c": self._temperatures.pop(record["number"], {}),
+            }
+        )
+
+    def _add_preview(self, number: int) -> None:
+        """Pieces are told one by one, so each has a sequence of its own."""
+        found = self._pictures(self.mission_path, number)
+        if found.vectors:
+            residuals = {"number": number, "size_px": found.size_px, "vectors": found.vectors}
+            self.sequence += 1
+            self._residuals.append({"sequence": self.sequence, **residuals})
+        for piece, data in enumerate(found.pieces):
+            self.sequence += 1
+            about = {"number": number, "piece": piece, "pieces": len(found.pieces)}
+            self._pieces.append({"sequence": self.sequence, **about, "data": data})
+
+    def _on_not_processed(self, event: Mapping[str, Any]) -> None:
+        record = self._exposure(event)
+        record |= {"step": "not processed", "sentence": event.get("sentence")}
+        _apply_report(record, event.get("report", {}))
+
+    def _on_lost(self, event: Mapping[str, Any]) -> None:
+        record = self._exposure(event)
+        record |= {"step": "lost", "state": "lost", "sentence": event.get("cause")}
+
+    def _on_not_written(self, event: Mapping[str, Any]) -> None:
+        self._exposure(event)["step"] = "not written"
+
+    def _on_ended(self, event: Mapping[str, Any]) -> None:
+        self._phase = "landed" if event.get("failure") is None else "fault"
+        self._status = {**self._status, "ledger": event.get("ledger")}
+
+    # Bookkeeping
+
+    def _device(self, name: str) -> Json:
+        initial: Json = {
+            "name": name,
+            "kind": None,
+            "state": "unknown",
+            "sentence": "",
+            "found": {},
+        }
+        device = self._devices.setdefault(name, initial)
+        device["sequence"] = self.sequence
+        return device
+
+    def _exposure(self, event: Mapping[str, Any]) -> Json:
+        number = int(event["number"])
+        record = self._exposures.setdefault(number, {"number": number, "step": "triggered"})
+        record["sequence"] = self.sequence
+        while len(self._exposures) > EXPOSURES_MAX:
+            verdict = self._exposures.pop(min(self._exposures)).get("verdict")
+            if verdict in self._dropped_verdicts:
+                self._dropped_verdicts[verdict] += 1
+        return record
+
+    def _verdict_counts(self) -> dict[str, int]:
+        counts = dict(self._dropped_verdicts)
+        for record in self._exposures.values():
+            verdict = record.get("verdict")
+            if verdict in counts:
+                counts[verdict] += 1
+        return counts
+
+
+def _apply_report(record: Json, report: Mapping[str, Any]) -> None:
+    """What a quality report says, into what is told of its exposure."""
+    record["verdict"] = report.get("verdict")
+    record["flags"] = report.get("flags", [])
+    record["findings"] = [
+        {key: finding.get(key) for key in ("flag", "sentence", "verdict")}
+        for finding in report.get("findings", [])
+    ]
+
+
+_HANDLERS: Mapping[str, Callable[[FlightState, Mapping[str, Any]], None]] = {
+    "mission": FlightState._on_mission,
+    "bound": FlightState._on_bound,
+    "device": FlightState._on_device,
+    "fault": FlightState._on_fault,
+    "phase": FlightState._on_phase,
+    "status": FlightState._on_status,
+    "triggered": FlightState._on_triggered,
+    "exposure-settings": FlightState._on_exposure_settings,
+    "stored": FlightState._on_stored,
+    "sealed": FlightState._on_sealed,
+    "judged": FlightState._on_verdict,
+    "processed": FlightState._on_processed,
+    "not-processed": FlightState._on_not_processed,
+    "not-written": FlightState._on_not_written,
+    "lost": FlightState._on_lost,
+    "ended": FlightState._on_ended,
+}

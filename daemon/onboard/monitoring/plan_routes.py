@@ -1,0 +1,65 @@
+"""Routes of the API that tell of the plan: its lines, the holes, and what to fly again."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any, Literal
+
+from fastapi import FastAPI, HTTPException, Response
+from fastapi.params import Depends
+
+from daemon.onboard.monitoring.coverage import Coverage, advice_json
+from daemon.planning import reflight_files
+
+ReflightFile = Literal["fly-again.geojson", "fly-again.kml", "fly-again.waypoints"]
+KINDS = {
+    "fly-again.geojson": "application/geo+json",
+    "fly-again.kml": "application/vnd.google-earth.kml+xml",
+    "fly-again.waypoints": "text/plain",
+}
+NO_PLAN = "this mission is flown without a plan ([plan] file)"
+
+
+def add_plan(app: FastAPI, coverage: Coverage, watcher: Depends) -> None:
+    """Add the routes; `watcher` is who may look."""
+
+    @app.get("/api/v1/plan", dependencies=[watcher], tags=["plan"])
+    async def plan() -> dict[str, Any]:
+        """Planned lines and what the project asks for; an empty object without a plan."""
+        return coverage.plan_json() or {}
+
+    @app.get("/api/v1/advice", dependencies=[watcher], tags=["plan"])
+    async def advice() -> dict[str, Any]:
+        """What of the plan is not well seen: holes, and what is only to be flown yet."""
+        advice_task = coverage.advice_task()
+        return (
+            {}
+            if advice_task is None
+            else advice_json(await asyncio.to_thread(advice_task), coverage)
+        )
+
+    @app.get(
+        "/api/v1/advice/{file}",
+        dependencies=[watcher],
+        tags=["plan"],
+        response_class=Response,
+        responses={200: {"content": {kind: {} for kind in KINDS.values()}}},
+    )
+    async def fly_again(file: ReflightFile) -> Response:
+        """The same segments as a plan (GeoJSON), for a map (KML), as a MAVLink mission."""
+        advice_task = coverage.advice_task()
+        if advice_task is None:
+            raise HTTPException(404, NO_PLAN)
+        found = await asyncio.to_thread(advice_task)
+        texts = {
+            "fly-again.geojson": lambda: reflight_files.geojson(
+                found.segments, simulated=coverage.is_simulated
+            ),
+            "fly-again.kml": lambda: reflight_files.kml(
+                found.segments, simulated=coverage.is_simulated
+            ),
+            "fly-again.waypoints": lambda: reflight_files.mavlink_mission(
+                found.segments, height_m=coverage.height_m, distance_m=coverage.distance_m
+            ),
+        }
+        return Response(texts[file](), media_type=KINDS[file])

@@ -1,0 +1,334 @@
+"""A flight without a mission: the processes that `run` starts, until each has proven what it does.
+
+The same builders, messages and arming rules as in flight (`daemon.onboard.service.startup`,
+`daemon.onboard.preflight.preflight`); nothing is written, and nothing is fired unless that is asked
+for.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, ClassVar, Final
+
+from daemon.configuration.model import Configuration
+from daemon.errors import DaemonError
+from daemon.onboard.capture.devices import bound_problem, device_specs
+from daemon.onboard.flight.flight import Flight, FlightIdentity
+from daemon.onboard.flight.ledger import Ledger
+from daemon.onboard.pipeline.pipeline_queue import PipelineQueue
+from daemon.onboard.preflight.check_results import CheckOutcome, CheckResult, failed, passed
+from daemon.onboard.preflight.preflight import Preflight
+from daemon.onboard.service.flight_line import FlightLine
+from daemon.onboard.service.message_dispatcher import MessageDispatcher
+from daemon.onboard.service.messages import (
+    BeginProcessing,
+    BindFailed,
+    Bound,
+    DeviceSpec,
+    Fire,
+    Fired,
+    Pong,
+    WorkerBuilt,
+    WorkerReady,
+    WorkerRefused,
+)
+from daemon.onboard.service.record_ingest import RecordIngest
+from daemon.onboard.service.startup import capture_process, frame_rings, worker_process
+from daemon.onboard.service.supervisor import Supervisor
+from drivers.contract import (
+    DeviceEvent,
+    EventMark,
+    Frame,
+    FrameStatus,
+    NavSample,
+    PpsEdge,
+    TemperatureSample,
+)
+from drivers.receivers.fix_monitor import fix_description, missing_for_flight
+from processing.rig import Rig
+
+BIND_TIMEOUT_S: Final = 25.0
+DATA_TIMEOUT_S: Final = 10.0
+"""From when every device has answered: a receiver that is not sure of its time by then searches."""
+KERNELS_TIMEOUT_S: Final = 120.0
+"""Loading takes seconds; compiling may take minutes, and is not waited for."""
+STEP_S: Final = 0.1
+WITHOUT_MARKS: Final = frozenset({"gpsd"})
+"""Drivers of receivers that have no event marks."""
+MARK_ACTION: Final = "check the strobe cable, and that the receiver is set to send its marks"
+ACTIONS: Final = {
+    "position": "wait, or check its antenna",
+    "usable time": "wait, or check its antenna",
+    "height": "wait for a fix in three dimensions; a receiver that sends no height above the "
+    "ellipsoid has to be set to send it, or the undulation has to be configured",
+}
+"""By what is missing (`drivers.receivers.fix_monitor.missing_for_flight`)."""
+ARRIVING_LATER: Final = frozenset({"arming-time", "arming-navigation", "arming-kernels"})
+"""What comes by itself where nothing else fails."""
+
+
+class SystemCheck(MessageDispatcher):
+    """Starts what a flight needs, and finds out of each part whether it is there.
+
+    Args:
+        configuration: what is tried.
+        rig: the camera that it names.
+        fire: whether one exposure is fired, to prove frames and event marks.
+    """
+
+    def __init__(self, configuration: Configuration, rig: Rig, *, fire: bool) -> None:
+        self._configuration = configuration
+        self._rig = rig
+        self._fire = fire
+        self._specs = device_specs(configuration, rig)
+        self._supervisor = Supervisor(self._dispatch, self._on_death)
+        heads = [head.sensor for head in configuration.head]
+        identity = FlightIdentity("", "", rig.calibration_id, "", "", "", simulated=False)
+        flight = Flight(
+            rig,
+            {head: rig.sensor(head).serial for head in heads},
+            identity,
+            configuration.limits,
+            Ledger(heads=heads),
+            1,
+        )
+        self._ingest = RecordIngest(flight, lambda _record: None, lambda *_, **__: None)
+        self._line = FlightLine(
+            configuration, rig, flight, _existing(configuration.mission.root), 0,
+            plan=configuration.plan.file,
+        )  # fmt: skip
+        self._pipeline = PipelineQueue(1, lambda *_: None, lambda *_, **__: None)
+        self._preflight = Preflight(
+            configuration, rig, flight, self._line, self._ingest, self._pipeline
+        )
+        self._changed = asyncio.Event()
+        self._bound: dict[str, Mapping[str, str]] = {}
+        self._unbound: dict[str, str] = {}
+        self._refusal = ""
+        self._data: dict[str, Any] = {}
+        """The last datum of each stream, by kind and name."""
+        self._device_faults: dict[str, str] = {}
+        self._not_fired = ""
+
+    async def run(self) -> list[CheckResult]:
+        """Everything that was found, in the order of the devices.
+
+        Raises:
+            DaemonError: a flight cannot even be laid out.
+        """
+        rings = frame_rings(self._configuration, self._rig)
+        try:
+            self._supervisor.spawn(*worker_process(self._configuration, None, rings))
+            self._supervisor.spawn(*capture_process(self._configuration, self._rig, rings))
+            await self._until(lambda: all(map(self._has_answered, self._specs)), BIND_TIMEOUT_S)
+            if self._fire and "trigger" in self._bound:
+                self._fire_once()
+            await self._until(self._is_verified, DATA_TIMEOUT_S)
+            await self._until(self._worker_has_answered, KERNELS_TIMEOUT_S)
+            return list(self._findings())
+        finally:
+            await self._supervisor.end(("capture", "worker"))
+
+    # While it runs
+
+    def _fire_once(self) -> None:
+        order = self._line.order(time.monotonic_ns())
+        self._ingest.orders[order.number] = order
+        self._supervisor.send("capture", Fire(order.number, order.delays_ns))
+
+    def _dispatch(self, message: object) -> None:
+        self.dispatch(message)
+        dispatchers: tuple[MessageDispatcher, ...] = (self._ingest, self._pipeline)
+        any(dispatcher.dispatch(message) for dispatcher in dispatchers)
+        self._changed.set()
+
+    def _on_death(self, name: str) -> None:
+        if name == "worker":
+            self._refusal = self._refusal or "the worker died while it built the pipeline"
+        else:
+            for spec in self._specs:
+                if not self._has_answered(spec):
+                    self._unbound[spec.name] = f"the process {name} died while it opened devices"
+        self._changed.set()
+
+    def _on_bound(self, bound: Bound) -> None:
+        self._bound[bound.name] = bound.found
+
+    def _on_bind_failed(self, unbound: BindFailed) -> None:
+        self._unbound[unbound.name] = unbound.sentence
+
+    def _on_built(self, _built: WorkerBuilt) -> None:
+        self._supervisor.send("worker", BeginProcessing(None))
+
+    def _on_refused(self, refused: WorkerRefused) -> None:
+        self._refusal = refused.sentence
+
+    def _on_navigation(self, sample: NavSample) -> None:
+        self._data[f"navigator {sample.receiver}"] = sample
+
+    def _on_mark(self, mark: EventMark) -> None:
+        self._data[f"mark {mark.receiver}"] = mark
+
+    def _on_temperature(self, sample: TemperatureSample) -> None:
+        self._data[f"probe {sample.probe}"] = sample
+
+    def _on_pps(self, edge: PpsEdge) -> None:
+        self._data[f"pps {edge.source}"] = edge
+
+    def _on_frame(self, frame: Frame) -> None:
+        if frame.status is FrameStatus.COMPLETE:
+            self._data[f"head {frame.head}"] = frame
+
+    def _on_device_event(self, event: DeviceEvent) -> None:
+        if event.name != "opened":
+            self._device_faults[event.device] = event.sentence
+
+    def _on_fired(self, fired: Fired) -> None:
+        if fired.pulse is None:
+            self._not_fired = fired.sentence
+
+    handlers: ClassVar = {
+        Bound: _on_bound,
+        BindFailed: _on_bind_failed,
+        WorkerBuilt: _on_built,
+        WorkerRefused: _on_refused,
+        NavSample: _on_navigation,
+        EventMark: _on_mark,
+        TemperatureSample: _on_temperature,
+        PpsEdge: _on_pps,
+        Frame: _on_frame,
+        DeviceEvent: _on_device_event,
+        Fired: _on_fired,
+        Pong: lambda *_: None,
+        WorkerReady: lambda *_: None,
+    }
+
+    async def _until(self, condition: Callable[[], bool], limit_s: float) -> None:
+        deadline = time.monotonic() + limit_s
+        while not condition() and time.monotonic() < deadline:
+            self._changed.clear()
+            with suppress(TimeoutError):
+                async with asyncio.timeout(STEP_S):
+                    await self._changed.wait()
+
+    # What was found
+
+    def _has_answered(self, spec: DeviceSpec) -> bool:
+        return spec.name in self._bound or spec.name in self._unbound
+
+    def _worker_has_answered(self) -> bool:
+        return bool(self._refusal) or self._pipeline.is_ready
+
+    def _is_verified(self) -> bool:
+        """Whether nothing is left that more time could prove."""
+        bound = {spec.kind for spec in self._specs if spec.name in self._bound}
+        waits = {"arming-time", "arming-navigation"} if "navigator" in bound else set()
+        waits |= {"arming-temperature"} if "thermometer" in bound else set()
+        if any(item.name in waits for item in self._preflight.missing_prerequisites()):
+            return False
+        return not any(f.outcome is not CheckOutcome.PASS for f in self._streams(is_final=False))
+
+    def _findings(self) -> Iterator[CheckResult]:
+        for spec in self._specs:
+            yield self._device(spec)
+        yield from self._streams(is_final=True)
+        if self._refusal:
+            yield failed("pipeline", "worker", self._refusal, is_blocking=True)
+        elif self._pipeline.is_ready:
+            yield passed("pipeline", "worker")
+        for item in self._preflight.missing_prerequisites():
+            if item.name == "arming-device" or (item.name == "arming-kernels" and self._refusal):
+                continue  # the device or the pipeline itself is among the findings
+            outcome = CheckOutcome.WAITING if item.name in ARRIVING_LATER else CheckOutcome.FAIL
+            yield CheckResult("arming", item.name.removeprefix("arming-"), outcome, str(item))
+
+    def _device(self, spec: DeviceSpec) -> CheckResult:
+        found = self._bound.get(spec.name)
+        if found is not None:
+            problem = bound_problem(self._rig, spec.kind, spec.name, found)
+            if problem is not None:
+                return failed(spec.kind, spec.name, problem, is_blocking=True)
+            properties = {"driver": spec.driver, **found}
+            return CheckResult(spec.kind, spec.name, CheckOutcome.PASS, found=properties)
+        timeout_sentence = (
+            f"no answer within {BIND_TIMEOUT_S:g} s while opening it; check its power and cable"
+        )
+        return failed(spec.kind, spec.name, self._unbound.get(spec.name, timeout_sentence))
+
+    def _streams(self, *, is_final: bool) -> Iterator[CheckResult]:
+        """One datum of each stream of the devices that answered."""
+        for spec in self._specs:
+            if spec.name not in self._bound:
+                continue
+            if spec.kind == "navigator":
+                yield self._navigation(spec)
+                if self._fire:
+                    yield self._mark(spec)
+            elif spec.kind == "pps" and f"pps {spec.name}" not in self._data:
+                sentence = f"no pulse per second of {spec.name} yet; check the receiver's output"
+                yield CheckResult("stream", f"pps {spec.name}", CheckOutcome.WAITING, sentence)
+            elif spec.kind == "pps":
+                yield passed("stream", f"pps {spec.name}")
+            elif spec.kind == "head" and (is_final or self._fire):
+                yield self._frame(spec.name)
+
+    def _navigation(self, spec: DeviceSpec) -> CheckResult:
+        sample = self._data.get(f"navigator {spec.name}")
+        name = f"position of {spec.name}"
+        if sample is None:
+            sentence = self._device_faults.get(
+                spec.name, f"receiver {spec.name} answers and sends no position yet; it searches"
+            )
+            return CheckResult("stream", name, CheckOutcome.WAITING, sentence)
+        state = fix_description(sample.fix, sample.satellites)
+        missing = missing_for_flight(sample)
+        if missing is not None:
+            sentence = f"receiver {spec.name} has no {missing} yet ({state}); {ACTIONS[missing]}"
+            return CheckResult("stream", name, CheckOutcome.WAITING, sentence)
+        table = ", GPS time by our table of leap seconds" if sample.leap_source == "table" else ""
+        return passed("stream", name, state + table)
+
+    def _mark(self, spec: DeviceSpec) -> CheckResult:
+        name = f"event mark of {spec.name}"
+        if spec.driver in WITHOUT_MARKS:
+            sentence = f"receivers of driver {spec.driver} have no event marks"
+            return CheckResult("stream", name, CheckOutcome.NOT_TRIED, sentence)
+        if f"mark {spec.name}" in self._data:
+            return passed("stream", name)
+        sentence = f"receiver {spec.name} gave no event mark of the exposure"
+        return failed("stream", name, f"{sentence}; {MARK_ACTION}")
+
+    def _frame(self, head: str) -> CheckResult:
+        name = f"frame of {head}"
+        if f"head {head}" in self._data:
+            return passed("stream", name)
+        if not self._fire:
+            return CheckResult(
+                "stream", name, CheckOutcome.NOT_TRIED, "nothing is fired without --fire"
+            )
+        why = f" ({self._not_fired})" if self._not_fired else ""
+        return failed(
+            "stream", name, f"Head {head} sent no image{why}. Check its trigger cable and settings"
+        )
+
+
+async def run_system_check(
+    configuration: Configuration, rig: Rig, *, fire: bool
+) -> list[CheckResult]:
+    """Everything that a flight needs of processes and devices.
+
+    A flight that cannot even be laid out is one finding with the error's sentence.
+    """
+    try:
+        return await SystemCheck(configuration, rig, fire=fire).run()
+    except (DaemonError, OSError, ValueError) as error:
+        return [failed("service", "layout", str(error), is_blocking=True)]
+
+
+def _existing(folder: Path) -> Path:
+    """A folder, or the nearest one above it that exists."""
+    return next(path for path in (folder, *folder.parents) if path.is_dir())

@@ -1,0 +1,296 @@
+"""What a person may tell a flying service to do, and when it may not be done.
+
+Each command answers with a sentence, and each is written into the flight log with who gave it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol, TypeGuard
+
+from daemon.mission.log.log_records import Message, lenient_json_bytes
+from daemon.onboard.flight.arming import MissingPrerequisite
+from daemon.onboard.service.messages import Answer, CommandRefused, InvalidMessages, ServiceCommand
+
+AUDIT_TOPIC = "audit"
+
+
+class LineControl(Protocol):
+    """The line commands act on; `daemon.onboard.service.flight_line.Line`."""
+
+    is_running: bool
+
+    @property
+    def is_flown(self) -> bool: ...
+    def trigger_once(self) -> None: ...
+    def trigger_at_interval(self, interval_s: float, count: int) -> None: ...
+    def trigger_at_distance(self, distance_m: float) -> None: ...
+
+
+class ArmingControl(Protocol):
+    """What a flight needs; `daemon.onboard.preflight.preflight.Preflight`."""
+
+    def missing_prerequisites(self) -> Sequence[MissingPrerequisite]: ...
+    def arm(self) -> None: ...
+    def override(
+        self, by: str, missing: Sequence[MissingPrerequisite], reason: str = ""
+    ) -> None: ...
+
+
+class ExposureCommands(Protocol):
+    """Who sets the heads; `daemon.onboard.capture.exposure_controller.ExposureControl`."""
+
+    def command(self, requested: Mapping[str, Any], by: str) -> str | None: ...
+
+
+class DiskCommands(Protocol):
+    """The disks of the mission; `daemon.onboard.storage.mirror.Mirror`."""
+
+    def release(self, label: str) -> str | None: ...
+    def accept(self, label: str) -> str | None: ...
+
+
+class CommandTarget(Protocol):
+    """The service commands act on."""
+
+    is_ready: bool
+
+    @property
+    def line(self) -> LineControl: ...
+    @property
+    def preflight(self) -> ArmingControl: ...
+    @property
+    def exposure(self) -> ExposureCommands: ...
+    @property
+    def mirror(self) -> DiskCommands: ...
+    def acknowledge(self, fault: str) -> bool: ...
+    def land(self, *, new_mission: bool = False) -> None: ...
+
+
+def execute(command: ServiceCommand, flight: CommandTarget) -> Answer:
+    """Do what is asked, or say why not."""
+    handler = _COMMANDS.get(command.name)
+    if handler is None:
+        return _rejected(command, f"there is no command {command.name}")
+    return handler(command, flight)
+
+
+def audit_message(command: ServiceCommand, answer: Answer) -> Message:
+    """The command and its answer, for the flight log."""
+    content = {
+        "command": command.name,
+        "arguments": dict(command.arguments),
+        "by": command.by,
+        "role": command.role,
+        "address": command.address,
+        "done": answer.done,
+        "sentence": answer.sentence,
+    }
+    return Message(AUDIT_TOPIC, time.monotonic_ns(), lenient_json_bytes(content))
+
+
+def refusal_message(refused: CommandRefused) -> Message:
+    """A command that was refused before the service, for the flight log."""
+    content = {
+        "command": refused.name,
+        "by": refused.by,
+        "role": refused.role,
+        "address": refused.address,
+        "done": False,
+        "refused": True,
+        "count": refused.count,
+        "sentence": refused.sentence,
+    }
+    return Message(AUDIT_TOPIC, time.monotonic_ns(), lenient_json_bytes(content))
+
+
+def command_event(command: ServiceCommand, answer: Answer) -> dict[str, Any]:
+    """The event that reports a command."""
+    return {
+        "event": "command",
+        "name": command.name,
+        "by": command.by,
+        "done": answer.done,
+        "sentence": answer.sentence,
+        "override": bool(command.arguments.get("override")),
+    }
+
+
+def refusal_event(refused: CommandRefused) -> dict[str, Any]:
+    """The event that reports a command refused before the service."""
+    return {
+        "event": "command-refused",
+        "name": refused.name,
+        "by": refused.by,
+        "address": refused.address,
+        "sentence": refused.sentence,
+    }
+
+
+def refused_command(command: ServiceCommand, sentence: str) -> CommandRefused:
+    """The record of a command that breaks the rules."""
+    known = command.name if command.name in _COMMANDS else "unknown"
+    return CommandRefused(known, command.by, command.role, command.address, sentence)
+
+
+def invalid_message(invalid: InvalidMessages) -> Message:
+    """Invalid messages of the page's process, for the flight log."""
+    content = {"invalid": invalid.count, "by": "page's process", "problem": invalid.sentence}
+    return Message(AUDIT_TOPIC, time.monotonic_ns(), lenient_json_bytes(content))
+
+
+def invalid_event(invalid: InvalidMessages) -> dict[str, Any]:
+    """The event that reports them."""
+    sentence = (
+        f"{invalid.count} messages of the page's process to the service were invalid "
+        f"({invalid.sentence}) and dropped. Somebody may control that process: keep strangers off "
+        "its network and restart the service"
+    )
+    return {"event": "page-link", "fault": True, "sentence": sentence}
+
+
+def _arm(command: ServiceCommand, flight: CommandTarget) -> Answer:
+    refusal = _arm_or_reject(command, flight)
+    return refusal or _accepted(command, "armed; the line may be started")
+
+
+def _start(command: ServiceCommand, flight: CommandTarget) -> Answer:
+    if flight.line.is_running and not flight.line.is_flown:
+        return _rejected(command, "the line runs already")
+    refusal = _arm_or_reject(command, flight)
+    if refusal is not None:
+        return refusal
+    flight.line.is_running = True
+    return _accepted(command, "the line runs")
+
+
+def _stop(command: ServiceCommand, flight: CommandTarget) -> Answer:
+    if not flight.line.is_running:
+        return _rejected(command, "the line does not run")
+    flight.line.is_running = False
+    return _accepted(command, "the line is stopped; what was triggered is finished")
+
+
+def _trigger(command: ServiceCommand, flight: CommandTarget) -> Answer:
+    refusal = _arm_or_reject(command, flight)
+    if refusal is not None:
+        return refusal
+    flight.line.trigger_once()
+    return _accepted(command, "one exposure is made as soon as the camera can")
+
+
+def _interval(command: ServiceCommand, flight: CommandTarget) -> Answer:
+    interval_s, count = command.arguments.get("interval_s"), command.arguments.get("count", 0)
+    if not _is_positive(interval_s) or not isinstance(count, int) or count < 0:
+        return _rejected(command, "interval needs interval_s above 0 and a count, 0 for no end")
+    refusal = _arm_or_reject(command, flight)
+    if refusal is not None:
+        return refusal
+    flight.line.trigger_at_interval(float(interval_s), count)
+    return _accepted(command, f"an exposure every {interval_s:g} s, or as fast as the camera can")
+
+
+def _distance(command: ServiceCommand, flight: CommandTarget) -> Answer:
+    distance_m = command.arguments.get("distance_m")
+    if not _is_positive(distance_m):
+        return _rejected(command, "distance needs distance_m above 0")
+    refusal = _arm_or_reject(command, flight)
+    if refusal is not None:
+        return refusal
+    flight.line.trigger_at_distance(float(distance_m))
+    return _accepted(command, f"an exposure every {distance_m:g} m")
+
+
+def _land(command: ServiceCommand, flight: CommandTarget) -> Answer:
+    flight.land()
+    return _accepted(command, "no more exposures; what is open is sealed, then the service ends")
+
+
+def _new_mission(command: ServiceCommand, flight: CommandTarget) -> Answer:
+    if flight.line.is_running and not flight.line.is_flown:
+        return _rejected(command, "the line runs; stop it first")
+    flight.land(new_mission=True)
+    return _accepted(
+        command, "this mission is closed, and the next one begins with its configuration"
+    )
+
+
+def _exposure(command: ServiceCommand, flight: CommandTarget) -> Answer:
+    refusal = flight.exposure.command(command.arguments, command.by)
+    if refusal is not None:
+        return _rejected(command, refusal)
+    return _accepted(command, "the exposures from now on are made with it")
+
+
+def _acknowledge(command: ServiceCommand, flight: CommandTarget) -> Answer:
+    fault = command.arguments.get("fault")
+    if not isinstance(fault, str) or not flight.acknowledge(fault):
+        return _rejected(command, f"no fault {fault!r} is listed")
+    return _accepted(command, f"noted that {command.by} has seen {fault}")
+
+
+def _release_disk(command: ServiceCommand, flight: CommandTarget) -> Answer:
+    label = str(command.arguments.get("disk", ""))
+    refusal = flight.mirror.release(label)
+    if refusal is not None:
+        return _rejected(command, refusal)
+    return _accepted(command, f"disk {label} is being released; unmount it when the events say so")
+
+
+def _accept_disk(command: ServiceCommand, flight: CommandTarget) -> Answer:
+    label = str(command.arguments.get("disk", ""))
+    refusal = flight.mirror.accept(label)
+    if refusal is not None:
+        return _rejected(command, refusal)
+    return _accepted(
+        command, f"the disk that is at the place of {label} is brought up to date and used"
+    )
+
+
+def _arm_or_reject(command: ServiceCommand, flight: CommandTarget) -> Answer | None:
+    """The refusal, where the camera is not ready to fly and nobody takes that upon them."""
+    if flight.line.is_flown:
+        return _rejected(command, "the planned number of exposures is flown")
+    if not flight.is_ready:
+        return _rejected(command, "the service is not ready: devices open and kernels load")
+    missing = flight.preflight.missing_prerequisites()
+    blocking = [item for item in missing if not item.may_be_overridden]
+    if blocking:
+        return _rejected(command, f"not armed: {'; '.join(map(str, blocking))}")
+    if missing and not command.arguments.get("override"):
+        details = "; ".join(map(str, missing))
+        return _rejected(command, f"not armed: {details}; override to fly without")
+    if missing:
+        reason = str(command.arguments.get("reason", ""))
+        flight.preflight.override(command.by, missing, reason)
+    flight.preflight.arm()
+    return None
+
+
+def _is_positive(value: object) -> TypeGuard[float]:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < 1e6
+
+
+def _accepted(command: ServiceCommand, sentence: str) -> Answer:
+    return Answer(command.number, True, sentence)
+
+
+def _rejected(command: ServiceCommand, sentence: str) -> Answer:
+    return Answer(command.number, False, sentence)
+
+
+_COMMANDS: Mapping[str, Callable[[ServiceCommand, CommandTarget], Answer]] = {
+    "arm": _arm,
+    "start": _start,
+    "stop": _stop,
+    "trigger": _trigger,
+    "interval": _interval,
+    "distance": _distance,
+    "land": _land,
+    "acknowledge": _acknowledge,
+    "new-mission": _new_mission,
+    "exposure": _exposure,
+    "release-disk": _release_disk,
+    "accept-disk": _accept_disk,
+}

@@ -1,0 +1,166 @@
+"""Before a flight: its mission folder, what its records repeat, and its processes.
+
+Nothing here waits or decides; `daemon.onboard.service.service` starts what is laid out.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from daemon.configuration.model import Configuration
+from daemon.mission.layout import Mission
+from daemon.mission.mirror.mirror_startup import FoundDisks, find_disks
+from daemon.onboard.capture.devices import device_specs, frame_nbytes
+from daemon.onboard.capture.frame_ring import FrameRing
+from daemon.onboard.flight.flight import FlightIdentity
+from daemon.onboard.service.messages import WorkerSettings
+from daemon.onboard.storage.storage import MirrorPlan
+from processing.rig import Rig, shipped_rigs
+
+
+class ProcessPlan(NamedTuple):
+    """A process of the service, as `Supervisor.spawn` takes it."""
+
+    name: str
+    target: str
+    arguments: tuple[Any, ...]
+    environment: Mapping[str, str]
+
+
+def disks_of(configuration: Configuration) -> FoundDisks | None:
+    """The disks of a mirrored configuration, and the mission being flown on them; else None.
+
+    Raises:
+        OSError, MissionError: no disk can be used.
+    """
+    mission = configuration.mission
+    if mission.mirror is None:
+        return None
+    return find_disks({"root": mission.root, "mirror": mission.mirror})
+
+
+def interrupted_mission(configuration: Configuration) -> Mission | None:
+    """The mission that was being flown when the service ended; None after an orderly end.
+
+    Raises:
+        MissionError: the marker of the mission being flown is damaged.
+        OSError: no disk of a mirrored configuration can be used.
+    """
+    found = disks_of(configuration)
+    if found is not None:
+        return found.mission
+    root = configuration.mission.root
+    return Mission.current(root) if root.is_dir() else None
+
+
+def create_mission(
+    configuration: Configuration, rig: Rig, config_path: Path, root: Path | None = None
+) -> Mission:
+    """A new mission, with copies of what it is flown by; below `root` where that is given.
+
+    Raises:
+        OSError: the disk refused.
+    """
+    rig_path = shipped_rigs().get(configuration.mission.rig, Path(configuration.mission.rig))
+    plan_file = configuration.plan.file
+    return Mission.create(
+        root or configuration.mission.root,
+        rig.name,
+        rig_toml=rig_path.read_bytes(),
+        service_toml=config_path.read_bytes(),
+        plan=None if plan_file is None else (plan_file.suffix.lower(), plan_file.read_bytes()),
+        started_utc=datetime.now(UTC),
+        simulated=configuration.mission.simulated,
+    )
+
+
+def identity(configuration: Configuration, rig: Rig, mission: Mission) -> FlightIdentity:
+    """What every record of this flight repeats."""
+    return FlightIdentity(
+        boot_id=Path("/proc/sys/kernel/random/boot_id").read_text().strip(),
+        line_id=configuration.plan.line,
+        calibration_id=rig.calibration_id,
+        calibration_sha256=_sha256(mission.rig_path),
+        configuration_sha256=_sha256(mission.service_path),
+        software=f"syntopic {version('syntopic')}",
+        simulated=configuration.mission.simulated,
+    )
+
+
+def frame_rings(configuration: Configuration, rig: Rig) -> tuple[FrameRing, ...]:
+    """The frame memory of every head, that the processes share."""
+    return tuple(
+        FrameRing.create(
+            head.sensor, configuration.limits.exposures_in_memory, frame_nbytes(rig, head.sensor)
+        )
+        for head in configuration.head
+    )
+
+
+def worker_process(
+    configuration: Configuration, mission: Mission | None, rings: tuple[FrameRing, ...]
+) -> ProcessPlan:
+    """The pipeline worker, with rig and plan of the mission, or as configured before there is one.
+
+    It says whether the pipeline can be built, and waits for `Begin`.
+    """
+    plan_file = configuration.plan.file if mission is None else mission.plan_path
+    worker = WorkerSettings(
+        rig=configuration.mission.rig if mission is None else str(mission.rig_path),
+        radiometry=configuration.mission.radiometry,
+        plan_file=plan_file,
+        plan=configuration.plan,
+        processing=configuration.processing,
+    )
+    many = thread_counts(configuration.processing.threads)
+    return ProcessPlan("worker", "daemon.onboard.pipeline.worker:main", (worker, rings), many)
+
+
+def capture_process(
+    configuration: Configuration, rig: Rig, rings: tuple[FrameRing, ...]
+) -> ProcessPlan:
+    """The process of the devices."""
+    specs = device_specs(configuration, rig)
+    return ProcessPlan(
+        "capture", "daemon.onboard.capture.capture:main", (specs, rings), thread_counts(1)
+    )
+
+
+def writer_process(
+    mission: Mission, rings: tuple[FrameRing, ...], mirror: MirrorPlan | None = None
+) -> ProcessPlan:
+    """The process of the disk, or of both disks of a mirrored mission."""
+    arguments = (mission.path, rings, mirror)
+    return ProcessPlan("writer", "daemon.onboard.storage.writer:main", arguments, thread_counts(1))
+
+
+def watch_process(configuration: Configuration) -> ProcessPlan | None:
+    """The process that serves watchers, where the configuration wants one."""
+    if configuration.watch is None:
+        return None
+    one = thread_counts(1)
+    return ProcessPlan(
+        "watch",
+        "daemon.onboard.monitoring.monitoring_process:main",
+        (configuration.watch, configuration.plan),
+        one,
+    )
+
+
+def thread_counts(threads: int) -> dict[str, str]:
+    """What a process finds in its environment.
+
+    Compiled kernels share the cores; small matrices do not, and nobody spins while waiting.
+    """
+    names = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")
+    fixed = {"OPENBLAS_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
+    return dict.fromkeys(names, str(threads)) | fixed
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()

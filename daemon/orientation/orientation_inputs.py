@@ -1,0 +1,110 @@
+"""What the exposures of a mission are oriented with: camera, mount, trajectory, coordinate system.
+
+What is not asked for is that of the flight; how one exposure is oriented is in
+`daemon.orientation.exterior_orientation`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from daemon.configuration.model import MountSection
+from daemon.errors import DaemonError
+from daemon.mission.exposure import Exposure
+from daemon.mission.layout import Mission
+from daemon.orientation.exterior_orientation import (
+    ExteriorOrientation,
+    MissingOrientation,
+    mount_of,
+    orient,
+    read_mount,
+)
+from daemon.orientation.georeference import Georeference, utm_of
+from daemon.orientation.trajectory import Trajectory, flown_trajectory, read_trajectory
+from drivers.base.extras import require
+from processing.rig import Rig, load_rig
+
+
+class OrientationError(DaemonError):
+    """Nothing can be oriented; the sentence says why."""
+
+
+@dataclass(frozen=True)
+class OrientationInputs:
+    """How to orient; `ground_height_m` as planned."""
+
+    rig: Rig
+    mount: MountSection
+    ground_height_m: float
+    trajectory: Trajectory
+    crs: str
+    georeference: Georeference
+
+    def of(self, exposure: Exposure) -> Iterator[ExteriorOrientation | MissingOrientation]:
+        """See `daemon.orientation.exterior_orientation.orient`."""
+        return orient(exposure, self.rig, self.mount, self.trajectory, self.georeference)
+
+    def oriented(self, exposures: Iterable[Exposure]) -> list[ExteriorOrientation]:
+        """What of them can be oriented."""
+        every = (one for exposure in exposures for one in self.of(exposure))
+        return [one for one in every if isinstance(one, ExteriorOrientation)]
+
+
+def read_orientation_inputs(
+    mission: Mission,
+    exposures: Sequence[Exposure],
+    *,
+    crs: str | None = None,
+    trajectory_file: Path | None = None,
+    mount_file: Path | None = None,
+    receiver: str | None = None,
+) -> OrientationInputs:
+    """What to orient these exposures with.
+
+    Args:
+        crs: such as EPSG:25833; None is the UTM zone of the trajectory's beginning.
+        trajectory_file: post-processed; None is the navigation of the flight.
+        mount_file: TOML with a `[mount]` in place of the one that was flown.
+        receiver: whose navigation, where the flight had several.
+
+    Raises:
+        OrientationError: none of them has a GPS time.
+        TrajectoryError, GeoreferenceError: as their modules say.
+    """
+    mount, plan = mount_of(mission)
+    if mount_file is not None:
+        mount = read_mount(mount_file)
+    trajectory = trajectory_of(mission, exposures, trajectory_file, receiver)
+    if crs is None:
+        first = trajectory.sample(0).position
+        if first is None:
+            raise OrientationError(
+                f"{trajectory.name}: no position in its first sample; give --crs"
+            )
+        crs = utm_of(*first)
+    rig = load_rig(mission.rig_path)
+    return OrientationInputs(rig, mount, plan.ground_height_m, trajectory, crs, Georeference(crs))
+
+
+def trajectory_of(
+    mission: Mission,
+    exposures: Iterable[Exposure],
+    trajectory_file: Path | None,
+    receiver: str | None = None,
+) -> Trajectory:
+    """A file's trajectory, its week known from the exposures; without one, that of the flight.
+
+    Raises:
+        OrientationError: none of the exposures has a GPS time.
+    """
+    require("geodesy")
+    stamped = next((e.mark_gps_ns for e in exposures if e.mark_gps_ns is not None), None)
+    if stamped is None:
+        raise OrientationError(
+            f"{mission.path}: no sealed exposure with a GPS time, so nothing can be oriented"
+        )
+    if trajectory_file is None:
+        return flown_trajectory(mission, receiver)
+    return read_trajectory(trajectory_file, around_gps_ns=stamped)

@@ -1,0 +1,153 @@
+"""Tables of an adjustment project: CSV with a line of column names, `#` begins a remark.
+
+Mistakes are gathered with file and line, so that all of them are told at once.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from daemon.errors import DaemonError
+from daemon.mission.foreign_files import ForeignFileError, read_regular_file
+from daemon.mission.store.durable import new_file
+
+_MAX_BYTES = 2_000_000_000
+_MAX_PROBLEMS = 30
+
+
+class ProjectError(DaemonError, ValueError):
+    """A project that cannot be read; `problems` holds one sentence for each mistake found."""
+
+    def __init__(self, problems: Sequence[str]) -> None:
+        self.problems = tuple(problems)
+        super().__init__("\n".join(problems))
+
+
+@dataclass
+class CsvTable:
+    """Rows of one file as text, and what was wrong with them."""
+
+    file: str
+    columns: tuple[str, ...]
+    rows: list[list[str]]
+    lines: list[int]
+    problems: list[str] = field(default_factory=list)
+
+    def has(self, column: str) -> bool:
+        return column in self.columns
+
+    def text(self, column: str, default: str = "") -> list[str]:
+        """A column of texts; an empty cell is `default`."""
+        if column not in self.columns:
+            return [default] * len(self.rows)
+        at = self.columns.index(column)
+        return [row[at] or default for row in self.rows]
+
+    def names(self, column: str) -> list[str]:
+        """A column of names, none of them twice or empty."""
+        found = self.text(column)
+        seen: set[str] = set()
+        for name, line in zip(found, self.lines, strict=True):
+            if not name:
+                self.add_problem(line, f"{column} is empty")
+            elif name in seen:
+                self.add_problem(line, f"{column} {name!r} is given twice")
+            seen.add(name)
+        return found
+
+    def numbers(self, column: str, default: float = math.nan) -> list[float]:
+        """A column of numbers; an empty cell is `default`."""
+        if column not in self.columns:
+            return [default] * len(self.rows)
+        at = self.columns.index(column)
+        found = []
+        for row, line in zip(self.rows, self.lines, strict=True):
+            try:
+                value = float(row[at]) if row[at] else default
+                if row[at] and not math.isfinite(value):
+                    raise ValueError
+            except ValueError:
+                self.add_problem(line, f"{column} is {row[at]!r}; a number is right")
+                value = default
+            found.append(value)
+        return found
+
+    def add_problem(self, line: int, what: str) -> None:
+        if len(self.problems) < _MAX_PROBLEMS:
+            self.problems.append(f"{self.file}:{line}: {what}")
+
+
+def read_table(path: Path, needed: Sequence[str], known: Sequence[str]) -> CsvTable:
+    """Read a table.
+
+    Args:
+        path: the file.
+        needed: columns it must have.
+        known: columns it may have beside them.
+
+    Raises:
+        ProjectError: no such file, or columns that are missing or not known.
+    """
+    try:
+        text = read_regular_file(path, _MAX_BYTES).decode("utf-8")
+    except ForeignFileError as error:
+        raise ProjectError([str(error)]) from error
+    except UnicodeDecodeError as error:
+        raise ProjectError([f"{path}: cannot be read ({error})"]) from error
+    columns: tuple[str, ...] = ()
+    rows: list[list[str]] = []
+    lines: list[int] = []
+    problems: list[str] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        bare = line.strip()
+        if not bare or bare.startswith("#"):
+            continue
+        cells = [cell.strip() for cell in next(csv.reader([bare]))]
+        if not columns:
+            columns = tuple(cells)
+            missing = [c for c in needed if c not in columns]
+            foreign = [c for c in columns if c not in needed and c not in known]
+            if missing:
+                problems.append(f"{path.name}:{number}: columns {missing} are missing")
+            if foreign:
+                allowed = ", ".join([*needed, *known])
+                problems.append(f"{path.name}:{number}: columns {foreign} are not among {allowed}")
+            if problems:
+                raise ProjectError(problems)
+            continue
+        if len(cells) != len(columns):
+            if len(problems) < _MAX_PROBLEMS:
+                problems.append(
+                    f"{path.name}:{number}: {len(cells)} cells for {len(columns)} columns"
+                )
+            continue
+        rows.append(cells)
+        lines.append(number)
+    if not columns:
+        problems.append(f"{path.name}: empty; its first line names the columns {list(needed)}")
+    if problems:
+        raise ProjectError(problems)
+    return CsvTable(path.name, columns, rows, lines)
+
+
+def write_table(
+    path: Path, remark: str, columns: Sequence[str], rows: Iterable[Sequence[str | float]]
+) -> None:
+    """Write a table; numbers in their shortest exact form, NaN as an empty cell."""
+    with new_file(path) as part, part.open("w", encoding="utf-8", newline="") as file:
+        for line in remark.splitlines():
+            file.write(f"# {line}\n")
+        file.write(",".join(columns) + "\n")
+        writer = csv.writer(file, lineterminator="\n")
+        for row in rows:
+            writer.writerow([_cell(value) for value in row])
+
+
+def _cell(value: str | float) -> str:
+    if isinstance(value, str):
+        return value
+    return "" if math.isnan(value) else repr(float(value))

@@ -1,0 +1,339 @@
+"""Writing an adjustment project, and what came out of it, as text."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.mission.store.durable import new_files
+from daemon.postflight.adjustment.csv_tables import ProjectError, write_table
+from daemon.postflight.adjustment.html_report import report_page
+from daemon.postflight.adjustment.project import ANGLES, SIGMAS, XYZ, CheckPoints, Project
+from daemon.postflight.adjustment.project_file import ProjectFile
+from processing.bundle.adjust import Adjustment
+from processing.bundle.adjustment_results import exposures_of, image_residuals_mm
+from processing.bundle.network import INTERIOR, Network
+from processing.bundle.rotations import omega_phi_kappa
+from processing.bundle.unknowns import ParameterValues, initial_values
+
+Array = NDArray[np.float64]
+
+
+PROJECT_FILE = "project.toml"
+
+
+def write_project(
+    folder: Path,
+    file: ProjectFile,
+    network: Network,
+    checks: CheckPoints,
+    state: ParameterValues | None = None,
+) -> None:
+    """Write a project that `read_project` reads back as it was.
+
+    Args:
+        folder: made, if need be; a project that lies there already is not overwritten.
+        file: its settings, cameras and heads.
+        network: observations and starting values.
+        checks: independent coordinates.
+        state: values to begin with in place of the network's; control coordinates stay as given.
+
+    Raises:
+        ProjectError: the folder holds a project.
+    """
+    with new_project(folder) as part:
+        _write_project(part, file, network, checks, state)
+
+
+@contextmanager
+def new_project(folder: Path) -> Iterator[Path]:
+    """A folder to write a project's files into; they appear in `folder` when the block ends.
+
+    `project.toml` comes last: where it is, the project is complete.
+
+    Raises:
+        ProjectError: the folder holds a project.
+    """
+    if (folder / PROJECT_FILE).exists():
+        raise ProjectError([f"{folder} holds a project already; give another folder"])
+    with new_files(folder, last=PROJECT_FILE) as part:
+        yield part
+
+
+def _write_project(
+    folder: Path,
+    file: ProjectFile,
+    network: Network,
+    checks: CheckPoints,
+    state: ParameterValues | None,
+) -> None:
+    state = state or initial_values(network)
+    tables = {"images": "images.csv", "image_points": "image_points.csv"}
+    tables |= {"exposures": "exposures.csv", "points": "points.csv"}
+    _images(folder, network, state)
+    _exposures(folder, network, state)
+    _points(folder, network, checks, state)
+    table = network.image_points
+    write_table(
+        folder / "image_points.csv",
+        "Measured image coordinates, x right, y up.",
+        ("image", "point", "x_mm", "y_mm", "sx_um", "sy_um"),
+        (
+            (network.images.names[i], network.points.names[p], *xy, *sigma)
+            for i, p, xy, sigma in zip(
+                table.image, table.point, table.xy_mm, table.sigma_mm * 1e3, strict=True
+            )
+        ),
+    )
+    if len(network.distances.point_a):
+        tables["distances"] = "distances.csv"
+        d, names = network.distances, network.points.names
+        write_table(
+            folder / "distances.csv",
+            "Measured distances between object points.",
+            ("point_a", "point_b", "distance_m", "sigma_m"),
+            (
+                (names[a], names[b], float(length), float(sigma))
+                for a, b, length, sigma in zip(
+                    d.point_a, d.point_b, d.distance_m, d.sigma_m, strict=True
+                )
+            ),
+        )
+    if len(network.gnss.station):
+        tables["gnss"] = "gnss.csv"
+        _gnss(folder, network)
+    if len(network.measured_attitudes.attitude):
+        tables["attitudes"] = "attitudes.csv"
+        b = network.measured_attitudes
+        angles = np.degrees(omega_phi_kappa(b.rotation))
+        write_table(
+            folder / "attitudes.csv",
+            "Measured attitudes, R = Rx(omega) Ry(phi) Rz(kappa), object from camera.",
+            ("exposure", *ANGLES, "sigma_deg"),
+            (
+                (network.attitudes.names[a], *own, math.degrees(sigma[0]))
+                for a, own, sigma in zip(b.attitude, angles, b.sigma_rad, strict=True)
+            ),
+        )
+    (folder / PROJECT_FILE).write_text(_toml(file, network, state, tables), encoding="utf-8")
+
+
+def write_results(
+    folder: Path, project: Project, result: Adjustment, report: Mapping[str, Any]
+) -> None:
+    """Write the adjusted project, adjusted points and orientations with sigmas, residuals, report.
+
+    Raises:
+        ProjectError: the folder holds a project.
+    """
+    with new_project(folder) as part:
+        fill_results(part, project, result, report)
+
+
+def fill_results(
+    folder: Path, project: Project, result: Adjustment, report: Mapping[str, Any]
+) -> None:
+    """As `write_results`, into the folder of `new_project`."""
+    network = result.network
+    _write_project(folder, project.file, network, project.checks, result.state)
+    sigma = result.sigma0 * np.sqrt(np.clip(np.einsum("nii->ni", result.point_cofactor), 0.0, None))
+    rays = np.bincount(
+        network.image_points.point[result.weight > 0.0], minlength=len(network.points.names)
+    )
+    write_table(
+        folder / "adjusted_points.csv",
+        "Adjusted object points; no sigma: took no part.",
+        ("point", *XYZ, *SIGMAS, "rays"),
+        (
+            (name, *result.state.points[k], *sigma[k], str(int(rays[k])))
+            for k, name in enumerate(network.points.names)
+        ),
+    )
+    write_table(
+        folder / "adjusted_images.csv",
+        "Projection centres and angles of the exposures the images belong to; no sigma: held.",
+        ("image", *XYZ, *ANGLES, *SIGMAS, "so_deg", "sp_deg", "sk_deg"),
+        (
+            (
+                o.name,
+                *o.position_m,
+                *np.degrees(o.angles_rad),
+                *o.position_sigma_m,
+                *np.degrees(o.angles_sigma_rad),
+            )
+            for o in exposures_of(result)
+        ),
+    )
+    write_table(
+        folder / "residuals.csv",
+        "Computed less measured image coordinates; redundancy numbers; standardised residuals.",
+        ("image", "point", "vx_um", "vy_um", "rx", "ry", "wx", "wy", "rejected"),
+        _residuals(result),
+    )
+    (folder / "report.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    page = report_page(result, project.checks, report)
+    (folder / "report.html").write_text(page, encoding="utf-8")
+
+
+def _residuals(result: Adjustment) -> Iterator[tuple[str | float, ...]]:
+    network, rows = result.network, result.equations
+    count = len(network.image_points.image)
+    redundancy, standardised = np.full((count, 2), np.nan), np.full((count, 2), np.nan)
+    for axis in range(2):
+        own = rows.group == axis
+        redundancy[rows.source[own], axis] = result.redundancy_number[own]
+        standardised[rows.source[own], axis] = result.standardised[own]
+    residual = image_residuals_mm(result) * 1e3
+    for k, (image, point) in enumerate(
+        zip(network.image_points.image, network.image_points.point, strict=True)
+    ):
+        yield (
+            network.images.names[image],
+            network.points.names[point],
+            *(round(float(v), 4) for v in residual[k]),
+            *(round(float(v), 4) for v in redundancy[k]),
+            *(round(float(v), 3) for v in standardised[k]),
+            "yes" if result.rejected[k] else "no",
+        )
+
+
+def _images(folder: Path, network: Network, state: ParameterValues) -> None:
+    images, angles = network.images, np.degrees(omega_phi_kappa(state.attitude))
+    rows: list[tuple[str | float, ...]] = []
+    for k, name in enumerate(images.names):
+        attitude = network.attitudes.names[images.attitude[k]]
+        own = angles[images.attitude[k]] if attitude.startswith("image ") else np.full(3, np.nan)
+        head = "" if images.head[k] < 0 else network.heads[images.head[k]].name
+        rows.append(
+            (
+                name,
+                network.cameras[images.camera[k]].name,
+                network.stations.names[images.station[k]],
+                head,
+                *own,
+            )
+        )
+    write_table(
+        folder / "images.csv",
+        "Images; one with angles has an attitude of its own and shares the exposure's centre.",
+        ("image", "camera", "exposure", "head", *ANGLES),
+        rows,
+    )
+
+
+def _exposures(folder: Path, network: Network, state: ParameterValues) -> None:
+    angles = np.degrees(omega_phi_kappa(state.attitude))
+    at = {name: k for k, name in enumerate(network.attitudes.names)}
+    rows: list[tuple[str | float, ...]] = []
+    for k, name in enumerate(network.stations.names):
+        own = at.get(name)
+        rows.append(
+            (
+                name,
+                *state.station[k],
+                *(np.full(3, np.nan) if own is None else angles[own]),
+                "held" if network.stations.fixed[k] else "free",
+                "held" if own is not None and network.attitudes.fixed[own] else "free",
+            )
+        )
+    write_table(
+        folder / "exposures.csv",
+        "Projection centres and angles, R = Rx(omega) Ry(phi) Rz(kappa), object from camera.",
+        ("exposure", *XYZ, *ANGLES, "position", "attitude"),
+        rows,
+    )
+
+
+def _points(folder: Path, network: Network, checks: CheckPoints, state: ParameterValues) -> None:
+    points = network.points
+    check_points = {name: k for k, name in enumerate(checks.names)}
+    rows: list[tuple[str | float, ...]] = []
+    for k, name in enumerate(points.names):
+        if name in check_points:
+            c = check_points[name]
+            rows.append((name, "check", *checks.xyz_m[c], *checks.sigma_m[c]))
+        elif points.at_infinity[k]:
+            rows.append((name, "direction", *points.xyz_m[k], *points.sigma_m[k]))
+        elif np.isfinite(points.sigma_m[k]).any():
+            rows.append((name, "control", *points.xyz_m[k], *points.sigma_m[k]))
+        else:
+            rows.append((name, "tie", *state.points[k], *np.full(3, np.nan)))
+    write_table(
+        folder / "points.csv",
+        "Object points. Control: an empty sigma leaves a coordinate free, 0 holds it.",
+        ("point", "role", *XYZ, *SIGMAS),
+        rows,
+    )
+
+
+def _gnss(folder: Path, network: Network) -> None:
+    gnss = network.gnss
+    write_table(
+        folder / "gnss.csv",
+        "Antenna positions; lever arm in camera (rig) axes.",
+        ("exposure", *XYZ, *SIGMAS, "line", "time_s", "lever_x_m", "lever_y_m", "lever_z_m"),
+        (
+            (
+                network.stations.names[s],
+                *gnss.position_m[k],
+                *gnss.sigma_m[k],
+                "" if gnss.line[k] < 0 else gnss.lines[gnss.line[k]],
+                float(gnss.time_s[k]),
+                *gnss.lever_m[k],
+            )
+            for k, s in enumerate(gnss.station)
+        ),
+    )
+
+
+def _toml(
+    file: ProjectFile, network: Network, state: ParameterValues, tables: Mapping[str, str]
+) -> str:
+    """project.toml with current values of interior orientation and heads."""
+    lines = ["format = 1", f"name = {_value(file.name)}", "", "[adjust]"]
+    lines += _keys(file.adjust.model_dump(exclude_none=True, exclude_defaults=True))
+    lines += ["", "[files]", *_keys(dict(tables))]
+    for k, section in enumerate(file.camera):
+        content = section.model_dump(exclude_none=True, exclude_defaults=True)
+        content |= {
+            name: float(value)
+            for name, value in zip(INTERIOR, state.interior[k], strict=True)
+            if value != 0.0
+        }
+        terms = {
+            t.name: float(v) for t, v in zip(network.cameras[k].terms, state.terms[k], strict=True)
+        }
+        content["terms"] = {name: value for name, value in terms.items() if value != 0.0}
+        lines += ["", "[[camera]]", *_keys(content)]
+    angles = np.degrees(omega_phi_kappa(state.head_rotation))
+    for k, head in enumerate(file.head):
+        content = head.model_dump(exclude_none=True, exclude_defaults=True)
+        content |= dict(zip(ANGLES, (float(v) for v in angles[k]), strict=True))
+        content |= dict(zip(XYZ, (float(v) for v in state.head_offset[k]), strict=True))
+        lines += ["", "[[head]]", *_keys(content)]
+    for constraint in file.constraint:
+        lines += ["", "[[constraint]]", *_keys(constraint.model_dump())]
+    return "\n".join(lines) + "\n"
+
+
+def _keys(content: Mapping[str, Any]) -> list[str]:
+    return [f"{key} = {_value(value)}" for key, value in content.items() if value not in ({}, ())]
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, int | float):
+        return repr(value)
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{json.dumps(k)} = {_value(v)}" for k, v in value.items()) + " }"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_value(v) for v in value) + "]"
+    return json.dumps(value, ensure_ascii=False)

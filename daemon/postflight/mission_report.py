@@ -1,0 +1,245 @@
+"""The report of a mission: one HTML file that needs nothing beside it.
+
+It draws what the records and quality reports say; nothing is computed here that they do not hold.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jinja2
+
+from daemon.configuration.model import ConfigurationError
+from daemon.errors import DaemonError
+from daemon.mission.exposure import Exposure, to_json
+from daemon.mission.exposure_batch import ExposureFailure, cause_of, for_each_exposure
+from daemon.mission.layout import Mission
+from daemon.mission.store.durable import make_directories, replace_file
+from daemon.mission.store.level0_folder import read_sealed
+from daemon.mission.store.level2 import read_report
+from daemon.planning.mission_coverage import coverage_of
+from daemon.postflight.displacements import flight_displacements, write_displacements
+from daemon.terminal.console import visible_value
+from processing.geometry.conditions import TIME_PARTS
+from processing.quality.band_levels import level_steps, levels_of
+from processing.rig import RigError
+
+REPORT_FILE = "report.html"
+T = TypeVar("T")
+
+_GLYPHS = {"good": "●", "usable": "▲", "refly": "■", "lost": "✕"}
+
+
+@dataclass(frozen=True)
+class WrittenReport:
+    """The page, and what of exposures could not be read and is not in it."""
+
+    path: Path
+    failures: tuple[ExposureFailure, ...]
+
+
+def write_report(
+    mission: Path,
+    *,
+    ledger: Mapping[str, Any] | None = None,
+    geometry: Mapping[str, Any] | None = None,
+    out: Path | None = None,
+) -> WrittenReport:
+    """Write `report.html` into the mission's export folder, or into another one.
+
+    Args:
+        mission: the mission folder.
+        ledger: the balance sheet, where the service just told it.
+        geometry: comparison with an emulator's truth, where there is one.
+        out: another folder; nothing is written into the mission then.
+    """
+    folder = Mission.open(mission)
+    read = for_each_exposure(folder.numbers(), lambda number: _exposure(folder, number))
+    exposures = [exposure for exposure, _ in read.results.values()]
+    failures = [*read.failures, *(one for _, found in read.results.values() for one in found)]
+    displacements = (
+        flight_displacements(mission) if out is not None else write_displacements(mission)
+    )
+    loader = jinja2.FileSystemLoader(Path(__file__).parent / "templates")
+    environment = jinja2.Environment(
+        loader=loader,
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        finalize=visible_value,
+    )
+    html = environment.get_template("report.html").render(
+        mission=mission.name,
+        coverage=_coverage(mission),
+        exposures=exposures,
+        simulated=any(exposure["record"].get("simulated") for exposure in exposures),
+        displaced=_displaced(exposures),
+        tested=len(_figure(exposures, "displacement_test")),
+        flight_sentences=[*displacements["sentences"], *_level_steps(exposures)],
+        unreadable=failures,
+        ledger=ledger,
+        geometry=geometry,
+        plots=[
+            _plot("dC by cone, K", _temperature_series(exposures)),
+            _plot("sigma0, px", {"sigma0": _figure(exposures, "sigma0_px")}),
+            _plot("Sigma of the exposure's time, ns", {"sigma": _time_sigma(exposures)}),
+        ],
+        glyphs=_GLYPHS,
+        time_parts=TIME_PARTS,
+    )
+    path = (out or mission / "export") / REPORT_FILE
+    make_directories(path.parent)
+    replace_file(path, html.encode("utf-8"))
+    return WrittenReport(path, tuple(failures))
+
+
+def _coverage(mission: Path) -> dict[str, Any] | None:
+    """What of the plan is seen often enough; None without a plan, or one that cannot be used."""
+    try:
+        return coverage_of(Mission.open(mission))
+    except (OSError, DaemonError, ConfigurationError, RigError):
+        return None
+
+
+def _exposure(mission: Mission, number: int) -> tuple[dict[str, Any], list[ExposureFailure]]:
+    """What the page says of an exposure, and what of it cannot be read."""
+    level2 = mission.level2(number)
+    failures: list[ExposureFailure] = []
+
+    def readable(read: Callable[[], T], otherwise: T) -> T:
+        try:
+            return read()
+        except (OSError, DaemonError) as error:
+            failures.append(ExposureFailure(number, cause_of(error)))
+            return otherwise
+
+    sealed = readable(lambda: read_sealed(mission.level0(number)), None)
+    record = to_json(Exposure(number) if sealed is None else sealed.exposure)
+    state = "unknown" if sealed is None else sealed.exposure.state
+    report = readable(lambda: read_report(level2), None) or {}
+    entry = {
+        "number": number,
+        "record": record,
+        "report": report,
+        "verdict": report.get("verdict", state),
+        "figures": report.get("figures", {}),
+        "findings": report.get("findings", []),
+        "gps": _gps_text(record.get("mark_gps_ns")),
+        "worst_time_sigma_ns": _worst_time_sigma(record),
+        "quicklook": readable(lambda: _data_uri(level2 / "quicklook.jpg", "image/jpeg"), None),
+        "residuals": readable(lambda: _data_uri(level2 / "residuals.svg", "image/svg+xml"), None),
+    }
+    return entry, failures
+
+
+def _data_uri(path: Path, kind: str) -> str | None:
+    if not path.exists():
+        return None
+    return f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"
+
+
+def _gps_text(gps_ns: str | None) -> str:
+    if gps_ns is None:
+        return "unknown"
+    seconds, nanoseconds = divmod(int(gps_ns), 1_000_000_000)
+    week, second = divmod(seconds, 604_800)
+    return f"week {week}, {second}.{nanoseconds:09d} s"
+
+
+def _worst_time_sigma(record: Mapping[str, Any]) -> int | None:
+    sigmas = [frame.get("time_sigma_ns") for frame in record.get("frames", [])]
+    return max((sigma for sigma in sigmas if sigma is not None), default=None)
+
+
+def _displaced(exposures: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Which sensor was found displaced, in how many exposures, and by how much on average."""
+    found: dict[str, list[Mapping[str, Any]]] = {}
+    for exposure in exposures:
+        name = exposure["figures"].get("displaced_sensor")
+        probe = exposure["figures"].get("misread_probe")
+        if name and probe:
+            name = f"{name}, or probe {probe} misreads"
+        if name:
+            found.setdefault(name, []).append(exposure["figures"])
+    return [
+        {
+            "sensor": name,
+            "count": len(figures),
+            "x_px": _mean(figures, "displacement_x_px"),
+            "y_px": _mean(figures, "displacement_y_px"),
+        }
+        for name, figures in found.items()
+    ]
+
+
+def _mean(figures: Sequence[Mapping[str, Any]], key: str) -> float | None:
+    values = [f[key] for f in figures if f.get(key) is not None]
+    return sum(values) / len(values) if values else None
+
+
+def _temperature_series(
+    exposures: Sequence[Mapping[str, Any]],
+) -> dict[str, list[tuple[int, float]]]:
+    series: dict[str, list[tuple[int, float]]] = {}
+    for exposure in exposures:
+        for key, value in exposure["figures"].items():
+            if key.startswith("dc_k_") and value is not None:
+                series.setdefault(key.removeprefix("dc_k_"), []).append((exposure["number"], value))
+    return series or {"mean": _figure(exposures, "dc_k")}
+
+
+def _level_steps(exposures: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Bands whose level changed alone from one exposure to the next, one sentence each."""
+    levels = {exposure["number"]: levels_of(exposure["figures"]) for exposure in exposures}
+    return [step.sentence for step in level_steps(levels)]
+
+
+def _figure(exposures: Sequence[Mapping[str, Any]], key: str) -> list[tuple[int, float]]:
+    return [
+        (exposure["number"], exposure["figures"][key])
+        for exposure in exposures
+        if exposure["figures"].get(key) is not None
+    ]
+
+
+def _time_sigma(exposures: Sequence[Mapping[str, Any]]) -> list[tuple[int, float]]:
+    return [
+        (exposure["number"], float(exposure["record"]["mark_sigma_ns"]))
+        for exposure in exposures
+        if exposure["record"].get("mark_sigma_ns") is not None
+    ]
+
+
+def _plot(title: str, series: Mapping[str, Sequence[tuple[int, float]]]) -> dict[str, Any]:
+    """A small line plot: polylines in a box of 600 x 140, with its scale."""
+    points = [point for line in series.values() for point in line]
+    if not points:
+        return {"title": title, "lines": [], "low": "", "high": "", "first": "", "last": ""}
+    xs = [x for x, _ in points]
+    ys = [y for _, y in points]
+    low, high = min(ys), max(ys)
+    margin = 0.1 * (high - low) or max(abs(high) * 0.1, 0.1)
+    low, high = low - margin, high + margin
+    span = max(max(xs) - min(xs), 1)
+    lines = [
+        {
+            "name": name,
+            "points": " ".join(
+                f"{(x - min(xs)) / span * 560 + 20:.1f},{130 - (y - low) / (high - low) * 120:.1f}"
+                for x, y in line
+            ),
+            "hue": round(360 * index / max(len(series), 1)),
+        }
+        for index, (name, line) in enumerate(series.items())
+    ]
+    return {
+        "title": title,
+        "lines": lines,
+        "low": f"{low:.3g}",
+        "high": f"{high:.3g}",
+        "first": str(min(xs)),
+        "last": str(max(xs)),
+    }

@@ -1,0 +1,319 @@
+"""One run of the service again, from its flight log: matching, clocks, ledger and records.
+
+Instants and decisions are those of the log; what follows from them is found anew and held against
+what the flight found. Pixels are the business of `daemon.postflight.replay.product_comparison`.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from daemon.configuration.model import Configuration
+from daemon.mission.canonical_json import RecordError, parse_record
+from daemon.mission.exposure import CaptureRecord, Exposure, FrameRecord
+from daemon.mission.layout import Mission
+from daemon.mission.log.flight_log import read
+from daemon.mission.log.log_records import (
+    LoggedRecord,
+    LoggedTrigger,
+    Message,
+    message_of,
+    record_of,
+)
+from daemon.mission.store.level0_folder import hash_file
+from daemon.mission.verification.recovery import LEDGER_TOPIC
+from daemon.onboard.capture.devices import device_specs
+from daemon.onboard.flight.decisions import Decision, decision_of, tick
+from daemon.onboard.flight.flight import Flight, FlightIdentity
+from daemon.onboard.flight.ledger import Ledger
+from daemon.onboard.flight.recovery_match import pulse_of
+from daemon.onboard.service.record_ingest import RecordIngest
+from daemon.postflight.replay.codecs import Decoded, codec_for, decode_all, has_first_bytes
+from drivers.contract import (
+    ClockReading,
+    DeviceEvent,
+    EventMark,
+    NavSample,
+    RawBytes,
+    TemperatureSample,
+)
+from processing.quality.report import Flag
+from processing.rig import Rig
+
+IdentityFactory = Callable[[str], FlightIdentity]
+"""What every record of a run repeats, by the boot its log names."""
+
+
+@dataclass
+class ReplayResult:
+    """What a run became the second time.
+
+    `records` are the sealed exposures in their order; `deferred` those the pipeline read from disk
+    in the air. `agreements` and `disagreements` count by what was compared; `sentences` say more of
+    what disagrees.
+    """
+
+    records: list[Exposure] = field(default_factory=list)
+    deferred: dict[int, bool] = field(default_factory=dict)
+    agreements: Counter[str] = field(default_factory=Counter)
+    disagreements: Counter[str] = field(default_factory=Counter)
+    sentences: list[str] = field(default_factory=list)
+    is_complete: bool = False
+
+    @property
+    def agrees(self) -> bool:
+        """Whether something was compared and nothing differs."""
+        return bool(self.agreements) and not self.disagreements
+
+    def add(self, other: ReplayResult) -> None:
+        """Take in another run of the same mission."""
+        self.records += other.records
+        self.deferred |= other.deferred
+        self.agreements += other.agreements
+        self.disagreements += other.disagreements
+        self.sentences += other.sentences
+        self.is_complete = self.is_complete and other.is_complete
+
+    def as_json(self) -> dict[str, Any]:
+        """What was compared, as plain JSON types."""
+        names = sorted(self.agreements.keys() | self.disagreements.keys())
+        return {
+            "agrees": self.agrees,
+            "exposures": len(self.records),
+            "deferred": sum(self.deferred.values()),
+            "compared": [
+                {"what": n, "equal": self.agreements[n], "different": self.disagreements[n]}
+                for n in names
+            ],
+            "sentences": self.sentences,
+        }
+
+    def compare(self, what: str, *, agrees: bool, sentence: str = "") -> None:
+        """Count one comparison."""
+        (self.agreements if agrees else self.disagreements)[what] += 1
+        if not agrees and sentence:
+            self.sentences.append(sentence)
+
+
+def replay_log(
+    log: Path, mission: Mission, rig: Rig, configuration: Configuration, identity: IdentityFactory
+) -> ReplayResult:
+    """Replay one run of the service.
+
+    A log of a service that did not record its decisions gives nothing but what its codecs say.
+    """
+    reader = read(log)
+    messages = list(reader)
+    out = ReplayResult(is_complete=reader.is_complete)
+    decoded = _decode(messages, configuration, rig, out)
+    begin = next((d for m in messages if (d := decision_of(m)) and d.kind == "begin"), None)
+    if begin is None:
+        out.sentences.append(f"{log.name}: holds no decisions; its records are not replayed")
+        return out
+    run_identity = replace(identity(reader.boot_id), software=str(begin.detail.get("software", "")))
+    heads = [head.sensor for head in configuration.head]
+    flight = Flight(
+        rig,
+        {head: rig.sensor(head).serial for head in heads},
+        run_identity,
+        configuration.limits,
+        Ledger(heads=heads),
+        begin.number,
+    )
+    run = _Run(flight, mission, out)
+    for message in messages:
+        run.take(message, decoded)
+    if not begin.detail.get("resumed") and run.sheet is not None:
+        run.compare_ledger()
+    return out
+
+
+class _Run:
+    """The pieces that fly, driven by the log."""
+
+    def __init__(self, flight: Flight, mission: Mission, out: ReplayResult) -> None:
+        self._flight = flight
+        self._mission = mission
+        self._out = out
+        self._ingest = RecordIngest(flight, lambda _record: None, lambda event, **_content: None)
+        self._captures: dict[int, CaptureRecord] = {}
+        self._sealing: Exposure | None = None
+        self.sheet: Mapping[str, Any] | None = None
+        self._current_sheet: Mapping[str, Any] = {}
+
+    def take(self, message: Message, decoded: Mapping[int, Decoded]) -> None:
+        """The next message of the log."""
+        if message.topic == LEDGER_TOPIC:
+            try:
+                self.sheet = parse_record(message.payload, message.topic)
+            except RecordError:
+                return
+            self._current_sheet = self._flight.ledger.sheet().as_json()
+            return
+        decision = decision_of(message)
+        if decision is not None:
+            self._decide(decision)
+            return
+        record: LoggedRecord | Decoded | None = decoded.get(id(message)) or record_of(message)
+        if isinstance(record, LoggedTrigger):
+            self._flight.fired(pulse_of(record))
+        elif record is not None:
+            self._ingest.dispatch(record)
+
+    def compare_ledger(self) -> None:
+        """The sheet after the last seal, against the one that was logged then."""
+        agrees = dict(self.sheet or {}) == dict(self._current_sheet)
+        sentence = "the ledger's sheet after the last seal differs from the flight's"
+        self._out.compare("ledger", agrees=agrees, sentence=sentence)
+
+    def _decide(self, decision: Decision) -> None:
+        handler = _HANDLERS.get(decision.kind)
+        if handler is not None:
+            handler(self, decision)
+
+    def _order(self, decision: Decision) -> None:
+        detail = decision.detail
+        self._flight.disk_is_low = bool(int(detail.get("flags", 0)) & Flag.DISK_LOW)
+        line_id, strip_id = str(detail.get("line_id", "")), str(detail.get("strip_id", ""))
+        number = self._flight.order(decision.mono_ns, line_id, strip_id)
+        self._out.compare("order", agrees=number == decision.number)
+
+    def _not_fired(self, decision: Decision) -> None:
+        self._flight.not_fired(decision.number, str(decision.detail.get("sentence", "")))
+
+    def _tick(self, decision: Decision) -> None:
+        may_seal = bool(decision.detail.get("asked_to_seal"))
+        allow_provisional = decision.detail.get("foreseen") is not None
+        due = tick(
+            self._flight, decision.mono_ns, may_seal=may_seal, allow_provisional=allow_provisional
+        )
+        self._flight.resolved_marks.clear()
+        self._flight.idle_slots.clear()
+        self._captures |= {one.capture.number: one.capture for one in due.to_store}
+        self._sealing = due.to_seal or self._sealing
+        found = due.detail or {}
+        for key, what in _COMPARED.items():
+            original = decision.detail.get(key)
+            sentence = f"{what}: {found.get(key)} fell due where the flight had {original}"
+            if original:
+                self._out.compare(what, agrees=found.get(key) == original, sentence=sentence)
+            elif found.get(key):
+                self._out.compare(what, agrees=False, sentence=sentence)
+
+    def _stored(self, decision: Decision) -> None:
+        capture = self._captures.pop(decision.number, None)
+        if capture is None:
+            return
+        folder = self._mission.level0(decision.number)
+        frames = tuple(_on_disk(folder, frame) for frame in capture.frames)
+        disks = tuple(map(str, decision.detail.get("disks", ())))
+        self._flight.stored(decision.number, frames, disks)
+
+    def _not_stored(self, decision: Decision) -> None:
+        self._flight.not_stored(decision.number, str(decision.detail.get("sentence", "")))
+
+    def _sealed(self, decision: Decision) -> None:
+        exposure, self._sealing = self._sealing, None
+        if exposure is None or exposure.number != decision.number:
+            sentence = f"exposure {decision.number} was sealed in flight and is not in the replay"
+            self._out.compare("seals", agrees=False, sentence=sentence)
+            return
+        self._flight.sealed(exposure.number, exposure.state)
+        self._out.records.append(exposure)
+
+    def _not_sealed(self, decision: Decision) -> None:
+        exposure, self._sealing = self._sealing, None
+        if exposure is not None:
+            self._flight.not_sealed(exposure.number, exposure.state)
+
+    def _process(self, decision: Decision) -> None:
+        self._out.deferred[decision.number] = bool(decision.detail.get("deferred"))
+
+
+_COMPARED = {"store": "stores", "given_up": "given up", "seal": "seals", "foreseen": "foreseen"}
+_HANDLERS: Mapping[str, Callable[[_Run, Decision], None]] = {
+    "order": _Run._order,
+    "not-fired": _Run._not_fired,
+    "tick": _Run._tick,
+    "stored": _Run._stored,
+    "not-stored": _Run._not_stored,
+    "sealed": _Run._sealed,
+    "not-sealed": _Run._not_sealed,
+    "process": _Run._process,
+}
+
+
+def _on_disk(folder: Path, frame: FrameRecord) -> FrameRecord:
+    """The frame with the file as it lies there now."""
+    name = f"{frame.sensor}.tif"
+    try:
+        return replace(frame, file=name, sha256=hash_file(folder / name))
+    except OSError:
+        return replace(frame, file=name, sha256="missing")
+
+
+def _decode(
+    messages: Iterable[Message], configuration: Configuration, rig: Rig, out: ReplayResult
+) -> dict[int, Decoded]:
+    """What the codecs make of the logged bytes, by the message it takes the place of.
+
+    A record arrives when the flight's did; what it says comes from the bytes.
+    """
+    recorded: dict[str, list[RawBytes | DeviceEvent]] = defaultdict(list)
+    expected: dict[str, list[tuple[Message, Decoded]]] = defaultdict(list)
+    specs = {spec.name: spec for spec in device_specs(configuration, rig)}
+    probes = {
+        str(probe): spec.name
+        for spec in specs.values()
+        for probe in _listed(spec.settings.get("channels"))
+    }
+    for message in messages:
+        kind, _, name = message.topic.partition("/")
+        if kind == "raw":
+            recorded[name].append(RawBytes(name, message.mono_ns, message.payload))
+            continue
+        record = record_of(message)
+        if isinstance(record, DeviceEvent):
+            recorded[record.device].append(record)
+        elif isinstance(record, NavSample | EventMark):
+            expected[name].append((message, record))
+        elif isinstance(record, TemperatureSample):
+            expected[probes.get(name, "")].append((message, record))
+    decoded: dict[int, Decoded] = {}
+    for name, spec in specs.items():
+        has_bytes = any(isinstance(record, RawBytes) for record in recorded[name])
+        codec = codec_for(spec.kind, spec.driver, name, spec.settings) if has_bytes else None
+        if codec is None:
+            continue
+        what = f"records of {name}"
+        # A reading of a clock answers a question; when that was asked is not among the bytes.
+        found = [r for r in decode_all(codec, recorded[name]) if not isinstance(r, ClockReading)]
+        pairs = [
+            (message, original, replace(again, mono_ns=original.mono_ns))
+            for (message, original), again in zip(expected[name], found, strict=False)
+        ]
+        agree = [message_of(again).payload == message.payload for message, _, again in pairs]
+        first = 0 if has_first_bytes(recorded[name]) or True not in agree else agree.index(True)
+        if first:
+            out.sentences.append(
+                f"{what}: the log does not hold what {name} said before it was open, which early "
+                f"versions did not log; the first {first} after it are taken as logged"
+            )
+        for (message, original, again), agrees in zip(pairs[first:], agree[first:], strict=True):
+            sentence = f"{what}: {again} where the flight had {original}"
+            out.compare(what, agrees=agrees, sentence=sentence)
+            decoded[id(message)] = again
+        # The last bytes may have been decoded after the log was closed.
+        short = len(expected[name]) - len(found)
+        if short > 0:
+            out.disagreements[what] += short
+            out.sentences.append(f"{what}: {short} of {len(expected[name])} are not in its bytes")
+    return decoded
+
+
+def _listed(value: object) -> tuple[object, ...]:
+    return tuple(value) if isinstance(value, list | tuple) else ()

@@ -1,0 +1,501 @@
+"""A GenICam head through Aravis: found, run, lost, and found again.
+
+Features are in `drivers.cameras.aravis.camera`, frames in `drivers.cameras.aravis.stream`.
+"""
+
+from __future__ import annotations
+
+import gc
+import threading
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Final
+
+from drivers.cameras.aravis.camera import AravisCamera, ClockLatch, ControlDeniedError
+from drivers.cameras.aravis.gvcp import (
+    ACTION_LATE,
+    DEFAULT_HEARTBEAT_S,
+    SUCCESS,
+    ActionKeys,
+    control_privilege,
+    heartbeat_timeout_s,
+    is_ip_address,
+    send_action,
+)
+from drivers.cameras.aravis.library import OPENING, aravis_error
+from drivers.cameras.aravis.settings import AravisSettings
+from drivers.cameras.aravis.stream import FrameStream, ReceivedFrame
+from drivers.cameras.head_device import HeadDevice
+from drivers.contract import (
+    DeviceError,
+    Frame,
+    FrameMemory,
+    FrameStatus,
+    LifeCycle,
+    Sink,
+)
+from drivers.timescales.clock import Clock
+
+POP_TIMEOUT_S: Final = 0.1
+PROBE_TIMEOUT_S: Final = 0.2
+PROBE_ATTEMPTS: Final = 3
+LOSS_GRACE_S: Final = 2.0
+"""A head that answers nothing for so long is lost; a pause of a second heals by itself."""
+CONTROL_WAIT_MARGIN_S: Final = 0.1
+TRIGGER_TIMEOUT_S: Final = 1.0
+CLOCK_DRIFT: Final = 100e-6
+"""How far a head's clock may run from the host's between two latches, as a part of the time."""
+NOT_FRAMES: Final = ("aborted", "cleared", "filling", "unknown")
+"""Buffers that come back empty when a stream ends."""
+
+
+class AravisHeadLostError(Exception):
+    """The head is gone; internal."""
+
+
+@dataclass
+class _Session:
+    """An opened head, from finding to losing it."""
+
+    camera: AravisCamera
+    stream: FrameStream
+    latch: ClockLatch | None = None
+    temperature_c: float | None = None
+    loss_suspected_ns: int | None = None
+    is_lost: bool = False
+
+
+class AravisHead(AravisSettings, HeadDevice):
+    """A GigE Vision or USB3 Vision head whose frames land in memory of the caller's.
+
+    Yields a Frame for every exposure of which at least a packet came: COMPLETE, INCOMPLETE where
+    packets are missing for good, CORRUPT where its size or format is not the configured one. A
+    frame that comes while all slots are taken is lost in Aravis and counted as an underrun.
+
+    Source: GenICam SFNC 2.7; GigE Vision 2.0. Quirks: docs/drivers/aravis.md.
+    """
+
+    kind: ClassVar = "head"
+    counted: ClassVar = (
+        *("frames", "frames_incomplete", "frames_corrupt", "underruns", "opened", "latches"),
+        "other_senders",
+    )
+
+    def __init__(
+        self,
+        name: str,
+        settings: Mapping[str, object],
+        *,
+        memory: FrameMemory,
+        clock: Clock | None = None,
+    ) -> None:
+        super().__init__(name, settings, memory=memory, clock=clock)
+        self._control = threading.Lock()
+        self._session: _Session | None = None
+        self._of_stream: Counter[str] = Counter()
+
+    def bind(self, sink: Sink | None = None) -> Mapping[str, str]:
+        """Open the head and write its settings; what was found. See `drivers.contract.Device`.
+
+        A hold by a dead controller is waited out; `sink` is told so.
+        """
+        self.emitter.sink = sink
+        try:
+            session = self._session or self._open()
+        finally:
+            self.emitter.sink = None
+        self._state = LifeCycle.BOUND
+        geometry = session.camera.geometry
+        return {
+            **session.camera.identity,
+            "frame": f"{geometry.width_px} x {geometry.height_px} {geometry.pixel_format}",
+            "packet_size": str(session.camera.frame_settings.get("GevSCPSPacketSize", "")),
+            "chunks": "yes" if session.camera.chunk_parser is not None else "no",
+            "clock": "no" if session.latch is None else f"+-{session.latch.sigma_ns / 1e3:.0f} us",
+            "temperature": ""
+            if session.temperature_c is None
+            else f"{session.temperature_c:.1f} degC",
+        }
+
+    def trigger(self) -> None:
+        """Software trigger or action command; from any thread. See `drivers.contract.Head`."""
+        if self.trigger_source == "line":
+            raise DeviceError(
+                f"{self.name}: the head waits for its line {self.trigger_line}; set "
+                'trigger_source = "software" to trigger it from here'
+            )
+        if self.trigger_source == "action":
+            self.send_action_command(None)
+            return
+        if not self._control.acquire(timeout=TRIGGER_TIMEOUT_S):
+            raise DeviceError(f"{self.name}: the head was busy for {TRIGGER_TIMEOUT_S:g} s; wait")
+        try:
+            session = self._session
+            if session is None or self._state is not LifeCycle.ACTIVE:
+                raise DeviceError(f"{self.name}: the head is not running; wait for it to be opened")
+            session.camera.software_trigger()
+        except aravis_error() as error:
+            raise DeviceError(
+                f"{self.name}: the software trigger was refused ({error}); see whether the head "
+                "is lost"
+            ) from None
+        finally:
+            self._control.release()
+
+    def adjust(self, exposure_time_us: float, gain_db: float, tdi_shifts: int) -> None:
+        """Expose with this from now on, also when the head is opened again."""
+        wanted = {
+            "exposure_time_us": exposure_time_us,
+            "gain_db": gain_db,
+            "tdi_shifts": tdi_shifts,
+        }
+        if not self._control.acquire(timeout=TRIGGER_TIMEOUT_S):
+            raise DeviceError(f"{self.name}: the head was busy for {TRIGGER_TIMEOUT_S:g} s; wait")
+        try:
+            session = self._session
+            if session is None or self._state is not LifeCycle.ACTIVE:
+                raise DeviceError(f"{self.name}: the head is not running; wait for it to be opened")
+            session.camera.adjust(exposure_time_us, gain_db, tdi_shifts)
+            self.configured = {**self.configured, **wanted}
+        finally:
+            self._control.release()
+
+    def statistics(self) -> Mapping[str, int]:
+        """Frames by status and reason, underruns, packets missing and resent, openings."""
+        found = self.counters + self._of_stream
+        names = self.counters.keys() | self._of_stream.keys()
+        return {name: found[name] for name in sorted(names)}
+
+    def send_action_command(self, device_ns: int | None) -> None:
+        """Give this head an action command, at once or for a time of its clock; from any thread.
+
+        Raises:
+            DeviceError: it does not answer, is not meant, or the time is past.
+        """
+        if self.trigger_source != "action":
+            raise DeviceError(
+                f"{self.name}: the head waits for its {self.trigger_source}; set trigger_source = "
+                '"action" to give it action commands'
+            )
+        if self._state is not LifeCycle.ACTIVE:
+            raise DeviceError(f"{self.name}: the head is not running; wait for it to be opened")
+        keys = ActionKeys(self.action_device_key, self.action_group_key, self.action_group_mask)
+        status = send_action(self.address, keys, device_ns=device_ns, timeout_s=TRIGGER_TIMEOUT_S)
+        if status == ACTION_LATE:
+            self.counters["actions_late"] += 1
+            raise DeviceError(
+                f"{self.name}: the action command came after its time; lengthen lead_ms"
+            )
+        if status != SUCCESS:
+            status_text = "no answer" if status is None else f"status 0x{status:04x}"
+            raise DeviceError(
+                f"{self.name}: the action command was not taken ({status_text}); see whether the head is "
+                "lost or another program has changed its keys"
+            )
+        self.counters["actions"] += 1
+
+    def clock_at(self, mono_ns: int) -> tuple[int, int] | None:
+        """The head's clock at a host time near now, and its sigma; None while it is not known."""
+        session = self._session
+        latch = None if session is None else session.latch
+        if latch is None:
+            return None
+        away_ns = mono_ns - latch.mono_ns
+        drift_ns = round(abs(away_ns) * CLOCK_DRIFT)
+        return latch.device_clock_ns + away_ns, latch.sigma_ns + drift_ns
+
+    # Finding
+
+    def _open_device(self) -> None:
+        if self._session is None:
+            self._open()
+
+    def _opened_sentence(self) -> str:
+        return f"The head {self.name} is open at {self.address}; nothing to do."
+
+    def _event_for(self, error: DeviceError) -> str:
+        return "held-by-another" if isinstance(error, ControlDeniedError) else "lost"
+
+    def _open(self) -> _Session:
+        """Open the head, waiting out whoever holds it. DeviceError where that is in vain."""
+        deadline_ns = self.clock.mono_ns() + round(self.control_wait_limit_s * 1e9)
+        held = self._is_controlled_by_other()
+        reported_settings = False
+        while not self._closing.is_set():
+            if not held:
+                try:
+                    return self._open_now()
+                except ControlDeniedError:
+                    held = True
+            if not reported_settings:
+                reported_settings = True
+                self.emitter.emit(
+                    "held-by-another",
+                    f"The head {self.name} at {self.address} is still held by another controller. "
+                    f"If that one is dead the head lets go by itself; it is waited for up to "
+                    f"{self.control_wait_limit_s:g} s.",
+                )
+            if self.clock.mono_ns() > deadline_ns:
+                raise ControlDeniedError(
+                    f"{self.name} at {self.address}: another program has held the head for "
+                    f"{self.control_wait_limit_s:g} s, so it is alive; end that program"
+                )
+            # In one go and without a question in between, which might count as a sign of life of
+            # the dead controller. Whether the head has let go only taking control can tell: some
+            # leave the register as it was.
+            left_s = (deadline_ns - self.clock.mono_ns()) * 1e-9
+            pause_s = self._heartbeat_s() + CONTROL_WAIT_MARGIN_S
+            self.clock.wait(self._closing, max(0.0, min(pause_s, left_s)) + CONTROL_WAIT_MARGIN_S)
+            held = False
+        raise DeviceError(f"{self.name}: closed while it was being opened; nothing to do")
+
+    def _is_controlled_by_other(self) -> bool:
+        if not is_ip_address(self.address):
+            return False
+        for _ in range(PROBE_ATTEMPTS):
+            privilege = control_privilege(self.address, timeout_s=PROBE_TIMEOUT_S)
+            if privilege is not None:
+                return privilege != 0
+            if self._closing.is_set():
+                break
+        raise DeviceError(
+            f"{self.name}: nothing answers at {self.address}; check the head's power, cable and "
+            "address"
+        )
+
+    def _heartbeat_s(self) -> float:
+        if not is_ip_address(self.address):
+            return DEFAULT_HEARTBEAT_S
+        return heartbeat_timeout_s(self.address, timeout_s=PROBE_TIMEOUT_S)
+
+    def _open_now(self) -> _Session:
+        camera = None
+        with OPENING, self._control:
+            try:
+                camera = AravisCamera(self.name, self)
+                with self._slots:
+                    free = [
+                        s for s in range(self._memory.slot_count) if s not in self._slots_in_use
+                    ]
+                    session = _Session(camera, FrameStream(camera, self, self._memory, free))
+                    self._session = session
+                session.latch = camera.latch()
+                session.temperature_c = camera.temperature_c()
+            except ControlDeniedError:
+                raise
+            except DeviceError as error:
+                message = str(error)
+            except aravis_error() as error:
+                message = (
+                    f"{self.name} at {self.address}: {error}; check the head's power and cable"
+                )
+            else:
+                self.counters["opened"] += 1
+                return session
+        self._release_device()
+        if camera is not None:
+            camera.release()
+        gc.collect()
+        raise DeviceError(message)
+
+    # Running
+
+    def _serve(self, sink: Sink) -> None:
+        """Deliver until closing or loss, then drop everything that belongs to this opening."""
+        session = self._session
+        if session is None:
+            return
+        reason = ""
+        try:
+            with self._control:
+                session.camera.start()
+            self._state = LifeCycle.ACTIVE
+            self._deliver(session, sink)
+        except (AravisHeadLostError, aravis_error()) as error:
+            reason = str(getattr(error, "message", error))
+        if reason:
+            self._state = LifeCycle.INACTIVE
+            session.is_lost = True
+            self.emitter.emit(
+                "lost",
+                f"The head {self.name} at {self.address} was lost ({reason}). Check its power and "
+                "cable; it is opened again by itself.",
+                fault=True,
+            )
+        elif is_ip_address(self.address):
+            alive = control_privilege(self.address, timeout_s=PROBE_TIMEOUT_S)
+            session.is_lost = alive is None
+        self._release_device()
+
+    def _deliver(self, session: _Session, sink: Sink) -> None:
+        next_check_ns = self.clock.mono_ns()
+        while not self._closing.is_set():
+            received = session.stream.pop(POP_TIMEOUT_S)
+            if received is not None:
+                self._deliver_frame(session, received, sink)
+            self._count(session)
+            if session.camera.has_lost_control:
+                raise AravisHeadLostError("it no longer takes our heartbeat")
+            if self.clock.mono_ns() >= next_check_ns:
+                healthy = self._check(session)
+                pause_s = self.latch_interval_s if healthy else 0.0
+                next_check_ns = self.clock.mono_ns() + round(pause_s * 1e9)
+
+    def _deliver_frame(self, session: _Session, received: ReceivedFrame, sink: Sink) -> None:
+        now_ns = self.clock.mono_ns()
+        status = _status(session.camera, received)
+        reason = received.reason.replace("-", "_")
+        if status is None:
+            self.counters[f"buffers_{reason}"] += 1
+            session.stream.queue_slot(received.slot)
+            return
+        if status is FrameStatus.COMPLETE:
+            self.counters["frames"] += 1
+        else:
+            self.counters[f"frames_{status.value}"] += 1
+            self.counters[f"{status.value}_{reason}"] += 1
+        if status is not FrameStatus.CORRUPT:
+            session.stream.unpack(received.slot)
+        self._mark_in_use(received.slot)
+        sink(self._frame(session, received, status, now_ns))
+
+    def _frame(
+        self, session: _Session, received: ReceivedFrame, status: FrameStatus, now_ns: int
+    ) -> Frame:
+        camera, latch = session.camera, session.latch
+        geometry = camera.geometry
+        if received.chunk_timestamp is not None:
+            device_ns: int | None = camera.ns_from_ticks(received.chunk_timestamp)
+        else:
+            device_ns = received.leader_ns or None
+        exposure_us = received.chunk_exposure_us
+        return Frame(
+            head=self.name,
+            slot=received.slot,
+            status=status,
+            frame_id=received.frame_id
+            if received.chunk_frame_id is None
+            else received.chunk_frame_id,
+            counter=received.chunk_counter,
+            width_px=geometry.width_px if received.width_px is None else received.width_px,
+            height_px=geometry.height_px if received.height_px is None else received.height_px,
+            pixel_format=geometry.pixel_format
+            if received.pixel_format_code in (None, geometry.pixel_format_code)
+            else f"0x{received.pixel_format_code:08x}",
+            device_ns=device_ns,
+            device_clock_ns=None if latch is None else latch.device_clock_ns,
+            device_clock_mono_ns=None if latch is None else latch.mono_ns,
+            latch_sigma_ns=None if latch is None else latch.sigma_ns,
+            mono_ns=now_ns,
+            exposure_time_us=camera.exposure_time_us if exposure_us is None else exposure_us,
+            temperature_c=session.temperature_c
+            if received.chunk_temperature_c is None
+            else received.chunk_temperature_c,
+            settings=_exposure_settings(camera.settings_of(exposure_us), received),
+        )
+
+    def _check(self, session: _Session) -> bool:
+        """Read clock and temperature; False while the head does not answer.
+
+        Raises:
+            AravisHeadLostError: it has not answered for two seconds, or no longer knows us.
+        """
+        if is_ip_address(self.address):
+            privilege = control_privilege(self.address, timeout_s=PROBE_TIMEOUT_S)
+            now_ns = self.clock.mono_ns()
+            if privilege is None:
+                if session.loss_suspected_ns is None:
+                    session.loss_suspected_ns = now_ns
+                if now_ns - session.loss_suspected_ns > LOSS_GRACE_S * 1e9:
+                    raise AravisHeadLostError(f"it has not answered for {LOSS_GRACE_S:g} s")
+                return False
+            session.loss_suspected_ns = None
+            if privilege == 0:
+                raise AravisHeadLostError("it has been restarted")
+        with self._control:
+            session.latch = session.camera.latch()
+            session.temperature_c = session.camera.temperature_c()
+            if session.latch is None and session.temperature_c is None:
+                session.camera.check_alive()
+        self.counters["latches"] += session.latch is not None
+        return True
+
+    def _count(self, session: _Session) -> None:
+        before, now = self._of_stream, session.stream.counted()
+        now["other_senders"] += session.camera.other_senders()
+        self._of_stream = now
+        if now["underruns"] > before["underruns"]:
+            self._report_underrun()
+        if now["other_senders"] > before["other_senders"]:
+            self._report_other_senders(session, now["other_senders"])
+        if session.stream.restart_if_behind():
+            self.emitter.emit_throttled(
+                "stream-restarted",
+                f"The head {self.name} numbered its frames out of order, so that they were dropped "
+                "as old. The stream was restarted; one exposure may miss its frame. Check the "
+                "head's power supply and firmware.",
+            )
+
+    def _report_other_senders(self, session: _Session, count: int) -> None:
+        details = session.stream.others or f"only {self.address} is accepted"
+        self.emitter.emit_throttled(
+            "other-sender",
+            f"{count} datagrams of other senders came to the ports of head {self.name} and were "
+            f"dropped, {details}. Disconnect the other sender, or give the heads a network of "
+            "their own.",
+        )
+
+    # Letting go
+
+    def _slot_returned(self, slot: int) -> None:
+        if self._session is not None:
+            self._session.stream.queue_slot(slot)
+
+    def _release_device(self) -> None:
+        with self._slots:
+            session, self._session = self._session, None
+        if session is None:
+            return
+        self.counters.update(self._of_stream)
+        self._of_stream = Counter()
+        if session.is_lost and self._closing.is_set():
+            # Aravis asks a dead head three times to let go, 2.5 s each; closing does not wait.
+            threading.Thread(
+                target=self._close_session, args=(session,), name=f"{self.name}-let-go", daemon=True
+            ).start()
+        else:
+            self._close_session(session)
+
+    def _close_session(self, session: _Session) -> None:
+        with self._control:
+            if not session.is_lost:
+                session.camera.stop()
+            session.stream.close()
+            session.camera.release()
+            gc.collect()
+
+
+def _exposure_settings(
+    settings: Mapping[str, float | int | str], received: ReceivedFrame
+) -> Mapping[str, float | int | str]:
+    """The head's settings, with what it wrote behind the pixels of this frame."""
+    reported_settings = {"ExposureTime": received.chunk_exposure_us, "Gain": received.chunk_gain}
+    return {
+        **settings,
+        **{key: value for key, value in reported_settings.items() if value is not None},
+    }
+
+
+def _status(camera: AravisCamera, received: ReceivedFrame) -> FrameStatus | None:
+    """What a returned buffer is worth; None where it holds no frame at all."""
+    if received.reason in NOT_FRAMES:
+        return None
+    if received.reason == "size-mismatch":
+        return FrameStatus.CORRUPT
+    if received.reason != "success":
+        return FrameStatus.INCOMPLETE
+    geometry = camera.geometry
+    found = (received.width_px, received.height_px, received.pixel_format_code)
+    configured = (geometry.width_px, geometry.height_px, geometry.pixel_format_code)
+    return FrameStatus.COMPLETE if found == configured else FrameStatus.CORRUPT

@@ -1,0 +1,40 @@
+"""A head opened through Aravis by its address alone, whatever has answered discovery."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from drivers.cameras.aravis.library import aravis, aravis_error, inet_address, message_of
+from drivers.cameras.aravis.packet_filter import interface_towards
+from drivers.contract import DeviceError
+
+
+def local_interface(head_name: str, address: str) -> str:
+    """The address of this computer's interface towards a head. DeviceError: there is none."""
+    try:
+        return interface_towards(address)
+    except OSError as error:
+        raise DeviceError(
+            f"{head_name}: no interface of this computer reaches it ({error}); check the network's "
+            "settings and cable"
+        ) from None
+
+
+def open_camera(head_name: str, interface: str, address: str) -> Any:
+    """The camera of Aravis at an IP address; without an interface, by its name.
+
+    Raises:
+        DeviceError: it does not answer.
+    """
+    library, failed = aravis(), aravis_error()
+    try:
+        if not interface:
+            return library.Camera.new(address)
+        # Not by name: Aravis would take the address from whatever has answered its discovery.
+        gio = inet_address()
+        device = library.GvDevice.new(gio.new_from_string(interface), gio.new_from_string(address))
+        return library.Camera.new_with_device(device)
+    except failed as error:
+        raise DeviceError(
+            f"{head_name}: the head cannot be opened ({message_of(error)}); check power, cable and address"
+        ) from None

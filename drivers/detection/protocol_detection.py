@@ -1,0 +1,144 @@
+"""What speaks, by what was heard: every decoder listens at once, and the messages decide.
+
+Which ports are listened to, and how fast, is in `drivers.detection.port_search`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from drivers.contract import DeviceError
+from drivers.detection.line_format import line_format_of
+from drivers.receivers.fix_monitor import fix_description
+from drivers.receivers.mavlink.decoder import MavlinkDecoder
+from drivers.receivers.mavlink.navigator import MavlinkNavigator
+from drivers.receivers.message_decoder import MessageDecoder
+from drivers.receivers.nmea.decoder import NmeaDecoder
+from drivers.receivers.nmea.navigator import NmeaNavigator
+from drivers.receivers.novatel.decoder import NovatelDecoder
+from drivers.receivers.novatel.navigator import NovatelNavigator
+from drivers.receivers.septentrio.decoder import SbfDecoder
+from drivers.receivers.septentrio.navigator import SeptentrioNavigator
+from drivers.receivers.streaming_navigator import StreamingNavigator
+from drivers.receivers.ublox.decoder import UbxDecoder
+from drivers.receivers.ublox.navigator import UbloxNavigator
+
+TEXT_BUFFER_NBYTES: Final = 20_000
+_GPSD: Final = re.compile(rb'(^|\n)\{"class": ?"VERSION", ?"release":')
+MIN_MESSAGES: Final = 2
+"""So many undamaged messages are no accident; one is, in enough noise."""
+
+
+@dataclass(frozen=True)
+class DetectedDevice:
+    """Who speaks: `driver` for it, what was `heard`, and what is `missing` for a flight."""
+
+    kind: str
+    driver: str
+    protocol: str
+    received: str
+    missing: str = ""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _ProtocolCandidate:
+    driver: str
+    navigator: type[StreamingNavigator]
+    new: Callable[[str], MessageDecoder]
+
+
+# Binary protocols first: their receivers often send NMEA beside them, and mean it less.
+_PROTOCOL_CANDIDATES: Final = (
+    _ProtocolCandidate("ublox", UbloxNavigator, UbxDecoder),
+    _ProtocolCandidate("septentrio", SeptentrioNavigator, SbfDecoder),
+    _ProtocolCandidate("novatel", NovatelNavigator, NovatelDecoder),
+    _ProtocolCandidate("mavlink", MavlinkNavigator, MavlinkDecoder),
+    _ProtocolCandidate("nmea", NmeaNavigator, NmeaDecoder),
+)
+
+
+class ProtocolDetector:
+    """What has been heard on one port at one speed."""
+
+    def __init__(self) -> None:
+        self.nbytes = 0
+        self._text = b""
+        self._decoders: list[tuple[_ProtocolCandidate, MessageDecoder]] = []
+        for candidate in _PROTOCOL_CANDIDATES:
+            try:
+                self._decoders.append((candidate, candidate.new("found")))
+            except DeviceError:
+                # A library that is not installed: that protocol cannot be recognised.
+                continue
+
+    @property
+    def has_messages(self) -> bool:
+        """Whether anything made sense so far: it is worth listening on."""
+        return any(decoder.frames for _, decoder in self._decoders) or self.looks_like_text
+
+    @property
+    def looks_like_text(self) -> bool:
+        text = self._text.translate(None, b"\x00")
+        printable = sum(32 <= byte < 127 or byte in b"\t\r\n\xb0" for byte in text)
+        return len(text) > 8 and printable >= 0.98 * len(text)
+
+    def feed(self, data: bytes, mono_ns: int) -> None:
+        self.nbytes += len(data)
+        self._text = (self._text + data)[-TEXT_BUFFER_NBYTES:]
+        for _, decoder in self._decoders:
+            decoder.feed(data, mono_ns)
+
+    def is_certain(self, *, has_listened_long_enough: bool) -> bool:
+        """Whether more listening would change nothing.
+
+        Text may be what a receiver says beside its binary messages: until it has settled, only
+        these decide.
+        """
+        detected = self.detected()
+        if detected is None or detected.missing:
+            return False
+        return has_listened_long_enough or detected.driver not in ("nmea", "ascii-line", "gpsd")
+
+    def detected(self) -> DetectedDevice | None:
+        """Who it is, by what was heard so far."""
+        for candidate, decoder in self._decoders:
+            if any(decoder.seen[name] for name in candidate.navigator.required):
+                return _detected_device(candidate, decoder, missing="")
+        for candidate, decoder in self._decoders:
+            if decoder.frames >= MIN_MESSAGES:
+                wanted = " or ".join(candidate.navigator.required)
+                return _detected_device(candidate, decoder, missing=wanted)
+        return self._detected_text_device()
+
+    def _detected_text_device(self) -> DetectedDevice | None:
+        if _GPSD.search(self._text):
+            return DetectedDevice("navigator", "gpsd", "gpsd", "its greeting")
+        if not self.looks_like_text:
+            return None
+        lines = line_format_of(self._text)
+        if lines is None:
+            return None
+        received = f"lines such as {lines.example!r}"
+        if lines.pattern is None:
+            missing = "a pattern: the lines differ, see docs/drivers/ascii-line.md"
+            return DetectedDevice("thermometer", "ascii-line", "lines of text", received, missing)
+        channels = [str(number) for number in range(lines.readings)]
+        settings = {"pattern": lines.pattern, "channels": channels}
+        return DetectedDevice(
+            "thermometer", "ascii-line", "lines of text", received, settings=settings
+        )
+
+
+def _detected_device(
+    candidate: _ProtocolCandidate, decoder: MessageDecoder, *, missing: str
+) -> DetectedDevice:
+    received = ", ".join(sorted(decoder.seen)) or f"{decoder.frames} messages of no use here"
+    if decoder.fix is not None:
+        received += f"; {fix_description(decoder.fix, decoder.satellites)}"
+    return DetectedDevice(
+        "navigator", candidate.driver, candidate.navigator.protocol, received, missing
+    )

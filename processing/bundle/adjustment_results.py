@@ -1,0 +1,258 @@
+"""What a person wants to know of an adjustment: parameters with their sigmas, checks, residuals.
+
+Everything is derived from an `Adjustment`; nothing is adjusted here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.bundle.adjust import Adjustment
+from processing.bundle.network import INTERIOR
+from processing.bundle.rotations import angles_by_rotation_vector, omega_phi_kappa
+from processing.bundle.terms import UNITS
+
+Array = NDArray[np.float64]
+
+HIGH_CORRELATION = 0.95
+SIGNIFICANT_T = 2.0
+
+
+@dataclass(frozen=True)
+class EstimatedParameter:
+    """One parameter of interior orientation, in `unit`; `t` is |value| / sigma.
+
+    `correlated` names parameters of the same camera with a correlation beyond 0.95.
+    """
+
+    camera: str
+    name: str
+    unit: str
+    value: float
+    sigma: float
+    t: float
+    high_correlations: tuple[tuple[str, float], ...]
+
+    @property
+    def is_insignificant(self) -> bool:
+        """Not significant, or hardly to be told from another: may be left out."""
+        return self.t < SIGNIFICANT_T or bool(self.high_correlations)
+
+
+@dataclass(frozen=True)
+class AdjustedOrientation:
+    """Position (3,) m and omega, phi, kappa (3,) rad with standard deviations; NaN where held."""
+
+    name: str
+    position_m: Array
+    position_sigma_m: Array
+    angles_rad: Array
+    angles_sigma_rad: Array
+
+
+@dataclass(frozen=True)
+class PointDifferences:
+    """Differences (adjusted less given) at `names` (n, 3) m, and their predicted sigmas (n, 3).
+
+    `squares` is the mean of the differences' squares in their own covariances: 1 when prediction
+    and truth agree.
+    """
+
+    names: tuple[str, ...]
+    difference_m: Array
+    sigma_m: Array
+    squares: float
+
+    @property
+    def rms_m(self) -> Array:
+        """(3,)."""
+        return np.asarray(np.sqrt(np.mean(self.difference_m**2, axis=0)))
+
+    @property
+    def predicted_m(self) -> Array:
+        """(3,) root mean square of the predicted sigmas."""
+        return np.asarray(np.sqrt(np.mean(self.sigma_m**2, axis=0)))
+
+
+@dataclass(frozen=True)
+class ResidualPattern:
+    """Mean image residuals by cells: places (n, 2) mm, means (n, 2) mm, counts (n,)."""
+
+    places_mm: Array
+    mean_mm: Array
+    count: NDArray[np.int64]
+
+
+def parameters_of(result: Adjustment) -> tuple[EstimatedParameter, ...]:
+    """Estimated interior orientation and additional parameters of every camera."""
+    found = []
+    for index, camera in enumerate(result.network.cameras):
+        columns = np.concatenate([result.layout.interior[index], result.layout.terms[index]])
+        values = np.concatenate([result.state.interior[index], result.state.terms[index]])
+        names = [*INTERIOR, *(t.name for t in camera.terms)]
+        units = [_unit(name) for name in INTERIOR] + [UNITS[t.kind] for t in camera.terms]
+        free = np.flatnonzero(columns >= 0)
+        own = result.cofactor[np.ix_(columns[free], columns[free])]
+        spread = np.sqrt(np.clip(np.diag(own), 1e-300, None))
+        correlation = own / spread[:, None] / spread
+        for k, at in enumerate(free):
+            unit, factor = units[at]
+            sigma = float(spread[k]) * result.sigma0
+            high = [
+                (names[free[j]], float(correlation[k, j]))
+                for j in range(len(free))
+                if j != k and abs(correlation[k, j]) > HIGH_CORRELATION
+            ]
+            found.append(
+                EstimatedParameter(
+                    camera.name,
+                    names[at],
+                    unit,
+                    float(values[at]) * factor,
+                    sigma * factor,
+                    abs(float(values[at])) / sigma if sigma > 0.0 else math.inf,
+                    tuple(high),
+                )
+            )
+    return tuple(found)
+
+
+def exposures_of(result: Adjustment) -> tuple[AdjustedOrientation, ...]:
+    """Projection centre and angles of every image's station and attitude, image by image."""
+    images, layout = result.network.images, result.layout
+    found = []
+    angles = omega_phi_kappa(result.state.attitude)
+    by_vector = angles_by_rotation_vector(result.state.attitude)
+    for k, name in enumerate(images.names):
+        s, a = images.station[k], images.attitude[k]
+        found.append(
+            AdjustedOrientation(
+                name,
+                result.state.station[s],
+                _sigmas(result, layout.station[s], np.eye(3)),
+                angles[a],
+                _sigmas(result, layout.attitude[a], by_vector[a]),
+            )
+        )
+    return tuple(found)
+
+
+def heads_of(result: Adjustment) -> tuple[AdjustedOrientation, ...]:
+    """Relative orientation of every head."""
+    angles = omega_phi_kappa(result.state.head_rotation)
+    by_vector = angles_by_rotation_vector(result.state.head_rotation)
+    return tuple(
+        AdjustedOrientation(
+            head.name,
+            result.state.head_offset[k],
+            _sigmas(result, result.layout.head_offset[k], np.eye(3)),
+            angles[k],
+            _sigmas(result, result.layout.head_rotation[k], by_vector[k]),
+        )
+        for k, head in enumerate(result.network.heads)
+    )
+
+
+def check_point_differences(
+    result: Adjustment, names: Sequence[str], xyz_m: Array, sigma_m: Array
+) -> PointDifferences:
+    """Adjusted object points against independent coordinates (n, 3) with sigmas (n, 3), m.
+
+    NaN coordinates are not compared; points that took no part are passed over.
+    """
+    at = {name: index for index, name in enumerate(result.network.points.names)}
+    checked_names, differences, sigmas, squares, count = [], [], [], 0.0, 0
+    for name, given, own in zip(names, xyz_m, sigma_m, strict=True):
+        index = at.get(name)
+        if index is None or not np.isfinite(result.point_cofactor[index]).all():
+            continue
+        covariance = result.sigma0**2 * result.point_cofactor[index] + np.diag(
+            np.nan_to_num(own) ** 2
+        )
+        difference = result.state.points[index] - given
+        there = np.isfinite(given)
+        part = difference[there]
+        squares += float(part @ np.linalg.solve(covariance[np.ix_(there, there)], part))
+        count += int(there.sum())
+        checked_names.append(name)
+        differences.append(difference)
+        sigmas.append(np.sqrt(np.diag(covariance)))
+    return PointDifferences(
+        tuple(checked_names),
+        np.array(differences).reshape(-1, 3),
+        np.array(sigmas).reshape(-1, 3),
+        squares / count if count else math.nan,
+    )
+
+
+def control_residuals(result: Adjustment) -> PointDifferences:
+    """Adjusted less given coordinates of weighted control points (`sigma_m`: a priori)."""
+    sigma = result.network.points.sigma_m
+    rows = np.flatnonzero((np.nan_to_num(sigma) > 0.0).any(axis=1))
+    rows = rows[np.isfinite(result.point_cofactor[rows]).all(axis=(1, 2))]
+    difference = result.state.points[rows] - result.network.points.xyz_m[rows]
+    difference = np.where(np.nan_to_num(sigma[rows]) > 0.0, difference, np.nan)
+    weighted = difference / sigma[rows]
+    return PointDifferences(
+        tuple(result.network.points.names[k] for k in rows),
+        difference,
+        sigma[rows],
+        float(np.nanmean(weighted**2)) if weighted.size else math.nan,
+    )
+
+
+def image_residuals_mm(result: Adjustment) -> Array:
+    """Computed less measured of every image point (n, 2), NaN for what took no part."""
+    residual = np.full((len(result.network.image_points.image), 2), np.nan)
+    rows = result.equations
+    weight = np.sqrt(np.where(result.weight > 0.0, result.weight, 1.0))
+    for axis in range(2):
+        own = rows.group == axis
+        source = rows.source[own]
+        residual[source, axis] = result.residual[own] * rows.sigma[own] / weight[source]
+    return residual
+
+
+def systematic_residuals(
+    result: Adjustment, camera: int, cells: tuple[int, int]
+) -> ResidualPattern:
+    """Mean image residuals of one camera over a grid of (columns, rows) cells, as in Ladstädter
+    et al. (2010), fig. 10."""
+    table = result.network.image_points
+    residual = image_residuals_mm(result)
+    own = (result.network.images.camera[table.image] == camera) & np.isfinite(residual).all(axis=1)
+    xy, residual = table.xy_mm[own], residual[own]
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    index = np.clip(((xy - low) / (high - low) * cells).astype(int), 0, np.array(cells) - 1)
+    flat = index[:, 1] * cells[0] + index[:, 0]
+    count = np.bincount(flat, minlength=cells[0] * cells[1])
+    seen = count > 0
+    mean = np.stack(
+        [
+            np.bincount(flat, weights=residual[:, axis], minlength=len(count))[seen] / count[seen]
+            for axis in range(2)
+        ],
+        axis=1,
+    )
+    column, row = np.meshgrid(np.arange(cells[0]), np.arange(cells[1]))
+    centre = (np.stack([column.ravel(), row.ravel()], axis=1) + 0.5) / cells * (high - low) + low
+    return ResidualPattern(centre[seen], mean, count[seen])
+
+
+def _sigmas(result: Adjustment, columns: NDArray[np.int64], by: Array) -> Array:
+    if (columns < 0).any():
+        return np.full(3, np.nan)
+    covariance = by @ result.cofactor[np.ix_(columns, columns)] @ by.T
+    return np.asarray(result.sigma0 * np.sqrt(np.clip(np.diag(covariance), 0.0, None)))
+
+
+def _unit(name: str) -> tuple[str, float]:
+    powers = {"k1": "mm^-2", "k2": "mm^-4", "k3": "mm^-6", "p1": "mm^-1", "p2": "mm^-1"}
+    if name in powers:
+        return powers[name], 1.0
+    return ("mm", 1.0) if name in ("dx0", "dy0", "df") else ("1", 1.0)

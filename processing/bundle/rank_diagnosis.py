@@ -1,0 +1,167 @@
+"""What a network cannot determine, in words.
+
+Directions without information in the reduced normal matrix are compared with the seven motions of
+a whole block; what is left of them is told by the unknowns that take part.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from processing.bundle.network import Network
+from processing.bundle.normal_equations import MIN_INFORMATION, ReducedEquations, constrained_matrix
+from processing.bundle.unknowns import ParameterLayout, ParameterValues, Unknown
+
+Array = NDArray[np.float64]
+
+_SAME: Final = 1e-4
+_MIN_PARTICIPATION: Final = 0.02
+"""Share of a direction (in units of each unknown's own information) that is worth naming."""
+
+_MAX_NAMED: Final = 6
+
+_DATUM_MOTIONS: Final = (
+    ("position in X", "control points, GNSS positions or a fixed station would fix it"),
+    ("position in Y", "control points, GNSS positions or a fixed station would fix it"),
+    ("height", "control points, GNSS positions or a fixed station would fix it"),
+    ("tilt about X", "height control or GNSS positions away from one line would fix it"),
+    ("tilt about Y", "height control or GNSS positions away from one line would fix it"),
+    ("rotation about Z", "two control points or GNSS positions would fix it"),
+    ("scale", "a distance, two control points or GNSS positions would fix it"),
+)
+
+
+@dataclass(frozen=True)
+class RankDefect:
+    """One direction nothing determines: a sentence, and the unknowns in it with their shares."""
+
+    sentence: str
+    shares: tuple[tuple[str, float], ...]
+
+
+class RankDefectError(ValueError):
+    """A network with undetermined unknowns."""
+
+    def __init__(self, found: Sequence[RankDefect]) -> None:
+        self.rank_defects = tuple(found)
+        super().__init__("; ".join(defect.sentence for defect in found))
+
+
+def rank_defects(
+    network: Network,
+    layout: ParameterLayout,
+    state: ParameterValues,
+    reduced: ReducedEquations,
+    *,
+    singular: bool,
+) -> tuple[RankDefect, ...]:
+    """Name every direction of the unknowns that has no information.
+
+    Args:
+        network, layout, state: what was to be adjusted.
+        reduced: its reduced equations.
+        singular: they could not be solved, so that the weakest direction is at fault at least.
+    """
+    matrix, _ = constrained_matrix(reduced, layout.constraints)
+    values, vectors = linalg.eigh(matrix)
+    none = vectors[:, values < MIN_INFORMATION]
+    if not none.shape[1]:
+        if not singular:
+            return ()
+        none = vectors[:, :1]
+    found: list[RankDefect] = []
+    named: list[Array] = []
+    for (what, hint), motion in zip(_DATUM_MOTIONS, _datum_motions(layout, state), strict=True):
+        scaled = motion * reduced.scale
+        length = float(np.linalg.norm(scaled))
+        if length == 0.0:
+            continue
+        inside = none.T @ scaled / length
+        if 1.0 - float(inside @ inside) < _SAME:
+            found.append(RankDefect(f"{what} of the whole block cannot be determined: {hint}", ()))
+            named.append(inside)
+    if named:
+        none = none @ linalg.null_space(np.array(named))
+    found += [_sentence(direction, layout.unknowns) for direction in _separated(none).T]
+    return tuple(found)
+
+
+def _separated(basis: Array) -> Array:
+    """Directions of the same space that share as few unknowns as possible (pivoted reduction)."""
+    if not basis.shape[1]:
+        return basis
+    _, _, pivots = linalg.qr(basis.T, pivoting=True, mode="economic")
+    chosen = pivots[: basis.shape[1]]
+    separated = np.linalg.solve(basis[chosen].T, basis.T).T
+    return np.asarray(separated / np.linalg.norm(separated, axis=0))
+
+
+def _sentence(direction: Array, unknowns: Sequence[Unknown]) -> RankDefect:
+    share = direction**2 / float(direction @ direction)
+    by_kind: dict[tuple[str, str], float] = defaultdict(float)
+    owners: dict[tuple[str, str], list[str]] = defaultdict(list)
+    for column in np.argsort(-share):
+        unknown = unknowns[int(column)]
+        by_kind[unknown.kind, unknown.component] += float(share[column])
+        if share[column] > 1e-3 * share.max():
+            owners[unknown.kind, unknown.component].append(unknown.owner)
+    phrases: list[str] = []
+    shares: list[tuple[str, float]] = []
+    for key, value in sorted(by_kind.items(), key=lambda item: -item[1]):
+        if value < _MIN_PARTICIPATION or len(phrases) >= _MAX_NAMED:
+            continue
+        kind, component = key
+        who = owners[key]
+        phrases.append(
+            f"{component} of {kind} {who[0]}"
+            if len(who) == 1
+            else f"{component} of {len(who)} {_plural(kind)} ({', '.join(who[:3])}"
+            + (", ...)" if len(who) > 3 else ")")
+        )
+        shares.append((phrases[-1], value))
+    things = {(u.kind, u.owner) for u, part in zip(unknowns, share, strict=True) if part > 1e-3}
+    if len(phrases) > 1 and len(things) == 1 and next(iter(things))[0] != "camera":
+        kind, owner = next(iter(things))
+        sentence = f"{kind} {owner} cannot be determined: it has too few observations"
+    elif len(phrases) == 1:
+        sentence = f"{phrases[0]} cannot be determined: no observation depends on it"
+    else:
+        sentence = (
+            f"{' and '.join([', '.join(phrases[:-1]), phrases[-1]])} cannot be told apart: a change of "
+            "one is undone by the others; fix one of them or measure what parts them"
+        )
+    return RankDefect(sentence, tuple(shares))
+
+
+def _plural(kind: str) -> str:
+    return f"{kind}s"
+
+
+def _datum_motions(layout: ParameterLayout, state: ParameterValues) -> Array:
+    """Shifts, turns and scale of the whole block as corrections of the columns, (7, c)."""
+    motions = np.zeros((7, layout.columns))
+    used = layout.station.min(axis=1) >= 0 if layout.station.size else np.zeros(0, dtype=bool)
+    centre = state.station[used].mean(axis=0) if used.any() else np.zeros(3)
+
+    def put(row: int, columns: NDArray[np.int64], values: Array) -> None:
+        there = columns >= 0
+        motions[row, columns[there]] = np.broadcast_to(values, columns.shape)[there]
+
+    for axis in range(3):
+        unit = np.eye(3)[axis]
+        put(axis, layout.station, unit)
+        put(axis, layout.retained_points, unit)
+        put(3 + axis, layout.station, np.cross(unit, state.station - centre))
+        put(3 + axis, layout.retained_points, np.cross(unit, state.points - centre))
+        put(3 + axis, layout.attitude, np.einsum("nji,j->ni", state.attitude, unit))
+    put(6, layout.station, state.station - centre)
+    put(6, layout.retained_points, state.points - centre)
+    put(6, layout.head_offset, state.head_offset)
+    return motions

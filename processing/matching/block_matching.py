@@ -1,0 +1,337 @@
+"""Tie points across exposures: features of one image found in every other that overlaps it.
+
+Prediction by direct georeferencing and the height that earlier matches of the same point gave;
+correlation and least squares as in `processing.matching.patches`. Images flown the other way or
+crosswise are turned by quarters first, oblique ones brought to where the other stood and looked, by
+the plane of the ground. Views from too far apart are not matched.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.bundle.initial_values import intersect
+from processing.geometry.projective import apply_projective
+from processing.matching.patches import INTERPOLATION, MARGIN_PX, match_patches, select_features
+from processing.rig import VirtualImage
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Picture = NDArray[np.float32]
+Carry = Callable[[Array], Array]
+
+_OBLIQUE_COSINE: Final = math.cos(math.radians(20.0))
+"""Looking farther from the vertical, an image differs from its neighbour by more than a turn."""
+_SIMILAR_VIEW_COSINE: Final = math.cos(math.radians(35.0))
+"""Views farther apart show other sides of what stands on the ground."""
+
+
+@dataclass(frozen=True)
+class BlockMatching:
+    """How to match.
+
+    Attributes:
+        cells: columns and rows of the grid with one feature each.
+        window_px: side of the patches, odd.
+        first_search_px: around the prediction while the height of the ground is a plane's.
+        search_px: once a point's height is known from an earlier match.
+        min_correlation, min_peak_margin, max_sigma_px: what a match must reach.
+    """
+
+    cells: tuple[int, int] = (20, 14)
+    window_px: int = 19
+    first_search_px: int = 24
+    search_px: int = 8
+    min_correlation: float = 0.9
+    min_peak_margin: float = 0.1
+    max_sigma_px: float = 0.1
+
+
+@dataclass(frozen=True)
+class BlockTiePoints:
+    """Image points: image (n,), point (n,), pixels (n, 2); points are numbered from zero.
+
+    `tried` and `matched` count patches by pair of images.
+    """
+
+    image: Indices
+    point: Indices
+    px: Array
+    points: int
+    tried: dict[tuple[int, int], int]
+    matched: dict[tuple[int, int], int]
+
+
+def match_block(
+    load: Callable[[int], Picture],
+    image: VirtualImage,
+    station_m: Array,
+    rotation: Array,
+    ground_m: float,
+    settings: BlockMatching | None = None,
+    *,
+    progress: Callable[[int], None] = lambda _done: None,
+) -> BlockTiePoints:
+    """Match all overlapping images of a block.
+
+    Args:
+        load: an image's pixels, (h, w) float32, NaN without data.
+        image: their common geometry.
+        station_m: (n, 3) projection centres, any Cartesian frame with z up.
+        rotation: (n, 3, 3) from camera.
+        ground_m: height of the ground there, to begin with.
+        progress: told how many images are done.
+    """
+    settings = settings or BlockMatching()
+    half = settings.window_px // 2
+    cells = _cells(image, settings)
+    found: list[tuple[int, Indices, Array]] = []
+    tried: dict[tuple[int, int], int] = {}
+    matched: dict[tuple[int, int], int] = {}
+    count = 0
+    for k in range(len(station_m)):
+        here = load(k)
+        chosen = select_features(here, cells, half, 2, False)
+        places = np.round(chosen[chosen[:, 2] > 0.0][:, :2]).astype(np.int64)
+        others = _overlapping(image, station_m, rotation, ground_m, k)
+        if not len(places) or not others:
+            progress(k + 1)
+            continue
+        own = places.astype(np.float64)
+        rays = directions(image, rotation[k], own)
+        ground = station_m[k] + rays * ((ground_m - station_m[k, 2]) / rays[:, 2:])
+        known = np.zeros(len(places), dtype=bool)
+        seen = np.zeros(len(places), dtype=np.int64)
+        parts: list[tuple[Indices, int, Array]] = []
+        for j in others:
+            poses = ((station_m[k], rotation[k]), (station_m[j], rotation[j]))
+            attempted, at = _matched_in(
+                here, _rectified(load(j), image, *poses, ground_m), image, rotation[j], station_m[j],
+                places, ground, known, settings,
+            )  # fmt: skip
+            tried[k, j] = attempted
+            rows = np.flatnonzero(np.isfinite(at[:, 0]))
+            matched[k, j] = len(rows)
+            if not len(rows):
+                continue
+            parts.append((rows, j, at[rows]))
+            seen[rows] += 1
+            new = rows[~known[rows]]
+            ground[new] = _intersected(
+                (station_m[k], rays[new]),
+                (station_m[j], directions(image, rotation[j], at[new])),
+                ground[new],
+            )
+            known[new] = True
+        used = np.flatnonzero(seen > 0)
+        number = np.full(len(places), -1, dtype=np.int64)
+        number[used] = count + np.arange(len(used))
+        count += len(used)
+        found.append((k, number[used], own[used]))
+        found += [(j, number[rows], at) for rows, j, at in parts]
+        progress(k + 1)
+    which = [np.full(len(p), k, dtype=np.int64) for k, p, _ in found]
+    return BlockTiePoints(
+        np.concatenate([np.zeros(0, np.int64), *which]),
+        np.concatenate([np.zeros(0, np.int64), *(p for _, p, _ in found)]),
+        np.concatenate([np.zeros((0, 2)), *(at for _, _, at in found)]),
+        count,
+        tried,
+        matched,
+    )
+
+
+def image_mm(image: VirtualImage, px: Array) -> Array:
+    """Image coordinates (n, 2), mm, x right, y up, of pixels (n, 2)."""
+    return np.stack(
+        [
+            (px[:, 0] - (image.width_px - 1) / 2.0) * image.pitch_mm,
+            ((image.height_px - 1) / 2.0 - px[:, 1]) * image.pitch_mm,
+        ],
+        axis=1,
+    )
+
+
+def directions(image: VirtualImage, rotation: Array, px: Array) -> Array:
+    """Rays (n, 3) of pixels (n, 2), object axes."""
+    xy = image_mm(image, px)
+    return np.asarray(np.column_stack([xy, np.full(len(xy), -image.f_mm)]) @ rotation.T)
+
+
+def pixels_of(image: VirtualImage, station_m: Array, rotation: Array, xyz_m: Array) -> Array:
+    """Pixels (n, 2) where an image sees points (n, 3); NaN behind it."""
+    seen = (xyz_m - station_m) @ rotation
+    with np.errstate(all="ignore"):
+        xy = -image.f_mm * seen[:, :2] / seen[:, 2:]
+    xy[seen[:, 2] >= 0.0] = np.nan
+    return np.stack(
+        [
+            xy[:, 0] / image.pitch_mm + (image.width_px - 1) / 2.0,
+            (image.height_px - 1) / 2.0 - xy[:, 1] / image.pitch_mm,
+        ],
+        axis=1,
+    )
+
+
+def quarter_rotations(rotation: Array, other: Array) -> int:
+    """By how many quarters, counter-clockwise, another image is turned to lie like the first."""
+    between = rotation.T @ other
+    return round(math.atan2(between[1, 0], between[0, 0]) / (math.pi / 2.0)) % 4
+
+
+def rotated_px(px: Array, width: int, height: int, quarters: int) -> Array:
+    """Pixels (n, 2) of an image in that image turned by `np.rot90(image, quarters)`."""
+    column, row = px[:, 0], px[:, 1]
+    rotated = {
+        0: (column, row),
+        1: (row, width - 1 - column),
+        2: (width - 1 - column, height - 1 - row),
+        3: (height - 1 - row, column),
+    }[quarters]
+    return np.stack(rotated, axis=1)
+
+
+def plane_homography(
+    image: VirtualImage, here: tuple[Array, Array], there: tuple[Array, Array], ground_m: float
+) -> Array:
+    """There from here, (3, 3) on pixels, of level ground at a height; poses are place, rotation."""
+    pitch, middle = image.pitch_mm, ((image.width_px - 1) / 2.0, (image.height_px - 1) / 2.0)
+    right, up = -middle[0] * pitch, middle[1] * pitch
+    ray_from_px = np.array([[pitch, 0.0, right], [0.0, -pitch, up], [0.0, 0.0, -image.f_mm]])
+    # A ray d from S meets the ground at S + d (g - S_z) / d_z; d_z times that, less T d_z:
+    seen = np.outer(here[0] - there[0], [0.0, 0.0, 1.0]) + (ground_m - here[0][2]) * np.eye(3)
+    px_from_ray = np.linalg.inv(ray_from_px)
+    return np.asarray(px_from_ray @ there[1].T @ seen @ here[1] @ ray_from_px)
+
+
+def _rectified(
+    there: Picture,
+    image: VirtualImage,
+    own: tuple[Array, Array],
+    other: tuple[Array, Array],
+    ground_m: float,
+) -> tuple[Picture, Carry, Carry]:
+    """Another image so that about a shift is left to find, and pixels' way into it and back."""
+    height, width = there.shape
+    if min(own[1][2, 2], other[1][2, 2]) < _OBLIQUE_COSINE:
+        from_here = plane_homography(image, own, other, ground_m)
+        to_here = np.asarray(np.linalg.inv(from_here))
+        seen = cv2.warpPerspective(
+            there, from_here, (width, height), flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_CONSTANT, borderValue=math.nan,
+        )  # fmt: skip
+        return (
+            np.asarray(seen, np.float32),
+            partial(apply_projective, to_here),
+            partial(apply_projective, from_here),
+        )
+    quarters = quarter_rotations(own[1], other[1])
+    rotated = np.ascontiguousarray(np.rot90(there, quarters))
+    return (
+        rotated,
+        lambda px: rotated_px(px, width, height, quarters),
+        lambda px: rotated_px(px, rotated.shape[1], rotated.shape[0], (4 - quarters) % 4),
+    )
+
+
+def _matched_in(
+    here: Picture,
+    rectified: tuple[Picture, Carry, Carry],
+    image: VirtualImage,
+    rotation: Array,
+    station_m: Array,
+    places: Indices,
+    ground: Array,
+    known: NDArray[np.bool_],
+    settings: BlockMatching,
+) -> tuple[int, Array]:
+    """How many places were sought in another image, and where they are in it (n, 2), else NaN."""
+    rotated, into, back = rectified
+    seen = pixels_of(image, station_m, rotation, ground)
+    predicted = into(seen)
+    margin_px = settings.window_px // 2 + MARGIN_PX + 2
+    last = np.array([rotated.shape[1] - 1, rotated.shape[0] - 1])
+    inside = ((predicted > margin_px) & (predicted < last - margin_px)).all(axis=1)
+    own = np.array([image.width_px - 1, image.height_px - 1])
+    inside &= ((seen > margin_px) & (seen < own - margin_px)).all(axis=1)
+    limits = np.array([0, last[0], 0, last[1]], dtype=np.int64)
+    at = np.full((len(places), 2), np.nan)
+    for rows, search in (
+        (np.flatnonzero(inside & known), settings.search_px),
+        (np.flatnonzero(inside & ~known), settings.first_search_px),
+    ):
+        if not len(rows):
+            continue
+        result = match_patches(
+            here, rotated, places[rows], np.round(predicted[rows]).astype(np.int64), limits, 1,
+            settings.window_px // 2, search, False, INTERPOLATION,
+        )  # fmt: skip
+        good = (
+            (result[:, 7] > 0.0)
+            & (result[:, 4] <= settings.max_sigma_px)
+            & (result[:, 5] >= settings.min_correlation)
+            & (result[:, 6] >= settings.min_peak_margin)
+        )
+        # Both places moved by a part of a pixel; what counts is where the chosen pixel is.
+        moved = result[good, 2:4] - (result[good, :2] - places[rows[good]])
+        at[rows[good]] = back(moved)
+    return int(inside.sum()), at
+
+
+def _overlapping(
+    image: VirtualImage, station_m: Array, rotation: Array, ground_m: float, k: int
+) -> list[int]:
+    """Later images that see part of what image k does from about its side, the nearest first."""
+    c, r = np.meshgrid(
+        np.linspace(0, image.width_px - 1, 9), np.linspace(0, image.height_px - 1, 9)
+    )
+    rays = directions(image, rotation[k], np.stack([c.ravel(), r.ravel()], axis=1))
+    level = station_m[k] + rays * ((ground_m - station_m[k, 2]) / rays[:, 2:])
+    last = np.array([image.width_px - 1, image.height_px - 1])
+    found = []
+    for j in range(k + 1, len(station_m)):
+        if rotation[j][:, 2] @ rotation[k][:, 2] < _SIMILAR_VIEW_COSINE:
+            continue
+        at = pixels_of(image, station_m[j], rotation[j], level)
+        if ((at >= 0.0) & (at <= last)).all(axis=1).any():
+            found.append((float(np.linalg.norm(station_m[j] - station_m[k])), j))
+    return [j for _, j in sorted(found)]
+
+
+def _intersected(a: tuple[Array, Array], b: tuple[Array, Array], otherwise: Array) -> Array:
+    n = len(otherwise)
+    stations = np.concatenate([np.broadcast_to(a[0], (n, 3)), np.broadcast_to(b[0], (n, 3))])
+    point = np.concatenate([np.arange(n), np.arange(n)])
+    found, _ = intersect(n, point, stations, np.concatenate([a[1], b[1]]))
+    return np.where(np.isfinite(found), found, otherwise)
+
+
+def _cells(image: VirtualImage, settings: BlockMatching) -> NDArray[Any]:
+    margin_px = settings.window_px // 2 + MARGIN_PX + 4
+    columns = np.linspace(margin_px, image.width_px - margin_px, settings.cells[0] + 1).astype(
+        np.int64
+    )
+    rows = np.linspace(margin_px, image.height_px - margin_px, settings.cells[1] + 1).astype(
+        np.int64
+    )
+    return np.array(
+        [
+            (columns[c], columns[c + 1] - 1, rows[r], rows[r + 1] - 1)
+            for r in range(settings.cells[1])
+            for c in range(settings.cells[0])
+        ]
+    )
+
+
+def match_counts_by_line(block: BlockTiePoints, line: Sequence[str]) -> tuple[int, int]:
+    """How many matches join images of one line, and of different lines."""
+    along = sum(n for (a, b), n in block.matched.items() if line[a] == line[b])
+    return along, sum(block.matched.values()) - along

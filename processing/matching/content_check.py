@@ -1,0 +1,232 @@
+"""Do frames show the ground that the calibration expects in them?
+
+Texture that matches nowhere is no water: frames are swapped, of another exposure, turned or
+mirrored, or a head has moved farther than tie points are sought. Frames whose tie points fail are
+searched again farther away; what is found there moves the prediction, and what is not is named.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.geometry.placement import SensorPlacement, vip_mm_from_raw
+from processing.geometry.topology import exact_colour_ratio
+from processing.matching.patches import INTERPOLATION, MARGIN_PX, match_patches
+from processing.matching.texture import has_texture
+from processing.matching.tie_point_search import (
+    PAN_TO_PAN,
+    PairSearch,
+    TiePointSettings,
+    colour_searches,
+    pan_searches,
+    usable_pixels,
+)
+from processing.matching.tie_points import TiePoints
+from processing.quality.report import Figure
+from processing.rig import Rig
+
+Array = NDArray[np.float64]
+Frame = NDArray[Any]
+
+MIN_ATTEMPTED: Final = 40
+SUSPICIOUS_SHARE: Final = 0.25
+"""A frame of whose positions so few were matched is looked at again."""
+MIN_TEXTURED: Final = 100
+"""Textured positions of a band from which on no match with green is no accident."""
+MISMATCHED_SHARE: Final = 0.1
+"""A frame of whose textured positions so few were matched shows something else."""
+WIDE_SEARCH_PX: Final = 60
+WIDE_POINTS: Final = 60
+MIN_AGREEING: Final = 12
+AGREEING_PX: Final = 3.0
+
+
+@dataclass(frozen=True)
+class ContentCheck:
+    """Frames that do not show what they should, by sensor name.
+
+    `shifted_px` were found elsewhere, by so much in the VIP (x right, y up); `mismatched` were not
+    found although they have texture, with the number of textured positions that were tried.
+    """
+
+    shifted_px: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    mismatched: Mapping[str, int] = field(default_factory=dict)
+
+
+def check_content(
+    rig: Rig,
+    placements: Mapping[str, SensorPlacement],
+    frames: Mapping[str, Frame],
+    tie_points: TiePoints,
+    *,
+    settings: TiePointSettings | None = None,
+) -> ContentCheck:
+    """Look again at frames that hardly match any other.
+
+    Args:
+        rig: the camera.
+        placements: where the frames were expected.
+        frames: Level-1 words by sensor name.
+        tie_points: what was matched there.
+        settings: those it was matched with; None takes the defaults.
+    """
+    settings = settings or TiePointSettings()
+    attempted, found = _counts(tie_points)
+    suspicious = {
+        name
+        for name, count in attempted.items()
+        if count >= MIN_ATTEMPTED and found[name] < SUSPICIOUS_SHARE * count
+    }
+    if not suspicious:
+        return ContentCheck()
+    ratio = exact_colour_ratio(rig) or 1.0
+    searches = pan_searches(rig, placements, frames, settings)
+    searches += colour_searches(rig, placements, frames, settings, ratio)
+    tried = tie_points.counts()
+    textured = dict.fromkeys(suspicious, 0)
+    matched = dict.fromkeys(suspicious, 0)
+    shifts: dict[str, list[Array]] = {name: [] for name in suspicious}
+    for search in searches:
+        if not len(search.at_b) or search.pair[0] not in frames:
+            continue
+        for name in set(search.pair) & suspicious:
+            rough = _textured(rig, frames, search, settings)
+            if np.count_nonzero(rough) < MIN_AGREEING:
+                continue
+            textured[name] += int(np.count_nonzero(rough))
+            matched[name] += tried[search.pair]
+            other = search.pair[search.pair[0] == name]
+            if other not in suspicious or len(suspicious) == len(attempted):
+                shifts[name] += _wide_search_shifts(
+                    placements, frames, search, rough, settings, name
+                )
+    shifted, mismatched = {}, {}
+    for name in sorted(suspicious):
+        if textured[name] < MIN_ATTEMPTED or matched[name] >= MISMATCHED_SHARE * textured[name]:
+            continue
+        shift = _consensus_shift(shifts[name])
+        if shift is None:
+            mismatched[name] = textured[name]
+        else:
+            shifted[name] = shift
+    return ContentCheck(shifted, mismatched)
+
+
+def moved_placements(
+    placements: Mapping[str, SensorPlacement], check: ContentCheck, pitch_mm: float
+) -> dict[str, SensorPlacement]:
+    """Where frames are to be sought once more: the shifted ones where they were found."""
+    moved = dict(placements)
+    for name, (dx_px, dy_px) in check.shifted_px.items():
+        shift = np.eye(3)
+        shift[:2, 2] = dx_px * pitch_mm, dy_px * pitch_mm
+        moved[name] = dataclasses.replace(placements[name], layer=shift @ placements[name].layer)
+    return moved
+
+
+def content_figures(check: ContentCheck) -> dict[str, Figure]:
+    """The check in figures of the quality report."""
+    return {
+        "mismatched_sensors": ", ".join(check.mismatched) or None,
+        "mismatched_positions": max(check.mismatched.values(), default=None),
+        "shifted_sensors": ", ".join(check.shifted_px) or None,
+        "shifted_px": max(
+            (float(np.hypot(*shift)) for shift in check.shifted_px.values()), default=None
+        ),
+    }
+
+
+def _counts(tie_points: TiePoints) -> tuple[dict[str, int], dict[str, int]]:
+    """Positions tried and points matched, by sensor."""
+    attempted: dict[str, int] = {}
+    found: dict[str, int] = {}
+    counts = tie_points.counts()
+    for pair, tried in zip(tie_points.pairs, tie_points.attempted, strict=True):
+        for name in pair:
+            attempted[name] = attempted.get(name, 0) + tried
+            found[name] = found.get(name, 0) + counts[pair]
+    return attempted, found
+
+
+def _textured(
+    rig: Rig, frames: Mapping[str, Frame], search: PairSearch, settings: TiePointSettings
+) -> NDArray[np.bool_]:
+    """Which positions (n,) of a search have texture well above noise in both frames."""
+    window = settings.window_pp_px if search.kind == PAN_TO_PAN else settings.window_pc_px
+    a, b = (rig.sensor(name) for name in search.pair)
+    in_b = has_texture(frames[b.name], b, search.at_b, window)
+    if search.region is not None:
+        return in_b
+    middle = search.at_a + (search.step - 1) // 2
+    return in_b & has_texture(frames[a.name], a, middle, window * search.step)
+
+
+def _wide_search_shifts(
+    placements: Mapping[str, SensorPlacement],
+    frames: Mapping[str, Frame],
+    search: PairSearch,
+    textured: NDArray[np.bool_],
+    settings: TiePointSettings,
+    name: str,
+) -> list[Array]:
+    """How far points of frame `name` lie from where they are expected, px in the VIP."""
+    if search.region is not None:
+        return []
+    a, b = search.pair
+    to_pan = search.kind == PAN_TO_PAN
+    window = settings.window_pp_px if to_pan else settings.window_pc_px
+    reach = WIDE_SEARCH_PX // search.step
+    limits = np.array(usable_pixels(placements[b]), dtype=np.int64)
+    margin_px = window // 2 + MARGIN_PX + 1 + reach
+    inside = (
+        (search.at_b[:, 0] >= limits[0] + margin_px)
+        & (search.at_b[:, 0] <= limits[1] - margin_px)
+        & (search.at_b[:, 1] >= limits[2] + margin_px)
+        & (search.at_b[:, 1] <= limits[3] - margin_px)
+    )
+    rows = np.flatnonzero(textured & inside)
+    rows = rows[:: max(1, len(rows) // WIDE_POINTS)]
+    if not len(rows):
+        return []
+    found = match_patches(
+        frames[a],
+        frames[b],
+        np.ascontiguousarray(search.at_a[rows]),
+        np.ascontiguousarray(search.at_b[rows]),
+        limits,
+        search.step,
+        window // 2,
+        reach,
+        frames[a].dtype == np.uint16,
+        INTERPOLATION,
+    )
+    good = (
+        (found[:, 7] > 0.0)
+        & (found[:, 5] >= settings.min_correlation)
+        & (found[:, 6] >= settings.min_peak_margin)
+    )
+    differences = vip_mm_from_raw(placements[a], found[good, 0:2]) - vip_mm_from_raw(
+        placements[b], found[good, 2:4]
+    )
+    pitch_mm = placements[a].sensor.pitch_mm
+    # Frame a lies where its neighbour shows the ground: it goes by what it is off.
+    return [(-row if name == a else row) / pitch_mm for row in differences]
+
+
+def _consensus_shift(shifts: list[Array]) -> tuple[float, float] | None:
+    """The shift that most points have in common; None where too few have one."""
+    if len(shifts) < MIN_AGREEING:
+        return None
+    every = np.array(shifts)
+    near = np.abs(every[:, None] - every[None]).max(axis=2) < AGREEING_PX
+    best = near[int(np.argmax(near.sum(axis=1)))]
+    if np.count_nonzero(best) < max(MIN_AGREEING, 0.3 * len(every)):
+        return None
+    x, y = np.median(every[best], axis=0)
+    return float(x), float(y)

@@ -1,0 +1,177 @@
+"""Small windows of every frame on the same ground: their signal and their fine detail.
+
+PAN heads share strips only, but each place is seen by all colour heads too. PAN is reduced to the
+size of colour pixels. What follows for a head is in `processing.quality.local_sharpness` and
+`processing.quality.band_levels`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from processing.geometry.placement import SensorPlacement, raw_from_vip_mm, vip_mm_from_px
+from processing.geometry.topology import exact_colour_ratio
+from processing.radiometry.level1 import exposed_rows, level1_counts_per_dn
+from processing.rig import Rig, Sensor
+
+Array = NDArray[Any]
+
+WINDOWS: Final = (56, 36)
+"""Columns and rows of windows in the virtual image."""
+WINDOW_PX: Final = 16
+"""Side of a window, colour pixels."""
+_COLUMNS: Final = 10
+
+
+@dataclass(frozen=True)
+class CommonWindows:
+    """Windows (n) of all frames (f) on the same ground; NaN where a frame does not show one whole.
+
+    `names` are the frames, `pan` (f,) says which are of PAN heads. `place` (f, n, 2) is the centre
+    of a window as a share of its frame's width and height, `mean` (f, n) its signal in Level-1
+    counts, `noise` (f, n) the variance of a pixel that light and read-out explain. The rest is
+    along columns and along rows, (f, n, 2): `near` and `far` the mean squared differences of pixels
+    one and two apart, `curved` the mean square of the second difference, all three in pixels of
+    colour and less noise; `fine` that of neighbouring pixels of the frame itself.
+    """
+
+    names: tuple[str, ...]
+    pan: Array
+    place: Array
+    mean: Array
+    noise: Array
+    noise_reduced: Array
+    near: Array
+    far: Array
+    curved: Array
+    fine: Array
+
+
+def measure_common_windows(
+    rig: Rig, placements: Mapping[str, SensorPlacement], frames: Mapping[str, Array]
+) -> CommonWindows | None:
+    """Measure all frames in windows on an even grid of the virtual image.
+
+    Args:
+        rig: the camera.
+        placements: where the sensors lie, by name.
+        frames: Level-1 words by sensor name, (h, w) uint16. Those behind a colour filter array are
+            left out.
+
+    Returns:
+        None for a rig without a virtual image.
+    """
+    image = rig.virtual_image
+    if image is None:
+        return None
+    columns, rows = WINDOWS
+    x = (np.arange(columns) + 0.5) * image.width_px / columns
+    y = (np.arange(rows) + 0.5) * image.height_px / rows
+    vip_mm = vip_mm_from_px(image, np.stack([g.ravel() for g in np.meshgrid(x, y)], axis=1))
+    ratio = max(round(exact_colour_ratio(rig) or 1.0), 1)
+    pan = {s.name for cone in rig.pan_cones for s in cone.sensors}
+    sensors = [s for s in rig.sensors if s.name in frames and s.colour_filter_array == "none"]
+    measured = np.full((len(sensors), len(vip_mm), _COLUMNS), np.nan)
+    noise = np.full((len(sensors), len(vip_mm)), np.nan)
+    place = np.full((len(sensors), len(vip_mm), 2), np.nan)
+    steps = np.array([ratio if s.name in pan else 1 for s in sensors])
+    for k, sensor in enumerate(sensors):
+        at, inside = _inside(placements[sensor.name], vip_mm, steps[k] * WINDOW_PX // 2)
+        place[k, inside] = at / (sensor.width_px, sensor.height_px)
+        sums = np.empty((len(at), _COLUMNS))
+        corners = np.rint(at).astype(np.int64) - steps[k] * WINDOW_PX // 2
+        _window_sums(frames[sensor.name], corners, steps[k], WINDOW_PX, sums)
+        sums[sums[:, 9] == 0.0] = np.nan
+        measured[k, inside] = sums
+        noise[k, inside] = _variance(sensor, sums[:, 8])
+    reduced = noise / steps[:, None] ** 2
+    return CommonWindows(
+        names=tuple(s.name for s in sensors),
+        pan=np.array([s.name in pan for s in sensors], dtype=np.bool_),
+        place=place,
+        mean=measured[..., 8],
+        noise=noise,
+        noise_reduced=reduced,
+        near=measured[..., 0:2] - 2.0 * reduced[..., None],
+        far=measured[..., 2:4] - 2.0 * reduced[..., None],
+        curved=measured[..., 4:6] - 6.0 * reduced[..., None],
+        fine=measured[..., 6:8] - 2.0 * noise[..., None],
+    )
+
+
+def _inside(placement: SensorPlacement, vip_mm: Array, half_px: int) -> tuple[Array, Array]:
+    """Raw places (m, 2) of the windows that lie whole in a frame, and which (n,) those are."""
+    sensor = placement.sensor
+    first, last = exposed_rows(sensor, placement.tdi_shifts)
+    with np.errstate(invalid="ignore"):
+        at = raw_from_vip_mm(placement, vip_mm)
+        inside = (at[:, 0] > half_px) & (at[:, 0] < sensor.width_px - half_px - 1)
+        inside &= (at[:, 1] > first + half_px) & (at[:, 1] < last - half_px)
+    return at[inside], inside
+
+
+def _variance(sensor: Sensor, signal: Array) -> Array:
+    """Variance of a pixel by photons and read-out, Level-1 counts squared."""
+    counts = level1_counts_per_dn(sensor.bits)
+    electrons = np.maximum(signal / counts, 0.0) * sensor.electrons_per_dn
+    variance: Array = (electrons + sensor.read_noise_e**2) * (counts / sensor.electrons_per_dn) ** 2
+    return variance
+
+
+@njit(cache=True, parallel=True, nogil=True, fastmath={"reassoc", "contract"})
+def _window_sums(frame, corners, step, size, out):
+    """Rows of `out`: near, far, curved, fine (each along columns and along rows), the mean, and 1
+    where all pixels are good."""
+    for i in prange(len(corners)):
+        left, top = corners[i, 0], corners[i, 1]
+        window = np.zeros((size, size), np.float32)
+        bad = np.uint16(0)
+        fine_y = fine_x = np.float32(0.0)
+        for y in range(size):
+            into = window[y]
+            for k in range(step):
+                line = frame[top + y * step + k, left : left + size * step + 1]
+                after = frame[top + y * step + k + 1, left : left + size * step]
+                for x in range(size):
+                    total = np.float32(0.0)
+                    for j in range(x * step, (x + 1) * step):
+                        pixel_value = line[j]
+                        bad |= (pixel_value & np.uint16(1)) | np.uint16(pixel_value == 0)
+                        total += np.float32(pixel_value)
+                    into[x] += total
+                for j in range(size * step):
+                    here = np.float32(line[j])
+                    down = np.float32(after[j]) - here
+                    right = np.float32(line[j + 1]) - here
+                    fine_y += down * down
+                    fine_x += right * right
+        near_y = near_x = far_y = far_x = curved_y = curved_x = mean = np.float32(0.0)
+        for y in range(size - 2):
+            here, below, under = window[y], window[y + 1], window[y + 2]
+            for x in range(size - 2):
+                value = here[x]
+                mean += value
+                one, two = below[x] - value, under[x] - value
+                near_y += one * one
+                far_y += two * two
+                curved_y += (two - one - one) * (two - one - one)
+                one, two = here[x + 1] - value, here[x + 2] - value
+                near_x += one * one
+                far_x += two * two
+                curved_x += (two - one - one) * (two - one - one)
+        inner = np.float64((size - 2) * (size - 2))
+        pixel = np.float64(step * step)
+        square = 1.0 / (inner * pixel * pixel)
+        out[i, 0], out[i, 1] = near_y * square, near_x * square
+        out[i, 2], out[i, 3] = far_y * square, far_x * square
+        out[i, 4], out[i, 5] = curved_y * square, curved_x * square
+        pixels = np.float64(size * size) * pixel
+        out[i, 6], out[i, 7] = fine_y / pixels, fine_x / pixels
+        out[i, 8] = mean / (inner * pixel)
+        out[i, 9] = 1.0 if bad == 0 else 0.0

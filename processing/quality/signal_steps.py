@@ -1,0 +1,154 @@
+"""Steps of signal along whole rows or columns of a frame: the read-out makes them, ground does not.
+
+A gain or an offset that changes from one line on, or banding, moves every part of two neighbouring
+lines alike. An edge on the ground would have to run along one line of pixels over the frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.image.line_means import line_means
+from processing.quality.report import Figure
+from processing.radiometry.level1 import level1_counts_per_dn
+from processing.rig import Sensor
+
+Array = NDArray[Any]
+
+QUANTILE: Final = 0.2
+"""A step holds in all but this share of the bundles of a line."""
+MIN_BUNDLES: Final = 16
+MIN_STEP: Final = 0.055
+BANDING_STEP: Final = 0.03
+BANDING_LINES: Final = 16
+"""Of the signal: of one line, and of so many lines of a frame. Edges of clouds reach 0.046."""
+MAX_FRAMES: Final = 2
+"""Steps in more frames of one exposure are rows of plants or roofs along the track."""
+MIN_STEP_DN: Final = 6.0
+SIGMAS: Final = 8.0
+_MAD_TO_SIGMA: Final = 1.4826
+
+
+@dataclass(frozen=True)
+class SignalStep:
+    """Between line `at` and the next along `axis` the signal changes by `relative` of itself.
+
+    `lines` counts the lines of the frame where it steps: more than a few are banding.
+    """
+
+    sensor: str
+    axis: Literal["rows", "columns"]
+    at: int
+    relative: float
+    lines: int
+
+
+@dataclass(frozen=True)
+class LineMeans:
+    """Means of bundles of pixels along every line of a frame (`processing.image.line_means`).
+
+    `by_row` (bundles, rows) begins with row `first_row`, `by_column` is (bundles, columns).
+    """
+
+    by_row: Array
+    by_column: Array
+    first_row: int
+
+
+def line_means_of(
+    sensors: Sequence[Sensor],
+    frames: Mapping[str, Array],
+    rows: Mapping[str, tuple[int, int]],
+) -> dict[str, LineMeans]:
+    """Line means of all frames that are there, by sensor name.
+
+    Args:
+        sensors: those to look at.
+        frames: Level-1 words by sensor name, (h, w) uint16.
+        rows: first and last exposed row by sensor name.
+    """
+    return {
+        s.name: LineMeans(*line_means(frames[s.name][first : last + 1]), first)
+        for s in sensors
+        if s.name in frames
+        for first, last in (rows[s.name],)
+    }
+
+
+def signal_steps(
+    sensors: Sequence[Sensor], means: Mapping[str, LineMeans]
+) -> tuple[SignalStep, ...]:
+    """Search frames for steps along whole lines.
+
+    Args:
+        sensors: those to look at.
+        means: of their lines, by sensor name.
+
+    Returns:
+        The largest step of each frame and axis that has one, the largest first; none where more
+        than `MAX_FRAMES` frames have one.
+    """
+    found = []
+    for sensor in sensors:
+        if sensor.name not in means:
+            continue
+        lines = means[sensor.name]
+        least = MIN_STEP_DN * level1_counts_per_dn(sensor.bits)
+        axes: tuple[tuple[Literal["rows", "columns"], Array, int], ...] = (
+            ("rows", lines.by_row, lines.first_row),
+            ("columns", lines.by_column, 0),
+        )
+        for axis, by_line, offset in axes:
+            step = _largest(sensor.name, axis, by_line, offset, least)
+            if step is not None:
+                found.append(step)
+    if len({step.sensor for step in found}) > MAX_FRAMES:
+        return ()
+    return tuple(sorted(found, key=lambda step: -abs(step.relative)))
+
+
+def step_figures(steps: Sequence[SignalStep]) -> dict[str, Figure]:
+    """The largest step in figures of the quality report."""
+    worst = steps[0] if steps else None
+    return {
+        "signal_step": None if worst is None else worst.relative,
+        "signal_step_sensor": None if worst is None else worst.sensor,
+        "signal_step_axis": None if worst is None else worst.axis,
+        "signal_step_at": None if worst is None else worst.at,
+        "signal_step_lines": None if worst is None else worst.lines,
+    }
+
+
+def _largest(
+    sensor: str,
+    axis: Literal["rows", "columns"],
+    means: Array,
+    offset: int,
+    min_counts: float,
+) -> SignalStep | None:
+    if len(means) < MIN_BUNDLES:
+        return None
+    signal = 0.5 * (means[:, 1:] + means[:, :-1])
+    change = np.diff(means, axis=1)
+    bright = np.median(signal, axis=0)
+    relative = change / np.maximum(signal, 1.0)
+    low, high = np.quantile(relative, (QUANTILE, 1.0 - QUANTILE), axis=0)
+    # What nearly all bundles of a line share; nothing where they differ in sign.
+    common = np.where(low > 0.0, low, np.where(high < 0.0, high, 0.0))
+    middle = np.median(relative, axis=0)
+    spread = _MAD_TO_SIGMA * float(np.median(np.abs(middle - np.median(middle))))
+    noise = np.maximum(SIGMAS * spread, min_counts / np.maximum(bright, 1.0))
+    shared = np.abs(middle) * (np.abs(common) > 0.5 * np.abs(middle))
+    steps = shared > np.maximum(BANDING_STEP, noise)
+    if np.count_nonzero(steps) < BANDING_LINES:
+        steps = shared > np.maximum(MIN_STEP, noise)
+    if not steps.any():
+        return None
+    at = int(np.argmax(np.where(steps, np.abs(middle), 0.0)))
+    count = int(np.count_nonzero(steps))
+    return SignalStep(sensor, axis, at + offset, float(middle[at]), count)

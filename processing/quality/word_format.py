@@ -1,0 +1,68 @@
+"""Are the words of a frame what the rig file says: so many bits, right or left-justified?"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.quality.report import Figure
+from processing.rig import Rig, Sensor
+
+Array = NDArray[Any]
+
+STEP: Final = (16, 4)
+"""Of the rows and columns looked at."""
+MIN_SHARE: Final = 1e-3
+"""Of the words looked at: fewer beyond the sensor's range are bits flipped on the way."""
+
+
+def word_format_figures(rig: Rig, frames: Mapping[str, Array]) -> dict[str, Figure]:
+    """Name frames whose words have another format than the rig file states.
+
+    Args:
+        rig: the camera.
+        frames: Level-0 frames by sensor name, (h, w) uint16, DN.
+    """
+    wrong = {
+        s.name: format_
+        for s in rig.sensors
+        if s.name in frames and (format_ := wrong_format(s, frames[s.name])) is not None
+    }
+    if not wrong:
+        return {}
+    return {
+        "word_format": ", ".join(dict.fromkeys(wrong.values())),
+        "word_format_sensors": ", ".join(wrong),
+    }
+
+
+def wrong_format(sensor: Sensor, frame: Array) -> str | None:
+    """The format of a frame's words where it is not the sensor's; None where it is.
+
+    Args:
+        sensor: what the rig file says.
+        frame: Level-0, (h, w) uint16.
+    """
+    if sensor.bits >= 16:
+        return None
+    sample = frame[:: STEP[0], :: STEP[1]]
+    unit = sensor.raw_units_per_dn
+    if _share_beyond(sensor, sample) < MIN_SHARE:
+        return None
+    if _share_beyond(sensor, sample.byteswap()) < MIN_SHARE:
+        return "byte-swapped"
+    shifted = 1 << (16 - sensor.bits)
+    if unit == 1 and np.mean(sample % shifted != 0) < MIN_SHARE:
+        return "left-justified"
+    if unit > 1 and np.mean(sample > sensor.full_scale_dn) < MIN_SHARE:
+        return "right-justified"
+    return f"beyond {sensor.bits} bits"
+
+
+def _share_beyond(sensor: Sensor, sample: Array) -> float:
+    """Share of words that the sensor cannot have given."""
+    unit = sensor.raw_units_per_dn
+    return float(np.mean((sample > sensor.full_scale_dn * unit) | (sample % unit != 0)))

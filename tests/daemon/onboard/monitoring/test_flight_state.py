@@ -1,0 +1,96 @@
+"""What watchers see follows the events, and a fault stays until a person has seen it."""
+
+from __future__ import annotations
+
+import json
+
+from daemon.onboard.monitoring.flight_state import EVENTS_MAX, EXPOSURES_MAX, FlightState
+from tests.daemon.onboard.monitoring import flight_events
+
+
+def state_of(*events: dict[str, object]) -> FlightState:
+    state = FlightState("syntopic test")
+    for event in events:
+        state.apply(event)
+    return state
+
+
+def test_an_exposure_goes_from_trigger_to_verdict() -> None:
+    steps = []
+    state = state_of(flight_events.mission())
+    for event in flight_events.exposure(7):
+        state.apply(event)
+        reported = state.exposure(7)
+        assert reported is not None
+        steps.append(reported["step"])
+    assert steps == ["triggered", "stored", "sealed", "processed"]
+    assert reported["verdict"] == "good"
+    assert reported["figures"] == {"sigma0_px": 0.01, "tie_points_pp": 900, "dc_k": 11.8}
+    assert state.brief()["verdicts"] == {"good": 1, "usable": 0, "refly": 0}
+    json.dumps(state.snapshot())
+
+
+def test_a_fault_that_passed_stays_until_it_is_acknowledged() -> None:
+    state = state_of(
+        flight_events.mission(), flight_events.lost("SU02"), flight_events.lost("SU02")
+    )
+    (fault,) = state.faults()
+    assert (fault["stands"], fault["count"], fault["acknowledged"]) == (True, 2, False)
+    state.apply(flight_events.recovered("SU02"))
+    (fault,) = state.faults()
+    assert fault["stands"] is False
+    assert state.acknowledge(fault["id"])
+    assert state.faults() == []
+
+
+def test_a_fault_that_stands_stays_even_when_it_is_acknowledged() -> None:
+    state = state_of(flight_events.lost("SU02"))
+    assert state.acknowledge("device SU02")
+    (fault,) = state.faults()
+    assert fault["acknowledged"] is True
+    state.apply(flight_events.recovered("SU02"))
+    assert state.faults() == []
+    assert not state.acknowledge("device SU02")
+
+
+def test_a_watcher_that_asks_for_what_changed_misses_nothing() -> None:
+    state = state_of(flight_events.mission())
+    seen: dict[int, dict[str, object]] = {}
+    cursor = 0
+    for number in range(1, 30):
+        for event in flight_events.exposure(number, "usable" if number % 3 else "refly"):
+            state.apply(event)
+        if number % 4 == 0:
+            for one in state.changed("exposures", cursor):
+                seen[one["number"]] = dict(one)
+                cursor = one["sequence"]
+    for one in state.changed("exposures", cursor):
+        seen[one["number"]] = dict(one)
+    assert seen == {one["number"]: one for one in state.exposures()}
+
+
+def test_it_never_grows_beyond_its_bounds() -> None:
+    state = state_of(flight_events.mission())
+    for number in range(1, EXPOSURES_MAX + 500):
+        for event in flight_events.exposure(number):
+            state.apply(event)
+    assert len(state.changed("exposures", 0)) == EXPOSURES_MAX
+    assert len(state.changed("events", 0)) == EVENTS_MAX
+    assert state.exposure(1) is None
+    # What is no longer kept still counts: a counter that falls is a restart to who scrapes it.
+    assert state.brief()["verdicts"]["good"] == EXPOSURES_MAX + 499
+
+
+def test_events_nobody_knows_are_listed_and_harm_nothing() -> None:
+    state = state_of({"event": "new-thing", "what": [1, {"deep": None}]}, {})
+    assert [event.get("event") for event in state.changed("events", 0)] == ["new-thing", None]
+
+
+def test_the_status_puts_right_what_was_dropped() -> None:
+    state = state_of(flight_events.mission())
+    state.apply({"event": "disk", "fault": True, "sentence": "room for 0 exposures"})
+    assert state.faults()[0]["stands"]
+    state.apply(flight_events.status("armed", triggers=5))
+    assert state.phase == "armed"
+    assert state.brief()["status"]["ledger"]["triggers"]["triggers"] == 5
+    assert not state.faults()[0]["stands"]

@@ -1,0 +1,35 @@
+"""A rig written as a file is read back as the same rig."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import replace
+
+import pytest
+
+from daemon.postflight.calibration.rig_writer import rig_toml
+from processing.rig import RigError, load_rig, rig_from_mapping, shipped_rigs
+
+
+@pytest.mark.parametrize("name", sorted(shipped_rigs()))
+def test_every_shipped_rig_survives_writing_and_reading(name):
+    rig = load_rig(shipped_rigs()[name])
+    text = rig_toml(rig, remark="a remark\nof two lines").decode()
+    assert text.startswith("# a remark\n# of two lines\n")
+    assert rig_from_mapping(tomllib.loads(text), "rig.toml") == rig
+
+
+def test_serial_numbers_of_probes_survive_it_too():
+    rig = load_rig(shipped_rigs()["ultracam-x-mini"])
+    rig = replace(rig, probe_serials={"0": "PT-17", "N": 'PT "18"'})
+    assert rig_from_mapping(tomllib.loads(rig_toml(rig).decode()), "rig.toml") == rig
+
+
+def test_left_justified_words_are_refused_where_images_are_stitched():
+    content = tomllib.loads(rig_toml(load_rig(shipped_rigs()["ultracam-x-mini"])).decode())
+    content["cone"][0]["sensor"][0]["justified"] = "left"
+    with pytest.raises(RigError, match="'SU00' is left-justified"):
+        rig_from_mapping(content, "rig.toml")
+    rig = load_rig(shipped_rigs()["rededge"])
+    assert {sensor.raw_units_per_dn for sensor in rig.sensors} == {16}
+    assert rig.probes == ()

@@ -1,0 +1,33 @@
+"""The report draws what the records say: time with its budget, and the sheet by head."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+from daemon.mission.store.store import Level0Writer
+from daemon.onboard.flight.ledger import Ledger
+from daemon.postflight.mission_report import write_report
+from tests.daemon.small_camera import SENSORS, final_record, new_mission, store_one
+
+
+def test_the_report_shows_what_a_time_is_unsure_by_and_the_ledger_of_every_head(
+    tmp_path: Path,
+) -> None:
+    mission = new_mission(tmp_path)
+    writer = Level0Writer(mission)
+    stored = store_one(writer, 1)
+    record = final_record(stored)
+    budget = {"clock": 900, "trigger": 24_000, "delay": 1_000, "head": 1_500}
+    frames = tuple(replace(frame, time_sigma_ns=24_084) for frame in record.frames)
+    record = replace(record, mark_source="pps", time_budget_ns=budget, frames=frames)
+    writer.seal(record)
+    writer.close()
+    ledger = Ledger(SENSORS)
+    ledger.trigger(1)
+    ledger.frame(SENSORS[0], "duplicate")
+    page = write_report(mission.path, ledger=ledger.sheet().as_json()).path.read_text()
+    cells = re.findall(r"<td>(.*?)</td>", page.split("<h2>Time</h2>")[1].split("</table>")[0])
+    assert cells == ["1", "pps", "24084", "–", "900", "24000", "1000", "1500", "–"]
+    assert re.search(rf"<tr><td>{SENSORS[0]}</td><td>1</td><td>0</td><td>0</td><td>1</td>", page)

@@ -1,0 +1,179 @@
+"""Steps of signal along whole lines, planted in means of bundles and in frames."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from processing.quality.signal_steps import (
+    SignalStep,
+    _largest,
+    line_means_of,
+    signal_steps,
+    step_figures,
+)
+from processing.rig import find_rig
+
+Array = NDArray[np.float64]
+MINI = find_rig("ultracam-x-mini")
+SENSORS = MINI.master_sensors
+BUNDLES, LINES = 20, 101
+
+
+def means(changes: Array, *, bundles: int = BUNDLES, level: float = 1000.0) -> Array:
+    """Means (bundles, n + 1) whose relative changes from line to line are these, (n,) or (b, n)."""
+    changes = np.broadcast_to(changes, (bundles, np.shape(changes)[-1]))
+    ratios = (1.0 + changes / 2.0) / (1.0 - changes / 2.0)
+    return level * np.hstack([np.ones((bundles, 1)), np.cumprod(ratios, axis=1)])
+
+
+def one_step(relative: float, at: int = 40, *, unstepped: int = 0) -> Array:
+    changes = np.zeros((BUNDLES, LINES - 1))
+    changes[unstepped:, at] = relative
+    return changes
+
+
+def largest(line_values: Array, *, offset: int = 0, least: float = 0.0) -> SignalStep | None:
+    return _largest("SU00", "rows", line_values, offset, least)
+
+
+@pytest.mark.parametrize("relative", [0.056, -0.056])
+def test_a_step_of_one_line_is_found_where_it_lies(relative: float) -> None:
+    step = largest(means(one_step(relative)), offset=7)
+    assert step == SignalStep("SU00", "rows", 47, pytest.approx(relative), 1)
+    assert largest(means(one_step(0.98 * relative))) is None
+
+
+@pytest.mark.parametrize(
+    ("lines", "relative", "found"),
+    [(16, 0.031, 16), (15, 0.031, 0), (16, 0.029, 0), (15, 0.06, 15)],
+)
+def test_sixteen_lines_are_banding_at_a_smaller_step(
+    lines: int, relative: float, found: int
+) -> None:
+    changes = np.zeros(LINES - 1)
+    changes[: 2 * lines : 2] = relative * (-1.0) ** np.arange(lines)
+    step = largest(means(changes))
+    assert (step.lines if step else 0) == found
+
+
+def test_of_several_steps_the_largest_that_all_bundles_share_counts() -> None:
+    changes = one_step(0.07, 20) + one_step(-0.09, 60)
+    # Half of the bundles step much farther: an edge on the ground.
+    changes[::2, 80] = 0.5
+    changes[:13, 10] = 0.5
+    step = largest(means(changes))
+    assert step == SignalStep("SU00", "rows", 60, pytest.approx(-0.09), 2)
+
+
+@pytest.mark.parametrize(("unstepped", "found"), [(4, True), (5, False)])
+@pytest.mark.parametrize("relative", [0.1, -0.1])
+def test_a_fifth_of_the_bundles_may_stay_where_they_are(
+    relative: float, unstepped: int, found: bool
+) -> None:
+    assert (largest(means(one_step(relative, unstepped=unstepped))) is not None) == found
+
+
+@pytest.mark.parametrize(("small", "found"), [(0.052, True), (0.048, False)])
+def test_what_nearly_all_share_is_more_than_half_of_the_step(small: float, found: bool) -> None:
+    changes = one_step(0.1)
+    changes[:5, 40] = small
+    assert (largest(means(changes)) is not None) == found
+
+
+@pytest.mark.parametrize(("bundles", "found"), [(15, False), (16, True)])
+def test_fewer_than_sixteen_bundles_say_nothing(bundles: int, found: bool) -> None:
+    line_values = means(one_step(0.1)[0], bundles=bundles)
+    assert (largest(line_values) is not None) == found
+
+
+@pytest.mark.parametrize(("sigmas", "found"), [(7.8, False), (8.2, True)])
+@pytest.mark.parametrize("count", [1, 16])
+def test_a_step_exceeds_eight_standard_deviations_of_lines(
+    sigmas: float, count: int, found: bool
+) -> None:
+    noise = 0.01
+    changes = np.where(np.arange(LINES - 1) % 2, noise, -noise)
+    spread = 1.4826 * noise
+    changes[5 : 5 + 4 * count : 4] = sigmas * spread
+    assert (largest(means(changes)) is not None) == found
+
+
+def test_a_slope_over_the_frame_is_no_noise() -> None:
+    changes = np.full(LINES - 1, 0.02)
+    changes[40] = 0.07
+    assert largest(means(changes)) == SignalStep("SU00", "rows", 40, pytest.approx(0.07), 1)
+
+
+def test_a_step_exceeds_the_least_counts() -> None:
+    line_values = means(one_step(0.1), level=400.0)
+    bright = float(np.median(line_values[:, 40:42]))
+    assert largest(line_values, least=0.098 * bright) is not None
+    assert largest(line_values, least=0.102 * bright) is None
+
+
+def test_nearly_no_signal_is_taken_as_one_count() -> None:
+    dark = np.full((BUNDLES, LINES), 0.2)
+    dark[:, 41:] = 0.4
+    step = largest(dark, least=0.15)
+    assert step is not None and step.relative == pytest.approx(0.2)
+    assert largest(dark, least=0.25) is None
+    assert largest(np.zeros((BUNDLES, LINES))) is None
+
+
+SIDE = 640
+FIRST = 32
+
+
+def frames(count: int, level: int = 4000) -> dict[str, NDArray[np.uint16]]:
+    """Even frames; rows that were not exposed are dark."""
+    line_values = {}
+    for sensor in SENSORS[:count]:
+        frame = np.zeros((SIDE + 2 * FIRST, SIDE), np.uint16)
+        frame[FIRST : FIRST + SIDE] = level
+        line_values[sensor.name] = frame
+    return line_values
+
+
+ROWS = {s.name: (FIRST, FIRST + SIDE - 1) for s in SENSORS}
+
+
+def test_steps_of_frames_are_named_the_largest_first() -> None:
+    line_values = frames(2)
+    a, b = line_values
+    assert signal_steps(SENSORS, line_means_of(SENSORS, line_values, ROWS)) == ()
+    line_values[a][:, 300:] = 4400
+    line_values[a][:FIRST], line_values[a][FIRST + SIDE :] = 0, 0
+    line_values[b][FIRST + SIDE - 1] = 2000
+    found = signal_steps(SENSORS, line_means_of(SENSORS, line_values, ROWS))
+    assert [(s.sensor, s.axis, s.at, s.lines) for s in found] == [
+        (b, "rows", FIRST + SIDE - 2, 1),
+        (a, "columns", 299, 1),
+    ]
+    assert [s.relative for s in found] == pytest.approx([-2000 / 3000, 400 / 4200])
+    assert step_figures(found) == {
+        "signal_step": pytest.approx(-2 / 3),
+        "signal_step_sensor": b,
+        "signal_step_axis": "rows",
+        "signal_step_at": FIRST + SIDE - 2,
+        "signal_step_lines": 1,
+    }
+    assert set(step_figures(()).values()) == {None}
+
+
+@pytest.mark.parametrize(("count", "found"), [(2, 2), (3, 0)])
+def test_steps_in_three_frames_are_the_ground_s(count: int, found: int) -> None:
+    line_values = frames(4)
+    for frame in list(line_values.values())[:count]:
+        frame[FIRST + 100 : FIRST + SIDE] = 4400
+    assert len(signal_steps(SENSORS, line_means_of(SENSORS, line_values, ROWS))) == found
+
+
+@pytest.mark.parametrize(("step_dn", "found"), [(5.75, 0), (6.25, 1)])
+def test_six_dn_of_a_sensor_are_the_least_step(step_dn: float, found: int) -> None:
+    # 12 bits: eight counts of Level 1 to the DN.
+    line_values = frames(1, level=400)
+    frame = line_values[SENSORS[0].name]
+    frame[FIRST + 100 : FIRST + SIDE] = 400 + round(8 * step_dn)
+    assert len(signal_steps(SENSORS, line_means_of(SENSORS, line_values, ROWS))) == found

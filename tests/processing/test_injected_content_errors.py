@@ -1,0 +1,131 @@
+"""Frames that show other ground than they should, although they are sharp and well exposed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from tests.processing.injected_errors import InjectedExposure, rendered, with_platform_rotation
+
+pytestmark = [pytest.mark.trust, pytest.mark.timeout(300)]
+
+Frames = Mapping[str, Any]
+
+
+@pytest.fixture(scope="module")
+def error_free() -> InjectedExposure:
+    return rendered("ultracam-x-mini")
+
+
+@pytest.fixture(scope="module")
+def elsewhere() -> InjectedExposure:
+    return rendered("ultracam-x-mini", seed=12, dc_k=-15.0)
+
+
+def _swapped(a: str, b: str) -> Callable[[Frames, Frames], Frames]:
+    return lambda frames, _: {**frames, a: frames[b], b: frames[a]}
+
+
+def _rotated(name: str) -> Callable[[Frames, Frames], Frames]:
+    return lambda frames, _: {**frames, name: frames[name][::-1, ::-1].copy()}
+
+
+def _mirrored(name: str) -> Callable[[Frames, Frames], Frames]:
+    return lambda frames, _: {**frames, name: frames[name][:, ::-1].copy()}
+
+
+def _old(*names: str) -> Callable[[Frames, Frames], Frames]:
+    return lambda frames, others: {**frames, **{name: others[name] for name in names}}
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (_swapped("SU00", "SU11"), {"SU00", "SU11"}),
+        (_swapped("SU20", "SU21"), {"SU20", "SU21"}),
+        (_rotated("SU30"), {"SU30"}),
+        (_mirrored("SU10"), {"SU10"}),
+        (_rotated("G"), {"G"}),
+        (_old("SU02"), {"SU02"}),
+        (_old("R", "G", "B", "N"), {"G"}),
+    ],
+)
+def test_other_ground_in_a_frame_is_named_and_flown_again(
+    error_free: InjectedExposure,
+    elsewhere: InjectedExposure,
+    change: Callable[[Frames, Frames], Frames],
+    named: set[str],
+) -> None:
+    outcome = replace(error_free, frames=change(error_free.frames, elsewhere.frames)).outcome()
+    assert outcome.verdict == "refly" and "FRAME_CORRUPT" in outcome.flags
+    assert set(str(outcome.figure("mismatched_sensors")).split(", ")) == named
+    assert "other ground" in outcome.sentences and "water" not in outcome.sentences
+    assert "DISPLACED_SENSOR" not in outcome.flags
+
+
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_red_and_green_exchanged_are_both_named(
+    error_free: InjectedExposure, calibrated: bool
+) -> None:
+    planted = replace(error_free, frames=_swapped("R", "G")(error_free.frames, {}))
+    if not calibrated:
+        planted = replace(planted, radiometry={})
+    outcome = planted.outcome()
+    assert outcome.verdict == "refly" and "FRAME_CORRUPT" in outcome.flags
+    pairs = zip(
+        outcome.figure("exchanged_frames").split(", "),
+        outcome.figure("exchanged_from").split(", "),
+        strict=True,
+    )
+    assert dict(pairs) == {"R": "G", "G": "R"}
+    assert outcome.figure("exchanged_by") == ("fixed pattern" if calibrated else "geometry")
+    assert "frame of R comes from head G" in outcome.sentences.replace("The", "the")
+    assert "CALIBRATION_EXPIRED" not in outcome.flags
+
+
+@pytest.mark.parametrize(("a", "b"), [("B", "N"), ("SU02", "SU21")])
+def test_frames_exchanged_between_calibrated_heads_are_named(
+    error_free: InjectedExposure, a: str, b: str
+) -> None:
+    outcome = replace(error_free, frames=_swapped(a, b)(error_free.frames, {})).outcome()
+    assert outcome.verdict == "refly" and outcome.figure("exchanged_by") == "fixed pattern"
+    assert set(outcome.figure("exchanged_frames").split(", ")) == {a, b}
+
+
+def test_an_error_free_exposure_has_its_own_frames(error_free: InjectedExposure) -> None:
+    for planted in (error_free, replace(error_free, radiometry={})):
+        assert planted.outcome().figure("exchanged_frames") is None
+
+
+@pytest.mark.parametrize("band", ["R", "B", "N"])
+def test_other_ground_in_a_colour_band_is_named(error_free: InjectedExposure, band: str) -> None:
+    outcome = replace(error_free, frames=_rotated(band)(error_free.frames, {})).outcome()
+    assert outcome.verdict == "refly" and "other ground" in outcome.sentences
+
+
+def test_frames_without_texture_are_not_called_other_ground(error_free: InjectedExposure) -> None:
+    flat = {name: frame // 16 * 0 + 900 for name, frame in error_free.frames.items()}
+    outcome = replace(error_free, frames={**error_free.frames, "SU30": flat["SU30"]}).outcome()
+    assert outcome.figure("mismatched_sensors") is None and "other ground" not in outcome.sentences
+    assert outcome.verdict != "good"
+
+
+@pytest.mark.parametrize(
+    ("cone", "angles"),
+    [
+        ("1", {"x_rad": 6e-4}),
+        ("3", {"y_rad": 1e-3}),
+        ("G", {"x_rad": 1e-3}),
+        ("2", {"z_rad": 3e-3}),
+    ],
+)
+def test_a_cone_rotated_beyond_the_search_is_found_corrected_and_named(
+    error_free: InjectedExposure, cone: str, angles: dict[str, float]
+) -> None:
+    outcome = error_free.with_cone(cone, with_platform_rotation(**angles)).outcome()
+    assert outcome.verdict == "usable" and outcome.figure("platform_causes") == cone
+    assert outcome.inner_px < 0.02
+    assert outcome.stated_sigma_px < 3.0 * outcome.true_sigma_px < 6.0 * outcome.stated_sigma_px

@@ -1,0 +1,211 @@
+"""Wrong geometry that once went as `good`: each is rendered, and named with its size.
+
+The stated sigma covers the error, and is at most three times as large.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from tests.processing.injected_errors import (
+    InjectedExposure,
+    Outcome,
+    moved,
+    rendered,
+    slipped,
+    with_f,
+    with_platform_rotation,
+)
+
+pytestmark = [pytest.mark.trust, pytest.mark.timeout(300)]
+
+
+@pytest.fixture(scope="module")
+def error_free() -> InjectedExposure:
+    return rendered("ultracam-x-mini")
+
+
+def assert_covered(outcome: Outcome, *, times: float = 3.0) -> None:
+    """The error lies within two stated sigmas, and these state no more than so many times it."""
+    assert outcome.true_sigma_px < 2.0 * outcome.stated_sigma_px, outcome.stated_sigma_px
+    assert outcome.stated_sigma_px < times * outcome.true_sigma_px, outcome.true_sigma_px
+
+
+def test_an_error_free_exposure_raises_nothing(error_free: InjectedExposure) -> None:
+    outcome = error_free.outcome()
+    assert outcome.verdict == "good" and outcome.flags == set(), outcome.sentences
+    assert_covered(outcome)
+    assert outcome.figure("platform_test") < 0.5 and outcome.figure("slip_sensor") is None
+
+
+def test_a_tdi_count_of_the_master_that_misfits_the_motion_widens_the_sigma(
+    error_free: InjectedExposure,
+) -> None:
+    master = [s.name for s in error_free.rig.master_sensors]
+    counts = {n: k - (n in master) for n, k in error_free.conditions.tdi_shifts.items()}
+    wrong = replace(error_free, conditions=replace(error_free.conditions, tdi_shifts=counts))
+    outcome = wrong.outcome()
+    assert "BLUR" in outcome.flags and outcome.true_sigma_px > 0.2
+    assert_covered(outcome)
+
+
+@pytest.mark.parametrize("ppm", [1000.0, -300.0])
+def test_the_masters_principal_distance_is_named_and_widens_the_sigma(
+    error_free: InjectedExposure, ppm: float
+) -> None:
+    outcome = error_free.with_cone("0", with_f(1.0 + ppm * 1e-6)).outcome()
+    assert "CALIBRATION_EXPIRED" in outcome.flags and outcome.verdict == "usable"
+    assert (
+        outcome.figure("platform_causes") == "0" and "not fit the master cone" in outcome.sentences
+    )
+    assert outcome.figure("common_scale_ppm") == pytest.approx(-ppm, abs=60.0)
+    assert_covered(outcome)
+
+
+def test_below_its_detection_limit_a_principal_distance_widens_the_sigma(
+    error_free: InjectedExposure,
+) -> None:
+    outcome = error_free.with_cone("0", with_f(1.0001)).outcome()
+    assert outcome.verdict == "good"
+    assert outcome.true_sigma_px > 0.08
+    assert_covered(outcome)
+
+
+def test_the_principal_distance_of_another_cone_is_corrected_and_named(
+    error_free: InjectedExposure,
+) -> None:
+    outcome = error_free.with_cone("2", with_f(1.001)).outcome()
+    assert outcome.figure("platform_causes") == "2" and "corrected" in outcome.sentences
+    assert_covered(outcome)
+    assert outcome.inner_px < 0.02
+
+
+@pytest.mark.parametrize(
+    ("sensor", "axis", "first", "by", "length", "shift_px"),
+    [
+        ("SU11", "rows", 300, 4, 84, 4.0),
+        ("SU21", "rows", 100, 2, 40, 2.0),
+        ("SU00", "rows", 416, 1, None, 1.0),
+        ("SU02", "columns", 900, 1, None, 1.0),
+        ("SU30", "rows", 416, 1, None, 1.0),
+        ("SU30", "columns", 600, 1, None, 1.0),
+        ("G", "rows", 300, 1, None, 3.0),
+    ],
+)
+def test_a_read_out_slip_is_found_named_and_measured(
+    error_free: InjectedExposure,
+    sensor: str,
+    axis: str,
+    first: int,
+    by: int,
+    length: int | None,
+    shift_px: float,
+) -> None:
+    outcome = error_free.with_frame(sensor, slipped(axis, first, by, length)).outcome()
+    assert outcome.verdict == "refly" and "FRAME_CORRUPT" in outcome.flags
+    assert outcome.figure("slip_sensor") == sensor and outcome.figure("slip_axis") == axis
+    assert outcome.figure("slip_px") == pytest.approx(shift_px, rel=0.5)
+    assert outcome.figure("slip_first") <= first + 25
+    # Nobody else is accused, and what is not in the band is in its place.
+    assert "DISPLACED_SENSOR" not in outcome.flags, outcome.sentences
+    assert "CALIBRATION_EXPIRED" not in outcome.flags, outcome.sentences
+    assert outcome.inner_px < 0.03
+    if sensor != "G":
+        share = (outcome.figure("slip_last") - outcome.figure("slip_first")) / 832
+        assert outcome.figure("stitched_sigma_worst_px") > 0.4 * share * shift_px
+
+
+@pytest.mark.parametrize("off_k", [4.0, -28.0])
+def test_all_probes_that_misread_alike_widen_the_sigma(
+    error_free: InjectedExposure, off_k: float
+) -> None:
+    outcome = error_free.with_probes(off_k).outcome()
+    assert "DC_DISAGREEMENT" in outcome.flags and "CALIBRATION_EXPIRED" not in outcome.flags
+    assert_covered(outcome)
+
+
+@pytest.mark.parametrize("moves", [((1.0, 0.5), (-0.4, 1.2)), ((0.3, 0.5), (-0.4, 0.2))])
+def test_two_moved_master_sensors_name_no_single_one(
+    error_free: InjectedExposure, moves: tuple[tuple[float, float], tuple[float, float]]
+) -> None:
+    first, second = moves
+    planted = error_free.with_sensor("SU00", moved(*first)).with_sensor("SU01", moved(*second))
+    outcome = planted.outcome()
+    assert "DISPLACED_SENSOR" in outcome.flags
+    assert (
+        outcome.figure("displaced_sensor") is None and "More than one sensor" in outcome.sentences
+    )
+    assert_covered(outcome)
+
+
+@pytest.mark.parametrize("angle", ["x_rad", "y_rad", "z_rad"])
+def test_a_rotated_cone_is_corrected_and_named(error_free: InjectedExposure, angle: str) -> None:
+    outcome = error_free.with_cone("2", with_platform_rotation(**{angle: 3e-4})).outcome()
+    assert outcome.figure("platform_causes") == "2" and "CALIBRATION_EXPIRED" in outcome.flags
+    assert_covered(outcome)
+
+
+@pytest.fixture(scope="module")
+def two_cones() -> InjectedExposure:
+    return rendered("ultracam-l-mini", seed=21, dc_k=6.0)
+
+
+@pytest.fixture(scope="module")
+def converging() -> InjectedExposure:
+    return rendered("dmc-mini", seed=21, dc_k=6.0)
+
+
+def test_error_free_exposures_of_other_rigs_raise_nothing(
+    two_cones: InjectedExposure, converging: InjectedExposure
+) -> None:
+    for planted in (two_cones, converging):
+        outcome = planted.outcome()
+        assert outcome.verdict == "good" and outcome.flags == set(), outcome.sentences
+        assert_covered(outcome)
+
+
+def test_a_master_of_one_sensor_with_a_wrong_principal_distance_is_named(
+    two_cones: InjectedExposure,
+) -> None:
+    outcome = two_cones.with_cone("0", with_f(1.001)).outcome()
+    assert outcome.figure("platform_causes") == "0"
+    assert_covered(outcome)
+
+
+def test_a_slip_that_two_frames_explain_alike_names_both(two_cones: InjectedExposure) -> None:
+    outcome = two_cones.with_frame("SU10", slipped("columns", 400, 2, 80)).outcome()
+    assert outcome.verdict == "refly"
+    named = {outcome.figure("slip_sensor"), outcome.figure("slip_alternatives")}
+    assert named == {"SU10", "RGB"} and " (or " in outcome.sentences
+
+
+@pytest.mark.parametrize("head", ["1", "2"])
+def test_a_converging_head_with_a_wrong_principal_distance_is_not_called_corrected(
+    converging: InjectedExposure, head: str
+) -> None:
+    outcome = converging.with_cone(head, with_f(1.001)).outcome()
+    assert outcome.verdict != "good" and "CALIBRATION_EXPIRED" in outcome.flags
+    assert "not corrected" in outcome.sentences and outcome.figure("slip_sensor") is None
+    assert_covered(outcome)
+
+
+def test_a_converging_head_that_rotated_widens_the_sigma_by_the_mean(
+    converging: InjectedExposure,
+) -> None:
+    outcome = converging.with_cone("2", with_platform_rotation(x_rad=8e-4)).outcome()
+    assert "CALIBRATION_EXPIRED" in outcome.flags and outcome.figure("platform_shift_head") == "2"
+    assert outcome.inner_px < 0.02
+    assert_covered(outcome)
+
+
+@pytest.mark.parametrize(
+    ("axis", "first", "by", "length"), [("rows", 300, 1, None), ("columns", 400, 2, 80)]
+)
+def test_slips_of_converging_heads_are_named(
+    converging: InjectedExposure, axis: str, first: int, by: int, length: int | None
+) -> None:
+    outcome = converging.with_frame("P2", slipped(axis, first, by, length)).outcome()
+    assert outcome.verdict == "refly" and outcome.figure("slip_sensor") == "P2"
+    assert "CALIBRATION_EXPIRED" not in outcome.flags, outcome.sentences

@@ -1,0 +1,227 @@
+"""Wrong radiometry and sharpness of one head that once went as `good`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from processing.geometry.placement import nominal_placements
+from processing.quality.band_levels import level_steps, levels_of
+from processing.quality.common_windows import measure_common_windows
+from processing.quality.local_sharpness import local_blur_figures
+from processing.quality.word_format import wrong_format
+from tests.processing.injected_errors import (
+    InjectedExposure,
+    banded,
+    block,
+    clipped,
+    gain,
+    in_part,
+    rendered,
+)
+
+pytestmark = [pytest.mark.trust, pytest.mark.timeout(300)]
+
+
+@pytest.fixture(scope="module")
+def error_free() -> InjectedExposure:
+    return rendered("ultracam-x-mini")
+
+
+@pytest.mark.parametrize(
+    ("sensor", "axis", "line", "factor"),
+    [("SU11", 0, 416, 1.08), ("SU00", 1, 600, 1.08), ("G", 0, 400, 1.2), ("SU30", 0, 300, 0.9)],
+)
+def test_a_gain_step_within_a_frame_is_named_with_its_line(
+    error_free: InjectedExposure, sensor: str, axis: int, line: int, factor: float
+) -> None:
+    outcome = error_free.with_frame(sensor, gain(factor, line, axis)).outcome()
+    assert outcome.verdict == "usable" and "FRAME_CORRUPT" in outcome.flags
+    assert outcome.figure("signal_step_sensor") == sensor
+    assert outcome.figure("signal_step_axis") == ("rows", "columns")[axis]
+    assert abs(outcome.figure("signal_step_at") - (line - 1)) <= 1
+    assert outcome.figure("signal_step") == pytest.approx(factor - 1.0, abs=0.03)
+
+
+def test_banding_is_named(error_free: InjectedExposure) -> None:
+    outcome = error_free.with_frame("SU10", banded(30, 20)).outcome()
+    assert outcome.figure("signal_step_sensor") == "SU10" and "banding" in outcome.sentences
+
+
+@pytest.mark.parametrize("factor", [0.5, 0.85, 1.3])
+def test_a_pan_head_with_another_exposure_is_named_and_draws_no_other(
+    error_free: InjectedExposure, factor: float
+) -> None:
+    clean = error_free.outcome()
+    outcome = error_free.with_frame("SU11", gain(factor)).outcome()
+    assert outcome.verdict == "usable" and outcome.figure("gain_outlier") == "SU11"
+    assert outcome.figure("gain_outlier_signal") == pytest.approx(factor, rel=0.02)
+    both = (outcome.product.pan > 0) & (clean.product.pan > 0)
+    ratio = np.median(outcome.product.pan[both] / clean.product.pan[both])
+    assert ratio == pytest.approx(1.0, abs=0.005)
+
+
+@pytest.mark.parametrize("sensor", ["R", "SU11", "SU30"])
+def test_a_head_exposed_half_as_long_as_its_record_states_keeps_its_level(
+    error_free: InjectedExposure, sensor: str
+) -> None:
+    clean = error_free.outcome()
+    pan, red = clean.product.pan.copy(), clean.product.colour["red"].copy()
+    times_s = {**error_free.conditions.exposure_time_s}
+    times_s[sensor] *= 0.5
+    planted = error_free.with_frame(sensor, gain(0.5))
+    planted = replace(planted, conditions=replace(planted.conditions, exposure_time_s=times_s))
+    outcome = planted.outcome()
+    assert outcome.verdict == "good" and "UNDEREXPOSED" in outcome.flags
+    assert outcome.figure("exposure_scaled_sensor") == sensor
+    assert outcome.figure("gain_outlier") is None and "as its record states" in outcome.sentences
+    for before, after in ((pan, outcome.product.pan), (red, outcome.product.colour["red"])):
+        both = (before > 0) & (after > 0)
+        assert np.median(after[both] / before[both]) == pytest.approx(1.0, abs=0.01)
+
+
+def test_red_exposed_half_as_long_without_saying_so_is_seen_over_a_flight(
+    error_free: InjectedExposure,
+) -> None:
+    usual = error_free.outcome().product.report.figures
+    changed = error_free.with_frame("R", gain(0.5)).outcome()
+    assert changed.verdict == "good"  # one exposure cannot show it
+    halved = changed.product.report.figures
+    flight = {3: levels_of(usual), 4: levels_of(halved), 6: {}, 7: levels_of(usual)}
+    down, up = level_steps(flight)
+    assert (down.band, down.before, down.exposure) == ("red", 3, 4)
+    assert (up.band, up.before, up.exposure) == ("red", 4, 7)
+    assert down.factor == pytest.approx(0.5, rel=0.02) and "level of red" in down.sentence
+
+
+def test_common_ground_of_few_frames_finds_no_blur_and_raises_nothing(
+    error_free: InjectedExposure,
+) -> None:
+    places = nominal_placements(error_free.rig, {}, error_free.conditions.tdi_shifts)
+    for names in ((), ("SU30",), ("G",), ("SU30", "G"), ("R", "G", "B", "N")):
+        frames = {name: error_free.frames[name] * np.uint16(8) for name in names}
+        ground = measure_common_windows(error_free.rig, places, frames)
+        assert ground is not None and ground.names == tuple(
+            s.name for s in error_free.rig.sensors if s.name in names
+        )
+        for kind in ("pan", "colour"):
+            deficit = local_blur_figures(error_free.rig, ground)[f"{kind}_blur_deficit"]
+            assert deficit is None or deficit < 0.12
+
+
+def test_ground_that_changes_several_bands_is_no_step_of_one() -> None:
+    fields = {"red": 0.77, "green": 0.90, "blue": 0.55, "nir": 2.3}
+    water = {"red": 0.80, "green": 1.20, "blue": 1.46, "nir": 0.32}
+    soil = {"red": 1.12, "green": 0.96, "blue": 0.71, "nir": 1.2}
+    assert level_steps({1: fields, 2: fields, 3: water, 4: soil, 5: fields}) == ()
+    red = {**fields, "red": 0.77 * 1.6}
+    assert level_steps({1: fields, 2: red}) == ()
+    assert level_steps({1: fields, 2: {**fields, "red": 0.77 * 1.7}})[0].band == "red"
+
+
+@pytest.mark.parametrize(("sensor", "size"), [("SU11", (0, 0)), ("SU30", (0, 0)), ("SU02", (1, 5))])
+def test_a_blurred_or_smeared_head_is_named(
+    error_free: InjectedExposure, sensor: str, size: tuple[int, int]
+) -> None:
+    def blurred(frame: Any) -> Any:
+        if size == (0, 0):
+            return cv2.GaussianBlur(frame, size, 1.5)
+        return cv2.blur(frame, size)
+
+    outcome = error_free.with_frame(sensor, blurred).outcome()
+    assert outcome.verdict == "usable" and "BLUR" in outcome.flags
+    assert outcome.figure("blurred_sensor") == sensor and outcome.figure("blurred_ratio") < 0.6
+
+
+@pytest.mark.parametrize(
+    ("named", "change"),
+    [("left-justified", lambda f: f << 4), ("byte-swapped", lambda f: f.byteswap())],
+)
+def test_values_of_another_format_are_named(
+    error_free: InjectedExposure, named: str, change: Callable[[Any], Any]
+) -> None:
+    outcome = error_free.with_frame("SU20", change).outcome()
+    assert outcome.verdict == "refly" and outcome.figure("word_format") == named
+    assert outcome.figure("word_format_sensors") == "SU20" and "pixel format" in outcome.sentences
+
+
+def test_formats_of_pixel_values_by_the_rig_file(error_free: InjectedExposure) -> None:
+    frame = error_free.frames["SU00"]
+    right = error_free.rig.sensor("SU00")
+    left = replace(right, justified="left")
+    assert wrong_format(right, frame) is None and wrong_format(left, frame << 4) is None
+    assert wrong_format(left, frame) == "right-justified"
+    assert wrong_format(right, frame + np.uint16(4096)) == "beyond 12 bits"
+
+
+@pytest.mark.parametrize(
+    ("sensor", "dn", "rows", "columns"),
+    [
+        ("SU11", 40, slice(300, 500), slice(400, 700)),
+        ("SU00", 40, slice(0, 300), slice(0, 400)),
+        ("G", 40, slice(300, 500), slice(400, 700)),
+    ],
+)
+def test_a_block_with_another_offset_is_named_with_an_edge(
+    error_free: InjectedExposure, sensor: str, dn: int, rows: slice, columns: slice
+) -> None:
+    outcome = error_free.with_frame(sensor, block(dn, rows, columns)).outcome()
+    assert outcome.verdict == "usable" and "FRAME_CORRUPT" in outcome.flags
+    assert outcome.figure("block_sensor") == sensor and "no other head shows" in outcome.sentences
+    assert abs(outcome.figure("block_step_dn")) == pytest.approx(abs(dn), rel=0.3)
+    edges = (rows if outcome.figure("block_axis") == "rows" else columns).indices(1248)[:2]
+    assert outcome.figure("block_at") + 1 in edges
+
+
+@pytest.mark.parametrize(("sensor", "level_dn"), [("SU21", 1500), ("G", 1200), ("N", 1500)])
+def test_a_head_that_clips_below_full_scale_is_named_with_its_level(
+    error_free: InjectedExposure, sensor: str, level_dn: int
+) -> None:
+    outcome = error_free.with_frame(sensor, clipped(level_dn)).outcome()
+    assert outcome.verdict == "usable" and "OVEREXPOSED" in outcome.flags
+    assert outcome.figure("clipped_sensor") == sensor
+    assert outcome.figure("clipped_dn") == level_dn
+    share = float(np.mean(error_free.frames[sensor] >= level_dn))
+    assert outcome.figure("clipped_fraction") == pytest.approx(share, rel=0.2)
+
+
+EVERYTHING = slice(None)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "kind", "sigma_px", "smear_px", "rows", "columns"),
+    [
+        ("G", "colour", 3.0, 0, EVERYTHING, EVERYTHING),
+        ("R", "colour", 2.0, 0, slice(416, 832), slice(0, 624)),
+        ("SU30", "pan", 0.0, 5, slice(0, 416), slice(0, 624)),
+        ("SU11", "pan", 1.5, 0, slice(416, 832), slice(624, 1248)),
+    ],
+)
+def test_a_colour_head_or_a_region_without_fine_detail_is_named(
+    error_free: InjectedExposure,
+    sensor: str,
+    kind: str,
+    sigma_px: float,
+    smear_px: int,
+    rows: slice,
+    columns: slice,
+) -> None:
+    def blurred(frame: Any) -> Any:
+        if smear_px:
+            return cv2.blur(frame, (1, smear_px))
+        return cv2.GaussianBlur(frame, (0, 0), sigma_px)
+
+    outcome = error_free.with_frame(sensor, in_part(blurred, rows, columns)).outcome()
+    assert outcome.verdict == "usable" and "BLUR" in outcome.flags
+    assert outcome.figure(f"{kind}_blur_sensor") == sensor
+    region = outcome.figure(f"{kind}_blur_region")
+    assert f"{sensor} shows less fine detail" in outcome.sentences and region in outcome.sentences
+    if rows != EVERYTHING:
+        assert region == (
+            f"columns {columns.start} to {columns.stop - 1}, rows {rows.start} to {rows.stop - 1}"
+        )
