@@ -37,8 +37,7 @@ from processing.bundle.network import (
 from processing.bundle.rotations import rotations_from_vectors
 from processing.bundle.self_calibration import SETS, SetName, parts_of, with_self_calibration
 from processing.matching.patches import INTERPOLATION, match_patches, select_features
-from processing.pipelines.stitched import PipelineSettings
-from processing.pipelines.stitched import Pipeline
+from processing.pipelines.stitched import Pipeline, PipelineSettings
 from processing.rig import VirtualImage
 from sim_hw.world import true_camera
 from sim_hw.world.scene import open_scene

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from processing.bundle.curvature_refraction import RayModel, bent, refraction_coefficient
-from processing.bundle.rotations import exponential
+from processing.bundle.curvature_refraction import RayModel, corrected_rays, refraction_coefficient
+from processing.bundle.rotations import rotations_from_vectors
 from processing.geometry.drift import lag_step, physical_similarity
 from processing.geometry.lens import ideal_from_measured
 from processing.geometry.orientation import grid_from_camera, level_from_body, omega_phi_kappa
@@ -54,7 +54,7 @@ def test_a_small_rotation_moves_an_image_point_as_the_matrix_of_the_page_says() 
     page = np.array([[x * y / f, -f - x * x / f, -y], [f + y * y / f, -x * y / f, x]])
     assert small_rotation_design(np.array([[x, y]]), f)[:, :, 0] == pytest.approx(page)
     w = np.array([2e-6, -3e-6, 1e-6])
-    ray = exponential(w[None])[0] @ np.array([x, y, -f])
+    ray = rotations_from_vectors(w[None])[0] @ np.array([x, y, -f])
     moved = -f * ray[:2] / ray[2] - np.array([x, y])
     assert moved == pytest.approx(page @ w, abs=1e-9)
 
@@ -199,7 +199,9 @@ def test_curvature_and_refraction() -> None:
     k = 2410e-6 * (hk / (hk**2 - 6 * hk + 250) - gk / (gk**2 - 6 * gk + 250) * gk / hk)
     assert float(refraction_coefficient(np.array(height), 200.0)) == pytest.approx(k)
     out = 1 + k * (1 + (e * e + n * n) / z**2)
-    found = bent(ray, np.array([height]), RayModel(radius, refraction=True, ground_m=200.0))[0][0]
+    found = corrected_rays(
+        ray, np.array([height]), RayModel(radius, refraction=True, ground_m=200.0)
+    )[0][0]
     assert found == pytest.approx([e * out, n * out, z], abs=1e-9)
 
 

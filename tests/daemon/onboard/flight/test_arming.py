@@ -39,7 +39,7 @@ def test_nothing_is_missing_where_all_is_there() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "name", "says"),
+    ("change", "name", "part"),
     [
         ({"has_kernels": False}, "arming-kernels", "kernels"),
         ({"absent": ["head SU02"]}, "arming-device", "no head SU02"),
@@ -56,10 +56,10 @@ def test_nothing_is_missing_where_all_is_there() -> None:
     ],
 )
 def test_each_thing_that_is_missing_is_named_with_its_cure(
-    change: dict[str, Any], name: str, sentences: str
+    change: dict[str, Any], name: str, part: str
 ) -> None:
     (item,) = missing_prerequisites(replace(READY, **change), LimitsSection())
-    assert (item.name, sentences in str(item)) == (name, True)
+    assert (item.name, part in str(item)) == (name, True)
     assert item.cure and item.cure in str(item)
     assert item.may_be_overridden is (name != "arming-kernels")
     assert entry_of(item.name) is not None

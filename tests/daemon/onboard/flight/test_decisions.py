@@ -24,7 +24,7 @@ def due(to_seal: object = None) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("may_seal", "allow_provisional", "to_seal", "foreseen"),
+    ("may_seal", "allow_provisional", "to_seal", "provisional"),
     [
         (True, True, None, "foreseen"),
         (True, False, None, None),

@@ -67,7 +67,7 @@ def test_a_position_with_height_and_time_passes_and_names_the_leap_table(tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("sample", "said"),
+    ("sample", "sentence"),
     [
         (
             replace(nav(0.0), fix="none", latitude_deg=None, longitude_deg=None, satellites=0),

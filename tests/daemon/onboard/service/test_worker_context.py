@@ -84,7 +84,7 @@ def test_what_is_sealed_otherwise_is_made_and_told_anew(bench: Bench) -> None:
     assert bench.verdicts == ["event-mark", "interpolated"] and bench.written == ["interpolated"]
 
 
-@pytest.mark.parametrize("settled", [RecordFinalized(1, None), None])
+@pytest.mark.parametrize("finalized", [RecordFinalized(1, None), None])
 def test_what_is_never_sealed_is_never_written(
     bench: Bench, finalized: RecordFinalized | None
 ) -> None:
