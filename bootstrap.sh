@@ -10,7 +10,7 @@ PYTHON=${PYTHON:-python3}
 PACKAGES="gir1.2-aravis-0.8 libgirepository1.0-dev libcairo2-dev gcc pkg-config python3-dev python3-venv openssl"
 # Peers that the tests hold our devices and our writing against; not needed for flying.
 PEERS="aravis-tools-cli aravis-tools gpsd systemd strace libimage-exiftool-perl libnss3-tools iproute2"
-# The virtual machine of `make test-v4l2`; where it cannot be installed that test says so.
+# The virtual machine of `make test-v4l2`; if it cannot be installed that test reports it.
 MACHINE="qemu-system-x86 busybox-static kmod v4l-utils"
 
 missing() {

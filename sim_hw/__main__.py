@@ -1,6 +1,6 @@
-"""`python -m sim_hw RIG --out DIR`: run an emulated rig until it is told to end.
+"""`python -m sim_hw RIG --out DIR`: run an emulated rig until a signal ends it.
 
-One JSON line on stdout says that everything answers; progress and complaints go to stderr.
+One JSON line on stdout reports that every device answers; progress and errors go to stderr.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""The judge: holds the geometry of stitched images against the emulator's truth.
+"""Compares the geometry of stitched images with the emulator's truth.
 
-A pure function with a thin command line. It reads what the mission says of itself and what the
-emulator knows, and nothing of the pipeline's.
+A pure function with a thin command line. It reads what the mission states and what the
+emulator knows. It uses no code of the pipeline.
 """
 
 from __future__ import annotations

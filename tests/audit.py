@@ -1,6 +1,6 @@
 """`python -m tests.audit`: known vulnerabilities of what is in requirements.lock and in the page.
 
-Asks the advisory database of OSV in one request. Where it cannot be asked that is said in capitals
+Asks the advisory database of OSV in one request. If it is not available, that is printed in capitals
 and the exit status is 0, with `--required` 2; it is 1 where an advisory matches that nobody has
 looked at.
 
@@ -21,7 +21,7 @@ from typing import Any, Final
 
 ROOT: Final = Path(__file__).parents[1]
 LOCKS: Final = ("requirements.lock", "requirements-fuzz.lock")
-VENDOR: Final = ROOT / "daemon" / "watch" / "page" / "vendor"
+VENDOR: Final = ROOT / "daemon" / "onboard" / "monitoring" / "page" / "vendor"
 DATABASE: Final = "https://api.osv.dev/v1/querybatch"
 TIMEOUT_S: Final = 20.0
 LARGEST_ANSWER_BYTES: Final = 10_000_000
@@ -34,7 +34,7 @@ _HEADERS: Final = {"leaflet": r"Leaflet (\d[\d.]*\d)", "uplot": r"uPlot \(v(\d[\
 
 
 class AuditError(Exception):
-    """The database did not answer, or not as it is specified; the sentence says how."""
+    """The database did not answer, or not as specified; the message gives the reason."""
 
 
 @dataclass(frozen=True)

@@ -95,7 +95,7 @@ class Browser:
             self._process.wait(20)
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """Call a method of the protocol; what else is told meanwhile is noted."""
+        """Call a method of the protocol; record the other messages that arrive meanwhile."""
         self._number += 1
         self._link.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
         while True:

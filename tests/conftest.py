@@ -1,7 +1,7 @@
 """What holds for all tests: patience on a busy machine, and the right of way for whole flights.
 
-Under pytest-xdist whole flights (tests/system) come first and one after another in one worker, at
-normal priority since they run in real time; everything else runs file by file beside them, at a
+Under pytest-xdist whole flights (tests/system) run first and one after another in one worker, at
+normal priority since they run in real time; everything else runs file by file in parallel, at a
 lower one.
 """
 

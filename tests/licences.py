@@ -26,7 +26,7 @@ PERMISSIVE: Final = frozenset(
         *("BSD", "CC0-1.0", "ISC", "MIT", "PSF-2.0", "Zlib"),
     }
 )
-"""May be part of anything. BSD: one of its permissive forms, not said which."""
+"""May be part of anything. BSD: one of its permissive forms, not stated which."""
 
 EXCEPTIONS: Final[Mapping[str, str]] = {
     "certifi": "MPL-2.0: a list of certificates, unchanged; comes with pyproj and rasterio",
@@ -55,7 +55,7 @@ _SPDX: Final = re.compile(r"[A-Za-z0-9.+-]+(?: WITH [A-Za-z0-9.-]+)?")
 
 @dataclass(frozen=True)
 class Package:
-    """A package of the lock; `licence` is empty where it is not installed or says nothing."""
+    """A package of the lock; `licence` is empty if it is not installed or states none."""
 
     name: str
     licence: str
@@ -97,7 +97,7 @@ def packages() -> tuple[list[Package], list[str]]:
 
 
 def stated(expression: str, text: str, classifiers: Iterable[str]) -> str:
-    """The licence by a package's metadata, as SPDX where that can be told."""
+    """The licence by a package's metadata, as SPDX if it can be determined."""
     if expression:
         return expression
     text = text.strip()
@@ -118,8 +118,8 @@ def page(found: Iterable[Package]) -> str:
     lines = [
         "# Licences",
         "",
-        "Syntopic is under Apache-2.0. What requirements.lock installs says of itself:",
-        "made by `python -m tests.licences --write`, held current by a test.",
+        "Reference. Syntopic is under Apache-2.0. The licences of the packages in requirements.lock,",
+        "written by `python -m tests.licences --write` and checked by a test:",
         "",
         "## In the product",
         "",
@@ -131,7 +131,7 @@ def page(found: Iterable[Package]) -> str:
             if not p.is_tool
         ),
         "",
-        "Vendored with the page: Leaflet (BSD-2-Clause) and uPlot (MIT), their licences beside",
+        "Vendored with the page: Leaflet (BSD-2-Clause) and uPlot (MIT), with their licences next to",
         "them. Wheels carry libraries of their own whose licences are in the wheels: OpenBLAS and",
         "the GCC runtime in numpy and scipy, FFmpeg (LGPL) in opencv, GDAL and PROJ in rasterio",
         "and pyproj.",

@@ -1,4 +1,4 @@
-"""A known vulnerability fails the check; a database out of reach is said, not passed over."""
+"""A known vulnerability fails the check; an unreachable database is reported, not passed over."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.audit import AuditError, Package, advisories, main, packages, problem
 
 
 class Database:
-    """An advisory database of our own: `known` is what it holds, `body` what it says instead."""
+    """An advisory database of our own: `known` is its content, `body` a reply in place of it."""
 
     def __init__(self) -> None:
         self.known: dict[tuple[str, str, str], list[str]] = {}

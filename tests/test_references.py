@@ -122,7 +122,7 @@ def test_every_page_named_in_code_is_there_with_its_section() -> None:
 def test_nothing_refers_to_documents_that_readers_do_not_have() -> None:
     wrong = []
     for name, text in texts():
-        # Tests may read recorded data beside the checkout if they skip without it.
+        # Tests may read recorded data next to the checkout if they skip without it.
         reads_data = name.startswith("tests/") and "skip" in text
         searched = DATA.sub("", text) if reads_data else text
         wrong += [f"{name}: {found}" for found in NOWHERE.findall(searched)]

@@ -136,7 +136,7 @@ class CcdDistortionPattern:
 
 @dataclass(frozen=True)
 class AerialBlock:
-    """What was measured, and beside it the truth.
+    """The measurements, and the truth for comparison.
 
     Attributes:
         plan: what was flown.
@@ -251,7 +251,7 @@ def ccd_pattern(rig: Rig, seed: int, size_mm: float) -> CcdDistortionPattern:
             projective.append(size_mm * 0.5 * np.array([*own, *(perspective / half[0] ** 2)]))
     table = np.array(projective)
     masters = [k for k, c in enumerate(_cones(rig)) if c == rig.master_cone]
-    # What the master cone's CCDs have in common nobody could tell from the orientation.
+    # The orientation absorbs what the master cone's CCDs have in common: remove it.
     table[:, :6] -= table[masters, :6].mean(axis=0)
     return CcdDistortionPattern(np.array(parts), table)
 

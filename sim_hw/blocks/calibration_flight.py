@@ -1,4 +1,4 @@
-"""A flight over control that tells boresight, lever arm and time offset; beside it the truth.
+"""A flight over control that determines boresight, lever arm and time offset, with its truth.
 
 Nothing is rendered: image coordinates are where the true camera sees ground points. The inertial
 unit sits askew, its antenna apart from the camera, and its clock is late; poses and their
@@ -65,7 +65,7 @@ ONE_WAY = (
 
 @dataclass(frozen=True)
 class CalibrationFlight:
-    """What was measured, and beside it the truth.
+    """The measurements, and the truth for comparison.
 
     Image coordinates of image `image`; the first `control` points are known. Inertial values are at
     the instants the camera's marks name: position of the antenna and velocity in east, north, up;

@@ -55,7 +55,7 @@ class MeasurementNoise:
 
 @dataclass(frozen=True)
 class ObliqueBlock:
-    """What was measured, and beside it the truth.
+    """The measurements, and the truth for comparison.
 
     Image coordinates are of image `image` = exposure * 5 + head. The first `control` points are
     known to the adjustment, the next `checks` are not.

@@ -17,9 +17,9 @@ class AsciiProbe(LineDevice):
     """The instrument, from `start()` to `close()`; a host opens `port`.
 
     `templates` are the lines of one reading in the manner of `str.format`: `{0}` is the first
-    channel's value, written as `value_format` says, or `open_sensor_text` where the channel says
-    None: an open sensor. It speaks every `interval_s`, or, with a `command`, only when that is
-    heard, followed by CR or LF.
+    channel's value, formatted with `value_format`, or `open_sensor_text` where the channel gives
+    None: an open sensor. It sends every `interval_s`, or, with a `command`, only when that is
+    received, followed by CR or LF.
 
     Example:
         >>> probe = AsciiProbe([lambda: 21.34, lambda: None], ["T1={0} T2={1}"])

@@ -1,6 +1,6 @@
-"""The one loop in which every emulated device on a line lives: waiting, hearing, speaking.
+"""The loop that every emulated device on a line runs: wait, receive, send.
 
-What a device says and when is in its own file, what its line is in `pseudo_terminal` and
+The messages of a device and their times are in its own file; its line is in `pseudo_terminal` or
 `network_line`.
 """
 
@@ -37,7 +37,7 @@ class DeviceLine(Protocol):
         """Send; how many bytes found a place."""
 
     def read(self, timeout_s: float) -> bytes:
-        """What the host has written, b"" where nothing came within the time-out."""
+        """What the host has written; b"" if nothing came within the timeout."""
 
     def close(self) -> None: ...
 
@@ -45,10 +45,10 @@ class DeviceLine(Protocol):
 class LineDevice:
     """An emulated device on a line, from `start()` to `close()`; a host opens `port`.
 
-    A device says in `due_mono_ns` when it wants to speak next and in `speak` what; in `hear` what
-    it answers to what the host wrote, and in `pause` what it does once nothing has been heard for
-    `idle_timeout_s`. What the host does not read is lost and counted. `wire` stands between the
-    device and the host.
+    `due_mono_ns` is the time of the device's next message and `emit_due` its content. `on_received`
+    returns the answer to what the host wrote, and `on_idle` what the device sends after
+    `idle_timeout_s` without input. What the host does not read is lost and counted. `byte_filter`
+    is applied to everything that the device sends.
     """
 
     idle_timeout_s: float = DRAIN_S
@@ -61,33 +61,33 @@ class LineDevice:
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
 
-    # What a device says
+    # Messages of a device
 
     def due_mono_ns(self) -> int | None:
-        """Monotonic time at which it speaks next by itself; None where it only answers."""
+        """Monotonic time of the next unsolicited message; None if the device only answers."""
         return None
 
     def emit_due(self) -> bytes:
-        """What it says by itself, now that it is due."""
+        """The unsolicited message that is now due."""
         return b""
 
     def on_received(self, data: bytes) -> bytes:
-        """The answer to what the host wrote; a receiver of few words swallows it."""
+        """The answer to what the host wrote; a device without commands discards it."""
         return b""
 
     def on_idle(self) -> bytes:
-        """Nothing was heard for `idle_timeout_s`: what it says to that."""
+        """What the device sends after `idle_timeout_s` without input."""
         return b""
 
     def parts(self, data: bytes) -> list[tuple[str, bytes]]:
-        """What was said at once, in messages with their topics, for faults of some of them."""
+        """One transmission divided into messages with topics, for faults of some of them."""
         return [("", data)]
 
     def restart_count(self) -> None:
-        """What the device counts begins anew."""
+        """Restart the counters of the device."""
 
     def restart(self) -> None:
-        """The power came back: the device is as new."""
+        """The power came back: the device is in its initial state."""
         self.restart_count()
 
     # The loop
@@ -110,7 +110,7 @@ class LineDevice:
 
     def statistics(self) -> Mapping[str, int]:
         """Counters since creation, by stable name."""
-        names = ("bytes_sent", "bytes_lost", "bytes_heard")
+        names = ("bytes_sent", "bytes_lost", "bytes_received")
         return {name: self.counts[name] for name in names}
 
     def _run(self) -> None:
@@ -127,7 +127,7 @@ class LineDevice:
     def _listen(self, timeout_s: float) -> None:
         idle_timeout_s = self.idle_timeout_s
         received = self._line.read(timeout_s)
-        self.counts["bytes_heard"] += len(received)
+        self.counts["bytes_received"] += len(received)
         if received:
             self._send(self.on_received(received))
             return

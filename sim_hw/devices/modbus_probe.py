@@ -31,7 +31,7 @@ _REGISTERS_MAX = 125
 class ModbusProbe(LineDevice):
     """The module, from `start()` to `close()`; a host opens `port`.
 
-    Register `first_register + i` is channel i in signed 0.1 degC, 0x7FFF where the channel says
+    Register `first_register + i` is channel i in signed 0.1 degC, 0x7FFF where the channel gives
     None: an open sensor. Functions 3 and 4 read the same registers. Requests for other slaves, and
     damaged ones, are met with silence.
     """
@@ -84,7 +84,7 @@ class ModbusProbe(LineDevice):
         return _framed(bytes((self._unit, (function | 0x80) & 0xFF, code)))
 
     def on_received(self, data: bytes) -> bytes:
-        # A babbling line never falls silent; its bytes are not worth keeping.
+        # A babbling line never falls silent; its bytes are discarded.
         self._frame = (self._frame + data)[: _FRAME_MAX_BYTES + 1]
         if len(self._frame) == _REQUEST_BYTES and crc16(self._frame) == 0:
             return self.on_idle()

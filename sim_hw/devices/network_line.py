@@ -1,4 +1,4 @@
-"""The device's end of a network connection: a TCP server, or a UDP sender that hears answers.
+"""The device's end of a network connection: a TCP server, or a UDP sender that receives answers.
 
 They stand in for a pseudo-terminal, see `sim_hw.devices.device_loop.Line`.
 """
@@ -14,7 +14,7 @@ _DATAGRAM_BYTES = 1200
 
 
 class TcpLine:
-    """Serves every host that connects; all of them are told the same."""
+    """Serves every host that connects; all of them receive the same bytes."""
 
     def __init__(self, host: str = "127.0.0.1", port: int = 0) -> None:
         self._server = socket.create_server((host, port))
@@ -88,7 +88,7 @@ class TcpLine:
 class UdpLine:
     """Sends datagrams to one address, as an autopilot does to its ground station.
 
-    Whoever writes to it from elsewhere is told from then on instead. `port` is what the host has to
+    A host that writes to it from another address becomes the receiver. `port` is what the host has to
     listen at.
     """
 

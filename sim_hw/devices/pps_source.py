@@ -73,8 +73,8 @@ class PpsSource:
             self._host.close()
 
     def statistics(self) -> Mapping[str, int]:
-        """edges, told."""
-        return {name: self._counts[name] for name in ("edges", "told")}
+        """edges, sent."""
+        return {name: self._counts[name] for name in ("edges", "sent")}
 
     def _accept(self) -> None:
         while not self._stop.is_set():
@@ -110,7 +110,7 @@ class PpsSource:
             return
         try:
             host.sendall(f"{self._counts['edges']} {real_ns}\n".encode("ascii"))
-            self._counts["told"] += 1
+            self._counts["sent"] += 1
         except OSError:
             self._host = None
 

@@ -1,6 +1,6 @@
 """The emulated trigger unit, exactly as docs/pulse-bus.md describes it.
 
-It counts, delays and tells the rest of the world when each output pulses; it knows no head.
+It counts, delays and reports when each output pulses; it knows no head.
 """
 
 from __future__ import annotations

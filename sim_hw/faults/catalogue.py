@@ -1,4 +1,4 @@
-"""The names of the faults: what each does, to which devices, and for how long if nobody says.
+"""The names of the faults: what each does, to which devices, and its default duration.
 
 Names only. Where they are read from is in `plan`, how they are carried out in `channel`.
 """
@@ -26,7 +26,7 @@ _ALL: Final = frozenset((HEAD, RECEIVER, THERMOMETER, TRIGGER))
 
 @dataclass(frozen=True)
 class FaultKind:
-    """One name. A *message* is what a device says at once: a frame, an epoch, an answer, a line.
+    """One name. A *message* is one transmission of a device: a frame, an epoch, an answer, a line.
 
     `duration_s` is how long it lasts where no duration is given; None means that it hits the next
     message only (level message and content) or lasts until the end (level clock). `amount` is what
@@ -54,13 +54,13 @@ _KINDS: Final = (
     ),
     FaultKind("truncated", "message", "the message breaks off"),
     FaultKind(
-        "stuck", "message", "the last message is said again instead of a new one", duration_s=5.0
+        "stuck", "message", "the last message is repeated instead of a new one", duration_s=5.0
     ),
-    FaultKind("silent", "message", "powered and connected, but nothing is said", duration_s=5.0),
+    FaultKind("silent", "message", "powered and connected, but sends nothing", duration_s=5.0),
     FaultKind(
         "flooding",
         "link",
-        "far more is said than was asked for: noise, and frames nobody triggered",
+        "sends far more than was requested: noise, and frames without a trigger",
         duration_s=5.0,
     ),
     FaultKind(
@@ -98,7 +98,10 @@ _KINDS: Final = (
         "cable-pulled", "link", "nothing passes either way, then all is back", duration_s=5.0
     ),
     FaultKind(
-        "power-cycle", "link", "off, and back with counts, clocks and settings anew", duration_s=3.0
+        "power-cycle",
+        "link",
+        "off, then back with initial counts, clocks and settings",
+        duration_s=3.0,
     ),
     FaultKind(
         "older-frame",
@@ -115,7 +118,7 @@ _KINDS: Final = (
     FaultKind(
         "open-sensor",
         "content",
-        "the probe's wire is broken; the module says so",
+        "the probe's wire is broken; the module reports it",
         frozenset((THERMOMETER,)),
         duration_s=5.0,
     ),

@@ -1,4 +1,4 @@
-"""What the faults of one device do to what it says: pure, on instants handed in.
+"""The effect of one device's faults on its messages: pure functions of the instants passed in.
 
 The same channel stands behind the sockets and pseudo-terminals of the wire emulators and behind
 the devices of the fake clock. What a message is, bytes or a frame, only `Damage` knows.
@@ -19,11 +19,11 @@ from sim_hw.world.world_clock import NS_PER_S, NS_PER_WEEK
 T = TypeVar("T")
 
 FLOOD_PERIOD_NS = 100_000_000
-"""A flooding device says something unasked so often."""
+"""Interval between the unsolicited messages of a flooding device."""
 DUPLICATE_AFTER_NS = 1_000_000
 REORDER_TIMEOUT_NS = 5_000_000
 NOTIFY_INTERVAL_NS = 5 * NS_PER_S
-"""A fault that hits again so much later is told again."""
+"""A fault that applies again after this time is reported again."""
 RECORD_INTERVAL_NS = NS_PER_S // 2
 """A fault that lasts is a hit so often."""
 
@@ -42,7 +42,7 @@ class Damage(Protocol[T]):
 
 
 class BytesDamage:
-    """Damage of what is said in bytes."""
+    """Damage to messages given as bytes."""
 
     def corrupt(self, message: bytes, rng: random.Random) -> bytes:
         damaged = bytearray(message)
@@ -92,7 +92,7 @@ class _ArmedFault:
 class Channel(Generic[T]):
     """The way out of one device, with its faults.
 
-    Times are ns of whatever clock the caller keeps. `begin` sets time zero; `pulse` tells of a
+    Times are ns of the caller's clock. `begin` sets time zero; `pulse` reports a
     pulse of the trigger unit, for faults that begin with one. From any thread.
     """
 
@@ -144,7 +144,7 @@ class Channel(Generic[T]):
         )
 
     def is_silent(self, now_ns: int) -> bool:
-        """Whether the device says nothing, though it is there."""
+        """Whether the device sends nothing although it is connected."""
         return self._is_on("silent", now_ns, note=True)
 
     def is_powered(self, now_ns: int) -> bool:
@@ -193,7 +193,7 @@ class Channel(Generic[T]):
         return error_ns
 
     def flood_is_due(self, now_ns: int) -> bool:
-        """Whether something nobody asked for is to be said now."""
+        """Whether an unsolicited message is due now."""
         if not self._is_on("flooding", now_ns, note=True) or now_ns < self._next_flood_ns:
             return False
         self._next_flood_ns = now_ns + FLOOD_PERIOD_NS
@@ -208,7 +208,7 @@ class Channel(Generic[T]):
     def send(
         self, message: T, now_ns: int, *, topic: str = "", what: str = ""
     ) -> list[Delivery[T]]:
-        """What goes out, and when, for a message that is said now.
+        """What goes out, and when, for a message that is sent now.
 
         `topic` is what kind of message it is, `what` its own name for `hits`.
         """
@@ -233,7 +233,7 @@ class Channel(Generic[T]):
             return due
 
     def _sent(self, message: T, now_ns: int, topic: str, what: str) -> list[Delivery[T]]:
-        # Silent is here what says some things and not others; a silent device comes not so far.
+        # Here `silent` suppresses some topics; a device that is completely silent does not get here.
         if self._take("silent", now_ns, topic, what) is not None:
             return []
         last = self._last.get(topic)
@@ -271,7 +271,7 @@ class Channel(Generic[T]):
                     continue
                 if fault.topic not in ("", topic):
                     continue
-                # A frame of an earlier pulse may be said when this one is given already.
+                # A frame of an earlier pulse may be delivered after this one was requested.
                 if fault.at_pulse is not None and what.isdecimal() and int(what) < fault.at_pulse:
                     continue
                 armed.is_spent = fault.duration_s is None

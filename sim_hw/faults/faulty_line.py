@@ -1,7 +1,7 @@
 """Faults of emulated devices on a line: what stands between a device and its host.
 
-Called from the device's own thread with everything it says, and with nothing every 50 ms, so that
-what is late can go later and what is unasked can come.
+Called from the device's own thread with everything it sends, and with nothing every 50 ms, so that
+delayed bytes can be released later and unsolicited bytes can be added.
 """
 
 from __future__ import annotations

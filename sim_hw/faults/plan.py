@@ -1,6 +1,6 @@
 """Which fault happens when and to whom: NAME@TIME[:DEVICE][,DURATION], or a scenario file.
 
-Reading and checking only, all mistakes told at once; what a fault does is in `channel`.
+Reading and validation only; all errors are reported at once. `channel` applies the faults.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class PlannedFault:
 
     It begins `at_s` seconds after the devices are ready, or with pulse `at_pulse` of the trigger
     unit (from 1). `duration_s` None: the next message, or until the end; see `FaultKind`. `topic`
-    narrows a message fault to some of what the device says, such as "mark".
+    narrows a message fault to some messages of the device, such as "mark".
     """
 
     name: str
@@ -174,7 +174,7 @@ def _planned(
     if not _is_number(amount):
         problems.append(f"{where}.{kind.amount_key} is {amount!r}; a number")
     elif kind.name == "late" and amount <= 0:
-        problems.append(f"{where}.by_s is {amount!r}; nothing comes earlier than it is said")
+        problems.append(f"{where}.by_s is {amount!r}; a message cannot arrive before it is sent")
     elif kind.name == "wrong-week" and amount != int(amount):
         problems.append(f"{where}.weeks is {amount!r}; a whole number of weeks")
     targets = _targets(where, entry.get("device"), kind, devices, problems)
@@ -216,7 +216,7 @@ def _targets(
         problems.append(f"{where}: {kind.name} is of the whole device; leave out /{topic}")
     elif topic and topic not in TOPICS.get(devices[name], ()):
         known = " or ".join(f"{name}/{one}" for one in TOPICS.get(devices[name], ()))
-        problems.append(f"{where}: {device} is nothing that is said; write {known or name}")
+        problems.append(f"{where}: {device} is not a message; write {known or name}")
     return [(name, topic)]
 
 

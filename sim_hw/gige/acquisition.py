@@ -184,7 +184,7 @@ class Acquisition:
     def execute_action(self, device_ns: int | None) -> Status:
         """An action command: expose now, or when the head's clock shows `device_ns`.
 
-        One whose time has passed is taken at once, and says that it is late.
+        A time that has passed triggers immediately, and the return value reports it as late.
         """
         if not self._is_waiting_for("Action1"):
             self.counts["actions_not_waited_for"] += 1

@@ -34,9 +34,9 @@ _NS_PER_MS = 1_000_000
 
 @dataclass(frozen=True)
 class HeadActions:
-    """What the head does when the control channel is told to.
+    """The actions of the head that the control channel triggers.
 
-    `written` hears the address of every register that was written. `control_lost` is called when
+    `written` receives the address of every register that was written. `control_lost` is called when
     the privilege ends, given back or timed out.
     """
 
@@ -205,7 +205,7 @@ class ControlChannel:
         self._registers.set_register(at.CONTROL_PRIVILEGE, requested_privilege & _PRIVILEGES)
 
     def _act(self, command: GvcpCommand) -> bytes | None:
-        """An action command, from whom ever; who is not meant says nothing."""
+        """An action command from any sender; a head that is not addressed sends no answer."""
         request = parse_action(command)
         if request is None:
             raise RegisterRefusedError(Status.INVALID_HEADER)

@@ -17,7 +17,7 @@ PACKET_MAX = 576
 READ_MAX = 536
 ACK_REQUIRED = 0x01
 SCHEDULED = 0x80
-"""An action command that says when."""
+"""An action command with its scheduled time."""
 
 _HEADER = struct.Struct(">BBHHH")
 _ACK_HEADER = struct.Struct(">HHHH")

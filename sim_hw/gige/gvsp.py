@@ -79,7 +79,7 @@ _libc.sendmmsg.restype = ctypes.c_int
 
 @dataclass(frozen=True)
 class FrameHeader:
-    """What the leader says of a frame; `timestamp_ns` is on the device's clock."""
+    """The description of a frame in its leader; `timestamp_ns` is on the device's clock."""
 
     block_id: int
     timestamp_ns: int

@@ -69,7 +69,7 @@ def channel_of(faults: WireFaults, serial: str) -> Channel[ExposedFrame]:
 
 
 class HeadClock:
-    """A head's own clock, with the error of its clock faults; anew after a power cycle."""
+    """A head's own clock, with the error of its clock faults; restarted by a power cycle."""
 
     def __init__(self, clock: FreeRunningClock, channel: Channel[ExposedFrame]) -> None:
         self._clock = clock

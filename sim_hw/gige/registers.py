@@ -45,7 +45,7 @@ class RegisterRefusedError(Exception):
 
 @dataclass(frozen=True)
 class HeadIdentity:
-    """Who a head is: its address on the network, and what it says of itself.
+    """The identity of a head: its network address and the strings it reports.
 
     `address` is IPv4, one per head; `serial` has at most 15 bytes, `user_id` 15, the others 31.
     """

@@ -20,7 +20,7 @@ _RECEIVE_BYTES = 2048
 
 
 class ControlServer:
-    """Serves one control channel on (address, 3956), and discovery by broadcast beside it."""
+    """Serves one control channel on (address, 3956), and discovery by broadcast."""
 
     def __init__(
         self, address: str, channel: ControlChannel, is_listening: Callable[[], bool] = lambda: True
@@ -66,7 +66,7 @@ class ControlServer:
         self._close_sockets()
 
     def ignore_until(self, until_mono_ns: int) -> None:
-        """Hear nothing until then, as a device that restarts."""
+        """Ignore all input until then, as a device that restarts."""
         self._ignore_until_ns = until_mono_ns
 
     def _bind(self) -> None:

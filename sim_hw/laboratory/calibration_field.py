@@ -36,7 +36,7 @@ OFFSET_MM: Final = 0.1
 LENS: Final = {"k1": 4e-7, "k2": 4e-9, "p1": 2e-6, "p2": 2e-6}
 SURVEY_SIGMA_M: Final = 20e-6
 HOLDER_SIGMA: Final = (0.003, 2e-3)
-"""How well the holder's settings tell position (m) and attitude (rad)."""
+"""Standard deviations of the holder's settings: position (m) and attitude (rad)."""
 PROBE_NOISE_K: Final = 0.05
 TARGET_RADIUS_PX: Final = 6.0
 LIGHT_SHARE: Final = 0.7

@@ -53,7 +53,7 @@ LENS_SPREAD: Final = {
 
 @dataclass(frozen=True)
 class TrueHead:
-    """A head as it is. `place` is how the sensor really lies in the layer, as the rig says."""
+    """The true head. `place` is the true position of the sensor in the layer, as in the rig file."""
 
     cone: Cone
     sensor: Sensor

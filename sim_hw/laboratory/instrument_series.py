@@ -1,7 +1,7 @@
 """A laboratory series as the emulated instruments leave it on disk, and the command that takes one.
 
-What is in the images, and what each says of itself, is the instrument's: `sphere`, `collimator`,
-`test_field`.
+The images and their metadata come from the instruments: `sphere`, `collimator`,
+`calibration_field`.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def run(
 
 
 def new_series(out: Path, rig_file: Path) -> Path:
-    """The folder of a series, with the rig file; the folder `truth` stands beside it."""
+    """The folder of a series, with the rig file; the folder `truth` is next to it."""
     series = out / "series"
     series.mkdir(parents=True)
     (out / "truth").mkdir()

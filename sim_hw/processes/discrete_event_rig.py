@@ -84,7 +84,7 @@ class FrameDamage:
 
 
 class DeviceListener(Protocol):
-    """Who hears the devices, at the moment their words arrive."""
+    """Receives the devices' messages at the moment of their arrival."""
 
     def on_trigger_answer(self, line: bytes, now_ns: int) -> None: ...
 
@@ -192,7 +192,7 @@ class DiscreteEventReceiver:
         self._count = rng.randrange(1 << 16)
         self._boots_until_ns = 0
         self.sent_marks: dict[int, SentMark] = {}
-        """Every mark that was put into a message, by the GPS time it was said to be at."""
+        """Every mark that was put into a message, by the GPS time stated in it."""
 
     def state(self, gps_ns: int) -> ReceiverState:
         """Where the aircraft truly is."""
@@ -216,7 +216,7 @@ class DiscreteEventReceiver:
             self._edges.append((at_ns, exposure))
 
     def epoch(self, now_ns: int) -> list[tuple[str, str, bytes]]:
-        """What it says for the epoch at this instant: topic, name and bytes of each message."""
+        """Its messages for the epoch at this instant: topic, name and bytes of each."""
         channel = self.channel
         if channel.has_power_cycled(now_ns):
             self._boots_until_ns = now_ns + BOOT_NS
@@ -264,7 +264,7 @@ class DiscreteEventReceiver:
 
 
 class DiscreteEventRig:
-    """All devices of a rig on one timeline; `listener` hears them.
+    """All devices of a rig on one timeline; `listener` receives their messages.
 
     Time zero of the faults is the start of the world. The devices are named as on the wire: heads
     by their sensors, `receiver`, `probes` and `trigger`.
@@ -336,7 +336,7 @@ class DiscreteEventRig:
         self._answer(f"PULSEBUS 1 {self.rig.name} {outputs}", now_ns)
 
     def execute(self, line: bytes, now_ns: int) -> None:
-        """A line of the program; nothing hears it where the cable is out. See docs/pulse-bus.md."""
+        """A line of the program; it is not received where the cable is out. See docs/pulse-bus.md."""
         if not self.trigger.is_connected(now_ns):
             return
         match line.decode().split():
@@ -348,7 +348,7 @@ class DiscreteEventRig:
             case ["STATUS"]:
                 self._answer(f"STATUS {self._count}", now_ns)
             case fields:
-                raise ValueError(f"the trigger client said {fields}")
+                raise ValueError(f"the trigger client sent {fields}")
 
     def _fire(self, sequence: int, now_ns: int) -> None:
         received_ns = now_ns + self._rng.randrange(*ANSWER_LATENCY_NS) // 2

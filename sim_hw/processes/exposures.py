@@ -1,7 +1,7 @@
 """`python -m sim_hw.processes.exposures RIG`: exposures on disk, without devices.
 
-Writes a mission folder as anybody may write one by hand (docs/formats.md), the laboratory's
-calibration beside it, and the truth. What is timed later must not be rendered while timing.
+Writes a mission folder in the format for hand-written missions (docs/formats.md), the laboratory's
+calibration and the truth. Rendering is separate so that benchmarks time the pipeline alone.
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ def _write_plan(world: World, mission: Path, radiometry: Path) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line; one JSON line says where everything is."""
+    """The command line; one JSON line gives the path of every result."""
     line = argparse.ArgumentParser(prog="python -m sim_hw.processes.exposures", description=__doc__)
     add = line.add_argument
     add("rig", help="name of a shipped rig, or a rig file")

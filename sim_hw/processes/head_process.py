@@ -74,7 +74,7 @@ class WorkerPlan:
 
 @dataclass(frozen=True)
 class PulseMessage:
-    """Told to a worker: a pulse of the bus, with the start of exposure of every sensor."""
+    """Sent to a worker: a pulse of the bus, with the start of exposure of every sensor."""
 
     count: int
     start_mono_ns: dict[str, int]
@@ -82,14 +82,14 @@ class PulseMessage:
 
 @dataclass(frozen=True)
 class FaultClockStart:
-    """Told to a worker: everything answers, and the seconds of the faults count from then."""
+    """Sent to a worker: every device answers; the seconds of the faults count from this time."""
 
     mono_ns: int
 
 
 @dataclass(frozen=True)
 class WorkerStatus:
-    """Told by a worker: that its heads answer, or why they cannot."""
+    """Sent by a worker: its heads answer, or the reason why they cannot."""
 
     event: Literal["ready", "failed"]
     sentence: str = ""
@@ -175,7 +175,7 @@ class RenderedHead:
         )
 
     def temperature_c(self, mono_ns: int) -> float:
-        """What the head's own thermometer says."""
+        """The reading of the head's own thermometer."""
         true_c = self._world.temperature_c(self.sensor.probe, self._clock.gps_ns(mono_ns))
         return true_c + self._temperature_error_c
 
@@ -217,7 +217,7 @@ class RenderedHead:
         self._frozen_frame(parameters, 0.0)
 
     def _frozen_frame(self, parameters: ExposureParameters, gain_db: float) -> NDArray[np.uint16]:
-        """The frame that is sent again and again; made anew where the settings have changed."""
+        """The frame that is sent repeatedly; rendered again after a change of the settings."""
         settings = (parameters.exposure_time_us, parameters.tdi_shifts, gain_db)
         if self._frozen is None or self._frozen[0] != settings:
             assert self._still is not None

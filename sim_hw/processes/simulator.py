@@ -1,6 +1,6 @@
-"""The emulated rig as a whole: heads in worker processes, bus, receiver and probes in this one.
+"""The emulated rig: heads in worker processes; bus, receiver and probes in this one.
 
-Composition only. What a device says on its wire is in the device's own file, what it sees in
+Composition only. The messages of a device are defined in its own file, what it sees in
 `rendering`, what is true in `truth`.
 """
 
@@ -57,7 +57,7 @@ PROBE_NOISE_SIGMA_C = 0.07
 
 
 class SimulatorError(RuntimeError):
-    """The emulator cannot come up; the message says why."""
+    """The emulator cannot start; the message gives the reason."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class SimulatorSettings:
 
 
 class Simulator:
-    """An emulated rig, from `start` to `close`. `tell` gets sentences for a person."""
+    """An emulated rig, from `start` to `close`. `report` receives messages for a person."""
 
     def __init__(
         self,

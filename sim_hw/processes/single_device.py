@@ -1,7 +1,7 @@
 """`python -m sim_hw.processes.single_device KIND --at WHERE`: one emulated device in a process of its own.
 
 For trying a driver, or a fault, without a rig. It moves straight north, is strobed once a second,
-says "ready" as a JSON line, and ends with a signal or with its parent.
+prints "ready" as a JSON line, and ends with a signal or with its parent.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def _create_device(
         from sim_hw.devices.pulse_bus import PulseBus
 
         host, _, port = at.rpartition(":")
-        bus = PulseBus("lone", OUTPUTS, lambda _: None, (host, int(port)), faults=channel)
+        bus = PulseBus("single", OUTPUTS, lambda _: None, (host, int(port)), faults=channel)
         return bus, channel.begin, lambda: None
     line = PseudoTerminal(Path(at).absolute())
     emulated = _line_device(kind, line, channel, FaultyWorldClock(world, channel))
@@ -185,7 +185,7 @@ def _head(
         return pixels
 
     head = GigeHead(
-        HeadIdentity(address, f"lone-{address}", "lone head", "Syntopic emulator", "lone"),
+        HeadIdentity(address, f"single-{address}", "single head", "Syntopic emulator", "single"),
         FrameSize(WIDTH_PX, HEIGHT_PX),
         expose,
         lambda _: 30.0,

@@ -1,6 +1,6 @@
 """Which receivers and probes an emulated rig can fly with, by kind, and on what line each is.
 
-What each of them says is in its own file.
+The messages of each kind are in its own file.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ Reading = Callable[[], float | None]
 
 
 class StrobedDevice(Protocol):
-    """A device on a line that is told of strobes."""
+    """A device on a line that receives the strobes."""
 
     wire: ByteFilter
 

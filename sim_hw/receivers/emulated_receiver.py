@@ -1,6 +1,6 @@
 """What emulated GNSS receivers have in common: epochs, the receiver's own clock, strobe edges.
 
-What a receiver says about them is in the file of each kind.
+The messages of each kind of receiver are in its own file.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ STROBE_WIDTH_NS = 50_000
 LATENCY_NS = (30_000_000, 80_000_000)
 """From the epoch to its bytes on the serial line: computing and the line itself."""
 EVENT_LATENCY_NS = (8_000_000, 30_000_000)
-"""Likewise from an edge, where the receiver tells it at once."""
+"""Likewise from an edge, where the receiver reports it immediately."""
 CLOCK_DRIFT_PPM = 0.2
 BOOT_NS = 3 * NS_PER_S
 """From power on to the first position."""
@@ -33,7 +33,7 @@ STEP_NS = 2 * NS_PER_S
 
 @dataclass(frozen=True)
 class ReceiverState:
-    """What the receiver says of itself at one instant.
+    """The state that the receiver reports at one instant.
 
     Geographic coordinates in WGS 84, height above the ellipsoid, velocity north, east, down.
     """
@@ -70,9 +70,9 @@ class Edge:
 
 
 class EmulatedReceiver(LineDevice):
-    """A receiver that keeps time by the world clock and reports what `state` says.
+    """A receiver that keeps time by the world clock and reports the result of `state`.
 
-    `state` gets a GPS time in ns and says what the receiver reports for it: noise is the caller's.
+    `state` maps a GPS time in ns to what the receiver reports for it: noise is the caller's.
     Epochs are whole periods of the receiver's own clock, which is off GPS by `bias_ns`: a slow
     saw-tooth within `clock_bias_max_ns`. Unless `sends_events_immediately`, edges wait for the
     epoch after them. With `is_active_low` strobes fall first and rise at their end.
@@ -115,10 +115,10 @@ class EmulatedReceiver(LineDevice):
 
     @abstractmethod
     def epoch_bytes(self, epoch_gps_ns: int) -> bytes:
-        """Everything the receiver says for one epoch, at that GPS time."""
+        """All messages of the receiver for one epoch, at that GPS time."""
 
     def event_bytes(self, edge: Edge) -> bytes:
-        """What the receiver says for one edge, where it tells them at once."""
+        """The messages of the receiver for one edge, if it reports edges immediately."""
         return b""
 
     def mark(self, gps_ns: int) -> None:
@@ -144,7 +144,7 @@ class EmulatedReceiver(LineDevice):
         return due
 
     def bias_ns(self, nominal_gps_ns: int) -> int:
-        """How much later than its own clock says an epoch really is."""
+        """True time of an epoch less the time by the receiver's own clock."""
         widest_ns = self.clock_bias_max_ns
         if not widest_ns:
             return 0
@@ -160,7 +160,7 @@ class EmulatedReceiver(LineDevice):
         return epoch_ns
 
     def nominal_ns(self, epoch_gps_ns: int) -> int:
-        """What the receiver's own clock says at an epoch: a whole period."""
+        """The reading of the receiver's own clock at an epoch: a multiple of the period."""
         return (epoch_gps_ns + self._period_ns // 2) // self._period_ns * self._period_ns
 
     def is_first_of_second(self, epoch_gps_ns: int) -> bool:

@@ -1,6 +1,6 @@
 """An emulated MAVLink autopilot: streams, camera triggers, TIMESYNC, parameters, commands.
 
-What its messages look like is in `mavlink_messages`. It flies what `state` says and commands
+Its messages are encoded in `mavlink_messages`. It flies as `state` states and commands
 nothing.
 
 Source: MAVLink common message set; guides on time synchronisation, parameters and message rates.
@@ -84,7 +84,7 @@ class MavlinkAutopilot(LineDevice):
 
     Its own clock begins `boot_ns` before the world's and runs `drift_ppm` fast. Stamps of
     CAMERA_TRIGGER are of that clock, as PX4's are, or of UTC with `triggers_in_utc`. `mark` is the
-    strobe at its camera feedback input; every rising edge is told by CAMERA_TRIGGER. `utc_jitter`
+    strobe at its camera feedback input; CAMERA_TRIGGER reports every rising edge. `utc_jitter`
     is that of SYSTEM_TIME and of stamps in UTC; with `sends_angles` attitude comes as ATTITUDE, and
     ATTITUDE_QUATERNION is denied.
     """
@@ -137,7 +137,7 @@ class MavlinkAutopilot(LineDevice):
             self._edge_count += 1
 
     def statistics(self) -> Mapping[str, int]:
-        names = ("marks", "commands", "timesyncs", "parameters_sent", "messages_heard")
+        names = ("marks", "commands", "timesyncs", "parameters_sent", "messages_received")
         return {**super().statistics(), **{name: self.counts[name] for name in names}}
 
     def boot_ns(self, gps_ns: int) -> int:
@@ -170,7 +170,7 @@ class MavlinkAutopilot(LineDevice):
         self._period_ns = _periods(self._default_hz)
         self._next_ns = dict.fromkeys(self._default_hz, now_ns + BOOT_NS)
 
-    # What it says by itself
+    # Unsolicited messages
 
     def due_mono_ns(self) -> int:
         due = [self._next_ns[name] for name, period_ns in self._period_ns.items() if period_ns]
@@ -324,8 +324,8 @@ class MavlinkAutopilot(LineDevice):
         return b"".join(self.answer(received, now_ns) for received in self._listener.feed(data))
 
     def answer(self, received: ReceivedMessage, mono_ns: int) -> bytes:
-        """The answer to one message heard at that moment of the host's clock; maybe nothing."""
-        self.counts["messages_heard"] += 1
+        """The answer to one message received at that host time; may be empty."""
+        self.counts["messages_received"] += 1
         values = received.values
         if received.name == "TIMESYNC":
             if values["tc1"] != 0:

@@ -1,6 +1,6 @@
-"""An emulated autopilot that flies a mission and has a camera do what stands in it, over UDP.
+"""An emulated autopilot that flies a mission and executes its camera commands, over UDP.
 
-It flies where it is said to be: what moves is the business of `sim_hw.world`. Missions are text as
+Its position is given: `sim_hw.world` computes the motion. Missions are text as
 ground stations save it ("QGC WPL 110"). Items that command the camera are sent to it when the
 waypoint before them is reached, as an autopilot does.
 

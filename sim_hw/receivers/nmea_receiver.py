@@ -16,7 +16,7 @@ class NmeaReceiver(EmulatedReceiver):
     """RMC, GGA, GST, VTG, HDT and PASHR every epoch, ZDA once a second, $PTNL,EVT at once.
 
     The standard's resolution is what a host gets: 10 ms, 1e-5 minutes (2 cm), 0.1 m of height; an
-    event is told to 1 us.
+    event has a resolution of 1 us.
     """
 
     def epoch_bytes(self, epoch_gps_ns: int) -> bytes:

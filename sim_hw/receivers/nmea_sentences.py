@@ -1,7 +1,7 @@
-"""NMEA 0183 sentences as bytes, as any receiver may say them.
+"""NMEA 0183 sentences as bytes, as any receiver may send them.
 
-Written from NMEA 0183 as published in gpsd's "NMEA Revealed", and Trimble's $PTNL,EVT; who says
-them and when is in the receivers.
+Written from NMEA 0183 as published in gpsd's "NMEA Revealed", and Trimble's $PTNL,EVT; senders
+and times are in the receivers.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from sim_hw.world.world_clock import (
 )
 
 GEOID_UNDULATION_M = 46.0
-"""Geoid above ellipsoid where the receiver says it is; one value, plausible for Central Europe."""
+"""Geoid above ellipsoid in the receiver's model; one value, plausible for Central Europe."""
 _NS_PER_CS = 10_000_000
 _NS_PER_US = 1_000
 

@@ -10,13 +10,13 @@ from sim_hw.receivers.emulated_receiver import Edge, EmulatedReceiver
 
 SATELLITES = 18
 CLOCK_OFFSET_MAX_NS = 200
-"""By which the steered clock of the receiver is off GPS; MARKxTIME says it, solutions have none."""
+"""Offset of the receiver's steered clock from GPS; MARKxTIME contains it, solutions do not."""
 
 
 class NovatelReceiver(EmulatedReceiver):
     """INSPVAX and INSATT every epoch; BESTPOS, BESTVEL and TIME once a second; marks at once.
 
-    Every rising edge on `mark_input` (1 to 4) is told by MARKxTIME and then by MARKxPVA.
+    MARKxTIME and then MARKxPVA report every rising edge on `mark_input` (1 to 4).
     """
 
     mark_input = 1

@@ -18,8 +18,8 @@ class SeptentrioReceiver(EmulatedReceiver):
     """Every epoch PVTGeodetic with its covariances, DOP, EndOfPVT and AttEuler; events at once.
 
     Epochs are whole periods of the receiver's own time, which its clock bias takes off GPS by up to
-    half a millisecond, as these receivers let it wander. Once a second it tells its time. As after
-    switching on, rising edges only are reported; `reported_edges` says which are.
+    half a millisecond, as these receivers let it wander. It sends its time once a second. As after
+    switching on, rising edges only are reported; `reported_edges` selects them.
     """
 
     reported_edges: frozenset[int] = frozenset((sbf.RISING,))
@@ -28,7 +28,7 @@ class SeptentrioReceiver(EmulatedReceiver):
 
     def epoch_bytes(self, epoch_gps_ns: int) -> bytes:
         rx_ns = self.nominal_ns(epoch_gps_ns)
-        # The clock is behind where an epoch comes later than it says.
+        # The clock is behind where an epoch comes later than its nominal time.
         bias_ns = rx_ns - epoch_gps_ns
         state = self.state(epoch_gps_ns)
         parts = [

@@ -56,8 +56,8 @@ _SATELLITES = (
 class UbloxReceiver(EmulatedReceiver):
     """The receiver, from `start()` to `close()`; a host opens `port`.
 
-    `chatter` adds what a real stream holds besides: NMEA, NAV-SAT, MON-VER. Marks are told with the
-    epoch after them, the last edge of each kind only. Whatever the host writes is swallowed.
+    `chatter` adds other messages of a real stream: NMEA, NAV-SAT, MON-VER. Marks are sent with the
+    epoch after them, the last edge of each kind only. Whatever the host writes is discarded.
     """
 
     sends_events_immediately: ClassVar[bool] = False
@@ -79,7 +79,7 @@ class UbloxReceiver(EmulatedReceiver):
         self._last_falling_ns = 0
 
     def epoch_bytes(self, epoch_gps_ns: int) -> bytes:
-        """Everything the receiver says for one epoch; edges up to it are used up."""
+        """All messages of the receiver for one epoch; edges up to it are consumed."""
         state = self.state(epoch_gps_ns)
         accuracy, leap_seconds = self.accuracy, self.leap_seconds
         satellites = len(_SATELLITES)
@@ -106,14 +106,14 @@ class UbloxReceiver(EmulatedReceiver):
         return b"".join(parts)
 
     def parts(self, data: bytes) -> list[tuple[str, bytes]]:
-        """The mark is told last in its epoch."""
+        """The mark is the last message of its epoch."""
         begin = data.find(TIM_TM2)
         if begin < 0:
             return super().parts(data)
         return [(NAVIGATION, data[:begin]), (MARK, data[begin:])]
 
     def _mark_message(self, epoch_gps_ns: int) -> bytes:
-        """TIM-TM2 for the edges since the last epoch: only the last of each kind is told."""
+        """TIM-TM2 for the edges since the last epoch: only the last of each kind is reported."""
         due = self.take_edges(epoch_gps_ns)
         if not due:
             return b""

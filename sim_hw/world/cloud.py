@@ -1,6 +1,6 @@
 """A cloud between camera and ground: bright, soft, and nearer than what it hides.
 
-Because it is nearer, cones that stand beside each other see it shifted against the ground. Its
+Because it is nearer, cones at different positions see it shifted against the ground. Its
 shadow is not emulated.
 """
 

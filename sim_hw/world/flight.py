@@ -181,7 +181,7 @@ class SimulatedFlight:
         return float(north), float(east), float(-up)
 
     def attitude_rad(self, pose: Pose) -> tuple[float, float, float]:
-        """Roll, pitch and heading against the local level at the aircraft, as an IMU tells them."""
+        """Roll, pitch and heading against the local level at the aircraft, as an IMU reports them."""
         east, north, up = self._local_from_enu(pose) @ pose.enu_from_body
         return (
             math.atan2(-up[1], -up[2]),
@@ -223,7 +223,7 @@ def random_attitude_motion(
 
 
 def random_track_deviation(random: np.random.Generator, *, rms: float) -> RandomMotion:
-    """Slow departure from the planned path, periods of 20 to 90 s."""
+    """Slow deviation from the planned path, periods of 20 to 90 s."""
     omega = 2 * math.pi / np.geomspace(20.0, 90.0, 5) * random.uniform(0.9, 1.1, 5)
     return RandomMotion(
         amplitude=rms * math.sqrt(2 / 5) * np.ones(5),

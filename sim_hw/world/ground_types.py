@@ -184,7 +184,7 @@ GROUNDS: Mapping[str, GroundType] = {
     "coast": GroundType("half land, half a lake without wind", _coast, over_land=True),
     "desert": GroundType("dunes", _desert),
     "snow": GroundType("fresh snow, exposed for", _snow),
-    "snow-burnt": GroundType("fresh snow, exposed as for fields", _snow, light=2.2),
+    "snow-saturated": GroundType("fresh snow, exposed as for fields", _snow, light=2.2),
     "night": GroundType("night, street lamps", _night, light=HEADROOM),
     "dusk": GroundType(
         "a landscape with a hundredth of the light", _landscape, light=0.01, over_land=True

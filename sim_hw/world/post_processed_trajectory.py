@@ -1,7 +1,7 @@
 """When an emulated flight exposes on each of its lines, and the trajectory computed after landing.
 
 The trajectory is a CSV of the reference point's place and attitude with slowly varying errors, each
-exposure's drawn anew, as receivers and inertial units have them once they are processed.
+exposure's drawn independently, as after post-processing of GNSS and inertial data.
 """
 
 from __future__ import annotations

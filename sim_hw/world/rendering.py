@@ -1,6 +1,6 @@
 """What a sensor sees: rays through the true camera onto the ground, and the light that comes back.
 
-The mapping is reckoned exactly on a coarse grid and interpolated; the scene is a spline, read
+The mapping is computed exactly on a coarse grid and interpolated; the scene is a spline, read
 with six by six taps at unrounded positions. What a sensor makes of the light is in `electronics`.
 """
 
@@ -260,7 +260,7 @@ def _keys(x: Array) -> Array:
 
 
 def sample_scene(scene: Scene, band: str, grid: Array, size: tuple[int, int]) -> Map:
-    """Radiances of one band where a grid of scene positions says.
+    """Radiances of one band on a grid of scene positions.
 
     Args:
         grid: scene columns and rows at every `GRID_PX`-th pixel, shape (rows, columns, 2).

@@ -49,7 +49,7 @@ LENS_OF_SOURCE_PX = 0.8
 
 
 class SceneError(ValueError):
-    """A scene that cannot be had; the message says why and what would help."""
+    """A scene is not available; the message gives the reason and the remedy."""
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ class Snapshot:
 class RigElectronics:
     """The electronics of the rig's sensors, and what the laboratory measured of each.
 
-    Keeps the maps of all sensors, about 20 bytes a pixel; unless `keep` says to draw them anew for
+    Keeps the maps of all sensors, about 20 bytes a pixel; with `keep=False` it draws them again for
     each exposure, which takes about a tenth of a second per million pixels.
     """
 

@@ -60,7 +60,7 @@ class TrueCamera:
     """A rig with the errors its calibration does not know.
 
     `place_error_mm` is added to the calibrated place of each sensor, in its layer (x right, y up).
-    `mounting_error_rad` turns a cone further than its platform calibration says:
+    `mounting_error_rad` is the rotation of a cone in addition to its platform calibration:
     master_from_cone = R(calibrated) R(error).
     """
 

@@ -47,7 +47,7 @@ class WorldClock:
 class FreeRunningClock:
     """A device's free-running clock: device = offset + mono * (1 + drift), in ns.
 
-    Reckoned in integers, so that a long uptime costs no digits; `drift_ppm` is resolved to 1e-12.
+    Computed in integers, so that a long uptime loses no digits; `drift_ppm` is resolved to 1e-12.
     """
 
     offset_ns: int = 0

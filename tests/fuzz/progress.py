@@ -1,7 +1,7 @@
 """How far the fuzzing of each parser went: CPU seconds and edges, recorded as JSON piece by piece.
 
-An edge is libFuzzer's "cov": a branch of instrumented Python code. A change of the code begins the
-quiet time anew, since its edges are others.
+An edge is libFuzzer's "cov": a branch of instrumented Python code. A change of the code restarts
+the time without new edges, since its edges differ.
 """
 
 from __future__ import annotations
@@ -61,12 +61,12 @@ class Progress:
 
 
 def begun(cpu_s: float) -> str:
-    """The line with which the fuzzer says what its start took."""
+    """The line in which the fuzzer reports its start."""
     return f"begun after {cpu_s:.3f} s of CPU"
 
 
 def piece_of(output: str, cpu_s: float, *, is_well: bool) -> Piece:
-    """What the fuzzer said of a run that took `cpu_s` in all."""
+    """The fuzzer's report on a run that took `cpu_s` in all."""
     counted = [(int(number), int(edges)) for number, edges in _LINE.findall(output)]
     start = _BEGUN.search(output)
     return Piece(

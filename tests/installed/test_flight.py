@@ -51,7 +51,7 @@ def needed() -> str | None:
 
 
 def boot(place: Path) -> dict[str, str]:
-    """Boot, fly, power off; the facts that flight.sh said."""
+    """Boot, fly, power off; the facts that flight.sh printed."""
     variables = {
         "PATH": "/usr/sbin:/usr/bin:/sbin:/bin",
         "PLACE": str(place),

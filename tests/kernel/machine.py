@@ -85,7 +85,7 @@ def main() -> None:
 def run(image: Path, command: str, *, with_kvm: bool = False) -> int:
     """Run a shell command as root of the machine, its output on ours; its exit status.
 
-    `NO_STATUS` where the machine ended, or had to be ended, without telling one.
+    `NO_STATUS` if the machine ended, or had to be ended, without reporting one.
     """
     has_kvm = with_kvm and os.access("/dev/kvm", os.R_OK | os.W_OK)
     with tempfile.TemporaryDirectory(prefix="kernel-machine-") as name:

@@ -56,7 +56,7 @@ def pulse() -> tuple[int, int]:
 
 
 class EdgeLog:
-    """What the driver told, kept in order."""
+    """The driver's events, in order."""
 
     def __init__(self) -> None:
         self.edges: list[PpsEdge] = []

@@ -1,4 +1,4 @@
-"""Every fault vivid can inject: seen, told, survived, with the head back by itself."""
+"""Every fault vivid can inject is detected and reported, and the head reconnects."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_a_stream_that_ends_for_good_is_reopened() -> None:
     lost = next(event for event in head.events if event.name == "lost")
     assert "its stream broke off" in lost.sentence
     ids = [frame.frame_id for frame in head.frames]
-    assert min(ids[3:]) < 3, "the sequence began anew"
+    assert min(ids[3:]) < 3, "the sequence restarted"
 
 
 def test_an_unplugged_head_is_noticed_let_go_of_and_found_again() -> None:

@@ -26,7 +26,7 @@ UNTOUCHED = 0xA5A5
 
 
 def load(**parameters: object) -> None:
-    """Load vivid anew."""
+    """Load vivid again."""
     unload()
     arguments = [f"{name}={value}" for name, value in parameters.items()]
     subprocess.run(["insmod", GUEST / "modules/vivid.ko", *arguments], timeout=60, check=True)
@@ -37,7 +37,7 @@ def unload() -> None:
 
 
 def ctl(node: int, *arguments: str) -> str:
-    """Run v4l2-ctl on a node; what it said."""
+    """Run v4l2-ctl on a node; its output."""
     done = subprocess.run(
         ["v4l2-ctl", "-d", f"/dev/video{node}", *arguments],
         capture_output=True,
@@ -145,7 +145,7 @@ class Flight:
 
     @property
     def reported(self) -> list[str]:
-        """What was told besides frames missing: a slow host loses some of its own."""
+        """Events other than missing frames: a slow host loses some of its own."""
         return [name for name in self.names if name != "frames-missing"]
 
 

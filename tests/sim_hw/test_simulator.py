@@ -211,7 +211,7 @@ def emulator_cache(emulator: Emulator) -> str:
 
 
 def marks(port: serial.Serial, *, count: int) -> list[int]:
-    """Rising edges the receiver tells of, GPS ns."""
+    """Rising edges reported by the receiver, GPS ns."""
     found: list[int] = []
     reader = UBXReader(port, protfilter=2)
     deadline = time.monotonic() + 10

@@ -18,7 +18,7 @@ WITHIN_S = 10.0
 
 
 class TickDevice(LineDevice):
-    """Says "tick" every 20 ms and answers everything in capitals."""
+    """Sends "tick" every 20 ms and answers everything in capitals."""
 
     next_ns = 0
 
@@ -58,7 +58,7 @@ def test_two_hosts_over_tcp_receive_the_same_and_may_leave() -> None:
         while line.is_open_by_a_host and time.monotonic() < deadline:
             time.sleep(0.02)
         assert not line.is_open_by_a_host
-        assert device.statistics()["bytes_heard"] == 6
+        assert device.statistics()["bytes_received"] == 6
     finally:
         device.close()
 

@@ -23,7 +23,7 @@ MS = 1_000_000
 
 
 class Bench:
-    """A control channel and what its head was told to do."""
+    """A control channel and the calls of its head's actions."""
 
     def __init__(self) -> None:
         self.written: list[int] = []

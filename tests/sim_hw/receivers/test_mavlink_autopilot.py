@@ -150,7 +150,7 @@ def test_rates_are_set_by_command_and_by_stream(autopilot: MavlinkAutopilot) -> 
 
 
 def count(autopilot: MavlinkAutopilot, from_ns: int, name: str) -> int:
-    """How often it says that within a second."""
+    """Number of messages of that kind within a second."""
     parsed_messages = b"".join(
         autopilot.messages_until(from_ns + n * 1_000_000) for n in range(1000)
     )

@@ -1,4 +1,4 @@
-"""An emulated autopilot flies the missions we write; pymavlink reads what it says."""
+"""An emulated autopilot flies the missions we write; pymavlink reads its messages."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ def make(kind: Kind, *, seed: int = 5) -> Any:
 
 
 def first_epoch(kind: Kind, *, seed: int = 5) -> tuple[bytes, int]:
-    """What it says for its first epoch, and when that was."""
+    """Its messages for the first epoch, and the time of that epoch."""
     receiver = make(kind, seed=seed)
     epoch_ns = receiver.epoch_after(START_GPS_NS - 1_000_000)
     data = receiver.epoch_bytes(epoch_ns)

@@ -328,7 +328,7 @@ def test_what_the_host_writes_is_swallowed_and_not_echoed() -> None:
     try:
         os.write(host.fd, b"\xb5\x62\x06\x8a" + bytes(200))
         data = b"".join(piece for _, piece in host.read_for(0.6))
-        assert receiver.statistics()["bytes_heard"] == 204
+        assert receiver.statistics()["bytes_received"] == 204
     finally:
         receiver.close()
         host.close()

@@ -1,4 +1,4 @@
-"""The true camera projects as independent code says, and its errors are where they were put."""
+"""The true camera projects as independent code does, and its errors have the values set."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The emulated flight is smooth, is where it says, and trembles as much as it was told to."""
+"""The emulated flight is smooth, follows its plan, and vibrates with the configured amplitude."""
 
 from __future__ import annotations
 
