@@ -21,7 +21,7 @@ from typing import Any, Final
 
 ROOT: Final = Path(__file__).parents[1]
 LOCKS: Final = ("requirements.lock", "requirements-fuzz.lock")
-VENDOR: Final = ROOT / "daemon" / "onboard" / "monitoring" / "page" / "vendor"
+VENDOR: Final = ROOT / "daemon/onboard/monitoring/web/page/vendor"
 DATABASE: Final = "https://api.osv.dev/v1/querybatch"
 TIMEOUT_S: Final = 20.0
 LARGEST_ANSWER_BYTES: Final = 10_000_000
