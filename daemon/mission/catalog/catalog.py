@@ -16,7 +16,13 @@ from pathlib import Path
 from typing import Any
 
 from daemon.errors import DaemonError
-from daemon.mission.catalog.catalog_schema import SCHEMA_VERSION, create, has_only_tables, migrate
+from daemon.mission.catalog.catalog_schema import (
+    DATABASE_ERRORS,
+    SCHEMA_VERSION,
+    create,
+    has_only_tables,
+    migrate,
+)
 from daemon.mission.exposure import CaptureRecord, Exposure, FrameRecord
 
 BUSY_TIMEOUT_S = 10.0
@@ -82,14 +88,14 @@ class Catalog:
             connection = sqlite3.connect(
                 path, timeout=BUSY_TIMEOUT_S, isolation_level=None, check_same_thread=False
             )
-        except sqlite3.Error as error:
+        except DATABASE_ERRORS as error:
             raise CatalogError(f"{path}: cannot be opened ({error})") from error
         try:
             _enter_wal(connection)
             connection.execute("PRAGMA synchronous = FULL")
             connection.execute("PRAGMA foreign_keys = ON")
             _prepare(connection, path)
-        except sqlite3.Error as error:
+        except DATABASE_ERRORS as error:
             connection.close()
             if _is_busy(error):
                 raise CatalogBusyError(
@@ -139,7 +145,7 @@ class Catalog:
                 connection = _migrated_copy(connection)
                 version = SCHEMA_VERSION
             is_ours = has_only_tables(connection)
-        except sqlite3.Error as error:
+        except DATABASE_ERRORS as error:
             raise CatalogError(_damaged(path, error)) from error
         if version != SCHEMA_VERSION:
             connection.close()
@@ -255,7 +261,7 @@ class Catalog:
                     "SELECT number, sensor, sha256 FROM frames"
                 ).fetchall()
                 self._connection.execute("COMMIT")
-            except sqlite3.Error as error:
+            except DATABASE_ERRORS as error:
                 raise CatalogError(f"mission.db: damaged ({error}); syntopic repair") from error
         by_number: dict[int, dict[str, str]] = {number: {} for number, _ in exposures}
         for number, sensor, sha256 in frames:
@@ -334,7 +340,7 @@ class Catalog:
         try:
             with self._lock:
                 return self._connection.execute(statement, values).fetchall()
-        except sqlite3.Error as error:
+        except DATABASE_ERRORS as error:
             raise CatalogError(f"mission.db: damaged ({error}); syntopic repair") from error
 
 
@@ -377,7 +383,7 @@ def _enter_wal(connection: sqlite3.Connection) -> None:
             return
 
 
-def _is_busy(error: sqlite3.Error) -> bool:
+def _is_busy(error: Exception) -> bool:
     # The low byte is the primary result code; the others say more about it.
     code = getattr(error, "sqlite_errorcode", 0) & 0xFF
     return code in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED)

@@ -8,8 +8,12 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Mapping
+from typing import Final
 
 SCHEMA_VERSION = 2
+
+DATABASE_ERRORS: Final = (sqlite3.Error, UnicodeDecodeError)
+"""What a damaged index raises. SQLite quotes damaged names in its messages, which need not be UTF-8."""
 
 _SCHEMA = """
 CREATE TABLE exposures (
@@ -89,7 +93,7 @@ def migrate(connection: sqlite3.Connection) -> None:
                 connection.execute(statement)
         connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
         connection.execute("COMMIT")
-    except sqlite3.Error:
+    except DATABASE_ERRORS:
         connection.execute("ROLLBACK")
         raise
 

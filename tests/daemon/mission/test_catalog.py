@@ -252,6 +252,24 @@ def test_an_index_that_fails_otherwise_is_damaged_at_once(path, monkeypatch, cod
 
 
 @pytest.mark.trust
+@pytest.mark.parametrize(
+    "statement", [b"CREATE \xa0\xa0BLE ex", b"C\xa0EATE TABLE ex", b"CREATE TABLE (\xa0"]
+)
+def test_a_damaged_schema_is_reported_and_never_another_error(tmp_path, statement):
+    path = tmp_path / "mission.db"
+    Catalog.open(path).close()
+    with sqlite3.connect(path) as connection:
+        connection.execute("PRAGMA journal_mode = DELETE")
+    connection.close()
+    data = path.read_bytes()
+    assert b"CREATE TABLE ex" in data and len(statement) == 15
+    path.write_bytes(data.replace(b"CREATE TABLE ex", statement))
+    for call in (Catalog.read, Catalog.open):
+        with pytest.raises(CatalogError, match=r"mission\.db"):
+            call(path)
+
+
+@pytest.mark.trust
 @pytest.mark.parametrize("page", range(8))
 def test_a_damaged_page_is_reported_and_never_another_error(tmp_path, page):
     path = tmp_path / "mission.db"
