@@ -52,6 +52,14 @@ class ConfigurationError(ValueError):
         super().__init__("\n".join(problems))
 
 
+def _refuse_old_keys(given: Any, renamed: Mapping[str, str]) -> Any:
+    """Raise a `ValueError` naming the new key when a section holds an old one."""
+    for old, new in renamed.items():
+        if isinstance(given, dict) and old in given:
+            raise ValueError(f"{old} is now named {new}; rename it")
+    return given
+
+
 class _ConfigurationSection(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -135,7 +143,14 @@ class TriggerSection(BaseModel):
     interval_s: float = Field(default=2.0, gt=0)
     distance_m: float | None = Field(default=None, gt=0)
     count: int | None = Field(default=None, gt=0)
-    start: Literal["at once", "on command"] = "at once"
+    start: Literal["immediate", "on command"] = "immediate"
+
+    @field_validator("start", mode="before")
+    @classmethod
+    def _refuse_old_start(cls, given: Any) -> Any:
+        if given == "at once":
+            raise ValueError("'at once' is now named 'immediate'; rename it")
+        return given
 
     @model_validator(mode="after")
     def _requires_distance(self) -> TriggerSection:
@@ -184,6 +199,19 @@ class ExposureSection(_ConfigurationSection):
     exposure_time_max_us: float = Field(default=20_000.0, gt=0)
     tdi_shifts_max: int = Field(default=32, ge=0, le=1000)
 
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_old_keys(cls, given: Any) -> Any:
+        return _refuse_old_keys(
+            given,
+            {
+                "gain_most_db": "gain_max_db",
+                "time_least_us": "exposure_time_min_us",
+                "time_most_us": "exposure_time_max_us",
+                "tdi_most": "tdi_shifts_max",
+            },
+        )
+
 
 class ProcessingSection(_ConfigurationSection):
     """How exposures become images, and by which thresholds they are judged.
@@ -198,6 +226,11 @@ class ProcessingSection(_ConfigurationSection):
     threads: int = Field(default=2, ge=1, le=256)
     parallel_exposures: int = Field(default=2, ge=1, le=16)
     thresholds: dict[str, FiniteFloat] = Field(default_factory=dict)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_old_keys(cls, given: Any) -> Any:
+        return _refuse_old_keys(given, {"exposures_in_work": "parallel_exposures"})
 
     @field_validator("thresholds")
     @classmethod
@@ -271,10 +304,10 @@ class WatchSection(_ConfigurationSection):
     @model_validator(mode="before")
     @classmethod
     def _refuse_old_keys(cls, given: Any) -> Any:
-        for old in ("certificate", "key"):
-            if isinstance(given, dict) and old in given:
-                raise ValueError(f"{old} is now named tls_{old}; rename it")
-        return given
+        return _refuse_old_keys(
+            given,
+            {"certificate": "tls_certificate", "key": "tls_key", "open": "anonymous_read"},
+        )
 
     @model_validator(mode="after")
     def _check_udp(self) -> WatchSection:

@@ -166,7 +166,7 @@ def test_a_flight_is_flown_from_the_page(
     service, address, token = camera
     with Browser(tmp_path / "profile") as browser:
         browser.open(address)
-        browser.wait_for("document.querySelector('#link')?.innerText === 'linked'", 60)
+        browser.wait_for("document.querySelector('#link')?.innerText === 'connected'", 60)
         assert browser.text("#simulated") == "SIMULATED"
         service.wait_for(lambda e: e["event"] == "ready", READY_WITHIN_S)
         browser.wait_for("document.querySelector('#phase').innerText === 'ready'", 10)
@@ -178,7 +178,7 @@ def test_a_flight_is_flown_from_the_page(
         assert not any(e["event"] == "triggered" for e in service.events)
 
         browser.evaluate(f"sessionStorage.setItem('token', {json.dumps(token)})")
-        browser.evaluate("document.querySelector('#exposure-room').open = true")
+        browser.evaluate("document.querySelector('#exposure-panel').open = true")
         browser.evaluate(f"document.querySelector('#exposure [name=gain_db]').value = '{GAIN_DB}'")
         browser.click("#exposure button[type=submit]")
         service.wait_for(lambda e: e["event"] == "exposure-settings" and e["by"] == "operator", 10)
@@ -217,8 +217,8 @@ def test_a_flight_is_flown_from_the_page(
             assert statistics.median(latencies_s) < SLACK * VERDICT_WITHIN_S
         browser.click("#show-residuals")
         browser.wait_for("document.querySelectorAll('#vectors path')[0]?.getAttribute('d')", 20)
-        browser.evaluate("document.querySelector('#exposure-room').open = false")
-        browser.evaluate("document.querySelector('#overlaps-room').open = true")
+        browser.evaluate("document.querySelector('#exposure-panel').open = false")
+        browser.evaluate("document.querySelector('#overlaps-panel').open = true")
         browser.picture(
             Path(pictures_folder) / "residuals.png"
             if pictures_folder
@@ -329,7 +329,7 @@ def test_a_mission_of_waypoints_is_exposed_and_a_head_that_goes_is_seen_and_ackn
         details = service.wait_for(lambda e: e["event"] == "watching", READY_WITHIN_S)
         with Browser(tmp_path / "profile") as browser:
             browser.open(f"http://{details['host']}:{details['port']}/")
-            browser.wait_for("document.querySelector('#link')?.innerText === 'linked'", 60)
+            browser.wait_for("document.querySelector('#link')?.innerText === 'connected'", 60)
             service.wait_for(lambda e: e["event"] == "ready", READY_WITHIN_S)
             browser.wait_for("document.querySelector('#phase').innerText === 'ready'", 30)
             fly_mission(emulator.ready, port, service)

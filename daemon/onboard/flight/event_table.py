@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
-Severity = Literal["note", "caution", "warning"]
+Severity = Literal["info", "caution", "warning"]
 """A note asks for nothing; a caution wants a look when there is time, a warning at once."""
 
 

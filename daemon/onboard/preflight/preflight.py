@@ -19,7 +19,7 @@ from daemon.onboard.service.flight_line import FlightLine
 from daemon.onboard.service.record_ingest import RecordIngest
 from processing.rig import Rig
 
-IMMEDIATE_START = 'the configuration (trigger.start = "at once")'
+IMMEDIATE_START = 'the configuration (trigger.start = "immediate")'
 """Who takes upon them what is missing where nobody is asked."""
 
 

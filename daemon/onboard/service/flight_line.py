@@ -82,7 +82,7 @@ class FlightLine:
         self._policy = _policy(configuration, rig)
         if configuration.trigger.mode == "plan" and self._steering is not None:
             self._policy = self._steering
-        self.is_running = configuration.trigger.start == "at once"
+        self.is_running = configuration.trigger.start == "immediate"
         self._last_position: tuple[NavSample | None, NavSample | None] = (None, None)
         self._pending_triggers = 0
         self._stop_at: int | None = None

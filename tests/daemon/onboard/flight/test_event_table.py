@@ -72,7 +72,7 @@ def test_every_entry_says_what_helps_in_whole_sentences() -> None:
         assert entry.severity in get_args(Severity), entry
         assert entry.cause.endswith("."), entry
         assert entry.cure.endswith("."), entry
-        assert entry.severity == "note" or entry.cure != "Nothing to do.", entry
+        assert entry.severity == "info" or entry.cure != "Nothing to do.", entry
 
 
 def test_the_page_of_the_docs_is_current() -> None:

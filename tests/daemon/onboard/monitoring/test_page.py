@@ -120,7 +120,7 @@ def service(folder: Path) -> Iterator[Service]:
 def browser(folder: Path, service: Service) -> Iterator[Browser]:
     with Browser(folder / "profile") as browser:
         browser.open(service.address)
-        browser.wait_for("document.querySelector('#link')?.innerText === 'linked'", WITHIN_S)
+        browser.wait_for("document.querySelector('#link')?.innerText === 'connected'", WITHIN_S)
         yield browser
 
 
@@ -160,9 +160,9 @@ def test_the_planned_line_is_on_the_map_with_the_holes_in_what_was_flown(
     assert 560 <= int(to_m) <= 660
     assert float(hectares) > 0.5
     assert "of 2 images" in why
-    assert "1 gap to re-fly" in browser.text("#well")
-    assert browser.evaluate("document.querySelectorAll('#map .hole-area').length") >= 1
-    assert "A1" in browser.text(".hole-label")
+    assert "1 gap to re-fly" in browser.text("#coverage")
+    assert browser.evaluate("document.querySelectorAll('#map .gap-area').length") >= 1
+    assert "A1" in browser.text(".gap-label")
     reported = browser.evaluate(
         "fetch('/api/v1/advice/fly-again.geojson').then((answer) => answer.json())"
     )
@@ -190,7 +190,7 @@ def test_residuals_are_laid_over_the_image_and_told_by_overlap_and_histogram_in_
     # The row goes down, as residuals of the virtual image do here: -0.02 is up.
     right, down = map(float, paths[0].split("l")[1].split(" "))
     assert right > 0 > down
-    browser.evaluate("document.querySelector('#overlaps-room').open = true")
+    browser.evaluate("document.querySelector('#overlaps-panel').open = true")
     assert browser.evaluate("document.querySelectorAll('#overlaps tr').length") == 2
     assert "▲ few: 5" in browser.text("#overlaps")
     assert "R 99 / 99 % ▲ 100.0 % full" in browser.text("#histogram-note")
@@ -209,12 +209,12 @@ def test_a_fault_is_seen_within_two_seconds_and_acknowledged_with_a_token(
     service: Service, browser: Browser
 ) -> None:
     service.emit(flight_events.lost("SU02"))
-    seen_s = browser.wait_for("document.querySelector('#faults li.stands') !== null", WITHIN_S)
+    seen_s = browser.wait_for("document.querySelector('#faults li.active') !== null", WITHIN_S)
     assert seen_s < 2.0
     assert "WARNING" in browser.text("#faults")
     assert "SU02 does not answer; look at its cable." in browser.text("#faults")
     service.emit(flight_events.recovered("SU02"))
-    browser.wait_for("document.querySelector('#faults li.passed') !== null", WITHIN_S)
+    browser.wait_for("document.querySelector('#faults li.cleared') !== null", WITHIN_S)
     # Nobody has shown a token yet: the page asks for one, and nothing is commanded.
     browser.click("#faults button")
     browser.wait_for("document.querySelector('#ask-token').open", WITHIN_S)
@@ -251,7 +251,7 @@ def test_what_forbids_arming_is_listed_with_its_cure_and_overridden_for_a_record
     press(browser, "Enter")
     service.until(lambda: service.commands[-1].name == "arm")
     browser.wait_for(anonymous_read, WITHIN_S)
-    listed = "[...document.querySelectorAll('#lacking li')].map((one) => one.innerText)"
+    listed = "[...document.querySelectorAll('#missing-items li')].map((one) => one.innerText)"
     assert browser.evaluate(listed) == missing_items
     assert browser.evaluate("document.activeElement.id") == "reason"
     browser.evaluate("document.querySelector('#reason').value = '  '")
@@ -284,7 +284,7 @@ def test_exposure_settings_are_seen_and_set_from_the_page(
     }
     reported = {"by": "automatic", "control": "automatic", "lock": "line", "settings": settings}
     service.emit({"event": "exposure-settings", "mono_ns": "1", **reported})
-    browser.evaluate("document.querySelector('#exposure-room').open = true")
+    browser.evaluate("document.querySelector('#exposure-panel').open = true")
     browser.wait_for("document.querySelectorAll('#exposure-now li').length === 2", WITHIN_S)
     assert "G: 2000 µs, 1.5 dB, 0 TDI" in browser.text("#exposure-now")
     assert browser.text("#exposure-control") == "(automatic)"
@@ -336,11 +336,11 @@ def test_axe_finds_nothing_serious(browser: Browser, tmp_path: Path) -> None:
 def test_a_head_that_sends_no_image_draws_its_hole_on_the_map(
     service: Service, browser: Browser
 ) -> None:
-    pieces = browser.evaluate("document.querySelectorAll('#map .hole-area').length")
+    pieces = browser.evaluate("document.querySelectorAll('#map .gap-area').length")
     for number, north_m in enumerate((816, 884, 952, 1020), start=20):
         for event in flight_events.exposure(number, "usable", line="A1", north_m=north_m):
             service.emit(event | ({"missing": ["SU00"]} if event["event"] == "sealed" else {}))
-    browser.wait_for(f"document.querySelectorAll('#map .hole-area').length > {pieces}", WITHIN_S)
+    browser.wait_for(f"document.querySelectorAll('#map .gap-area').length > {pieces}", WITHIN_S)
     browser.wait_for("document.querySelector('#segments').innerText.includes('SU00')", WITHIN_S)
     assert "pan: " in browser.text("#segments")
     assert "of 2 images" in browser.text("#segments")
@@ -382,7 +382,7 @@ def test_what_was_absent_at_the_start_and_came_stands_no_longer(
 ) -> None:
     service.emit({"event": "ready", "mono_ns": "1", "absent": ["trigger", "head SU02"]})
     standing = (
-        "[...document.querySelectorAll('#faults li.stands')].map((one) => one.dataset.fault)"
+        "[...document.querySelectorAll('#faults li.active')].map((one) => one.dataset.fault)"
         ".filter((fault) => fault.startsWith('absent')).sort().join()"
     )
     browser.wait_for(f"{standing} === 'absent head SU02,absent trigger'", WITHIN_S)
@@ -411,15 +411,15 @@ def test_what_is_shown_without_a_link_is_marked_and_forgotten_when_another_fligh
     finally:
         closed.end()
     browser.wait_for(
-        "document.querySelector('#stale').innerText.includes('Connection lost')", WITHIN_S
+        "document.querySelector('#connection-lost').innerText.includes('Connection lost')", WITHIN_S
     )
     (tmp_path / "another").mkdir()
     another = Service(tmp_path / "another", port=int(closed.address.rstrip("/").split(":")[-1]))
     try:
         another.emit(flight_events.mission() | {"id": "20261122T080000Z-other"})
-        browser.wait_for("document.querySelector('#link').innerText === 'linked'", WITHIN_S)
+        browser.wait_for("document.querySelector('#link').innerText === 'connected'", WITHIN_S)
         browser.wait_for("document.querySelector('#rows').childElementCount === 0", WITHIN_S)
-        assert browser.evaluate("document.querySelector('#stale').hidden")
+        assert browser.evaluate("document.querySelector('#connection-lost').hidden")
         browser.wait_for("document.querySelector('#verdict .word').innerText === 'WAITING'", 30)
     finally:
         another.end()
@@ -485,15 +485,15 @@ def test_a_landing_ends_in_no_alarm_and_a_lost_service_does(
             service.emit({"event": "phase", "mono_ns": "1", "phase": "landed"})
             browser.wait_for("document.querySelector('#phase').innerText === 'landed'", WITHIN_S)
         service.end()
-        browser.wait_for("document.body.classList.contains('stale')", WITHIN_S)
-        lamp, bar = browser.text("#link"), browser.text("#stale")
+        browser.wait_for("document.body.classList.contains('connection-lost')", WITHIN_S)
+        lamp, bar = browser.text("#link"), browser.text("#connection-lost")
         style = browser.evaluate("document.querySelector('#link').className.trim()")
         if has_landed:
             assert (lamp, style) == ("ended", "chip")
             assert bar.startswith("Landed. The service ended ")
         else:
-            assert (lamp, style) == ("no link", "chip warning")
+            assert (lamp, style) == ("disconnected", "chip warning")
             assert "Connection lost" in bar
         browser.evaluate("new Promise((resolve) => setTimeout(resolve, 1500))")
-        assert (browser.text("#link"), browser.text("#stale")) == (lamp, bar)
+        assert (browser.text("#link"), browser.text("#connection-lost")) == (lamp, bar)
         save_screenshot(browser, "landed" if has_landed else "lost-link")

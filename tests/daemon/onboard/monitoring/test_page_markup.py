@@ -31,7 +31,7 @@ PLANTED = "document.querySelectorAll('.planted, meta[http-equiv], [onerror], [on
 SHOWN_IN = (
     *("#missing", "#devices", "#faults", "#findings", "#temperatures", "#exposure-now"),
     *("#exposure-control", "#overlaps", "#disks", "#recovery", "#rows", "#chart-temperature"),
-    *("#segments", "#map .line-label", "#map .hole-label"),
+    *("#segments", "#map .line-label", "#map .gap-label"),
 )
 HOSTILE_SVG = f"""<svg xmlns="http://www.w3.org/2000/svg" xmlns:h="http://www.w3.org/1999/xhtml"
  onload="window.planted=1"><script>window.planted=1</script><foreignObject>
@@ -114,7 +114,7 @@ def test_markup_in_any_string_is_text(service: Service, tmp_path: Path, policy: 
     with Browser(tmp_path / "profile") as browser:
         browser.call("Page.setBypassCSP", enabled=not policy)
         browser.open(service.address)
-        browser.wait_for("document.querySelector('#link')?.innerText === 'linked'", WITHIN_S)
+        browser.wait_for("document.querySelector('#link')?.innerText === 'connected'", WITHIN_S)
         for where in SHOWN_IN:
             if where == "#overlaps":
                 browser.click("#rows tr:last-child button")
@@ -129,7 +129,7 @@ def test_markup_in_any_string_is_text(service: Service, tmp_path: Path, policy: 
         browser.evaluate(f"sessionStorage.setItem('token', {json.dumps(service.token)})")
         browser.click("[data-command=arm]")
         service.until(lambda: any(one.name == "arm" for one in service.commands))
-        for where in ("#answer", "#lacking"):
+        for where in ("#answer", "#missing-items"):
             shown = f"document.querySelector('{where}').textContent.includes('{TAG}')"
             browser.wait_for(shown, WITHIN_S)
         assert TAG in str(browser.evaluate("document.title"))
@@ -145,7 +145,7 @@ def test_markup_in_any_string_is_text(service: Service, tmp_path: Path, policy: 
 def test_the_browser_turns_html_of_a_library_into_text(service: Service, tmp_path: Path) -> None:
     with Browser(tmp_path / "profile") as browser:
         browser.open(service.address)
-        browser.wait_for("document.querySelector('#link')?.innerText === 'linked'", WITHIN_S)
+        browser.wait_for("document.querySelector('#link')?.innerText === 'connected'", WITHIN_S)
         script = (
             "((one) => { one.innerHTML = TEXT; return [one.childElementCount, one.textContent]; })"
             "(document.createElement('div'))"

@@ -1,12 +1,12 @@
-// Figures over the flight: sigma0, dC measured and estimated, time sigma, temperatures.
+// Charts over the flight: sigma0, dC measured and estimated, time sigma, temperatures.
 
-import { flight } from "./state.js";
+import { flight } from "./telemetry.js";
 
 const charts = {};
 const STROKES = ["#2a7fd4", "#d4572a", "#2a9a5b", "#8a5bd0", "#b58900"];
 const DASHES = [null, [6, 4], [2, 3], [10, 3, 2, 3]];
 const HEIGHT_PX = 118;
-const none = document.getElementById("no-charts");
+const emptyNote = document.getElementById("no-charts");
 
 function ink() {
   return getComputedStyle(document.documentElement).getPropertyValue("--soft").trim();
@@ -21,39 +21,39 @@ function axes(unit) {
   ];
 }
 
-// A sigma is seen from zero on; half a kelvin fills the room at least: noise must not look like news.
-const fromZero = (_, __, most) => [0, most ? 1.2 * most : 1];
-const aKelvin = (_, least, most) => {
-  const half = Math.max(0.25, 0.6 * (most - least));
-  return least == null ? [0, 1] : [(least + most) / 2 - half, (least + most) / 2 + half];
+// The axis of a sigma begins at zero. A temperature axis spans at least 0.5 K, so that noise stays small.
+const fromZero = (_, __, maximum) => [0, maximum ? 1.2 * maximum : 1];
+const atLeastHalfKelvin = (_, minimum, maximum) => {
+  const half = Math.max(0.25, 0.6 * (maximum - minimum));
+  return minimum == null ? [0, 1] : [(minimum + maximum) / 2 - half, (minimum + maximum) / 2 + half];
 };
 
 function chart(id, title, unit, range, series) {
-  const room = document.getElementById(id);
+  const container = document.getElementById(id);
   return new uPlot({
     title,
-    width: Math.max(room.clientWidth, 200),
+    width: Math.max(container.clientWidth, 200),
     height: HEIGHT_PX,
     scales: { x: { time: false }, y: { range } },
     axes: axes(unit),
     cursor: { show: false },
     legend: {
-      show: series.length > 1 || range === aKelvin, live: false,
+      show: series.length > 1 || range === atLeastHalfKelvin, live: false,
       markers: { dash: (_, k) => series[k - 1]?.[2] ? (series[k - 1][2][0] < 4 ? "dotted" : "dashed") : "solid" },
     },
     series: [{ label: "exposure" }, ...series.map(([label, stroke, dash]) => ({
       label, stroke, dash, width: 2, spanGaps: false, points: { size: 4 },
     }))],
-  }, [[], ...series.map(() => [])], room);
+  }, [[], ...series.map(() => [])], container);
 }
 
 export function drawCharts() {
   const history = [...flight.history].sort((a, b) => a.number - b.number);
-  none.hidden = history.length > 0;
+  emptyNote.hidden = history.length > 0;
   if (!charts.sigma0) {
     if (!history.length) return;
     charts.sigma0 = chart("chart-sigma0", "σ0", "px", fromZero, [["σ0", STROKES[0]]]);
-    charts.dc = chart("chart-dc", "dC", "K", aKelvin, [["measured", STROKES[1]], ["estimated", STROKES[3], [6, 4]]]);
+    charts.dc = chart("chart-dc", "dC", "K", atLeastHalfKelvin, [["measured", STROKES[1]], ["estimated", STROKES[3], [6, 4]]]);
     charts.time = chart("chart-time", "time σ", "µs", fromZero, [["time σ", STROKES[2]]]);
   }
   const numbers = history.map((one) => one.number);
@@ -64,7 +64,7 @@ export function drawCharts() {
   drawTemperatures(history, numbers);
 }
 
-// One line a probe, told apart by colour and dash; made anew when a probe comes.
+// One line per probe, with its own colour and dash. A new probe rebuilds the chart.
 function drawTemperatures(history, numbers) {
   const probes = [...new Set(history.flatMap((one) => Object.keys(one.temperatures_c || {})))].sort();
   const key = probes.join();
@@ -75,7 +75,7 @@ function drawTemperatures(history, numbers) {
   }
   if (charts.temperature?.probes !== key) {
     charts.temperature?.destroy();
-    charts.temperature = chart("chart-temperature", "temperatures", "°C", aKelvin, probes.map((probe, k) =>
+    charts.temperature = chart("chart-temperature", "temperatures", "°C", atLeastHalfKelvin, probes.map((probe, k) =>
       [probe, STROKES[k % STROKES.length], DASHES[Math.floor(k / STROKES.length) % DASHES.length]]));
     charts.temperature.probes = key;
   }
@@ -83,11 +83,11 @@ function drawTemperatures(history, numbers) {
     history.map((one) => one.temperatures_c?.[probe] ?? null))]);
 }
 
-// To the width of their room, in the colours of the day or the night.
+// Resize the charts to their containers and redraw them in the colours of the theme.
 export function fitCharts() {
   for (const [name, drawn] of Object.entries(charts)) {
-    const room = document.getElementById(`chart-${name}`);
-    drawn.setSize({ width: Math.max(room.clientWidth, 200), height: HEIGHT_PX });
+    const container = document.getElementById(`chart-${name}`);
+    drawn.setSize({ width: Math.max(container.clientWidth, 200), height: HEIGHT_PX });
     drawn.redraw(false, true);
   }
 }

@@ -1,11 +1,11 @@
-// Commands: asked for with a token, answered in a sentence.
+// Commands: sent with an access token; the answer is shown as one sentence.
 
-import { flight } from "./state.js";
+import { flight } from "./telemetry.js";
 
 const answer = document.getElementById("answer");
 
-// What is typed into a dialog; nothing where it is left.
-export function ask(dialogId, fieldId) {
+// The text entered in a dialog; empty if it is cancelled.
+export function openDialog(dialogId, fieldId) {
   const dialog = document.getElementById(dialogId);
   const field = document.getElementById(fieldId);
   return new Promise((resolve) => {
@@ -17,20 +17,20 @@ export function ask(dialogId, fieldId) {
   });
 }
 
-// A token; whatever else was copied along with it is left out, since headers take no other characters.
-export async function askToken() {
-  return (await ask("ask-token", "token")).replace(/[^A-Za-z0-9_-]/g, "");
+// An access token. Characters that a header cannot hold are removed.
+export async function requestToken() {
+  return (await openDialog("ask-token", "token")).replace(/[^A-Za-z0-9_-]/g, "");
 }
 
-// Why somebody flies although something is missing; each of that is listed with its cure.
-function askReason(refusal) {
+// The reason for an override. The dialog lists each missing item with its corrective action.
+function requestReason(refusal) {
   const missing = flight.brief?.status?.missing;
-  document.getElementById("lacking").replaceChildren(...(missing?.length ? missing : [refusal]).map((one) =>
+  document.getElementById("missing-items").replaceChildren(...(missing?.length ? missing : [refusal]).map((one) =>
     Object.assign(document.createElement("li"), { textContent: one })));
-  return ask("ask-override", "reason");
+  return openDialog("ask-override", "reason");
 }
 
-function say(sentence, refused) {
+function showAnswer(sentence, refused) {
   answer.textContent = sentence;
   answer.classList.toggle("refused", refused);
 }
@@ -38,48 +38,48 @@ function say(sentence, refused) {
 export async function command(name, body = {}) {
   let token = sessionStorage.getItem("token");
   if (!token) {
-    token = await askToken();
+    token = await requestToken();
     if (!token) return false;
   }
   let response;
-  let told;
+  let result;
   try {
     response = await fetch(`/api/v1/commands/${name}`, {
       method: "POST",
       headers: { "Authorization": `Bearer ${token}`, "Content-Type": "application/json" },
       body: JSON.stringify(body),
     });
-    told = await response.json();
+    result = await response.json();
   } catch {
-    say("No link to the camera; whether the command was heard is not known.", true);
+    showAnswer("No connection to the camera. The command may not have arrived; check the state.", true);
     return false;
   }
   if (response.status === 401) sessionStorage.removeItem("token");
   else sessionStorage.setItem("token", token);
   if (response.ok) {
-    say(`Done: ${told.sentence}`, false);
+    showAnswer(`Done: ${result.sentence}`, false);
     return true;
   }
-  say(`${told.title}: ${told.detail}`, true);
-  if (response.status !== 409 || !told.detail.includes("override")) return false;
-  const why = await askReason(told.detail);
+  showAnswer(`${result.title}: ${result.detail}`, true);
+  if (response.status !== 409 || !result.detail.includes("override")) return false;
+  const why = await requestReason(result.detail);
   return why ? command(name, { ...body, override: true, reason: why }) : false;
 }
 
-const GRAVE = {
-  land: "Land: no more exposures, the service ends. Go on?",
-  "new-mission": "New mission: this one is closed, the next begins with its configuration. Go on?",
-  "release-disk": "Release disk: exposures are stored on the other disk alone from now on. Go on?",
-  "accept-disk": "Accept disk: this mission is copied to the disk that is mounted there now. Go on?",
+const CONFIRMATIONS = {
+  land: "Land: exposures stop and the service ends. Continue?",
+  "new-mission": "New mission: the current mission is closed and a new one starts. Continue?",
+  "release-disk": "Release disk: exposures are stored on the other disk only. Continue?",
+  "accept-disk": "Accept disk: this mission is copied to the disk that is mounted now. Continue?",
 };
 
-// A command that is confirmed first where it is grave.
-export function askCommand(name, body = {}) {
-  if (!GRAVE[name] || confirm(GRAVE[name])) command(name, body);
+// Send a command, after confirmation if it is destructive.
+export function confirmCommand(name, body = {}) {
+  if (!CONFIRMATIONS[name] || confirm(CONFIRMATIONS[name])) command(name, body);
 }
 
 for (const button of document.querySelectorAll("[data-command]")) {
   button.addEventListener("click", () => {
-    askCommand(button.dataset.command);
+    confirmCommand(button.dataset.command);
   });
 }

@@ -1,27 +1,27 @@
-// Exposure settings: what is set, by whom, and a form to set them by hand or leave them to the automatic.
+// Exposure settings: current values, control mode, and a form for manual or automatic control.
 
-import { flight } from "./state.js";
+import { flight } from "./telemetry.js";
 import { command } from "./commands.js";
 
 const form = document.getElementById("exposure");
 const now = document.getElementById("exposure-now");
 const control = document.getElementById("exposure-control");
-let told = "";
+let shownKey = "";
 
 export function drawExposure() {
   const current = flight.settings;
-  const fresh = JSON.stringify(current || {});
-  if (fresh === told || !current?.settings) return;
-  told = fresh;
+  const key = JSON.stringify(current || {});
+  if (key === shownKey || !current?.settings) return;
+  shownKey = key;
   const locked = current.locked_on ? `, locked on line ${current.locked_on}` : "";
   control.textContent = `(${current.control}${locked})`;
   const groups = Object.entries(current.settings);
   now.replaceChildren(...groups.map(([group, one]) => Object.assign(document.createElement("li"), {
     textContent: `${group}: ${one.exposure_time_us.toFixed(0)} µs, ${one.gain_db.toFixed(1)} dB, ${one.tdi_shifts} TDI`,
   })));
-  const chosen = form.of.value;
+  const selected = form.of.value;
   form.of.replaceChildren(new Option("all", ""), ...groups.map(([group]) => new Option(group, group)));
-  form.of.value = chosen;
+  form.of.value = selected;
 }
 
 form.addEventListener("submit", (event) => {

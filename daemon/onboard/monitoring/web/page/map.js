@@ -1,32 +1,32 @@
 // The map: track and footprints, coloured by verdict and marked by shape. No tiles: it works offline.
 
-import { flight } from "./state.js";
+import { flight } from "./telemetry.js";
 
 const COLOURS = { good: "--good", usable: "--caution", refly: "--warning", lost: "--warning" };
 const DASHES = { good: null, usable: "6 3", refly: "2 4", lost: "1 7" };
 
-// A string would be taken for HTML.
-const label = (words) => document.createTextNode(words);
+// Leaflet parses a string as HTML.
+const label = (text) => document.createTextNode(text);
 
 const map = L.map("map", { zoomControl: true, attributionControl: false, zoomSnap: 0.25 });
 map.setView([0, 0], 2);
 L.control.scale({ imperial: false }).addTo(map);
 const track = L.polyline([], { color: "#777", weight: 2 }).addTo(map);
-const here = L.circleMarker([0, 0], { radius: 6, weight: 3 });
+const marker = L.circleMarker([0, 0], { radius: 6, weight: 3 });
 const footprints = new Map();
 const follow = document.getElementById("map-follow");
-let follows = true;
-let isOurs = false;
+let isFollowing = true;
+let isProgrammatic = false;
 
-function setFollows(wanted) {
-  follows = wanted;
+function setFollowing(wanted) {
+  isFollowing = wanted;
   follow.setAttribute("aria-pressed", String(wanted));
 }
 
-// Whoever moves the map, by finger, wheel, button or key, keeps it where it is put.
-map.on("movestart", () => { if (!isOurs) setFollows(false); });
+// A map that the operator moved no longer follows the flight.
+map.on("movestart", () => { if (!isProgrammatic) setFollowing(false); });
 follow.addEventListener("click", () => {
-  setFollows(!follows);
+  setFollowing(!isFollowing);
   frame();
 });
 
@@ -34,7 +34,7 @@ function colour(name) {
   return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 }
 
-function style(one) {
+function styleOf(one) {
   const verdict = one.verdict || (one.step === "lost" ? "lost" : null);
   return {
     color: colour(COLOURS[verdict] || "--soft"),
@@ -45,23 +45,23 @@ function style(one) {
 }
 
 const plan = L.layerGroup().addTo(map);
-const holes = L.layerGroup().addTo(map);
-let planned = null;
+const gaps = L.layerGroup().addTo(map);
+let planBounds = null;
 
-// Where a line's id stands beside no other line: away from where it leads.
+// Direction of a line's label: opposite to the line, so that it covers no other line.
 function behind([[lat0, lon0], [lat1, lon1]]) {
   const [north, east] = [lat1 - lat0, (lon1 - lon0) * Math.cos(lat0 * Math.PI / 180)];
   if (Math.abs(north) > Math.abs(east)) return north > 0 ? "bottom" : "top";
   return east > 0 ? "left" : "right";
 }
 
-// The planned lines with their ids, and where exposures are due.
-export function drawPlan(told) {
+// The planned lines with their ids and planned exposure positions.
+export function drawPlan(received) {
   plan.clearLayers();
-  planned = null;
-  const lines = told?.lines || [];
+  planBounds = null;
+  const lines = received?.lines || [];
   if (!lines.length) return;
-  planned = L.latLngBounds(lines.flatMap((line) => line.at));
+  planBounds = L.latLngBounds(lines.flatMap((line) => line.at));
   for (const line of lines) {
     L.polyline(line.at, { color: colour("--soft"), weight: 2, dashArray: "8 6", interactive: false }).addTo(plan);
     L.circleMarker(line.at[0], { radius: 2, color: colour("--soft"), interactive: false })
@@ -78,18 +78,18 @@ export function drawPlan(told) {
   }
 }
 
-// The ground that too few images see, and the parts of lines to be flown again for it.
-export function drawHoles(segments) {
-  holes.clearLayers();
+// Ground covered by too few images, and the line segments to re-fly for it.
+export function drawGaps(segments) {
+  gaps.clearLayers();
   for (const one of segments) {
     if (one.kind !== "hole") continue;
-    for (const ring of one.holes.flatMap((hole) => hole.rings)) {
-      L.polygon(ring, { color: colour("--warning"), weight: 1, fillOpacity: 0.6, className: "hole-area", interactive: false })
-        .addTo(holes);
+    for (const ring of one.holes.flatMap((gap) => gap.rings)) {
+      L.polygon(ring, { color: colour("--warning"), weight: 1, fillOpacity: 0.6, className: "gap-area", interactive: false })
+        .addTo(gaps);
     }
     L.polyline(one.at, { color: colour("--warning"), weight: 12, opacity: 0.55, dashArray: "2 6", lineCap: "butt" })
       .bindTooltip(label(`✖ ${one.line}`),
-        { permanent: true, direction: "right", className: "hole-label" }).addTo(holes);
+        { permanent: true, direction: "right", className: "gap-label" }).addTo(gaps);
   }
 }
 
@@ -97,8 +97,8 @@ export function drawMap(choose) {
   track.setLatLngs(flight.track.map((point) => point.at));
   const position = flight.brief?.status?.position;
   if (position?.latitude_deg != null) {
-    here.setLatLng([position.latitude_deg, position.longitude_deg]).addTo(map);
-    here.setStyle({ color: colour("--accent") });
+    marker.setLatLng([position.latitude_deg, position.longitude_deg]).addTo(map);
+    marker.setStyle({ color: colour("--accent") });
   }
   for (const one of flight.exposures.values()) {
     if (!one.footprint) continue;
@@ -107,14 +107,14 @@ export function drawMap(choose) {
       drawn = L.polygon(one.footprint, { interactive: true }).addTo(map);
       drawn.on("click", () => choose(one.number));
       drawn.bindTooltip(() => label(`${one.number}: ${flight.exposures.get(one.number)?.verdict || one.step}`));
-      // By keyboard the table of exposures does the same; nobody steps through a thousand footprints.
+      // Footprints take no keyboard focus; the table of exposures serves the keyboard.
       drawn.getElement().setAttribute("tabindex", "-1");
       footprints.set(one.number, drawn);
     }
-    const looks = style(one);
-    const told = JSON.stringify(looks);
-    if (drawn.told !== told) drawn.setStyle(looks);
-    drawn.told = told;
+    const style = styleOf(one);
+    const key = JSON.stringify(style);
+    if (drawn.key !== key) drawn.setStyle(style);
+    drawn.key = key;
   }
   for (const number of footprints.keys()) {
     if (!flight.exposures.has(number)) {
@@ -125,16 +125,16 @@ export function drawMap(choose) {
   frame();
 }
 
-// Where the camera is, with what was exposed, or what is planned.
+// Fit the map to the footprints or the plan, and to the camera position.
 function frame() {
-  if (!follows) return;
+  if (!isFollowing) return;
   const bounds = L.featureGroup([...footprints.values()]).getBounds();
-  if (planned && (!bounds.isValid() || !planned.intersects(bounds))) bounds.extend(planned);
-  const isSomewhere = map.hasLayer(here);
-  isOurs = true;
+  if (planBounds && (!bounds.isValid() || !planBounds.intersects(bounds))) bounds.extend(planBounds);
+  const isSomewhere = map.hasLayer(marker);
+  isProgrammatic = true;
   if (bounds.isValid()) {
-    if (isSomewhere) bounds.extend(here.getLatLng());
+    if (isSomewhere) bounds.extend(marker.getLatLng());
     map.fitBounds(bounds, { padding: [20, 20], maxZoom: 17, animate: false });
-  } else if (isSomewhere) map.setView(here.getLatLng(), 14, { animate: false });
-  isOurs = false;
+  } else if (isSomewhere) map.setView(marker.getLatLng(), 14, { animate: false });
+  isProgrammatic = false;
 }

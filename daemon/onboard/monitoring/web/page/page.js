@@ -1,11 +1,11 @@
-// The operator's page: what came by telemetry, put where an operator looks for it.
+// The operator's page: draws the telemetry.
 
-import { flight, listen, onChange } from "./state.js";
-import { askCommand, askToken, command } from "./commands.js";
+import { flight, connect, onChange } from "./telemetry.js";
+import { confirmCommand, requestToken, command } from "./commands.js";
 import { drawMap } from "./map.js";
 import { drawExposure } from "./exposure.js";
 import { followPlan } from "./plan.js";
-import { forgetImage, prepareImage, showImage } from "./image.js";
+import { clearImage, prepareImage, showImage } from "./quicklook.js";
 import { drawCharts, fitCharts } from "./charts.js";
 
 const MARKS = { good: "●", usable: "▲", refly: "■", lost: "✖" };
@@ -13,12 +13,12 @@ const PHASE_CLASS = { flying: "good", armed: "good", fault: "warning", idle: "ca
 const POSITION_HOLDS_S = 5;
 const DEVICE_MARKS = { ready: "●", searching: "◌", found: "○", unknown: "○", lost: "✖", absent: "✖" };
 const KINDS = { head: "heads", navigator: "receivers", thermometer: "thermometers", trigger: "trigger", pps: "pulse per second" };
-const GRAVITY = { refly: 0, usable: 1, good: 2 };
+const SEVERITY_ORDER = { refly: 0, usable: 1, good: 2 };
 const ROWS_SHOWN = 300;
 
 const by = (id) => document.getElementById(id);
-let chosen = null;
-let follows = true;
+let selected = null;
+let isFollowing = true;
 
 function text(id, value) {
   by(id).textContent = value == null ? "–" : value;
@@ -33,12 +33,12 @@ function duration(ns) {
 }
 
 function element(name, properties = {}, ...children) {
-  const made = Object.assign(document.createElement(name), properties);
-  made.append(...children);
-  return made;
+  const created = Object.assign(document.createElement(name), properties);
+  created.append(...children);
+  return created;
 }
 
-// A position of some seconds ago is not where the camera is now.
+// The position; null if it is older than POSITION_HOLDS_S.
 function presentPosition() {
   const position = flight.brief.status?.position;
   return position && (position.age_s ?? 0) <= POSITION_HOLDS_S ? position : null;
@@ -72,16 +72,16 @@ function drawHead() {
     element("dd", { textContent: value == null ? "no reading" : `${value.toFixed(2)} °C` }))));
 }
 
-// The disks of a mirrored mission, each with the command that changes it.
+// The disks of a mirrored mission, each with its command.
 function drawDisks(disks) {
-  by("disks-room").hidden = !disks.length;
+  by("disks-panel").hidden = !disks.length;
   const shown = JSON.stringify(disks);
   if (by("disks").dataset.shown === shown) return;
   by("disks").dataset.shown = shown;
   by("disks").replaceChildren(...disks.map((disk) => {
     const isUsed = disk.state === "in use";
     const details = [disk.state];
-    if (isUsed && disk.exposures_left != null) details.push(`room for ${disk.exposures_left} exposures`);
+    if (isUsed && disk.exposures_left != null) details.push(`space for ${disk.exposures_left} exposures`);
     if (disk.exposures_to_copy) details.push(`${disk.exposures_to_copy} exposures to copy`);
     if (disk.temperature_c != null) details.push(`${disk.temperature_c} °C`);
     if (disk.wear_percent != null) details.push(`${disk.wear_percent} % worn`);
@@ -90,54 +90,54 @@ function drawDisks(disks) {
     const item = element("li", { className: isUsed && disk.healthy !== false ? "ready" : "lost" },
       element("span", { textContent: isUsed ? "●" : "✖", ariaHidden: "true" }),
       element("span", { textContent: `${disk.disk} ${disk.path}` }),
-      element("span", { className: "said", textContent: details.join(", ") }));
+      element("span", { className: "detail", textContent: details.join(", ") }));
     if (disks.length < 2) return item;
     const name = isUsed ? "release-disk" : "accept-disk";
     const button = element("button", { type: "button", textContent: isUsed ? "Release disk" : "Accept disk" });
-    button.addEventListener("click", () => askCommand(name, { disk: disk.disk }));
+    button.addEventListener("click", () => confirmCommand(name, { disk: disk.disk }));
     item.append(button);
     return item;
   }));
 }
 
-function last(isIt) {
+function lastWhere(predicate) {
   let found = null;
-  for (const one of flight.exposures.values()) if (isIt(one) && (!found || one.number > found.number)) found = one;
+  for (const one of flight.exposures.values()) if (predicate(one) && (!found || one.number > found.number)) found = one;
   return found;
 }
 
 function drawVerdict() {
-  const judged = last((one) => one.verdict || one.step === "lost");
-  const word = judged ? judged.verdict || "lost" : "waiting";
-  const room = by("verdict");
-  const which = judged ? `exposure ${judged.number}` : "";
-  if (room.dataset.told === `${which} ${word}`) return;
-  room.dataset.told = `${which} ${word}`;
-  room.className = `verdict ${word}`;
-  room.querySelector(".mark").textContent = MARKS[word] || "·";
-  room.querySelector(".word").textContent = word;
-  room.querySelector(".which").textContent = which;
-  const lost = { verdict: "lost", sentence: judged?.sentence || "Its frames are lost. If its ground is not seen often enough, the table of re-flights lists it." };
-  const findings = (word === "lost" ? [lost] : [...(judged?.findings || [])]).sort((a, b) => GRAVITY[a.verdict] - GRAVITY[b.verdict]);
+  const latest = lastWhere((one) => one.verdict || one.step === "lost");
+  const label = latest ? latest.verdict || "lost" : "waiting";
+  const container = by("verdict");
+  const which = latest ? `exposure ${latest.number}` : "";
+  if (container.dataset.shown === `${which} ${label}`) return;
+  container.dataset.shown = `${which} ${label}`;
+  container.className = `verdict ${label}`;
+  container.querySelector(".mark").textContent = MARKS[label] || "·";
+  container.querySelector(".word").textContent = label;
+  container.querySelector(".which").textContent = which;
+  const lost = { verdict: "lost", sentence: latest?.sentence || "The frames are lost. The table of re-flights lists its ground if the coverage is too low." };
+  const findings = (label === "lost" ? [lost] : [...(latest?.findings || [])]).sort((a, b) => SEVERITY_ORDER[a.verdict] - SEVERITY_ORDER[b.verdict]);
   by("findings").replaceChildren(...findings.map((finding) =>
     element("li", { textContent: `${MARKS[finding.verdict] || ""} ${finding.sentence}`, className: finding.verdict })));
 }
 
 function drawFaults() {
   const faults = flight.brief.faults;
-  const told = JSON.stringify(faults);
+  const shownKey = JSON.stringify(faults);
   const list = by("faults");
-  if (list.dataset.told === told) return;
-  list.dataset.told = told;
+  if (list.dataset.shown === shownKey) return;
+  list.dataset.shown = shownKey;
   if (!faults.length) {
     list.replaceChildren(element("li", { className: "none", textContent: "none" }));
     return;
   }
   list.replaceChildren(...faults.map((fault) => {
-    const word = fault.stands ? "✖ WARNING" : fault.previous ? "▲ BEFORE THE RESTART" : "▲ PASSED";
+    const label = fault.stands ? "✖ WARNING" : fault.previous ? "▲ BEFORE THE RESTART" : "▲ CLEARED";
     const repeated = (fault.count > 1 ? ` (${fault.count} times)` : "") + (fault.acknowledged ? ", acknowledged" : "");
-    const item = element("li", { className: fault.stands ? "stands" : "passed" },
-      element("span", {}, element("strong", { textContent: word + repeated }), fault.sentence));
+    const item = element("li", { className: fault.stands ? "active" : "cleared" },
+      element("span", {}, element("strong", { textContent: label + repeated }), fault.sentence));
     item.dataset.fault = fault.id;
     if (!fault.acknowledged) {
       const button = element("button", { type: "button", textContent: "Acknowledge" });
@@ -152,37 +152,37 @@ function deviceItem(device) {
   return element("li", { className: device.state },
     element("span", { textContent: DEVICE_MARKS[device.state] || "○", ariaHidden: "true" }),
     element("span", { textContent: device.name }),
-    element("span", { className: "said", textContent:
+    element("span", { className: "detail", textContent:
       device.state === "ready" ? "ready" : `${device.state}. ${device.sentence}` }));
 }
 
 const isWaiting = (device) => device.state === "searching";
 
-// By kind; what is wrong is on top and open, what is well can be looked into.
+// Devices by kind. Kinds with a device that is not ready come first and are expanded.
 function drawDevices() {
   const kinds = Map.groupBy([...flight.devices.values()].sort((a, b) => a.name.localeCompare(b.name)),
     (device) => KINDS[device.kind] || device.kind || "other");
-  const ill = (devices) => devices.filter((device) => device.state !== "ready");
-  const opened = new Set([...by("devices").querySelectorAll("details.well[open]")].map((one) => one.dataset.kind));
-  const sorted = [...kinds].sort((a, b) => ill(b[1]).length - ill(a[1]).length || a[0].localeCompare(b[0]));
+  const notReadyOf = (devices) => devices.filter((device) => device.state !== "ready");
+  const opened = new Set([...by("devices").querySelectorAll("details.all-ready[open]")].map((one) => one.dataset.kind));
+  const sorted = [...kinds].sort((a, b) => notReadyOf(b[1]).length - notReadyOf(a[1]).length || a[0].localeCompare(b[0]));
   by("devices").replaceChildren(...sorted.map(([kind, devices]) => {
-    const wrong = ill(devices);
-    const well = devices.length - wrong.length;
-    const room = element("details", { open: wrong.length > 0 || opened.has(kind), className: !wrong.length ? "well" : wrong.every(isWaiting) ? "well waiting" : "ill" },
-      element("summary", { textContent: `${!wrong.length ? "●" : wrong.every(isWaiting) ? "◌" : "✖"} ${kind}: ${well} of ${devices.length} ready` }),
-      element("ul", {}, ...wrong.map(deviceItem), ...devices.filter((one) => !wrong.includes(one)).map(deviceItem)));
-    room.dataset.kind = kind;
-    return element("li", {}, room);
+    const notReady = notReadyOf(devices);
+    const readyCount = devices.length - notReady.length;
+    const container = element("details", { open: notReady.length > 0 || opened.has(kind), className: !notReady.length ? "all-ready" : notReady.every(isWaiting) ? "all-ready waiting" : "not-ready" },
+      element("summary", { textContent: `${!notReady.length ? "●" : notReady.every(isWaiting) ? "◌" : "✖"} ${kind}: ${readyCount} of ${devices.length} ready` }),
+      element("ul", {}, ...notReady.map(deviceItem), ...devices.filter((one) => !notReady.includes(one)).map(deviceItem)));
+    container.dataset.kind = kind;
+    return element("li", {}, container);
   }));
 }
 
 function row(one) {
   const figures = one.figures || {};
-  const word = one.verdict || one.step;
+  const label = one.verdict || one.step;
   const choose = element("button", { type: "button", textContent: one.number });
   const cells = [
     [choose],
-    [`${MARKS[word] || ""} ${word}`, one.verdict || (one.step === "lost" ? "lost" : "")],
+    [`${MARKS[label] || ""} ${label}`, one.verdict || (one.step === "lost" ? "lost" : "")],
     [one.line || ""],
     [one.frames == null ? "" : `${one.frames}`],
     [duration(one.mark_sigma_ns) || ""],
@@ -191,11 +191,11 @@ function row(one) {
     [figures.dc_k == null ? "" : figures.dc_k.toFixed(1)],
     [figures.displaced_sensor || ""],
   ];
-  const made = element("tr", {}, ...cells.map(([content, style]) =>
+  const tableRow = element("tr", {}, ...cells.map(([content, style]) =>
     element("td", { className: style || "" }, content)));
-  made.addEventListener("click", () => select(one.number));
-  made.setAttribute("aria-selected", String(one.number === chosen));
-  return made;
+  tableRow.addEventListener("click", () => select(one.number));
+  tableRow.setAttribute("aria-selected", String(one.number === selected));
+  return tableRow;
 }
 
 function drawRows() {
@@ -206,38 +206,38 @@ function drawRows() {
 }
 
 function select(number) {
-  chosen = number;
+  selected = number;
   follow(false);
   showImage(number);
   drawRows();
 }
 
 function follow(wanted) {
-  follows = wanted;
+  isFollowing = wanted;
   by("follow").setAttribute("aria-pressed", String(wanted));
 }
 
-onChange((record, isFresh) => {
-  if (isFresh) {
-    chosen = null;
-    forgetImage();
+onChange((record, isFirstRecord) => {
+  if (isFirstRecord) {
+    selected = null;
+    clearImage();
   }
   drawHead();
   drawVerdict();
   drawFaults();
   drawExposure();
-  // The image that is followed is the last there is, under its own number.
-  if (follows) chosen = last((one) => one.step === "processed")?.number ?? chosen;
-  if (isFresh || record.devices) drawDevices();
-  if (isFresh || record.exposures || record.track) drawMap(select);
+  // While following, select the latest processed exposure.
+  if (isFollowing) selected = lastWhere((one) => one.step === "processed")?.number ?? selected;
+  if (isFirstRecord || record.devices) drawDevices();
+  if (isFirstRecord || record.exposures || record.track) drawMap(select);
   followPlan(Boolean(record.exposures));
-  if (isFresh || record.exposures) drawRows();
-  if (isFresh || record.history) drawCharts();
-  if (chosen != null) showImage(chosen);
+  if (isFirstRecord || record.exposures) drawRows();
+  if (isFirstRecord || record.history) drawCharts();
+  if (selected != null) showImage(selected);
 });
 
-by("follow").addEventListener("click", () => follow(!follows));
-function cabin(isDark) {
+by("follow").addEventListener("click", () => follow(!isFollowing));
+function setTheme(isDark) {
   document.documentElement.dataset.theme = isDark ? "dark" : "";
   by("theme").setAttribute("aria-pressed", String(isDark));
   localStorage.setItem("cabin", isDark ? "dark" : "");
@@ -245,41 +245,41 @@ function cabin(isDark) {
   fitCharts();
 }
 
-by("theme").addEventListener("click", () => cabin(document.documentElement.dataset.theme !== "dark"));
-cabin(localStorage.getItem("cabin") === "dark");
+by("theme").addEventListener("click", () => setTheme(document.documentElement.dataset.theme !== "dark"));
+setTheme(localStorage.getItem("cabin") === "dark");
 addEventListener("resize", fitCharts);
-prepareImage(() => chosen != null && showImage(chosen));
+prepareImage(() => selected != null && showImage(selected));
 
 let isLive = false;
 
-// What the lamp of the link says: a service that landed ended by itself, and that is no fault.
+// State of the connection. A service that ended after landing is no fault.
 function linkState(isLinked) {
-  if (isLinked) return { word: "linked", style: "good" };
-  if (!flight.brief) return { word: "connecting", style: "caution" };
+  if (isLinked) return { label: "connected", style: "good" };
+  if (!flight.brief) return { label: "connecting", style: "caution" };
   const at = new Date().toLocaleTimeString("en-GB");
   return flight.brief.phase === "landed"
-    ? { word: "ended", style: "", title: "LANDED", sentence: `Landed. The service ended ${at}. Values are those at its end.` }
-    : { word: "no link", style: "warning", title: "NO LINK", sentence: `✖ Connection lost ${at}. Values are frozen.` };
+    ? { label: "ended", style: "", title: "LANDED", sentence: `Landed. The service ended ${at}. Values are those at its end.` }
+    : { label: "disconnected", style: "warning", title: "CONNECTION LOST", sentence: `✖ Connection lost ${at}. Values are frozen.` };
 }
 
-listen((isLinked) => {
+connect((isLinked) => {
   const link = by("link");
   const state = linkState(isLinked);
   if (isLinked || isLive || !flight.brief) {
-    link.textContent = state.word;
+    link.textContent = state.label;
     link.className = `chip ${state.style}`;
   }
-  document.body.classList.toggle("stale", !isLinked);
+  document.body.classList.toggle("connection-lost", !isLinked);
   if (!isLinked && isLive) {
-    by("stale").textContent = state.sentence;
-    by("stale").classList.toggle("ended", state.title === "LANDED");
+    by("connection-lost").textContent = state.sentence;
+    by("connection-lost").classList.toggle("ended", state.title === "LANDED");
     document.title = `${state.title} · ${document.title}`;
   }
-  by("stale").hidden = isLinked || !(isLive || flight.brief);
+  by("connection-lost").hidden = isLinked || !(isLive || flight.brief);
   isLive = isLinked;
 }, async () => {
   by("link").textContent = "token needed";
   let token = "";
-  while (!token) token = await askToken();
+  while (!token) token = await requestToken();
   sessionStorage.setItem("token", token);
 });

@@ -1,67 +1,67 @@
-// The plan of the mission, and what of it has to be flown again.
+// The flight plan of the mission, and the segments to re-fly.
 
-import { askedJson } from "./asking.js";
-import { flight } from "./state.js";
-import { drawHoles, drawPlan } from "./map.js";
+import { fetchJson } from "./http.js";
+import { flight } from "./telemetry.js";
+import { drawGaps, drawPlan } from "./map.js";
 
-const AGAIN_MS = 3000;
-const room = document.getElementById("fly-again");
-const well = document.getElementById("well");
+const REFRESH_MS = 3000;
+const section = document.getElementById("reflights");
+const coverageText = document.getElementById("coverage");
 const rows = document.getElementById("segments");
 let mission = null;
 let hasPlan = false;
-let asked = 0;
-let waits = null;
+let requestedMs = 0;
+let timer = null;
 
-const areaOf = (one) => one.holes.reduce((sum, hole) => sum + hole.area_m2, 0);
+const areaOf = (one) => one.holes.reduce((sum, gap) => sum + gap.area_m2, 0);
 
-// What is wrong in a segment: bands that some ground lacks, and by how many images it is seen.
-function lacksOf(one) {
-  const words = one.holes.map((hole) =>
-    `${hole.bands.length ? `${hole.bands.join(", ")}: ` : ""}${hole.images} of ${hole.needed} images`);
-  return [...new Set(words)];
+// Shortfalls of a segment: missing bands, and images found of images required.
+function shortfallsOf(one) {
+  const texts = one.holes.map((gap) =>
+    `${gap.bands.length ? `${gap.bands.join(", ")}: ` : ""}${gap.images} of ${gap.needed} images`);
+  return [...new Set(texts)];
 }
 
 function row(one) {
-  const made = document.createElement("tr");
+  const tableRow = document.createElement("tr");
   for (const text of [one.line, one.from_m.toFixed(0), one.to_m.toFixed(0),
-    (areaOf(one) / 1e4).toFixed(2), `✖ ${[...lacksOf(one), ...one.reasons].join("; ")}`]) {
+    (areaOf(one) / 1e4).toFixed(2), `✖ ${[...shortfallsOf(one), ...one.reasons].join("; ")}`]) {
     const cell = document.createElement("td");
     cell.textContent = text;
-    made.append(cell);
+    tableRow.append(cell);
   }
-  return made;
+  return tableRow;
 }
 
-async function advise() {
-  asked = Date.now();
-  const advice = await askedJson("/api/v1/advice");
+async function updateAdvice() {
+  requestedMs = Date.now();
+  const advice = await fetchJson("/api/v1/advice");
   if (!advice?.segments) return;
-  const holes = advice.segments.filter((one) => one.kind === "hole");
+  const gaps = advice.segments.filter((one) => one.kind === "hole");
   const share = advice.planned_m ? 100 * advice.covered_m / advice.planned_m : 0;
-  well.textContent = [
+  coverageText.textContent = [
     `${share.toFixed(0)} % of ${(advice.planned_m / 1000).toFixed(1)} km covered`,
-    holes.length ? `${holes.length} ${holes.length === 1 ? "gap" : "gaps"} to re-fly, ${(advice.hole_m2 / 1e4).toFixed(2)} ha`
+    gaps.length ? `${gaps.length} ${gaps.length === 1 ? "gap" : "gaps"} to re-fly, ${(advice.hole_m2 / 1e4).toFixed(2)} ha`
       : "no gap to re-fly",
     ...advice.notes,
   ].join(". ");
-  rows.replaceChildren(...holes.map(row));
-  rows.closest(".scroll").hidden = !holes.length;
-  drawHoles(holes);
+  rows.replaceChildren(...gaps.map(row));
+  rows.closest(".scroll").hidden = !gaps.length;
+  drawGaps(gaps);
 }
 
-// Ask for the plan once a mission, and for advice when exposures came, not more often than is useful.
+// Fetch the plan once per mission. Fetch the coverage after new exposures, at most every REFRESH_MS.
 export async function followPlan(hasNewExposures) {
   const current = flight.brief?.mission?.id || null;
   if (current !== mission) {
     mission = current;
-    const plan = current && await askedJson("/api/v1/plan");
+    const plan = current && await fetchJson("/api/v1/plan");
     hasPlan = Boolean(plan?.lines);
-    room.hidden = !hasPlan;
+    section.hidden = !hasPlan;
     drawPlan(plan);
-    if (hasPlan) advise();
+    if (hasPlan) updateAdvice();
     return;
   }
-  if (!hasPlan || !hasNewExposures || waits) return;
-  waits = setTimeout(() => { waits = null; advise(); }, Math.max(0, asked + AGAIN_MS - Date.now()));
+  if (!hasPlan || !hasNewExposures || timer) return;
+  timer = setTimeout(() => { timer = null; updateAdvice(); }, Math.max(0, requestedMs + REFRESH_MS - Date.now()));
 }

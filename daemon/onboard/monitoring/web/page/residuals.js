@@ -1,47 +1,47 @@
-// What the stitching left over, laid over the quick look, and what the converters saw.
+// Residuals of the stitching over the quick look, and the histogram of raw counts.
 
 const FEW = 12;
 const SCREEN_PX = 24;
 const KINDS = ["", "colour", "left-out"];
 const COLOURS = { PAN: "#888", R: "#d33", G: "#2a2", B: "#35e", N: "#a3a" };
 const note = document.getElementById("vectors-note");
-const said = document.getElementById("histogram-note");
+const histogramNote = document.getElementById("histogram-note");
 
-// Vectors in pixels of the virtual image, enlarged so that most are some pixels of the picture long.
-export function drawVectors(svg, told, width, height) {
+// Residual vectors in pixels of the virtual image, enlarged so that most are visible.
+export function drawVectors(svg, residuals, width, height) {
   svg.replaceChildren();
-  note.textContent = "No residuals of this exposure.";
-  if (!told?.vectors?.length) return;
-  const reduced = width / told.width_px;
-  const lengths = told.vectors.filter((v) => v[4] !== 2).map((v) => Math.hypot(v[2], v[3])).sort((a, b) => a - b);
-  const usual = lengths[Math.floor(lengths.length * 0.9)] || 1;
-  const enlarge = 2 * SCREEN_PX / usual;
+  note.textContent = "No residuals for this exposure.";
+  if (!residuals?.vectors?.length) return;
+  const reduced = width / residuals.width_px;
+  const lengths = residuals.vectors.filter((v) => v[4] !== 2).map((v) => Math.hypot(v[2], v[3])).sort((a, b) => a - b);
+  const p90Px = lengths[Math.floor(lengths.length * 0.9)] || 1;
+  const enlarge = 2 * SCREEN_PX / p90Px;
   svg.setAttribute("width", width);
   svg.setAttribute("height", height);
   svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
-  const most = 8 * SCREEN_PX;
+  const longestPx = 8 * SCREEN_PX;
   KINDS.forEach((kind, index) => {
     const path = document.createElementNS(svg.namespaceURI, "path");
     path.setAttribute("class", kind);
-    path.setAttribute("d", told.vectors.filter((v) => v[4] === index).map(([column, row, right, down]) => {
-      const shrink = Math.min(1, most / (enlarge * Math.hypot(right, down) || 1)) * enlarge;
+    path.setAttribute("d", residuals.vectors.filter((v) => v[4] === index).map(([column, row, right, down]) => {
+      const shrink = Math.min(1, longestPx / (enlarge * Math.hypot(right, down) || 1)) * enlarge;
       const [x, y] = [(column + 0.5) * reduced, (row + 0.5) * reduced];
       return `M${x.toFixed(1)} ${y.toFixed(1)}l${(right * shrink).toFixed(1)} ${(down * shrink).toFixed(1)}`;
     }).join(""));
     svg.append(path);
   });
-  note.textContent = `${told.vectors.length} vectors, ${(enlarge / reduced).toFixed(0)} times enlarged; ` +
-    `nine of ten are shorter than ${usual.toFixed(2)} px. Solid: between PAN sensors, dashed: to colour, thick: left out.`;
+  note.textContent = `${residuals.vectors.length} vectors, ${(enlarge / reduced).toFixed(0)}x enlarged; ` +
+    `90th percentile ${p90Px.toFixed(2)} px. Solid: between PAN sensors, dashed: to colour, thick: rejected.`;
 }
 
-export function forgetHistogram(canvas) {
+export function clearHistogram(canvas) {
   canvas.getContext("2d").clearRect(0, 0, canvas.width, canvas.height);
   canvas.setAttribute("aria-label", "Histogram");
-  said.replaceChildren();
+  histogramNote.replaceChildren();
 }
 
-export function listOverlaps(told, number) {
-  const rows = (told?.overlaps || []).map((one) => {
+export function listOverlaps(residuals, number) {
+  const rows = (residuals?.overlaps || []).map((one) => {
     const row = document.createElement("tr");
     const few = one.used < FEW ? "▲ few: " : "";
     const cells = [one.sensors.join("–"), `${few}${one.used}`, one.sought, one.rms_px == null ? "" : one.rms_px.toFixed(3)];
@@ -51,7 +51,7 @@ export function listOverlaps(told, number) {
   });
   document.getElementById("overlaps").replaceChildren(...rows);
   const drawing = document.getElementById("drawing");
-  drawing.hidden = !told;
+  drawing.hidden = !residuals;
   drawing.href = `/api/v1/exposures/${number}/residuals.svg`;
 }
 
@@ -65,34 +65,34 @@ function quantile(counts, share) {
   return 1;
 }
 
-// Raw counts by sensor: PAN sensors together, colours each. Also in words, for those who see no colours.
-export function drawHistogram(canvas, told) {
+// Raw counts: one curve for all PAN sensors, one per colour. Also as text, for readers who cannot distinguish the colours.
+export function drawHistogram(canvas, countsOfSensor) {
   const groups = {};
-  for (const [sensor, counts] of Object.entries(told)) {
+  for (const [sensor, counts] of Object.entries(countsOfSensor)) {
     const name = COLOURS[sensor] ? sensor : "PAN";
     groups[name] = groups[name] ? groups[name].map((value, bin) => value + counts[bin]) : [...counts];
   }
   const pen = canvas.getContext("2d");
   pen.clearRect(0, 0, canvas.width, canvas.height);
-  said.replaceChildren("Raw counts, black to full scale. Median / brightest hundredth: ");
+  histogramNote.replaceChildren("Raw counts, black to full scale. Median / 99th percentile: ");
   for (const [name, counts] of Object.entries(groups)) {
-    const most = Math.max(...counts, 1);
+    const maximum = Math.max(...counts, 1);
     pen.strokeStyle = COLOURS[name];
     pen.lineWidth = name === "PAN" ? 3 : 1.5;
     pen.beginPath();
     counts.forEach((count, bin) => pen.lineTo((bin + 0.5) * canvas.width / counts.length,
-      canvas.height * (1 - 0.95 * Math.sqrt(count / most))));
+      canvas.height * (1 - 0.95 * Math.sqrt(count / maximum))));
     pen.stroke();
     const total = counts.reduce((a, b) => a + b, 0) || 1;
     const high = 100 * counts[counts.length - 1] / total;
-    const word = `${name} ${(100 * quantile(counts, 0.5)).toFixed(0)} / ${(100 * quantile(counts, 0.99)).toFixed(0)} %` +
+    const label = `${name} ${(100 * quantile(counts, 0.5)).toFixed(0)} / ${(100 * quantile(counts, 0.99)).toFixed(0)} %` +
       (high >= 0.5 ? ` ▲ ${high.toFixed(1)} % full` : "");
     const swatch = document.createElement("i");
     swatch.className = "swatch";
     swatch.style.borderTop = `${name === "PAN" ? 4 : 2}px solid ${COLOURS[name]}`;
-    const whole = Object.assign(document.createElement("span"), { className: "curve" });
-    whole.append(swatch, word);
-    said.append(whole, " ");
+    const curveItem = Object.assign(document.createElement("span"), { className: "curve" });
+    curveItem.append(swatch, label);
+    histogramNote.append(curveItem, " ");
   }
-  canvas.setAttribute("aria-label", `Histogram of raw counts. ${said.textContent}`);
+  canvas.setAttribute("aria-label", `Histogram of raw counts. ${histogramNote.textContent}`);
 }

@@ -1,5 +1,5 @@
-// Whatever a library puts into the page as HTML becomes text, except what it draws itself.
-// The browser asks this policy because of require-trusted-types-for in the content security policy.
+// Trusted Types policy: HTML from a library becomes text, except the fixed elements below.
+// The content security policy enables it (require-trusted-types-for).
 
 const DRAWN = new Set([
   "<svg/>",

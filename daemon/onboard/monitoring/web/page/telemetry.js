@@ -1,6 +1,6 @@
-// The flight as this page knows it: telemetry records merged, and listeners told.
+// State of the flight, merged from telemetry records. Notifies listeners of each record.
 
-import { headers } from "./asking.js";
+import { headers } from "./http.js";
 
 export const flight = {
   brief: null,
@@ -17,7 +17,7 @@ export function onChange(listener) {
   listeners.add(listener);
 }
 
-function forget() {
+function clear() {
   flight.exposures.clear();
   flight.devices.clear();
   flight.track.length = 0;
@@ -25,7 +25,7 @@ function forget() {
   flight.settings = null;
 }
 
-function merge(record, isFresh) {
+function merge(record, isFirstRecord) {
   const { exposures = [], devices = [], track = [], history = [], settings = [], events: _, ...brief } = record;
   flight.brief = brief;
   for (const one of exposures) flight.exposures.set(one.number, one);
@@ -33,7 +33,7 @@ function merge(record, isFresh) {
   flight.settings = settings.at(-1) || flight.settings;
   flight.track.push(...track);
   flight.history.push(...history);
-  for (const listener of listeners) listener(record, isFresh);
+  for (const listener of listeners) listener(record, isFirstRecord);
 }
 
 async function isRefused() {
@@ -44,45 +44,45 @@ async function isRefused() {
   }
 }
 
-// Hear the service for ever; `told(isLinked)` is called whenever the link comes or goes, and
-// `needsToken()` where looking is not for everybody: it gives back when there is a token to try.
-export function listen(told, needsToken) {
+// Receive telemetry and reconnect for ever. `onLinkChange(isLinked)` is called when the connection
+// opens or closes. `requestToken()` is called if reading requires a token; it resolves with one.
+export function connect(onLinkChange, requestToken) {
   const scheme = location.protocol === "https:" ? "wss" : "ws";
   let waitMs = 500;
   let silence = null;
-  const connect = () => {
-    let isFresh = true;
+  const open = () => {
+    let isFirstRecord = true;
     const token = sessionStorage.getItem("token");
-    // A browser sets no other header of a WebSocket; in the address a token would end up in logs.
+    // A browser sets no other header of a WebSocket; a token in the address would appear in logs.
     const protocols = token ? ["syntopic.v1", `bearer.${token}`] : ["syntopic.v1"];
     const socket = new WebSocket(`${scheme}://${location.host}/api/v1/telemetry?form=json`, protocols);
-    const alive = () => {
+    const restartTimeout = () => {
       clearTimeout(silence);
       silence = setTimeout(() => socket.close(), 5000);
     };
-    socket.onopen = alive;
+    socket.onopen = restartTimeout;
     socket.onmessage = (message) => {
       waitMs = 500;
-      alive();
-      // Each link tells all there is: what is known from before may be of another flight.
-      if (isFresh) {
-        forget();
-        told(true);
+      restartTimeout();
+      // The first record is complete. The previous state may belong to another flight.
+      if (isFirstRecord) {
+        clear();
+        onLinkChange(true);
       }
-      merge(JSON.parse(message.data), isFresh);
-      isFresh = false;
+      merge(JSON.parse(message.data), isFirstRecord);
+      isFirstRecord = false;
     };
     socket.onclose = async () => {
       clearTimeout(silence);
-      told(false);
-      if (isFresh && await isRefused()) {
+      onLinkChange(false);
+      if (isFirstRecord && await isRefused()) {
         sessionStorage.removeItem("token");
-        await needsToken();
+        await requestToken();
         waitMs = 500;
       }
-      setTimeout(connect, waitMs);
+      setTimeout(open, waitMs);
       waitMs = Math.min(waitMs * 2, 8000);
     };
   };
-  connect();
+  open();
 }

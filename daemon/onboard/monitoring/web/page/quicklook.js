@@ -1,21 +1,21 @@
-// The quick look: zoom, pan, histogram, residual vectors in its place.
+// The quick look: zoom, pan, histogram, residual vectors.
 
-import { asked, askedJson } from "./asking.js";
-import { flight } from "./state.js";
-import { drawHistogram, drawVectors, forgetHistogram, listOverlaps } from "./residuals.js";
+import { fetchOk, fetchJson } from "./http.js";
+import { flight } from "./telemetry.js";
+import { drawHistogram, drawVectors, clearHistogram, listOverlaps } from "./residuals.js";
 
-const room = document.getElementById("image");
+const viewport = document.getElementById("image");
 const image = document.getElementById("quicklook");
-const nothing = document.getElementById("no-image");
+const placeholder = document.getElementById("no-image");
 const canvas = document.getElementById("histogram");
-const which = document.getElementById("image-which");
-const about = document.getElementById("about-image");
+const numberLabel = document.getElementById("image-which");
+const figuresList = document.getElementById("about-image");
 const residuals = document.getElementById("show-residuals");
-const noteRoom = document.getElementById("vectors-note");
+const vectorsNote = document.getElementById("vectors-note");
 const drawing = document.getElementById("vectors");
-const AGAIN_MS = 5000;
+const RETRY_MS = 5000;
 const view = { scale: 1, x: 0, y: 0 };
-let shown = null;
+let shownAddress = null;
 
 function place() {
   image.style.transform = `translate(${view.x}px, ${view.y}px) scale(${view.scale})`;
@@ -24,13 +24,13 @@ function place() {
 
 function fit() {
   if (!image.naturalWidth) return;
-  view.scale = Math.min(room.clientWidth / image.naturalWidth, room.clientHeight / image.naturalHeight);
-  view.x = (room.clientWidth - image.naturalWidth * view.scale) / 2;
-  view.y = (room.clientHeight - image.naturalHeight * view.scale) / 2;
+  view.scale = Math.min(viewport.clientWidth / image.naturalWidth, viewport.clientHeight / image.naturalHeight);
+  view.x = (viewport.clientWidth - image.naturalWidth * view.scale) / 2;
+  view.y = (viewport.clientHeight - image.naturalHeight * view.scale) / 2;
   place();
 }
 
-function zoom(factor, x = room.clientWidth / 2, y = room.clientHeight / 2) {
+function zoom(factor, x = viewport.clientWidth / 2, y = viewport.clientHeight / 2) {
   const scale = Math.min(Math.max(view.scale * factor, 0.02), 32);
   view.x = x - (x - view.x) * (scale / view.scale);
   view.y = y - (y - view.y) * (scale / view.scale);
@@ -50,14 +50,14 @@ function quicklookHistogram() {
     for (let band = 0; band < 3; band += 1) counts[band][pixels[i + band]] += 1;
   }
   const draw = canvas.getContext("2d");
-  forgetHistogram(canvas);
+  clearHistogram(canvas);
   canvas.setAttribute("aria-label", "Histogram of the quick look");
-  const most = Math.max(...counts.flatMap((one) => [...one.slice(1, 255)]), 1);
+  const maximum = Math.max(...counts.flatMap((one) => [...one.slice(1, 255)]), 1);
   ["#d33", "#2a2", "#35e"].forEach((colour, band) => {
     draw.strokeStyle = colour;
     draw.beginPath();
     counts[band].forEach((count, value) => {
-      draw.lineTo(value * 2, canvas.height * (1 - Math.sqrt(Math.min(count / most, 1))));
+      draw.lineTo(value * 2, canvas.height * (1 - Math.sqrt(Math.min(count / maximum, 1))));
     });
     draw.stroke();
   });
@@ -67,112 +67,112 @@ function share(value) {
   return value == null ? null : `${(100 * value).toFixed(0)} %`;
 }
 
-function figures(one) {
-  about.replaceChildren();
-  const told = one.figures || {};
+function showFigures(one) {
+  figuresList.replaceChildren();
+  const figures = one.figures || {};
   const lines = {
-    "tie points": told.tie_points_pp === undefined ? null : `${told.tie_points_pp} + ${told.tie_points_pc ?? 0}`,
-    "σ0": told.sigma0_px == null ? null : `${told.sigma0_px.toFixed(3)} px`,
-    "accuracy": told.stitched_sigma_px == null ? null : `${told.stitched_sigma_px.toFixed(3)} px`,
-    "displaced": told.displaced_sensor,
-    "saturated": told.saturated_fraction == null ? null : `${(100 * told.saturated_fraction).toFixed(2)} %`,
-    "tilt": told.tilt_deg == null ? null : `${told.tilt_deg.toFixed(1)}°`,
-    "overlap": share(told.forward_overlap),
-    "sidelap": share(told.sidelap),
-    "crab": told.crab_deg == null ? null : `${told.crab_deg.toFixed(1)}°`,
-    "sun": told.sun_deg == null ? null : `${told.sun_deg.toFixed(0)}°`,
-    "GSD": told.gsd_m == null ? null : `${(100 * told.gsd_m).toFixed(1)} cm`,
+    "tie points": figures.tie_points_pp === undefined ? null : `${figures.tie_points_pp} + ${figures.tie_points_pc ?? 0}`,
+    "σ0": figures.sigma0_px == null ? null : `${figures.sigma0_px.toFixed(3)} px`,
+    "accuracy": figures.stitched_sigma_px == null ? null : `${figures.stitched_sigma_px.toFixed(3)} px`,
+    "displaced": figures.displaced_sensor,
+    "saturated": figures.saturated_fraction == null ? null : `${(100 * figures.saturated_fraction).toFixed(2)} %`,
+    "tilt": figures.tilt_deg == null ? null : `${figures.tilt_deg.toFixed(1)}°`,
+    "overlap": share(figures.forward_overlap),
+    "sidelap": share(figures.sidelap),
+    "crab": figures.crab_deg == null ? null : `${figures.crab_deg.toFixed(1)}°`,
+    "sun": figures.sun_deg == null ? null : `${figures.sun_deg.toFixed(0)}°`,
+    "GSD": figures.gsd_m == null ? null : `${(100 * figures.gsd_m).toFixed(1)} cm`,
     "pipeline": one.duration_s == null ? null : `${one.duration_s.toFixed(2)} s`,
   };
   for (const [name, value] of Object.entries(lines)) {
     if (value == null) continue;
     const line = document.createElement("div");
     const term = document.createElement("dt");
-    const said = document.createElement("dd");
+    const definition = document.createElement("dd");
     term.textContent = name;
-    said.textContent = value;
-    line.append(term, said);
-    about.append(line);
+    definition.textContent = value;
+    line.append(term, definition);
+    figuresList.append(line);
   }
 }
 
 export async function showImage(number) {
   const one = flight.exposures.get(number);
   if (!one) return;
-  figures(one);
-  which.textContent = `${number}`;
+  showFigures(one);
+  numberLabel.textContent = `${number}`;
   if (one.step !== "processed") {
-    showNone(`exposure ${number}: ${one.step === "lost" ? "lost, no image" : `${one.step}, no image yet`}`);
+    showPlaceholder(`exposure ${number}: ${one.step === "lost" ? "lost, no image" : `${one.step}, no image yet`}`);
     return;
   }
   drawing.toggleAttribute("hidden", residuals.getAttribute("aria-pressed") !== "true");
-  noteRoom.hidden = drawing.hasAttribute("hidden");
+  vectorsNote.hidden = drawing.hasAttribute("hidden");
   const address = `/api/v1/exposures/${number}/quicklook.jpg`;
-  if (shown === address) return;
-  shown = address;
+  if (shownAddress === address) return;
+  shownAddress = address;
   const refit = image.hidden;
   const products = Promise.all(["histogram.json", "residuals.json"].map((name) =>
-    askedJson(`/api/v1/exposures/${number}/${name}`)));
+    fetchJson(`/api/v1/exposures/${number}/${name}`)));
   image.onload = async () => {
     image.hidden = false;
-    nothing.hidden = true;
+    placeholder.hidden = true;
     if (refit) fit();
     const [raw, vectors] = await products;
-    if (shown !== address) return;
+    if (shownAddress !== address) return;
     if (raw) drawHistogram(canvas, raw);
     else quicklookHistogram();
     drawVectors(drawing, vectors, image.naturalWidth, image.naturalHeight);
     listOverlaps(vectors, number);
     place();
   };
-  image.onerror = () => showNone(`exposure ${number}: its quick look cannot be read`);
+  image.onerror = () => showPlaceholder(`exposure ${number}: the quick look cannot be read`);
   image.alt = `Quick look of exposure ${number}, verdict ${one.verdict}`;
-  const picture = await (await asked(address))?.blob();
-  if (shown !== address) return;
+  const picture = await (await fetchOk(address))?.blob();
+  if (shownAddress !== address) return;
   if (!picture) {
-    showNone(`exposure ${number}: no quick look`);
-    // Asked for again in a while, not with every word of the service.
-    shown = address;
-    setTimeout(() => { if (shown === address) shown = null; }, AGAIN_MS);
+    showPlaceholder(`exposure ${number}: no quick look`);
+    // Retry after RETRY_MS, not with every telemetry record.
+    shownAddress = address;
+    setTimeout(() => { if (shownAddress === address) shownAddress = null; }, RETRY_MS);
     return;
   }
   if (image.src) URL.revokeObjectURL(image.src);
   image.src = URL.createObjectURL(picture);
 }
 
-export function forgetImage() {
-  showNone("no image yet");
-  which.textContent = "";
-  about.replaceChildren();
+export function clearImage() {
+  showPlaceholder("no image yet");
+  numberLabel.textContent = "";
+  figuresList.replaceChildren();
 }
 
-// Better no image than that of another exposure.
-function showNone(why) {
-  shown = null;
+// Show a placeholder instead of the image of another exposure.
+function showPlaceholder(why) {
+  shownAddress = null;
   image.hidden = true;
-  nothing.hidden = false;
-  nothing.textContent = why;
+  placeholder.hidden = false;
+  placeholder.textContent = why;
   drawVectors(drawing, null);
-  noteRoom.hidden = true;
-  forgetHistogram(canvas);
+  vectorsNote.hidden = true;
+  clearHistogram(canvas);
   listOverlaps(null, null);
 }
 
-export function prepareImage(again) {
+export function prepareImage(redraw) {
   document.getElementById("zoom-in").addEventListener("click", () => zoom(1.5));
   document.getElementById("zoom-out").addEventListener("click", () => zoom(1 / 1.5));
   document.getElementById("zoom-fit").addEventListener("click", fit);
   residuals.addEventListener("click", () => {
     const pressed = residuals.getAttribute("aria-pressed") === "true";
     residuals.setAttribute("aria-pressed", String(!pressed));
-    again();
+    redraw();
   });
-  room.addEventListener("wheel", (event) => {
+  viewport.addEventListener("wheel", (event) => {
     event.preventDefault();
-    const box = room.getBoundingClientRect();
+    const box = viewport.getBoundingClientRect();
     zoom(event.deltaY < 0 ? 1.2 : 1 / 1.2, event.clientX - box.left, event.clientY - box.top);
   }, { passive: false });
-  room.addEventListener("keydown", (event) => {
+  viewport.addEventListener("keydown", (event) => {
     const moves = { ArrowLeft: [40, 0], ArrowRight: [-40, 0], ArrowUp: [0, 40], ArrowDown: [0, -40] };
     if (event.key in moves) {
       view.x += moves[event.key][0];
@@ -184,29 +184,29 @@ export function prepareImage(again) {
     else return;
     event.preventDefault();
   });
-  // One finger moves, two zoom about the middle between them.
+  // One finger pans. Two fingers zoom about their midpoint.
   const fingers = new Map();
-  const grip = () => {
+  const pinchState = () => {
     const at = [...fingers.values()];
     const middle = [0, 1].map((k) => at.reduce((sum, one) => sum + one[k], 0) / at.length);
     return [...middle, at.length > 1 ? Math.hypot(at[0][0] - at[1][0], at[0][1] - at[1][1]) : 0];
   };
-  room.addEventListener("pointerdown", (event) => {
+  viewport.addEventListener("pointerdown", (event) => {
     fingers.set(event.pointerId, [event.clientX, event.clientY]);
-    room.setPointerCapture(event.pointerId);
+    viewport.setPointerCapture(event.pointerId);
   });
-  room.addEventListener("pointermove", (event) => {
+  viewport.addEventListener("pointermove", (event) => {
     if (!fingers.has(event.pointerId)) return;
-    const [x0, y0, apart0] = grip();
+    const [x0, y0, spread0Px] = pinchState();
     fingers.set(event.pointerId, [event.clientX, event.clientY]);
-    const [x, y, apart] = grip();
+    const [x, y, spreadPx] = pinchState();
     view.x += x - x0;
     view.y += y - y0;
-    const box = room.getBoundingClientRect();
-    zoom(apart0 && apart ? apart / apart0 : 1, x - box.left, y - box.top);
+    const box = viewport.getBoundingClientRect();
+    zoom(spread0Px && spreadPx ? spreadPx / spread0Px : 1, x - box.left, y - box.top);
   });
   for (const end of ["pointerup", "pointercancel"]) {
-    room.addEventListener(end, (event) => fingers.delete(event.pointerId));
+    viewport.addEventListener(end, (event) => fingers.delete(event.pointerId));
   }
   addEventListener("resize", fit);
 }

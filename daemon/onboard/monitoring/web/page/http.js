@@ -1,0 +1,35 @@
+// HTTP requests to the service, with the access token if there is one.
+
+export function headers() {
+  const token = sessionStorage.getItem("token");
+  return token ? { Authorization: `Bearer ${token}` } : {};
+}
+
+// The response; null if the request fails or is refused.
+export async function fetchOk(address) {
+  try {
+    const response = await fetch(address, { headers: headers() });
+    return response.ok ? response : null;
+  } catch {
+    return null;
+  }
+}
+
+export async function fetchJson(address) {
+  return (await fetchOk(address))?.json() ?? null;
+}
+
+// A browser follows a link without a token. A file that requires one is fetched here.
+document.addEventListener("click", async (event) => {
+  const link = event.target.closest?.(".files a");
+  if (!link || !sessionStorage.getItem("token") || link.href.startsWith("blob:")) return;
+  event.preventDefault();
+  const response = await fetchOk(link.href);
+  if (!response) return;
+  const download = document.createElement("a");
+  download.href = URL.createObjectURL(await response.blob());
+  if (link.hasAttribute("download")) download.download = link.pathname.split("/").at(-1);
+  else download.target = "_blank";
+  download.click();
+  setTimeout(() => URL.revokeObjectURL(download.href), 60000);
+});
