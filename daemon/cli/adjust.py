@@ -15,12 +15,14 @@ from rich.progress import Progress
 
 from daemon.terminal.console import Console
 
-HELP = """Adjust a bundle: a project of text files, made by hand or by `syntopic import dbat`.
+HELP = """Adjust a bundle from a project of text files.
+
+The project is written by hand or by `syntopic import dbat`.
 
 Prints sigma0, redundancy, residuals by kind, interior orientation with standard deviations, and
 check points against their predicted accuracy. With --out the adjusted project, coordinates and
-residuals are written as tables. What cannot be determined is named. The format is told in
-docs/formats.md.
+residuals are written as tables. Parameters that cannot be determined are named. The format is
+described in docs/formats.md.
 
 Examples: `syntopic adjust project.toml`, `syntopic adjust project.toml --reject 4 --out adjusted`
 """
@@ -30,17 +32,17 @@ def adjust(
     project: Annotated[Path, typer.Argument(help="project.toml, or the folder that holds it.")],
     out: Annotated[Path | None, typer.Option(help="Folder for results; must be new.")] = None,
     robust: Annotated[
-        bool | None, typer.Option("--robust/--no-robust", help="Begin with robust weights.")
+        bool | None, typer.Option("--robust/--no-robust", help="Robust weights at the start.")
     ] = None,
     reject: Annotated[
-        float | None, typer.Option(help="Leave out image points beyond this many sigmas.")
+        float | None, typer.Option(help="Rejection limit of image points in sigmas.")
     ] = None,
     components: Annotated[
         bool | None, typer.Option("--components/--no-components", help="Variance components.")
     ] = None,
     free_network: Annotated[
         bool | None,
-        typer.Option("--free-network/--no-free-network", help="Undetermined is no error."),
+        typer.Option("--free-network/--no-free-network", help="Accept a network without datum."),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:

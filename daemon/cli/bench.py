@@ -1,4 +1,4 @@
-"""`syntopic bench`: how fast and how right the pipeline is on a rig, beside its peers."""
+"""`syntopic bench`: speed and accuracy of the pipeline on a rig, compared with other software."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ import typer
 from daemon.terminal.console import Console
 from daemon.terminal.tables import light_table
 
-HELP = """Time the pipeline on one emulated exposure of a rig, beside its peers.
+HELP = """Time the pipeline on one emulated exposure of a rig and compare it with other software.
 
-The exposure (dC 12 K, one sensor displaced) is rendered once by a separate process and kept. Timed
+The exposure (dC 12 K, one sensor displaced) is rendered once by a separate process and cached. Timed
 in turn: the pipeline from Level-0 in memory to Level-2 on the disk, the fixed method, a copy
 of the same bytes; then the pace with exposures side by side, as the service works (realtime_factor
 is the frame interval over the time per exposure); then a bare cv2.remap, and nona + enblend where
@@ -28,12 +28,14 @@ Examples: `syntopic bench ultracam-x-mini`, `syntopic bench ultracam-x --runs 5 
 
 def bench(
     rig: Annotated[str, typer.Argument(help="Name of a shipped rig, or a rig file.")],
-    runs: Annotated[int, typer.Option(min=1, help="How often everything is timed.")] = 5,
-    peers: Annotated[bool, typer.Option(help="Time cv2.remap and nona + enblend too.")] = True,
-    threads: Annotated[int, typer.Option(min=1, help="Cores the pipeline may use.")] = 2,
+    runs: Annotated[int, typer.Option(min=1, help="Number of runs.")] = 5,
+    peers: Annotated[
+        bool, typer.Option(help="Comparison with cv2.remap and nona + enblend.")
+    ] = True,
+    threads: Annotated[int, typer.Option(min=1, help="Number of threads of the pipeline.")] = 2,
     parallel: Annotated[int, typer.Option(min=1, help="Exposures in work at a time.")] = 2,
     folder: Annotated[
-        Path | None, typer.Option(help="Where rendered exposures are kept (default: cache).")
+        Path | None, typer.Option(help="Folder of rendered exposures (default: cache).")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
@@ -45,7 +47,7 @@ def bench(
     console = Console(stderr=True)
     with console.status(f"timing {found.name}"):
         place = measuring.benchmark_exposure(rig, found, folder or _cache_folder(found.name))
-        console.print(f"Rendered exposures are kept in {place}", soft_wrap=True)
+        console.print(f"Rendered exposures are cached in {place}", soft_wrap=True)
         # In a process of its own, which begins as the service's worker does.
         for name, count in thread_counts(threads).items():
             os.environ.setdefault(name, count)
@@ -85,7 +87,7 @@ def _print(result: dict[str, Any]) -> None:
     )
     side = result["side_by_side"]
     console.print(
-        f"{side['lanes']} at a time: realtime_factor {result['realtime_factor']:.2f}, "
+        f"{side['parallel']} at a time: realtime_factor {result['realtime_factor']:.2f}, "
         f"{side['seconds_per_exposure']:.2f} s and {side['cpu_s_per_exposure']:.2f} CPU s an "
         f"exposure, {side['latency']['median_s']:.2f} s from frames to files"
     )

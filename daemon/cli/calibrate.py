@@ -26,27 +26,28 @@ if TYPE_CHECKING:
     from processing.calibration.thermal_learning import LearnedDrift, Observability
     from processing.calibration.thermal_proposal import ProposedChange
 
-HELP = """Calibrations from the laboratory, and from flown missions; each is a new, dated file.
+HELP = """Compute calibrations from laboratory series and flown missions, each as a new, dated file.
 
 Examples: `syntopic calibrate lab SERIES`, `syntopic calibrate thermal MISSION...`
 """
 
 app = typer.Typer(help=HELP, no_args_is_help=True, rich_markup_mode="markdown")
 
-THERMAL_HELP = """Learn the temperature-dependent model from flown missions.
+THERMAL_HELP = """Estimate the temperature-dependent model from flown missions.
 
-The missions were flown with one rig file at dC that spread over at least 5 K. What their stitching
-says becomes a new, dated rig file; it counts only when a person configures it. No file is ever
-overwritten.
+The missions were flown with one rig file at dC that spread over at least 5 K. The residuals of
+their stitching give a new, dated rig file, which takes effect only after it is configured. No file
+is overwritten.
 
 Examples: `syntopic calibrate thermal MISSION...`, `syntopic calibrate thermal A B --out rig.toml`
 """
 
 
-VALIDITY_HELP = """Say whether a sensor moved in flight or a probe misread, since when and how far.
+VALIDITY_HELP = """Detect displaced sensors and misreading probes, with time and amount.
 
-Takes the stitching of all exposures together (`mosaic.json` of Level-2) and so sees less than one
-exposure can: a few hundredths of a pixel. Writes `export/displacements.json` into the mission.
+Combines the stitching of all exposures (`mosaic.json` of Level-2). The detection limit is a few
+hundredths of a pixel, lower than that of a single exposure. Writes `export/displacements.json` into the
+mission.
 
 Example: `syntopic calibrate validity MISSION`
 """
@@ -69,7 +70,7 @@ app.command(name="platform", help=calibrate_platform.HELP)(calibrate_platform.pl
 def thermal(
     missions: Annotated[list[Path], typer.Argument(help="Mission folders with Level-2.")],
     out: Annotated[
-        Path | None, typer.Option(help="The new rig file; else beside the mission, dated.")
+        Path | None, typer.Option(help="New rig file (default: dated, next to the mission).")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:

@@ -15,15 +15,16 @@ from daemon.cli.options import AsJson, NewFolder
 from daemon.terminal.console import Console
 from daemon.terminal.tables import light_table
 
-HELP = """Boresight, lever arm and time offset: inertial against controlled orientation.
+HELP = """Estimate boresight, lever arm and time offset from a controlled block.
 
-PROJECT is an adjustment project (docs/formats.md) with control; it is adjusted without its antenna
-positions and attitudes, and the result is compared with the trajectory: `inertial.csv` in the
-project, or a mission's (--mission, exposures named as their folders; --crs of the project, which
-a project of `syntopic triangulate` tells itself). Fly
-two heights, opposite and crossing lines and two speeds; what the flight cannot part is named and
-stays as it was given. The rig (--rig, or the mission's) tells the serial numbers of heads, lenses
-and probes. Writes a dated folder with mount.toml, report.html and calibration.json.
+PROJECT is an adjustment project (docs/formats.md) with control points. It is adjusted without its
+antenna positions and attitudes. The result is compared with the trajectory: `inertial.csv` in the
+project, or that of --mission (exposures are named as their folders). --crs is required unless
+`syntopic triangulate` wrote the project. Fly two heights, opposite and crossing lines and two
+speeds. Parameters the flight cannot separate are named and keep their given values. The rig (--rig,
+or the mission's) holds the serial numbers of heads, lenses and probes.
+
+Writes a dated folder with mount.toml, report.html and calibration.json.
 
 Examples: `syntopic calibrate boresight project --rig midas`,
 `syntopic calibrate boresight project --mission M --trajectory sbet.out --crs EPSG:25833`
@@ -32,28 +33,31 @@ Examples: `syntopic calibrate boresight project --rig midas`,
 
 def boresight(
     project: Annotated[Path, typer.Argument(help="project.toml, or the folder that holds it.")],
-    mission: Annotated[Path | None, typer.Option(help="Mission whose trajectory counts.")] = None,
+    mission: Annotated[Path | None, typer.Option(help="Mission that holds the trajectory.")] = None,
     trajectory: Annotated[
         Path | None, typer.Option(help="Post-processed trajectory: SBET, or .csv.")
     ] = None,
     crs: Annotated[str | None, typer.Option(help="Coordinate system of the project.")] = None,
     mount: Annotated[
-        Path | None, typer.Option(help="TOML with the [mount] so far; default: the mission's.")
+        Path | None,
+        typer.Option(help="TOML file with the current [mount] (default: the mission's)."),
     ] = None,
     rig: Annotated[
-        str | None, typer.Option(help="Shipped rig or rig file flown; default: the mission's.")
+        str | None, typer.Option(help="Shipped rig or rig file (default: the mission's).")
     ] = None,
     hold: Annotated[
-        list[str] | None, typer.Option(help="boresight, lever, time or shift; repeatable.")
+        list[str] | None,
+        typer.Option(help="Fixed parameter: boresight, lever, time or shift; repeatable."),
     ] = None,
     lever_sigma: Annotated[
-        float | None, typer.Option(help="The given lever arm was surveyed to this, m.", min=1e-6)
+        float | None, typer.Option(help="Standard deviation of the given lever arm in m.", min=1e-6)
     ] = None,
     position_sigma: Annotated[
-        tuple[float, float, float], typer.Option(help="Of the trajectory, m: east north up.")
+        tuple[float, float, float],
+        typer.Option(help="Standard deviation of positions in m: east north up."),
     ] = (0.03, 0.03, 0.05),
     attitude_sigma: Annotated[
-        tuple[float, float, float], typer.Option(help="Of the inertial unit, mdeg.")
+        tuple[float, float, float], typer.Option(help="Standard deviation of attitudes in mdeg.")
     ] = (3.0, 3.0, 7.0),
     previous: Annotated[
         Path | None, typer.Option(help="Folder of the calibration to compare with.")
@@ -125,7 +129,7 @@ def boresight(
     serials = {} if flown_with is None else flown_with.serials
     warnings = [] if before is None else serial_warnings(before, serials)
     if flown_with is None:
-        warnings.append("the rig is not told, nor serial numbers of its parts: give --rig")
+        warnings.append("the rig and the serial numbers of its parts are unknown: give --rig")
     report = flight.report_of(
         done,
         given,

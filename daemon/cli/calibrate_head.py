@@ -13,7 +13,7 @@ from rich.progress import Progress
 from daemon.cli.options import AsJson, NewFolder
 from daemon.terminal.console import Console
 
-HELP = """Geometric calibration of single heads from collimator series.
+HELP = """Calibrate the geometry of single heads from collimator series.
 
 Targets seen under known angles are found by least-squares matching of the images with one another;
 the Australis ten parameters are adjusted with three unknowns for the orientation of each series,
@@ -33,7 +33,7 @@ def head(
     previous: Annotated[
         Path | None, typer.Option(help="A calibration of heads to compare with.")
     ] = None,
-    k3: Annotated[bool, typer.Option("--k3", help="Estimate K3 too.")] = False,
+    k3: Annotated[bool, typer.Option("--k3", help="Estimation of K3.")] = False,
     as_json: AsJson = False,
 ) -> None:
     from daemon.cli.calibration_output import publish_calibration

@@ -13,7 +13,7 @@ from rich.progress import Progress
 from daemon.cli.options import AsJson, NewFolder, Series
 from daemon.terminal.console import Console
 
-HELP = """Calibration of a whole rig in a 3D test field.
+HELP = """Calibrate a complete rig in a 3D calibration field.
 
 Every CCD's shift, rotation, scale and perspective skew, every cone's radial and decentring
 distortion and its rotation against the master cone, by one bundle adjustment. Principal distance

@@ -1,4 +1,4 @@
-"""How a calibration command ends: the folder written, verdicts and comparison told."""
+"""Output of a calibration command: the folder, verdicts and comparison."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ def publish_calibration(
     rig_file: Callable[[str], bytes] | None = None,
     as_json: bool,
 ) -> None:
-    """Write the calibration as a new folder and tell it, as one JSON object or for a person.
+    """Write the calibration as a new folder and print it, as text or one JSON object.
 
-    The report's id is `place.name`; a digest of the content is put behind it. `rig_file` makes
-    `rig.toml` by the whole id.
+    The report's id is `place.name`; a digest of the content is appended. `rig_file` builds
+    `rig.toml` from the complete id.
     """
     from daemon.postflight.calibration.calibration_report import (
         calibration_json,

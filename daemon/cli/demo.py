@@ -46,7 +46,7 @@ EVENT_TIMEOUT_S = 180.0
 
 
 class DemoError(RuntimeError):
-    """The demonstration cannot go on; the sentence says where to look."""
+    """The demonstration cannot continue; the message states where to look."""
 
 
 def demo(
@@ -165,7 +165,7 @@ def _fly(
 
 
 def _events(service: subprocess.Popen[str]) -> Iterator[dict[str, Any]]:
-    """What the service says, line by line, until it ends."""
+    """Events of the service, one per line, until it ends."""
     assert service.stdout is not None
     for line in service.stdout:
         yield json.loads(line)

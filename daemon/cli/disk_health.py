@@ -7,10 +7,10 @@ from typing import Annotated
 
 import typer
 
-HELP = """Read the health of every disk with smartctl, as root, and leave it for the service.
+HELP = """Read the health of every disk with smartctl and store it for the service.
 
-A timer runs this every two minutes (syntopic-disk-health.timer). The exit status is 1 when no disk
-could be asked; the service then says so.
+A timer runs this as root every two minutes (syntopic-disk-health.timer). If no disk can be read,
+the exit status is 1 and the service reports it.
 
 Examples: `syntopic disk-health`, `syntopic disk-health --out /tmp/disks.json`
 """

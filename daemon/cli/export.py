@@ -23,11 +23,11 @@ Examples: `syntopic orient MISSION`, `syntopic orient MISSION --trajectory sbet.
 `syntopic orient MISSION --mount boresight-2026-11-21/mount.toml`
 """
 
-PICTURES_HELP = """Level-2 for other programs: Cloud Optimized GeoTIFF, or JPEG with EXIF and XMP.
+PICTURES_HELP = """Export Level-2 as Cloud Optimized GeoTIFF, or as JPEG with EXIF and XMP.
 
-Geometry stays that of the image, nothing is rectified. A COG has overviews, tags, and ground
-control points on level ground; a JPEG tells time, place, attitude, focal length and pixel size to
-whoever reads EXIF (exiftool, photogrammetric programs). COGs take
+The images are not rectified. A COG has overviews, tags, and ground control points on level ground.
+A JPEG contains time, position, attitude, focal length and pixel size for programs that read EXIF
+(exiftool, photogrammetric programs). COGs require
 `pip install 'syntopic[geotiff]'`.
 
 Examples: `syntopic export pictures MISSION --trajectory sbet.out`,

@@ -48,7 +48,7 @@ def find(ports: Sequence[str], *, as_json: bool, ask: bool) -> NoReturn:
 
 
 class _Progress:
-    """What is being tried at each port; told from the threads that try it."""
+    """Progress at each port, reported by the threads that probe it."""
 
     def __init__(self, ports: Sequence[str]) -> None:
         self._doing = dict.fromkeys(ports, "opening")
@@ -109,14 +109,14 @@ def _as_json(one: DetectionResult) -> dict[str, Any]:
         "protocol": detected.protocol,
         "baudrate": one.baudrate,
         "parity": one.parity,
-        "heard": detected.received,
+        "received": detected.received,
         "missing": detected.missing,
         "settings": dict(detected.settings),
     }
 
 
 def _print(console: Console, found: Sequence[DetectionResult], sections: str) -> None:
-    table = light_table("", ("port", "speaks", "heard"), ("baud",))
+    table = light_table("", ("port", "protocol", "received"), ("baud",))
     for one in found:
         if one.detected is None:
             table.add_row(one.port, Text("nothing", "dim"), one.sentence, "")

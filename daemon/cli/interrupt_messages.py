@@ -1,7 +1,7 @@
-"""What Ctrl-C leaves behind, in one sentence for each command.
+"""State after Ctrl-C, in one sentence for each command.
 
-Files appear whole or not at all (`daemon.mission.store.durable`), so that what each sentence says
-holds at any instant. A command that handles Ctrl-C itself (`run`, `sim`) ends in its own way.
+Files appear complete or not at all (`daemon.mission.store.durable`), so that each sentence is true
+at any instant. The commands `run` and `sim` handle Ctrl-C themselves.
 """
 
 from __future__ import annotations

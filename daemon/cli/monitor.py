@@ -40,7 +40,7 @@ MARKS = {"good": "●", "usable": "▲", "refly": "■", "lost": "✖"}
 
 
 class MonitorError(DaemonError):
-    """Nothing can be watched; the sentence says why."""
+    """No service can be monitored; the message contains the reason."""
 
 
 class _Figures(BaseModel):
@@ -137,7 +137,7 @@ def monitor(
                 live.update(Group(Text(since, style="bold red"), state.drawn(service.address)))
                 state = None
             elif record is not None:
-                # Each link tells all there is.
+                # The first record of a connection is complete.
                 state = state or _MonitorState()
                 state.receive(record)
                 if as_json:
@@ -171,7 +171,7 @@ def _single_service(console: Console, token: str) -> str:
 
 
 class _MonitorState:
-    """The state as far as it was told."""
+    """The state as received so far."""
 
     def __init__(self) -> None:
         self.brief: dict[str, Any] = {}

@@ -15,7 +15,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Series = Annotated[Path, typer.Argument(help="Folder with series.json, rig.toml and frames.")]
 NewFolder = Annotated[
     Path | None,
-    typer.Option(help="The new folder; else beside what it is made from, named by its id."),
+    typer.Option(help="New folder (default: next to the input, named by its id)."),
 ]
 
 Trajectory = Annotated[Path | None, typer.Option(help="Post-processed trajectory: SBET, or .csv.")]

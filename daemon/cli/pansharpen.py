@@ -22,13 +22,13 @@ from daemon.terminal.tables import light_table
 if TYPE_CHECKING:
     from daemon.products.level3 import PansharpenedExposure
 
-HELP = """Make Level-3 of a mission after landing: pansharpened RGB and CIR in 16 and 8 bits.
+HELP = """Compute Level-3 of a mission: pansharpened RGB and CIR in 16 and 8 bits.
 
-One tone curve serves all exposures that have Level-2, so that neighbouring images match; it is made
-anew from all of them each time. An exposure's earlier images are replaced.
+One tone curve serves all exposures that have Level-2, so that neighbouring images match; it is computed
+again from all of them in each run. Earlier images of an exposure are replaced.
 
-An exposure that cannot be developed is listed at the end with its cause, is not in the tone curve,
-and makes the exit status 1; the others are done.
+An exposure that cannot be pansharpened is listed at the end with its cause and excluded from the
+tone curve. The others are processed, and the exit status is 1.
 
 Examples: `syntopic pansharpen MISSION`, `syntopic pansharpen MISSION --only 3 --image cir --bits 8`
 """

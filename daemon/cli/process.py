@@ -23,9 +23,9 @@ from processing.image.kernels import DEFAULT_INTERPOLATION, INTERPOLATIONS
 
 HELP = """Process the exposures of a mission folder again, Level-0 to Level-2.
 
-The folder may be a flight's, imported, or written by hand as docs/formats.md tells. Level-0 stays
-as it is; products are replaced. A rig without a virtual image gives one raster per
-band, or, where its heads look apart, an image of each head in strict perspective.
+The folder is from a flight, imported, or written by hand after docs/formats.md. Level-0 is not
+changed; products are replaced. A rig without a virtual image gives one raster per band, or, if its
+heads have diverging axes, one perspective image per head.
 
 Every frame is compared with the hash in its record, and record, file and rig with each other
 (docs/formats.md). An exposure that cannot be processed is listed at the end with its cause; the

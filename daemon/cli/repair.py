@@ -13,12 +13,12 @@ from daemon.terminal.console import Console
 
 HELP = """Bring index, records, logs and disk of a mission together, as the service does on start.
 
-A lost or damaged index is built again from the records, what was stored is sealed from the flight
-log, and what was never whole is set aside. Level-0 is not touched. The exit status is 1 when
-something cannot be put right. With --rebuild the index is made anew even if it looks well.
+A lost or damaged index is rebuilt from the records. Stored exposures are sealed from the flight
+log, and incomplete ones are moved aside. Level-0 is not changed. The exit status is 1 if something
+cannot be repaired. With --rebuild the index is rebuilt even if it is intact.
 
-With --mirror two copies of a mission are brought together: the one that leads is repaired, the
-other one is brought up to date with it. What differs there is set aside, nothing is overwritten.
+With --mirror two copies of a mission are synchronized: the leading copy is repaired, and the other
+copy is updated from it. Differing files are moved aside, and nothing is overwritten.
 
 Examples: `syntopic repair MISSION`, `syntopic repair MISSION --mirror /mnt/b/MISSION`
 """
@@ -26,7 +26,7 @@ Examples: `syntopic repair MISSION`, `syntopic repair MISSION --mirror /mnt/b/MI
 
 def repair(
     mission: Annotated[Path, typer.Argument(help="Mission folder.")],
-    rebuild: Annotated[bool, typer.Option("--rebuild", help="Make the index anew.")] = False,
+    rebuild: Annotated[bool, typer.Option("--rebuild", help="Rebuild of the index.")] = False,
     mirror: Annotated[
         Path | None, typer.Option("--mirror", help="Folder of the mission's other copy.")
     ] = None,

@@ -12,13 +12,13 @@ from daemon.cli.exposure_failures import exit_if_failed
 from daemon.cli.options import lock_for
 from daemon.terminal.console import Console
 
-HELP = """Write the mission's report: one HTML file that needs nothing beside it.
+HELP = """Write the mission's report: one self-contained HTML file.
 
-With --bundle also `export/support.zip`: configuration without secrets, records, verdicts, what
-devices and service said, versions. No pixels, no raw bytes, no positions.
+With --bundle also `export/support.zip`: configuration without secrets, records, verdicts, messages
+of devices and service, versions. It contains no pixels, raw bytes or positions.
 
-With --out nothing is written into the mission; this also works while it is being flown. What cannot
-be read is listed in the report and at the end, and makes the exit status 1.
+With --out nothing is written into the mission; this also works during the flight. Unreadable files
+are listed in the report and at the end, and the exit status is 1.
 
 Examples: `syntopic report MISSION --bundle`, `syntopic report MISSION --out FOLDER`
 """

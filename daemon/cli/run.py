@@ -26,17 +26,15 @@ Examples: `syntopic run service.toml`, `syntopic run service.toml --json-lines`
 def run(
     config: Annotated[Path, typer.Argument(help="Service configuration (TOML).")],
     json_lines: Annotated[
-        bool, typer.Option("--json-lines", help="One JSON object an event.")
+        bool, typer.Option("--json-lines", help="One JSON object per event.")
     ] = False,
     parent: Annotated[
         int | None,
-        typer.Option(help="Land when this process, which started us, is gone.", metavar="PID"),
+        typer.Option(help="Process whose end makes the service land.", metavar="PID"),
     ] = None,
     new_mission: Annotated[
         bool,
-        typer.Option(
-            "--new-mission", help="Seal and close an interrupted mission, and begin a new one."
-        ),
+        typer.Option("--new-mission", help="New mission; an interrupted one is sealed and closed."),
     ] = False,
 ) -> None:
     from daemon.configuration.model import load
@@ -50,7 +48,7 @@ def run(
     show = _print_json if json_lines else _print_line
     continues, status = True, 0
     while continues:
-        # Read anew: a new mission may have another plan.
+        # Read again: a new mission may have another plan.
         configuration, rig = load(config)
         if new_mission and (mission := interrupted_mission(configuration)) is not None:
             show({"event": "closed", "id": mission.id, "recovery": close_interrupted(mission)})

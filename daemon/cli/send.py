@@ -1,4 +1,4 @@
-"""`syntopic send`: tell a running service something, over its Unix socket."""
+"""`syntopic send`: send a command to a running service over its Unix socket."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import typer
 
 from daemon.terminal.console import Console
 
-HELP = """Give a running service a command.
+HELP = """Send a command to a running service.
 
 Commands are those of the API (docs/watching.md): arm, start, stop, trigger, interval, distance,
 land, acknowledge, exposure, new-mission, release-disk, accept-disk. They go over the service's Unix
@@ -27,10 +27,10 @@ DEFAULT_SOCKET = Path("/run/syntopic/control.sock")
 
 
 def send(
-    name: Annotated[str, typer.Argument(help="What to do.")],
-    socket: Annotated[Path, typer.Option(help="Where the service listens.")] = DEFAULT_SOCKET,
+    name: Annotated[str, typer.Argument(help="Command.")],
+    socket: Annotated[Path, typer.Option(help="Unix socket of the service.")] = DEFAULT_SOCKET,
     override: Annotated[
-        bool, typer.Option("--override", help="Fly although something is missing.")
+        bool, typer.Option("--override", help="Override of missing prerequisites.")
     ] = False,
     values: Annotated[
         list[str] | None, typer.Option("--set", help="KEY=VALUE of the command; repeatable.")

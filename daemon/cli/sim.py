@@ -1,6 +1,6 @@
 """`syntopic sim`: the emulated devices alone, for any program to connect to.
 
-The emulator always runs in processes of its own; this file only starts it and reads what it says.
+The emulator runs in processes of its own; this module starts it and reads its output.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from processing.rig import find_rig
 
 HELP = """Run the emulated devices of a rig until Ctrl-C.
 
-Prints their addresses and writes a fitting service configuration, for our daemon in another
-terminal or for any other GigE Vision, u-blox or Modbus program.
+Prints their addresses and writes a matching service configuration for the daemon. Any other GigE
+Vision, u-blox or Modbus program can connect as well.
 
 Example: `syntopic sim ultracam-x-mini --out flights/sim --fault silent@60:receiver,8` and then
 `syntopic run flights/sim/service.toml`
@@ -36,13 +36,13 @@ GVCP_PORT = 3956
 
 
 class EmulatorError(RuntimeError):
-    """The emulator did not come up; the message is what it said last."""
+    """The emulator did not start; the message is its last output."""
 
 
 class Emulator:
-    """A running emulator process and what it said when it was ready.
+    """A running emulator process and its first output.
 
-    It ends with the thread that made it, however that ends.
+    It ends with the thread that created it.
     """
 
     def __init__(self, arguments: Sequence[str]) -> None:
@@ -77,26 +77,29 @@ def sim(
     out: Annotated[Path, typer.Option(help="Folder for calibration, truth and scene.")] = Path(
         "flights/sim"
     ),
-    seed: Annotated[int, typer.Option(help="Everything random follows from it.")] = 1,
-    dc: Annotated[float, typer.Option(help="Temperature above calibration, K.")] = 0.0,
+    seed: Annotated[int, typer.Option(help="Seed for all random generators.")] = 1,
+    dc: Annotated[float, typer.Option(help="Temperature above calibration in K.")] = 0.0,
     displace: Annotated[
-        list[str] | None, typer.Option(help="Move a sensor: SU02=1.0,-0.6 (px); repeatable.")
+        list[str] | None,
+        typer.Option(help="Displacement of a sensor in px: SU02=1.0,-0.6; repeatable."),
     ] = None,
     packet_loss: Annotated[float, typer.Option(help="Share of image packets lost.")] = 0.0,
     fault: Annotated[
         list[str] | None,
         typer.Option(help="NAME@TIME[:DEVICE][,DURATION], see docs/faults.md; repeatable."),
     ] = None,
-    scenario: Annotated[Path | None, typer.Option(help="A file with faults.")] = None,
+    scenario: Annotated[Path | None, typer.Option(help="Scenario file with faults.")] = None,
     receiver: Annotated[
         str, typer.Option(help="ublox, novatel, septentrio, nmea, or mavlink (an autopilot).")
     ] = "ublox",
     probe: Annotated[str, typer.Option(help="Thermometer: modbus or ascii.")] = "modbus",
-    pps: Annotated[bool, typer.Option("--pps", help="A pulse per second as well.")] = False,
+    pps: Annotated[bool, typer.Option("--pps", help="Emulated pulse per second.")] = False,
     first_address: Annotated[
-        str, typer.Option(help="Address of the first head; a free one by default.")
+        str, typer.Option(help="Address of the first head (default: a free one).")
     ] = "",
-    scene: Annotated[Path | None, typer.Option(help="A GeoTIFF to fly over instead.")] = None,
+    scene: Annotated[
+        Path | None, typer.Option(help="GeoTIFF as the ground (default: generated scene).")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     if scene is not None:

@@ -12,24 +12,26 @@ from daemon.terminal.console import Console
 from daemon.terminal.tables import light_table
 
 app = typer.Typer(
-    help="""Make and take back tokens for the API and the operator's page.
+    help="""Create and revoke access tokens for the API and the operator's page.
 
 Examples: `syntopic token add operator --role operator`, `syntopic token list`
 """,
     rich_markup_mode="markdown",
     no_args_is_help=True,
 )
-TokenFile = Annotated[Path, typer.Option("--file", help="The file [watch] tokens names.")]
+TokenFile = Annotated[Path, typer.Option("--file", help="Token file, as in [watch] tokens.")]
 DEFAULT_FILE = Path("/etc/syntopic/tokens.toml")
 
 
 @app.command()
 def add(
-    name: Annotated[str, typer.Argument(help="Who: a person or a program.")],
-    role: Annotated[str, typer.Option(help="observer, operator or administrator.")] = "observer",
+    name: Annotated[str, typer.Argument(help="Name of the person or program.")],
+    role: Annotated[
+        str, typer.Option(help="Role: observer, operator or administrator.")
+    ] = "observer",
     file: TokenFile = DEFAULT_FILE,
 ) -> None:
-    """Make a token and show it once.
+    """Create a token and print it once.
 
     Example: `syntopic token add operator --role operator`
     """
@@ -47,9 +49,9 @@ def add(
 
 @app.command()
 def remove(
-    name: Annotated[str, typer.Argument(help="Whose.")], file: TokenFile = DEFAULT_FILE
+    name: Annotated[str, typer.Argument(help="Name of the token.")], file: TokenFile = DEFAULT_FILE
 ) -> None:
-    """Take a token back.
+    """Revoke a token.
 
     Example: `syntopic token remove operator`
     """
@@ -64,7 +66,7 @@ def list_(
     file: TokenFile = DEFAULT_FILE,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Who has a token, and what it allows.
+    """List the tokens with their roles.
 
     Example: `syntopic token list --file tokens.toml`
     """

@@ -27,10 +27,10 @@ from drivers.base.extras import require
 if TYPE_CHECKING:
     from processing.bundle.self_calibration import SetName
 
-HELP = """Aerial triangulation of the stitched PAN images of a mission, or of its heads' images.
+HELP = """Triangulate the stitched PAN images of a mission, or the images of its heads.
 
-Direct georeferencing is the start, tie points are matched between all exposures that overlap, lines
-flown the other way or crosswise included. Control and check points come from two tables: where they
+Direct georeferencing gives the initial orientation. Tie points are matched between all overlapping
+exposures, also of opposite and crossing lines. Control and check points come from two tables: where they
 are on the ground (--points) and where in the images (--measured). Writes an adjustment project with
 its report (image residuals in um, control and checks in m and px, systematic image residuals on a
 grid), `exterior.csv` with the adjusted orientations, and all the tables docs/formats.md names.
@@ -49,33 +49,41 @@ SETS = ("none", "radial", "sensors", "sensors-full")
 def triangulate(
     mission: Annotated[Path, typer.Argument(help="Mission folder with Level-2.")],
     set_name: Annotated[
-        str, typer.Option("--set", help="none, radial, sensors or sensors-full (docs/bundle.md).")
+        str,
+        typer.Option(
+            "--set", help="Parameters: none, radial, sensors or sensors-full (docs/bundle.md)."
+        ),
     ] = "none",
     interior: Annotated[
-        bool, typer.Option("--interior", help="The set holds dx0, dy0, df: GNSS, two heights.")
+        bool,
+        typer.Option(
+            "--interior", help="Estimation of dx0, dy0 and df; requires GNSS and two heights."
+        ),
     ] = False,
-    points: Annotated[Path | None, typer.Option(help="Control and check points.")] = None,
-    measured: Annotated[Path | None, typer.Option(help="Their places in the images.")] = None,
+    points: Annotated[Path | None, typer.Option(help="Table of control and check points.")] = None,
+    measured: Annotated[
+        Path | None, typer.Option(help="Table of their image measurements.")
+    ] = None,
     head: Annotated[
         list[str] | None,
-        typer.Option(help="Cone whose own images make the block, not stitched ones; repeatable."),
+        typer.Option(help="Cone whose images form the block instead of stitched ones; repeatable."),
     ] = None,
     trajectory: Trajectory = None,
     mount: MountFile = None,
     crs: Crs = None,
     gnss: Annotated[
-        str, typer.Option(help="Unknown of the positions of a line: none, shift or linear.")
+        str, typer.Option(help="Model of GNSS errors per line: none, shift or linear.")
     ] = "none",
     position_sigma: PositionSigma = (0.05, 0.05, 0.08),
     attitude_sigma: AttitudeSigma = (5.0, 5.0, 8.0),
     search: Annotated[
-        int, typer.Option(help="Pixels around the prediction that are searched.", min=4, max=200)
+        int, typer.Option(help="Search radius around the prediction in pixels.", min=4, max=200)
     ] = 24,
     reject: Annotated[
-        float, typer.Option(help="Leave out image points beyond this many sigmas.", min=2.0)
+        float, typer.Option(help="Rejection limit of image points in sigmas.", min=2.0)
     ] = 4.0,
     out: Annotated[
-        Path | None, typer.Option(help="Folder for results; default: in the mission's export.")
+        Path | None, typer.Option(help="Folder for results (default: in the mission's export).")
     ] = None,
     as_json: AsJson = False,
 ) -> None:

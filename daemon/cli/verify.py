@@ -17,10 +17,10 @@ from daemon.terminal.console import Console
 if TYPE_CHECKING:
     from daemon.mission.verification.verification import VerifyReport
 
-HELP = """Check everything in a mission folder against its hashes and list what has no hash.
+HELP = """Check a mission folder against its hashes and list files without a hash.
 
-The exit status is 0 when nothing is wrong, 1 when something is missing, altered or does not belong
-there, 2 when the command was given wrongly. Files that are not covered do not change it. A mission
+The exit status is 0 without errors, 1 if a file is missing, altered or foreign, and 2 for invalid
+arguments. Files without a hash do not change it. A mission
 may be verified while it is flown.
 
 Example: `syntopic verify flights/demo/missions/20261121T101500Z-ultracam-x-mini`

@@ -1,6 +1,6 @@
-"""What the service is told to do: one TOML file, refused with all its mistakes at once.
+"""Configuration of the service: one TOML file. All errors of a file are reported together.
 
-Settings of a device are the business of its driver; here they are only checked through
+Drivers define the settings of devices; this module validates them through
 `drivers.base.registry`.
 """
 
@@ -38,14 +38,14 @@ from processing.rig.toml_text import TomlError, parse_toml
 
 CONFIGURATION_MAX_BYTES = 1_000_000
 _WATCH_FILES = ("tokens", "tls_certificate", "tls_key", "control")
-"""Keys of `[watch]` whose paths count from the file's folder."""
+"""Keys of `[watch]` with paths relative to the folder of the file."""
 
 SIGNING_STATE = ".mavlink-signing.json"
 """Below the missions: the last timestamps of signed MAVLink messages."""
 
 
 class ConfigurationError(ValueError):
-    """A configuration that cannot be used; `problems` holds one sentence for each mistake."""
+    """An invalid configuration; `problems` holds one sentence per error."""
 
     def __init__(self, problems: Sequence[str]) -> None:
         self.problems = tuple(problems)
@@ -65,9 +65,9 @@ class _ConfigurationSection(BaseModel):
 
 
 class MissionSection(_ConfigurationSection):
-    """Where flights are kept and which camera flies.
+    """Storage of missions, and the rig.
 
-    With `mirror`, a folder on another disk, everything is stored on both (docs/mirror.md).
+    With `mirror`, a folder on another disk, all files are stored on both (docs/mirror.md).
     """
 
     root: Path
@@ -79,12 +79,12 @@ class MissionSection(_ConfigurationSection):
 
 
 class PlanSection(_ConfigurationSection):
-    """What the flight was planned to be; navigation replaces it as soon as it speaks.
+    """The planned flight; navigation data replace its values when they arrive.
 
-    `file` holds the lines (docs/plan.md); beside them by more than `corridor_m`, a quarter of the
-    image where it is not given, none is flown. `line` names the line where there is no file.
-    `elevation` is a height model in `elevation_crs` (docs/dmc.md): the height above the mean of the
-    terrain an image shows is then the model's.
+    `file` holds the lines (docs/plan.md). A position farther than `corridor_m` from a line (default:
+    a quarter of the image) belongs to no line. `line` names the line without a file.
+    `elevation` is a height model in `elevation_crs` (docs/dmc.md): it then gives the height
+    above the mean terrain of an image.
     """
 
     line: str = ""
@@ -106,11 +106,11 @@ class PlanSection(_ConfigurationSection):
 
 
 class MountSection(_ConfigurationSection):
-    """How the camera sits against what the receiver speaks of (docs/orientation.md).
+    """Mounting of the camera relative to the navigation receiver (docs/orientation.md).
 
-    `antenna_m` is the point whose position the receiver tells, in the body frame of the rig;
-    `boresight_deg` (roll, pitch, heading) turns the rig's body axes into the inertial unit's.
-    `time_offset_ms` is added to the instants of exposures before the trajectory is asked.
+    `antenna_m` is the point whose position the receiver reports, in the body frame of the rig;
+    `boresight_deg` (roll, pitch, heading) rotates the rig's body axes into the inertial unit's.
+    `time_offset_ms` is added to exposure times before the trajectory is interpolated.
     """
 
     antenna_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -119,8 +119,9 @@ class MountSection(_ConfigurationSection):
 
 
 class SerialsSection(_ConfigurationSection):
-    """Serial numbers that no bus tells, read off the labels of lenses (by cone) and probes;
-    compared with the calibration's before a flight (docs/arming.md).
+    """Serial numbers that no bus reports, from the labels of lenses (by cone) and probes.
+
+    They are compared with those of the calibration before a flight (docs/arming.md).
     """
 
     lens: Mapping[str, str] = {}
@@ -134,7 +135,7 @@ class SerialsSection(_ConfigurationSection):
 
 
 class TriggerSection(BaseModel):
-    """When to expose, and who fires. Further keys are settings of the trigger's driver."""
+    """Exposure times and the trigger. Further keys are settings of the trigger's driver."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
@@ -155,12 +156,14 @@ class TriggerSection(BaseModel):
     @model_validator(mode="after")
     def _requires_distance(self) -> TriggerSection:
         if self.mode == "distance" and self.distance_m is None:
-            raise ValueError("mode 'distance' needs distance_m, the way between two exposures in m")
+            raise ValueError(
+                "mode 'distance' needs distance_m, the distance between two exposures in m"
+            )
         return self
 
 
 class DeviceSection(BaseModel):
-    """One device: its driver, and whatever that driver wants to know."""
+    """One device: its driver, and the settings of that driver."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
@@ -184,10 +187,10 @@ class NamedDeviceSection(DeviceSection):
 
 
 class ExposureSection(_ConfigurationSection):
-    """Who sets the exposure of the heads, and within what (docs/exposure.md).
+    """Control of the exposure settings of the heads, with limits (docs/exposure.md).
 
-    `target` is where the brightest hundredth of the pixels should begin, as a share of the full
-    scale. With `lock` "line" nothing is changed any more on a line that is well exposed.
+    `target` is the desired 99th percentile of the pixels, as a fraction of full scale. With `lock`
+    "line" the settings do not change on a line after they meet the target.
     """
 
     control: Literal["manual", "automatic"] = "manual"
@@ -214,7 +217,7 @@ class ExposureSection(_ConfigurationSection):
 
 
 class ProcessingSection(_ConfigurationSection):
-    """How exposures become images, and by which thresholds they are judged.
+    """Processing of exposures, and the thresholds of their verdicts.
 
     `thresholds` are those of `processing.quality.report.Thresholds` that are not the defaults.
     """
@@ -246,10 +249,10 @@ class ProcessingSection(_ConfigurationSection):
 class MavlinkCameraSection(_ConfigurationSection):
     """The rig as one camera of a vehicle (docs/mavlink-camera.md).
 
-    `connect` is "udpout:HOST:PORT", where a ground station or autopilot listens, or
-    "udpin:HOST:PORT". `commands` from others are obeyed when "signed" (with `signing_key`, a file
-    of 64 hexadecimal digits), from "any", or from "none". `signing_state` is the file that keeps
-    the last timestamps of signed messages; below the missions if omitted.
+    `connect` is "udpout:HOST:PORT", the address of a ground station or autopilot, or
+    "udpin:HOST:PORT". `commands` from others are executed when "signed" (with `signing_key`, a file
+    of 64 hexadecimal digits), from "any", or from "none". `signing_state` is the file for
+    the last timestamps of signed messages (default: in the folder of missions).
     """
 
     connect: str = "udpout:127.0.0.1:14550"
@@ -270,13 +273,13 @@ class MavlinkCameraSection(_ConfigurationSection):
                 f"connect is {self.connect!r}; write udpout:HOST:PORT or udpin:HOST:PORT"
             )
         if self.commands == "signed" and self.signing_key is None:
-            raise ValueError("commands are 'signed' and there is no signing_key; give its file")
+            raise ValueError("commands are 'signed' and signing_key is missing; give its file")
         return self
 
 
 class WatchSection(_ConfigurationSection):
-    """Who may look in, and from where (docs/watching.md). Commands over the network always need a
-    token; at the Unix socket `control` members of `control_group` are operators, and members of
+    """Access for monitoring and commands (docs/watching.md). Commands over the network require a
+    token. At the Unix socket `control` members of `control_group` are operators, and members of
     `control_administrator_group` administrators.
     """
 
@@ -298,7 +301,7 @@ class WatchSection(_ConfigurationSection):
 
     @property
     def udp_addresses(self) -> dict[str, tuple[str, int]]:
-        """Where datagrams go, by the text in the configuration."""
+        """Addresses of datagrams by their text in the configuration."""
         return {text: (text.rpartition(":")[0], int(text.rpartition(":")[2])) for text in self.udp}
 
     @model_validator(mode="before")
@@ -342,14 +345,14 @@ class WatchSection(_ConfigurationSection):
         is_remote = not (self.host.startswith("127.") or self.host in ("::1", "localhost"))
         if is_remote and self.tokens is not None and self.tls_certificate is None:
             raise ValueError(
-                f"host {self.host} lies outside this machine, and tokens would travel in the "
-                "clear; give tls_certificate and tls_key, or no tokens (then nobody may command)"
+                f"host {self.host} is not on this machine, and tokens would be sent without "
+                "encryption; give tls_certificate and tls_key, or no tokens (no commands)"
             )
         return self
 
 
 class LimitsSection(_ConfigurationSection):
-    """How long is waited for what, and how deep the memory is."""
+    """Time limits, and the number of exposures in memory."""
 
     frame_timeout_s: float = Field(default=8.0, gt=0)
     mark_timeout_s: float = Field(default=3.0, gt=0)
@@ -364,7 +367,7 @@ class LimitsSection(_ConfigurationSection):
 
 
 class Configuration(_ConfigurationSection):
-    """The whole file."""
+    """The complete file."""
 
     mission: MissionSection
     plan: PlanSection = PlanSection()
@@ -402,10 +405,10 @@ class Configuration(_ConfigurationSection):
 def load(path: Path) -> tuple[Configuration, Rig]:
     """Read a service configuration and the rig it names.
 
-    Relative paths in the file count from the file's folder.
+    Relative paths are relative to the folder of the file.
 
     Raises:
-        ConfigurationError: with a sentence per mistake: file, key, value, and what is right.
+        ConfigurationError: with one sentence per error: file, key, value, and the correction.
     """
     try:
         status = path.stat()
@@ -425,7 +428,7 @@ def load(path: Path) -> tuple[Configuration, Rig]:
 
 
 def from_mapping(content: Mapping[str, Any], path: Path) -> tuple[Configuration, Rig]:
-    """Validate parsed TOML; `path` names the file in the sentences and anchors relative paths."""
+    """Validate parsed TOML; `path` names the file in messages and anchors relative paths."""
     file = path.name
     problems = device_problems(content, file, frozenset(TriggerSection.model_fields))
     rig: Rig | None = None

@@ -1,7 +1,7 @@
-"""Mistakes in a configuration that lie between its sections: devices, triggers, ports, the rig.
+"""Errors between sections of a configuration: devices, triggers, ports, the rig.
 
-Each is a sentence with file, key, value and what would be right. What a section alone may hold is
-in `daemon.configuration.model`.
+Each is a sentence with file, key, value and the correction. The rules of a single section are in
+`daemon.configuration.model`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from processing.rig import Rig
 def device_problems(
     content: Mapping[str, Any], file: str, trigger_keys: frozenset[str]
 ) -> list[str]:
-    """What is wrong with the devices of a configuration, whatever the rig.
+    """Errors in the devices of a configuration, independent of the rig.
 
     Args:
         content: parsed TOML.
@@ -34,7 +34,7 @@ def device_problems(
 
 
 def rig_problems(content: Mapping[str, Any], rig: Rig, file: str) -> list[str]:
-    """Where the devices of a configuration and the rig do not belong together."""
+    """Conflicts between the devices of a configuration and the rig."""
     return [
         *_sensor_problems(content, rig, file),
         *_serial_problems(content, rig, file),
@@ -53,7 +53,7 @@ def nested_value(content: Mapping[str, Any], *keys: str) -> Any:
 def _driver_problems(
     content: Mapping[str, Any], file: str, trigger_keys: frozenset[str]
 ) -> list[str]:
-    """What the drivers say of the settings meant for them."""
+    """Errors that the drivers find in their settings."""
     own_keys = {
         "head": {"driver", "sensor"},
         "thermometer": {"driver", "name"},
@@ -76,7 +76,7 @@ def _driver_problems(
 
 
 def _sensor_problems(content: Mapping[str, Any], rig: Rig, file: str) -> list[str]:
-    """Whether the heads and the sensors of the rig belong together."""
+    """Conflicts between the heads and the sensors of the rig."""
     heads = content.get("head")
     given = [
         head["sensor"]

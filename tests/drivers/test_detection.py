@@ -148,7 +148,7 @@ def test_the_command_prints_what_to_paste_and_reports_whether_anything_was_found
     report = json.loads(done.stdout)
     assert [port["found"] for port in report["ports"]] == [True, False]
     assert report["ports"][0]["protocol"] == "UBX"
-    assert "NAV-PVT" in report["ports"][0]["heard"]
+    assert "NAV-PVT" in report["ports"][0]["received"]
     assert tomllib.loads(report["toml"]) == {"navigator": [{
         "name": "gnss", "driver": "ublox", "port": receiver.port, "baudrate": 115_200,
         "parity": "N",

@@ -29,7 +29,7 @@ def spread(seconds: list[float]) -> dict[str, float]:
 
 
 def machine() -> dict[str, Any]:
-    """What a reader needs to weigh a figure; the load says whether the machine was idle."""
+    """Properties of the machine, with its load at the time of the measurement."""
     text = Path("/proc/cpuinfo").read_text()
     models = [line.split(":", 1)[1].strip() for line in text.splitlines() if "model name" in line]
     memory_kb = int(Path("/proc/meminfo").read_text().split()[1])

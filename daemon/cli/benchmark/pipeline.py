@@ -1,6 +1,6 @@
-"""Timing the pipeline on one exposure that lies on disk, beside a copy, the fixed method, peers.
+"""Timing of the pipeline on one stored exposure, compared with a copy and other methods.
 
-Everything is timed in turn in one run, so that a machine whose speed drifts is fair to all. The
+All methods are timed in turn in one run, so that drift of the machine affects all equally. The
 peers themselves are in `daemon.cli.benchmark.peers`; the exposure is rendered by a separate
 process.
 """
@@ -50,7 +50,7 @@ EVALUATION_TIMEOUT_S = 600.0
 
 
 class BenchError(DaemonError):
-    """What is to be timed cannot be had; the sentence says why."""
+    """The exposure to time is not available; the message contains the reason."""
 
 
 def benchmark_exposure(rig_name: str, rig: Rig, folder: Path) -> Path:
@@ -76,10 +76,10 @@ def measure(
 
     Args:
         folder: from `benchmark_exposure`.
-        runs: how often everything is timed.
-        threads: cores the pipeline may use.
+        runs: number of repetitions.
+        threads: number of threads of the pipeline.
         peers: also cv2.remap and, where installed, nona + enblend.
-        lanes: exposures in work at a time, as the service's `parallel_exposures`.
+        parallel: exposures processed at a time, as the service's `parallel_exposures`.
     """
     configure_threads()
     mission = Mission.open(folder / "mission")
@@ -181,10 +181,10 @@ def _timed(
 def _side_by_side(
     processor: Processor, make: Callable[[Processor], ProductFiles], *, parallel: int, count: int
 ) -> dict[str, Any]:
-    """The pace with exposures in work side by side, as in the service, and each one's latency.
+    """Throughput and latency of exposures processed in parallel, as in the service.
 
-    Timed from the end of the first exposures to the end of the last, all lanes full all the while.
-    Each file is written anew, and removed when as many others were written as there are lanes.
+    Timed from the end of the first exposures to the end of the last, with all pipelines busy.
+    Each file is written again, and removed after one further exposure per pipeline.
     """
     work = PipelinePool[Processor](processor, parallel)
     ends: list[float] = []
@@ -204,7 +204,7 @@ def _side_by_side(
             latencies.append(ended - started)
             shutil.rmtree(Path(scratch) / str(number - parallel), ignore_errors=True)
 
-        # As many before, to fill the buffers of the others, and as many after, to keep lanes full.
+        # One exposure per pipeline before, to fill the buffers, and one after, to keep all busy.
         tasks = [work.submit(partial(one, k)) for k in range(count + 2 * work.count)]
         for task in tasks:
             task.result()

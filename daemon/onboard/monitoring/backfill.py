@@ -1,7 +1,7 @@
-"""What of a mission was exposed before this process began, read from the mission folder.
+"""Earlier exposures of a mission, read from the mission folder.
 
-A service that was killed goes on in the same mission, a watch process that died is started again;
-whoever watches then is told of the whole flight all the same.
+A service that was killed resumes the same mission, and a monitoring process that ended is started
+again. Its clients then receive the complete flight.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ async def backfill_exposures(state: FlightState, path: Path, on_batch: Callable[
                 state.add_sealed(sealed, report)
             on_batch()
     except (OSError, DaemonError) as error:
-        _log.error("earlier exposures of %s cannot be told: %s", path, error)
+        _log.error("earlier exposures of %s could not be loaded: %s", path, error)
 
 
 def sealed_exposures(path: Path) -> Iterator[SealedExposure]:
@@ -53,7 +53,7 @@ def sealed_exposures(path: Path) -> Iterator[SealedExposure]:
         try:
             exposure = sealed_exposure(mission, number)
         except RecordError:
-            continue  # `syntopic verify` tells of it
+            continue  # `syntopic verify` reports it
         if exposure is not None:
             yield summary(exposure), _report(mission.level2(number) / "quality.json")
 

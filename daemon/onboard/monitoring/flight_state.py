@@ -1,7 +1,7 @@
-"""What a watcher sees: the service's events, gathered into one state that is told whole or in part.
+"""State of the flight, gathered from the service's events, for complete or incremental telemetry.
 
-Pure: events in, JSON types out. Events may be missing, since the line from the service drops what
-does not fit; the `status` event, once a second, says everything that must not stay wrong.
+Pure: events in, JSON types out. Events may be missing, since the connection to the service drops
+events when it is full. The `status` event corrects the essential state once a second.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from daemon.onboard.monitoring.previews import Preview
 
 PHASES = frozenset(phase.value for phase in Phase)
 EXPOSURES_MAX = 2000
-"""In the snapshot; earlier ones are on disk, and `/exposures` tells them."""
+"""In the snapshot; earlier ones are on disk, and `/exposures` reports them."""
 EVENTS_MAX = 500
 HISTORY_MAX = 7200
 FIGURES_REPORTED = (
@@ -158,7 +158,7 @@ class FlightState:
         return self._latches.acknowledge(fault)
 
     def add_sealed(self, sealed: Mapping[str, Any], report: Mapping[str, Any] | None) -> None:
-        """An exposure made before this state began, as its files tell; what was heard holds."""
+        """Add an earlier exposure from its files; received events take precedence."""
         number = sealed["number"]
         if number in self._exposures:
             return
@@ -269,7 +269,7 @@ class FlightState:
         )
 
     def _add_preview(self, number: int) -> None:
-        """Pieces are told one by one, so each has a sequence of its own."""
+        """Each piece is sent separately and has a sequence of its own."""
         found = self._pictures(self.mission_path, number)
         if found.vectors:
             residuals = {"number": number, "size_px": found.size_px, "vectors": found.vectors}
@@ -330,7 +330,7 @@ class FlightState:
 
 
 def _apply_report(record: Json, report: Mapping[str, Any]) -> None:
-    """What a quality report says, into what is told of its exposure."""
+    """Copy a quality report into the record of its exposure."""
     record["verdict"] = report.get("verdict")
     record["flags"] = report.get("flags", [])
     record["findings"] = [

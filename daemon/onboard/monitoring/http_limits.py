@@ -119,7 +119,7 @@ class LimitedWebSocket(WebSocketsSansIOProtocol):
 
 
 class RateLimitFilter(logging.Filter):
-    """Lets few records pass: what strangers send must not fill the log."""
+    """Limits the rate of log records, so that unknown senders cannot fill the log."""
 
     def __init__(self) -> None:
         super().__init__()

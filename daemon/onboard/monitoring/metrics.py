@@ -1,6 +1,6 @@
-"""Figures for a monitoring system, in the conventions of Prometheus: base units, `_total`.
+"""Metrics in the conventions of Prometheus: base units, `_total`.
 
-Made anew from the state at each scrape; nothing is counted twice.
+Computed from the state at each scrape; nothing is counted twice.
 """
 
 from __future__ import annotations

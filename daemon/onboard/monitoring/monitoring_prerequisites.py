@@ -30,7 +30,7 @@ from daemon.onboard.preflight.check_results import CheckOutcome, CheckResult, fa
 
 
 class WatchError(DaemonError):
-    """Watching is not possible; the sentence says why, and what to do."""
+    """Monitoring is not possible; the message contains the reason and the corrective action."""
 
 
 def check_monitoring(settings: WatchSection, *, port: bool = True) -> Iterator[CheckResult]:

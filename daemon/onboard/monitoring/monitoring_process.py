@@ -1,4 +1,4 @@
-"""The watch process: hears the service, keeps the state, serves the page, the API and telemetry."""
+"""The monitoring process: receives events, holds the state, serves page, API and telemetry."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ holds for one that stalls may be minutes of telemetry."""
 
 
 def main(link: PageConnection, settings: WatchSection, plan: PlanSection | None = None) -> None:
-    """Serve watchers until told to stop; `plan` names files that a mission may not."""
+    """Serve clients until the service stops it; `plan` names files that a mission may not."""
     apply_resource_limits()
     logging.getLogger("uvicorn.error").addFilter(RateLimitFilter())
     asyncio.run(_serve(link, settings, plan or PlanSection()))
@@ -179,9 +179,9 @@ def _guarded(
 
 
 class _Server(uvicorn.Server):
-    """Ends when the service says so: signals of the whole process group are the service's.
+    """Ends on request of the service, which handles the signals of the process group.
 
-    Connections are accepted by a `Listener`, with TLS where there are certificate files.
+    A `Listener` accepts connections, with TLS if certificate files are configured.
     """
 
     def __init__(self, config: uvicorn.Config, files: CertificateFiles | None) -> None:
@@ -236,7 +236,7 @@ async def _renew(files: CertificateFiles | None, link: PageConnection) -> None:
 
 
 async def _update_coverage(coverage: Coverage) -> None:
-    """Coverage hears of every exposure, whether anybody asks or not."""
+    """Update the coverage with every exposure, also without a request."""
     while True:
         coverage.update()
         await asyncio.sleep(COVERAGE_UPDATE_S)
@@ -345,7 +345,7 @@ def _receive(
     stopped: asyncio.Event,
     start_backfill: Callable[[str], None],
 ) -> None:
-    """Everything the service has said."""
+    """Receive all pending messages of the service."""
     try:
         while (message := link.receive(0.0)) is not None:
             if isinstance(message, ServiceEvent):

@@ -1,4 +1,4 @@
-"""Routes of the API that tell of the plan: its lines, the holes, and what to fly again."""
+"""Routes of the API for the plan: its lines, coverage gaps, and re-flights."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def add_plan(app: FastAPI, coverage: Coverage, watcher: Depends) -> None:
 
     @app.get("/api/v1/advice", dependencies=[watcher], tags=["plan"])
     async def advice() -> dict[str, Any]:
-        """What of the plan is not well seen: holes, and what is only to be flown yet."""
+        """Insufficient coverage of the plan: gaps, and segments still to be flown."""
         advice_task = coverage.advice_task()
         return (
             {}

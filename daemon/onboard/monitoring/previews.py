@@ -1,6 +1,6 @@
-"""What a watcher without the page may see of an exposure: a thumbnail in pieces, a few vectors.
+"""Previews of an exposure for clients without the page: thumbnail pieces and a few vectors.
 
-The least important of all that is told; read from the mission folder once an exposure is processed.
+They have the lowest priority and are read from the mission folder after processing.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Bounds of the page's process: what reaches it from the network costs no other process.
+"""Resource limits of the monitoring process, so that its load affects no other process.
 
-A unit's limits hold for all processes of the service; these hold for the one that strangers can
-reach. When it exceeds them it ends and is started again; the flight goes on.
+The limits of the systemd unit hold for all processes of the service. These hold for the process
+with network access. If it exceeds them, it ends and is started again; the flight continues.
 """
 
 from __future__ import annotations
@@ -23,10 +23,9 @@ OOM_SCORE = 900
 
 
 def apply_resource_limits() -> None:
-    """Bound this process; what the machine does not permit is left out.
+    """Limit this process; limits that the machine does not permit are skipped.
 
-    Only a process that was started for this is bounded, never one that serves a page beside other
-    work: limits cannot be taken back.
+    Only a process started for monitoring is limited, since limits cannot be removed.
     """
     if multiprocessing.parent_process() is None:
         return

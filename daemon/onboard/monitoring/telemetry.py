@@ -1,7 +1,7 @@
-"""Telling watchers under a byte budget: what matters first, the rest when there is room.
+"""Telemetry under a byte budget: the brief state first, then changed items as the budget allows.
 
-Nothing is queued for anybody. A watcher has cursors into the state; each record holds what is brief
-and, as far as the budget goes, what changed behind each cursor. A slow link therefore costs
+No client has a queue. A client has cursors into the state. Each record holds the brief state
+and, as far as the budget allows, the changes after each cursor. A slow link therefore costs
 freshness, never memory, and ends up with the same state. The schema is in docs/telemetry.md.
 """
 
@@ -24,12 +24,12 @@ ARRAY_HEAD_BYTES = 3
 """Of a list of up to 65535 items."""
 
 BURST_S = 2.0
-"""How much of unused budget is kept for a moment when more is to be said."""
+"""Unused budget is accumulated for at most this time."""
 
 
 @dataclass
 class Subscription:
-    """One watcher: its budget, what it wants to be told, and how far it has been."""
+    """One client: its budget, the requested parts, and its cursors."""
 
     bytes_per_s: float = math.inf
     parts: tuple[str, ...] = PARTS
@@ -41,11 +41,11 @@ class Subscription:
     _refilled_s: float | None = None
 
     def record(self, state: FlightState, now_s: float, *, repeat_s: float = 1.0) -> Any:
-        """The next record, as msgpack or JSON types; None when nothing is to be said yet.
+        """The next record, as msgpack or JSON types; None if nothing is due.
 
         Args:
-            now_s: any clock that goes evenly.
-            repeat_s: what is brief is said again this often even if nothing changed.
+            now_s: time of any monotonic clock in s.
+            repeat_s: interval of the brief state in s if nothing changed.
         """
         self._refill(now_s)
         if state.sequence == self._sent_sequence and now_s - self._sent_s < repeat_s:
@@ -81,7 +81,7 @@ class Subscription:
     def _take_items(
         self, state: FlightState, part: str, left: float
     ) -> tuple[list[Any], float, bool]:
-        """Items of a part that fit, what is left of the budget, and whether all were told."""
+        """Items of a part that fit, what is left of the budget, and whether all were included."""
         selected: list[Any] = []
         for item in state.changed(part, self._cursors.get(part, 0)):
             nbytes = packed_nbytes(item)

@@ -24,7 +24,7 @@ MISSING_FILE_STAMP: Final = (0, 0, 0)
 
 
 class TlsCertificateError(DaemonError):
-    """A certificate or key that cannot be used; the sentence says why, and the cure."""
+    """An unusable certificate or key; the message contains the reason and the corrective action."""
 
 
 @dataclass(frozen=True)
@@ -166,8 +166,8 @@ def name_problem(certificate: Certificate, host: str, names: Collection[str]) ->
     if address.is_unspecified or str(address) in certificate.addresses:
         return None
     return (
-        f"the certificate lacks {host}, the address of [watch] host, and clients refuse it under "
-        "that address; make one with it: syntopic certificate"
+        f"the certificate does not contain {host}, the address of [watch] host, and clients reject "
+        "it; make one with this address: syntopic certificate"
     )
 
 

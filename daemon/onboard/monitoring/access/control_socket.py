@@ -3,8 +3,8 @@
 Members of `control_group` are operators; root, the service's own user and members of
 `control_administrator_group` are administrators.
 
-Who asks is told by the kernel (SO_PEERCRED, SO_PEERGROUPS; unix(7)), never by the one who asks. A
-request is a line of JSON, {"command": "start", "arguments": {}}, and so is its answer,
+Clients are identified by peer credentials (SO_PEERCRED, SO_PEERGROUPS; unix(7)), never by their own
+statement. A request is a line of JSON, {"command": "start", "arguments": {}}, and so is its answer,
 {"done": true, "sentence": "..."}.
 """
 
@@ -52,7 +52,7 @@ CALLERS_MAX: Final = 8
 
 
 class ControlError(DaemonError):
-    """A socket that cannot be opened or reached; the sentence says what to do."""
+    """A socket that cannot be opened or reached; the message contains the corrective action."""
 
 
 @dataclass(frozen=True)
@@ -308,7 +308,7 @@ def _listen(path: Path, gid: int) -> socket.socket:
             try:
                 os.chown(path, -1, gid)
             except PermissionError:
-                # The hardened unit may not; then everybody may knock, and the kernel says who.
+                # The hardened unit may not chown: world-connectable, authorized by peer credentials.
                 path.chmod(0o666)
         listening.listen(CALLERS_MAX)
     except OSError as error:

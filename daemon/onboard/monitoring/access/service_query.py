@@ -1,4 +1,4 @@
-"""What a running service says of itself, for `syntopic check`: devices are held, and not opened."""
+"""Query of a running service for `syntopic check`, which opens no device that the service holds."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Being found: the service announced as `_syntopic._tcp` by multicast DNS, without a directory.
+"""Announcement of the service as `_syntopic._tcp` by multicast DNS, without a directory.
 
-The text record tells version, rig, mission, phase, and whether commands need a token.
+The text record contains version, rig, mission, phase, and whether commands require a token.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _TEXT_MAX_BYTES = 200
 
 
 class MdnsAnnouncer:
-    """Announces as long as it is begun; silent on loopback only when told so by zeroconf itself."""
+    """Announces the service from start to stop."""
 
     def __init__(self, state: FlightState, settings: WatchSection, port: int) -> None:
         self._state = state

@@ -24,7 +24,7 @@ TEXT_MAX: Final = 40
 
 @dataclass(frozen=True)
 class AnnouncedService:
-    """A service that announced itself: its address, and what it says of itself."""
+    """An announced service: its address and its text record."""
 
     address: str
     text: dict[str, str]

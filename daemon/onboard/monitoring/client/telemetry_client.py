@@ -33,7 +33,7 @@ _TOKEN = re.compile(r"[A-Za-z0-9._~+/=\-]{1,200}")
 
 
 class ClientError(DaemonError):
-    """Nothing can be watched; the sentence says why."""
+    """No service can be monitored; the message contains the reason."""
 
 
 @dataclass(frozen=True)
@@ -206,7 +206,7 @@ def _no_extension(code: int, _data: bytes) -> Any:
 
 
 def _reason(error: BaseException) -> str:
-    """Why a link failed, in a sentence with the cure; what the service says is made printable."""
+    """Reason and corrective action for a failed connection, with printable characters only."""
     from websockets.exceptions import ConnectionClosed, InvalidStatus
 
     if isinstance(error, ssl.SSLCertVerificationError):

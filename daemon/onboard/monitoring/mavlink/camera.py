@@ -1,8 +1,8 @@
 """The rig as one camera of a vehicle: MAVLink's camera protocol over UDP.
 
-Ground stations and autopilots see a camera that takes pictures, tells of each of them once, and
-again when asked. The index of a picture is the exposure's number less one, so that it is never used
-twice in a mission. Source: the MAVLink camera protocol v2; the dialect is pymavlink's.
+Ground stations and autopilots see a camera that takes pictures and reports each of them once, and
+again on request. The index of a picture is the exposure number minus one, so that it is unique in a
+mission. Source: the MAVLink camera protocol v2; the dialect is pymavlink's.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ _log = logging.getLogger(__name__)
 class MavlinkCamera(asyncio.DatagramProtocol):
     """A camera component.
 
-    `counts` are statistics by stable name: messages heard, bad bytes, commands refused.
+    `counts` are statistics by stable name: messages received, bad bytes, commands refused.
     """
 
     def __init__(
@@ -168,7 +168,7 @@ class MavlinkCamera(asyncio.DatagramProtocol):
             self._acknowledge(message, address, self._dialect.MAV_RESULT_UNSUPPORTED)
 
     def _request(self, message: Any, address: Address, requested: str | None) -> None:
-        """512 and its older siblings: tell one message again."""
+        """Command 512 and its predecessors: send one message again."""
         if requested is None:
             requested = BY_IDENTITY.get(as_integer(message.param1))
         if requested == "CAMERA_IMAGE_CAPTURED":

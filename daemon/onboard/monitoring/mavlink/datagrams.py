@@ -1,8 +1,8 @@
-"""Telemetry over a lossy one-way link: datagrams that stand for themselves, said again and again.
+"""Telemetry over a lossy one-way link: self-contained datagrams, sent repeatedly.
 
-Nothing is acknowledged. What matters most is said first and most often: what is brief, faults, the
-exposure that just changed; what is left of the budget repeats earlier exposures, so that a watcher
-that lost some, or came late, ends up with the same state. Format in docs/telemetry.md.
+Nothing is acknowledged. The brief state, faults and the latest exposure are sent first and most
+often. The remaining budget repeats earlier exposures, so that a client that lost datagrams or
+connected late obtains the same state. Format in docs/telemetry.md.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ DATAGRAM_MAX_BYTES = 1200
 BRIEF_EVERY_S = 1.0
 FAULT_EVERY_S = 2.0
 NEW_FAULT_TIMES, NEW_FAULT_EVERY_S = 6, 0.6
-"""A new fault is said densely at first: a link that loses a third loses all six once in 700."""
+"""A new fault is first sent six times: a link with one third loss loses all of them once in 700."""
 
 REPEATED_EXPOSURES = 200
-"""How many of the newest exposures are said again."""
+"""Number of the newest exposures that are repeated."""
 
 PICTURE_EVERY = 4
-"""One picture, or piece of one, to so many exposures that are said again."""
+"""One picture, or piece of one, per this many repeated exposures."""
 
 PREVIEWS_MAX = 8
 PIECES_MAX = 1000
@@ -43,7 +43,7 @@ BURST_S = 1.0
 
 @dataclass
 class DatagramScheduler:
-    """What is said when; one for each link. Times are those of any clock that goes evenly."""
+    """Order of the datagrams of one link. Times are those of any monotonic clock."""
 
     bytes_per_s: float
     _credit: float = 0.0

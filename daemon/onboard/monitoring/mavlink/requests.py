@@ -1,6 +1,6 @@
-"""MAVLink's commands as wishes: what is asked for, and what of the service would fulfil it.
+"""MAVLink commands as requests: the request, and the command of the service that executes it.
 
-Numbers in, names out; who may wish is checked in `daemon.onboard.monitoring.mavlink.camera`.
+Numbers in, names out; authorization is in `daemon.onboard.monitoring.mavlink.camera`.
 Source: the MAVLink camera protocol v2.
 """
 

@@ -29,10 +29,10 @@ class _Peer:
 
 
 class Senders:
-    """Those who were heard lately.
+    """Senders of recent messages.
 
-    `peers` get what is sent unasked. Where there is no place left, a sender whose signature was
-    verified takes the place of one without; an unsigned newcomer waits until one is free.
+    `peers` receive unrequested messages. If the table is full, a sender with a verified signature
+    replaces one without. An unsigned new sender waits for a free entry.
     """
 
     def __init__(self, parser: MavlinkParser) -> None:

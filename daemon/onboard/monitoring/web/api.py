@@ -381,7 +381,7 @@ def _add_telemetry(app: FastAPI, state: FlightState, access: _AccessControl) -> 
             connection.enter(ConnectionUse.WATCHER)
         offered = socket.scope.get("subprotocols", [])
         await socket.accept(SUBPROTOCOL if SUBPROTOCOL in offered else None)
-        # Over JSON pictures are fetched, not told.
+        # JSON clients fetch pictures over HTTP.
         parts = PARTS if form == "json" else (*PARTS, *PREVIEW_PARTS)
         subscription = Subscription(max(bytes_per_s, MIN_BYTES_PER_S), parts)
         disconnected = asyncio.ensure_future(_wait_for_disconnect(socket))
@@ -407,7 +407,7 @@ async def _send(socket: WebSocket, record: Any, form: str) -> None:
 
 
 async def _wait_for_disconnect(socket: WebSocket) -> None:
-    """Hear what the watcher says, which is nothing, until it goes."""
+    """Discard messages of the client until it disconnects."""
     with suppress(WebSocketDisconnect, RuntimeError):
         while True:
             await socket.receive_text()

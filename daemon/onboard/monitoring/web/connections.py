@@ -1,8 +1,8 @@
 """Connections to the page server: how many, from where, and how long each may take.
 
 The table sits where connections are accepted, so that it also bounds unfinished TLS handshakes.
-A full table closes the least useful connection; it never refuses a newcomer while an anonymous
-connection is open, so that strangers cannot keep out somebody with a valid token.
+A full table closes the least useful connection; it never refuses a new one while an anonymous
+connection is open, so that unknown clients cannot exclude one with a valid token.
 """
 
 from __future__ import annotations

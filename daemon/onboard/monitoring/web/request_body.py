@@ -27,7 +27,7 @@ COMMAND_OPENAPI = {
 
 
 async def command_body(request: Request) -> CommandBody:
-    """What the body of a command says.
+    """Read and validate the body of a command.
 
     Raises:
         HTTPException: 408, 413, 415 or 422, with a sentence.
@@ -48,7 +48,7 @@ def parse_command_body(body: bytes) -> CommandBody:
     """A command's body from JSON.
 
     Raises:
-        ValueError: it is not strict JSON, nested too deeply, or says what a command cannot.
+        ValueError: it is not strict JSON, nested too deeply, or no valid command body.
     """
     try:
         found = json.loads(
