@@ -56,7 +56,7 @@ TABLE: Final = {
         _command("send", _IN_FLIGHT, "Send a command to a running service."),
         _command("token", _IN_FLIGHT, "Create, list and revoke access tokens.", "token:app"),
         _command("certificate", _IN_FLIGHT, "Create a local authority and a TLS certificate."),
-        _command("explain", _IN_FLIGHT, "Explain an event or a quality flag: cause and cure."),
+        _command("explain", _IN_FLIGHT, "Explain an event or a quality flag: cause and action."),
         _command(
             "reflights", _IN_FLIGHT, "List the segments of the plan that must be flown again."
         ),
@@ -89,7 +89,7 @@ TABLE: Final = {
         _command("adjust", _LABORATORY, "Adjust a bundle from a project of text files."),
         _command("demo", _BENCH, "Fly the first flight with emulated devices."),
         _command("sim", _BENCH, "Run the emulated devices of a rig until Ctrl-C."),
-        _command("bench", _BENCH, "Time the pipeline on one exposure, in turn with its peers."),
+        _command("bench", _BENCH, "Time the pipeline on one exposure against other software."),
         _command("kernels", _BENCH, "Compile the pipeline's kernels before a flight."),
         _command(
             "disk-health", _BENCH, "Read the health of every disk with smartctl.", "disk_health"

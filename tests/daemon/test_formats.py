@@ -175,5 +175,5 @@ def test_a_hand_written_exposure_with_mistakes_is_refused_with_all_of_them(tmp_p
     assert "holds uint8" in caught.value.problems[1]
     assert "not a usable TIFF" in caught.value.problems[2]
     (folder / "exposure.json").write_text('{"number": 2}')
-    with pytest.raises(RecordError, match="number is 2; the folder says 000001"):
+    with pytest.raises(RecordError, match="number is 2; the folder is 000001"):
         load_level0(folder, small_rig())

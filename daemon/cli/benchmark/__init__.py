@@ -1,1 +1,1 @@
-"""`syntopic bench`: the pipeline timed in turn with its peers."""
+"""`syntopic bench`: timing of the pipeline and of other software."""

@@ -53,7 +53,7 @@ def read_sealed(folder: Path) -> SealedRecord | None:
     name = f"{folder.name}/{EXPOSURE_FILE}"
     exposure = from_json(parse_record(data, name), name)
     if folder.name.isdigit() and int(folder.name) != exposure.number:
-        raise RecordError([f"{name}: number is {exposure.number}; the folder says {folder.name}"])
+        raise RecordError([f"{name}: number is {exposure.number}; the folder is {folder.name}"])
     return SealedRecord(exposure, sha256_hex(data))
 
 

@@ -39,7 +39,7 @@ def test_figures_of_all_stages_are_reported_with_their_spread(figures: dict[str,
         figures["fixed_method"],
         figures["copy"],
     ):
-        # A stage of a small rig may take less than the tenth of a millisecond that is told.
+        # A stage of a small rig may take less than 0.1 ms, the resolution of the report.
         assert 0.0 <= times["min_s"] <= times["median_s"] <= times["max_s"]
     assert figures["pipeline"]["min_s"] > 0.0
     assert (

@@ -145,7 +145,7 @@ def check_complete(folder: Path) -> None:
 def test_an_interrupted_command_leaves_complete_files_and_states_how_to_continue(
     case: Case, original: Path, tmp_path: Path
 ) -> None:
-    folder, output_file, begun = tmp_path / "trial", tmp_path / "said.json", tmp_path / "begun"
+    folder, output_file, begun = tmp_path / "trial", tmp_path / "output.json", tmp_path / "begun"
     shutil.copytree(original, begun)
     if case.before is not None:
         run_to_call(run(case.before(begun), output_file), None)
@@ -180,7 +180,7 @@ def test_an_interrupted_command_leaves_complete_files_and_states_how_to_continue
             check_complete(folder)
         if interrupted % 3 == 1 or not case.reruns:
             continue
-        # Once more, as the sentence says.
+        # Again, as the message asks.
         run_to_call(run(case.arguments(folder), output_file), None)
         assert json.loads(output_file.read_text())["status"] == 0, (last, output_file.read_text())
         assert expected_names == sorted(str(p.relative_to(folder)) for p in folder.rglob("*")), last
@@ -201,7 +201,7 @@ def test_every_command_has_a_sentence_of_its_own() -> None:
 def test_a_disk_that_refuses_ends_in_a_sentence(
     original: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder, output_file = tmp_path / "trial", tmp_path / "said.json"
+    folder, output_file = tmp_path / "trial", tmp_path / "output.json"
     shutil.copytree(original, folder)
 
     def full(*_: object, **__: object) -> None:

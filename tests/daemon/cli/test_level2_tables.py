@@ -1,4 +1,4 @@
-"""What `syntopic process` prints says why an exposure is not good."""
+"""The output of `syntopic process` states why an exposure is not good."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Without an optional library every command that needs it says at once how to install it."""
+"""Without an optional library every command that requires it states how to install it."""
 
 from __future__ import annotations
 

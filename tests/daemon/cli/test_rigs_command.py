@@ -1,4 +1,4 @@
-"""`syntopic rigs show` tells what a rig file means, and draws only where it is told to."""
+"""`syntopic rigs show` describes a rig file, and draws only into a given file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The running service tells its events; whoever listened may go."""
+"""The running service prints its events; a reader may close the pipe."""
 
 from __future__ import annotations
 

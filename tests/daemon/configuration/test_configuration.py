@@ -1,4 +1,4 @@
-"""A bad configuration is refused with all its mistakes at once; a good one means what it says."""
+"""An invalid configuration is refused with all its errors; a valid one is read as written."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_five_mistakes_are_refused_with_five_sentences_that_name_file_and_key() 
     ):
         (sentence,) = [problem for problem in problems if key in problem]
         assert sentence.startswith("service.toml: ")
-        assert "; " in sentence, "the cure stands behind the finding"
+        assert "; " in sentence, "the correction follows the finding"
 
 
 def test_a_distance_trigger_without_a_distance_is_refused() -> None:
@@ -80,6 +80,27 @@ def test_a_misspelt_key_is_refused_by_its_name() -> None:
     content["mission"]["simulatd"] = True
     (sentence,) = problems_of(content)
     assert "mission.simulatd" in sentence
+
+
+@pytest.mark.parametrize(
+    ("section", "old", "value", "new"),
+    [
+        ("exposure", "gain_most_db", 12.0, "gain_max_db"),
+        ("exposure", "time_least_us", 100.0, "exposure_time_min_us"),
+        ("exposure", "time_most_us", 20_000.0, "exposure_time_max_us"),
+        ("exposure", "tdi_most", 32, "tdi_shifts_max"),
+        ("processing", "exposures_in_work", 2, "parallel_exposures"),
+        ("trigger", "start", "at once", "'immediate'"),
+        ("watch", "open", True, "anonymous_read"),
+    ],
+)
+def test_a_former_key_is_refused_with_the_present_one(
+    section: str, old: str, value: Any, new: str
+) -> None:
+    content = copy.deepcopy(GOOD)
+    content.setdefault(section, {})[old] = value
+    (sentence,) = problems_of(content)
+    assert old in sentence and f"is now named {new}; rename it" in sentence
 
 
 def test_two_heads_for_one_sensor_are_refused() -> None:
@@ -107,7 +128,7 @@ def test_a_file_that_is_not_toml_or_not_there_is_refused_in_one_sentence(tmp_pat
         assert len(refused.value.problems) == 1
 
 
-def test_tdi_on_a_bayer_head_is_refused_with_its_cure() -> None:
+def test_tdi_on_a_bayer_head_is_refused_with_the_correction() -> None:
     content = copy.deepcopy(GOOD)
     content["mission"]["rig"] = "ultracam-l-mini"
     content["head"] = [

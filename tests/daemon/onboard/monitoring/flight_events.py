@@ -1,4 +1,4 @@
-"""What a service tells of a short flight, as events, for the tests of watching."""
+"""Events of a short flight, for the tests of monitoring."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The API tells watchers the state, and does what a person with a token asks, and nobody else."""
+"""The API reports the state to clients and executes commands with a valid token only."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def bearer(token: str) -> dict[str, str]:
     return {"Authorization": f"Bearer {token}"}
 
 
-def test_what_a_watcher_asks_for_is_told(camera: Camera, client: TestClient) -> None:
+def test_requested_parts_are_reported(camera: Camera, client: TestClient) -> None:
     for event in (
         *flight_events.exposure(1),
         *flight_events.exposure(2, "refly"),

@@ -1,4 +1,4 @@
-"""Whoever watches after a restart is told of the whole flight, as the mission folder has it."""
+"""After a restart clients receive the complete flight from the mission folder."""
 
 from __future__ import annotations
 
@@ -38,7 +38,9 @@ def mission(tmp_path: Path) -> Mission:
     return mission
 
 
-def test_exposures_of_before_are_told_and_what_was_heard_holds(mission: Mission) -> None:
+def test_earlier_exposures_are_reported_and_received_events_take_precedence(
+    mission: Mission,
+) -> None:
     state, on_batch = FlightState("syntopic test"), []
     state.apply(flight_events.mission(str(mission.path)))
     for event in flight_events.exposure(SENT_LIVE, "good"):

@@ -98,13 +98,13 @@ def test_an_address_with_too_many_connections_loses_its_oldest_idle_one(
     assert links.connections.closed == 1
 
 
-def test_a_full_table_closes_strangers_and_nobody_who_is_known(links: Links, clock: Clock) -> None:
+def test_a_full_table_closes_unknown_clients_and_no_known_one(links: Links, clock: Clock) -> None:
     operator = [opened(links, "10.0.1.1", clock) for _ in range(10)]
     for one in operator:
         one.is_authenticated = True
-    strangers = [opened(links, f"10.1.{n // 250}.{n % 250}", clock) for n in range(CONNECTIONS_MAX)]
+    unknown = [opened(links, f"10.1.{n // 250}.{n % 250}", clock) for n in range(CONNECTIONS_MAX)]
     assert not any(is_aborted(one) for one in operator)
-    assert [is_aborted(one) for one in strangers[:12]] == [True] * 10 + [False] * 2
+    assert [is_aborted(one) for one in unknown[:12]] == [True] * 10 + [False] * 2
     assert not is_aborted(opened(links, "10.0.1.1", clock))
 
 

@@ -1,4 +1,4 @@
-"""At the Unix socket the kernel says who asks, and the group decides."""
+"""Clients of the Unix socket are authorized by peer credentials and group."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def test_a_fault_that_is_acknowledged_leaves_the_list(tmp_path: Path) -> None:
     assert service.state.faults() == []
 
 
-def test_nonsense_is_answered_and_the_next_line_is_heard(tmp_path: Path) -> None:
+def test_an_invalid_line_is_answered_and_the_next_line_is_executed(tmp_path: Path) -> None:
     service, path = Service(), tmp_path / "control.sock"
     nonsense = (
         *(b"\n", b"start\n", b"[]\n", b"{}\n", b'{"command": ["start"]}\n', b"\xff\xfe\n"),
@@ -137,7 +137,7 @@ def test_nonsense_is_answered_and_the_next_line_is_heard(tmp_path: Path) -> None
     assert [command.name for command in service.commands] == ["start"]
 
 
-def test_a_line_without_end_is_cut_off_and_others_are_heard(tmp_path: Path) -> None:
+def test_an_endless_line_is_cut_off_and_other_clients_are_served(tmp_path: Path) -> None:
     service, path = Service(), tmp_path / "control.sock"
 
     def flood() -> tuple[bool, str]:
@@ -172,7 +172,7 @@ def test_user_and_groups_of_a_process_are_its_role(
     assert control.role_of(caller) == role
 
 
-def test_the_kernel_says_which_groups_somebody_is_of() -> None:
+def test_groups_are_read_from_peer_credentials() -> None:
     here, there = socket.socketpair(socket.AF_UNIX)
     with here, there:
         caller = peer_process(here)
@@ -181,7 +181,7 @@ def test_the_kernel_says_which_groups_somebody_is_of() -> None:
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to ask as somebody else")
-def test_a_stranger_is_refused_and_told_of_and_a_member_is_obeyed() -> None:
+def test_an_unknown_client_is_refused_and_logged_and_a_member_is_served() -> None:
     with tempfile.TemporaryDirectory() as folder:
         # Everybody may enter it, as /run/syntopic.
         Path(folder).chmod(0o755)
@@ -251,7 +251,7 @@ def test_nobody_listening_and_no_such_group_end_in_sentences(tmp_path: Path) -> 
         ControlSocket(tmp_path / "c", "no-such-group", None, service.gateway, service.state)
 
 
-def test_the_command_line_gives_what_it_is_told_and_its_status_says_what_became(
+def test_the_command_line_sends_its_values_and_returns_the_result_as_status(
     tmp_path: Path,
 ) -> None:
     service, path = Service(), tmp_path / "control.sock"

@@ -112,7 +112,7 @@ def test_a_fault_in_an_outage_is_seen_soon_after_it() -> None:
     assert 80.0 <= seen["SU02"] <= 85.0
 
 
-def test_one_who_comes_late_is_told_what_was() -> None:
+def test_a_late_client_receives_the_earlier_state() -> None:
     relay = Relay(loss=0.0, delay_s=0.0, bytes_per_s=1e9, outages_s=((0.0, 150.0),))
     state, watcher, _ = fly(relay, 260.0, exposures=60, faults_s={})
     assert len(watcher.exposures) == len(state.exposures()) == 60

@@ -24,7 +24,7 @@ from tests.daemon.onboard.monitoring import flight_events
 
 
 def attacking(link: PageConnection, folder: str) -> None:
-    """A page's process that reaches for its parent, and says what it could do."""
+    """A monitoring process that accesses its parent and reports what succeeded."""
     parent = os.getppid()
 
     def can(what: str) -> bool:

@@ -22,7 +22,7 @@ WITHIN_S = 30.0
 
 
 class Echo(asyncio.Protocol):
-    """Sends back what it hears."""
+    """Sends back what it receives."""
 
     made = 0
 
@@ -118,7 +118,7 @@ def test_plain_http_is_answered_with_where_to_go(tls: Path) -> None:
     answer = asyncio.run(request())
     assert answer.startswith(b"HTTP/1.1 400 ")
     assert b"evil" not in answer and b"script" not in answer and b"secret" not in answer
-    assert Echo.made == made, "the application hears nothing of it"
+    assert Echo.made == made, "the application receives nothing"
 
 
 def test_noise_instead_of_tls_is_closed(tls: Path) -> None:

@@ -102,7 +102,7 @@ def flight(tmp_path: Path, **settings: Any) -> Iterator[Flying]:
 def hammering(
     flying: Flying, *, hosts: list[str], payload: bytes, every_s: float
 ) -> Iterator[None]:
-    """Strangers that say the same again and again until the block ends."""
+    """Unknown senders that repeat the same message until the block ends."""
     sockets = []
     for host in hosts:
         sockets.append(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
@@ -175,7 +175,7 @@ def test_senders_of_fragments_are_bounded_and_unsigned_ones_leave_first() -> Non
     senders.register(("operator", 1), 0.0, is_signed=True)
     assert senders.messages(complete[:9], ("operator", 1), 0.0) == ([], 0)
     for n in range(500):
-        senders.messages(complete[:9], (f"stranger {n}", 1), 0.0)
+        senders.messages(complete[:9], (f"unknown {n}", 1), 0.0)
     assert len(senders._streams) == STREAMS_MAX
     assert senders.messages(complete[9:], ("operator", 1), 0.0) == ([complete], 0)
 
@@ -328,7 +328,7 @@ def test_a_new_stream_may_lag_by_a_minute_and_a_known_one_as_long_as_it_goes_on(
 def test_a_tablet_with_a_slow_clock_gets_in_by_the_time_of_our_signed_messages() -> None:
     camera, tablet = Clock().signatures(), Clock(behind_s=7200).signatures()
     assert not camera.accept(signed(tablet.next_timestamp()))
-    # It hears our heartbeat, and its own signing clock follows, as the specification asks.
+    # It receives our heartbeat, and its signing clock follows, as the specification requires.
     assert tablet.accept(signed(camera.next_timestamp(), system=1, component=100))
     assert camera.accept(signed(tablet.next_timestamp()))
 
@@ -356,7 +356,7 @@ def test_what_is_sent_is_signed_with_the_clock_and_ever_later() -> None:
     assert signatures.next_timestamp() == NOW + TICKS_PER_S
 
 
-def test_streams_and_clock_survive_a_restart_and_another_key_begins_anew(tmp_path: Path) -> None:
+def test_streams_and_clock_survive_a_restart_and_another_key_resets_them(tmp_path: Path) -> None:
     path = tmp_path / "state"
     first = Clock().signatures(path)
     assert first.accept(signed(NOW + HOUR))
@@ -411,12 +411,12 @@ CROWD = [f"127.0.1.{n}" for n in range(1, 21)]
 
 
 def heartbeats(station: Station, count: int) -> float:
-    """Seconds until so many heartbeats of the camera were heard, with one of ours a second."""
+    """Seconds until so many heartbeats of the camera are received, sending one a second."""
     begin = beat_s = time.monotonic()
     station.received.clear()
     station.beat()
     while len(station.receive("HEARTBEAT")) < count:
-        assert time.monotonic() - begin < 30.0, "the operator hears no heartbeat"
+        assert time.monotonic() - begin < 30.0, "the operator receives no heartbeat"
         if time.monotonic() - beat_s >= 1.0:
             beat_s = time.monotonic()
             station.beat()
@@ -442,7 +442,7 @@ def test_who_was_there_first_stays_and_who_falls_silent_makes_room() -> None:
     senders = Senders(MavlinkParser())
     assert senders.register(("operator", 1), 0.0, is_signed=False)
     for n in range(100):
-        senders.register((f"stranger {n}", 1), 1.0, is_signed=False)
+        senders.register((f"unknown {n}", 1), 1.0, is_signed=False)
     assert len(senders.peers) == PEERS_MAX
     assert ("operator", 1) in senders.peers
     senders.register(("operator", 1), 59.0, is_signed=False)
@@ -454,7 +454,7 @@ def test_a_signed_sender_is_never_replaced_by_an_unsigned_one() -> None:
     senders = Senders(MavlinkParser())
     for n in range(PEERS_MAX):
         assert senders.register((f"operator {n}", 1), float(n), is_signed=n % 2 == 0)
-    assert not senders.register(("stranger", 1), 20.0, is_signed=False)
+    assert not senders.register(("unknown", 1), 20.0, is_signed=False)
     assert senders.register(("signed", 1), 20.0, is_signed=True)
     assert ("operator 1", 1) not in senders.peers, "the unsigned one that was silent for longest"
     for n in range(PEERS_MAX):

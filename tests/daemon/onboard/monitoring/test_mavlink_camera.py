@@ -34,7 +34,7 @@ RIG = load_rig(shipped_rigs()["ultracam-x-mini"])
 
 
 class Station:
-    """A ground station by pymavlink itself, behind the port the camera tells."""
+    """A ground station by pymavlink itself, at the port the camera reports."""
 
     def __init__(self, port: int, key: bytes | None = None) -> None:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -162,7 +162,7 @@ def test_no_parameter_is_too_odd(action: str, parameters: list[float]) -> None:
 
 @settings(max_examples=300)
 @given(st.binary(max_size=300))
-def test_any_bytes_are_heard_without_harm(data: bytes) -> None:
+def test_any_bytes_are_received_without_error(data: bytes) -> None:
     camera = _camera()
     camera.datagram_received(data, ("127.0.0.1", 1))
     assert len(camera._senders.peers) <= 1

@@ -24,7 +24,7 @@ RIG = load_rig(shipped_rigs()["ultracam-x-mini"])
 
 
 class Flying:
-    """A camera component over a service that exposes at once when it is told to."""
+    """A camera component over a service that exposes immediately on command."""
 
     def __init__(self, **settings: Any) -> None:
         self.port = free_port()
@@ -151,7 +151,7 @@ def test_mavsdk_takes_photos_and_recovers_a_lost_record(client: Any, flying: Fly
     wait_for(lambda: {one.index for one in received} >= {0, 1, 2}, "records of all three")
     assert [c.name for c in flying.commands] == ["trigger"] * 3
     assert all(c.by.startswith("mavlink ") for c in flying.commands)
-    # The lost one was told twice: once into nothing, once when it was asked for.
+    # The lost one was sent twice: first lost, then on request.
     assert flying.sent_indices.count(1) >= 2
     lost = next(one for one in received if one.index == 1)
     assert lost.position.latitude_deg == pytest.approx(47.07)

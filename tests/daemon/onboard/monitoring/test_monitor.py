@@ -24,7 +24,7 @@ def service(tmp_path: Path) -> Iterator[Service]:
     service.end()
 
 
-def test_the_state_is_told_once_as_json_and_drawn_with_what_is_wrong(service: Service) -> None:
+def test_the_state_is_printed_once_as_json_and_drawn_with_its_faults(service: Service) -> None:
     for event in (
         *flight_events.exposure(1, "refly"),
         flight_events.lost("SU02"),

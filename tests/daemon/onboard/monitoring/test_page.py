@@ -170,7 +170,7 @@ def test_the_planned_line_is_on_the_map_with_the_holes_in_what_was_flown(
     assert all(f["properties"]["simulated"] for f in reported["features"])
 
 
-def test_residuals_are_laid_over_the_image_and_told_by_overlap_and_histogram_in_words(
+def test_residuals_are_drawn_over_the_image_and_listed_with_overlaps_and_histogram(
     browser: Browser,
 ) -> None:
     browser.click("#rows tr:last-child button")
@@ -297,7 +297,7 @@ def test_exposure_settings_are_seen_and_set_from_the_page(
     assert "exposure_time_us" not in given
 
 
-def test_image_zooms_by_keyboard_and_the_cabin_gets_dark(browser: Browser) -> None:
+def test_the_image_zooms_by_keyboard_and_the_theme_turns_dark(browser: Browser) -> None:
     before = browser.evaluate("document.querySelector('#quicklook').style.transform")
     browser.evaluate(
         "document.querySelector('#image').dispatchEvent(new KeyboardEvent('keydown', {key: '+'}))"
@@ -313,7 +313,7 @@ def test_nothing_leaves_the_host_and_nothing_breaks(service: Service, browser: B
     outside = [url for url in browser.requested if not url.startswith(("data:", "blob:"))]
     assert outside
     assert all(url.replace("ws:", "http:").startswith(service.address) for url in outside), outside
-    # Refused tokens and commands, and residuals that are not there, are told by the browser, too.
+    # The browser logs rejected tokens and commands and missing residuals, too.
     refused = ("401", "404", "409")
     broken = [c for c in browser.complaints if not any(status in c for status in refused)]
     assert broken == []
@@ -432,7 +432,9 @@ def test_a_picture_is_taken(browser: Browser, tmp_path: Path) -> None:
     assert path.stat().st_size > 20_000
 
 
-def test_the_api_is_told_in_words_and_by_nobody_else(service: Service, browser: Browser) -> None:
+def test_the_api_is_described_as_text_by_the_service_only(
+    service: Service, browser: Browser
+) -> None:
     browser.requested.clear()
     browser.open(f"{service.address}docs")
     browser.wait_for("document.querySelectorAll('#routes section').length > 10", WITHIN_S)

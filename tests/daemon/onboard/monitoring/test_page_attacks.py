@@ -160,7 +160,7 @@ def pour(link: socket.socket, data: bytes, most: int) -> int:
 
 
 @pytest.mark.trust
-@pytest.mark.parametrize("with_token", [False, True], ids=["stranger", "operator"])
+@pytest.mark.parametrize("with_token", [False, True], ids=["anonymous", "operator"])
 @pytest.mark.parametrize("length", ["Content-Length: {0}", "Transfer-Encoding: chunked"])
 def test_a_body_of_1200_megabytes_is_refused_before_it_is_read(
     page: Page, length: str, with_token: bool
@@ -193,7 +193,7 @@ def test_60_megabytes_of_brackets_do_not_hold_up_others(page: Page) -> None:
     assert slowest_s < ANSWERED_WITHIN_S
 
 
-def test_a_stranger_learns_about_the_token_before_the_body_is_looked_at(page: Page) -> None:
+def test_a_missing_token_is_refused_before_the_body_is_read(page: Page) -> None:
     broken = b"{" * 1000
     status, _ = page.request(command("", body=broken))
     assert status == 401
@@ -262,7 +262,7 @@ def test_a_body_that_does_not_come_is_waited_for_briefly(page: Page) -> None:
 
 @pytest.mark.trust
 def test_wrong_tokens_never_keep_a_valid_one_out(page: Page) -> None:
-    """From the same address, over HTTP and WebSocket, whatever X-Forwarded-For says."""
+    """From the same address, over HTTP and WebSocket, whatever X-Forwarded-For contains."""
     statuses = [page.request(command("guess"))[0] for _ in range(FAILURES_ALLOWED + 2)]
     assert statuses[:FAILURES_ALLOWED] == [401] * FAILURES_ALLOWED
     assert statuses[FAILURES_ALLOWED:] == [429, 429]

@@ -68,7 +68,7 @@ def test_a_record_is_msgpack_that_any_reader_reads() -> None:
     assert record["version"] == 1
 
 
-def test_nothing_new_is_said_only_once_in_a_while() -> None:
+def test_an_unchanged_state_is_repeated_at_the_interval_only() -> None:
     state = FlightState("syntopic test")
     state.apply(flight_events.mission())
     subscription = Subscription()
@@ -78,7 +78,7 @@ def test_nothing_new_is_said_only_once_in_a_while() -> None:
     assert len(times) == pytest.approx(10, abs=1)
 
 
-def test_the_schema_names_every_key_that_is_told() -> None:
+def test_the_schema_names_every_reported_key() -> None:
     state = FlightState("syntopic test")
     settings = {"by": "operator", "control": "manual", "lock": "line", "locked_on": None}
     lost = {"event": "lost", "mono_ns": "1", "number": 2, "cause": "no frames"}

@@ -98,7 +98,7 @@ def test_a_trusted_certificate_gives_service_worker_and_wake_lock_on_another_hos
 ) -> None:
     with camera_and_tablet(tmp_path) as (service, camera, tablet):
         home_folder = trusting_profile(tmp_path / "home", tmp_path / "tls/authority.pem")
-        untrusting = tmp_path / "stranger"
+        untrusting = tmp_path / "untrusting"
         port = service.address.rstrip("/").rpartition(":")[2]
         plain = service.address.replace("https", "http")
 

@@ -1,4 +1,4 @@
-"""Fifty watchers, ten of them stalled: the others are told everything, and memory stays."""
+"""Fifty clients, ten of them stalled: the others receive everything, and memory is constant."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def resident_kb(pid: int) -> int:
 
 
 async def follow(port: int, until: int) -> set[int]:
-    """Numbers of the exposures this watcher was told the verdict of."""
+    """Numbers of the exposures whose verdict this client received."""
     from websockets.asyncio.client import connect
 
     seen: set[int] = set()
@@ -75,7 +75,7 @@ async def stall(port: int, release: asyncio.Event) -> None:
     )
     await release.wait()
     await asyncio.sleep(max(0.0, connected_s + LET_GO_WITHIN_S - time.monotonic()))
-    # What was on its way comes, then the end; a living link would be told something every second.
+    # Pending records arrive, then the end; an open link would receive one every second.
     with suppress(ConnectionError):
         async with asyncio.timeout(PING_S):
             while await reader.read(65536):
@@ -115,7 +115,7 @@ def test_stalled_watchers_cost_the_others_nothing(watch: tuple[ChildProcess, int
     assert resident_kb(child.process.pid or 0) - before_kb < GROWTH_MAX_KB
 
 
-def test_who_watches_is_served_until_the_service_says_so_whoever_is_signalled(
+def test_clients_are_served_until_the_service_stops_whichever_process_is_signalled(
     watch: tuple[ChildProcess, int],
 ) -> None:
     """Ctrl-C and systemd signal the whole group; the service has exposures to seal."""
