@@ -19,7 +19,12 @@ from daemon.mission.canonical_json import (
 )
 from daemon.mission.foreign_files import ForeignFileError, read_regular_file
 from daemon.mission.store.durable import replace_file
-from processing.mosaic.flight_validity import FlightSettings, FlightValidity, evaluate_flight
+from processing.mosaic.flight_validity import (
+    FlightDisplacement,
+    FlightSettings,
+    FlightValidity,
+    evaluate_flight,
+)
 from processing.mosaic.stitch_record import StitchRecord, StitchRecordError, stitch_record_from_json
 from processing.rig import load_rig
 
@@ -76,13 +81,19 @@ def _records(mission: Path) -> tuple[dict[int, StitchRecord], list[str]]:
     return records, unreadable
 
 
+def _step_content(step: FlightDisplacement) -> dict[str, Any]:
+    content = asdict(step)
+    content["misread"] = bias = content.pop("probe_bias")
+    if bias is not None:
+        bias["off_k"] = bias.pop("bias_k")
+    length_and_alternatives = {"length_px": step.length_px, "alternatives": list(step.alternatives)}
+    return content | length_and_alternatives
+
+
 def _content(found: FlightValidity, unreadable: list[str]) -> dict[str, Any]:
     return {
         "sentences": [step.sentence for step in found.steps],
-        "steps": [
-            asdict(step) | {"length_px": step.length_px, "alternatives": list(step.alternatives)}
-            for step in found.steps
-        ],
+        "steps": [_step_content(step) for step in found.steps],
         "exposures": dict(found.exposures),
         "left_out": {cone: list(numbers) for cone, numbers in found.left_out.items()},
         "unreadable": unreadable,

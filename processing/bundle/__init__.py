@@ -1,6 +1,7 @@
 """Bundle adjustment: one engine for laboratory, platform and block.
 
-`network` says what is measured and known, `adjust` adjusts it, `rank` names what it cannot
-determine, `self_calibration` offers sets of additional parameters, `start` gives starting values.
+`network` holds observations and prior knowledge, `adjust` adjusts them, `rank_diagnosis` names
+undetermined parameters, `self_calibration` provides sets of additional parameters,
+`initial_values` computes starting values.
 No file is opened here.
 """

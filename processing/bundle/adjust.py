@@ -1,6 +1,6 @@
 """The adjustment: Gauss-Newton with step control, robust weights, data snooping, components.
 
-Pure and deterministic: a network in, an adjusted network with all its statistics out.
+A pure function of a network. It returns the adjusted network with all its statistics.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ class AdjustmentSettings:
         robust: first with Huber weights on image points, so that blunders pull less.
         reject_beyond: image points whose standardised residual (residual over its own a posteriori
             standard deviation) exceeds this are left out, worst first; None: no data snooping.
-        variance_components: scale the sigmas of each kind of observation by what it shows.
-        minimum_norm: undetermined directions are no error; the shortest correction is taken.
+        variance_components: scale the sigmas of each kind of observation by its residuals.
+        minimum_norm: undetermined directions raise no error; the shortest correction is used.
     """
 
     max_iterations: int = 30
@@ -68,7 +68,7 @@ class Adjustment:
         left_out: (points,) object points that their rays do not fix.
         factors: variance factor applied to each kind of observation.
         groups: statistics of each kind of observation.
-        defects: what nothing determines (only with `minimum_norm`).
+        rank_defects: undetermined directions (only with `minimum_norm`).
     """
 
     network: Network
@@ -109,13 +109,13 @@ def adjust(
 
     Args:
         network: observations and starting values.
-        settings: see `Settings`.
+        settings: see `AdjustmentSettings`.
         progress: called with what is done, the iteration, and the weighted sum of squares.
 
     Raises:
         NetworkError: tables that do not fit, starting values far off, no convergence, or fewer
             observations than unknowns.
-        RankDefectError: something cannot be determined; it is named.
+        RankDefectError: a parameter cannot be determined; the message names it.
     """
     validate(network)
     settings = settings or AdjustmentSettings()
@@ -172,8 +172,8 @@ def undetermined_points(
 ) -> Flags:
     """Object points whose rays do not fix them.
 
-    They are seen once or from one projection centre only; or they start behind a camera that sees
-    them, where a few do (rays that hardly converge) and not so many that the images are to blame.
+    They are seen once or from one projection centre only. Or their starting value is behind a
+    camera that sees them. Only a few points may be: with many, the images are wrong.
     """
     found = np.zeros(len(network.points.names), dtype=bool)
     if weight is None:
@@ -285,8 +285,8 @@ def _fixed_distance_points(layout: ParameterLayout) -> Flags:
 def _points_to_reject(result: Adjustment, limit: float | None) -> Flags:
     """Image points to leave out next: beyond the limit and the largest of their image and point.
 
-    One blunder makes its neighbours look bad; taking only the largest of each image and each object
-    point at a time lets those come back.
+    One blunder enlarges its neighbours' residuals. Only the largest of each image and each object
+    point is rejected at a time.
     """
     table = result.network.image_points
     worst = np.zeros(len(table.image), dtype=bool)

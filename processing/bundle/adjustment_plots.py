@@ -1,6 +1,6 @@
 """Plain SVG drawings of an adjustment: systematic image residuals, and the block from above.
 
-Strings only, without scripts or fonts of their own. Source of the first picture:
+The drawings have no scripts and no embedded fonts. Source of the first picture:
 Ladstädter et al. (2010), fig. 10.
 """
 
@@ -39,7 +39,7 @@ class ResidualPanel:
 def pattern_svg(panels: Sequence[ResidualPanel], title: str) -> str:
     """Mean image residuals of one or more adjustments or cameras, side by side in one scale.
 
-    Vectors are enlarged alike; the bar below says by how much. y is up, in flight direction.
+    All vectors have one scale; the bar below shows it. y is up, in flight direction.
     """
     gap, wide = 40.0, 510.0
     longest = max([float(np.hypot(*p.pattern.mean_mm.T).max(initial=0.0)) for p in panels] + [1e-9])
@@ -69,7 +69,7 @@ def block_svg(
 ) -> str:
     """The block from above: projection centres, object points, control and check points.
 
-    Differences at control and check points are vectors in plan and bars in height, enlarged alike.
+    Differences at control and check points are vectors in plan and bars in height, in one scale.
     """
     images = np.unique(result.network.image_points.image[result.weight > 0.0])
     station = result.state.station[np.unique(result.network.images.station[images])]

@@ -1,4 +1,4 @@
-"""What a person wants to know of an adjustment: parameters with their sigmas, checks, residuals.
+"""Results of an adjustment: parameters with their sigmas, checks, residuals.
 
 Everything is derived from an `Adjustment`; nothing is adjusted here.
 """
@@ -27,7 +27,7 @@ SIGNIFICANT_T = 2.0
 class EstimatedParameter:
     """One parameter of interior orientation, in `unit`; `t` is |value| / sigma.
 
-    `correlated` names parameters of the same camera with a correlation beyond 0.95.
+    `high_correlations` names parameters of the same camera with a correlation beyond 0.95.
     """
 
     camera: str
@@ -40,7 +40,7 @@ class EstimatedParameter:
 
     @property
     def is_insignificant(self) -> bool:
-        """Not significant, or hardly to be told from another: may be left out."""
+        """Not significant, or highly correlated with another parameter: may be left out."""
         return self.t < SIGNIFICANT_T or bool(self.high_correlations)
 
 
@@ -163,7 +163,7 @@ def check_point_differences(
 ) -> PointDifferences:
     """Adjusted object points against independent coordinates (n, 3) with sigmas (n, 3), m.
 
-    NaN coordinates are not compared; points that took no part are passed over.
+    NaN coordinates are not compared; points that were not adjusted are skipped.
     """
     at = {name: index for index, name in enumerate(result.network.points.names)}
     checked_names, differences, sigmas, squares, count = [], [], [], 0.0, 0
@@ -207,7 +207,7 @@ def control_residuals(result: Adjustment) -> PointDifferences:
 
 
 def image_residuals_mm(result: Adjustment) -> Array:
-    """Computed less measured of every image point (n, 2), NaN for what took no part."""
+    """Computed less measured of every image point (n, 2), NaN for points that were not adjusted."""
     residual = np.full((len(result.network.image_points.image), 2), np.nan)
     rows = result.equations
     weight = np.sqrt(np.where(result.weight > 0.0, result.weight, 1.0))

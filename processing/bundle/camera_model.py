@@ -1,6 +1,6 @@
 """Interior orientation: measured image coordinates to ideal ones, and derivatives.
 
-Heier et al. (2002), eq. 5.1, in two readings (`Camera.model`), plus the additional terms
+Heier et al. (2002), eq. 5.1, in two interpretations (`CameraModel.model`), plus the additional terms
 (docs/mathematics/bundle.md#camera-model).
 The correction is added to what was measured: ideal = measured + delta(measured).
 """
@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 def principal_distance_mm(camera: CameraModel, interior: Array) -> float:
-    """What the collinearity equations project with.
+    """Principal distance of the collinearity equations.
 
     Australis keeps f and carries df in the correction (+x df / f); the centred model projects with
     f - df, which is the same to first order.
@@ -77,8 +77,8 @@ def term_derivatives(camera: CameraModel, interior: Array, terms: Array, xy_mm: 
 
 
 def _placed(camera: CameraModel, terms: Array, xy_mm: Array) -> Array:
-    """Measured coordinates with what the additional parameters correct: they come before the ten,
-    as a CCD lies behind its lens."""
+    """Measured coordinates corrected by the additional parameters, which apply before the ten:
+    the light passes the lens before the CCD."""
     result = xy_mm
     for value, term in zip(terms, camera.terms, strict=True):
         if value != 0.0:

@@ -1,4 +1,4 @@
-"""Earth curvature and refraction: what makes a ray in map coordinates other than a straight line.
+"""Earth curvature and refraction: deviations of a ray in map coordinates from a straight line.
 
 For blocks given in map coordinates and heights. In a local Cartesian system there is no curvature,
 and refraction alone may be switched on.
@@ -20,7 +20,7 @@ MEAN_EARTH_RADIUS_M = 6_371_000.0
 
 @dataclass(frozen=True)
 class RayModel:
-    """How rays run. `earth_radius_m`: coordinates are map coordinates and heights above a sphere
+    """Model of rays. `earth_radius_m`: coordinates are map coordinates and heights above a sphere
     of that radius; None: they are Cartesian. `refraction`: through the standard atmosphere, from
     `ground_m` above the sea."""
 
@@ -48,15 +48,15 @@ def refraction_coefficient(height_m: Array, ground_m: float) -> Array:
 def corrected_rays(
     ray_m: Array, station_height_m: Array, rays: RayModel
 ) -> tuple[Array, Array, Array]:
-    """The straight ray a camera would see the point along, and its derivatives.
+    """The straight ray along which the camera sees the point, and its derivatives.
 
-    A point at height Z lies out by 1 + Z / R of its map distance d, and lower by d^2 / 2R than its
-    height says; it is seen farther out than it is, by K tan(angle).
+    Curvature scales the map distance d of a point at height Z by 1 + Z / R and lowers the point by
+    d^2 / 2R. Refraction moves its image outwards by K tan(angle).
 
     Args:
         ray_m: point less projection centre, (n, 3), east, north, up.
         station_height_m: (n,) of the projection centre.
-        rays: how rays run.
+        rays: model of curvature and refraction.
 
     Returns:
         (n, 3); by the point and by the projection centre (n, 3, 3) each. That the height of the

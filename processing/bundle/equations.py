@@ -28,7 +28,7 @@ Indices = NDArray[np.int64]
 
 
 class BehindCameraError(ValueError):
-    """Object points lie behind the camera that saw them: starting values are far off."""
+    """Object points are behind the camera that saw them: starting values are far off."""
 
     def __init__(self, image_points: Indices) -> None:
         self.image_points = image_points
@@ -315,7 +315,7 @@ def _gnss_rows(
 
 
 def _seconds_from_mean(network: Network) -> Array:
-    """Seconds since the mean time of each line's positions, so that shift and drift part."""
+    """Seconds since the mean time of each line's positions, so that shift and drift are uncorrelated."""
     gnss = network.gnss
     since = np.zeros(len(gnss.station))
     for line in range(len(gnss.lines)):

@@ -1,6 +1,6 @@
 """Gauss-Newton iterations of a network: steps that always lower the sum of squares, robust weights.
 
-Nothing is decided here about which observations take part; see `adjust`.
+The selection of observations is in `adjust`.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ Array = NDArray[np.float64]
 Progress = Callable[[str, int, float], None]
 
 _CONVERGED: Final = 1e-14
-"""Promised decrease over the sum of squares: far below what any figure is printed to."""
+"""Predicted decrease over the sum of squares: far below the printed precision."""
 
 _OBJECTIVE_CONVERGED: Final = 1e-10
-"""Promised decrease, in squared a priori sigmas, that no figure would show."""
+"""Predicted decrease, in squared a priori sigmas, below the printed precision."""
 
 _HUBER: Final = 2.0
 _MAX_HALVINGS: Final = 8
@@ -38,7 +38,7 @@ _MAX_HALVINGS: Final = 8
 
 @dataclass
 class Run:
-    """What changes while adjusting: state, weights, history."""
+    """Variables of a running adjustment: state, weights, history."""
 
     network: Network
     layout: ParameterLayout
@@ -54,7 +54,7 @@ class Run:
 
 
 def iterate(run: Run) -> tuple[Equations, ReducedEquations]:
-    """Iterate to convergence; the rows and reduced equations at the solution come back."""
+    """Iterate to convergence; return the rows and reduced equations at the solution."""
     for iteration in range(run.max_iterations + 1):
         rows = _front(run, run.state)
         objective = float(rows.misclosure @ rows.misclosure)

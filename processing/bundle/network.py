@@ -1,7 +1,7 @@
-"""A network: what was measured between images and ground, and what is known beforehand.
+"""A network: observations between images and ground, and prior knowledge.
 
-Frozen arrays without behaviour but their checks. A projection centre (station) and a rotation
-(attitude) are things of their own, so that images may share either; a head is the place of a camera
+Frozen arrays; the only behaviour is validation. A projection centre (station) and a rotation
+(attitude) are separate, so that images may share either; a head is the place of a camera
 against the rotation and the projection centre it shares with others.
 
 Conventions: image coordinates mm, x right, y up; camera axes x right, y forward, z up, an image
@@ -31,7 +31,7 @@ Model = Literal["australis", "centred"]
 
 
 class NetworkError(ValueError):
-    """A network that cannot be adjusted as given; `problems` has a sentence for each mistake."""
+    """A network that cannot be adjusted as given; `problems` has a sentence for each error."""
 
     def __init__(self, problems: Sequence[str]) -> None:
         self.problems = tuple(problems)
@@ -42,7 +42,7 @@ class NetworkError(ValueError):
 class CameraModel:
     """The interior orientation of one camera.
 
-    `model` says how the ten act on measured coordinates (`camera_model`): `australis` is eq. 5.1 of
+    `model` selects how the ten act on measured coordinates (`camera_model`): `australis` is eq. 5.1 of
     Heier et al. (2002) about the given principal point; `centred` applies affinity and shear first
     and the polynomials about the estimated principal point, as most close-range programs do.
 
@@ -67,7 +67,7 @@ class CameraModel:
 
 @dataclass(frozen=True)
 class HeadMounting:
-    """Where a camera sits in a rig: rotation rig_from_camera (3, 3), offset in rig axes, m (3,).
+    """Mounting of a camera in a rig: rotation rig_from_camera (3, 3), offset in rig axes, m (3,).
 
     A quantity is held at its value, estimated, or (`sigma` given, positive) estimated with its
     value as an observation.
@@ -149,9 +149,9 @@ class Distances:
 class Gnss:
     """Antenna positions, (n, 3) m, of images' exposures.
 
-    The antenna is at station + attitude * lever_m; to it come the line's shift and drift.
-    `line` (n,) indexes `lines`, -1 is none; `time_s` (n,) is what drift is linear in. `drift` says
-    what is estimated for every line: nothing, a shift, or a shift and a drift.
+    The antenna is at station + attitude * lever_m, plus the line's shift and drift.
+    `line` (n,) indexes `lines`, -1 is none; drift is linear in `time_s` (n,). `drift` selects what is
+    estimated for every line: nothing, a shift, or a shift and a drift.
     """
 
     station: Indices
@@ -196,7 +196,7 @@ def no_measured_attitudes() -> MeasuredAttitudes:
 
 @dataclass(frozen=True)
 class Network:
-    """All of it. `problems` names what does not fit together."""
+    """All tables. `problems` names inconsistencies."""
 
     cameras: tuple[CameraModel, ...]
     stations: Stations
@@ -212,7 +212,7 @@ class Network:
     rays: RayModel = field(default_factory=RayModel)
 
     def problems(self) -> tuple[str, ...]:
-        """One sentence for each mistake in shapes, indices and numbers; empty when it fits."""
+        """One sentence for each error in shapes, indices and numbers; empty when it fits."""
         return tuple(_problems(self))
 
 

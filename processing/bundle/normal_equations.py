@@ -1,7 +1,7 @@
 """Normal equations with the object points eliminated (Schur complement), and their solution.
 
 Each point's three columns are first made orthonormal within the point (its own Cholesky factor), so
-that eliminating it is a product and no inverse. Columns that most rows touch (interior orientation)
+that eliminating it needs a product and no inverse. Columns that most rows touch (interior orientation)
 are kept dense, all others sparse; the reduced matrix itself is dense.
 """
 
@@ -39,7 +39,7 @@ class SingularError(ValueError):
 
 @dataclass(frozen=True)
 class ReducedEquations:
-    """What is left for the columns after the points are gone.
+    """Normal equations of the columns after elimination of the points.
 
     Attributes:
         matrix, right: (c, c), (c,): reduced normal equations.
@@ -70,9 +70,9 @@ class ReducedEquations:
 
 @dataclass(frozen=True)
 class GaussNewtonStep:
-    """Corrections of columns (c,) and eliminated points (p, 3), and the decrease they promise.
+    """Corrections of columns (c,) and eliminated points (p, 3), and the predicted decrease.
 
-    `promised` is the predicted decrease of the weighted sum of squares.
+    `predicted_decrease` is the predicted decrease of the weighted sum of squares.
     """
 
     dx: Array
@@ -104,8 +104,8 @@ def reduced_equations(equations: Equations, layout: ParameterLayout) -> ReducedE
     columns, points = layout.columns, len(layout.eliminated_points)
     if columns > MAX_COLUMNS:
         raise ValueError(
-            f"{columns} unknowns beside the object points; up to {MAX_COLUMNS} are adjusted in "
-            "one piece: part the block"
+            f"{columns} unknowns in addition to the object points; at most {MAX_COLUMNS} "
+            "are adjusted at once: split the block"
         )
     design = equations.reduced
     fill = np.bincount(design.indices, minlength=columns) / max(design.shape[0], 1)
@@ -235,7 +235,7 @@ def cofactor_matrix(reduced: ReducedEquations, constraints: Array, *, minimum_no
 
 
 def _factor(matrix: Array, reduced: ReducedEquations) -> Array:
-    """Lower Cholesky factor, refused where a pivot says that a direction has no information."""
+    """Lower Cholesky factor, refused where a pivot shows a direction without information."""
     factor, info = linalg.lapack.dpotrf(matrix, lower=1, clean=1)
     if info != 0 or float(factor.diagonal().min(initial=1.0)) ** 2 < MIN_INFORMATION:
         raise SingularError(reduced)

@@ -1,7 +1,7 @@
-"""Combined intersection: object points from oriented images, with what their orientation is worth.
+"""Combined intersection: object points from oriented images, with the orientations' covariance.
 
-Orientations, heads and cameras are taken as they are; their covariance, common errors included, is
-carried into the points.
+Orientations, heads and cameras are not changed. Their covariance, common errors included, is
+propagated into the points.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class IntersectedPoints:
 
 
 def orientation_layout(network: Network) -> ParameterLayout:
-    """Columns of everything whose errors are to be carried: what the network leaves free."""
+    """Columns of everything whose errors are propagated: what the network leaves free."""
     return layout_of(network, undetermined_points(network, initial_values(network)))
 
 
@@ -119,7 +119,7 @@ def intersect_points(
             break
     else:
         raise NetworkError(
-            ["object points do not settle; are the orientations those of the images?"]
+            ["object points do not converge; are the orientations those of the images?"]
         )
     cofactor = np.linalg.inv(normal)
     by_column = np.zeros((len(points), 3, layout.columns))

@@ -1,7 +1,7 @@
-"""What a network cannot determine, in words.
+"""Parameters that a network cannot determine, in words.
 
-Directions without information in the reduced normal matrix are compared with the seven motions of
-a whole block; what is left of them is told by the unknowns that take part.
+Directions without information in the reduced normal matrix are compared with the seven datum
+motions of the block; the remainder is described by the unknowns that take part.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _DATUM_MOTIONS: Final = (
 
 @dataclass(frozen=True)
 class RankDefect:
-    """One direction nothing determines: a sentence, and the unknowns in it with their shares."""
+    """One undetermined direction: a sentence, and the unknowns in it with their shares."""
 
     sentence: str
     shares: tuple[tuple[str, float], ...]
@@ -67,7 +67,7 @@ def rank_defects(
     Args:
         network, layout, state: what was to be adjusted.
         reduced: its reduced equations.
-        singular: they could not be solved, so that the weakest direction is at fault at least.
+        singular: they could not be solved; the weakest direction is reported at least.
     """
     matrix, _ = constrained_matrix(reduced, layout.constraints)
     values, vectors = linalg.eigh(matrix)
@@ -134,8 +134,9 @@ def _sentence(direction: Array, unknowns: Sequence[Unknown]) -> RankDefect:
         sentence = f"{phrases[0]} cannot be determined: no observation depends on it"
     else:
         sentence = (
-            f"{' and '.join([', '.join(phrases[:-1]), phrases[-1]])} cannot be told apart: a change of "
-            "one is undone by the others; fix one of them or measure what parts them"
+            f"{' and '.join([', '.join(phrases[:-1]), phrases[-1]])} cannot be "
+            "separated: a change of one is compensated by the others; fix one of them or add an "
+            "observation that separates them"
         )
     return RankDefect(sentence, tuple(shares))
 
@@ -145,7 +146,7 @@ def _plural(kind: str) -> str:
 
 
 def _datum_motions(layout: ParameterLayout, state: ParameterValues) -> Array:
-    """Shifts, turns and scale of the whole block as corrections of the columns, (7, c)."""
+    """Shifts, rotations and scale of the whole block as corrections of the columns, (7, c)."""
     motions = np.zeros((7, layout.columns))
     used = layout.station.min(axis=1) >= 0 if layout.station.size else np.zeros(0, dtype=bool)
     centre = state.station[used].mean(axis=0) if used.any() else np.zeros(3)

@@ -1,7 +1,7 @@
 """Many rotations at once: from small rotation vectors, to omega, phi, kappa and their covariance.
 
 Unknown rotations are improved by a rotation vector about the camera's own axes, R exp([d]x), which
-has no singular attitude; angles are for people. The order of angles is that of
+has no singular attitude; angles are for display. The order of angles is that of
 `processing.geometry.rotation`.
 """
 
@@ -70,7 +70,7 @@ def omega_phi_kappa(rotations: Array) -> Array:
 def angles_by_rotation_vector(rotations: Array) -> Array:
     """d(omega, phi, kappa) / d(rotation vector about the camera's axes), (n, 3, 3).
 
-    At phi = +-90 degrees omega and kappa cannot be told apart and the elements grow without bound.
+    At phi = +-90 degrees omega and kappa cannot be separated and the elements grow without bound.
     """
     angles = omega_phi_kappa(rotations)
     sp, cp = np.sin(angles[:, 1]), np.cos(angles[:, 1])

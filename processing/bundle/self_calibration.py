@@ -1,19 +1,20 @@
 """Sets of additional parameters for stitched images, composed from a rig's arrangement.
 
-Four sets, each holding the one before it. For nine CCDs in four cones they have 0, 2, 23 and 61
-parameters, as the sets a photogrammetrist of these cameras knows; what the last two of those are
-made of is not public, and these are our own:
+Four sets, each including the one before it. For nine CCDs in four cones they have 0, 2, 23 and 61
+parameters, as the vendor's sets for these cameras. The vendor's last two sets are not published;
+these are defined here:
 
 - `none`;
 - `radial`: K1 and K2 of Heier et al. (2002), eq. 5.1;
 - `sensors`: with them P1 and P2 (lens elements off the axis), dx0, dy0 and df (interior
-  orientation; only where GNSS positions and two flying heights part it from the orientation of the
-  images), and two shifts of every CCD: 7 + 2 (n - 1);
+  orientation; only where GNSS positions and two flying heights separate it from the orientation of
+  the images), and two shifts of every CCD: 7 + 2 (n - 1);
 - `sensors-full`: with them rotation, scale, affinity and shear of every CCD and two perspective
   terms of every cone but the master: 7 + 6 (n - 1) + 2 (c - 1).
 
-What all CCDs do alike cannot be told from the orientation and the lens: of each kind, the sum over
-the CCDs of the master cone is zero, as in the datum of the mosaic. So one is lost of each kind.
+What all CCDs have in common cannot be separated from the orientation and the lens. Of each kind,
+the sum over the CCDs of the master cone is zero, as in the datum of the mosaic. This removes one
+parameter of each kind.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ _OF_CONE: Final[tuple[Kind, ...]] = ("perspective-x", "perspective-y")
 
 
 def parts_of(rig: Rig) -> tuple[Part, ...]:
-    """Which PAN CCD makes which part of the stitched image, from calibrated places.
+    """The part of the stitched image that each PAN CCD covers, from calibrated positions.
 
     Raises:
         ValueError: a rig without a stitched image.
@@ -79,7 +80,7 @@ def with_self_calibration(
         name: the set.
         parts: the CCDs of its image; needed for `sensors` and `sensors-full`.
         master_cone: whose CCDs carry the datum.
-        interior: whether dx0, dy0 and df can be told from the images' orientation.
+        interior: whether dx0, dy0 and df can be separated from the images' orientation.
 
     Raises:
         ValueError: a set of CCDs for an image that is not made of several.

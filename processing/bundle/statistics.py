@@ -1,4 +1,4 @@
-"""What is known of an adjusted network: covariances of points, redundancy numbers, groups.
+"""Statistics of an adjusted network: covariances of points, redundancy numbers, groups.
 
 Everything is exact, from the reduced equations and their inverse; nothing of the size of all
 unknowns squared is ever formed.

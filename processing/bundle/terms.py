@@ -1,4 +1,4 @@
-"""Additional parameters of a stitched image: what one CCD or one cone may do to image coordinates.
+"""Additional parameters of a stitched image: corrections of image coordinates by one CCD or cone.
 
 Each term is a correction of measured coordinates, linear in its parameter, that acts on a part of
 the image only. Which terms make up a set is in `self_calibration`.
@@ -32,18 +32,18 @@ UNITS: Final[Mapping[Kind, tuple[str, float]]] = {
 """What a parameter is printed in, and how many of it make one of the internal unit (mm, rad, 1)."""
 
 MEANING: Final[Mapping[Kind, str]] = {
-    "shift-x": "the CCD lies displaced to the right of where the stitching put it",
-    "shift-y": "the CCD lies displaced in flight direction from where the stitching put it",
-    "rotation": "the CCD is turned in the image plane about its centre",
-    "scale": "the CCD is larger or smaller than thought: its mount is warmer, or it lies deeper",
+    "shift-x": "the CCD is displaced to the right of where the stitching put it",
+    "shift-y": "the CCD is displaced in flight direction from where the stitching put it",
+    "rotation": "the CCD is rotated in the image plane about its centre",
+    "scale": "the CCD's scale differs from the calibration: its mount is warmer, or it is deeper",
     "affinity": "x and y of the CCD have different scales: it is tilted out of the focal plane, "
     "seen off axis",
     "shear": "the CCD's rows and columns are not square to each other: the same tilt, seen in the "
     "other diagonal",
     "perspective-x": "the cone's layer converges to the right: its pointing about the flight axis "
-    "was not wholly taken out",
+    "was not completely removed",
     "perspective-y": "the cone's layer converges in flight direction: its pointing about the cross "
-    "axis was not wholly taken out",
+    "axis was not completely removed",
 }
 
 

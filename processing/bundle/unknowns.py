@@ -1,4 +1,4 @@
-"""What is unknown in a network: names, columns, current values, and how corrections are applied.
+"""Unknowns of a network: names, columns, current values, and how corrections are applied.
 
 The unknowns of most object points are eliminated and have no column; those that distances tie to
 each other keep theirs. Everything held has column -1.
@@ -20,7 +20,7 @@ Indices = NDArray[np.int64]
 
 
 class Unknown(NamedTuple):
-    """One column: what kind of thing, which of them, which of its components."""
+    """One column: kind, owner and component of an unknown."""
 
     kind: str
     owner: str
@@ -41,8 +41,8 @@ class ParameterLayout:
         interior: (cameras, 10).
         terms: (t,) per camera.
         shift, drift: (lines, 3).
-        kept: (points, 3), points with columns of their own.
-        eliminated: (points,) position among the eliminated points, -1 for kept and left-out ones.
+        retained_points: (points, 3), points with columns of their own.
+        eliminated_points: (points,) position among the eliminated points, -1 for retained and left-out ones.
         locked: (points, 3) coordinates that are held.
         unknowns: what each column is.
         constraints: (c, columns) rows; corrections summed over all iterations obey them.
@@ -105,11 +105,11 @@ def initial_values(network: Network) -> ParameterValues:
 
 
 def layout_of(network: Network, left_out: NDArray[np.bool_]) -> ParameterLayout:
-    """Give every unknown its column.
+    """Assign a column to every unknown.
 
     Args:
         network: what is estimated and what is held.
-        left_out: (points,) object points that take no part.
+        left_out: (points,) object points that are not adjusted.
 
     Raises:
         NetworkError: a constraint names what is not there.

@@ -1,7 +1,7 @@
 """Boresight, lever arm and time offset: inertial attitude and position against controlled images.
 
-Least squares of all exposures at once, with the whole covariance of the adjusted orientations. What
-the flight cannot separate is left at its given value and named, with what would part it.
+Least squares of all exposures at once, with the whole covariance of the adjusted orientations. Parameters
+that the flight cannot separate keep their given values and are named, with a remedy.
 
 Source: docs/mathematics/boresight.md#model; Jacobsen (2008), boresite calibration.
 """
@@ -29,7 +29,7 @@ PARAMETERS: Final = (
 )
 GROUPS: Final = {"boresight": (0, 1, 2), "lever": (3, 4, 5), "time": (6,), "shift": (7, 8, 9)}
 PARAMETER_SCALES: Final = np.array([1e-3, 1e-3, 1e-3, 0.5, 0.5, 0.5, 5e-3, 0.5, 0.5, 0.5])
-"""rad, m, s, m: a direction known no better than this is as good as unknown."""
+"""rad, m, s, m: a direction with a larger sigma counts as unknown."""
 
 _MIN_PARTICIPATION: Final = 0.05
 _ITERATIONS: Final = 8
@@ -38,7 +38,7 @@ _MIN_SPEED_SPREAD_MPS: Final = 2.0
 
 @dataclass(frozen=True)
 class ImageOrientations:
-    """Orientations of n exposures from an adjustment that knew nothing of the trajectory.
+    """Orientations of n exposures from an adjustment without the trajectory.
 
     `centre_m` (n, 3) projection centres in object axes (east, north, up); `rotation` (n, 3, 3)
     object from rig, in camera axes; `covariance` (6n, 6n) of centres (m) and of rotation vectors
@@ -52,7 +52,7 @@ class ImageOrientations:
 
 @dataclass(frozen=True)
 class InertialOrientations:
-    """What receiver and inertial unit said at the same n mid-exposures, in the same object axes.
+    """Measurements of receiver and inertial unit at the same n mid-exposures, in the same object axes.
 
     `position_m` (n, 3) of the antenna; `velocity_mps` (n, 3); `rotation` (n, 3, 3) object from
     inertial unit (forward, right, down); `rate_rad_per_s` (n, 3) about the unit's axes; sigmas (3,)
@@ -69,7 +69,7 @@ class InertialOrientations:
 
 @dataclass(frozen=True)
 class ImuMounting:
-    """How the rig sits against the inertial unit and antenna.
+    """Mounting of the rig against the inertial unit and antenna.
 
     `imu_from_body` (3, 3); `antenna_m` (3,) from the rig's origin, forward, right, down;
     `time_offset_s`: a mid-exposure's instant on the trajectory's time scale less its own;
@@ -84,7 +84,7 @@ class ImuMounting:
 
 @dataclass(frozen=True)
 class InseparableParameters:
-    """Parameters this flight does not part: a sentence with the cure, and who takes part."""
+    """Parameters that this flight does not separate: a sentence with the remedy, and their names."""
 
     sentence: str
     parameters: tuple[str, ...]
@@ -92,11 +92,11 @@ class InseparableParameters:
 
 @dataclass(frozen=True)
 class BoresightCalibration:
-    """What a calibration flight says.
+    """Result of a calibration flight.
 
     `covariance` (10, 10) in the order of `PARAMETERS` (rad, m, s), within what is determined: held
-    parameters and unseparated directions have none. `determined` (10,) tells the parameters that
-    are known whole. `basis` (10, r) are the determined directions, scaled by `WORTH`. Residuals are
+    parameters and unseparated directions have none. `determined` (10,) marks the parameters that
+    are completely determined. `basis` (10, r) are the determined directions, scaled by `WORTH`. Residuals are
     (n, 3): positions in m (object axes), attitudes in rad (rig's body axes). `sigma0` has expected
     value one.
     """
@@ -137,7 +137,7 @@ def calibrate_boresight(
 
     Args:
         controlled, inertial: the same exposures in the same order.
-        given: what was thought so far; what is held or cannot be separated stays as it is there.
+        given: the values so far; what is held or cannot be separated stays as it is there.
         held: of "boresight", "lever", "time", "shift".
         lever_sigma_m: the given lever arm was surveyed to this and counts as an observation.
 
@@ -206,7 +206,7 @@ def calibrate_boresight(
 
 
 def roll_pitch_heading(imu_from_body: Array) -> Array:
-    """Angles (3,), rad, of Rz(heading) Ry(pitch) Rx(roll): what `level_from_body` turns back."""
+    """Angles (3,), rad, of Rz(heading) Ry(pitch) Rx(roll): the inverse of `level_from_body`."""
     r = imu_from_body
     return np.array(
         [
@@ -291,7 +291,7 @@ def _with_step(at: ImuMounting, step: Array) -> ImuMounting:
 
 def _back(at: ImuMounting, step: Array, given: ImuMounting, lost: Array, free: Array) -> Array:
     """A way along unseparated directions (scaled) that leaves lever arm and time as given, so that
-    the shift of positions takes what nobody can tell."""
+    the shift of positions absorbs the unseparated part."""
     moved = np.zeros(10)
     moved[3:6] = at.antenna_m - given.antenna_m
     moved[6] = at.time_offset_s - given.time_offset_s
@@ -382,8 +382,10 @@ def _sentence(group: list[int], inertial: InertialOrientations) -> InseparablePa
     if has & {3, 4, 6} and has & {7, 8}:
         hints.append("fly lines in opposite and in crossing directions")
     if {5, 9} <= has:
-        hints.append("level flight never parts them: survey the lever arm and give --lever-sigma")
+        hints.append(
+            "level flight never separates them: survey the lever arm and give --lever-sigma"
+        )
     if not hints:
         hints.append("fly two heights, opposite and crossing lines and two speeds, or hold one")
-    verb = "cannot be told apart" if len(names) > 1 else "cannot be determined"
+    verb = "cannot be separated" if len(names) > 1 else "cannot be determined"
     return InseparableParameters(f"{listed} {verb}: {'; '.join(hints)}", names)

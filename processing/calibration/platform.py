@@ -1,11 +1,11 @@
-"""The platform calibration from many exposures: how every cone is mounted, and how well known.
+"""Platform calibration from many exposures: mounting angles of every cone and their sigmas.
 
-Each exposure's stitching tells turns against the calibration it was made with
-(`processing.mosaic.stitch_record`); here they become one. Turns are rotation vectors (rad) about
-the axes of the virtual image.
+Each exposure's stitching estimates rotations against the calibration in use
+(`processing.mosaic.stitch_record`); this module averages them. Rotations are rotation vectors (rad)
+about the axes of the virtual image.
 
-A cone beside the flight axis sees from another place than the master cone; what that turns its
-image by is taken off with the height above ground.
+A cone off the flight axis has another perspective centre than the master cone. The apparent
+rotation this causes is removed with the height above ground.
 
 Source: docs/mathematics/virtual-camera.md#platform-calibration-from-a-flight; Heier et al. (2002),
 6.1; Ladstädter et al. (2010), "platform calibration".
@@ -31,18 +31,18 @@ Array = NDArray[np.float64]
 
 MIN_EXPOSURES: Final = 3
 MIN_EXPOSURES_SYNTOPIC: Final = 12
-"""Cones that fire one after the other are turned by the aircraft in between: more are needed."""
+"""The aircraft rotates between cones that expose one after the other: more are needed."""
 MIN_SIGMA_URAD: Final = 2.0
-"""A mount is not claimed to keep its angles better than this from flight to flight."""
+"""Smallest sigma stated for the angles of a mount from flight to flight."""
 COLOUR_SHIFT_PX: Final = 0.002
 COLOUR_ROTATION_PX: Final = 0.001
-"""What matching of PAN to the colour master leaves in every exposure alike, colour pixels: of
-shift, and at the corners turned about the middle. Measured on rendered flights
+"""Systematic error of matching PAN to the colour master, colour pixels: of shift, and of rotation
+at the corners. Measured on rendered flights
 (docs/calibration.md)."""
 REGISTERED_PX: Final = 0.02
 """The same of a band registered to the colour master, shift and turn (docs/dmc.md)."""
 HEIGHT_SIGMA: Final = 0.02
-"""How well the mean height above ground is known, of itself: relief, and the plan's own error."""
+"""Sigma of the mean height above ground: relief, and the error of the plan."""
 _OUTLIER_LIMIT: Final = 5.0
 _MAD_TO_SIGMA: Final = 1.4826
 _SCATTER_ALPHA: Final = 0.01
@@ -50,7 +50,7 @@ _SCATTER_ALPHA: Final = 0.01
 
 @dataclass(frozen=True)
 class CalibratedConeMounting:
-    """One cone, turned as the exposures say.
+    """Estimated rotation of one cone.
 
     `correction_rad` against the calibration flown with, `correction_sigma_rad` of the mean, the
     sensor's place in its head taken as calibrated; `scatter_rad` is that of a single exposure.
@@ -70,28 +70,28 @@ class CalibratedConeMounting:
     used: tuple[int, ...]
     left_out: int
     unexplained_rad: Array
-    """Scatter beyond what the exposures state: turning between syntopic instants, a loose mount."""
+    """Scatter beyond the exposures' sigmas: rotation between syntopic instants, a loose mount."""
 
     @property
     def sigma_urad(self) -> float:
-        """What a single exposure may find the mounting off by, for the rig file."""
+        """Sigma of the mounting in a single exposure, for the rig file."""
         own = float(np.sqrt(np.max(self.correction_sigma_rad**2 + self.unexplained_rad**2))) * 1e6
         return max(own, MIN_SIGMA_URAD)
 
 
 @dataclass(frozen=True)
 class PlatformCalibration:
-    """`cones` that could be calibrated; `missing` those that no or too few exposures tell of."""
+    """`cones` that could be calibrated; `missing` those with no or too few exposures."""
 
     cones: tuple[CalibratedConeMounting, ...]
     missing: tuple[str, ...]
 
 
 def calibrate_platform(rig: Rig, records: Sequence[StitchRecord]) -> PlatformCalibration:
-    """Average the turns of every cone but the master over exposures.
+    """Average the rotations of every cone except the master over exposures.
 
-    An exposure in which a cone's turn is far off (a head blurred, a cloud) is left out for it. Of
-    converging heads only exposures that tell of all of them count: their datum is their mean.
+    An exposure in which a cone's rotation is an outlier (a blurred head, a cloud) is left out for it.
+    Of converging heads only exposures with all of them count: their datum is their mean.
 
     Raises:
         ValueError: a record of another rig or calibration.
@@ -125,7 +125,7 @@ def calibrate_platform(rig: Rig, records: Sequence[StitchRecord]) -> PlatformCal
 def calibrated_rig(
     rig: Rig, calibration: PlatformCalibration, *, calibration_id: str, date: str
 ) -> Rig:
-    """The rig with the new angles and how well they are known."""
+    """The rig with the new angles and their sigmas."""
     found = {c.cone: c for c in calibration.cones}
     cones = []
     for cone in rig.cones:
@@ -142,7 +142,7 @@ def calibrated_rig(
 
 @dataclass(frozen=True)
 class ConfoundingEffect:
-    """What passes for a turn of a cone and cannot be told from one, rad (about x, y, z).
+    """Effects that cannot be separated from a rotation of a cone, rad (about x, y, z).
 
     `places` of the sensors, the datum's too (one standard deviation, held in the angles' sigma);
     `speed` a speed or delay off by 1 %, always the same; `crab` of one degree, always the same;
@@ -156,7 +156,7 @@ class ConfoundingEffect:
 
 
 def confounding_effect(rig: Rig, cone: Cone, records: Sequence[StitchRecord]) -> ConfoundingEffect:
-    """How far each of these would turn a cone's image, at the heights that were flown."""
+    """Rotation of a cone's image by each of these, at the heights that were flown."""
     heights = [r.height_m for r in records if r.height_m]
     per_m = 1.0 / float(np.mean(heights)) if heights else 0.0
     base_along_m = 0.0
@@ -172,7 +172,7 @@ def confounding_effect(rig: Rig, cone: Cone, records: Sequence[StitchRecord]) ->
 
 
 def shift_px(rig: Rig, correction_rad: Array) -> float:
-    """How far a turn moves the middle of a cone's field, PAN pixels, about x and y alone."""
+    """Displacement by a rotation of the middle of a cone's field, PAN pixels, about x and y alone."""
     if rig.virtual_image is None:
         return 0.0
     return (
@@ -204,7 +204,7 @@ def _calibrated(
     # Scatter counts where the exposures' own statement does not explain it.
     ratio = np.diag(seen) / np.maximum(np.diag(own), 1e-30)
     beyond = ratio > chi2.ppf(1.0 - _SCATTER_ALPHA / 3.0, n - 1) / (n - 1)
-    # An aircraft turns slowly: neighbouring exposures err alike and count for less.
+    # An aircraft rotates slowly: errors of neighbouring exposures are correlated and count for less.
     variance = np.where(beyond, np.diag(seen) * _autocorrelation_factor(corrections), np.diag(own))
     scale = np.sqrt(variance / np.maximum(np.diag(own), 1e-30))
     of_mean = own * np.outer(scale, scale) / n
@@ -228,7 +228,7 @@ def _calibrated(
 
 
 def min_exposures(rig: Rig) -> int:
-    """Below, a cone's mean is not told."""
+    """Below, a cone's mean is not reported."""
     return MIN_EXPOSURES_SYNTOPIC if rig.timing == "syntopic" else MIN_EXPOSURES
 
 
@@ -252,7 +252,7 @@ def base_mm(rig: Rig, cone: Cone) -> tuple[float, float]:
 
 
 def _common_covariance(rig: Rig, cone: Cone, records: Sequence[StitchRecord]) -> Array:
-    """What all exposures err by alike, (3, 3): places, matching of colour, height."""
+    """Covariance common to all exposures, (3, 3): places, matching of colour, height."""
     share = _position_covariance(rig, cone, records)
     if cone.role == "colour":
         sensor = cone.sensors[0]
@@ -293,7 +293,7 @@ def _mounting_correction(rig: Rig, cone: Cone, record: StitchRecord) -> tuple[Ar
 
 
 def _base_rotation(rig: Rig, cone: Cone, record: StitchRecord) -> Array:
-    """The turn a base passes for over even ground: seen from the right, all lies farther left."""
+    """Apparent rotation by a base over even ground: seen from the right, everything appears farther left."""
     right, forward = base_mm(rig, cone)
     if record.height_m is None:
         return np.zeros(3)

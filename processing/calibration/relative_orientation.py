@@ -1,7 +1,7 @@
 """Relative orientation of the heads of a rig, from a block in which every image was oriented.
 
-Every image's rotation is turned back by that of the reference image of the same exposure; what is
-left is averaged over the block with the whole covariance of the adjustment.
+Every image's rotation is taken relative to the reference image of the same exposure, and averaged
+over the block with the full covariance of the adjustment.
 
 Source: docs/mathematics/boresight.md#relative-orientation-of-heads; Jacobsen (2008), table 2.
 """

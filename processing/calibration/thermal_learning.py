@@ -1,7 +1,7 @@
 """Learning the temperature-dependent model from flights: recursive least squares with an intercept.
 
-Each exposure's stitching adds to normal equations; what comes out is a proposal for a person to
-accept, and never finds its way into a product by itself.
+Each exposure's stitching adds to normal equations. The result is a proposal that a person accepts;
+it never changes a product automatically.
 
 Source: docs/mathematics/drift.md#learning and #what-is-observable.
 """
@@ -54,7 +54,7 @@ class NormalEquations:
 
 @dataclass(frozen=True)
 class ThermalState:
-    """What was gathered so far, by cone: `places` of its sensors to each other, `scales` of its
+    """Normal equations so far, by cone: `places` of its sensors to each other, `scales` of its
     layer to the master's. It belongs to one calibration of one rig."""
 
     rig: str
@@ -95,7 +95,7 @@ class LearnedScale:
 
 @dataclass(frozen=True)
 class LearnedDrift:
-    """What the flights say. `reasons` tell by cone why nothing was learned there."""
+    """Learned corrections. `reasons` states by cone why nothing was learned there."""
 
     sensors: tuple[LearnedSensor, ...]
     scales: tuple[LearnedScale, ...]
@@ -114,7 +114,7 @@ class Observability:
 
 
 def empty_state(rig: Rig) -> ThermalState:
-    """Nothing gathered yet."""
+    """The empty state."""
     places, scales = {}, {}
     for cone in mosaic_cones(rig):
         if cone.role == "pan" and len(cone.sensors) >= 2:
@@ -127,7 +127,7 @@ def empty_state(rig: Rig) -> ThermalState:
 def add_exposure(rig: Rig, state: ThermalState, record: StitchRecord) -> ThermalState:
     """The state after one more exposure; the order of exposures does not matter.
 
-    A cone is passed over where a sensor of it is missing or its temperature was not measured.
+    A cone is skipped where a sensor of it is missing or its temperature was not measured.
 
     Raises:
         ValueError: the record is of another rig or calibration.
@@ -147,7 +147,7 @@ def add_exposure(rig: Rig, state: ThermalState, record: StitchRecord) -> Thermal
         cone = rig.cone(name)
         names = set(record.names)
         recorded_names = {s.name for s in (*cone.sensors, *master.sensors)} <= set(record.measured)
-        # A lone master sensor is fixed: it is the scale.
+        # A single master sensor is fixed: it is the scale.
         fixed = len(master.sensors) == 1 or _is_recorded(master, names)
         if f"{name}.{LAYER_SCALE}" in names and recorded_names and fixed:
             scales[name] = _add_scale(normal, master, cone, record)
@@ -155,10 +155,10 @@ def add_exposure(rig: Rig, state: ThermalState, record: StitchRecord) -> Thermal
 
 
 def solve_drift(rig: Rig, state: ThermalState) -> LearnedDrift:
-    """Solve what was gathered; cones with less than `MIN_DC_SPREAD_K` of spread in dC say nothing.
+    """Solve the normal equations; cones with less than `MIN_DC_SPREAD_K` of spread in dC are skipped.
 
     Standard deviations hold the scatter about the straight line where it exceeds what the
-    covariances of the stitching promise.
+    covariances of the stitching predict.
     """
     sensors: list[LearnedSensor] = []
     scales: list[LearnedScale] = []
@@ -194,7 +194,7 @@ def solve_drift(rig: Rig, state: ThermalState) -> LearnedDrift:
 
 
 def observability(rig: Rig) -> tuple[Observability, ...]:
-    """What stitching can and cannot tell about the drift of this rig."""
+    """What stitching can and cannot determine of the drift of this rig."""
     result = []
     for cone in rig.pan_cones:
         m = len(cone.sensors)

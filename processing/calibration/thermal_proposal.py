@@ -1,7 +1,7 @@
-"""A calibration that takes in what flights taught: the rig as it would be, old beside new.
+"""A proposed calibration from learned drift: the changed rig, with old and new values.
 
-What was learned is in `processing.calibration.thermal_learning`; whether it is accepted is a
-person's to say.
+What was learned is in `processing.calibration.thermal_learning`; a person decides whether it
+is accepted.
 """
 
 from __future__ import annotations

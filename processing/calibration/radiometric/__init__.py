@@ -1,7 +1,7 @@
 """How a sensor's radiometric calibration is found from dark and flat series.
 
-`dark_signal` fits bias and dark signal, `photon_transfer` and `spatial_noise` say what EMVA 1288
-asks, `defects` finds pixels, columns and clusters, `vignetting` what the diaphragm changes. What a
-calibration is and how it is applied is in `processing.radiometry.calibration` and
+`dark_signal` fits bias and dark signal, `photon_transfer` and `spatial_noise` compute the figures
+of EMVA 1288, `defects` finds pixels, columns and clusters, `vignetting` models the effect of the
+aperture. The calibration and its application are in `processing.radiometry.calibration` and
 `processing.radiometry.level1`.
 """

@@ -56,16 +56,16 @@ def fit_dark_signal(
         temperature_sigma_c: standard deviation of a probe reading, carried into the doubling.
 
     Raises:
-        ValueError: the sets cannot tell the parameters apart; the sentence says what is missing.
+        ValueError: the sets cannot separate the parameters; the message names what is missing.
     """
     times = {round(s.condition.exposure_time_s, 9) for s in sets}
     temperatures = np.array([s.condition.temperature_c for s in sets])
     if len(times) < 2:
-        raise ValueError("dark sets have one exposure time; two or more tell dark signal from bias")
+        raise ValueError("dark sets have one exposure time; two separate dark signal from bias")
     if np.ptp(temperatures) < 5.0:
         raise ValueError(
-            f"dark sets lie within {np.ptp(temperatures):.1f} K; 5 K or more tell how the dark "
-            "signal grows"
+            f"dark sets lie within {np.ptp(temperatures):.1f} K; 5 K or more are needed for "
+            "the growth of the dark signal"
         )
     weight = np.array([s.count / max(s.noise_dn2, 1e-3) for s in sets])
     clipped = np.logical_or.reduce([s.clipped for s in sets])

@@ -1,4 +1,4 @@
-"""Pixels, columns and clusters whose words mean nothing, found from what the series measured.
+"""Pixels, columns and clusters without usable values, found from dark and flat series.
 
 Three maps are looked at: response against its surroundings, dark signal, and temporal noise. A
 column too faint to stand out pixel by pixel is found by the mean along it.
@@ -44,8 +44,8 @@ class DefectColumn:
 
 @dataclass(frozen=True)
 class DefectMap:
-    """What was found. `mask` (height, width) uint8; `single` pixels, `clusters` of two or more
-    that are no column, and `columns`. `by_cause` counts pixels by the map that gave them away."""
+    """What was found. `mask` (height, width) uint8; `single_pixels`, `clusters` of two or more
+    that are no column, and `columns`. `by_cause` counts pixels by the map that revealed them."""
 
     mask: NDArray[np.uint8]
     single_pixels: int
@@ -195,7 +195,7 @@ def _merged(columns: list[DefectColumn]) -> list[DefectColumn]:
 
 
 def _grouped(found: Flags, in_column: Flags) -> tuple[int, tuple[int, ...], Flags]:
-    """Count single pixels and clusters beside the columns; holes within clusters are filled."""
+    """Count single pixels and clusters in addition to the columns; holes within clusters are filled."""
     eight = np.ones((3, 3), bool)
     labels, count = ndimage.label(found & ~in_column, structure=eight)
     sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:]

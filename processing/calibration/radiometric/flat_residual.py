@@ -1,4 +1,4 @@
-"""What a corrected frame of even light still holds, against what photons and converter must leave.
+"""Residual noise of a corrected flat frame, compared with photon and quantisation noise.
 
 The frame goes through the same pass as in flight; the ratio is one when the calibration adds
 nothing to the noise.

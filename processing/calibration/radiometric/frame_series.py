@@ -1,6 +1,6 @@
-"""Sets of frames taken in one condition, boiled down to maps while they are read.
+"""Sets of frames taken in one condition, reduced to maps while they are read.
 
-Nothing is opened here: frames come one after another, and only sums are kept.
+No file is opened here. Frames come one after another, and only sums are stored.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Map = NDArray[np.float32]
 class SeriesCondition:
     """How the frames of a set were taken.
 
-    `monitor` is the mean of the light's own meter (any unit, one for a whole series; 0: dark),
+    `monitor` is the mean of the light's monitor (any unit, one for a whole series; 0: dark),
     `temperature_c` the mean of the sensor's probe.
     """
 
@@ -36,8 +36,8 @@ class SeriesCondition:
 class FrameSet:
     """A set of `count` frames: mean and temporal variance of every pixel, DN and DN squared.
 
-    Frames are brought to their common mean level before, so that a lamp that drifts does not pass
-    for noise. `temperatures_c` (count,) are those of the single frames; `clipped`
+    Frames are brought to their common mean level before, so that a lamp that drifts does not count
+    as noise. `temperatures_c` (count,) are those of the single frames; `clipped`
     (height, width) marks pixels that reached full scale in any frame.
     """
 
@@ -63,7 +63,7 @@ def _trimmed_mean(values: NDArray[Any]) -> float:
 
 @dataclass
 class FrameAccumulator:
-    """Adds frames of a set up; `finished` gives the set."""
+    """Sums the frames of a set; `finished` returns the set."""
 
     condition: SeriesCondition
     black_dn: float

@@ -42,7 +42,7 @@ class ExposureSeries:
 
 @dataclass(frozen=True)
 class PhotonTransfer:
-    """What EMVA 1288 asks of temporal noise and linearity.
+    """Figures of EMVA 1288 for temporal noise and linearity.
 
     Attributes:
         gain_dn_per_e: overall system gain K, with its sigma.

@@ -1,4 +1,4 @@
-"""What the diaphragm changes: the fall of light to the corners, as a function of the aperture.
+"""Vignetting as a function of the aperture.
 
 The part of vignetting that comes from mounts at a distance falls with the area of the diaphragm.
 So the field of light at f-number N over that at N0 is 1 + (1/N^2 - 1/N0^2) * polynomial in r^2, and

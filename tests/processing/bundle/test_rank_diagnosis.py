@@ -63,7 +63,7 @@ def test_one_height_control_point_too_few_leaves_one_tilt() -> None:
     shares = dict(caught.value.rank_defects[0].shares)
     # A turn about the line through both points: no axis of its own, told by what takes part.
     assert any("station" in phrase for phrase in shares)
-    assert "cannot be told apart" in caught.value.rank_defects[0].sentence
+    assert "cannot be separated" in caught.value.rank_defects[0].sentence
 
 
 def test_principal_distance_and_height_over_flat_ground_are_named_together() -> None:
