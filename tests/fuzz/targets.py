@@ -134,7 +134,7 @@ def configuration() -> Target:
         b'elevation_crs = "EPSG:25833+7837"\n[trigger]\ndriver = "pulse-bus"\nport = "a"\n'
         b'[[head]]\nsensor = "SU00"\ndriver = "aravis"\naddress = "10.0.0.5"\n'
         b'[[navigator]]\nname = "gnss"\ndriver = "ublox"\nport = "udpin://0.0.0.0:1"\n'
-        b"[watch]\nport = 8080\nopen = true\n[limits]\nexposures_in_memory = 3\n"
+        b"[watch]\nport = 8080\nanonymous_read = true\n[limits]\nexposures_in_memory = 3\n"
     )
     return Target(
         lambda data: from_mapping(parse_toml(data), _folder() / "service.toml"),
