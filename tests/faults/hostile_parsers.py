@@ -405,6 +405,7 @@ def gvcp_answers() -> Parser:
             mock.patch.object(gvcp.secrets, "randbelow", return_value=0),
         ):
             answered += gvcp.control_privilege("127.0.0.1", timeout_s=0.1) is not None
+        channel.reset_mock()  # it records each call
 
     return Parser(
         "gvcp-answer",
