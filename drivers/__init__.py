@@ -1,4 +1,4 @@
-"""Real devices behind small protocols, one room per device family.
+"""Drivers of real devices behind small protocols, one package per device family.
 
-`drivers.contract` says what a device is and what it yields; nothing here knows the daemon.
+`drivers.contract` defines what a device is and what it yields. No driver imports the daemon.
 """

@@ -1,7 +1,7 @@
-"""What a device is to this program, and what it yields.
+"""The public interface of `drivers`: record types, life cycle and device protocols.
 
-The public contract of `drivers`: record types, life cycle and the protocols head, trigger,
-thermometer and navigator. How a device is reached is in the room of its family.
+The protocols are head, trigger, thermometer, navigator and pulse per second. Access to a device is
+in the package of its family.
 
 Times: `mono_ns` is CLOCK_MONOTONIC of the host at arrival, `gps_ns` counts nanoseconds since the
 GPS epoch (1980-01-06T00:00:00), `device_ns` is the device's own clock. All are `int`.
@@ -16,14 +16,14 @@ from typing import Final, Protocol
 
 
 class DeviceError(Exception):
-    """A device that cannot do what was asked; the message names device, finding and cure."""
+    """A device failed to do what was requested; the message states device, cause and remedy."""
 
 
 class LifeCycle(enum.Enum):
-    """The states of a device, and no others.
+    """The states of a device.
 
-    CREATED: configured, nothing touched yet. BOUND: its address answered and its settings are
-    written. ACTIVE: it delivers. INACTIVE: closed for good, or lost and waiting to be found again.
+    CREATED: configured, not accessed yet. BOUND: the device answered and its settings are written.
+    ACTIVE: it delivers. INACTIVE: closed, or lost and waiting for reconnection.
     """
 
     CREATED = "created"
@@ -33,23 +33,23 @@ class LifeCycle(enum.Enum):
 
 
 class FrameStatus(enum.Enum):
-    """Whether a frame's pixels can be used."""
+    """The usability of the pixels of a frame."""
 
     COMPLETE = "complete"
     INCOMPLETE = "incomplete"
-    """Packets are missing for good: the pixels have holes."""
+    """Packets are missing after all resend requests: the pixels have holes."""
     CORRUPT = "corrupt"
-    """Size or format differ from what was configured."""
+    """Size or format differ from the configured ones."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One sensor's pixels of one exposure, lying in slot `slot` of the head's memory.
+    """The pixels of one sensor and one exposure, in slot `slot` of the head's memory.
 
     `device_ns` is the start of exposure on the head's clock (chunk data); `device_clock_ns` and
     `device_clock_mono_ns` are the last latch of that clock and the host time it belongs to, with
     `latch_sigma_ns` from the round trip. `counter` counts the frames the head exposed since its
-    acquisition started, sent or not. `settings` are the head's own words: exposure time, gain...
+    acquisition started, sent or not. `settings` are the head's own features: exposure time, gain...
     """
 
     head: str
@@ -72,11 +72,11 @@ class Frame:
 
 @dataclass(frozen=True)
 class EventMark:
-    """The receiver's time of one strobe: of its edge at mid-exposure.
+    """The receiver's time of one strobe edge at mid-exposure.
 
-    `count` is the receiver's own count of edges (`count_bits` wide, it wraps); where `count_bits`
-    is 0 the receiver does not count and `count` says nothing. `time_valid` is the receiver's word
-    that `gps_ns` can be trusted.
+    `count` is the receiver's own count of edges; it is `count_bits` wide and wraps. If `count_bits`
+    is 0, the receiver does not count and `count` has no meaning. `time_valid` is the receiver's
+    flag that `gps_ns` is valid.
     """
 
     receiver: str
@@ -90,23 +90,23 @@ class EventMark:
 
 
 Velocity = tuple[float, float, float | None]
-"""North, east, down in m/s; down is None where the receiver does not send it."""
+"""North, east, down in m/s; down is None if the receiver does not send it."""
 
 POSITION_FIXES: Final = ("2d", "3d", "dead-reckoning")
-"""Fixes that come with a position; a "2d" fix has no height."""
+"""Fixes with a position; a "2d" fix has no height."""
 
 
 @dataclass(frozen=True)
 class NavSample:
-    """Position, velocity and, where the receiver knows it, attitude at one GPS instant.
+    """Position, velocity and, if the receiver provides it, attitude at one GPS instant.
 
     Geographic coordinates in WGS 84, height above the ellipsoid; velocity north, east, down.
-    `fix` is the receiver's word: "none", "2d", "3d", "time", "dead-reckoning". What was not
-    received is None, never 0: latitude and longitude without a fix, height in a 2d fix or where
-    only a height above the geoid came, sigmas that nobody stated. `sigma_source` says where
-    `horizontal_sigma_m` comes from: "receiver", "dop" (dilution of precision times a configured
-    range error) or "none". `leap_source` is "receiver", or "table" where GPS time was computed from
-    UTC with our table of leap seconds: if the table is outdated, time is wrong by whole seconds.
+    `fix` is the fix status of the receiver: "none", "2d", "3d", "time", "dead-reckoning". A value
+    that was not received is None, never 0: latitude and longitude without a fix, height in a 2d fix
+    or without an ellipsoidal height, sigmas that are not sent. `sigma_source` is the source of
+    `horizontal_sigma_m`: "receiver", "dop" (dilution of precision times a configured range error)
+    or "none". `leap_source` is "receiver", or "table" if GPS time was computed from UTC with the
+    built-in table of leap seconds. If that table is outdated, time is wrong by integer seconds.
     """
 
     receiver: str
@@ -139,7 +139,7 @@ class NavSample:
 
 @dataclass(frozen=True)
 class TemperatureSample:
-    """One reading of one probe; `value_c` is None where the probe is open."""
+    """One reading of one probe; `value_c` is None if the probe is open."""
 
     probe: str
     value_c: float | None
@@ -148,11 +148,11 @@ class TemperatureSample:
 
 @dataclass(frozen=True)
 class TriggerPulse:
-    """A pulse that was given.
+    """A pulse that was fired.
 
-    `mono_ns` is the host's estimate of the moment the delays count from, `sigma_ns` its half
-    width; `count` is the unit's own count since power-on. `spread_ns` is how well the delays are
-    kept against each other, as a standard deviation.
+    `mono_ns` is the host's estimate of the instant from which the delays count, `sigma_ns` its half
+    width. `count` is the unit's own count since power-on. `spread_ns` is the standard deviation of
+    the delays relative to each other.
     """
 
     sequence: int
@@ -164,10 +164,11 @@ class TriggerPulse:
 
 @dataclass(frozen=True)
 class PpsEdge:
-    """The host's time of one edge of a pulse per second: a whole second of GPS time, which one is
-    not said.
+    """The host's time of one edge of a pulse per second: an integer second of GPS time.
 
-    `mono_ns` has the source's known latency taken off; `sigma_ns` is its standard deviation.
+    The edge does not identify the second.
+
+    `mono_ns` is corrected for the known latency of the source; `sigma_ns` is its standard deviation.
     `sequence` is the source's own count of edges.
     """
 
@@ -179,10 +180,10 @@ class PpsEdge:
 
 @dataclass(frozen=True)
 class ClockReading:
-    """A device's clock, asked for and answered: what it said, and the middle of the round trip.
+    """A reading of a device's clock, and the middle of the round trip on the host's clock.
 
-    `half_width_ns` is half of the round trip: the reading was made within `mono_ns` plus or minus
-    that, and most likely near the middle where the round trip was short.
+    `half_width_ns` is half of the round trip. The clock was read within `mono_ns` plus or minus
+    that; if the round trip was short, most likely near the middle.
     """
 
     device: str
@@ -193,7 +194,7 @@ class ClockReading:
 
 @dataclass(frozen=True)
 class RawBytes:
-    """Bytes as they came from a device, for the flight log."""
+    """Bytes as received from a device, for the flight log."""
 
     device: str
     mono_ns: int
@@ -204,8 +205,8 @@ class RawBytes:
 class DeviceEvent:
     """A change of state or a fault of a device.
 
-    `name` is a stable kebab-case word ("opened", "lost", "timeout", "checksum", "held-by-another");
-    `sentence` is for the operator and ends with what to do.
+    `name` is a stable kebab-case word ("opened", "lost", "timeout", "checksum", "held-by-another").
+    `sentence` is for the operator and ends with the remedy.
     """
 
     device: str
@@ -226,18 +227,17 @@ Record = (
     | DeviceEvent
 )
 Sink = Callable[[Record], None]
-"""Where a device puts what it yields. Called from the device's own thread; returns quickly."""
+"""Receives the records of a device. Called from the device's own thread; returns quickly."""
 
 
 CHUNK_ALLOWANCE_NBYTES = 4096
-"""What a head may write behind the pixels of a frame: time, exposure time, counter."""
+"""Bytes that a head may append to the pixels of a frame: time, exposure time, counter."""
 
 
 class FrameMemory(Protocol):
     """Slots of pixel memory that outlive the driver; one ring per head.
 
-    A slot has room for the pixels and CHUNK_ALLOWANCE_NBYTES behind them; its address is a
-    multiple of 8.
+    A slot holds the pixels and CHUNK_ALLOWANCE_NBYTES after them. Its address is a multiple of 8.
     """
 
     @property
@@ -251,7 +251,7 @@ class FrameMemory(Protocol):
 
 
 class Device(Protocol):
-    """What every device has."""
+    """The interface of every device."""
 
     @property
     def name(self) -> str: ...
@@ -260,21 +260,21 @@ class Device(Protocol):
     def state(self) -> LifeCycle: ...
 
     def bind(self) -> Mapping[str, str]:
-        """Reach the device, write its settings, and say what was found (model, serial, ...).
+        """Open the device, write its settings, and return its identity (model, serial, ...).
 
         Raises:
-            DeviceError: it does not answer or refuses a setting; the sentence names the cure.
+            DeviceError: it does not answer or refuses a setting; the message contains the remedy.
         """
 
     def run(self, sink: Sink) -> None:
-        """Deliver until `close` is called, from a thread of the caller's.
+        """Deliver until `close` is called; called from a thread of the caller.
 
-        Never raises for what a device does: it is found again with back-off, and says so through
-        `DeviceEvent`.
+        A device fault never raises. The driver reports it as a `DeviceEvent` and reconnects with
+        back-off.
         """
 
     def close(self) -> None:
-        """Stop `run` within two seconds and let go of the device. May be called twice."""
+        """Stop `run` within two seconds and release the device. May be called twice."""
 
     def statistics(self) -> Mapping[str, int]:
         """Counters since creation, by stable name."""
@@ -284,20 +284,20 @@ class Head(Device, Protocol):
     """A camera head: frames land in the memory it was created with."""
 
     def bind(self, sink: Sink | None = None) -> Mapping[str, str]:
-        """As for a device; `sink` hears at once that another controller is waited out."""
+        """As for a device. `sink` receives an event while another controller holds the head."""
 
     def recycle(self, slot: int) -> None:
-        """Hand a slot back; from any thread."""
+        """Return a slot; from any thread."""
 
     def trigger(self) -> None:
-        """Software trigger; from any thread. DeviceError where the head waits for a line."""
+        """Software trigger; from any thread. DeviceError if the head waits for a line."""
 
     def adjust(self, exposure_time_us: float, gain_db: float, tdi_shifts: int) -> None:
-        """Expose with this from the next frame on, also after a loss; from any thread.
+        """Use these settings from the next frame on, also after a loss; from any thread.
 
         Raises:
-            DeviceError: the head is not there, refuses it, or cannot be changed while it runs; what
-                was set before holds.
+            DeviceError: the head is lost, refuses them, or cannot be changed while it runs; the
+                previous settings stay in force.
         """
 
 
@@ -314,18 +314,18 @@ class PulsePerSecond(Device, Protocol):
 
 
 class Trigger(Protocol):
-    """Who fires. Not a stream of records: it is asked, and answers."""
+    """A trigger unit: it answers requests and delivers no stream of records."""
 
     @property
     def name(self) -> str: ...
 
     def bind(self) -> Mapping[str, str]:
-        """Reach the unit and say what was found. DeviceError as for a device."""
+        """Open the unit and return its identity. DeviceError as for a device."""
 
     def program(self, delays_ns: Mapping[str, int]) -> None:
-        """Set the delay of every output, by cone, from the moment of firing."""
+        """Set the delay of every output, by cone, from the instant of firing."""
 
     def fire(self, sequence: int) -> TriggerPulse:
-        """Give one pulse. DeviceError where none was given or nobody knows."""
+        """Fire one pulse. DeviceError if none was fired or if that is unknown."""
 
     def close(self) -> None: ...

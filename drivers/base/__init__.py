@@ -1,1 +1,1 @@
-"""What all drivers share: life cycle, settings, registry and throttled messages."""
+"""Parts common to all drivers: life cycle, settings, registry and throttled events."""

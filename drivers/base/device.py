@@ -1,6 +1,6 @@
-"""What every device of ours has: settings, a voice, counters, a life cycle, back-off and an end.
+"""Base of all drivers: settings, events, counters, life cycle, back-off and closing.
 
-How a device is reached, served and let go of is in the room of its family.
+Opening, reading and releasing a device are in the package of its family.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ CLOSE_TIMEOUT_S: Final = 2.0
 
 
 class DeviceDriver(Configured):
-    """A device that one thread of the caller's runs: reached, served, lost and reached again.
+    """A device that is run by one thread of the caller: opened, read, lost and reopened.
 
-    A driver says how: `_reach` opens the device where it is not open, `_serve` delivers until
-    `_closing` is set or the device is lost, `_release_device` drops what belongs to the opening.
-    `close` and `statistics` are for any thread.
+    A driver overrides three methods. `_open_device` opens the device if it is not open. `_serve`
+    delivers until `_closing` is set or the device is lost. `_release_device` releases the resources
+    of this opening. `close` and `statistics` may be called from any thread.
     """
 
     counted: ClassVar[tuple[str, ...]] = ()
-    """Counters that are told even while they are zero."""
+    """Counters that are reported even while they are zero."""
     delivery_counter: ClassVar[str] = ""
-    """The counter that rises with what is delivered; then the next attempt comes soon again."""
+    """The counter of delivered records. If it has risen, the back-off restarts."""
 
     def __init__(
         self, name: str, settings: Mapping[str, object], *, clock: Clock | None = None
@@ -49,7 +49,7 @@ class DeviceDriver(Configured):
         return self._state
 
     def run(self, sink: Sink) -> None:
-        """Deliver until closed. See `drivers.contract.Device`."""
+        """Deliver until `close` is called. See `drivers.contract.Device`."""
         if self._closing.is_set():
             return
         self._ended.clear()
@@ -62,7 +62,7 @@ class DeviceDriver(Configured):
                 except DeviceError as error:
                     self._state = LifeCycle.INACTIVE
                     if not self._closing.is_set():
-                        sentence = f"{error}. It is tried again by itself."
+                        sentence = f"{error}. Retrying automatically."
                         self._emit_lost(sentence, self._event_for(error))
                 else:
                     self._emit_opened()
@@ -81,7 +81,7 @@ class DeviceDriver(Configured):
             self._ended.set()
 
     def close(self) -> None:
-        """End `run` within two seconds and let go of the device; may be called twice."""
+        """End `run` within two seconds and release the device; may be called twice."""
         self._closing.set()
         if self._ended.wait(CLOSE_TIMEOUT_S):
             self._release_device()
@@ -92,28 +92,28 @@ class DeviceDriver(Configured):
         return dict(self.counters)
 
     def _emit_lost(self, sentence: str, event: str = "lost") -> None:
-        """Tell of a loss once, until the device is open again."""
+        """Report a loss once, until the device is open again."""
         if not self._is_lost:
             self._is_lost = True
             self.emitter.emit(event, sentence, fault=True)
 
-    # For a driver to say
+    # Overridden by drivers
 
     def _open_device(self) -> None:
-        """Open the device where it is not open. DeviceError where it cannot be."""
+        """Open the device if it is not open. DeviceError if that fails."""
         raise NotImplementedError
 
     def _serve(self, sink: Sink) -> None:
-        """Deliver until `_closing` is set or the device is lost; tells of a loss itself."""
+        """Deliver until `_closing` is set or the device is lost; reports a loss itself."""
         raise NotImplementedError
 
     def _release_device(self) -> None:
-        """Drop what belongs to this opening; called twice, too."""
+        """Release the resources of this opening; may be called twice."""
 
     def _emit_opened(self) -> None:
-        """Tell that the device is open."""
+        """Report that the device is open."""
         raise NotImplementedError
 
     def _event_for(self, error: DeviceError) -> str:
-        """The event that tells of a device that cannot be opened."""
+        """The name of the event for a device that cannot be opened."""
         return "lost"

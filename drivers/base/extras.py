@@ -1,7 +1,7 @@
-"""Optional libraries: what needs them, whether they are there, and the command that installs them.
+"""Optional libraries: their purpose, their presence, and the command that installs them.
 
-The names are those of `[project.optional-dependencies]`. Asking loads no library, except that the
-GObject introspection itself is loaded to ask for Aravis.
+The names are those of `[project.optional-dependencies]`. The checks import no library,
+except that the check for Aravis imports GObject introspection.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from drivers.contract import DeviceError
 
 @dataclass(frozen=True)
 class OptionalDependency:
-    """An optional dependency: what it is needed for, its modules, and its Debian packages."""
+    """An optional dependency: its purpose, its modules, and its Debian packages."""
 
     purpose: str
     modules: tuple[str, ...]
@@ -41,17 +41,17 @@ EXTRAS: Final[Mapping[str, OptionalDependency]] = {
 
 
 class MissingExtraError(DeviceError):
-    """A library that is not installed; the message has the command that installs it."""
+    """A library is not installed; the message contains the command that installs it."""
 
 
 def require(*names: str) -> None:
     """Make sure that optional libraries can be loaded.
 
     Args:
-        names: of EXTRAS.
+        names: keys of EXTRAS.
 
     Raises:
-        MissingExtraError: one cannot; the message has the command that installs it.
+        MissingExtraError: one cannot; the message contains the command that installs it.
     """
     for name in names:
         for module in EXTRAS[name].modules:
@@ -62,7 +62,7 @@ def require(*names: str) -> None:
 
 
 def missing(name: str, reason: object) -> MissingExtraError:
-    """The error that says how to install an extra, and why it is asked for."""
+    """The error with the purpose of an extra and the command that installs it."""
     extra = EXTRAS[name]
     sentence = f"{extra.purpose}, which cannot be loaded ({reason})"
     if extra.modules[1:]:
@@ -72,7 +72,7 @@ def missing(name: str, reason: object) -> MissingExtraError:
 
 
 def missing_module(error: ImportError) -> MissingExtraError | None:
-    """The same error for an import that failed; None where the module belongs to no extra."""
+    """The same error for a failed import; None if the module belongs to no extra."""
     module = (error.name or "").partition(".")[0]
     for name, extra in EXTRAS.items():
         if module in (*extra.modules, "starlette" if name == "watch" else ""):
@@ -88,7 +88,7 @@ def _is_there(module: str) -> bool:
 
 
 def _require_typelib() -> None:
-    """Aravis itself: a library of the system, described by a file beside it."""
+    """Check for Aravis, a system library that is described by a typelib file."""
     try:
         importlib.import_module("gi").require_version("Aravis", "0.8")
     except (ImportError, ValueError) as error:

@@ -1,7 +1,7 @@
-"""Which drivers there are, by kind and name.
+"""The drivers, by kind and name.
 
-The service validates configuration with this and the capture process creates devices with it;
-importing it, or asking it, loads no hardware library.
+The service validates configurations with this registry, and the capture process creates devices
+with it. Importing or querying it loads no hardware library.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def extras_of(kind: str, driver_name: str) -> tuple[str, ...]:
 
 
 def kinds() -> Mapping[str, tuple[str, ...]]:
-    """The kinds of device, and the names of the drivers of each."""
+    """The kinds of devices, and the names of the drivers of each kind."""
     return {kind: tuple(driver_paths) for kind, driver_paths in _DRIVER_PATHS.items()}
 
 
@@ -67,7 +67,7 @@ def driver_for(kind: str, driver_name: str) -> type[Configured]:
     software trigger with `heads=` (heads by output).
 
     Raises:
-        DeviceError: no such kind or driver; the sentence lists those there are.
+        DeviceError: no such kind or driver; the message lists the known ones.
     """
     if kind not in _DRIVER_PATHS:
         raise DeviceError(f"kind is {kind!r}; one of {', '.join(_DRIVER_PATHS)}")
@@ -80,9 +80,9 @@ def driver_for(kind: str, driver_name: str) -> type[Configured]:
 
 
 def problems(kind: str, driver_name: str, settings: Mapping[str, object]) -> list[str]:
-    """What is wrong with the settings of a device, one sentence a mistake; empty where nothing is.
+    """The errors in the settings of a device, one sentence each; empty if there are none.
 
-    `settings` holds the driver's own keys only, neither the device's name nor the driver's.
+    `settings` holds only the driver's own keys, not the names of the device and the driver.
     """
     try:
         driver = driver_for(kind, driver_name)

@@ -1,7 +1,7 @@
-"""Settings of a driver, declared in its class: what they are, what they may be, and what they mean.
+"""Settings of a driver, declared in its class: type, allowed values and meaning.
 
-A configuration section is a mapping of plain values; here it is checked key by key, all mistakes at
-once. What a driver does with its settings is in the driver.
+A configuration section is a mapping of plain values. It is checked key by key, and all errors are
+reported at once. The use of a setting is in its driver.
 """
 
 from __future__ import annotations
@@ -15,9 +15,16 @@ from drivers.contract import DeviceError
 
 T = TypeVar("T")
 
+FORMER_NAMES: Final[Mapping[str, str]] = {
+    "channel_words": "channel_labels",
+    "held_limit_s": "control_wait_limit_s",
+    "open_words": "open_sensor_labels",
+}
+"""Former name of a setting to its present name; a former name is refused."""
+
 
 class SettingsError(DeviceError):
-    """Settings that cannot be used; `problems` holds one sentence for each mistake."""
+    """Invalid settings; `problems` holds one sentence for each error."""
 
     def __init__(self, name: str, problems: Sequence[str]) -> None:
         self.problems = tuple(problems)
@@ -25,15 +32,15 @@ class SettingsError(DeviceError):
 
 
 class Setting(Generic[T]):
-    """One setting of a driver class; read from an instance it is the configured value.
+    """One setting of a driver class; on an instance, the attribute is the configured value.
 
-    The type follows from the default: bool, int, float (a whole number is accepted), str, or a
-    tuple of str. `required` settings have to be given; their default only tells the type.
-    `minimum` and `maximum` are inclusive and, for a tuple, bound its length.
+    The type follows from the default: bool, int, float (an integer is accepted), str, or a tuple
+    of str. `required` settings must be given; their default only defines the type. `minimum` and
+    `maximum` are inclusive. For a tuple, they limit its length.
 
     Example:
         >>> class Lamp(Configured):
-        ...     brightness = Setting(50, minimum=0, maximum=100, says="brightness in percent")
+        ...     brightness = Setting(50, minimum=0, maximum=100, help="brightness in percent")
         >>> Lamp("nose", {"brightness": 20}).brightness
         20
         >>> Lamp.problems({"brightness": 300})
@@ -75,14 +82,14 @@ class Setting(Generic[T]):
 
     @property
     def type_name(self) -> str:
-        """The type in words, for documentation and error sentences."""
+        """The name of the type in documents and error messages."""
         return _TYPES[type(self.default)][0]
 
     def convert(self, value: object) -> T:
         """The value as this setting's type.
 
         Raises:
-            ValueError: with what would be right.
+            ValueError: the value is not allowed; the message states what is.
         """
         type_description, convert = _TYPES[type(self.default)]
         try:
@@ -107,10 +114,10 @@ class Setting(Generic[T]):
 
 
 class Configured:
-    """Base of every driver: a name, and the settings its class declares.
+    """Base of every driver: a name, and the settings that its class declares.
 
     Raises:
-        SettingsError: on creation, with one sentence per mistake.
+        SettingsError: on creation, with one sentence per error.
     """
 
     def __init__(self, name: str, settings: Mapping[str, object]) -> None:
@@ -136,9 +143,9 @@ class Configured:
 
     @classmethod
     def problems(cls, settings: Mapping[str, object]) -> list[str]:
-        """What is wrong with a configuration section; empty where nothing is.
+        """The errors in a configuration section; empty if there are none.
 
-        Each sentence has the key, the value found, and what would be right.
+        Each sentence contains the key, the value found, and the allowed values.
         """
         declared = {setting.name: setting for setting in cls.settings()}
         problems = []
@@ -162,7 +169,7 @@ class Configured:
 
     @classmethod
     def setting_conflicts(cls, values: Mapping[str, Any]) -> list[str]:
-        """Mistakes that lie between settings, each right by itself; for a driver to override."""
+        """Conflicts between settings that are valid one by one; overridden by drivers."""
         return []
 
     @classmethod
@@ -176,6 +183,9 @@ class Configured:
 
 
 def _unknown(key: str, known: Sequence[str]) -> str:
+    renamed = FORMER_NAMES.get(key)
+    if renamed in known:
+        return f"this setting is now named {renamed}"
     close = difflib.get_close_matches(key, known, n=1)
     if close:
         return f"there is no such setting, {close[0]} is meant?"

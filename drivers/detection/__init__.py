@@ -1,1 +1,1 @@
-"""Finding out what speaks at a port: which protocol, at which speed, and the settings it needs."""
+"""Detection of the device at a port: its protocol, its baud rate, and the settings it needs."""

@@ -1,6 +1,6 @@
-"""Lines of text of an instrument nobody knows: what they have in common, as a pattern.
+"""Format of the text lines of an unknown instrument, as a pattern.
 
-What a pattern is, is in `drivers.thermometers.ascii_line.pattern`.
+Patterns are defined in `drivers.thermometers.ascii_line.pattern`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _SPECIAL: Final = re.compile(r"([.^$*+?{}\[\]\\|()])")
 
 @dataclass(frozen=True)
 class LineFormat:
-    """What was read: an example, and the pattern and count of its readings where lines agree."""
+    """An example line, and the pattern and number of readings if the lines agree."""
 
     example: str
     pattern: str | None
@@ -30,16 +30,16 @@ class LineFormat:
 
 
 def line_format_of(data: bytes) -> LineFormat | None:
-    """What the lines of a stream have in common; None where it is no text, or has no readings.
+    """The common format of the lines of a stream; None if it is no text or has no readings.
 
-    A reading is what stands behind `=` or `:`, or else a number.
+    A reading is the text after `=` or `:`, or else a number.
 
     Example:
         >>> found = line_format_of(b"T1=21.5 T2=OPEN\\r\\nT1=21.6 T2=-3.0\\r\\n")
         >>> found.pattern, found.readings
         ('^T1=(?P<t0>\\\\S+) T2=(?P<t1>\\\\S+)$', 2)
     """
-    # What came first may have begun in the middle of a line.
+    # The first bytes may begin in the middle of a line.
     lines_found = [match.decode("latin-1") for match in _LINE.findall(data)]
     text = sum(len(line) for line in lines_found)
     if (
@@ -57,8 +57,10 @@ def line_format_of(data: bytes) -> LineFormat | None:
 
 
 def _shape(line: str) -> tuple[str, int] | None:
-    """The line with its readings replaced by groups; None where it has none, or is a sentence of
-    another protocol."""
+    """The line with its readings replaced by groups, and their number.
+
+    None if it has no reading or is a sentence of another protocol.
+    """
     if line[0] in "$!#%{":
         return None
     places = list(_NAMED.finditer(line)) or list(_NUMBER.finditer(line))

@@ -1,6 +1,6 @@
-"""Which port and which speed: opening ports one way after another until something makes sense.
+"""Search for the port and baud rate of a device: ports are opened with one setting after another.
 
-What makes sense is decided in `drivers.detection.protocol_detection`.
+Messages are recognized in `drivers.detection.protocol_detection`.
 """
 
 from __future__ import annotations
@@ -23,28 +23,28 @@ from drivers.transport.serial_device import LineLostError, PortOpener, SerialLin
 BAUDRATES: Final = (
     115_200, 9_600, 38_400, 57_600, 230_400, 460_800, 921_600, 19_200, 4_800,
 )  # fmt: skip
-"""From the likeliest: factory settings of receivers, then what crews raise them to."""
+"""In order of probability: factory settings of receivers, then usual higher rates."""
 MODBUS_LINES: Final = tuple(
     (baudrate, parity) for baudrate in (19_200, 9_600, 38_400, 115_200, 57_600) for parity in "EN"
 )
 MODBUS_UNITS: Final = (1, 2, 3, 4)
 MODBUS_ANSWER_S: Final = 0.15
 SILENCE_S: Final = 2.2
-"""Receivers and instruments that speak by themselves do so once a second; one may be missed."""
+"""Receivers and instruments that send unrequested do so once a second; one message may be lost."""
 UNDECODED_TIMEOUT_S: Final = 0.4
 UNDECODED_NBYTES: Final = 300
-"""So much that makes no sense is the wrong speed."""
+"""That many bytes without a message mean a wrong baud rate."""
 LISTEN_S: Final = 3.2
-"""For whom something made sense: the message that tells who it is comes once a second."""
+"""Listening time after a first message; the identifying message is sent once a second."""
 UNDECODED_LIMIT_S: Final = 1.4
-"""Likewise whatever has come by then."""
+"""After that time without a message, the baud rate is wrong for any number of bytes."""
 CYCLE_COMPLETE_S: Final = 1.5
-"""By then a receiver has said everything it says once a second."""
+"""By then, every message that is sent once a second has been received."""
 STEP_S: Final = 0.1
 SEARCH_TIMEOUT_S: Final = 120.0
-"""Twice through all speeds takes 80 s; a driver of the kernel that hangs is not waited for."""
+"""Two passes over all baud rates take 80 s. The limit ends the wait for a hung kernel driver."""
 DEFAULT_ADDRESSES: Final = ("udpin://0.0.0.0:14550", "tcp://127.0.0.1:2947")
-"""Where autopilots send to, and where gpsd serves."""
+"""Usual addresses of autopilots and of gpsd."""
 BY_ID: Final = Path("/dev/serial/by-id")
 
 ProgressCallback = Callable[[str, str], None]
@@ -52,7 +52,7 @@ ProgressCallback = Callable[[str, str], None]
 
 @dataclass(frozen=True)
 class DetectionResult:
-    """What is at a port: a speaker and how it is reached, or None and a sentence about it."""
+    """The device at a port and its line settings, or None and a sentence with the reason."""
 
     port: str
     detected: DetectedDevice | None
@@ -62,7 +62,7 @@ class DetectionResult:
 
 
 def default_ports() -> list[str]:
-    """Every serial port of the host by its lasting name where it has one, and usual addresses."""
+    """Every serial port of the host, by its persistent name if it has one, and usual addresses."""
     by_id = {}
     if BY_ID.is_dir():
         by_id = {str(link.resolve()): str(link) for link in sorted(BY_ID.iterdir())}
@@ -79,18 +79,24 @@ def search(
     clock: Clock | None = None,
     open_port: PortOpener = open_serial_port,
 ) -> list[DetectionResult]:
-    """What speaks at every port, all of them at once; `tell` hears what is being tried.
+    """The device at every port; all ports are searched in parallel.
 
-    With `ask`, a serial port where nothing speaks by itself is asked for Modbus registers.
+    Args:
+        ports: serial ports and network addresses.
+        ask: whether Modbus registers are requested at a serial port that receives nothing.
+        on_progress: receives the port and the present step.
+        baudrates: in the order of the search.
+        clock: of the listening times.
+        open_port: opens a port with a baud rate and a parity.
     """
     names = list(dict.fromkeys(ports))
     found: dict[str, DetectionResult] = {}
 
-    def look(port: str) -> None:
+    def search_port(port: str) -> None:
         searcher = _Search(port, on_progress, clock or MonotonicClock(), open_port)
         found[port] = searcher.run(baudrates, ask=ask)
 
-    threads = [threading.Thread(target=look, args=(port,), daemon=True) for port in names]
+    threads = [threading.Thread(target=search_port, args=(port,), daemon=True) for port in names]
     for thread in threads:
         thread.start()
     deadline = time.monotonic() + SEARCH_TIMEOUT_S
@@ -114,12 +120,12 @@ class _Search:
         is_network = "://" in self._port
         received_data = False
         try:
-            # A second time for those of whom too little came the first time.
+            # A second pass for devices that sent too little in the first one.
             for number, baudrate in enumerate(baudrates[:1] if is_network else (*baudrates,) * 2):
                 self._on_progress(
                     self._port, "listening" + ("" if is_network else f" at {baudrate}")
                 )
-                # Who has been heard at another speed will be heard at this one.
+                # A device that was received at another baud rate is received at this one, too.
                 silence_s = 2 * SILENCE_S if received_data else SILENCE_S
                 detector = self._listen(baudrate, silence_s)
                 detected = detector.detected()
@@ -127,7 +133,7 @@ class _Search:
                     return DetectionResult(self._port, detected, None if is_network else baudrate)
                 received_data = received_data or detector.nbytes > 0
                 if number >= 1 and not received_data:
-                    # Also at a wrong speed a speaker is heard, only not understood.
+                    # A wrong baud rate also receives bytes, but no messages.
                     break
             if ask and not is_network and not received_data:
                 modbus_result = self._ask()
@@ -145,14 +151,14 @@ class _Search:
             return DetectionResult(
                 self._port,
                 None,
-                sentence="speaks, but nothing known at any usual speed; check the wiring and what "
-                "the device is set to send",
+                sentence="data received, but no known message at any usual baud rate; check the "
+                "wiring and the output settings of the device",
             )
         where = "address" if is_network else "port"
         return DetectionResult(
             self._port,
             None,
-            sentence=f"nothing speaks there; check power, cable and the {where}'s name",
+            sentence=f"no data received; check power, cable and the {where}'s name",
         )
 
     def _listen(self, baudrate: int, silence_s: float) -> ProtocolDetector:
@@ -161,7 +167,7 @@ class _Search:
         begun_ns = self._clock.mono_ns()
         try:
             if "://" not in self._port:
-                # What still lies there was heard at the speed before.
+                # Bytes in the buffer were received at the previous baud rate.
                 line.read(0.0)
             while True:
                 elapsed_s = (self._clock.mono_ns() - begun_ns) * 1e-9
@@ -182,14 +188,14 @@ class _Search:
             line.close()
 
     def _ask(self) -> DetectionResult | None:
-        """Modbus slaves say nothing by themselves: read one register of the usual ones."""
+        """Request one register of the usual Modbus units; they send nothing unrequested."""
         for baudrate, parity in MODBUS_LINES:
             try:
                 port = self._open_port(self._port, baudrate, parity)
             except DeviceError:
-                # A port that cannot do parity, such as a pseudo-terminal.
+                # A port without parity, such as a pseudo-terminal.
                 continue
-            self._on_progress(self._port, f"asking for Modbus at {baudrate} {parity}")
+            self._on_progress(self._port, f"requesting Modbus registers at {baudrate} {parity}")
             line = SerialLine(port, lambda _: None)
             try:
                 for unit in MODBUS_UNITS:

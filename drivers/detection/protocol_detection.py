@@ -1,6 +1,6 @@
-"""What speaks, by what was heard: every decoder listens at once, and the messages decide.
+"""Detection of a protocol: all decoders receive the bytes, and their messages identify the device.
 
-Which ports are listened to, and how fast, is in `drivers.detection.port_search`.
+Ports and baud rates are chosen in `drivers.detection.port_search`.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from drivers.receivers.ublox.navigator import UbloxNavigator
 TEXT_BUFFER_NBYTES: Final = 20_000
 _GPSD: Final = re.compile(rb'(^|\n)\{"class": ?"VERSION", ?"release":')
 MIN_MESSAGES: Final = 2
-"""So many undamaged messages are no accident; one is, in enough noise."""
+"""Minimum number of undamaged messages; a single one may occur in noise by chance."""
 
 
 @dataclass(frozen=True)
 class DetectedDevice:
-    """Who speaks: `driver` for it, what was `heard`, and what is `missing` for a flight."""
+    """A detected device: its `driver`, what was `received`, and what a flight still requires."""
 
     kind: str
     driver: str
@@ -51,7 +51,7 @@ class _ProtocolCandidate:
     new: Callable[[str], MessageDecoder]
 
 
-# Binary protocols first: their receivers often send NMEA beside them, and mean it less.
+# Binary protocols first: their receivers often send NMEA in addition.
 _PROTOCOL_CANDIDATES: Final = (
     _ProtocolCandidate("ublox", UbloxNavigator, UbxDecoder),
     _ProtocolCandidate("septentrio", SeptentrioNavigator, SbfDecoder),
@@ -62,7 +62,7 @@ _PROTOCOL_CANDIDATES: Final = (
 
 
 class ProtocolDetector:
-    """What has been heard on one port at one speed."""
+    """The bytes and messages received on one port at one baud rate."""
 
     def __init__(self) -> None:
         self.nbytes = 0
@@ -72,12 +72,12 @@ class ProtocolDetector:
             try:
                 self._decoders.append((candidate, candidate.new("found")))
             except DeviceError:
-                # A library that is not installed: that protocol cannot be recognised.
+                # A library is not installed: that protocol cannot be recognized.
                 continue
 
     @property
     def has_messages(self) -> bool:
-        """Whether anything made sense so far: it is worth listening on."""
+        """Whether a message or text was received so far."""
         return any(decoder.frames for _, decoder in self._decoders) or self.looks_like_text
 
     @property
@@ -93,10 +93,10 @@ class ProtocolDetector:
             decoder.feed(data, mono_ns)
 
     def is_certain(self, *, has_listened_long_enough: bool) -> bool:
-        """Whether more listening would change nothing.
+        """Whether further listening cannot change the result.
 
-        Text may be what a receiver says beside its binary messages: until it has settled, only
-        these decide.
+        A receiver may send text in addition to binary messages. Until the device has been listened
+        to long enough, only binary messages are decisive.
         """
         detected = self.detected()
         if detected is None or detected.missing:
@@ -104,7 +104,7 @@ class ProtocolDetector:
         return has_listened_long_enough or detected.driver not in ("nmea", "ascii-line", "gpsd")
 
     def detected(self) -> DetectedDevice | None:
-        """Who it is, by what was heard so far."""
+        """The device, by the messages received so far; None if there are none."""
         for candidate, decoder in self._decoders:
             if any(decoder.seen[name] for name in candidate.navigator.required):
                 return _detected_device(candidate, decoder, missing="")
@@ -136,7 +136,7 @@ class ProtocolDetector:
 def _detected_device(
     candidate: _ProtocolCandidate, decoder: MessageDecoder, *, missing: str
 ) -> DetectedDevice:
-    received = ", ".join(sorted(decoder.seen)) or f"{decoder.frames} messages of no use here"
+    received = ", ".join(sorted(decoder.seen)) or f"{decoder.frames} other messages"
     if decoder.fix is not None:
         received += f"; {fix_description(decoder.fix, decoder.satellites)}"
     return DetectedDevice(

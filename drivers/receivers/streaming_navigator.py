@@ -51,7 +51,10 @@ class StreamingNavigator(SerialDevice):
     baudrate = Setting(115200, minimum=4800, maximum=4_000_000, help="speed of the line, bit/s")
     parity = Setting("N", choices=("N", "E", "O"), help="parity on the wire")
     silence_s = Setting(
-        3.0, minimum=0.5, maximum=3600, help="without a message for so long the device is silent"
+        3.0,
+        minimum=0.5,
+        maximum=3600,
+        help="time without a message after which the device is reported silent",
     )
 
     def __init__(

@@ -1,6 +1,7 @@
-"""The host's monotonic clock and waiting on it, so that tests can bring their own.
+"""The host's monotonic clock and waits on it, behind a protocol that tests can replace.
 
-Also the back-off between attempts to reach a lost device. GPS time is not known here.
+Also the back-off between attempts to reopen a lost device. GPS time is in
+`drivers.timescales.gps_time`.
 """
 
 from __future__ import annotations
@@ -14,17 +15,17 @@ BACK_OFF_LIMIT_S: Final = 5.0
 
 
 class Clock(Protocol):
-    """What a driver asks of time."""
+    """The clock that a driver uses."""
 
     def mono_ns(self) -> int:
         """CLOCK_MONOTONIC."""
 
     def wait(self, event: threading.Event, timeout_s: float) -> bool:
-        """Wait for the event, at most so long; whether it is set."""
+        """Wait for the event, at most `timeout_s`; returns whether it is set."""
 
 
 class MonotonicClock:
-    """The host's own clock."""
+    """CLOCK_MONOTONIC of the host."""
 
     def mono_ns(self) -> int:
         return time.monotonic_ns()
@@ -34,7 +35,7 @@ class MonotonicClock:
 
 
 class BackOff:
-    """Pauses between attempts: 0.2 s doubling to 5 s, from the start again after a success.
+    """Pauses between attempts: 0.2 s, doubled up to 5 s; `reset` restarts the series.
 
     Example:
         >>> pause = BackOff()

@@ -1,7 +1,7 @@
-"""GPS time out of weeks, times of week, dates and leap seconds, in whole nanoseconds.
+"""GPS time from weeks, times of week, dates and leap seconds, in integer nanoseconds.
 
-What every decoder of a receiver reckons with; messages are taken apart in the decoders. How many
-leap seconds there were at a date is in `drivers.timescales.leap_seconds`.
+All receiver decoders compute time with this module. The table of leap seconds is in
+`drivers.timescales.leap_seconds`.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ WEEK_NS: Final = 7 * DAY_NS
 GPS_EPOCH_DAY: Final = datetime.date(1980, 1, 6).toordinal()
 MAX_LEAP_SECONDS: Final = 99
 FAR_NS: Final = 3600 * SECOND_NS
-"""A mark further from the last navigation epoch has a wrong week or a restarted clock."""
+"""A mark farther from the last navigation epoch has a wrong week or a restarted clock."""
 RECENT_NS: Final = 10 * SECOND_NS
 ITOW_SLACK_NS: Final = 1_000_000
-"""iTOW is rounded to milliseconds; what lies further from it is of another epoch."""
+"""iTOW is rounded to milliseconds; a larger difference belongs to another epoch."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class UtcFields:
 
 
 def utc_ns(fields: UtcFields) -> int | None:
-    """Nanoseconds since the GPS epoch without leap seconds; None where no such date exists."""
+    """Nanoseconds since the GPS epoch without leap seconds; None if no such date exists."""
     in_day = fields.hour < 24 and fields.minute < 60 and fields.second <= 60
     if not in_day or abs(fields.nano) > SECOND_NS:
         return None
@@ -49,11 +49,11 @@ def utc_ns(fields: UtcFields) -> int | None:
 
 
 def gps_from_utc(utc: int, itow_ms: int) -> tuple[int, int] | None:
-    """GPS time of a UTC instant whose GPS time of week is known too, and the leap seconds between.
+    """GPS time and leap seconds of a UTC instant whose GPS time of week is known.
 
-    The difference of both, modulo one week, is the leap seconds the receiver itself counts with:
-    so the result is right also while the receiver still uses its firmware's default, in the leap
-    second itself, and where UTC and GPS lie in different weeks. None where they contradict.
+    The difference of both, modulo one week, is the number of leap seconds that the receiver uses.
+    So the result is also correct while the receiver uses its firmware's default, in a leap second,
+    and if UTC and GPS are in different weeks. None if they contradict each other.
 
     Example:
         >>> gps_from_utc(utc_ns(UtcFields(2024, 1, 30, 15, 31, 52, -422154)), 228730000)
@@ -67,7 +67,7 @@ def gps_from_utc(utc: int, itow_ms: int) -> tuple[int, int] | None:
 
 
 def gps_near(itow_ms: int, near_gps_ns: int) -> int:
-    """The instant of that time of week which lies nearest to another; across the week's end too.
+    """The instant of a time of week that is nearest to another instant, also across a week's end.
 
     Example:
         >>> gps_near(604_799_900, 2400 * WEEK_NS + 50_000_000) - 2400 * WEEK_NS

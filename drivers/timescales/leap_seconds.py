@@ -1,6 +1,6 @@
-"""Leap seconds between GPS and UTC as data, for receivers that speak UTC only.
+"""Leap seconds between GPS and UTC as data, for receivers that send only UTC.
 
-A receiver that says its own count is believed before this table. Source: IERS Bulletin C.
+The count of a receiver takes precedence over this table. Source: IERS Bulletin C.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ SINCE: Final = (
     (1993, 7), (1994, 7), (1996, 1), (1997, 7), (1999, 1), (2006, 1), (2009, 1), (2012, 7),
     (2015, 7), (2017, 1),
 )  # fmt: skip
-"""Year and month from whose first instant on there is one more."""
+"""Year and month from whose first instant on one more leap second applies."""
 
 _STARTS_NS: Final = tuple(
     (datetime.date(year, month, 1).toordinal() - GPS_EPOCH_DAY) * 86_400 * SECOND_NS
@@ -27,6 +27,6 @@ _STARTS_NS: Final = tuple(
 def leap_seconds_at(utc_ns: int) -> int:
     """GPS - UTC in seconds at a UTC instant counted without leap seconds from the GPS epoch.
 
-    Within a leap second itself, ask for the instant one second before.
+    Within a leap second, pass the instant one second before.
     """
     return bisect.bisect_right(_STARTS_NS, utc_ns)

@@ -1,7 +1,7 @@
-"""Which program has a serial port open, as far as this user may know.
+"""Programs that have a serial port open, as far as this user may see them.
 
-A port that two programs read gives each of them a part of the bytes. The kernel shows who has it
-open only to the owner of that process and to root; who has locked it is shown to everybody.
+If two programs read a port, each receives a part of the bytes. The kernel shows open files only to
+the owner of the process and to root. It shows locks to every user.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Final
 
 PROC: Final = Path("/proc")
 LOCK_FOLDERS: Final = (Path("/run/lock"), Path("/var/lock"))
-"""Where programs note in `LCK..ttyUSB0` that they use a port (Filesystem Hierarchy 3.0, 5.9)."""
+"""Folder of lock files such as `LCK..ttyUSB0` (Filesystem Hierarchy 3.0, 5.9)."""
 
 PTS_MAJORS: Final = range(136, 144)
 """Device numbers of pseudo-terminals (Linux: Documentation/admin-guide/devices.txt)."""
@@ -25,7 +25,7 @@ _HINTS: Final = {
     "ModemManager": "run: systemctl stop ModemManager",
     "gpsd": "run: systemctl stop gpsd.socket gpsd, or use driver gpsd",
     "agetty": "disable the login on this port: systemctl disable --now serial-getty@NAME",
-    "syntopic": "end that service, or ask it: syntopic check CONFIG",
+    "syntopic": "end that service, or query it: syntopic check CONFIG",
 }
 
 
@@ -41,10 +41,10 @@ class PortHolder:
 
 
 def holders(path: str) -> list[PortHolder]:
-    """Processes that hold a port, this one too, as far as this user may see them.
+    """Processes that use a port, including this one, as far as this user may see them.
 
-    Those that locked it; where it is not locked, those that have it open; where none is seen, the
-    one that a lock file names.
+    These are the processes that locked it; if it is not locked, those that have it open; if none is
+    visible, the one that a lock file names.
 
     Args:
         path: the port; links such as those in /dev/serial/by-id are followed.
@@ -55,7 +55,7 @@ def holders(path: str) -> list[PortHolder]:
 def other_holders(path: str) -> list[PortHolder]:
     """Other processes that have a port open, locked or not; for a port that this one has locked.
 
-    Nobody is named for a pseudo-terminal: the program that made it may keep both of its ends.
+    Empty for a pseudo-terminal: the program that created it may keep both of its ends open.
 
     Args:
         path: the port, as for `holders`.
@@ -73,21 +73,21 @@ def is_pseudo_terminal(path: str) -> bool:
 
 
 def port_in_use_sentence(path: str, found: list[PortHolder]) -> str:
-    """Who holds a port, and what to do.
+    """The users of a port, and the remedy.
 
     Args:
         path: the port.
-        found: what `holders` or `other_holders` named.
+        found: the result of `holders` or `other_holders`.
     """
     others = [holder for holder in found if holder.pid != os.getpid()]
     if others:
         hints = [_HINTS[holder.name] for holder in others if holder.name in _HINTS]
         name = Path(path).resolve().name
         hint = hints[0].replace("NAME", name) if hints else "end that program"
-        return f"it is held by {' and '.join(str(holder) for holder in others)}; {hint}"
+        return f"it is in use by {' and '.join(str(holder) for holder in others)}; {hint}"
     if found:
-        return "this program has it open already; give each device a port of its own"
-    return f"it is held by another program, which this user cannot see; run: sudo fuser -v {path}"
+        return "this program has it open already; configure a separate port for each device"
+    return f"it is in use by a program that this user cannot see; run: sudo fuser -v {path}"
 
 
 def _seen(path: str, *, lockers_first: bool) -> list[PortHolder]:
@@ -143,7 +143,7 @@ def _lock_file_owners(path: str) -> list[int]:
 
 
 def _name(pid: int) -> str:
-    """The program's name; that of an interpreter's script where it runs one of ours."""
+    """The program's name; for an interpreter that runs this product, the script's name."""
     try:
         arguments = (PROC / str(pid) / "cmdline").read_bytes().split(b"\0")
         name = (PROC / str(pid) / "comm").read_text("utf-8", "replace").strip()

@@ -1,6 +1,6 @@
-"""Base of devices on a serial line: opening, reconnecting, counting, and noticing silence.
+"""Base of devices on a serial line: opening, reconnecting, counting, and receive time-outs.
 
-What the bytes mean is in the driver of each device, which says it in `step` and `identify`.
+The driver of each device decodes the bytes in `step` and `identify`.
 """
 
 from __future__ import annotations
@@ -46,19 +46,19 @@ from drivers.transport.udp_port import (
 )
 
 READ_TIMEOUT_S: Final = 0.2
-"""Longest wait for bytes before the driver looks up again."""
+"""Longest wait for bytes before the driver checks whether it is closed."""
 WRITE_TIMEOUT_S: Final = 1.0
 UNLOGGED_MAX: Final = 4096
-"""Chunks of bytes read before there is a log to put them into."""
+"""Maximum number of chunks that are kept until a log exists."""
 
 STALE_SUFFIX: Final = ".stale"
-"""Ends the name under which bytes are logged that came too late to be read."""
+"""Suffix of the log name of bytes that were drained, not decoded."""
 
 Sample = NavSample | EventMark | TemperatureSample | ClockReading
 
 
 class SerialPort(Protocol):
-    """What is used of `serial.Serial`."""
+    """The used part of `serial.Serial`."""
 
     timeout: Any
 
@@ -73,11 +73,11 @@ class SerialPort(Protocol):
 
 
 class LineLostError(Exception):
-    """The port went away below us; internal to the serial drivers."""
+    """The open port was lost; internal to the serial drivers."""
 
 
 class SerialLine:
-    """One open port. Every byte read is counted and handed to the flight log."""
+    """One open port. Every byte read is counted and passed to the flight log."""
 
     def __init__(
         self,
@@ -90,10 +90,10 @@ class SerialLine:
         self._stale = stale
 
     def read(self, timeout_s: float) -> bytes:
-        """What has come, waiting for the first byte at most so long; may be empty.
+        """The received bytes, after a wait of at most `timeout_s` for the first; may be empty.
 
         Raises:
-            LineLostError: the port is gone.
+            LineLostError: the port is lost.
         """
         data = self._take(timeout_s)
         if data:
@@ -101,9 +101,9 @@ class SerialLine:
         return data
 
     def drain(self, steps: int) -> int:
-        """Take away what came unasked, in so many reads at most; how many bytes that were.
+        """Remove unrequested bytes, in at most `steps` reads; returns their number.
 
-        They are logged apart: a replay that took them for an answer would have one too many.
+        They are logged separately, so that a replay does not take them for an answer.
         """
         count = 0
         for _ in range(steps):
@@ -126,14 +126,14 @@ class SerialLine:
         return data
 
     def write(self, data: bytes) -> None:
-        """Send; LineLostError where the port is gone or takes nothing for a second."""
+        """Send; LineLostError if the port is lost or accepts nothing for a second."""
         try:
             self._port.write(data)
         except (serial.SerialException, OSError, termios.error, TypeError) as error:
             raise LineLostError(_reason(error)) from error
 
     def close(self) -> None:
-        # A port that is already gone may refuse even this; there is nothing left to let go of.
+        # A lost port may refuse to close; there is nothing left to release.
         try:
             self._port.close()
         except (serial.SerialException, OSError, termios.error):
@@ -144,16 +144,16 @@ PortOpener = Callable[[str, int, str], SerialPort]
 
 
 def open_serial_port(path: str, baudrate: int, parity: str) -> SerialPort:
-    """Open a port for ourselves alone, 8 data bits, one stop bit; or a network address.
+    """Open a port exclusively, with 8 data bits and one stop bit; or a network address.
 
     Addresses are tcp://host:port, udpin://host:port (listens; with ?from=ADDRESS to that sender
-    only) and udpout://host:port (speaks).
+    only) and udpout://host:port (sends first).
 
-    A port that another program has open is not used: each would get a part of the bytes.
+    A port that another program has open is refused, since each would receive a part of the bytes.
 
     Raises:
-        DeviceError: it cannot be opened, or another program holds it; the sentence says why, which
-            program as far as it can be known, and what to do.
+        DeviceError: it cannot be opened or another program uses it; the message states the reason,
+            the program if it is visible, and the remedy.
     """
     if path.startswith(SCHEME):
         return open_tcp_port(path)
@@ -190,14 +190,14 @@ def open_serial_port(path: str, baudrate: int, parity: str) -> SerialPort:
 
 
 def _lock_port(port: serial.Serial) -> None:
-    """Have the kernel refuse the port to programs that do not look at locks, such as gpsd."""
-    # A driver without terminal settings refuses; the lock is there all the same.
+    """Make the kernel refuse the port to programs that ignore locks, such as gpsd."""
+    # A driver without terminal settings refuses this; the lock itself is set.
     with suppress(OSError):
         fcntl.ioctl(port.fileno(), termios.TIOCEXCL)
 
 
 def _port_shared_sentence(path: str) -> str:
-    """Who else reads a port by now, as a sentence to be appended; empty where nobody is seen."""
+    """The other present users of a port, as a sentence to append; empty if none is visible."""
     others = [] if "://" in path else other_holders(path)
     return f" The port is shared: {port_in_use_sentence(path, others)}." if others else ""
 
@@ -207,15 +207,18 @@ def _reason(error: BaseException) -> str:
 
 
 class SerialDevice(DeviceDriver):
-    """A device on a serial line, run by one thread of the caller's.
+    """A device on a serial line, run by one thread of the caller.
 
-    A driver declares its settings and says in `step` how it listens or asks; `heard` is to be
-    called for every message that was understood. No byte from the line raises out of `run`.
+    A driver declares its settings, and listens or sends requests in `step`. It calls
+    `count_messages` for every decoded message. No byte from the line raises out of `run`.
     """
 
     port = Setting("", required=True, help="serial port, such as /dev/ttyUSB0")
     silence_s = Setting(
-        5.0, minimum=0.5, maximum=3600, help="without a message for so long the device is silent"
+        5.0,
+        minimum=0.5,
+        maximum=3600,
+        help="time without a message after which the device is reported silent",
     )
 
     counted = (
@@ -229,9 +232,9 @@ class SerialDevice(DeviceDriver):
     )
     delivery_counter = "messages"
     what: str = "device"
-    """What it is, for the operator's sentences."""
+    """The type of device in event sentences."""
     silence_hint: str = "Check its power, wiring and baud rate"
-    """What the operator is to do about its silence."""
+    """The remedy if the device is silent."""
 
     def __init__(
         self,
@@ -250,7 +253,7 @@ class SerialDevice(DeviceDriver):
         self._sender: SenderFilter | None = None
         self._unlogged: deque[RawBytes] = deque(maxlen=UNLOGGED_MAX)
 
-    # What a driver says
+    # Overridden by drivers
 
     @abstractmethod
     def line_settings(self) -> tuple[int, str]:
@@ -258,21 +261,21 @@ class SerialDevice(DeviceDriver):
 
     @abstractmethod
     def identify(self, line: SerialLine) -> Mapping[str, str]:
-        """Ask who is there; DeviceError with the cure where nobody fitting answers."""
+        """Query the identity; DeviceError with the remedy if no suitable device answers."""
 
     @abstractmethod
     def step(self, line: SerialLine) -> Iterable[Sample]:
-        """One turn of listening or asking, a second at most; what was understood."""
+        """Listen or send a request once, for a second at most; returns the decoded samples."""
 
     def connected(self) -> None:
-        """A port was opened: what was half received on the one before is of no use."""
+        """A port was opened: discard messages that are incomplete."""
 
     def is_identified(self) -> bool:
-        """Whether what was understood is of the device itself, not of somebody else on its bus."""
+        """Whether the messages are of the device itself, not of another one on its bus."""
         return True
 
     def count_messages(self, *, messages: int = 1) -> None:
-        """So many messages were understood just now."""
+        """Count messages that were decoded just now."""
         if messages <= 0:
             return
         self.counters["messages"] += messages
@@ -282,13 +285,13 @@ class SerialDevice(DeviceDriver):
         if self._is_silent:
             self._is_silent = False
             self.emitter.emit(
-                "recovered", f"The {self.what} {self.name} speaks again; nothing to do."
+                "recovered", f"The {self.what} {self.name} sends data again; nothing to do."
             )
 
-    # The contract
+    # Interface of Device
 
     def bind(self) -> Mapping[str, str]:
-        """Open the port and ask who is there. See `drivers.contract.Device`."""
+        """Open the port and query the identity. See `drivers.contract.Device`."""
         if self._line is None:
             self._line = self._open()
         try:
@@ -306,16 +309,16 @@ class SerialDevice(DeviceDriver):
         self._state = LifeCycle.BOUND
         return found
 
-    # How it is done
+    # Implementation
 
     def _open_device(self) -> None:
         self._line = self._line or self._open()
 
     def _emit_opened(self) -> None:
-        # What came while binding belongs into the log as well: a replay begins there.
+        # Bytes received by `bind` are logged as well: a replay begins with them.
         while self._unlogged and self.emitter.sink is not None:
             self.emitter.sink(self._unlogged.popleft())
-        # A silent line is opened anew again and again, which is not news.
+        # A silent line is reopened repeatedly; that is not reported.
         if self._is_lost or not self._is_silent:
             self.emitter.emit("opened", f"The {self.what} {self.name} is open at {self.port}.")
 
@@ -327,7 +330,7 @@ class SerialDevice(DeviceDriver):
             raise DeviceError(f"{self.name}: {error}") from error
         self.counters["opened"] += 1
         if isinstance(port, UdpPort) and port.sender is not None:
-            # Who is listened to does not change because the port was opened again.
+            # The accepted sender does not change when the port is reopened.
             self._sender = port.sender = self._sender or port.sender
         self.connected()
         return SerialLine(port, self._received, lambda data: self._received(data, STALE_SUFFIX))
@@ -341,7 +344,7 @@ class SerialDevice(DeviceDriver):
             self._unlogged.append(raw)
 
     def _serve(self, sink: Sink) -> None:
-        """Listen until closing, loss, or a whole silence, after which it is worth opening anew."""
+        """Listen until closing, loss, or a receive time-out, after which the port is reopened."""
         line = self._line
         assert line is not None
         self._state = LifeCycle.ACTIVE
@@ -356,7 +359,7 @@ class SerialDevice(DeviceDriver):
                 self._state = LifeCycle.INACTIVE
                 self._emit_lost(
                     f"The {self.what} {self.name} at {self.port} was lost ({error}). Check cable "
-                    f"and power; it is opened again by itself.{_port_shared_sentence(self.port)}"
+                    f"and power. Reconnecting automatically.{_port_shared_sentence(self.port)}"
                 )
                 return
             if self.clock.mono_ns() - self._last_message_ns >= silence_ns:
@@ -379,8 +382,8 @@ class SerialDevice(DeviceDriver):
         self.counters["silences"] += 1
         self.emitter.emit(
             "silent",
-            f"The {self.what} {self.name} at {self.port} has said nothing understandable for "
-            f"{self.silence_s:g} s. {self.silence_hint}; the port is opened anew by itself."
+            f"The {self.what} {self.name} at {self.port} sent no valid data for "
+            f"{self.silence_s:g} s. {self.silence_hint}. Reconnecting automatically."
             f"{_port_shared_sentence(self.port)}",
             fault=True,
         )

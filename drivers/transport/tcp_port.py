@@ -1,7 +1,7 @@
 """A TCP connection that reads and writes like a serial port.
 
-For receivers on the camera's network and for terminal servers; which devices use it is said by
-their `port`, "tcp://host:port".
+For receivers on the camera's network and for terminal servers. A device uses it if its `port` is
+"tcp://host:port".
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from drivers.contract import DeviceError
 
 SCHEME: Final = "tcp://"
 CONNECT_TIMEOUT_S: Final = 1.5
-"""Less than what closing a device may take."""
+"""Shorter than the limit for closing a device."""
 WRITE_TIMEOUT_S: Final = 1.0
 CHUNK_NBYTES: Final = 65_536
 
 
 class TcpPort:
-    """One connection; the port `drivers.transport.serial_device.SerialLine` reads from."""
+    """One connection; a port of `drivers.transport.serial_device.SerialLine`."""
 
     def __init__(self, connection: socket.socket) -> None:
         self._connection = connection
@@ -30,11 +30,11 @@ class TcpPort:
 
     @property
     def in_waiting(self) -> int:
-        """Bytes that `read` has without waiting."""
+        """Number of bytes that `read` returns without waiting."""
         return len(self._buffer)
 
     def read(self, size: int = 1) -> bytes:
-        """At most `size` bytes, empty where none comes in `timeout` seconds.
+        """At most `size` bytes; empty if none is received within `timeout` seconds.
 
         Raises:
             OSError: the other end closed or the connection broke.
@@ -52,13 +52,13 @@ class TcpPort:
         return data
 
     def write(self, data: bytes, /) -> int:
-        """Send all of it within a second; OSError where that fails."""
+        """Send all bytes within a second; OSError if that fails."""
         self._connection.settimeout(WRITE_TIMEOUT_S)
         self._connection.sendall(data)
         return len(data)
 
     def close(self) -> None:
-        # Already reset by the other end: there is nothing left to shut down.
+        # The other end has reset the connection: there is nothing left to shut down.
         with contextlib.suppress(OSError):
             self._connection.shutdown(socket.SHUT_RDWR)
         self._connection.close()
@@ -68,7 +68,7 @@ def open_tcp_port(address: str) -> TcpPort:
     """Connect to "tcp://host:port".
 
     Raises:
-        DeviceError: the address is wrong or nobody answers there; the sentence names the cure.
+        DeviceError: the address is wrong or does not answer; the message contains the remedy.
     """
     place = host_and_number(address)
     if place is None:
@@ -87,7 +87,7 @@ def open_tcp_port(address: str) -> TcpPort:
 
 
 def host_and_number(address: str) -> tuple[str, int] | None:
-    """Host and port number of "scheme://host:port"; None where it is none.
+    """Host and port number of "scheme://host:port"; None for any other text.
 
     Example:
         >>> host_and_number("tcp://10.0.0.5:3001")

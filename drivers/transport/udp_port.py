@@ -1,8 +1,8 @@
 """Datagrams that read and write like a serial port.
 
-For autopilots and receivers that send over UDP; which devices use it is said by their `port`:
-"udpin://host:port" listens there, "udpin://host:port?from=ADDRESS" to that sender only, and
-"udpout://host:port" speaks to that address.
+For autopilots and receivers that send over UDP, by the form of `port`: "udpin://host:port" listens
+there, "udpin://host:port?from=ADDRESS" accepts only that sender, and "udpout://host:port" sends to
+that address.
 """
 
 from __future__ import annotations
@@ -23,40 +23,40 @@ LISTEN_SCHEME: Final = "udpin://"
 SEND_SCHEME: Final = "udpout://"
 DATAGRAM_NBYTES: Final = 65_536
 PORT_CHANGE_TIMEOUT_S: Final = 2.0
-"""A sender that was silent for so long may come back from another port: it was restarted."""
+"""After that silence, the sender may use another port, since it may have been restarted."""
 
 Address = tuple[str, int]
 
 listening: Final[weakref.WeakSet[socket.socket]] = weakref.WeakSet()
-"""The sockets of this process that listen here; from before they are bound."""
+"""The listening sockets of this process, entered before they are bound."""
 
 
 @dataclass
 class SenderFilter:
-    """Whose datagrams a listening port takes; it outlives the port, which may be opened again.
+    """The sender that a listening port accepts; it outlives the port, which may be reopened.
 
-    `address` is the configured one, or that of the first sender whose message was understood. Until
-    there is one, datagrams of all senders are taken. Afterwards no other address is accepted,
-    however long the sender is silent; only its own port may change, `PORT_CHANGE_TIMEOUT_S` after
-    its last datagram.
+    `address` is the configured one, or that of the first sender of a valid message. Until it is
+    known, datagrams of all senders are accepted. Afterwards no other address is accepted, however
+    long the sender is silent. Only its port may change, `PORT_CHANGE_TIMEOUT_S` after its last
+    datagram.
     """
 
     address: str | None = None
     port: int | None = None
     is_configured: bool = False
     others: int = 0
-    """Datagrams of other senders, which were dropped."""
+    """Number of dropped datagrams of other senders."""
     last_other: str = ""
     _last: Address | None = None
     _last_ns: int = 0
 
     @property
     def last(self) -> Address | None:
-        """Where the newest datagram that was taken came from, and answers go."""
+        """The source of the latest accepted datagram, to which answers are sent."""
         return self._last
 
     def accepts(self, source: Address, mono_ns: int) -> bool:
-        """Whether a datagram from there is taken; one that is not is counted."""
+        """Whether a datagram from `source` is accepted; a rejected one is counted."""
         is_restarted = mono_ns - self._last_ns >= PORT_CHANGE_TIMEOUT_S * 1e9
         is_same_port = self.port in (None, source[1]) or is_restarted
         if self.address not in (None, source[0]) or not is_same_port:
@@ -69,12 +69,12 @@ class SenderFilter:
         return True
 
     def lock(self) -> None:
-        """What was taken last was understood: from now on it is this sender's port alone."""
+        """The latest datagram was valid: from now on, accept only its sender."""
         if self._last is not None and self.port is None:
             self.address, self.port = self._last
 
     def sentence(self) -> str:
-        """How many datagrams of others were dropped, and what to do."""
+        """The number of dropped datagrams of other senders, and the remedy."""
         hint = (
             "correct ?from= in its port" if self.is_configured else "add ?from=ADDRESS to its port"
         )
@@ -87,10 +87,10 @@ class SenderFilter:
 
 
 class UdpPort:
-    """One UDP socket; the port `drivers.transport.serial_device.SerialLine` reads from.
+    """One UDP socket; a port of `drivers.transport.serial_device.SerialLine`.
 
-    `sender` says whose datagrams are taken where it listens, so that two senders cannot tear each
-    other's messages apart; None where it speaks to one address, as the kernel drops others then.
+    `sender` selects the accepted sender of a listening port, so that two senders cannot corrupt
+    each other's messages. It is None for a connected port, where the kernel drops other senders.
     """
 
     def __init__(
@@ -112,14 +112,14 @@ class UdpPort:
         return len(self._buffer)
 
     def read(self, size: int = 1) -> bytes:
-        """At most `size` bytes, empty where none comes in `timeout` seconds; OSError: refused."""
+        """At most `size` bytes; empty if none is received in `timeout` seconds; OSError: refused."""
         if not self._buffer:
             self._buffer = self._datagram()
         data, self._buffer = self._buffer[:size], self._buffer[size:]
         return data
 
     def _datagram(self) -> bytes:
-        """The next datagram that is taken; empty where none comes in time."""
+        """The next accepted datagram; empty if none is received in time."""
         until_s = time.monotonic() + self.timeout
         while True:
             self._socket.settimeout(max(until_s - time.monotonic(), 1e-3))
@@ -133,7 +133,7 @@ class UdpPort:
                 return b""
 
     def write(self, data: bytes, /) -> int:
-        """Send one datagram; nothing is sent while nobody has spoken yet."""
+        """Send one datagram; nothing is sent before a first datagram was received."""
         if self.sender is None:
             return self._socket.send(data)
         return self._socket.sendto(data, self.sender.last) if self.sender.last else 0
@@ -146,7 +146,7 @@ def open_udp_port(address: str) -> UdpPort:
     """Open "udpin://host:port", "udpin://host:port?from=ADDRESS" or "udpout://host:port".
 
     Raises:
-        DeviceError: the address is wrong or taken; the sentence names the cure.
+        DeviceError: the address is wrong or in use; the message contains the remedy.
     """
     place = host_and_number(address)
     if place is None:
@@ -172,7 +172,7 @@ def open_udp_port(address: str) -> UdpPort:
 
 
 def _only_from(address: str) -> str | None:
-    """The sender that "?from=" names.
+    """The sender in "?from=".
 
     Raises:
         DeviceError: it is no IPv4 address, or there is another key.

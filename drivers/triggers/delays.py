@@ -1,4 +1,4 @@
-"""What delays a trigger can be asked for."""
+"""The delays that a trigger accepts."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def check_delays(name: str, delays_ns: Mapping[str, int], outputs: Collection[st
     """Refuse delays by output, in ns from firing, that the trigger `name` cannot give.
 
     Raises:
-        DeviceError: all mistakes at once.
+        DeviceError: with all errors.
     """
     wrong = [
         f"output {output!r} does not exist; the trigger has {', '.join(outputs)}"

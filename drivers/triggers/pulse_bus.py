@@ -20,11 +20,11 @@ from drivers.triggers.delays import check_delays
 PROTOCOL: Final = ("PULSEBUS", "1")
 MAX_LINE: Final = 4096
 MAX_STALE_ANSWERS: Final = 32
-"""Answers that may still come twice, or after their time."""
+"""Number of earlier answers that may still arrive twice or late."""
 
 
 class SocketLike(Protocol):
-    """What is used of a `socket.socket`."""
+    """The used part of a `socket.socket`."""
 
     def settimeout(self, value: float, /) -> None: ...
 
@@ -38,22 +38,21 @@ class SocketLike(Protocol):
 
 
 Connect = Callable[[str, int, float], SocketLike]
-"""Connects to host and port within so many seconds; OSError where that fails."""
+"""Connects to host and port within a time-out in seconds; OSError if that fails."""
 
 
 def connect_tcp(host: str, port: int, timeout_s: float) -> SocketLike:
-    """A TCP connection that sends every line at once."""
+    """A TCP connection that sends every line without delay (TCP_NODELAY)."""
     connection = socket.create_connection((host, port), timeout=timeout_s)
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return connection
 
 
 class PulseBusTrigger(Configured):
-    """A trigger unit that speaks the pulse bus.
+    """A trigger unit with the pulse bus protocol.
 
-    A pulse whose answer does not come is not given again: nobody knows whether the heads have
-    fired. The connection is then dropped and made anew at the next call, with the delays of the
-    last `program`.
+    A pulse without an answer is not fired again, since the heads may have been triggered. The
+    connection is closed. The next call reconnects with the delays of the last `program`.
 
     Source: docs/pulse-bus.md.
     """
@@ -86,7 +85,7 @@ class PulseBusTrigger(Configured):
         self._outputs: tuple[str, ...] = ()
         self._closed = False
         self._count: int | None = None
-        """The unit's, where it is known."""
+        """The unit's count of pulses; None if it is unknown."""
         self._counters: Counter[str] = Counter(
             pulses=0, failures=0, answers_lost=0, opened=0, stale_answers=0
         )
@@ -107,7 +106,7 @@ class PulseBusTrigger(Configured):
         """Set the delay of every output named, in ns from firing.
 
         Raises:
-            DeviceError: an output the unit has not, a delay it cannot give, or no answer.
+            DeviceError: unknown output, delay out of range, or no answer.
         """
         with self._lock:
             self._connect()
@@ -118,19 +117,19 @@ class PulseBusTrigger(Configured):
             except DeviceError:
                 if self._socket is not None:
                     raise
-                # The connection is lost; a new one begins with the delays, and twice does no harm.
+                # The connection is lost; a new one sends the delays again, which is harmless.
                 self._connect()
 
     def fire(self, sequence: int) -> TriggerPulse:
-        """Give one pulse.
+        """Fire one pulse.
 
-        The time is the middle of the round trip, its sigma half of it. Where the answer is lost the
-        unit is connected anew and its count says whether it fired: then at some time between asking
-        and giving up, and sigma says so.
+        The time is the middle of the round trip, its sigma half of it. If the answer is lost, the
+        driver reconnects and compares the unit's count. If the unit has fired, the time is between
+        the request and the time-out, and sigma is half of that interval.
 
         Raises:
-            DeviceError: no unit, refused, or no answer in time and none of its count; then nobody
-                knows.
+            DeviceError: no unit, refused, or no answer in time. If the count cannot be read either,
+                it is unknown whether the unit has fired.
         """
         with self._lock:
             before_ns: int | None = None
@@ -144,7 +143,7 @@ class PulseBusTrigger(Configured):
             except DeviceError:
                 self._counters["failures"] += 1
                 after_ns = self._clock.mono_ns()
-                # A unit that refuses says so and stays connected.
+                # A unit that refuses sends an error and stays connected.
                 if before_ns is None or self._socket is not None or not self._has_fired():
                     raise
                 self._counters["answers_lost"] += 1
@@ -155,7 +154,7 @@ class PulseBusTrigger(Configured):
         return TriggerPulse(sequence, before_ns + sigma_ns, sigma_ns, self._count)
 
     def close(self) -> None:
-        """Disconnect; may be called twice. An answer that is being waited for is given up."""
+        """Disconnect; may be called twice. A pending wait for an answer is ended."""
         self._closed = True
         unit = self._socket
         if unit is not None:
@@ -165,13 +164,13 @@ class PulseBusTrigger(Configured):
             self._disconnect()
 
     def statistics(self) -> Mapping[str, int]:
-        """pulses, failures, answers_lost (of pulses that were given), opened, stale_answers."""
+        """pulses, failures, answers_lost (of pulses that were fired), opened, stale_answers."""
         return dict(self._counters)
 
     # The connection; the lock is held
 
     def _has_fired(self) -> bool:
-        """Whether the unit's count, asked anew, is one more than before."""
+        """Whether the unit's count, read again, has increased by one."""
         known, self._count = self._count, None
         try:
             self._connect()
@@ -183,7 +182,7 @@ class PulseBusTrigger(Configured):
     def _query_count(self) -> int:
         count = self._command("STATUS", "STATUS")[0]
         if not count.isdecimal():
-            raise self._lost("STATUS", f"the count {count!r} makes no sense")
+            raise self._lost("STATUS", f"the count {count!r} is invalid")
         return int(count)
 
     def _connect(self) -> None:
@@ -203,8 +202,8 @@ class PulseBusTrigger(Configured):
         if greeting[:1] == ["ERR"]:
             self._disconnect()
             raise DeviceError(
-                f"{self.name}: the trigger unit says {' '.join(greeting[1:])!r}; end the program "
-                "that owns it"
+                f"{self.name}: the trigger unit reports {' '.join(greeting[1:])!r}; end the "
+                "program that uses it"
             )
         if tuple(greeting[:2]) != PROTOCOL or len(greeting) < 3:
             self._disconnect()
@@ -227,7 +226,7 @@ class PulseBusTrigger(Configured):
                 )
 
     def _command(self, command: str, expected: str, *, field_count: int = 1) -> list[str]:
-        """Send a line; the words behind the expected one in the answer."""
+        """Send a line; returns the words after the expected one in the answer."""
         assert self._socket is not None
         try:
             self._socket.sendall(command.encode("ascii") + b"\n")
@@ -240,11 +239,11 @@ class PulseBusTrigger(Configured):
                 "nothing was done"
             )
         if answer[:1] != [expected] or len(answer) != field_count + 1:
-            raise self._lost(command, f"the answer {' '.join(answer)!r} makes no sense")
+            raise self._lost(command, f"the answer {' '.join(answer)!r} is invalid")
         return answer[1:]
 
     def _answer(self, command: str) -> list[str]:
-        """The words of the next line that does not answer an earlier question once more."""
+        """The words of the next line that is not a repeated answer to an earlier command."""
         verb, *rest = command.split()
         answered = " ".join(("FIRED" if verb == "FIRE" else f"OK {verb}", *rest))
         deadline_ns = self._clock.mono_ns() + round(self.timeout_s * 1e9)
@@ -257,7 +256,7 @@ class PulseBusTrigger(Configured):
             self._counters["stale_answers"] += 1
 
     def _line(self, command: str, deadline_ns: int | None = None) -> str:
-        """The next line, within the time-out as a whole."""
+        """The next line, within one time-out in total."""
         assert self._socket is not None
         if deadline_ns is None:
             deadline_ns = self._clock.mono_ns() + round(self.timeout_s * 1e9)
@@ -273,18 +272,20 @@ class PulseBusTrigger(Configured):
             except OSError as error:
                 raise self._lost(command, error.strerror or str(error)) from error
             if not piece or len(self._received) > MAX_LINE:
-                raise self._lost(command, "the unit hung up" if not piece else "no end of line")
+                raise self._lost(
+                    command, "the unit closed the connection" if not piece else "no end of line"
+                )
             self._received += piece
         line, _, self._received = self._received.partition(b"\n")
         return line.decode("ascii", errors="replace")
 
     def _lost(self, command: str, why: str) -> DeviceError:
-        """Drop the connection: a late answer must not be taken for that of the next question."""
+        """Close the connection: a late answer must not be taken for that of the next command."""
         self._disconnect()
         fired = "; whether the heads fired is not known" if command.startswith("FIRE") else ""
         return DeviceError(
-            f"{self.name}: trigger unit at {self.host}:{self.port}, asked for {command}: {why}"
-            f"{fired}; it is connected anew at the next pulse, check power and cable"
+            f"{self.name}: trigger unit at {self.host}:{self.port}, command {command}: {why}"
+            f"{fired}; the next pulse reconnects, check power and cable"
         )
 
     def _disconnect(self) -> None:

@@ -1,4 +1,4 @@
-"""Software triggers of the heads, fired together: the degraded case, with its jitter stated."""
+"""Software triggers of all heads, fired together: the degraded mode, with its jitter stated."""
 
 from __future__ import annotations
 
@@ -18,17 +18,19 @@ log = logging.getLogger(__name__)
 
 
 class SoftwareTrigger(Configured):
-    """Fires every head by its own software trigger, all at once from a thread each.
+    """Fires every head by its own software trigger, in parallel, with one thread per head.
 
-    `heads` are the heads by output (cone). The time of a pulse is the middle between the first
-    and the last moment any head can have fired, less its delay; sigma is half of that span.
+    `heads` are the heads by output (cone). The time of a pulse is the middle between the first and
+    the last possible instant of any head, minus its delay; sigma is half of that interval.
     """
 
     kind: ClassVar = "trigger"
     fires_heads: ClassVar = True
     head_trigger_source: ClassVar = "software"
 
-    timeout_s = Setting(2.0, minimum=0.1, maximum=10, help="longest wait for the heads to be asked")
+    timeout_s = Setting(
+        2.0, minimum=0.1, maximum=10, help="longest wait for the heads to be triggered"
+    )
 
     def __init__(
         self,
@@ -46,13 +48,13 @@ class SoftwareTrigger(Configured):
         self._delays_ns = dict.fromkeys(heads, 0)
         self._closing = threading.Event()
         self._counters: Counter[str] = Counter(pulses=0, failures=0)
-        # The threads are there before the first pulse: starting one costs more than a trigger.
+        # The threads are started before the first pulse: a start takes longer than a trigger.
         self._threads = concurrent.futures.ThreadPoolExecutor(
             len(self._heads), thread_name_prefix=f"{name}-fire"
         )
 
     def bind(self) -> Mapping[str, str]:
-        """What is fired. See `drivers.contract.Trigger`."""
+        """The outputs and heads. See `drivers.contract.Trigger`."""
         return {"outputs": " ".join(self._delays_ns), "heads": str(len(self._heads))}
 
     def program(self, delays_ns: Mapping[str, int]) -> None:
@@ -61,10 +63,10 @@ class SoftwareTrigger(Configured):
         self._delays_ns.update(delays_ns)
 
     def fire(self, sequence: int) -> TriggerPulse:
-        """Trigger all heads; returns if at least one took it, and logs those that did not.
+        """Trigger all heads; returns if at least one was triggered, and logs the failed ones.
 
         Raises:
-            DeviceError: no head was triggered; one line a head.
+            DeviceError: no head was triggered; one line per head.
         """
         if self._closing.is_set():
             raise DeviceError(f"{self.name}: the trigger is closed; create a new one")
@@ -74,7 +76,7 @@ class SoftwareTrigger(Configured):
             for output, head in self._heads
         }
         done, late = concurrent.futures.wait(pending, timeout=self.timeout_s)
-        failures = [f"{pending[f].name}: not asked within {self.timeout_s:g} s" for f in late]
+        failures = [f"{pending[f].name}: not triggered within {self.timeout_s:g} s" for f in late]
         spans: list[tuple[int, int]] = []
         for future in done:
             error = future.exception()
@@ -93,12 +95,12 @@ class SoftwareTrigger(Configured):
         first_ns = min(before for before, _ in spans)
         last_ns = max(after for _, after in spans)
         sigma_ns = (last_ns - first_ns + 1) // 2
-        # Each head fired at a moment of its own within that span.
+        # Each head fired at its own instant within that interval.
         count, spread_ns = self._counters["pulses"], round(sigma_ns / 3**0.5)
         return TriggerPulse(sequence, first_ns + sigma_ns, sigma_ns, count, spread_ns)
 
     def close(self) -> None:
-        """Let the threads end; may be called twice."""
+        """End the threads; may be called twice."""
         self._closing.set()
         self._threads.shutdown(wait=False, cancel_futures=True)
 
@@ -107,7 +109,7 @@ class SoftwareTrigger(Configured):
         return dict(self._counters)
 
     def _fire_one(self, head: Head, delay_ns: int, start_ns: int) -> tuple[int, int]:
-        """Trigger a head at its delay; between which times it fired, its delay taken off."""
+        """Trigger a head at its delay; returns the first and last possible time minus the delay."""
         left_ns = start_ns + delay_ns - self._clock.mono_ns()
         if left_ns > 0:
             self._clock.wait(self._closing, left_ns * 1e-9)

@@ -122,7 +122,7 @@ def test_a_command_is_sent_at_its_interval() -> None:
     ("said", "cure"),
     [
         (b"", "nothing came"),
-        (b"T1=", "no whole line came"),
+        (b"T1=", "no complete line came"),
         (b"hello\n", "the last was 'hello'; check pattern"),
         (b"T1=1 T2=?\n", "no reading of G"),
     ],

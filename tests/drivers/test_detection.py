@@ -133,7 +133,7 @@ def test_devices_on_the_network_are_found_without_a_speed() -> None:
         None,
     ]
     assert [one.baudrate for one in found] == [None] * 4
-    assert "nothing speaks there" in found[2].sentence
+    assert "no data received" in found[2].sentence
     assert "cannot be opened" in found[3].sentence
     section = tomllib.loads(toml_sections(found))["navigator"][0]
     assert "baudrate" not in section
@@ -173,7 +173,7 @@ def test_listening_only_sends_nothing() -> None:
         os.close(master)
         os.close(slave)
     assert found.detected is None
-    assert "nothing speaks there; check power, cable and the port's name" in found.sentence
+    assert "no data received; check power, cable and the port's name" in found.sentence
 
 
 def test_a_port_that_is_not_there_is_reported_with_its_remedy() -> None:

@@ -66,7 +66,7 @@ def like_real_ports(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_held_port_is_refused_and_the_error_names_the_holder(
     line: PtyLine, held: subprocess.Popen[str], like_real_ports: None
 ) -> None:
-    with pytest.raises(DeviceError, match=rf"is held by .+ \(process {held.pid}\); end that"):
+    with pytest.raises(DeviceError, match=rf"is in use by .+ \(process {held.pid}\); end that"):
         open_serial_port(line.near, 9600, "N")
 
 
@@ -74,7 +74,7 @@ def test_check_find_names_the_holder(
     line: PtyLine, held: subprocess.Popen[str], like_real_ports: None
 ) -> None:
     run_result = CliRunner().invoke(app, ["check", "--find", line.near, "--json"])
-    assert f"(process {held.pid})" in run_result.stdout and "is held by" in run_result.stdout, (
+    assert f"(process {held.pid})" in run_result.stdout and "is in use by" in run_result.stdout, (
         run_result.output
     )
 
@@ -84,7 +84,7 @@ def test_a_device_on_a_held_port_names_the_holder(
 ) -> None:
     device = driver_for("navigator", "nmea")("gnss", {"port": line.near})
     assert isinstance(device, SerialDevice)
-    with pytest.raises(DeviceError, match=rf"gnss: port .+ is held by .+ \(process {held.pid}\)"):
+    with pytest.raises(DeviceError, match=rf"gnss: port .+ is in use by .+ \(process {held.pid}\)"):
         device.bind()
 
 
@@ -110,7 +110,7 @@ def test_an_exclusively_opened_port_that_the_kernel_refuses_names_the_holder(
 
     monkeypatch.setattr(serial_device.serial, "Serial", refuses)
     monkeypatch.setattr(serial_device, "holders", lambda _path: [PortHolder(812, "gpsd")])
-    with pytest.raises(DeviceError, match=r"held by gpsd \(process 812\); run: systemctl stop gps"):
+    with pytest.raises(DeviceError, match=r"in use by gpsd \(process 812\); run: systemctl stop gps"):
         open_serial_port(line.near, 9600, "N")
 
 

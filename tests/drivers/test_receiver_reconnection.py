@@ -115,7 +115,7 @@ def test_a_pulled_cable_is_reported_and_healed_for_every_kind(tmp_path: Path) ->
     for pair in pairs[:-1]:
         assert pair.recorder.event_names[:3] == ["opened", "lost", "opened"]
         lost = next(e for e in pair.recorder.events if e.name == "lost")
-        assert lost.is_fault and "by itself" in lost.sentence
+        assert lost.is_fault and "automatically" in lost.sentence
     assert pairs[-1].recorder.event_names == ["opened"], "the one nobody touched"
     assert (held_descriptors(), threading.active_count()) == (held, threads), "nothing leaks"
 

@@ -1,10 +1,11 @@
-"""Declared settings: defaults, types, and mistakes told all at once."""
+"""Declared settings: defaults, types, and errors reported all at once."""
 
 from __future__ import annotations
 
 import pytest
 
-from drivers.base.settings import Configured, Setting, SettingsError
+from drivers.base import registry
+from drivers.base.settings import FORMER_NAMES, Configured, Setting, SettingsError
 from drivers.contract import DeviceError
 
 
@@ -81,3 +82,23 @@ def test_a_list_of_names_holds_texts(value: object) -> None:
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), True, None, "1"])
 def test_a_number_is_finite_and_neither_truth_nor_text(value: object) -> None:
     assert len(LampDevice.problems({"sockets": ["a"], "warm_up_s": value})) == 1
+
+
+@pytest.mark.parametrize(
+    ("kind", "driver_name", "former"),
+    [
+        ("head", "aravis", "held_limit_s"),
+        ("thermometer", "ascii-line", "channel_words"),
+        ("thermometer", "ascii-line", "open_words"),
+    ],
+)
+def test_a_former_name_is_refused_with_the_present_one(
+    kind: str, driver_name: str, former: str
+) -> None:
+    problems = registry.problems(kind, driver_name, {former: 3})
+    assert f"{former} is 3; this setting is now named {FORMER_NAMES[former]}" in problems
+
+
+def test_a_former_name_of_another_driver_is_only_unknown() -> None:
+    (problem, _) = LampDevice.problems({"held_limit_s": 3})
+    assert "there is no such setting" in problem

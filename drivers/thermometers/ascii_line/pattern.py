@@ -1,7 +1,7 @@
-"""Patterns with named groups, matched in a time that grows with the line and never beyond.
+"""Patterns with named groups, matched in a time proportional to the length of the line.
 
-The dialect is the part of Python's regular expressions that can be matched without backtracking:
-no pattern a configuration can hold, and no line a device can send, holds the driver up.
+The syntax is the part of Python's regular expressions that can be matched without backtracking.
+No configured pattern and no received line can block the driver.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Final
 
 MAX_PATTERN: Final = 400
 MAX_STEPS: Final = 800
-"""Counted repeats are written out; a pattern longer than this then is refused."""
+"""Maximum number of steps, with counted repeats expanded."""
 MAX_LINE: Final = 256
 _LATIN: Final = "".join(map(chr, range(256)))
 _REPEAT: Final = re.compile(r"\{(\d{0,4})(,?)(\d{0,4})\}")
@@ -29,7 +29,7 @@ def _compiled(text: str) -> re.Pattern[str]:
 
 
 class PatternError(ValueError):
-    """A pattern that cannot be used; the message says why."""
+    """A pattern cannot be used; the message contains the reason."""
 
 
 @dataclass(frozen=True)
@@ -45,11 +45,11 @@ class _Step:
 class LinePattern:
     """A pattern, searched in a line of Latin-1 text.
 
-    Known are characters, `.`, classes, `\\d \\w \\s` and their opposites, groups, `|`, `* + ?`,
-    `{m,n}`, their lazy forms, `^` and `$`. What needs backtracking is refused.
+    Supported are characters, `.`, classes, `\\d \\w \\s` and their opposites, groups, `|`, `* + ?`,
+    `{m,n}`, their lazy forms, `^` and `$`. Elements that need backtracking are refused.
 
     Raises:
-        PatternError: the pattern does not compile, or needs more than the dialect.
+        PatternError: the pattern does not compile, or uses an unsupported element.
 
     Example:
         >>> LinePattern(r"T=(?P<nose>[-+]?\\d+\\.\\d)").search("12:00 T=-5.2 C")
@@ -75,9 +75,9 @@ class LinePattern:
             raise PatternError("its groups are nested too deeply") from error
 
     def search(self, line: str) -> Mapping[str, str] | None:
-        """The named groups of the leftmost match, in the order of the pattern; None without one.
+        """The named groups of the leftmost match, in the order of the pattern; None if none matches.
 
-        A group that took no part is left out. At most `MAX_LINE` characters are looked at.
+        A group that did not participate is omitted. At most `MAX_LINE` characters are searched.
         """
         line = line[:MAX_LINE]
         found: tuple[int, ...] | None = None
@@ -175,7 +175,7 @@ class LinePattern:
         if lazy:
             self._at += 1
         elif self._peek() == "+":
-            raise PatternError(f"possessive repeats are not known (at {self._at})")
+            raise PatternError(f"possessive repeats are not supported (at {self._at})")
 
         def build(after: int) -> int:
             first = after
@@ -185,7 +185,7 @@ class LinePattern:
                 nexts = (after, body) if lazy else (body, after)
                 self._steps[first] = _Step("split", nexts=nexts)
             for optional in [True] * (most - least) + [False] * least:
-                # Counted although it may be empty: nested repeats of nothing take time as well.
+                # Counted although it may be empty: nested empty repeats take time as well.
                 self._count_step()
                 first = part(first)
                 if optional:
@@ -213,7 +213,7 @@ class LinePattern:
         elif character == "\\":
             escaped = self._text[self._at + 1 : self._at + 2]
             if escaped.isalnum() and escaped not in "dDwWsSt":
-                raise PatternError(f"\\{escaped} at {begin} is not known")
+                raise PatternError(f"\\{escaped} at {begin} is not supported")
             self._at += 2
         else:
             self._at += 1
@@ -228,7 +228,7 @@ class LinePattern:
         if self._peek() == "?":
             opened = _GROUP.match(self._text, self._at)
             if opened is None:
-                raise PatternError(f"{self._text[begin : begin + 4]!r} at {begin} is not known")
+                raise PatternError(f"{self._text[begin : begin + 4]!r} at {begin} is not supported")
             name = opened[1]
             self._at = opened.end()
         index = len(self.groups)

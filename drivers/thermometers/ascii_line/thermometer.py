@@ -1,7 +1,7 @@
 """Instruments that send temperatures as lines of text.
 
-What a line may look like is in `drivers.thermometers.ascii_line.pattern`; opening, reconnecting and
-counting in `drivers.transport.serial_device`.
+Patterns of lines are in `drivers.thermometers.ascii_line.pattern`; opening, reconnecting and
+counting are in `drivers.transport.serial_device`.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ class AsciiLineThermometer(SerialDevice):
     """Probes of an instrument that sends its readings as lines of text.
 
     The named groups of `pattern` are, in their order, the readings of `channels`. A pattern with
-    the groups `channel` and `value` is for instruments that send a line per channel: the text of
-    `channel` is looked up in `channel_labels`. A reading that is one of `open_sensor_labels` is an
-    open sensor and yields a sample with `value_c=None`; one that is no temperature yields nothing.
+    the groups `channel` and `value` is for instruments that send one line per channel: the text of
+    `channel` is looked up in `channel_labels`. A reading in `open_sensor_labels` means an open
+    sensor and yields a sample with `value_c=None`. A reading that is no temperature yields nothing.
     """
 
     kind: ClassVar = "thermometer"
@@ -90,7 +90,7 @@ class AsciiLineThermometer(SerialDevice):
         if set(groups) == {"channel", "value"}:
             if labels and len(labels) != len(channels):
                 found.append(
-                    f"channel_labels has {len(labels)} words; channels has {len(channels)}"
+                    f"channel_labels has {len(labels)} labels; channels has {len(channels)}"
                 )
         elif labels:
             found.append("channel_labels is given; only a pattern with the group channel uses it")
@@ -112,7 +112,7 @@ class AsciiLineThermometer(SerialDevice):
         return self.baudrate, self.parity
 
     def identify(self, line: SerialLine) -> Mapping[str, str]:
-        """Listen until every probe was read, `silence_s` at most; what they said."""
+        """Listen until every probe was read, `silence_s` at most; returns the readings."""
         deadline_ns = self.clock.mono_ns() + round(self.silence_s * 1e9)
         readings_text: dict[str, str] = {}
         before = self.counters["bytes"]
@@ -135,7 +135,7 @@ class AsciiLineThermometer(SerialDevice):
             )
         came = self.counters["bytes"] - before
         raise DeviceError(
-            f"{self.name}: {'no whole line' if came else 'nothing'} came at {self.port} in "
+            f"{self.name}: {'no complete line' if came else 'nothing'} came at {self.port} in "
             f"{self.silence_s:g} s; check power, cable, "
             + ("command, command_end and " if self.command else "")
             + f"baudrate ({self.baudrate})"
@@ -163,7 +163,7 @@ class AsciiLineThermometer(SerialDevice):
         return samples
 
     def _lines(self, data: bytes) -> Iterable[str]:
-        """Whole lines, without empty ones; one that is too long is dropped to its end."""
+        """Complete lines, without empty ones; a line that is too long is dropped to its end."""
         *complete_lines, rest = re.split(rb"[\r\n\0]", self._pending + data)
         for piece in complete_lines:
             overlong, self._overlong = self._overlong, False
@@ -215,7 +215,7 @@ class AsciiLineThermometer(SerialDevice):
         return samples
 
     def _celsius(self, reading: str) -> float | None:
-        """The reading in degC, None for an open sensor; ValueError where it is no temperature."""
+        """The reading in degC, None for an open sensor; ValueError if it is no temperature."""
         if reading.casefold() in self._open_sensor_labels:
             self.counters["open_sensors"] += 1
             return None
@@ -235,6 +235,6 @@ class AsciiLineThermometer(SerialDevice):
     def _report_bad_line(self, what: str) -> None:
         self.emitter.emit_throttled(
             "unreadable",
-            f"The thermometer {self.name} at {self.port} sent {what}, which is no reading as the "
-            "pattern has it. Check pattern, open_sensor_labels, baud rate and parity.",
+            f"The thermometer {self.name} at {self.port} sent {what}, which does not fit the "
+            "pattern. Check pattern, open_sensor_labels, baud rate and parity.",
         )

@@ -1,1 +1,1 @@
-"""Temperatures the host itself measures."""
+"""Temperatures measured by the host itself."""

@@ -1,7 +1,7 @@
-"""Temperature sensors as the kernel shows them under /sys: hwmon chips and iio devices.
+"""Temperature sensors of the kernel below /sys: hwmon chips and iio devices.
 
-Finding them by name and reading one is here; when to read is in
-`drivers.thermometers.host.thermometer`.
+This module finds sensors by name and reads them; `drivers.thermometers.host.thermometer` decides
+when.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ _NUMBER: Final = re.compile(r"[-+]?\d{1,12}(\.\d{1,12})?")
 
 
 class SensorLostError(Exception):
-    """The sensor's files cannot be read, or hold no number; internal."""
+    """The sensor's files cannot be read or contain no number; internal."""
 
 
 @dataclass(frozen=True)
 class HostSensor:
     """One temperature of the host.
 
-    `chip` is the driver's name of it, `device` the name of the device it sits on (tells chips of
-    one name apart), `channel` such as temp1 or temp_ambient, `label` the chip's own word for it.
+    `chip` is the name given by its kernel driver. `device` is the parent device; it distinguishes
+    chips of the same name. `channel` is such as temp1 or temp_ambient, `label` the chip's label.
     """
 
     chip: str
@@ -39,16 +39,16 @@ class HostSensor:
 
     @property
     def aliases(self) -> tuple[str, ...]:
-        """What the sensor may be called in a configuration, the plainest first."""
+        """The names of the sensor in a configuration, the shortest first."""
         channels = (self.channel, self.label) if self.label else (self.channel,)
         chips = (self.chip, f"{self.chip}@{self.device}") if self.device else (self.chip,)
         return tuple(f"{chip}/{channel}" for chip in chips for channel in channels)
 
     def read_c(self) -> float | None:
-        """The temperature in degC; None where the chip says that the sensor is open.
+        """The temperature in degC; None if the chip reports an open sensor.
 
         Raises:
-            SensorLostError: it is no longer there, or does not answer.
+            SensorLostError: it no longer exists or does not answer.
         """
         if self.is_raw:
             stem = self.path.name.removesuffix("_raw")
@@ -63,7 +63,7 @@ class HostSensor:
 
 
 def find_sensors(root: Path) -> list[HostSensor]:
-    """Every temperature of the host, hwmon before iio; empty where the kernel shows none.
+    """Every temperature of the host, hwmon before iio; empty if the kernel has none.
 
     Args:
         root: where sysfs is mounted, normally /sys.
@@ -81,7 +81,7 @@ def find_sensors(root: Path) -> list[HostSensor]:
         channels: dict[str, Path] = {}
         for path in _folders(folder, "in_temp*"):
             named = _IIO.fullmatch(path.name)
-            # What the driver has already computed goes before what is to be scaled.
+            # A value computed by the driver takes precedence over a raw value.
             if named and (named[2] == "input" or named[1] not in channels):
                 channels[named[1]] = path
         found += [_sensor(folder, path, channel) for channel, path in channels.items()]
@@ -126,7 +126,7 @@ def _number(path: Path) -> float:
     except OSError as error:
         raise SensorLostError(f"{path}: {error.strerror or error}") from error
     if _NUMBER.fullmatch(text) is None:
-        raise SensorLostError(f"{path} holds {text[:40]!r}, which is no number")
+        raise SensorLostError(f"{path} contains {text[:40]!r}, which is no number")
     return float(text)
 
 

@@ -1,6 +1,6 @@
 """The host's own temperature sensors as a thermometer.
 
-What they are and how one is read is in `drivers.thermometers.host.sensors`.
+Finding and reading a sensor is in `drivers.thermometers.host.sensors`.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ SYSFS: Final = Path("/sys")
 class HostThermometer(DeviceDriver):
     """Sensors of the Linux host: hwmon chips (processor, disks, boards) and iio devices.
 
-    A sensor is named `chip/channel`, `chip/label`, or `chip@device/...` where chips of one name
-    are to be told apart; never by its number, which changes from boot to boot. A sensor whose
-    files vanish yields nothing until it is found again under its name; one that its chip calls
-    faulty yields samples with `value_c=None`.
+    A sensor is named `chip/channel` or `chip/label`, or `chip@device/...` if chips share a name. It
+    is never named by its number, which changes from boot to boot. A sensor whose files vanish yields
+    nothing until it is found again by its name. A sensor that its chip reports as faulty yields
+    samples with `value_c=None`.
 
     Source: Linux Documentation/hwmon/sysfs-interface, ABI/testing/sysfs-bus-iio.
     """
@@ -87,7 +87,7 @@ class HostThermometer(DeviceDriver):
         return found
 
     def _open_device(self) -> None:
-        """Sysfs is always there; a sensor that is not is looked for at every reading."""
+        """Nothing to open: sysfs is always there; missing sensors are searched at every reading."""
 
     def _emit_opened(self) -> None:
         self.emitter.emit("opened", f"The host's sensors {self.name} are read; nothing to do.")
@@ -118,7 +118,7 @@ class HostThermometer(DeviceDriver):
                     self.emitter.emit(
                         "lost",
                         f"The sensor {sensor} of probe {probe} cannot be read ({error}). Check "
-                        "that its kernel module is loaded; it is looked for again by itself.",
+                        "that its kernel module is loaded. Retrying automatically.",
                         fault=True,
                     )
                 continue

@@ -13,18 +13,18 @@ from typing import Final
 READ_INPUT_REGISTERS: Final = 4
 MAX_REGISTERS: Final = 125
 EXCEPTIONS: Final = {
-    1: "it knows no function 4; the module is of another kind",
+    1: "function 4 is not supported; the module is of another type",
     2: "it has no such registers; check first_register and the number of channels",
-    3: "it refuses the number of registers; name fewer channels",
-    4: "it failed inside; look at the module's own lamp",
-    5: "it has begun and needs longer",
+    3: "it refuses the number of registers; configure fewer channels",
+    4: "internal device failure; check the status lamp of the module",
+    5: "the request is accepted and needs more time",
     6: "it is busy",
 }
 
 
 @dataclass(frozen=True)
 class Reply:
-    """An answer: registers as unsigned words, or an exception code. `skipped` bytes were noise."""
+    """A reply: registers as unsigned words, or an exception code. `skipped` bytes were noise."""
 
     registers: tuple[int, ...]
     exception: int | None
@@ -58,9 +58,9 @@ def read_request(unit: int, first_register: int, count: int) -> bytes:
 
 
 def find_reply(received: bytes, unit: int, count: int) -> Reply | None:
-    """The first whole and valid answer in what was received, wherever it begins; None if none.
+    """The first complete and valid reply in the received bytes; None if there is none.
 
-    Noise before the answer, such as the echo of a two-wire line, is stepped over.
+    Noise before the reply, such as the echo of a two-wire line, is skipped.
     """
     for start in range(len(received) - 4):
         if received[start] != unit:

@@ -22,14 +22,14 @@ from drivers.transport.serial_device import READ_TIMEOUT_S, SerialDevice, Serial
 
 OPEN_SENSOR: Final = 0x7FFF
 DRAIN_STEPS: Final = 50
-"""A line that babbles without end is left after so many reads, and asked all the same."""
+"""Maximum number of reads before a request, for a line that sends without end."""
 
 
 class ModbusThermometer(SerialDevice):
     """Resistance thermometers behind one Modbus RTU slave.
 
-    Reads as many consecutive input registers as there are channels, signed, in units of 0.1 degC.
-    A register holding 0x7FFF is an open sensor and yields a sample with `value_c=None`.
+    Reads one input register per channel, consecutive, signed, in units of 0.1 degC. The value
+    0x7FFF means an open sensor and yields a sample with `value_c=None`.
 
     Source: the module's register map; Modbus over Serial Line V1.02, section 2.5.1.
     """
@@ -39,7 +39,7 @@ class ModbusThermometer(SerialDevice):
 
     baudrate = Setting(19200, minimum=300, maximum=4_000_000, help="speed of the line, bit/s")
     parity = Setting("E", choices=("N", "E", "O"), help="parity on the wire")
-    unit = Setting(1, minimum=1, maximum=247, help="the module's number on the line")
+    unit = Setting(1, minimum=1, maximum=247, help="unit identifier of the module")
     first_register = Setting(0, minimum=0, maximum=65535, help="address of the first channel")
     channels: Setting[tuple[str, ...]] = Setting(
         (),
@@ -77,7 +77,7 @@ class ModbusThermometer(SerialDevice):
         return self.baudrate, self.parity
 
     def identify(self, line: SerialLine) -> Mapping[str, str]:
-        """Read once; what every probe says."""
+        """Read every probe once; returns the readings."""
         reply = self._read_registers(line)
         if reply is None:
             raise DeviceError(
@@ -117,7 +117,7 @@ class ModbusThermometer(SerialDevice):
         ]
 
     def _read_registers(self, line: SerialLine) -> Reply | None:
-        """One request; None where no valid answer came in time."""
+        """Send one request; None if no valid reply came in time."""
         self.counters["bad_bytes"] += line.drain(DRAIN_STEPS)
         line.write(read_request(self.unit, self.first_register, len(self.channels)))
         received = b""
@@ -135,13 +135,13 @@ class ModbusThermometer(SerialDevice):
             self.counters["bad_messages"] += 1
             self.emitter.emit_throttled(
                 "checksum",
-                f"The thermometer {self.name} at {self.port} answers with bytes that make no "
-                "sense. Check baud rate, parity and the line's termination.",
+                f"The thermometer {self.name} at {self.port} sent invalid replies. Check "
+                "baud rate, parity and the line's termination.",
             )
         return None
 
     def _exception(self, code: int) -> str:
-        meaning = EXCEPTIONS.get(code, "an exception the standard does not name")
+        meaning = EXCEPTIONS.get(code, "an exception that the standard does not define")
         return (
             f"The thermometer {self.name}, unit {self.unit} at {self.port}, refuses registers "
             f"{self.first_register} to {self.first_register + len(self.channels) - 1} with "

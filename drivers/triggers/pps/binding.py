@@ -1,4 +1,4 @@
-"""The kernel's PPS interface: its structures and requests, and nothing of what edges mean.
+"""The kernel's PPS interface: its structures and requests, without the meaning of edges.
 
 Source: include/uapi/linux/pps.h, Documentation/driver-api/pps.rst; RFC 2783.
 """
@@ -29,7 +29,7 @@ _WRITE, _READ = 1, 2
 
 
 def _request(direction: int, number: int) -> int:
-    # The header gives the pointer's size, not the structure's: so does the kernel.
+    # The kernel's header uses the size of the pointer, not of the structure.
     return direction << 30 | _POINTER << 16 | ord("p") << 8 | number
 
 
@@ -41,7 +41,7 @@ FETCH: Final = _request(_READ | _WRITE, 0xA4)
 
 @dataclass(frozen=True)
 class Edges:
-    """The last edges a source has seen; times on CLOCK_REALTIME, zero before the first."""
+    """The last edges of a source; times on CLOCK_REALTIME, zero before the first."""
 
     assert_sequence: int
     clear_sequence: int
@@ -50,7 +50,7 @@ class Edges:
 
 
 class KernelPps:
-    """An open /dev/pps device. OSError as the kernel says it."""
+    """An open /dev/pps device. Errors of the kernel are raised as OSError."""
 
     def __init__(self, path: str) -> None:
         self._path = path
@@ -63,7 +63,7 @@ class KernelPps:
         return int(struct.unpack("@i", answer)[0])
 
     def mode(self) -> int:
-        """Which edges are captured now."""
+        """The edges that are captured at present."""
         return int(self._params()[1])
 
     def set_mode(self, mode: int) -> None:
@@ -72,9 +72,9 @@ class KernelPps:
         fcntl.ioctl(self._fd, SETPARAMS, bytearray(PARAMS.pack(API_VERSION, mode, *params[2:])))
 
     def fetch(self, timeout_s: float) -> Edges | None:
-        """The edges after the next one came; None where none comes in time.
+        """The edges after the next one was captured; None if none is captured in time.
 
-        One that comes before the kernel is asked is not waited for: `latest` has it.
+        An edge before the call does not end the wait; `latest` returns it.
         """
         seconds, nanoseconds = divmod(round(timeout_s * 1e9), 1_000_000_000)
         zeros = (0,) * 9
@@ -86,11 +86,11 @@ class KernelPps:
         return edges_of(bytes(data))
 
     def latest(self) -> Edges | None:
-        """The last edges, without waiting: asked for no time at all, the kernel tells at once."""
+        """The last edges, without waiting: with a time-out of 0, the kernel returns at once."""
         return self.fetch(0.0)
 
     def is_there(self) -> bool:
-        """Whether the path still leads to this device; waiting for an edge does not tell."""
+        """Whether the path still leads to this device; a wait for an edge does not report that."""
         try:
             return os.path.samestat(Path(self._path).stat(), os.fstat(self._fd))
         except FileNotFoundError:
@@ -108,6 +108,6 @@ class KernelPps:
 
 
 def edges_of(data: bytes) -> Edges:
-    """What a struct pps_fdata says."""
+    """The edges in a struct pps_fdata."""
     asserts, clears, a_s, a_ns, _, c_s, c_ns, *_ = FDATA.unpack(data)
     return Edges(asserts, clears, a_s * 1_000_000_000 + a_ns, c_s * 1_000_000_000 + c_ns)

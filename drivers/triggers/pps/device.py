@@ -1,6 +1,6 @@
-"""A pulse per second: edges with the host's monotonic time, whatever the wall clock does.
+"""A pulse per second: edges on the host's monotonic clock, independent of wall clock steps.
 
-Which second an edge begins is not known here, and GPS time is not either.
+The second of an edge, and GPS time, are determined elsewhere.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from drivers.triggers.pps.binding import CAN_WAIT, CAPTURE_ASSERT, CAPTURE_CLEAR
 from drivers.triggers.pps.emulated import SCHEME, EmulatedPps
 
 WAIT_TIMEOUT_S: Final = 0.5
-"""Longest wait in the kernel before the driver looks up again."""
+"""Longest wait in the kernel before the driver checks whether it is closed."""
 OFFSET_ATTEMPTS: Final = 5
 MAX_SLEW_RATE: Final = 1e-3
-"""No time daemon slews the wall clock faster than this, twice."""
+"""Twice the fastest slew of the wall clock by a time daemon."""
 STEP_NS: Final = 50_000
 MAX_EDGE_AGE_NS: Final = 2_000_000_000
 
 
 class PpsBackend(Protocol):
-    """Where edges come from."""
+    """A source of edges."""
 
     def capabilities(self) -> int: ...
 
@@ -47,12 +47,12 @@ class PpsBackend(Protocol):
 
 
 def open_source(device: str) -> PpsBackend:
-    """The kernel's device, or an emulated one where the name is tcp://host:port."""
+    """The kernel's device, or an emulated one if the name is tcp://host:port."""
     return EmulatedPps(device) if device.startswith(SCHEME) else KernelPps(device)
 
 
 def wall_clock() -> tuple[int, int]:
-    """CLOCK_MONOTONIC, and CLOCK_REALTIME less it, both at about the same moment."""
+    """CLOCK_MONOTONIC, and CLOCK_REALTIME minus CLOCK_MONOTONIC at about the same instant."""
     best: tuple[int, int, int] | None = None
     for _ in range(OFFSET_ATTEMPTS):
         before = time.monotonic_ns()
@@ -68,9 +68,9 @@ def wall_clock() -> tuple[int, int]:
 class PpsDevice(DeviceDriver):
     """Edges of one PPS source of the kernel.
 
-    The kernel stamps edges with the wall clock. They are carried to the monotonic clock with the
-    difference of both just after; where that difference jumped since the edge before, the wall
-    clock was set in between and the edge is dropped and counted.
+    The kernel stamps edges with the wall clock. The driver converts them to the monotonic clock
+    with the difference of both clocks just afterwards. If that difference has jumped since the
+    previous edge, the wall clock was set in between; the edge is dropped and counted.
 
     Source: include/uapi/linux/pps.h; RFC 2783.
     """
@@ -94,13 +94,19 @@ class PpsDevice(DeviceDriver):
         0,
         minimum=-1_000_000,
         maximum=1_000_000,
-        help="from the edge to the kernel's stamp, as known",
+        help="known latency from the edge to the kernel's time stamp",
     )
     sigma_ns = Setting(
-        5_000, minimum=10, maximum=10_000_000, help="standard deviation of that, with its jitter"
+        5_000,
+        minimum=10,
+        maximum=10_000_000,
+        help="standard deviation of that latency, with its jitter",
     )
     silence_s = Setting(
-        2.5, minimum=1.1, maximum=60, help="without an edge for so long the source is silent"
+        2.5,
+        minimum=1.1,
+        maximum=60,
+        help="time without an edge after which the source is reported silent",
     )
 
     def __init__(
@@ -142,7 +148,7 @@ class PpsDevice(DeviceDriver):
         )
 
     def edge_of(self, edges: Edges) -> PpsEdge | None:
-        """An edge on the monotonic clock; None where it is no new one, or not to be trusted."""
+        """An edge on the monotonic clock; None if it is not new or not valid."""
         mono_ns, offset_ns = wall = self._wall()
         last, self._last_wall = self._last_wall, wall
         if last is not None:
@@ -176,7 +182,7 @@ class PpsDevice(DeviceDriver):
         try:
             self._listen(sink)
         except OSError as error:
-            self._emit_lost(f"{self._source_lost(error)}. It is tried again by itself.")
+            self._emit_lost(f"{self._source_lost(error)}. Retrying automatically.")
 
     def _listen(self, sink: Sink) -> None:
         source = self._source
@@ -208,7 +214,7 @@ class PpsDevice(DeviceDriver):
                 raise OSError(errno.ENODEV, os.strerror(errno.ENODEV))
 
     def _edge_between_waits(self, source: PpsBackend) -> Edges | None:
-        """An edge that came between two waits; None where none did."""
+        """An edge that was captured between two waits; None if there is none."""
         edges = source.latest()
         return None if edges is None or self._of(edges)[0] == self._last_sequence else edges
 
@@ -229,7 +235,7 @@ class PpsDevice(DeviceDriver):
                 other = "clear" if self.edge == "assert" else "assert"
                 raise DeviceError(
                     f"{self.name}: {self.device} cannot capture {self.edge} edges; set edge = "
-                    f'"{other}", or turn the polarity of the receiver\'s PPS'
+                    f'"{other}", or invert the polarity of the receiver\'s PPS'
                 )
             mode = source.mode()
             if not mode & wanted:
@@ -244,7 +250,7 @@ class PpsDevice(DeviceDriver):
     def _source_lost(self, error: OSError) -> DeviceError:
         why = error.strerror or str(error)
         if isinstance(error, FileNotFoundError):
-            why = "there is none; load pps-ldisc or pps-gpio and check its name in /sys/class/pps"
+            why = "no such device; load pps-ldisc or pps-gpio and check its name in /sys/class/pps"
         elif isinstance(error, PermissionError):
             why = "permission denied; install the udev rules, which give it to the service's group"
         return DeviceError(f"{self.name}: pulse per second at {self.device}: {why}")

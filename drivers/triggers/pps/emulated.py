@@ -1,4 +1,4 @@
-"""An emulated PPS source behind a TCP port, for machines without one: same edges, same interface.
+"""An emulated PPS source behind a TCP port, with the interface of the kernel's source.
 
 Each line is an edge: `<assert sequence> <nanoseconds of CLOCK_REALTIME>`.
 """
@@ -17,12 +17,12 @@ LINE_MAX_BYTES: Final = 64
 
 
 class EmulatedPps:
-    """The client of an emulated source. OSError where it is not there, or gone."""
+    """The client of an emulated source. OSError if it does not exist or is lost."""
 
     def __init__(self, address: str) -> None:
         host, _, port = address.removeprefix(SCHEME).rpartition(":")
         if not port.isdecimal():
-            raise OSError(f"{address!r} names no port; tcp://host:port is right")
+            raise OSError(f"{address!r} names no port; write tcp://host:port")
         self._socket = socket.create_connection((host, int(port)), timeout=CONNECT_TIMEOUT_S)
         self._received = b""
 
@@ -33,10 +33,13 @@ class EmulatedPps:
         return CAPTURE_ASSERT
 
     def set_mode(self, mode: int) -> None:
-        """Nothing to set: it captures what it can."""
+        """No effect: the source captures all its edges."""
 
     def fetch(self, timeout_s: float) -> Edges | None:
-        """As the kernel's: the next edge, None where none comes in time. Odd lines are skipped."""
+        """The next edge, as from the kernel; None if none is received in time.
+
+        Invalid lines are skipped.
+        """
         deadline = time.monotonic() + timeout_s
         while (left_s := deadline - time.monotonic()) > 0:
             line, separator, rest = self._received.partition(b"\n")
@@ -54,16 +57,16 @@ class EmulatedPps:
             except TimeoutError:
                 return None
             if not piece:
-                raise OSError("the source hung up")
+                raise OSError("the source closed the connection")
             self._received = (self._received + piece)[-4096:]
         return None
 
     def latest(self) -> Edges | None:
-        """None: edges wait in the line until they are fetched."""
+        """None: edges are buffered until they are fetched."""
         return None
 
     def is_there(self) -> bool:
-        """Yes: `fetch` raises where the source hung up."""
+        """True: `fetch` raises if the source closed the connection."""
         return True
 
     def close(self) -> None:
