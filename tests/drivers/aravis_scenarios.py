@@ -1,4 +1,4 @@
-"""What happens to an Aravis head and to its fake camera, each told as a JSON object.
+"""What happens to an Aravis head and to its fake camera, each printed as a JSON object.
 
 Run as a program of its own, one scenario a run, so that it can live in a network namespace where
 port 3956 is free and discovery reaches nobody. The tests are in test_aravis_fake_camera.py.
@@ -256,7 +256,7 @@ def a_dead_controllers_hold_is_waited_out() -> dict[str, object]:
     return {
         "controls": controls,
         "refused": refused,
-        "told": event_names,
+        "reported": event_names,
         "waited_s": waited_s,
         "frames": len(flight.frames),
     }
@@ -450,7 +450,7 @@ def light_that_changes_is_followed() -> dict[str, object]:
     head.close()
     return {
         "asked": [[r.exposure_time_us, r.gain_db, r.tdi_shifts] for r in requests],
-        "told": [
+        "reported": [
             [f.exposure_time_us, f.settings["Gain"], f.settings["TdiShifts"]] for f in flight.frames
         ],
         "bright": [float(np.percentile(p, 99)) / 4095.0 for p in flight.pictures],

@@ -98,8 +98,8 @@ def test_a_head_that_restarts_at_once_is_noticed_too() -> None:
 def test_the_hold_of_a_dead_controller_is_waited_out_and_shown() -> None:
     outcome = _scenario("a_dead_controllers_hold_is_waited_out")
     assert outcome["controls"] == "True"
-    assert "another program has held the head for 1 s" in outcome["refused"]
-    assert outcome["told"] == ["held-by-another"]
+    assert "another program has had control of the head for 1 s" in outcome["refused"]
+    assert outcome["reported"] == ["held-by-another"]
     assert outcome["waited_s"] < 8, "the fake camera lets go 3 s after the last heartbeat"
     assert outcome["frames"] == 2
 
@@ -163,10 +163,10 @@ def test_the_packet_size_is_negotiated_down_to_what_the_network_carries() -> Non
 def test_light_that_changes_is_followed_and_every_frame_states_what_it_was_exposed_with() -> None:
     outcome = _scenario("light_that_changes_is_followed")
     count = len(outcome["sun"])
-    assert len(outcome["told"]) == len(outcome["asked"]) == count
-    for asked, said in zip(outcome["asked"], outcome["told"], strict=True):
-        assert said == pytest.approx(asked, rel=1e-4, abs=1e-3)
-    times_us, gains_db, shifts = zip(*outcome["told"], strict=True)
+    assert len(outcome["reported"]) == len(outcome["asked"]) == count
+    for asked, reported in zip(outcome["asked"], outcome["reported"], strict=True):
+        assert reported == pytest.approx(asked, rel=1e-4, abs=1e-3)
+    times_us, gains_db, shifts = zip(*outcome["reported"], strict=True)
     assert max(times_us) / min(times_us) > 3.0
     assert max(gains_db) <= 12.0
     assert len(set(shifts)) >= 3

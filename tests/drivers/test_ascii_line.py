@@ -144,7 +144,7 @@ def test_contradicting_settings_are_refused_with_a_sentence() -> None:
     assert "pattern has 0 named groups; 2 are needed" in said(pattern=r"T=\d+")
     assert "channels names 0 twice" in said(channels=["0", "0"])
     assert "channel_labels is given; only" in said(channel_labels=["a", "b"])
-    assert "has 1 words; channels has 2" in said(pattern=ONE, channel_labels=["a"])
+    assert "has 1 labels; channels has 2" in said(pattern=ONE, channel_labels=["a"])
     assert "at least twice interval_s = 20" in said(command="T?", interval_s=10.0)
 
 

@@ -110,7 +110,9 @@ def test_an_exclusively_opened_port_that_the_kernel_refuses_names_the_holder(
 
     monkeypatch.setattr(serial_device.serial, "Serial", refuses)
     monkeypatch.setattr(serial_device, "holders", lambda _path: [PortHolder(812, "gpsd")])
-    with pytest.raises(DeviceError, match=r"in use by gpsd \(process 812\); run: systemctl stop gps"):
+    with pytest.raises(
+        DeviceError, match=r"in use by gpsd \(process 812\); run: systemctl stop gps"
+    ):
         open_serial_port(line.near, 9600, "N")
 
 

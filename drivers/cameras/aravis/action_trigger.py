@@ -1,4 +1,4 @@
-"""GigE Vision action commands to all heads: at once, or for one moment on each head's own clock."""
+"""GigE Vision action commands to all heads: immediate, or scheduled on each head's own clock."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from drivers.triggers.software import SoftwareTrigger
 class ActionTrigger(SoftwareTrigger):
     """Fires every head by an action command of its own, so that each acknowledges it.
 
-    With `scheduled` the commands go out ahead of time and carry the moment on the head's clock,
-    from its last latch: no precision time protocol is needed, and what is left of the jitter is
-    the sigma of the latch. Without it each head exposes when its command comes.
+    With `scheduled`, the commands are sent ahead of time and contain the instant on the head's
+    clock, computed from its last latch. No precision time protocol is needed, and the remaining
+    jitter is the sigma of the latch. Otherwise each head exposes when it receives its command.
 
     Source: GigE Vision 2.0, section 14.5.
     """
@@ -25,7 +25,9 @@ class ActionTrigger(SoftwareTrigger):
     kind: ClassVar = "trigger"
     head_trigger_source: ClassVar = "action"
 
-    scheduled = Setting(True, help="say when on the head's clock, instead of at once")
+    scheduled = Setting(
+        True, help="send the time of exposure on the head's clock, not an immediate command"
+    )
     lead_ms = Setting(50.0, minimum=1, maximum=1000, help="how long ahead commands are sent")
 
     def __init__(
@@ -48,8 +50,8 @@ class ActionTrigger(SoftwareTrigger):
         super().__init__(name, settings, heads=heads, clock=clock)
 
     def bind(self) -> Mapping[str, str]:
-        """What is fired, and how. See `drivers.contract.Trigger`."""
-        return {**super().bind(), "actions": "scheduled" if self.scheduled else "at once"}
+        """The outputs, heads and mode. See `drivers.contract.Trigger`."""
+        return {**super().bind(), "actions": "scheduled" if self.scheduled else "immediate"}
 
     def _fire_one(self, head: Head, delay_ns: int, start_ns: int) -> tuple[int, int]:
         if not self.scheduled:
@@ -59,7 +61,7 @@ class ActionTrigger(SoftwareTrigger):
         head_clock = head.clock_at(moment_ns + delay_ns)
         if head_clock is None:
             raise DeviceError(
-                f"{head.name}: the head's clock is not known; set scheduled = false, or take a "
+                f"{head.name}: the head's clock is unknown; set scheduled = false, or use a "
                 "head with a timestamp latch"
             )
         device_ns, sigma_ns = head_clock

@@ -1,4 +1,4 @@
-"""A GenICam head through Aravis: found, run, lost, and found again.
+"""A GenICam head through Aravis: opening, acquisition, loss and reconnection.
 
 Features are in `drivers.cameras.aravis.camera`, frames in `drivers.cameras.aravis.stream`.
 """
@@ -41,22 +41,22 @@ POP_TIMEOUT_S: Final = 0.1
 PROBE_TIMEOUT_S: Final = 0.2
 PROBE_ATTEMPTS: Final = 3
 LOSS_GRACE_S: Final = 2.0
-"""A head that answers nothing for so long is lost; a pause of a second heals by itself."""
+"""Time without any answer after which a head is lost; shorter pauses are tolerated."""
 CONTROL_WAIT_MARGIN_S: Final = 0.1
 TRIGGER_TIMEOUT_S: Final = 1.0
 CLOCK_DRIFT: Final = 100e-6
-"""How far a head's clock may run from the host's between two latches, as a part of the time."""
+"""Maximum drift of a head's clock against the host's between two latches, relative."""
 NOT_FRAMES: Final = ("aborted", "cleared", "filling", "unknown")
-"""Buffers that come back empty when a stream ends."""
+"""Status of buffers that are returned empty when a stream ends."""
 
 
 class AravisHeadLostError(Exception):
-    """The head is gone; internal."""
+    """The head is lost; internal."""
 
 
 @dataclass
 class _Session:
-    """An opened head, from finding to losing it."""
+    """An opened head, from opening to closing or loss."""
 
     camera: AravisCamera
     stream: FrameStream
@@ -67,11 +67,12 @@ class _Session:
 
 
 class AravisHead(AravisSettings, HeadDevice):
-    """A GigE Vision or USB3 Vision head whose frames land in memory of the caller's.
+    """A GigE Vision or USB3 Vision head whose frames are written to the caller's memory.
 
-    Yields a Frame for every exposure of which at least a packet came: COMPLETE, INCOMPLETE where
-    packets are missing for good, CORRUPT where its size or format is not the configured one. A
-    frame that comes while all slots are taken is lost in Aravis and counted as an underrun.
+    Yields a Frame for every exposure of which at least one packet was received. It is COMPLETE,
+    INCOMPLETE if packets are missing after all resend requests, or CORRUPT if its size or format is
+    not the configured one. A frame that arrives while all slots are in use is lost in Aravis and
+    counted as an underrun.
 
     Source: GenICam SFNC 2.7; GigE Vision 2.0. Quirks: docs/drivers/aravis.md.
     """
@@ -96,9 +97,10 @@ class AravisHead(AravisSettings, HeadDevice):
         self._of_stream: Counter[str] = Counter()
 
     def bind(self, sink: Sink | None = None) -> Mapping[str, str]:
-        """Open the head and write its settings; what was found. See `drivers.contract.Device`.
+        """Open the head, write its settings, return its identity. See `drivers.contract.Device`.
 
-        A hold by a dead controller is waited out; `sink` is told so.
+        If another controller has control, the call waits for the head's heartbeat time-out and
+        `sink` receives an event.
         """
         self.emitter.sink = sink
         try:
@@ -137,14 +139,14 @@ class AravisHead(AravisSettings, HeadDevice):
             session.camera.software_trigger()
         except aravis_error() as error:
             raise DeviceError(
-                f"{self.name}: the software trigger was refused ({error}); see whether the head "
-                "is lost"
+                f"{self.name}: the software trigger was refused ({error}); check whether the "
+                "head is lost"
             ) from None
         finally:
             self._control.release()
 
     def adjust(self, exposure_time_us: float, gain_db: float, tdi_shifts: int) -> None:
-        """Expose with this from now on, also when the head is opened again."""
+        """Use these exposure settings from now on, also after the head is reopened."""
         wanted = {
             "exposure_time_us": exposure_time_us,
             "gain_db": gain_db,
@@ -168,10 +170,13 @@ class AravisHead(AravisSettings, HeadDevice):
         return {name: found[name] for name in sorted(names)}
 
     def send_action_command(self, device_ns: int | None) -> None:
-        """Give this head an action command, at once or for a time of its clock; from any thread.
+        """Send an action command to this head, immediate or scheduled; from any thread.
+
+        Args:
+            device_ns: time of exposure on the head's clock; None for an immediate command.
 
         Raises:
-            DeviceError: it does not answer, is not meant, or the time is past.
+            DeviceError: it does not answer, has other keys, or the time is past.
         """
         if self.trigger_source != "action":
             raise DeviceError(
@@ -185,18 +190,18 @@ class AravisHead(AravisSettings, HeadDevice):
         if status == ACTION_LATE:
             self.counters["actions_late"] += 1
             raise DeviceError(
-                f"{self.name}: the action command came after its time; lengthen lead_ms"
+                f"{self.name}: the head received the action command after its time; increase lead_ms"
             )
         if status != SUCCESS:
             status_text = "no answer" if status is None else f"status 0x{status:04x}"
             raise DeviceError(
-                f"{self.name}: the action command was not taken ({status_text}); see whether the head is "
-                "lost or another program has changed its keys"
+                f"{self.name}: the action command was not accepted ({status_text}); check whether "
+                "the head is lost or another program has changed its keys"
             )
         self.counters["actions"] += 1
 
     def clock_at(self, mono_ns: int) -> tuple[int, int] | None:
-        """The head's clock at a host time near now, and its sigma; None while it is not known."""
+        """The head's clock at a host time near now, and its sigma; None while it is unknown."""
         session = self._session
         latch = None if session is None else session.latch
         if latch is None:
@@ -205,7 +210,7 @@ class AravisHead(AravisSettings, HeadDevice):
         drift_ns = round(abs(away_ns) * CLOCK_DRIFT)
         return latch.device_clock_ns + away_ns, latch.sigma_ns + drift_ns
 
-    # Finding
+    # Opening
 
     def _open_device(self) -> None:
         if self._session is None:
@@ -218,7 +223,7 @@ class AravisHead(AravisSettings, HeadDevice):
         return "held-by-another" if isinstance(error, ControlDeniedError) else "lost"
 
     def _open(self) -> _Session:
-        """Open the head, waiting out whoever holds it. DeviceError where that is in vain."""
+        """Open the head after another controller has released it. DeviceError if it does not."""
         deadline_ns = self.clock.mono_ns() + round(self.control_wait_limit_s * 1e9)
         held = self._is_controlled_by_other()
         reported_settings = False
@@ -232,18 +237,18 @@ class AravisHead(AravisSettings, HeadDevice):
                 reported_settings = True
                 self.emitter.emit(
                     "held-by-another",
-                    f"The head {self.name} at {self.address} is still held by another controller. "
-                    f"If that one is dead the head lets go by itself; it is waited for up to "
-                    f"{self.control_wait_limit_s:g} s.",
+                    f"Another controller has control of the head {self.name} at {self.address}. If "
+                    "that controller has ended, the head releases control. Retrying automatically "
+                    f"for up to {self.control_wait_limit_s:g} s.",
                 )
             if self.clock.mono_ns() > deadline_ns:
                 raise ControlDeniedError(
-                    f"{self.name} at {self.address}: another program has held the head for "
-                    f"{self.control_wait_limit_s:g} s, so it is alive; end that program"
+                    f"{self.name} at {self.address}: another program has had control of the head "
+                    f"for {self.control_wait_limit_s:g} s, so it is running; end that program"
                 )
-            # In one go and without a question in between, which might count as a sign of life of
-            # the dead controller. Whether the head has let go only taking control can tell: some
-            # leave the register as it was.
+            # Wait without a request in between, since a head may take it for a heartbeat of the
+            # dead controller. Only an attempt to take control shows whether the head is free: some
+            # heads leave the register unchanged.
             left_s = (deadline_ns - self.clock.mono_ns()) * 1e-9
             pause_s = self._heartbeat_s() + CONTROL_WAIT_MARGIN_S
             self.clock.wait(self._closing, max(0.0, min(pause_s, left_s)) + CONTROL_WAIT_MARGIN_S)
@@ -302,7 +307,7 @@ class AravisHead(AravisSettings, HeadDevice):
     # Running
 
     def _serve(self, sink: Sink) -> None:
-        """Deliver until closing or loss, then drop everything that belongs to this opening."""
+        """Deliver until closing or loss, then release all resources of this opening."""
         session = self._session
         if session is None:
             return
@@ -320,7 +325,7 @@ class AravisHead(AravisSettings, HeadDevice):
             self.emitter.emit(
                 "lost",
                 f"The head {self.name} at {self.address} was lost ({reason}). Check its power and "
-                "cable; it is opened again by itself.",
+                "cable. Reconnecting automatically.",
                 fault=True,
             )
         elif is_ip_address(self.address):
@@ -336,7 +341,7 @@ class AravisHead(AravisSettings, HeadDevice):
                 self._deliver_frame(session, received, sink)
             self._count(session)
             if session.camera.has_lost_control:
-                raise AravisHeadLostError("it no longer takes our heartbeat")
+                raise AravisHeadLostError("it no longer accepts the heartbeat")
             if self.clock.mono_ns() >= next_check_ns:
                 healthy = self._check(session)
                 pause_s = self.latch_interval_s if healthy else 0.0
@@ -399,7 +404,7 @@ class AravisHead(AravisSettings, HeadDevice):
         """Read clock and temperature; False while the head does not answer.
 
         Raises:
-            AravisHeadLostError: it has not answered for two seconds, or no longer knows us.
+            AravisHeadLostError: it has not answered for two seconds, or was restarted.
         """
         if is_ip_address(self.address):
             privilege = control_privilege(self.address, timeout_s=PROBE_TIMEOUT_S)
@@ -432,21 +437,21 @@ class AravisHead(AravisSettings, HeadDevice):
         if session.stream.restart_if_behind():
             self.emitter.emit_throttled(
                 "stream-restarted",
-                f"The head {self.name} numbered its frames out of order, so that they were dropped "
-                "as old. The stream was restarted; one exposure may miss its frame. Check the "
-                "head's power supply and firmware.",
+                f"The head {self.name} numbered its frames out of order, so they were dropped as "
+                "old. The stream was restarted; one exposure may have no frame. Check the head's "
+                "power supply and firmware.",
             )
 
     def _report_other_senders(self, session: _Session, count: int) -> None:
         details = session.stream.others or f"only {self.address} is accepted"
         self.emitter.emit_throttled(
             "other-sender",
-            f"{count} datagrams of other senders came to the ports of head {self.name} and were "
-            f"dropped, {details}. Disconnect the other sender, or give the heads a network of "
-            "their own.",
+            f"{count} datagrams of other senders arrived at the ports of head {self.name} and were "
+            f"dropped, {details}. Disconnect the other sender, or connect the heads to a separate "
+            "network.",
         )
 
-    # Letting go
+    # Closing
 
     def _slot_returned(self, slot: int) -> None:
         if self._session is not None:
@@ -460,7 +465,7 @@ class AravisHead(AravisSettings, HeadDevice):
         self.counters.update(self._of_stream)
         self._of_stream = Counter()
         if session.is_lost and self._closing.is_set():
-            # Aravis asks a dead head three times to let go, 2.5 s each; closing does not wait.
+            # Aravis sends three release requests to a dead head, 2.5 s each; closing does not wait.
             threading.Thread(
                 target=self._close_session, args=(session,), name=f"{self.name}-let-go", daemon=True
             ).start()
@@ -479,7 +484,7 @@ class AravisHead(AravisSettings, HeadDevice):
 def _exposure_settings(
     settings: Mapping[str, float | int | str], received: ReceivedFrame
 ) -> Mapping[str, float | int | str]:
-    """The head's settings, with what it wrote behind the pixels of this frame."""
+    """The head's settings, updated with the chunk data of this frame."""
     reported_settings = {"ExposureTime": received.chunk_exposure_us, "Gain": received.chunk_gain}
     return {
         **settings,
@@ -488,7 +493,7 @@ def _exposure_settings(
 
 
 def _status(camera: AravisCamera, received: ReceivedFrame) -> FrameStatus | None:
-    """What a returned buffer is worth; None where it holds no frame at all."""
+    """The status of a returned buffer; None if it contains no frame at all."""
     if received.reason in NOT_FRAMES:
         return None
     if received.reason == "size-mismatch":

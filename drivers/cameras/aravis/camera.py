@@ -1,6 +1,6 @@
-"""One opened GenICam head: its settings written, its clock, temperature and trigger.
+"""One opened GenICam head: its settings, clock, temperature and trigger.
 
-Frames are in `drivers.cameras.aravis.stream`; finding, losing and finding again in
+Frames are in `drivers.cameras.aravis.stream`; opening, loss and reconnection are in
 `drivers.cameras.aravis.aravis_head`.
 """
 
@@ -28,13 +28,13 @@ LATCH_ATTEMPTS: Final = 3
 NS_PER_S: Final = 1_000_000_000
 SETTINGS_HISTORY_LENGTH: Final = 4
 EXPOSURE_TIME_TOLERANCE: Final = 0.01
-"""How near the time a frame tells must be to that it was exposed with; heads round it."""
+"""Relative tolerance between a frame's exposure time and the configured one; heads round it."""
 CHUNKS: Final = ("Timestamp", "ExposureTime", "CounterValue", "Gain", "Temperature", "FrameID")
 
 
 @dataclass(frozen=True)
 class ClockLatch:
-    """The head's clock and the host time it belongs to."""
+    """A reading of the head's clock and its host time."""
 
     device_clock_ns: int
     mono_ns: int
@@ -43,7 +43,7 @@ class ClockLatch:
 
 @dataclass(frozen=True)
 class FrameGeometry:
-    """What a frame has to look like."""
+    """The configured size and format of a frame."""
 
     width_px: int
     height_px: int
@@ -58,10 +58,10 @@ class ControlDeniedError(DeviceError):
 
 
 class AravisCamera:
-    """An opened head, configured and under our control.
+    """An opened and configured head, with control access.
 
-    Not for several threads at once: the caller holds a lock around every call, and
-    `drivers.cameras.aravis.library.OPENING` while it is made and configured.
+    Not thread-safe: the caller holds a lock during every call, and
+    `drivers.cameras.aravis.library.OPENING` during construction.
 
     Raises:
         ControlDeniedError: another program has control.
@@ -86,7 +86,7 @@ class AravisCamera:
             if not self._camera.is_gv_device():
                 self._configure_all(settings)
                 return
-            # Again by its address, which can be held to.
+            # Open it again by its address, which the socket filters need.
             address = self.ip_address
             self._camera = None
             gc.collect()
@@ -121,11 +121,12 @@ class AravisCamera:
 
     @property
     def has_lost_control(self) -> bool:
-        """Whether Aravis' heartbeat has found that the head no longer obeys us.
+        """Whether Aravis' heartbeat has found that the head no longer accepts control.
 
-        Asked for, and not heard of through the signal "control-lost": while that is told, the
-        heartbeat's thread holds a reference to the device. Were we to let go meanwhile, that
-        reference would be the last, and the thread would wait for its own end: GLib aborts then.
+        The state is polled. The signal "control-lost" is not used: while it is emitted, the
+        heartbeat's thread holds a reference to the device. If the driver released the device in
+        that time, this reference would be the last one. The thread would then join itself, and
+        GLib aborts.
         """
         camera = self._camera
         return bool(camera.is_gv_device() and not camera.get_device().is_controller())
@@ -134,12 +135,12 @@ class AravisCamera:
         self._camera.start_acquisition()
 
     def stop(self) -> None:
-        """Stop acquiring; a head that is gone says nothing, and that is all right here."""
+        """Stop acquisition; errors of a lost head are ignored."""
         with contextlib.suppress(aravis_error()):
             self._camera.stop_acquisition()
 
     def release(self) -> None:
-        """Let go of the head: the last reference gives control back."""
+        """Release the head: dropping the last reference releases control."""
         self._camera = self.chunk_parser = None
         if self._control is not None:
             self._control.close()
@@ -147,28 +148,28 @@ class AravisCamera:
 
     @property
     def ip_address(self) -> str:
-        """Address of a GigE Vision head, also where it was opened by its name."""
+        """Address of a GigE Vision head, also if it was opened by its name."""
         return str(self._camera.get_device().get_device_address().get_address().to_string())
 
     @property
     def stream_source_port(self) -> int:
-        """The UDP port that the head says it sends its stream from; 0 where it does not say."""
+        """The source port of the stream in the head's register; 0 if it has none."""
         try:
             return int(self._camera.get_device().get_integer_feature_value("ArvGevSCSP")) & 0xFFFF
         except aravis_error():
             return 0
 
     def fire_test_packet(self) -> None:
-        """Let the head send a test packet to the stream's port; some heads cannot."""
+        """Make the head send a test packet to the stream's port; some heads cannot."""
         with contextlib.suppress(aravis_error()):
             self._camera.get_device().execute_command("ArvGevSCPSFireTestPacket")
 
     def other_senders(self) -> int:
-        """Datagrams of others that came to the control socket; they were dropped."""
+        """Number of dropped datagrams of other senders at the control socket."""
         return 0 if self._control is None else self._control.dropped_datagrams()
 
     def adjust(self, exposure_time_us: float, gain_db: float, tdi_shifts: int) -> None:
-        """Write exposure settings while the head runs; those it has not are left out.
+        """Write exposure settings while the head runs; features that it does not have are skipped.
 
         Raises:
             DeviceError: it refuses one.
@@ -190,7 +191,7 @@ class AravisCamera:
             ) from None
 
     def settings_of(self, exposure_us: float | None) -> Mapping[str, float | int | str]:
-        """What a frame was exposed with, by the exposure time it tells: it may be from before."""
+        """The settings of a frame, by its exposure time; they may be from before `adjust`."""
         for settings in (self.frame_settings, *reversed(self._earlier)):
             time_us = float(settings["ExposureTime"])
             if (
@@ -201,11 +202,11 @@ class AravisCamera:
         return self.frame_settings
 
     def software_trigger(self) -> None:
-        """Raises what Aravis raises."""
+        """Fire the software trigger; raises the error of Aravis."""
         self._camera.software_trigger()
 
     def latch(self) -> ClockLatch | None:
-        """Read the head's clock; the best of three tries. None where the head cannot."""
+        """Read the head's clock; the best of three attempts. None if the head has no latch."""
         if self._latch_features is None:
             return None
         command, value, is_ns = self._latch_features
@@ -222,11 +223,11 @@ class AravisCamera:
         return best
 
     def temperature_c(self) -> float | None:
-        """DeviceTemperature; None where the head has none."""
+        """DeviceTemperature; None if the head has none."""
         return float(self._camera.get_float("DeviceTemperature")) if self._has_temperature else None
 
     def check_alive(self) -> None:
-        """Read something that is not cached; raises what Aravis raises."""
+        """Read a feature that is not cached; raises the error of Aravis."""
         self._camera.get_exposure_time()
 
     def ns_from_ticks(self, ticks: int) -> int:
@@ -264,7 +265,7 @@ class AravisCamera:
         return identity
 
     def _configure(self, settings: AravisSettings) -> list[str]:
-        """Write every setting; what was refused, one sentence each."""
+        """Write every setting; returns one sentence per refusal."""
         library, failed = aravis(), aravis_error()
         camera = self._camera
         refusals: list[str] = []
@@ -275,7 +276,7 @@ class AravisCamera:
             except failed as error:
                 refusals.append(f"{key} = {value!r} is refused ({message_of(error)}); {hint}")
 
-        # A head that a killed controller left running would refuse the rest.
+        # A head that still acquires for a killed controller would refuse the other settings.
         write("acquisition", "stop", camera.stop_acquisition, "switch the head off and on")
         self._write_format(settings, write, refusals)
         self._write_exposure(settings, write, refusals)
@@ -283,7 +284,7 @@ class AravisCamera:
             "acquisition",
             "continuous",
             lambda: camera.set_acquisition_mode(library.AcquisitionMode.CONTINUOUS),
-            "the head is unsuitable",
+            "this head cannot be used",
         )
         key, source = {
             "software": ("trigger_source", "Software"),
@@ -325,10 +326,10 @@ class AravisCamera:
     def _write_action(
         self, settings: AravisSettings, write: Callable[..., None], refusals: list[str]
     ) -> None:
-        """Keys and mask of action commands; a head may have several signals to choose from."""
+        """Write keys and mask of action commands; a head may have several action signals."""
         camera = self._camera
         if not camera.is_gv_device():
-            refusals.append('trigger_source is "action"; only GigE Vision heads take actions')
+            refusals.append('trigger_source is "action"; only GigE Vision heads accept actions')
             return
         number = "".join(c for c in settings.trigger_action if c.isdigit())
         if self._has("ActionSelector") and number:
@@ -348,7 +349,7 @@ class AravisCamera:
                 key,
                 value,
                 functools.partial(camera.set_integer, feature, value),
-                "the head takes no action commands",
+                "the head accepts no action commands",
             )
 
     def _write_format(
@@ -437,8 +438,13 @@ class AravisCamera:
                 size = min(int(camera.gv_auto_packet_size()), settings.packet_size_limit)
             camera.gv_set_packet_size(size)
 
-        write("packet_size", settings.packet_size, set_size, "give 0, or what the network carries")
-        # It is settled; Aravis would otherwise try again when the stream is made.
+        write(
+            "packet_size",
+            settings.packet_size,
+            set_size,
+            "set 0, or a size that the network transports",
+        )
+        # The size is final; otherwise Aravis would negotiate again when the stream is created.
         camera.gv_set_packet_size_adjustment(library.GvPacketSizeAdjustment.NEVER)
         options = library.GvStreamOption
         camera.gv_set_stream_options(
@@ -466,7 +472,7 @@ class AravisCamera:
         return int(self._camera.get_device().get_timestamp_tick_frequency()) or NS_PER_S
 
     def _find_latch(self) -> tuple[str, str, bool] | None:
-        """Command and value of the clock, and whether the value is in ns already (SFNC 2)."""
+        """Command and value features of the clock, and whether the value is in ns (SFNC 2)."""
         for command, value, is_ns in (
             ("TimestampLatch", "TimestampLatchValue", True),
             ("GevTimestampControlLatch", "GevTimestampValue", False),

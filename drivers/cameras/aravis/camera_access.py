@@ -1,4 +1,4 @@
-"""A head opened through Aravis by its address alone, whatever has answered discovery."""
+"""Opening a head through Aravis by its address alone, independent of discovery replies."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from drivers.contract import DeviceError
 
 
 def local_interface(head_name: str, address: str) -> str:
-    """The address of this computer's interface towards a head. DeviceError: there is none."""
+    """The address of the local interface towards a head. DeviceError: there is none."""
     try:
         return interface_towards(address)
     except OSError as error:
@@ -21,7 +21,7 @@ def local_interface(head_name: str, address: str) -> str:
 
 
 def open_camera(head_name: str, interface: str, address: str) -> Any:
-    """The camera of Aravis at an IP address; without an interface, by its name.
+    """The Aravis camera at an IP address; without an interface, by its name.
 
     Raises:
         DeviceError: it does not answer.
@@ -30,7 +30,7 @@ def open_camera(head_name: str, interface: str, address: str) -> Any:
     try:
         if not interface:
             return library.Camera.new(address)
-        # Not by name: Aravis would take the address from whatever has answered its discovery.
+        # Not by name: Aravis would use the address of any discovery reply.
         gio = inet_address()
         device = library.GvDevice.new(gio.new_from_string(interface), gio.new_from_string(address))
         return library.Camera.new_with_device(device)

@@ -1,4 +1,4 @@
-"""Which GigE Vision and USB3 Vision heads answer on this computer's networks and ports."""
+"""Discovery of GigE Vision and USB3 Vision heads on the local networks and ports."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from drivers.cameras.aravis.library import OPENING, aravis
 
 @dataclass(frozen=True)
 class FoundHead:
-    """A head that answered, or somebody who says so: anybody on the network can.
+    """A discovery reply of a head; any host on the network can forge one.
 
-    `address` is what the driver's setting wants. Characters that cannot be printed are "?".
+    `address` is the value for the driver's setting. Unprintable characters are replaced by "?".
     """
 
     address: str
@@ -24,7 +24,7 @@ class FoundHead:
 
 
 def heads() -> list[FoundHead]:
-    """Every head that answers Aravis' discovery, about a second's wait.
+    """Every head that answers Aravis' discovery; takes about a second.
 
     Raises:
         DeviceError: Aravis is not installed.
@@ -37,7 +37,7 @@ def heads() -> list[FoundHead]:
             protocol = str(library.get_device_protocol(index) or "")
             if protocol == "Fake":
                 continue
-            # USB heads have no address that stays; they are opened by their name.
+            # USB heads have no persistent address; they are opened by their name.
             name = library.get_device_id(index)
             address = library.get_device_address(index) if protocol == "GigEVision" else name
             found.append(

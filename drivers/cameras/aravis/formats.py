@@ -25,7 +25,7 @@ _PACKINGS: Final = {
 
 
 def packing_of(pixel_format: str) -> Packing | None:
-    """How a format's pixels lie; None for a format that is no frame of a survey camera.
+    """The packing of a pixel format; None for an unsupported format.
 
     Example:
         >>> packing_of("BayerRG12p")
@@ -36,7 +36,7 @@ def packing_of(pixel_format: str) -> Packing | None:
 
 
 def packing_problem(packing: Packing, width_px: int) -> str | None:
-    """Why a packing does not fit a width; None where it does."""
+    """The reason why a packing does not fit a width; None if it fits."""
     group = pixels_in_a_group(packing)
     if width_px % group == 0:
         return None

@@ -1,10 +1,8 @@
-"""Questions of our own to a GigE Vision head: is it alive, is it held, and for how long.
+"""GVCP requests without Aravis: presence, control privilege, heartbeat and action commands.
 
-Aravis needs 2.5 s to find that a head does not answer, and opens a head that someone else holds
-without saying so; reading a register beforehand tells both in a moment. Everything else about a
-head goes through Aravis.
-
-Action commands are ours, too: Aravis 0.8 has none.
+Aravis needs 2.5 s to detect that a head does not answer. It reports no error if another controller
+has control. Reading a register beforehand detects both at once. Aravis 0.8 has no action commands.
+All other access to a head uses Aravis.
 
 Source: GigE Vision 2.0, sections 14.3.1 (READREG), 14.5 (ACTION) and 28.1 (control channel
 privilege).
@@ -29,7 +27,7 @@ ACK_REQUIRED: Final = 0x01
 REQUEST_IDS: Final = 0xFFFF
 PENDING_ACK: Final = 0x0089
 PENDING_MAX_S: Final = 2.0
-"""How long a head that says that it needs more time is waited for, however often it says so."""
+"""Maximum total wait for a head that sends PENDING_ACK, however often it sends it."""
 READREG_CMD: Final = 0x0080
 ACTION_CMD: Final = 0x0100
 SCHEDULED: Final = 0x80
@@ -42,7 +40,7 @@ PRIVILEGED: Final = 0b11
 
 
 def is_ip_address(address: str) -> bool:
-    """Whether a head is named by its IPv4 address; USB3 Vision heads are not."""
+    """Whether a head is configured by its IPv4 address; USB3 Vision heads are not."""
     try:
         ipaddress.IPv4Address(address)
     except ValueError:
@@ -51,10 +49,10 @@ def is_ip_address(address: str) -> bool:
 
 
 def control_privilege(address: str, *, timeout_s: float) -> int | None:
-    """The head's control channel privilege: 0 is free; None where it does not answer in time.
+    """The head's control channel privilege: 0 is free; None if it does not answer in time.
 
-    Never raises for what the head or the network does. Some heads take any reading of this
-    register for their controller's heartbeat, so it must not be polled while a hold is waited out.
+    Faults of the head or network never raise. Some heads take any read of this register for a
+    heartbeat of their controller. So it must not be polled while waiting for another controller.
     """
     answer = _read_register(address, CONTROL_CHANNEL_PRIVILEGE, timeout_s)
     if answer is None:
@@ -66,7 +64,7 @@ def control_privilege(address: str, *, timeout_s: float) -> int | None:
 
 
 def heartbeat_timeout_s(address: str, *, timeout_s: float) -> float:
-    """How long after its last word a head lets go of a controller; the standard's 3 s if unsaid."""
+    """The head's heartbeat time-out; the standard's 3 s if it does not report one."""
     answer = _read_register(address, HEARTBEAT_TIMEOUT, timeout_s)
     if answer is None or answer[0] != 0:
         return DEFAULT_HEARTBEAT_S
@@ -75,7 +73,7 @@ def heartbeat_timeout_s(address: str, *, timeout_s: float) -> float:
 
 @dataclass(frozen=True)
 class ActionKeys:
-    """Whom an action command means: heads with both keys and a common bit of the masks."""
+    """The addressees of an action command: heads with both keys and a common bit of the masks."""
 
     device_key: int
     group_key: int
@@ -85,10 +83,10 @@ class ActionKeys:
 def send_action(
     address: str, keys: ActionKeys, *, device_ns: int | None, timeout_s: float
 ) -> int | None:
-    """Give an action command; the head's status, None where it did not answer in time.
+    """Send an action command; returns the head's status, None if it did not answer in time.
 
-    `device_ns` is when, on the head's clock; None is at once. Sent once: a second one might be a
-    second exposure.
+    `device_ns` is the time of exposure on the head's clock; None is immediate. The command is never
+    repeated, since a second one might cause a second exposure.
     """
     body = struct.pack(">III", keys.device_key, keys.group_key, keys.group_mask)
     flags = ACK_REQUIRED
@@ -102,16 +100,16 @@ def send_action(
 def _request(
     address: str, command: int, body: bytes, *, timeout_s: float, flags: int = ACK_REQUIRED
 ) -> tuple[int, bytes] | None:
-    """Status and body of the answer to a command; None for silence or an unreachable head.
+    """Status and body of the answer to a command; None if the head does not answer.
 
-    Only the head's own answer counts: the kernel drops what comes from elsewhere, and the answer
-    has to carry the number of the request, which nobody else can know.
+    Only the head's own answer is accepted: the kernel drops datagrams of other senders, and the
+    answer must contain the random number of the request.
     """
     request_id = 1 + secrets.randbelow(REQUEST_IDS)
     now_s = time.monotonic()
     until_s, latest_s = now_s + timeout_s, now_s + timeout_s + PENDING_MAX_S
     try:
-        # A fresh port for every question: an answer to an older one cannot be mistaken for it.
+        # A new port for every request, so that a late answer to an older one is not accepted.
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as channel:
             channel.connect((address, GVCP_PORT))
             channel.send(struct.pack(">BBHHH", KEY, flags, command, len(body), request_id) + body)
@@ -134,7 +132,7 @@ def _request(
 
 
 def _read_register(address: str, register: int, timeout_s: float) -> tuple[int, int] | None:
-    """Status and value of a register; None where no fitting answer came."""
+    """Status and value of a register; None if no matching answer came."""
     answer = _request(address, READREG_CMD, struct.pack(">I", register), timeout_s=timeout_s)
     if answer is None:
         return None

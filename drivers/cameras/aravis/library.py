@@ -1,4 +1,4 @@
-"""The Aravis library itself: loaded when it is first needed, and its quirks in one place."""
+"""The Aravis library, loaded at its first use."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from typing import Any, Final
 from drivers.base.extras import missing
 
 OPENING: Final = threading.Lock()
-"""Held while a head is opened and configured. Aravis 0.8.26 parses a head's description, and the
-nodes it adds of its own, with state of the whole process: two heads opened at once see features as
-missing or end in a segmentation fault."""
+"""Held while a head is opened and configured. Aravis 0.8.26 parses a head's description with global
+state. Two heads that are opened in parallel miss features or cause a segmentation fault."""
 
 
 @functools.cache
@@ -19,7 +18,7 @@ def aravis() -> Any:
     """The Aravis namespace of PyGObject.
 
     Raises:
-        MissingExtraError: it is not installed; the message has the command.
+        MissingExtraError: it is not installed; the message contains the command that installs it.
     """
     try:
         import gi
@@ -33,7 +32,7 @@ def aravis() -> Any:
 
 @functools.cache
 def aravis_error() -> type[Exception]:
-    """What a call into Aravis raises."""
+    """The exception type of Aravis calls."""
     aravis()
     from gi.repository import GLib
 
@@ -42,7 +41,7 @@ def aravis_error() -> type[Exception]:
 
 
 def inet_address() -> Any:
-    """The class of GLib for IP addresses."""
+    """GLib's class of IP addresses."""
     aravis()
     from gi.repository import Gio
 
@@ -50,5 +49,5 @@ def inet_address() -> Any:
 
 
 def message_of(error: Exception) -> str:
-    """The words of what Aravis raised."""
+    """The message of an Aravis exception."""
     return str(getattr(error, "message", error))

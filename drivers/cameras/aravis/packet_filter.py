@@ -1,8 +1,8 @@
 """Only the head's own datagrams reach Aravis; those of other senders are dropped and counted.
 
-Aravis 0.8 reads its control and its stream socket whoever sent the datagram (`arvgvdevice.c`,
-`arvgvstream.c`); only its packet socket looks at the address, and at no port. The kernel does it
-here, on Aravis' own sockets. Who forges the head's address is not noticed.
+Aravis 0.8 accepts datagrams of any sender on its control and stream sockets (`arvgvdevice.c`,
+`arvgvstream.c`). Its packet socket filters by address, but not by port. This module makes the
+kernel filter Aravis' own sockets. A forged address of the head is not detected.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ SCAN_INTERVAL_S: Final = 0.0005
 TEST_PACKET_TIMEOUT_S: Final = 0.1
 DRAIN_BATCH: Final = 256
 QUEUED_MAX: Final = 100_000
-"""More datagrams than any receive buffer holds."""
+"""Larger than the number of datagrams in any receive buffer."""
 
 LOAD_WORD: Final = 0x20
 LOAD_HALF: Final = 0x28
@@ -40,7 +40,7 @@ JUMP_BITS: Final = 0x45
 RETURN: Final = 0x06
 ACCEPT_ALL: Final = 0xFFFF_FFFF
 IP_HEADER: Final = 0xFFF0_0000
-"""SKF_NET_OFF: from here the network header counts, whatever the socket's data begin with."""
+"""SKF_NET_OFF: offsets from here on are relative to the network header."""
 
 Condition = tuple[int, int, int, int]
 """Load, offset, jump and value."""
@@ -54,9 +54,9 @@ def interface_towards(address: str) -> str:
 
 
 class SocketCapture:
-    """Holds every UDP socket that Aravis binds meanwhile to the head's address.
+    """Captures every UDP socket that Aravis binds to the interface in the meantime.
 
-    Aravis makes a socket and uses it within one call, so a thread looks for it. The caller holds
+    Aravis creates and uses a socket within one call, so a thread scans for it. The caller holds
     `drivers.cameras.aravis.library.OPENING`.
     """
 
@@ -84,7 +84,7 @@ class SocketCapture:
             found.close()
 
     def take(self) -> socket.socket:
-        """The first that was made, for the caller to close.
+        """The first captured socket; the caller closes it.
 
         Raises:
             DeviceError: there is none.
@@ -115,7 +115,7 @@ class SocketCapture:
                     self._found.append(found)
 
     def _is_aravis(self, candidate: socket.socket) -> bool:
-        """Whether it is bound to the interface and connected to nobody."""
+        """Whether the socket is bound to the interface and not connected."""
         if (candidate.family, candidate.type) != (socket.AF_INET, socket.SOCK_DGRAM):
             return False
         host, port = candidate.getsockname()
@@ -129,9 +129,10 @@ class SocketCapture:
 
 
 class ControlSocketFilter:
-    """The control socket of an opened head, from now on for answers of its GVCP port only.
+    """Filters the control socket of an opened head: only its GVCP port is accepted.
 
-    Filtered and not connected: a connected socket fails on ICMP errors, which anybody can forge.
+    The socket is filtered, not connected: a connected socket fails on ICMP errors, which any host
+    can forge.
     """
 
     def __init__(self, control: socket.socket, address: str, port: int) -> None:
@@ -139,7 +140,7 @@ class ControlSocketFilter:
         filter_by_source(control, address, port)
 
     def dropped_datagrams(self) -> int:
-        """How many datagrams of others were dropped."""
+        """Number of dropped datagrams of other senders."""
         return _drops(self._control)
 
     def close(self) -> None:
@@ -149,19 +150,19 @@ class ControlSocketFilter:
 class StreamSocketFilter:
     """The stream socket, connected to the head, and a second socket at the same address.
 
-    The kernel gives a datagram to the connected socket where it comes from there, and any other one
-    to the second socket, which counts it. Made while Aravis does not read.
+    The kernel delivers the head's datagrams to the connected socket and all others to the second
+    socket, which counts them. Create it while Aravis does not read.
 
     Args:
         port: of the stream's socket.
         address: of the head.
-        source_port: what the head's register holds; 0 where it holds nothing.
-        fire_test_packet: lets the head send one datagram, whose port counts more than the register.
+        source_port: the port in the head's register; 0 if it is empty.
+        fire_test_packet: makes the head send one datagram; its port overrides the register.
 
-    Where neither names the port, it is the first one that is seen.
+    If both are missing, the first source port of the head is used.
 
     Raises:
-        DeviceError: the socket is not there or the kernel refuses.
+        DeviceError: the socket does not exist or the kernel refuses.
     """
 
     def __init__(
@@ -181,14 +182,14 @@ class StreamSocketFilter:
             self._others = _second_socket(self._stream)
         except OSError as error:
             raise DeviceError(
-                f"the stream of the head at {address} cannot be held to its address ({error}); "
+                f"the stream of the head at {address} cannot be filtered by its address ({error}); "
                 f"check that no other program uses UDP port {port}"
             ) from error
         self._discard_queued()
 
     @property
     def source(self) -> str:
-        """Who is accepted."""
+        """The accepted sender."""
         return f"{self._address}:{self.source_port}" if self.source_port else self._address
 
     def set_receive_buffer(self, nbytes: int) -> None:
@@ -196,10 +197,10 @@ class StreamSocketFilter:
         self._stream.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, nbytes)
 
     def poll(self, received_packets: int) -> int:
-        """Count what others sent, and settle the head's port; how many there were in all.
+        """Count datagrams of other senders, lock the head's port; returns the total count.
 
         Args:
-            received_packets: what Aravis has received of the head.
+            received_packets: number of packets that Aravis has received from the head.
         """
         self._is_certain |= self.source_port != 0 and received_packets > 0
         if not self._is_certain:
@@ -226,7 +227,7 @@ class StreamSocketFilter:
                 self.source_port = self._stream.recvfrom(1, socket.MSG_DONTWAIT)[1][1]
 
     def _lock_to_queued_datagram(self) -> None:
-        """The port of a datagram that Aravis has not read yet; it stays in the queue."""
+        """Lock the port of a datagram that Aravis has not read yet; it stays in the queue."""
         with contextlib.suppress(OSError):
             _, (_, port) = self._stream.recvfrom(1, socket.MSG_PEEK | socket.MSG_DONTWAIT)
             self._lock_source_port(port)
@@ -236,7 +237,7 @@ class StreamSocketFilter:
         self.source_port, self._is_certain = port, True
 
     def _discard_queued(self) -> None:
-        """Drop what came before the socket was connected; Aravis does not read it now."""
+        """Drop the datagrams from before the socket was connected."""
         for _ in range(QUEUED_MAX):
             try:
                 self._stream.recv(1, socket.MSG_DONTWAIT)
@@ -247,7 +248,7 @@ class StreamSocketFilter:
 
 
 def filter_by_source(udp: socket.socket, address: str, port: int | None = None) -> None:
-    """Let the kernel drop what a UDP socket gets from another address (or port)."""
+    """Make the kernel drop datagrams of a UDP socket from other addresses (or ports)."""
     conditions = [(LOAD_WORD, IP_HEADER + 12, JUMP_EQUAL, _as_number(address))]
     if port is not None:
         conditions.append((LOAD_HALF, 0, JUMP_EQUAL, port))
@@ -255,10 +256,10 @@ def filter_by_source(udp: socket.socket, address: str, port: int | None = None) 
 
 
 def filter_packet_sockets(known: set[str], source: tuple[str, int], to: tuple[str, int]) -> int:
-    """Let packet sockets made since `known` take whole datagrams from `source` to `to` alone.
+    """Restrict packet sockets that are not in `known` to datagrams from `source` to `to`.
 
-    Replaces the filter of Aravis, which does not look at the source's port (0: any). Returns how
-    many there are.
+    Only unfragmented datagrams are accepted. Replaces the filter of Aravis, which ignores the
+    source port (0: any). Returns the number of sockets.
     """
     program = [
         (LOAD_HALF, 12, JUMP_EQUAL, 0x0800),
@@ -284,18 +285,18 @@ def filter_packet_sockets(known: set[str], source: tuple[str, int], to: tuple[st
 
 
 def socket_inodes() -> set[str]:
-    """All sockets of this process, to find later which ones are new."""
+    """Inodes of all sockets of this process, to detect new ones later."""
     return {inode for _, inode in _sockets()}
 
 
 def attach_filter(to: socket.socket, conditions: list[Condition]) -> None:
     """Filter a socket: every condition (load, offset, jump, value) must hold.
 
-    JUMP_EQUAL wants the value, JUMP_BITS none of its bits.
+    JUMP_EQUAL requires the value, JUMP_BITS that none of its bits is set.
     """
     code = b""
     for index, (load, offset, jump, value) in enumerate(conditions):
-        # Behind the conditions there are two instructions: take it whole, and drop it.
+        # Two instructions follow the conditions: accept all bytes, and drop.
         to_drop = 2 * (len(conditions) - index) - 1
         code += struct.pack("=HBBI", load, 0, 0, offset)
         yes, no = (0, to_drop) if jump == JUMP_EQUAL else (to_drop, 0)
@@ -309,7 +310,7 @@ def attach_filter(to: socket.socket, conditions: list[Condition]) -> None:
 
 
 def socket_at(port: int) -> socket.socket:
-    """A descriptor of ours for this process's UDP socket that is bound to `port`.
+    """A duplicate descriptor of this process's UDP socket that is bound to `port`.
 
     Raises:
         OSError: there is none.
@@ -327,7 +328,7 @@ def socket_at(port: int) -> socket.socket:
 
 
 def _second_socket(first: socket.socket) -> socket.socket:
-    """A socket at the address of `first`; nobody else may bind there afterwards."""
+    """A second socket at the address of `first`; afterwards no other one can bind there."""
     second = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     both = (first, second)
     try:
@@ -346,7 +347,7 @@ def _second_socket(first: socket.socket) -> socket.socket:
 
 
 def _drops(of: socket.socket) -> int:
-    """Datagrams that the kernel dropped for this socket; 0 where it does not say."""
+    """Datagrams that the kernel dropped for this socket; 0 if it does not report them."""
     try:
         found = of.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, MEMINFO_NBYTES)
     except OSError:
@@ -357,7 +358,7 @@ def _drops(of: socket.socket) -> int:
 def _sockets() -> Iterator[tuple[int, str]]:
     """Descriptor and inode of every socket of this process."""
     for entry in Path("/proc/self/fd").iterdir():
-        # Another thread may close a descriptor while this looks at it.
+        # Another thread may close the descriptor in the meantime.
         with contextlib.suppress(OSError):
             target = str(entry.readlink())
             if target.startswith("socket:"):
@@ -367,7 +368,7 @@ def _sockets() -> Iterator[tuple[int, str]]:
 def _duplicate_socket(
     descriptor: int, predicate: Callable[[socket.socket], bool]
 ) -> socket.socket | None:
-    """A descriptor of ours for somebody's socket, where it is the wanted one."""
+    """A duplicate of a descriptor, if the predicate accepts its socket; else None."""
     with contextlib.suppress(OSError):
         found = socket.socket(fileno=os.dup(descriptor))
         with contextlib.suppress(OSError):

@@ -1,4 +1,4 @@
-"""What can be set of a GenICam head, and which settings contradict each other."""
+"""Settings of a GenICam head, and conflicts between them."""
 
 from __future__ import annotations
 

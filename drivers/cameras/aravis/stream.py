@@ -1,7 +1,7 @@
-"""Frames of one head, received into memory of our own.
+"""Frames of one head, received into the slots of a `FrameMemory`.
 
-Slots and Aravis' buffers are paired here; when a stream is made and dropped is decided in
-`drivers.cameras.aravis.aravis_head`.
+This module pairs slots with Aravis' buffers; `drivers.cameras.aravis.aravis_head` creates and
+closes streams.
 """
 
 from __future__ import annotations
@@ -36,17 +36,17 @@ STATISTIC_NAMES: Final = {
     "n_error_packets": "error_packets",
     "n_transferred_bytes": "bytes",
 }
-"""What Aravis counts, and what it is called here. Its underruns are packets, not frames."""
+"""Aravis' statistics and their names here. Aravis counts underruns in packets, not frames."""
 ALIGNMENT: Final = 8
 GVSP_OVERHEAD_NBYTES: Final = 36
-"""IP, UDP and GVSP headers of a packet: what its size holds besides pixels."""
+"""IP, UDP and GVSP headers, which are part of the packet size."""
 
 
 @dataclass(frozen=True)
 class ReceivedFrame:
-    """A buffer that Aravis has given back, and the slot its pixels lie in.
+    """A buffer that Aravis has returned, and the slot of its pixels.
 
-    `reason` is Aravis' word for its status; the figures are None where no leader came.
+    `reason` is Aravis' name of its status; the other values are None if no leader was received.
     """
 
     slot: int
@@ -67,8 +67,8 @@ class ReceivedFrame:
 class FrameStream:
     """The stream of an opened head into `memory`.
 
-    `free` slots are lent to Aravis at once, others by `lend`. Aravis writes into a slot from
-    `lend` until `pop` gives it back; the buffers are kept alive here for as long.
+    `free` slots are queued immediately, others by `queue_slot`. Aravis writes into a slot from
+    `queue_slot` until `pop` returns it; the buffers are referenced here in that time.
 
     Raises:
         DeviceError: the slots are too small, or the stream cannot be made.
@@ -90,17 +90,17 @@ class FrameStream:
         if memory.slot_nbytes < needed:
             raise DeviceError(
                 f"{settings.name} at {settings.address}: a frame has {needed} bytes, its slot "
-                f"{memory.slot_nbytes}; give slots of the sensor's size plus "
+                f"{memory.slot_nbytes}; create slots of the sensor's size plus "
                 "CHUNK_ALLOWANCE_NBYTES, and check width_px, height_px and pixel_format"
             )
         self._parser = camera.chunk_parser
         packet_size = int(camera.frame_settings.get("GevSCPSPacketSize", 0))
-        # Leader and trailer besides the payload; without packets (USB) every underrun is a frame.
+        # Payload plus leader and trailer; without packets (USB) every underrun is a frame.
         self._packets_per_frame = (
             2 + -(-nbytes // (packet_size - GVSP_OVERHEAD_NBYTES)) if packet_size else 1
         )
-        # Packed pixels are received at the end of the slot: unpacked from there to its start they
-        # never overtake themselves, and no memory besides is needed.
+        # Packed pixels are received at the end of the slot and unpacked towards its start. So
+        # unread bytes are never overwritten, and no additional memory is needed.
         self._offset = 0
         if self._packing is not Packing.WORDS:
             self._offset = (memory.slot_nbytes - nbytes) // ALIGNMENT * ALIGNMENT
@@ -126,16 +126,16 @@ class FrameStream:
             self.queue_slot(slot)
 
     def queue_slot(self, slot: int) -> None:
-        """Let Aravis fill this slot next; from any thread."""
+        """Queue this slot for Aravis; from any thread."""
         self._stream.push_buffer(self._buffers[slot])
 
     def pop(self, timeout_s: float) -> ReceivedFrame | None:
-        """Wait for a frame, at most so long. The slot is the caller's until `lend`."""
+        """Wait for a frame, at most `timeout_s`. The caller owns the slot until `queue_slot`."""
         buffer = self._stream.timeout_pop_buffer(round(timeout_s * 1e6))
         if buffer is None:
             return None
         reason = str(buffer.get_status().value_nick)
-        # Aravis complains on stderr when asked for the size of a frame that it gave up.
+        # Aravis prints a warning when the size of an aborted frame is read.
         is_complete = reason == "success"
         if is_complete:
             self._ignored = self._ignored_packets()
@@ -157,7 +157,7 @@ class FrameStream:
         )
 
     def unpack(self, slot: int) -> None:
-        """Make 16-bit words, right-justified, of what was received into a slot; after `pop`."""
+        """Convert the received pixels of a slot to right-justified 16-bit words; after `pop`."""
         if self._packing is Packing.WORDS:
             return
         address = self._memory.address(slot)
@@ -165,9 +165,9 @@ class FrameStream:
         unpack(self._packing, packed, words_at(address, self._pixel_count))
 
     def counted(self) -> Counter[str]:
-        """What Aravis has counted of this stream, and `underruns` in frames.
+        """Aravis' statistics of this stream, and `underruns` in frames.
 
-        `other_senders` are datagrams of others, which were dropped.
+        `other_senders` are dropped datagrams of other senders.
         """
         found: Counter[str] = Counter()
         for theirs, ours in STATISTIC_NAMES.items():
@@ -180,16 +180,16 @@ class FrameStream:
 
     @property
     def others(self) -> str:
-        """Who sent last without being the head, and who is accepted."""
+        """The last other sender, and the accepted one."""
         if self._senders is None or not self._senders.last_other:
             return ""
         return f"the last from {self._senders.last_other}; only {self._senders.source} is accepted"
 
     def restart_if_behind(self) -> bool:
-        """Begin again where Aravis takes the head's frames for old ones and drops them.
+        """Restart the stream if Aravis takes the head's frames for old ones and drops them.
 
-        Aravis drops up to 100 frames after a block number that was too large, or once the head
-        counts from 1 again. A whole frame of ignored packets, and none delivered since, means that.
+        Aravis drops up to 100 frames after a block number that was too large, or if the head counts
+        from 1 again. The sign is a complete frame of ignored packets with no frame delivered since.
         """
         if self._ignored_packets() - self._ignored < self._packets_per_frame:
             return False
@@ -200,12 +200,12 @@ class FrameStream:
         return True
 
     def close(self) -> None:
-        """End the stream. When this returns Aravis writes into no slot any more."""
+        """End the stream. After the return, Aravis no longer writes into any slot."""
         weak = self._stream.weak_ref()
         self._stream = None
         gc.collect()
-        # The last reference stops the stream's thread. Were one left somewhere, memory that is
-        # handed out anew would be written into: stop the thread by hand then.
+        # Dropping the last reference stops the stream's thread. If a reference were left, the
+        # thread would write into slots that are in use again; so it is stopped explicitly.
         left = weak()
         if left is not None:
             left.stop_thread(False)
@@ -219,11 +219,11 @@ class FrameStream:
         return int(self._stream.get_info_uint64_by_name(name))
 
     def _ignored_packets(self) -> int:
-        """Packets that Aravis dropped although there was a buffer for them."""
+        """Packets that Aravis dropped although a buffer was available."""
         return self._info("n_ignored_packets") - self._info("n_underruns")
 
     def _filter_to_head(self, camera: AravisCamera, settings: AravisSettings) -> None:
-        """Let only the head's datagrams reach Aravis, and begin after those that came before."""
+        """Accept only the head's datagrams, and discard those that were received before."""
         stream, address = self._stream, camera.ip_address
         stream.stop_thread(False)
         port = int(stream.get_port())
@@ -241,7 +241,7 @@ class FrameStream:
         socket_nbytes = min(settings.socket_buffer_bytes, receive_buffer_limit())
         stream.set_property("socket-buffer", library.GvStreamSocketBuffer.FIXED)
         stream.set_property("socket-buffer-size", socket_nbytes)
-        # Aravis widens its socket only once a first frame has begun, and loses that one.
+        # Aravis enlarges its receive buffer only after a first frame has begun, and loses that one.
         if self._senders is not None:
             self._senders.set_receive_buffer(socket_nbytes)
         stream.set_property("packet-resend", library.GvStreamPacketResend.ALWAYS)
@@ -259,7 +259,7 @@ def receive_buffer_limit() -> int:
 
 
 def _chunk(parser: Any, method: str, buffer: Any, name: str) -> Any:
-    """A chunk's value; None where the head does not send this one."""
+    """The value of a chunk; None if the head does not send it."""
     if parser is None:
         return None
     failed = aravis_error()
