@@ -250,7 +250,7 @@ def test_scheduled_actions_expose_heads_at_their_delays_whatever_their_clocks() 
 def test_an_action_that_comes_after_its_time_is_reported_as_late() -> None:
     with flying(trigger_source="action") as (pair,):
         now_ns = pair.clock.device_ns(time.monotonic_ns())
-        with pytest.raises(DeviceError, match="came after its time; lengthen lead_ms"):
+        with pytest.raises(DeviceError, match="after its time; increase lead_ms"):
             pair.driver.send_action_command(now_ns - 1_000_000_000)
         pair.wait_frames(1)
     assert pair.driver.statistics()["actions_late"] == 1
