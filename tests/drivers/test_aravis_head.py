@@ -260,7 +260,7 @@ def test_an_action_that_means_other_heads_is_reported_as_not_taken() -> None:
     with flying(trigger_source="action", action_group_mask=0b100) as (pair,):
         # Somebody else has given the head another group.
         pair.emulated._registers.set_register(0x9804, 0b010)
-        with pytest.raises(DeviceError, match="was not taken"):
+        with pytest.raises(DeviceError, match="was not accepted"):
             pair.driver.trigger()
     assert pair.emulated.statistics()["actions_ignored"] == 1
 
