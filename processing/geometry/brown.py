@@ -1,7 +1,7 @@
-"""Brown's distortion as computer vision writes it, carried into the lens correction.
+"""Brown's distortion in the form of computer vision, converted to the lens correction.
 
 Makers of small cameras state measured = f(ideal); a rig file holds ideal = measured + delta. The
-correction is fitted once, and the fit says how well it does.
+correction is fitted once; the fit returns its largest error.
 
 Source: docs/mathematics/lens.md#from-browns-model; Brown (1971); Heier et al. (2002), eq. 5.1.
 """

@@ -1,4 +1,4 @@
-"""What is known about an exposure besides its pixels, and the figures that follow from it alone.
+"""Conditions of an exposure apart from its pixels, and the figures computed from them.
 
 Smear, parallax, ground sampling distance and dC are computed here; they become findings in
 `processing.quality.report`.
@@ -31,7 +31,7 @@ TIME_PARTS = ("receiver", "clock", "trigger", "delay", "head")
 
 @dataclass(frozen=True)
 class Conditions:
-    """The circumstances of one exposure; None or an absent key is "not known".
+    """The conditions of one exposure; None or an absent key is "not known".
 
     Temperatures are by probe; exposure times and TDI counts are those of each frame, by sensor.
     Angles and rates are of the body (x forward, y right, z down); `crab_rad` is the angle from the
@@ -105,7 +105,7 @@ def usable_temperatures(
 
 
 def by_sensor_name(cone: Cone, of_frames: Mapping[str, T]) -> dict[str, T]:
-    """What is known of a cone's frames, by sensor name."""
+    """Values of a cone's frames, by sensor name."""
     names = [sensor.name for sensor in cone.sensors]
     return {name: of_frames[name] for name in names if name in of_frames}
 
@@ -121,7 +121,7 @@ def for_sensors(rig: Rig, of_cones: Mapping[str, T]) -> dict[str, T]:
 
 
 def reference_exposure_times(rig: Rig, exposure_times: Mapping[str, float]) -> dict[str, float]:
-    """What exposure time the signal of each frame is brought to, by sensor name.
+    """Common exposure time to which the signal of each frame is scaled, by sensor name.
 
     The median of its cone where that is the median of all PAN cones, or of all colour cones, to
     within `ALIKE`; else the median of those. A cone exposed less than half as long keeps its own:
@@ -152,9 +152,9 @@ def reference_exposure_times(rig: Rig, exposure_times: Mapping[str, float]) -> d
 
 
 def exposure_scales(rig: Rig, exposure_time_s: Mapping[str, float]) -> dict[str, float]:
-    """What the signal of each frame is multiplied by, so that all frames compare.
+    """Factors on the signal of each frame that make all frames comparable.
 
-    Exactly 1 where the frames of a cone were exposed alike, and as long as other cones. A frame
+    Exactly 1 where the frames of a cone have one exposure time, and that of the other cones. A frame
     whose exposure time is not known has none.
 
     Args:
@@ -219,7 +219,7 @@ def ground_sampling_distance_m(rig: Rig, conditions: Conditions) -> float | None
 
 
 def parallax_px(rig: Rig, conditions: Conditions, relief_fraction: float) -> float:
-    """What relief leaves between PAN and the colour master beside the flight axis, PAN pixels.
+    """Parallax by relief between PAN and a colour master off the flight axis, PAN pixels.
 
     base * f * dh / h^2 for relief of `relief_fraction` of the height; zero where the height is not
     known. Along the flight axis syntopic exposure removes it; crab turns some of it back.

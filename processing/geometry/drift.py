@@ -20,7 +20,7 @@ from processing.rig import Cone, Rig, Sensor
 def sensor_dc(sensor: Sensor, temperatures_c: Mapping[str, float]) -> float:
     """dC of a sensor, K; zero where its probe has no temperature.
 
-    Its lagged temperature counts where the rig asks for one and it is there.
+    Uses the lagged temperature where the rig configures a lag and the value is present.
     """
     known = temperatures_c.get(sensor.probe, sensor.calibration_c)
     if sensor.drift.lag_s > 0.0:
@@ -29,7 +29,7 @@ def sensor_dc(sensor: Sensor, temperatures_c: Mapping[str, float]) -> float:
 
 
 def lagged_probe(sensor: Sensor) -> str:
-    """The name under which a sensor's lagged temperature goes, beside those of the probes."""
+    """Name of a sensor's lagged temperature in a table of probe temperatures."""
     return f"{sensor.probe}/{sensor.name}"
 
 
@@ -64,7 +64,7 @@ def cone_dc(cone: Cone, temperatures_c: Mapping[str, float]) -> float:
 
 
 def missing_probes(rig: Rig, temperatures_c: Mapping[str, float]) -> tuple[str, ...]:
-    """Probes the rig asks for and the exposure lacks: their sensors stay at calibration."""
+    """Probes of the rig without a temperature in the exposure: their sensors stay at calibration."""
     return tuple(probe for probe in rig.probes if probe not in temperatures_c)
 
 

@@ -1,4 +1,4 @@
-"""The lens correction of a cone: the ten parameters of Australis, and the grid of what they leave,
+"""The lens correction of a cone: the ten parameters of Australis, and the grid of residuals,
 where the rig file holds one.
 
 Points are mm in the layer, origin at the calibrated principal point; the direction is part of

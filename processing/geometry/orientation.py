@@ -1,7 +1,7 @@
-"""From the attitude of the aircraft to the angles of photogrammetry; the one home of that step.
+"""Conversion of aircraft attitude to the angles of photogrammetry; only this module does it.
 
-Inertial systems tell roll, pitch and heading of the body against the local level (north, east,
-down); photogrammetry wants omega, phi, kappa of the camera against a map grid (east, north, up).
+Inertial systems report roll, pitch and heading of the body against the local level (north, east,
+down); photogrammetry uses omega, phi, kappa of the camera against a map grid (east, north, up).
 Between them lie two constant matrices, the boresight, and the convergence of the meridian.
 Conversion goes through the matrix, never by renaming angles. Rotations are (3, 3), float64.
 

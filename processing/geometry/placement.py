@@ -1,4 +1,4 @@
-"""Where a sensor's pixels fall in the virtual image plane, and back.
+"""Projection of a sensor's pixels to the virtual image plane, and back.
 
 A placement composes TDI, TDM, skew, lens, principal distance, similarity S and layer
 transformation P; adjusting S and P is the work of `processing.mosaic.free_mosaic`.
@@ -63,7 +63,7 @@ def nominal_placements(
     Args:
         rig: the camera.
         temperatures_c: temperature by probe name. A probe without one leaves its sensors at their
-            calibration temperature; saying so is the caller's
+            calibration temperature; the caller reports it
             (`processing.geometry.drift.missing_probes`).
         tdi_shifts: N of each frame by sensor name; a sensor without one has none.
         use_drift: False ignores the temperatures (places and principal distances as calibrated).

@@ -1,4 +1,4 @@
-"""What a lens does beyond the ten parameters: a grid of corrections, to be added on top of them.
+"""Residual distortion beyond the ten parameters: a grid of corrections that is added to them.
 
 Direction: *ideal from measured*, as the ten parameters. The grid is taken at the measured place and
 added to what they made of it.

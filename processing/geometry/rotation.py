@@ -1,4 +1,4 @@
-"""Rotation matrices from angles; the one home of the order omega, phi, kappa.
+"""Rotation matrices from angles; only this module fixes the order omega, phi, kappa.
 
 R = Rx(omega) Ry(phi) Rz(kappa), camera to object, radians. Other orders convert through the matrix.
 

@@ -1,7 +1,7 @@
 """Plane similarities: shift, rotation and scale of a sensor in the layer of its cone.
 
-Only the transformation itself lives here; what a sensor's similarity is at a temperature is told
-by `processing.geometry.drift`, how it is adjusted by `processing.mosaic.free_mosaic`.
+This module holds the transformation only. `processing.geometry.drift` computes a sensor's
+similarity at a temperature; `processing.mosaic.free_mosaic` adjusts it.
 """
 
 from __future__ import annotations

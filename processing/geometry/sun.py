@@ -1,4 +1,4 @@
-"""Where the sun stands, to some hundredths of a degree: enough for shadows and for a specification.
+"""Elevation of the sun to some hundredths of a degree: enough for shadows and for a specification.
 
 Refraction and the observer's height are left out.
 """

@@ -35,7 +35,7 @@ class HeightModel:
     step_y_m: float
 
     def at(self, xy_m: Array) -> Array:
-        """Heights (n,) at places (n, 2); NaN outside, and beside unknown ones."""
+        """Heights (n,) at places (n, 2); NaN outside, and next to unknown ones."""
         column = (xy_m[:, 0] - self.x_m) / self.step_x_m
         row = (xy_m[:, 1] - self.y_m) / self.step_y_m
         height, width = self.height_m.shape

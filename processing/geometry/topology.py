@@ -1,7 +1,7 @@
-"""What follows from a rig's arrangement alone: overlaps, multiple corners, parameter counts.
+"""Properties of a rig's arrangement: overlaps, multiple corners, parameter counts.
 
-Everything is derived from nominal placements at calibration temperature; nothing here looks at an
-image. Rectangles are in the virtual image plane, mm, y up.
+Everything is derived from nominal placements at calibration temperature; no image is
+used. Rectangles are in the virtual image plane, mm, y up.
 
 Source: docs/mathematics/mosaicking.md#parameters-and-degrees-of-freedom; Ladstädter et al. (2010),
 tables 1 and 2, fig. 2.
@@ -30,7 +30,7 @@ from processing.rig import Cone, Rig
 Array = NDArray[np.float64]
 
 _RIGS: Final = 8
-"""What follows from a rig alone is reckoned once, not for every exposure."""
+"""Values that depend on the rig alone are computed once, not for every exposure."""
 
 # A strip runs along at least half of a sensor's side; what is shorter both ways is a corner.
 _STRIP_FRACTION = 0.5

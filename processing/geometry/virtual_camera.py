@@ -1,4 +1,4 @@
-"""The virtual camera between converging heads: where it stands, and how it sees what a head saw.
+"""The virtual camera between converging heads: its position, and the projection of heads into it.
 
 A head's image is carried onto a horizontal plane of the ground and from there into the virtual
 image; that is a projective transformation of its layer. Which heads are turned how is adjusted in

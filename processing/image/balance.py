@@ -1,6 +1,6 @@
 """Balancing the PAN heads from the histograms of their overlaps.
 
-A gain for each sensor; an offset too where an overlap spans light and dark enough to tell it. Also
+A gain for each sensor, and an offset where the contrast of an overlap determines it. Also
 samples the heads at common nodes of the virtual image, which the seams use too.
 
 Source: docs/mathematics/radiometry.md#balance-between-heads; Heier et al. (2002), 6.2.
@@ -34,16 +34,16 @@ _BLOCK_PX: Final = 8
 _COARSE: Final = 8
 _MIN_SAMPLES: Final = 30
 _MIN_SIGNAL: Final = 80.0
-"""Level-1 counts (10 DN of 12 bits): below, the ratio of two means says little."""
+"""Level-1 counts (10 DN of 12 bits): below, the ratio of two means is too uncertain."""
 _SPAN: Final = 4.0
-"""Light over dark from which on an overlap tells an offset from a gain."""
+"""Ratio of light to dark from which an overlap separates an offset from a gain."""
 _LEVELS: Final = 12
 _PAIR_DIFFERENCE_SIGMA: Final = 2e-4
 """What parallax and reflection leave between two cones at one level, of its signal."""
 _GAIN_SIGMA: Final = 0.05
 _OFFSET_SIGMA: Final = 24.0
 _NO_OFFSET_SIGMA: Final = 1e-3
-"""Level-1 counts: black drifts by a few DN, and where nothing tells it is not drawn on."""
+"""Level-1 counts: a priori sigma of an offset; black drifts by a few DN."""
 
 
 @dataclass(frozen=True)
@@ -64,10 +64,10 @@ class PairBalance:
 
 @dataclass(frozen=True)
 class Balance:
-    """Gains by sensor (the mean of their logarithms is zero) and what every overlap said.
+    """Gains by sensor (the mean of their logarithms is zero) and the measurement of every overlap.
 
     Balanced signal is gain * signal + offset; `offsets` are in Level-1 counts and zero where no
-    overlap of a sensor spans enough light and dark to tell them from its gain.
+    overlap of a sensor spans enough light and dark to separate them from its gain.
     """
 
     gains: Mapping[str, float]
@@ -127,11 +127,11 @@ def covered_box(means: Array) -> tuple[slice, slice]:
 
 
 def balance_gains(names: Sequence[str], means: Array) -> Balance:
-    """Gains, and offsets where they can be told, that make the overlaps agree.
+    """Gains, and offsets where they are determinable, that make the overlaps agree.
 
     First each overlap gives the median of its log ratios, which neither a car that moved between
     two exposures nor a saturated roof can pull; gains follow by weighted least squares over all
-    pairs. Where the histogram of an overlap spans a factor of four, medians level by level tell
+    pairs. Where the histogram of an overlap spans a factor of four, medians level by level separate
     gain from offset, and both are adjusted once more. A sensor without overlap keeps the mean gain.
 
     Args:
@@ -218,7 +218,7 @@ def _gains_and_offsets(
 ) -> tuple[Array, Array]:
     """Relative changes of gain, and offsets of the sensors `free` to have one, (count,) each.
 
-    What the overlaps do not tell stays near none: drift of black between heads is small.
+    Offsets that the overlaps do not determine stay near zero: drift of black is small.
     """
     rows, values = [], []
     for level in levels:

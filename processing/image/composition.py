@@ -1,7 +1,7 @@
 """Composing rasters from corrected frames: PAN of many sensors, colour of one sensor each band.
 
-Holds the buffers, which are allocated once and used again for every exposure. Where sensors lie is
-given by placements; what they are good for is not asked here.
+Holds the buffers, which are allocated once and used again for every exposure. Placements
+give the positions of sensors.
 """
 
 from __future__ import annotations
@@ -174,8 +174,8 @@ class PanComposer:
         raw pixels, `<sensor>.weight` (n,) above zero.
 
         Args:
-            placements: None tells what the last image was made with. Others tell where the same
-                VIP pixels would be fetched if these placements were used instead.
+            placements: None uses those of the last image. Others return where the same VIP
+                pixels would be fetched with these placements.
         """
         result: dict[str, Array] = {}
         for k, name in enumerate(self.names):

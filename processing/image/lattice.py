@@ -1,4 +1,4 @@
-"""Lattices of inverse mapping: where on a sensor the pixels of a target raster come from.
+"""Lattices of inverse mapping: sensor positions of the pixels of a target raster.
 
 A lattice holds raw (column, row) at every `cell_px`-th target pixel, `OUTSIDE` where the sensor is
 far; between the nodes it is bilinear. The pixels are fetched in `processing.image.resampling`.

@@ -1,6 +1,6 @@
 """One resampling from raw geometry to a target raster, fused with gain, seams and validity.
 
-Inverse mapping: each target pixel is fetched from where the lattice says its ray fell on a sensor.
+Inverse mapping: each target pixel is fetched from the sensor position that the lattice gives for it.
 Which sensor serves which pixel is decided in `processing.image.seams`, the lattice comes from
 `processing.image.lattice`.
 

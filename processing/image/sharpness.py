@@ -18,7 +18,7 @@ _EVERY_ROW: Final = 16
 _BUNDLE: Final = 32
 _MIN_LENGTH: Final = 34
 _MIN_SIGNAL: Final = 4.0
-"""Detail at two pixels' distance must exceed its noise so many times before sharpness is told."""
+"""Detail at two pixels' distance must exceed its noise so many times before sharpness is reported."""
 
 
 def sharpness(

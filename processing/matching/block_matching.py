@@ -88,7 +88,7 @@ def match_block(
         station_m: (n, 3) projection centres, any Cartesian frame with z up.
         rotation: (n, 3, 3) from camera.
         ground_m: height of the ground there, to begin with.
-        progress: told how many images are done.
+        progress: called with the number of images that are done.
     """
     settings = settings or BlockMatching()
     half = settings.window_px // 2

@@ -1,4 +1,4 @@
-"""Do frames show the ground that the calibration expects in them?
+"""Check that frames show the ground that the calibration predicts.
 
 Texture that matches nowhere is no water: frames are swapped, of another exposure, turned or
 mirrored, or a head has moved farther than tie points are sought. Frames whose tie points fail are

@@ -1,4 +1,4 @@
-"""Bright discs on dark ground: found, measured by weighted means, and told which target each is.
+"""Bright discs on dark ground: detection, measurement by weighted means, and identification.
 
 Which target a disc shows follows from where the nominal camera would see each: the holder's
 settings are off by tens of pixels, alike for all, so the shift most pairs agree on is taken first.
@@ -74,7 +74,7 @@ def _middle(values: NDArray[Any], box: tuple[slice, slice], ground: float) -> Ar
         column, row = moved
         if step < 1e-4:
             break
-    # Beside another disc the circle holds a part of that one.
+    # Next to another disc the circle holds a part of that one.
     rim = part[np.abs(np.hypot(x - column, y - row) - radius) < 1.0]
     if float(np.max(rim)) > 0.25 * float(part.max()):
         return None

@@ -8,8 +8,8 @@ Why it is unbiased: both patches are carried half of the shift towards each othe
 does to the gradients cancels; and interpolation passes the same noise at every sub-pixel phase.
 
 Why unequal sharpness does not matter: to first order it leaves a multiple of the image's Laplacian,
-which is even where slopes are odd. One unknown of its own takes it out of shift and residuals, so
-that what is left to tell the sigma is noise.
+which is even where slopes are odd. A separate unknown removes it from shift and residuals, so
+that the sigma follows from noise alone.
 
 Source: docs/mathematics/matching.md#least-squares-matching; Gruen (1985).
 """
@@ -212,7 +212,7 @@ def refine(
         dy += step_y
         if abs(dx) > _MAX_SHIFT_PX or abs(dy) > _MAX_SHIFT_PX:
             return False
-    # The last step once more, with the difference in sharpness beside the shift. Noise is in the
+    # The last step once more, with the difference in sharpness and the shift. Noise is in the
     # Laplacian too; weighed by what is behind a sample it agrees with neither image.
     bent[:size] = np.float32(0.0)
     back, forth = (-0.5 * dx, -0.5 * dy), (0.5 * dx, 0.5 * dy)

@@ -1,6 +1,6 @@
-"""Asking the memory for what is needed next, while something else is reckoned.
+"""Prefetching of memory that is needed next, during other computations.
 
-A patch is some hundred lines of cache that lie rows apart, which no hardware foresees.
+A patch is some hundred lines of cache that lie rows apart, which no hardware predicts.
 """
 
 from __future__ import annotations

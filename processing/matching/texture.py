@@ -21,7 +21,7 @@ PIXEL_SPACING_PX: Final = 2
 def has_texture(
     frame: NDArray[Any], sensor: Sensor, at: NDArray[np.int64], window_px: int
 ) -> NDArray[np.bool_]:
-    """Tell windows whose near pixels differ clearly more than noise makes them.
+    """Mark windows whose near pixels differ clearly more than by noise.
 
     Args:
         frame: Level-1 words, (h, w) uint16.

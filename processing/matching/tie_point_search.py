@@ -1,4 +1,4 @@
-"""Where tie points are sought: feature-rich positions, and where the other sensor should see them.
+"""Search positions of tie points: feature-rich positions, and their prediction in the other sensor.
 
 What is found there is matched in `processing.matching.tie_points`.
 """
@@ -40,8 +40,8 @@ class TiePointSettings:
     """How many points are sought, how, and what a match must reach.
 
     Window and search of P/C are in pixels of the colour master, of P/P in PAN pixels; so are the
-    sigmas. `floor_sigma_px` is what noise does not tell: rotation within the patch, interpolation.
-    Where an area is too small for the wished number, windows are not let overlap.
+    sigmas. `floor_sigma_px` is the error besides noise: rotation within the patch, interpolation.
+    Where an area is too small for the requested number, windows still do not overlap.
     """
 
     points_per_overlap: int = 850
@@ -248,7 +248,7 @@ def saturated_window_fraction(
         settings: None takes the defaults.
 
     Returns:
-        The share in the frame that is burnt more; None where the pair has no overlap or no frame.
+        The share in the frame with more saturation; None where the pair has no overlap or no frame.
     """
     size = (settings or TiePointSettings()).window_pp_px
     shares = []

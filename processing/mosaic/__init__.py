@@ -1,1 +1,1 @@
-"""Free image mosaicking: the adjustment of one exposure, and whether it is to be believed."""
+"""Free image mosaicking: the adjustment of one exposure, and its validation."""

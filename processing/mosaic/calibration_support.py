@@ -1,8 +1,8 @@
 """Where tie points are weak, calibration and platform take part in the adjustment.
 
-The free mosaic asks tie points alone; over water, sand, snow or under a cloud they say too little
-and their noise would bend the image. Here it is decided when that is so, and what calibration,
-temperature and platform know; the adjustment itself is in `processing.mosaic.free_mosaic`.
+The free mosaic uses tie points alone. Over water, sand, snow or under a cloud there are too few,
+and their noise would bend the image. This module detects that, and computes the prior information
+of calibration, temperature and platform. The adjustment itself is in `processing.mosaic.free_mosaic`.
 
 Source: docs/mathematics/mosaicking.md#supported-mosaic.
 """
@@ -83,7 +83,7 @@ def contradicted_colour(
     """Which tie points (n,) are P/C points that may put a sensor where it is not.
 
     Those of a sensor found off its calibrated place that P/P points do not hold on every side. A
-    cloud under the camera is nearer than the ground, and the colour master stands beside the PAN
+    cloud under the camera is nearer than the ground, and the colour master is next to the PAN
     cones: all P/C points of a sensor that sees the cloud are off alike, and hide P/P points, too.
     """
     affected = {

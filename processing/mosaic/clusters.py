@@ -1,9 +1,9 @@
-"""Neighbouring tie points err alike, and so tell less than their number says.
+"""Correlated errors of neighbouring tie points, which carry less information than independent ones.
 
 A roof's sunny side or the edge of a field looks otherwise in green than in PAN, and so does ground
-whose colours are not quite in one place: every point on it is off the same way. What that does to
-the covariance of the unknowns is reckoned here from the residuals of one exposure; single points
-and their weights are judged in `processing.mosaic.weights`.
+whose colours are not quite in one place: every point on it is off the same way. The effect
+on the covariance of the unknowns is computed here from the residuals of one exposure; single points
+and their weights are evaluated in `processing.mosaic.weights`.
 
 Source: docs/mathematics/mosaicking.md#accuracy.
 """
@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 _POINTS_PER_CLUSTER: Final = 30.0
 _MIN_CLUSTERS: Final = 30
-"""Fewer sums of residuals tell their variance to no better than a quarter."""
+"""Fewer sums of residuals determine their variance to no better than a quarter."""
 _REACH_PX: Final = 93.0
 """How far, in colour pixels, P/C points err alike: sums over cells of area a show a / (a + reach^2)
 of what sums over whole sensors have. Measured on rendered exposures (docs/matching.md)."""
@@ -43,7 +43,7 @@ def clustered_cofactor(
     """The cofactor of unknowns whose observations are not independent: Q + sum (k - 1) Q N_c Q.
 
     N_c are the normal equations of a class of points, k how many times larger than for independent
-    points the variance of sums over neighbours is, one at least. Cells of a few points tell it from
+    points the variance of sums over neighbours is, one at least. Cells of a few points determine it from
     one exposure; unknowns are sums over whole sensors, and to these it is carried on.
 
     Args:

@@ -1,6 +1,6 @@
 """dC as the stitching sees it: how far sensors of one cone have moved apart, in sensor lengths.
 
-A second way to dC beside the probes, for cones of two or more CCDs, always with its standard
+A second way to dC in addition to the probes, for cones of two or more CCDs, always with its standard
 deviation. What drift does is in `processing.geometry.drift`; nothing found here moves a pixel.
 
 Source: docs/mathematics/drift.md#estimated-dc; Ladstädter et al. (2010), fig. 1, "estimation of dC
@@ -46,7 +46,7 @@ class EstimatedDc:
     `estimated_k` and `sigma_k` are None where dC is not determinable: fewer than two sensors found,
     or a mount that expands like silicon (`rate_ppm_per_k` near zero). `expansion_ppm` is how much
     more than the sensors the distances between them have grown since calibration. `measured_k` is
-    None where no probe of the cone tells.
+    None where no probe of the cone has a temperature.
     """
 
     cone: str
@@ -80,7 +80,7 @@ def estimate_dc(
         temperatures_c: temperature by probe name, as the mosaic's start was made with; a probe
             without one held its sensors at calibration.
         measured: those of them that were read and not bridged; None is all.
-        displaced: sensors left out, for their place says nothing about temperature.
+        displaced: sensors left out, whose place carries no information on temperature.
         settings: None takes the defaults.
     """
     settings = settings or EstimateSettings()

@@ -1,4 +1,4 @@
-"""What the stitching records of a flight say of the sensors of one cone, exposure by exposure.
+"""Series of the stitching records of a flight for the sensors of one cone, by exposure.
 
 Contrasts of their places that no shift, scale or rotation of the whole cone can change, and what
 calibration, drift coefficients and probes make of them; what follows for the sensors is in
@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 class ConeContrasts:
     """Contrasts (c, n) of what records call `names` (n,), and what is known of them.
 
-    `moved` (c, 2 m) is what a px of each sensor's x and y makes of them, `warmed` (c,) what a
+    `moved` (c, 2 m) is what a px of each sensor's x and y makes of them, `thermal_design` (c,) what a
     kelvin, by probe; `place`, `drift` (c, c) are covariances of what calibration leaves, and of
     what coefficients leave of a kelvin.
     """
@@ -49,7 +49,7 @@ class ConeContrasts:
 class ContrastSeries:
     """Contrasts of one cone over a flight: y (t, c), covariance (t, c, c), dC (t,).
 
-    `factor` is by how much exposures differ more from their neighbours than their covariance says.
+    `factor` is the variance of differences between neighbours over that of their covariance.
     """
 
     numbers: tuple[int, ...]
@@ -64,7 +64,7 @@ def is_master(rig: Rig, cone: Cone) -> bool:
 
 
 def contrasts_of(rig: Rig, cone: Cone, *, quantities: Sequence[str] = POSITION) -> ConeContrasts:
-    """The master's sensors beside a similarity in common, two sensors of others by difference."""
+    """The master's sensors up to a common similarity, two sensors of others by difference."""
     relative = not is_master(rig, cone)
     sensors = cone.sensors[:2] if relative else cone.sensors
     pitch_um = sensors[0].pitch_um if rig.virtual_image is None else rig.virtual_image.pitch_um
@@ -120,7 +120,7 @@ def _of_layer(sensors: Sequence[Sensor], own: Sequence[bool]) -> Array:
 
 
 def series_of(rig: Rig, view: ConeContrasts, records: Mapping[int, StitchRecord]) -> ContrastSeries:
-    """The exposures that tell of all of the view's sensors, with the rig's own calibration."""
+    """The exposures with all of the contrasts' sensors, with the rig's own calibration."""
     numbers, y, covariance, dc = [], [], [], []
     for number in sorted(records):
         record = records[number]
@@ -141,7 +141,7 @@ def series_of(rig: Rig, view: ConeContrasts, records: Mapping[int, StitchRecord]
 
 
 def variance_factor(series: ContrastSeries) -> float:
-    """By how much exposures differ more from their neighbours than their covariance says; >= 1."""
+    """Variance of differences between neighbouring exposures over that of their covariance; >= 1."""
     size = series.y.shape[1]
     if len(series.numbers) < 4:
         return 1.0
@@ -152,7 +152,7 @@ def variance_factor(series: ContrastSeries) -> float:
 
 
 def probe_bias_series(view: ConeContrasts, series: ContrastSeries, probe: str) -> Array:
-    """What a probe reads too much in each exposure (t,), K, as far as places and scales tell."""
+    """Bias of a probe in each exposure (t,), K, from places and scales."""
     design = -view.thermal_design[probe]
     weight = np.linalg.inv(series.covariance + view.place)
     normal_vector = np.einsum("i,tij,tj->t", design, weight, series.y)

@@ -1,13 +1,13 @@
-"""Did a sensor move in flight? What the stitching of many exposures says together.
+"""Sensors displaced in flight, detected from the stitching of many exposures.
 
 One exposure sees a displacement of a few hundredths of a pixel through its own noise; a flight of
 them sees when it began, and what calibration does not know drops out of the difference. The single
-exposure is judged in `processing.mosaic.validity`.
+exposure is evaluated in `processing.mosaic.validity`.
 
 Model, cone by cone, of contrasts y of the sensors' places that no shift, scale or rotation of the
 whole cone can change: y_t = b + k dC_t + steps + noise. b is what calibration leaves, k what drift
 coefficients leave, both with the rig file's sigmas; the noise is the adjustment's and the probe's.
-What a step is, a sensor that slipped or a probe that misreads since, the sensors' scales tell, too.
+The sensors' scales distinguish a displaced sensor from a biased probe.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ Kind = Literal["named", "several", "relative", "misread"]
 class FlightSettings:
     """What is assumed and demanded.
 
-    `family_alpha` is the probability of telling of any step in a healthy flight, all cones and
-    exposures together. A step is told from `min_exposures` on either side of it, for one
-    exposure may be wrong. Sensors, probes and exposures within `odds` of the best are alternatives.
-    What a probe that misreads says is worth `unknown_sigma_k`.
+    `family_alpha` is the probability of reporting any step in a healthy flight, all cones and
+    exposures together. A step needs `min_exposures` on either side of it, for one
+    exposure may be wrong. Sensors, probes and exposures within `odds_limit` of the best are
+    alternatives. The sigma of a biased probe is `unknown_sigma_k`.
     """
 
     family_alpha: float = 0.001
@@ -64,13 +64,13 @@ class FlightDisplacement:
     """A sensor that has been displaced since an exposure, (x right, y up), PAN px.
 
     "named": it is `sensor`, unless one of `alternatives`. "several": more than one sensor of the
-    cone moved, and which cannot be told; dx, dy are of the one that fits best. "relative": of two
+    cone moved, and which is not determinable; dx, dy are of the one that fits best. "relative": of two
     sensors, `sensor` has moved against `alternatives[0]`, or that against this. "misread": the
-    probe of `misread` reads wrong, by that on average (`sensor` is empty, dx and dy are of the one
-    that fits best); with the other kinds, `misread` is a probe that explains it nearly as well,
+    probe of `probe_bias` reads wrong, by that on average (`sensor` is empty, dx and dy are of the one
+    that fits best); with the other kinds, `probe_bias` is a probe that explains it nearly as well,
     None if none does.
-    `since` is the first exposure with it, between `earliest` and `latest`; `from_start` says that
-    all of the flight has it. `sigma_px` is that of the length.
+    `since` is the first exposure with it, between `earliest` and `latest`; `from_start`
+    is true where all of the flight has it. `sigma_px` is that of the length.
     """
 
     cone: str
@@ -94,7 +94,7 @@ class FlightDisplacement:
 
     @property
     def sentence(self) -> str:
-        """For a person who has just landed."""
+        """The finding in one sentence."""
         size = f"{self.length_px:.2f} +- {self.sigma_px:.2f} px"
         since = f"since exposure {self.since}"
         if self.from_start:
@@ -113,12 +113,12 @@ class FlightDisplacement:
             cause_text = f"or {probe}; what it was" if probe else "which of them moved"
             return (
                 f"{self.sensor} and {self.alternatives[0]} have been displaced against each other "
-                f"by {size} {since}{', ' if probe else '; '}{cause_text} cannot be told."
+                f"by {size} {since}{', ' if probe else '; '}{cause_text} cannot be determined."
             )
         if self.kind == "several":
             return (
                 f"More than one sensor of cone {self.cone} has been displaced {since}; which ones "
-                "cannot be told from the stitching."
+                "cannot be determined from the stitching."
             )
         others = [*self.alternatives, *([f"that {probe}"] if probe else [])]
         unless = f", unless it is {' or '.join(others)}" if others else ""
@@ -127,7 +127,7 @@ class FlightDisplacement:
 
 @dataclass(frozen=True)
 class FlightValidity:
-    """The judgement on a flight; `exposures` counts those used, by cone."""
+    """The verdict on a flight; `exposures` counts those used, by cone."""
 
     steps: tuple[FlightDisplacement, ...]
     exposures: Mapping[str, int]
@@ -147,7 +147,7 @@ def evaluate_flight(
 
     Args:
         rig: the camera, as calibrated.
-        records: by number of the exposure; those of other calibrations are passed over.
+        records: by number of the exposure; those of other calibrations are skipped.
         settings: None takes the defaults.
     """
     settings = settings or FlightSettings()

@@ -1,8 +1,8 @@
-"""Free image mosaicking: every sensor finds its place from tie points alone.
+"""Free image mosaicking: positions of all sensors from tie points alone.
 
-The adjustment and its statistics live here; the unknowns are laid out in
+The adjustment and its statistics are here; the unknowns are laid out in
 `processing.mosaic.model`, what observations weigh is in `processing.mosaic.weights`, and whether
-the result agrees with the calibration is judged in `processing.mosaic.validity`.
+the result agrees with the calibration is evaluated in `processing.mosaic.validity`.
 
 Source: docs/mathematics/mosaicking.md#observation-equations; Ladstädter et al. (2010), eq. 1-7,
 tables 1 and 2.
@@ -75,14 +75,14 @@ class Mosaic:
     """The outcome of an adjustment; placements in the virtual image and how good they are.
 
     `values` (u,) are accumulated corrections against the start, `covariance` (u, u) theirs, a
-    posteriori, both in the unknowns' own units (see `MosaicModel`); neighbours that err alike are
-    counted for what they tell (`processing.mosaic.clusters`). `residuals_px` (n, 2) is place
+    posteriori, both in the unknowns' own units (see `MosaicModel`); correlated neighbours are
+    down-weighted (`processing.mosaic.clusters`). `residuals_px` (n, 2) is place
     of a minus place of b in the VIP after the adjustment, (x right, y up), for all tie points,
     outliers included; `redundancy_numbers` (n, 2) likewise; `outliers` (n,) marks points not used.
     `sigma0` has no unit; `sigma0_px` is that of one coordinate difference of a P/P pair.
     `used` counts points per pair, `undetermined` names unknowns held at their start.
-    `pseudo_observations` is the number of directions held. `supported` says that calibration and
-    platform took part as observations (`processing.mosaic.calibration_support`).
+    `pseudo_observations` is the number of directions held. `supported` is true where calibration and
+    platform are observations (`processing.mosaic.calibration_support`).
     """
 
     method: str
@@ -148,7 +148,7 @@ def free_mosaic(
         settings: None takes the defaults.
         excluded_datum_sensors: master sensors the datum (eq. 6) does not rest on.
         begin: an adjustment of the same points in another datum, to go on from.
-        prior: what is known of the unknowns beside the points, see `adjust_mosaic`.
+        prior: information on the unknowns in addition to the points, see `adjust_mosaic`.
 
     Returns:
         The mosaic. What tie points do not determine (missing frames, empty overlaps) stays at its

@@ -1,7 +1,7 @@
-"""Do the layers of the other cones agree with the platform calibration, in scale and rotation?
+"""Test of the layers of the other cones against the platform calibration, in scale and rotation.
 
-Stitching carries every layer onto the master's, whatever the calibration says. What it had to
-change is compared here with how well principal distances, mountings and sensor places are known.
+Stitching transforms every layer onto the master's, independent of the calibration. The change is
+compared here with how well principal distances, mountings and sensor places are known.
 A change that all other cones share is the master's own; it moves the whole image and is not
 corrected. What changes in all cones alike cannot be observed by stitching: that takes a bundle
 adjustment with ground control or GNSS.

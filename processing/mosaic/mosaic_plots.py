@@ -1,6 +1,6 @@
 """Plain SVG drawings: a rig's focal planes and virtual image, and what a stitching left over.
 
-Strings only, no fonts or scripts needed; they are shown by a browser, in the report and by
+The drawings need no fonts or scripts; they are shown by a browser, in the report and by
 `syntopic rigs show`. Sources of the pictures: Ladstädter et al. (2010), fig. 2 to 5.
 """
 
@@ -68,7 +68,7 @@ def residuals_svg(
 ) -> str:
     """Residual vectors of P/P and P/C tie points, and of the master cone's sensors.
 
-    Vectors are enlarged; the bar in each panel says by how much. Points left out by data snooping
+    Vectors are enlarged; the bar in each panel shows the scale. Points left out by data snooping
     are orange. At most a few thousand vectors are drawn, evenly thinned.
     """
     image = rig.virtual_image

@@ -90,7 +90,7 @@ class PlatformCheck:
 
     `covariance` (3 n, 3 n) is that of the turns of all heads, by tie points and by the sensors'
     places; their mean, which is the datum, has none.
-    `statistic` is chi-square with `freedom` degrees of freedom on a platform as calibrated; what
+    `statistic` is chi-square with `degrees_of_freedom` degrees of freedom on a platform as calibrated; what
     all heads turned together does not count, it cannot be seen.
     """
 
@@ -262,7 +262,7 @@ def rotation_of_layer(rig: Rig, mosaic: Mosaic, cone: Cone) -> Array | None:
 
 
 def rotation_of_band(rig: Rig, mosaic: Mosaic, band: BandRegistration) -> tuple[Array, Array]:
-    """The turn of a colour head that its registration to green says, and its sigma, (3,) rad each.
+    """The rotation of a colour head by its registration to green, and its sigma, (3,) rad each.
 
     The rotation nearest to the projective transformation over the head's sensor; green itself has
     its place by the adjustment.

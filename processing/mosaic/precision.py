@@ -2,7 +2,7 @@
 
 Three parts: the adjustment's covariance, which `processing.mosaic.free_mosaic` makes; calibration
 and drift coefficients of the master sensors the datum rests on; and the temperature of the master
-cone, which a common expansion hides in. Whether the calibration holds is judged in
+cone, which a common expansion hides in. Whether the calibration holds is tested in
 `processing.mosaic.validity`.
 
 Source: docs/mathematics/mosaicking.md#accuracy-of-the-image. Eq. 6 is that of Ladstädter et al.
@@ -36,7 +36,7 @@ BLIND_SIGMA_K = 15.0
 
 @dataclass(frozen=True)
 class UncertaintyContribution:
-    """Covariance beside that of tie points and datum (`processing.mosaic.uncertainty_contribution`).
+    """Covariance in addition to that of tie points and datum (`processing.mosaic.uncertainty_contribution`).
 
     `datum` (4, 4) is that of shift x, y (px), scale and rotation (px per mm) of the whole image;
     `frames` (2,) the variance of a coordinate, px squared, of one sensor's pixels, by its name;

@@ -1,4 +1,4 @@
-"""What one exposure's stitching says about the places of sensors, small enough to keep for ever.
+"""Record of one exposure's stitching: corrections of sensor positions, in a compact form.
 
 Corrections of the adjustment against calibration + TDM with their covariance; what is learned from
 many of them is in `processing.calibration.thermal_learning`.
@@ -45,7 +45,7 @@ class StitchRecord:
     `<cone>.rotation_x_urad`, `_y_`, `_z_` for every cone that is not the master, colour included;
     `values` (n,) and `covariance` (n, n) go with them. What tie points did not determine is left
     out. `dc_k` is the dC by sensor the start was made with; `measured` are the sensors whose own
-    probe told it. Values are in the gauge of the adjustment: a similarity common to the sensors of
+    probe was read. Values are in the gauge of the adjustment: a similarity common to the sensors of
     a cone means nothing. `height_m` above ground is None where it was not known.
     """
 

@@ -1,6 +1,6 @@
-"""Tie points in, judged placements out: which mosaic an image is made with, and why.
+"""Adjustment of tie points to tested placements, and the choice of the mosaic of an image.
 
-The order of adjustment, judgement, robust datum and support is decided here; each has a room of
+The order of adjustment, test, robust datum and support is decided here; each has a module of
 its own (`processing.mosaic.free_mosaic`, `processing.mosaic.validity`,
 `processing.mosaic.calibration_support`).
 """
@@ -35,10 +35,10 @@ Method = Literal["free", "fixed", "pan-only"]
 class Stitching:
     """The mosaics of one exposure.
 
-    `tie_points` are those believed. `equal` has its datum over all master sensors, `free` over
+    `tie_points` are those accepted. `equal_datum` has its datum over all master sensors, `free` over
     those in place, both by tie points alone; `image` is what the image is made with: `free`, or
     supported by calibration because of the sensors `weak`. `slips` are shifted bands of frames,
-    whose tie points are not among those believed. `validity` is None with the methods that are
+    whose tie points are not among those accepted. `validity` is None with the methods that are
     there to be compared with.
     """
 
@@ -61,7 +61,7 @@ def stitch(
     method: Method,
     settings: MosaicSettings,
 ) -> Stitching:
-    """Adjust, judge, repair the datum, and support what tie points do not carry.
+    """Adjust, test, correct the datum, and support what tie points do not determine.
 
     Args:
         rig: the camera.

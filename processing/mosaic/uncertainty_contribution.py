@@ -2,7 +2,7 @@
 
 The covariance of `processing.mosaic.precision` holds for a camera that is as calibrated. Where the
 report itself finds a displaced sensor, a wrong temperature, a changed master cone or a read-out
-slip, the image is as uncertain as that finding, and says so.
+slip, the stated accuracy of the image includes that finding.
 
 Source: docs/mathematics/validity.md#what-findings-add. Eq. 6 is that of Ladstädter et al. (2010).
 """

@@ -1,6 +1,6 @@
-"""Does the calibration still hold? Sensors as the stitching finds them against calibration + TDM.
+"""Test of the calibration: sensors in the stitching against calibration + TDM.
 
-Only the judgement and the datum that follows from it live here; the adjustment is in
+This module holds the test and the datum that follows from it; the adjustment is in
 `processing.mosaic.free_mosaic`. Displacements are (x right, y up), found minus expected, in PAN px.
 
 Source: docs/mathematics/validity.md#one-displaced-sensor; Ladstädter et al. (2010), "Optimal IO
@@ -38,7 +38,7 @@ from processing.rig import Rig
 Array = NDArray[np.float64]
 
 MIN_PAN_POINTS = 24
-"""P/P points used below which a sensor's place is not the stitching's to tell."""
+"""Fewer used P/P points do not determine a sensor's place."""
 
 Observability = Literal["named", "relative", "unobservable"]
 
@@ -107,15 +107,16 @@ class RelativeDisplacement:
 
 @dataclass(frozen=True)
 class Validity:
-    """The judgement on one exposure.
+    """The verdict on one exposure.
 
-    `observability` says per cone what can be known: a single displaced sensor is named, only a
+    `observability` states per cone what can be determined: a single displaced sensor is named, only a
     relative displacement is seen, or nothing (one sensor: the layer transformation absorbs it).
     `consistent` is the global test of the master sensors. `displaced` is the named sensor, with
-    `alternatives` that fit nearly as well; `several` says that one sensor does not explain it all.
-    `misread` is a probe whose error explains the misfit nearly as well as the named sensor, or,
-    with no sensor named, clearly better. `unproven` is a sensor that would be named if more than
-    P/C points and a few P/P said so.
+    `alternatives` that fit nearly as well; `several_displaced` is true where one sensor does not
+    explain it all.
+    `probe_bias` is a probe whose error explains the misfit nearly as well as the named sensor, or,
+    with no sensor named, clearly better. `insignificant_displacement` is a sensor that would be
+    named if more than P/C points and a few P/P showed it.
     """
 
     observability: Mapping[str, Observability]
@@ -224,7 +225,7 @@ def _cause(
 ) -> _Cause:
     """A sensor that moved or a probe that misreads: which explains the misfit.
 
-    That something is wrong is seen in the sensors' places. What it is, their scales tell, too: a
+    The sensors' places show that something is wrong. Their scales identify the cause: a
     wrong temperature grows the cone and its sensors by the drift coefficients, a slip does not.
     """
     hypotheses = _hypotheses(places)

@@ -54,7 +54,7 @@ BAND_FIGURES: Final[Mapping[str, str]] = {
     "<band>_rms_px": "root mean square length of their residuals, pixels",
     "<band>_shift_px": "largest displacement of raw pixels against the reference band, pixels",
 }
-"""Figures of a band beside those of `processing.quality.report.FIGURES`."""
+"""Figures of a band in addition to those of `processing.quality.report.FIGURES`."""
 
 _MATCHING_LEVEL: Final = 1000.0
 """Frames are matched with their median at this value: the kernels' guards are made for counts."""
@@ -62,7 +62,7 @@ _MATCHING_LEVEL: Final = 1000.0
 
 @dataclass(frozen=True)
 class FrameSettings:
-    """What a head told with its frame: gain, and the black level in words where it knows it."""
+    """Values a head reports with its frame: gain, and the black level in words where known."""
 
     gain: float = 1.0
     black: float | None = None
@@ -73,7 +73,7 @@ class BandProduct:
     """The bands of one exposure on the raster of `image`.
 
     `bands` (H, W) float32 by band in the rig's order, NaN without data, in `units`. `masks` (H, W)
-    uint8: VALID and SATURATED bits; `valid_area` says where they are valid, in a few numbers.
+    uint8: VALID and SATURATED bits; `valid_area` describes where they are valid, in a few numbers.
     `registrations` are those of all bands but the reference.
     """
 
@@ -97,7 +97,7 @@ class BandPipeline:
         radiance: by sensor name; a sensor without one gives DN above black.
         thresholds: of the verdict. None asks ten times less saturation than for a picture: a
             radiance that is wrong is worse than a roof without detail.
-        asked: what the project asks for, where it does.
+        requirements: of the project, if any.
 
     Raises:
         ValueError: a rig of other make.
@@ -150,7 +150,7 @@ class BandPipeline:
         *,
         frames_read: Callable[[], None] | None = None,
     ) -> BandProduct:
-        """Make the bands of one exposure and judge it.
+        """Make the bands of one exposure and evaluate it.
 
         Args:
             frames: Level-0 frames by sensor name, (h, w) uint16. A missing one leaves no band;

@@ -1,6 +1,6 @@
 """Which compiled kernels there are, and compiling them before a flight: none compiles in the air.
 
-Kernels are cached on disk (numba; `NUMBA_CACHE_DIR` where the service says so), so that after the
+Kernels are cached on disk (numba; `NUMBA_CACHE_DIR` where the service sets it), so that after the
 installation a start only loads them.
 """
 

@@ -1,6 +1,6 @@
 """Each head of a rig as an image of its own, resampled once to strict perspective.
 
-For rigs whose heads look apart (oblique heads) nothing is stitched: distortion, principal point and
+For rigs with diverging axes (oblique heads) nothing is stitched: distortion, principal point and
 the drift of sensor and lens are taken out, and the image is a central perspective of `f_mm`.
 
 Source: Jacobsen (2008) ("perfect perspective based on a resampling").
@@ -77,7 +77,7 @@ class HeadImage:
 
 @dataclass(frozen=True)
 class HeadsProduct:
-    """The images of one exposure by cone name, and what is thought of them.
+    """The images of one exposure by cone name, and their quality report.
 
     `valid_area` is that of the rig's image cone, whose image the plan counts.
     """
@@ -113,13 +113,13 @@ def raw_of_perspective(
 
 
 class HeadPipeline:
-    """A rig whose heads look apart, and its radiometric calibrations.
+    """A rig with diverging axes, and its radiometric calibrations.
 
     Args:
         rig: every cone has one sensor.
         radiometry: by sensor name; a sensor without one is taken as flat.
         interpolation: as in `processing.image.kernels`.
-        asked: what the project asks for, where it does.
+        requirements: of the project, if any.
 
     Raises:
         ValueError: a rig of other make.

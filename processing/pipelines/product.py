@@ -1,4 +1,4 @@
-"""What one exposure becomes, and how it is wished: the pipeline's settings and its result."""
+"""Settings of the pipeline and its result for one exposure."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Product:
     data. `valid` (H, W) uint8 is 0 without data, else 1 + the index into `sensors` of the sensor
     that contributes most; its highest bit marks saturation. `colour` holds the bands by name,
     (h, w) uint16 on the raster of `processing.image.lattice.colour_raster`. `quicklook` is (h, w,
-    3) uint8. `valid_area` says the same as `valid`, and of every band, in a few numbers.
+    3) uint8. `valid_area` summarizes `valid`, and every band, in a few numbers.
 
     `geometry` is keyed by method ("free", "fixed", "fixed-no-tdm"), then `<sensor>.vip` (n, 2),
     `<sensor>.raw` (n, 2), `<sensor>.weight` (n,): which raw pixel serves which VIP pixel.

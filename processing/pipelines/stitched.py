@@ -1,7 +1,7 @@
-"""One exposure through the whole chain: Level-0 frames in, the virtual image and its verdict out.
+"""The complete chain for one exposure: from Level-0 frames to the virtual image and its verdict.
 
-The order of the steps is decided here; each step's mathematics has a room of its own. Nothing here
-reads a file or waits for anything.
+The order of the steps is decided here; each step has a module of its own. Nothing here
+reads a file or waits.
 """
 
 from __future__ import annotations
@@ -188,7 +188,7 @@ class Pipeline:
         *,
         frames_read: Callable[[], None] | None = None,
     ) -> Product:
-        """Make the virtual image of one exposure and judge it.
+        """Make the virtual image of one exposure and evaluate it.
 
         Args:
             frames: Level-0 frames by sensor name, (h, w) uint16, DN. A missing one leaves a hole.

@@ -1,1 +1,1 @@
-"""What is said of an exposure: figures, flags, verdict."""
+"""The quality of an exposure: figures, flags, verdict."""

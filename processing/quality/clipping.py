@@ -55,7 +55,7 @@ def clipped_at(sensor: Sensor, frame: Array) -> tuple[int, float] | None:
     """The value where a frame ends, DN, and the share of its pixels there; None for none.
 
     Args:
-        sensor: what the rig file says.
+        sensor: as in the rig file.
         frame: Level-0, (h, w) uint16.
     """
     sample = frame[:: STEP[0], :: STEP[1]].ravel() // sensor.raw_units_per_dn

@@ -33,7 +33,7 @@ _COLUMNS: Final = 10
 class CommonWindows:
     """Windows (n) of all frames (f) on the same ground; NaN where a frame does not show one whole.
 
-    `names` are the frames, `pan` (f,) says which are of PAN heads. `place` (f, n, 2) is the centre
+    `names` are the frames, `pan` (f,) marks those of PAN heads. `place` (f, n, 2) is the centre
     of a window as a share of its frame's width and height, `mean` (f, n) its signal in Level-1
     counts, `noise` (f, n) the variance of a pixel that light and read-out explain. The rest is
     along columns and along rows, (f, n, 2): `near` and `far` the mean squared differences of pixels

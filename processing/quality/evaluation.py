@@ -77,7 +77,7 @@ _CAPTURE: Final[Mapping[Flag, tuple[Verdict, str]]] = {
     ),
     Flag.SUN: (
         Verdict.USABLE,
-        "The sun stands low: long shadows; go on when it is higher if the project asks for it.",
+        "The sun is low: long shadows; go on when it is higher if the project asks for it.",
     ),
     Flag.GSD: (
         Verdict.USABLE,
@@ -121,7 +121,7 @@ def evaluate(
 ) -> QualityReport:
     """Findings and verdict of one exposure from its figures.
 
-    A figure that is missing or None raises nothing: what is not known is not judged.
+    A figure that is missing or None raises nothing: what is not known is not evaluated.
 
     Args:
         figures: by documented name.
@@ -131,7 +131,7 @@ def evaluate(
         probes_out_of_range: probes whose temperature cannot be.
         nominal_bands: colours placed by calibration because too few tie points were found.
         mismatched_bands: those of them that have texture that does not match that of green.
-        asked: what the project asks for, where it does.
+        requirements: of the project, if any.
     """
     t = thresholds or Thresholds()
     findings = [
@@ -228,7 +228,7 @@ def _time_and_temperature(
         "time_error_px",
         Flag.TIME_SIGMA,
         (t.time_error_px, t.time_error_refly_px),
-        "The exposure's time is too uncertain for this speed and GSD; the budget says by what: "
+        "The exposure's time is too uncertain for this speed and GSD; see the time budget: "
         "check strobe cable and receiver.",
     )
     if missing_probes:

@@ -1,6 +1,6 @@
 """Figures of the quality report that come from pixels and stitching, by their documented names.
 
-What the circumstances alone tell is in `processing.geometry.conditions`; what the figures mean for
+Figures from the conditions alone are in `processing.geometry.conditions`; what the figures mean for
 the crew is decided in `processing.quality.report`.
 """
 
@@ -105,7 +105,7 @@ def valid_area_figures(area: ValidArea) -> dict[str, Figure]:
 
 
 def estimated_dc_figures(estimates: Sequence[EstimatedDc]) -> dict[str, Figure]:
-    """dC by stitching over all cones that tell, and the cones whose probes disagree."""
+    """dC by stitching over all cones with an estimate, and the cones whose probes disagree."""
     combined = combined_dc(estimates)
     return {
         "dc_estimated_k": None if combined is None else combined[0],

@@ -49,7 +49,7 @@ def identity_findings(figures: Mapping[str, Figure]) -> list[Finding]:
 
 
 def word_format_findings(figures: Mapping[str, Figure]) -> list[Finding]:
-    """Words that have another format than the rig file says."""
+    """Words in another format than the rig file states."""
     word_format = figures.get("word_format")
     if not word_format:
         return []
@@ -57,8 +57,8 @@ def word_format_findings(figures: Mapping[str, Figure]) -> list[Finding]:
         Finding(
             Flag.FRAME_CORRUPT,
             Verdict.REFLY,
-            f"The words of {figures.get('word_format_sensors')} are {word_format}, not as the rig "
-            "file says: set the pixel format of the head, or `bits` and `justified` in the rig "
+            f"The words of {figures.get('word_format_sensors')} are {word_format}, not as in the rig "
+            "file: set the pixel format of the head, or `bits` and `justified` in the rig "
             "file. The pixels stored are good; process them again with the right rig file.",
         )
     ]
@@ -92,7 +92,7 @@ def signal_findings(figures: Mapping[str, Figure], t: Thresholds) -> list[Findin
                 Flag.UNDEREXPOSED if signal < 1.0 else Flag.OVEREXPOSED,
                 Verdict.USABLE,
                 f"Head {outlier} shows {signal:.2f} times the signal of the others in the "
-                "overlaps: its exposure time, aperture or gain is not what the record says. The "
+                "overlaps: its exposure time, aperture or gain is not that of the record. The "
                 "image is balanced to the other heads; its noise differs there. Check the head's "
                 "settings.",
                 signal,
@@ -208,7 +208,7 @@ def exposure_findings(figures: Mapping[str, Figure], t: Thresholds) -> list[Find
         "saturated_fraction",
         Flag.OVEREXPOSED,
         (t.saturated_fraction, t.saturated_refly_fraction),
-        "Parts of the image are burnt out; shorten the exposure.",
+        "Parts of the image are saturated; shorten the exposure.",
     )
     for name, way in (("smear_along_px", "along"), ("smear_across_px", "across")):
         findings += above(

@@ -1,7 +1,7 @@
-"""Temperature probes over a flight: which of them can be believed, and what stands in for the rest.
+"""Temperature probes over a flight: which of them are valid, and values for the others.
 
 Pure functions on recorded samples; whether a reading may be used in one exposure alone is decided
-in `processing.geometry.conditions`, what stitching says about temperature in
+in `processing.geometry.conditions`, the temperature by stitching in
 `processing.mosaic.estimated_dc`.
 """
 
@@ -19,7 +19,7 @@ from processing.rig import Rig
 
 
 class ProbeState(enum.Enum):
-    """What is the matter with a probe; the flag it raises is `FLAGS`."""
+    """State of a probe; the flag it raises is `FLAGS`."""
 
     GOOD = "good"
     MISSING = "missing"
@@ -125,7 +125,7 @@ def evaluate_probes(
         at_s: the instant, on the clock of the samples.
         calibration_c: temperature at calibration, for every probe wanted.
         estimates: temperature (degC) and its standard deviation (K) by stitching, for probes whose
-            cone tells; used for bridging only, weighted with what the other probes say.
+            cone has an estimate; used for bridging only, weighted with the other probes.
         settings: None takes the defaults.
     """
     settings = settings or ProbeSettings()
@@ -154,7 +154,7 @@ def evaluate_probes(
 
 
 def _own_state(samples: Sequence[ProbeSample], at_s: float, settings: ProbeSettings) -> ProbeState:
-    """What a probe's own readings tell."""
+    """State of a probe by its own readings."""
     if not samples or at_s - samples[-1].time_s > settings.missing_s:
         return ProbeState.MISSING
     last = samples[-1].value_c

@@ -1,4 +1,4 @@
-"""Were the pixels of a frame read out at all? Without light a pixel still shows its black level.
+"""Pixels of a frame that were not read out. Without light a pixel still shows its black level.
 
 Pixels that were not read out are no data: they are left out of the image and of its valid area.
 """
@@ -30,7 +30,7 @@ def unread_figures(rig: Rig, frames: Mapping[str, Array]) -> dict[str, Figure]:
     """The sensor with the largest share of words far below black, and that share.
 
     Lines that were lost on the way, and a head without pixels, are zeros. Sensors whose black level
-    is not above the noise cannot tell and are passed over.
+    is not above the noise are skipped.
 
     Args:
         rig: the camera.

@@ -63,7 +63,7 @@ def requirement_findings(
         ),
         (
             *("sun_deg", requirements.sun_deg, Flag.SUN, True),
-            "The sun stands {value:.1f} deg high, {limit:.1f} deg asked for; fly this part again "
+            "The sun is {value:.1f} deg high, {limit:.1f} deg asked for; fly this part again "
             "when it is higher.",
         ),
         (

@@ -29,7 +29,7 @@ def stitching_findings(
         )
         if saturated_fraction > t.saturated_overlap_fraction:
             sentence = (
-                f"Few tie points in {where} because it is burnt out: {saturated_fraction:.0%} of the places "
+                f"Few tie points in {where} because it is saturated: {saturated_fraction:.0%} of the places "
                 "where points are sought hold saturated pixels. Shorten the exposure."
             )
         findings.append(
@@ -86,14 +86,14 @@ def stitching_findings(
         if figures.get("displaced_several"):
             sentence = (
                 "More than one sensor of the master cone sits off its calibrated place, and which "
-                "ones cannot be told: the image fits together, but its place in the camera is "
+                "ones cannot be determined: the image fits together, but its place in the camera is "
                 "uncertain. Go on, and have the camera calibrated."
             )
         elif misread:
             others = f" or {alternatives}" if alternatives else ""
             sentence = (
                 f"Either sensor {displaced}{others} sits {size:.2f} px off its calibrated place or "
-                f"{misread}; the stitching cannot tell, and the image fits together. Go on, check "
+                f"{misread}; the stitching cannot separate them. The image fits together. Go on, check "
                 "the probe after landing, and have the camera calibrated."
             )
         elif alternatives:
@@ -135,8 +135,8 @@ def _platform(figures: Mapping[str, Figure]) -> list[Finding]:
             f"ppm; cause: cone {causes}"
             + (f", or {other}" if other else "")
             + "): its principal distance or mounting has changed, or the rig file is of another "
-            "camera. The whole image may be shifted or scaled; its stated accuracy says by how "
-            "much. Check the serial numbers, and process again with the right calibration."
+            "camera. The whole image may be shifted or scaled; its stated accuracy includes "
+            "this. Check the serial numbers, and process again with the right calibration."
         )
     elif causes:
         sentence = (

@@ -24,7 +24,7 @@ SAMPLES: Final = 4
 """Pixels looked at in each direction of a cell."""
 SATURATION_WINDOW: Final = 5
 """Saturated cells count where they are the majority of so many cells squared: a white roof is no
-gap, a burnt-out field is."""
+gap, a saturated field is."""
 BOXES_MAX: Final = 24
 """Of a band. A mask that needs more is described in cells twice, four times ... as large."""
 

@@ -1,4 +1,4 @@
-"""Are the words of a frame what the rig file says: so many bits, right or left-justified?"""
+"""Check the words of a frame against the rig file: bits, right or left-justified."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def wrong_format(sensor: Sensor, frame: Array) -> str | None:
     """The format of a frame's words where it is not the sensor's; None where it is.
 
     Args:
-        sensor: what the rig file says.
+        sensor: as in the rig file.
         frame: Level-0, (h, w) uint16.
     """
     if sensor.bits >= 16:

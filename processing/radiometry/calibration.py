@@ -42,7 +42,7 @@ RESPONSE_LIMIT_PER_K: Final = 0.01
 
 
 class CalibrationError(ValueError):
-    """A calibration that cannot be used; the sentence names file, finding and cure."""
+    """A calibration that cannot be used; the message names file, finding and remedy."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class RadiometricCalibration:
 
 
 def neutral_radiometry(sensor: Sensor) -> RadiometricCalibration:
-    """The calibration of a sensor nobody calibrated: the rig's black level, gain one, no defect."""
+    """The calibration of an uncalibrated sensor: the rig's black level, gain one, no defect."""
     shape = (sensor.height_px, sensor.width_px)
     return RadiometricCalibration(
         bias_dn=np.broadcast_to(np.float32(sensor.black_dn), shape),
@@ -78,7 +78,7 @@ def neutral_radiometry(sensor: Sensor) -> RadiometricCalibration:
 
 
 def load_radiometry(path: Path) -> RadiometricCalibration:
-    """Read `<sensor>.npz`, which holds the names of `RadiometricCalibration`; the last may lack.
+    """Read `<sensor>.npz`, which holds the names of `RadiometricCalibration`; the last is optional.
 
     Nothing is unpickled, and no array is read before its announced size was checked.
 

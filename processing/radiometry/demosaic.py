@@ -143,7 +143,7 @@ def _red_and_blue(level1, letters, out):
                 total = 0.0
                 count = 0
                 saturated = middle & 1
-                # Pixels of this colour lie beside, above and below, or at the four corners.
+                # Pixels of this colour are left and right, above and below, or at the four corners.
                 for r in range(-1, 2):
                     for c in range(-1, 2):
                         y, x = row + r, col + c

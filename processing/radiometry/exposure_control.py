@@ -13,13 +13,13 @@ from dataclasses import dataclass
 from typing import Final
 
 BRIGHT_SHARE: Final = 0.99
-"""Where the brightest hundredth begins is what is steered: of bright roofs little is lost."""
+"""The 99th percentile is controlled: of bright roofs little is lost."""
 
 MAX_STEP_FACTOR: Final = 2.0
 """The most that light is changed at once, up or down: one odd image must not spoil the next."""
 
 SATURATED_STEP: Final = 0.5
-"""What is saturated does not tell by how much."""
+"""Saturated pixels do not show by how much."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class ExposureLimits:
     None where height or speed are not known, then the exposure time may only become shorter.
     `smear_px` is the motion that may be left, along track after TDI and, by `crab_rad`, across.
     `gain_max_db` is the noise limit. `black` is the black level as a share of the full scale,
-    `target` where the brightest hundredth of the pixels should begin, `deadband` how far off that
+    `target` where the 99th percentile of the pixels should be, `deadband` how far off that
     is left alone.
     """
 
@@ -78,7 +78,7 @@ def next_settings(
 
 
 def light_factor(counts: Sequence[int], limits: ExposureLimits) -> float:
-    """By how much more light the brightest hundredth would begin at the target; 1 for no counts."""
+    """Factor on light that brings the 99th percentile to the target; 1 for no counts."""
     total = sum(counts)
     if total == 0:
         return 1.0

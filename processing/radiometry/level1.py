@@ -6,7 +6,7 @@ Defects are interpolated here too; what the calibration is and where it comes fr
 A Level-1 word is uint16. 0 means no data: partly exposed TDI rows, and defects without a good
 neighbour in reach. Any other word is linear signal above black in units of 1 /
 `level1_counts_per_dn` DN (8 counts to the DN for 12 bits, so rounding stays far below the read
-noise); its lowest bit says that the pixel was saturated before it was scaled. Signal at or below
+noise); its lowest bit marks that the pixel was saturated before it was scaled. Signal at or below
 black is held at `LEVEL1_FLOOR`.
 
 Source: docs/mathematics/radiometry.md#offset-and-gain, #tdi and #defects; Heier et al. (2002), 5.2.

@@ -56,10 +56,10 @@ def radiance_from_raw(
     """Radiance of a raw frame in its own geometry.
 
     Args:
-        sensor: says how its words hold DN, and the black level where `black` does not.
+        sensor: format of its words, and the black level where `black` is None.
         words: (h, w) uint16 as stored.
         exposure_time_s, gain: of this exposure.
-        black: word without light, as the head told it for this frame.
+        black: word without light, as the head reports it for this frame.
 
     Returns:
         (h, w) float32, W/m2/sr/nm. Noise may leave it below zero.

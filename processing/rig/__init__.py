@@ -1,4 +1,4 @@
-"""The rig: what the camera is made of, and the file that says so.
+"""The rig: the parts of the camera, and the file that describes them.
 
 A leaf: it imports nothing of ours. What follows from the geometry (overlaps, parameter counts) is
 in `processing.geometry.topology`; where a sensor's pixels fall in the virtual image is in

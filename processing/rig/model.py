@@ -14,10 +14,10 @@ from dataclasses import dataclass, field
 from typing import Final, Literal
 
 VIRTUAL_CAMERA: Final = "virtual"
-"""What the camera between converging heads is called beside the cones."""
+"""Name of the camera between converging heads in tables of cones."""
 
 CALIBRATION_VALID_DAYS: Final = 730
-"""Where the rig file says nothing: customers ask for a calibration of the last two years."""
+"""Default of the rig file: customers require a calibration of the last two years."""
 
 Timing = Literal["syntopic", "synchronous"]
 Role = Literal["pan", "colour"]
@@ -183,7 +183,7 @@ class VirtualImage:
 
 @dataclass(frozen=True)
 class Rig:
-    """A camera of several heads, as its file tells it.
+    """A camera of several heads, as in its file.
 
     `master_cone` is None where all PAN heads converge and none of them is the virtual image plane:
     the virtual camera then stands in the middle of their projection centres. The calibration is

@@ -14,7 +14,7 @@ DEPTH_MAX: Final = 32
 
 
 class TomlError(ValueError):
-    """Text that is not TOML; the sentence says why."""
+    """Text that is not TOML; the message states why."""
 
 
 def parse_toml(data: bytes) -> dict[str, Any]:

@@ -47,7 +47,7 @@ def expose(
     Args:
         rig: as calibrated.
         dc_k: all probes above calibration.
-        displaced: shift (x right, y up) in px of a sensor against what the rig says.
+        displaced: shift (x right, y up) in px of a sensor against the rig.
         tdi_shifts: of the PAN cones; colour has its share by the ratio.
         brightness: factor on the light of a sensor; one where not named.
         contrast: one for a well textured scene; zero for open water.

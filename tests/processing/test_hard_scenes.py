@@ -1,4 +1,4 @@
-"""Over ground that is hard to stitch the image is right, or its report says that it is not.
+"""Over ground that is hard to stitch the image is right, or its report states that it is not.
 
 Rendered by the emulator, held against its truth; the whole set, with pictures, is in
 docs/accuracy.md.

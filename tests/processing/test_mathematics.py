@@ -49,7 +49,7 @@ def test_the_elements_of_the_rotation_matrix(omega: float, phi: float, kappa: fl
     assert omega_phi_kappa(r) == pytest.approx(angles, abs=1e-12)
 
 
-def test_a_small_rotation_moves_an_image_point_as_the_matrix_of_the_page_says() -> None:
+def test_a_small_rotation_moves_an_image_point_as_the_matrix_of_the_page() -> None:
     x, y, f = 12.0, -7.0, 100.0
     page = np.array([[x * y / f, -f - x * x / f, -y], [f + y * y / f, -x * y / f, x]])
     assert small_rotation_design(np.array([[x, y]]), f)[:, :, 0] == pytest.approx(page)
@@ -156,8 +156,8 @@ def test_inner_constraints_over_four_sensors() -> None:
         page[0][f"{n}.x"] = page[1][f"{n}.y"] = 1.0
         page[2] |= {f"{n}.x": x, f"{n}.y": y}
         page[3] |= {f"{n}.x": -y, f"{n}.y": x}
-    for found, said in zip(datum_constraints(start, names), page, strict=True):
-        assert dict(found.coefficients) == pytest.approx(said)
+    for found, expected in zip(datum_constraints(start, names), page, strict=True):
+        assert dict(found.coefficients) == pytest.approx(expected)
 
 
 def test_one_of_four_displaced_sensors_shows_half_and_shifts_a_quarter() -> None:

@@ -34,7 +34,7 @@ def test_table_2_is_read_with_phi_primary() -> None:
     assert np.degrees(np.arctan2(axis[1], -axis[2])) == pytest.approx(49.9609 * 0.9, abs=0.01)
     for name, (_, _, kappa) in TABLE_2_GRAD.items():
         tilt = np.degrees(np.arccos(table_2_rotation(name)[2, 2]))
-        assert 44.1 < tilt < 46.3, "44.2 to 46.2 degrees, the paper says"
+        assert 44.1 < tilt < 46.3, "44.2 to 46.2 degrees in the paper"
         assert abs(kappa) < 200.0
 
 
@@ -51,7 +51,7 @@ def test_averaging_over_the_block_gives_what_the_common_adjustment_gives(blocks)
     for block in blocks:
         for name, head in block.figures["heads"].items():
             difference = np.abs(head["averaged_less_adjusted_mgrad"])
-            # A mean of a dozen exposures, and principal points that are determined anew.
+            # A mean of a dozen exposures, and principal points that are determined again.
             bound = 3.0 * np.array(head["averaged_spread_mgrad"]) / np.sqrt(8.0)
             bound += 1.5 * np.array(head["sigma_mgrad"])
             assert (difference < bound).all(), name
@@ -69,7 +69,7 @@ def test_intersections_err_as_predicted_with_the_control_of_the_paper(blocks) ->
     predicted = np.sqrt(np.mean(np.concatenate([b.sigma_m for b in blocks]) ** 2, axis=0))
     assert all(b.figures["checks"] >= 20 for b in blocks)
     assert (np.abs(rms / predicted - 1.0) < 0.3).all()
-    # Beside the paper's 0.62, 0.60, 1.63 m, which its control limits as well.
+    # Next to the paper's 0.62, 0.60, 1.63 m, which its control limits as well.
     assert (rms < [0.62, 0.60, 2.0]).all()
     pooled = np.concatenate([(b.true_error_m / b.true_sigma_m).ravel() for b in blocks])
     assert (np.abs(pooled) < 3.0).mean() > 0.98

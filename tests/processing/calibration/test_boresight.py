@@ -1,4 +1,4 @@
-"""Boresight, lever arm, time offset err as their covariance says; what is not parted is named."""
+"""Boresight, lever arm, time offset err as their covariance predicts; inseparable parameters are named."""
 
 from __future__ import annotations
 

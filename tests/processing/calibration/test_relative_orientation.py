@@ -1,4 +1,4 @@
-"""Relative orientations of a block err as their covariance says, averaged or as parameters."""
+"""Relative orientations of a block err as their covariance predicts, averaged or as parameters."""
 
 from __future__ import annotations
 

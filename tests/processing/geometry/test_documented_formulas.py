@@ -28,7 +28,7 @@ def example(section):
 
 
 def from_the_page(example, pixel, shifts):
-    """Steps 1 to 8, as the page says them: a list of (x, y)."""
+    """Steps 1 to 8, as on the page: a list of (x, y)."""
     w, h, p, big_w, big_h = 1248, 832, 0.036, 4872, 3192
     sensor, drift, lens = example["sensor"], example["drift"], example["lens"]
     c, r = pixel

@@ -104,7 +104,7 @@ def test_a_rig_file_holds_the_grid_and_names_what_is_wrong_in_one() -> None:
 
 
 def test_halves_that_differ_leave_their_difference() -> None:
-    """Every other residual is 1 um, the others -1 um: either half says nothing of the other."""
+    """Every other residual is 1 um, the others -1 um: either half is independent of the other."""
     at = np.random.default_rng(1).uniform(-1.0, 1.0, (200, 2)) * HALF_MM
     sign = np.where(np.arange(200) % 2, -1.0, 1.0)
     residual = sign[:, None] * [1e-3, -5e-4]

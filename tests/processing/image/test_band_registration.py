@@ -48,7 +48,7 @@ def small_rig():
 
 RIG = small_rig()
 TRUE = rotation_homography(ROTATION, 2.2, 2.2)
-"""How a band is really turned against its calibration; the rig file says nothing of it."""
+"""True rotation of a band against its calibration; the rig file does not contain it."""
 
 
 def rendered(rig, name, true, texture, contrast=1.0):

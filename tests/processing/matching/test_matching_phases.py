@@ -28,7 +28,7 @@ def test_no_phase_draws_matches_and_the_sigma_is_the_true_one(case: Case) -> Non
 
 
 def test_sharpness_costs_next_to_nothing_where_nothing_of_it_is_lost() -> None:
-    """Green that is softer by half of its pixel tells places half as well, not a tenth."""
+    """Green that is softer by half of its pixel has twice the position error, not ten times."""
     equal_sharpness, soft = (
         run(Case(RATIO, 0.5, 0.15, 0.3, blur), phases=2, size=800) for blur in (0.0, 0.6)
     )

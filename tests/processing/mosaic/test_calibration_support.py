@@ -30,7 +30,7 @@ def test_an_image_without_its_master_cone_lies_as_surely_as_the_platform_states(
 ) -> None:
     """Three cones, each turned against the master by its own error: their mean places the image.
 
-    How well points are matched says nothing of it.
+    It is independent of matching accuracy.
     """
     rng = np.random.default_rng(3)
     truth = make_truth(MINI, rng, sensor_px=0.02, layer_px=0.1)

@@ -109,7 +109,7 @@ def test_what_is_missing_leaves_an_image_that_reports_it(
     if set(missing) < set(MASTER):
         assert stated > 1.08 * before
     if missing == MASTER:
-        # Nothing but the platform calibration says where the image lies.
+        # Only the platform calibration places the image.
         assert stated > 0.5
     assert set(missing) & pan_sensors(RIG) <= set(_held(product_copy)) or missing == ("SU30",)
 

@@ -40,9 +40,9 @@ def test_at_twice_that_the_right_sensor_is_named(outcomes: Outcomes, dc_k: float
 
 @pytest.mark.parametrize("off_k", [4.0, 16.0])
 def test_no_sensor_is_named_for_the_bias_of_a_probe(outcomes: Outcomes, off_k: float) -> None:
-    told = outcomes.probe_bias(0.0, off_k, exposures=300, flights=2)
-    assert told.misattributed + told.either <= 0.01 and told.flights_misattributed == 0.0
-    assert told.named > (0.1 if off_k < 10.0 else 0.95)
+    rates = outcomes.probe_bias(0.0, off_k, exposures=300, flights=2)
+    assert rates.misattributed + rates.either <= 0.01 and rates.flights_misattributed == 0.0
+    assert rates.named > (0.1 if off_k < 10.0 else 0.95)
 
 
 def test_the_best_test_there_is_finds_little_more() -> None:

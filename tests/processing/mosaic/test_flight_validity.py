@@ -1,4 +1,4 @@
-"""A flight of exposures tells of small displacements that one exposure cannot see."""
+"""A flight of exposures shows small displacements that one exposure cannot see."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def camera_errors(rig: Rig, seed: int) -> dict[str, tuple[float, float]]:
 
 
 def template(rig: Rig) -> StitchRecord:
-    """What one real adjustment says, of a camera as calibrated: its covariance is what counts."""
+    """The record of one real adjustment, of a camera as calibrated: its covariance is what counts."""
     rng = np.random.default_rng(0)
     truth = make_truth(rig, rng, temperature_c=20.0, sensor_px=0.0)
     points = tie_points_of(
@@ -132,7 +132,7 @@ def test_two_sensors_that_move_at_once_are_reported_as_ambiguous() -> None:
     (step,) = validity.steps
     assert step.kind == "several" and abs(step.since - 20) <= 1
     assert "More than one sensor of cone 0" in step.sentence
-    assert "cannot be told" in step.sentence
+    assert "cannot be determined" in step.sentence
 
 
 def test_two_sensors_that_move_one_after_the_other_are_both_named() -> None:
@@ -204,7 +204,7 @@ def test_a_stuck_probe_is_no_row_of_steps_and_hides_no_sensor() -> None:
     for moved, records in (((), records_of({}, seed=10, count=32)), (("SU02",), slipped)):
         stuck = {}
         for number, record in records.items():
-            # The mount cools by 0.375 K from one exposure to the next; the probe does not tell.
+            # The mount cools by 0.375 K from one exposure to the next; the probe does not follow.
             bias_k = 0.375 * max(0, number - 8)
             values, dc_k = record.values.copy(), dict(record.dc_k)
             for sensor in MINI.master_sensors:

@@ -1,7 +1,7 @@
 """A camera of two PAN cones and a Bayer head (ultracam-l), over real imagery of the emulator.
 
 One overlap between two single sensors: a projective layer holds only thanks to green, and green
-comes out of a Bayer head. The earlier experiment without either stands beside it.
+comes out of a Bayer head. The earlier experiment without either is included for comparison.
 """
 
 from __future__ import annotations

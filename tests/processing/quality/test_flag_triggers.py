@@ -20,7 +20,7 @@ SEED = 50_001
 pytestmark = pytest.mark.timeout(600)
 
 FAULTY = (
-    *("dark", "burnt", "defocused", "no-detail"),
+    *("dark", "saturated", "defocused", "no-detail"),
     # In a shorter run test_pipeline_emulated and test_degraded_mode raise these two.
     pytest.param("displaced", marks=pytest.mark.soak),
     pytest.param("stuck-probe", marks=pytest.mark.soak),
@@ -52,7 +52,7 @@ def test_a_fault_raises_its_flag(camera: Camera, name: str) -> None:
 
 
 def _everything(conditions_in: Conditions) -> Conditions:
-    """Instruments say twice what is allowed of everything that they tell."""
+    """Instruments report twice the limit of every figure."""
     probes = dict(conditions_in.temperatures_c) | {
         "1": None,
         "2": 2 * THRESHOLDS.temperature_high_c,

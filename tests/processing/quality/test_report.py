@@ -169,7 +169,7 @@ def test_two_displaced_sensors_are_reported_as_ambiguous() -> None:
     report = evaluate(GOOD | moved | {"displaced_several": 1})
     assert report.flags == Flag.DISPLACED_SENSOR
     assert "More than one sensor" in report.findings[0].sentence
-    assert "cannot be told" in report.findings[0].sentence
+    assert "cannot be determined" in report.findings[0].sentence
     unsure = evaluate(GOOD | moved | {"displaced_alternatives": "SU00, SU03"})
     assert "unless it is SU00, SU03" in unsure.findings[0].sentence
 
@@ -185,7 +185,7 @@ def test_a_probe_that_explains_it_is_named_instead_of_a_sensor_or_in_addition_to
     assert report.flags == Flag.DC_DISAGREEMENT | Flag.DISPLACED_SENSOR
     for finding in report.findings:
         assert "probe 0 reads 2.0 K too low" in finding.sentence and "SU01" in finding.sentence
-    assert "the stitching cannot tell" in report.findings[1].sentence
+    assert "the stitching cannot separate them" in report.findings[1].sentence
 
 
 def test_an_overlap_without_tie_points_because_it_is_saturated_reports_it() -> None:
@@ -198,7 +198,7 @@ def test_an_overlap_without_tie_points_because_it_is_saturated_reports_it() -> N
         f.sentence for f in saturated_report.findings if f.flag == Flag.TIE_POINTS
     )
     assert (
-        "SU03-SU11 because it is burnt out: 83%" in sentence_of_overlap
+        "SU03-SU11 because it is saturated: 83%" in sentence_of_overlap
         and "water" not in sentence_of_overlap
     )
     lake = evaluate(GOOD | few | {"tie_points_min_overlap_burnt": 0.1, "saturated_fraction": 0.06})

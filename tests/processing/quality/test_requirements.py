@@ -34,7 +34,7 @@ def test_an_exposure_that_keeps_everything_is_good() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "flag", "said"),
+    ("name", "value", "flag", "phrase"),
     [
         ("forward_overlap", 0.42, Flag.OVERLAP, "Only 42% forward overlap, 50% asked for"),
         ("sidelap", 0.0, Flag.OVERLAP, "Only 0% sidelap"),
@@ -46,14 +46,14 @@ def test_an_exposure_that_keeps_everything_is_good() -> None:
     ],
 )
 def test_what_breaks_it_is_flown_again_and_states_by_how_much(
-    name: str, value: float, flag: Flag, said: str
+    name: str, value: float, flag: Flag, phrase: str
 ) -> None:
     figures = GOOD | CONFORMING | {name: value}
     report = evaluate(figures, requirements=REQUIREMENTS)
     assert report.verdict is Verdict.REFLY
     assert report.flags == flag
     (finding,) = report.findings
-    assert said in finding.sentence
+    assert phrase in finding.sentence
     assert "again" in finding.sentence
     assert finding.value == value
     assert evaluate(figures).verdict is not Verdict.REFLY

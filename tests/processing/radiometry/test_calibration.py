@@ -1,4 +1,4 @@
-"""Radiometric calibration files: what is read, and what hostile ones are told."""
+"""Radiometric calibration files: contents, and errors of hostile ones."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_a_good_file_is_read_as_it_was_written(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "message"),
     [
         ({"gain": None}, "it holds bias_dn.npy"),
         ({"extra": np.zeros(3)}, "it holds bias_dn.npy"),
@@ -63,9 +63,9 @@ def test_a_good_file_is_read_as_it_was_written(tmp_path: Path) -> None:
     ],
 )
 def test_a_file_with_other_content_is_refused_with_what_was_found(
-    tmp_path: Path, changes: dict[str, Any], says: str
+    tmp_path: Path, changes: dict[str, Any], message: str
 ) -> None:
-    with pytest.raises(CalibrationError, match=says):
+    with pytest.raises(CalibrationError, match=message):
         load_radiometry(written(tmp_path / "SU00.npz", **changes))
 
 

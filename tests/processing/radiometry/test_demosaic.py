@@ -141,7 +141,7 @@ def test_green_matches_without_bias_over_all_phases(array: str) -> None:
 
 
 def test_pixels_without_data_stay_without_and_pull_nothing() -> None:
-    """A gradient beside a hole comes out as the gradient: mirror images fall away together."""
+    """A gradient next to a hole comes out as the gradient: mirror images fall away together."""
     ramp = 8000.0 + 100.0 * np.arange(60)[None, :] + np.zeros((60, 1))
     mosaic = behind_filters(np.stack([ramp] * 3), "RGGB")
     mosaic[:, 30] = 0
